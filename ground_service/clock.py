@@ -23,6 +23,17 @@ def utc_now_ns() -> int:
     return time.time_ns()
 
 
+@dataclass(frozen=True, slots=True)
+class TelemetryTime:
+    """Mission time that stands at the newest telemetry, which cannot be compared with it."""
+
+    utc_ns: int
+
+    def __call__(self) -> int:
+        """Return the time."""
+        return self.utc_ns
+
+
 @dataclass(slots=True)
 class _Source:
     read: Callable[[], int] | None = None
@@ -38,6 +49,12 @@ def mission_now_ns() -> int:
     That of a simulation, otherwise the clock that the mission descriptions in force state, otherwise the wall clock.
     """
     return (_mission.read or _mission.stated or utc_now_ns)()
+
+
+def independent_now_ns() -> int | None:
+    """Return the mission time if another clock than telemetry states it."""
+    now = mission_now_ns()
+    return None if isinstance(_mission.read or _mission.stated, TelemetryTime) else now
 
 
 def set_mission_clock(read: Callable[[], int] | None = None) -> None:

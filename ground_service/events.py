@@ -48,6 +48,25 @@ class TelemetryReceived(Event):
     kinds: tuple[str, ...] = ()
 
 
+class TimesDoubted(Event):
+    """Packets of a vehicle have an implausible on-board time and are kept apart."""
+
+    event_kind = "times doubted"
+    vehicle_id: int
+    ingest_id: int
+    packets: int
+
+
+class TelemetryWithdrawn(Event):
+    """Packets of a vehicle with these on-board times were removed from the archive."""
+
+    event_kind = "telemetry withdrawn"
+    vehicle_id: int
+    packets: int
+    first_ticks: int
+    last_ticks: int
+
+
 class ReceptionsEntered(Event):
     """Reception times of time reports of a vehicle were entered."""
 
@@ -62,6 +81,15 @@ class CorrelationChanged(Event):
     event_kind = "correlation"
     vehicle_id: int
     segments: int
+
+
+class ClockDoubted(Event):
+    """The clock of a station disagrees with others or with the on-board clock: its time reports do not count."""
+
+    event_kind = "clock doubted"
+    vehicle_id: int
+    station: str
+    difference_s: float
 
 
 class EphemerisAdded(Event):

@@ -29,7 +29,7 @@ ALL = {
 LISTS = {
     "list_passes", "list_ingests", "list_monthly_reports", "list_landmarks", "list_missions",
     "list_windows", "list_requests", "list_telecommands", "list_alarms",
-    "list_handovers", "list_spacecraft", "list_links", "list_contacts",
+    "list_handovers", "list_implausible", "list_spacecraft", "list_links", "list_contacts",
 }  # fmt: skip
 """Lists from which the rows of other spacecraft are left out."""
 

@@ -204,6 +204,16 @@ class Operations(Connection):
     def list_ingests(self) -> Listing[ingest.Ingest]:
         """List the ingests, newest first."""
 
+    @operation("GET /implausible-packets", reads="ingest.doubts.list_implausible")
+    def list_implausible(
+        self, *, spacecraft_id: int | None = None, instance: str | None = None, ingest_id: int | None = None
+    ) -> Listing[ingest.ImplausiblePacket]:
+        """List the packets that are kept apart because their on-board time is implausible, newest first."""
+
+    @operation("POST /ingests/{ingest_id}/withdraw", body=("reason",))
+    def withdraw_ingest(self, ingest_id: int, reason: str) -> ingest.Ingest:
+        """Withdraw an ingest: everything is derived again without it; its file and the audit entry stay."""
+
     @operation("GET /ingests/{ingest_id}")
     def get_ingest(self, ingest_id: int) -> ingest.Ingest:
         """Show an ingest: its state and the accounting of the file."""
@@ -330,7 +340,7 @@ class Operations(Connection):
 
     @operation("DELETE /ephemerides/{ephemeris_id}")
     def withdraw_ephemeris(self, ephemeris_id: int) -> None:
-        """Withdraw a reference ephemeris that no pass or window names; its file and the audit entries are kept."""
+        """Withdraw a reference ephemeris: passes and windows use others; its file and the audit entries are kept."""
 
     # jobs
 

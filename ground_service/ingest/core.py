@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lunar.arrays import IntArray
-from tmtc.cuc import TICKS_PER_SECOND
+from lunar.plausible import AGREEING_PACKETS, CLOCK_ERROR_S, SILENCE_S, UNSET_CLOCK_S
+from tmtc.cuc import NO_TICKS, TICKS_PER_SECOND
 
 COUNT_MODULUS = 1 << 14
 
@@ -119,3 +120,76 @@ def _usual_rate(near: IntArray, step_ticks: IntArray) -> float:
     packets, ticks = count[RATE_PACKETS:] - count[:-RATE_PACKETS], time[RATE_PACKETS:] - time[:-RATE_PACKETS]
     forward = (packets > 0) & (ticks > 0)
     return float(np.median(packets[forward] / ticks[forward])) if forward.any() else 0.0
+
+
+LONGEST_STEP = round(CLOCK_ERROR_S * TICKS_PER_SECOND)
+UNSET_TICKS = round(UNSET_CLOCK_S * TICKS_PER_SECOND)
+LONGEST_SILENCE = round(SILENCE_S * TICKS_PER_SECOND)
+
+
+def implausible_times(
+    ticks: IntArray, received: IntArray | None, newest: int | None, latest: int | None
+) -> dict[int, str]:
+    """Return the packets whose on-board time is implausible, with the reason.
+
+    Time goes on in stretches without a longer silence than `LONGEST_STEP`. One that begins later than that after all
+    telemetry is believed if a station received it then, or by a clock of the mission, or because enough of its packets
+    agree. A clock that shows the time since its epoch was not set.
+
+    Parameters
+    ----------
+    ticks
+        On-board time (n,), `NO_TICKS` where a packet has none.
+    received
+        On-board time (n,) at which an ideal clock would have shown the reception, `NO_TICKS` if unknown.
+    newest
+        Greatest on-board time of the archive; None if the archive has too little to compare with.
+    latest
+        Greatest on-board time that the mission clock allows; None if no clock but telemetry states it.
+    """
+    timed = np.flatnonzero(ticks != NO_TICKS)
+    order = timed[np.argsort(ticks[timed], kind="stable")]
+    if not order.size:
+        return {}
+    times, doubts = ticks[order], {}
+    known = None if received is None else (received != NO_TICKS) & (ticks != NO_TICKS)
+    agreed = np.zeros(len(ticks), dtype=np.bool_)
+    if received is not None and known is not None:
+        ahead = known & (ticks > received + LONGEST_STEP)
+        agreed = known & (np.abs(ticks - received) <= LONGEST_STEP)
+        if agreed.any():  # otherwise the clock of the station is wrong
+            doubts = {
+                int(k): f"{_span(int(ticks[k] - received[k]))} after its reception"
+                for k in np.flatnonzero(ahead)
+            }
+    reached = newest
+    for stretch in np.split(order, np.flatnonzero(np.diff(times) > LONGEST_STEP) + 1):
+        first, last = int(ticks[stretch[0]]), int(ticks[stretch[-1]])
+        reason = None
+        if reached is not None and first - reached > LONGEST_STEP and not agreed[stretch].any():
+            if latest is not None:
+                reason = f"{_span(last - latest)} after the mission time" if last > latest else None
+            elif len(stretch) < AGREEING_PACKETS:
+                reason = f"{_span(first - reached)} after all other telemetry, {len(stretch)} packets agree"
+            elif first - reached > LONGEST_SILENCE:
+                reason = f"{_span(first - reached)} after all other telemetry"
+        if reason is None:
+            is_firm = newest is not None or len(stretch) >= AGREEING_PACKETS
+            reached = max(reached or last, last) if is_firm else reached
+        else:
+            doubts.update(dict.fromkeys(stretch.tolist(), reason))
+    if reached is not None and reached > 2 * UNSET_TICKS and times[0] < UNSET_TICKS:
+        doubts.update(dict.fromkeys(order[times < UNSET_TICKS].tolist(), "the clock was not set"))
+    return doubts
+
+
+def fits_between(count: int, before: int | None, after: int | None) -> bool:
+    """Return whether a 14-bit count is plausible between those of the packets around it in time."""
+    if before is None or after is None:
+        return True
+    return (count - before) % COUNT_MODULUS <= (after - before) % COUNT_MODULUS
+
+
+def _span(ticks: int) -> str:
+    seconds = ticks / TICKS_PER_SECOND
+    return f"{seconds / 86_400:.1f} d" if seconds >= 86_400 else f"{seconds / 3600:.1f} h"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pydantic import ConfigDict, Field
 
-from ground_service.http.model import Entity
+from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber
 from ground_service.http.times import UtcTime
+from ground_service.text import LINE_PATTERN_JSON
 
 
 class IngestAccepted(Entity):
@@ -101,6 +102,9 @@ class IngestResult(Entity):
     packets_new: int = Field(description="Packets that were not in the archive")
     packets_joined: int = Field(description="New packets completed with earlier pieces or other recordings")
     packets_repeated: int
+    packets_implausible: int = Field(
+        default=0, description="Packets kept apart because their on-board time is implausible"
+    )
     samples: int
     crc_errors: int
     octets_skipped: int
@@ -122,11 +126,40 @@ class IngestResult(Entity):
     uplink: tuple[ReceivedControlWords, ...] = ()
 
 
+class Withdrawal(Given):
+    """Why an ingest is withdrawn."""
+
+    reason: str = Field(min_length=1, max_length=500, pattern=LINE_PATTERN_JSON, examples=["another flight"])
+
+
+class ImplausibleFilter(Paging):
+    """Packets with an implausible time to list."""
+
+    spacecraft_id: SpacecraftNumber | None = None
+    instance: InstanceName | None = None
+    ingest_id: int | None = None
+
+
+class ImplausiblePacket(Entity):
+    """A packet whose on-board time is implausible: kept, but not used."""
+
+    id: int
+    spacecraft_id: int = Field(examples=[76])
+    instance: str = Field(examples=["flight"])
+    ingest_id: int
+    apid: int
+    sequence_count: int
+    time: UtcTime = Field(description="On-board time, not corrected")
+    reason: str = Field(examples=["1.1 d after all other telemetry, 1 packets agree"])
+
+
 class Ingest(Entity):
     """One ingest of one file."""
 
     id: int = Field(examples=[1])
-    state: str = Field(examples=["done"], description="queued, running, done or failed")
+    state: str = Field(
+        examples=["done"], description="queued, running, done, failed, withdrawing or withdrawn"
+    )
     sha256: str
     received: UtcTime
     finished: UtcTime | None

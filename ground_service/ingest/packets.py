@@ -62,6 +62,10 @@ class PacketBatch:
     def __len__(self) -> int:
         return len(self.octets)
 
+    def count_of(self, index: int) -> int:
+        """Return the sequence count of a packet."""
+        return int(self.sequence_count[index])
+
 
 def batch_of_cut(
     buffer: Octets,

@@ -21,6 +21,7 @@ from ground_service.ground import Ground
 from ground_service.ingest import bare, frames, store
 from ground_service.ingest import recording_store as recordings
 from ground_service.ingest.bare import PacketReader
+from ground_service.ingest.doubts import count_implausible, plausible_part
 from ground_service.ingest.fragments import Fragment, complete, join
 from ground_service.ingest.frames import CADU_MAX_OCTETS, FrameReader, Section
 from ground_service.ingest.link_settings import known_before, packet_form
@@ -153,10 +154,15 @@ def _sections(
 
 
 class Reading:
-    """Reading of one piece whose ingest is entered; `progress` is called with the share that is stored."""
+    """Reading of one piece whose ingest is entered; `progress` is called with the share that is stored.
 
-    def __init__(self, ground: Ground, piece: Piece, progress: Progress | None = None) -> None:
-        self.ground, self.piece, self.progress = ground, piece, progress
+    `judged`: which packets have an implausible time is known already.
+    """
+
+    def __init__(
+        self, ground: Ground, piece: Piece, progress: Progress | None = None, *, judged: bool = False
+    ) -> None:
+        self.ground, self.piece, self.progress, self.judged = ground, piece, progress, judged
         with ground.database.reading() as connection:
             self.known = known_before(connection, piece)
         self.expected = self.known.expected
@@ -176,7 +182,8 @@ class Reading:
         self.has_link = False
         self.octets_new = piece.octets
         self.is_framed = False
-        self.is_started = False
+        self.is_started = self.is_doubted = False
+        self.implausible = 0
         self.result: IngestResult
 
     def read(self) -> None:
@@ -398,6 +405,9 @@ class Reading:
     def _store(self, connection: Connection, packets: PacketBatch) -> Stored:
         assert packets.spacecraft_id is not None
         vehicle = self._vehicle(connection, packets.spacecraft_id)
+        whole = packets
+        packets = plausible_part(connection, vehicle, self.piece.ingest_id, packets, judged=self.judged)
+        self.is_doubted |= packets is not whole
         stored = store.store_batch(connection, vehicle, packets)
         store.note_receptions(connection, vehicle, self.piece.station, time_receptions(packets))
         defined = np.isin(packets.apid, self._definitions(packets.spacecraft_id).apids)
@@ -425,6 +435,8 @@ class Reading:
         if not is_last:
             recordings.count_stored(connection, key, added)
             return
+        if self.is_doubted:
+            self.implausible = count_implausible(connection, key)
         waits = None if self.has_link else 1
         self.result = self._result(recordings.count_stored(connection, key, added, waits=waits))
         store.finish_ingest(connection, self.result, utc_now_ns())
@@ -470,7 +482,8 @@ class Reading:
             packets=found.packets,
             packets_new=new,
             packets_joined=joined,
-            packets_repeated=found.packets - (new - joined),
+            packets_repeated=found.packets - (new - joined) - self.implausible,
+            packets_implausible=self.implausible,
             samples=samples,
             crc_errors=found.crc_errors,
             octets_repeated=self.piece.octets - self.octets_new,

@@ -17,9 +17,9 @@ from ground_service.http.common import (
     RowId,
     upload_body,
 )
-from ground_service.http.requests import operations
-from ground_service.ingest import store
-from ground_service.ingest.model import Ingest, IngestAccepted
+from ground_service.http.requests import operations, problems
+from ground_service.ingest import doubts, service, store
+from ground_service.ingest.model import Ingest, IngestAccepted, Withdrawal
 from ground_service.ingest.service import Place, enter_ingest
 from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.store.vehicles import FLOWN
@@ -102,6 +102,18 @@ async def upload_telemetry(
 
 
 add_list(ingests, "/ingests", store.list_ingests)
+
+
+add_list(ingests, "/implausible-packets", doubts.list_implausible)
+
+
+@ingests.post("/ingests/{ingest_id}/withdraw", responses=problems(409))
+def withdraw_ingest(
+    ground: GroundOf, caller: Operator, dispatcher: DispatcherOf, ingest_id: RowId, given: Withdrawal
+) -> Ingest:
+    """Withdraw an ingest: everything is derived again without it; its file and the audit entry stay."""
+    dispatcher.start(service.withdraw_ingest(ground, ingest_id, reason=given.reason, actor=caller.name))
+    return ground.read(store.get_ingest, ingest_id)
 
 
 @ingests.get("/ingests/{ingest_id}")

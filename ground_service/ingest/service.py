@@ -13,10 +13,11 @@ from typing import Any
 
 from sqlalchemy import Connection
 
+from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
-from ground_service.errors import PASSING, Conflict, GroundError, InvalidInput
+from ground_service.errors import PASSING, Conflict, GroundError, InvalidInput, StateConflict
 from ground_service.ground import Ground
-from ground_service.ingest import store
+from ground_service.ingest import doubts, store
 from ground_service.ingest.model import IngestResult
 from ground_service.ingest.parameters import decode_declared, definitions_in_force
 from ground_service.ingest.reception import Progress, Reading
@@ -25,11 +26,14 @@ from ground_service.ingest.redecode import redecode
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import OTHER_REQUEST, add_job
 from ground_service.jobs.store import find_job
-from ground_service.store import parameters
+from ground_service.missions.store import stations_in_force
+from ground_service.store import parameters, telemetry
 from ground_service.store.counters import hold
 from ground_service.store.files import StoredFile
 from ground_service.store.stored_files import register_file
-from ground_service.store.vehicles import FLOWN, all_vehicles
+from ground_service.store.vehicles import FLOWN, all_vehicles, lock_vehicle
+from ground_service.text import REASON_LIMIT, require_line
+from tmtc.cuc import NO_TICKS
 from tmtc.dictionary import DICTIONARY
 from tmtc.errors import TmtcError
 from tmtc.link import LinkSettings
@@ -154,6 +158,12 @@ def _add(
         assert link is None or LinkSettings.parse(link)
     except TmtcError as error:
         raise InvalidInput("telemetry", "link", "link settings", str(error)) from error
+    stations = stations_in_force(connection, spacecraft_id)
+    if station and stations and station not in stations:
+        known = ", ".join(sorted(stations))
+        raise Conflict(
+            f"telemetry, station: expected one of the mission description ({known}), found {station[:64]}"
+        )
     now = utc_now_ns()
     register_file(connection, stored, "downlink", name, now)
     ingest_id = store.add_ingest(
@@ -176,25 +186,30 @@ def _known_ingest(connection: Connection, job: Job, stored: StoredFile, asked: d
     raise Conflict(OTHER_REQUEST)
 
 
-def run_ingest(ground: Ground, ingest_id: int, *, progress: Progress | None = None) -> IngestResult:
+def run_ingest(
+    ground: Ground, ingest_id: int, *, progress: Progress | None = None, judged: bool = False
+) -> IngestResult:
     """Read the piece of an ingest that was entered; a repetition changes nothing.
 
-    `progress` is called with the stored share of the file, several times for a long file.
+    `progress` is called with the stored share of the file, several times for a long file. `judged`: which packets have
+    an implausible time is known already.
     """
     with ground.database.reading() as connection:
         piece = get_piece(connection, ingest_id)
-    return _ingest(ground, piece, progress)
+    return _ingest(ground, piece, progress, judged=judged)
 
 
-def _ingest(ground: Ground, piece: Piece, progress: Progress | None = None) -> IngestResult:
+def _ingest(
+    ground: Ground, piece: Piece, progress: Progress | None = None, *, judged: bool = False
+) -> IngestResult:
     with ground.database.listeners.held():  # one call for the whole file, not one for each batch
         try:
-            reading = Reading(ground, piece, progress)
+            reading = Reading(ground, piece, progress, judged=judged)
             reading.read()
             readings = [reading]
             for other in reading.readable_now():
                 with suppress(InvalidInput):
-                    again = Reading(ground, other)
+                    again = Reading(ground, other, judged=judged)
                     again.read()
                     readings.append(again)
             for one in readings:
@@ -206,6 +221,52 @@ def _ingest(ground: Ground, piece: Piece, progress: Progress | None = None) -> I
                 store.fail_ingest(connection, piece.ingest_id, str(error), utc_now_ns())
             raise
     return [one.result for one in readings if one.piece.ingest_id == piece.ingest_id][-1]
+
+
+def withdraw_ingest(ground: Ground, ingest_id: int, *, reason: str, actor: str) -> str:
+    """Withdraw an ingest and add the job that derives everything again without it; return the id of the job.
+
+    The file, the ingest and the audit entry stay.
+
+    Raises
+    ------
+    StateConflict
+        It is not done.
+    """
+    require_line(reason, "ingest", "reason", REASON_LIMIT)
+    with ground.database.writing() as connection:
+        found = store.get_ingest(connection, ingest_id)
+        if not store.change_ingest(connection, ingest_id, "done", "withdrawing"):
+            raise StateConflict("ingest", ingest_id, "done", found.state)
+        audit(
+            connection, actor, "withdraw ingest", str(ingest_id), {"reason": reason, "sha256": found.sha256}
+        )
+        return add_job(connection, "withdrawal", {"ingest_id": ingest_id})
+
+
+def derive_without(ground: Ground, ingest_id: int) -> int:
+    """Read the other ingests of the vehicles of a withdrawn one again; return their number.
+
+    Doing it again changes nothing.
+    """
+    with ground.database.listeners.held():
+        with ground.database.writing() as connection:
+            found = store.get_ingest(connection, ingest_id)
+            vehicles = [] if found.accounting is None else list(found.accounting.vehicle_ids)
+            for vehicle in vehicles:
+                lock_vehicle(connection, vehicle)
+                doubts.withdraw_packets(
+                    connection, vehicle, telemetry.packets_before(connection, vehicle, 2**62, NO_TICKS)
+                )
+                store.forget_rest(connection, vehicle, ingest_id)
+            others = store.ingests_of_vehicles(connection, vehicles, ingest_id)
+        for other in others:
+            ground.check_stopping()
+            with suppress(InvalidInput, TmtcError):
+                run_ingest(ground, other)
+        with ground.database.writing() as connection:
+            store.change_ingest(connection, ingest_id, "withdrawing", "withdrawn")
+    return len(others)
 
 
 def apply_definition(ground: Ground, vehicle: int) -> int:

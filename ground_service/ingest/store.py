@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from pydantic import ValidationError
-from sqlalchemy import ColumnElement, Connection, bindparam, delete, func, or_, select
+from sqlalchemy import ColumnElement, Connection, bindparam, delete, func, or_, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
 from ground_service.events import ReceptionsEntered, TelemetryReceived, publish
@@ -20,7 +20,9 @@ from ground_service.store import repository
 from ground_service.store.bulk import insert_columns
 from ground_service.store.codec import pack_detections, pack_filter_states, pack_identifications
 from ground_service.store.models import NO_TICKS, PACKETS, SAMPLE_TABLES, VEHICLES
-from ground_service.store.rollups import add_to_rollups, forget_rollups
+from ground_service.store.parameters import forget_others
+from ground_service.store.rollups import add_to_rollups, forget_rollups, rebuild_rollups
+from ground_service.store.states import change_if
 from lunar.arrays import IntArray
 
 RANGE_GAP_TICKS = 600 << 16
@@ -28,6 +30,8 @@ RANGE_GAP_TICKS = 600 << 16
 with one stray packet of another year does not read the years between."""
 
 FEW_PACKETS = 64
+FORGOTTEN_PACKETS = 1000
+"""Packets that one statement removes."""
 
 _TABLES: dict[str, Any] = {table.name: table for table in SAMPLE_TABLES}
 _PACKETS: Any = PACKETS
@@ -428,6 +432,72 @@ def forget_samples(connection: Connection, vehicle: int, dictionary_version: int
             )
         )
     forget_rollups(connection, vehicle, dictionary_version)
+
+
+def forget_packets(connection: Connection, vehicle: int, ids: Sequence[int]) -> tuple[int, int]:
+    """Remove packets of a vehicle and what was decoded from them; return the extent of their times.
+
+    Declared packets have to be decoded again.
+    """
+    extent: list[int] = []
+    for first in range(0, len(ids), FORGOTTEN_PACKETS):
+        chosen = ids[first : first + FORGOTTEN_PACKETS]
+        for kind, table in _TABLES.items():
+            mine = (table.c.vehicle_id == vehicle, table.c.packet_id.in_(chosen))
+            gone = connection.execute(
+                delete(table).where(*mine).returning(table.c.dictionary_version, table.c.ticks)
+            ).all()
+            for version in {row[0] for row in gone}:
+                times = [row[1] for row in gone if row[0] == version]
+                extent += times
+                rebuild_rollups(connection, vehicle, version, kind, times)
+        mine = (_PACKETS.c.vehicle_id == vehicle, _PACKETS.c.id.in_(chosen))
+        extent += connection.execute(delete(_PACKETS).where(*mine).returning(_PACKETS.c.ticks)).scalars()
+    forget_others(connection, vehicle, None)
+    return min(extent, default=NO_TICKS), max(extent, default=NO_TICKS)
+
+
+def limit_extents(connection: Connection, vehicle: int, newest_ticks: int | None) -> None:
+    """Limit the extent of the ingests of a vehicle to the times of its packets."""
+    later = (_INGESTS.c.vehicle_id == vehicle, _INGESTS.c.last_ticks > (newest_ticks or 0))
+    connection.execute(update(_INGESTS).where(*later).values(last_ticks=newest_ticks))
+
+
+def change_ingest(connection: Connection, ingest_id: int, state: str, new: str) -> bool:
+    """Change the state of an ingest if it is `state`; return whether it was."""
+    return change_if(connection, _INGESTS, ingest_id, {"state": state}, state=new)
+
+
+def ingests_of_vehicles(connection: Connection, vehicles: Sequence[int], but: int) -> list[int]:
+    """Return the ingests, except one, that may have packets of these vehicles, oldest first."""
+    mine = _INGESTS.c.vehicle_id.in_(vehicles) | _INGESTS.c.accounting["vehicle_ids"][1].as_integer().is_not(
+        None
+    )
+    query = select(_INGESTS.c.id).where(mine, _INGESTS.c.state == "done", _INGESTS.c.id != but)
+    return [int(key) for key in connection.execute(query.order_by(_INGESTS.c.id)).scalars()]
+
+
+def forget_rest(connection: Connection, vehicle: int, ingest_id: int) -> None:
+    """Remove what an ingest has left besides packets of a vehicle: fragments, doubts, its place, and its marks.
+
+    Telecommands that were sent after it are verified from where those before it were.
+    """
+    fragments, doubted, sent = repository.FRAGMENTS, repository.IMPLAUSIBLE_PACKETS, repository.TELECOMMANDS
+    connection.execute(delete(fragments).where(fragments.c.vehicle_id == vehicle))
+    connection.execute(delete(doubted).where(doubted.c.vehicle_id == vehicle))
+    connection.execute(update(_PIECES).where(_PIECES.c.ingest_id == ingest_id).values(stream="", waits=None))
+    mine = sent.c.vehicle_id == vehicle
+    received = select(_INGESTS.c.received_utc_ns).where(_INGESTS.c.id == ingest_id).scalar_subquery()
+    before = select(func.max(sent.c.sent_after_ticks)).where(mine, sent.c.sent_utc_ns < received)
+    known = connection.execute(before).scalar()
+    later = update(sent).where(mine, sent.c.sent_utc_ns >= received)
+    connection.execute(later.values(sent_after_ticks=-1 if known is None else known))
+
+
+def newest_ingest(connection: Connection, vehicle: int) -> int:
+    """Return the id of the newest ingest with packets of a vehicle."""
+    query = select(func.max(_INGESTS.c.id)).where(_INGESTS.c.vehicle_id == vehicle)
+    return int(connection.execute(query).scalar_one())
 
 
 def packets_between(

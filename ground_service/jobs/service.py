@@ -32,6 +32,7 @@ KINDS = (
     "nightly",
     "plan",
     "redecode",
+    "withdrawal",
     "re-evaluation",
     "automation",
     "notification",

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import numpy as np
 from sqlalchemy import Connection
 
-from ground_service.clock import follow_missions, utc_now_ns
+from ground_service.clock import TelemetryTime, follow_missions, utc_now_ns
 from ground_service.errors import GroundError, NotFound
 from ground_service.ground import Ground
 from ground_service.missions import store
@@ -38,7 +38,7 @@ def stated_clock(connection: Connection) -> Callable[[], int] | None:
         return None
     if clock.source == "telemetry":
         known = [time for one in stated if (time := _newest_telemetry(connection, one)) is not None]
-        return (lambda: max(known)) if known else None
+        return TelemetryTime(max(known)) if known else None
     mission, wall = parse_utc(clock.mission or ""), parse_utc(clock.wall or "")
     return lambda: mission + round((utc_now_ns() - wall) * clock.rate)
 

@@ -191,6 +191,12 @@ def mission_in_force(connection: Connection, ccsds_id: int | None) -> Mission | 
     return None if ccsds_id is None else missions_in_force(connection, ccsds_id).get(ccsds_id)
 
 
+def stations_in_force(connection: Connection, ccsds_id: int | None) -> set[str]:
+    """Return the stations in the descriptions in force of a spacecraft; None: of all."""
+    found = missions_in_force(connection, ccsds_id)
+    return {name for one in found.values() for name in one.link.stations or {}}
+
+
 def mission_of_vehicle(connection: Connection, vehicle: int) -> Mission | None:
     """Return the description of the newest pass of a vehicle, otherwise that in force of its spacecraft.
 

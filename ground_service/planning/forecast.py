@@ -62,9 +62,9 @@ def get_forecast(
             connection, spacecraft_id, instance, start_utc_ns - HISTORY_NS, stop_utc_ns
         )
         try:
-            reference = service.ephemeris_for(
+            reference = service.ephemerides_for(
                 connection, ephemeris_id, start_utc_ns, stop_utc_ns, spacecraft_id
-            )
+            )[0]
         except NotFound:
             if ephemeris_id is not None:
                 raise

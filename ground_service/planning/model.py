@@ -20,7 +20,15 @@ Time = Annotated[GivenTime, AfterValidator(lambda time: UtcTime(time.utc_ns // 1
 """Time of a plan, in whole microseconds, so that an exported plan states it exactly."""
 
 WindowState = Literal[
-    "draft", "approved", "uplinked", "executing", "executed", "downlinked", "processed", "failed"
+    "draft",
+    "approved",
+    "uplinked",
+    "cancelling",
+    "executing",
+    "executed",
+    "downlinked",
+    "processed",
+    "failed",
 ]
 Decision = Literal["draft", "approved", "failed"]
 
@@ -349,7 +357,7 @@ class WindowRecord(Window):
     mission_id: int | None
     closed: bool
     uploads: WindowUploads | None
-    decision: Decision
+    decision: Literal["draft", "approved", "cancelling", "failed"]
     edited_by: str
 
     def entry(self) -> WindowEntry:

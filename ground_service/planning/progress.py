@@ -10,7 +10,7 @@ from typing import Any
 
 from sqlalchemy import Connection
 
-from ground_service.clock import utc_now_ns
+from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.contacts.commanding.store import views_of_window
 from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
@@ -25,6 +25,7 @@ from ground_service.store import telemetry
 from ground_service.store.counters import lock_spacecraft
 
 REASON_LENGTH = 500
+DELETE = "delete_activity"
 HEARD_TICKS = 7 * 86_400 << 16
 AWAITED_TICKS = 12 * 3600 << 16
 """On-board time for which missing packets of a window without images are expected after its end."""
@@ -80,7 +81,8 @@ def _advance(connection: Connection, window: WindowRecord) -> str | None:
         mission_id = window.mission_id or missions.in_force(connection, window.vehicle_id)
         pass_id = store.add_pass(connection, window, mission_id, utc_now_ns())
         values |= {"pass_id": pass_id, "mission_id": mission_id}
-    if state != window.state:
+    is_remarked = window.decision == "cancelling" and reason not in (None, window.reason)
+    if state != window.state or is_remarked:
         values |= {"state": state, "reason": reason, "changed_utc_ns": utc_now_ns()}
     if values and not store.change_window(connection, window, **values):
         return None
@@ -105,7 +107,8 @@ def _facts(connection: Connection, window: WindowRecord) -> WindowFacts:
         and not store.has_reports_between(connection, vehicle, stop + AWAITED_TICKS, stop + HEARD_TICKS)
         and _is_interrupted(connection, vehicle, start, stop)
     )
-    commands = views_of_window(connection, window.id, utc_now_ns())
+    views = views_of_window(connection, window.id, utc_now_ns())
+    commands = [one for one in views if (one.record.name == DELETE) == (window.decision == "cancelling")]
     failed = (f"{view.record.name} {view.remark}" for view in commands if view.state == "failed")
     return WindowFacts(
         decision=window.decision,
@@ -113,11 +116,13 @@ def _facts(connection: Connection, window: WindowRecord) -> WindowFacts:
         predecessor_failed=predecessor is not None
         and store.get_window(connection, predecessor).state == "failed",
         command_states=tuple(view.state for view in commands),
+        deletion_states=tuple(view.state for view in commands if view.record.name == DELETE),
         failure=next(failed, ""),
         frames=frames,
         started=STARTED in events,
         stopped=STOPPED in events,
         heard_after=heard_after,
+        ended=mission_now_ns() >= window.stop.utc_ns,
         awaited=awaited,
         lost=_lost(connection, vehicle, start, stop) if frames else None,
         reported=window.pass_id is not None and store.has_report(connection, window.pass_id),

@@ -166,7 +166,7 @@ def planned_vehicles(connection: Connection) -> list[int]:
 def unfinished_windows(
     connection: Connection, until_utc_ns: int, vehicle_id: int | None = None
 ) -> list[WindowRecord]:
-    """Return the drafts of requests, and all approved windows without an uplink, that begin before a time.
+    """Return the drafts, and the approved windows without an uplink, that begin before a time.
 
     Those of a vehicle; None: of all.
     """
@@ -174,8 +174,7 @@ def unfinished_windows(
         connection,
         _WINDOWS.c.start_utc_ns <= until_utc_ns,
         *(() if vehicle_id is None else (_WINDOWS.c.vehicle_id == vehicle_id,)),
-        (_WINDOWS.c.state == "approved")
-        | ((_WINDOWS.c.state == "draft") & _WINDOWS.c.request_id.is_not(None)),
+        _WINDOWS.c.state.in_(("approved", "draft")),
     )
 
 

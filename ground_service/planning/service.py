@@ -82,6 +82,7 @@ BATTERY_HISTORY_S = 7200
 """The battery is taken to be full one orbit before a window that is checked by itself."""
 
 VERIFICATION_MARGIN_S = 3600
+DELETE = "delete_activity"
 ENABLE = "enable_schedule"
 
 DAYLIGHT_RAD = (0.0, math.pi / 2.0)
@@ -90,7 +91,15 @@ DAYLIGHT_RAD = (0.0, math.pi / 2.0)
 _DECIDABLE = {
     "draft": ("approved", "uplinked", "failed"),
     "approved": ("draft",),
-    "failed": ("draft", "approved", "uplinked", "executing", "executed", "downlinked", "processed"),
+    "failed": (
+        "draft",
+        "approved",
+        "uplinked",
+        "executing",
+        "executed",
+        "downlinked",
+        "processed",
+    ),
 }
 """States in which a window can be decided, by decision."""
 
@@ -111,22 +120,42 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     start = None if given.start is None else given.start.utc_ns
     stop = None if given.stop is None else given.stop.utc_ns
     with ground.database.reading() as connection:
-        reference = ephemeris_for(connection, given.ephemeris_id, start, stop, given.spacecraft_id)
+        if given.spacecraft_id is not None:
+            require_described(connection, given.spacecraft_id)
+        references = ephemerides_for(connection, given.ephemeris_id, start, stop, given.spacecraft_id)
         mission = mission_of(connection, given.spacecraft_id)
         constraints = observable(given.constraints(), mission)
         commitments = store.commitments(connection, given.spacecraft_id, given.instance)
+    reference, spans = _covered_spans(ground, references, start, stop, given.step_s)
     start = reference.start.utc_ns if start is None else start
     stop = reference.stop.utc_ns if stop is None else stop
     _check_span(start, stop, given.step_s, reference)
+    now = mission_now_ns()
+    if stop <= now:
+        raise Conflict(
+            f"search: expected a span that ends after the mission time {UtcTime(now)}, found {UtcTime(stop)}"
+        )
+    start = max(start, now)
     catalogue = catalogue_of(ground, mission) if constraints.craters_per_frame is not None else None
     mare = _mare(ground.data) if constraints.mare is not None else None
     if constraints.mare is not None and mare is None:
         raise InvalidInput("search", "terrain", "an albedo map among the public data", "none")
     planner = planner_of(ground, reference, mission, catalogue, mare)
-    found = planner.search(
-        constraints, start, stop, given.cadence_s, step_s=given.step_s, commitments=commitments
-    )
+    found = [
+        planner.search(
+            constraints,
+            max(first, start),
+            last,
+            given.cadence_s,
+            step_s=given.step_s,
+            commitments=commitments,
+        )
+        for first, last in spans
+        if last > start
+    ]
     names = [f"ephemeris {reference.name}", f"orientation {planner.orientation.name}"]
+    if len(spans) > 1:
+        names[0] += f" without {len(spans) - 1} spans that it does not cover"
     if catalogue is not None:
         names.append(f"crater catalogue {catalogue.source}")
     if mare is not None:
@@ -134,10 +163,12 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     return SearchResult(
         ephemeris_id=reference.id,
         data=names,
-        candidates=[model.Candidate.from_core(one) for one in found.candidates],
-        contacts=[Contact.of(asdict(one)) for one in found.contacts],
-        rejected=[model.RejectedSpan.of(asdict(one)) for one in found.rejected],
-        reason=found.reason,
+        candidates=[model.Candidate.from_core(one) for part in found for one in part.candidates],
+        contacts=[Contact.of(asdict(one)) for part in found for one in part.contacts],
+        rejected=[model.RejectedSpan.of(asdict(one)) for part in found for one in part.rejected],
+        reason=next((part.reason for part in found if part.reason is not None), None)
+        if not any(part.candidates for part in found)
+        else None,
     )
 
 
@@ -168,6 +199,7 @@ def add_window(ground: Ground, entry: WindowEntry, *, actor: str) -> Window:
 def insert_window(ground: Ground, connection: Connection, entry: WindowEntry, *, actor: str) -> Window:
     """Add a window as `add_window` does, within the caller's transaction."""
     _check_entry(entry)
+    require_described(connection, entry.spacecraft_id)
     vehicle = vehicle_id(connection, entry.spacecraft_id, entry.instance)
     lock_spacecraft(connection, vehicle)
     assessed = _assessed(ground, connection, vehicle, 0, entry, "draft")
@@ -190,6 +222,8 @@ def change_window(
     expected: Callable[[Window], None] | None = None,
 ) -> Window:
     """Change a draft, or decide on a window: approved, back to draft, or failed with a reason.
+
+    A window whose telecommands were sent does not fail before others have deleted them on board: it is cancelling.
 
     Parameters
     ----------
@@ -226,6 +260,12 @@ def change_window(
                 _assessed(ground, connection, window.vehicle_id, window_id, entry, wanted)
             )
         if decision in ("draft", "failed"):
+            if (
+                decision == "failed"
+                and window.state == "uplinked"
+                and _delete_on_board(connection, window, actor)
+            ):
+                decision = wanted = "cancelling"
             commands.withdraw_window(connection, window_id, actor=actor, now_utc_ns=utc_now_ns())
         if changes:
             values["edited_by"] = actor
@@ -247,6 +287,41 @@ def change_window(
             raise StateConflict("window", window_id, window.state, found.state)
         _note(connection, actor, decision or "change", window_id, wanted, {"reason": reason or ""})
         return store.get_window(connection, window_id)
+
+
+def _delete_on_board(connection: Connection, window: WindowRecord, actor: str) -> list[int]:
+    """Release telecommands that delete the activities of a window on board; return their ids.
+
+    One person can do that, as one can stop an observation.
+
+    Raises
+    ------
+    Conflict
+        If the observation has begun.
+    """
+    now = mission_now_ns()
+    if window.start.utc_ns <= now < window.stop.utc_ns:
+        raise Conflict(
+            f"window {window.id}: began at {window.start}, too late to delete its activities; "
+            "perform_function stop_observation ends the observation"
+        )
+    if now >= window.stop.utc_ns:
+        return []
+    approval = commanding.Approval("", actor)
+    ids = [
+        commanding.add_released(
+            connection,
+            window.vehicle_id,
+            DELETE,
+            {"request_id": request},
+            actor=actor,
+            window_id=window.id,
+            approval=approval,
+        )
+        for request in commands.activities_on_board(connection, window.id)
+    ]
+    commands.limit_sending(connection, ids, window.start.utc_ns)
+    return ids
 
 
 def delete_window(
@@ -294,10 +369,15 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
     with ground.database.writing() as connection:
         window = _locked_window(connection, window_id)
         ids = commands.carriers_of_window(connection, window_id)
+        if "sent" in commands.states_of_window(connection, window_id):
+            return ids
+        if window.start.utc_ns <= mission_now_ns():
+            raise Conflict(f"window {window_id} began at {window.start}: its telecommands are not sent")
         if ids:
             return ids
         if window.state != "approved":
             raise StateConflict("window", window_id, "approved", window.state)
+        require_described(connection, window.spacecraft_id)
         mission = mission_of(connection, window.spacecraft_id)
         conflicts = _span_conflicts(connection, window.vehicle_id, window_id, window.entry(), mission)
         if conflicts:
@@ -396,7 +476,11 @@ def _preparation(
         connection, start - MARGIN_NS, stop + MARGIN_NS, window.spacecraft_id
     )
     whole = [
-        one for one in found if one.start.utc_ns <= start - MARGIN_NS and stop + MARGIN_NS <= one.stop.utc_ns
+        one
+        for one in found
+        if one.start.utc_ns <= start - MARGIN_NS
+        and stop + MARGIN_NS <= one.stop.utc_ns
+        and _covered_spans(ground, [one], start, stop, 60.0)[1] == [(start, stop)]
     ]
     orientation = declared_frames(mission.frames, ground.data).orientation or ground.orientation
     uploads, begin, experiment = mission.uploads, None, None
@@ -453,6 +537,11 @@ def _assessed(
     """
     mission = mission_of(connection, entry.spacecraft_id)
     conflicts = _span_conflicts(connection, vehicle, window_id, entry, mission)
+    if entry.start_utc_ns <= (now := mission_now_ns()):
+        expected = (
+            f"expected a start after the mission time {UtcTime(now)}, found {UtcTime(entry.start_utc_ns)}"
+        )
+        conflicts.append(PlanConflict("past", None, expected))
     commitments = store.commitments(connection, entry.spacecraft_id, entry.instance, without=window_id)
     prediction = _prediction(ground, connection, entry, mission, commitments)
     frames = frames_between(entry.start_utc_ns, entry.stop_utc_ns, entry.cadence_s)
@@ -518,6 +607,23 @@ def planner_of(
         mare,
         gap_ns(mission.uploads),
     )
+
+
+def require_described(connection: Connection, spacecraft_id: int) -> None:
+    """Refuse to plan for a spacecraft that no mission description states, unless there is no description at all.
+
+    Raises
+    ------
+    Conflict
+        There is none; the message names the known spacecraft.
+    """
+    described = missions.missions_in_force(connection)
+    if described and spacecraft_id not in described:
+        known = ", ".join(map(str, sorted(described)))
+        raise Conflict(
+            f"spacecraft {spacecraft_id}: expected one that a mission description states ({known}), found none; "
+            "add its description first"
+        )
 
 
 def mission_of(connection: Connection, spacecraft_id: int | None) -> Mission:
@@ -643,15 +749,16 @@ def _span_conflicts(
     return span_conflicts(mine, predecessor, spans, gap)
 
 
-def ephemeris_for(
+def ephemerides_for(
     connection: Connection,
     ephemeris_id: int | None,
     start: int | None,
     stop: int | None,
     spacecraft_id: int | None,
-) -> Ephemeris:
+) -> list[Ephemeris]:
+    """Return the ephemerides that cover a span, the best first: all of it, then by precedence and coverage."""
     if ephemeris_id is not None:
-        return ephemerides.get_ephemeris(connection, ephemeris_id)
+        return [ephemerides.get_ephemeris(connection, ephemeris_id)]
     first = start if start is not None else -(2**62)
     last = stop if stop is not None else 2**62
     found = ephemerides.covering_ephemerides(connection, first, last, spacecraft_id)
@@ -661,7 +768,32 @@ def ephemeris_for(
     def covered(one: Ephemeris) -> int:
         return min(one.stop.utc_ns, last) - max(one.start.utc_ns, first)
 
-    return max(found, key=lambda one: (one.precedence, covered(one), one.id))
+    whole = last - first if start is not None and stop is not None else 2**63
+    return sorted(
+        found, key=lambda one: (covered(one) >= whole, one.precedence, covered(one), one.id), reverse=True
+    )
+
+
+def _covered_spans(
+    ground: Ground, references: Sequence[Ephemeris], start: int | None, stop: int | None, step_s: float
+) -> tuple[Ephemeris, list[tuple[int, int]]]:
+    """Return the first ephemeris without a hole in a span, otherwise that with the fewest, and what it covers."""
+    best: tuple[float, Ephemeris, list[tuple[int, int]]] | None = None
+    for one in references:
+        first = max(one.start.utc_ns, one.start.utc_ns if start is None else start)
+        last = min(one.stop.utc_ns, one.stop.utc_ns if stop is None else stop)
+        if last - first > SEARCH_LIMIT_S * NS:
+            return one, [(first, last)]
+        times = np.append(np.arange(first, last, max(round(step_s * NS), 1), dtype=np.int64), last)
+        known = open_ephemeris(ground, one).covers(times)
+        if known.all():
+            return one, [(first, last)]
+        edges = np.flatnonzero(np.diff(np.concatenate(([False], known, [False])).astype(np.int8)))
+        spans = [(int(times[a]), int(times[b - 1])) for a, b in edges.reshape(-1, 2).tolist() if b - a > 1]
+        if best is None or known.sum() > best[0]:
+            best = float(known.sum()), one, spans
+    assert best is not None
+    return best[1], best[2]
 
 
 def _check_span(start: int, stop: int, step_s: float, reference: Ephemeris) -> None:

@@ -22,7 +22,7 @@ from ground_service.planning.model import (
     WindowRecord,
     WindowUploads,
 )
-from ground_service.planning.window_states import COMMITTED, PlannedSpan
+from ground_service.planning.window_states import COMMITTED, FLOWN, PlannedSpan
 from ground_service.store import repository
 from ground_service.store.repository import page, within
 from ground_service.store.states import change_if
@@ -120,9 +120,9 @@ def list_windows(connection: Connection, asked: WindowFilter) -> PageOf[Window]:
 
 
 def open_windows(connection: Connection, vehicle: int) -> list[WindowRecord]:
-    """Return the approved windows of a vehicle that are not processed, in order of time."""
-    mine = WINDOWS.c.vehicle_id == vehicle
-    return records_where(connection, mine, WINDOWS.c.decision == "approved", WINDOWS.c.state != "processed")
+    """Return the approved and cancelled windows of a vehicle that are not processed, in order of time."""
+    mine = WINDOWS.c.vehicle_id == vehicle, WINDOWS.c.decision.in_(("approved", "cancelling"))
+    return records_where(connection, *mine, WINDOWS.c.state != "processed")
 
 
 def is_replaced(connection: Connection, window: WindowRecord) -> bool:
@@ -201,7 +201,7 @@ def add_pass(connection: Connection, window: WindowRecord, mission_id: int | Non
     return passes.add_pass(
         connection,
         vehicle_id=window.vehicle_id,
-        name=window.name,
+        name=f"{window.name} ({FLOWN})" if window.decision == "cancelling" else window.name,
         start_utc_ns=window.start.utc_ns,
         stop_utc_ns=window.stop.utc_ns,
         mission_id=mission_id,

@@ -1,6 +1,7 @@
 """Where a planned window has come, from what people decided and what telemetry says; and what stands in its way.
 
-draft → approved → uplinked → executing → executed → downlinked → processed, or failed
+draft → approved → uplinked → executing → executed → downlinked → processed, or failed; a window whose telecommands were
+sent is cancelled by others that delete them on board: it is cancelling until their verification, then failed
 
 The state is a function of facts, not of the order in which they became known: late telemetry mends a state that was
 concluded without it.
@@ -13,11 +14,15 @@ from dataclasses import dataclass
 
 from ground_service.errors import PlanConflict
 
-STATES = ("draft", "approved", "uplinked", "executing", "executed", "downlinked", "processed", "failed")
-DECISIONS = ("draft", "approved", "failed")
-COMMITTED = ("approved", "uplinked", "executing", "executed", "downlinked")
+STATES = (
+    "draft", "approved", "uplinked", "cancelling", "executing", "executed", "downlinked", "processed", "failed",
+)  # fmt: skip
+DECISIONS = ("draft", "approved", "cancelling", "failed")
+COMMITTED = ("approved", "uplinked", "cancelling", "executing", "executed", "downlinked")
 """States in which a window claims its time and its storage."""
 
+FLOWN = "it was flown although it was cancelled"
+CANCELLED = "it was cancelled, its activities were deleted on board"
 REPLACED = "it failed, and another window has its time"
 
 
@@ -28,13 +33,15 @@ class WindowFacts:
     Attributes
     ----------
     decision
-        What people decided last: draft, approved or failed.
+        What people decided last: draft, approved, cancelling or failed.
     predecessor_failed
         Whether the window that has to come before it failed.
     replaced
         Whether a later window that has not failed covers part of its time: data of that time belong to the later one.
     command_states
         States of the telecommands that carry it up and of those they carry.
+    deletion_states
+        States of the telecommands that delete its activities on board.
     failure
         Name of the first of them that failed, with the reason.
     frames
@@ -43,6 +50,8 @@ class WindowFacts:
         Whether an event report or a verification report shows the start, and the end, of the observation.
     heard_after
         Whether telemetry from after its end has come down.
+    ended
+        Whether it has ended by the mission clock: telemetry does not fail a window before that.
     awaited
         Whether packets of its time are missing that may still come down.
     lost
@@ -57,11 +66,13 @@ class WindowFacts:
     predecessor_failed: bool = False
     replaced: bool = False
     command_states: tuple[str, ...] = ()
+    deletion_states: tuple[str, ...] = ()
     failure: str = ""
     frames: int = 0
     started: bool = False
     stopped: bool = False
     heard_after: bool = False
+    ended: bool = True
     awaited: bool = False
     lost: int | None = None
     reported: bool = False
@@ -70,24 +81,50 @@ class WindowFacts:
 
 def state_of(facts: WindowFacts) -> tuple[str, str | None]:
     """The state of a window, and the reason where it failed."""
+    if facts.decision == "cancelling":
+        return _cancelled(facts)
     if facts.decision != "approved":
         return facts.decision, None
     if facts.replaced:
         return "failed", REPLACED
+    return _flown(facts) or _awaiting(facts)
+
+
+def _cancelled(facts: WindowFacts) -> tuple[str, str | None]:
+    """Return state and reason of a window that is cancelled: what flies all the same becomes a pass."""
+    flown = _flown(facts)
+    if flown is not None:
+        return flown[0], FLOWN
+    if set(facts.deletion_states) == {"completed"}:
+        return "failed", CANCELLED
+    if facts.heard_after and facts.ended and not facts.awaited:
+        return "failed", "it was cancelled, telemetry from after its end shows no observation"
+    refused = facts.deletion_states.count("failed")
+    return (
+        "cancelling",
+        f"{refused} of its activities could not be deleted: {facts.failure}" if refused else None,
+    )
+
+
+def _flown(facts: WindowFacts) -> tuple[str, str | None] | None:
+    """Return the state of a window whose observation has begun; None if it has not."""
     begun = facts.started or facts.frames > 0
     over = begun and (facts.stopped or facts.heard_after)
     if over and facts.heard_after and (facts.lost == 0 or facts.closed):
         return ("processed" if facts.reported else "downlinked"), None
     if over:
         return "executed", None
-    if begun:
-        return "executing", None
+    return ("executing", None) if begun else None
+
+
+def _awaiting(facts: WindowFacts) -> tuple[str, str | None]:
+    """Return the state of an approved window whose observation has not begun."""
     if "failed" in facts.command_states:
         return "failed", f"a telecommand of it failed: {facts.failure or 'no reason is known'}"
     if facts.predecessor_failed:
         return "failed", "its predecessor failed"
     sent = bool(facts.command_states) and not {"queued", "released", "carried"} & set(facts.command_states)
-    if sent and facts.heard_after and not facts.awaited:
+    if sent and facts.heard_after and facts.ended and not facts.awaited:
         return "failed", "telemetry from after its end shows no observation"
     return ("uplinked" if sent else "approved"), None
 

@@ -27,9 +27,11 @@ def lock_spacecraft(connection: Connection, vehicle: int) -> int:
     return int(given)
 
 
-def next_telecommand(connection: Connection, vehicle: int) -> int:
-    """Return the number of the next telecommand of a vehicle, from 0, unwrapped; the number is unique."""
-    lock_spacecraft(connection, vehicle)
+def next_telecommand(connection: Connection, vehicle: int, first: int = 0) -> int:
+    """Return the number of the next telecommand of a vehicle, from `first` on, unwrapped; the number is unique."""
+    if lock_spacecraft(connection, vehicle) == 0:
+        mine = COMMAND_COUNTERS.c.vehicle_id == vehicle
+        connection.execute(update(COMMAND_COUNTERS).where(mine).values(telecommands=first))
     taken = connection.execute(
         update(COMMAND_COUNTERS)
         .where(COMMAND_COUNTERS.c.vehicle_id == vehicle)

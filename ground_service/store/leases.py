@@ -27,17 +27,15 @@ def renew_or_take(
 ) -> bool:
     """Renew the lease of `owner`, or take one that is free or has ended; return whether `owner` has it now.
 
+    A lease that has ended is renewed as long as no other process has taken it: its owner stood still.
+
     Parameters
     ----------
     taken
         Columns that are set when the lease is taken, not when it is renewed.
     """
     rows = table.c
-    renewal = (
-        update(table)
-        .where(rows.name == name, rows.owner == owner, rows.lease_utc_ns >= now_utc_ns)
-        .values(lease_utc_ns=until_utc_ns)
-    )
+    renewal = update(table).where(rows.name == name, rows.owner == owner).values(lease_utc_ns=until_utc_ns)
     free = or_(rows.owner.is_(None), rows.lease_utc_ns < now_utc_ns)
     taking = (
         update(table).where(rows.name == name, free).values(owner=owner, lease_utc_ns=until_utc_ns, **taken)

@@ -141,6 +141,20 @@ PACKETS = table(
 )
 """A space packet, immutable, once per vehicle by content."""
 
+IMPLAUSIBLE_PACKETS = table(
+    "implausible_packets",
+    key("id", BigKey),
+    column("vehicle_id", ForeignKey("vehicles.id")),
+    column("ingest_id", ForeignKey("ingests.id"), index=True),
+    *columns(SmallInteger, "apid", "sequence_count"),
+    column("ticks", BigInteger),
+    column("digest", LargeBinary(16)),
+    column("octets", LargeBinary),
+    column("reason", Text),
+    UniqueConstraint("vehicle_id", "digest"),
+)
+"""A space packet whose on-board time is implausible: kept apart from `packets`, so that it decides nothing."""
+
 PIECES = table(
     "pieces",
     key("ingest_id", ForeignKey("ingests.id"), autoincrement=False),

@@ -18,6 +18,7 @@ from sqlalchemy import ColumnElement, Connection, LargeBinary, and_, bindparam, 
 from ground_service.store.bulk import FEW_ROWS, insert_columns
 from ground_service.store.counters import hold
 from ground_service.store.models import HOUSEKEEPING, NAVIGATION_STATES, ROLLUPS
+from ground_service.store.telemetry import sample_arrays
 from lunar.arrays import FloatArray, IntArray
 
 HOUSEKEEPING_VALUES = tuple(one.name for one in HOUSEKEEPING.c if not one.primary_key)
@@ -104,6 +105,32 @@ def add_values(
             numbers = (vehicle_id, version, code, part, level)
             found.append((dict(zip(_KEY, numbers, strict=True)), level_values))
     _store(connection, found)
+
+
+def rebuild_rollups(
+    connection: Connection, vehicle_id: int, dictionary_version: int, kind: str, ticks: Sequence[int]
+) -> None:
+    """Aggregate the samples again in the longest buckets that contain these times, after some were removed."""
+    if kind not in KINDS:
+        return
+    code, part_column, names = KINDS[kind]
+    wanted = ("ticks", *names) if part_column is None else ("ticks", part_column, *names)
+    top = LEVELS - 1
+    for bucket in sorted({one // width_ticks(top) for one in ticks}):
+        first, last = bucket * width_ticks(top), (bucket + 1) * width_ticks(top) - 1
+        for level in range(LEVELS):
+            connection.execute(
+                delete(_TABLE).where(
+                    _TABLE.c.vehicle_id == vehicle_id,
+                    _TABLE.c.dictionary_version == dictionary_version,
+                    _TABLE.c.kind == code,
+                    _TABLE.c.level == level,
+                    _TABLE.c.bucket.between(first // width_ticks(level), last // width_ticks(level)),
+                )
+            )
+        where = vehicle_id, first, last, dictionary_version
+        columns = sample_arrays(connection, kind, where, wanted)
+        add_to_rollups(connection, vehicle_id, dictionary_version, kind, columns)
 
 
 def forget_rollups(connection: Connection, vehicle_id: int, dictionary_version: int) -> None:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from functools import lru_cache
 from itertools import chain
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection, bindparam, func, select
 from sqlalchemy.sql import Select
 
-from ground_service.store.repository import PACKETS, SAMPLES, within
+from ground_service.store.repository import IMPLAUSIBLE_PACKETS, PACKETS, SAMPLES, within
 from lunar.arrays import IntArray
+from tmtc.dictionary import DICTIONARY
 
 
 def packet_headers(
@@ -51,6 +53,54 @@ def _apids(connection: Connection, vehicle: int) -> list[int]:
     ) is not None:
         found.append(int(apid))
     return found
+
+
+def newest_ticks(connection: Connection, vehicle: int, apids: IntArray | None = None) -> int | None:
+    """Return the greatest on-board time of the stored packets of a vehicle; None without any.
+
+    `apids` are those of packets that the dictionary does not have; None: they are looked up.
+    """
+    return newest_and_doubted(connection, vehicle, _apids(connection, vehicle) if apids is None else apids)[0]
+
+
+def newest_and_doubted(
+    connection: Connection, vehicle: int, apids: Collection[int] | IntArray = ()
+) -> tuple[int | None, bool]:
+    """Return the newest time as `newest_ticks` does, and whether packets of the vehicle are kept apart."""
+    query = _newest_query(tuple(sorted({*_APIDS, *np.unique(np.asarray(apids)).tolist()})))
+    *row, doubted = connection.execute(query, {"vehicle_id": vehicle}).one()
+    return max((int(ticks) for ticks in row if ticks is not None and ticks >= 0), default=None), bool(doubted)
+
+
+_APIDS = frozenset(definition.apid for definition in DICTIONARY.telemetry)
+
+
+@lru_cache(maxsize=16)
+def _newest_query(apids: tuple[int, ...]) -> Any:
+    """Return the query of the greatest on-board time of each APID, which the index has."""
+    mine = select(func.max(PACKETS.c.ticks)).where(PACKETS.c.vehicle_id == bindparam("vehicle_id"))
+    doubted = select(func.min(IMPLAUSIBLE_PACKETS.c.id)).where(
+        IMPLAUSIBLE_PACKETS.c.vehicle_id == bindparam("vehicle_id")
+    )
+    newest = (mine.where(PACKETS.c.apid == apid).scalar_subquery() for apid in apids)
+    return select(*newest, doubted.scalar_subquery())
+
+
+def last_packets(connection: Connection, vehicle: int, count: int) -> IntArray:
+    """Return on-board time and id (n, 2) of at least the last `count` packets of a vehicle, newest first."""
+    found = []
+    for apid in _apids(connection, vehicle):
+        mine = PACKETS.c.vehicle_id == vehicle, PACKETS.c.apid == apid, PACKETS.c.ticks >= 0
+        query = select(PACKETS.c.ticks, PACKETS.c.id).where(*mine).order_by(PACKETS.c.ticks.desc())
+        found += [tuple(row) for row in connection.execute(query.limit(count))]
+    return np.array(sorted(found, reverse=True), dtype=np.int64).reshape(-1, 2)
+
+
+def packets_before(connection: Connection, vehicle: int, ticks: int, first: int = 0) -> list[int]:
+    """Return the ids of the packets of a vehicle with an on-board time from `first` until before `ticks`."""
+    mine = PACKETS.c.vehicle_id == vehicle, PACKETS.c.apid.in_(_apids(connection, vehicle))
+    query = select(PACKETS.c.id).where(*mine, PACKETS.c.ticks >= first, PACKETS.c.ticks < ticks)
+    return [int(key) for key in connection.execute(query).scalars()]
 
 
 def packet_octets(

@@ -20,6 +20,7 @@ from sqlalchemy import Connection
 
 from ground_service.errors import PASSING, NotFound, fault_of
 from ground_service.events import (
+    ClockDoubted,
     CommandsSent,
     ContactEnded,
     ContactMissed,
@@ -31,16 +32,19 @@ from ground_service.events import (
     ReceptionsEntered,
     RequestChanged,
     TelemetryReceived,
+    TelemetryWithdrawn,
+    TimesDoubted,
     WindowChanged,
     publish,
 )
 from ground_service.ground import Ground
+from ground_service.ingest.doubts import needs_review, review_times
 from ground_service.ingest.service import undecoded_vehicles
 from ground_service.jobs.service import add_job
 from ground_service.jobs.store import queued_arguments
 from ground_service.missions.timekeeping.recorrelation import recorrelate
 from ground_service.missions.timekeeping.store import vehicles_with_receptions
-from ground_service.passes.alarms.service import examine_packets
+from ground_service.passes.alarms.service import examine_again, examine_packets, note_finding
 from ground_service.passes.span import REACH_NS, PassSpan, pass_span, vehicle_span
 from ground_service.passes.store import passes_of_vehicle, reported_without_ephemeris
 from ground_service.planning.progress import advance_windows
@@ -68,7 +72,15 @@ Start = Callable[[str], object]
 
 
 def _after_telemetry(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
-    event = TelemetryReceived.of(logged)
+    event: TelemetryReceived | TelemetryWithdrawn
+    if logged.kind == TelemetryWithdrawn.event_kind:
+        event = TelemetryWithdrawn.of(logged)
+        yield "decode", event.vehicle_id
+        yield "alarms again", event.vehicle_id
+    else:
+        event = TelemetryReceived.of(logged)
+    if _ground.read(needs_review, event.vehicle_id, event.first_ticks):
+        yield "review times", event.vehicle_id
     yield "recorrelate", event.vehicle_id
     yield "alarms", event.vehicle_id
     yield "advance windows", event.vehicle_id
@@ -80,6 +92,12 @@ def _after_telemetry(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
                     connection, event.vehicle_id, event.first_ticks, event.last_ticks
                 )
             )
+
+
+def _after_doubt(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
+    yield "note finding", logged.number
+    if logged.kind == TimesDoubted.event_kind:
+        yield "review times", TimesDoubted.of(logged).vehicle_id
 
 
 def _of_vehicle(work: str) -> Following:
@@ -117,6 +135,9 @@ def _after_window(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
 
 FOLLOWING: Mapping[str, Following] = {
     TelemetryReceived.event_kind: _after_telemetry,
+    TelemetryWithdrawn.event_kind: _after_telemetry,
+    TimesDoubted.event_kind: _after_doubt,
+    ClockDoubted.event_kind: _after_doubt,
     ReceptionsEntered.event_kind: _of_vehicle("recorrelate"),
     CorrelationChanged.event_kind: _of_vehicle("advance windows"),
     EphemerisAdded.event_kind: _after_ephemeris,
@@ -143,6 +164,26 @@ def _work_of(ground: Ground, event: LoggedEvent) -> Iterator[Work]:
             yield "act", event.number
         if any(True for _ in messages_after(connection, event)):
             yield "notify", event.number
+
+
+def _review(ground: Ground, vehicle: int, _event: int) -> None:
+    review_times(ground, vehicle)
+
+
+def _note_finding(ground: Ground, number: int, _event: int) -> None:
+    [logged] = ground.read(events.read_events, number - 1, 1)
+    if logged.kind == TimesDoubted.event_kind:
+        times = TimesDoubted.of(logged)
+        note_finding(ground, times.vehicle_id, "implausible_time", times.packets)
+    else:
+        clock = ClockDoubted.of(logged)
+        note_finding(
+            ground, clock.vehicle_id, f"station_clock {clock.station}"[:64], value=clock.difference_s
+        )
+
+
+def _alarms_again(ground: Ground, vehicle: int, _event: int) -> None:
+    examine_again(ground, vehicle)
 
 
 def _recorrelate(ground: Ground, vehicle: int, _event: int) -> None:
@@ -193,7 +234,10 @@ def _plan(ground: Ground, vehicle: int, event: int) -> str | None:
 
 
 DOING: Mapping[str, Callable[[Ground, int, int], str | None]] = {
+    "review times": _review,
+    "note finding": _note_finding,
     "recorrelate": _recorrelate,
+    "alarms again": _alarms_again,
     "alarms": _alarms,
     "advance windows": _advance,
     "re-evaluate": _reevaluate,

@@ -198,12 +198,14 @@ def _rebuild(connection: Connection, ground: Ground, good: set[str], found: _Fin
             store.copy_entered(connection, writing)
         for one in store.ingests(connection):
             ground.check_stopping()
+            if one.state == "withdrawn":
+                continue
             if one.state not in ("done", "failed"):
                 found.skip("unfinished ingests")
             elif one.sha256 in good:
                 found.count("raw files ingested again")
                 try:
-                    run_ingest(scratch, one.id)
+                    run_ingest(scratch, one.id, judged=True)
                 except (GroundError, TmtcError) as error:
                     if one.state == "done":
                         reason = f"expected a file that can be ingested, found: {error}"

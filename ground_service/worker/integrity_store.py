@@ -21,7 +21,7 @@ DERIVED = (models.PACKETS, models.PARAMETER_SAMPLES, *models.SAMPLE_TABLES, mode
 
 ENTERED = (
     models.FILES, models.VEHICLES, models.INGESTS, models.PIECES, models.MISSIONS, models.EPHEMERIDES,
-    models.PASSES, models.RECEPTIONS, models.PACKET_DEFINITIONS,
+    models.PASSES, models.RECEPTIONS, models.PACKET_DEFINITIONS, models.IMPLAUSIBLE_PACKETS,
 )  # fmt: skip
 """Tables that decide what follows from the raw files."""
 

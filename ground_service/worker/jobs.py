@@ -24,7 +24,7 @@ from ground_service.evaluation.service import make_report, reevaluate
 from ground_service.events import JobChanged, publish
 from ground_service.ground import Ground
 from ground_service.ingest.redecode import catch_up, redecode_job_id, vehicles_behind
-from ground_service.ingest.service import apply_definition, run_ingest
+from ground_service.ingest.service import apply_definition, derive_without, run_ingest
 from ground_service.jobs import store
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import enter_job
@@ -84,6 +84,10 @@ def _redecode(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dic
     return {"rows": catch_up(ground, vehicle) + apply_definition(ground, vehicle)}
 
 
+def _withdraw(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
+    return {"ingests": derive_without(ground, int(arguments["ingest_id"]))}
+
+
 WORK: dict[str, Work] = {
     "report": _report,
     "ingest": _ingest,
@@ -95,6 +99,7 @@ WORK: dict[str, Work] = {
     "nightly": nightly,
     "plan": _plan,
     "redecode": _redecode,
+    "withdrawal": _withdraw,
     "re-evaluation": _reevaluate,
     "automation": lambda ground, arguments, _job_id: run_steps(ground, int(arguments["event"])),
     "notification": lambda ground, arguments, _job_id: send_messages(ground, int(arguments["event"])),

@@ -39,7 +39,7 @@ def count_work(connection: Connection) -> WorkCounts:
             jobs.created_utc_ns,
             (jobs.state == "queued") & jobs.kind.not_in(("regression", "analysis", "replay", "rendering")),
         ),
-        oldest(ingests.received_utc_ns, ingests.state.not_in(("done", "failed"))),
+        oldest(ingests.received_utc_ns, ingests.state.not_in(("done", "failed", "withdrawn"))),
     )
 
 

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from linna.commands._table import Command, Option, add_commands
+from linna.output import log
 
 if TYPE_CHECKING:
     from ground_service.client import Client
+    from ground_service.ingest.model import ImplausiblePacket
     from ground_service.missions.timekeeping.model import Correlation, TimeReport
 
 BLOCK = 10_000
@@ -41,6 +43,11 @@ def _receptions(
     rows: list[Correlation] = []
     for start in range(0, len(given), BLOCK):
         rows = service.add_receptions(spacecraft_id, given[start : start + BLOCK], instance=instance)
+    reports = service.list_time_reports(spacecraft_id, instance=instance)
+    for remark in sorted({one.remark for one in reports} - {""}):
+        log(
+            f"linna: warning: {remark}: {sum(one.remark == remark for one in reports)} time reports do not count"
+        )
     return rows
 
 
@@ -56,7 +63,12 @@ def _residual(row: TimeReport) -> str:
     return (
         f"{row.received}  boot {row.boot_count}  light time {row.light_time_s:.6f} s  "
         f"correlation {row.correlation_id}  residual {row.residual_ns * 1e-3:+.1f} us"
+        f"{f'  {row.remark}' if row.remark else ''}"
     )
+
+
+def _implausible(row: ImplausiblePacket) -> str:
+    return f"{row.time}  APID {row.apid}  count {row.sequence_count}  ingest {row.ingest_id}: {row.reason}"
 
 
 SEGMENTS = (_segment, "correlations", "no time correlation: the on-board clock is assumed to be ideal")
@@ -73,6 +85,19 @@ COMMANDS = {
         _residual,
         "time_reports",
         "no time reports with a known reception time",
+    ),
+    "implausible": Command(
+        "list_implausible",
+        "list the packets that are kept apart because their on-board time is implausible",
+        _implausible,
+        "packets",
+        "no packets with an implausible on-board time",
+    ),
+    "withdraw-ingest": Command(
+        "withdraw_ingest",
+        "withdraw a received file, such as one of another flight: everything is derived again without it",
+        lambda row: f"ingest {row.id}: {row.state}",
+        options={"reason": "what is wrong with it"},
     ),
     "run": Command(
         "run_correlation",

@@ -71,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
             )
             kept = (
                 "packets", "packets_new", "crc_errors", "octets_skipped", "octets_pending", "frames_bad",
-                "symbols_corrected", "remark",
+                "symbols_corrected", "packets_implausible", "remark",
             )  # fmt: skip
             assert made.accounting is not None
             figures = made.accounting.model_dump(include=set(kept))
@@ -103,6 +103,11 @@ def _line(one: dict[str, Any]) -> str:
     )
     if one["remark"]:
         line += f"; {one['remark']}"
+    if one["packets_implausible"]:
+        line += (
+            f"; {one['packets_implausible']} packets with an implausible on-board time are kept apart and not used "
+            "(linna correlate implausible)"
+        )
     if one["octets_pending"]:
         line += (
             f"; {one['octets_pending']} octets of an incomplete frame or packet at the ends "

@@ -84,12 +84,19 @@ def _delete(service: Client, window_id: int) -> dict[str, Any]:
 
 
 def _uplink(service: Client, window_id: int, *, out: Path | None = None) -> dict[str, Any]:
+    from linna.errors import UsageError
+
     released = service.uplink_window(window_id)
     if out is not None:
         window = service.get_window(window_id)
+        octets = service.take_uplink(window.spacecraft_id, instance=window.instance).octets
+        if not octets:
+            states = ", ".join(sorted({one.state for one in released})) or "none"
+            raise UsageError(
+                f"window {window_id}: nothing to send: its telecommands are {states}; no file is written"
+            )
         out.parent.mkdir(parents=True, exist_ok=True)
-        with out.open("wb") as file:
-            file.write(service.take_uplink(window.spacecraft_id, instance=window.instance).octets)
+        out.write_bytes(octets)
     return {"window_id": window_id, "telecommands": [as_json(one) for one in released]}
 
 

@@ -31,6 +31,9 @@ STAGES = {
 DUPLICATE = _FAILURE_CODES["duplicate"]
 """Failure code of a command that the payload had accepted before: it was transmitted again."""
 
+OUT_OF_SEQUENCE = _FAILURE_CODES["out_of_sequence"]
+"""Failure code of a command whose sequence count the payload does not expect."""
+
 FAILURES = (NOT_ACCEPTED, NOT_STARTED, PROGRESS_FAILED, NOT_COMPLETED, NOT_ROUTED)
 
 

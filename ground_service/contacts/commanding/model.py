@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from ground_service.contacts.commanding.core import DUPLICATE, STAGES, CommandFate
+from ground_service.contacts.commanding.core import DUPLICATE, OUT_OF_SEQUENCE, STAGES, CommandFate
 from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber
 from ground_service.http.times import UtcTime
 from ground_service.ingest.model import ControlWords
@@ -17,6 +17,7 @@ from tmtc.arguments import argument_text
 from tmtc.codes import FAILURES
 
 _FAILURES = dict(FAILURES)
+REMEDY = "; the payload expects other sequence counts: send perform_function resynchronise_commands first"
 
 
 class CommandEntry(Given):
@@ -149,6 +150,7 @@ class CommandView:
             return f"no report of completion in time, last report: {stages[-1] if stages else 'none'}"
         failed = (
             f"{stage}: {_FAILURES.get(report.failure_code or 0, str(report.failure_code)).replace('_', ' ')}"
+            + (REMEDY if report.failure_code == OUT_OF_SEQUENCE else "")
             for stage, report in zip(stages, self.fate.reports, strict=True)
             if report.failure_code not in (None, DUPLICATE)
         )

@@ -382,8 +382,13 @@ def _release(connection: Connection, record: CommandRecord, actor: str) -> None:
 
 
 def _issued(connection: Connection, vehicle: int, name: str, arguments: Mapping[str, Any]) -> CommandOctets:
-    """Return the octets of a telecommand with the next sequence count of its spacecraft."""
-    count = next_telecommand(connection, vehicle) % SEQUENCE_COUNT_LIMIT
+    """Return the octets of a telecommand with the next sequence count of its spacecraft.
+
+    The first one follows the newest telecommand that the payload reports: another ground may have sent it.
+    """
+    before = store.last_command_count(connection, vehicle)
+    first = 0 if before is None else before + 1
+    count = next_telecommand(connection, vehicle, first) % SEQUENCE_COUNT_LIMIT
     _require_not_held(connection, vehicle)
     return CommandOctets(count, _packed(name, arguments, count))
 

@@ -20,14 +20,22 @@ from ground_service.contacts.commanding.model import (
     UplinkChannel,
 )
 from ground_service.http.model import PageOf
+from ground_service.ingest.core import LONGEST_SILENCE, LONGEST_STEP
+from ground_service.ingest.doubts import latest_ticks
 from ground_service.ingest.redecode import readable_version
-from ground_service.store import repository
+from ground_service.store import repository, telemetry
 from ground_service.store.states import TELECOMMAND, change_if, move, move_all
 from ground_service.store.vehicles import get_vehicle
 from lunar.constants import NANOSECONDS_PER_SECOND
+from tmtc.dictionary import DICTIONARY
+from tmtc.stream import cut_packets
 
 TELECOMMANDS, VERIFICATIONS = TELECOMMAND.table, repository.SAMPLES["verifications"]
 HANDOVERS = repository.HANDOVERS
+
+COUNTED = "performance"
+NO_COMMAND = 65_535
+"""Packet that reports the count of the newest telecommand, and the count if there was none."""
 
 SEARCHED_INGESTS = 200
 """Number of newest ingests that are searched for channels: some contain no frames of a channel."""
@@ -80,6 +88,14 @@ def release(
     """
     values = _issued(issued, actor, now_utc_ns)
     move(connection, TELECOMMAND, command_id, "released", expected=("queued",), **values)
+
+
+def last_command_count(connection: Connection, vehicle: int) -> int | None:
+    """Return the sequence count of the newest telecommand that the payload has reported; None if it has none."""
+    octets = telemetry.newest_packet(connection, vehicle, DICTIONARY.packet(COUNTED).apid) or b""
+    table = DICTIONARY.unpack_many(octets, cut_packets(octets)).get(COUNTED)
+    count = NO_COMMAND if table is None else int(table.columns["last_command_count"][-1])
+    return None if count == NO_COMMAND else count
 
 
 def list_handovers(connection: Connection, asked: HandoverFilter) -> PageOf[Handover]:
@@ -143,12 +159,16 @@ def send_released(
     Those whose time for transmission has passed at `mission_utc_ns` stay released.
 
     Return the released ones in order of release. The caller holds the lock of the spacecraft. Verification
-    reports after the newest one so far count.
+    reports after the newest one so far count, and after the time of release.
     """
     newest = connection.execute(
         select(func.max(VERIFICATIONS.c.ticks)).where(*_readable_reports(connection, vehicle))
     ).scalar()
-    sent = {"sent_utc_ns": now_utc_ns, "sent_after_ticks": -1 if newest is None else int(newest)}
+    after = -1 if newest is None else int(newest)
+    latest = latest_ticks(newest)
+    if latest is not None and after > latest - LONGEST_SILENCE:  # the clock of the mission states when
+        after = max(after, latest - 2 * LONGEST_STEP)
+    sent = {"sent_utc_ns": now_utc_ns, "sent_after_ticks": after}
     mine = [TELECOMMANDS.c.vehicle_id == vehicle, *_sendable(mission_utc_ns)]
     rows = move_all(connection, TELECOMMAND, mine, "sent", **sent)
     rows.sort(key=lambda row: (row["decided_utc_ns"], row["id"]))
@@ -239,6 +259,16 @@ def carriers_of_window(connection: Connection, window_id: int) -> list[int]:
         TELECOMMANDS.c.state != "rejected",
     )
     return [int(key) for key in connection.execute(query.order_by(TELECOMMANDS.c.id)).scalars()]
+
+
+def activities_on_board(connection: Connection, window_id: int) -> list[int]:
+    """Return the request ids of the activities of a window that were sent, in order of release."""
+    query = select(TELECOMMANDS.c.request_id).where(
+        TELECOMMANDS.c.window_id == window_id,
+        TELECOMMANDS.c.carrier_id.is_not(None),
+        TELECOMMANDS.c.state == "sent",
+    )
+    return [int(request) for request in connection.execute(query.order_by(TELECOMMANDS.c.id)).scalars()]
 
 
 def sent_for_pass(connection: Connection, pass_id: int) -> bytes:

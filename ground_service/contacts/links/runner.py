@@ -504,7 +504,8 @@ class LinkRunner:
     # State
 
     def _keep_lease(self) -> bool:
-        if time.monotonic() - self._renewed_s < RENEW_S:
+        since = time.monotonic() - self._renewed_s
+        if since < RENEW_S:
             return True
         if not service.acquire(self._ground, self.declared, self._owner, LEASE_NS):
             log.warning("link %s: another process has taken it over", self._name)
@@ -512,6 +513,8 @@ class LinkRunner:
             self._stopping.set()
             self._work.set()
             return False
+        if since * 1e9 > LEASE_NS:
+            self._shown = None  # another process may have changed what is stored
         self._renewed_s = time.monotonic()
         return True
 

@@ -44,8 +44,8 @@ async def add_ephemeris(
 add_list(ephemerides, "/ephemerides", store.list_ephemerides)
 
 
-@ephemerides.delete("/ephemerides/{ephemeris_id}", status_code=204, responses=problems(404, 409))
+@ephemerides.delete("/ephemerides/{ephemeris_id}", status_code=204, responses=problems(404))
 def withdraw_ephemeris(ground: GroundOf, caller: Operator, ephemeris_id: RowId) -> Response:
-    """Withdraw a reference ephemeris that no pass or window names; its file and the audit entries are kept."""
+    """Withdraw a reference ephemeris: passes and windows use others; its file and the audit entries are kept."""
     service.withdraw_ephemeris(ground, ephemeris_id, actor=caller.name, caller=caller)
     return Response(status_code=204)

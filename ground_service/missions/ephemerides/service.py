@@ -86,13 +86,7 @@ def _check_object(connection: Connection, name: str, caller: Caller) -> None:
 def withdraw_ephemeris(
     ground: Ground, ephemeris_id: int, *, actor: str, caller: Caller = LOCAL_CALLER
 ) -> None:
-    """Withdraw a reference ephemeris: plans and reports no longer use it; the audit log and its file are kept.
-
-    Raises
-    ------
-    Conflict
-        A pass or a window names it.
-    """
+    """Withdraw a reference ephemeris: plans and reports no longer use it; the audit log and its file are kept."""
     with ground.database.writing() as connection:
         if caller.spacecraft is not None:
             _check_object(connection, store.get_ephemeris(connection, ephemeris_id).object_name, caller)

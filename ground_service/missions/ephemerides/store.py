@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, select, update
 
-from ground_service.errors import Conflict
 from ground_service.http.model import PageOf, Paging
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.store import mission_in_force
@@ -79,18 +78,11 @@ def covering_ephemerides(
 
 
 def withdraw_ephemeris(connection: Connection, ephemeris_id: int) -> Ephemeris:
-    """Delete the entry of an ephemeris, whose file is kept, and return it.
-
-    Raises
-    ------
-    Conflict
-        A pass or a window names it.
-    """
+    """Delete the entry of an ephemeris, whose file is kept, and return it; passes and windows use others."""
     found = get_ephemeris(connection, ephemeris_id)
-    for table, what in ((repository.PASSES, "pass"), (repository.WINDOWS, "window")):
-        user = repository.find(connection, table, ephemeris_id=ephemeris_id)
-        if user is not None:
-            raise Conflict(f"ephemeris {ephemeris_id}: is that of {what} {user['id']}")
+    for table in (repository.PASSES, repository.WINDOWS):
+        users = update(table).where(table.c.ephemeris_id == ephemeris_id)
+        connection.execute(users.values(ephemeris_id=None))
     connection.execute(EPHEMERIDES.delete().where(EPHEMERIDES.c.id == ephemeris_id))
     return found
 

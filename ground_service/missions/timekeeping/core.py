@@ -7,16 +7,19 @@ without any, the clock is taken as ideal (correlation 0).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.errors import EvaluationError
-from lunar.arrays import IntArray
+from lunar.arrays import BoolArray, IntArray
 from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.plausible import STATION_DIFFERENCE_NS, WHOLE_SECONDS
 from lunar.timescales import (
+    ONBOARD_EPOCH_TAI_NS,
+    TICKS_PER_SECOND,
     tai_ns_from_utc_ns,
     ticks_from_utc_ns,
     utc_ns_from_tai_ns,
@@ -196,6 +199,115 @@ def _without_chance(
     return float(deviation.mean()), 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class StationDoubt:
+    """A station whose reception times disagree with those of others, by how much, and the usual cause."""
+
+    station: str
+    difference_s: float
+
+    def __str__(self) -> str:
+        """Return the remark for a person."""
+        whole = round(abs(self.difference_s))
+        cause = f": {WHOLE_SECONDS[whole]}?" if _is_whole(1e9 * self.difference_s) else ""
+        side = "ahead of" if self.difference_s > 0 else "behind"
+        name = self.station or "without a name"
+        return f"the clock of station {name} is {abs(self.difference_s):.3f} s {side} the others{cause}"
+
+
+def doubted_stations(
+    ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray, boot: IntArray, station: Sequence[str]
+) -> tuple[BoolArray, dict[int, StationDoubt]]:
+    """Return which time reports (n,) count, and the doubt about each of the others.
+
+    The reports of a station are split into runs as those of the clock. Two runs disagree if every change between them
+    shows it: a clock that was set changes for all stations. Of runs that disagree, those count that more stations
+    share, or that agree with the on-board clock; otherwise neither.
+    """
+    sent = np.asarray(tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - light_time_ns
+    whole, part = np.divmod(np.asarray(ticks, dtype=np.int64), TICKS_PER_SECOND)
+    nominal = whole * NANOSECONDS_PER_SECOND + part * _NS_NUMERATOR // _NS_DENOMINATOR
+    off = (nominal + ONBOARD_EPOCH_TAI_NS - sent).astype(np.float64)
+    kept = np.ones(len(ticks), dtype=np.bool_)
+    names = np.array(station)
+    units: list[IntArray] = []
+    for name in sorted(set(station)):
+        mine = np.flatnonzero(names == name)
+        found = clock_runs(ticks[mine], earth_utc_ns[mine], light_time_ns[mine], boot[mine])
+        units += [mine[run] for run in found if len(run)]
+    unit = np.zeros(len(ticks), dtype=np.int64)
+    for number, rows in enumerate(units):
+        unit[rows] = number
+    differences = _differences(ticks, nominal, off, boot, unit, units)
+    group = list(range(len(units)))
+    for (one, other), found in differences.items():
+        if abs(found.least_ns) <= found.tolerance_ns:
+            group = [group[one] if number == group[other] else number for number in group]
+    doubts: dict[int, StationDoubt] = {}
+    for (one, other), found in differences.items():
+        if group[one] == group[other] or not (found.changes > 1 or _is_whole(found.least_ns)):
+            continue
+        sides = [{number for number, of in enumerate(group) if of == group[k]} for k in (one, other)]
+        weight = [len({names[units[number][0]] for number in side}) for side in sides]
+        near = [abs(float(np.median(off[units[k]]))) <= 0.1 * abs(found.least_ns) for k in (one, other)]
+        wrong = [weight[0] < weight[1], weight[1] < weight[0]]
+        if weight[0] == weight[1]:
+            wrong = [not near[0], not near[1]] if any(near) or found.changes > 1 else [False, False]
+        for side, is_wrong, sign in zip(sides, wrong, (1.0, -1.0), strict=True):
+            for rows in (units[number] for number in side if is_wrong):
+                kept[rows] = False
+                doubt = StationDoubt(str(names[rows[0]]), sign * found.least_ns * 1e-9)
+                doubts.update(dict.fromkeys(rows.tolist(), doubt))
+    return kept, doubts
+
+
+@dataclass(frozen=True, slots=True)
+class _Difference:
+    """Least difference of two runs over all changes between them, its tolerance, and the number of changes."""
+
+    least_ns: float
+    tolerance_ns: float
+    changes: int
+
+
+def _differences(
+    ticks: IntArray,
+    nominal: IntArray,
+    off: NDArray[np.float64],
+    boot: IntArray,
+    unit: IntArray,
+    units: Sequence[IntArray],
+) -> dict[tuple[int, int], _Difference]:
+    """Return the differences of the offsets of runs (second minus first) that follow one another in time."""
+    drifts = []
+    for rows in units:
+        lasted = float(np.ptp(nominal[rows])) if len(rows) > 2 else 0.0
+        known = JUMP_NS + DRIFT_CHANGE * lasted < JUMP_RATE * lasted
+        drift = _line((nominal[rows] - nominal[rows[0]]).astype(np.float64), off[rows])[1] if known else 0.0
+        drifts.append((drift, DRIFT_CHANGE + JUMP_NS / lasted if known else JUMP_RATE))
+    found: dict[tuple[int, int], _Difference] = {}
+    order = np.lexsort((ticks, boot))
+    for k in np.flatnonzero((np.diff(unit[order]) != 0) & (np.diff(boot[order]) == 0)).tolist():
+        first, second = int(order[k]), int(order[k + 1])
+        since = float(nominal[second] - nominal[first])
+        drift, unknown = drifts[unit[first]]
+        value = off[second] - off[first] - drift * since
+        pair = int(unit[first]), int(unit[second])
+        if pair[0] > pair[1]:
+            pair, value = (pair[1], pair[0]), -value
+        one = _Difference(float(value), STATION_DIFFERENCE_NS + unknown * since, 1)
+        before = found.get(pair, one)
+        least = one if abs(one.least_ns) <= abs(before.least_ns) else before
+        found[pair] = replace(least, changes=before.changes + (pair in found))
+    return found
+
+
+def _is_whole(difference_ns: float) -> bool:
+    """Return whether a difference has a usual cause: a whole number of seconds."""
+    whole = round(abs(difference_ns) * 1e-9)
+    return whole in WHOLE_SECONDS and abs(abs(difference_ns) - whole * 1e9) <= STATION_DIFFERENCE_NS
+
+
 def clock_runs(
     ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray, boot: IntArray
 ) -> list[IntArray]:
@@ -211,7 +323,7 @@ def clock_runs(
     runs: list[IntArray] = []
     for number in np.unique(boot[order]):
         mine = order[boot[order] == number]
-        nominal = ticks[mine] * _NS_NUMERATOR // _NS_DENOMINATOR
+        nominal = (ticks[mine] - ticks[mine[0]]) * _NS_NUMERATOR // _NS_DENOMINATOR
         at = (sent[mine] - sent[mine[0]]).astype(np.float64)
         off = (nominal - nominal[0]).astype(np.float64) - at
         start, level = 0, 0

@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,13 @@ from sqlalchemy import Connection
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput
-from ground_service.events import CorrelationChanged, ReceptionsEntered, publish
+from ground_service.events import (
+    ClockDoubted,
+    CorrelationChanged,
+    ReceptionsEntered,
+    publish,
+    publish_once,
+)
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime, time_of
 from ground_service.missions.ephemerides.model import Ephemeris
@@ -31,17 +37,20 @@ from ground_service.missions.store import mission_of_vehicle
 from ground_service.missions.timekeeping import store
 from ground_service.missions.timekeeping.core import (
     CorrelationFit,
+    StationDoubt,
     clock_runs,
+    doubted_stations,
     fit_correlation,
     utc_ns_of_ticks,
 )
 from ground_service.missions.timekeeping.model import RECEPTIONS_LIMIT, Correlation, TimeReport
 from ground_service.store.vehicles import get_vehicle, lock_vehicle, vehicle_id
-from lunar.arrays import IntArray
+from lunar.arrays import BoolArray, IntArray
 from lunar.constants import SPEED_OF_LIGHT_M_S
 from lunar.ephemeris import Ephemeris as States
 from lunar.errors import LunarError
 from lunar.messages.ephemeris_files import load_ephemeris
+from lunar.plausible import CORRELATION_RMS_NS
 from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import tai_ns_from_utc_ns, tdb_s_from_utc_ns
 from lunar.visibility import GroundStation, link
@@ -189,7 +198,12 @@ def recorrelate(ground: Ground, vehicle: int, *, over_manual: bool = False) -> b
         mission = mission_of_vehicle(connection, vehicle)
         if mission is not None and mission.time.correlation in ("manual", "ideal") and not over_manual:
             return False
-        fits = fit_runs(time_reports(ground, connection, vehicle))
+        fits, doubts = fit_runs(time_reports(ground, connection, vehicle))
+        for doubt in doubts:
+            doubted = ClockDoubted(
+                vehicle_id=vehicle, station=doubt.station, difference_s=round(doubt.difference_s, 3)
+            )
+            publish_once(connection, doubted)
         lines = {_line(one.boot_count, one) for one in old}
         if lines == {_line(*fit) for fit in fits} and len(old) == len(fits):
             return False
@@ -198,17 +212,32 @@ def recorrelate(ground: Ground, vehicle: int, *, over_manual: bool = False) -> b
     return True
 
 
-def fit_runs(reports: TimeReports) -> list[tuple[int, CorrelationFit]]:
-    """The boot and the fitted line of every run of the clock."""
-    runs = clock_runs(reports.ticks, reports.earth_utc_ns, reports.light_time_ns, reports.boot)
-    return [
-        (
-            int(reports.boot[run[0]]),
-            fit_correlation(reports.ticks[run], reports.earth_utc_ns[run], reports.light_time_ns[run]),
-        )
-        for run in runs
-        if len(run)
-    ]
+def fit_runs(reports: TimeReports) -> tuple[list[tuple[int, CorrelationFit]], list[StationDoubt]]:
+    """Return the boot and the fitted line of every run of the clock, and the stations whose clocks are doubted.
+
+    A line about which the reports scatter by more than `CORRELATION_RMS_NS` is left out.
+    """
+    kept, doubts = _doubts(reports)
+    rows = np.flatnonzero(kept)
+    runs = clock_runs(
+        reports.ticks[rows], reports.earth_utc_ns[rows], reports.light_time_ns[rows], reports.boot[rows]
+    )
+    fits = []
+    for run in (rows[found] for found in runs if len(found)):
+        fit = fit_correlation(reports.ticks[run], reports.earth_utc_ns[run], reports.light_time_ns[run])
+        inside = (reports.ticks >= fit.start_ticks) & (reports.ticks <= fit.stop_ticks) & ~kept
+        rejected = fit.rejected + int((inside & (reports.boot == reports.boot[run[0]])).sum())
+        if fit.residual_rms_ns <= CORRELATION_RMS_NS:
+            fits.append((int(reports.boot[run[0]]), replace(fit, rejected=rejected)))
+        else:
+            doubts[int(run[0])] = StationDoubt(reports.station[run[0]], fit.residual_rms_ns * 1e-9)
+    return fits, sorted(set(doubts.values()), key=str)
+
+
+def _doubts(reports: TimeReports) -> tuple[BoolArray, dict[int, StationDoubt]]:
+    return doubted_stations(
+        reports.ticks, reports.earth_utc_ns, reports.light_time_ns, reports.boot, reports.station
+    )
 
 
 def residuals(ground: Ground, vehicle: int) -> list[TimeReport]:
@@ -217,6 +246,7 @@ def residuals(ground: Ground, vehicle: int) -> list[TimeReport]:
         reports = time_reports(ground, connection, vehicle)
         correlations = store.load_correlations(connection, vehicle)
     utc_ns, ids = utc_ns_of_ticks(reports.ticks, correlations)
+    _, doubts = _doubts(reports)
     sent = np.asarray(tai_ns_from_utc_ns(reports.earth_utc_ns)) - reports.light_time_ns
     left = sent - np.asarray(tai_ns_from_utc_ns(utc_ns))
     return [
@@ -230,6 +260,7 @@ def residuals(ground: Ground, vehicle: int) -> list[TimeReport]:
             boot_count=int(reports.boot[k]),
             correlation_id=int(ids[k]),
             residual_ns=int(left[k]),
+            remark=str(doubts.get(k, "")),
         )
         for k in range(len(reports.ticks))
     ]

@@ -159,6 +159,31 @@ def note_operations(ground: Ground, spacecraft_id: int, lasting: Set[str], holdi
             _update(connection, vehicle, found, names, is_operations=True)
 
 
+def note_finding(ground: Ground, vehicle: int, name: str, count: int = 1, value: float | None = None) -> None:
+    """Raise an alarm of something implausible that was received, at the mission time."""
+    with ground.database.writing() as connection:
+        lock_vehicle(connection, vehicle)
+        rows = store.open_alarms(connection, vehicle)
+        active = {row.name for row in rows if row.source == core.OPERATIONS and row.active}
+        ticks = ticks_of_utc_ns(mission_now_ns(), load_correlations(connection, vehicle))
+        found = Condition(core.OPERATIONS, name, core.WARNING, ticks, ticks, count, value)
+        _update(connection, vehicle, (found,), active, is_operations=True)
+
+
+def examine_again(ground: Ground, vehicle: int) -> None:
+    """Examine all packets of a vehicle again, after some were removed; alarms without packets are cleared."""
+    with ground.database.writing() as connection:
+        lock_vehicle(connection, vehicle)
+        store.begin_again(connection, vehicle)
+    examine_packets(ground, vehicle)
+    now = utc_now_ns()
+    with ground.database.writing() as connection:
+        for row in store.open_alarms(connection, vehicle):
+            if row.count == 0:
+                _move(connection, row, "cleared", now)
+                store.note_change(connection, row.id, now, TELEMETRY, "cleared", "its packets were withdrawn")
+
+
 def _update(
     connection: Connection,
     vehicle: int,

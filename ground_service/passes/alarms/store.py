@@ -70,6 +70,15 @@ def advance(connection: Connection, vehicle: int, packet_id: int) -> None:
         connection.execute(insert(_POSITIONS).values(vehicle_id=vehicle, packet_id=packet_id))
 
 
+def begin_again(connection: Connection, vehicle: int) -> None:
+    """Forget which packets of a vehicle were examined, and what the alarms of its telemetry counted."""
+    connection.execute(update(_POSITIONS).where(_POSITIONS.c.vehicle_id == vehicle).values(packet_id=0))
+    mine = _ALARMS.c.vehicle_id == vehicle, _ALARMS.c.source != "operations"
+    connection.execute(update(_ALARMS).where(*mine).values(count=0))
+    unseen = {"first_ticks": 2**62, "last_ticks": -1}
+    connection.execute(update(_ALARMS).where(*mine, _ALARMS.c.open == OPEN).values(**unseen))
+
+
 def open_alarms(connection: Connection, vehicle: int) -> list[AlarmRow]:
     """Return the alarms of a vehicle that are not cleared, locked until the transaction ends."""
     query = _select().where(_ALARMS.c.vehicle_id == vehicle, _ALARMS.c.open == OPEN)

@@ -18,7 +18,7 @@ from tmtc.downlink import encode_cadus
 from tmtc.link import LinkSettings
 
 SPACECRAFT = 76
-STATEMENTS = 9
+STATEMENTS = 10
 """Statements of one piece besides the three bulk inserts (packets, samples, roll-ups)."""
 
 

@@ -10,7 +10,7 @@ from ground_service.app import create_app
 from ground_service.passes.span import Observation, Planned, belongs_to
 from ground_service.settings import Settings
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
-from tests.ground_service.conftest import Downlink, event_packet
+from tests.ground_service.conftest import Clock, Downlink, event_packet
 from tests.serving import TestClient
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import encode_cadus
@@ -227,11 +227,12 @@ def test_the_state_follows_telemetry_in_whatever_order_it_comes(
     ],
 )
 def test_a_window_without_images_fails_when_no_packet_of_its_time_may_come(
-    client: TestClient, received: tuple[int, int], last_s: int, expected: str
+    client: TestClient, mission_time: Clock, received: tuple[int, int], last_s: int, expected: str
 ) -> None:
     key = approved(client, 1860, 1920)
     client.post(f"{V1}/windows/{key}/uplink")
     client.post(f"{V1}/uplink", params={"spacecraft_id": 76})
+    mission_time.utc_ns = START + (1920 + last_s) * NS
     for count, seconds in zip(received, (1700, 1920 + last_s), strict=True):
         stream = encode_cadus([event_packet(ticks_at(seconds), count)], spacecraft_id=76)
         assert client.post(f"{V1}/telemetry", content=stream).status_code == 202

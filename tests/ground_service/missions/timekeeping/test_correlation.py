@@ -1,5 +1,7 @@
 """Time correlation: whole nanoseconds in and out, drift and offset found, outliers left out."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +11,8 @@ from ground_service.errors import EvaluationError
 from ground_service.missions.timekeeping.core import (
     IDEAL_CLOCK,
     TimeCorrelation,
+    clock_runs,
+    doubted_stations,
     fit_correlation,
     ticks_of_utc_ns,
     utc_ns_of_ticks,
@@ -83,3 +87,63 @@ def test_ticks_and_time_are_inverse(after_s: int, drift_ppb: float) -> None:
     utc = START + after_s * NS
     ticks = ticks_of_utc_ns(utc, [line])
     assert abs(int(line.utc_ns(np.array([ticks]))[0]) - utc) <= 2 * TICK_NS
+
+
+MINUTE = 60 * 10**9
+NAMES = {"a": "canberra", "b": "madrid", "c": "goldstone"}
+
+
+def reports_of_stations(
+    pattern: str, clocks_s: dict[str, list[float]], steps_s: list[float] | None = None
+) -> Any:
+    """Time reports, one a minute: station, error of its clock and of the on-board clock by number of the report."""
+    sent = START + np.arange(len(pattern), dtype=np.int64) * MINUTE
+    on_board = np.asarray(steps_s if steps_s is not None else np.zeros(len(pattern)))
+    wrong = np.array([clocks_s[name][k] for k, name in enumerate(pattern)])
+    ticks = np.asarray(ticks_from_utc_ns(sent)) + np.rint(on_board * 65_536).astype(np.int64)
+    zero = np.zeros(len(pattern), dtype=np.int64)
+    received = sent + np.rint(wrong * 1e9).astype(np.int64)
+    return ticks, received, zero, zero, [NAMES[name] for name in pattern]
+
+
+@pytest.mark.parametrize(
+    ("difference", "cause"),
+    [
+        (37.0, ": TAI instead of UTC?"),
+        (-18.0, ": GPS time instead of UTC?"),
+        (1.0, ": a leap second?"),
+        (5.5, ""),
+    ],
+)
+@pytest.mark.parametrize("pattern", ["abababababababab", "bbbbaaaabbbbaaaa", "abcabcabcabcabca"])
+def test_a_station_whose_clock_is_wrong_is_named_and_left_out(
+    pattern: str, difference: float, cause: str
+) -> None:
+    clocks = {"a": [difference] * 16, "b": [0.0] * 16, "c": [0.0] * 16}
+    kept, doubts = doubted_stations(*reports_of_stations(pattern, clocks))
+    assert kept.tolist() == [name != "a" for name in pattern]
+    side = "ahead of" if difference > 0 else "behind"
+    assert {str(one) for one in doubts.values()} == {
+        f"the clock of station canberra is {abs(difference):.3f} s {side} the others{cause}"
+    }
+
+
+def test_two_stations_that_disagree_with_the_on_board_clock_as_well_are_both_left_out() -> None:
+    clocks = {"a": [37.0] * 8, "b": [0.0] * 8}
+    kept, _ = doubted_stations(*reports_of_stations("abababab", clocks, [90.0] * 8))
+    assert not kept.any()
+
+
+def test_a_clock_that_was_set_on_board_is_no_fault_of_a_station() -> None:
+    right = {"a": [0.0] * 16, "b": [0.0] * 16}
+    for pattern in ("a" * 16, "abababababababab", "aaaabbbbaaaabbbb"):
+        given = reports_of_stations(pattern, right, [0.0] * 8 + [1.0] * 8)
+        kept, doubts = doubted_stations(*given)
+        assert kept.all() and not doubts
+        assert len(clock_runs(*given[:4])) == 2
+
+
+def test_a_station_whose_clock_changes_is_left_out_from_then_on() -> None:
+    clocks = {"a": [0.0] * 8 + [37.0] * 8, "b": [0.0] * 16, "c": [0.0] * 16}
+    kept, _ = doubted_stations(*reports_of_stations("abcabcabcabcabca", clocks))
+    assert np.flatnonzero(~kept).tolist() == [9, 12, 15]

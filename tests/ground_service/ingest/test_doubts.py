@@ -1,0 +1,266 @@
+"""Packets with an implausible on-board time are kept, named, and decide nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ground_service.access.model import AuditFilter
+from ground_service.access.store import list_audit
+from ground_service.clock import TelemetryTime, set_mission_clock
+from ground_service.contacts.commanding.service import (
+    enter_command,
+    get_command,
+    release_command,
+    take_uplink,
+)
+from ground_service.contacts.links import store as links
+from ground_service.errors import Conflict, StateConflict
+from ground_service.ground import Ground
+from ground_service.ingest.core import fits_between, implausible_times
+from ground_service.ingest.doubts import list_implausible
+from ground_service.ingest.model import ImplausibleFilter
+from ground_service.ingest.service import ingest_file, withdraw_ingest
+from ground_service.ingest.store import get_ingest
+from ground_service.missions.service import add_mission
+from ground_service.missions.store import newest_ticks
+from ground_service.passes.alarms.model import AlarmFilter
+from ground_service.passes.alarms.service import list_alarms
+from ground_service.worker.integrity import verify
+from ground_service.worker.jobs import run_job
+from lunar.timescales import parse_utc, ticks_from_utc_ns
+from tests.ground_service.archive_hash import hash_of
+from tests.ground_service.conftest import _housekeeping
+from tmtc.cuc import NO_TICKS
+from tmtc.dictionary import DICTIONARY
+
+NOW = parse_utc("2029-08-18T09:00:00Z")
+TICKS = int(ticks_from_utc_ns(NOW))
+HOUR = 3600 << 16
+DAY = 24 * HOUR
+YEARS = 70 * 365 * DAY
+
+
+@pytest.fixture(autouse=True)
+def clock() -> Iterator[None]:
+    yield
+    set_mission_clock()
+
+
+def report(ticks: int, count: int, temperature_c: float = 20.0) -> bytes:
+    values = _housekeeping(1) | {"temperature_c": temperature_c}
+    return DICTIONARY.pack("housekeeping", values, ticks=ticks, sequence_count=count)
+
+
+def contact(start: int = TICKS, count: int = 0, number: int = 12) -> bytes:
+    """Reports of a contact, one a minute, the last one at `start` plus their time."""
+    return b"".join(report(start + (60 << 16) * k, count + k) for k in range(number))
+
+
+def receive(ground: Ground, path: Path, octets: bytes) -> int:
+    """Ingest packets; return the number of those that are kept apart."""
+    file = path / f"{abs(hash(octets))}.packets"
+    file.write_bytes(octets)
+    return ingest_file(ground, file, spacecraft_id=76).packets_implausible
+
+
+def reasons(ground: Ground) -> list[str]:
+    return [one.reason for one in ground.read(list_implausible, ImplausibleFilter(limit=99)).items]
+
+
+def alarms(ground: Ground) -> dict[str, int]:
+    asked = AlarmFilter(limit=99, state=["raised", "acknowledged"])
+    return {one.name: one.count for one in ground.read(list_alarms, asked).items}
+
+
+@pytest.mark.parametrize("ahead", [2 * HOUR, 26 * HOUR, YEARS])
+@pytest.mark.parametrize("source", ["telemetry", "simulated", "time of day"])
+def test_a_report_from_the_future_is_kept_and_decides_nothing(
+    ground: Ground, tmp_path: Path, ahead: int, source: str
+) -> None:
+    clocks = {"telemetry": TelemetryTime(NOW), "simulated": lambda: NOW, "time of day": None}
+    set_mission_clock(clocks[source])
+    receive(ground, tmp_path, contact())
+    before = hash_of(ground)
+    assert receive(ground, tmp_path, report(TICKS + ahead, 12, temperature_c=99.0)) == 1
+    assert hash_of(ground) == before
+    assert ground.read(newest_ticks, 1) == TICKS + 11 * (60 << 16)
+    assert alarms(ground) == {"implausible_time": 1}
+    [reason] = reasons(ground)
+    assert ("after the mission time" if source == "simulated" else "after all other telemetry") in reason
+
+
+def test_the_same_report_again_is_kept_once(either: Ground, tmp_path: Path) -> None:
+    receive(either, tmp_path, contact())
+    receive(either, tmp_path, report(TICKS + DAY, 12))
+    assert receive(either, tmp_path, report(TICKS + DAY, 12)) == 0
+    assert len(reasons(either)) == 1 and alarms(either) == {"implausible_time": 1}
+
+
+def test_the_archive_does_not_depend_on_whether_the_wrong_report_came_first(
+    either: Ground, tmp_path: Path
+) -> None:
+    receive(either, tmp_path, report(TICKS + DAY, 12, temperature_c=99.0))
+    receive(either, tmp_path, report(5 << 16, 13, temperature_c=-99.0))
+    assert "temperature_c" in alarms(either)
+    receive(either, tmp_path, contact())
+    assert len(reasons(either)) == 2
+    assert either.read(newest_ticks, 1) == TICKS + 11 * (60 << 16)
+    assert "temperature_c" not in alarms(either)
+    assert verify(either, rebuild=True).verdict == "intact"
+
+
+def test_the_next_contact_is_believed_and_puts_back_what_was_kept_apart(
+    either: Ground, tmp_path: Path
+) -> None:
+    receive(either, tmp_path, contact())
+    assert receive(either, tmp_path, contact(TICKS + DAY, 1440, number=2)) == 2
+    assert receive(either, tmp_path, contact(TICKS + DAY + (120 << 16), 1442)) == 0
+    assert reasons(either) == []
+    assert either.read(newest_ticks, 1) == TICKS + DAY + 13 * (60 << 16)
+
+
+def test_a_wrong_report_does_not_become_right_when_its_time_comes(ground: Ground, tmp_path: Path) -> None:
+    receive(ground, tmp_path, contact())
+    receive(ground, tmp_path, report(TICKS + DAY + (90 << 16), 12))
+    receive(ground, tmp_path, contact(TICKS + DAY, 1440))
+    assert len(reasons(ground)) == 1
+
+
+def test_a_clock_of_the_mission_believes_a_single_report_after_a_silence(
+    ground: Ground, tmp_path: Path
+) -> None:
+    receive(ground, tmp_path, contact())
+    set_mission_clock(lambda: NOW + 86_400 * 10**9)
+    assert receive(ground, tmp_path, report(TICKS + DAY, 12)) == 0
+
+
+def test_a_clock_that_was_not_set_and_a_stamp_from_the_past_are_kept_apart(
+    ground: Ground, tmp_path: Path
+) -> None:
+    receive(ground, tmp_path, contact(TICKS - DAY))
+    receive(ground, tmp_path, contact(TICKS, 1440))
+    assert receive(ground, tmp_path, report(100 << 16, 1452)) == 1
+    assert receive(ground, tmp_path, report(TICKS - DAY + (90 << 16), 1453)) == 1
+    assert reasons(ground) == ["its sequence count belongs to another time", "the clock was not set"]
+
+
+def test_a_late_report_and_a_reboot_are_believed(ground: Ground, tmp_path: Path) -> None:
+    receive(ground, tmp_path, contact(TICKS - DAY) + contact(TICKS - DAY + 13 * (60 << 16), 13))
+    receive(ground, tmp_path, contact(TICKS, 0))  # counts begin again with the boot
+    assert receive(ground, tmp_path, report(TICKS - DAY + 12 * (60 << 16), 12)) == 0
+    assert reasons(ground) == []
+
+
+def test_reception_times_decide_for_single_packets_and_not_for_a_station_whose_clock_is_wrong() -> None:
+    ticks = TICKS + np.array([0, 1, 2, DAY])
+    received = np.full(4, TICKS)
+    assert set(implausible_times(ticks, received, TICKS, None)) == {3}
+    assert implausible_times(ticks[:3], received[:3] - DAY, TICKS, None) == {}
+    assert implausible_times(ticks[3:], received[3:] + DAY, TICKS, None) == {}
+    assert set(implausible_times(ticks[3:], np.array([NO_TICKS]), TICKS, None)) == {0}
+
+
+@pytest.mark.parametrize(
+    ("count", "before", "after", "fits"),
+    [(5, 4, 6, True), (5, 5, 5, True), (7, 4, 6, False), (0, 16_383, 1, True), (9, None, 1, True)],
+)
+def test_a_sequence_count_fits_between_its_neighbours(
+    count: int, before: int | None, after: int | None, fits: bool
+) -> None:
+    assert fits_between(count, before, after) is fits
+
+
+def test_a_withdrawn_ingest_leaves_no_trace_but_its_record(either: Ground, tmp_path: Path) -> None:
+    receive(either, tmp_path, contact())
+    before, alone = hash_of(either), alarms(either)
+    foreign = contact(TICKS - 9 * DAY) + contact(TICKS + (30 << 16), 500) + report(TICKS + 60, 600, 99.0)
+    receive(either, tmp_path, foreign)
+    assert hash_of(either) != before and alarms(either) != alone
+    job = withdraw_ingest(either, 2, reason="another flight", actor="ann")
+    with pytest.raises(StateConflict, match="expected state done, found withdrawing"):
+        withdraw_ingest(either, 2, reason="another flight", actor="ann")
+    assert run_job(either, job).state == "done"
+    assert (hash_of(either), alarms(either)) == (before, alone)
+    assert either.read(get_ingest, 2).state == "withdrawn"
+    assert verify(either, rebuild=True).verdict == "intact"
+    [entry] = either.read(list_audit, AuditFilter(action="withdraw ingest", limit=9)).items
+    assert entry.detail["reason"] == "another flight"
+
+
+def test_telecommands_are_verified_again_after_a_foreign_flight_is_withdrawn(
+    either: Ground, tmp_path: Path
+) -> None:
+    def verification(ticks: int, request: int) -> bytes:
+        values = {"request_id": request}
+        return DICTIONARY.pack("verification_completed", values, ticks=ticks, sequence_count=0)
+
+    receive(either, tmp_path, contact())
+    receive(either, tmp_path, verification(TICKS + HOUR // 2, 5))  # of another flight
+    key = enter_command(either, "test_connection", {}, spacecraft_id=76, actor="ann")
+    release_command(either, key, actor="ann")
+    take_uplink(either, spacecraft_id=76, actor="ann")
+    request = get_command(either, key).record.request_id or 0
+    receive(either, tmp_path, verification(TICKS + HOUR // 4, request))
+    assert get_command(either, key).state == "sent"
+    run_job(either, withdraw_ingest(either, 2, reason="another flight", actor="ann"))
+    assert get_command(either, key).state == "completed"
+
+
+def test_reports_from_before_the_release_do_not_verify_a_telecommand(either: Ground, tmp_path: Path) -> None:
+    set_mission_clock(lambda: NOW)
+    receive(either, tmp_path, contact())
+    old = DICTIONARY.pack("verification_completed", {"request_id": 5}, ticks=TICKS - DAY, sequence_count=0)
+    receive(either, tmp_path, old)
+    key = enter_command(either, "test_connection", {}, spacecraft_id=76, actor="ann")
+    release_command(either, key, actor="ann")
+    take_uplink(either, spacecraft_id=76, actor="ann")
+    request = get_command(either, key).record.request_id or 0
+    late = {"request_id": request}
+    receive(
+        either,
+        tmp_path,
+        DICTIONARY.pack("verification_completed", late, ticks=TICKS - 2 * HOUR, sequence_count=1),
+    )
+    assert get_command(either, key).state == "sent"
+
+
+def test_commanding_starts_from_the_count_that_the_payload_reports(either: Ground, tmp_path: Path) -> None:
+    fields = DICTIONARY.packet("performance").fields
+    values = {one.name: 0 for one in fields} | {"structure_id": 2, "last_command_count": 41}
+    receive(either, tmp_path, DICTIONARY.pack("performance", values, ticks=TICKS, sequence_count=0))
+    key = enter_command(either, "test_connection", {}, spacecraft_id=76, actor="ann")
+    release_command(either, key, actor="ann")
+    record = get_command(either, key).record
+    assert record.sequence_count == 42
+    take_uplink(either, spacecraft_id=76, actor="ann")
+    refused = {"request_id": record.request_id, "failure_code": "out_of_sequence"}
+    receive(
+        either,
+        tmp_path,
+        DICTIONARY.pack("verification_not_accepted", refused, ticks=TICKS + 9, sequence_count=0),
+    )
+    assert "send perform_function resynchronise_commands first" in get_command(either, key).remark
+
+
+def test_a_station_that_the_description_does_not_have_is_refused(either: Ground, tmp_path: Path) -> None:
+    add_mission(either, b'name = "m"\n[spacecraft]\nid = 76\n[link.stations.madrid]\n')
+    file = tmp_path / "a.packets"
+    file.write_bytes(contact())
+    with pytest.raises(Conflict, match=r"expected one of the mission description \(madrid\), found mars"):
+        ingest_file(either, file, spacecraft_id=76, station="mars")
+
+
+def test_a_lease_that_ended_in_a_standstill_is_renewed_with_its_state(either: Ground) -> None:
+    given = {"owner": "a", "until_utc_ns": 15, "mission_utc_ns": 0}
+    with either.database.writing() as connection:
+        assert links.acquire(connection, "l", 76, "flight", wall_utc_ns=0, **given)
+        links.change_link(connection, "l", "a", state="contact")
+        assert links.acquire(connection, "l", 76, "flight", wall_utc_ns=40, **given | {"until_utc_ns": 55})
+        found = links.find_link(connection, "l")
+        assert found is not None and (found.state, found.lease_utc_ns) == ("contact", 55)
+        assert links.acquire(connection, "l", 76, "flight", wall_utc_ns=70, **given | {"owner": "b"})
+        assert not links.acquire(connection, "l", 76, "flight", wall_utc_ns=10, **given)

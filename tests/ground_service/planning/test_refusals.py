@@ -1,0 +1,212 @@
+"""Windows in the past, of unknown spacecraft, and those that are taken back from the spacecraft; on both databases."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ground_service.contacts.commanding.service import get_command, take_uplink
+from ground_service.errors import Conflict, PlanConflicts
+from ground_service.ground import Ground
+from ground_service.ingest.service import ingest_file
+from ground_service.missions.service import add_mission
+from ground_service.passes.model import PassFilter
+from ground_service.passes.store import list_passes
+from ground_service.planning import service as planning
+from ground_service.planning import standing
+from ground_service.planning.model import Window, WindowEntry, WindowSearch
+from ground_service.planning.store import get_window
+from linna.cli import run
+from lunar.ephemeris import Ephemeris, ephemeris_from_states
+from lunar.messages.oem import save_oem
+from lunar.timescales import format_utc, ticks_from_utc_ns
+from tests.ground_service.conftest import (
+    START,
+    Clock,
+    add_reference,
+    circular_states,
+    event_packet,
+    save_circle,
+)
+from tmtc.dictionary import DICTIONARY
+
+NS = 10**9
+MINUTE = 60 * NS
+MISSION = b'name = "m"\n[spacecraft]\nid = 76\nname = "SelenITA"\n'
+
+
+@pytest.fixture
+def now(mission_time: Clock) -> Clock:
+    mission_time.utc_ns = START
+    return mission_time
+
+
+def entry(start: int = START + 60 * MINUTE, spacecraft: int = 76) -> WindowEntry:
+    return WindowEntry("w", start, start + 10 * MINUTE, 15.0, spacecraft)
+
+
+def decided(ground: Ground, window: Window, decision: str) -> Window:
+    return planning.change_window(ground, window.id, actor="bob", changes={}, decision=decision)
+
+
+def on_board(ground: Ground) -> Window:
+    """A window whose telecommands were sent."""
+    add_mission(ground, MISSION)
+    window = decided(ground, planning.add_window(ground, entry(), actor="ann"), "approved")
+    planning.uplink_window(ground, window.id, actor="ann")
+    take_uplink(ground, spacecraft_id=76, actor="ann")
+    assert ground.read(get_window, window.id).state == "uplinked"
+    return window
+
+
+def receive(ground: Ground, folder: Path, *packets: bytes) -> None:
+    file = folder / f"{abs(hash(packets))}.packets"
+    file.write_bytes(b"".join(packets))
+    ingest_file(ground, file, spacecraft_id=76)
+
+
+def verified(
+    ground: Ground, window: Window, after: int, outcome: str = "verification_completed"
+) -> list[bytes]:
+    """Reports of the telecommands of a window that delete activities."""
+    found = [get_command(ground, key).record for key in ground.read(get_window, window.id).telecommands]
+    values = {} if outcome == "verification_completed" else {"failure_code": "no_such_activity"}
+    return [
+        DICTIONARY.pack(outcome, {"request_id": one.request_id, **values}, ticks=after, sequence_count=k)
+        for k, one in enumerate(found)
+        if one.name == "delete_activity"
+    ]
+
+
+def test_a_window_that_has_begun_is_neither_entered_nor_approved_nor_released(
+    either: Ground, now: Clock
+) -> None:
+    add_mission(either, MISSION)
+    with pytest.raises(PlanConflicts, match="expected a start after the mission time 2029-08-07T06:00:00"):
+        planning.add_window(either, entry(START), actor="ann")
+    window = planning.add_window(either, entry(), actor="ann")
+    now.utc_ns += 61 * MINUTE
+    with pytest.raises(PlanConflicts, match="expected a start after the mission time"):
+        decided(either, window, "approved")
+    now.utc_ns = START
+    decided(either, window, "approved")
+    now.utc_ns += 61 * MINUTE
+    with pytest.raises(Conflict, match=r"began at 2029-08-07T07:00:00.*its telecommands are not sent"):
+        planning.uplink_window(either, window.id, actor="ann")
+
+
+def test_a_draft_whose_time_has_come_ends(either: Ground, now: Clock) -> None:
+    add_mission(either, MISSION)
+    window = planning.add_window(either, entry(), actor="ann")
+    assert standing.needs_plan(either)
+    standing.plan_tick(either, now_utc_ns=START + 61 * MINUTE)
+    assert either.read(get_window, window.id).state == "failed"
+
+
+def test_nothing_to_send_is_status_2_and_no_file(
+    ground: Ground, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    window = on_board(ground)
+    out = tmp_path / "w.cltu"
+    assert run(["plan", "uplink", str(window.id), "--home", str(ground.home), "--out", str(out)]) == 2
+    assert "nothing to send: its telecommands are sent" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_candidates_in_the_past_are_not_offered(ground: Ground, tmp_path: Path, now: Clock) -> None:
+    add_reference(ground, save_circle(tmp_path / "a.oem"))
+    now.utc_ns = START + 30 * MINUTE
+    found = planning.search_windows(ground, WindowSearch())
+    assert found.candidates and min(one.start.utc_ns for one in found.candidates) >= now.utc_ns
+    now.utc_ns += 86_400 * NS
+    with pytest.raises(Conflict, match="expected a span that ends after the mission time"):
+        planning.search_windows(ground, WindowSearch())
+
+
+def test_a_spacecraft_without_a_description_is_not_planned(either: Ground, now: Clock) -> None:
+    add_mission(either, MISSION)
+    with pytest.raises(Conflict, match=r"spacecraft 77: .*states \(76\), found none"):
+        planning.add_window(either, entry(spacecraft=77), actor="ann")
+    with pytest.raises(Conflict, match=r"spacecraft 77"):
+        planning.search_windows(either, WindowSearch(spacecraft_id=77))
+
+
+def test_a_window_on_board_is_cancelling_until_its_activities_are_deleted(
+    either: Ground, tmp_path: Path, now: Clock
+) -> None:
+    window = on_board(either)
+    cancelled = decided(either, window, "failed")
+    assert cancelled.state == "cancelling"
+    commands = [get_command(either, key).record for key in cancelled.telecommands]
+    deleted = [one.arguments["request_id"] for one in commands if one.name == "delete_activity"]
+    assert deleted == [one.request_id for one in commands if one.carrier_id is not None]
+    assert len(deleted) == 2
+    with pytest.raises(Conflict):  # it still has its time
+        decided(either, planning.add_window(either, entry(), actor="ann"), "approved")
+    take_uplink(either, spacecraft_id=76, actor="ann")
+    receive(either, tmp_path, *verified(either, window, int(ticks_from_utc_ns(START + MINUTE))))
+    ended = either.read(get_window, window.id)
+    assert (ended.state, ended.reason) == ("failed", "it was cancelled, its activities were deleted on board")
+
+
+def test_a_cancelled_window_that_flies_all_the_same_becomes_a_pass_with_a_remark(
+    either: Ground, tmp_path: Path, now: Clock
+) -> None:
+    window = on_board(either)
+    decided(either, window, "failed")
+    take_uplink(either, spacecraft_id=76, actor="ann")
+    ticks = int(ticks_from_utc_ns(START + MINUTE))
+    receive(either, tmp_path, *verified(either, window, ticks, "verification_not_completed"))
+    found = either.read(get_window, window.id)
+    assert found.state == "cancelling" and "no such activity" in (found.reason or "")
+    start = int(ticks_from_utc_ns(START + 60 * MINUTE))
+    now.utc_ns += 61 * MINUTE
+    state = {"frame_number": 0, "image_ticks": start + 9, "image_quality": 0, "items": {}}
+    empty = {name: np.zeros(0) for name in ("u_px", "v_px", "diameter_px", "score", "size_class", "sigma_px")}
+    frame = DICTIONARY.pack("detections", state | {"items": empty}, ticks=start + 99, sequence_count=0)
+    receive(either, tmp_path, event_packet(start, 0, "observation_started"), frame)
+    found = either.read(get_window, window.id)
+    assert (found.state, found.reason) == ("executing", "it was flown although it was cancelled")
+    [made] = either.read(list_passes, PassFilter(limit=9)).items
+    assert made.name == "w (it was flown although it was cancelled)"
+
+
+def test_a_window_that_has_begun_on_board_cannot_be_cancelled(either: Ground, now: Clock) -> None:
+    window = on_board(either)
+    now.utc_ns += 61 * MINUTE
+    with pytest.raises(
+        Conflict, match="too late to delete its activities; perform_function stop_observation"
+    ):
+        decided(either, window, "failed")
+
+
+def save_with_hole(path: Path) -> Path:
+    """Write an ephemeris of four hours without the second one."""
+    utc_ns = START + np.arange(0, 240, dtype=np.int64) * MINUTE
+    parts = [
+        ephemeris_from_states(times, *circular_states(times)).segments[0]
+        for times in (utc_ns[:60], utc_ns[120:])
+    ]
+    save_oem(Ephemeris(tuple(parts)), path)
+    return path
+
+
+def test_a_search_goes_around_a_hole_or_takes_the_ephemeris_that_has_none(
+    ground: Ground, tmp_path: Path, now: Clock
+) -> None:
+    hole = add_reference(ground, save_with_hole(tmp_path / "hole.oem"))
+    span = {"start": format_utc(START), "stop": format_utc(START + 239 * MINUTE)}
+    asked = WindowSearch.model_validate(span)
+    found = planning.search_windows(ground, asked)
+    assert found.ephemeris_id == hole and found.candidates
+    inside = (START + 60 * MINUTE, START + 119 * MINUTE)
+    assert not [
+        one for one in found.candidates if one.start.utc_ns < inside[1] and one.stop.utc_ns > inside[0]
+    ]
+    assert "without 1 spans that it does not cover" in found.data[0]
+    whole = add_reference(ground, save_circle(tmp_path / "whole.oem"))
+    later = add_reference(ground, save_with_hole(tmp_path / "hole2.oem"))
+    assert later in (hole, whole + 1)
+    assert planning.search_windows(ground, asked).ephemeris_id == whole
