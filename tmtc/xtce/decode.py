@@ -195,12 +195,16 @@ class Decoder:
         packets = np.flatnonzero(verdict == DECODED)
         if len(self.roots) == 1:
             return self._decode(self.roots[0], buffer, cut, verdict, packets)
+        octets, whole = as_octets(buffer), packets[cut.lengths[packets] >= 2]
+        apid = np.full(len(cut), -1, dtype=np.int64)
+        apid[whole] = (octets[cut.offsets[whole]].astype(np.int64) & 7) << 8 | octets[cut.offsets[whole] + 1]
+        named = [packet_apids(root) for root in self.roots]
         found = []
-        for root in self.roots:
-            mine = verdict.copy()
-            chosen = _of_apids(root, as_octets(buffer), cut, packets)
-            mine[np.setdiff1d(packets, chosen)] = NO_CONTAINER
-            found.append(self._decode(root, buffer, cut, mine, chosen))
+        for root, (apids, accepts_others) in zip(self.roots, named, strict=True):
+            foreign = frozenset().union(*(one for one, _ in named)) - apids
+            possible = ~np.isin(apid, list(foreign)) if accepts_others else np.isin(apid, list(apids))
+            mine = np.where((verdict == DECODED) & ~possible, NO_CONTAINER, verdict).astype(np.int8)
+            found.append(self._decode(root, buffer, cut, mine, packets[possible[packets]]))
         return _merged(found, self._conditional)
 
     def _decode(
@@ -269,16 +273,6 @@ def _asks_for(root: Container, bit: int, bits: int) -> bool:
     conditions = [one.condition for one in containers]
     conditions += [entry.condition for one in containers for entry in one.entries]
     return field is not None and field.parameter in references(tuple(conditions))
-
-
-def _of_apids(root: Container, octets: OctetArray, cut: PacketCut, packets: IntArray) -> IntArray:
-    """Return the packets that can begin with a container, by their APIDs."""
-    apids, accepts_others = packet_apids(root)
-    if accepts_others:
-        return packets
-    packets = packets[cut.lengths[packets] >= 2]
-    first = cut.offsets[packets]
-    return packets[np.isin((octets[first].astype(np.int64) & 7) << 8 | octets[first + 1], list(apids))]
 
 
 def _merged(found: Sequence[XtceDecode], conditional: Sequence[set[str]]) -> XtceDecode:

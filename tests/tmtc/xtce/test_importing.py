@@ -210,7 +210,7 @@ def test_long_chains_of_inheritance_are_read_and_endless_ones_refused():
         (integer("t", 8, order="middle"), "byteOrder"),
         (integer("t", 8).replace("encoding=", 'bitOrder="leastSignificantBitFirst" encoding='), "bitOrder"),
         (integer("t", 8, inner="<ErrorDetectCorrect/>"), "ErrorDetectCorrect, which is not"),
-        (integer("t", 8).replace("IntegerDataEncoding", "FloatDataEncoding"), "expected one of IntegerDataEncoding"),
+        (integer("t", 8).replace("IntegerDataEncoding", "StringDataEncoding"), "expected one of IntegerDataEncoding"),
         (floating("t", 80), "sizeInBits 16, 32 or 64"),
         (floating("t", 64, "MILSTD_1750A"), "sizeInBits 32 or 48"),
         (floating("t", 32, "DEC"), "found DEC"),
@@ -224,7 +224,7 @@ def test_long_chains_of_inheritance_are_read_and_endless_ones_refused():
             "an exponent of 0 to 30, found -1",
         ),
         (calibrated("t", 8, "unsigned", default(foreign.spline([(1, 1)], 1, True))), "two points"),
-        (calibrated("t", 8, "unsigned", default(foreign.spline([(2, 1), (1, 1)], 1, True))), "rising"),
+        (calibrated("t", 8, "unsigned", default(foreign.spline([(1, 2), (1, 1)], 1, True))), "value, found two"),
         (calibrated("t", 8, "unsigned", default(foreign.spline([(1, 1), (2, 1)], 3, True))), "order 0 or 1"),
         (text_type(foreign.fixed_size(-8), name="t"), "found -8"),
         (text_type(foreign.fixed_size(999_999_999_999), name="t"), "found 999999999999"),
@@ -273,8 +273,9 @@ def test_types_beyond_the_subset_or_their_bounds_are_refused_by_name(types, word
         ('<StreamSegmentEntry streamRef="x"/>', "StreamSegmentEntry"),
         ('<ParameterSegmentRefEntry parameterRef="a" sizeInBits="4"/>', "ParameterSegmentRefEntry"),
         (
-            '<ParameterRefEntry parameterRef="a"><RepeatEntry/></ParameterRefEntry>',
-            "RepeatEntry, which is not",
+            '<ParameterRefEntry parameterRef="a"><RepeatEntry><Count><FixedValue>2</FixedValue></Count>'
+            "<Offset><FixedValue>8</FixedValue></Offset></RepeatEntry></ParameterRefEntry>",
+            "repetitions without an Offset",
         ),
         (
             '<ParameterRefEntry parameterRef="a"><LocationInContainerInBits referenceLocation="containerEnd">'
