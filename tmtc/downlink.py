@@ -289,6 +289,7 @@ class DownlinkDecode:
             "packets_missing": self.sequence.missing,
             "duplicates": self.sequence.duplicates,
             "conflicts": self.sequence.conflicts,
+            "count_restarts": self.sequence.restarts,
             "crc_errors": self.crc_errors,
             "unknown": self.unknown,
             "octets_skipped": self.octets_skipped,

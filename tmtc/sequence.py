@@ -6,7 +6,8 @@ come late, interleaved and twice). Only extended counts are compared.
 
 Between two packets that follow each other in on-board time the count is taken to have moved by the least
 number of steps that explains what is seen: a loss of 8192 packets or more in one stretch looks like a
-shorter one.
+shorter one. A sender that restarts begins to count again: a count that falls far, or falls among counts that
+packets of other content had, is a restart.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tmtc.arrays import IntArray
+from tmtc.arrays import BoolArray, IntArray
 from tmtc.packets import SEQUENCE_COUNT_LIMIT
 
 FIRST, DUPLICATE, CONFLICT = 0, 1, 2
@@ -25,6 +26,8 @@ FIRST, DUPLICATE, CONFLICT = 0, 1, 2
 # A sender that restarts counts from zero; a count that falls far, to nearly zero, as time goes on is such a start
 _RESET_FALL = 64
 _RESET_COUNT = 64
+_REPEATED = 2
+"""Packets with counts of earlier ones and other content that are a restart; a single one is a conflict."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,14 +87,23 @@ class SequenceReport:
         """Packets with the count of another one but other octets."""
         return sum(account.conflicts for account in self.accounts)
 
+    @property
+    def restarts(self) -> int:
+        """Restarts of counters, all APIDs; how many packets are missing around them is unknown."""
+        return sum(account.restarts for account in self.accounts)
 
-def extend_counts(sequence_count: IntArray, ticks: IntArray) -> tuple[IntArray, IntArray]:
+
+def extend_counts(
+    sequence_count: IntArray, ticks: IntArray, same: Callable[[int, int], bool] | None = None
+) -> tuple[IntArray, IntArray]:
     """(extended counts (n,), extended counts at which the counter restarted (r,)) of one APID and boot.
 
     Parameters
     ----------
     sequence_count, ticks : (n,)
         The 14-bit counts and the on-board times, in any order.
+    same
+        Whether two packets, by index, hold the same octets; if given, restarts are found by content as well.
     """
     if not sequence_count.size:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
@@ -104,6 +116,9 @@ def extend_counts(sequence_count: IntArray, ticks: IntArray) -> tuple[IntArray, 
     extended = np.empty(count.size, dtype=np.int64)
     extended[0] = count[0]
     extended[1:] = count[0] + np.cumsum(step)
+    if same is not None and np.unique(extended).size < extended.size:
+        later = np.append(False, np.diff(time) > 0)
+        restart[_begins_again(extended, later, restart, lambda a, b: same(order[a], order[b]))] = True
     # after a restart the extended count begins at the next multiple of the limit above all before it
     bases = []
     for at in (np.flatnonzero(restart) + 1).tolist():
@@ -114,6 +129,37 @@ def extend_counts(sequence_count: IntArray, ticks: IntArray) -> tuple[IntArray, 
     result = np.empty_like(extended)
     result[order] = extended
     return result, np.array(bases, dtype=np.int64)
+
+
+def _begins_again(
+    extended: IntArray, later: BoolArray, restart: BoolArray, same: Callable[[int, int], bool]
+) -> list[int]:
+    """Return the steps at which counts (n,) in time order fall among counts that other content had, copies of none."""
+    counts, found = extended.tolist(), []
+    seen: dict[int, int] = {}
+    highest = counts[0] - 1
+    for k, count in enumerate(counts):
+        begins = k > 0 and bool(restart[k - 1])
+        if not begins and later[k] and count <= highest and count <= counts[k - 1]:
+            conflicts = copies = 0
+            stop = k
+            while (
+                stop < len(counts)
+                and counts[stop] <= highest
+                and (stop == k or counts[stop] > counts[stop - 1])
+            ):
+                if (earlier := seen.get(counts[stop])) is not None:
+                    is_copy = same(earlier, stop)
+                    copies, conflicts = copies + is_copy, conflicts + (not is_copy)
+                stop += 1
+            begins = conflicts >= _REPEATED and not copies
+            if begins:
+                found.append(k - 1)
+        if begins:
+            seen, highest = {}, count
+        seen.setdefault(count, k)
+        highest = max(highest, count)
+    return found
 
 
 def account(
@@ -140,7 +186,8 @@ def account(
     for key in np.unique(boots * (1 << 16) + apid).tolist():
         this_boot, this_apid = divmod(key, 1 << 16)
         rows = np.flatnonzero((boots == this_boot) & (apid == this_apid))
-        counts, restarts = extend_counts(sequence_count[rows], ticks[rows])
+        content = None if boot is not None else lambda a, b, rows=rows: same(int(rows[a]), int(rows[b]))
+        counts, restarts = extend_counts(sequence_count[rows], ticks[rows], content)
         extended[rows] = counts
         by_count = np.lexsort((rows, counts))
         ordered = counts[by_count]

@@ -87,6 +87,7 @@ class PrimaryHeaders:
     apid: IntArray
     sequence_count: IntArray
     secondary_header: BoolArray
+    sequence_flags: IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,6 +227,7 @@ def primary_headers(buffer: Octets, cut: PacketCut) -> PrimaryHeaders:
         apid=first & 0x7FF,
         sequence_count=second & 0x3FFF,
         secondary_header=(first & 0x800) != 0,
+        sequence_flags=second >> 14,
     )
 
 

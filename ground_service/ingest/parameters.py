@@ -31,7 +31,7 @@ from lunar.timescales import (
 from tmtc.arrays import Octets
 from tmtc.cuc import NO_TICKS, TICKS_LIMIT
 from tmtc.packet_times import TimeCode, elapsed
-from tmtc.stream import PacketCut, whole_packets
+from tmtc.stream import PacketCut, primary_headers, whole_packets
 from tmtc.xtce.decode import VERDICTS
 from tmtc.xtce.series import series_matrix
 
@@ -135,7 +135,7 @@ def decoded_values(
         octets = [packets.octets[row] for row in rows.tolist()]
         buffer = b"".join(octets)
         cut = whole_packets(np.array([len(one) for one in octets], dtype=np.int64))
-        found = declared.decoder.decode(buffer, cut)
+        found = declared.decoder.decode(buffer, cut, primary_headers(buffer, cut))
         ticks = packet_times(buffer, cut, declared.source.time)
         numbers = declared.numbers
         for name, table in found.tables.items():
@@ -149,14 +149,20 @@ def decoded_values(
 
 
 def packet_times(buffer: Octets, cut: PacketCut, time: PacketTime | None) -> IntArray:
-    """Return the on-board time (n,) of packets as ticks; `NO_TICKS` where a packet has none that is possible."""
+    """Return the on-board time (n,) of packets as ticks; `NO_TICKS` where a packet has none that is possible.
+
+    A packet has none without a secondary header, and as a later part of a segmented packet.
+    """
     if time is None:
         return np.full(len(cut), NO_TICKS, dtype=np.int64)
     code = TimeCode(time.code, time.offset, time.whole_octets, time.fraction_octets, time.p_field)
     whole, part, known = elapsed(buffer, cut.offsets, cut.lengths, code)
+    known &= primary_headers(buffer, cut).secondary_header
     epoch_ns = parse_utc(time.epoch.removesuffix(EPOCH_TAI))
     if time.code == "cds":
         ticks = np.asarray(ticks_from_utc_ns(epoch_ns + whole * _DAY_NS + part))
+    elif time.clock == "unix":
+        ticks = np.asarray(ticks_from_utc_ns(epoch_ns + whole * NS + part * NS // TICKS_PER_SECOND))
     else:
         epoch_tai_ns = epoch_ns if time.epoch.endswith(EPOCH_TAI) else int(tai_ns_from_utc_ns(epoch_ns))
         since = (epoch_tai_ns - ONBOARD_EPOCH_TAI_NS) * TICKS_PER_SECOND // NS

@@ -7,7 +7,6 @@ import binascii
 import gzip
 import hashlib
 import json
-import re
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,16 +21,16 @@ from tmtc.errors import DefinitionError
 from tmtc.packets import IDLE_APID
 from tmtc.stream import CHECKED, PacketForm
 from tmtc.xtce.decode import Decoder
+from tmtc.xtce.definition import packet_apids
 from tmtc.xtce.importing import parse_xtce
 from tmtc.xtce.nodes import MAX_OCTETS
 from tmtc.xtce.series import SeriesValue, packet_layouts
 
+DECODING_VERSION = 2
+"""Version of the values that decoding gives. Stored packets are decoded again if it changes."""
+
 EMBEDDED_AS_TEXT_OCTETS = 64 << 10
 """Longer XTCE files are embedded compressed, since a mission description has a limited length."""
-
-
-_COMPARISON = re.compile(r"<(?:\w+:)?Comparison\b[^>]*>")
-_OF_APID, _COMPARED = re.compile(r'parameterRef="[^"]*apid', re.IGNORECASE), re.compile(r'\bvalue="(\d+)"')
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,25 +119,35 @@ def read_mission_file(path: Path) -> bytes:
 def minimal_description(xtce: Path, spacecraft_id: int) -> str:
     """Return a mission description of packets without checksum that an XTCE file defines.
 
-    Their APIDs are the numbers that its containers compare with a parameter whose name holds ``apid``.
+    Their APIDs are the numbers with which its containers compare the APID of the primary header.
 
     Raises
     ------
     InvalidInput
-        The file cannot be read, or compares no APID.
+        The file cannot be read, is not XTCE that is supported, or compares no APID.
     """
+    document = _embedded(xtce, str(xtce), "")
     try:
-        document = xtce.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInput(str(xtce), "", "an XTCE file that can be read", str(error)) from None
-    tags = [one for one in _COMPARISON.findall(document) if _OF_APID.search(one)]
-    apids = sorted({int(one[1]) for one in map(_COMPARED.search, tags) if one is not None})
+        decoder = Decoder(parse_xtce({xtce.name: _document(document)}))
+    except DefinitionError as error:
+        raise InvalidInput(str(xtce), "", "XTCE that is supported", str(error)) from None
+    apids = sorted({apid for root in decoder.roots for apid in packet_apids(root)[0] if apid < IDLE_APID})
     if not apids:
         raise InvalidInput(
             str(xtce), "Comparison", "a container that compares its APID with a number", "none"
         )
     packets = {"name": xtce.stem[:64], "apids": apids, "packet_checksum": "none", "xtce": [document]}
     return format_toml({"name": xtce.stem, "spacecraft": {"id": spacecraft_id}, "packets": [packets]})
+
+
+def definition_remarks(mission: Mission) -> list[str]:
+    """Return what a person should know of the XTCE documents of a mission description, one line each."""
+    return [
+        f"packets {one.source.name}: {remark}"
+        for one in packet_definitions(mission).declared
+        if one.decoder is not None
+        for remark in one.decoder.definition.remarks
+    ]
 
 
 def embed_documents(text: str, folder: Path, source: str) -> str:
@@ -201,19 +210,20 @@ def _decoder(source: PacketSource) -> Decoder | None:
     if not source.xtce:
         return None
     documents = {f"{source.name} [{index}]": _document(entry) for index, entry in enumerate(source.xtce)}
-    return Decoder(parse_xtce(documents), source.container)
+    return Decoder(parse_xtce(documents, source.leading_size), source.container)
 
 
 @lru_cache(maxsize=16)
 def _compiled(sources: Sequence[PacketSource]) -> PacketDefinitions:
     if not sources:
         return PacketDefinitions()
-    stated = json.dumps([one.model_dump(mode="json", exclude_none=True) for one in sources], sort_keys=True)
+    listed = [one.model_dump(mode="json", exclude_none=True) for one in sources]
+    stated = json.dumps([DECODING_VERSION, listed], sort_keys=True)
     declared = []
     number = 0
     for source in sources:
         decoder = _decoder(source)
-        layouts = {} if decoder is None else dict(sorted(packet_layouts(decoder.root).items()))
+        layouts = {} if decoder is None else dict(sorted(packet_layouts(*decoder.roots).items()))
         declared.append(DeclaredPackets(source, decoder, layouts, number))
         number += len(layouts)
     unchecked = {apid for one in sources if one.packet_checksum == "none" for apid in one.apids}

@@ -585,7 +585,8 @@ class PacketTime(Section):
     epoch
         UTC of the zero of the code; with `` TAI`` at its end, TAI.
     clock
-        "payload": the clock whose time reports are correlated with UTC. "own": another one, taken as correct.
+        "payload": the clock whose time reports are correlated with UTC. "own": another one, taken as correct. "unix":
+        as "own", but seconds are counted without leap seconds, as by Unix time.
     """
 
     code: Literal["cuc", "cds"]
@@ -594,7 +595,7 @@ class PacketTime(Section):
     whole_octets: Annotated[int, Field(ge=1, le=7)]
     fraction_octets: Annotated[int, Field(ge=0, le=10)]
     epoch: str
-    clock: Literal["payload", "own"]
+    clock: Literal["payload", "own", "unix"]
 
     @model_validator(mode="after")
     def _possible(self) -> PacketTime:
@@ -604,8 +605,8 @@ class PacketTime(Section):
             raise ValueError(
                 f"0, 2 or 4 octets below the millisecond in a CDS code, found {self.fraction_octets}"
             )
-        if self.code == "cds" and self.epoch.endswith(EPOCH_TAI):
-            raise ValueError("an epoch in UTC for a CDS code, found one in TAI")
+        if self.epoch.endswith(EPOCH_TAI) and (self.code == "cds" or self.clock == "unix"):
+            raise ValueError("an epoch in UTC for a CDS code or a Unix clock, found one in TAI")
         try:
             parse_utc(self.epoch.removesuffix(EPOCH_TAI))
         except TimeFormatError as error:
@@ -617,14 +618,17 @@ class PacketSource(Section):
     """Packets of some APIDs that the packet dictionary of the payload does not define.
 
     `xtce` holds one or more XTCE documents, as texts or compressed (``gzip:`` and base64). In a file for
-    `linna mission`, an entry can be the path of a document, which is embedded when the file is read.
+    `linna mission`, an entry can be the path of a document, which is embedded when the file is read. `container` names
+    one container or several that packets begin with; by default all that inherit from none. `leading_size` is what the
+    size before a text counts, if the documents do not show it.
     """
 
     name: Annotated[str, Field(min_length=1, max_length=64)]
     apids: Annotated[tuple[Annotated[int, Field(ge=0, le=2046)], ...], Array, Field(min_length=1)]
     packet_checksum: Literal["crc16", "none"]
     xtce: Annotated[tuple[str, ...], Array] | None = None
-    container: str | None = None
+    container: str | Annotated[tuple[str, ...], Array, Field(min_length=1)] | None = None
+    leading_size: Literal["octets", "bits"] | None = None
     time: PacketTime | None = None
 
     @model_validator(mode="after")
@@ -634,8 +638,9 @@ class PacketSource(Section):
                 raise ValueError(
                     f"texts of XTCE documents, or files that `linna mission` reads, found {text[:80]!r}"
                 )
-        if self.container is not None and not self.xtce:
-            raise ValueError("xtce documents with a container, found none")
+        for key in ("container", "leading_size"):
+            if getattr(self, key) is not None and not self.xtce:
+                raise ValueError(f"xtce documents with a {key}, found none")
         return self
 
 

@@ -59,7 +59,7 @@ def _configure_run(running: LinnaParser) -> None:
 
 def write(arguments: argparse.Namespace) -> int:
     from ground_service.missions.definitions import minimal_description
-    from ground_service.missions.model import parse_mission
+    from ground_service.missions.service import read_mission
     from linna.data import data_folder
     from linna.errors import UsageError
     from payload_emulator.session.mission import scenario_mission_text
@@ -77,7 +77,7 @@ def write(arguments: argparse.Namespace) -> int:
         text = write_flight(scenario, data_folder(), arguments.out, arguments.windows, window_s)
     else:
         text = scenario_mission_text(scenario, data_folder())
-    mission = parse_mission(text, str(arguments.out))
+    mission, _ = read_mission(text.encode(), str(arguments.out))
     arguments.out.write_text(text, encoding="utf-8")
     figures = {**_figures(mission), "file": str(arguments.out)}
     return emit(arguments, figures, text=f"{arguments.out}\n{_described(figures)}")
@@ -88,7 +88,13 @@ def check(arguments: argparse.Namespace) -> int:
 
     mission, faults = check_mission_file(arguments.file)
     if mission is None:
-        figures: dict[str, Any] = {"mission": None, "revision": None, "unknown": [], "faults": faults}
+        figures: dict[str, Any] = {
+            "mission": None,
+            "revision": None,
+            "unknown": [],
+            "remarks": [],
+            "faults": faults,
+        }
         emit(arguments, figures, text="\n".join(faults))
         return 2
     figures = {**_figures(mission), "faults": []}
@@ -115,7 +121,14 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def _figures(mission: Any) -> dict[str, Any]:
-    return {"mission": mission.name, "revision": mission.revision, "unknown": list(mission.unknown)}
+    from ground_service.missions.definitions import definition_remarks
+
+    return {
+        "mission": mission.name,
+        "revision": mission.revision,
+        "unknown": list(mission.unknown),
+        "remarks": definition_remarks(mission),
+    }
 
 
 def _described(figures: Mapping[str, Any]) -> str:
@@ -123,7 +136,7 @@ def _described(figures: Mapping[str, Any]) -> str:
     lines = [f"mission {figures['mission']}, revision {figures['revision'][:16]}"]
     if unknown:
         lines.append(f"not stated ({len(unknown)}): {', '.join(unknown)}")
-    return "\n".join(lines)
+    return "\n".join([*lines, *figures.get("remarks", ())])
 
 
 def run_mission(arguments: argparse.Namespace) -> int:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from tmtc.downlink import DownlinkDecode
     from tmtc.schema import Dictionary
     from tmtc.xtce.decode import XtceDecode
+    from tmtc.xtce.definition import Definition
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -75,19 +76,19 @@ def _decode_foreign(arguments: argparse.Namespace) -> int:
     from linna.errors import UsageError
     from tmtc.xtce.records import format_xtce_records, xtce_records
 
-    decoded, found, known = _read_foreign(arguments)
-    wanted = set(arguments.packet or ())
+    decoded, found, definition = _read_foreign(arguments)
+    wanted, known = set(arguments.packet or ()), set(definition.containers)
     if wanted - known:
         listed = ", ".join(sorted(known)[:12])
         raise UsageError(f"--packet: expected a container ({listed}), found {min(wanted - known)!r}")
     if wanted:
         found = replace(found, tables={name: t for name, t in found.tables.items() if name in wanted})
     records = xtce_records(found, raw=arguments.raw)
-    figures = {**decoded.accounting(), "verdicts": found.counts()}
+    figures = {**decoded.accounting(), **_definition_figures(found, definition)}
     if arguments.json and arguments.out is None:
         return emit(arguments, {**figures, "telemetry": records})
     octets = format_xtce_records(records, arguments.format)
-    text = f"{_describe(decoded)}\n{_describe_verdicts(found)}"
+    text = f"{_describe(decoded)}\n{_describe_definition(found, definition)}"
     return _write(arguments, octets, len(records), figures, text)
 
 
@@ -104,9 +105,9 @@ def _write(
 
 def run_check(arguments: argparse.Namespace) -> int:
     if arguments.xtce:
-        decoded, found, _ = _read_foreign(arguments)
-        figures = {**decoded.accounting(), "verdicts": found.counts()}
-        emit(arguments, figures, text=f"{_describe(decoded)}\n{_describe_verdicts(found)}")
+        decoded, found, definition = _read_foreign(arguments)
+        figures = {**decoded.accounting(), **_definition_figures(found, definition)}
+        emit(arguments, figures, text=f"{_describe(decoded)}\n{_describe_definition(found, definition)}")
     else:
         _refuse_without_definition(arguments)
         decoded = _read(arguments)
@@ -114,26 +115,27 @@ def run_check(arguments: argparse.Namespace) -> int:
     return 1 if arguments.strict and not decoded.complete else 0
 
 
-def _read_foreign(arguments: argparse.Namespace) -> tuple[DownlinkDecode, XtceDecode, set[str]]:
-    """The downlink, its packets through the definition, and the names of the containers."""
+def _read_foreign(arguments: argparse.Namespace) -> tuple[DownlinkDecode, XtceDecode, Definition]:
+    """The downlink, its packets through the definition, and the definition."""
     from tmtc.schema import Dictionary
     from tmtc.xtce.decode import DECODED, Decoder
     from tmtc.xtce.importing import parse_xtce
 
-    definition = parse_xtce({str(path): path.read_bytes() for path in arguments.xtce})
+    documents = {str(path): path.read_bytes() for path in arguments.xtce}
+    definition = parse_xtce(documents, arguments.leading_size)
     decoder = Decoder(definition, arguments.container)
     decoded = _read(arguments, Dictionary(version=0, telemetry=()))
-    found = decoder.decode(decoded.buffer, decoded.cut)
+    found = decoder.decode(decoded.buffer, decoded.cut, decoded.headers, whole_stream=True)
     unknown = int((decoded.cut.crc_ok & (found.verdict != DECODED)).sum())
-    return replace(decoded, unknown=unknown), found, set(definition.containers)
+    return replace(decoded, unknown=unknown), found, definition
 
 
 def _refuse_without_definition(arguments: argparse.Namespace) -> None:
     from linna.errors import UsageError
 
-    if arguments.container is not None or getattr(arguments, "raw", False):
-        option = "--raw" if arguments.container is None else "--container"
-        raise UsageError(f"{option}: expected --xtce DEFINITION with it, found none")
+    for name in ("container", "leading_size", "raw"):
+        if getattr(arguments, name, None):
+            raise UsageError(f"--{name.replace('_', '-')}: expected --xtce DEFINITION with it, found none")
 
 
 def run_icd(arguments: argparse.Namespace) -> int:
@@ -168,7 +170,19 @@ def _add_definition_options(parser: argparse.ArgumentParser) -> None:
         "decode through this XTCE file in place of the payload's dictionary (repeatable)",
         action="append",
     )
-    option(group, "--container NAME", str, "container that packets begin with, where there are several")
+    option(
+        group,
+        "--container NAME",
+        str,
+        "container that packets begin with (repeatable; default: those without a base)",
+        action="append",
+    )
+    option(
+        group,
+        "--leading-size",
+        ("octets", "bits"),
+        "what a size before a text counts (default: octets in documents of Yamcs and F Prime, else bits)",
+    )
     option(group, "--no-error-control", bool, "packets do not end with a checksum (CRC-16)")
     option(
         group, "--prefix-octets N", int, "octets before each packet of a file without frames (default: tried)"
@@ -222,9 +236,22 @@ def _read(arguments: argparse.Namespace, dictionary: Dictionary | None = None) -
     return decoded
 
 
-def _describe_verdicts(found: XtceDecode) -> str:
+def _definition_figures(found: XtceDecode, definition: Definition) -> dict[str, object]:
+    return {
+        "verdicts": found.counts(),
+        "values_unknown": found.values_unknown(),
+        "alarms_not_read": definition.alarms_not_read,
+        "leading_size": definition.size_tags or None,
+    }
+
+
+def _describe_definition(found: XtceDecode, definition: Definition) -> str:
     counts = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in found.counts().items() if count)
-    return "definition: " + (counts or "no packets")
+    lines = ["definition: " + (counts or "no packets")]
+    unknown = ", ".join(f"{name} {count}" for name, count in found.values_unknown().items())
+    if unknown:
+        lines.append(f"  values not known (outside their calibrator, or no text): {unknown}")
+    return "\n".join([*lines, *(f"  {remark}" for remark in definition.remarks)])
 
 
 def _describe(decoded: DownlinkDecode) -> str:
@@ -247,6 +274,11 @@ def _describe(decoded: DownlinkDecode) -> str:
         f"duplicates {sequence.duplicates}, conflicts {sequence.conflicts}, "
         f"wrong checksum {decoded.crc_errors}, not in the dictionary {decoded.unknown}"
     )
+    if sequence.conflicts:
+        lines.append("  conflict: a packet with the count of another one of its APID and other content")
+    if sequence.restarts:
+        times = "once" if sequence.restarts == 1 else f"{sequence.restarts} times"
+        lines.append(f"  counts restart {times}; how many packets are missing around a restart is unknown")
     if decoded.prefix_octets:
         lines.append(f"  each behind {decoded.prefix_octets} other octets")
     lines += [f"  APID 0x{apid:03X}: {count}" for apid, count in decoded.by_apid.items()]

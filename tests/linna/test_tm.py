@@ -2,6 +2,7 @@
 
 import csv
 import json
+import struct
 
 import numpy as np
 import pytest
@@ -288,3 +289,63 @@ def test_arrays_and_aggregates_are_lists_and_mappings_and_columns_of_a_table(tmp
     rows = list(csv.reader(capsys.readouterr().out.splitlines()))
     assert rows[0] == ["packet", "head", "n", "pair.a", "pair.b", "packet_", "list"]
     assert rows[1][2:] == ["2", "3", "4", "5", "[6, 7]"] and rows[2][2:] == ["0", "8", "9", "10", "[]"]
+
+
+def bus_packet(count: int, data: bytes, *, secondary: bool = True, flags: int = 3, apid: int = 200) -> bytes:
+    first = apid | (0x0800 if secondary else 0)
+    return struct.pack(">HHH", first, flags << 14 | count, len(data) - 1) + data
+
+
+@pytest.fixture
+def timed(tmp_path):
+    """A definition whose packets have a time of four octets, and a function that checks or decodes packets with it."""
+    from tests.tmtc.foreign import (
+        HEADER_CONTAINER,
+        HEADER_PARAMETERS,
+        HEADER_TYPES,
+        comparison,
+        container,
+        document,
+    )
+
+    parameters = {**HEADER_PARAMETERS, "time": "U32", "value": "U16"}
+    entries = container("hk", ["time", "value"], "CCSDSPacket", comparison("PKT_APID", 200))
+    definition = tmp_path / "bus.xml"
+    definition.write_text(document(HEADER_TYPES, parameters, HEADER_CONTAINER + entries))
+
+    def told(command: str, packets: list[bytes], *more: str) -> list[str]:
+        path = tmp_path / "bus.bin"
+        path.write_bytes(b"".join(packets))
+        return ["tm", command, str(path), "--xtce", str(definition), "--no-error-control", *more]
+
+    return told
+
+
+def test_parts_of_segmented_packets_and_packets_without_their_header_are_counted_apart(timed, capsys):
+    packets = [bus_packet(k, bytes(6)) for k in range(5)]
+    packets += [bus_packet(5, bytes(6), flags=1), bus_packet(6, bytes(6), secondary=False, flags=2)]
+    packets += [bus_packet(7, b"BOOTED", secondary=False)]
+    assert run(timed("check", packets, "--json")) == 0
+    verdicts = figures(capsys)["verdicts"]
+    assert {name: count for name, count in verdicts.items() if count} == {
+        "decoded": 5, "segments_not_joined": 2, "no_secondary_header": 1,
+    }  # fmt: skip
+    assert run(timed("decode", packets)) == 0
+    assert [record["value"] for record in json.loads(capsys.readouterr().out)] == [0] * 5
+    bare = [bus_packet(k, bytes(6), secondary=False) for k in range(3)]  # no packet of the APID has a header
+    assert run(timed("check", bare, "--json")) == 0
+    assert figures(capsys)["verdicts"]["decoded"] == 3
+
+
+def test_counts_that_restart_are_told_from_conflicts(timed, capsys):
+    counts = [*range(25), *range(3, 30)]
+    packets = [bus_packet(count, struct.pack(">IH", k, k)) for k, count in enumerate(counts)]
+    assert run(timed("check", packets)) == 0
+    out = capsys.readouterr().out
+    assert "conflicts 0" in out
+    assert "counts restart once; how many packets are missing around a restart is unknown" in out
+    assert run(timed("check", [*packets[:25], bus_packet(20, bytes(6)), *packets[25:25]])) == 0
+    assert (
+        "conflict: a packet with the count of another one of its APID and other content"
+        in capsys.readouterr().out
+    )

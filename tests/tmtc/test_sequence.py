@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -148,6 +149,23 @@ def test_a_count_that_falls_to_less_than_64_by_more_than_64_is_a_restart():
     for before, after, restarts in ((3000, 63, 1), (3000, 64, 0), (115, 50, 1), (114, 50, 0)):
         result = report([before, after])
         assert result.accounts[0].restarts == restarts, (before, after)
+
+
+@pytest.mark.parametrize(
+    ("counts", "restarts", "conflicts", "missing"),
+    [
+        ([*range(25), *range(3, 30)], 1, 0, 0),  # the last five before and the first three after it are lost
+        ([*range(25), *range(30), *range(2, 20)], 2, 0, 0),
+        ([*range(40), 20, *range(40, 60)], 0, 1, 0),  # one packet with a wrong count
+        ([*range(25), *range(3, 10), *range(12, 30)], 1, 0, 2),
+    ],
+)
+def test_counts_of_other_content_that_come_again_are_a_restart(counts, restarts, conflicts, missing):
+    found = report(counts, same=never_same)
+    assert (found.restarts, found.conflicts, found.missing) == (restarts, conflicts, missing)
+    given = report(counts, same=never_same, boot=np.zeros(len(counts), dtype=np.int64))
+    assert given.restarts == 0  # boots are known
+    assert report(counts).restarts == 0  # copies
 
 
 @settings(max_examples=80, deadline=None)

@@ -22,8 +22,9 @@ import numpy.typing as npt
 
 from tmtc.arrays import BoolArray, IntArray, OctetArray, Octets, RecordArray, as_octets
 from tmtc.errors import DefinitionError
+from tmtc.packets import FLAGS_WHOLE
 from tmtc.schema import gather
-from tmtc.stream import PacketCut
+from tmtc.stream import PacketCut, PrimaryHeaders
 from tmtc.xtce.columns import (
     ArrayColumn,
     Column,
@@ -55,12 +56,20 @@ from tmtc.xtce.definition import (
     Size,
     Spline,
     StringEncoding,
+    header_field,
+    packet_apids,
+    references,
+    tree,
 )
 
-DECODED, NO_CONTAINER, AMBIGUOUS, TOO_SHORT, MALFORMED, DAMAGED = 0, 1, 2, 3, 4, 5
-VERDICTS = ("decoded", "no_container", "ambiguous", "too_short", "malformed", "damaged")
-"""What came of a packet: decoded; no or several containers match; shorter than its container; a size that is none, a
-text that is none or a number that its calibrator does not cover; a wrong checksum."""
+DECODED, NO_CONTAINER, AMBIGUOUS, TOO_SHORT, MALFORMED, DAMAGED, SEGMENT, NO_HEADER = range(8)
+VERDICTS = (
+    "decoded", "no_container", "ambiguous", "too_short", "malformed", "damaged", "segments_not_joined",
+    "no_secondary_header",
+)  # fmt: skip
+"""Outcomes of decoding a packet: decoded; no or several containers match; shorter than its container; a size that is
+not possible, so that the places of the values behind it are unknown; a wrong checksum; a part of a segmented packet;
+without the secondary header that other packets of its APID have."""
 
 _CHUNK = 1 << 17
 """Packets decoded together: bounds the memory for what is between."""
@@ -90,73 +99,144 @@ class XtceTable:
     def __len__(self) -> int:
         return len(self.packet_index)
 
+    def kept(self, keep: BoolArray) -> XtceTable:
+        """Return the selected packets."""
+        index = np.flatnonzero(keep)
+        columns = {name: column.take(index) for name, column in self.columns.items()}
+        return XtceTable(self.name, self.packet_index[index], columns, self.unread_bits[index])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class XtceDecode:
-    """Tables by container, and for every packet of the cut an index of `VERDICTS` (n,)."""
+    """Tables by container, and for every packet of the cut an index of `VERDICTS` (n,).
+
+    `unknown` are, by parameter, the packets of values that are not known: a number that its calibrator does not cover,
+    a text that is none. Their transmitted values are kept.
+    """
 
     tables: dict[str, XtceTable]
     verdict: npt.NDArray[np.int8]
+    unknown: dict[str, IntArray]
 
     def counts(self) -> dict[str, int]:
-        """Packets by verdict."""
+        """Packets by verdict; those of the primary header only if there are any."""
         found = np.bincount(self.verdict, minlength=len(VERDICTS)).tolist()
-        return dict(zip(VERDICTS, found, strict=True))
+        return {VERDICTS[k]: count for k, count in enumerate(found) if count or k <= DAMAGED}
+
+    def values_unknown(self) -> dict[str, int]:
+        """Values of decoded packets that are not known, by parameter."""
+        return {name: len(packets) for name, packets in self.unknown.items() if len(packets)}
 
 
-def choose_root(definition: Definition, name: str | None = None) -> Container:
-    """The container that every packet begins with: the one named, or the only one without a base.
+def choose_roots(definition: Definition, names: Sequence[str] = ()) -> tuple[Container, ...]:
+    """The containers that packets begin with: those named, or all without a base if they can be told apart.
 
     Raises
     ------
     DefinitionError
-        There is no such container, or there are several and none is named.
+        There is no such container, or none is named and packets cannot tell between several.
     """
-    if name is not None:
-        found = definition.containers.get(name)
-        if found is None:
+    for name in names:
+        if name not in definition.containers:
             known = ", ".join(sorted(definition.containers)[:12])
             raise DefinitionError(
                 f"{definition.name}: expected the name of a container ({known}), found {name!r}"
             )
-        return found
-    if len(definition.roots) == 1:
-        return next(iter(definition.roots.values()))
-    listed = ", ".join(sorted(definition.roots)[:12])
-    raise DefinitionError(
-        f"{definition.name}: expected one container without a base, found {len(definition.roots)} ({listed}); "
-        "name the one that packets begin with"
-    )
+    roots = tuple(definition.containers[name] for name in names) or tuple(definition.roots.values())
+    open_roots = [root.name for root in roots if not any(conditions for _, conditions in tree(root))]
+    if len(open_roots) > 1:
+        listed = ", ".join(sorted(open_roots)[:12])
+        raise DefinitionError(
+            f"{definition.name}: expected one container without a base, found {len(open_roots)} ({listed}) "
+            "without conditions; name the one that packets begin with"
+        )
+    return roots
 
 
 class Decoder:
     """A definition with its containers compiled to steps; stateless between calls."""
 
-    def __init__(self, definition: Definition, root: str | None = None) -> None:
+    def __init__(self, definition: Definition, roots: str | Sequence[str] | None = None) -> None:
         self.definition = definition
-        self.root = choose_root(definition, root)
+        self.roots = choose_roots(definition, (roots,) if isinstance(roots, str) else roots or ())
         self._steps: dict[str, list[_Step]] = {}
+        self._conditional = [
+            {one.name for one, conditions in tree(root) if conditions} for root in self.roots
+        ]
+        self._reads_segments = any(_asks_for(root, 16, 2) for root in self.roots)
+        self._reads_header_flag = any(_asks_for(root, 4, 1) for root in self.roots)
 
-    def decode(self, buffer: Octets, cut: PacketCut) -> XtceDecode:
-        """Tables of all packets, and a verdict for each."""
+    def decode(
+        self,
+        buffer: Octets,
+        cut: PacketCut,
+        headers: PrimaryHeaders | None = None,
+        *,
+        whole_stream: bool = False,
+    ) -> XtceDecode:
+        """Tables of all packets, and a verdict for each.
+
+        Parameters
+        ----------
+        headers
+            Primary headers: parts of segmented packets are not decoded, unless the definition asks for the sequence
+            flags.
+        whole_stream
+            With `headers`: of an APID whose packets have a secondary header, packets without one are not decoded,
+            unless the definition asks for the flag.
+        """
         verdict = np.where(cut.crc_ok, DECODED, DAMAGED).astype(np.int8)
+        if headers is not None and not self._reads_segments:
+            verdict[cut.crc_ok & (headers.sequence_flags != FLAGS_WHOLE)] = SEGMENT
+        if headers is not None and whole_stream and not self._reads_header_flag:
+            whole = verdict == DECODED
+            usual = np.unique(headers.apid[whole & headers.secondary_header])
+            verdict[whole & ~headers.secondary_header & np.isin(headers.apid, usual)] = NO_HEADER
+        packets = np.flatnonzero(verdict == DECODED)
+        if len(self.roots) == 1:
+            return self._decode(self.roots[0], buffer, cut, verdict, packets)
+        octets, whole = as_octets(buffer), packets[cut.lengths[packets] >= 2]
+        apid = np.full(len(cut), -1, dtype=np.int64)
+        apid[whole] = (octets[cut.offsets[whole]].astype(np.int64) & 7) << 8 | octets[cut.offsets[whole] + 1]
+        named = [packet_apids(root) for root in self.roots]
+        found = []
+        for root, (apids, accepts_others) in zip(self.roots, named, strict=True):
+            foreign = frozenset().union(*(one for one, _ in named)) - apids
+            possible = ~np.isin(apid, list(foreign)) if accepts_others else np.isin(apid, list(apids))
+            mine = np.where((verdict == DECODED) & ~possible, NO_CONTAINER, verdict).astype(np.int8)
+            found.append(self._decode(root, buffer, cut, mine, packets[possible[packets]]))
+        return _merged(found, self._conditional)
+
+    def _decode(
+        self,
+        root: Container,
+        buffer: Octets,
+        cut: PacketCut,
+        verdict: npt.NDArray[np.int8],
+        packets: IntArray,
+    ) -> XtceDecode:
+        """Decode packets that begin with a container; their verdicts are set."""
         octets = as_octets(buffer)
-        packets = np.flatnonzero(cut.crc_ok)
         begins, ends = cut.offsets * 8, (cut.offsets + cut.lengths) * 8
         pieces: dict[str, list[XtceTable]] = {}
+        unknown: dict[str, list[IntArray]] = {}
         for first in range(0, len(packets), _CHUNK):
             chunk = packets[first : first + _CHUNK]
             base = int(cut.offsets[chunk].min())
             end = int((cut.offsets[chunk] + cut.lengths[chunk]).max())
             data = b"".join((octets[base:end].data, bytes(_SHORT_TEXT)))
             padded = np.frombuffer(data, dtype=np.uint8)
-            run = _Run(octets, begins, ends, verdict, data, padded, base)
-            for table in self._tables(run, _Rows(chunk, cut.offsets[chunk] * 8)):
+            run = _Run(octets, begins, ends, verdict, data, padded, base, unknown)
+            for table in self._tables(root, run, _Rows(chunk, cut.offsets[chunk] * 8)):
                 pieces.setdefault(table.name, []).append(table)
-        return XtceDecode({name: _joined(found) for name, found in sorted(pieces.items())}, verdict)
+        tables = {name: _joined(found) for name, found in sorted(pieces.items())}
+        noted = {name: np.concatenate(parts) for name, parts in sorted(unknown.items())}
+        return XtceDecode(
+            tables, verdict, {name: one[verdict[one] == DECODED] for name, one in noted.items()}
+        )
 
-    def _tables(self, run: _Run, packets: _Rows) -> Iterator[XtceTable]:
-        pending = [(self.root, packets)]
+    def _tables(self, root: Container, run: _Run, packets: _Rows) -> Iterator[XtceTable]:
+        pending = [(root, packets)]
         while pending:
             container, rows = pending.pop()
             if rows.parent is None:  # a container that inherits begins where its root does
@@ -184,6 +264,43 @@ class Decoder:
         if container.path not in self._steps:
             self._steps[container.path] = _compile(container.entries, _START)
         return self._steps[container.path]
+
+
+def _asks_for(root: Container, bit: int, bits: int) -> bool:
+    """Return whether conditions of containers and entries ask for the value in a place of the header."""
+    field = header_field(root, bit, bits)
+    containers = [one for one, _ in tree(root)]
+    conditions = [one.condition for one in containers]
+    conditions += [entry.condition for one in containers for entry in one.entries]
+    return field is not None and field.parameter in references(tuple(conditions))
+
+
+def _merged(found: Sequence[XtceDecode], conditional: Sequence[set[str]]) -> XtceDecode:
+    """Return what several first containers give: each packet by the one that decodes it.
+
+    A container whose conditions hold comes before one without conditions.
+    """
+    n = len(found[0].verdict)
+    claims = np.zeros((2, len(found), n), dtype=np.bool_)
+    for k, one in enumerate(found):
+        for table in one.tables.values():
+            claims[int(table.name in conditional[k]), k, table.packet_index] = True
+    chosen = np.where(claims[1].any(axis=0), claims[1], claims[0])
+    number = chosen.sum(axis=0)
+    worst = np.max([one.verdict for one in found], axis=0)
+    verdict = np.where(number > 0, np.where(number > 1, AMBIGUOUS, DECODED), worst).astype(np.int8)
+    chosen &= number == 1
+    tables: dict[str, XtceTable] = {}
+    unknown: dict[str, list[IntArray]] = {}
+    for k, one in enumerate(found):
+        for name, table in one.tables.items():
+            kept = table.kept(chosen[k, table.packet_index])
+            if len(kept):
+                tables[name] = kept
+        for name, packets in one.unknown.items():
+            unknown.setdefault(name, []).append(packets[chosen[k, packets]])
+    noted = {name: np.concatenate(parts) for name, parts in sorted(unknown.items())}
+    return XtceDecode(dict(sorted(tables.items())), verdict, noted)
 
 
 # steps: what a list of entries comes to
@@ -268,6 +385,8 @@ def _compile(entries: Sequence[Entry], mark: str) -> list[_Step]:
             inner = f"{mark}/{len(steps)}"
             own.append(_Mark(inner))
             own.extend(_compile(item.entries, inner))
+            if item.bits is not None:
+                own.append(_Seek(inner, item.bits))
         if entry.condition is None:
             steps.extend(own)
         else:
@@ -339,7 +458,7 @@ class _Rows:
 class _Run:
     """A buffer that is being decoded; `data` are the octets of this chunk of packets, from `base` on.
 
-    `padded` are the same octets with `_SHORT_TEXT` zeros behind them.
+    `padded` are the same octets with `_SHORT_TEXT` zeros behind them. `unknown` are packets of unknown values.
     """
 
     octets: OctetArray
@@ -349,6 +468,11 @@ class _Run:
     data: bytes
     padded: OctetArray
     base: int
+    unknown: dict[str, list[IntArray]]
+
+    def note(self, name: str, packets: IntArray) -> None:
+        """Note packets in which a value of a parameter is not known."""
+        self.unknown.setdefault(name, []).append(packets)
 
     def end(self, rows: _Rows) -> IntArray:
         """Bits into the buffer at which the packets end."""
@@ -445,51 +569,50 @@ _Found = tuple[Column, IntArray, "BoolArray | None"]
 
 
 def _fixed_columns(run: _Run, step: _Fixed, rows: _Rows) -> _Rows:
-    good = np.ones(len(rows), dtype=np.bool_)
     raws = _raw_fields(run, rows.at, [(one.encoding, offset) for _, one, offset in step.fields], step.extent)
     for (name, data_type, _), raw in zip(step.fields, raws, strict=True):
         values, covered = _calibrated(data_type, raw, rows, name)
         rows.columns[name] = ValueColumn(raw, values)
         if covered is not None:
-            good &= covered
-    return run.keep(rows, good, MALFORMED)
+            run.note(name, rows.packet[~covered])
+    return rows
 
 
-def _read(run: _Run, data_type: DataType, rows: _Rows, name: str | None = None) -> _Found:
+def _read(run: _Run, data_type: DataType, rows: _Rows, name: str) -> _Found:
+    """Read values of the parameter `name`, or of a part of it."""
     if isinstance(data_type, AggregateType):
-        return _read_aggregate(run, data_type, rows)
+        return _read_aggregate(run, data_type, rows, name)
     if isinstance(data_type, ArrayType):
-        return _read_array(run, data_type, rows)
+        return _read_array(run, data_type, rows, name)
     encoding = data_type.encoding
     if isinstance(encoding, (IntegerEncoding, FloatEncoding)):
         return _read_records(run, data_type, [(data_type, 0)], rows, name)
     if isinstance(encoding, BinaryEncoding):
+        if encoding.tag_bits:
+            bits, sized = _tagged(run, rows, encoding.tag_bits, 8)
+            return _read_octets(run, _moved(rows, rows.at + encoding.tag_bits), bits, sized, None, name)
         bits, sized = _sizes(run, encoding.size, rows, 0)
-        return _read_octets(run, rows, bits, sized, None)
+        return _read_octets(run, rows, bits, sized, None, name)
     if encoding.size is None:
-        return _read_open_text(run, rows, encoding)
+        return _read_open_text(run, rows, encoding, name)
     bits, sized = _sizes(run, encoding.size, rows, 0)
-    if encoding.most_bits is not None:
-        fits = bits <= encoding.most_bits
-        run.verdict[rows.packet[sized & ~fits]] = MALFORMED
-        sized = sized & fits
-    return _read_octets(run, rows, bits, sized, encoding)
+    return _read_octets(run, rows, bits, sized, encoding, name)
 
 
-def _read_aggregate(run: _Run, data_type: AggregateType, rows: _Rows) -> _Found:
+def _read_aggregate(run: _Run, data_type: AggregateType, rows: _Rows, name: str) -> _Found:
     fixed = _fixed_fields(data_type)
     if fixed is not None:
-        return _read_records(run, data_type, fixed, rows)
+        return _read_records(run, data_type, fixed, rows, name)
     members: dict[str, Column] = {}
     mine, index = rows, np.arange(len(rows), dtype=np.int64)
-    for name, member in data_type.members:
-        column, at, good = _read(run, member, mine)
+    for part, member in data_type.members:
+        column, at, good = _read(run, member, mine, name)
         if good is not None:
             chosen = np.flatnonzero(good)
             members = {key: value.take(chosen) for key, value in members.items()}
             index = index[chosen]
             mine = mine.narrowed(good)
-        members[name] = column
+        members[part] = column
         mine = _moved(mine, at)
     kept = np.zeros(len(rows), dtype=np.bool_)
     kept[index] = True
@@ -518,9 +641,9 @@ def _fixed_fields(data_type: DataType, offset: int = 0) -> list[tuple[ScalarType
 
 
 def _read_records(
-    run: _Run, data_type: DataType, fields: list[tuple[ScalarType, int]], rows: _Rows, name: str | None = None
+    run: _Run, data_type: DataType, fields: list[tuple[ScalarType, int]], rows: _Rows, name: str
 ) -> _Found:
-    """Values (of the parameter `name`, if they are one) or aggregates of fixed width."""
+    """Values or aggregates of fixed width."""
     last, place = fields[-1]
     assert last.bits is not None
     bits = place + last.bits
@@ -528,21 +651,13 @@ def _read_records(
     mine = run.keep(rows, enough, TOO_SHORT)
     raws = _raw_fields(run, mine.at, [(one.encoding, offset) for one, offset in fields], bits)
     columns: list[Column] = []
-    covered = np.ones(len(mine), dtype=np.bool_)
     for (one, _), raw in zip(fields, raws, strict=True):
-        values, good = _calibrated(one, raw, mine, name)
+        values, covered = _calibrated(one, raw, mine, name)
         columns.append(ValueColumn(raw, values))
-        if good is not None:
-            covered &= good
+        if covered is not None:
+            run.note(name, mine.packet[~covered])
     column: Column = _assembled(data_type, iter(columns))
-    at = mine.at + bits
-    if enough.all() and covered.all():
-        return column, at, None
-    run.verdict[mine.packet[~covered]] = MALFORMED
-    index = np.flatnonzero(covered)
-    whole = enough.copy()
-    whole[np.flatnonzero(enough)] = covered
-    return column.take(index), at[index], whole
+    return column, mine.at + bits, None if enough.all() else enough
 
 
 def _assembled(data_type: DataType, columns: Any) -> Column:
@@ -552,7 +667,7 @@ def _assembled(data_type: DataType, columns: Any) -> Column:
     return column
 
 
-def _read_array(run: _Run, data_type: ArrayType, rows: _Rows) -> _Found:
+def _read_array(run: _Run, data_type: ArrayType, rows: _Rows, name: str) -> _Found:
     last, sized = _sizes(run, data_type.last, rows, None)
     first, also = _sizes(run, data_type.first, rows, None)
     counts = last - first + 1
@@ -570,9 +685,9 @@ def _read_array(run: _Run, data_type: ArrayType, rows: _Rows) -> _Found:
     mine = rows.narrowed(room)
     counts = counts[room]
     if fixed is not None:
-        column, at, whole = _read_fixed_elements(run, data_type.element, fixed, mine, counts, bits)
+        column, at, whole = _read_fixed_elements(run, data_type.element, fixed, mine, counts, bits, name)
     else:
-        column, at, whole = _read_open_elements(run, data_type.element, mine, counts)
+        column, at, whole = _read_open_elements(run, data_type.element, mine, counts, name)
     if whole is not None:
         kept = room.copy()
         kept[np.flatnonzero(room)] = whole
@@ -587,11 +702,12 @@ def _read_fixed_elements(
     rows: _Rows,
     counts: IntArray,
     bits: int,
+    name: str,
 ) -> _Found:
     owner = np.repeat(np.arange(len(rows), dtype=np.int64), counts)
     place = np.arange(len(owner), dtype=np.int64) - np.repeat(np.cumsum(counts) - counts, counts)
     elements = _Rows(rows.packet[owner], rows.at[owner] + place * bits, rows, owner)
-    column, _, good = _read_records(run, element, fields, elements)
+    column, _, good = _read_records(run, element, fields, elements, name)
     at = rows.at + counts * bits
     if good is None:
         return ArrayColumn(counts, column), at, None
@@ -602,7 +718,7 @@ def _read_fixed_elements(
     return ArrayColumn(counts[index], column.take(stays)), at[index], kept
 
 
-def _read_open_elements(run: _Run, element: DataType, rows: _Rows, counts: IntArray) -> _Found:
+def _read_open_elements(run: _Run, element: DataType, rows: _Rows, counts: IntArray, name: str) -> _Found:
     """Elements whose width depends on the packet: the k-th of all packets together."""
     at = rows.at.copy()
     kept = np.ones(len(rows), dtype=np.bool_)
@@ -614,7 +730,7 @@ def _read_open_elements(run: _Run, element: DataType, rows: _Rows, counts: IntAr
         if not len(active):
             break
         elements = _Rows(rows.packet[active], at[active], rows, active)
-        column, behind, good = _read(run, element, elements)
+        column, behind, good = _read(run, element, elements, name)
         if good is not None:
             kept[active[~good]] = False
             active = active[good]
@@ -624,7 +740,7 @@ def _read_open_elements(run: _Run, element: DataType, rows: _Rows, counts: IntAr
         k += 1
     if not pieces:
         # no packet has an element: a column of none, read from no rows
-        column, _, _ = _read(run, element, rows.narrowed(np.zeros(len(rows), dtype=np.bool_)))
+        column, _, _ = _read(run, element, rows.narrowed(np.zeros(len(rows), dtype=np.bool_)), name)
     else:
         joined = concatenated(pieces)
         owner = np.concatenate(owners)
@@ -662,7 +778,7 @@ def _sizes(run: _Run, size: Size, rows: _Rows, least: int | None) -> tuple[IntAr
 
 
 def _read_octets(
-    run: _Run, rows: _Rows, bits: IntArray, sized: BoolArray, text: StringEncoding | None
+    run: _Run, rows: _Rows, bits: IntArray, sized: BoolArray, text: StringEncoding | None, name: str
 ) -> _Found:
     """Octets, or texts in buffers, of so many bits (n,) each."""
     enough = run.room(rows, bits)
@@ -678,15 +794,16 @@ def _read_octets(
     behind = at + bits
     if text is None:
         return ValueColumn(column, column), behind, None if good.all() else good
-    plain = _aligned_texts(run, at, bits, column, text) if aligned else None
-    if plain is not None:
-        return ValueColumn(column, plain), behind, None if good.all() else good
-    texts = _texts(column.tolist(), text)
-    readable = np.array([one is not None for one in texts], dtype=np.bool_)
-    run.verdict[rows.packet[index[~readable]]] = MALFORMED
-    good[index[~readable]] = False
-    found = ValueColumn(column[readable], _objects(texts)[readable])
-    return found, behind[readable], None if good.all() else good
+    texts = _aligned_texts(run, at, bits, column, text) if aligned else None
+    is_plain = texts is not None
+    if texts is None:
+        texts = _objects(_texts(column.tolist(), text))
+    if text.most_bits is not None and (bits > text.most_bits).any():
+        texts[bits > text.most_bits], is_plain = None, False
+    if not is_plain:
+        unknown = np.array([one is None for one in texts.tolist()], dtype=np.bool_)
+        run.note(name, rows.packet[index[unknown]])
+    return ValueColumn(column, texts), behind, None if good.all() else good
 
 
 def _slices(run: _Run, starts: IntArray, sizes: IntArray) -> RecordArray:
@@ -706,10 +823,11 @@ def _aligned_texts(
     """Texts (n,) in buffers `raw` of whole octets; None where one is no text or the layout is not a plain one."""
     starts, sizes = at >> 3, bits >> 3
     if encoding.tag_bits:
-        if encoding.tag_bits & 7 or (bits < encoding.tag_bits).any():
+        if encoding.tag_bits & 7 or encoding.terminator or (bits < encoding.tag_bits).any():
             return None
         tag = IntegerEncoding(encoding.tag_bits)
         (lengths,) = _raw_fields(run, at, [(tag, 0)], encoding.tag_bits)
+        lengths = lengths * encoding.unit_bits
         if (lengths & 7).any() or (lengths + encoding.tag_bits > bits).any():
             return None
         starts, sizes = at + encoding.tag_bits >> 3, lengths >> 3
@@ -719,9 +837,7 @@ def _aligned_texts(
             return None
         buffers = gather(run.octets, starts, np.dtype((np.void, size))).view(np.uint8).reshape(-1, size)
         ends = buffers == encoding.terminator[0]
-        if not ends.any(axis=1).all():
-            return None
-        sizes = ends.argmax(axis=1)
+        sizes = np.where(ends.any(axis=1), ends.argmax(axis=1), size)
     plain = not encoding.tag_bits and not encoding.terminator
     return _decoded_texts(run, starts, sizes, encoding.charset, raw if plain else None)
 
@@ -801,48 +917,52 @@ def _text(octets: bytes, encoding: StringEncoding) -> str:
         if len(octets) * 8 < encoding.tag_bits:
             raise ValueError("no room for the size")
         tagged = (encoding.tag_bits + 7) // 8
-        length = int.from_bytes(octets[:tagged], "big") >> (-encoding.tag_bits & 7)
+        length = (int.from_bytes(octets[:tagged], "big") >> (-encoding.tag_bits & 7)) * encoding.unit_bits
         if length % 8 or encoding.tag_bits + length > len(octets) * 8:
             raise ValueError("a size that is none")
         rest = int.from_bytes(octets, "big") >> (len(octets) * 8 - encoding.tag_bits - length)
         octets = (rest & ((1 << length) - 1)).to_bytes(length // 8, "big")
-    elif encoding.terminator:
-        octets = octets[: _terminated(octets, encoding.terminator)]
+    if encoding.terminator:
+        end = _terminated(octets, encoding.terminator)
+        octets = octets if end < 0 else octets[:end]
     return octets.decode(encoding.charset)
 
 
 def _terminated(octets: bytes, terminator: bytes) -> int:
-    """Where the terminator stands, at a whole character."""
-    place = octets.index(terminator)
-    while place % len(terminator):
-        place = octets.index(terminator, place + 1)
+    """Where the terminator stands, at a whole character; -1 without one."""
+    place = octets.find(terminator)
+    while place > 0 and place % len(terminator):
+        place = octets.find(terminator, place + 1)
     return place
 
 
-def _read_open_text(run: _Run, rows: _Rows, encoding: StringEncoding) -> _Found:
-    """Texts without a buffer: as long as the size before them or the terminator says."""
-    most = _MOST_BITS if encoding.most_bits is None else encoding.most_bits
+def _read_open_text(run: _Run, rows: _Rows, encoding: StringEncoding, name: str) -> _Found:
+    """Texts without a buffer: as long as the size before them or the terminator says, or to the end of the packet."""
     if encoding.tag_bits:
-        enough = run.room(rows, encoding.tag_bits)
-        mine = run.keep(rows, enough, TOO_SHORT)
-        tag = IntegerEncoding(encoding.tag_bits)
-        (lengths,) = _raw_fields(run, mine.at, [(tag, 0)], encoding.tag_bits)
-        bits = np.zeros(len(rows), dtype=np.int64)
-        bits[np.flatnonzero(enough)] = lengths + encoding.tag_bits
-    else:
-        enough = np.ones(len(rows), dtype=np.bool_)
-        bits = np.zeros(len(rows), dtype=np.int64)
-        ends = run.end(rows)
-        for row, (at, end) in enumerate(zip(rows.at.tolist(), ends.tolist(), strict=True)):
-            rest = _pieces(run.octets, np.array([at]), np.array([min(end - at, most) // 8 * 8]), left=True)[0]
-            try:
-                bits[row] = (_terminated(rest, encoding.terminator) + len(encoding.terminator)) * 8
-            except ValueError:
-                enough[row] = False
-                run.verdict[rows.packet[row]] = MALFORMED
-    fits = bits <= most
-    run.verdict[rows.packet[enough & ~fits]] = MALFORMED
-    return _read_octets(run, rows, bits, enough & fits, encoding)
+        bits, sized = _tagged(run, rows, encoding.tag_bits, encoding.unit_bits)
+        return _read_octets(run, rows, bits + encoding.tag_bits, sized, encoding, name)
+    most = _MOST_BITS if encoding.most_bits is None else encoding.most_bits
+    sized = np.ones(len(rows), dtype=np.bool_)
+    bits = np.zeros(len(rows), dtype=np.int64)
+    ends = run.end(rows)
+    for row, (at, end) in enumerate(zip(rows.at.tolist(), ends.tolist(), strict=True)):
+        size = min(end - at, most) // 8
+        rest = _pieces(run.octets, np.array([at]), np.array([size * 8]), left=True)[0]
+        place = _terminated(rest, encoding.terminator)
+        bits[row] = 8 * (size if place < 0 else place + len(encoding.terminator))
+        sized[row] = place >= 0 or end - at <= most
+    run.verdict[rows.packet[~sized]] = MALFORMED
+    return _read_octets(run, rows, bits, sized, encoding, name)
+
+
+def _tagged(run: _Run, rows: _Rows, tag_bits: int, unit: int) -> tuple[IntArray, BoolArray]:
+    """Bits (n,) that leading sizes state, which count so many bits, and which packets have room for the size."""
+    enough = run.room(rows, tag_bits)
+    mine = run.keep(rows, enough, TOO_SHORT)
+    (lengths,) = _raw_fields(run, mine.at, [(IntegerEncoding(tag_bits), 0)], tag_bits)
+    bits = np.zeros(len(rows), dtype=np.int64)
+    bits[np.flatnonzero(enough)] = lengths * unit
+    return bits, enough
 
 
 # numbers
@@ -974,9 +1094,9 @@ def _floats(records: OctetArray, bit: int, encoding: FloatEncoding) -> RecordArr
 
 
 def _calibrated(
-    data_type: ScalarType, raw: RecordArray, rows: _Rows, name: str | None
+    data_type: ScalarType, raw: RecordArray, rows: _Rows, name: str
 ) -> tuple[RecordArray, BoolArray | None]:
-    """Values of raw numbers, and which of them a calibrator covers (None: all)."""
+    """Values of raw numbers, and which of them a calibrator covers (None: all); the others are NaN."""
     if data_type.is_boolean:
         return raw != 0, None
     if data_type.labels:
@@ -1003,16 +1123,14 @@ def _named(data_type: ScalarType, raw: RecordArray) -> RecordArray:
 
 
 def _in_context(
-    calibration: Calibration, raw: RecordArray, rows: _Rows, name: str | None
+    calibration: Calibration, raw: RecordArray, rows: _Rows, name: str
 ) -> tuple[RecordArray, BoolArray | None]:
     """Values by the first calibrator whose condition holds; a condition may ask for the raw value itself."""
     values = raw.astype(np.float64)
     covered = np.ones(len(raw), dtype=np.bool_)
     left = np.ones(len(raw), dtype=np.bool_)
-    here = rows
-    if name is not None:
-        here = rows.narrowed(np.ones(len(rows), dtype=np.bool_))
-        here.columns[name] = ValueColumn(raw, raw)
+    here = rows.narrowed(np.ones(len(rows), dtype=np.bool_))
+    here.columns[name] = ValueColumn(raw, raw)
     choices = [*calibration.contexts, (None, calibration.default)]
     for condition, calibrator in choices:
         chosen = left if condition is None else left & _holds(condition, here)
@@ -1049,7 +1167,9 @@ def _splined(spline: Spline, x: RecordArray) -> tuple[RecordArray, BoolArray | N
     inside = (x >= raws[0]) & (x <= raws[-1])
     if spline.extrapolate:
         inside = ~np.isnan(x)
-    return values, None if inside.all() else inside
+    if inside.all():
+        return values, None
+    return np.where(inside, values, np.nan), inside
 
 
 # conditions
@@ -1077,6 +1197,12 @@ def _resolved(reference: Reference, rows: _Rows) -> tuple[RecordArray, BoolArray
     return values, present
 
 
+def _known(values: RecordArray) -> BoolArray:
+    if values.dtype == np.object_:
+        return np.array([one is not None for one in values.tolist()], dtype=np.bool_)
+    return ~np.isnan(values) if values.dtype.kind == "f" else np.ones(len(values), dtype=np.bool_)
+
+
 def _holds(condition: Condition, rows: _Rows) -> BoolArray:
     """Where a condition holds (n,); a comparison with a parameter that a packet does not have does not."""
     if isinstance(condition, (AllOf, AnyOf)):
@@ -1094,4 +1220,6 @@ def _holds(condition: Condition, rows: _Rows) -> BoolArray:
     if isinstance(right, Reference):
         right, also = _resolved(right, rows)
         present = present & also
+    if condition.operator == "!=":  # of an unknown value, this is not known either
+        present = present & _known(left)
     return present & np.asarray(_OPERATORS[condition.operator](left, right), dtype=np.bool_)

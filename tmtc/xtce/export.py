@@ -14,9 +14,11 @@ OMG XTCE 1.2, namespace http://www.omg.org/spec/XTCE/20180204; CCSDS 660.0-B-2.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 from tmtc.dictionary import DICTIONARY
 from tmtc.fields import Field
+from tmtc.onboard_parameters import PARAMETERS
 from tmtc.schema import Dictionary, PacketDefinition
 
 NAMESPACE = "http://www.omg.org/spec/XTCE/20180204"
@@ -301,7 +303,10 @@ def _inherit(container: ET.Element, base: str, conditions: list[tuple[str, str, 
 
 
 def _commands(root: ET.Element, dictionary: Dictionary) -> None:
-    """Commands: header fields that the sender fills in (count, length, checksum) are written as zeros."""
+    """Commands: header fields that the sender fills in (count, length) are zeros; it appends the checksum.
+
+    On-board parameters are named.
+    """
     if not dictionary.telecommands:
         return
     metadata = ET.SubElement(root, "CommandMetaData")
@@ -313,6 +318,8 @@ def _commands(root: ET.Element, dictionary: Dictionary) -> None:
         names = []
         for f in d.fields:
             type_name = f"{d.name}_{f.name}_Type"
+            if f.name == "parameter_id":
+                f = replace(f, labels=tuple((one.number, one.name) for one in PARAMETERS))
             _parameter_type(types, type_name, f, "Argument")
             ET.SubElement(
                 arguments,
@@ -338,8 +345,3 @@ def _commands(root: ET.Element, dictionary: Dictionary) -> None:
         )
         for name in names:
             ET.SubElement(entries, "ArgumentRefEntry", {"argumentRef": name})
-        ET.SubElement(
-            entries,
-            "FixedValueEntry",
-            {"name": "error_control", "binaryValue": "0000", "sizeInBits": "16"},
-        )

@@ -3,7 +3,7 @@
 Types are `Integer`, `Float`, `Enumerated`, `Boolean`, `String`, `Binary`, `AbsoluteTime`, `RelativeTime`, `Array` and
 `AggregateParameterType` in nested space systems; containers inherit under comparisons and boolean expressions. Only
 what the containers use is read: a type or algorithm that no container needs is not looked at, and neither are
-commands. Nothing that could change a value is passed over.
+commands. Nothing that could change a value is passed over: alarms that are not read are counted.
 
 References
 ----------
@@ -14,9 +14,11 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, replace
 from graphlib import CycleError, TopologicalSorter
+from typing import Literal
 
 from tmtc.errors import DefinitionError
 from tmtc.packets import PACKET_MAX_LENGTH
@@ -48,6 +50,7 @@ from tmtc.xtce.definition import (
     Size,
     Spline,
     StringEncoding,
+    references,
 )
 from tmtc.xtce.nodes import Node, parse_xml
 
@@ -60,23 +63,23 @@ MAX_TYPE_DEPTH = 16
 MAX_EXPONENT = 30
 
 _DESCRIPTION = ("LongDescription", "AliasSet", "AncillaryDataSet")
-_NAMED = ("name", "shortDescription")
+_NAMED = ("name", "shortDescription", "initialValue")
 _TYPE_CHILDREN = (
     *_DESCRIPTION, "UnitSet", "ToString", "ValidRange", "ValidRangeSet", "SizeRangeInCharacters", "DefaultAlarm",
     "ContextAlarmList", "BinaryContextAlarmList", "EnumerationList", "IntegerDataEncoding", "FloatDataEncoding",
     "StringDataEncoding", "BinaryDataEncoding",
 )  # fmt: skip
 _TYPE_ATTRIBUTES = (
-    *_NAMED, "baseType", "initialValue", "signed", "sizeInBits", "oneStringValue", "zeroStringValue",
+    *_NAMED, "baseType", "signed", "sizeInBits", "oneStringValue", "zeroStringValue",
     "restrictionPattern", "characterWidth",
 )  # fmt: skip
 _ENCODINGS = ("IntegerDataEncoding", "FloatDataEncoding", "StringDataEncoding", "BinaryDataEncoding")
 _ENCODINGS_OF_NUMBERS = _ENCODINGS[:2]
 _ENCODINGS_OF = {
-    "IntegerParameterType": ("IntegerDataEncoding",),
-    "FloatParameterType": ("IntegerDataEncoding", "FloatDataEncoding"),
+    "IntegerParameterType": _ENCODINGS_OF_NUMBERS,
+    "FloatParameterType": _ENCODINGS_OF_NUMBERS,
     "EnumeratedParameterType": ("IntegerDataEncoding",),
-    "BooleanParameterType": ("IntegerDataEncoding",),
+    "BooleanParameterType": _ENCODINGS_OF_NUMBERS,
     "StringParameterType": ("StringDataEncoding",),
     "BinaryParameterType": ("BinaryDataEncoding",),
     "AbsoluteTimeParameterType": _ENCODINGS,
@@ -101,15 +104,31 @@ _CHARSETS = {
 }  # fmt: skip
 _NO_PARAMETER = "_yamcs_ignore"
 """Name that Yamcs gives where the schema asks for a size parameter but the size tag or terminator says it all."""
+_OF_YAMCS = (_NO_PARAMETER.encode(), b"Yamcs PyMDB", b'name="Yamcs"')
+"""Marks of documents that were made for Yamcs, or by F Prime for it: a size before a text counts octets there, and
+splines are extrapolated."""
+_TAGGED_OCTETS = re.compile(r"org\.yamcs\.algo\.LeadingSizeBinaryDecoder\((\d+)\)")
+_ALARMS = (
+    "ChangeAlarmRanges", "AlarmMultiRanges", "AlarmConditions", "CustomAlarm", "EnumerationAlarmList",
+    "StringAlarmList", "ContextAlarm",
+)  # fmt: skip
+_WARNING, _ALARM = ("WarningRange", "WatchRange"), ("CriticalRange", "DistressRange", "SevereRange")
+
+LeadingSize = Literal["octets", "bits"]
 
 
-def parse_xtce(documents: str | bytes | Mapping[str, str | bytes]) -> Definition:
+def parse_xtce(
+    documents: str | bytes | Mapping[str, str | bytes], leading_size: LeadingSize | None = None
+) -> Definition:
     """Return what XTCE documents define.
 
     Parameters
     ----------
     documents
         One document, or several by name; the names appear in errors. References may cross documents.
+    leading_size
+        What the size before a text counts. By default octets in documents that were made for Yamcs or by F Prime, and
+        bits in others: the standard does not name the unit.
 
     Raises
     ------
@@ -120,7 +139,11 @@ def parse_xtce(documents: str | bytes | Mapping[str, str | bytes]) -> Definition
     if isinstance(documents, (str, bytes)):
         documents = {"XTCE": documents}
     top: list[_System] = []
+    of_yamcs = set()
     for name, text in documents.items():
+        octets = text.encode() if isinstance(text, str) else text
+        if any(mark in octets for mark in _OF_YAMCS):
+            of_yamcs.add(name)
         root = parse_xml(text, name)
         if root.tag != "SpaceSystem":
             raise root.error("a SpaceSystem", root.tag)
@@ -128,7 +151,7 @@ def parse_xtce(documents: str | bytes | Mapping[str, str | bytes]) -> Definition
         if any(other.name == system.name for other in top):
             raise root.error("different names of space systems", f"{system.name!r} twice")
         top.append(system)
-    return _Importer(top).definition()
+    return _Importer(top, of_yamcs, leading_size).definition()
 
 
 @dataclass(slots=True, eq=False)
@@ -167,6 +190,8 @@ def _system(node: Node, parent: _System | None) -> _System:
         for tag, found in zip(sets, (system.types, system.parameters, system.containers), strict=True):
             group = metadata.child(tag)
             for element in group.children if group is not None else ():
+                if element.tag == "ParameterRef":
+                    continue
                 if tag == "ParameterSet":
                     _expect(element, element.tag == "Parameter", "a Parameter", element.tag)
                 if tag == "ContainerSet":
@@ -194,8 +219,13 @@ def _expect(node: Node, right: bool, expected: str, found: str) -> None:
 class _Importer:
     """Elements by name as values, each made once."""
 
-    def __init__(self, top: list[_System]) -> None:
+    def __init__(self, top: list[_System], of_yamcs: set[str], leading_size: LeadingSize | None) -> None:
         self.top = top
+        self.of_yamcs = of_yamcs
+        self.leading_size = leading_size
+        self.extrapolates = False
+        self.size_tags: set[LeadingSize] = set()
+        self.alarms_not_read = 0
         self.systems: list[_System] = []
         pending = list(reversed(top))
         while pending:
@@ -238,6 +268,9 @@ class _Importer:
             roots={made[key].name: made[key] for key in roots},
             parameters={parameter.name: parameter for parameter in self.parameters.values()},
             containers={container.name: container for container in made.values()},
+            alarms_not_read=self.alarms_not_read,
+            size_tags=" and ".join(sorted(self.size_tags, reverse=True)),
+            extrapolates=self.extrapolates,
         )
 
     def children_first(self) -> list[int]:
@@ -257,7 +290,14 @@ class _Importer:
         """The container of an element, with those that continue it."""
         system, node = self.owner[key]
         node.only(
-            (*_DESCRIPTION, "DefaultRateInStream", "RateInStreamSet", "EntryList", "BaseContainer"),
+            (
+                *_DESCRIPTION,
+                "DefaultRateInStream",
+                "RateInStreamSet",
+                "BinaryEncoding",
+                "EntryList",
+                "BaseContainer",
+            ),
             (*_NAMED, "abstract", "idlePattern", "sizeInBits"),
         )
         base = node.child("BaseContainer")
@@ -292,6 +332,9 @@ class _Importer:
             else:
                 item, count = self.parameter_entry(element, system)
                 reference = "parameterRef"
+            repeat = element.child("RepeatEntry")
+            if repeat is not None:
+                item = self.repeated(repeat, item, system)
             size += count
             found.append(self.entry(element, item, system, (reference,)))
             _expect(node, size <= MAX_VALUES, f"at most {MAX_VALUES} values", "more")
@@ -307,10 +350,42 @@ class _Importer:
         if key in self.bases or self.followers[key]:
             raise element.error("a container without base and without containers that inherit from it", name)
         self.included.add(key)
+        encoding = inner.child("BinaryEncoding")
+        size = None if encoding is None else self.size(encoding.required("SizeInBits"), home, least=1)
+        _expect(inner, size is None or size.fixed is not None, "a fixed size of a part", "another")
         content = Container(
-            self.container_names[home.path, name], f"{home.path}/{name}", self.entries(key), False, None, ()
+            self.container_names[home.path, name],
+            f"{home.path}/{name}",
+            self.entries(key),
+            False,
+            None,
+            (),
+            bits=None if size is None else size.fixed,
         )
         return content, self.sizes[key]
+
+    def repeated(self, node: Node, item: Parameter | Container, system: _System) -> Parameter:
+        """Return an entry that is repeated, as an array; the repetitions of a container are aggregates."""
+        node.only(("Count", "Offset"))
+        offset = node.child("Offset")
+        gap = Size(fixed=0) if offset is None else self.size(offset, system, least=0)
+        _expect(node, gap.fixed == 0, "repetitions without an Offset", "one")
+        count = self.size(node.required("Count"), system, least=0)
+        if isinstance(item, Container):
+            plain = [
+                (one.item.name, one.item.type)
+                for one in item.entries
+                if isinstance(one.item, Parameter) and one == Entry(one.item)
+            ]
+            _expect(node, len(plain) == len(item.entries), "parameters one after another", "other entries")
+            item = Parameter(item.name, item.path, AggregateType(item.name, tuple(plain)))
+        if count.fixed is not None:
+            last = replace(count, fixed=count.fixed - 1)
+        elif count.lookup:
+            last = replace(count, lookup=tuple((condition, value - 1) for condition, value in count.lookup))
+        else:
+            last = replace(count, intercept=count.intercept - 1)
+        return replace(item, type=ArrayType(item.type.name, item.type, Size(fixed=0), last))
 
     # references
 
@@ -363,11 +438,12 @@ class _Importer:
                 owner, found = self.find("parameters", text, system, node)
                 break
             except DefinitionError:
-                text, dot, member = text.rpartition(".")
-                if not dot:
+                place = max(text.rfind("/"), text.rfind("."))
+                if place <= 0:
                     self.find("parameters", node.attribute("parameterRef"), system, node)
                     raise
-                members.insert(0, member)
+                members.insert(0, text[place + 1 :])
+                text = text[:place]
         _, type_node = self.find("types", found.attribute("parameterTypeRef"), owner, found)
         if any(type_node is opened for opened in self.open):
             return self.own_reference(node, self.names[owner.path, found.attributes["name"]], type_node)
@@ -398,7 +474,7 @@ class _Importer:
         """The parameter of an element."""
         path = f"{system.path}/{node.attributes['name']}"
         if path not in self.parameters:
-            node.only((*_DESCRIPTION, "ParameterProperties"), (*_NAMED, "parameterTypeRef", "initialValue"))
+            node.only((*_DESCRIPTION, "ParameterProperties"), (*_NAMED, "parameterTypeRef"))
             column = self.names[system.path, node.attributes["name"]]
             owner, type_node = self.find("types", node.attribute("parameterTypeRef"), system, node)
             data_type = self.type(owner, type_node)
@@ -461,7 +537,7 @@ class _Importer:
         members: dict[str, DataType] = {}
         values = 0
         for member in listed.children:
-            member.only(_DESCRIPTION, (*_NAMED, "typeRef", "initialValue"))
+            member.only(_DESCRIPTION, (*_NAMED, "typeRef"))
             name = member.attribute("name")
             _expect(member, name not in members, "a unique name", "a second one")
             owner, found = self.find("types", member.attribute("typeRef"), system, member)
@@ -482,15 +558,17 @@ class _Importer:
             _expect(node, chain[-1][1].tag == node.tag, f"a base type that is a {node.tag}", chain[-1][1].tag)
         is_time = "Time" in node.tag
         for _, one in chain:
-            children = (*_DESCRIPTION, "Encoding", "ReferenceTime") if is_time else _TYPE_CHILDREN
+            children = (
+                (*_DESCRIPTION, "Encoding", "ReferenceTime", *_ENCODINGS) if is_time else _TYPE_CHILDREN
+            )
             one.only(children, _TYPE_ATTRIBUTES)
         encoding, place, home = None, node, system
         scale: tuple[float, float] | None = None
         for home, one in chain:
-            holder = one.child("Encoding") if is_time else one
-            if holder is not None and is_time:
+            holder = (one.child("Encoding") if is_time else None) or one
+            if holder is not one:
                 holder.only(_ENCODINGS, ("units", "scale", "offset"))
-            found = [child for child in (holder.children if holder else ()) if child.tag in _ENCODINGS]
+            found = [child for child in holder.children if child.tag in _ENCODINGS]
             if found:
                 _expect(found[-1], len(found) == 1, "one encoding", f"{len(found)}")
                 place = found[0]
@@ -500,7 +578,7 @@ class _Importer:
                     f"one of {', '.join(_ENCODINGS_OF[node.tag])} for a {node.tag}",
                     place.tag,
                 )
-                if holder is not None and is_time and holder.attributes.keys() & {"scale", "offset"}:
+                if holder is not one and holder.attributes.keys() & {"scale", "offset"}:
                     scale = _number(holder, "scale", 1.0), _number(holder, "offset", 0.0)
                 encoding = self.encoding(place, home, scale)
                 break
@@ -512,15 +590,17 @@ class _Importer:
         units = next((u for _, one in chain if (u := one.child("UnitSet")) is not None), None)
         time = node.child("ReferenceTime")
         reference = None if time is None else time.child("Epoch")
+        self.alarms_not_read += _alarms_not_read(chain)
         return ScalarType(
             name=node.attributes["name"],
             encoding=encoding,
             labels=_labels(node, labels, encoding) if node.tag == "EnumeratedParameterType" else (),
             is_boolean=node.tag == "BooleanParameterType",
+            truth=(_stated(chain, "zeroStringValue", "False"), _stated(chain, "oneStringValue", "True")),
             unit=" ".join(u.text for u in units.children) if units is not None else "",
             epoch=reference.text if is_time and reference is not None else "",
-            warning=_limits(chain, ("WarningRange", "WatchRange")),
-            alarm=_limits(chain, ("CriticalRange", "DistressRange", "SevereRange")),
+            warning=_limits(chain, _WARNING),
+            alarm=_limits(chain, _ALARM),
         )
 
     def encoding(self, node: Node, system: _System, scale: tuple[float, float] | None) -> Encoding:
@@ -530,15 +610,9 @@ class _Importer:
         if node.tag == "StringDataEncoding":
             _expect(node, scale is None, "a number where scale and offset are given", "text")
             return self.string(node, system)
-        order = node.attributes.get("byteOrder", "mostSignificantByteFirst")
-        orders = ("mostSignificantByteFirst", "leastSignificantByteFirst")
-        _expect(node, order in orders, f"byteOrder {' or '.join(orders)}", order)
-        little = order == orders[1]
         if node.tag == "BinaryDataEncoding":
-            node.only(("SizeInBits",), ("bitOrder", "byteOrder"))
-            _expect(node, not little, "octets in their order", order)
             _expect(node, scale is None, "a number where scale and offset are given", "octets")
-            return BinaryEncoding(self.size(node.required("SizeInBits"), system, least=1))
+            return self.binary(node, system)
         node.only(
             ("DefaultCalibrator", "ContextCalibratorList"),
             ("bitOrder", "byteOrder", "encoding", "sizeInBits", "changeThreshold"),
@@ -552,6 +626,7 @@ class _Importer:
             _expect(node, 1 <= bits <= 64, "sizeInBits of 1 to 64", f"{bits}")
             form = node.attributes.get("encoding", "unsigned")
             _expect(node, form in _INTEGER_FORMS, f"encoding {', '.join(_INTEGER_FORMS)}", form)
+            little = _is_little(node, bits)
             _expect(
                 node, not little or bits % 8 == 0, "whole octets where the least comes first", f"{bits} bits"
             )
@@ -563,10 +638,29 @@ class _Importer:
         )  # so spelt in older documents
         if form in ("IEEE754", "IEEE754_1985"):
             _expect(node, bits in (16, 32, 64), "sizeInBits 16, 32 or 64", f"{bits}")
-            return FloatEncoding(bits, "IEEE754", little, calibration)
+            return FloatEncoding(bits, "IEEE754", _is_little(node, bits), calibration)
         _expect(node, form == "MILSTD_1750A", "encoding IEEE754, IEEE754_1985 or MILSTD_1750A", form)
         _expect(node, bits in (32, 48), "sizeInBits 32 or 48", f"{bits}")
-        return FloatEncoding(bits, "MILSTD_1750A", little, calibration)
+        return FloatEncoding(bits, "MILSTD_1750A", _is_little(node, bits), calibration)
+
+    def binary(self, node: Node, system: _System) -> BinaryEncoding:
+        """Return the encoding of octets; of the algorithms, only a size in octets before them is supported."""
+        children = ("SizeInBits", "FromBinaryTransformAlgorithm", "ToBinaryTransformAlgorithm")
+        node.only(children, ("bitOrder", "byteOrder"))
+        _expect(node, not _is_little(node, 8), "octets in their order", "leastSignificantByteFirst")
+        algorithm = node.child(children[1])
+        if algorithm is None:
+            return BinaryEncoding(self.size(node.required("SizeInBits"), system, least=1))
+        text = algorithm.child("AlgorithmText")
+        tagged = None if text is None else _TAGGED_OCTETS.fullmatch(text.text)
+        tag_bits = 0 if tagged is None else int(tagged[1])
+        _expect(
+            algorithm,
+            1 <= tag_bits <= 32,
+            "elements that are supported here",
+            f"{algorithm.tag}, which is not",
+        )
+        return BinaryEncoding(Size(), tag_bits)
 
     def string(self, node: Node, system: _System) -> StringEncoding:
         """A text: its buffer, and what says where the text ends in it."""
@@ -584,7 +678,6 @@ class _Importer:
         if holder is None or (fixed is not None and variable is not None):
             raise node.error("either SizeInBits or Variable", "both" if holder is not None else "neither")
         end, tag = holder.child("TerminationChar"), holder.child("LeadingSize")
-        _expect(holder, end is None or tag is None, "a TerminationChar or a LeadingSize", "both")
         size: Size | None = None
         most: int | None = None
         if fixed is not None:
@@ -602,10 +695,10 @@ class _Importer:
             name_of = dynamic.required("ParameterInstanceRef") if dynamic is not None else None
             if name_of is None or name_of.attributes.get("parameterRef") != _NO_PARAMETER:
                 size = self.size(holder, system, least=0, others=("TerminationChar", "LeadingSize"))
-        terminator, tag_bits = b"", 0
+        terminator, tag_bits, unit = b"", 0, 1
         if end is not None:
             try:
-                terminator = bytes.fromhex(end.text)
+                terminator = bytes.fromhex(end.text or "00")
             except ValueError:
                 raise end.error("hexadecimal digits", repr(end.text)) from None
             try:
@@ -617,8 +710,11 @@ class _Importer:
             tag.only((), ("sizeInBitsOfSizeTag",))
             tag_bits = _integer(tag, "sizeInBitsOfSizeTag", 16)
             _expect(tag, 1 <= tag_bits <= 32, "sizeInBitsOfSizeTag of 1 to 32", f"{tag_bits}")
+            counted = self.leading_size or ("octets" if node.document in self.of_yamcs else "bits")
+            self.size_tags.add(counted)
+            unit = 8 if counted == "octets" else 1
         _expect(holder, size is not None or end is not None or tag is not None, "a size of the text", "none")
-        return StringEncoding(charset, size, terminator, tag_bits, most)
+        return StringEncoding(charset, size, terminator, tag_bits, most, unit)
 
     def size(self, node: Node, system: _System, least: int | None, others: tuple[str, ...] = ()) -> Size:
         """A fixed or dynamic number; a fixed one is not below `least`."""
@@ -666,8 +762,14 @@ class _Importer:
         for context in listed.children if listed is not None else ():
             context.only(("ContextMatch", "Calibrator"))
             condition = self.condition(context.required("ContextMatch"), system)
-            contexts.append((condition, _calibrator(context.required("Calibrator"))))
-        return Calibration(None if default is None else _calibrator(default), tuple(contexts))
+            contexts.append((condition, self.calibrator(context.required("Calibrator"))))
+        return Calibration(None if default is None else self.calibrator(default), tuple(contexts))
+
+    def calibrator(self, node: Node) -> Calibrator:
+        is_default = node.document in self.of_yamcs
+        made = _calibrator(node, is_default)
+        self.extrapolates |= is_default and isinstance(made, Spline)
+        return made
 
     # conditions
 
@@ -739,8 +841,11 @@ class _Importer:
     ) -> Entry:
         """The entry: where it begins and whether it is there."""
         extra = ("DimensionList",) if node.tag == "ArrayParameterRefEntry" else ()
-        children = (*_DESCRIPTION, "LocationInContainerInBits", "IncludeCondition", "TimeAssociation", *extra)
-        node.only(children, (*attributes, "shortDescription", "lastEntryForThisArrayInstance"))
+        children = ("LocationInContainerInBits", "RepeatEntry", "IncludeCondition", "TimeAssociation")
+        node.only(
+            (*_DESCRIPTION, *children, *extra),
+            (*attributes, "shortDescription", "lastEntryForThisArrayInstance"),
+        )
         location, condition = node.child("LocationInContainerInBits"), node.child("IncludeCondition")
         offset, from_start = 0, False
         if location is not None:
@@ -765,23 +870,23 @@ def _column_names(elements: list[tuple[str, str]]) -> dict[tuple[str, str], str]
 
 def _check_order(root: Container, document: str) -> None:
     """Refuse references to parameters that no packet holds before them."""
-    pending: list[tuple[Container, frozenset[str]]] = [(root, frozenset())]
+    pending: list[tuple[Container, dict[str, bool]]] = [(root, {})]
     while pending:
         container, known = pending.pop()
-        names = set(known)
+        names = dict(known)
         place = f"{document}, container {container.path}"
         if container.condition is not None:
-            _check_known(_references(container.condition), names, place)
+            _check_known(references(container.condition), names, place)
         _check_entries(container.entries, names, place)
-        after = frozenset(names)
-        pending.extend((child, after) for child in container.children)
+        pending.extend((child, names) for child in container.children)
 
 
-def _check_entries(entries: tuple[Entry, ...], names: set[str], place: str) -> None:
+def _check_entries(entries: tuple[Entry, ...], names: dict[str, bool], place: str) -> None:
+    """Add the parameters of entries to `names`, with whether they have one value; refuse references to others."""
     for entry in entries:
         if entry.condition is not None:
-            _check_known(_references(entry.condition), names, place)
-            twice = sorted(_names_of(entry.item) & names)
+            _check_known(references(entry.condition), names, place)
+            twice = sorted(_names_of(entry.item) & names.keys())
             if twice:
                 raise DefinitionError(
                     f"{place}: expected a parameter once where it is under a condition, "
@@ -790,8 +895,8 @@ def _check_entries(entries: tuple[Entry, ...], names: set[str], place: str) -> N
         if isinstance(entry.item, Container):
             _check_entries(entry.item.entries, names, place)
         else:
-            _check_known(_references(entry.item.type) - {entry.item.name}, names, place)
-            names.add(entry.item.name)
+            _check_known(references(entry.item.type) - {entry.item.name}, names, place)
+            names[entry.item.name] = not isinstance(entry.item.type, ArrayType)
 
 
 def _names_of(item: Parameter | Container) -> set[str]:
@@ -800,23 +905,12 @@ def _names_of(item: Parameter | Container) -> set[str]:
     return set().union(*(_names_of(entry.item) for entry in item.entries))
 
 
-def _check_known(wanted: set[str], names: set[str], place: str) -> None:
-    missing = sorted(wanted - names)
+def _check_known(wanted: set[str], names: Mapping[str, bool], place: str) -> None:
+    missing = sorted(name for name in wanted if not names.get(name))
     if missing:
         raise DefinitionError(
             f"{place}: expected references to parameters that stand before, found {missing[0]!r}"
         )
-
-
-def _references(item: object) -> set[str]:
-    """Names of the parameters that a type or a condition refers to."""
-    if isinstance(item, Reference):
-        return {item.parameter}
-    if isinstance(item, ScalarType):
-        return _references(item.encoding)
-    if is_dataclass(item):
-        item = tuple(getattr(item, one.name) for one in fields(item))
-    return set().union(*map(_references, item)) if isinstance(item, tuple) else set()
 
 
 def _operator(node: Node, text: str) -> Operator:
@@ -837,9 +931,10 @@ def _compared(node: Node, left: Reference, data_type: ScalarType, operator_text:
         _expect(node, bool(ranges), f"a name of a code ({known})", repr(text))
         return CodeIn(left, ranges, operator == "!=")
     if data_type.is_boolean and left.calibrated:
-        truth = {"true": True, "1": True, "false": False, "0": False}.get(text.lower())
+        plain = {"true": True, "1": True, "false": False, "0": False}.get(text.lower())
+        truth = dict(zip(data_type.truth, (False, True), strict=True)).get(text, plain)
         if truth is None:
-            raise node.error("true or false", repr(text))
+            raise node.error(f"true, false, {' or '.join(map(repr, data_type.truth))}", repr(text))
         return Comparison(left, operator, truth)
     if isinstance(encoding, StringEncoding):
         return Comparison(left, operator, text)
@@ -850,7 +945,7 @@ def _compared(node: Node, left: Reference, data_type: ScalarType, operator_text:
     calibrated = left.calibrated and encoding.calibration != Calibration()
     try:
         if isinstance(encoding, IntegerEncoding) and not calibrated:
-            return Comparison(left, operator, _whole(text))
+            return Comparison(left, operator, _whole(re.sub(r"\.0+\Z", "", text.strip())))
         value = float(text)
     except ValueError:
         raise node.error("a number", repr(text)) from None
@@ -858,7 +953,7 @@ def _compared(node: Node, left: Reference, data_type: ScalarType, operator_text:
     return Comparison(left, operator, value)
 
 
-def _calibrator(node: Node) -> Calibrator:
+def _calibrator(node: Node, extrapolate: bool) -> Calibrator:
     kinds = ("PolynomialCalibrator", "SplineCalibrator")
     node.only((*kinds, "AncillaryDataSet"), _NAMED)
     listed = [child for child in node.children if child.tag in kinds]
@@ -874,13 +969,15 @@ def _calibrator(node: Node) -> Calibrator:
         _expect(inner, bool(terms), "a Term", "none")
         return Polynomial(tuple(terms))
     inner.only(("SplinePoint", "AncillaryDataSet"), (*_NAMED, "order", "extrapolate"))
-    points = [(_number(p, "raw", None), _number(p, "calibrated", None)) for p in inner.all("SplinePoint")]
+    points = sorted(
+        {(_number(p, "raw", None), _number(p, "calibrated", None)) for p in inner.all("SplinePoint")}
+    )
     order = _integer(inner, "order", 1)
     _expect(inner, order in (0, 1), "order 0 or 1", f"{order}")
     _expect(inner, len(points) >= 2, "two points or more", f"{len(points)}")
     rising = all(a[0] < b[0] for a, b in itertools.pairwise(points))
-    _expect(inner, rising, "points with rising raw values", "others")
-    return Spline(tuple(points), order, _boolean(inner, "extrapolate", False))
+    _expect(inner, rising, "one calibrated value for each raw value", "two")
+    return Spline(tuple(points), order, _boolean(inner, "extrapolate", extrapolate))
 
 
 def _labels(node: Node, listed: Node | None, encoding: Encoding) -> tuple[tuple[int, int, str], ...]:
@@ -917,9 +1014,8 @@ def _limits(chain: Sequence[tuple[_System, Node]], levels: tuple[str, ...]) -> L
 
     Other alarms (inside of a range, of changes, of names, in a context) are not read.
     """
-    alarm = next((found for _, one in chain if (found := one.child("DefaultAlarm")) is not None), None)
-    ranges = alarm.child("StaticAlarmRanges") if alarm is not None else None
-    if ranges is None or ranges.attributes.get("rangeForm", "outside") != "outside":
+    ranges = _static_ranges(chain)
+    if ranges is None:
         return None
     stated = next((found for level in levels if (found := ranges.child(level)) is not None), None)
     if stated is None:
@@ -929,6 +1025,46 @@ def _limits(chain: Sequence[tuple[_System, Node]], levels: tuple[str, ...]) -> L
         for names in (("minInclusive", "minExclusive"), ("maxInclusive", "maxExclusive"))
     )
     return least, greatest
+
+
+def _static_ranges(chain: Sequence[tuple[_System, Node]]) -> Node | None:
+    """Return the ranges whose outside is an alarm, None without any."""
+    alarm = next((found for _, one in chain if (found := one.child("DefaultAlarm")) is not None), None)
+    ranges = alarm.child("StaticAlarmRanges") if alarm is not None else None
+    outside = ranges is not None and ranges.attributes.get("rangeForm", "outside") == "outside"
+    return ranges if outside else None
+
+
+def _alarms_not_read(chain: Sequence[tuple[_System, Node]]) -> int:
+    """Return the number of alarms of a type other than the ranges that `_limits` reads."""
+    read = _static_ranges(chain)
+    used = [next((one for one in levels if read and read.child(one)), "") for levels in (_WARNING, _ALARM)]
+    lists = ("DefaultAlarm", "ContextAlarmList", "BinaryContextAlarmList")
+    holders = [child for _, one in chain for child in one.children if child.tag in lists]
+    found = [alarm for holder in holders for alarm in holder.children]
+    ranges = [
+        one
+        for alarm in found
+        if alarm.tag == "StaticAlarmRanges"
+        for one in alarm.children
+        if one.tag in (*_WARNING, *_ALARM) and not (alarm is read and one.tag in used)
+    ]
+    return len(ranges) + sum(alarm.tag in _ALARMS for alarm in found)
+
+
+def _stated(chain: Sequence[tuple[_System, Node]], name: str, default: str) -> str:
+    """Return an attribute of a type, or of the nearest base type that states it."""
+    return next((one.attributes[name] for _, one in chain if name in one.attributes), default)
+
+
+def _is_little(node: Node, bits: int) -> bool:
+    """Return whether the least significant octet of a number comes first."""
+    orders = {"mostSignificantByteFirst": False, "leastSignificantByteFirst": True}
+    order = node.attributes.get("byteOrder", "mostSignificantByteFirst")
+    octets = [str(octet) for octet in range(bits // 8)] if bits % 8 == 0 else []
+    orders |= {",".join(octets): True, ",".join(reversed(octets)): False}
+    _expect(node, order in orders, f"byteOrder {' or '.join([*orders][:2])}", order)
+    return orders[order]
 
 
 def _fixed(node: Node, least: int | None) -> int:

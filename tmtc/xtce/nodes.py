@@ -137,14 +137,14 @@ class _Builder:
             )
         # attributes of other namespaces (xsi:schemaLocation, xml:base) say nothing about the packets
         own = {key: value for key, value in attributes.items() if _SEPARATOR not in key}
+        if not self.stack:
+            self.namespace = namespace
+        elif namespace != self.namespace:
+            tag = f"{tag} of the namespace {namespace!r}"  # refused where it is read
         node = Node(tag, own, self.document, line)
         if not self.stack:
-            self.root, self.namespace = node, namespace
+            self.root = node
         else:
-            if namespace != self.namespace:
-                raise node.error(
-                    f"elements of the namespace {self.namespace!r}", f"one of the namespace {namespace!r}"
-                )
             self.stack[-1].children.append(node)
         self.stack.append(node)
 

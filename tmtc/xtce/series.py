@@ -39,10 +39,10 @@ class SeriesValue:
         return ".".join((self.parameter, *self.members))
 
 
-def packet_layouts(root: Container) -> dict[str, tuple[SeriesValue, ...]]:
+def packet_layouts(*roots: Container) -> dict[str, tuple[SeriesValue, ...]]:
     """Return the values of the packets of each container, by its name, in the order of the packet."""
     layouts: dict[str, tuple[SeriesValue, ...]] = {}
-    pending: list[tuple[Container, dict[str, SeriesValue]]] = [(root, {})]
+    pending: list[tuple[Container, dict[str, SeriesValue]]] = [(root, {}) for root in roots]
     while pending:
         container, before = pending.pop()
         values = before | {one.name: one for one in _of_entries(container.entries)}

@@ -19,8 +19,8 @@ from ground_service.http.model import Paging
 from ground_service.ingest import parameters as decoding
 from ground_service.ingest.service import Place, decode_all_again, ingest_file, undecoded_vehicles
 from ground_service.missions import store as missions
-from ground_service.missions.definitions import minimal_description, read_mission_file
-from ground_service.missions.model import read_document
+from ground_service.missions.definitions import definition_remarks, minimal_description, read_mission_file
+from ground_service.missions.model import PacketTime, read_document
 from ground_service.missions.service import add_mission, check_mission_file
 from ground_service.missions.store import packets_in_force
 from ground_service.passes import series
@@ -31,15 +31,18 @@ from ground_service.passes.service import completeness, define_pass, get_pass, p
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.parameters import readable_decoding
+from ground_service.toml import read_table
 from ground_service.worker import follow_up
 from ground_service.worker.integrity import verify
-from lunar.timescales import parse_utc
+from lunar.timescales import parse_utc, utc_ns_from_ticks
 from tests.serving import TestClient
 from tests.tmtc import foreign
 from tmtc.crc import crc16
+from tmtc.cuc import NO_TICKS
 from tmtc.dictionary import DICTIONARY
 from tmtc.downlink import decode, encode_cadus
 from tmtc.packets import pack_packet
+from tmtc.stream import whole_packets
 
 NS = 1_000_000_000
 START = parse_utc("2029-08-07T00:00:00Z")
@@ -164,6 +167,84 @@ def test_a_minimal_description_of_a_definition_decodes_its_packets(ground: Groun
     (tmp_path / "none.xml").write_text("<SpaceSystem/>", encoding="utf-8")
     with pytest.raises(InvalidInput, match="compares its APID with a number, found none"):
         minimal_description(tmp_path / "none.xml", 76)
+
+
+def written(folder: Path, text: str) -> str:
+    folder.mkdir(exist_ok=True)
+    (folder / "bus.xml").write_text(text, encoding="utf-8")
+    return minimal_description(folder / "bus.xml", 76)
+
+
+def test_a_minimal_description_is_one_that_the_check_accepts(tmp_path: Path) -> None:
+    bus = foreign.document(
+        foreign.HEADER_TYPES,
+        foreign.HEADER_PARAMETERS,
+        foreign.HEADER_CONTAINER
+        + foreign.container(
+            "A", [], "CCSDSPacket", foreign._either(("PKT_APID", "==", 7), ("PKT_APID", "==", 2047))
+        ),
+    )
+    found, faults = check_mission_file(saved(tmp_path, written(tmp_path / "a", bus)))
+    assert not faults and found is not None and found.packets is not None and found.packets[0].apids == (7,)
+    with pytest.raises(InvalidInput, match=r"XTCE that is supported, found bus\.xml, line 1.*UnitsSet"):
+        written(tmp_path / "b", foreign.BUS.replace("UnitSet", "UnitsSet"))
+    same = bus.replace('name="CCSDSPacket" abstract="true"', 'name="CCSDSPacket"')
+    assert "apids = [7]" in written(tmp_path / "c", same)
+    own = bus.replace("<Value>7<", "<Value>160<")
+    assert "160" in str(check_mission_file(saved(tmp_path, written(tmp_path / "d", own)))[1])
+
+
+def saved(folder: Path, text: str) -> Path:
+    (folder / "mission.toml").write_text(text, encoding="utf-8")
+    return folder / "mission.toml"
+
+
+UNIX = (
+    '{ code = "cuc", offset = 6, p_field = false, whole_octets = 4, fraction_octets = 2, '
+    'epoch = "EPOCH", clock = "unix" }'
+)
+
+
+@pytest.mark.parametrize("epoch", ["1970-01-01T00:00:00Z", "1980-01-01T00:00:00Z", "2000-01-01T00:00:00Z"])
+def test_a_unix_clock_counts_no_leap_seconds(epoch: str) -> None:
+    time = PacketTime.model_validate(read_table(f"t = {UNIX.replace('EPOCH', epoch)}", "t", "TOML")["t"])
+    count = (START - parse_utc(epoch)) // NS
+    packet = foreign.space_packet(100, struct.pack(">IH", count, 1 << 15), 0)
+    bare = foreign.space_packet(100, struct.pack(">IH", count, 1 << 15), 0, secondary=False)
+    ticks = decoding.packet_times(packet + bare, whole_packets(np.array([len(packet), len(bare)])), time)
+    assert utc_ns_from_ticks(ticks[:1]).tolist() == [START + NS // 2]
+    assert ticks[1] == NO_TICKS  # its header says that it has no time
+    with pytest.raises(ValueError, match="an epoch in UTC for a CDS code or a Unix clock"):
+        PacketTime.model_validate({**time.model_dump(), "epoch": "1970-01-01T00:00:00 TAI"})
+
+
+def test_parts_of_segmented_packets_are_counted_and_packets_without_header_have_no_time(
+    ground: Ground, tmp_path: Path
+) -> None:
+    """The definition asks for the secondary header flag, but not for the sequence flags."""
+    enter(ground, tmp_path / "m")
+    packets = bus_packets(8)
+    parts = [
+        packets[3][:2] + struct.pack(">H", flags << 14 | 50 + flags) + packets[3][4:] for flags in (1, 0, 2)
+    ]
+    boot = bytes((packets[2][0] & ~0x08, *packets[2][1:]))
+    ingest_file(ground, downlink(tmp_path, [*packets, *parts, boot]))
+    listed = pass_parameters(ground, define(ground))
+    assert listed.outcomes["100"] == {"decoded": 8, "segments_not_joined": 3, "no_container": 1}
+    assert parameter_series(ground, 1, "VOLTAGE", 100).samples == 8
+
+
+def test_an_entry_may_name_several_containers_and_the_unit_of_sizes(tmp_path: Path) -> None:
+    text = DEFINED.replace(
+        "time = ", "container = ['CCSDSPacket', 'TIMED']\nleading_size = 'octets'\ntime = "
+    )
+    found, faults = check_mission_file(mission(tmp_path, text))
+    assert not faults and found is not None
+    assert definition_remarks(found) == ["packets bus: sizes before texts count octets"]
+    assert (
+        "expected the name of a container"
+        in check_mission_file(mission(tmp_path, text.replace("TIMED", "X")))[1][0]
+    )
 
 
 def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(

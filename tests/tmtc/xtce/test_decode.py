@@ -201,8 +201,8 @@ def test_ieee_floats_stand_at_every_place(bits, phase):
         assert found["A"] == found["B"] == [value]
 
 
-def test_a_spline_says_nothing_outside_its_points_unless_told_to():
-    points = [(10.0, 1.0), (20.0, 3.0), (40.0, 5.0)]
+def test_a_value_outside_its_spline_is_unknown_and_keeps_its_raw_value_unless_extrapolated():
+    points = [(20.0, 3.0), (10.0, 1.0), (40.0, 5.0)]
     steps = calibrated("T", 8, "unsigned", default(foreign.spline(points, 0, False)))
     lines = calibrated("T", 8, "unsigned", default(foreign.spline(points, 1, False)))
     on = calibrated("T", 8, "unsigned", default(foreign.spline(points, 1, True)))
@@ -211,10 +211,39 @@ def test_a_spline_says_nothing_outside_its_points_unless_told_to():
     def read(types: str) -> list[float]:
         return values(document(types, {"A": "T"}, container("P", ["A"])), packets)["A"]
 
-    assert read(steps) == [1.0, 1.0, 3.0, 3.0, 5.0]
-    assert read(lines) == [1.0, 2.8, 3.0, 3.5, 5.0]
+    assert read(steps) == pytest.approx([math.nan, 1.0, 1.0, 3.0, 3.0, 5.0, math.nan], nan_ok=True)
+    assert read(lines) == pytest.approx([math.nan, 1.0, 2.8, 3.0, 3.5, 5.0, math.nan], nan_ok=True)
     assert read(on) == pytest.approx([0.8, 1.0, 2.8, 3.0, 3.5, 5.0, 5.1], rel=1e-15)
-    assert verdicts(document(lines, {"A": "T"}, container("P", ["A"])), packets)[::6] == ["malformed"] * 2
+    found = decoded(document(lines, {"A": "T"}, container("P", ["A"])), packets)
+    assert found.counts()["decoded"] == 7 and found.values_unknown() == {"A": 2}
+    assert found.tables["P"].columns["A"].to_list(raw=True) == [9, 10, 19, 20, 25, 40, 41]
+    differs = container("Q", [], "P", comparison("A", 1.0, "!="))
+    text = document(lines, {"A": "T"}, container("P", ["A"]) + differs)
+    assert decoded(text, packets).tables["Q"].packet_index.tolist() == [
+        2,
+        3,
+        4,
+        5,
+    ]  # nothing is known of the others
+
+
+def test_splines_of_yamcs_are_extrapolated_and_its_sizes_before_texts_count_octets():
+    spline = foreign.spline([(0, 0), (100, 10)], 1, False).replace(' extrapolate="false"', "")
+    tagged = foreign.fixed_size(72, '<LeadingSize sizeInBitsOfSizeTag="8"/>')
+    types = calibrated("T", 8, "unsigned", default(spline)) + foreign._string("S", tagged)
+    text = document(types, {"A": "T", "B": "S"}, container("P", ["A", "B"]))
+    packet = bytes((200, 8)) + b"ABCDEFGH"
+    others = decoded(text, [packet])
+    assert values(text, [packet])["B"] == ["A"] and others.values_unknown() == {"A": 1}
+    assert parse_xtce(text).remarks == ("sizes before texts count bits",)
+    made = text.replace("<TelemetryMetaData>", "<!-- generated with Yamcs PyMDB --><TelemetryMetaData>")
+    assert values(made, [packet]) == {"A": [20.0], "B": ["ABCDEFGH"]}
+    assert parse_xtce(made).remarks == (
+        "sizes before texts count octets",
+        "splines are extrapolated, as Yamcs does",
+    )
+    stated = Decoder(parse_xtce(text, "octets")).decode(*whole([packet]))
+    assert stated.tables["P"].columns["B"].to_list() == ["ABCDEFGH"]
 
 
 def test_a_code_without_a_name_stays_a_number_and_ranges_of_codes_share_one():
@@ -253,16 +282,33 @@ def test_a_text_may_say_its_length_itself():
     size = YAMCS_TAG.format(most=800, end='<LeadingSize sizeInBitsOfSizeTag="16"/>')
     types = text_type(size) + integer("N", 8)
     text = document(types, {"A": "T", "B": "N"}, container("P", ["A", "B"]))
-    packets = [struct.pack(">H", 8 * len(t)) + t + b"\x07" for t in (b"", b"x", "µx".encode(), b"y" * 98)]
+    packets = [struct.pack(">H", len(t)) + t + b"\x07" for t in (b"", b"x", "µx".encode(), b"y" * 98)]
     assert values(text, packets) == {"A": ["", "x", "µx", "y" * 98], "B": [7] * 4}
     wrong = [
-        struct.pack(">H", 8 * 99) + b"y" * 99 + b"\x07",  # beyond maxSizeInBits
-        struct.pack(">H", 12) + b"yyyy",  # no whole octets
-        struct.pack(">H", 64) + b"y",  # beyond the packet
-        struct.pack(">H", 16) + b"\xc3\x28\x07",  # not UTF-8
+        struct.pack(">H", 99) + b"y" * 99 + b"\x07",  # beyond maxSizeInBits
+        struct.pack(">H", 8) + b"y",  # beyond the packet
+        struct.pack(">H", 2) + b"\xc3\x28\x07",  # not UTF-8
         b"\x00",
     ]
-    assert verdicts(text, wrong) == ["malformed", "malformed", "too_short", "malformed", "too_short"]
+    assert verdicts(text, wrong) == ["decoded", "too_short", "decoded", "too_short"]
+    assert values(text, wrong) == {"A": [None, None], "B": [7, 7]}
+    column = decoded(text, wrong).tables["P"].columns["A"]
+    assert column.to_list(raw=True)[1] == b"\0\2\xc3\x28"
+    bits = Decoder(parse_xtce(text, "bits")).decode(*whole([struct.pack(">H", 12) + b"yyyy"]))
+    assert bits.tables["P"].columns["A"].to_list() == [None]  # no whole octets
+
+
+def test_octets_may_say_their_length_themselves_as_yamcs_writes_it():
+    algorithm = '<AlgorithmText language="Java">org.yamcs.algo.LeadingSizeBinaryDecoder({})</AlgorithmText>'
+    types = integer("N", 8) + (
+        '<BinaryParameterType name="B"><BinaryDataEncoding><SizeInBits><DynamicValue>'
+        '<ParameterInstanceRef parameterRef="_yamcs_ignore"/></DynamicValue></SizeInBits>'
+        f'<FromBinaryTransformAlgorithm name="x">{algorithm.format(16)}</FromBinaryTransformAlgorithm>'
+        "</BinaryDataEncoding></BinaryParameterType>"
+    )
+    text = document(types, {"b": "B", "n": "N"}, container("P", ["b", "n"]))
+    assert values(text, [b"\0\0\7", b"\0\3abc\7"]) == {"b": [b"", b"abc"], "n": [7, 7]}
+    assert verdicts(text, [b"\0", b"\0\3ab"]) == ["too_short", "too_short"]
 
 
 def test_a_text_may_end_with_a_character_and_what_follows_begins_there():
@@ -271,7 +317,17 @@ def test_a_text_may_end_with_a_character_and_what_follows_begins_there():
     text = document(types, {"A": "T", "B": "N"}, container("P", ["A", "B"]))
     found = values(text, [b"\0\x05", b"ab\0\x06", b"abcdefghi\0\x07"])
     assert found == {"A": ["", "ab", "abcdefghi"], "B": [5, 6, 7]}
-    assert verdicts(text, [b"abc", b"abcdefghijk\0\x07"]) == ["malformed", "malformed"]
+    assert verdicts(text, [b"abc", b"abcdefghijk\0\x07"]) == ["too_short", "malformed"]
+    last = document(types, {"A": "T"}, container("P", ["A"]))
+    assert values(last, [b"abc"])["A"] == ["abc"]  # the text fills what is left
+
+
+def test_a_text_without_terminator_fills_its_field_and_one_that_is_no_text_is_unknown():
+    types = text_type(foreign.fixed_size(24, "<TerminationChar/>")) + integer("N", 8)
+    text = document(types, {"A": "T", "B": "N"}, container("P", ["A", "B"]))
+    packets = [b"ab\0\x07", b"abc\x07", b"\xc3\x28\0\x07"]
+    assert values(text, packets) == {"A": ["ab", "abc", None], "B": [7] * 3}
+    assert decoded(text, packets).values_unknown() == {"A": 1}
 
 
 def test_a_terminator_of_two_octets_stands_at_a_whole_character():
@@ -412,10 +468,10 @@ def test_elements_that_say_their_own_length_are_read_one_after_another():
     text = document(types, {"n": "N", "a": "A", "z": "N"}, container("P", ["n", "a", "z"]))
     rows = [[], [(1, "a")], [(2, "bcd"), (3, ""), (4, "efghij")], [(5, "x" * 31)]]
     packets = [
-        bytes((len(row),)) + b"".join(bytes((k, 8 * len(t))) + t.encode() for k, t in row) + b"\x63"
+        bytes((len(row),)) + b"".join(bytes((k, len(t))) + t.encode() for k, t in row) + b"\x63"
         for row in rows
     ]
-    broken = bytes((2, 9, 8, 65, 9, 200, 65))  # the second text is longer than the packet
+    broken = bytes((2, 9, 1, 65, 9, 25, 65))  # the second text is longer than the packet
     found = decoded(text, [*packets, broken])
     columns = found.tables["P"].columns
     assert [[(e["key"], e["text"]) for e in row] for row in columns["a"].to_list()] == rows
@@ -609,14 +665,16 @@ def test_sizes_that_are_none_condemn_the_packet_alone(slope, verdict):
     assert found[0] == verdict and found[1] != "decoded"
 
 
-def test_an_element_that_its_calibrator_does_not_cover_condemns_its_packet_alone():
+def test_an_element_that_its_calibrator_does_not_cover_is_unknown_alone():
     element = calibrated("E", 8, "unsigned", default(foreign.spline([(0, 0), (100, 50)], 1, False)))
     types = integer("N", 8) + element + array_type("A", "E", dimension("n"))
     text = document(types, {"n": "N", "a": "A", "z": "N"}, container("P", ["n", "a", "z"]))
     packets = [bytes((2, 10, 20, 1)), bytes((3, 30, 101, 40, 2)), bytes((1, 100, 3)), bytes((0, 4))]
-    assert verdicts(text, packets) == ["decoded", "malformed", "decoded", "decoded"]
+    assert verdicts(text, packets) == ["decoded"] * 4
     found = values(text, packets)
-    assert found["a"] == [[5.0, 10.0], [50.0], []] and found["z"] == [1, 3, 4]
+    assert found["z"] == [1, 2, 3, 4] and found["a"][0::2] == [[5.0, 10.0], [50.0]]
+    assert found["a"][1] == pytest.approx([15.0, math.nan, 20.0], nan_ok=True)
+    assert decoded(text, packets).values_unknown() == {"a": 1}
 
 
 def test_every_truncation_of_every_packet_is_a_verdict():
@@ -648,7 +706,29 @@ def test_chunks_of_packets_are_joined(monkeypatch):
     assert small == rows_of(decoded(foreign.BUS, packets), 100)
 
 
-def test_the_first_container_is_named_where_there_are_several():
+def of_apid(name: str, apid: int, entries: list[str], *, abstract: bool = True) -> str:
+    """A first container of its own and one that continues it for packets of an APID, as OpenC3 writes them."""
+    first = container(f"{name}_Base", [*HEADER, *entries], abstract=abstract)
+    return first + container(name, [], f"{name}_Base", comparison("PKT_APID", apid))
+
+
+def test_first_containers_are_told_apart_by_their_conditions():
+    containers = of_apid("A", 1, ["N"]) + of_apid("B", 2, ["N", "M"]) + of_apid("C", 3, ["N"], abstract=False)
+    text = document(HEADER_TYPES, {**HEADER_PARAMETERS, "N": "U8", "M": "U8"}, containers)
+    packets = [
+        space_packet(apid, data, 0) for apid, data in ((1, b"a"), (2, b"ab"), (3, b"c"), (4, b"d"), (2, b"x"))
+    ]
+    found = decoded(text, packets)
+    assert {name: table.packet_index.tolist() for name, table in found.tables.items()} == {
+        "A": [0], "B": [1], "C": [2], "C_Base": [3],
+    }  # fmt: skip
+    assert verdicts(text, packets)[4] == "too_short"  # its APID is that of B
+    same = parse_xtce(text.replace('value="2"', 'value="1"'))
+    only = Decoder(same, ["A_Base", "B_Base"]).decode(*whole([*packets, space_packet(1, b"ab", 0)]))
+    assert [VERDICTS[v] for v in only.verdict] == ["decoded", *["no_container"] * 4, "ambiguous"]
+
+
+def test_the_first_container_is_named_where_several_have_no_conditions():
     text = document(integer("N", 8), {"a": "N"}, container("P", ["a"]) + container("Q", ["a"]))
     with pytest.raises(
         DefinitionError, match=r"BUS: expected one container without a base, found 2 \(P, Q\)"

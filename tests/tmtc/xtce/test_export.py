@@ -2,14 +2,17 @@
 
 import math
 import warnings
+import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
 import space_packet_parser as spp
 from space_packet_parser.xtce.validation import validate_xtce
 
+from tmtc.crc import CRC_LENGTH
 from tmtc.dictionary import DICTIONARY
 from tmtc.fields import Field
+from tmtc.onboard_parameters import PARAMETERS
 from tmtc.schema import PacketDefinition
 from tmtc.stream import whole_packets
 from tmtc.xtce.decode import Decoder
@@ -176,3 +179,31 @@ def assert_equal(theirs, value, raw, f: Field) -> None:
         assert math.isnan(theirs)
     else:
         assert theirs == value and theirs.raw_value == raw
+
+
+def test_telecommands_are_as_long_as_the_dictionary_expects_once_the_sender_appends_their_checksum():
+    name = "{http://www.omg.org/spec/XTCE/20180204}"
+    tree = ET.fromstring(format_xtce())
+    commands = {one.get("name"): one for one in tree.iter(f"{name}MetaCommand")}
+    assert len(commands) == len(DICTIONARY.telecommands) == 27
+    for definition in DICTIONARY.telecommands:
+        command = commands[definition.name]
+        fixed = [int(one.attrib["sizeInBits"]) for one in command.iter(f"{name}FixedValueEntry")]
+        names = [one.attrib["argumentRef"] for one in command.iter(f"{name}ArgumentRefEntry")]
+        group = [definition.group.name] if definition.group else []
+        assert names == [f.name for f in definition.fields] + group
+        given = {f.name: first_value(f) for f in definition.fields}
+        if definition.group:
+            given[definition.group.name] = []
+            del given[definition.group.count]
+        packet = DICTIONARY.pack_command(definition.name, given, sequence_count=0)
+        assert len(packet) == sum(fixed) // 8 + sum(f.octets for f in definition.fields) + CRC_LENGTH
+    for kind in tree.iter(f"{name}EnumeratedArgumentType"):
+        if "parameter_id" in kind.attrib["name"]:
+            listed = {one.get("label"): one.get("value") for one in kind.iter(f"{name}Enumeration")}
+            assert listed == {one.name: str(one.number) for one in PARAMETERS}
+
+
+def first_value(f: Field):
+    """Return a value that the field accepts."""
+    return f.labels[0][0] if f.labels else max(f.minimum or 0, 0)

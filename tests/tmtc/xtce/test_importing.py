@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+
 import numpy as np
 import pytest
 
@@ -204,7 +206,7 @@ def test_long_chains_of_inheritance_are_read_and_endless_ones_refused():
         (integer("t", 8, order="middle"), "byteOrder"),
         (integer("t", 8).replace("encoding=", 'bitOrder="leastSignificantBitFirst" encoding='), "bitOrder"),
         (integer("t", 8, inner="<ErrorDetectCorrect/>"), "ErrorDetectCorrect, which is not"),
-        (integer("t", 8).replace("IntegerDataEncoding", "FloatDataEncoding"), "expected one of IntegerDataEncoding"),
+        (integer("t", 8).replace("IntegerDataEncoding", "StringDataEncoding"), "expected one of IntegerDataEncoding"),
         (floating("t", 80), "sizeInBits 16, 32 or 64"),
         (floating("t", 64, "MILSTD_1750A"), "sizeInBits 32 or 48"),
         (floating("t", 32, "DEC"), "found DEC"),
@@ -218,7 +220,7 @@ def test_long_chains_of_inheritance_are_read_and_endless_ones_refused():
             "an exponent of 0 to 30, found -1",
         ),
         (calibrated("t", 8, "unsigned", default(foreign.spline([(1, 1)], 1, True))), "two points"),
-        (calibrated("t", 8, "unsigned", default(foreign.spline([(2, 1), (1, 1)], 1, True))), "rising"),
+        (calibrated("t", 8, "unsigned", default(foreign.spline([(1, 2), (1, 1)], 1, True))), "value, found two"),
         (calibrated("t", 8, "unsigned", default(foreign.spline([(1, 1), (2, 1)], 3, True))), "order 0 or 1"),
         (text_type(foreign.fixed_size(-8), name="t"), "found -8"),
         (text_type(foreign.fixed_size(999_999_999_999), name="t"), "found 999999999999"),
@@ -267,8 +269,9 @@ def test_types_beyond_the_subset_or_their_bounds_are_refused_by_name(types, word
         ('<StreamSegmentEntry streamRef="x"/>', "StreamSegmentEntry"),
         ('<ParameterSegmentRefEntry parameterRef="a" sizeInBits="4"/>', "ParameterSegmentRefEntry"),
         (
-            '<ParameterRefEntry parameterRef="a"><RepeatEntry/></ParameterRefEntry>',
-            "RepeatEntry, which is not",
+            '<ParameterRefEntry parameterRef="a"><RepeatEntry><Count><FixedValue>2</FixedValue></Count>'
+            "<Offset><FixedValue>8</FixedValue></Offset></RepeatEntry></ParameterRefEntry>",
+            "repetitions without an Offset",
         ),
         (
             '<ParameterRefEntry parameterRef="a"><LocationInContainerInBits referenceLocation="containerEnd">'
@@ -415,6 +418,114 @@ def test_members_of_aggregates_and_booleans_are_compared():
         "P": [3],
     }
     assert found.verdict.tolist() == [0, 2, 0, 0]
+
+
+# spellings of other tools
+
+
+def test_a_document_of_yamcs_pymdb_is_read_to_the_values_of_yamcs():
+    """Members of aggregates with `/`, a container with a size, names of booleans, points in any order."""
+    flag = (
+        '<BooleanParameterType name="f" zeroStringValue="Absent" oneStringValue="Present">'
+        '<IntegerDataEncoding sizeInBits="1"/></BooleanParameterType>'
+    )
+    types = flag + integer("u7", 7) + integer("u8", 8) + aggregate("id", {"flag": "f", "kind": "u7"})
+    size = "<BinaryEncoding><SizeInBits><FixedValue>16</FixedValue></SizeInBits></BinaryEncoding><EntryList>"
+    part = '<ContainerRefEntry containerRef="part"/>'
+
+    def criteria(member: str, value: str) -> str:
+        return (
+            f'<BooleanExpression><Condition><ParameterInstanceRef parameterRef="{member}"/>'
+            f"<ComparisonOperator>==</ComparisonOperator><Value>{value}</Value></Condition></BooleanExpression>"
+        )
+
+    text = document(
+        types,
+        {"id": "id", "a": "u8", "b": "u8"},
+        container("part", ["a"]).replace("<EntryList>", size)
+        + container("head", ["id"], abstract=True).replace("<EntryList>", size)
+        + container("P", [part, "b"], "head", criteria("id/kind", "3.0"))
+        + container("Q", ["b"], "P", criteria("/BUS/id/flag", "Present")),
+    )
+    found = Decoder(parse_xtce(text)).decode(*whole([bytes((0x83, 1, 0, 2, 9)), bytes((0x03, 5, 0, 6))]))
+    assert {name: table.columns["b"].to_list() for name, table in found.tables.items()} == {
+        "P": [6],
+        "Q": [9],
+    }
+    assert "a member of 'id', found 'sort'" in refused(text.replace("id/kind", "id/sort"))
+
+
+def test_entries_are_repeated_as_arrays():
+    def repeated(entry: str, count: str) -> str:
+        return entry.replace(
+            "/>", f"><RepeatEntry><Count>{count}</Count></RepeatEntry></{entry[1:].split()[0]}>"
+        )
+
+    three = "<FixedValue>3</FixedValue>"
+    dynamic = "<DynamicValue><ParameterInstanceRef parameterRef='n'/></DynamicValue>"
+    entries = [
+        "n",
+        repeated('<ParameterRefEntry parameterRef="a"/>', three),
+        repeated('<ContainerRefEntry containerRef="R"/>', dynamic),
+        "z",
+    ]
+    text = document(
+        U8,
+        dict.fromkeys(["n", "a", "b", "c", "z"], "u8"),
+        container("R", ["b", "c"]) + container("P", entries),
+    )
+    columns = (
+        Decoder(parse_xtce(text))
+        .decode(*whole([bytes((2, *range(10, 13), 1, 2, 3, 4, 9))]))
+        .tables["P"]
+        .columns
+    )
+    assert {name: column.to_list()[0] for name, column in columns.items()} == {
+        "n": 2, "a": [10, 11, 12], "R": [{"b": 1, "c": 2}, {"b": 3, "c": 4}], "z": 9,
+    }  # fmt: skip
+    later = container("Q", [], "P", comparison("a", 10))
+    assert "stand before, found 'a'" in refused(text.replace("</ContainerSet>", f"{later}</ContainerSet>"))
+
+
+def test_integers_and_booleans_may_be_stored_as_floats():
+    types = floating("t", 32).replace("FloatParameterType", "IntegerParameterType")
+    types += floating("f", 32).replace("FloatParameterType", "BooleanParameterType")
+    text = document(types, {"a": "t", "b": "f"}, container("P", ["a", "b"]))
+    columns = Decoder(parse_xtce(text)).decode(*whole([struct.pack(">ff", 42.0, 1.0)])).tables["P"].columns
+    assert (columns["a"].to_list(), columns["b"].to_list()) == ([42.0], [True])
+
+
+def test_octet_orders_may_be_listed():
+    for order, value in (("3,2,1,0", 0x01020304), ("0,1,2,3", 0x04030201)):
+        text = document(integer("t", 32, order=order), {"a": "t"}, PLAIN)
+        columns = Decoder(parse_xtce(text)).decode(*whole([bytes((1, 2, 3, 4))])).tables["P"].columns
+        assert columns["a"].to_list() == [value]
+    assert "byteOrder" in refused(of_type(integer("t", 32, order="2,3,0,1")))
+
+
+def test_elements_of_commands_cannot_refuse_a_document():
+    more = '<CommandMetaData><MetaCommandSet><x:Odd xmlns:x="urn:x"/><Unknown/></MetaCommandSet></CommandMetaData>'
+    assert list(parse_xtce(document(U8, {"a": "u8"}, PLAIN, more=more)).roots) == ["P"]
+
+
+def test_alarms_that_are_not_read_are_counted():
+    alarms = (
+        "<DefaultAlarm><StaticAlarmRanges><WatchRange minInclusive='0'/><WarningRange minInclusive='0'/>"
+        "<SevereRange maxInclusive='9'/></StaticAlarmRanges><ChangeAlarmRanges/></DefaultAlarm>"
+        "<ContextAlarmList><ContextAlarm/><ContextAlarm/></ContextAlarmList>"
+    )
+    kind = integer("t", 8)
+    end = kind.index("</IntegerParameterType>")
+    definition = parse_xtce(of_type(kind[:end] + alarms + kind[end:] + integer("unused", 8)))
+    assert definition.alarms_not_read == 4  # watch beside warning, changes, two in a context
+    assert definition.remarks == ("alarms that are not read: 4",)
+    inside = (
+        kind[:end]
+        + alarms.replace("<StaticAlarmRanges>", "<StaticAlarmRanges rangeForm='inside'>")
+        + kind[end:]
+    )
+    assert parse_xtce(of_type(inside)).alarms_not_read == 6
+    assert parse_xtce(of_type(kind)).alarms_not_read == 0
 
 
 # what is passed over on purpose
