@@ -537,7 +537,7 @@ def _placed(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tupl
     if crs.is_geographic:
         across = down = math.radians(1.0) / crs.units_factor[1]
     elif values.get("proj") == "eqc" and values.get("lat_0", 0.0) == 0.0:
-        unit_m = crs.linear_units_factor[1]
+        unit_m = _unit_m(values)
         down = degree / unit_m
         across = down * math.cos(math.radians(values.get("lat_ts", 0.0)))
         middle_deg = float(values.get("lon_0", 0.0))
@@ -551,6 +551,11 @@ def _placed(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tupl
     return _warped(file, crs, transform, radius_m)
 
 
+def _unit_m(values: dict[str, Any]) -> float:
+    """Return the unit of the coordinates of a projection, as PROJ names it."""
+    return float(values.get("to_meter", UNITS_M.get(str(values.get("units", "m")), 1.0)))
+
+
 def _warped(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tuple[float, RasterFile]:
     """Return a file as GDAL resamples it, on a grid of longitude and latitude with pixels of its own size."""
     from rasterio import Affine
@@ -558,7 +563,7 @@ def _warped(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tupl
     sphere = f"+proj=longlat +R={radius_m!r} +no_defs"
     rows, columns = file.shape
     pixel = math.sqrt(abs(transform.determinant))
-    pixel_deg = pixel if crs.is_geographic else pixel * crs.linear_units_factor[1] / math.radians(radius_m)
+    pixel_deg = pixel if crs.is_geographic else pixel * _unit_m(crs.to_dict()) / math.radians(radius_m)
     ppd = round(1.0 / pixel_deg, 6)
     y, x = np.meshgrid(np.linspace(0, rows, 65), np.linspace(0, columns, 65), indexing="ij")
     east, north = _transformed(crs, sphere, *_applied(transform, x.ravel(), y.ravel()))
