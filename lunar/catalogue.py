@@ -429,7 +429,9 @@ def _numbers(path: Path, columns: dict[str, list[str]], name: str, missing: bool
         raise
 
 
-def _places(path: Path, columns: dict[str, list[str]], latitude: str, longitude: str) -> list[FloatArray]:
+def _places(
+    path: Path, columns: dict[str, list[str]], latitude: str, longitude: str
+) -> tuple[FloatArray, FloatArray]:
     """Return latitudes and longitudes in radians of columns in degrees."""
     angles = []
     for name, low, high in ((latitude, -90.0, 90.0), (longitude, -360.0, 720.0)):
@@ -439,7 +441,7 @@ def _places(path: Path, columns: dict[str, list[str]], latitude: str, longitude:
             expected = f"a {'latitude' if name == latitude else 'longitude'} of {low:g}..{high:g} deg"
             raise DataFileError(path, f"line {wrong[0] + 2}", expected, f"{values[wrong[0]]:g}")
         angles.append(np.radians(values))
-    return angles
+    return angles[0], angles[1]
 
 
 def _ids(path: Path, columns: dict[str, list[str]]) -> IntArray:

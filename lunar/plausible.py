@@ -64,7 +64,7 @@ LISTED_DEPTH_RATIO = Limit(0.45, 1.5, "")
 """Medians of depths measured on a height raster over those in a list: on GLD100 at 128 pixels per degree, which smooths
 small craters, 0.59 (3 to 6 km) and 0.78 (6 to 30 km) of those of LU1319381."""
 
-CRATER_COVER = 1.0
+CRATER_COVER = 0.6
 """Greatest ground that the craters of a list cover, all with its median diameter, over the ground that they span: 0.06
 for the 222,447 craters of LU1319381 from 2 km on; saturated ground has 0.3."""
 

@@ -43,11 +43,10 @@ def read_picture(path: Path) -> tuple[NDArray[np.generic], str]:
         image = image.astype(np.float32)
     if image.dtype not in (np.uint16, np.float32, np.float64) or not image.size:
         return image, ""
-    missing = ~(image > _NO_DATA_BELOW)
-    missing |= ~np.isfinite(image)
+    missing = ~(np.greater(image, _NO_DATA_BELOW) & np.isfinite(image))
     image = np.where(missing, image.dtype.type(0), image)
     limit = _HOT * float(np.quantile(image[~missing], 0.999)) if not missing.all() else 0.0
-    hot = image > limit if limit > 0.0 else np.zeros_like(missing)
+    hot = np.greater(image, limit if limit > 0.0 else np.inf)
     greatest = float(image[~hot].max())
     if image.dtype == np.uint16:
         held = next(bits for bits in (12, 14, 16) if greatest < 1 << bits)

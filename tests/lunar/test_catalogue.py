@@ -231,7 +231,7 @@ def test_a_column_in_another_unit_is_refused(tmp_path, column, factor):
 
     def written(values):
         rows = np.column_stack(list(values.values()))
-        np.savetxt(path, rows, "%.9f", ",", header=",".join(values), comments="")
+        np.savetxt(path, rows, "%.9g", ",", header=",".join(values), comments="")
         return load_catalogue(path)
 
     assert len(written(table)) == 60

@@ -201,7 +201,8 @@ class RasterLayer:
                 east = west + turn * self.turn
                 left, right = _lattice_span(east, file.columns, first_column, columns)
                 if left < right:
-                    part = self._part(number, np.arange(top, bottom) - north, np.arange(left, right) - east)
+                    at = np.arange(float(top), bottom) - north, np.arange(float(left), right) - east
+                    part = self._part(number, *at)
                     place = out[
                         top - first_row : bottom - first_row, left - first_column : right - first_column
                     ]
@@ -347,8 +348,8 @@ def open_layers(
     for path in paths:
         ppd, file = _open_header(Path(path), heights)
         steps = 1.0 / SAME_LATTICE_PIXELS
-        offsets = (round(_offset(edge) * steps) / steps + 0.0 for edge in (file.row, file.column))
-        groups.setdefault((ppd, *offsets), []).append(file)
+        north, west = (round(_offset(edge) * steps) / steps + 0.0 for edge in (file.row, file.column))
+        groups.setdefault((ppd, north, west), []).append(file)
     shared = ChunkCache() if chunks is None else chunks
     layers = [RasterLayer(key[0], files, shared, relief) for key, files in groups.items()]
     return sorted(layers, key=lambda layer: layer.pixels_per_degree)
@@ -444,7 +445,7 @@ def _open_header(path: Path, heights: bool) -> tuple[float, RasterFile]:
                 reading = _stated(path, source, heights)
     except rasterio.errors.RasterioError as error:
         raise TerrainError(f"{path}: expected a raster, found {error}") from None
-    file = RasterFile(path, 0.0, 0.0, *shape, heights, reading, None, shape)
+    file = RasterFile(path, 0.0, 0.0, shape[0], shape[1], heights, reading, None, shape)
     with rasterio.Env():  # has the data of PROJ
         return _placed(file, crs, transform, _sphere(file, crs))
 
@@ -536,7 +537,7 @@ def _placed(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tupl
     if crs.is_geographic:
         across = down = math.radians(1.0) / crs.units_factor[1]
     elif values.get("proj") == "eqc" and values.get("lat_0", 0.0) == 0.0:
-        unit_m = crs.linear_units_factor[1]
+        unit_m = _unit_m(values)
         down = degree / unit_m
         across = down * math.cos(math.radians(values.get("lat_ts", 0.0)))
         middle_deg = float(values.get("lon_0", 0.0))
@@ -550,6 +551,11 @@ def _placed(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tupl
     return _warped(file, crs, transform, radius_m)
 
 
+def _unit_m(values: dict[str, Any]) -> float:
+    """Return the unit of the coordinates of a projection, as PROJ names it."""
+    return float(values.get("to_meter", UNITS_M.get(str(values.get("units", "m")), 1.0)))
+
+
 def _warped(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tuple[float, RasterFile]:
     """Return a file as GDAL resamples it, on a grid of longitude and latitude with pixels of its own size."""
     from rasterio import Affine
@@ -557,7 +563,7 @@ def _warped(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tupl
     sphere = f"+proj=longlat +R={radius_m!r} +no_defs"
     rows, columns = file.shape
     pixel = math.sqrt(abs(transform.determinant))
-    pixel_deg = pixel if crs.is_geographic else pixel * crs.linear_units_factor[1] / math.radians(radius_m)
+    pixel_deg = pixel if crs.is_geographic else pixel * _unit_m(crs.to_dict()) / math.radians(radius_m)
     ppd = round(1.0 / pixel_deg, 6)
     y, x = np.meshgrid(np.linspace(0, rows, 65), np.linspace(0, columns, 65), indexing="ij")
     east, north = _transformed(crs, sphere, *_applied(transform, x.ravel(), y.ravel()))
@@ -581,9 +587,9 @@ def _warped(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tupl
     first_row, first_column = math.floor((90.0 - high) * ppd), math.floor(west % 360.0 * ppd) - spare
     size = math.ceil((90.0 - low) * ppd) - first_row, math.ceil(width * ppd) + 2 * spare
     grid = Affine(1.0 / ppd, 0.0, first_column / ppd, 0.0, -1.0 / ppd, 90.0 - first_row / ppd)
-    place = (float(first_row), float(first_column), *size)
-    named = dict(zip(("row", "column", "rows", "columns"), place, strict=True))
-    return ppd, replace(file, **named, warp=Warp(crs, ~transform, sphere, grid))
+    warp = Warp(crs, ~transform, sphere, grid)
+    row, column = float(first_row), float(first_column)
+    return ppd, replace(file, row=row, column=column, rows=size[0], columns=size[1], warp=warp)
 
 
 def _transformed(source: Any, target: Any, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -143,7 +143,7 @@ def write_labels(folder, boxes=BOXES, change=lambda document: None, **keys):
         "annotations": [
             {"id": k, "image_id": 0, "category_id": 0, "bbox": box} | keys for k, box in enumerate(boxes)
         ],
-        "categories": [CRATER, BOULDER],
+        "categories": [dict(CRATER), dict(BOULDER)],
     }
     change(document)
     write_set(folder)
