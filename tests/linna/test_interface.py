@@ -42,7 +42,7 @@ regress suite low --out D
 data verify
 mission write S --out M.toml
 mission check M
-mission run S --days 1 --speed max --kill 1
+mission run S --days 1 --speed max
 verify --rebuild
 navigation survey --region 0,10,0,10 --seeds 3
 export 1 --format tum --out F
