@@ -142,4 +142,4 @@ def _moved(position: FloatArray, velocity: FloatArray, span: FloatArray, earth: 
         k2 = rate(state + step / 2.0 * k1)
         k3 = rate(state + step / 2.0 * k2)
         state = state + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + rate(state + step * k3))
-    return state[0]
+    return np.asarray(state[0])

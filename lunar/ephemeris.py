@@ -75,7 +75,7 @@ class EphemerisSegment:
     useable_stop_utc_ns: int | None = None
     comments: tuple[str, ...] = ()
     covariances: tuple[Covariance, ...] = ()
-    tai_ns: IntArray = field(default=None, repr=False)  # type: ignore[assignment] # computed if it is not given
+    tai_ns: IntArray = field(default=None, repr=False)  # type: ignore[arg-type] # computed if it is not given
 
     def __post_init__(self) -> None:
         n = len(self.utc_ns)

@@ -227,7 +227,7 @@ def _fitted(
 ) -> _Series:
     """Return the series through states at the Chebyshev nodes; its error is that at twice as many other places."""
     half_s = record_s / 2.0
-    middle = start_s + half_s + record_s * np.arange(records)
+    middle: FloatArray = start_s + half_s + record_s * np.arange(records, dtype=np.float64)
     # Seconds of TDB and TAI differ by 3e-10, which are 0.1 mm in some minutes.
     rate = (_tdb_minus_tt_s(middle + half_s) - _tdb_minus_tt_s(middle - half_s)) / record_s
 

@@ -196,7 +196,7 @@ def test_geojson_and_geopackage_have_the_same_features_on_the_moon(
         times = database.execute("SELECT start, stop FROM tracks").fetchall()
     expected = {"utc": "DATETIME", "start": "DATETIME", "stop": "DATETIME", "complete": "BOOLEAN"}
     assert {name: columns[name] for name in expected} == expected
-    assert times[0] == tuple(format_utc(int(rich_pass.utc_ns[k])) for k in (0, -1))
+    assert times[0] == tuple(format_utc(int(rich_pass.utc_ns[k]), 0) for k in (0, -1))
     read = pyogrio.read_info(tmp_path / "pass.geojson")
     assert "1737400" in read["crs"]
 
