@@ -15,7 +15,14 @@ from typing import Any, Literal, Protocol
 
 from lunar.constants import MOON_RADIUS_M
 from lunar.errors import LunarError
-from lunar.plausible import CAMERA_FIELD_DEG, CAMERA_PIXELS, MAP_SHIFT_M
+from lunar.plausible import (
+    CAMERA_FIELD_DEG,
+    CAMERA_PIXELS,
+    MAP_SHIFT_M,
+    ORBIT_RADIUS_M,
+    ORBIT_SPEED_M_S,
+    UTC_NS,
+)
 from lunar.timescales import parse_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.typed_toml import TableFault, read_table, toml_text
@@ -496,6 +503,10 @@ def _check_cartesian(orbit: OrbitSection, require: Require) -> None:
         list(orbit.position_km),
     )
     require(any(orbit.velocity_km_s), "orbit.velocity_km_s", "a velocity", list(orbit.velocity_km_s))
+    for key, limit in (("position_km", ORBIT_RADIUS_M), ("velocity_km_s", ORBIT_SPEED_M_S)):
+        values = getattr(orbit, key)
+        good = bool(limit.holds(1e3 * math.hypot(*values)))
+        require(good, f"orbit.{key}", f"of {limit} in all, stated with km", list(values))
 
 
 _ELEMENT_KEYS = (
@@ -588,10 +599,10 @@ def _check_orbit(scenario: Scenario, require: Require) -> None:
     }
     for key, text in texts.items():
         try:
-            if text or key == "orbit.epoch":
-                parse_utc(text)
+            good = bool(UTC_NS.holds(parse_utc(text))) if text or key == "orbit.epoch" else True
         except (LunarError, ValueError):
-            require(False, key, "a UTC time such as 2029-08-07T00:00:00Z", text)
+            good = False
+        require(good, key, "a UTC time such as 2029-08-07T00:00:00Z, from 1972 to 2100", text)
     if orbit.position_km or orbit.velocity_km_s:
         _check_cartesian(orbit, require)
     elif not orbit.oem:
@@ -602,6 +613,12 @@ def _check_orbit(scenario: Scenario, require: Require) -> None:
             "orbit.semi_major_axis_km and eccentricity",
             f"an orbit above the ground (perilune radius over {_MOON_RADIUS_KM} km)",
             round(perilune_km, 3),
+        )
+        apolune_m = 1e3 * orbit.semi_major_axis_km * (1.0 + orbit.eccentricity)
+        require(
+            bool(ORBIT_RADIUS_M.holds(apolune_m)),
+            "orbit.semi_major_axis_km",
+            f"of an orbit about the Moon, {ORBIT_RADIUS_M}",
         )
 
 

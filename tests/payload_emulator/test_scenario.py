@@ -109,6 +109,20 @@ def test_an_empty_scenario_is_the_papers_orbit() -> None:
         ('name = "x"\n[dynamics]\nintegrator = "dop853"', "dynamics.integrator: only 'rkn86' is left"),
         ('name = "x"\n[altimeter]', "section [altimeter]: instruments other than the camera were withdrawn"),
         (
+            'name = "x"\n[orbit]\nsemi_major_axis_km = 1768180.0',
+            "semi_major_axis_km must be of an orbit about the Moon",
+        ),
+        (
+            'name = "x"\n[orbit]\nposition_km = [1768180.0, 0, 0]\nvelocity_km_s = [0, 1.6, 0]',
+            "orbit.position_km must be of 1737400 to 66000000 m in all, stated with km, found",
+        ),
+        (
+            'name = "x"\n[orbit]\nposition_km = [1768.18, 0, 0]\nvelocity_km_s = [0, 1600.0, 0]',
+            "orbit.velocity_km_s must be of 0 to 3500 m/s in all, stated with km, found",
+        ),
+        ('name = "x"\n[orbit]\nepoch = "0029-08-07T00:00:00Z"', "orbit.epoch must be a UTC time such as"),
+        ('name = "x"\n[orbit]\nepoch = "2129-08-07T00:00:00Z"', "from 1972 to 2100, found '2129"),
+        (
             'name = "x"\n[link]\nclock_errors = ["madrid 1", "madrid 2"]',
             "link.clock_errors must be one entry for each station, found ['madrid', 'madrid']",
         ),

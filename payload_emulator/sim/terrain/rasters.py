@@ -250,31 +250,29 @@ class RasterLayer:
         window = Window(left, top, min(CHUNK_PIXELS, file.columns - left), min(CHUNK_PIXELS, file.rows - top))
         with file.opened() as source:
             raw = source.read(1, window=window, masked=_has_mask(source))
-        values: Heights = np.ma.filled(raw.astype(np.float32), np.nan)
+        is_wide = (raw.dtype.kind != "f" and raw.dtype.itemsize > 2) or raw.dtype == np.float64
+        values = np.ma.filled(raw.astype(np.float64 if is_wide else np.float32), np.nan)
         if file.reading.nodata is not None:
             values[np.asarray(raw) == file.reading.nodata] = np.nan
         if np.issubdtype(raw.dtype, np.floating):
             values[values < NO_DATA_BELOW] = np.nan
-        if file.is_heights:
-            values = self._heights(number, values, (top, left))
-        self._chunks.put(key, values)
-        return values
+        chunk = self._heights(number, values, (top, left)) if file.is_heights else values.astype(np.float32)
+        self._chunks.put(key, chunk)
+        return chunk
 
-    def _heights(self, number: int, raw: Heights, corner: tuple[int, int]) -> Heights:
+    def _heights(self, number: int, raw: Heights | FloatArray, corner: tuple[int, int]) -> Heights:
         """Return raw values in metres above the map sphere; how they are taken follows from the first ones read."""
         file = self.files[number]
         reading = self._readings.get(number)
         if reading is None and not np.isfinite(raw).any():
-            return raw
+            return raw.astype(np.float32)
         chosen = reading or _plausible(file, raw)
         values = _scaled(raw, chosen)
         with np.errstate(invalid="ignore"):
             wrong = ~HEIGHT_M.holds(values) & np.isfinite(values)
         if wrong.any():
-            constant = np.unique(raw[wrong])
-            if constant.size > 1 and np.count_nonzero(wrong) > _SPIKES * np.count_nonzero(
-                np.isfinite(values)
-            ):
+            constant, count = np.unique(raw[wrong]), np.count_nonzero(np.isfinite(values))
+            if constant.size > 1 and np.count_nonzero(wrong) > _SPIKES * count:
                 raise _implausible(file, values)
             values[wrong] = np.nan
             if reading is None and constant.size == 1:
@@ -379,15 +377,17 @@ def _mixed(first: Heights, second: Heights, share: float) -> Heights:
     return np.asarray(first + np.float32(share) * (second - first))
 
 
-def _scaled(raw: Heights, reading: Reading) -> Heights:
+def _scaled(raw: Heights | FloatArray, reading: Reading) -> Heights:
     """Return heights in single precision; radii are differences of double precision."""
-    if abs(reading.offset_m) > HEIGHT_M.high:
+    if raw.dtype == np.float64 or abs(reading.offset_m) > HEIGHT_M.high:
         return np.asarray(raw * np.float64(reading.scale_m) + reading.offset_m, dtype=np.float32)
-    values = raw if reading.scale_m == 1.0 else raw * np.float32(reading.scale_m)
-    return values + np.float32(reading.offset_m) if reading.offset_m else values.copy()
+    values = np.array(raw, dtype=np.float32)
+    if reading.scale_m != 1.0:
+        values *= np.float32(reading.scale_m)
+    return values + np.float32(reading.offset_m) if reading.offset_m else values
 
 
-def _plausible(file: RasterFile, raw: Heights) -> Reading:
+def _plausible(file: RasterFile, raw: Heights | FloatArray) -> Reading:
     """Return how the values of a file are taken: as it states, or as radii where that is all that they can be."""
     stated = file.reading
     values = _scaled(raw, stated)[np.isfinite(raw)].astype(np.float64)
