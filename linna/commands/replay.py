@@ -22,7 +22,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         parser,
         "--check-build BUILD",
         Path,
-        "only check the parameters of a build file against this flight code",
+        "only check a build file, and its parameters against this flight code",
     )
     option(
         parser,
@@ -74,16 +74,25 @@ def _fly(arguments: argparse.Namespace, archive: Path) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> int:
+    from ground_service.errors import InvalidInput
+    from ground_service.regression.builds import load_build
     from payload_emulator.errors import ParameterError
     from payload_emulator.session.replay import check_parameters
 
+    fault: InvalidInput | ParameterError
     try:
+        load_build(arguments.check_build)
         check_parameters(arguments.check_build)
+    except InvalidInput as error:
+        fault, place = error, (error.what, error.where)
     except ParameterError as error:
-        fault = {name: getattr(error, name) for name in ("file", "key", "expected", "found")}
-        emit(arguments, {"fault": fault}, text=str(error))
-        return 2
-    return emit(arguments, {"fault": None}, text=f"{arguments.check_build}: parameters are valid")
+        fault, place = error, (error.file, error.key)
+    else:
+        return emit(arguments, {"fault": None}, text=f"{arguments.check_build}: the build is valid")
+    names = ("file", "key", "expected", "found")
+    figures = {"fault": dict(zip(names, (*place, fault.expected, fault.found), strict=True))}
+    emit(arguments, figures, text=str(fault))
+    return 2
 
 
 def _complete(arguments: argparse.Namespace, archive: Path) -> int:

@@ -107,6 +107,13 @@ def test_the_command_checks_a_build_file(
 ) -> None:
     assert run_command(["replay", "--check-build", write("detector.max_detection = 3")]) == 2
     assert "expected max_detections (nearest known key), found an unknown key" in capsys.readouterr().out
-    assert run_command(["replay", "--check-build", write("detector.max_detections = 3")]) == 0
+    file = write("detector.max_detections = 3")
+    assert run_command(["replay", "--check-build", file]) == 0
+    text = Path(file).read_text()
+    for wrong, told in (("schema_version = 7", "expected 1, found 7"), ("modle = 'x'", "expected 'model'")):
+        Path(file).write_text(f"{wrong}\n{text.replace('schema_version = 1', '')}")
+        capsys.readouterr()
+        assert run_command(["replay", "--check-build", file]) == 2
+        assert told in capsys.readouterr().out
     assert run_command(["replay", "--out", "x"]) == 2
     assert "expected ARCHIVE, or --check-build BUILD" in capsys.readouterr().err
