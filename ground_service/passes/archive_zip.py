@@ -64,7 +64,7 @@ def _opened(path: Path, name: str) -> Iterator[zipfile.ZipFile]:
         _check_directory(path, name)
         archive = zipfile.ZipFile(path)
     except (zipfile.BadZipFile, OSError, ValueError, EOFError):
-        raise InvalidInput(name, "", "a zip file of a pass archive", "something else") from None
+        raise InvalidInput(name, "", "a complete zip file", "something else, or a part of one") from None
     with archive:
         yield archive
 
