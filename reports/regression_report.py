@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 from reports.document import Block, Cell, Column, Document, Heading, Picture, Table
 from reports.figures.regression import draw_changed_craters
 from reports.sections.detection import gallery_picture
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
-from reports.text import count_text, number_text, significant_text
+from reports.text import count_text, loss_text, number_text, significant_text
 from reports.values import RegressionGate, RegressionReport
 
 _ORDER = ("fail", "inconclusive", "not judged", "pass")
@@ -43,7 +45,7 @@ def _gates(report: RegressionReport) -> Table:
             significant_text(g.candidate),
             significant_text(g.limit),
             g.unit,
-            significant_text(g.resolution) if g.evidence else "",
+            loss_text(g.resolution, g.relative) if g.evidence and math.isfinite(g.resolution) else "",
             Cell(_outcome_text(g), strong=g.outcome != "pass"),
         )
         for g in sorted(report.gates, key=lambda g: _ORDER.index(g.outcome))

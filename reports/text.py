@@ -122,3 +122,8 @@ def length_text(metres: float | None) -> str:
 def hash_text(digest: str) -> str:
     """A long hash in groups of eight, so that it can break over lines."""
     return " ".join(digest[i : i + 8] for i in range(0, len(digest), 8))
+
+
+def loss_text(loss: float, relative: bool) -> str:
+    """Return a loss as a number, or as a percentage if it is a share of the baseline."""
+    return f"{100.0 * loss:,.{1 if abs(loss) < 0.1 else 0}f} %" if relative else f"{loss:.3g}"

@@ -680,6 +680,8 @@ class RegressionGate:
         Number and name of the units.
     reason
         The fact in words; may be empty.
+    relative
+        Whether the resolution is a share of the baseline.
     """
 
     name: str
@@ -694,6 +696,7 @@ class RegressionGate:
     frames_needed: int | None = None
     evidence: str = ""
     reason: str = ""
+    relative: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

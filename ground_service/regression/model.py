@@ -8,6 +8,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from ground_service.http.model import Entity, Given
 from ground_service.http.times import UtcTime
+from reports.text import loss_text
 
 UNUSABLE_STATES = ("unusable", "baseline failed")
 """States of a pass that no candidate can be blamed for."""
@@ -229,6 +230,9 @@ class JudgedGate(Entity):
     @classmethod
     def _without_waiver(cls, given: Any) -> Any:
         """Read a gate of an earlier verdict, which could be waived: it did not count."""
+    relative: bool = Field(
+        default=False, description="Whether margin, bounds and resolution are shares of the baseline"
+    )
         if not isinstance(given, dict) or "waived" not in given:
             return given
         kept = {key: value for key, value in given.items() if key != "waived"}
@@ -245,7 +249,9 @@ class JudgedGate(Entity):
         parts = [f"{self.name}{place}: {self.baseline:.4g} to {self.candidate:.4g}{unit}"]
         low, high = self.change_bounds
         if self.outcome in ("fail", "inconclusive") and low is not None and high is not None:
-            parts.append(f"loss {low:.3g} to {high:.3g}, margin {self.margin:.3g}, {self.evidence}")
+            loss = [loss_text(one, self.relative) for one in (low, high, self.margin or 0.0)]
+            of_what = " of the baseline" if self.relative else ""
+            parts.append(f"loss {loss[0]} to {loss[1]}{of_what}, margin {loss[2]}, {self.evidence}")
         if self.reason:
             parts.append(self.reason)
         if self.outcome == "inconclusive" and self.frames_needed is not None:

@@ -57,7 +57,7 @@ from ground_service.regression.gates.statistics import (
     student_quantile,
     student_upper_tail,
 )
-from reports.text import counted
+from reports.text import counted, loss_text
 
 PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
 NOT_JUDGED, INFORMS = "not judged", "informs"
@@ -180,6 +180,8 @@ class Gate:
     outcome: str
     baseline: float
     candidate: float
+    relative
+        Whether margin, change and resolution are shares of the baseline.
     margin: float
     limit: float
     unit: str = ""
@@ -199,6 +201,7 @@ class Gate:
         """Whether the gate passed."""
         return self.outcome == PASS
 
+    relative: bool = False
 
 def judge(
     before: Mapping[str, PassFrames],
@@ -411,6 +414,7 @@ def _decided(
             return replace(gate, outcome=FAIL, reason="the candidate has no value")
         return replace(gate, reason="unknown: the baseline has no value")
     loss, by_pass = sign * change.estimate, metric.sums is None
+        relative=metric.relative,
     error, freedom = change.error, change.units - 1.0
     if by_pass and change.units < FEWEST_PASSES:
         error, freedom = PASS_SPREAD / math.sqrt(change.units), math.inf
@@ -444,7 +448,7 @@ def _decided(
     needed_to_pass = frames_needed(frames, error, margin - max(loss, 0.0), ahead + power)
     needed_to_fail = frames_needed(frames, error, loss - materiality, reach + power)
     known = [one for one in (needed_to_pass, needed_to_fail) if one is not None]
-    told = f"a loss of {_stated(metric, max(high, 0.0)):.3g} cannot be excluded"
+    told = f"a loss of {loss_text(_stated(metric, max(high, 0.0)), metric.relative)} cannot be excluded"
     return replace(gate, reason=told, frames_needed=min(known, default=None))
 
 
