@@ -15,12 +15,14 @@ from ground_service.regression.gates.core import (
     PASS,
     Gate,
 )
+from ground_service.regression.gates.metrics import LATENCY, RUN, START
 from ground_service.regression.model import UNUSABLE_STATES
 from ground_service.regression.outcome import RegressionOutcome
 
 SUSPICIOUS = 1.15
 """Ratio of the median position errors from which navigation may be affected."""
 
+TIMES = (LATENCY, START, RUN)
 NAMES = {
     "detector.recall": "recall",
     "detector.precision": "precision",
@@ -31,8 +33,10 @@ NAMES = {
 
 
 def headline(outcome: RegressionOutcome) -> str:
-    """Return the verdict and its reason in one line."""
-    return f"{outcome.verdict}: {_reason(outcome)}"
+    """Return the verdict and its reason in one line; a pass without a judged processor time says so."""
+    judged = any(gate.name in TIMES and gate.outcome != NOT_JUDGED for gate in outcome.gates)
+    unknown = "" if judged or outcome.verdict != PASS else "; latency was not judged"
+    return f"{outcome.verdict}: {_reason(outcome)}{unknown}"
 
 
 def _reason(outcome: RegressionOutcome) -> str:

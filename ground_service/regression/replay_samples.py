@@ -179,7 +179,7 @@ def read_downlink(
         replace(
             frames,
             latency_ms=latency_ms,
-            cpu_s=cpu_s if latency_ms else math.nan,
+            cpu_s=cpu_s,
             undecodable=decoded.unknown
             + decoded.crc_errors
             + _meaningless(decoded, tables, context.dictionary),

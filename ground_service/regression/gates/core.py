@@ -40,6 +40,7 @@ from ground_service.regression.gates.metrics import (
     MEMORY,
     PRECISION,
     RECALL,
+    RUN,
     START,
     Metric,
     metrics_of,
@@ -62,7 +63,12 @@ from reports.text import counted, loss_text
 PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
 NOT_JUDGED, INFORMS = "not judged", "informs"
 
-COSTS = {MEMORY: "peak memory", LATENCY: "processor time of a frame", START: "processor time of the start"}
+COSTS = {
+    MEMORY: "peak memory",
+    LATENCY: "processor time of a frame",
+    START: "processor time of the start",
+    RUN: "processor time of the run",
+}
 EXACT_METRICS = (UNDECODABLE, TIMES, FRAMES, WRONG_FIXES, *COSTS)
 """Metrics that are compared without chance."""
 
@@ -88,7 +94,7 @@ FEWEST_PASSES = 10
 """Passes from which position errors are judged by their own spread; fewer inform only, except of a gross change."""
 
 START_FLOOR_S = 0.5
-"""Shorter delays of the start are tolerated."""
+"""Shorter delays of the start and of a run are tolerated."""
 
 PASSES_OF_TIMES = 5
 """Passes from which the narrower margin of processor times applies to the median of their ratios."""
@@ -174,14 +180,14 @@ class Gate:
         Number and name of the units.
     reason
         The fact in words, where the figures alone do not state it.
+    relative
+        Whether margin, change and resolution are shares of the baseline.
     """
 
     name: str
     outcome: str
     baseline: float
     candidate: float
-    relative
-        Whether margin, change and resolution are shares of the baseline.
     margin: float
     limit: float
     unit: str = ""
@@ -195,13 +201,13 @@ class Gate:
     frames_needed: int | None = None
     evidence: str = ""
     reason: str = ""
+    relative: bool = False
 
     @property
     def passed(self) -> bool:
         """Whether the gate passed."""
         return self.outcome == PASS
 
-    relative: bool = False
 
 def judge(
     before: Mapping[str, PassFrames],
@@ -303,8 +309,8 @@ def _cost_gate(
         _, margin = rule.sizes(int(known.sum()) < PASSES_OF_TIMES)
         then = float(np.median(old[known]))
         now = then * float(np.median(new[known] / old[known]))
-    # A program that starts in a tenth of a second has no start to speak of.
-    limit = max(then * (1.0 + margin), then + START_FLOOR_S * (metric.name == START))
+    # A program that starts or runs in a tenth of a second has no time to speak of.
+    limit = max(then * (1.0 + margin), then + START_FLOOR_S * (metric.name in (START, RUN)))
     told = f"{COSTS[metric.name]} rises from {then:.4g} to {now:.4g} {metric.unit}" if now > limit else ""
     outcome = FAIL if told else PASS
     return Gate(metric.name, outcome, then, now, margin, limit, metric.unit, frames=frames, reason=told)
@@ -408,13 +414,13 @@ def _decided(
     gate = Gate(
         metric.name, INCONCLUSIVE, change.baseline, change.candidate, stated, limit, metric.unit, place,
         level=level, resolution=math.inf, frames=frames, evidence=counted(change.units, metric.evidence),
+        relative=metric.relative,
     )  # fmt: skip
     if not math.isfinite(change.estimate):
         if math.isfinite(change.baseline):
             return replace(gate, outcome=FAIL, reason="the candidate has no value")
         return replace(gate, reason="unknown: the baseline has no value")
     loss, by_pass = sign * change.estimate, metric.sums is None
-        relative=metric.relative,
     error, freedom = change.error, change.units - 1.0
     if by_pass and change.units < FEWEST_PASSES:
         error, freedom = PASS_SPREAD / math.sqrt(change.units), math.inf

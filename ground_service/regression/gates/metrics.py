@@ -18,7 +18,7 @@ BLOCK_FRAMES = 6
 """Successive frames share the state of the filter: a block of them is one unit."""
 
 RECALL, PRECISION = "detector.recall", "detector.precision"
-MEMORY, LATENCY, START = "memory", "latency.total", "latency.start"
+MEMORY, LATENCY, START, RUN = "memory", "latency.total", "latency.start", "latency.run"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +68,8 @@ def metrics_of(passes: Sequence[PassFrames]) -> tuple[Metric, ...]:
         Metric("telemetry.octets_per_frame", "octets", False, True, lambda f: _mean(f.octets)),
         Metric(MEMORY, "MiB", False, True, lambda f: f.memory_mib),
         Metric(LATENCY, "ms", False, True, lambda f: _mean(frame_ms(f)[START_FRAMES:])),
-        Metric(
-            START, "s", False, True, lambda f: f.cpu_s - float(np.nansum(frame_ms(f)[START_FRAMES:])) / 1e3
-        ),
+        Metric(START, "s", False, True, _start_s),
+        Metric(RUN, "s", False, True, lambda f: f.cpu_s),
     ]
     for name in estimators:
         place = f"navigation.{name}"
@@ -142,6 +141,12 @@ def _fixes(name: str) -> Callable[[PassFrames], UnitSums]:
         return unit_sums(block, np.zeros_like(block), np.nan_to_num(fixed), known)
 
     return sums
+
+
+def _start_s(frames: PassFrames) -> float:
+    """Return the processor time of a run without its frames; NaN if those of the frames are not known."""
+    of_frames = frame_ms(frames)[START_FRAMES:]
+    return frames.cpu_s - float(np.nansum(of_frames)) / 1e3 if np.isfinite(of_frames).any() else float("nan")
 
 
 def _bias(frames: PassFrames) -> float:

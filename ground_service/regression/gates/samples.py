@@ -156,7 +156,7 @@ class PassFrames:
     digests
         Hash of the packets since each frame, in the order received; the first one of packets before all frames.
     cpu_s
-        CPU time of the whole run; NaN without the times of its frames.
+        CPU time of the whole run as the sandbox measured it; NaN if that of the other build is of another time.
     times
         Time tags of the packets.
     """

@@ -30,6 +30,7 @@ from ground_service.regression.gates.samples import (
     TimeTags,
     _estimator,
 )
+from reports.text import loss_text
 
 POLICY = load_policy().policy
 NARROW = read_policy(
@@ -339,6 +340,22 @@ def test_processor_times_are_compared_by_the_median_of_their_ratios_from_five_pa
     busy = simulated(0, 1, **{**TIMES, "latency_ms": {"a": np.full(FRAMES, 400.0)}})
     gates = judge(suite(0, **TIMES), {**suite(1, **TIMES), "pass 0": busy}, POLICY)
     assert by_name(gates)["latency.total"].outcome == "pass"
+
+
+def test_a_program_without_times_of_its_frames_is_judged_by_the_processor_time_of_its_run() -> None:
+    """Four times the processor time fails although all packets are the same; half a second more is tolerated."""
+    before = suite(0, 2, cpu_s=5.0)
+    for cpu_s, outcome in ((20.0, "fail"), (5.4, "pass"), (float("nan"), "not judged")):
+        gates = by_name(judge(before, suite(0, 2, cpu_s=cpu_s), POLICY))
+        assert (gates["latency.run"].outcome, gates["latency.total"].outcome) == (outcome, "not judged")
+    assert by_name(judge(suite(0, 2, cpu_s=0.1), suite(0, 2, cpu_s=0.4), POLICY))["latency.run"].passed
+
+
+def test_a_loss_that_is_a_share_of_the_baseline_is_a_percentage() -> None:
+    gates = by_name(judge(suite(0, 12), suite(1, 12), POLICY))
+    assert (gates["navigation.anchored.p50"].relative, gates["detector.recall"].relative) == (True, False)
+    assert [loss_text(one, True) for one in (0.005, 0.15, 70.7)] == ["0.5 %", "15 %", "7,070 %"]
+    assert loss_text(0.0153, False) == "0.0153"
 
 
 def test_placebos_are_rejected_as_often_as_their_level_allows_and_a_noisier_metric_is_uncalibrated() -> None:
