@@ -16,7 +16,7 @@ import shutil
 import stat
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -239,33 +239,41 @@ def load_build(given: str | Path) -> Build:
     )
 
 
-def changes(baseline: Build, candidate: Build) -> list[str]:
-    """Return what differs between two builds on the flight code; nothing is known of the inside of a program."""
+def changes(baseline: Build, candidate: Build, flown: Sequence[Mapping[str, Any]] = ({},)) -> list[str]:
+    """Return what differs between two builds on the flight code; nothing is known of the inside of a program.
+
+    `flown` are the parameters of each pass, by dotted name, which a build keeps unless it sets them.
+    """
     if baseline.command or candidate.command:
         return []
     (old_network, old), (new_network, new) = _contents(baseline), _contents(candidate)
     found = ["flight code"] if baseline.flight_code != candidate.flight_code else []
     found += ["network"] if old_network != new_network else []
+
+    def effective(own: Mapping[str, Any], name: str) -> str:
+        values = {str(own.get(name, parameters.get(name, "not set"))) for parameters in flown}
+        return " or ".join(sorted(values))
+
     return found + [
-        f"{name} = {new.get(name, 'not set')} (baseline: {old.get(name, 'not set')})"
+        f"{name} = {effective(new, name)} (baseline: {effective(old, name)})"
         for name in sorted({*old, *new})
-        if old.get(name) != new.get(name)
+        if effective(old, name) != effective(new, name)
     ]
+
+
+def flat(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+    """Return the values of a table and of those in it by dotted name."""
+    found: dict[str, Any] = {}
+    for key, value in table.items():
+        found |= flat(value, f"{path}{key}.") if isinstance(value, dict) else {f"{path}{key}": value}
+    return found
 
 
 def _contents(build: Build) -> tuple[str | None, dict[str, Any]]:
     """Return the SHA-256 of the network of a build (None: the shipped one) and its parameters by dotted name."""
     network = _read(build.file).get("model") if build.folder_needed else None
-
-    def flat(table: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
-        for key, value in table.items():
-            if isinstance(value, dict):
-                yield from flat(value, f"{path}{key}.")
-            else:
-                yield f"{path}{key}", value
-
     table = _read(build.folder / build.parameters) if build.parameters else {}
-    return dict(build.files).get(str(network)), dict(flat(table, ""))
+    return dict(build.files).get(str(network)), flat(table)
 
 
 def register_build(ground: Ground, build: Build, *, actor: str = "local") -> Build:

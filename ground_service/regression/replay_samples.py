@@ -24,11 +24,13 @@ from ground_service.missions.ephemerides.attitudes import (
     no_attitudes,
 )
 from ground_service.missions.frames import camera_of
-from ground_service.missions.model import Camera, Evidence
+from ground_service.missions.model import Camera, Evidence, Mission
 from ground_service.passes.archive_import import archived_mission
 from ground_service.passes.samples import DetectionSamples, NavigationSamples, no_detections
 from ground_service.regression.archives import PassArchive, frame_inputs
+from ground_service.regression.builds import flat
 from ground_service.regression.gates.samples import KINDS, CraterRows, PassFrames, TimeTags, pass_frames
+from ground_service.toml import read_table
 from lunar.arrays import IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, load_catalogue
@@ -69,6 +71,7 @@ class PassContext:
     viewing: Viewing
     evidence: Evidence
     mission: str = ""
+    flown: Mapping[str, Any] = field(default_factory=dict)
     step_ticks: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
@@ -112,8 +115,17 @@ def pass_context(archive: PassArchive, data: DataFolder) -> PassContext:
             mission.evidence, camera, reference_states(reference, orientation, utc_ns)
         ),
         mission=mission.revision,
+        flown=_flown_parameters(folder, mission),
         step_ticks=np.array([row["ticks"] for row in frame_inputs(folder, steps=True)], dtype=np.int64),
     )
+
+
+def _flown_parameters(folder: Path, mission: Mission) -> dict[str, Any]:
+    """Return the parameters of the flight code as they were flown, by dotted name."""
+    threshold = mission.detector.score_threshold
+    own = {} if threshold is None else {"detector.score_threshold": threshold}
+    path = folder / "payload/parameters.toml"
+    return own | flat(read_table(path.read_bytes(), str(path), "parameters (TOML)"))
 
 
 def _viewing(

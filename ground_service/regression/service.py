@@ -239,7 +239,8 @@ def judge_regression(
         for one in kept
     )
     judged = [one for one in passes if one.baseline_read is not None and one.candidate_read is not None]
-    changed = changes(baseline, candidate)
+    flown = [one.context.flown for one in judged if one.context]
+    changed = changes(baseline, candidate, flown or ({},))
     remarks = [f"changed from baseline to candidate: {', '.join(changed)}"] if changed else []
     names = _unique_names(judged)
     before: dict[str, PassFrames] = {}

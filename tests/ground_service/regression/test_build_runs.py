@@ -259,6 +259,11 @@ def test_what_differs_between_two_builds_on_the_flight_code_is_named(
     own = 'parameters = "p.toml"\n'
     good = build("good", own, "flight.odometry.time_gap_s = 61.0\ndetector.score_threshold = 0.5\n")
     bad = build("bad", own, "detector.score_threshold = 0.9\n[flight]\nhousekeeping_interval_s = 30.0\n")
+    flown = [{"flight.housekeeping_interval_s": 60.0, "flight.odometry.time_gap_s": 61.0}]
+    assert changes(good, bad, flown) == [
+        "detector.score_threshold = 0.9 (baseline: 0.5)",
+        "flight.housekeeping_interval_s = 30.0 (baseline: 60.0)",
+    ]
     assert changes(good, bad) == [
         "detector.score_threshold = 0.9 (baseline: 0.5)",
         "flight.housekeeping_interval_s = 30.0 (baseline: not set)",
