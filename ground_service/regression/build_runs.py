@@ -24,6 +24,9 @@ from ground_service.toml import read_json
 
 PERFORMANCE_LIMIT_OCTETS = 8 << 20
 PRINTED_SHOWN = 2000
+PRINTED_LINES, PRINTED_OCTETS = 40, 16_384
+"""Last lines of a failed program that are kept, and their greatest length."""
+
 PRINTED = "printed.txt"
 
 OUTCOMES = {
@@ -53,6 +56,8 @@ class BuildRun:
         Explanation of the outcome for users.
     isolation
         Sandbox in which the program ran; "" if it was not run.
+    printed
+        Last lines that the program printed; "" for a run that ended well.
     """
 
     build: str
@@ -64,6 +69,7 @@ class BuildRun:
     cpu_s: float
     peak_rss_mib: float
     isolation: str
+    printed: str = ""
 
     def summary(self) -> dict[str, Any]:
         """The run as figures for a script, and as a line for a person."""
@@ -138,6 +144,7 @@ def _judged(build: Build, report: Mapping[str, Any], written: Path, out: Path) -
         float(report["cpu_s"]),
         float(report["peak_rss_mib"]),
         str(report["isolation"]),
+        "" if outcome == OK else "\n".join(tail(out / PRINTED, PRINTED_OCTETS).splitlines()[-PRINTED_LINES:]),
     )
 
 

@@ -108,7 +108,17 @@ def regression_text(verdict: Verdict) -> str:
         f"{counts[NOT_JUDGED]} not judged, over {sum(one.state in JUDGED_STATES for one in verdict.passes)} of "
         f"{len(verdict.passes)} passes ({verdict.frames} frames)"
     )
-    return "\n  ".join([*lines, *verdict.remarks])
+    return "\n".join(filter(None, ("\n  ".join([*lines, *verdict.remarks]), printed_text(verdict))))
+
+
+def printed_text(verdict: Verdict | RegressionOutcome) -> str:
+    """Return the last lines of the programs that failed, each text once."""
+    found: dict[str, str] = {}
+    for one in verdict.passes:
+        for label, replay in (("candidate", one.candidate), ("baseline", one.baseline)):
+            if replay is not None and replay.printed:
+                found.setdefault(replay.printed, f"last lines of the {label} on {one.name}:")
+    return "\n".join(f"{title}\n{text}" for text, title in found.items())
 
 
 def _names(one: Verdict | RegressionOutcome) -> tuple[str, str]:
@@ -172,7 +182,7 @@ def regression_junit(verdict: Verdict, finished_utc_ns: int) -> str:
         elif kind:
             ET.SubElement(case, kind, message=_xml(text), type=text.split(":")[0])
     ET.SubElement(suite, "system-out").text = _xml(regression_text(verdict))
-    ET.SubElement(suite, "system-err")
+    ET.SubElement(suite, "system-err").text = _xml(printed_text(verdict)) or None
     ET.indent(suite)
     return ET.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"
 
@@ -220,6 +230,7 @@ def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str)
         data_sources=tuple(sources),
         remarks=(
             *(f"{one.name}: {one.state}: {one.detail}" for one in troubled),
+            *filter(None, (printed_text(outcome),)),
             *outcome.remarks,
             "A gate fails if the lower bound of the loss is above what is material, at a level of "
             f"{outcome.policy.policy.fail_level:g} for all gates together. It passes if the upper 95 % bound is below "
@@ -365,7 +376,7 @@ def _pass(one: PassVerdict) -> dict[str, Any]:
         "state": one.state,
         "detail": one.detail,
     }
-    costs = {"outcome", "detail", "cpu_s", "wall_s", "peak_rss_mib"}
+    costs = {"outcome", "detail", "cpu_s", "wall_s", "peak_rss_mib", "printed"}
     for label, replay, read in (
         ("baseline", one.baseline, one.baseline_read),
         ("candidate", one.candidate, one.candidate_read),

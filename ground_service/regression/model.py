@@ -78,6 +78,7 @@ class KeptReplay(Entity):
     cpu_s: float = 0.0
     peak_rss_mib: float = 0.0
     isolation: str = ""
+    printed: str | None = Field(default=None, description="Last lines printed by a program that failed")
     machine: str
     created_utc_ns: int = 0
 
@@ -271,6 +272,7 @@ class JudgedReplay(Entity):
     stages_ms: dict[str, float] | None = None
     memory_mib: float | None = None
     undecodable: int | None = None
+    printed: str | None = Field(default=None, description="Last lines printed by a program that failed")
 
 
 class JudgedPass(Entity):

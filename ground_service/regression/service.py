@@ -210,6 +210,7 @@ def _replayed(ground: Ground, digest: str, build: Build) -> tuple[KeptReplay, st
         )
         return replay, archive.manifest_sha256
 
+            printed=run.printed or None,
 
 def find_replay(ground: Ground, digest: str, build: Build) -> KeptReplay | None:
     """What was kept of a replay; None where it was not done, or something of it is lost."""
