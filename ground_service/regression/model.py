@@ -357,6 +357,7 @@ class Regression(Entity):
             gates=len(deciding),
             gates_failed=counted.count("fail"),
             gates_inconclusive=counted.count("inconclusive"),
+            headline=self.result.headline,
             frames=self.result.frames,
             frames_needed=self.result.frames_needed,
             created=self.created,
@@ -376,6 +377,7 @@ class RegressionSummary(Entity):
     gates: int = Field(description="Number of gates")
     gates_failed: int
     gates_inconclusive: int
+    headline: str = Field(description="First line of the verdict")
     frames: int = Field(description="Number of frames processed by both builds")
     frames_needed: int | None = Field(
         description="Number of frames needed to decide every gate over the suite; null if unknown"

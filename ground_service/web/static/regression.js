@@ -71,14 +71,14 @@ async function regressionRows() {
   return { rows: rows.sort((a, b) => b.created.localeCompare(a.created)), total: verdicts.total };
 }
 
-// How many gates failed, and why the verdict is not pass.
+// The first line of the verdict, and why it is not pass.
 function outcomeOf({ job, verdict }) {
   if (!verdict) return job.state === "running" ? element("progress", { max: 1, value: job.progress, "aria-label": "regression" }) : (job.error ?? "");
   const counts = `${figure(verdict.gates_failed)} of ${figure(verdict.gates)} gates failed${verdict.gates_inconclusive ? `, ${figure(verdict.gates_inconclusive)} inconclusive` : ""}`;
   const needed = verdict.frames_needed == null ? null : `${figure(verdict.frames_needed)} frames needed, ${figure(verdict.frames)} compared`;
   const reasons = [...(needed ? [needed] : []), ...verdict.reasons];
   return [
-    element("span", {}, verdict.gates ? counts : "No gate was judged."),
+    element("span", {}, verdict.headline || (verdict.gates ? counts : "No gate was judged.")),
     reasons.length ? element("ul", { class: "reasons" }, reasons.map((one) => element("li", {}, words(one)))) : null,
   ].filter(Boolean);
 }
@@ -97,12 +97,9 @@ async function loadRegressions() {
   const opened = rows.some((row) => row.verdict?.id === open) ? await openedGates() : null;
   const actions = ({ verdict }) => verdict && buttons(button("Gates and craters", () => toggle(verdict.id), { needs: null }), element("a", { class: "button", href: `/regressions/${verdict.id}`, target: "_blank" }, "Report"));
   const columns = [
-    ["Candidate", (row) => titleOf(row, "candidate")],
-    ["", actions],
-    ["Verdict", (row) => stateMark(row.verdict?.verdict ?? row.job.state)],
+    ["Candidate", (row) => [titleOf(row, "candidate"), element("p", { class: "hint" }, `against ${titleOf(row, "baseline")}, ${timeText(row.created)}`)]],
+    ["Verdict", (row) => [stateMark(row.verdict?.verdict ?? row.job.state), actions(row)].filter(Boolean)],
     ["Outcome", outcomeOf],
-    ["Baseline", (row) => titleOf(row, "baseline")],
-    ["Entered", "created"],
   ];
   show(
     "regressions",

@@ -37,6 +37,7 @@ def regression(verdict: str, gates: list[JudgedGate], **values: Any) -> Regressi
         baseline={"name": "old", **BUILD},
         candidate={"name": "new", **BUILD},
         policy=POLICY,
+        headline=f"{verdict}: no loss",
         frames=10,
         frames_needed=None,
         gates=gates,
@@ -50,7 +51,7 @@ def test_a_list_names_builds_and_not_only_their_hashes() -> None:
     summary = regression("pass", [gate("recall", "pass")]).summary()
     assert summary.candidate_title == "new 1.2 (abababababab)"
     assert summary.baseline_title == "old 1.2 (abababababab)"
-    assert summary.reasons == []
+    assert (summary.reasons, summary.headline) == ([], "pass: no loss")
 
 
 def test_a_gate_that_was_waived_in_an_earlier_verdict_does_not_count() -> None:
