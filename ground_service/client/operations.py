@@ -707,8 +707,10 @@ class Operations(Connection):
         """Show the verdict of a regression."""
 
     @operation("GET /regressions/{regression_id}/report")
-    def get_regression_report(self, regression_id: str, out: Path) -> None:
-        """Return the report of a regression as HTML."""
+    def get_regression_report(
+        self, regression_id: str, out: Path, *, format: Literal["html", "junit"] = "html"
+    ) -> None:
+        """Return the report of a regression as HTML, or its verdict as JUnit XML."""
 
     # access
 

@@ -145,4 +145,5 @@ def _outcome(
     options: dict[str, Any] = {"workers": arguments.get("workers"), "progress": progress}
     if seed := arguments.get("placebo"):
         return run_placebo(ground, archives, baseline, policy, int(seed), **options)
-    return run_regression(ground, archives, candidate, baseline, policy, **options)
+    repeated = bool(arguments.get("repeat_baseline"))
+    return run_regression(ground, archives, candidate, baseline, policy, repeated=repeated, **options)

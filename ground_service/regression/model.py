@@ -132,6 +132,10 @@ class RegressionRequest(Comparison):
         default=None, max_length=200_000, description="Policy of the gates (TOML); default: the shipped one"
     )
     policy_name: str = Field(default="policy", max_length=300, description="Name of the policy in messages")
+    repeat_baseline: bool = Field(
+        default=False,
+        description="Replay the baseline again with the candidate, so that their processor times are compared",
+    )
     placebo: int | None = Field(
         default=None,
         ge=1,
@@ -226,14 +230,14 @@ class JudgedGate(Entity):
     frames_needed: int | None
     evidence: str = Field(default="", description="Number and name of the units of the evidence")
     reason: str | None
+    relative: bool = Field(
+        default=False, description="Whether margin, bounds and resolution are shares of the baseline"
+    )
 
     @model_validator(mode="before")
     @classmethod
     def _without_waiver(cls, given: Any) -> Any:
         """Read a gate of an earlier verdict, which could be waived: it did not count."""
-    relative: bool = Field(
-        default=False, description="Whether margin, bounds and resolution are shares of the baseline"
-    )
         if not isinstance(given, dict) or "waived" not in given:
             return given
         kept = {key: value for key, value in given.items() if key != "waived"}
@@ -268,11 +272,11 @@ class JudgedReplay(Entity):
     cpu_s: float
     wall_s: float
     peak_rss_mib: float
+    printed: str | None = Field(default=None, description="Last lines printed by a program that failed")
     outcome_shares: dict[str, dict[str, float]] | None = None
     stages_ms: dict[str, float] | None = None
     memory_mib: float | None = None
     undecodable: int | None = None
-    printed: str | None = Field(default=None, description="Last lines printed by a program that failed")
 
 
 class JudgedPass(Entity):
@@ -353,11 +357,11 @@ class Regression(Entity):
             candidate_title=self.result.candidate.title,
             baseline=self.result.baseline.digest,
             baseline_title=self.result.baseline.title,
+            headline=self.result.headline,
             reasons=self.reasons(),
             gates=len(deciding),
             gates_failed=counted.count("fail"),
             gates_inconclusive=counted.count("inconclusive"),
-            headline=self.result.headline,
             frames=self.result.frames,
             frames_needed=self.result.frames_needed,
             created=self.created,
@@ -373,11 +377,11 @@ class RegressionSummary(Entity):
     candidate_title: str = Field(description="Name, version and beginning of the identity")
     baseline: str = Field(description="Identity of the baseline build")
     baseline_title: str
+    headline: str = Field(description="First line of the verdict")
     reasons: list[str] = Field(description="Why the verdict is not pass, the most important first")
     gates: int = Field(description="Number of gates")
     gates_failed: int
     gates_inconclusive: int
-    headline: str = Field(description="First line of the verdict")
     frames: int = Field(description="Number of frames processed by both builds")
     frames_needed: int | None = Field(
         description="Number of frames needed to decide every gate over the suite; null if unknown"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import Path, Query, Response
 
@@ -31,6 +31,7 @@ from ground_service.regression.builds import (
     load_build,
     register_build,
 )
+from ground_service.regression.documents import regression_junit
 from ground_service.regression.gates.policy import read_policy
 from ground_service.regression.jobs import compared, missing_replays
 from ground_service.regression.model import (
@@ -142,9 +143,9 @@ def start_regression(
     arguments = {
         **compared(ground, request),
         "policy": request.policy,
-        **request.model_dump(include={"policy_name", "placebo"}),
+        **request.model_dump(include={"policy_name", "placebo", "repeat_baseline"}),
     }
-    in_one_job = request.workers or request.placebo
+    in_one_job = request.workers or request.placebo or request.repeat_baseline
     missing = [] if in_one_job else missing_replays(ground, arguments)
     replays = {f"{one['archive']} {one['build']}": one for one in missing}
     for job in enter_jobs(ground, replays, "regression", arguments, identity):
@@ -187,10 +188,15 @@ def get_regression(ground: GroundOf, _: Viewer, regression_id: Key) -> Regressio
 @regressions.get(
     "/regressions/{regression_id}/report",
     response_class=Response,
-    responses={200: {"content": {"text/html": {}}, "description": "The report"}},
+    responses={200: {"content": {"text/html": {}, "application/xml": {}}, "description": "The report"}},
 )
-def get_regression_report(ground: GroundOf, _: Viewer, regression_id: Key) -> Response:
-    """Return the report of a regression as HTML."""
+def get_regression_report(
+    ground: GroundOf, _: Viewer, regression_id: Key, format: Literal["html", "junit"] = "html"
+) -> Response:
+    """Return the report of a regression as HTML, or its verdict as JUnit XML."""
+    if format == "junit":
+        found = ground.read(store.get_regression, regression_id)
+        return Response(regression_junit(found.result, found.created.utc_ns), media_type="application/xml")
     return Response(service.report_of(ground, regression_id), media_type="text/html; charset=utf-8")
 
 

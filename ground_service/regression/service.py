@@ -81,6 +81,7 @@ def run_regression(
     *,
     workers: int | None = None,
     progress: Progress | None = None,
+    repeated: bool = False,
 ) -> RegressionOutcome:
     """Fly archives with both builds, where that was not done before, and judge.
 
@@ -92,6 +93,8 @@ def run_regression(
         Number of parallel replays, each in a separate process. Default: one for each core.
     progress
         Wraps the iteration over replays (items, total), for a progress bar.
+    repeated
+        Whether to replay both builds although replays are kept, so that their processor times are of the same time.
     """
     if not archives:
         raise InvalidInput("archives", "", "at least one pass archive", "none")
@@ -100,8 +103,8 @@ def run_regression(
     builds = tuple(dict.fromkeys((baseline, candidate)))
     usable = [one.digest for one in kept if isinstance(one, PassArchive) and not _unreplayable(one, builds)]
     shards = [(digest, build) for digest in dict.fromkeys(usable) for build in builds]
-    missing = [shard for shard in shards if not is_done(find_replay(ground, *shard))]
-    fly_shards(ground, missing, workers=workers, progress=progress)
+    missing = [shard for shard in shards if repeated or not is_done(find_replay(ground, *shard))]
+    fly_shards(ground, missing, workers=workers, progress=progress, again=repeated)
     return judge_regression(ground, kept, candidate, baseline, policy)
 
 
@@ -124,6 +127,7 @@ def fly_shards(
     *,
     workers: int | None = None,
     progress: Progress | None = None,
+    again: bool = False,
 ) -> None:
     """Do replays, several at a time: every one is a process, the threads here only wait for them."""
     if not shards:
@@ -135,7 +139,7 @@ def fly_shards(
 
     def replays(digest: str, builds: Sequence[Build]) -> None:
         with ThreadPoolExecutor(size, "replay") as pair:
-            list(pair.map(lambda build: do_replay(ground, digest, build), builds))
+            list(pair.map(lambda build: do_replay(ground, digest, build, again=again), builds))
 
     with ThreadPoolExecutor(max(threads // size, 1), "replays") as pool:
         futures = [pool.submit(replays, digest, builds) for digest, builds in together.items()]
@@ -149,13 +153,13 @@ def fly_shards(
             raise
 
 
-def do_replay(ground: Ground, digest: str, build: Build) -> KeptReplay:
-    """One build over one kept archive: done now, or what was kept of an earlier time.
+def do_replay(ground: Ground, digest: str, build: Build, *, again: bool = False) -> KeptReplay:
+    """Replay a kept archive with a build, or return what was kept of an earlier time unless `again` is set.
 
     A replay of an archive that was completed meanwhile is done again.
     """
     while True:
-        known = find_replay(ground, digest, build)
+        known = None if again else find_replay(ground, digest, build)
         if known is not None and is_done(known):
             return known
         settle_archive(ground, digest)
@@ -206,11 +210,11 @@ def _replayed(ground: Ground, digest: str, build: Build) -> tuple[KeptReplay, st
             cpu_s=run.cpu_s,
             peak_rss_mib=run.peak_rss_mib,
             isolation=run.isolation,
+            printed=run.printed or None,
             machine=_machine(),
         )
         return replay, archive.manifest_sha256
 
-            printed=run.printed or None,
 
 def find_replay(ground: Ground, digest: str, build: Build) -> KeptReplay | None:
     """What was kept of a replay; None where it was not done, or something of it is lost."""

@@ -36,6 +36,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(run, "--build BUILD", str, "candidate: build file, 'current' or identity", required=True)
     option(run, "--baseline BUILD", str, "baseline", "current")
     option(run, "--policy FILE", Path, "policy of the gates: a file, or a shipped one by name", Path("ci"))
+    option(
+        run, "--repeat-baseline", bool, "replay kept baselines again, so that processor times are compared"
+    )
     option(run, "--junit FILE", Path, "write JUnit XML")
     option(run, "--report FILE", Path, "write the report as HTML")
     _finish(run, _run)
@@ -117,8 +120,7 @@ def _finish(parser: argparse.ArgumentParser, handler: Callable[[argparse.Namespa
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from ground_service.clock import utc_now_ns
-    from ground_service.regression.documents import regression_junit, regression_text
+    from ground_service.regression.documents import regression_text
     from ground_service.regression.gates.policy import SHIPPED, load_policy
 
     request: dict[str, Any] = {}
@@ -128,12 +130,12 @@ def _run(arguments: argparse.Namespace) -> int:
         request = {"policy": text, "policy_name": str(arguments.policy)}
     with ground_client(arguments, background=True) as service:
         request |= _comparison(service, arguments, arguments.build, arguments.baseline)
+        request["repeat_baseline"] = arguments.repeat_baseline
         job = service.wait(service.start_regression(request).id, progress=_percent())
         found = service.get_regression(job.id)
-        if arguments.report:
-            service.get_regression_report(found.id, arguments.report)
-    if arguments.junit:
-        arguments.junit.write_text(regression_junit(found.result, utc_now_ns()), encoding="utf-8")
+        for file, form in ((arguments.report, "html"), (arguments.junit, "junit")):
+            if file:
+                service.get_regression_report(found.id, file, format=form)
     emit(arguments, {"id": found.id, **found.result.document()}, text=regression_text(found.result))
     return found.result.exit_status
 

@@ -476,7 +476,7 @@ def sparse_out():
 
 
 def swap_out():
-    """Repeatedly replace the output with a link to a secret while the launcher copies it."""
+    """Repeatedly replace the output with a link to a secret while the service copies it."""
     name = OUT / "downlink.packets"
     finish()
     if os.fork() == 0:

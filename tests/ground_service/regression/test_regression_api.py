@@ -58,6 +58,8 @@ def test_a_build_is_registered_held_against_another_and_judged(
         assert found["result"]["passes"][0]["archive"] == kept.json()["digest"]
         report = client.get(f"{job.headers['location']}/report")
         assert "Regression report" in report.text
+        junit = client.get(f"{job.headers['location']}/report", params={"format": "junit"})
+        assert f'<property name="verdict" value="{verdict}" />' in junit.text
     listed = client.get(f"{V1}/regressions").json()
     assert [(one["verdict"], one["candidate"], one["baseline"]) for one in listed["items"]] == [
         ("fail", digests[1], digests[0]),
@@ -94,7 +96,9 @@ def test_a_regression_of_nothing_known_is_refused(client: TestClient, body: dict
 
 
 def test_something_else_than_a_zip_is_no_build(client: TestClient) -> None:
-    assert client.post(f"{V1}/builds", content=b"name = 'x'").status_code == 422
+    refused = client.post(f"{V1}/builds", content=b"name = 'x'")
+    assert refused.status_code == 422
+    assert "expected a complete zip file, found something else, or a part of one" in refused.text
 
 
 def test_only_an_administrator_registers_a_program(

@@ -103,12 +103,21 @@ def judge(home: Ground, passes: list[Any], packets: Packets, make_build: Callabl
     """Hold a build that sends these packets against the build that flew."""
 
     def run(
-        given: Packets | None = None, archives: list[Path] | None = None, **options: Any
+        given: Packets | None = None,
+        archives: list[Path] | None = None,
+        repeated: bool = False,
+        **options: Any,
     ) -> RegressionOutcome:
         baseline = register_build(home, load_build(make_build("good", packets)))
         candidate = register_build(home, load_build(make_build("candidate", given or packets, **options)))
         return run_regression(
-            home, archives or [one.folder for one in passes], candidate, baseline, policy, workers=2
+            home,
+            archives or [one.folder for one in passes],
+            candidate,
+            baseline,
+            policy,
+            workers=2,
+            repeated=repeated,
         )
 
     return run
@@ -149,8 +158,15 @@ def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge) ->
     outcome = judge(network_ms=20.0)
     (latency,) = [gate for gate in outcome.gates if gate.name == "latency.total"]
     assert (outcome.verdict, latency.outcome) == ("pass", "not judged")
+    assert verdict_document(outcome).headline.endswith("; latency was not judged")
     told = "no latency is compared on 2 of 2 passes: the builds were not replayed at the same time"
     assert told in outcome.remarks
+    again = judge(network_ms=20.0, repeated=True)
+    assert (
+        {gate.name for gate in again.gates if gate.name.startswith("latency.")}
+        >= failed(again)
+        >= {"latency.total"}
+    )
     one = KeptReplay(outcome="ok", detail="", machine="a", wall_s=8.0)
     changed = ({"created_utc_ns": at} for at in (3 * 10**9, 5 * 10**9))
     beside = [one.beside(one.model_copy(update=values)) for values in (*changed, {"machine": "b"})]
@@ -365,6 +381,22 @@ def test_a_crash_is_one_failure_in_junit(judge, passes) -> None:
         "candidate crashed: exit status 1: no network"
     )
     assert verdict.headline == ("fail: candidate crashed: exit status 1: no network, on synthetic pass 41")
+
+
+def test_the_last_lines_of_a_program_that_crashed_are_in_every_output(home, judge, passes) -> None:
+    program = "for k in range(50): print('line', k)\nraise RuntimeError('no network')"
+    outcome = judge(archives=[passes[0].folder], program=program)
+    verdict = verdict_document(outcome)
+    (one,) = verdict.document()["passes"]
+    lines = one["candidate"]["printed"].splitlines()
+    assert (len(lines), lines[-1], one["baseline"]["printed"]) == (40, "RuntimeError: no network", None)
+    suite = ET.fromstring(regression_junit(verdict, 0))
+    for text in (
+        regression_text(verdict),
+        suite.findtext("system-err"),
+        regression_html(home, outcome, "0" * 32),
+    ):
+        assert text is not None and "Traceback (most recent call last)" in text and "line 49" in text
 
 
 def test_the_report_shows_the_craters_that_changed_side_by_side(home, judge, packets: Packets) -> None:
