@@ -352,7 +352,7 @@ def test_counts_that_restart_are_told_from_conflicts(timed, capsys):
 
 
 def test_the_configuration_of_yamcs_is_written_for_a_spacecraft_and_a_station(tmp_path, capsys):
-    import yaml
+    from ruamel.yaml import YAML
 
     from lunar.timescales import ONBOARD_EPOCH_TAI_NS, parse_utc, tai_ns_from_utc_ns
 
@@ -370,7 +370,7 @@ def test_the_configuration_of_yamcs_is_written_for_a_spacecraft_and_a_station(tm
     assert run(command) == 0
     files = figures(capsys)["files"]
     assert sorted(files) == sorted(str(path) for path in (tmp_path / "y").rglob("*.*"))
-    instance = yaml.safe_load((tmp_path / "y/etc/yamcs.linna.yaml").read_text())
+    instance = YAML(typ="safe").load((tmp_path / "y/etc/yamcs.linna.yaml").read_text())
     frames, telecommands = instance["dataLinks"]
     assert (frames["spacecraftId"], frames["frameLength"], frames["errorDetection"]) == (77, 1115, "CRC16")
     assert [one["vcId"] for one in frames["virtualChannels"]] == [0, 1]
@@ -378,7 +378,7 @@ def test_the_configuration_of_yamcs_is_written_for_a_spacecraft_and_a_station(tm
     arguments = frames["virtualChannels"][0]["packetPreprocessorArgs"]
     epoch = tai_ns_from_utc_ns(parse_utc(arguments["timeEncoding"]["epochUTC"]))
     assert epoch == ONBOARD_EPOCH_TAI_NS and arguments["pktTimeOffset"] == 13
-    assert yaml.safe_load((tmp_path / "y/etc/yamcs.yaml").read_text())["instances"] == ["linna"]
+    assert YAML(typ="safe").load((tmp_path / "y/etc/yamcs.yaml").read_text())["instances"] == ["linna"]
     assert run([*command[:-2], "host", "--json"]) == 2
     assert "--station: expected HOST:PORT, found 'host'" in capsys.readouterr().err
 
