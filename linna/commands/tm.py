@@ -201,7 +201,11 @@ def run_frames(arguments: argparse.Namespace) -> int:
     settings = _link_settings(arguments) or LinkSettings()
     path = Path(arguments.source)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        pieces = _file_pieces(path) if path.is_file() else _received(_address("SOURCE", arguments.source))
+        pieces = (
+            _file_pieces(path)
+            if path.is_file()
+            else _received(_address("SOURCE (no file)", arguments.source))
+        )
         for frame in plain_frames(pieces, settings):
             sender.sendto(frame, target)
             count += 1
@@ -219,7 +223,14 @@ def _file_pieces(path: Path) -> Iterator[bytes]:
 def _received(address: tuple[str, int]) -> Iterator[bytes]:
     import socket
 
-    with socket.create_connection(address) as connection:
+    from linna.errors import UsageError
+
+    try:
+        connection = socket.create_connection(address)
+    except OSError as error:
+        host, port = address
+        raise UsageError(f"SOURCE: expected a station at {host}:{port}, found {error.strerror}") from None
+    with connection:
         while piece := connection.recv(1 << 16):
             yield piece
 

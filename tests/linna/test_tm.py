@@ -413,3 +413,10 @@ def test_frames_are_found_across_pieces_of_a_stream(downlink):
     whole = list(plain_frames([octets], LinkSettings()))
     pieces = [octets[first : first + 900] for first in range(0, len(octets), 900)]
     assert list(plain_frames(pieces, LinkSettings())) == whole and len(whole) == len(octets) // 1279
+
+
+def test_a_station_that_does_not_answer_is_named(capsys):
+    assert run(["tm", "frames", "127.0.0.1:1"]) == 2
+    assert "SOURCE: expected a station at 127.0.0.1:1, found Connection refused" in capsys.readouterr().err
+    assert run(["tm", "frames", "absent.cadu"]) == 2
+    assert "SOURCE (no file): expected HOST:PORT, found 'absent.cadu'" in capsys.readouterr().err
