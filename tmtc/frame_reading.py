@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from tmtc import cadu, reed_solomon
-from tmtc.arrays import BoolArray, IntArray, OctetArray
+from tmtc.arrays import BoolArray, IntArray, OctetArray, as_octets
 from tmtc.frames import TmFrameHeaders, frame_checksums_hold, frame_headers
 from tmtc.link import LinkSettings
 from tmtc.randomiser import randomise
@@ -53,6 +54,19 @@ def read_frames(stream: OctetArray, sync: cadu.CaduSync, settings: LinkSettings)
         usable = np.flatnonzero(valid)
         valid[usable[~frame_checksums_hold(frames[usable])]] = False
     return Frames(frames, frame_headers(frames), corrected, wrong_bits, valid)
+
+
+def plain_frames(pieces: Iterable[bytes], settings: LinkSettings) -> Iterator[bytes]:
+    """Yield the valid frames of a stream of CADUs that arrives in pieces, corrected and without code and marker."""
+    rest = b""
+    for piece in pieces:
+        rest += piece
+        stream = as_octets(rest)
+        sync = cadu.synchronise(stream, settings.cadu_length, verify=proof_of(stream, settings))
+        found = read_frames(stream, sync, settings)
+        yield from map(bytes, found.octets[found.valid])
+        behind = int(sync.start_bits[-1]) // 8 + settings.cadu_length if sync.start_bits.size else 0
+        rest = rest[max(behind, len(rest) - settings.cadu_length) :]
 
 
 def proof_of(stream: OctetArray, settings: LinkSettings) -> cadu.Verify | None:

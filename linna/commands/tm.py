@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,9 +15,13 @@ from linna.parser import option
 
 if TYPE_CHECKING:
     from tmtc.downlink import DownlinkDecode
+    from tmtc.link import LinkSettings
     from tmtc.schema import Dictionary
     from tmtc.xtce.decode import XtceDecode
     from tmtc.xtce.definition import Definition
+
+_PAUSE_S = 0.005
+"""Time between two frames of a file, so that a receiver loses none."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -49,6 +54,25 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(xtce, "--out F", Path, "write there (default: standard output)")
     option(xtce, "--unrolled", bool, "without arrays, for decoders that do not support them")
     finish(xtce, run_xtce)
+
+    yamcs = commands.add_parser(
+        "yamcs", help="configuration of a Yamcs instance for our frames and telecommands"
+    )
+    option(yamcs, "--out DIR", Path, "folder in which Yamcs is started", required=True)
+    option(yamcs, "--frame-port N", int, "UDP port of Yamcs for frames", 10016)
+    option(yamcs, "--station HOST:PORT", str, "TCP port of the station for telecommands", "127.0.0.1:10025")
+    option(yamcs, "--spacecraft-id ID", lambda text: int(text, 0), "", 76)
+    option(yamcs, "--frame-length N", int, "octets of a transfer frame", 1115)
+    option(yamcs, "--no-frame-checksum", bool, "frames carry no frame error control")
+    finish(yamcs, run_yamcs)
+
+    frames = commands.add_parser(
+        "frames", help="send plain frames of a downlink as UDP datagrams, as Yamcs takes them"
+    )
+    option(frames, "source SOURCE", str, "file of CADUs, or HOST:PORT of a station")
+    option(frames, "--to HOST:PORT", str, "", "127.0.0.1:10016")
+    _add_link_options(frames)
+    finish(frames, run_frames)
 
 
 def run_decode(arguments: argparse.Namespace) -> int:
@@ -151,6 +175,75 @@ def run_xtce(arguments: argparse.Namespace) -> int:
     return _document(arguments, format_xtce(unrolled=arguments.unrolled))
 
 
+def run_yamcs(arguments: argparse.Namespace) -> int:
+    from tmtc.xtce.yamcs import yamcs_files
+
+    checksum, station = not arguments.no_frame_checksum, _address("--station", arguments.station)
+    files = yamcs_files(
+        arguments.spacecraft_id, arguments.frame_length, checksum, arguments.frame_port, station
+    )
+    for name, text in files.items():
+        path = arguments.out / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save(path, text.encode())
+    paths = [str(arguments.out / name) for name in files]
+    return emit(arguments, {"files": paths}, text="\n".join(paths))
+
+
+def run_frames(arguments: argparse.Namespace) -> int:
+    import socket
+    import time
+
+    from tmtc.frame_reading import plain_frames
+    from tmtc.link import LinkSettings
+
+    target, count = _address("--to", arguments.to), 0
+    settings = _link_settings(arguments) or LinkSettings()
+    path = Path(arguments.source)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        pieces = (
+            _file_pieces(path)
+            if path.is_file()
+            else _received(_address("SOURCE (no file)", arguments.source))
+        )
+        for frame in plain_frames(pieces, settings):
+            sender.sendto(frame, target)
+            count += 1
+            if path.is_file():
+                time.sleep(_PAUSE_S)
+    return emit(arguments, {"frames": count}, text=f"{count} frames sent to {arguments.to}")
+
+
+def _file_pieces(path: Path) -> Iterator[bytes]:
+    with path.open("rb") as stream:
+        while piece := stream.read(1 << 20):
+            yield piece
+
+
+def _received(address: tuple[str, int]) -> Iterator[bytes]:
+    import socket
+
+    from linna.errors import UsageError
+
+    try:
+        connection = socket.create_connection(address)
+    except OSError as error:
+        host, port = address
+        raise UsageError(f"SOURCE: expected a station at {host}:{port}, found {error.strerror}") from None
+    with connection:
+        while piece := connection.recv(1 << 16):
+            yield piece
+
+
+def _address(option: str, text: str) -> tuple[str, int]:
+    from linna.errors import UsageError
+
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
+        raise UsageError(f"{option}: expected HOST:PORT, found {text!r}")
+    return host, int(port)
+
+
 def _document(arguments: argparse.Namespace, text: str) -> int:
     from tmtc.dictionary import DICTIONARY
 
@@ -199,27 +292,28 @@ def _add_link_options(parser: argparse.ArgumentParser) -> None:
     option(link, "--spacecraft-id ID", lambda text: int(text, 0))
 
 
+def _link_settings(arguments: argparse.Namespace) -> LinkSettings | None:
+    """Return the stated settings of the link, None without any."""
+    from tmtc.link import LinkSettings
+
+    names = ("frame_length", "coding", "randomiser", "interleave")
+    chosen = {name: value for name in names if (value := getattr(arguments, name)) is not None}
+    if arguments.no_frame_checksum:
+        chosen["checksum"] = False
+    return LinkSettings(**chosen) if chosen else None
+
+
 def _read(arguments: argparse.Namespace, dictionary: Dictionary | None = None) -> DownlinkDecode:
     from linna.errors import UsageError
     from tmtc.arrays import as_octets
     from tmtc.dictionary import DICTIONARY
     from tmtc.downlink import decode
     from tmtc.errors import UnknownCoding
-    from tmtc.link import LinkSettings
     from tmtc.stream import PacketForm, find_prefix
 
     octets = arguments.file.read_bytes()
     form = PacketForm(not arguments.no_error_control, prefix_octets=arguments.prefix_octets or 0)
-    given = {
-        "frame_length": arguments.frame_length,
-        "coding": arguments.coding,
-        "randomiser": arguments.randomiser,
-        "interleave": arguments.interleave,
-    }
-    chosen = {name: value for name, value in given.items() if value is not None}
-    if arguments.no_frame_checksum:
-        chosen["checksum"] = False
-    settings = LinkSettings(**chosen) if chosen else None
+    settings = _link_settings(arguments)
     own = DICTIONARY if dictionary is None else dictionary
     read = partial(decode, octets, settings=settings, spacecraft_id=arguments.spacecraft_id, dictionary=own)
     try:

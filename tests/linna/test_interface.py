@@ -29,6 +29,7 @@ tm decode F --format parquet --out G
 tm check F
 tm icd
 tm xtce --out F.xml
+tm yamcs --out D
 serve --host 127.0.0.1 --port 1
 worker
 db upgrade

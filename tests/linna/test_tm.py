@@ -349,3 +349,74 @@ def test_counts_that_restart_are_told_from_conflicts(timed, capsys):
         "conflict: a packet with the count of another one of its APID and other content"
         in capsys.readouterr().out
     )
+
+
+def test_the_configuration_of_yamcs_is_written_for_a_spacecraft_and_a_station(tmp_path, capsys):
+    from ruamel.yaml import YAML
+
+    from lunar.timescales import ONBOARD_EPOCH_TAI_NS, parse_utc, tai_ns_from_utc_ns
+
+    command = [
+        "tm",
+        "yamcs",
+        "--out",
+        str(tmp_path / "y"),
+        "--spacecraft-id",
+        "77",
+        "--station",
+        "host:1234",
+        "--json",
+    ]
+    assert run(command) == 0
+    files = figures(capsys)["files"]
+    assert sorted(files) == sorted(str(path) for path in (tmp_path / "y").rglob("*.*"))
+    instance = YAML(typ="safe").load((tmp_path / "y/etc/yamcs.linna.yaml").read_text())
+    frames, telecommands = instance["dataLinks"]
+    assert (frames["spacecraftId"], frames["frameLength"], frames["errorDetection"]) == (77, 1115, "CRC16")
+    assert [one["vcId"] for one in frames["virtualChannels"]] == [0, 1]
+    assert (telecommands["host"], telecommands["port"]) == ("host", 1234)
+    arguments = frames["virtualChannels"][0]["packetPreprocessorArgs"]
+    epoch = tai_ns_from_utc_ns(parse_utc(arguments["timeEncoding"]["epochUTC"]))
+    assert epoch == ONBOARD_EPOCH_TAI_NS and arguments["pktTimeOffset"] == 13
+    assert YAML(typ="safe").load((tmp_path / "y/etc/yamcs.yaml").read_text())["instances"] == ["linna"]
+    assert run([*command[:-2], "host", "--json"]) == 2
+    assert "--station: expected HOST:PORT, found 'host'" in capsys.readouterr().err
+
+
+def test_plain_frames_of_a_downlink_are_sent_as_datagrams(downlink, capsys):
+    import socket
+
+    damaged = bytearray(downlink.read_bytes())
+    damaged[1279 + 4 : 2 * 1279] = bytes(1275)  # beyond repair
+    downlink.write_bytes(bytes(100) + damaged)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5)
+        assert (
+            run(["tm", "frames", str(downlink), "--to", f"127.0.0.1:{receiver.getsockname()[1]}", "--json"])
+            == 0
+        )
+        count = figures(capsys)["frames"]
+        received = [receiver.recv(2000) for _ in range(count)]
+    assert count == len(damaged) // 1279 - 1
+    assert {len(frame) for frame in received} == {1115} and {frame[3] for frame in received} == {
+        0,
+        *range(2, count + 1),
+    }
+
+
+def test_frames_are_found_across_pieces_of_a_stream(downlink):
+    from tmtc.frame_reading import plain_frames
+    from tmtc.link import LinkSettings
+
+    octets = downlink.read_bytes()
+    whole = list(plain_frames([octets], LinkSettings()))
+    pieces = [octets[first : first + 900] for first in range(0, len(octets), 900)]
+    assert list(plain_frames(pieces, LinkSettings())) == whole and len(whole) == len(octets) // 1279
+
+
+def test_a_station_that_does_not_answer_is_named(capsys):
+    assert run(["tm", "frames", "127.0.0.1:1"]) == 2
+    assert "SOURCE: expected a station at 127.0.0.1:1, found Connection refused" in capsys.readouterr().err
+    assert run(["tm", "frames", "absent.cadu"]) == 2
+    assert "SOURCE (no file): expected HOST:PORT, found 'absent.cadu'" in capsys.readouterr().err

@@ -252,15 +252,17 @@ def _unsigned_type(types: ET.Element, name: str, bits: int) -> None:
     ET.SubElement(element, "IntegerDataEncoding", {"sizeInBits": str(bits), "encoding": "unsigned"})
 
 
-def _binary_type(types: ET.Element, name: str, count: str, what: str = "Parameter") -> None:
-    """Octets, as many as the parameter or argument `count` says."""
+def _binary_type(
+    types: ET.Element, name: str, count: str, what: str = "Parameter", item_octets: int = 1
+) -> None:
+    """Octets of as many items as the parameter or argument `count` says."""
     element = ET.SubElement(types, f"Binary{what}Type", {"name": name})
     ET.SubElement(element, "UnitSet")
     size = ET.SubElement(ET.SubElement(element, "BinaryDataEncoding"), "SizeInBits")
     dynamic = ET.SubElement(size, "DynamicValue")
     reference = {f"{what.lower()}Ref": count, "useCalibratedValue": "false"}
     ET.SubElement(dynamic, f"{what}InstanceRef", reference)
-    ET.SubElement(dynamic, "LinearAdjustment", {"slope": "8", "intercept": "0"})
+    ET.SubElement(dynamic, "LinearAdjustment", {"slope": str(8 * item_octets), "intercept": "0"})
 
 
 def _parameter(parameters: ET.Element, name: str, type_name: str, description: str) -> None:
@@ -329,7 +331,8 @@ def _commands(root: ET.Element, dictionary: Dictionary) -> None:
             names.append(f.name)
         if d.group is not None:
             type_name = f"{d.name}_{d.group.name}_Type"
-            _binary_type(types, type_name, d.group.count, "Argument")
+            octets = sum(f.octets for f in d.group.fields)
+            _binary_type(types, type_name, d.group.count, "Argument", octets)
             ET.SubElement(arguments, "Argument", {"name": d.group.name, "argumentTypeRef": type_name})
             names.append(d.group.name)
         if names:

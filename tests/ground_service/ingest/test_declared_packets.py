@@ -164,7 +164,8 @@ def test_a_minimal_description_of_a_definition_decodes_its_packets(ground: Groun
         vehicle = connection.exec_driver_sql("SELECT id FROM vehicles").scalar_one()
         found = readable_decoding(connection, vehicle)
     assert found is not None and found.counts["100"] == {"decoded": 8}
-    (tmp_path / "none.xml").write_text("<SpaceSystem/>", encoding="utf-8")
+    bare = foreign.document(foreign.integer("u8", 8), {"a": "u8"}, foreign.container("P", ["a"]))
+    (tmp_path / "none.xml").write_text(bare, encoding="utf-8")
     with pytest.raises(InvalidInput, match="compares its APID with a number, found none"):
         minimal_description(tmp_path / "none.xml", 76)
 
@@ -189,7 +190,7 @@ def test_a_minimal_description_is_one_that_the_check_accepts(tmp_path: Path) -> 
     with pytest.raises(InvalidInput, match=r"XTCE that is supported, found bus\.xml, line 1.*UnitsSet"):
         written(tmp_path / "b", foreign.BUS.replace("UnitSet", "UnitsSet"))
     same = bus.replace('name="CCSDSPacket" abstract="true"', 'name="CCSDSPacket"')
-    assert "apids = [7]" in written(tmp_path / "c", same)
+    assert '"apids" = [7]' in written(tmp_path / "c", same)
     own = bus.replace("<Value>7<", "<Value>160<")
     assert "160" in str(check_mission_file(saved(tmp_path, written(tmp_path / "d", own)))[1])
 

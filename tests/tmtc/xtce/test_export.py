@@ -198,6 +198,14 @@ def test_telecommands_are_as_long_as_the_dictionary_expects_once_the_sender_appe
             del given[definition.group.count]
         packet = DICTIONARY.pack_command(definition.name, given, sequence_count=0)
         assert len(packet) == sum(fixed) // 8 + sum(f.octets for f in definition.fields) + CRC_LENGTH
+        if definition.group:
+            (kind,) = (
+                one
+                for one in tree.iter(f"{name}BinaryArgumentType")
+                if one.get("name") == f"{definition.name}_{group[0]}_Type"
+            )
+            (size,) = kind.iter(f"{name}LinearAdjustment")
+            assert size.get("slope") == str(8 * sum(f.octets for f in definition.group.fields))
     for kind in tree.iter(f"{name}EnumeratedArgumentType"):
         if "parameter_id" in kind.attrib["name"]:
             listed = {one.get("label"): one.get("value") for one in kind.iter(f"{name}Enumeration")}
