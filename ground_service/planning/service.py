@@ -68,6 +68,7 @@ from ground_service.text import REASON_LIMIT, require_line
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.datafolder import DataFolder
+from lunar.ephemeris import Ephemeris as States
 from lunar.errors import EphemerisCoverageError
 from tmtc.arguments import argument_text
 
@@ -142,7 +143,7 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
         raise InvalidInput("search", "terrain", "an albedo map among the public data", "none")
     planner = planner_of(ground, reference, mission, catalogue, mare)
     found = [
-        planner.search(
+        replace(planner, ephemeris=_part(planner.ephemeris, first, last)).search(
             constraints,
             max(first, start),
             last,
@@ -260,13 +261,13 @@ def change_window(
                 _assessed(ground, connection, window.vehicle_id, window_id, entry, wanted)
             )
         if decision in ("draft", "failed"):
-            if (
-                decision == "failed"
-                and window.state == "uplinked"
-                and _delete_on_board(connection, window, actor)
-            ):
-                decision = wanted = "cancelling"
             commands.withdraw_window(connection, window_id, actor=actor, now_utc_ns=utc_now_ns())
+        if (
+            decision == "failed"
+            and window.state == "uplinked"
+            and _delete_on_board(connection, window, actor)
+        ):
+            decision = wanted = "cancelling"
         if changes:
             values["edited_by"] = actor
         if decision is not None:
@@ -772,6 +773,12 @@ def ephemerides_for(
     return sorted(
         found, key=lambda one: (covered(one) >= whole, one.precedence, covered(one), one.id), reverse=True
     )
+
+
+def _part(ephemeris: States, start: int, stop: int) -> States:
+    """Return the part of an ephemeris between two times without a hole; the whole if it has a single segment."""
+    mine = [one for one in ephemeris.segments if one.start_utc_ns <= stop and one.stop_utc_ns >= start]
+    return ephemeris if len(ephemeris.segments) == 1 else replace(ephemeris, segments=tuple(mine))
 
 
 def _covered_spans(

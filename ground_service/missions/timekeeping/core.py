@@ -68,7 +68,8 @@ class TimeCorrelation:
     def utc_ns(self, ticks: IntArray) -> IntArray:
         """UTC (n,) of on-board ticks (n,)."""
         since = np.asarray(ticks, dtype=np.int64) - self.reference_ticks
-        nominal = since * _NS_NUMERATOR // _NS_DENOMINATOR
+        whole, part = np.divmod(since, TICKS_PER_SECOND)  # the product overflows after two years
+        nominal = whole * NANOSECONDS_PER_SECOND + part * _NS_NUMERATOR // _NS_DENOMINATOR
         drift = np.rint(nominal * (self.drift_ppb * 1e-9)).astype(np.int64)
         tai = int(tai_ns_from_utc_ns(self.reference_utc_ns)) + nominal + drift
         return np.asarray(utc_ns_from_tai_ns(tai), dtype=np.int64)
@@ -245,10 +246,11 @@ def doubted_stations(
             group = [group[one] if number == group[other] else number for number in group]
     doubts: dict[int, StationDoubt] = {}
     for (one, other), found in differences.items():
-        if group[one] == group[other] or not (found.changes > 1 or _is_whole(found.least_ns)):
-            continue
         sides = [{number for number, of in enumerate(group) if of == group[k]} for k in (one, other)]
         weight = [len({names[units[number][0]] for number in side}) for side in sides]
+        is_station = found.changes > 1 or (min(weight) == 1 and _is_whole(found.least_ns))
+        if group[one] == group[other] or names[units[one][0]] == names[units[other][0]] or not is_station:
+            continue  # the clock was set on board
         near = [abs(float(np.median(off[units[k]]))) <= 0.1 * abs(found.least_ns) for k in (one, other)]
         wrong = [weight[0] < weight[1], weight[1] < weight[0]]
         if weight[0] == weight[1]:

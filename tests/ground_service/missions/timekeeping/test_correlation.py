@@ -147,3 +147,10 @@ def test_a_station_whose_clock_changes_is_left_out_from_then_on() -> None:
     clocks = {"a": [0.0] * 8 + [37.0] * 8, "b": [0.0] * 16, "c": [0.0] * 16}
     kept, _ = doubted_stations(*reports_of_stations("abcabcabcabcabca", clocks))
     assert np.flatnonzero(~kept).tolist() == [9, 12, 15]
+
+
+def test_a_correlation_holds_years_away() -> None:
+    line = TimeCorrelation(1, 0, 1, int(ticks_from_utc_ns(START)), START, 0.0)
+    for years in (-9, 5):
+        utc_ns = START + years * 365 * 86_400 * NS
+        assert ticks_of_utc_ns(utc_ns, [line]) == pytest.approx(int(ticks_from_utc_ns(utc_ns)), abs=2)
