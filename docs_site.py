@@ -86,6 +86,7 @@ def on_files(files: Any, config: Any) -> Any:
     for path, content in (
         ("reference/cli.md", cli_page()),
         ("reference/http.md", http_page()),
+        ("icd.md", icd_page()),
         ("reference/configuration.md", configuration_page()),
         ("reference/scenario.md", scenario_page()),
         ("explanation/programs.svg", layers_svg("")),
@@ -342,6 +343,14 @@ def http_page() -> str:
     return "\n".join(lines) + "\n"
 
 
+def icd_page() -> str:
+    """Return the interface control document, as `linna tm icd` prints it."""
+    from payload_emulator.flight.onboard.icd import format_interfaces
+    from tmtc.icd import format_icd
+
+    return f"{format_icd()}\n{format_interfaces()}"
+
+
 def configuration_page() -> str:
     """Return every setting of a deployment."""
     from ground_service.settings import Settings
@@ -458,7 +467,7 @@ def generated_figures() -> dict[str, str]:
 
     return {
         "xtce": f"`linna tm xtce` writes {sizes(False)}; with `--unrolled` {sizes(True)}.",
-        "mutation": mutation_table((ROOT / "docs" / "mutation.csv").read_text(encoding="utf-8")),
+        "mutation": mutation_table((ROOT / "docs" / "results" / "mutation.csv").read_text(encoding="utf-8")),
     }
 
 
@@ -480,7 +489,7 @@ def mutation_table(samples: str) -> str:
     fresh = {row["group"] for row in rows if (now - date.fromisoformat(row["date"])).days <= 60}
     if stale := GROUPS.keys() - fresh:
         raise ValueError(
-            f"docs/mutation.csv: expected a sample of the last 60 days, found none: {sorted(stale)}"
+            f"docs/results/mutation.csv: expected a sample of the last 60 days, found none: {sorted(stale)}"
         )
 
     lines = [

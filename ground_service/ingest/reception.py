@@ -405,12 +405,12 @@ class Reading:
     def _store(self, connection: Connection, packets: PacketBatch) -> Stored:
         assert packets.spacecraft_id is not None
         vehicle = self._vehicle(connection, packets.spacecraft_id)
-        whole = packets
+        spacecraft, whole = packets.spacecraft_id, packets
         packets = plausible_part(connection, vehicle, self.piece.ingest_id, packets, judged=self.judged)
         self.is_doubted |= packets is not whole
         stored = store.store_batch(connection, vehicle, packets)
         store.note_receptions(connection, vehicle, self.piece.station, time_receptions(packets))
-        defined = np.isin(packets.apid, self._definitions(packets.spacecraft_id).apids)
+        defined = np.isin(packets.apid, self._definitions(spacecraft).apids)
         self.unknown += packets.unknown - int(np.count_nonzero(defined))
         timed = packets.ticks[packets.ticks != NO_TICKS]
         if timed.size:

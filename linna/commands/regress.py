@@ -133,9 +133,10 @@ def _run(arguments: argparse.Namespace) -> int:
         request["repeat_baseline"] = arguments.repeat_baseline
         job = service.wait(service.start_regression(request).id, progress=_percent())
         found = service.get_regression(job.id)
-        for file, form in ((arguments.report, "html"), (arguments.junit, "junit")):
-            if file:
-                service.get_regression_report(found.id, file, format=form)
+        if arguments.report:
+            service.get_regression_report(found.id, arguments.report, format="html")
+        if arguments.junit:
+            service.get_regression_report(found.id, arguments.junit, format="junit")
     emit(arguments, {"id": found.id, **found.result.document()}, text=regression_text(found.result))
     return found.result.exit_status
 
