@@ -130,7 +130,7 @@ def _run(arguments: argparse.Namespace) -> int:
         request = {"policy": text, "policy_name": str(arguments.policy)}
     with ground_client(arguments, background=True) as service:
         request |= _comparison(service, arguments, arguments.build, arguments.baseline)
-        request["repeat_baseline"] = arguments.repeat_baseline
+        request["repeat_baseline"] = bool(arguments.repeat_baseline)
         job = service.wait(service.start_regression(request).id, progress=_percent())
         found = service.get_regression(job.id)
         if arguments.report:
