@@ -68,12 +68,14 @@ def test_twelve_bits_in_a_file_of_sixteen_are_no_dark_picture(write_image, capsy
     assert item["quality"] == "ok"
 
 
-def test_a_picture_with_values_that_are_no_numbers_is_a_verdict(write_image, capsys):
+def test_a_picture_that_is_not_searched_is_a_verdict_with_its_reason(write_image, capsys):
     image = np.full((512, 512), 0.5, np.float32)
     image[3, 4] = np.nan
-    assert run(["detector", "detect", str(write_image("nan.tiff", image)), "--json"]) == 0
+    assert run(["detector", "detect", str(write_image("nan.tiff", image)), "--json"]) == 1
     (item,) = json.loads(capsys.readouterr().out)["images"]
-    assert item["quality"] == "invalid" and item["detections"] == []
+    assert item["quality"] == "uniform" and item["detections"] == []
+    assert item["reason"].startswith("deviation 0.00")
+    assert item["pixels"] == "1 without data (black) of 262144 pixels"
 
 
 def test_detect_finds_the_sun_that_is_not_given_and_says_so_in_one_line(write_image, capsys):
@@ -160,10 +162,11 @@ def test_a_camera_that_cannot_be_is_refused(write_image, capsys, extra, words):
 def test_a_black_picture_is_a_verdict_not_an_error(write_image, capsys):
     assert (
         run(["detector", "detect", str(write_image("black.png", np.zeros((512, 512), np.uint8))), "--json"])
-        == 0
+        == 1
     )
     (item,) = json.loads(capsys.readouterr().out)["images"]
     assert item["quality"] == "dark" and item["detections"] == []
+    assert item["reason"] == "0.00% of the pixels over 4.0% of full scale, expected over 0.2%"
 
 
 def test_what_is_no_image_is_refused_in_one_line(tmp_path, capsys):

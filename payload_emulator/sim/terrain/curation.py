@@ -449,7 +449,7 @@ class RasterHeights:
 
         if not paths:
             raise TerrainError("terrain of the curation: expected at least one height raster, found none")
-        (coarse,) = [None] if relief is None else open_layers([relief])
+        coarse = None if relief is None else open_layers([relief])[0]
         layers = open_layers(paths, relief=coarse)
         # Most craters must lie on one resolution, or heights would jump: that with most files.
         self._layer = max(layers, key=lambda layer: (len(layer.files), layer.pixels_per_degree))

@@ -201,8 +201,9 @@ class RasterLayer:
                 east = west + turn * self.turn
                 left, right = _lattice_span(east, file.columns, first_column, columns)
                 if left < right:
-                    at = np.arange(float(top), bottom) - north, np.arange(float(left), right) - east
-                    part = self._part(number, *at)
+                    rows_px = np.arange(top, bottom, dtype=np.float64) - north
+                    columns_px = np.arange(left, right, dtype=np.float64) - east
+                    part = self._part(number, rows_px, columns_px)
                     place = out[
                         top - first_row : bottom - first_row, left - first_column : right - first_column
                     ]
