@@ -170,7 +170,7 @@ def implausible_times(
             if latest is not None:
                 reason = f"{_span(last - latest)} after the mission time" if last > latest else None
             elif len(stretch) < AGREEING_PACKETS:
-                reason = f"{_span(first - reached)} after all other telemetry, {len(stretch)} packets agree"
+                reason = f"{_span(first - reached)} after all other telemetry, {len(stretch)} of {AGREEING_PACKETS} packets agree"
             elif first - reached > LONGEST_SILENCE:
                 reason = f"{_span(first - reached)} after all other telemetry"
         if reason is None:
