@@ -170,7 +170,8 @@ def implausible_times(
             if latest is not None:
                 reason = f"{_span(last - latest)} after the mission time" if last > latest else None
             elif len(stretch) < AGREEING_PACKETS:
-                reason = f"{_span(first - reached)} after all other telemetry, {len(stretch)} packets agree"
+                few = f"{len(stretch)} of {AGREEING_PACKETS} packets agree"
+                reason = f"{_span(first - reached)} after all other telemetry, {few}"
             elif first - reached > LONGEST_SILENCE:
                 reason = f"{_span(first - reached)} after all other telemetry"
         if reason is None:

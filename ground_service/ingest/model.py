@@ -150,7 +150,7 @@ class ImplausiblePacket(Entity):
     apid: int
     sequence_count: int
     time: UtcTime = Field(description="On-board time, not corrected")
-    reason: str = Field(examples=["1.1 d after all other telemetry, 1 packets agree"])
+    reason: str = Field(examples=["1.1 d after all other telemetry, 1 of 10 packets agree"])
 
 
 class Ingest(Entity):

@@ -57,6 +57,7 @@ def get_forecast(
         expected = f"a time after the start, at most {LIMIT_S // 86_400} days"
         raise InvalidInput("forecast", "stop", expected, f"{span_s:.0f} s after it")
     with ground.database.reading() as connection:
+        service.require_described(connection, spacecraft_id)
         mission = service.mission_of(connection, spacecraft_id)
         windows = store.windows_between(
             connection, spacecraft_id, instance, start_utc_ns - HISTORY_NS, stop_utc_ns

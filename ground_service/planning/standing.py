@@ -82,6 +82,7 @@ def add_request(ground: Ground, given: StandingRequestIn, *, actor: str) -> Stan
     _check_terms(terms)
     anchor = mission_now_ns() if terms.start is None else terms.start.utc_ns
     with ground.database.writing() as connection:
+        planning.require_described(connection, given.spacecraft_id)
         vehicle = vehicle_id(connection, given.spacecraft_id, given.instance)
         key = store.add_request(
             connection, vehicle, given.name, terms, anchor_utc_ns=anchor, actor=actor, now_utc_ns=utc_now_ns()

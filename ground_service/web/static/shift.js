@@ -3,7 +3,7 @@ import { finished, get, request, send } from "./api.js";
 import { chainOf, contactOf, inTime, uplink } from "./chain.js";
 import { acting, button, byId, element, lengthText, loading, missionNow, notice, on, parameterName, seconds, show, showTable, stateMark, table, textOf, timeText, watch } from "./page.js";
 
-const OPEN = ["draft", "approved", "uplinked", "executing", "executed", "downlinked"];
+const OPEN = ["draft", "approved", "uplinked", "cancelling", "executing", "executed", "downlinked"];
 const SHOWN = 5;
 const DAY_S = 86400;
 

@@ -16,6 +16,7 @@ from ground_service.passes.model import PassFilter
 from ground_service.passes.store import list_passes
 from ground_service.planning import service as planning
 from ground_service.planning import standing
+from ground_service.planning.forecast import get_forecast
 from ground_service.planning.model import Window, WindowEntry, WindowSearch
 from ground_service.planning.store import get_window
 from linna.cli import run
@@ -131,6 +132,10 @@ def test_a_spacecraft_without_a_description_is_not_planned(either: Ground, now: 
         planning.add_window(either, entry(spacecraft=77), actor="ann")
     with pytest.raises(Conflict, match=r"spacecraft 77"):
         planning.search_windows(either, WindowSearch(spacecraft_id=77))
+    with pytest.raises(Conflict, match=r"spacecraft 77"):
+        get_forecast(
+            either, spacecraft_id=77, instance="flight", start_utc_ns=START, stop_utc_ns=START + MINUTE
+        )
 
 
 def test_a_window_on_board_is_cancelling_until_its_activities_are_deleted(
