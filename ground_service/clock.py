@@ -25,9 +25,13 @@ def utc_now_ns() -> int:
 
 @dataclass(frozen=True, slots=True)
 class TelemetryTime:
-    """Mission time that stands at the newest telemetry, which cannot be compared with it."""
+    """Mission time that stands at the newest telemetry, which cannot be compared with it.
+
+    `recorded`: that of archives alone. What arrives later is compared with the wall clock.
+    """
 
     utc_ns: int
+    recorded: bool = False
 
     def __call__(self) -> int:
         """Return the time."""
@@ -53,8 +57,17 @@ def mission_now_ns() -> int:
 
 def independent_now_ns() -> int | None:
     """Return the mission time if another clock than telemetry states it."""
-    now = mission_now_ns()
-    return None if isinstance(_mission.read or _mission.stated, TelemetryTime) else now
+    now, source = mission_now_ns(), _mission.read or _mission.stated
+    if isinstance(source, TelemetryTime):
+        return utc_now_ns() if source.recorded else None
+    return now
+
+
+def is_recorded() -> bool:
+    """Return whether the mission time is that of recorded passes, of which nothing flies."""
+    mission_now_ns()  # a clock that is read when it is first needed
+    source = _mission.read or _mission.stated
+    return isinstance(source, TelemetryTime) and source.recorded
 
 
 def set_mission_clock(read: Callable[[], int] | None = None) -> None:

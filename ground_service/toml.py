@@ -4,13 +4,37 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 import tomllib
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
 from ground_service.errors import InvalidInput
+
+LIMIT_OCTETS = 4 << 20
+DEPTH_LIMIT = 16
+KEY_LIMIT = 200
+KEYS_LIMIT = 100_000
+"""Limits of TOML before it is parsed: size, depth and length of a key, and number of keys, brackets and commas.
+
+A parser takes about a kilobyte for each part of a key, so that a document of the limit takes 100 MiB.
+"""
+
+_TEXT = re.compile(
+    r'"""(?:\\.|[^\\])*?(?:"{3,5}|\Z)|'
+    r"'''.*?(?:'{3,5}|\Z)|"
+    r'"(?:\\.|[^"\\\n])*"?|'
+    r"'[^'\n]*'?|#[^\n]*",
+    re.DOTALL,
+)
+"""Strings and comments; without its end, one takes the rest, as for the parser."""
+
+_DEEP = re.compile(rf"(?:[\w-]*[ \t]*\.[ \t]*){{{DEPTH_LIMIT}}}")
+_BRACKET = re.compile(r"[\[\]{}]")
+_LONG = re.compile(rf"[\w-]{{{KEY_LIMIT + 1}}}")
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -24,9 +48,27 @@ def read_table(text: str | bytes, source: str, what: str) -> dict[str, Any]:
         The text is not TOML; `what` names the expected file.
     """
     try:
-        return tomllib.loads(text.decode("utf-8") if isinstance(text, bytes) else text)
+        text = text.decode("utf-8") if isinstance(text, bytes) else text
+        _check_limits(text, source, what)
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise InvalidInput(source, "", what, _met(error)) from None
+
+
+def _check_limits(text: str, source: str, what: str) -> None:
+    if len(text) > LIMIT_OCTETS:
+        found = f"{len(text)} characters"
+        raise InvalidInput(source, "", f"{what} of at most {LIMIT_OCTETS >> 20} MiB", found)
+    bare = _TEXT.sub("_", text)
+    if _DEEP.search(bare) or _LONG.search(bare):
+        expected = f"keys of at most {DEPTH_LIMIT} parts of {KEY_LIMIT} characters"
+        raise InvalidInput(source, "", expected, "a deeper or longer one")
+    if (count := sum(map(bare.count, "=.,[{"))) > KEYS_LIMIT:
+        raise InvalidInput(source, "", f"{what} of at most {KEYS_LIMIT} keys and values", str(count))
+    steps = (1 if one in "[{" else -1 for one in _BRACKET.findall(bare))
+    if max(accumulate(steps), default=0) > DEPTH_LIMIT:
+        expected = f"at most {DEPTH_LIMIT} brackets inside each other"
+        raise InvalidInput(source, "", expected, "brackets that are nested too deeply")
 
 
 def read_json(octets: str | bytes, source: str, limit_octets: int = 16 << 20) -> Any:
@@ -91,6 +133,8 @@ def _fault(kind: type[BaseModel], error: Any, source: str) -> InvalidInput:
         found = found or repr(error["input"])[:80]
     except ValueError:  # hexadecimal, so that it was read
         found = "a number with too many digits"
+    if error["loc"][-1:] == ("webhook",):
+        found = "another text"  # what follows the host may be a password
     return InvalidInput(source, place, expected, found)
 
 

@@ -58,6 +58,7 @@ def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
 
 def test_the_service_shows_the_site_under_its_policy(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(documentation, "HELP", Path("absent"))
+    monkeypatch.setattr(documentation, "DOCS", Path("absent"))
     absent = documentation.documentation_file("index.html")
     assert absent.status_code == 404 and b"make docs" in absent.body
     monkeypatch.setattr(documentation, "HELP", site)
@@ -73,12 +74,34 @@ def test_the_service_shows_the_site_under_its_policy(site: Path, monkeypatch: py
             documentation.documentation_file(path)
 
 
-@pytest.mark.parametrize("folder, links", [(DOCS / "pictures", 1), (DOCS / "absent", 0)])
-def test_the_footer_links_to_the_documentation_where_it_was_built(
-    folder: Path, links: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pages, "HELP", folder)
-    assert pages.rendered.__wrapped__(pages.PAGES[0]).count('href="/help"') == links
+def test_every_page_links_to_help_and_help_needs_no_build(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert {pages.rendered.__wrapped__(one).count('href="/help"') for one in pages.PAGES} == {1}
+    monkeypatch.setattr(documentation, "HELP", Path("absent"))
+    answer = documentation.documentation_file("index.html")
+    assert answer.headers["Content-Security-Policy"] == pages.POLICY
+    assert b'<a href="tutorials/first-pass.html">first pass</a>' in answer.body
+    assert documentation.documentation_file("pictures/tour.gif").media_type == "image/gif"
+    warned = bytes(documentation.documentation_file("tutorials/first-pass.html").body)
+    assert b"<strong>What went wrong</strong>" in warned and b"!!!" not in warned
+
+
+def test_links_and_anchors_of_help_lead_to_what_is_there() -> None:
+    found = {
+        one.relative_to(DOCS).as_posix(): documentation.page_of(one.relative_to(DOCS).as_posix())
+        for one in DOCS.rglob("*.md")
+    }
+    for source, page in found.items():
+        for target, anchor in re.findall(r'<a href="([^":#]*)(?:#([^"]*))?"', page):
+            if target.startswith("/"):
+                continue
+            name = (
+                os.path.normpath(Path(source).parent / target).replace(".html", ".md") if target else source
+            )
+            assert (DOCS / name).exists() and (not anchor or f'id="{anchor}"' in found[name]), (
+                source,
+                target,
+                anchor,
+            )
 
 
 def test_spelling() -> None:

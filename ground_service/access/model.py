@@ -149,6 +149,9 @@ class Session(Entity):
         default=False, description="Whether the session was started with an OpenID provider"
     )
     time: UtcTime = Field(description="Mission time of the service: its clock, unless a simulation sets it")
+    recorded: bool = Field(
+        default=False, description="Whether the mission time is that of recorded passes, and nothing flies"
+    )
 
 
 class NewSession(Given):

@@ -12,7 +12,7 @@ from sqlalchemy import Connection
 
 from ground_service.access import service, store
 from ground_service.access.model import ProviderIdentity, Session, UserRecord
-from ground_service.clock import mission_now_ns, utc_now_ns
+from ground_service.clock import is_recorded, mission_now_ns, utc_now_ns
 from ground_service.errors import InvalidInput, SignInRefused
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
@@ -54,6 +54,7 @@ def start_provider_session(ground: Ground, who: ProviderIdentity, state: str) ->
         expires=UtcTime(now + service.PROVIDER_SESSION_NS),
         browser=True,
         time=UtcTime(mission_now_ns()),
+        recorded=is_recorded(),
     )
     return secret, started
 

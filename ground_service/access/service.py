@@ -19,7 +19,7 @@ from sqlalchemy import Connection
 
 from ground_service.access import store
 from ground_service.access.model import DAYS_LIMIT, Role, Session, Token, User, UserRecord
-from ground_service.clock import mission_now_ns, utc_now_ns
+from ground_service.clock import is_recorded, mission_now_ns, utc_now_ns
 from ground_service.errors import Conflict, InvalidInput, NotAuthorised, StoreError
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
@@ -329,6 +329,7 @@ def start_session(ground: Ground, token: str) -> tuple[str, Session]:
         expires=UtcTime(expires),
         browser=True,
         time=UtcTime(mission_now_ns()),
+        recorded=is_recorded(),
     )
     return secret, started
 
@@ -348,6 +349,7 @@ def session_of(ground: Ground, caller: Caller, *, browser: bool) -> Session:
         browser=browser,
         provider=provider,
         time=UtcTime(mission_now_ns()),
+        recorded=is_recorded(),
     )
 
 

@@ -609,7 +609,7 @@ class Operations(Connection):
 
     @operation("POST /alarms/{alarm_id}/shelve", body=("until", "comment"))
     def shelve_alarm(self, alarm_id: int, until: str, *, comment: str = "") -> alarms.AlarmDetail:
-        """Suppress an alarm until a time; a time in the past ends this."""
+        """Suppress an alarm until a mission time; one in the past ends this."""
 
     # regression
 

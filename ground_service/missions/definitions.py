@@ -29,6 +29,9 @@ from tmtc.xtce.series import SeriesValue, packet_layouts
 DECODING_VERSION = 2
 """Version of the values that decoding gives. Stored packets are decoded again if it changes."""
 
+DOCUMENTS_LIMIT_OCTETS = 16 << 20
+"""Largest size of all XTCE documents of a mission description together: their elements take ten times as much."""
+
 EMBEDDED_AS_TEXT_OCTETS = 64 << 10
 """Longer XTCE files are embedded compressed, since a mission description has a limited length."""
 
@@ -89,8 +92,16 @@ def definition_faults(mission: Mission, source: str) -> list[InvalidInput]:
         faults.append(
             InvalidInput(source, "approval.windows", expected, f"a second person needed for {needed}")
         )
-    for index, one in enumerate(mission.packets or ()):
+    sources, unpacked = mission.packets or (), 0
+    for index, one in enumerate(sources):
         try:
+            unpacked += sum(
+                len(_document(entry, DOCUMENTS_LIMIT_OCTETS)) for entry in one.xtce or ()
+            )  # one at a time
+            if unpacked > DOCUMENTS_LIMIT_OCTETS:
+                raise DefinitionError(
+                    f"expected {DOCUMENTS_LIMIT_OCTETS >> 20} MiB of documents in all, found more"
+                )
             _decoder(one)
         except DefinitionError as error:
             faults.append(InvalidInput(source, f"packets.{index}.xtce", "XTCE that is supported", str(error)))
@@ -191,18 +202,20 @@ def _embedded(path: Path, source: str, place: str) -> str:
     return XTCE_COMPRESSED + base64.b64encode(gzip.compress(octets, mtime=0)).decode()
 
 
-def _document(entry: str) -> str | bytes:
+def _document(entry: str, limit_octets: int = MAX_OCTETS) -> str | bytes:
     """Return an embedded document."""
     if not entry.startswith(XTCE_COMPRESSED):
         return entry
     try:
         packed = base64.b64decode(entry.removeprefix(XTCE_COMPRESSED), validate=True)
         unpacking = zlib.decompressobj(zlib.MAX_WBITS | 16)
-        octets = unpacking.decompress(packed, MAX_OCTETS + 1)
+        octets = unpacking.decompress(packed, limit_octets + 1)
     except (binascii.Error, ValueError, zlib.error):
         raise DefinitionError("embedded document: expected gzip in base64, found other text") from None
-    if not unpacking.eof or len(octets) > MAX_OCTETS:
-        raise DefinitionError(f"embedded document: expected at most {MAX_OCTETS} whole octets, found others")
+    if not unpacking.eof or len(octets) > limit_octets:
+        raise DefinitionError(
+            f"embedded document: expected at most {limit_octets} whole octets, found others"
+        )
     return octets
 
 

@@ -29,6 +29,9 @@ from ground_service.missions.model import (
     read_document,
 )
 
+COMPARED_LIMIT = 1_000_000
+"""Largest product of the numbers of lines that are compared; the comparison of lines that repeat takes seconds."""
+
 
 def read_mission(octets: bytes, source: str = "mission.toml") -> tuple[Mission, str]:
     """Return the mission description and its text from the octets of a file.
@@ -75,8 +78,22 @@ def check_mission(ground: Ground, octets: bytes, *, caller: Caller = LOCAL_CALLE
     with ground.database.reading() as connection:
         key = store.newest_of_spacecraft(connection, mission.spacecraft.id)
         before = "" if key is None else store.detail(connection, key).text
-    changes = difflib.unified_diff(before.splitlines(), text.splitlines(), lineterm="", n=1)
-    return MissionCheck(faults=tuple(map(str, faults)), unknown=mission.unknown, changes=tuple(changes)[2:])
+    changes = _changes(before.splitlines(), text.splitlines())
+    return MissionCheck(faults=tuple(map(str, faults)), unknown=mission.unknown, changes=changes)
+
+
+def _changes(before: list[str], after: list[str]) -> tuple[str, ...]:
+    """Return a unified difference; of texts that would take seconds to compare, the number of lines that differ."""
+    longest = min(len(before), len(after))
+    head = next((k for k in range(longest) if before[k] != after[k]), longest)
+    rest = longest - head
+    tail = next((k for k in range(rest) if before[-1 - k] != after[-1 - k]), rest)
+    removed, added = len(before) - head - tail, len(after) - head - tail
+    if removed * added > COMPARED_LIMIT:
+        return (
+            f"@@ {removed} lines from line {head + 1} on are replaced by {added}: too many to compare @@",
+        )
+    return tuple(difflib.unified_diff(before, after, lineterm="", n=1))[2:]
 
 
 def _text_of(octets: bytes, source: str) -> str:

@@ -11,6 +11,7 @@ from sqlalchemy import Connection
 from ground_service.clock import mission_now_ns
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
+from ground_service.missions.store import mission_of_vehicle
 from ground_service.missions.timekeeping.core import TimeCorrelation, utc_ns_of_ticks
 from ground_service.missions.timekeeping.store import load_correlations
 from ground_service.passes.model import (
@@ -46,7 +47,13 @@ def list_spacecraft(ground: Ground) -> list[SpacecraftInstance]:
     """Return all spacecraft in all instances."""
     with ground.database.reading() as connection:
         found = [
-            SpacecraftInstance(spacecraft_id=one.ccsds_id, instance=one.instance)
+            SpacecraftInstance(
+                spacecraft_id=one.ccsds_id,
+                instance=one.instance,
+                name=None
+                if (mission := mission_of_vehicle(connection, one.id)) is None
+                else mission.spacecraft.name,
+            )
             for one in all_vehicles(connection)
         ]
     return sorted(found, key=lambda one: (one.instance != FLOWN, one.spacecraft_id, one.instance))

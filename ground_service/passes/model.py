@@ -257,6 +257,9 @@ class SpacecraftInstance(Entity):
 
     spacecraft_id: int = Field(examples=[76])
     instance: str = Field(examples=["flight"])
+    name: str | None = Field(
+        description="Name in the mission description; null: not stated", examples=["SelenITA"]
+    )
 
 
 class LiveValue(Entity):

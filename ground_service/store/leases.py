@@ -14,6 +14,12 @@ from ground_service.store import repository
 
 _LEASES = repository.LEASES
 
+LONGEST_NS = 3_600_000_000_000
+"""No lease is longer: one that ends later was taken while a clock was ahead, and has ended."""
+
+_CLOCKS_NS = 60_000_000_000
+"""Difference of the clocks of hosts that compete for a lease."""
+
 
 def renew_or_take(
     connection: Connection,
@@ -27,7 +33,8 @@ def renew_or_take(
 ) -> bool:
     """Renew the lease of `owner`, or take one that is free or has ended; return whether `owner` has it now.
 
-    A lease that has ended is renewed as long as no other process has taken it: its owner stood still.
+    A lease that has ended is renewed as long as no other process has taken it: its owner stood still. One that ends
+    later than its own length is of a clock that was ahead, and is free.
 
     Parameters
     ----------
@@ -36,7 +43,8 @@ def renew_or_take(
     """
     rows = table.c
     renewal = update(table).where(rows.name == name, rows.owner == owner).values(lease_utc_ns=until_utc_ns)
-    free = or_(rows.owner.is_(None), rows.lease_utc_ns < now_utc_ns)
+    ahead = rows.lease_utc_ns > until_utc_ns + _CLOCKS_NS
+    free = or_(rows.owner.is_(None), rows.lease_utc_ns < now_utc_ns, ahead)
     taking = (
         update(table).where(rows.name == name, free).values(owner=owner, lease_utc_ns=until_utc_ns, **taken)
     )
@@ -62,7 +70,8 @@ def release(connection: Connection, name: str, owner: str) -> None:
 def owner_of(connection: Connection, name: str) -> str | None:
     """Return the process that has a lease now; None without any."""
     row = connection.execute(select(_LEASES).where(_LEASES.c.name == name)).mappings().first()
-    if row is None or row["lease_utc_ns"] < database_now_ns(connection):
+    now = database_now_ns(connection)
+    if row is None or not now <= row["lease_utc_ns"] <= now + LONGEST_NS:
         return None
     return None if row["owner"] is None else str(row["owner"])
 
@@ -86,7 +95,9 @@ def owners(connection: Connection, prefix: str) -> dict[str, str]:
     """Return the owners of the leases in force whose names begin with `prefix`."""
     rows = _LEASES.c
     now = database_now_ns(connection)
-    query = select(rows.name, rows.owner).where(rows.name.startswith(prefix), rows.lease_utc_ns >= now)
+    query = select(rows.name, rows.owner).where(
+        rows.name.startswith(prefix), rows.lease_utc_ns.between(now, now + LONGEST_NS)
+    )
     return {str(name): str(owner) for name, owner in connection.execute(query)}
 
 
@@ -98,4 +109,5 @@ def remove(connection: Connection, name: str) -> None:
 def remove_ended(connection: Connection, prefix: str) -> None:
     """Remove the leases whose names begin with `prefix` and that have ended."""
     rows, now = _LEASES.c, database_now_ns(connection)
-    connection.execute(delete(_LEASES).where(rows.name.startswith(prefix), rows.lease_utc_ns < now))
+    in_force = rows.lease_utc_ns.between(now, now + LONGEST_NS)
+    connection.execute(delete(_LEASES).where(rows.name.startswith(prefix), ~in_force))

@@ -40,7 +40,7 @@ from tmtc.onboard_parameters import PARAMETERS
 _HERE = Path(__file__).parent
 _STATIC = _HERE / "static"
 HELP = _HERE / "help"
-"""Folder of the documentation; absent where it was not built."""
+"""Folder of the documentation site; absent where it was not built."""
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
@@ -56,6 +56,7 @@ MEDIA = {
     ".json": "application/json",
     ".png": "image/png",
     ".jpg": "image/jpeg",
+    ".gif": "image/gif",
     ".md": "text/plain; charset=utf-8",
     ".ttf": "font/ttf",
     ".woff": "font/woff",
@@ -231,7 +232,6 @@ def rendered(
             schemas=schemas,
             openmct=openmct,
             provider=provider,
-            help=bool(files_of(HELP)),
             areas={one.area: one.path for one in reversed(PAGES) if one.entry},
             pages=[one for one in PAGES if one.entry and one.area == page.area],
             version=_version(),
@@ -268,6 +268,11 @@ def sign_in_page(*, next_page: str = "/", refusal: str = "") -> str:
         .get_template("sign_in.html")
         .render(next_page=next_page, refusal=refusal, version=_version())
     )
+
+
+def help_page(title: str, body: str) -> str:
+    """Return the HTML of a page of the documentation."""
+    return _environment().get_template("help.html").render(title=title, body=body, version=_version())
 
 
 @cache

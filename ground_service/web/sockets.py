@@ -22,12 +22,22 @@ from typing import Any
 from fastapi import WebSocket, WebSocketDisconnect
 from starlette.concurrency import run_in_threadpool
 
+from ground_service.access.scopes import ROWS, SPACECRAFT
 from ground_service.access.security import SESSION_COOKIE
 from ground_service.access.service import LOCAL_CALLER, Caller, authenticate
-from ground_service.access.store import has_users
+from ground_service.access.store import has_users, owner_of
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, NotAuthorised, NotFound
-from ground_service.events import TelemetryReceived, last_number, read_events
+from ground_service.events import (
+    CommandStateChanged,
+    LinkChanged,
+    PlanChanged,
+    RequestChanged,
+    TelemetryReceived,
+    WindowChanged,
+    last_number,
+    read_events,
+)
 from ground_service.ground import Ground
 from ground_service.http.problems import problem
 from ground_service.http.times import time_text
@@ -65,6 +75,15 @@ class NewestValues:
 
 
 log = logging.getLogger(__name__)
+
+OWNED = {
+    WindowChanged.event_kind: ("window_id", "id"),
+    CommandStateChanged.event_kind: ("command_id", "id"),
+    LinkChanged.event_kind: ("name", "link"),
+    RequestChanged.event_kind: ("request_id", "id"),
+    PlanChanged.event_kind: ("request_id", "request_id"),
+}
+"""Events of rows that belong to a spacecraft: parameter of `scopes.ROWS`, and key of the row in the payload."""
 
 VERIFY_S = 2.0
 POLL_S = 0.5
@@ -105,9 +124,13 @@ class Session:
         if not self.ended.done():
             self.ended.set_result(code)
 
-    def permits(self, vehicle: int | None) -> bool:
-        """Return whether the caller may see messages of a vehicle; None: of no vehicle, or of an unknown one."""
-        return self.caller.missions is None or vehicle in self.vehicles
+    def permits(self, vehicle: int | None, spacecraft: int | None = None) -> bool:
+        """Return whether the caller may see messages of a vehicle or a spacecraft; None: of none or an unknown one."""
+        return (
+            self.caller.missions is None
+            or vehicle in self.vehicles
+            or (spacecraft is not None and self.caller.may_use(spacecraft))
+        )
 
     def offer(self, number: int, text: str) -> None:
         """Queue an event."""
@@ -204,8 +227,10 @@ class Sockets:
         while at < known:
             async with self._replays:
                 items = await run_in_threadpool(read_events, self._ground.database, at, BATCH)
+            owners = await run_in_threadpool(self._owners, items, [session])
             for item in items:
-                if item.number <= known and session.permits(item.payload.get("vehicle_id")):
+                owner = owners.get(item.number)
+                if item.number <= known and session.permits(item.payload.get("vehicle_id"), owner):
                     await session.socket.send_text(text_of(item))
             at = items[-1].number if items else known
         await session.send_offered(max(number, known))
@@ -234,13 +259,14 @@ class Sockets:
                 continue
             try:
                 items = await run_in_threadpool(read_events, self._ground.database, self._number, BATCH)
+                owners = await run_in_threadpool(self._owners, items, list(self._readers))
             except GroundError as error:
                 log.warning("the event log cannot be read: %s", error)
                 continue
             for item in items:
                 text = text_of(item)
                 for session in self._readers:
-                    if session.permits(item.payload.get("vehicle_id")):
+                    if session.permits(item.payload.get("vehicle_id"), owners.get(item.number)):
                         session.offer(item.number, text)
                 self._number = item.number
             if len(items) == BATCH:
@@ -286,6 +312,12 @@ class Sockets:
                         session.caller = caller
                         session.vehicles = await run_in_threadpool(self._vehicles, caller)
 
+    def _owners(self, items: list[LoggedEvent], readers: list[Session]) -> dict[int, int | None]:
+        """Return the spacecraft of events by number, if a reader is limited to missions."""
+        if all(one.caller.missions is None for one in readers):
+            return {}
+        return {item.number: event_owner(self._ground, item) for item in items}
+
     def _vehicles(self, caller: Caller) -> frozenset[int]:
         """Return the vehicles of a caller who is limited to missions; none for others."""
         if caller.spacecraft is None:
@@ -327,6 +359,15 @@ async def until_gone(socket: WebSocket) -> None:
     with contextlib.suppress(WebSocketDisconnect, RuntimeError):
         while (await socket.receive())["type"] != "websocket.disconnect":
             pass
+
+
+def event_owner(ground: Ground, item: LoggedEvent) -> int | None:
+    """Return the spacecraft that an event states, or that of the row it names; None for events of all missions."""
+    parameter, key = OWNED.get(item.kind, ("", ""))
+    if parameter:
+        return ground.read(owner_of, ROWS[parameter], item.payload[key])
+    stated = item.payload.get(SPACECRAFT)
+    return None if stated is None else int(stated)
 
 
 def token_of(socket: WebSocket) -> str | None:

@@ -8,7 +8,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ground_service.clock import utc_now_ns
+from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.ground import Ground
 from ground_service.http.times import UtcTime
 from ground_service.store import leases
@@ -154,6 +154,7 @@ def service_status(ground: Ground, backups: Path | None, broker_url: str | None 
         jobs[state] += count
     return ServiceStatus(
         time=UtcTime(utc_now_ns()),
+        mission_time=UtcTime(mission_now_ns()),
         complaints=complaints(found),
         jobs=dict(jobs),
         ingests=found.counts.ingests,

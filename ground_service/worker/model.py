@@ -25,7 +25,8 @@ class CorrelationAge(Entity):
 class ServiceStatus(Entity):
     """Condition of the deployment: waiting work, disk, backups, time correlations, scheduler."""
 
-    time: UtcTime
+    time: UtcTime = Field(description="Time of day, as in records and logs")
+    mission_time: UtcTime = Field(description="Time of operations: contacts, windows and shelved alarms")
     complaints: list[str] = Field(description="What an operator has to look after; empty: nothing")
     jobs: dict[str, int] = Field(description="Number of jobs by state", examples=[{"done": 12, "queued": 1}])
     ingests: dict[str, int] = Field(description="Number of ingests by state", examples=[{"done": 3}])

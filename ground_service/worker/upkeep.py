@@ -9,6 +9,7 @@ settings say so; the audit log has a record of each.
 from __future__ import annotations
 
 import hashlib
+import logging
 import re
 from collections.abc import Mapping
 from functools import partial
@@ -22,7 +23,7 @@ from ground_service.errors import InvalidInput
 from ground_service.evaluation.performance.service import make_due_reports
 from ground_service.events import LimitsBroken, publish
 from ground_service.ground import Ground
-from ground_service.jobs.store import delete_finished
+from ground_service.jobs.store import delete_finished, find_job
 from ground_service.missions.automation import Channel
 from ground_service.missions.store import channels_in_force
 from ground_service.passes.service import vehicle_trends
@@ -33,6 +34,8 @@ from ground_service.store.files import UNPACKING, remove_leftovers
 from ground_service.store.vehicles import all_vehicles, get_vehicle
 from ground_service.worker.notifications import key_of, send, signature
 from lunar.timescales import format_utc
+
+log = logging.getLogger(__name__)
 
 RETENTION_DAYS = 90
 DAY_NS = 86_400_000_000_000
@@ -54,12 +57,17 @@ def plan_job_id(utc_ns: int) -> str:
 def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> dict[str, Any]:
     """What was taken away, and trends and due reports of every spacecraft.
 
-    The removal is first, so that a failure of the rest does not make the archive grow.
+    The removal is first, so that a failure of the rest does not make the archive grow. Without a nightly job of the day
+    before, nothing is removed: a clock that has jumped ahead would make everything old.
     """
-    removed = tidy(ground, int(arguments.get("retention_days", RETENTION_DAYS)))
-    removed["archives"] = remove_archives(
-        ground, int(arguments.get("archive_days", 0)), int(arguments.get("archive_limit_mib", 0))
-    )
+    removed: dict[str, int] = {}
+    if ground.read(find_job, nightly_job_id(utc_now_ns() - DAY_NS)) is None:
+        log.warning("no nightly job ran a day ago: nothing is removed, because the clock may have jumped")
+    else:
+        removed = tidy(ground, int(arguments.get("retention_days", RETENTION_DAYS)))
+        removed["archives"] = remove_archives(
+            ground, int(arguments.get("archive_days", 0)), int(arguments.get("archive_limit_mib", 0))
+        )
     vehicles = ground.read(all_vehicles)
     found: list[dict[str, Any]] = []
     for vehicle in vehicles:

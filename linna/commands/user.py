@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from linna.commands._ground import add_service_options, local_actor, open_service
 from linna.commands._table import Command, Commands, Hand, Option, add_commands
-from linna.output import emit, finish
+from linna.output import emit, finish, log
 from linna.parser import option
 
 if TYPE_CHECKING:
@@ -19,6 +19,15 @@ if TYPE_CHECKING:
 Role = Literal["viewer", "operator", "admin"]
 
 
+def _say_unknown(service: Client, missions: Sequence[str] | None) -> None:
+    """Warn of missions that no description has: the user sees nothing of them."""
+    known = {one.mission for one in service.list_missions()} if missions else set()
+    for name in sorted({*(missions or ())} - known):
+        log(
+            f"linna: warning: no spacecraft has the mission {name!r}; known: {', '.join(sorted(known)) or 'none'}"
+        )
+
+
 def _add(
     service: Client,
     name: str,
@@ -27,6 +36,7 @@ def _add(
     missions: Sequence[str] | None = None,
     days: float | None = None,
 ) -> dict[str, Any]:
+    _say_unknown(service, missions)
     made = service.add_user(name, role, missions=missions, days_valid=days)
     return {"name": name, "role": role, "token": made.token}
 
@@ -39,6 +49,7 @@ def _renew(
     missions: Sequence[str] | None = None,
     days: float | None = None,
 ) -> dict[str, Any]:
+    _say_unknown(service, missions)
     made = service.add_token(name, missions=missions, days_valid=days, revoke_others=not keep)
     return {"name": name, "token": made.token}
 
@@ -48,6 +59,7 @@ def _rank(service: Client, name: str, role: Role) -> User:
 
 
 def _limit(service: Client, name: str, missions: Sequence[str] = ()) -> User:
+    _say_unknown(service, missions)
     return service.change_user(name, missions=list(missions))
 
 

@@ -20,6 +20,7 @@ from ground_service.passes.model import PassFilter
 from ground_service.passes.store import list_passes
 from ground_service.regression.build_runs import read_performance
 from ground_service.regression.builds import load_build
+from ground_service.toml import read_table
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError
 from lunar.messages import ephemeris_files, oem
@@ -43,6 +44,31 @@ def test_toml_without_end_is_refused_in_one_line(text: str, told: str, tmp_path:
         load_build(tmp_path / "build.toml")
     with pytest.raises(ScenarioError, match="not TOML"):
         parse_scenario(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("a" + ".a" * 16 + " = 1", "a deeper or longer one"),
+        ("[a" + ' . "b.c"' * 16 + "]", "a deeper or longer one"),
+        ("k" * 201 + " = 1", "a deeper or longer one"),
+        ("a = [" + "[], [" * 17 + "]" * 18, "nested too deeply"),
+        ("[a.a]\n" * 60_000, "at most 100000 keys and values, found 120000"),
+        ("# " + "x" * (4 << 20), "at most 4 MiB"),
+    ],
+)
+def test_toml_that_would_cost_much_is_not_parsed(
+    text: str, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr("tomllib.loads")
+    with pytest.raises(InvalidInput, match=told):
+        read_table(text, "body", "TOML")
+
+
+def test_toml_in_its_limits_is_parsed_whatever_its_strings_contain() -> None:
+    text = "a" + ".a" * 15 + " = 1\n" + "b = '''" + "x.[" * 60_000 + "'''\nc = \"\\\"[[[[[[[[[[[[[[[[[[\"\n"
+    found = read_table(text, "body", "TOML")
+    assert found["b"] == "x.[" * 60_000 and found["c"] == '"' + "[" * 18
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from kernels import KEPT_S
+from kernels import KEPT_S, keep, kept
 
 ROOT = Path(__file__).resolve().parents[2]
 CALLEE = """
@@ -115,6 +115,24 @@ def test_processes_that_compile_at_once_leave_whole_files(tmp_path: Path) -> Non
     assert {process.communicate()[0].split()[0] for process in processes} == {"20"}
     assert len(list(cache.iterdir())) == 2  # outer and inner, without remains
     assert run(folder, cache) == "20 1"
+
+
+def test_the_folder_is_private_and_files_of_others_are_ignored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    keep("a-1", b"code")
+    uid = os.getuid()
+    assert (tmp_path / "cache").stat().st_mode & 0o777 == (0o700 if uid else 0o755)
+    assert kept("a-1") == b"code"
+    monkeypatch.setattr(os, "getuid", lambda: uid + 1)
+    assert kept("a-1") == (b"code" if uid == 0 else None)
+    os.chown(tmp_path / "cache" / "a-1", 12345, -1) if uid == 0 else None
+    assert kept("a-1") is None
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "of-a-user"))
+    monkeypatch.setattr(os, "getuid", lambda: uid or 12345)
+    keep("a-1", b"code")
+    assert (tmp_path / "of-a-user").stat().st_mode & 0o777 == 0o700
 
 
 def test_damaged_and_unwritable_caches_are_compiled_around(tmp_path: Path) -> None:

@@ -32,18 +32,18 @@ class Alarm(Entity):
     limits: str = Field(description="Limits of the parameter; empty for an event")
     first: UtcTime = Field(description="Spacecraft time of the first packet with the condition")
     last: UtcTime = Field(description="Spacecraft time of the last packet with the condition")
-    raised: UtcTime = Field(description="When this service raised the alarm")
+    raised: UtcTime = Field(description="When this service raised the alarm, time of day")
     acknowledged_by: str | None = None
-    acknowledged: UtcTime | None = None
+    acknowledged: UtcTime | None = Field(default=None, description="Time of day")
     shelved_by: str | None = None
-    shelved_until: UtcTime | None = None
-    cleared: UtcTime | None = None
+    shelved_until: UtcTime | None = Field(default=None, description="Mission time")
+    cleared: UtcTime | None = Field(default=None, description="Time of day")
 
 
 class AlarmChange(Entity):
     """A change in the life of an alarm."""
 
-    time: UtcTime
+    time: UtcTime = Field(description="Time of day")
     actor: str = Field(description="User, or 'telemetry'", examples=["eva"])
     change: str = Field(examples=["acknowledged"])
     comment: str
@@ -63,7 +63,7 @@ class Acknowledgement(Given):
 
 
 class Shelving(Given):
-    """Suppression of an alarm until a time; a time in the past ends it."""
+    """Suppression of an alarm until a mission time; one in the past ends it."""
 
     until: GivenTime
     comment: str = Field(default="", max_length=500)

@@ -30,5 +30,5 @@ def acknowledge_alarm(
 
 @alarms.post("/alarms/{alarm_id}/shelve")
 def shelve_alarm(ground: GroundOf, caller: Operator, alarm_id: RowId, given: Shelving) -> AlarmDetail:
-    """Suppress an alarm until a time; a time in the past ends this."""
+    """Suppress an alarm until a mission time; one in the past ends this."""
     return service.shelve_alarm(ground, alarm_id, given.until.utc_ns, given.comment, actor=caller.name)

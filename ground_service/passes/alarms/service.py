@@ -73,7 +73,7 @@ def examine_packets(ground: Ground, vehicle: int) -> int:
 
 def list_alarms(connection: Connection, asked: AlarmFilter) -> PageOf[Alarm]:
     """List the alarms of all spacecraft, open ones first and the latest first."""
-    now = utc_now_ns()
+    now = mission_now_ns()
     rows, total = store.list_alarms(connection, asked, now)
     return asked.page([_alarm(connection, row, now) for row in rows], total)
 
@@ -114,7 +114,7 @@ def acknowledge_alarm(ground: Ground, alarm_id: int, comment: str, *, actor: str
 def shelve_alarm(
     ground: Ground, alarm_id: int, until_utc_ns: int, comment: str, *, actor: str
 ) -> AlarmDetail:
-    """Suppress an open alarm until a time, or end its suppression with a time in the past.
+    """Suppress an open alarm until a mission time, or end its suppression with one in the past.
 
     Raises
     ------
@@ -125,17 +125,22 @@ def shelve_alarm(
     InvalidInput
         The time is more than `SHELVED_DAYS_LIMIT` days ahead.
     """
-    now = utc_now_ns()
+    now = mission_now_ns()
     if until_utc_ns > now + SHELVED_DAYS_LIMIT * DAY_NS:
         found = format_utc(until_utc_ns)
-        raise InvalidInput("alarm", "until", f"a time within {SHELVED_DAYS_LIMIT} days", found)
+        raise InvalidInput(
+            "alarm",
+            "until",
+            f"a time within {SHELVED_DAYS_LIMIT} days of the mission time {format_utc(now)}",
+            found,
+        )
     ends = until_utc_ns <= now
     with ground.database.writing() as connection:
         row = store.get(connection, alarm_id)
         if not store.shelve(connection, alarm_id, None if ends else actor, None if ends else until_utc_ns):
             raise Conflict(f"alarm {alarm_id}: expected an open alarm, found cleared")
         change = "unshelved" if ends else "shelved"
-        store.note_change(connection, alarm_id, now, actor, change, comment)
+        store.note_change(connection, alarm_id, utc_now_ns(), actor, change, comment)
         detail = {"name": row.name, "until": format_utc(until_utc_ns), "comment": comment}
         audit(
             connection, actor, "shelve alarm" if not ends else "unshelve alarm", f"alarm {alarm_id}", detail
@@ -264,7 +269,7 @@ def _condition(row: AlarmRow) -> Condition:
 
 def get_alarm(connection: Connection, alarm_id: int) -> AlarmDetail:
     """Return an alarm with its history and the procedure of the mission description."""
-    alarm = _alarm(connection, store.get(connection, alarm_id), utc_now_ns())
+    alarm = _alarm(connection, store.get(connection, alarm_id), mission_now_ns())
     mission = mission_in_force(connection, alarm.spacecraft_id)
     procedure = None if mission is None else mission.procedures.get(alarm.name)
     history = store.history(connection, alarm_id)

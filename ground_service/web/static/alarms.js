@@ -2,7 +2,7 @@ import { state, stated } from "./address.js";
 import { get, send } from "./api.js";
 import { chart } from "./charts.js";
 import { list } from "./lists.js";
-import { acting, button, buttons, byId, dictionary, element, figure, isoText, limitText, loading, notice, on, parameterName, plural, seconds, show, showTable, table, timeText, unitText, words } from "./page.js";
+import { acting, button, buttons, byId, dictionary, element, figure, isoText, limitText, loading, missionNow, notice, on, parameterName, plural, seconds, show, showTable, table, timeText, unitText, words } from "./page.js";
 import { seriesOf } from "./parameters.js";
 
 const OPEN = ["raised", "acknowledged", "shelved"];
@@ -65,7 +65,7 @@ async function acknowledgeChosen() {
 
 function actions(alarm) {
   const act = (label, task, needs) => button(label, task, { needs, name: `${label} alarm ${alarm.id}` });
-  const until = (hours) => new Date(Date.now() + hours * HOUR_MS).toISOString();
+  const until = (hours) => new Date(1000 * missionNow() + hours * HOUR_MS).toISOString();
   return buttons(
     alarm.state === "raised" ? act("Acknowledge", change("acknowledge", alarm.id, {})) : null,
     alarm.state === "shelved" ? act("Unshelve", change("shelve", alarm.id, { until: until(-1) })) : null,

@@ -290,7 +290,7 @@ dialog.addEventListener("close", async () => {
 // Who is signed in: adapts the page to the role and returns the session.
 async function signedIn() {
   const session = await get("session");
-  setClock(session.time);
+  setClock(session);
   byId("user").textContent = session.browser ? `${session.name}, ${session.role}` : "";
   byId("user").title = session.browser && session.expires ? `The session ends ${timeText(session.expires)} UTC` : "";
   byId("caller").textContent = session.browser ? "Sign out" : "Sign in";
@@ -317,20 +317,20 @@ let clock = null; // time of the service and of the browser at the last answer, 
 const missionMs = () => (clock ? clock.time + clock.speed * (Date.now() - clock.at) : Date.now());
 export const missionNow = () => missionMs() / 1000;
 
-function setClock(text) {
+function setClock({ time: text, recorded }) {
   const [time, at] = [Date.parse(text), Date.now()];
   const simulated = Math.abs(time - at) > SIMULATED_MS;
-  const speed = simulated && clock && at > clock.at ? (time - clock.time) / (at - clock.at) : 1;
+  const speed = simulated && clock && at > clock.at ? (time - clock.time) / (at - clock.at) : recorded ? 0 : 1;
   // The second answer tells the speed.
-  if (simulated) setTimeout(() => get("session").then((session) => setClock(session.time), () => {}), clock ? ASK_AGAIN_MS : 1000);
-  clock = { time, at, speed, simulated };
+  if (simulated) setTimeout(() => get("session").then(setClock, () => {}), clock ? ASK_AGAIN_MS : 1000);
+  clock = { time, at, speed, simulated, recorded };
   tick();
 }
 
 function tick() {
   if (!clock) return;
   const now = new Date(missionMs()).toISOString();
-  byId("clock").textContent = `${now.slice(0, 10)} ${now.slice(11, 19)} UTC${clock.simulated ? ", simulated" : ""}`;
+  byId("clock").textContent = clock.recorded ? `data of ${now.slice(0, 10)}, recorded` : `${now.slice(0, 10)} ${now.slice(11, 19)} UTC${clock.simulated ? ", simulated" : ""}`;
   byId("clock").dateTime = now;
 }
 setInterval(tick, 1000);

@@ -31,8 +31,9 @@ function contactFigure(craft, data) {
   return number("Contact", open ? "now" : inTime(contact.start), `${contact.station}${left ? `, ${open ? "to" : "at"} ${timeText(left).slice(5, 16)}` : ""}`);
 }
 
-function ageFigure(newest) {
+function ageFigure(newest, recorded) {
   const [last] = [...newest].sort((one, other) => one.age_s - other.age_s);
+  if (last && recorded) return number("Data", "recorded", `data of ${last.time.slice(0, 10)}`);
   return last ? number("Age of data", lengthText(last.age_s), `newest telemetry of ${timeText(last.time)}`) : number("Age of data", "none", "no telemetry received");
 }
 
@@ -148,13 +149,14 @@ function spacecraftOf(craft, data, newest) {
   return element(
     "section",
     { class: "craft", "aria-label": `Spacecraft ${keyOf(craft)}` },
-    element("div", { class: "head" }, element("h2", {}, `Spacecraft ${craft.spacecraft_id}${craft.instance === "flight" ? "" : `, ${craft.instance}`}`), holdOf(craft, data)),
+    element("div", { class: "head" }, element("h2", { title: keyOf(craft) }, craft.name ?? `Spacecraft ${craft.spacecraft_id}`), holdOf(craft, data)),
+    data.recorded ? element("p", {}, "A finished recording. Next step: open its ", link(data.passes.length ? `/passes/${data.passes[0].id}` : "/passes", "pass"), " and report, then plan an observation window in the ", link("/planner", "planner"), ".") : null,
     element(
       "dl",
       { class: "glance" },
       contactFigure(craft, data),
       next ? number("Next window", seconds(next.start) <= missionNow() ? "now" : inTime(next.start), next.name) : number("Next window", "none", "no window planned"),
-      ageFigure(newest),
+      ageFigure(newest, data.recorded),
       number("Open alarms", String(mine(data.alarms, craft).filter((one) => one.state !== "shelved").length), "raised or acknowledged"),
     ),
     element(
@@ -182,6 +184,7 @@ document.addEventListener("pointerdown", () => {
 });
 
 async function load() {
+  const { recorded } = await get("session");
   const [spacecraft, windows, links, contacts, alarms, passes, handovers, jobs] = await Promise.all([
     get("spacecraft"),
     get("windows", { limit: 100, state: OPEN }),
@@ -195,13 +198,15 @@ async function load() {
   const ids = windows.items.map((one) => one.id);
   const passIds = passes.items.map((one) => one.id);
   // The flown one of each spacecraft; a spacecraft of archives alone is shown in one of its instances. Flown ones come first.
-  const crafts = [...new Map(spacecraft.items.toReversed().map((one) => [one.spacecraft_id, one])).values()].reverse();
+  const known = (one) => spacecraft.items.filter((other) => other.spacecraft_id === one.spacecraft_id);
+  const crafts = [...new Map(spacecraft.items.toReversed().map((one) => [one.spacecraft_id, one])).values()].reverse().map((one) => ({ ...one, name: one.name ?? known(one).at(-1).name }));
+  const sources = crafts.map((one) => (recorded ? known(one).at(-1) : one)); // of values
   const [telecommands, reports, ...newest] = await Promise.all([
     ids.length ? get("telecommands", { limit: 1000, window_id: ids }) : { items: [] },
     passIds.length ? get("reports", { pass_id: passIds }) : { items: [] },
-    ...crafts.map((one) => get("parameters", { live: true, spacecraft_id: one.spacecraft_id, instance: one.instance }).then((answer) => answer.items)),
+    ...sources.map((one) => get("parameters", { live: true, spacecraft_id: one.spacecraft_id, instance: one.instance }).then((answer) => answer.items)),
   ]);
-  const data = { windows: windows.items, links: links.items, contacts, alarms: alarms.items, passes: passes.items, handovers: handovers.items, telecommands: telecommands.items, reports: reports.items };
+  const data = { recorded, windows: windows.items, links: links.items, contacts, alarms: alarms.items, passes: passes.items, handovers: handovers.items, telecommands: telecommands.items, reports: reports.items };
   await pressEnded; // a button that is drawn again while it is pressed is not clicked
   show("spacecraft", crafts.length ? crafts.map((craft, index) => spacecraftOf(craft, data, newest[index])) : element("p", { class: "hint" }, "No spacecraft yet: register a mission description on the page ", element("a", { href: "/missions" }, "Missions"), ", or upload a downlink."));
   showJobs(jobs.items);

@@ -17,11 +17,23 @@ from ground_service.access.scopes import DECIDED, ROWS, Scope, check_scope, scop
 from ground_service.access.service import Caller, add_token, add_user, authenticate, change_user
 from ground_service.app import create_app
 from ground_service.errors import Forbidden
-from ground_service.events import CorrelationChanged, publish
+from ground_service.events import (
+    CommandStateChanged,
+    CorrelationChanged,
+    Event,
+    HandoverChanged,
+    LinkChanged,
+    PlanChanged,
+    RequestChanged,
+    WindowChanged,
+    publish,
+)
 from ground_service.missions.service import add_mission
 from ground_service.settings import Settings
 from ground_service.store import repository
+from ground_service.store.events import LoggedEvent
 from ground_service.store.models import METADATA
+from ground_service.web.sockets import event_owner
 from lunar.timescales import format_utc
 from tests.ground_service.conftest import START, save_circle
 from tests.serving import TestClient
@@ -259,9 +271,27 @@ def test_a_socket_sends_only_events_of_the_callers_spacecraft(fleet: Fleet) -> N
     with fleet.client.websocket_connect(f"{V1}/live", headers=fleet.headers) as socket:
         for vehicle in (1, 2):
             ground.write(publish, CorrelationChanged(vehicle_id=vehicle, segments=1))
+        for number in (THEIRS, OURS):
+            ground.write(publish, HandoverChanged(spacecraft_id=number, instance="flight", held_by="ann"))
         assert socket.receive_json()["payload"]["vehicle_id"] == 2
+        assert socket.receive_json()["payload"]["spacecraft_id"] == OURS
     with fleet.client.websocket_connect(f"{V1}/live?after=0", headers=fleet.headers) as socket:
-        assert socket.receive_json()["payload"]["vehicle_id"] == 2
+        assert socket.receive_json()["payload"]["mission"] == "ours"
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        WindowChanged(id=1, state="approved"),
+        CommandStateChanged(id=1, state="sent"),
+        LinkChanged(link="theirs", state="connected"),
+        RequestChanged(id=1, state="active"),
+        PlanChanged(request_id=1, windows_added=(1,)),
+    ],
+)
+def test_an_event_of_a_row_is_of_the_spacecraft_of_the_row(event: Event, fleet: Fleet) -> None:
+    logged = LoggedEvent(1, 0, event.event_kind, event.model_dump(mode="json"))
+    assert event_owner(fleet.client.app.state.ground, logged) == THEIRS
 
 
 def test_a_scope_names_its_parameter() -> None:

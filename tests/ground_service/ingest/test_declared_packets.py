@@ -1,5 +1,7 @@
 """Packets that a mission description defines: received, decoded, read as series, exported, decoded again."""
 
+import base64
+import gzip
 import hashlib
 import json
 import shutil
@@ -18,9 +20,10 @@ from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest import parameters as decoding
 from ground_service.ingest.service import Place, decode_all_again, ingest_file, undecoded_vehicles
+from ground_service.missions import definitions
 from ground_service.missions import store as missions
 from ground_service.missions.definitions import definition_remarks, minimal_description, read_mission_file
-from ground_service.missions.model import PacketTime, read_document
+from ground_service.missions.model import XTCE_COMPRESSED, Mission, PacketTime, read_document
 from ground_service.missions.service import add_mission, check_mission_file
 from ground_service.missions.store import packets_in_force
 from ground_service.passes import series
@@ -618,6 +621,17 @@ def test_each_faulty_document_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match=r"packets.0.xtce: expected the file .*bus\.xml"):
         check_mission_file(path)
     assert "expected texts of XTCE documents" in str(read_document(path.read_text(), "m.toml")[0])
+
+
+def test_documents_have_one_limit_for_their_sum(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(definitions, "DOCUMENTS_LIMIT_OCTETS", 1000)
+    packed = XTCE_COMPRESSED + base64.b64encode(gzip.compress(b"<x>" + b" " * 600)).decode()
+    source = {"name": "a", "apids": [5], "packet_checksum": "none", "xtce": [packed]}
+    mission = Mission.model_validate(
+        {"name": "m", "packets": [source, {**source, "name": "b", "apids": [6]}]}
+    )
+    faults = [str(one) for one in definitions.definition_faults(mission, "m")]
+    assert "of documents in all, found more" in faults[-1] and "in all" not in faults[0]
 
 
 def test_a_long_document_is_embedded_compressed(ground: Ground, tmp_path: Path) -> None:

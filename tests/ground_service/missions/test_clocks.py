@@ -9,16 +9,25 @@ from typing import Any
 
 import pytest
 
+from ground_service.access.service import LOCAL_CALLER, session_of
 from ground_service.app import create_app
-from ground_service.clock import follow_missions, mission_now_ns, set_mission_clock
+from ground_service.clock import (
+    follow_missions,
+    independent_now_ns,
+    is_recorded,
+    mission_now_ns,
+    set_mission_clock,
+)
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
 from ground_service.missions import clocks
 from ground_service.missions.clocks import mission_clock, read_mission_clock
 from ground_service.missions.model import parse_mission
 from ground_service.missions.service import add_mission
+from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from ground_service.worker.app import _ground_of
+from ground_service.worker.condition import service_status
 from linna.commands._ground import ground_client
 from lunar.timescales import format_utc, parse_utc
 from tests.serving import TestClient, wait_for
@@ -93,6 +102,22 @@ def test_the_clock_of_telemetry_stands_at_the_newest(ground: Ground, synthetic_p
         assert {
             one["age_s"] < 600.0 for one in client.get("/api/v1/parameters?spacecraft_id=76").json()["items"]
         } == {True}
+
+
+def test_archives_alone_have_the_time_of_their_data(ground: Ground, synthetic_pass: Any) -> None:
+    import_archive(ground, synthetic_pass.folder)
+    read_mission_clock(ground)
+    assert 0 <= mission_now_ns() - synthetic_pass.utc_ns[-1] < 1e9
+    seen = session_of(ground, LOCAL_CALLER, browser=False)
+    assert seen.recorded and seen.time.utc_ns == mission_now_ns()
+    status = service_status(ground, None)
+    assert status.mission_time == seen.time and abs(status.time.utc_ns - time.time_ns()) < 600e9
+    assert (
+        abs((independent_now_ns() or 0) - time.time_ns()) < 600e9
+    )  # new telemetry is judged by the wall clock
+    add_mission(ground, b'name = "m"\n[spacecraft]\nid = 76\n')
+    read_mission_clock(ground)
+    assert not is_recorded() and abs(mission_now_ns() - time.time_ns()) < 600e9
 
 
 def test_several_stated_clocks_are_none(ground: Ground, caplog: pytest.LogCaptureFixture) -> None:

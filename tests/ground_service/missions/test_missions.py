@@ -325,6 +325,22 @@ def test_windows_approved_automatically_with_critical_telecommands_are_refused(
     assert add_mission(ground, (TEXT + released).encode()).document.critical_in_windows == ()
 
 
+def test_a_check_of_texts_that_take_long_to_compare_counts_their_lines(ground) -> None:
+    head = TEXT + "\n".join(f"# {k % 7}" for k in range(1500)) + "\n"
+    add_mission(ground, head.encode())
+    (change,) = check_mission(ground, (TEXT + "# x\n" + "# y\n# z\n" * 700).encode()).changes
+    assert change == (
+        f"@@ 1500 lines from line {TEXT.count(chr(10)) + 1} on are replaced by 1401: too many to compare @@"
+    )
+
+
+def test_a_wrong_address_of_a_webhook_is_not_shown(ground) -> None:
+    (fault,) = check_mission(
+        ground, (TEXT + '[notify.ops]\nwebhook = "htp://ann:S3CRET@x"\n').encode()
+    ).faults
+    assert "notify.ops.webhook" in fault and "S3CRET" not in fault
+
+
 def test_a_check_tells_all_faults_or_what_changes_and_adds_nothing(ground) -> None:
     add_mission(ground, TEXT.encode())
     assert check_mission(ground, TEXT.encode()).changes == ()

@@ -9,6 +9,7 @@ from ground_service.clock import set_mission_clock
 from ground_service.errors import NotFound
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
+from ground_service.missions.service import add_mission
 from ground_service.passes.live import list_spacecraft, live_parameters
 from lunar.timescales import utc_ns_from_ticks
 from tmtc.dictionary import DICTIONARY
@@ -40,7 +41,10 @@ def test_the_newest_packet_by_on_board_time_counts(either: Ground, tmp_path: Pat
     assert (found["mode"].text, found["mode"].limit_state) == ("observing", "none")
     assert found["model_hash"].text == "df7f5779"
     assert temperature.time.utc_ns == int(utc_ns_from_ticks(TICKS + 10 * 65_536))
-    assert [(one.spacecraft_id, one.instance) for one in list_spacecraft(either)] == [(76, "flight")]
+    (listed,) = list_spacecraft(either)
+    assert (listed.spacecraft_id, listed.instance, listed.name) == (76, "flight", None)
+    add_mission(either, b'name = "m"\n[spacecraft]\nid = 76\nname = "SelenITA"\n')
+    assert list_spacecraft(either)[0].name == "SelenITA"
 
 
 @pytest.mark.parametrize(("later_s", "age_s"), [(42.5, 42.5), (-1e8, 0.0)])

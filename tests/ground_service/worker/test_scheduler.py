@@ -71,6 +71,16 @@ def test_one_of_two_works_until_its_lease_ends(either: Ground, monkeypatch: pyte
     assert (work_1.resumed, work_2.resumed) == (2, 1)
 
 
+def test_a_lease_of_a_clock_that_was_ahead_is_ended(either: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+    (first, _), (second, _) = make(either), make(either)
+    now = [parse_utc("2031-08-07T00:00:00Z")]
+    monkeypatch.setattr(leases, "database_now_ns", lambda connection: now[0])
+    assert first.tick()
+    now[0] = parse_utc("2029-08-07T00:00:00Z")
+    assert not has_scheduler(either)
+    assert second.tick() and has_scheduler(either) and not first.tick()
+
+
 def test_a_process_that_stops_gives_its_lease_back(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scheduling, "TICK_S", 0.01)
     (first, work), (second, _) = make(ground), make(ground)

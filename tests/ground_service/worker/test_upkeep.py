@@ -26,7 +26,7 @@ from ground_service.store import repository
 from ground_service.store.events import publish
 from ground_service.store.models import METADATA
 from ground_service.worker.jobs import run_job
-from ground_service.worker.upkeep import nightly_job_id, tidy
+from ground_service.worker.upkeep import nightly, nightly_job_id, tidy
 from tests.serving import token_valid
 from tmtc.dictionary import DICTIONARY
 
@@ -93,6 +93,18 @@ def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pyte
     assert [item.number for item in read_events(ground.database, 0)] == [3]
     with ground.database.reading() as connection:
         assert repository.newest(connection, repository.AUDIT, Paging())[1] == 1
+
+
+def test_nothing_is_removed_in_the_first_night_after_a_jump_of_the_clock(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    enter_job(ground, "plan", {})
+    now = utc_now_ns() + 400 * DAY_NS
+    monkeypatch.setattr("ground_service.worker.upkeep.utc_now_ns", lambda: now)
+    assert nightly(ground, {})["removed"] == {}
+    enter_job(ground, "nightly", {}, job_id=nightly_job_id(now))
+    now += DAY_NS
+    assert "events" in nightly(ground, {})["removed"]
 
 
 def counts(ground: Ground) -> dict[str, int]:

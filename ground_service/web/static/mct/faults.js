@@ -127,8 +127,9 @@ export function installFaults(openmct, session) {
   };
   if (session.role !== "viewer") {
     provider.acknowledgeFault = (fault, given) => act(fault, "acknowledge", { comment: given?.comment ?? "" });
-    provider.shelveFault = (fault, { shelved = true, shelveDuration, comment } = {}) => {
-      const until = shelved ? Date.now() + (shelveDuration ?? DURATIONS[0].value) : Date.now() - MINUTE_MS;
+    provider.shelveFault = async (fault, { shelved = true, shelveDuration, comment } = {}) => {
+      const now = Date.parse((await get("session")).time); // alarms are shelved in mission time
+      const until = now + (shelved ? (shelveDuration ?? DURATIONS[0].value) : -MINUTE_MS);
       return act(fault, "shelve", { until: new Date(until).toISOString(), comment: comment ?? "" });
     };
   }

@@ -184,6 +184,21 @@ def test_a_shelved_alarm_returns_at_its_time(either: Ground, tmp_path: Path) -> 
         shelve_alarm(either, alarm.id, now + hour, "", actor="eva")
 
 
+def test_an_alarm_is_shelved_in_mission_time_and_its_records_are_in_time_of_day(
+    ground: Ground, tmp_path: Path
+) -> None:
+    receive(ground, tmp_path / "in", [event(0)])
+    moment = utc_now_ns() + 1000 * 86_400 * 10**9
+    set_mission_clock(lambda: moment)
+    try:
+        shelved = shelve_alarm(ground, alarms(ground)[0].id, moment + 10**9, "known", actor="eva")
+        assert shelved.state == "shelved" and abs(shelved.history[-1].time.utc_ns - utc_now_ns()) < 600e9
+        moment += 2 * 10**9
+        assert [one.state for one in alarms(ground)] == ["raised"]
+    finally:
+        set_mission_clock()
+
+
 def test_changes_are_published(ground: Ground, tmp_path: Path) -> None:
     receive(ground, tmp_path / "in", [event(0)])
     acknowledge_alarm(ground, alarms(ground)[0].id, "", actor="eva")
