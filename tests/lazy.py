@@ -11,6 +11,8 @@ class Lazy:
         self._module = module
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # asked of every name of a test module while tests are collected
+            raise AttributeError(name)
         return getattr(import_module(self._module), name)
 
 

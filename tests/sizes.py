@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import csv
 import io
+import re
 import subprocess
 import sys
 import tokenize
@@ -19,35 +20,30 @@ PACKAGES = (
     "ground_service", "payload_emulator", "tmtc", "lunar", "kernels", "reports", "linna", "studies",
     "benchmarks", "db", "deploy", "tests",
 )  # fmt: skip
-LAYOUT = {
-    tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENCODING,
-    tokenize.ENDMARKER,
-}  # fmt: skip
+_STRING = "|".join(rf"{q}(?:[^\\]|\\.)*?{q}" for q in ('"""', "'''", '"', "'"))
+TOKEN = re.compile(
+    rf"#[^\n]*|(?:\b[rRbBfFuU]{{1,2}})?(?:{_STRING})|{tokenize.Number}|{tokenize.Name}|{tokenize.Special}",
+    re.DOTALL,
+)
+"""A comment or a code token, as `tokenize` cuts them; layout is passed over."""
 Sizes = dict[str, tuple[int, int]]
 
 
 def size_of(source: str) -> tuple[int, int]:
     """Return lines and code tokens of a module; comments, docstrings and layout are no tokens."""
-    tokens = [
-        token for token in tokenize.generate_tokens(io.StringIO(source).readline) if token.type not in LAYOUT
-    ]
-    starts = _docstrings(source)
-    return len(source.splitlines()), sum(token.start not in starts for token in tokens)
+    tokens = sum(not found.group().startswith("#") for found in TOKEN.finditer(source))
+    return len(source.splitlines()), tokens - _docstrings(ast.parse(source))
 
 
-def _docstrings(source: str) -> set[tuple[int, int]]:
-    """Return line and column of each docstring."""
-    places = set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and node.body:
-            first = node.body[0]
-            if (
-                isinstance(first, ast.Expr)
-                and isinstance(first.value, ast.Constant)
-                and isinstance(first.value.value, str)
-            ):
-                places.add((first.lineno, first.col_offset))
-    return places
+def _docstrings(node: ast.AST) -> int:
+    """Return the number of docstrings of a module, class, function or other statement and of all that it contains."""
+    count = 0
+    if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+        count += ast.get_docstring(node, clean=False) is not None
+    for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+        statements = getattr(node, part, ())
+        count += sum(map(_docstrings, statements)) if isinstance(statements, list) else 0
+    return count
 
 
 def sizes_of(root: Path) -> Sizes:

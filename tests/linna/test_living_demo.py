@@ -68,7 +68,6 @@ def test_a_living_demo_plans_and_commands_until_it_is_ended(tmp_path: Path) -> N
                 & {one.state for one in client.list_windows()}
             ),
             "telecommands of a window sent",
-            300.0,
         )
         demo.finish()
         assert not listens(port)

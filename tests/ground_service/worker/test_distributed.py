@@ -45,9 +45,7 @@ def job_row(ground: Ground, job_id: str) -> dict[str, Any]:
 
 
 def finished(ground: Ground, job_id: str) -> dict[str, Any]:
-    wait_for(
-        lambda: job_row(ground, job_id)["state"] in ("done", "failed"), f"the end of job {job_id}", 180.0
-    )
+    wait_for(lambda: job_row(ground, job_id)["state"] in ("done", "failed"), f"the end of job {job_id}")
     return job_row(ground, job_id)
 
 

@@ -62,7 +62,6 @@ def test_a_killed_owner_is_replaced_and_nothing_is_lost_or_sent_twice(
             wait_for(
                 lambda: packets_of(bytes(station.telecommands))[2:] == octets_of(ground, after),
                 "the later telecommand",
-                60.0,
             )
             assert f":{killed.pid}:" not in (service.get_link(ground, "lab").owner or "")
         finally:
