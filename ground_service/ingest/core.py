@@ -151,7 +151,8 @@ def implausible_times(
     order = timed[np.argsort(ticks[timed], kind="stable")]
     if not order.size:
         return {}
-    times, doubts = ticks[order], {}
+    times = ticks[order]
+    doubts: dict[int, str] = {}
     known = None if received is None else (received != NO_TICKS) & (ticks != NO_TICKS)
     agreed = np.zeros(len(ticks), dtype=np.bool_)
     if received is not None and known is not None:

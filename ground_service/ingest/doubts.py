@@ -43,7 +43,7 @@ def plausible_part(
     `judged`: only packets that are kept apart already are left out.
     """
     newest, is_doubted = telemetry.newest_and_doubted(connection, vehicle, batch.apid)
-    known = set()
+    known: set[bytes] = set()
     if is_doubted:
         digests = connection.execute(select(_DOUBTED.c.digest).where(_DOUBTED.c.vehicle_id == vehicle))
         known = {bytes(digest) for digest in digests.scalars()}
