@@ -358,7 +358,7 @@ class Operations(Connection):
 
     @operation("DELETE /jobs/{job_id}")
     def delete_job(self, job_id: str) -> None:
-        """Dismiss a failed job, such as the ingest of a file that is no downlink; what it has stored is kept."""
+        """Delete a failed job, such as the ingest of a file that is no downlink; what it has stored is kept."""
 
     # missions
 

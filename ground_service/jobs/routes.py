@@ -36,7 +36,7 @@ def repeat_job(ground: GroundOf, caller: Operator, dispatcher: DispatcherOf, job
 
 @jobs.delete("/jobs/{job_id}", status_code=204, responses=problems(404, 409))
 def delete_job(ground: GroundOf, caller: Operator, job_id: Key) -> Response:
-    """Dismiss a failed job, such as the ingest of a file that is no downlink; what it has stored is kept."""
+    """Delete a failed job, such as the ingest of a file that is no downlink; what it has stored is kept."""
     with ground.database.writing() as connection:
         found = store.delete_failed(connection, job_id)
         audit(connection, caller.name, "dismiss job", job_id, {"kind": found.kind, "error": found.error})
