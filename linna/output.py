@@ -7,7 +7,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -86,6 +86,11 @@ def progress(
             left = f", {(total - count) / rate:.0f} s left" if total else ""
             log(f"{label}: {count}{f'/{total}' if total else ''} {unit} ({rate:.1f}/s{left})")
     log(f"{label}: {count} {unit} in {time.monotonic() - started:.1f} s")
+
+
+def watched_rims(parts: Sequence[Item]) -> Iterator[Item]:
+    """Yield parts of the craters that are measured, and show the progress."""
+    return progress(parts, len(parts), "rims of craters", "part")
 
 
 def _plain(value: Any) -> Any:

@@ -9,18 +9,18 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
-from lunar.compressed import read_expanded
+from lunar.compressed import EXPANDED_LIMIT_OCTETS, open_expanded
 from lunar.constants import MOON_RADIUS_M
 from lunar.errors import DataFileError, LunarError
 from lunar.frames import mcmf_from_spherical
@@ -74,6 +74,12 @@ craters in a footprint of 120 deg from the paper's orbit equals that of LU131938
 OWN_COLUMNS = ("id", "latitude_deg", "longitude_deg", "diameter_m", "rim_height_m", "depth_m", "complete")
 
 BAND_RAD = math.radians(1.0)
+
+BLOCK_OCTETS = 1 << 20
+ROWS_LIMIT = 2_000_000
+"""Most craters of a file; the largest public lists have 1.3 million."""
+
+_COMPOSITE = "composite of "
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,21 +323,37 @@ def load_catalogue(path: Path | str) -> CraterCatalogue:
         one id, or diameters, depths and places do not fit each other.
     """
     path = Path(path)
-    columns = _read_columns(path)
-    names = set(columns)
+    catalogue = _joined([_reader_of(path, columns)(path, columns) for columns in _read_blocks(path)])
+    _check_ranges(path, catalogue)
+    kept = _first_of_repetitions(catalogue)
+    _check_identity(path, catalogue.ids, kept)
+    catalogue = catalogue.select(kept)
+    _check_whole(path, catalogue)
+    return catalogue
+
+
+def _reader_of(path: Path, columns: _Columns) -> Reader:
     for reader, needed in _READERS:
-        if needed <= names:
-            catalogue = reader(path, columns)
-            _check_ranges(path, catalogue)
-            kept = _first_of_repetitions(catalogue)
-            _check_identity(path, catalogue.ids, kept)
-            catalogue = catalogue.select(kept)
-            _check_whole(path, catalogue)
-            return catalogue
+        if needed <= set(columns):
+            return reader
     known = "; ".join(", ".join(sorted(needed)) for _, needed in _READERS)
     raise DataFileError(
         path, "line 1", f"the columns of a crater catalogue ({known})", ", ".join(columns) or "nothing"
     )
+
+
+def _joined(blocks: list[CraterCatalogue]) -> CraterCatalogue:
+    """Return the blocks of a list as one; a composite has the sources of all."""
+    if len(blocks) == 1:
+        return blocks[0]
+    columns = {
+        one.name: np.concatenate([getattr(block, one.name) for block in blocks])
+        for one in fields(CraterCatalogue)
+        if one.name != "source"
+    }
+    prefix = _COMPOSITE if blocks[0].source.startswith(_COMPOSITE) else ""
+    sources = {name for block in blocks for name in block.source.removeprefix(prefix).split(", ")}
+    return CraterCatalogue(**columns, source=prefix + ", ".join(sorted(sources)))
 
 
 def save_catalogue(catalogue: CraterCatalogue, path: Path | str) -> None:
@@ -367,45 +389,86 @@ def _band(latitude_rad: float) -> int:
     return math.floor((latitude_rad + math.pi / 2) / BAND_RAD)
 
 
-def _read_columns(path: Path) -> dict[str, list[str]]:
-    try:
-        octets = read_expanded(path, "a crater catalogue in CSV, plain or gzip")
-        text = octets.decode("utf-8-sig")
-        lines = text.split("\n") if '"' not in text else None
-        rows = list(csv.reader(io.StringIO(text))) if lines is None else []
-    except (ValueError, csv.Error) as error:
-        raise DataFileError(path, "", "a complete CSV or gzip file", str(error)) from None
-    if lines is not None:
+class _Columns(dict[str, list[str]]):
+    """Texts of a block of rows by column; `first` is the line of its first row."""
+
+    first = 2
+
+
+def _read_blocks(path: Path) -> Iterator[_Columns]:
+    """Yield the rows of a file, block by block: texts take many times the memory of the numbers in them."""
+    header: list[str] = []
+    first, encoding = 2, "utf-8-sig"
+    with open_expanded(path, "a crater catalogue in CSV, plain or gzip") as stream:
+        for octets in _line_blocks(path, stream):
+            try:
+                text = octets.decode(encoding)
+            except ValueError as error:
+                raise DataFileError(path, "", "a complete CSV or gzip file", str(error)) from None
+            columns, header, rows = _columns_of(path, text, header, first)
+            first, encoding = first + rows, "utf-8"
+            if first - 2 > ROWS_LIMIT:
+                raise DataFileError(path, "", f"at most {ROWS_LIMIT} craters", "more")
+            yield columns
+
+
+def _line_blocks(path: Path, stream: IO[bytes]) -> Iterator[bytes]:
+    """Yield blocks of whole lines of a stream, at least one."""
+    left, total = b"", 0
+    while octets := stream.read(BLOCK_OCTETS):
+        total += len(octets)
+        whole, _, left = (left + octets).rpartition(b"\n")
+        if total > EXPANDED_LIMIT_OCTETS or len(left) > BLOCK_OCTETS:
+            limits = f"{EXPANDED_LIMIT_OCTETS >> 20} MiB when expanded and {BLOCK_OCTETS} octets of a line"
+            raise DataFileError(path, "", f"at most {limits}", "more")
+        if whole:
+            yield whole
+    if left or not total:
+        yield left
+
+
+def _columns_of(path: Path, text: str, header: list[str], first: int) -> tuple[_Columns, list[str], int]:
+    """Return the columns of lines, the names of the columns, which the first block begins with, and the rows."""
+    if '"' not in text:
         # Without quotes, a plain split is sufficient and five times as fast as the csv module.
         lines = [line for line in text.replace("\r", "").split("\n") if line]
-        header = lines[0].split(",") if lines else []
+        rows = []
         widths = [line.count(",") + 1 for line in lines]
-        wanted = [k for k, name in enumerate(header) if name.strip() in _KNOWN_COLUMNS]
-        if 2 * len(wanted) < len(header):
-            # Parse only the required columns of a wide table (Robbins: 21 columns, 1.3 million rows).
-            _check_widths(path, widths, len(header))
-            return _some_columns(header, lines[1:], wanted)
-        flat = ",".join(lines[1:]).split(",") if len(lines) > 1 else []
+        own = lines[0].split(",") if lines else []
     else:
-        rows = [row for row in rows if row]
-        header = rows[0]
+        lines = []
+        try:
+            rows = [row for row in csv.reader(io.StringIO(text)) if row]
+        except csv.Error as error:
+            raise DataFileError(path, "", "a complete CSV or gzip file", str(error)) from None
         widths = [len(row) for row in rows]
-        flat = [value for row in rows[1:] for value in row]
+        own = rows[0]
+    begins = not header
+    header = header or own
     if not header:
         raise DataFileError(path, "line 1", "the column names of a crater catalogue", "an empty file")
-    _check_widths(path, widths, len(header))
-    return {name.strip(): flat[k :: len(header)] for k, name in enumerate(header)}
+    _check_widths(path, widths, len(header), first - begins)
+    lines, rows = lines[begins:], rows[begins:]
+    wanted = [k for k, name in enumerate(header) if name.strip() in _KNOWN_COLUMNS]
+    if lines and 2 * len(wanted) < len(header):
+        # Parse only the required columns of a wide table (Robbins: 21 columns, 1.3 million rows).
+        columns = _some_columns(header, lines, wanted)
+    else:
+        flat = ",".join(lines).split(",") if lines else [value for row in rows for value in row]
+        columns = _Columns({name.strip(): flat[k :: len(header)] for k, name in enumerate(header)})
+    columns.first = first
+    return columns, header, len(lines) or len(rows)
 
 
-def _check_widths(path: Path, widths: list[int], expected: int) -> None:
-    for number, width in enumerate(widths, start=1):
+def _check_widths(path: Path, widths: list[int], expected: int, first: int) -> None:
+    for number, width in enumerate(widths, start=first):
         if width != expected:
             raise DataFileError(path, f"line {number}", f"{expected} values", f"{width}")
 
 
-def _some_columns(header: list[str], lines: list[str], wanted: list[int]) -> dict[str, list[str]]:
+def _some_columns(header: list[str], lines: list[str], wanted: list[int]) -> _Columns:
     """Return the columns of a table by name; columns that are not required are empty."""
-    columns: dict[str, list[str]] = {name.strip(): [] for name in header}
+    columns = _Columns({name.strip(): [] for name in header})
     last = max(wanted, default=0) + 1
     for line in lines:
         values = line.split(",", last)
@@ -414,14 +477,14 @@ def _some_columns(header: list[str], lines: list[str], wanted: list[int]) -> dic
     return columns
 
 
-def _numbers(path: Path, columns: dict[str, list[str]], name: str, missing: bool = False) -> FloatArray:
+def _numbers(path: Path, columns: _Columns, name: str, missing: bool = False) -> FloatArray:
     texts = columns[name]
     if missing:
         texts = [text if text.strip() else "nan" for text in texts]
     try:
         return np.array([float(text) for text in texts], dtype=np.float64)
     except ValueError:
-        for number, text in enumerate(texts, start=2):
+        for number, text in enumerate(texts, start=columns.first):
             try:
                 float(text)
             except ValueError:
@@ -429,9 +492,7 @@ def _numbers(path: Path, columns: dict[str, list[str]], name: str, missing: bool
         raise
 
 
-def _places(
-    path: Path, columns: dict[str, list[str]], latitude: str, longitude: str
-) -> tuple[FloatArray, FloatArray]:
+def _places(path: Path, columns: _Columns, latitude: str, longitude: str) -> tuple[FloatArray, FloatArray]:
     """Return latitudes and longitudes in radians of columns in degrees."""
     angles = []
     for name, low, high in ((latitude, -90.0, 90.0), (longitude, -360.0, 720.0)):
@@ -439,29 +500,38 @@ def _places(
         wrong = np.flatnonzero(~((values >= low) & (values <= high)))
         if wrong.size:
             expected = f"a {'latitude' if name == latitude else 'longitude'} of {low:g}..{high:g} deg"
-            raise DataFileError(path, f"line {wrong[0] + 2}", expected, f"{values[wrong[0]]:g}")
+            raise DataFileError(path, f"line {wrong[0] + columns.first}", expected, f"{values[wrong[0]]:g}")
         angles.append(np.radians(values))
     return angles[0], angles[1]
 
 
-def _ids(path: Path, columns: dict[str, list[str]]) -> IntArray:
+def _ids(path: Path, columns: _Columns) -> IntArray:
     numbers = _numbers(path, columns, "id")
     whole = (np.rint(numbers) == numbers) & (np.abs(numbers) < 2.0**53)
     if not whole.all():
         row = int(np.argmin(whole))
-        raise DataFileError(path, f"line {row + 2}, column id", "a whole number", columns["id"][row])
+        raise DataFileError(
+            path, f"line {row + columns.first}, column id", "a whole number", columns["id"][row]
+        )
     return numbers.astype(np.int64)
 
 
-def _flags(path: Path, columns: dict[str, list[str]], name: str) -> BoolArray:
+def _numbered(columns: _Columns) -> IntArray:
+    rows = max(map(len, columns.values()))
+    return np.arange(columns.first - 2, columns.first - 2 + rows, dtype=np.int64)
+
+
+def _flags(path: Path, columns: _Columns, name: str) -> BoolArray:
     texts = [text.strip().lower() for text in columns[name]]
     for row, text in enumerate(texts):
         if text not in ("1", "true", "0", "false", ""):
-            raise DataFileError(path, f"line {row + 2}, column {name}", "1, 0, true or false", repr(text))
+            raise DataFileError(
+                path, f"line {row + columns.first}, column {name}", "1, 0, true or false", repr(text)
+            )
     return np.array([text in ("1", "true") for text in texts], dtype=np.bool_)
 
 
-def _read_lu(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
+def _read_lu(path: Path, columns: _Columns) -> CraterCatalogue:
     return make_catalogue(
         *_places(path, columns, "latitude_deg", "longitude_deg"),
         _numbers(path, columns, "diameter_m"),
@@ -471,32 +541,35 @@ def _read_lu(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
     )
 
 
-def _read_composite(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
+def _read_composite(path: Path, columns: _Columns) -> CraterCatalogue:
     return make_catalogue(
         *_places(path, columns, "latitude_deg", "longitude_deg"),
         1000.0 * _numbers(path, columns, "diameter_km"),
-        source="composite of " + ", ".join(sorted(set(columns["source"]))),
+        source=_COMPOSITE + ", ".join(sorted(set(columns["source"]))),
+        ids=_numbered(columns),
         complete=_flags(path, columns, "tile_complete"),
     )
 
 
-def _read_robbins(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
+def _read_robbins(path: Path, columns: _Columns) -> CraterCatalogue:
     return make_catalogue(
         *_places(path, columns, "lat", "lon"),
         1000.0 * _numbers(path, columns, "diam"),
         source="Robbins",
+        ids=_numbered(columns),
     )
 
 
-def _read_robbins_whole(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
+def _read_robbins_whole(path: Path, columns: _Columns) -> CraterCatalogue:
     return make_catalogue(
         *_places(path, columns, "LAT_CIRC_IMG", "LON_CIRC_IMG"),
         1000.0 * _numbers(path, columns, "DIAM_CIRC_IMG"),
         source="Robbins",
+        ids=_numbered(columns),
     )
 
 
-def _read_own(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
+def _read_own(path: Path, columns: _Columns) -> CraterCatalogue:
     return make_catalogue(
         *_places(path, columns, "latitude_deg", "longitude_deg"),
         _numbers(path, columns, "diameter_m"),
@@ -508,7 +581,7 @@ def _read_own(path: Path, columns: dict[str, list[str]]) -> CraterCatalogue:
     )
 
 
-Reader = Callable[[Path, dict[str, list[str]]], CraterCatalogue]
+Reader = Callable[[Path, _Columns], CraterCatalogue]
 _READERS: tuple[tuple[Reader, set[str]], ...] = (
     (_read_own, set(OWN_COLUMNS)),
     (_read_composite, {"latitude_deg", "longitude_deg", "diameter_km", "source", "tile_complete"}),

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import gzip
-import io
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 from lunar.errors import DataFileError
 
@@ -25,40 +27,44 @@ def read_expanded(path: Path | str, expected: str, limit_octets: int = EXPANDED_
     DataFileError
         If the file cannot be read, the compression is damaged, or the expanded file is larger than the limit.
     """
-    try:
-        with Path(path).open("rb") as stream:
-            octets = stream.read(limit_octets + 1)
-    except OSError as error:
-        raise DataFileError(path, "", expected, error.strerror or str(error)) from None
-    for mark, expanded in ((_GZIP, _gunzipped), (_ZIP, _unzipped)):
-        if octets.startswith(mark) and len(octets) <= limit_octets:
-            octets = expanded(octets, path, limit_octets)
-            break
+    with open_expanded(path, expected) as stream:
+        octets = stream.read(limit_octets + 1)
     if len(octets) > limit_octets:
         raise DataFileError(path, "", f"at most {limit_octets >> 20} MiB when expanded", "more")
     return octets
 
 
-# Both read no more than one octet above the limit, whatever size the archive states.
+@contextmanager
+def open_expanded(path: Path | str, expected: str) -> Iterator[IO[bytes]]:
+    """Yield a stream of the octets of a file, expanded as they are read; no archive's word on its size is trusted.
 
-
-def _gunzipped(octets: bytes, path: Path | str, limit_octets: int) -> bytes:
+    Raises
+    ------
+    DataFileError
+        If the file cannot be read or the compression is damaged, also while the stream is read.
+    """
+    kind = "file"
     try:
-        with gzip.GzipFile(fileobj=io.BytesIO(octets)) as stream:
-            return stream.read(limit_octets + 1)
+        with Path(path).open("rb") as file:
+            mark = file.read(len(_ZIP))
+            file.seek(0)
+            if mark.startswith(_GZIP):
+                kind = "gzip file"
+                with gzip.GzipFile(fileobj=file) as stream:
+                    yield stream
+            elif mark == _ZIP:
+                kind = "zip archive"
+                with zipfile.ZipFile(file) as archive:
+                    files = [one for one in archive.infolist() if not one.is_dir()]
+                    if len(files) != 1:
+                        raise DataFileError(path, "", "a zip archive of one file", f"{len(files)} files")
+                    with archive.open(files[0]) as member:
+                        yield member
+            else:
+                yield file
     except EOFError:
-        raise DataFileError(path, "", "a complete gzip file", "one that is cut short") from None
-    except (OSError, zlib.error) as error:
-        raise DataFileError(path, "", "a gzip file", f"damaged data ({error})") from None
-
-
-def _unzipped(octets: bytes, path: Path | str, limit_octets: int) -> bytes:
-    try:
-        with zipfile.ZipFile(io.BytesIO(octets)) as archive:
-            files = [one for one in archive.infolist() if not one.is_dir()]
-            if len(files) != 1:
-                raise DataFileError(path, "", "a zip archive of one file", f"{len(files)} files")
-            with archive.open(files[0]) as stream:
-                return stream.read(limit_octets + 1)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
-        raise DataFileError(path, "", "a zip archive", f"damaged data ({error})") from None
+        raise DataFileError(path, "", f"a complete {kind}", "one that is cut short") from None
+    except (OSError, zlib.error, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
+        if kind == "file":
+            raise DataFileError(path, "", expected, getattr(error, "strerror", "") or str(error)) from None
+        raise DataFileError(path, "", f"a {kind}", f"damaged data ({error})") from None

@@ -104,7 +104,7 @@ def change_user(ground: GroundOf, caller: Admin, name: UserName, given: UserChan
 
 
 @access.post("/users/{name}/tokens", status_code=201)
-def add_token(ground: GroundOf, caller: Admin, name: UserName, given: NewToken) -> UserWithToken:
+def add_token(ground: GroundOf, caller: Admin, name: UserName, given: NewToken = NewToken()) -> UserWithToken:
     """Create a token for a user; the response contains it, and it cannot be read again."""
     token = users.add_token(
         ground,

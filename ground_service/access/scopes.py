@@ -37,7 +37,7 @@ CONTENT = {"add_ephemeris", "withdraw_ephemeris", "add_mission", "check_mission"
 """Operations whose content states the spacecraft; their use cases ask `Caller.may_use`."""
 
 SERVICE = {
-    "upload_archive", "repeat_job", "withdraw_catalogue", "add_build",
+    "upload_archive", "repeat_job", "delete_job", "withdraw_catalogue", "add_build",
     "add_current_build", "list_kept_archives", "keep_archive", "render_kept_archive", "change_kept_archive",
     "delete_kept_archives", "start_regression", "start_analysis", "list_regressions", "list_calibrations",
     "get_regression", "get_regression_report", "regression_page", "list_users", "add_user", "get_user", "change_user",

@@ -356,6 +356,10 @@ class Operations(Connection):
     def repeat_job(self, job_id: str) -> jobs.Job:
         """Queue a failed job again, which changes nothing that is done already."""
 
+    @operation("DELETE /jobs/{job_id}")
+    def delete_job(self, job_id: str) -> None:
+        """Delete a failed job, such as the ingest of a file that is no downlink; what it has stored is kept."""
+
     # missions
 
     @operation("GET /missions", reads="missions.store.list_missions")

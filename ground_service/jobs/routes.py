@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fastapi import Response
+
 from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.access.service import audit
 from ground_service.http.common import GroundOf, Key
@@ -30,3 +32,12 @@ def repeat_job(ground: GroundOf, caller: Operator, dispatcher: DispatcherOf, job
         audit(connection, caller.name, "repeat job", job_id, {})
     dispatcher.start(job_id)
     return ground.read(store.get_job, job_id)
+
+
+@jobs.delete("/jobs/{job_id}", status_code=204, responses=problems(404, 409))
+def delete_job(ground: GroundOf, caller: Operator, job_id: Key) -> Response:
+    """Delete a failed job, such as the ingest of a file that is no downlink; what it has stored is kept."""
+    with ground.database.writing() as connection:
+        found = store.delete_failed(connection, job_id)
+        audit(connection, caller.name, "dismiss job", job_id, {"kind": found.kind, "error": found.error})
+    return Response(status_code=204)

@@ -7,6 +7,7 @@ from typing import Any
 
 from sqlalchemy import Connection, and_, delete, or_, select
 
+from ground_service.errors import StateConflict
 from ground_service.http.model import PageOf
 from ground_service.jobs.model import Job, JobFilter
 from ground_service.store import repository
@@ -130,6 +131,20 @@ def repeat_job(connection: Connection, job_id: str) -> None:
         The job has not failed.
     """
     move(connection, JOB, job_id, "queued", expected=("failed",), progress=0.0)
+
+
+def delete_failed(connection: Connection, job_id: str) -> Job:
+    """Delete a failed job; return it.
+
+    Raises
+    ------
+    StateConflict
+        The job has not failed.
+    """
+    found = get_job(connection, job_id)
+    if not connection.execute(delete(JOBS).where(JOBS.c.id == job_id, JOBS.c.state == "failed")).rowcount:
+        raise StateConflict("job", job_id, "failed", found.state)
+    return found
 
 
 def repeat_failed(connection: Connection, now_utc_ns: int) -> None:

@@ -24,7 +24,7 @@ from ground_service.passes.model import (
 from ground_service.passes.parameters import DeclaredParameter, declared_reading
 from ground_service.store import parameters as declared_values
 from ground_service.store import telemetry
-from ground_service.store.vehicles import FLOWN, Vehicle, all_vehicles, find_vehicle, get_vehicle
+from ground_service.store.vehicles import FLOWN, Vehicle, find_vehicle, get_vehicle, used_vehicles
 from tmtc.dictionary import DICTIONARY, STRUCTURES
 from tmtc.fields import Field
 from tmtc.schema import DecodedPacket, limit_states
@@ -54,7 +54,7 @@ def list_spacecraft(ground: Ground) -> list[SpacecraftInstance]:
                 if (mission := mission_of_vehicle(connection, one.id)) is None
                 else mission.spacecraft.name,
             )
-            for one in all_vehicles(connection)
+            for one in used_vehicles(connection)
         ]
     return sorted(found, key=lambda one: (one.instance != FLOWN, one.spacecraft_id, one.instance))
 

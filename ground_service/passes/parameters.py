@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -241,7 +242,9 @@ def series_source(
     found = declared_reading(connection, span.vehicle)
     one = None if found is None else found.parameters.get(parameter)
     if found is None or one is None:
-        raise NotFound("parameter", parameter[:80])
+        known = [*PARAMETERS, *STATE_PARAMETERS, *PACKET_FIELDS, *(() if found is None else found.parameters)]
+        near = "".join(f" (nearest: {name})" for name in get_close_matches(parameter[:80], known, 1))
+        raise NotFound("parameter", parameter[:80] + near)
     number = one.declared.numbers[one.container]
     declared = declared_samples(found.decoding.definition_id, number, {parameter: one.index})
     return declared, span_of(span, one.declared), parameter, one.value.type.unit

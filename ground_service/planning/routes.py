@@ -62,7 +62,7 @@ def check_mission(
 
 
 @planning.post("/windows/search", responses=problems(404))
-def search_windows(ground: GroundOf, _: Viewer, constraints: WindowSearch) -> SearchResult:
+def search_windows(ground: GroundOf, _: Viewer, constraints: WindowSearch = WindowSearch()) -> SearchResult:
     """Search candidate windows by constraints over a reference ephemeris."""
     return service.search_windows(ground, constraints)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, or_, select, union
 from sqlalchemy.exc import IntegrityError
 
 from ground_service.errors import InvalidInput, NotFound
@@ -57,6 +57,23 @@ def find_vehicle(connection: Connection, ccsds_id: int, instance: str) -> Vehicl
 def all_vehicles(connection: Connection) -> list[Vehicle]:
     """Return all vehicles."""
     return [Vehicle(**row) for row in connection.execute(select(repository.VEHICLES)).mappings()]
+
+
+def used_vehicles(connection: Connection) -> list[Vehicle]:
+    """Return the vehicles that a description states or that have data, plans, telecommands or a hold.
+
+    What was entered for a mistyped spacecraft, and deleted or rejected, leaves a vehicle with nothing.
+    """
+    table, commands, held = repository.VEHICLES, repository.TELECOMMANDS, repository.HANDOVERS
+    owned = (repository.PASSES, repository.INGESTS, repository.WINDOWS, repository.STANDING_REQUESTS)
+    used = union(
+        *(select(one.c.vehicle_id) for one in owned),
+        select(commands.c.vehicle_id).where(commands.c.state != "rejected"),
+        select(held.c.vehicle_id).where(held.c.held_by.is_not(None)),
+    )
+    described = select(repository.MISSIONS.c.ccsds_id).where(repository.MISSIONS.c.ccsds_id.is_not(None))
+    query = select(table).where(or_(table.c.id.in_(used), table.c.ccsds_id.in_(described)))
+    return [Vehicle(**row) for row in connection.execute(query).mappings()]
 
 
 def lock_vehicle(connection: Connection, vehicle: int) -> Vehicle:

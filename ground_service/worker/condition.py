@@ -132,7 +132,7 @@ def complaints(found: Condition) -> list[str]:
     if found.ingest_lag_s > INGEST_LAG_LIMIT_S:
         said.append(f"An ingest has been unfinished for {found.ingest_lag_s:.0f} s.")
     if failed := found.counts.jobs.get(("ingest", "failed")):
-        said.append(f"{failed} ingests have failed; repeat them on the page Shift.")
+        said.append(f"{failed} ingests have failed; repeat or dismiss them on the page Shift.")
     if found.disk_free < DISK_FREE_LIMIT * found.disk_size:
         said.append(f"{found.disk_free / found.disk_size:.0%} of the disk of the archive are free.")
     if found.backup_missing:

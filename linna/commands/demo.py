@@ -9,7 +9,7 @@ from typing import Any
 
 from linna.commands._ground import event_of_signals, local_actor
 from linna.commands.pass_ import requirement_lines
-from linna.output import emit, finish, log, progress
+from linna.output import emit, finish, log, progress, watched_rims
 from linna.parser import option
 
 
@@ -44,7 +44,9 @@ def run(arguments: argparse.Namespace) -> int:
         from studies.mission_run.living import living_demo
 
         stopping = event_of_signals()
-        living_demo(scenario, data, arguments.out, arguments.rate, arguments.port, log, stopping)
+        living_demo(
+            scenario, data, arguments.out, arguments.rate, arguments.port, log, stopping, watched_rims
+        )
         return 0
     archive = arguments.out / "pass"
     log("emulating the payload ...")

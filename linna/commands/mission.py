@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from linna.commands._table import Command, Commands, Hand, add_commands, as_json
-from linna.output import emit, finish
+from linna.output import emit, finish, log, watched_rims
 from linna.parser import ABOVE_ZERO, LinnaParser, number, option
 
 
@@ -74,7 +74,11 @@ def write(arguments: argparse.Namespace) -> int:
         from studies.mission_run.dynamics import write_flight
 
         window_s = 60.0 * arguments.window_min
-        text = write_flight(scenario, data_folder(), arguments.out, arguments.windows, window_s)
+        log("computing the orbit, measuring the rims of the craters around the windows ...")
+        folder = data_folder()
+        text = write_flight(
+            scenario, folder, arguments.out, arguments.windows, window_s, watched=watched_rims
+        )
     else:
         text = scenario_mission_text(scenario, data_folder())
     mission, _ = read_mission(text.encode(), str(arguments.out))

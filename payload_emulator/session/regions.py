@@ -12,7 +12,7 @@ import numpy as np
 from lunar.arrays import BoolArray
 from lunar.boxes import Box, inside_box
 from lunar.catalogue import CraterCatalogue
-from payload_emulator.session.rims import rims_of
+from payload_emulator.session.rims import Watched, rims_of
 from payload_emulator.session.world import World
 from payload_emulator.sim.terrain.tiles import Terrain
 
@@ -101,13 +101,15 @@ def _covered(terrain: Terrain) -> BoolArray:
     return np.asarray(held.reshape(rows, SAMPLES, columns, SAMPLES).all(axis=(1, 3)))
 
 
-def observed_craters(world: World, latitude_limit_deg: float = WINDOW_LATITUDE_DEG) -> CraterCatalogue:
+def observed_craters(
+    world: World, latitude_limit_deg: float = WINDOW_LATITUDE_DEG, watched: Watched = iter
+) -> CraterCatalogue:
     """Return the craters around the observed boxes, with the heights of their rims."""
     listed = world.terrain.catalogue
     near = [one.widened(CATALOGUE_MARGIN_DEG) for one in observed_boxes(world.terrain, latitude_limit_deg)]
     places = np.degrees(listed.latitude_rad), np.degrees(listed.longitude_rad)
     inside = np.any([inside_box(one, *places) for one in near], axis=0)
-    catalogue = rims_of(world.scenario, world.terrain, np.flatnonzero(inside))
+    catalogue = rims_of(world.scenario, world.terrain, np.flatnonzero(inside), watched)
     world.terrain.release_ground()
     world.terrain.release_thread()
     return catalogue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,12 @@ from lunar.catalogue import CraterCatalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.sim.terrain.tiles import Terrain, ground_hash
+
+Watched = Callable[[list[IntArray]], Iterable[IntArray]]
+"""Function that yields the parts of a long work and shows its progress."""
+
+PART = 2000
+"""Craters of a part."""
 
 KEPT = 32
 """Sets of craters that are kept, up to 2 MB each."""
@@ -27,8 +34,13 @@ def sources_of(scenario: Scenario, data: DataFolder) -> str:
     return repr((scenario.terrain, scenario.seed, stated))
 
 
-def rims_of(scenario: Scenario, terrain: Terrain, craters: IntArray) -> CraterCatalogue:
-    """Return the craters of useful size with the heights of their rims: on the sphere, or measured on the ground."""
+def rims_of(
+    scenario: Scenario, terrain: Terrain, craters: IntArray, watched: Watched = iter
+) -> CraterCatalogue:
+    """Return the craters of useful size with the heights of their rims: on the sphere, or measured on the ground.
+
+    `watched` yields the parts of a long measurement and shows its progress.
+    """
     listed, navigation = terrain.catalogue, scenario.navigation
     diameter_m = listed.diameter_m[craters]
     least_km, most_km = navigation.catalogue_min_diameter_km, navigation.catalogue_max_diameter_km
@@ -40,6 +52,11 @@ def rims_of(scenario: Scenario, terrain: Terrain, craters: IntArray) -> CraterCa
     octets = kept(name) if terrain.sources else None
     if octets is not None:
         terrain.take_measurements(useful, np.frombuffer(octets).reshape(-1, 4))
+    elif useful.size:
+        # From west to east, as the terrain is made.
+        eastward = useful[np.argsort(listed.longitude_rad[useful], kind="stable")]
+        for part in watched(np.array_split(eastward, 1 + useful.size // PART)):
+            terrain.measured(part)
     found = terrain.measured(useful)
     if octets is None and terrain.sources:
         keep(name, terrain.measurements_m(useful).tobytes(), KEPT)

@@ -20,6 +20,7 @@ from lunar.timescales import format_utc
 from payload_emulator.session.live import pruned, station_names
 from payload_emulator.session.mission import OPERATIONS, default_ports, live_mission_text
 from payload_emulator.session.regions import observed_boxes, observed_craters
+from payload_emulator.session.rims import Watched
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.session.world import (
     CHUNK_S,
@@ -70,9 +71,9 @@ class FlightDynamics:
         save_oem(with_reference_error(arc, errors, scenario.seed + 1_000 * (1 + day)), path)
         return path
 
-    def save_craters(self, window_s: float, path: Path) -> int:
+    def save_craters(self, window_s: float, path: Path, watched: Watched = iter) -> int:
         """Write the craters around the places of the windows with their rim heights; their number."""
-        catalogue = observed_craters(self.world, self._latitude_limit_deg(window_s))
+        catalogue = observed_craters(self.world, self._latitude_limit_deg(window_s), watched)
         save_catalogue(catalogue, path)
         return len(catalogue)
 
@@ -118,15 +119,16 @@ def write_flight(
     windows_per_day: int,
     window_s: float,
     ports: dict[str, tuple[int, int]] | None = None,
+    watched: Watched = iter,
 ) -> str:
     """Write what the ground posts to fly a scenario, beside its mission description; return the description.
 
     The files are `craters.csv`, `reference.oem` and `request.json`. `ports` are those of the stations for telemetry
-    and telecommands (default: as `linna emulate --live` opens them).
+    and telecommands (default: as `linna emulate --live` opens them). `watched` shows the progress of the longest step.
     """
     dynamics, folder = FlightDynamics(open_world(scenario, data)), mission.parent
     craters = folder / "craters.csv"
-    dynamics.save_craters(window_s, craters)
+    dynamics.save_craters(window_s, craters, watched)
     dynamics.save_reference(scenario.epoch_utc_ns, folder / "reference.oem")
     request = dynamics.request(windows_per_day, window_s)
     (folder / "request.json").write_text(json.dumps(request, indent=2) + "\n", encoding="utf-8")

@@ -15,6 +15,7 @@ from ground_service.errors import GroundError
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.live import station_names
+from payload_emulator.session.rims import Watched
 from payload_emulator.session.scenario import Scenario, format_scenario
 from payload_emulator.session.world import open_world
 from studies.harness.parts import Part, answers_http, bare_environment, free_port
@@ -35,34 +36,45 @@ def living_demo(
     port: int,
     say: Callable[[str], None],
     stopping: threading.Event,
+    watched: Watched = iter,
 ) -> None:
     """Start spacecraft and service, post what a user posts, and deliver an orbit a day until `stopping` is set.
 
     Parameters
     ----------
     folder
-        New folder for the documents, the logs and the ground service.
+        New folder for documents, logs and ground service; or that of a demo of this scenario, which goes on.
     rate
         Simulated seconds per second.
     port
         Port of the service on this machine.
+    watched
+        Yields the parts of the longest step and shows its progress.
 
     Raises
     ------
     ScenarioError
-        The folder has files.
+        The folder has other files.
     GroundError
         A part does not start, or ends by itself.
     """
-    if folder.exists() and any(folder.iterdir()):
-        raise ScenarioError(f"{folder}: expected a new folder for a living demo, found one with files")
-    folder.mkdir(parents=True, exist_ok=True)
-    say("making the mission description, the craters, the orbit and the request ...")
     mission, flown, clock = folder / "mission.toml", folder / "scenario.toml", folder / "clock"
-    stations = {name: (free_port(), free_port()) for name in station_names(scenario, has_operator=False)}
-    text = write_flight(scenario, data, mission, WINDOWS_A_DAY, WINDOW_S, stations)
-    mission.write_text(text, encoding="utf-8")
-    flown.write_text(format_scenario(scenario), encoding="utf-8")
+    ports, told = folder / "ports.json", format_scenario(scenario)
+    goes_on = ports.is_file() and flown.read_text(encoding="utf-8") == told
+    if not goes_on and folder.exists() and any(folder.iterdir()):
+        raise ScenarioError(
+            f"{folder}: expected a new folder, or that of a living demo of this scenario, found one with other files"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    if goes_on:
+        say("going on from the state of the spacecraft and the archive of the service ...")
+        stations = {name: (down, up) for name, (down, up) in json.loads(ports.read_text()).items()}
+    else:
+        say("making the mission description, the craters, the orbit and the request ...")
+        stations = {name: (free_port(), free_port()) for name in station_names(scenario, has_operator=False)}
+        text = write_flight(scenario, data, mission, WINDOWS_A_DAY, WINDOW_S, stations, watched)
+        mission.write_text(text, encoding="utf-8")
+        flown.write_text(told, encoding="utf-8")
     address = f"http://127.0.0.1:{port}"
     with ExitStack() as running:
         parts = _parts(folder, rate, port, stations)
@@ -70,12 +82,17 @@ def living_demo(
             say(f"starting the {name} ...")
             running.enter_context(part)
         client = running.enter_context(Client(address))
-        client.add_catalogue(folder / "craters.csv")
-        client.add_mission(mission)
-        client.add_ephemeris(folder / "reference.oem")
-        client.add_request(json.loads((folder / "request.json").read_text(encoding="utf-8")))
+        if not goes_on:
+            client.add_catalogue(folder / "craters.csv")
+            client.add_mission(mission)
+            client.add_ephemeris(folder / "reference.oem")
+            client.add_request(json.loads((folder / "request.json").read_text(encoding="utf-8")))
+            ports.write_text(
+                json.dumps(stations), encoding="utf-8"
+            )  # all is posted: from now on, it can go on
         say(f"{address}/ shows the shift at {rate:g} times real time; Ctrl-C ends")
-        dynamics, day, now = None, 0, ClockFile(clock)
+        dynamics, now = None, ClockFile(clock)
+        day = (now.read() - scenario.epoch_utc_ns) // DAY_NS if goes_on else 0
         while not stopping.wait(LOOK_S):
             ended = next((name for name, part in parts.items() if part.has_ended), None)
             if ended is not None:
@@ -94,6 +111,7 @@ def _parts(folder: Path, rate: float, port: int, stations: Mapping[str, tuple[in
     settings = bare_environment(LINNA_CLOCK_FILE=str(clock), LINNA_LIVE_CONSOLE=f"127.0.0.1:{console}")
     flight = ["emulate", folder / "scenario.toml", "--live", "--no-operator", "--rate", rate]
     flight += ["--craters", folder / "craters.csv", "--clock-file", clock]
+    flight += ["--state", folder / "state", "--journal", folder / "journal"]
     flight += ["--console-port", console, "--mission-port", free_port()]
     for name, (telemetry, telecommand) in stations.items():
         flight += ["--station-port", f"{name}:{telemetry}:{telecommand}"]

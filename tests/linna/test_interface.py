@@ -3,7 +3,9 @@
 import pytest
 
 from linna.cli import GROUPS
+from linna.help import example
 from linna.parser import command_parser
+from tmtc.dictionary import DICTIONARY
 
 RELIED_ON = """
 demo --out D
@@ -56,3 +58,7 @@ link check F --mission M
 def test_a_documented_command_is_understood(line: str) -> None:
     words = line.split()
     command_parser(GROUPS, words[0]).parse_args(words)
+
+
+def test_the_example_of_a_telecommand_is_one_of_the_dictionary() -> None:
+    assert example("linna command enter").split()[3] in {one.name for one in DICTIONARY.telecommands}

@@ -44,8 +44,23 @@ def test_a_part_that_ends_is_named_after_the_documents_were_posted(
     assert posted == ["add_catalogue", "add_mission", "add_ephemeris", "add_request"]
     client.add_request.assert_called_once_with({"windows": 12})
     assert said.pop() == "http://127.0.0.1:8042/ shows the shift at 60 times real time; Ctrl-C ends"
-    with pytest.raises(ScenarioError, match="expected a new folder for a living demo, found one with files"):
-        living.living_demo(*demo)
+    client.reset_mock()
+    with pytest.raises(GroundError, match="spacecraft: expected it to run, found its end; see "):
+        living.living_demo(*demo)  # goes on: nothing is posted again
+    assert client.method_calls == [] and said[-3].startswith("going on from the state of the spacecraft")
+    other = (load_scenario("live-pictures"), *demo[1:])
+    with pytest.raises(
+        ScenarioError, match="that of a living demo of this scenario, found one with other files"
+    ):
+        living.living_demo(*other)
+
+
+def test_a_spacecraft_that_goes_on_has_its_state_and_ports_and_the_terrain_of_the_demo(
+    tmp_path: Path,
+) -> None:
+    command = living._parts(tmp_path, 60.0, 8042, {"madrid": (1, 2)})["spacecraft"]._command
+    assert {"--state", "--journal", "madrid:1:2"} <= {*command}
+    assert load_scenario("live-demo").terrain == load_scenario("selenita").terrain
 
 
 @pytest.mark.campaign

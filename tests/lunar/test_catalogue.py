@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lunar import catalogue
 from lunar.catalogue import (
     PAPER_CLASS_COUNTS,
     class_counts,
@@ -172,6 +173,36 @@ def test_a_missing_file_a_folder_and_a_cut_gzip_are_refused(tmp_path):
     for path in (tmp_path / "none.csv", tmp_path, cut):
         with pytest.raises(DataFileError, match="expected"):
             load_catalogue(path)
+
+
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_a_file_is_read_by_blocks_and_a_fault_has_its_line(tmp_path, monkeypatch, quote):
+    rows = [f"{k},{k % 60}.25,{k}.5,{5000 + k},{quote}1{quote},,1" for k in range(200)]
+    head = "id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete"
+    path = tmp_path / "c.csv"
+    path.write_text("\n".join([head, *rows]) + "\n")
+    whole = load_catalogue(path)
+    monkeypatch.setattr(catalogue, "BLOCK_OCTETS", 300)
+    found = load_catalogue(path)
+    assert len(found) == 200
+    for name in ("ids", "latitude_rad", "longitude_rad", "diameter_m", "rim_height_m", "complete"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+    path.write_text("\n".join([head, *rows]).replace(",5150,", ",x,"))
+    with pytest.raises(DataFileError, match="line 152, column diameter_m"):
+        load_catalogue(path)
+    monkeypatch.setattr(catalogue, "ROWS_LIMIT", 199)
+    path.write_text("\n".join([head, *rows]))
+    with pytest.raises(DataFileError, match="at most 199 craters"):
+        load_catalogue(path)
+
+
+def test_blocks_of_a_composite_have_the_sources_and_numbers_of_the_whole(tmp_path, monkeypatch):
+    rows = [f"{k % 60},{k},6.0,{'ab'[k > 50]},1" for k in range(100)]
+    path = tmp_path / "c.csv"
+    path.write_text("\n".join(["latitude_deg,longitude_deg,diameter_km,source,tile_complete", *rows]))
+    monkeypatch.setattr(catalogue, "BLOCK_OCTETS", 300)
+    found = load_catalogue(path)
+    assert found.source == "composite of a, b" and found.ids.tolist() == list(range(100))
 
 
 def test_quoted_values_are_read_too(tmp_path):

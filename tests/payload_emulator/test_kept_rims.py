@@ -117,3 +117,21 @@ def test_sources_change_with_the_seed_the_section_and_each_file_of_a_raster(tmp_
     os.utime(raster, ns=(0, 1))
     texts.append(sources_of(SCENARIO, data))
     assert len(set(texts)) == len(texts)
+
+
+def test_a_long_measurement_is_watched_in_parts_and_a_kept_one_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(rims, "PART", 4)
+    seen: list[list[int]] = []
+
+    def watched(parts: list[IntArray]) -> list[IntArray]:
+        seen.extend(part.tolist() for part in parts)
+        return parts
+
+    whole = rims_of(SCENARIO, opened("other"), ALL)
+    found = rims_of(SCENARIO, opened(), ALL, watched)
+    assert seen == [[0, 1, 2], [3, 4, 5]]
+    np.testing.assert_allclose(found.rim_height_m, whole.rim_height_m, rtol=0, atol=1e-9)
+    rims_of(SCENARIO, opened(), ALL, watched)
+    assert len(seen) == 2

@@ -28,7 +28,7 @@ def get_landmark(ground: GroundOf, _: Viewer, landmark_id: RowId) -> LandmarkDet
 
 @landmarks.post("/landmarks/{landmark_id}/accept", responses=problems(404, 409))
 def accept_landmark(
-    ground: GroundOf, caller: Operator, landmark_id: RowId, decision: LandmarkDecision
+    ground: GroundOf, caller: Operator, landmark_id: RowId, decision: LandmarkDecision = LandmarkDecision()
 ) -> LandmarkDetail:
     """Accept a proposed landmark as a crater of the next anchoring catalogue."""
     return service.decide_landmark(
@@ -38,7 +38,7 @@ def accept_landmark(
 
 @landmarks.post("/landmarks/{landmark_id}/reject", responses=problems(404, 409))
 def reject_landmark(
-    ground: GroundOf, caller: Operator, landmark_id: RowId, decision: LandmarkDecision
+    ground: GroundOf, caller: Operator, landmark_id: RowId, decision: LandmarkDecision = LandmarkDecision()
 ) -> LandmarkDetail:
     """Reject a proposed landmark."""
     return service.decide_landmark(

@@ -22,7 +22,7 @@ def get_alarm(ground: GroundOf, _: Viewer, alarm_id: RowId) -> AlarmDetail:
 
 @alarms.post("/alarms/{alarm_id}/acknowledge")
 def acknowledge_alarm(
-    ground: GroundOf, caller: Operator, alarm_id: RowId, given: Acknowledgement
+    ground: GroundOf, caller: Operator, alarm_id: RowId, given: Acknowledgement = Acknowledgement()
 ) -> AlarmDetail:
     """Acknowledge an alarm. It is cleared when its condition has ended as well."""
     return service.acknowledge_alarm(ground, alarm_id, given.comment, actor=caller.name)

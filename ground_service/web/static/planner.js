@@ -24,10 +24,15 @@ let dragging = false; // what is in the hand is not drawn again
 const LENGTH = ["Length", (row) => lengthText(seconds(row.stop) - seconds(row.start)), "num"];
 const selectable = (row) => ({ start: seconds(row.start), stop: seconds(row.stop) });
 
+// From now to the end of what is planned; without any to come, all windows.
 function whole() {
-  const spans = [...windows, ...candidates].map(selectable);
+  const now = 600 * Math.floor(missionNow() / 600);
+  const all = [...windows, ...candidates].map(selectable);
+  const coming = all.filter((one) => one.stop > now);
+  const spans = coming.length ? coming : all;
   if (!spans.length) return emptyView();
-  const from = Math.min(...spans.map((one) => one.start));
+  const first = Math.min(...spans.map((one) => one.start));
+  const from = first - now < 7 * DAY_S ? Math.min(now, first) : first;
   const to = Math.max(...spans.map((one) => one.stop));
   const margin = Math.max(600, 0.05 * (to - from));
   return [from - margin, to + margin];
@@ -107,7 +112,7 @@ function drawTimeline() {
   }
   drawLanes(drawn, x, width, lanesTop);
   for (const one of linked) {
-    drawn.append(bar(x(seconds(one.start)), x(seconds(one.stop ?? one.start)), sections[2].bars, `contact ${one.state}`, `link ${one.link}, ${one.station}, ${one.state}, ${timeText(one.start)} to ${timeText(one.stop)}`));
+    drawn.append(bar(x(seconds(one.start)), x(seconds(one.stop ?? one.predicted_stop ?? isoText(missionNow()))), sections[2].bars, `contact ${one.state}`, `link ${one.link}, ${one.station}, ${one.state}, ${timeText(one.start)} to ${timeText(one.stop)}`));
   }
   for (const one of contacts) {
     drawn.append(bar(x(seconds(one.start)), x(seconds(one.stop)), sections[2].bars, "contact", `${one.station} ${timeText(one.start)} to ${timeText(one.stop)}`));
@@ -127,11 +132,22 @@ function drawTimeline() {
   });
   drawn.addEventListener("pointermove", (event) => readAt(view[0] + (event.clientX - drawn.getBoundingClientRect().left) / scale));
   const cursor = svg("line", { y1: HEAD_PX - 6, y2: height, class: "cursor" });
-  drawn.append(cursor);
+  drawn.append(cursor, svg("line", { y1: HEAD_PX - 6, y2: height, class: "now" }), svg("text", { y: height - 4, class: "now" }, "now"));
   show(place, drawn);
+  markNow();
   readAt(view[0] + readShare * (view[1] - view[0]));
   drawTrack(windows.map((row) => ({ id: row.id, ...selectable(row) })), chosen);
 }
+
+function markNow() {
+  const share = (missionNow() - view[0]) / (view[1] - view[0]);
+  const x = share * Math.max(240, byId("timeline").clientWidth);
+  for (const one of byId("timeline").querySelectorAll(".now")) {
+    for (const end of one.matches("text") ? ["x"] : ["x1", "x2"]) one.setAttribute(end, x + (end === "x" ? 3 : 0));
+    one.toggleAttribute("hidden", share < 0 || share > 1);
+  }
+}
+setInterval(markNow, 5000);
 
 // The values of the forecast at the pointer, or at the time of the slider.
 let readShare = 0.5; // of the view

@@ -1,7 +1,7 @@
 // The shift: for each spacecraft its time, contact, windows with the step that waits, alarms, verdicts, note and hold.
 import { finished, get, request, send } from "./api.js";
 import { chainOf, contactOf, inTime, uplink } from "./chain.js";
-import { acting, button, byId, element, lengthText, loading, missionNow, notice, on, parameterName, seconds, show, showTable, stateMark, table, textOf, timeText, watch } from "./page.js";
+import { acting, button, buttons, byId, element, lengthText, loading, missionNow, notice, on, parameterName, seconds, show, showTable, stateMark, table, textOf, timeText, watch } from "./page.js";
 
 const OPEN = ["draft", "approved", "uplinked", "cancelling", "executing", "executed", "downlinked"];
 const SHOWN = 5;
@@ -174,7 +174,8 @@ function showJobs(jobs) {
   byId("jobs-count").textContent = `${running} under way, ${failed} of the latest failed`;
   if (failed) byId("work").open = true;
   const progress = (row) => (row.state === "running" ? element("progress", { max: 1, value: row.progress, "aria-label": row.kind }) : stateMark(row.state));
-  const repeat = (row) => (row.state === "failed" ? deed("Repeat", () => send("POST", `jobs/${row.id}/repeat`), `Repeat ${row.kind} of ${timeText(row.created)}`) : "");
+  const named = (label, row) => `${label} ${row.kind} of ${timeText(row.created)}`;
+  const repeat = (row) => (row.state === "failed" ? buttons(deed("Repeat", () => send("POST", `jobs/${row.id}/repeat`), named("Repeat", row)), deed("Dismiss", () => send("DELETE", `jobs/${row.id}`), named("Dismiss", row))) : "");
   showTable("jobs", "Jobs", [["Job", "kind"], ["Entered", "created"], ["State", progress], ["", "error"], ["", repeat]], jobs, "None.");
 }
 

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from ground_service.clock import set_mission_clock
+from ground_service.contacts.commanding.service import enter_command, reject_command
 from ground_service.errors import NotFound
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
@@ -63,3 +64,10 @@ def test_ages_are_those_of_mission_time_and_count_from_the_newest_packet_where_t
 def test_an_unknown_spacecraft_is_not_found(ground: Ground) -> None:
     with pytest.raises(NotFound, match="spacecraft 5"):
         live_parameters(ground, 5, "flight")
+
+
+def test_a_mistyped_spacecraft_is_listed_until_its_telecommand_is_rejected(either: Ground) -> None:
+    command = enter_command(either, "test_connection", {}, spacecraft_id=67, actor="ann")
+    assert [one.spacecraft_id for one in list_spacecraft(either)] == [67]
+    reject_command(either, command, actor="ann", reason="mistyped")
+    assert list_spacecraft(either) == []

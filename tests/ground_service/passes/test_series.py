@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from sqlalchemy import event, select
 
+from ground_service.errors import NotFound
 from ground_service.ground import Ground
 from ground_service.ingest.store import store_samples
 from ground_service.passes import series
+from ground_service.passes.parameters import series_source
 from ground_service.passes.service import trend_series
 from ground_service.passes.span import PassSpan
 from ground_service.store import rollups
@@ -191,3 +193,9 @@ def test_few_texts_of_the_query_for_buckets_find_any_number_of_them(ground: Grou
             found = rollups._few_stored(connection, wanted)
             assert {place: sorted(row[0] for row in rows) for place, rows in found.items()} == whole
     assert len(texts) == 4, "for 4, 8, 16 and 32 buckets"
+
+
+def test_a_misspelled_parameter_is_refused_with_the_nearest_one(ground: Ground) -> None:
+    span = PassSpan(1, FIRST, FIRST + SECOND, (), DICTIONARY.version)
+    with pytest.raises(NotFound, match=r"parameter temprature_c \(nearest: temperature_c\): not found"):
+        ground.read(series_source, span, "temprature_c")

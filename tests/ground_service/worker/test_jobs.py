@@ -93,7 +93,8 @@ def test_a_failed_ingest_is_repeated_with_longer_and_longer_waits(
     job, other = (enter_job(either, kind, {"pass_id": 1, "ingest_id": 1}) for kind in ("ingest", "report"))
     scheduler = Scheduler(either, InlineDispatcher(either), lambda: None, {"retention_days": 90})
     assert run_job(either, other).state == run_job(either, job).state == "failed"
-    assert "1 ingests have failed; repeat them on the page Shift." in complaints(read_condition(either, None))
+    told = complaints(read_condition(either, None))
+    assert "1 ingests have failed; repeat or dismiss them on the page Shift." in told
     for attempt, minutes in enumerate(waits_min, start=1):
         for passed_min, attempts in ((minutes - 0.5, attempt), (minutes, attempt + 1)):
             since = utc_now_ns() - int(passed_min * 60e9)
@@ -113,6 +114,17 @@ def test_a_failed_job_is_repeated_by_one_action(ground: Ground, monkeypatch: pyt
         with pytest.raises(ClientConflict, match="expected state failed, found done"):
             client.repeat_job(job)
         assert next(iter(client.list_audit(action="repeat job"))).actor == "ann"
+        with pytest.raises(ClientConflict, match="expected state failed, found done"):
+            client.delete_job(job)
+
+
+def test_a_failed_ingest_is_dismissed(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = job_that(monkeypatch, ground, lambda *_: {}["missing"])
+    run_job(ground, job)
+    with local_client(ground, "ann") as client:
+        client.delete_job(job)
+        assert [one.id for one in client.list_jobs()] == []
+        assert next(iter(client.list_audit(action="dismiss job"))).target == job
 
 
 def test_the_traceback_of_an_unexpected_error_is_in_the_log(
