@@ -139,7 +139,8 @@ def _table(folder: Path) -> tuple[IntArray, tuple[Path, ...]]:
         raise ScenarioError(
             f"{path}: expected a table with columns file and utc, found none ({error})"
         ) from None
-    times, files = [], []
+    times: list[int] = []
+    files: list[Path] = []
     for line, row in enumerate(rows, start=2):
         name, text = row.get("file"), row.get("utc")
         if not name or not text:
