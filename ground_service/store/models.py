@@ -865,8 +865,8 @@ REPLAYS = table(
     *optionals(String(64), "downlink_sha256", "performance_sha256"),
     *columns(Double, "wall_s", "cpu_s", "peak_rss_mib"),
     *columns(Text, "isolation", "machine"),
-    optional("printed", Text),
     column("created_utc_ns", BigInteger),
+    optional("printed", Text),
 )
 """Result of one build on one archive; `id` is the hash of both identities."""
 

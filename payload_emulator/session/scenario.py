@@ -631,7 +631,7 @@ _UNUSED: tuple[tuple[str, str, Callable[[Scenario], bool]], ...] = (
     ("window duration_s", "without window.search = 'none'", lambda s: s.window.search != "none"),
     (_SEARCH, "where window.search is 'none'", lambda s: s.window.search == "none"),
     (f"orbit frame {' '.join(_ELEMENT_KEYS)}", "with orbit.oem", lambda s: bool(s.orbit.oem)),
-    ("dynamics earth sun integrator solar_area_to_mass_m2_kg", "with orbit.oem", lambda s: bool(s.orbit.oem)),
+    ("dynamics earth sun solar_area_to_mass_m2_kg", "with orbit.oem", lambda s: bool(s.orbit.oem)),
     ("dynamics solar_reflection", "without a solar area", lambda s: not s.dynamics.solar_area_to_mass_m2_kg),
     (_BURNS, "without maneuvers", lambda s: not s.maneuvers.enabled or bool(s.orbit.oem)),
     (

@@ -115,8 +115,7 @@ def test_noise_is_part_of_the_recording_and_an_unknown_coding_does_not_stop_the_
         spool.keep(octets)
         spool.cut()
         spool.drain()
-    assert seen[0] == {"packets_new": 0}
-    assert isinstance(seen[1], InvalidInput)
+    assert seen[:2] == [{"packets_new": 0}] * 2
     assert hash_of(ground) == expected
 
 

@@ -152,7 +152,7 @@ def test_a_full_database_is_one_clear_line(tmp_path: Path) -> None:
     with pytest.raises(StorageFull, match="no space left"), database.writing() as connection:
         pages = connection.execute(text("PRAGMA page_count")).scalar_one()
         connection.execute(text(f"PRAGMA max_page_count = {pages}"))
-        for number in range(200):
+        for number in range(2000):
             connection.execute(
                 text("INSERT INTO vehicles (ccsds_id, instance) VALUES (:n, :i)"),
                 {"n": number, "i": "x" * 90},
