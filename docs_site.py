@@ -134,7 +134,7 @@ def fly_passes(home: Path, starts: tuple[str, ...] = PASSES) -> None:
     from ground_service.ground import open_ground
     from ground_service.passes.archive_import import import_archive
     from lunar.datafolder import DataFolder
-    from payload_emulator.session.emulator import emulate
+    from payload_emulator.session.archive.emulator import emulate
     from payload_emulator.session.scenario import parse_scenario
 
     with tempfile.TemporaryDirectory() as folder, open_ground(home) as ground:
@@ -346,7 +346,7 @@ def http_page() -> str:
 def icd_page() -> str:
     """Return the interface control document, as `linna tm icd` prints it."""
     from payload_emulator.flight.onboard.icd import format_interfaces
-    from tmtc.icd import format_icd
+    from tmtc.dictionary.icd import format_icd
 
     return f"{format_icd()}\n{format_interfaces()}"
 

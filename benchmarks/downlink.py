@@ -25,15 +25,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks._rows import Row
-from tmtc import reed_solomon
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import DownlinkEncoder, decode
 from tmtc.errors import TmtcError
-from tmtc.frames import frame_checksums_hold
-from tmtc.link import LinkSettings
-from tmtc.packets import PacketSequencer, pack_packet
-from tmtc.randomiser import randomise
-from tmtc.stream import PacketForm
+from tmtc.link import reed_solomon
+from tmtc.link.frames import frame_checksums_hold
+from tmtc.link.randomiser import randomise
+from tmtc.link.settings import LinkSettings
+from tmtc.packets.space_packets import PacketSequencer, pack_packet
+from tmtc.packets.stream import PacketForm
 
 SPACECRAFT, OTHER_SPACECRAFT = 76, 33
 FRAMES = 2000

@@ -30,13 +30,13 @@ from lunar.datafolder import DataFolder
 from payload_emulator.errors import ScenarioError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.vision.calibration import CALIBRATION_KEY, network_sha256, with_metadata
-from payload_emulator.session.recording import load_record
-from payload_emulator.session.replay import FlightBuild, replay, stored_images
+from payload_emulator.session.archive.recording import load_record
+from payload_emulator.session.archive.replay import FlightBuild, replay, stored_images
+from payload_emulator.session.archive.suite import SUITE, suite_scenarios, write_suite
 from payload_emulator.session.scenario import Scenario, parse_scenario
-from payload_emulator.session.suite import SUITE, suite_scenarios, write_suite
-from tmtc.crc import append_crc
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
+from tmtc.packets.crc import append_crc
 
 FRAMES = 49
 SEEDS = 7

@@ -34,9 +34,9 @@ from ground_service.store.database import prepare_database
 from ground_service.store.rollups import STATE_VALUES
 from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
-from tmtc.packets import PacketSequencer
+from tmtc.packets.space_packets import PacketSequencer
 
 PARTS = ("sqlite", "postgresql", "states", "api", "stream")
 STATE_BLOCK = 200_000

@@ -63,7 +63,11 @@ _FLIGHT_TESTS = "tests/payload_emulator/flight"
 
 GROUPS = {
     "accounting": Group(
-        ("ground_service/ingest/core.py", "ground_service/passes/downlink_accounting.py", "tmtc/sequence.py"),
+        (
+            "ground_service/ingest/core.py",
+            "ground_service/passes/downlink_accounting.py",
+            "tmtc/packets/sequence.py",
+        ),
         (
             f"{_GROUND_TESTS}/ingest/test_sequence.py",
             f"{_GROUND_TESTS}/passes/test_downlink_accounting.py",

@@ -30,7 +30,7 @@ from ground_service.store.vehicles import vehicle_id
 from ground_service.web.pages import PAGES
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from studies.harness.parts import Part, answers_http, free_port
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 SPACECRAFT = 76
 START = parse_utc("2029-08-07T00:00:00Z")

@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks._rows import Row
-from tmtc import reed_solomon
+from tmtc.dictionary.fields import Field
+from tmtc.dictionary.schema import Dictionary, Group, PacketDefinition
 from tmtc.downlink import LinkSettings, decode, encode_cadus
-from tmtc.fields import Field
-from tmtc.schema import Dictionary, Group, PacketDefinition
-from tmtc.stream import cut_packets
+from tmtc.link import reed_solomon
+from tmtc.packets.stream import cut_packets
 from tmtc.xtce.export import format_xtce
 
 PACKETS = 200_000

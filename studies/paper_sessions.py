@@ -14,7 +14,7 @@ import numpy as np
 
 from ground_service.client.local import local_client
 from ground_service.ground import open_ground
-from payload_emulator.session.emulator import emulate
+from payload_emulator.session.archive.emulator import emulate
 from payload_emulator.session.scenario import Scenario, format_scenario, load_scenario
 from reports.paper_values import PaperSession
 from reports.values import (

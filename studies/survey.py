@@ -21,14 +21,14 @@ from lunar.catalogue import NAVIGATION_CLASS, CraterCatalogue
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
 from payload_emulator.errors import ScenarioError
-from payload_emulator.session.loading import network_octets
-from payload_emulator.session.mission import level_of, level_text, unseen_share
+from payload_emulator.session.archive.mission import level_of, level_text, unseen_share
+from payload_emulator.session.archive.scoring import JudgedSession, judge_session
 from payload_emulator.session.scenario import Scenario, format_scenario
-from payload_emulator.session.schedule import fly_scenario, timeline
-from payload_emulator.session.scoring import JudgedSession, judge_session
-from payload_emulator.session.spacecraft import new_spacecraft
-from payload_emulator.session.starting import load_scenario_payload
-from payload_emulator.session.world import World, build_world, registered_share
+from payload_emulator.session.spacecraft.loading import network_octets
+from payload_emulator.session.spacecraft.loop import new_spacecraft
+from payload_emulator.session.spacecraft.schedule import fly_scenario, timeline
+from payload_emulator.session.spacecraft.starting import load_scenario_payload
+from payload_emulator.session.world.world import World, build_world, registered_share
 from payload_emulator.sim.terrain.curation import Region
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]

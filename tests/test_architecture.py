@@ -52,16 +52,16 @@ def test_every_import_contract_is_kept() -> None:
 @pytest.mark.parametrize(
     ("module", "planted"),
     [
-        ("payload_emulator/flight/navigation/odometry.py", "import payload_emulator.sim"),
-        ("payload_emulator/flight/navigation/odometry.py", "import torch"),
+        ("payload_emulator/flight/navigation/odometry/odometry.py", "import payload_emulator.sim"),
+        ("payload_emulator/flight/navigation/odometry/odometry.py", "import torch"),
         ("payload_emulator/flight/payload.py", "import payload_emulator.training"),
-        ("payload_emulator/session/emulator.py", "import ground_service"),
+        ("payload_emulator/session/archive/emulator.py", "import ground_service"),
         ("ground_service/__init__.py", "import payload_emulator"),
         ("lunar/camera.py", "import tmtc"),
         ("ground_service/evaluation/core.py", "import sqlalchemy"),
         ("ground_service/ingest/service.py", "import ground_service.evaluation.service"),
-        ("payload_emulator/sim/render/renderer.py", "import payload_emulator.session.world"),
-        ("tmtc/tables.py", "import lunar.constants"),
+        ("payload_emulator/sim/render/renderer.py", "import payload_emulator.session.world.world"),
+        ("tmtc/dictionary/tables.py", "import lunar.constants"),
     ],
 )
 def test_a_planted_import_across_a_wall_is_refused(copy_of_the_tree: Path, module: str, planted: str) -> None:
@@ -166,7 +166,7 @@ def test_no_import_cycles_also_in_functions_and_for_type_checking() -> None:
             "ground_service.store.files",
         ),
         ("lunar/constants.py", "import lunar.frames", "lunar.constants"),
-        ("tmtc/crc.py", "from tmtc import frames", "tmtc.crc"),
+        ("tmtc/packets/crc.py", "from tmtc import frames", "tmtc.packets.crc"),
     ],
 )
 def test_a_planted_cycle_is_found(copy_of_the_tree: Path, module: str, planted: str, cycle: str) -> None:

@@ -27,11 +27,11 @@ from lunar.datafolder import DataFolder
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import format_utc, parse_utc
 from payload_emulator.errors import LinkError, ScenarioError
-from payload_emulator.session.emulator import emulate
-from payload_emulator.session.mission import live_mission_text
-from payload_emulator.session.regions import observed_boxes
+from payload_emulator.session.archive.emulator import emulate
+from payload_emulator.session.archive.mission import live_mission_text
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.world import first_utc_ns, open_world
+from payload_emulator.session.world.regions import observed_boxes
+from payload_emulator.session.world.world import first_utc_ns, open_world
 from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.disturbances import UNDISTURBED, ReferenceDisturbances, load_disturbances
 from studies.mission_run.dynamics import FlightDynamics
@@ -40,10 +40,10 @@ from studies.mission_run.ground import EmbeddedGround
 from studies.mission_run.run import MissionRun, RunTerms, _take_turns, read_progress, run_fleet, run_mission
 from tests.mission_reports import figures_of
 from tests.scenarios import commanded_scenario
-from tmtc.dictionary import APID_DETECTIONS, DICTIONARY
+from tmtc.dictionary.payload import APID_DETECTIONS, DICTIONARY
 from tmtc.downlink import decode
-from tmtc.packets import unpack_primary_header
-from tmtc.stream import cut_packets
+from tmtc.packets.space_packets import unpack_primary_header
+from tmtc.packets.stream import cut_packets
 
 SCENARIO = commanded_scenario("half-a-day", "[clock]\noffset_s = 0.4\ndrift_ppm = 5.0\n")
 SECOND = f'spacecraft = "Second"\nspacecraft_id = 77{SCENARIO.replace("seed = 3", "seed = 4")}'

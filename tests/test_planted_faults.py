@@ -13,9 +13,9 @@ from ground_service.missions.timekeeping.recorrelation import recorrelate
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.store import get_pass
 from lunar.datafolder import DataFolder
-from payload_emulator.session import reduced
-from payload_emulator.session.emulator import emulate
+from payload_emulator.session.archive.emulator import emulate
 from payload_emulator.session.scenario import Scenario, parse_scenario
+from payload_emulator.session.world import reduced
 from reports.values import PassReport
 from tests.scenarios import live_scenario
 

@@ -13,9 +13,9 @@ import pytest
 
 from linna import cli
 from lunar.datafolder import DataFolder
-from payload_emulator.session.emulator import emulate
+from payload_emulator.session.archive.emulator import emulate
+from payload_emulator.session.archive.suite import SUITE, suite_scenarios, write_suite
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.suite import SUITE, suite_scenarios, write_suite
 from tests.payload_emulator.test_replay import SCENARIO
 
 FRAMES = 8

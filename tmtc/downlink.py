@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tmtc import cadu, reed_solomon
 from tmtc.arrays import BoolArray, IntArray, OctetArray, Octets, as_octets
-from tmtc.clcw import UplinkSeen, uplink_seen
-from tmtc.crc import CRC_LENGTH, crc16
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.schema import Dictionary, Table
 from tmtc.errors import UnknownCoding, ValueRefused
-from tmtc.frame_reading import Frames, proof_of, read_frames
-from tmtc.frames import (
+from tmtc.link import cadu, reed_solomon
+from tmtc.link.clcw import UplinkSeen, uplink_seen
+from tmtc.link.frame_reading import Frames, proof_of, read_frames
+from tmtc.link.frames import (
     FRAME_HEADER_LENGTH,
     IDLE_CHANNEL,
     NO_PACKET_BEGINS,
@@ -30,16 +30,16 @@ from tmtc.frames import (
     append_frame_checksums,
     idle_data,
 )
-from tmtc.link import LinkSettings
-from tmtc.link_check import CountPackets, LinkProposal, propose_link
-from tmtc.link_plan import LinkPlan, LinkSection, one_section, plan_link
-from tmtc.marker_survey import survey_markers
-from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, idle_packet
-from tmtc.pus import TM_HEADER_LENGTH
-from tmtc.randomiser import randomise
-from tmtc.schema import Dictionary, Table
-from tmtc.sequence import SequenceReport, account
-from tmtc.stream import (
+from tmtc.link.link_check import CountPackets, LinkProposal, propose_link
+from tmtc.link.link_plan import LinkPlan, LinkSection, one_section, plan_link
+from tmtc.link.marker_survey import survey_markers
+from tmtc.link.randomiser import randomise
+from tmtc.link.settings import LinkSettings
+from tmtc.packets.crc import CRC_LENGTH, crc16
+from tmtc.packets.pus import TM_HEADER_LENGTH
+from tmtc.packets.sequence import SequenceReport, account
+from tmtc.packets.space_packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, idle_packet
+from tmtc.packets.stream import (
     CHECKED,
     PacketCut,
     PacketForm,

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from tmtc.cuc import TICKS_PER_SECOND
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.fields import Field
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.schema import Table
 from tmtc.errors import UnknownPacket
-from tmtc.fields import Field
+from tmtc.packets.cuc import TICKS_PER_SECOND
 from tmtc.parquet import parquet_octets
-from tmtc.schema import Table
 
 FORMATS = ("json", "csv", "parquet")
 

@@ -41,12 +41,12 @@ from ground_service.store.database import prepare_database
 from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import utc_ns_from_ticks
 from tests.ground_service.archive_hash import archive_hash
-from tmtc.crc import append_crc
 from tmtc.downlink import DownlinkEncoder
 from tmtc.errors import TmtcError
-from tmtc.frames import Clcw, pack_clcw
-from tmtc.link import LinkSettings
-from tmtc.packets import pack_packet
+from tmtc.link.frames import Clcw, pack_clcw
+from tmtc.link.settings import LinkSettings
+from tmtc.packets.crc import append_crc
+from tmtc.packets.space_packets import pack_packet
 
 SPACECRAFT, OTHER, RECORDED, FOREIGN, PREFIXED, BARE = 76, 33, 90, 91, 92, 93
 ORDERS = ("in order", "reversed", "shuffled", "interleaved", "repeated", "cut twice")

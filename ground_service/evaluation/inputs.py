@@ -55,8 +55,8 @@ from lunar.frames import Orientation
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import format_utc, parse_utc
 from reports.values import HousekeepingParameter, SettingsComparison
-from tmtc.dictionary import APID_DETECTIONS, APID_PERFORMANCE, DICTIONARY, DRAWN, STRUCTURES
-from tmtc.stream import cut_packets
+from tmtc.dictionary.payload import APID_DETECTIONS, APID_PERFORMANCE, DICTIONARY, DRAWN, STRUCTURES
+from tmtc.packets.stream import cut_packets
 
 _UNITS = {"degC": "°C", "1/1000": "‰", "": "packets"}
 """Units of the dictionary as reports write them; a count without a unit is of packets."""

@@ -14,10 +14,10 @@ from ground_service.ingest.frames import Known, Section
 from ground_service.ingest.packets import PacketBatch, batch_of_cut
 from ground_service.ingest.quality import Found
 from lunar.arrays import IntArray, OctetArray
-from tmtc.dictionary import DICTIONARY
-from tmtc.packets import PACKET_MAX_LENGTH
-from tmtc.schema import Dictionary
-from tmtc.stream import CHECKED, PacketCut, PacketForm, cut_packets
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.schema import Dictionary
+from tmtc.packets.space_packets import PACKET_MAX_LENGTH
+from tmtc.packets.stream import CHECKED, PacketCut, PacketForm, cut_packets
 
 REACH_OCTETS = 2 * PACKET_MAX_LENGTH
 """Octets before and after a piece that are read with it."""

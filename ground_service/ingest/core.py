@@ -14,7 +14,7 @@ import numpy as np
 
 from lunar.arrays import IntArray
 from lunar.plausible import AGREEING_PACKETS, CLOCK_ERROR_S, SILENCE_S, UNSET_CLOCK_S
-from tmtc.cuc import NO_TICKS, TICKS_PER_SECOND
+from tmtc.packets.cuc import NO_TICKS, TICKS_PER_SECOND
 
 COUNT_MODULUS = 1 << 14
 

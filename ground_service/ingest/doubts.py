@@ -28,9 +28,9 @@ from ground_service.store.vehicles import get_vehicle, lock_vehicle
 from lunar.arrays import IntArray
 from lunar.plausible import AGREEING_PACKETS
 from lunar.timescales import ticks_from_utc_ns, utc_ns_from_ticks
-from tmtc.cuc import NO_TICKS
-from tmtc.dictionary import DICTIONARY
-from tmtc.stream import whole_packets
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.packets.cuc import NO_TICKS
+from tmtc.packets.stream import whole_packets
 
 _DOUBTED, _PACKETS, _VEHICLES = repository.IMPLAUSIBLE_PACKETS, repository.PACKETS, repository.VEHICLES
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 
-from tmtc.crc import CRC_LENGTH, crc16
-from tmtc.packets import IDLE_APID, PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
-from tmtc.stream import PacketForm
+from tmtc.packets.crc import CRC_LENGTH, crc16
+from tmtc.packets.space_packets import IDLE_APID, PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
+from tmtc.packets.stream import PacketForm
 
 COUNTS = 256
 UNKNOWN = -1

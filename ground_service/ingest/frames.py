@@ -18,16 +18,16 @@ from ground_service.ingest.fragments import COUNTS, UNKNOWN, Channel, Fragment, 
 from ground_service.ingest.packets import PacketBatch, batch_of_cut
 from ground_service.ingest.quality import Found, RecordFormat
 from lunar.arrays import BoolArray, IntArray, OctetArray
-from tmtc import cadu
-from tmtc.clcw import uplink_seen
-from tmtc.crc import CRC_LENGTH
-from tmtc.dictionary import DICTIONARY
-from tmtc.frame_reading import Frames, proof_of, read_frames
-from tmtc.frames import FRAME_HEADER_LENGTH, FRAME_MAX_LENGTH, OCF_LENGTH, ONLY_IDLE_DATA
-from tmtc.link import LinkSettings
-from tmtc.packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
-from tmtc.schema import Dictionary
-from tmtc.stream import CHECKED, PacketCut, PacketForm, cut_packets
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.schema import Dictionary
+from tmtc.link import cadu
+from tmtc.link.clcw import uplink_seen
+from tmtc.link.frame_reading import Frames, proof_of, read_frames
+from tmtc.link.frames import FRAME_HEADER_LENGTH, FRAME_MAX_LENGTH, OCF_LENGTH, ONLY_IDLE_DATA
+from tmtc.link.settings import LinkSettings
+from tmtc.packets.crc import CRC_LENGTH
+from tmtc.packets.space_packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
+from tmtc.packets.stream import CHECKED, PacketCut, PacketForm, cut_packets
 
 CADU_MAX_OCTETS = FRAME_MAX_LENGTH + 2 * 16 * 8 + cadu.ASM_LENGTH
 """Length of the longest CADU of the known link settings."""

@@ -20,8 +20,8 @@ from ground_service.ingest.recording_store import Piece, Surroundings, surroundi
 from ground_service.missions.definitions import PacketDefinitions
 from ground_service.missions.model import Link, StationLink
 from ground_service.missions.store import links_in_force
-from tmtc.link import LinkSettings
-from tmtc.stream import CHECKED, PacketForm
+from tmtc.link.settings import LinkSettings
+from tmtc.packets.stream import CHECKED, PacketForm
 
 STATED, MISSION, DEFAULT = "stated", "mission", "default"
 

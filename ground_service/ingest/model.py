@@ -60,7 +60,7 @@ class ReceivedLink(Entity):
 
 
 class ControlWords(Entity):
-    """Telecommand channel as its command link control words show it, see `tmtc.clcw.UplinkSeen`."""
+    """Telecommand channel as its command link control words show it, see `tmtc.link.clcw.UplinkSeen`."""
 
     virtual_channel: int = Field(ge=0, le=63, examples=[0])
     frames: int = Field(

@@ -15,11 +15,11 @@ from lunar.arrays import IntArray
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.timescales import utc_ns_from_ticks
 from tmtc.arrays import Octets, as_octets
-from tmtc.cuc import NO_TICKS, onboard_ticks
-from tmtc.dictionary import DICTIONARY
-from tmtc.estimates import ESTIMATE_PACKETS, filter_estimates
-from tmtc.schema import Dictionary, Table, gather
-from tmtc.stream import PacketCut, primary_headers
+from tmtc.dictionary.estimates import ESTIMATE_PACKETS, filter_estimates
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.schema import Dictionary, Table, gather
+from tmtc.packets.cuc import NO_TICKS, onboard_ticks
+from tmtc.packets.stream import PacketCut, primary_headers
 
 Columns = dict[str, Any]
 

@@ -29,9 +29,9 @@ from lunar.timescales import (
     ticks_from_utc_ns,
 )
 from tmtc.arrays import Octets
-from tmtc.cuc import NO_TICKS, TICKS_LIMIT
-from tmtc.packet_times import TimeCode, elapsed
-from tmtc.stream import PacketCut, primary_headers, whole_packets
+from tmtc.packets.cuc import NO_TICKS, TICKS_LIMIT
+from tmtc.packets.packet_times import TimeCode, elapsed
+from tmtc.packets.stream import PacketCut, primary_headers, whole_packets
 from tmtc.xtce.decode import VERDICTS
 from tmtc.xtce.series import series_matrix
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lunar.arrays import IntArray, OctetArray
-from tmtc.clcw import UplinkSeen
+from tmtc.link.clcw import UplinkSeen
 
 DAY_NS = 86_400_000_000_000
 CDS_EPOCH_DAYS = 4383

@@ -38,13 +38,13 @@ from ground_service.store.stored_files import recorded_name
 from ground_service.store.vehicles import vehicle_id
 from lunar.arrays import OctetArray
 from tmtc.arrays import as_octets
-from tmtc.cuc import NO_TICKS
-from tmtc.dictionary import DICTIONARY
-from tmtc.link import LinkSettings
-from tmtc.link_plan import declared_sections
-from tmtc.marker_survey import survey_markers
-from tmtc.packets import PACKET_MAX_LENGTH
-from tmtc.stream import PacketForm, cut_packets, whole_packets
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.link.link_plan import declared_sections
+from tmtc.link.marker_survey import survey_markers
+from tmtc.link.settings import LinkSettings
+from tmtc.packets.cuc import NO_TICKS
+from tmtc.packets.space_packets import PACKET_MAX_LENGTH
+from tmtc.packets.stream import PacketForm, cut_packets, whole_packets
 
 Progress = Callable[[float], None]
 

@@ -24,9 +24,9 @@ from ground_service.store.vehicles import (
     get_vehicle,
     lock_vehicle,
 )
-from tmtc.dictionary import DICTIONARY
-from tmtc.schema import Dictionary
-from tmtc.stream import whole_packets
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.schema import Dictionary
+from tmtc.packets.stream import whole_packets
 
 BLOCK_PACKETS = 20_000
 

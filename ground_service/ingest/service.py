@@ -33,10 +33,10 @@ from ground_service.store.files import StoredFile
 from ground_service.store.stored_files import register_file
 from ground_service.store.vehicles import FLOWN, all_vehicles, lock_vehicle
 from ground_service.text import REASON_LIMIT, require_line
-from tmtc.cuc import NO_TICKS
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import TmtcError
-from tmtc.link import LinkSettings
+from tmtc.link.settings import LinkSettings
+from tmtc.packets.cuc import NO_TICKS
 
 
 @dataclass(frozen=True, slots=True)

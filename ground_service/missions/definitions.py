@@ -16,10 +16,10 @@ from pathlib import Path
 from ground_service.errors import InvalidInput
 from ground_service.missions.model import XTCE_COMPRESSED, Mission, PacketSource, format_toml
 from ground_service.toml import read_table
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import DefinitionError
-from tmtc.packets import IDLE_APID
-from tmtc.stream import CHECKED, PacketForm
+from tmtc.packets.space_packets import IDLE_APID
+from tmtc.packets.stream import CHECKED, PacketForm
 from tmtc.xtce.decode import Decoder
 from tmtc.xtce.definition import packet_apids
 from tmtc.xtce.importing import parse_xtce

@@ -23,8 +23,8 @@ from ground_service.toml import faults, read_table
 from lunar.boxes import Box, Region
 from lunar.errors import TimeFormatError
 from lunar.timescales import parse_utc
-from tmtc.dictionary import DICTIONARY
-from tmtc.effects import EFFECTS, FUNCTION, Effect
+from tmtc.dictionary.effects import EFFECTS, FUNCTION, Effect
+from tmtc.dictionary.payload import DICTIONARY
 
 SCHEMA_VERSION: Final = 1
 MISSION_LIMIT_OCTETS = 1 << 20

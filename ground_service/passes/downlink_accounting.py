@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from ground_service.ingest.packets import packet_ticks
 from lunar.arrays import BoolArray, IntArray
 from tmtc.arrays import Octets
-from tmtc.cuc import NO_TICKS
 from tmtc.downlink import FRAME_FOREIGN, FRAME_GOOD, DownlinkDecode, decode
-from tmtc.link_plan import LinkPlan, LinkSection
-from tmtc.stream import CHECKED, PacketForm
+from tmtc.link.link_plan import LinkPlan, LinkSection
+from tmtc.packets.cuc import NO_TICKS
+from tmtc.packets.stream import CHECKED, PacketForm
 
 DIGEST_OCTETS = 16
 

@@ -18,11 +18,11 @@ from ground_service.passes.span import PassSpan, pass_span, vehicle_span
 from ground_service.store.vehicles import find_vehicle
 from lunar.arrays import FloatArray
 from lunar.timescales import TICKS_PER_SECOND
-from tmtc.dictionary import APID_LARGE_DATA, DICTIONARY
+from tmtc.dictionary.payload import APID_LARGE_DATA, DICTIONARY
 from tmtc.errors import ValueRefused
-from tmtc.large_data import LargeDataReceiver
-from tmtc.stream import cut_packets
-from tmtc.thumbnails import Thumbnail, unpack_thumbnail
+from tmtc.packets.large_data import LargeDataReceiver
+from tmtc.packets.stream import cut_packets
+from tmtc.packets.thumbnails import Thumbnail, unpack_thumbnail
 
 IMAGES_LIMIT = 2000
 """Largest number of images in a list; the newest of an interval are listed."""

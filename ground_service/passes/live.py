@@ -25,9 +25,9 @@ from ground_service.passes.parameters import DeclaredParameter, declared_reading
 from ground_service.store import parameters as declared_values
 from ground_service.store import telemetry
 from ground_service.store.vehicles import FLOWN, Vehicle, find_vehicle, get_vehicle, used_vehicles
-from tmtc.dictionary import DICTIONARY, STRUCTURES
-from tmtc.fields import Field
-from tmtc.schema import DecodedPacket, limit_states
+from tmtc.dictionary.fields import Field
+from tmtc.dictionary.payload import DICTIONARY, STRUCTURES
+from tmtc.dictionary.schema import DecodedPacket, limit_states
 
 LIVE_PACKETS = (
     *(one.name for one in STRUCTURES.values()),

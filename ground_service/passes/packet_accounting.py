@@ -27,10 +27,10 @@ from ground_service.store import telemetry
 from ground_service.store.files import FileArchive
 from ground_service.store.vehicles import get_vehicle
 from reports.values import ApidAccounting, CompletenessSeries, PacketAccounting, ReceptionQuality
-from tmtc.dictionary import APID_DETECTIONS, DICTIONARY
-from tmtc.link import LinkSettings
-from tmtc.link_plan import LinkSection
-from tmtc.stream import PacketForm
+from tmtc.dictionary.payload import APID_DETECTIONS, DICTIONARY
+from tmtc.link.link_plan import LinkSection
+from tmtc.link.settings import LinkSettings
+from tmtc.packets.stream import PacketForm
 
 IntArray = NDArray[np.int64]
 

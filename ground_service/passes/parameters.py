@@ -24,11 +24,11 @@ from ground_service.store import parameters as declared_values
 from ground_service.store import rollups
 from ground_service.store.vehicles import find_vehicle
 from lunar.timescales import format_utc, ticks_from_utc_ns
-from tmtc.dictionary import DICTIONARY, STRUCTURES
+from tmtc.dictionary.fields import Field
+from tmtc.dictionary.payload import DICTIONARY, STRUCTURES
+from tmtc.dictionary.schema import PacketDefinition
 from tmtc.export import Record, format_records, packet_records
-from tmtc.fields import Field
-from tmtc.schema import PacketDefinition
-from tmtc.stream import cut_packets, whole_packets
+from tmtc.packets.stream import cut_packets, whole_packets
 from tmtc.xtce.records import format_xtce_records, xtce_records
 from tmtc.xtce.series import SeriesValue
 

@@ -20,10 +20,10 @@ from ground_service.store.models import TELECOMMANDS
 from lunar.arrays import IntArray
 from lunar.timescales import format_utc
 from reports.values import PassEvent
-from tmtc.dictionary import DICTIONARY
-from tmtc.event_texts import event_text, request_text
-from tmtc.schema import PacketDefinition
-from tmtc.stream import cut_packets
+from tmtc.dictionary.event_texts import event_text, request_text
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.schema import PacketDefinition
+from tmtc.packets.stream import cut_packets
 
 _SEVERITIES = {1: "info", 2: "low", 3: "medium", 4: "high"}
 

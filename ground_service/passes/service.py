@@ -56,9 +56,9 @@ from ground_service.store.stored_files import register_file
 from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
 from ground_service.text import require_line
 from reports.values import PacketAccounting
-from tmtc.dictionary import DICTIONARY
-from tmtc.fields import Field
-from tmtc.schema import limit_states
+from tmtc.dictionary.fields import Field
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.schema import limit_states
 
 DAY_NS = 86_400_000_000_000
 LIMIT_STATES = ("within", "warning", "alarm")

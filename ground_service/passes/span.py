@@ -15,7 +15,7 @@ from ground_service.passes import store
 from ground_service.passes.model import PassRecord
 from ground_service.store import telemetry
 from lunar.arrays import IntArray
-from tmtc.codes import EVENTS
+from tmtc.dictionary.codes import EVENTS
 
 _EVENT_CODES = {name: code for code, name in EVENTS}
 STARTED, STOPPED = _EVENT_CODES["observation_started"], _EVENT_CODES["observation_stopped"]

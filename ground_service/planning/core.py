@@ -28,7 +28,7 @@ from lunar.frames import Orientation, spherical_from_mcmf
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns
 from lunar.visibility import GroundStation, find_windows, sun_elevation_azimuth, sunlit_fraction
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 Range = tuple[float, float]
 TerrainAt = Callable[[FloatArray, FloatArray], BoolArray]

@@ -17,13 +17,13 @@ from lunar.ephemeris import Ephemeris
 from lunar.errors import EphemerisCoverageError
 from lunar.frames import IauOrientation, Orientation
 from lunar.timescales import format_utc, tdb_s_from_utc_ns
-from tmtc.large_data import split
-from tmtc.tables import (
+from tmtc.dictionary.tables import (
     InitialState,
     pack_anchor_table,
     pack_initial_state,
     pack_orientation_table,
 )
+from tmtc.packets.large_data import split
 
 LEAD_NS = 60 * NS
 """The payload is in standby from then on before the window, and takes its tables."""

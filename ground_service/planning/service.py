@@ -70,7 +70,7 @@ from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris as States
 from lunar.errors import EphemerisCoverageError
-from tmtc.arguments import argument_text
+from tmtc.dictionary.arguments import argument_text
 
 NS = NANOSECONDS_PER_SECOND
 

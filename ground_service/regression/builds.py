@@ -48,9 +48,9 @@ CHECK_LIMIT_OCTETS = 1 << 14
 # Packages of the flight code of this installation, in addition to the shipped network.
 _FLIGHT_CODE = (
     "payload_emulator/flight",
-    "payload_emulator/session/replay.py",
-    "payload_emulator/session/recording.py",
-    "payload_emulator/session/parameter_file.py",
+    "payload_emulator/session/archive/replay.py",
+    "payload_emulator/session/archive/recording.py",
+    "payload_emulator/session/spacecraft/parameter_file.py",
     "kernels",
     "lunar",
     "tmtc",

@@ -36,7 +36,7 @@ from ground_service.regression.model import TELEMETRY_ONLY, TO_RENDER, KeptArchi
 from ground_service.regression.rendering import LIVE_BEGINNING
 from ground_service.store.vehicles import get_vehicle
 from lunar.timescales import format_utc
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 LIVE = (
     f"{LIVE_BEGINNING}: telemetry does not contain the images and inputs of the payload, and the mission "

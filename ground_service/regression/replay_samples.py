@@ -39,10 +39,10 @@ from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import TICKS_PER_SECOND, utc_ns_from_ticks
-from tmtc.definitions import parse_dictionary
+from tmtc.dictionary.definitions import parse_dictionary
+from tmtc.dictionary.schema import Dictionary, Table
 from tmtc.downlink import DownlinkDecode, decode
 from tmtc.errors import TmtcError
-from tmtc.schema import Dictionary, Table
 
 FRAME_TIMES = "frame_times.csv"
 NAVIGATION_COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "sigma_rtn_m", "nis", "matched")

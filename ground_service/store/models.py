@@ -32,7 +32,7 @@ from sqlalchemy import (
     UniqueConstraint,
 )
 
-from tmtc.housekeeping import HOUSEKEEPING_FIELDS
+from tmtc.dictionary.housekeeping import HOUSEKEEPING_FIELDS
 
 NO_TICKS = -1
 """On-board time of a packet that carries none."""

@@ -12,7 +12,7 @@ from sqlalchemy import Connection, LargeBinary, delete, func, select, update
 from ground_service.store import repository, rollups
 from ground_service.store.bulk import insert_columns
 from lunar.arrays import FloatArray, IntArray
-from tmtc.cuc import NO_TICKS
+from tmtc.packets.cuc import NO_TICKS
 
 _DEFINITIONS = repository.PACKET_DEFINITIONS
 _DECODINGS = repository.PACKET_DECODINGS

@@ -14,7 +14,7 @@ from sqlalchemy.sql import Select
 
 from ground_service.store.repository import IMPLAUSIBLE_PACKETS, PACKETS, SAMPLES, within
 from lunar.arrays import IntArray
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 
 def packet_headers(

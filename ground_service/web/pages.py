@@ -33,9 +33,9 @@ from ground_service.missions.model import Approval, StationConnection, StationLi
 from ground_service.passes.series import STATE_VALUES
 from ground_service.planning.request_model import StandingRequestIn
 from ground_service.regression.store import get_report as get_regression_report
-from tmtc.arguments import FUNCTION_ARGUMENTS
-from tmtc.dictionary import DICTIONARY, STRUCTURES
-from tmtc.onboard_parameters import PARAMETERS
+from tmtc.dictionary.arguments import FUNCTION_ARGUMENTS
+from tmtc.dictionary.onboard_parameters import PARAMETERS
+from tmtc.dictionary.payload import DICTIONARY, STRUCTURES
 
 _HERE = Path(__file__).parent
 _STATIC = _HERE / "static"

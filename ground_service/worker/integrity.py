@@ -34,7 +34,7 @@ from ground_service.store.vehicles import all_vehicles
 from ground_service.worker import integrity_store as store
 from ground_service.worker.follow_up import CONSUMER
 from tmtc.errors import TmtcError
-from tmtc.packets import PRIMARY_HEADER_LENGTH
+from tmtc.packets.space_packets import PRIMARY_HEADER_LENGTH
 
 LIMIT_OF_A_KIND = 200
 """Largest number of listed damages of each kind; the rest is only counted."""

@@ -14,7 +14,7 @@ from ground_service.store import models
 from ground_service.store.rollups import PARAMETERS_CODE
 from ground_service.store.rows import insert_rows, row_blocks
 from ground_service.store.vehicles import FLOWN
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 DERIVED = (models.PACKETS, models.PARAMETER_SAMPLES, *models.SAMPLE_TABLES, models.ROLLUPS)
 """Tables whose rows follow from the raw files."""

@@ -98,7 +98,7 @@ def run_curate(arguments: argparse.Namespace) -> int:
     from linna.errors import UsageError
     from lunar.catalogue import format_catalogue, load_catalogue
     from payload_emulator.sim.terrain.curation import CurationRules, RasterHeights, curate
-    from tmtc.tables import pack_catalogue_table, table_hash
+    from tmtc.dictionary.tables import pack_catalogue_table, table_hash
 
     region = parse_region(arguments.region)
     paths = arguments.terrain

@@ -42,7 +42,7 @@ def _build(arguments: argparse.Namespace) -> int:
 
     from linna.data import blender_python, data_folder
     from linna.output import emit, log
-    from payload_emulator.session.recipe import load_recipe
+    from payload_emulator.session.world.recipe import load_recipe
     from payload_emulator.training.data.build import build
     from payload_emulator.training.data.integrity import summarise
 

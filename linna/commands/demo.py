@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     from ground_service.client.local import local_client
     from ground_service.ground import open_ground
     from linna.data import data_folder
-    from payload_emulator.session.emulator import emulate
+    from payload_emulator.session.archive.emulator import emulate
     from payload_emulator.session.scenario import load_scenario
 
     started = time.monotonic()

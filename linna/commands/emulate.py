@@ -10,8 +10,8 @@ from linna.output import emit, finish, log, progress
 from linna.parser import ABOVE_ZERO, number, option
 
 if TYPE_CHECKING:
-    from payload_emulator.session.external import ExternalFrames
     from payload_emulator.session.scenario import Scenario
+    from payload_emulator.session.world.external import ExternalFrames
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -128,9 +128,9 @@ def _add_live(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from linna.errors import UsageError
-    from payload_emulator.session.emulator import emulate
-    from payload_emulator.session.external import SCENARIO, load_external
+    from payload_emulator.session.archive.emulator import emulate
     from payload_emulator.session.scenario import load_scenario
+    from payload_emulator.session.world.external import SCENARIO, load_external
 
     if arguments.scenario is None and arguments.images is None:
         raise UsageError("emulate: expected a scenario or --images DIR, found none")
@@ -168,8 +168,8 @@ def _check(arguments: argparse.Namespace, scenario: Scenario, external: External
     from ground_service.missions.model import parse_mission
     from linna.data import data_folder
     from lunar.timescales import format_utc
-    from payload_emulator.session.emulator import checked_world
-    from payload_emulator.session.mission import mission_text
+    from payload_emulator.session.archive.emulator import checked_world
+    from payload_emulator.session.archive.mission import mission_text
 
     data = data_folder()
     world = checked_world(scenario, data, external)
@@ -201,10 +201,10 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
 
     from linna.data import data_folder
     from lunar.timescales import format_utc
-    from payload_emulator.session.live import LiveSession, station_names
-    from payload_emulator.session.mission import OPERATIONS, default_ports, live_mission_text
-    from payload_emulator.session.starting import launch, load_scenario_payload
-    from payload_emulator.session.world import build_world
+    from payload_emulator.session.archive.mission import OPERATIONS, default_ports, live_mission_text
+    from payload_emulator.session.live.session import LiveSession, station_names
+    from payload_emulator.session.spacecraft.starting import launch, load_scenario_payload
+    from payload_emulator.session.world.world import build_world
 
     data, operated = data_folder(), not arguments.no_operator
     if operated:

@@ -33,7 +33,7 @@ def _export(
         format_labels,
     )
     from lunar.catalogue import format_catalogue, load_catalogue
-    from tmtc.tables import pack_catalogue_table, unpack_catalogue_table
+    from tmtc.dictionary.tables import pack_catalogue_table, unpack_catalogue_table
 
     chosen = [catalogue is not None, table is not None, labels]
     if sum(chosen) != 1:
@@ -51,7 +51,7 @@ def _export(
 
 
 def _table(service: Client, pass_id: int, *, out: Path) -> dict[str, Any]:
-    from tmtc.tables import table_hash, unpack_catalogue_table
+    from tmtc.dictionary.tables import table_hash, unpack_catalogue_table
 
     service.get_onboard_table(pass_id, out)
     octets = out.read_bytes()
@@ -66,7 +66,7 @@ def _upload(
     service: Client, table: Path, *, transaction: int = 1, instance: str = "flight", spacecraft_id: int
 ) -> dict[str, Any]:
     from ground_service.evaluation.landmarks.documents import upload_entries
-    from tmtc.tables import unpack_catalogue_table
+    from tmtc.dictionary.tables import unpack_catalogue_table
 
     octets = _octets(table)
     craters = len(unpack_catalogue_table(octets))

@@ -15,8 +15,8 @@ from linna.parser import option
 if TYPE_CHECKING:
     from ground_service.contacts.links.model import Contacts, LinkStatus
     from linna.parser import LinnaParser
-    from tmtc.link_check import LinkProposal
-    from tmtc.stream import PacketForm
+    from tmtc.link.link_check import LinkProposal
+    from tmtc.packets.stream import PacketForm
 
 INCONCLUSIVE = 3
 SHOWN = 6

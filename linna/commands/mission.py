@@ -62,7 +62,7 @@ def write(arguments: argparse.Namespace) -> int:
     from ground_service.missions.service import read_mission
     from linna.data import data_folder
     from linna.errors import UsageError
-    from payload_emulator.session.mission import scenario_mission_text
+    from payload_emulator.session.archive.mission import scenario_mission_text
     from payload_emulator.session.scenario import load_scenario
 
     if (arguments.scenario is None) == (arguments.xtce is None):

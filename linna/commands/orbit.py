@@ -34,8 +34,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run_propagate(arguments: argparse.Namespace) -> int:
     from linna.data import data_folder
     from lunar.messages.oem import format_oem
-    from payload_emulator.session.orbit import force_model, propagate_to_impact, sample
     from payload_emulator.session.scenario import load_scenario
+    from payload_emulator.session.world.orbit import force_model, propagate_to_impact, sample
 
     out: Path = arguments.out
     if not out.parent.is_dir():

@@ -203,7 +203,7 @@ def _suite(arguments: argparse.Namespace) -> int:
     from ground_service.regression.gates.policy import load_policy
     from ground_service.regression.gates.power import detectable, power_text
     from linna.data import data_folder
-    from payload_emulator.session.suite import suite_scenarios, write_suite
+    from payload_emulator.session.archive.suite import suite_scenarios, write_suite
 
     scenarios = suite_scenarios(arguments.scenario, frames=arguments.frames, seeds=arguments.seeds)
     if arguments.out is None:

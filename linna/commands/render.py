@@ -50,7 +50,7 @@ def run_render(arguments: argparse.Namespace) -> int:
 def _run_frame(arguments: argparse.Namespace) -> int:
     from linna.data import blender_python, data_folder
     from lunar.timescales import parse_utc
-    from payload_emulator.session.frame import render_frame
+    from payload_emulator.session.world.frame import render_frame
     from payload_emulator.training.data.dataset import write_whole
     from payload_emulator.training.evaluate.sheets import draw_labels, save_png
 
@@ -85,7 +85,7 @@ def _run_frame(arguments: argparse.Namespace) -> int:
 
 def _run_sheet(arguments: argparse.Namespace) -> int:
     from linna.data import blender_python
-    from payload_emulator.session.frame import take_frame, view_at
+    from payload_emulator.session.world.frame import take_frame, view_at
     from payload_emulator.training.evaluate.sheets import contact_sheet, draw_labels, eight_bits, save_png
 
     world, epochs = _views(arguments)
@@ -134,7 +134,7 @@ def _views(arguments: argparse.Namespace) -> tuple[Any, list[int]]:
     """The world, and the epochs named or those spread over its observation windows."""
     from linna.data import data_folder
     from lunar.timescales import parse_utc
-    from payload_emulator.session.frame import window_epochs, world_at
+    from payload_emulator.session.world.frame import window_epochs, world_at
 
     if not arguments.epoch:
         return window_epochs(_scenario(arguments), data_folder(), arguments.views)
@@ -143,7 +143,7 @@ def _views(arguments: argparse.Namespace) -> tuple[Any, list[int]]:
 
 
 def _caption(world: Any, view: Any) -> str:
-    from payload_emulator.session.frame import metadata_of
+    from payload_emulator.session.world.frame import metadata_of
 
     row = metadata_of(world, view)
     return (

@@ -58,7 +58,12 @@ def run(arguments: argparse.Namespace) -> int:
 def _fly(arguments: argparse.Namespace, archive: Path) -> int:
     if arguments.complete:
         return _complete(arguments, archive)
-    from payload_emulator.session.replay import FlightBuild, load_flight_build, names_command, replay_archive
+    from payload_emulator.session.archive.replay import (
+        FlightBuild,
+        load_flight_build,
+        names_command,
+        replay_archive,
+    )
 
     current = arguments.build == "current"
     if not current and names_command(Path(arguments.build)):
@@ -77,7 +82,7 @@ def _check(arguments: argparse.Namespace) -> int:
     from ground_service.errors import InvalidInput
     from ground_service.regression.builds import load_build
     from payload_emulator.errors import ParameterError
-    from payload_emulator.session.replay import check_parameters
+    from payload_emulator.session.archive.replay import check_parameters
 
     fault: InvalidInput | ParameterError
     try:
@@ -97,7 +102,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
 def _complete(arguments: argparse.Namespace, archive: Path) -> int:
     from linna.data import data_folder
-    from payload_emulator.session.replay import complete_archive
+    from payload_emulator.session.archive.replay import complete_archive
 
     manifest = complete_archive(archive, arguments.out, data_folder(), progress=_bar)
     frames = sum(name.startswith("frames/") for name in manifest["files"])

@@ -14,9 +14,9 @@ from linna.output import emit, finish, save
 from linna.parser import option
 
 if TYPE_CHECKING:
+    from tmtc.dictionary.schema import Dictionary
     from tmtc.downlink import DownlinkDecode
-    from tmtc.link import LinkSettings
-    from tmtc.schema import Dictionary
+    from tmtc.link.settings import LinkSettings
     from tmtc.xtce.decode import XtceDecode
     from tmtc.xtce.definition import Definition
 
@@ -76,7 +76,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run_decode(arguments: argparse.Namespace) -> int:
-    from tmtc.dictionary import DICTIONARY
+    from tmtc.dictionary.payload import DICTIONARY
     from tmtc.export import format_records, packet_records
 
     if arguments.xtce:
@@ -141,7 +141,7 @@ def run_check(arguments: argparse.Namespace) -> int:
 
 def _read_foreign(arguments: argparse.Namespace) -> tuple[DownlinkDecode, XtceDecode, Definition]:
     """The downlink, its packets through the definition, and the definition."""
-    from tmtc.schema import Dictionary
+    from tmtc.dictionary.schema import Dictionary
     from tmtc.xtce.decode import DECODED, Decoder
     from tmtc.xtce.importing import parse_xtce
 
@@ -164,7 +164,7 @@ def _refuse_without_definition(arguments: argparse.Namespace) -> None:
 
 def run_icd(arguments: argparse.Namespace) -> int:
     from payload_emulator.flight.onboard.icd import format_interfaces
-    from tmtc.icd import format_icd
+    from tmtc.dictionary.icd import format_icd
 
     return _document(arguments, f"{format_icd()}\n{format_interfaces()}")
 
@@ -194,8 +194,8 @@ def run_frames(arguments: argparse.Namespace) -> int:
     import socket
     import time
 
-    from tmtc.frame_reading import plain_frames
-    from tmtc.link import LinkSettings
+    from tmtc.link.frame_reading import plain_frames
+    from tmtc.link.settings import LinkSettings
 
     target, count = _address("--to", arguments.to), 0
     settings = _link_settings(arguments) or LinkSettings()
@@ -245,7 +245,7 @@ def _address(option: str, text: str) -> tuple[str, int]:
 
 
 def _document(arguments: argparse.Namespace, text: str) -> int:
-    from tmtc.dictionary import DICTIONARY
+    from tmtc.dictionary.payload import DICTIONARY
 
     figures = {"dictionary_version": DICTIONARY.version, "dictionary_hash": DICTIONARY.hash}
     if arguments.out is None:
@@ -294,7 +294,7 @@ def _add_link_options(parser: argparse.ArgumentParser) -> None:
 
 def _link_settings(arguments: argparse.Namespace) -> LinkSettings | None:
     """Return the stated settings of the link, None without any."""
-    from tmtc.link import LinkSettings
+    from tmtc.link.settings import LinkSettings
 
     names = ("frame_length", "coding", "randomiser", "interleave")
     chosen = {name: value for name in names if (value := getattr(arguments, name)) is not None}
@@ -306,10 +306,10 @@ def _link_settings(arguments: argparse.Namespace) -> LinkSettings | None:
 def _read(arguments: argparse.Namespace, dictionary: Dictionary | None = None) -> DownlinkDecode:
     from linna.errors import UsageError
     from tmtc.arrays import as_octets
-    from tmtc.dictionary import DICTIONARY
+    from tmtc.dictionary.payload import DICTIONARY
     from tmtc.downlink import decode
     from tmtc.errors import UnknownCoding
-    from tmtc.stream import PacketForm, find_prefix
+    from tmtc.packets.stream import PacketForm, find_prefix
 
     octets = arguments.file.read_bytes()
     form = PacketForm(not arguments.no_error_control, prefix_octets=arguments.prefix_octets or 0)

@@ -17,12 +17,12 @@ from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.datafolder import DataFolder
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc
-from payload_emulator.session.live import pruned, station_names
-from payload_emulator.session.mission import OPERATIONS, default_ports, live_mission_text
-from payload_emulator.session.regions import observed_boxes, observed_craters
-from payload_emulator.session.rims import Watched
+from payload_emulator.session.archive.mission import OPERATIONS, default_ports, live_mission_text
+from payload_emulator.session.live.session import pruned, station_names
 from payload_emulator.session.scenario import Scenario
-from payload_emulator.session.world import (
+from payload_emulator.session.world.regions import observed_boxes, observed_craters
+from payload_emulator.session.world.rims import Watched
+from payload_emulator.session.world.world import (
     CHUNK_S,
     World,
     extended_flight,

@@ -14,10 +14,10 @@ from ground_service.clock import ClockFile
 from ground_service.errors import GroundError
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import ScenarioError
-from payload_emulator.session.live import station_names
-from payload_emulator.session.rims import Watched
+from payload_emulator.session.live.session import station_names
 from payload_emulator.session.scenario import Scenario, format_scenario
-from payload_emulator.session.world import open_world
+from payload_emulator.session.world.rims import Watched
+from payload_emulator.session.world.world import open_world
 from studies.harness.parts import Part, answers_http, bare_environment, free_port
 from studies.mission_run.dynamics import DAY_NS, FlightDynamics, write_flight
 

@@ -17,9 +17,9 @@ from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.datafolder import DataFolder
 from lunar.timescales import format_utc, parse_utc
 from payload_emulator.errors import LinkError, ScenarioError
-from payload_emulator.session.mission import SILENCE_S
+from payload_emulator.session.archive.mission import SILENCE_S
 from payload_emulator.session.scenario import Scenario, format_scenario, parse_scenario
-from payload_emulator.session.world import open_world
+from payload_emulator.session.world.world import open_world
 from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.disturbances import UNDISTURBED, Disturbances
 from studies.mission_run.dynamics import DAY_NS, LAST_NS, FlightDynamics

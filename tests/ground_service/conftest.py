@@ -43,9 +43,9 @@ from lunar.frames import IauOrientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
 from tests.serving import TestClient, wait_for
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
-from tmtc.packets import PacketSequencer
+from tmtc.packets.space_packets import PacketSequencer
 
 NS = 1_000_000_000
 START = parse_utc("2029-08-07T06:00:00Z")
@@ -365,7 +365,7 @@ def make_flyable(make_pass: Callable[..., SyntheticPass]) -> Callable[..., Flyab
 
     from PIL import Image
 
-    from tmtc.definitions import format_dictionary
+    from tmtc.dictionary.definitions import format_dictionary
 
     def make(frames: int = 12, seed: int = 1, **options: Any) -> FlyablePass:
         made = make_pass(frames=frames, seed=seed, **options)

@@ -17,7 +17,7 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from tests.serving import TestClient
 from tmtc.downlink import DownlinkEncoder
-from tmtc.frames import Clcw, pack_clcw
+from tmtc.link.frames import Clcw, pack_clcw
 
 V1 = "/api/v1"
 

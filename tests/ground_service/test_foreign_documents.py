@@ -28,7 +28,7 @@ from lunar.messages.oem import format_oem
 from lunar.messages.oem_xml import format_oem_xml
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import parse_scenario
-from tmtc.definitions import parse_dictionary
+from tmtc.dictionary.definitions import parse_dictionary
 from tmtc.errors import MalformedPacket
 
 DEEP = "a = " + "[" * 50_000 + "]" * 50_000

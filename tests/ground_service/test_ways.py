@@ -21,17 +21,17 @@ from ground_service.ground import Ground
 from ground_service.passes.archive_import import import_archive
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
-from payload_emulator.session.emulator import emulate, file_entries
-from payload_emulator.session.live import LiveSession
-from payload_emulator.session.recording import frame_path
-from payload_emulator.session.replay import FlightBuild, replay_archive
+from payload_emulator.session.archive.emulator import emulate, file_entries
+from payload_emulator.session.archive.recording import frame_path
+from payload_emulator.session.archive.replay import FlightBuild, replay_archive
+from payload_emulator.session.live.session import LiveSession
+from payload_emulator.session.live.station_ports import RECORD_HEADER
 from payload_emulator.session.scenario import Scenario, parse_scenario
-from payload_emulator.session.starting import launch, load_scenario_payload
-from payload_emulator.session.station_ports import RECORD_HEADER
-from payload_emulator.session.world import build_world, clock_ticks, open_world
-from tmtc.dictionary import DICTIONARY
+from payload_emulator.session.spacecraft.starting import launch, load_scenario_payload
+from payload_emulator.session.world.world import build_world, clock_ticks, open_world
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode, encode_cadus
-from tmtc.link import LinkSettings
+from tmtc.link.settings import LinkSettings
 
 NO_DATA = DataFolder(None)
 NS = 1_000_000_000

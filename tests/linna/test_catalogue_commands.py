@@ -14,7 +14,7 @@ from linna.cli import run
 from lunar.catalogue import make_catalogue, save_catalogue
 from payload_emulator.sim.terrain.registration import parse_registration
 from tests.payload_emulator.sim.rasters import write_raster
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 METRES_PER_DEG = math.radians(1.0) * 1_737_400.0
 

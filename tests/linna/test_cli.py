@@ -12,8 +12,8 @@ import pytest
 from linna import cli
 from linna.parser import ABOVE_ZERO, REQUIRED, all_commands, command_parser, number
 from payload_emulator.errors import install_hint
-from payload_emulator.session.recipe import load_recipe, procedural_recipe
 from payload_emulator.session.scenario import load_scenario
+from payload_emulator.session.world.recipe import load_recipe, procedural_recipe
 from tests.scenarios import still_scenario
 
 

@@ -5,7 +5,7 @@ import pytest
 from linna.cli import GROUPS
 from linna.help import example
 from linna.parser import command_parser
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 RELIED_ON = """
 demo --out D

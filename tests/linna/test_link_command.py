@@ -8,9 +8,9 @@ import pytest
 
 from linna.cli import run
 from tests.tmtc.test_downlink import make_packets
-from tmtc.cadu import ASM
 from tmtc.downlink import encode_cadus
-from tmtc.packets import pack_packet
+from tmtc.link.cadu import ASM
+from tmtc.packets.space_packets import pack_packet
 
 
 @pytest.fixture

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from linna.cli import run
-from tmtc.cadu import ASM
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
-from tmtc.packets import PacketSequencer
+from tmtc.link.cadu import ASM
+from tmtc.packets.space_packets import PacketSequencer
 
 
 def make_packets(count: int) -> list[bytes]:
@@ -406,8 +406,8 @@ def test_plain_frames_of_a_downlink_are_sent_as_datagrams(downlink, capsys):
 
 
 def test_frames_are_found_across_pieces_of_a_stream(downlink):
-    from tmtc.frame_reading import plain_frames
-    from tmtc.link import LinkSettings
+    from tmtc.link.frame_reading import plain_frames
+    from tmtc.link.settings import LinkSettings
 
     octets = downlink.read_bytes()
     whole = list(plain_frames([octets], LinkSettings()))

@@ -22,17 +22,17 @@ from linna import cli
 from lunar.datafolder import DataFolder
 from lunar.timescales import parse_utc, tai_ns_from_utc_ns
 from payload_emulator.errors import ScenarioError
-from payload_emulator.session.live import LiveSession
-from payload_emulator.session.mission import OPERATIONS, live_mission_text, scenario_mission_text
+from payload_emulator.session.archive.mission import OPERATIONS, live_mission_text, scenario_mission_text
+from payload_emulator.session.live.session import LiveSession
+from payload_emulator.session.live.station_ports import RECORD_HEADER
 from payload_emulator.session.scenario import Scenario, parse_scenario
-from payload_emulator.session.starting import launch
-from payload_emulator.session.station_ports import RECORD_HEADER
-from payload_emulator.session.world import open_world
+from payload_emulator.session.spacecraft.starting import launch
+from payload_emulator.session.world.world import open_world
 from tests.scenarios import commanded_scenario
 from tests.serving import wait_for
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode
-from tmtc.link import LinkSettings
+from tmtc.link.settings import LinkSettings
 
 NS = 1_000_000_000
 HOUR_NS = 3600 * NS

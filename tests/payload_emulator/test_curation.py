@@ -13,7 +13,7 @@ from lunar.catalogue import CraterCatalogue, load_catalogue, make_catalogue
 from lunar.datafolder import find_data
 from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain.curation import Curation, CurationRules, RasterHeights, Region, curate
-from tmtc.tables import pack_catalogue_table, unpack_catalogue_table
+from tmtc.dictionary.tables import pack_catalogue_table, unpack_catalogue_table
 
 RADIUS_M = 1_737_400.0
 METRES_PER_DEG = math.radians(1.0) * RADIUS_M

@@ -13,12 +13,12 @@ import pytest
 from lunar.datafolder import find_data
 from lunar.timescales import parse_utc
 from payload_emulator.flight.payload import Payload
-from payload_emulator.session import emulator
-from payload_emulator.session.emulator import emulate
+from payload_emulator.session.archive import emulator
+from payload_emulator.session.archive.emulator import emulate
 from payload_emulator.session.scenario import parse_scenario
+from tmtc.dictionary.tables import CatalogueTable, pack_catalogue_table
 from tmtc.downlink import decode
 from tmtc.errors import TableError
-from tmtc.tables import CatalogueTable, pack_catalogue_table
 
 ORBIT = """
 [dynamics]

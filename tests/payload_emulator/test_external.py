@@ -15,13 +15,13 @@ from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.vision.detector import OnnxDetector
-from payload_emulator.session import sun_check
-from payload_emulator.session.emulator import emulate
-from payload_emulator.session.external import load_external
-from payload_emulator.session.replay import FlightBuild, replay_archive
+from payload_emulator.session.archive import sun_check
+from payload_emulator.session.archive.emulator import emulate
+from payload_emulator.session.archive.replay import FlightBuild, replay_archive
+from payload_emulator.session.archive.sun_check import sun_warnings
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.sun_check import sun_warnings
-from payload_emulator.session.world import build_world
+from payload_emulator.session.world.external import load_external
+from payload_emulator.session.world.world import build_world
 
 TEXT = """
 name = "given"

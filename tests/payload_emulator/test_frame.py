@@ -7,8 +7,8 @@ import pytest
 from lunar.datafolder import DataFolder
 from lunar.timescales import parse_utc
 from payload_emulator.errors import ScenarioError
-from payload_emulator.session.frame import render_frame
 from payload_emulator.session.scenario import SHIPPED, load_scenario
+from payload_emulator.session.world.frame import render_frame
 
 EPOCH = parse_utc("2029-08-07T00:10:00Z")
 

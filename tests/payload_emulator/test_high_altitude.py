@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lunar.datafolder import DataFolder
-from payload_emulator.session.emulator import emulate
+from payload_emulator.session.archive.emulator import emulate
 from payload_emulator.session.scenario import parse_scenario
 
 SCENARIO = """

@@ -10,9 +10,9 @@ import pytest
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
-from payload_emulator.session import rims
-from payload_emulator.session.rims import rims_of, sources_of
 from payload_emulator.session.scenario import Scenario
+from payload_emulator.session.world import rims
+from payload_emulator.session.world.rims import rims_of, sources_of
 from payload_emulator.sim.terrain import tiles
 from payload_emulator.sim.terrain.procedural import ProceduralTerrain
 from payload_emulator.sim.terrain.tiles import Heights

@@ -13,10 +13,10 @@ from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import LinkSection
 from payload_emulator.sim.board.link import Receiver, Transmitter, contacts, station, transmit
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import LinkSettings, decode
-from tmtc.frames import Clcw, pack_clcw, unpack_clcw
-from tmtc.uplink import UplinkEncoder
+from tmtc.link.frames import Clcw, pack_clcw, unpack_clcw
+from tmtc.link.uplink import UplinkEncoder
 
 EPOCH = parse_utc("2029-08-08T00:00:00Z")
 

@@ -23,25 +23,25 @@ from lunar.frames import mcmf_from_spherical
 from lunar.timescales import parse_utc
 from payload_emulator.errors import LinkError
 from payload_emulator.flight.onboard.modes import PayloadMode
-from payload_emulator.session.camera import Exposure, expose
-from payload_emulator.session.live import LiveSession
-from payload_emulator.session.live_ports import CLIENT_LIMIT, UNSENT_LIMIT_OCTETS, Server
-from payload_emulator.session.loading import LoadedPayload
+from payload_emulator.session.live.live_ports import CLIENT_LIMIT, UNSENT_LIMIT_OCTETS, Server
+from payload_emulator.session.live.session import LiveSession
+from payload_emulator.session.live.station_ports import RECORD_HEADER, TelecommandBuffer
+from payload_emulator.session.live.viewing import turn_message
 from payload_emulator.session.scenario import FaultsSection, parse_scenario
-from payload_emulator.session.schedule import Operator, fly_scenario
-from payload_emulator.session.spacecraft import Moment, Turn, new_spacecraft
-from payload_emulator.session.starting import load_scenario_payload
-from payload_emulator.session.station_ports import RECORD_HEADER, TelecommandBuffer
-from payload_emulator.session.viewing import turn_message
-from payload_emulator.session.world import World, build_world
+from payload_emulator.session.spacecraft.loading import LoadedPayload
+from payload_emulator.session.spacecraft.loop import Moment, Turn, new_spacecraft
+from payload_emulator.session.spacecraft.schedule import Operator, fly_scenario
+from payload_emulator.session.spacecraft.starting import load_scenario_payload
+from payload_emulator.session.world.camera import Exposure, expose
+from payload_emulator.session.world.world import World, build_world
 from payload_emulator.sim.board.faults import FAULT_KINDS
 from payload_emulator.sim.board.link import Receiver
 from studies.harness.parts import free_port, listens
 from tests.scenarios import live_scenario
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode
-from tmtc.link import LinkSettings
-from tmtc.uplink import UplinkEncoder
+from tmtc.link.settings import LinkSettings
+from tmtc.link.uplink import UplinkEncoder
 
 SCENARIO = live_scenario("live", 3, 240.0)
 NO_DATA = find_data(None)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from lunar.catalogue import CraterCatalogue
-from payload_emulator.session.loading import SEEN_BELOW_RIM_M, onboard_catalogue
 from payload_emulator.session.scenario import load_scenario
-from tmtc.tables import CatalogueTable
+from payload_emulator.session.spacecraft.loading import SEEN_BELOW_RIM_M, onboard_catalogue
+from tmtc.dictionary.tables import CatalogueTable
 
 
 def measured(source: str) -> CraterCatalogue:

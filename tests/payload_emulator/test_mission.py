@@ -14,7 +14,7 @@ from lunar.datafolder import DataFolder
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.errors import ModelError
 from payload_emulator.flight.models import load_shipped_model
-from payload_emulator.session.mission import (
+from payload_emulator.session.archive.mission import (
     OPERATIONS,
     live_mission_text,
     mission_text,
@@ -22,7 +22,7 @@ from payload_emulator.session.mission import (
     unseen_share,
 )
 from payload_emulator.session.scenario import DetectorSection, parse_scenario
-from payload_emulator.session.world import build_world
+from payload_emulator.session.world.world import build_world
 from payload_emulator.sim.terrain.registration import Rims, fit_registration
 from payload_emulator.sim.terrain.tiles import Terrain
 from tests.scenarios import still_scenario

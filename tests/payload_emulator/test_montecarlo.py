@@ -16,12 +16,12 @@ from lunar.frames import rtn_from_inertial
 from lunar.timescales import tdb_s_from_utc_ns
 from payload_emulator.flight.navigation import landmark_map
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
-from payload_emulator.flight.navigation.dynamics import ProcessNoise, process_noise
-from payload_emulator.flight.navigation.filter import CommonErrors
+from payload_emulator.flight.navigation.filter.dynamics import ProcessNoise, process_noise
+from payload_emulator.flight.navigation.filter.filter import CommonErrors
 from payload_emulator.flight.navigation.outcomes import Outcome
-from payload_emulator.session import loading
-from payload_emulator.session.distortion import regional_field
 from payload_emulator.session.scenario import load_scenario
+from payload_emulator.session.spacecraft import loading
+from payload_emulator.session.world.distortion import regional_field
 from payload_emulator.sim.detector import SimulatedDetector
 from studies import montecarlo
 from studies.montecarlo import (
@@ -35,7 +35,7 @@ from studies.montecarlo import (
     verdict,
 )
 from studies.montecarlo_world import TRACKS, crater_world, standard_case
-from tmtc.tables import unpack_catalogue_table
+from tmtc.dictionary.tables import unpack_catalogue_table
 
 # Tuned on other seeds than the tests use: what degree 50 leaves out of the field of degree 60 in the fixture.
 NOISE = ProcessNoise(

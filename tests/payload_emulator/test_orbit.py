@@ -7,14 +7,14 @@ from lunar.datafolder import find_data
 from lunar.frames import mci_from_icrf
 from lunar.propagation import SolarPressure
 from lunar.timescales import tdb_s_from_utc_ns
-from payload_emulator.session.orbit import (
+from payload_emulator.session.scenario import format_scenario, parse_scenario
+from payload_emulator.session.world.orbit import (
     force_model,
     initial_state_icrf,
     propagate_scenario,
     propagate_to_impact,
     sample,
 )
-from payload_emulator.session.scenario import format_scenario, parse_scenario
 
 BARE = 'name = "x"\n[maneuvers]\nenabled = false\n[dynamics]\ngravity = "builtin"\norientation = "iau"\n'
 

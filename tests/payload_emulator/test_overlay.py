@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from lunar.datafolder import DataFolder
-from payload_emulator.session.camera import Exposure
-from payload_emulator.session.reduced import craters_in_view
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.world import build_world
+from payload_emulator.session.world.camera import Exposure
+from payload_emulator.session.world.reduced import craters_in_view
+from payload_emulator.session.world.world import build_world
 from tests.scenarios import still_scenario
 
 SCENARIO = (

@@ -16,12 +16,12 @@ from lunar.catalogue import save_catalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import PayloadError
 from payload_emulator.flight.payload import FlightParameters
-from payload_emulator.session.loading import launch_payload
-from payload_emulator.session.reconstruction import CATALOGUE, reconstruct
-from payload_emulator.session.replay import FlightBuild, complete_archive, replay_archive
+from payload_emulator.session.archive.reconstruction import CATALOGUE, reconstruct
+from payload_emulator.session.archive.replay import FlightBuild, complete_archive, replay_archive
+from payload_emulator.session.live.station_ports import RECORD_HEADER
 from payload_emulator.session.scenario import Scenario, format_scenario, parse_scenario
-from payload_emulator.session.station_ports import RECORD_HEADER
-from payload_emulator.session.world import clock_ticks, first_utc_ns, open_world
+from payload_emulator.session.spacecraft.loading import launch_payload
+from payload_emulator.session.world.world import clock_ticks, first_utc_ns, open_world
 from tests.payload_emulator.test_continuous import (
     CADU,
     EPOCH,
@@ -31,9 +31,9 @@ from tests.payload_emulator.test_continuous import (
     flown,
     scenario,
 )
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode
-from tmtc.link import LinkSettings
+from tmtc.link.settings import LinkSettings
 
 FRAMES = 4
 WINDOW = EPOCH + 5 * HOUR_NS

@@ -11,7 +11,7 @@ from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states
 from lunar.frames import IauOrientation, rtn_from_inertial
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import SHIPPED, ReferenceSection, load_scenario, parse_scenario
-from payload_emulator.session.world import _truth_of_ephemeris, sample_truth, with_reference_error
+from payload_emulator.session.world.world import _truth_of_ephemeris, sample_truth, with_reference_error
 
 GM = 4.9028e12
 RADIUS_M = 1_767_400.0

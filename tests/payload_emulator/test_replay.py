@@ -19,15 +19,9 @@ from payload_emulator.errors import ParameterError, RecordError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.payload import FlightParameters
 from payload_emulator.flight.vision.detector import OnnxDetector
-from payload_emulator.session import world
-from payload_emulator.session.emulator import emulate, file_entries
-from payload_emulator.session.parameter_file import (
-    BuildParameters,
-    format_parameters,
-    parse_parameters,
-)
-from payload_emulator.session.recording import load_image, load_record, missing_frames
-from payload_emulator.session.replay import (
+from payload_emulator.session.archive.emulator import emulate, file_entries
+from payload_emulator.session.archive.recording import load_image, load_record, missing_frames
+from payload_emulator.session.archive.replay import (
     FlightBuild,
     complete_archive,
     load_flight_build,
@@ -36,12 +30,18 @@ from payload_emulator.session.replay import (
     replay_archive,
     stored_images,
 )
+from payload_emulator.session.archive.suite import SUITE, suite_scenarios
 from payload_emulator.session.scenario import format_scenario, parse_scenario
-from payload_emulator.session.suite import SUITE, suite_scenarios
+from payload_emulator.session.spacecraft.parameter_file import (
+    BuildParameters,
+    format_parameters,
+    parse_parameters,
+)
+from payload_emulator.session.world import world
 from tests.scenarios import short_scenario
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode
-from tmtc.stream import cut_packets
+from tmtc.packets.stream import cut_packets
 
 FRAMES = 5
 SCENARIO = short_scenario(75.0, "") + "[disturbances]\noutage_at_s = 25.0\noutage_duration_s = 15.0\n"
@@ -312,7 +312,7 @@ def test_the_shipped_suite_has_a_pass_of_every_kind() -> None:
 
 
 def test_the_dictionary_of_the_archive_decodes_its_downlink(archive: Path) -> None:
-    from tmtc.definitions import parse_dictionary
+    from tmtc.dictionary.definitions import parse_dictionary
 
     dictionary = parse_dictionary((archive / "payload/dictionary.json").read_text())
     assert dictionary.hash == DICTIONARY.hash

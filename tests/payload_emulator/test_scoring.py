@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from payload_emulator.session.scoring import _absolute_percentiles, frames_to_recover
+from payload_emulator.session.archive.scoring import _absolute_percentiles, frames_to_recover
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,9 @@ import pytest
 
 from payload_emulator.errors import RecordError
 from payload_emulator.flight.onboard.modes import PayloadMode
-from payload_emulator.session.state import VERSION, load_state, pack_state, save_state, unpack_state
+from payload_emulator.session.live.state import VERSION, load_state, pack_state, save_state, unpack_state
 from payload_emulator.sim.board.faults import parse_fault
-from tmtc.uplink import Farm
+from tmtc.link.uplink import Farm
 
 
 def kept(value: Any) -> Any:
@@ -150,18 +150,18 @@ def sealed(root: Any) -> bytes:
     [
         7, None, ["list", 1], ["ref", 9], ["dict", ["one"]], ["dict", ["one", ["known", "x"]]], ["unknown"], [],
         ["dict", ["one", ["object", "subprocess:Popen"]]],
-        ["dict", ["one", ["object", "payload_emulator.session.state:Path"]]],
-        ["dict", ["one", ["object", "payload_emulator.session.state:pack_state"]]],
-        ["dict", ["one", ["object", "payload_emulator.session.state:json.JSONDecoder"]]],
+        ["dict", ["one", ["object", "payload_emulator.session.live.state:Path"]]],
+        ["dict", ["one", ["object", "payload_emulator.session.live.state:pack_state"]]],
+        ["dict", ["one", ["object", "payload_emulator.session.live.state:json.JSONDecoder"]]],
         ["dict", ["one", ["object", "payload_emulator.session.none:Any"]]],
         ["dict", ["one", ["object", "payload_emulator.flight.onboard.modes:PayloadMode"]]],
-        ["dict", ["one", ["enum", "tmtc.uplink:Farm", 1]]],
+        ["dict", ["one", ["enum", "tmtc.link.uplink:Farm", 1]]],
         ["dict", ["one", ["trajectory", ["dict"]]]],
         ["dict", ["one", ["array", "O", [1], "C", 0]]],
         ["dict", ["one", ["view", ["array", "|u1", [8], "C", 0], 0, [1], [8], "O"]]],
         ["dict", ["one", ["view", ["array", "|u1", [8], "C", 0], 4, [1], [8], "<i8"]]],
         ["dict", ["one", ["bytes", 1]]],
-        ["dict", ["one", ["object", "tmtc.uplink:Farm", ["unknown", 1]]]],
+        ["dict", ["one", ["object", "tmtc.link.uplink:Farm", ["unknown", 1]]]],
     ],
     ids=json.dumps,
 )  # fmt: skip

@@ -9,10 +9,15 @@ import pytest
 
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import RecordError
-from payload_emulator.session.live import LiveSession
+from payload_emulator.session.live.session import LiveSession
+from payload_emulator.session.live.station_ports import (
+    JournalEntry,
+    StationPorts,
+    add_to_journal,
+    load_journal,
+)
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.starting import launch
-from payload_emulator.session.station_ports import JournalEntry, StationPorts, add_to_journal, load_journal
+from payload_emulator.session.spacecraft.starting import launch
 from tests.payload_emulator.test_continuous import SCENARIO
 
 FIRST = JournalEntry(5, "madrid", 256, b"\x01\x02")

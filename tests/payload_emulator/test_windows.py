@@ -9,10 +9,10 @@ from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
-from payload_emulator.session import world as world_module
-from payload_emulator.session.emulator import checked_world, emulate
+from payload_emulator.session.archive.emulator import checked_world, emulate
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.world import build_world
+from payload_emulator.session.world import world as world_module
+from payload_emulator.session.world.world import build_world
 
 SCENARIO = parse_scenario("""
 name = "band"

@@ -2,11 +2,11 @@
 
 import pytest
 
-from tmtc.arguments import FUNCTION_ARGUMENTS, argument_text, arguments_by_number
-from tmtc.codes import FUNCTIONS
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.arguments import FUNCTION_ARGUMENTS, argument_text, arguments_by_number
+from tmtc.dictionary.codes import FUNCTIONS
+from tmtc.dictionary.onboard_parameters import PARAMETERS
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import ValueRefused
-from tmtc.onboard_parameters import PARAMETERS
 
 OBSERVATION = {"function_id": "start_observation", "argument_1": 2227.5, "argument_2": 15.0}
 

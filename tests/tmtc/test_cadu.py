@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from tmtc.cadu import ASM, cadu_octets, synchronise
-from tmtc.marker_survey import survey_markers
+from tmtc.link.cadu import ASM, cadu_octets, synchronise
+from tmtc.link.marker_survey import survey_markers
 
 PERIOD = 128
 

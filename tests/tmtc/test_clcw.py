@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tmtc.clcw import uplink_seen
-from tmtc.frames import Clcw, pack_clcw
+from tmtc.link.clcw import uplink_seen
+from tmtc.link.frames import Clcw, pack_clcw
 
 TYPE_TWO_REPORT = 0x8000_0001
 

@@ -1,7 +1,7 @@
 import pytest
 
-from tmtc.crc import append_crc, check_crc, crc16
 from tmtc.errors import ChecksumError, TruncatedPacket
+from tmtc.packets.crc import append_crc, check_crc, crc16
 
 
 def test_the_checksum_has_the_published_check_value():

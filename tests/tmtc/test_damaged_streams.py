@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from tests.tmtc.test_downlink import make_packets
-from tmtc.crc import append_crc
 from tmtc.downlink import (
     FRAME_GOOD,
     FRAME_UNCHECKED,
@@ -23,7 +22,8 @@ from tmtc.downlink import (
     propose_settings,
 )
 from tmtc.errors import LinkFormatError
-from tmtc.packets import pack_packet
+from tmtc.packets.crc import append_crc
+from tmtc.packets.space_packets import pack_packet
 
 SETTINGS = LinkSettings()
 ZONE = 1115 - 6 - 2

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from tmtc.definitions import format_dictionary, parse_dictionary
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.definitions import format_dictionary, parse_dictionary
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import MalformedPacket
 
 

@@ -6,10 +6,9 @@ from ccsdspy import FixedLength, PacketArray, PacketField, VariableLength
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tmtc.dictionary import DICTIONARY
-from tmtc.errors import ChecksumError, MalformedPacket, TruncatedPacket, UnknownPacket, ValueRefused
-from tmtc.fields import Field
-from tmtc.schema import (
+from tmtc.dictionary.fields import Field
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.schema import (
     ALARM,
     WARNING,
     WITHIN_LIMITS,
@@ -19,7 +18,8 @@ from tmtc.schema import (
     PacketDefinition,
     limit_states,
 )
-from tmtc.stream import cut_packets
+from tmtc.errors import ChecksumError, MalformedPacket, TruncatedPacket, UnknownPacket, ValueRefused
+from tmtc.packets.stream import cut_packets
 
 HOUSEKEEPING = {
     "structure_id": 1, "boot_count": 3, "mode": "observing", "frames_processed": 148, "frames_bad": 2,

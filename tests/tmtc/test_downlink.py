@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from spacepackets.ccsds.tm_frame import TmTransferFrame
 
-from tmtc.cadu import ASM
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import (
     FRAME_BAD_CHECKSUM,
     FRAME_FOREIGN,
@@ -20,9 +19,10 @@ from tmtc.downlink import (
     encode_cadus,
 )
 from tmtc.errors import LinkFormatError, ValueRefused
-from tmtc.frames import Clcw, pack_clcw, unpack_clcw
-from tmtc.packets import PacketSequencer, pack_packet
-from tmtc.randomiser import randomise
+from tmtc.link.cadu import ASM
+from tmtc.link.frames import Clcw, pack_clcw, unpack_clcw
+from tmtc.link.randomiser import randomise
+from tmtc.packets.space_packets import PacketSequencer, pack_packet
 
 # Packet of the altimeter that the payload had until commit 7787a11f, from a recording.
 WITHDRAWN = bytes.fromhex(
@@ -144,7 +144,7 @@ def test_an_empty_file_is_empty():
 
 def test_packets_longer_than_frames_span_them():
     long = [pack_packet(0x7A, bytes(5000) + b"\0\0", sequence_count=0)]
-    from tmtc.crc import append_crc
+    from tmtc.packets.crc import append_crc
 
     packets = [append_crc(p[:-2]) for p in long] + sent()[:3]
     decoded = decode(encode_cadus(packets, spacecraft_id=1, frame_length=223))
@@ -154,7 +154,7 @@ def test_packets_longer_than_frames_span_them():
 @pytest.mark.parametrize("spare", range(9))
 def test_the_last_frame_is_filled_exactly_however_little_is_left(spare):
     # zone of 215 octets: the packet leaves 0..8, fewer than the seven of the least idle packet among them
-    from tmtc.crc import append_crc
+    from tmtc.packets.crc import append_crc
 
     packet = append_crc(pack_packet(0x11, bytes(215 - spare - 6), sequence_count=0)[:-2])
     octets = encode_cadus([packet], spacecraft_id=1, frame_length=223, coding="none")
@@ -358,7 +358,7 @@ def test_a_reboot_starts_new_counts_and_is_no_loss():
 
 
 def test_packets_outside_the_dictionary_are_counted_as_unknown():
-    from tmtc.crc import append_crc
+    from tmtc.packets.crc import append_crc
 
     stranger = append_crc(pack_packet(0x55, bytes(30), sequence_count=0)[:-2])
     decoded = decode(b"".join([*sent()[:5], stranger, WITHDRAWN, *sent()[5:]]))
@@ -383,7 +383,7 @@ def test_settings_that_are_given_are_used():
 
 def test_the_legacy_sequence_is_a_codeword_so_that_the_code_alone_cannot_tell_it_from_none():
     # the reason why the settings are found out by headers and packets as well
-    from tmtc.reed_solomon import ReedSolomon, clean
+    from tmtc.link.reed_solomon import ReedSolomon, clean
 
     assert clean(randomise(np.zeros((1, 255), dtype=np.uint8), "legacy"), ReedSolomon(interleave=1)).all()
 

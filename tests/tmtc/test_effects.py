@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from tmtc.codes import FUNCTIONS
-from tmtc.dictionary import DICTIONARY
-from tmtc.effects import CARRIER, EFFECTS, FUNCTION, Effect, effect_of
+from tmtc.dictionary.codes import FUNCTIONS
+from tmtc.dictionary.effects import CARRIER, EFFECTS, FUNCTION, Effect, effect_of
+from tmtc.dictionary.payload import DICTIONARY
 
 
 def effect(name: str, **arguments: Any) -> Effect:

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tmtc.dictionary import DICTIONARY
-from tmtc.estimates import filter_estimates
-from tmtc.stream import cut_packets
+from tmtc.dictionary.estimates import filter_estimates
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.packets.stream import cut_packets
 
 RNG = np.random.default_rng(3)
 STATES = RNG.standard_normal((2, 9)) * np.repeat([1.7e6, 1.6e3, 1e-6], 3)

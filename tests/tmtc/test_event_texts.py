@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 import payload_emulator.flight
-from tmtc.codes import EVENTS
-from tmtc.event_texts import EVENT_TEXTS, event_text
-from tmtc.icd import format_icd
+from tmtc.dictionary.codes import EVENTS
+from tmtc.dictionary.event_texts import EVENT_TEXTS, event_text
+from tmtc.dictionary.icd import format_icd
 
 FLIGHT = Path(next(iter(payload_emulator.flight.__path__)))
 

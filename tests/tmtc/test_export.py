@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import MissingLibrary, UnknownPacket
 from tmtc.export import format_onboard_time, format_records, packet_records
+from tmtc.packets.stream import cut_packets
 from tmtc.parquet import parquet_octets
-from tmtc.stream import cut_packets
 
 
 def tables():

@@ -26,11 +26,11 @@ from tests.tmtc.foreign import (
     integer,
     space_packet,
 )
-from tmtc.crc import append_crc
 from tmtc.downlink import DownlinkDecode, decode, encode_cadus
 from tmtc.errors import ValueRefused
-from tmtc.packets import idle_packet
-from tmtc.stream import UNCHECKED, PacketCut, PacketForm, cut_packets, find_prefix
+from tmtc.packets.crc import append_crc
+from tmtc.packets.space_packets import idle_packet
+from tmtc.packets.stream import UNCHECKED, PacketCut, PacketForm, cut_packets, find_prefix
 from tmtc.xtce.decode import Decoder
 from tmtc.xtce.importing import parse_xtce
 

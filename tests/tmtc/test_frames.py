@@ -3,7 +3,7 @@ import pytest
 from spacepackets.ccsds.tm_frame import TmFramePrimaryHeader
 
 from tmtc.errors import FrameError
-from tmtc.frames import (
+from tmtc.link.frames import (
     Clcw,
     append_frame_checksums,
     frame_checksums_hold,

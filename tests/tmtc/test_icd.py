@@ -1,5 +1,5 @@
-from tmtc.dictionary import DICTIONARY
-from tmtc.icd import format_icd
+from tmtc.dictionary.icd import format_icd
+from tmtc.dictionary.payload import DICTIONARY
 
 
 def test_every_packet_field_and_label_is_in_the_document():

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import ValueRefused
-from tmtc.large_data import LargeData, LargeDataReceiver, split
+from tmtc.packets.large_data import LargeData, LargeDataReceiver, split
 
 IMAGE = np.random.default_rng(0).bytes(10_000)
 

@@ -2,7 +2,13 @@ import pytest
 from spacepackets.ccsds import PacketType, SpacePacketHeader
 
 from tmtc.errors import MalformedPacket, TruncatedPacket, ValueRefused
-from tmtc.packets import PacketSequencer, PrimaryHeader, idle_packet, pack_packet, unpack_primary_header
+from tmtc.packets.space_packets import (
+    PacketSequencer,
+    PrimaryHeader,
+    idle_packet,
+    pack_packet,
+    unpack_primary_header,
+)
 
 
 @pytest.mark.parametrize("apid", [0, 0x0A0, 0x7FF])

@@ -2,9 +2,9 @@ import pytest
 from spacepackets.ccsds import SpacePacketHeader
 from spacepackets.ecss import PusTc, PusTm
 
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import MalformedPacket, TruncatedPacket
-from tmtc.pus import (
+from tmtc.packets.pus import (
     ACK_ACCEPTANCE,
     ACK_COMPLETION,
     TcSecondaryHeader,

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from tmtc.errors import LinkFormatError
-from tmtc.randomiser import randomise, sequence
+from tmtc.link.randomiser import randomise, sequence
 
 
 @pytest.mark.parametrize(

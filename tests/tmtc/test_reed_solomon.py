@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tmtc.errors import LinkFormatError
-from tmtc.reed_solomon import (
+from tmtc.link.reed_solomon import (
     UNCORRECTABLE,
     ReedSolomon,
     clean,

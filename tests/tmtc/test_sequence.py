@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tmtc.sequence import CONFLICT, DUPLICATE, FIRST, account
+from tmtc.packets.sequence import CONFLICT, DUPLICATE, FIRST, account
 
 
 def never_same(a: int, b: int) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tmtc.errors import ValueRefused
-from tmtc.thumbnails import HEADER, Thumbnail, pack_thumbnail, unpack_thumbnail
+from tmtc.packets.thumbnails import HEADER, Thumbnail, pack_thumbnail, unpack_thumbnail
 
 
 @pytest.mark.parametrize("shape", [(3, 5), (1, 1), (0, 0)])

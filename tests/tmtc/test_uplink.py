@@ -2,10 +2,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import ChecksumError, FrameError, TruncatedPacket, ValueRefused
-from tmtc.stream import cut_packets
-from tmtc.uplink import (
+from tmtc.link.uplink import (
     CLTU_START,
     CLTU_TAIL,
     CONTROL_SET_COUNT,
@@ -19,6 +18,7 @@ from tmtc.uplink import (
     pack_tc_frame,
     unpack_tc_frame,
 )
+from tmtc.packets.stream import cut_packets
 
 COMMANDS = [
     DICTIONARY.pack_command("set_parameter", {"parameter_id": k, "value": k / 3}, sequence_count=k)

@@ -21,10 +21,10 @@ import numpy as np
 import numpy.typing as npt
 
 from tmtc.arrays import BoolArray, IntArray, OctetArray, Octets, RecordArray, as_octets
+from tmtc.dictionary.schema import gather
 from tmtc.errors import DefinitionError
-from tmtc.packets import FLAGS_WHOLE
-from tmtc.schema import gather
-from tmtc.stream import PacketCut, PrimaryHeaders
+from tmtc.packets.space_packets import FLAGS_WHOLE
+from tmtc.packets.stream import PacketCut, PrimaryHeaders
 from tmtc.xtce.columns import (
     ArrayColumn,
     Column,

@@ -16,10 +16,10 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 
-from tmtc.dictionary import DICTIONARY
-from tmtc.fields import Field
-from tmtc.onboard_parameters import PARAMETERS
-from tmtc.schema import Dictionary, PacketDefinition
+from tmtc.dictionary.fields import Field
+from tmtc.dictionary.onboard_parameters import PARAMETERS
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.schema import Dictionary, PacketDefinition
 
 NAMESPACE = "http://www.omg.org/spec/XTCE/20180204"
 SCHEMA_LOCATION = f"{NAMESPACE} https://www.omg.org/spec/XTCE/20180204/SpaceSystem.xsd"

@@ -21,7 +21,7 @@ from graphlib import CycleError, TopologicalSorter
 from typing import Literal
 
 from tmtc.errors import DefinitionError
-from tmtc.packets import PACKET_MAX_LENGTH
+from tmtc.packets.space_packets import PACKET_MAX_LENGTH
 from tmtc.xtce.definition import (
     AggregateType,
     AllOf,

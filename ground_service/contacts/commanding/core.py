@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from tmtc.codes import FAILURES as _CODES
+from tmtc.dictionary.codes import FAILURES as _CODES
 
 _FAILURE_CODES = {name: code for code, name in _CODES}
 

@@ -13,8 +13,8 @@ from ground_service.http.times import UtcTime
 from ground_service.ingest.model import ControlWords
 from ground_service.text import LINE_PATTERN_JSON
 from lunar.timescales import format_utc, utc_ns_from_ticks
-from tmtc.arguments import argument_text
-from tmtc.codes import FAILURES
+from tmtc.dictionary.arguments import argument_text
+from tmtc.dictionary.codes import FAILURES
 
 _FAILURES = dict(FAILURES)
 REMEDY = "; the payload expects other sequence counts: send perform_function resynchronise_commands first"

@@ -1,7 +1,7 @@
 """Telecommands: entry, release or rejection, transmission, and verification.
 
 queued → released → sent → (accepted → started → completed | failed), or queued → rejected. A command that
-changes the state of the payload or destroys data (`tmtc.effects`) is critical: a second person must release
+changes the state of the payload or destroys data (`tmtc.dictionary.effects`) is critical: a second person must release
 it. Every step is a compare-and-set in the database (`store.states`) and
 goes into the audit log in the transaction that makes it.
 """
@@ -37,12 +37,12 @@ from ground_service.missions.store import approval_in_force, in_force
 from ground_service.store.counters import lock_spacecraft, next_telecommand
 from ground_service.store.vehicles import FLOWN, find_vehicle, get_vehicle, vehicle_id
 from ground_service.text import REASON_LIMIT, require_line
-from tmtc.arguments import argument_text, arguments_by_number
-from tmtc.dictionary import DICTIONARY
-from tmtc.effects import CommandEffect, effect_of
+from tmtc.dictionary.arguments import argument_text, arguments_by_number
+from tmtc.dictionary.effects import CommandEffect, effect_of
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import TmtcError
-from tmtc.packets import SEQUENCE_COUNT_LIMIT
-from tmtc.uplink import UplinkEncoder
+from tmtc.link.uplink import UplinkEncoder
+from tmtc.packets.space_packets import SEQUENCE_COUNT_LIMIT
 
 DEFAULT_TIMEOUT_S = 600
 TIMEOUT_LIMIT_S = 2**31 - 1

@@ -27,8 +27,8 @@ from ground_service.store import repository, telemetry
 from ground_service.store.states import TELECOMMAND, change_if, move, move_all
 from ground_service.store.vehicles import get_vehicle
 from lunar.constants import NANOSECONDS_PER_SECOND
-from tmtc.dictionary import DICTIONARY
-from tmtc.stream import cut_packets
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.packets.stream import cut_packets
 
 TELECOMMANDS, VERIFICATIONS = TELECOMMAND.table, repository.SAMPLES["verifications"]
 HANDOVERS = repository.HANDOVERS

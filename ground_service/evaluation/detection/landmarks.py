@@ -15,7 +15,7 @@ from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
 from reports.values import PayloadMap
-from tmtc.schema import Table
+from tmtc.dictionary.schema import Table
 
 LOG_DIAMETER_GATE = 0.4
 """Largest difference of the logarithms of mapped and catalogued diameter."""

@@ -13,8 +13,8 @@ from ground_service.errors import InvalidInput
 from ground_service.evaluation.landmarks.model import Landmark
 from lunar.arrays import FloatArray
 from lunar.catalogue import CraterCatalogue, make_catalogue
-from tmtc.large_data import split
-from tmtc.tables import CatalogueTable
+from tmtc.dictionary.tables import CatalogueTable
+from tmtc.packets.large_data import split
 
 FIRST_ID = 2_000_000_000
 """Learned craters have identities from here on; catalogues have lower ones, the map of the payload has higher ones."""

@@ -49,12 +49,12 @@ from ground_service.passes.samples import DetectionSamples
 from ground_service.passes.span import pass_span
 from ground_service.store.stored_files import files_beginning
 from ground_service.store.vehicles import get_vehicle
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.tables import table_hash, unpack_catalogue_table
 from tmtc.errors import TmtcError
-from tmtc.large_data import LargeDataReceiver
-from tmtc.packets import TYPE_TELECOMMAND
-from tmtc.stream import cut_packets
-from tmtc.tables import table_hash, unpack_catalogue_table
+from tmtc.packets.large_data import LargeDataReceiver
+from tmtc.packets.space_packets import TYPE_TELECOMMAND
+from tmtc.packets.stream import cut_packets
 
 DECIDED = ("accepted", "rejected")
 

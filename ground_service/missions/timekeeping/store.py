@@ -12,7 +12,7 @@ from ground_service.missions.timekeeping.core import CorrelationFit, TimeCorrela
 from ground_service.missions.timekeeping.model import Correlation
 from ground_service.store import repository
 from lunar.arrays import IntArray
-from tmtc.dictionary import APID_TIME_REPORT
+from tmtc.dictionary.payload import APID_TIME_REPORT
 
 _CORRELATIONS = repository.CORRELATIONS
 _RECEPTIONS = repository.RECEPTIONS

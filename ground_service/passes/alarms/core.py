@@ -14,10 +14,10 @@ from typing import Literal
 import numpy as np
 
 from lunar.arrays import IntArray
-from tmtc.dictionary import DICTIONARY, STRUCTURES
-from tmtc.fields import Field
-from tmtc.schema import PacketDefinition, Table, limit_states
-from tmtc.stream import cut_packets
+from tmtc.dictionary.fields import Field
+from tmtc.dictionary.payload import DICTIONARY, STRUCTURES
+from tmtc.dictionary.schema import PacketDefinition, Table, limit_states
+from tmtc.packets.stream import cut_packets
 
 WARNING, ALARM = 1, 2
 SEVERITIES = {WARNING: "warning", ALARM: "alarm"}

@@ -30,7 +30,7 @@ from ground_service.passes.alarms.store import AlarmRow
 from ground_service.store import parameters, telemetry
 from ground_service.store.vehicles import FLOWN, lock_vehicle, vehicle_id
 from lunar.timescales import format_utc
-from tmtc.dictionary import STRUCTURES
+from tmtc.dictionary.payload import STRUCTURES
 
 TELEMETRY = "telemetry"
 """Name of the cause of changes that no user has made."""

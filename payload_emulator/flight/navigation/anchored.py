@@ -23,10 +23,8 @@ from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import rtn_from_inertial
-from payload_emulator.flight.navigation import filter as kalman
 from payload_emulator.flight.navigation import landmark_map as mapping
 from payload_emulator.flight.navigation import recovery
-from payload_emulator.flight.navigation.acquisition import SEARCHABLE_DETECTIONS
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.flight.navigation.association import (
     altitude_above_sphere_m,
@@ -35,15 +33,16 @@ from payload_emulator.flight.navigation.association import (
     search_margin_px,
     tracking_limit_m,
 )
-from payload_emulator.flight.navigation.attitude_monitor import (
+from payload_emulator.flight.navigation.correction import Fix, correct, is_usable, predicted
+from payload_emulator.flight.navigation.filter import filter as kalman
+from payload_emulator.flight.navigation.filter.attitude_monitor import (
     AttitudeMonitor,
     RotationEvidence,
     is_examined,
     monitored,
 )
-from payload_emulator.flight.navigation.correction import Fix, correct, is_usable, predicted
-from payload_emulator.flight.navigation.dynamics import OrbitModel, process_noise
-from payload_emulator.flight.navigation.filter import FilterState
+from payload_emulator.flight.navigation.filter.dynamics import OrbitModel, process_noise
+from payload_emulator.flight.navigation.filter.filter import FilterState
 from payload_emulator.flight.navigation.landmark_map import (
     FIRST_LANDMARK_ID,
     Landmark,
@@ -51,8 +50,9 @@ from payload_emulator.flight.navigation.landmark_map import (
     View,
     unclaimed,
 )
-from payload_emulator.flight.navigation.lost_in_space import PlaceIndex, place_index
 from payload_emulator.flight.navigation.outcomes import Outcome
+from payload_emulator.flight.navigation.search.acquisition import SEARCHABLE_DETECTIONS
+from payload_emulator.flight.navigation.search.lost_in_space import PlaceIndex, place_index
 from payload_emulator.flight.navigation.sighting import (
     LandmarkMap,
     Pose,
@@ -63,8 +63,7 @@ from payload_emulator.flight.navigation.sighting import (
     turned_by,
 )
 from payload_emulator.flight.vision.detections import Detections
-from tmtc.cuc import TICKS_PER_SECOND
-from tmtc.tables import (
+from tmtc.dictionary.tables import (
     BurnTable,
     CatalogueTable,
     GravityTable,
@@ -72,6 +71,7 @@ from tmtc.tables import (
     OrientationTable,
     no_burns,
 )
+from tmtc.packets.cuc import TICKS_PER_SECOND
 
 _NAN = float("nan")
 _NO_CRATERS = np.empty(0, dtype=np.int64)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from lunar.constants import MOON_RADIUS_M
-from payload_emulator.flight.navigation.acquisition import AcquisitionParameters
-from payload_emulator.flight.navigation.attitude_monitor import MonitorParameters
-from payload_emulator.flight.navigation.dynamics import ProcessNoise
-from payload_emulator.flight.navigation.filter import CommonErrors
-from payload_emulator.flight.navigation.identification import IdentificationParameters
+from payload_emulator.flight.navigation.filter.attitude_monitor import MonitorParameters
+from payload_emulator.flight.navigation.filter.dynamics import ProcessNoise
+from payload_emulator.flight.navigation.filter.filter import CommonErrors
 from payload_emulator.flight.navigation.landmark_map import MappingParameters
-from payload_emulator.flight.navigation.lost_in_space import LostParameters
+from payload_emulator.flight.navigation.search.acquisition import AcquisitionParameters
+from payload_emulator.flight.navigation.search.identification import IdentificationParameters
+from payload_emulator.flight.navigation.search.lost_in_space import LostParameters
 
 
 @dataclass(frozen=True, slots=True)

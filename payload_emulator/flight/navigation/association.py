@@ -7,10 +7,10 @@ import numpy as np
 from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
-from payload_emulator.flight.navigation import filter as kalman
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredLimits, AnchoredParameters
-from payload_emulator.flight.navigation.filter import FilterState
-from payload_emulator.flight.navigation.identification import Identification, identify
+from payload_emulator.flight.navigation.filter import filter as kalman
+from payload_emulator.flight.navigation.filter.filter import FilterState
+from payload_emulator.flight.navigation.search.identification import Identification, identify
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Sighting, ground_scale
 from payload_emulator.flight.vision.detections import Detections
 

@@ -8,15 +8,15 @@ import numpy as np
 
 from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
-from payload_emulator.flight.navigation import filter as kalman
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredLimits, AnchoredParameters
 from payload_emulator.flight.navigation.association import detection_variance_px2
-from payload_emulator.flight.navigation.dynamics import OrbitModel
-from payload_emulator.flight.navigation.filter import CommonErrors, FilterState, Update
-from payload_emulator.flight.navigation.identification import GATE, Identification
+from payload_emulator.flight.navigation.filter import filter as kalman
+from payload_emulator.flight.navigation.filter.dynamics import OrbitModel
+from payload_emulator.flight.navigation.filter.filter import CommonErrors, FilterState, Update
+from payload_emulator.flight.navigation.search.identification import GATE, Identification
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, Sighting
 from payload_emulator.flight.vision.detections import Detections
-from tmtc.tables import BurnTable
+from tmtc.dictionary.tables import BurnTable
 
 
 @dataclass(frozen=True, slots=True, eq=False)

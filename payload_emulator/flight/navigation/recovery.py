@@ -9,14 +9,14 @@ import numpy as np
 
 from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
-from payload_emulator.flight.navigation import filter as kalman
-from payload_emulator.flight.navigation.acquisition import acquire
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.flight.navigation.association import altitude_above_sphere_m, detection_variance_px2
 from payload_emulator.flight.navigation.correction import Fix, correct
-from payload_emulator.flight.navigation.filter import FilterState
-from payload_emulator.flight.navigation.identification import Identification
-from payload_emulator.flight.navigation.lost_in_space import LostParameters, PlaceIndex, find_place
+from payload_emulator.flight.navigation.filter import filter as kalman
+from payload_emulator.flight.navigation.filter.filter import FilterState
+from payload_emulator.flight.navigation.search.acquisition import acquire
+from payload_emulator.flight.navigation.search.identification import Identification
+from payload_emulator.flight.navigation.search.lost_in_space import LostParameters, PlaceIndex, find_place
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, look
 from payload_emulator.flight.vision.detections import Detections
 

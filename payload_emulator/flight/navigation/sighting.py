@@ -19,7 +19,7 @@ from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import enu_from_mcmf
-from tmtc.tables import CatalogueTable
+from tmtc.dictionary.tables import CatalogueTable
 
 # A crater is in sight if its centre is above the limb by this much: on the very limb a degree is many pixels.
 _LIMB_MARGIN_RAD = np.radians(5.0)

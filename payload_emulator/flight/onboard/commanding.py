@@ -8,9 +8,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import ChecksumError, MalformedPacket, TmtcError, UnknownPacket
-from tmtc.packets import SEQUENCE_COUNT_LIMIT
+from tmtc.packets.space_packets import SEQUENCE_COUNT_LIMIT
 
 _PRIMARY_HEADER_LENGTH = 6
 _SHORTEST_PACKET = 13

@@ -7,8 +7,8 @@ from payload_emulator.flight.onboard.loads import TABLE_NUMBERS
 from payload_emulator.flight.onboard.machine import Machine
 from payload_emulator.flight.ports import Stage
 from payload_emulator.flight.telemetry.store import StoreClass
-from tmtc.dictionary import DICTIONARY, STRUCTURES
-from tmtc.large_data import split
+from tmtc.dictionary.payload import DICTIONARY, STRUCTURES
+from tmtc.packets.large_data import split
 
 _POOL = DICTIONARY.labels("housekeeping_report", "quantity")
 _STAGES = (Stage.commands, Stage.detector, Stage.navigation, Stage.telemetry, Stage.monitoring)

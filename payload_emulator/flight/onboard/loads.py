@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 from lunar.camera import PinholeCamera
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
-from payload_emulator.flight.navigation.odometry import OdometryParameters
+from payload_emulator.flight.navigation.odometry.odometry import OdometryParameters
 from payload_emulator.flight.navigation.outcomes import Mode
-from tmtc.tables import (
+from tmtc.dictionary.tables import (
     unpack_anchor_table,
     unpack_burn_table,
     unpack_catalogue_table,

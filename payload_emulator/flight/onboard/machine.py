@@ -25,9 +25,9 @@ from payload_emulator.flight.onboard.settings import Settings
 from payload_emulator.flight.ports import Board, Load, Memory
 from payload_emulator.flight.telemetry.packets import Telemetry
 from payload_emulator.flight.telemetry.store import PacketStore
-from tmtc.dictionary import STRUCTURES
-from tmtc.large_data import LargeDataReceiver
-from tmtc.tables import table_hash
+from tmtc.dictionary.payload import STRUCTURES
+from tmtc.dictionary.tables import table_hash
+from tmtc.packets.large_data import LargeDataReceiver
 
 
 @dataclass(slots=True, eq=False)

@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import size_class
 from lunar.frames import matrix_from_quaternion
-from payload_emulator.flight.navigation import anchored, odometry
-from payload_emulator.flight.navigation import filter as kalman
+from payload_emulator.flight.navigation import anchored
 from payload_emulator.flight.navigation.anchored import (
     AnchoredReport,
     AnchoredSetup,
     AnchoredState,
     Observation,
 )
+from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.landmark_map import map_rows
-from payload_emulator.flight.navigation.odometry import OdometryState
+from payload_emulator.flight.navigation.odometry import odometry
+from payload_emulator.flight.navigation.odometry.odometry import OdometryState
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.onboard.housekeeping import StageTimer
 from payload_emulator.flight.onboard.loads import TABLE_NUMBERS, FlightParameters, FlightTables
@@ -29,8 +30,7 @@ from payload_emulator.flight.ports import Stage
 from payload_emulator.flight.telemetry.packets import Telemetry
 from payload_emulator.flight.vision.detections import Detections, Detector, no_detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
-from tmtc.errors import TableError
-from tmtc.tables import (
+from tmtc.dictionary.tables import (
     AnchorTable,
     table_hash,
     unpack_anchor_table,
@@ -40,6 +40,7 @@ from tmtc.tables import (
     unpack_initial_state,
     unpack_orientation_table,
 )
+from tmtc.errors import TableError
 
 Table = TypeVar("Table")
 

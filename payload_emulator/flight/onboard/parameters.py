@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from tmtc.onboard_parameters import BY_NAME, Parameter
+from tmtc.dictionary.onboard_parameters import BY_NAME, Parameter
 
 
 @dataclass(slots=True)

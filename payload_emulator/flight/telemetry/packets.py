@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from payload_emulator.flight.telemetry.store import PacketStore, StoreClass
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import TmtcError
-from tmtc.packets import PacketSequencer, unpack_primary_header
+from tmtc.packets.space_packets import PacketSequencer, unpack_primary_header
 
 _CLASSES = {
     "detections": StoreClass.detections,

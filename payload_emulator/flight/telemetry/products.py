@@ -1,7 +1,7 @@
 """Products of images: thumbnails, checksums, and the map of landmarks that were used.
 
-Thumbnail: see `tmtc.thumbnails`. Landmark map: for every crater, by identity: identity (u32), frames that used it
-(u16). Big-endian.
+Thumbnail: see `tmtc.packets.thumbnails`. Landmark map: for every crater, by identity: identity (u32), frames that
+used it (u16). Big-endian.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray
-from tmtc.thumbnails import Thumbnail, pack_thumbnail
+from tmtc.packets.thumbnails import Thumbnail, pack_thumbnail
 
 _LANDMARK = np.dtype([("crater_id", ">u4"), ("frames", ">u2")])
 

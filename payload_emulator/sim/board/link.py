@@ -20,13 +20,13 @@ from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import format_utc, tdb_s_from_utc_ns
 from lunar.visibility import GroundStation, link
 from payload_emulator.errors import ScenarioError
-from tmtc import cadu
-from tmtc.crc import CRC_LENGTH
 from tmtc.downlink import DownlinkEncoder
-from tmtc.frames import FRAME_HEADER_LENGTH, OCF_LENGTH, pack_clcw
-from tmtc.link import LinkSettings
-from tmtc.stream import cut_packets
-from tmtc.uplink import Farm, UplinkDecoder, UplinkEncoder
+from tmtc.link import cadu
+from tmtc.link.frames import FRAME_HEADER_LENGTH, OCF_LENGTH, pack_clcw
+from tmtc.link.settings import LinkSettings
+from tmtc.link.uplink import Farm, UplinkDecoder, UplinkEncoder
+from tmtc.packets.crc import CRC_LENGTH
+from tmtc.packets.stream import cut_packets
 
 LIGHT_S = 1.28
 _LIGHT_NS = 1_500_000_000

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lunar.arrays import FloatArray, OctetArray
-from tmtc.cuc import TICKS_PER_SECOND
+from tmtc.packets.cuc import TICKS_PER_SECOND
 
 Memory = OctetArray
 

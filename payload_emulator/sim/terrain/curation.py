@@ -25,7 +25,7 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.plausible import CRATER_DEPTH_RATIO, LISTED_DEPTH_RATIO, Limit
 from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain.registration import Registration, Rims, clear_rims, fit_registration
-from tmtc.tables import CatalogueTable
+from tmtc.dictionary.tables import CatalogueTable
 
 Mask = BoolArray
 

@@ -26,8 +26,8 @@ import numpy as np
 from lunar.camera import PinholeCamera
 from lunar.datafolder import DataFolder, find_data
 from payload_emulator.errors import DatasetError
-from payload_emulator.session.frame import find_renderer
-from payload_emulator.session.recipe import Recipe, Source
+from payload_emulator.session.world.frame import find_renderer
+from payload_emulator.session.world.recipe import Recipe, Source
 from payload_emulator.training.data import dataset as store
 from payload_emulator.training.data.finishing import write_index
 from payload_emulator.training.data.frames import describe, take_frame

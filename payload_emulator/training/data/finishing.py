@@ -14,7 +14,7 @@ import numpy as np
 
 from lunar.arrays import FloatArray
 from lunar.catalogue import size_class
-from payload_emulator.session.recipe import SPLITS, Recipe
+from payload_emulator.session.world.recipe import SPLITS, Recipe
 from payload_emulator.training.data.dataset import (
     CATEGORIES,
     SCHEMA_VERSION,

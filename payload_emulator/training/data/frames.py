@@ -16,7 +16,7 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.plausible import HEIGHT_M
 from lunar.timescales import format_utc
-from payload_emulator.session.recipe import Recipe, Source
+from payload_emulator.session.world.recipe import Recipe, Source
 from payload_emulator.training.data.shots import Pose, draw_photometry, draw_sensor, draw_sun
 
 _LABEL_MINIMUM_M = 2_000.0

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from payload_emulator.errors import DatasetError
-from payload_emulator.session.recipe import PAPER_SHARES, SPLITS
+from payload_emulator.session.world.recipe import PAPER_SHARES, SPLITS
 from payload_emulator.training.data.dataset import (
     Dataset,
     ShardLabels,

@@ -17,7 +17,7 @@ from lunar.camera import PinholeCamera, ground_point_sphere, nadir_camera_from_m
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.errors import DatasetError
-from payload_emulator.session.recipe import Source
+from payload_emulator.session.world.recipe import Source
 
 _ATTEMPTS = 4000
 _LOWEST_FLIGHT_M = 9_000.0  # above the ground: lower, a 5 km crater fills more than a sixth of the frame

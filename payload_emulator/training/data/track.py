@@ -15,7 +15,7 @@ from lunar.datafolder import DataFolder, default_orientation
 from lunar.frames import spherical_from_mcmf
 from lunar.timescales import tdb_s_from_utc_ns
 from payload_emulator.errors import DatasetError
-from payload_emulator.session.recipe import EVERYWHERE, PAPER_SHARES, PAPER_SPLIT, Source
+from payload_emulator.session.world.recipe import EVERYWHERE, PAPER_SHARES, PAPER_SPLIT, Source
 from payload_emulator.training.data.shots import allowed, edge_pixels
 
 _NS = 1_000_000_000
@@ -124,8 +124,8 @@ def _places(source: Source, data: DataFolder) -> tuple[IntArray, FloatArray]:
 
         ephemeris, orientation = load_ephemeris(Path(source.ephemeris)), default_orientation(data)
     else:
-        from payload_emulator.session.orbit import force_model, propagate_scenario, sample
         from payload_emulator.session.scenario import load_scenario
+        from payload_emulator.session.world.orbit import force_model, propagate_scenario, sample
 
         scenario = load_scenario(source.ephemeris)
         model = force_model(scenario, data)

@@ -37,7 +37,7 @@ from ground_service.web.sockets import event_owner
 from lunar.timescales import format_utc
 from tests.ground_service.conftest import START, save_circle
 from tests.serving import TestClient
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 V1 = "/api/v1"

@@ -34,9 +34,9 @@ from tests.ground_service.conftest import (
     enter_files,
     event_packet,
 )
-from tmtc.cuc import TICKS_PER_SECOND
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import LinkSettings, encode_cadus
+from tmtc.packets.cuc import TICKS_PER_SECOND
 
 Maker = Callable[..., Any]
 FRAMES = 12

@@ -23,7 +23,7 @@ from lunar.gravity import GravityField, builtin_gravity
 from lunar.gravity_omission import field_noise
 from lunar.propagation import ForceModel, propagate_with_stm
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
-from payload_emulator.flight.navigation.filter import CommonErrors
+from payload_emulator.flight.navigation.filter.filter import CommonErrors
 from tests.payload_emulator.flight.test_dynamics import start_state
 
 Arrays = tuple[np.ndarray, np.ndarray]

@@ -27,7 +27,7 @@ from tests.ground_service.conftest import (
     write_manifest,
 )
 from tests.ground_service.evaluation.still import TurnedOrientation
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 FRAMES = 12
 COVARIANCE = np.diag([100.0, 400.0, 900.0, 1e-4, 2e-4, 3e-4, 1e-12, 1e-12, 1e-12])
@@ -102,7 +102,7 @@ def rich_pass(make_pass: Callable[..., SyntheticPass]) -> RichPass:
 
 def _detections(packets: list[bytes], tick: int) -> np.ndarray:
     """Pixels (n, 2) of the detections of the image taken at an on-board time."""
-    from tmtc.stream import cut_packets
+    from tmtc.packets.stream import cut_packets
 
     octets = b"".join(packets)
     table = DICTIONARY.unpack_many(octets, cut_packets(octets))["detections"]

@@ -40,12 +40,12 @@ from ground_service.worker.integrity import verify
 from lunar.timescales import parse_utc, utc_ns_from_ticks
 from tests.serving import TestClient
 from tests.tmtc import foreign
-from tmtc.crc import crc16
-from tmtc.cuc import NO_TICKS
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode, encode_cadus
-from tmtc.packets import pack_packet
-from tmtc.stream import whole_packets
+from tmtc.packets.crc import crc16
+from tmtc.packets.cuc import NO_TICKS
+from tmtc.packets.space_packets import pack_packet
+from tmtc.packets.stream import whole_packets
 
 NS = 1_000_000_000
 START = parse_utc("2029-08-07T00:00:00Z")

@@ -19,7 +19,7 @@ from ground_service.ingest.redecode import redecode
 from ground_service.ingest.service import ingest_file
 from ground_service.store import repository
 from tests.ground_service.archive_hash import hash_of
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 KILLS = 4
 

@@ -12,7 +12,7 @@ from ground_service.ingest.frames import FrameReader, Section
 from ground_service.ingest.quality import NO_RECORD, Found
 from tmtc.arrays import as_octets
 from tmtc.downlink import DownlinkEncoder, LinkSettings, decode, encode_cadus, plan_of
-from tmtc.frames import Clcw, pack_clcw
+from tmtc.link.frames import Clcw, pack_clcw
 
 SPACECRAFT = 76
 

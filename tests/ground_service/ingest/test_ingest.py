@@ -18,8 +18,8 @@ from ground_service.ingest.service import Place, ingest_file
 from ground_service.store import repository
 from ground_service.store.vehicles import vehicle_id
 from tests.ground_service.archive_hash import hash_of
-from tmtc.crc import append_crc
 from tmtc.downlink import encode_cadus
+from tmtc.packets.crc import append_crc
 
 SPACECRAFT = 76
 
@@ -106,7 +106,7 @@ def test_a_file_cut_short_gives_what_is_whole(ground: Ground, packets: list[byte
 def test_clocks_of_2000_and_of_the_future_are_kept_apart_once(
     ground: Ground, packets: list[bytes], tmp_path: Path
 ) -> None:
-    from tmtc.dictionary import DICTIONARY
+    from tmtc.dictionary.payload import DICTIONARY
 
     values = {"event_id": 1, "frame_number": 0, "value_1": 0.0, "value_2": 0.0}
     strays = [DICTIONARY.pack("event_info", values, ticks=t, sequence_count=9) for t in (0, (1 << 48) - 1)]

@@ -15,7 +15,7 @@ from ground_service.ingest.service import ingest_file
 from ground_service.missions.service import add_mission
 from ground_service.store.vehicles import vehicle_id
 from tmtc.downlink import encode_cadus
-from tmtc.link import LinkSettings
+from tmtc.link.settings import LinkSettings
 
 SPACECRAFT = 76
 STATEMENTS = 10

@@ -1,9 +1,9 @@
 """Decoded columns as the store takes them."""
 
 from ground_service.ingest.packets import batch_of_cut
-from tmtc.cuc import NO_TICKS
-from tmtc.dictionary import DICTIONARY
-from tmtc.stream import cut_packets
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.packets.cuc import NO_TICKS
+from tmtc.packets.stream import cut_packets
 
 
 def test_an_impossible_on_board_time_is_none_and_never_negative_garbage():

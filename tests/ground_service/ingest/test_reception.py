@@ -35,7 +35,7 @@ from ground_service.store import repository
 from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import utc_ns_from_ticks
 from tests.ground_service.archive_hash import archive_hash
-from tmtc.link import LinkSettings
+from tmtc.link.settings import LinkSettings
 
 NS = 1_000_000_000
 START = 1_900_000_000 * NS

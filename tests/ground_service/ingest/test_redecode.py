@@ -23,7 +23,7 @@ from ground_service.store.vehicles import vehicle_id
 from tests.ground_service.archive_hash import archive_hash
 from tests.ground_service.conftest import define_pass_of
 from tests.serving import TestClient
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode
 
 OLD = replace(DICTIONARY, version=DICTIONARY.version - 1)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ground_service.ingest.core import COUNT_MODULUS, account_sequence
-from tmtc.cuc import TICKS_PER_SECOND
+from tmtc.packets.cuc import TICKS_PER_SECOND
 
 SECOND = TICKS_PER_SECOND
 

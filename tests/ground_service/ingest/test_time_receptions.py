@@ -19,12 +19,12 @@ from ground_service.store.vehicles import vehicle_id
 from lunar.arrays import IntArray
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tmtc.arrays import as_octets
-from tmtc.crc import CRC_LENGTH
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
-from tmtc.frames import FRAME_HEADER_LENGTH
-from tmtc.link import LinkSettings
-from tmtc.stream import cut_packets
+from tmtc.link.frames import FRAME_HEADER_LENGTH
+from tmtc.link.settings import LinkSettings
+from tmtc.packets.crc import CRC_LENGTH
+from tmtc.packets.stream import cut_packets
 
 NS = 1_000_000_000
 START = parse_utc("2029-08-07T06:00:00Z")

@@ -17,7 +17,7 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.messages.oem import save_oem
 from lunar.timescales import parse_utc, ticks_from_utc_ns
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 NS = 1_000_000_000

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ground_service.passes.downlink_accounting import account_raw, read_raw
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import LinkSettings, encode_cadus
 
 SPACECRAFT = 76

@@ -15,7 +15,7 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.passes.model import EventFilter
 from lunar.catalogue import load_catalogue
 from lunar.timescales import utc_ns_from_ticks
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 TICKS = 900_000_000 * 65_536

@@ -23,9 +23,9 @@ from ground_service.passes.store import get_pass
 from ground_service.store import repository
 from ground_service.store.vehicles import vehicle_id
 from tests.ground_service.conftest import SPACECRAFT, define_pass_of, enter_files
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
-from tmtc.stream import cut_packets
+from tmtc.packets.stream import cut_packets
 
 ERROR_RTN_M = np.array([30.0, -40.0, 10.0])
 SIGMA_M = np.array([20.0, 50.0, 10.0])

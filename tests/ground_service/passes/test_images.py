@@ -21,9 +21,9 @@ from ground_service.passes.service import detections, trend_series
 from ground_service.store.stored_files import register_file
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service.conftest import NS, SPACECRAFT, SyntheticPass, encode_downlink
-from tmtc.dictionary import DICTIONARY
-from tmtc.large_data import split
-from tmtc.thumbnails import Thumbnail, pack_thumbnail
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.packets.large_data import split
+from tmtc.packets.thumbnails import Thumbnail, pack_thumbnail
 
 START = parse_utc("2029-08-07T06:00:00Z")
 TICKS = int(ticks_from_utc_ns(START))

@@ -13,7 +13,7 @@ from ground_service.ingest.service import ingest_file
 from ground_service.missions.service import add_mission
 from ground_service.passes.live import list_spacecraft, live_parameters
 from lunar.timescales import utc_ns_from_ticks
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 TICKS = 900_000_000 * 65_536

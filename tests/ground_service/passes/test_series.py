@@ -17,7 +17,7 @@ from ground_service.store import rollups
 from ground_service.store.models import ROLLUPS
 from ground_service.store.rollups import BASE_TICKS, HOUSEKEEPING_VALUES, STATE_VALUES
 from ground_service.store.vehicles import vehicle_id
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 SECOND = 1 << 16
 FIRST = 900_000_000 * SECOND

@@ -6,7 +6,7 @@ from ground_service.client.local import local_client
 from ground_service.evaluation import inputs
 from ground_service.ground import Ground
 from lunar.timescales import format_utc, utc_ns_from_ticks
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 TICKS = 900_000_000 * 65_536

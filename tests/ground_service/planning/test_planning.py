@@ -203,7 +203,7 @@ def test_data_leave_the_store_in_the_order_they_came() -> None:
 
 def test_data_of_a_frame_are_as_long_as_its_packets() -> None:
     # Packet lengths by the ICD: detections 35 + 9 n, navigation state 84, frame outcome 59, housekeeping 92 octets.
-    from tmtc.dictionary import DICTIONARY
+    from tmtc.dictionary.payload import DICTIONARY
 
     lengths = {
         n: DICTIONARY.packet(n).base_length for n in ("navigation_state", "frame_outcome", "housekeeping")

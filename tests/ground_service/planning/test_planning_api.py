@@ -12,9 +12,9 @@ from ground_service.settings import Settings
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
 from tests.ground_service.conftest import Clock, Downlink, event_packet
 from tests.serving import TestClient
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
-from tmtc.uplink import UplinkDecoder
+from tmtc.link.uplink import UplinkDecoder
 
 V1 = "/api/v1"
 NS = 1_000_000_000

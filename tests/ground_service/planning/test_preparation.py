@@ -13,8 +13,8 @@ from ground_service.planning.preparation import experiment_accuracy, experiment_
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.frames import IauOrientation
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
-from tmtc.large_data import LargeDataReceiver
-from tmtc.tables import unpack_anchor_table, unpack_initial_state, unpack_orientation_table
+from tmtc.dictionary.tables import unpack_anchor_table, unpack_initial_state, unpack_orientation_table
+from tmtc.packets.large_data import LargeDataReceiver
 
 NS = 1_000_000_000
 START = parse_utc("2029-08-08T10:00:00Z")

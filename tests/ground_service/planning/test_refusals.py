@@ -31,7 +31,7 @@ from tests.ground_service.conftest import (
     event_packet,
     save_circle,
 )
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 NS = 10**9
 MINUTE = 60 * NS

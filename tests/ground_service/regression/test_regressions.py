@@ -55,7 +55,7 @@ from ground_service.regression.store import keep_archive as store_archive_record
 from ground_service.settings import Settings
 from ground_service.store.states import change_if
 from ground_service.worker.upkeep import DAY_NS, remove_archives
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 Packets = dict[str, list[bytes]]
 

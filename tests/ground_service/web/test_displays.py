@@ -21,7 +21,7 @@ from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service.web.conftest import press, strict_page
 from tests.lazy import expect
 from tests.serving import wait_for
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 WAIT_MS = 30_000

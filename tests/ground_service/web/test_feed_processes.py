@@ -18,7 +18,7 @@ from ground_service.web import sockets
 from tests.ground_service.contacts.links.conftest import HEAD, Station
 from tests.ground_service.web.test_displays import ask as fetch
 from tests.serving import TestClient, wait_for
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 NEVER_S = 3600.0

@@ -25,16 +25,16 @@ from lunar.datafolder import find_data
 from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import save_oem
 from lunar.timescales import parse_utc
-from payload_emulator.session.live import LiveSession
+from payload_emulator.session.live.session import LiveSession
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.starting import load_scenario_payload
-from payload_emulator.session.world import build_world
+from payload_emulator.session.spacecraft.starting import load_scenario_payload
+from payload_emulator.session.world.world import build_world
 from tests.ground_service.conftest import circular_states
 from tests.ground_service.web.conftest import PATIENCE_S, Pictures, press, strict_page
 from tests.lazy import expect
 from tests.scenarios import SELENITA
 from tests.serving import wait_for
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page

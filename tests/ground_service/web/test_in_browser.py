@@ -9,7 +9,7 @@ from tests.ground_service.regression.test_regressions import with_detections
 from tests.ground_service.web.conftest import press, shows
 from tests.lazy import expect
 from tests.serving import wait_for
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 NS = 1_000_000_000

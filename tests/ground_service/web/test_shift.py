@@ -31,9 +31,9 @@ from tests.ground_service.web.conftest import PATIENCE_S, end_socket, press, sho
 from tests.lazy import expect
 from tests.scenarios import SELENITA
 from tests.serving import wait_for
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import DownlinkEncoder
-from tmtc.uplink import UplinkDecoder
+from tmtc.link.uplink import UplinkDecoder
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

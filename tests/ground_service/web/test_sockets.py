@@ -16,7 +16,7 @@ from ground_service.settings import Settings
 from ground_service.store.events import publish
 from ground_service.web import sockets
 from tests.serving import TestClient, WebSocketDenialResponse, wait_for
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 LIVE = "/api/v1/live"

@@ -15,7 +15,7 @@ from ground_service.store.rows import table_digests
 from ground_service.worker.integrity import verify
 from ground_service.worker.integrity_store import same_values
 from tests.ground_service.conftest import event_packet
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 SPACECRAFT = 76

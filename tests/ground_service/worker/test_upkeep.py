@@ -28,7 +28,7 @@ from ground_service.store.models import METADATA
 from ground_service.worker.jobs import run_job
 from ground_service.worker.upkeep import nightly, nightly_job_id, tidy
 from tests.serving import token_valid
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 DAY_NS = 86_400_000_000_000
 

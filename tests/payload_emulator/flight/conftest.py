@@ -13,9 +13,9 @@ from lunar.arrays import FloatArray
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload, PayloadMode
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
-from payload_emulator.session.spacecraft import new_board
-from tmtc.cuc import TICKS_PER_SECOND
-from tmtc.dictionary import DICTIONARY
+from payload_emulator.session.spacecraft.loop import new_board
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.packets.cuc import TICKS_PER_SECOND
 
 RADIUS_M = 1_737_400.0
 GM_M3_S2 = 4.902800066e12

@@ -9,11 +9,11 @@ import pytest
 from scipy.special import pdtrc
 
 from lunar.camera import PinholeCamera
-from payload_emulator.flight.navigation import acquisition
-from payload_emulator.flight.navigation.acquisition import AcquisitionParameters, acquire
+from payload_emulator.flight.navigation.search import acquisition
+from payload_emulator.flight.navigation.search.acquisition import AcquisitionParameters, acquire
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, landmark_map
 from payload_emulator.flight.vision.detections import Detections
-from tmtc.tables import CatalogueTable
+from tmtc.dictionary.tables import CatalogueTable
 
 CAMERA = PinholeCamera()
 FOCAL_PX = 256.0 / np.tan(np.radians(60.0))

@@ -18,8 +18,8 @@ from payload_emulator.flight.payload import FlightParameters, FlightTables, Payl
 from payload_emulator.flight.vision.detections import Detections, no_detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from studies.montecarlo import catalogue_table
-from tmtc.dictionary import DICTIONARY
-from tmtc.tables import (
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.tables import (
     GravityTable,
     InitialState,
     pack_catalogue_table,

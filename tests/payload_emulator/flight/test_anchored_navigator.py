@@ -14,8 +14,6 @@ from lunar.camera import nadir_camera_from_mcmf
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
 from payload_emulator.flight.navigation import anchored, association, correction, recovery
-from payload_emulator.flight.navigation import filter as kalman
-from payload_emulator.flight.navigation.acquisition import Acquisition
 from payload_emulator.flight.navigation.anchored import (
     AnchoredReport,
     AnchoredSetup,
@@ -24,15 +22,17 @@ from payload_emulator.flight.navigation.anchored import (
 )
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredLimits, AnchoredParameters
 from payload_emulator.flight.navigation.correction import Fix, frame_limit, is_usable
-from payload_emulator.flight.navigation.filter import FilterState
-from payload_emulator.flight.navigation.identification import Identification
+from payload_emulator.flight.navigation.filter import filter as kalman
+from payload_emulator.flight.navigation.filter.filter import FilterState
 from payload_emulator.flight.navigation.landmark_map import MapState
-from payload_emulator.flight.navigation.lost_in_space import Place
 from payload_emulator.flight.navigation.outcomes import Outcome
+from payload_emulator.flight.navigation.search.acquisition import Acquisition
+from payload_emulator.flight.navigation.search.identification import Identification
+from payload_emulator.flight.navigation.search.lost_in_space import Place
 from payload_emulator.flight.navigation.sighting import Pose, in_view, landmark_map
 from payload_emulator.flight.vision.detections import Detections
 from studies import montecarlo
-from tmtc.tables import BurnTable
+from tmtc.dictionary.tables import BurnTable
 
 SECOND = 65_536
 

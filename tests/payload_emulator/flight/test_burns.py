@@ -8,10 +8,9 @@ import pytest
 from lunar.frames import IauOrientation
 from lunar.gravity import builtin_gravity
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
-from payload_emulator.flight.navigation.dynamics import OrbitModel, ProcessNoise, flown
+from payload_emulator.flight.navigation.filter.dynamics import OrbitModel, ProcessNoise, flown
 from tests.payload_emulator.flight.test_dynamics import start_state
-from tmtc.errors import TableError
-from tmtc.tables import (
+from tmtc.dictionary.tables import (
     BurnTable,
     GravityTable,
     no_burns,
@@ -20,6 +19,7 @@ from tmtc.tables import (
     unpack_burn_table,
     unpack_orientation_table,
 )
+from tmtc.errors import TableError
 
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
 START = int(ticks_from_utc_ns(EPOCH))

@@ -12,9 +12,9 @@ from lunar.gravity import builtin_gravity
 from lunar.gravity_omission import densities_at, field_noise
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns, utc_ns_from_ticks
-from payload_emulator.flight.navigation.dynamics import OrbitModel, ProcessNoise, process_noise
-from tmtc.tables import GravityTable, OrientationTable, pack_orientation_table
-from tmtc.tables import unpack_orientation_table as unpack
+from payload_emulator.flight.navigation.filter.dynamics import OrbitModel, ProcessNoise, process_noise
+from tmtc.dictionary.tables import GravityTable, OrientationTable, pack_orientation_table
+from tmtc.dictionary.tables import unpack_orientation_table as unpack
 
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
 START = int(ticks_from_utc_ns(EPOCH))

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from payload_emulator.flight.navigation.identification import (
+from payload_emulator.flight.navigation.search.identification import (
     IdentificationParameters,
     _consistent,
     identify,

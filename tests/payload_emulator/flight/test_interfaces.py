@@ -7,8 +7,8 @@ import re
 from payload_emulator.flight.onboard.icd import format_interfaces
 from payload_emulator.flight.onboard.modes import ALLOWED
 from payload_emulator.flight.ports import Board
-from tmtc.dictionary import DICTIONARY
-from tmtc.onboard_parameters import PARAMETERS
+from tmtc.dictionary.onboard_parameters import PARAMETERS
+from tmtc.dictionary.payload import DICTIONARY
 
 
 def test_every_port_parameter_and_restricted_command_is_in_it() -> None:

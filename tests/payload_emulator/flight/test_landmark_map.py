@@ -23,7 +23,7 @@ from payload_emulator.flight.navigation.landmark_map import (
 )
 from payload_emulator.flight.navigation.sighting import Sighting
 from payload_emulator.flight.vision.detections import Detections, no_detections
-from tmtc.tables import CatalogueTable
+from tmtc.dictionary.tables import CatalogueTable
 
 RADIUS_M = 1_737_400.0
 CAMERA = PinholeCamera()

@@ -13,8 +13,8 @@ import pytest
 from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
 from lunar.frames import enu_from_mcmf, mcmf_from_spherical
-from payload_emulator.flight.navigation._fit_kernel import Found, Image, Seen, log_evidence
-from payload_emulator.flight.navigation.lost_in_space import (
+from payload_emulator.flight.navigation.search._fit_kernel import Found, Image, Seen, log_evidence
+from payload_emulator.flight.navigation.search.lost_in_space import (
     NADIR_NORTH_UP,
     LostParameters,
     PlaceIndex,
@@ -26,7 +26,7 @@ from payload_emulator.flight.navigation.lost_in_space import (
 )
 from payload_emulator.flight.navigation.sighting import LandmarkMap, landmark_map
 from payload_emulator.flight.vision.detections import Detections, no_detections
-from tmtc.tables import CatalogueTable
+from tmtc.dictionary.tables import CatalogueTable
 
 RADIUS_M = 1_737_400.0
 CAMERA = PinholeCamera()

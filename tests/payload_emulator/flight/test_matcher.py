@@ -7,7 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from payload_emulator.flight.navigation.matcher import GroundFeatures, MatcherParameters, match_frames
+from payload_emulator.flight.navigation.odometry.matcher import (
+    GroundFeatures,
+    MatcherParameters,
+    match_frames,
+)
 
 
 def features(places: object, classes: object) -> GroundFeatures:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from payload_emulator.flight.onboard.modes import ALLOWED, TRANSITIONS, PayloadMode
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 SAFE, STANDBY, OBSERVING, DOWNLINKING = PayloadMode
 # Written out here a second time on purpose: who may follow whom.

@@ -13,11 +13,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lunar.camera import PinholeCamera
-from payload_emulator.flight.navigation import filter as kalman
-from payload_emulator.flight.navigation.dynamics import Prediction
-from payload_emulator.flight.navigation.filter import CommonErrors, FilterState
+from payload_emulator.flight.navigation.filter import filter as kalman
+from payload_emulator.flight.navigation.filter.dynamics import Prediction
+from payload_emulator.flight.navigation.filter.filter import CommonErrors, FilterState
 from payload_emulator.flight.navigation.sighting import LandmarkMap, landmark_map, look
-from tmtc.tables import CatalogueTable
+from tmtc.dictionary.tables import CatalogueTable
 
 CAMERA = PinholeCamera()
 RADIUS_M = 1_737_400.0

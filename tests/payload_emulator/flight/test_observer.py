@@ -15,7 +15,7 @@ from payload_emulator.flight.onboard.loads import FlightParameters, FlightTables
 from payload_emulator.flight.onboard.observer import Observer
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
-from tmtc.tables import pack_anchor_table, table_hash
+from tmtc.dictionary.tables import pack_anchor_table, table_hash
 
 ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 IMAGE = np.zeros((4, 4), dtype=np.uint8)
@@ -333,7 +333,7 @@ def test_a_frame_of_odometry_is_reported_in_full(
         calls.append((given, more))
         return state, report
 
-    monkeypatch.setattr("payload_emulator.flight.navigation.odometry.step", step)
+    monkeypatch.setattr("payload_emulator.flight.navigation.odometry.odometry.step", step)
     rig.telemetry.frame_number = 5
     observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
     observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
@@ -386,7 +386,9 @@ def test_odometry_without_a_position_reports_its_outcome_alone(
         outcome=Outcome.rejected, reset_trigger=ResetTrigger.none, candidate_pairs=3, pairs=0, shift_east_m=np.nan,
         shift_north_m=np.nan,
     )  # fmt: skip
-    monkeypatch.setattr("payload_emulator.flight.navigation.odometry.step", lambda *_, **__: (None, report))
+    monkeypatch.setattr(
+        "payload_emulator.flight.navigation.odometry.odometry.step", lambda *_, **__: (None, report)
+    )
     observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
     assert rig.telemetry.named("frame_outcome")[1] == {
         **expected, "frame_number": 1, "outcome": int(Outcome.rejected), "candidate_pairs": 3,

@@ -10,12 +10,16 @@ import pytest
 
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
-from payload_emulator.flight.navigation import odometry
-from payload_emulator.flight.navigation.matcher import GroundFeatures, Match
-from payload_emulator.flight.navigation.odometry import OdometryParameters, OdometryState, frame_features
+from payload_emulator.flight.navigation.odometry import odometry
+from payload_emulator.flight.navigation.odometry.matcher import GroundFeatures, Match
+from payload_emulator.flight.navigation.odometry.odometry import (
+    OdometryParameters,
+    OdometryState,
+    frame_features,
+)
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.vision.detections import Detections
-from tmtc.tables import AnchorTable, pack_anchor_table, unpack_anchor_table
+from tmtc.dictionary.tables import AnchorTable, pack_anchor_table, unpack_anchor_table
 
 CAMERA = PinholeCamera()
 # Two passes between -60 and 60 degrees of latitude, seconds after the epoch of Table I. The ascending one

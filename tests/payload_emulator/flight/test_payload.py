@@ -11,8 +11,8 @@ from payload_emulator.flight.navigation.outcomes import Mode
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload
 from payload_emulator.flight.vision.detections import Detections, no_detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
-from tmtc.dictionary import DICTIONARY
-from tmtc.tables import pack_anchor_table, table_hash
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.tables import pack_anchor_table, table_hash
 
 IMAGE = np.zeros((4, 4, 3), dtype=np.uint8)
 ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
-from payload_emulator.flight.navigation.lost_in_space import LostParameters
+from payload_emulator.flight.navigation.search.lost_in_space import LostParameters
 from studies.montecarlo import CatalogueErrors, Kidnap, NavigationCase, NavigationRun, fly
 
 FRAME = 20

@@ -16,12 +16,12 @@ from payload_emulator.flight.onboard.loads import TABLE_NUMBERS
 from payload_emulator.flight.payload import PayloadMode
 from payload_emulator.flight.ports import ResetCause
 from payload_emulator.flight.telemetry.products import map_octets
-from tmtc.crc import append_crc
-from tmtc.dictionary import DICTIONARY
-from tmtc.large_data import LargeDataReceiver, split
-from tmtc.onboard_parameters import PARAMETERS, find_parameter
-from tmtc.tables import pack_anchor_table
-from tmtc.thumbnails import unpack_thumbnail
+from tmtc.dictionary.onboard_parameters import PARAMETERS, find_parameter
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.tables import pack_anchor_table
+from tmtc.packets.crc import append_crc
+from tmtc.packets.large_data import LargeDataReceiver, split
+from tmtc.packets.thumbnails import unpack_thumbnail
 
 NUMBERS = {parameter.name: parameter.number for parameter in PARAMETERS}
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from lunar.camera import PinholeCamera, project_mcmf
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, in_view, landmark_map, look
-from tmtc.tables import CatalogueTable
+from tmtc.dictionary.tables import CatalogueTable
 
 CAMERA = PinholeCamera()
 NADIR_AT_ORIGIN = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])

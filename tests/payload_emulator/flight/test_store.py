@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from payload_emulator.flight.telemetry.store import SHARES, PacketStore, StoreClass
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 
 HEADER = 13
 

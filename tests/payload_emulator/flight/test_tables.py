@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lunar.constants import MOON_RADIUS_M
-from tmtc import tables
+from tmtc.dictionary import tables
 from tmtc.errors import TableError
 
 

@@ -12,7 +12,7 @@ from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
 from lunar.lens import pointed_camera_from_mcmf
 from payload_emulator.errors import ScenarioError, TerrainError
-from payload_emulator.session.mission import level_of
+from payload_emulator.session.archive.mission import level_of
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.sim.render.light import sun_direction_mcmf
 from payload_emulator.sim.render.renderer import PHOTOGRAPH_RADIANCE, render

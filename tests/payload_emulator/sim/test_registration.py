@@ -16,7 +16,7 @@ from lunar.catalogue import make_catalogue, save_catalogue
 from lunar.datafolder import DataFolder, find_data
 from lunar.frames import mcmf_from_spherical
 from payload_emulator.errors import TerrainError
-from payload_emulator.session.world import _register, _registration_name
+from payload_emulator.session.world.world import _register, _registration_name
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.registering import (
     PRODUCT,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from payload_emulator.session.recipe import Recipe, Source
+from payload_emulator.session.world.recipe import Recipe, Source
 from payload_emulator.training.data import dataset as store
 from payload_emulator.training.data.finishing import write_index
 

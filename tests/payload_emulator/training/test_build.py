@@ -15,7 +15,7 @@ import pytest
 
 from lunar.datafolder import find_data
 from payload_emulator.errors import DatasetError, RendererError, ScenarioError
-from payload_emulator.session.recipe import Recipe, Source, load_recipe
+from payload_emulator.session.world.recipe import Recipe, Source, load_recipe
 from payload_emulator.training.data import dataset as store
 from payload_emulator.training.data.build import _runs, build, make_shard, plan_shards
 from payload_emulator.training.data.integrity import check

@@ -11,11 +11,11 @@ import pytest
 from lunar.camera import PinholeCamera
 from lunar.datafolder import find_data
 from payload_emulator.errors import DatasetError, ModelError
-from payload_emulator.flight.navigation.odometry import frame_features
+from payload_emulator.flight.navigation.odometry.odometry import frame_features
 from payload_emulator.flight.navigation.outcomes import Mode
 from payload_emulator.flight.vision.detector import OnnxDetector, decode_classes
 from payload_emulator.flight.vision.preprocess import Preparation, gray_levels, prepare_image
-from payload_emulator.session.recipe import Recipe, Source, load_recipe
+from payload_emulator.session.world.recipe import Recipe, Source, load_recipe
 from payload_emulator.training.data.build import build
 from payload_emulator.training.data.dataset import Dataset
 from payload_emulator.training.data.feeder import AugmentParameters, TrainParameters, make_crop

@@ -7,7 +7,7 @@ import pytest
 
 from lunar.boxes import Box, inside_box
 from payload_emulator.errors import DatasetError
-from payload_emulator.session.recipe import Source, load_recipe, procedural_recipe
+from payload_emulator.session.world.recipe import Source, load_recipe, procedural_recipe
 from payload_emulator.training.data.build import plan_shards
 from payload_emulator.training.data.shots import allowed
 

@@ -15,7 +15,7 @@ from lunar.frames import IauOrientation, mcmf_from_spherical, spherical_from_mcm
 from lunar.messages.oem import save_oem
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.errors import DatasetError
-from payload_emulator.session.recipe import PAPER_SPLIT, Source, load_recipe
+from payload_emulator.session.world.recipe import PAPER_SPLIT, Source, load_recipe
 from payload_emulator.training.data.shots import pose_at
 from payload_emulator.training.data.track import lay_track, order_by_ground, split_track
 

@@ -27,9 +27,9 @@ from tests.tmtc.foreign import (
     space_packet,
 )
 from tests.tmtc.xtce.test_export import random_packet
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import DefinitionError
-from tmtc.stream import PacketCut
+from tmtc.packets.stream import PacketCut
 from tmtc.xtce.columns import ArrayColumn, OptionalColumn, ValueColumn
 from tmtc.xtce.decode import VERDICTS, Decoder, XtceDecode
 from tmtc.xtce.export import format_xtce

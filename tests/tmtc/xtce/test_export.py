@@ -9,12 +9,12 @@ import pytest
 import space_packet_parser as spp
 from space_packet_parser.xtce.validation import validate_xtce
 
-from tmtc.crc import CRC_LENGTH
-from tmtc.dictionary import DICTIONARY
-from tmtc.fields import Field
-from tmtc.onboard_parameters import PARAMETERS
-from tmtc.schema import PacketDefinition
-from tmtc.stream import whole_packets
+from tmtc.dictionary.fields import Field
+from tmtc.dictionary.onboard_parameters import PARAMETERS
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.schema import PacketDefinition
+from tmtc.packets.crc import CRC_LENGTH
+from tmtc.packets.stream import whole_packets
 from tmtc.xtce.decode import Decoder
 from tmtc.xtce.export import format_xtce, parameter_name
 from tmtc.xtce.importing import parse_xtce

@@ -1,7 +1,7 @@
 """Second persons: from the effects of telecommands, raised or relaxed by a mission description."""
 
 from ground_service.missions.model import Approval
-from tmtc.effects import EFFECTS, Effect
+from tmtc.dictionary.effects import EFFECTS, Effect
 
 needs = Approval().needs_second_person
 

@@ -39,9 +39,9 @@ from ground_service.planning.service import (
 from ground_service.planning.store import list_windows
 from ground_service.store import repository
 from lunar.timescales import parse_utc
-from tmtc.dictionary import DICTIONARY
-from tmtc.stream import cut_packets
-from tmtc.uplink import UplinkDecoder
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.link.uplink import UplinkDecoder
+from tmtc.packets.stream import cut_packets
 
 SPACECRAFT = 76
 START = {"function_id": "start_observation", "argument_1": 600.0, "argument_2": 15.0}

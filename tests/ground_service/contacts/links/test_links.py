@@ -36,7 +36,7 @@ from tests.ground_service.archive_hash import archive_hash
 from tests.ground_service.conftest import START, Clock, add_reference
 from tests.ground_service.contacts.links.conftest import Station, declare, operated
 from tests.serving import wait_for
-from tmtc.uplink import UplinkDecoder
+from tmtc.link.uplink import UplinkDecoder
 
 CADU = 1279
 SPACECRAFT = 76

@@ -20,9 +20,9 @@ from lunar.visibility import GroundStation, link
 from tests.ground_service.conftest import START, circular_states
 from tests.ground_service.contacts.links.conftest import Station, declare, operated
 from tests.serving import wait_for
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import DownlinkEncoder
-from tmtc.link import LinkSettings
+from tmtc.link.settings import LinkSettings
 
 NS = 1_000_000_000
 REPORTS = 30

@@ -22,10 +22,10 @@ from ground_service.passes.archive_import import import_archive
 from linna import cli
 from lunar.catalogue import CraterCatalogue, load_catalogue, save_catalogue
 from lunar.datafolder import DataFolder
-from payload_emulator.session.replay import FlightBuild, replay_archive
-from payload_emulator.session.suite import suite_scenarios, write_suite
+from payload_emulator.session.archive.replay import FlightBuild, replay_archive
+from payload_emulator.session.archive.suite import suite_scenarios, write_suite
 from tests.ground_service.conftest import write_manifest
-from tmtc.tables import pack_catalogue_table, unpack_catalogue_table
+from tmtc.dictionary.tables import pack_catalogue_table, unpack_catalogue_table
 
 SCENARIO = "suite-real-sun"
 FRAMES = 8

@@ -47,9 +47,9 @@ from lunar.datafolder import DataFolder
 from lunar.frames import mcmf_from_spherical
 from payload_emulator.training.data.landmarks import load_landmarks
 from tests.ground_service.conftest import SyntheticPass, write_manifest
-from tmtc.dictionary import DICTIONARY
-from tmtc.large_data import LargeDataReceiver
-from tmtc.tables import CatalogueTable, pack_catalogue_table, unpack_catalogue_table
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.tables import CatalogueTable, pack_catalogue_table, unpack_catalogue_table
+from tmtc.packets.large_data import LargeDataReceiver
 
 FRAMES = 24
 

@@ -42,9 +42,9 @@ from lunar.constants import SPEED_OF_LIGHT_M_S
 from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
 from tests.ground_service.conftest import circular_states, save_circle
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
-from tmtc.packets import PacketSequencer
+from tmtc.packets.space_packets import PacketSequencer
 
 NS = 1_000_000_000
 START = parse_utc("2029-08-07T06:00:00Z")

@@ -33,7 +33,7 @@ from ground_service.planning.service import add_window, change_window
 from ground_service.planning.standing import add_request, plan_tick
 from ground_service.store import repository
 from ground_service.worker.watch import Watch
-from tmtc.dictionary import DICTIONARY
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 SPACECRAFT = 76

@@ -1,0 +1,1 @@
+"""The filter with its dynamics, attitude monitor and landmark map."""

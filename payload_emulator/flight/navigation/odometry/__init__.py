@@ -1,0 +1,1 @@
+"""The paper's visual odometry and the spherical one."""

@@ -1,0 +1,1 @@
+"""Identification of craters without a pose, kilometres off, and near a pose."""

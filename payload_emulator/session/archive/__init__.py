@@ -1,0 +1,1 @@
+"""Written and flown again: emulator, recording, mission description, replay, reconstruction, scoring, suite."""

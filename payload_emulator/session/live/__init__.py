@@ -1,0 +1,1 @@
+"""The spacecraft as a process: session, contacts, console, station ports, exact state, viewing."""

@@ -1,0 +1,1 @@
+"""The one loop: payload, board, receiver, loads, parameter file, schedule."""

@@ -1,0 +1,1 @@
+"""The packet dictionary of the payload: schema, packets, fields, codes, on-board tables, ICD."""

@@ -1,0 +1,1 @@
+"""The link: CADUs, Reed-Solomon, transfer frames, CLCW, uplink, link settings."""

@@ -1,0 +1,141 @@
+"""TM transfer frames: header, operational control field (CLCW), frame error control; many frames at once.
+
+References
+----------
+CCSDS 132.0-B section 4.1. Header of six octets: version 00 (2 bits), spacecraft id (10), virtual channel
+(3), OCF flag (1) | master channel count (8) | virtual channel count (8) | secondary header flag,
+synchronisation flag, packet order flag (1 each), segment length id 11 (2), first header pointer (11). CCSDS
+232.0-B 4.2 for the CLCW.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tmtc.arrays import BoolArray, IntArray, OctetArray
+from tmtc.errors import FrameError, TruncatedPacket, ValueRefused
+from tmtc.packets.crc import CRC_LENGTH, crc16
+
+FRAME_HEADER_LENGTH = 6
+FRAME_MAX_LENGTH = 2048
+OCF_LENGTH = 4
+NO_PACKET_BEGINS = 0x7FF
+ONLY_IDLE_DATA = 0x7FE
+IDLE_CHANNEL = 7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TmFrameHeaders:
+    """Header fields of n frames as columns."""
+
+    version: IntArray
+    spacecraft_id: IntArray
+    virtual_channel: IntArray
+    master_count: IntArray
+    channel_count: IntArray
+    first_header_pointer: IntArray
+    ocf: BoolArray
+    secondary_header: BoolArray
+
+
+@dataclass(frozen=True, slots=True)
+class Clcw:
+    """Command link control word: the spacecraft's view of the uplink."""
+
+    virtual_channel: int
+    report_value: int
+    lockout: bool = False
+    wait: bool = False
+    retransmit: bool = False
+    no_rf_available: bool = False
+    no_bit_lock: bool = False
+    farm_b_counter: int = 0
+    status: int = 0
+
+
+def frame_headers(frames: OctetArray) -> TmFrameHeaders:
+    """Header fields of frames (n, length)."""
+    head = frames[:, :FRAME_HEADER_LENGTH].astype(np.int64)
+    first = head[:, 0] << 8 | head[:, 1]
+    status = head[:, 4] << 8 | head[:, 5]
+    return TmFrameHeaders(
+        version=first >> 14,
+        spacecraft_id=first >> 4 & 0x3FF,
+        virtual_channel=first >> 1 & 7,
+        master_count=head[:, 2],
+        channel_count=head[:, 3],
+        first_header_pointer=status & 0x7FF,
+        ocf=(first & 1) != 0,
+        secondary_header=status >> 15 != 0,
+    )
+
+
+def frame_checksums_hold(frames: OctetArray) -> BoolArray:
+    """Whether the last two octets of each frame (n, length) are the checksum of those before."""
+    if frames.shape[1] <= CRC_LENGTH:
+        return np.zeros(frames.shape[0], dtype=np.bool_)
+    from tmtc.packets import _cutting
+
+    holds = np.empty(frames.shape[0], dtype=np.bool_)
+    rows = np.ascontiguousarray(frames).view()
+    rows.flags.writeable = False  # one compiled variant for frames of every origin
+    _cutting.checksums_hold(rows, _cutting.crc_tables(), holds)
+    return holds
+
+
+def append_frame_checksums(frames: OctetArray) -> None:
+    """Write the checksum of each frame (n, length) into its last two octets, in place."""
+    for row in frames:
+        checksum = crc16(row[:-CRC_LENGTH].tobytes())
+        row[-2], row[-1] = checksum >> 8, checksum & 0xFF
+
+
+def pack_clcw(clcw: Clcw) -> bytes:
+    """Four octets for the operational control field."""
+    for name, value, limit in (
+        ("virtual_channel", clcw.virtual_channel, 1 << 6),
+        ("report_value", clcw.report_value, 1 << 8),
+        ("farm_b_counter", clcw.farm_b_counter, 1 << 2),
+        ("status", clcw.status, 1 << 3),
+    ):
+        if not 0 <= value < limit:
+            raise ValueRefused("CLCW", name, value, f"0..{limit - 1}")
+    word = clcw.status << 26 | 0b01 << 24 | clcw.virtual_channel << 18
+    word |= clcw.no_rf_available << 15 | clcw.no_bit_lock << 14 | clcw.lockout << 13
+    word |= clcw.wait << 12 | clcw.retransmit << 11 | clcw.farm_b_counter << 9 | clcw.report_value
+    return word.to_bytes(OCF_LENGTH, "big")
+
+
+def unpack_clcw(octets: bytes | memoryview) -> Clcw:
+    """The CLCW in an operational control field."""
+    if len(octets) < OCF_LENGTH:
+        raise TruncatedPacket("CLCW", OCF_LENGTH, len(octets))
+    word = int.from_bytes(octets[:OCF_LENGTH], "big")
+    if word >> 31 or word >> 29 & 0b11:
+        raise FrameError(f"CLCW: expected control word type 0, version 0, found 0x{word:08X}")
+    return Clcw(
+        virtual_channel=word >> 18 & 0x3F,
+        report_value=word & 0xFF,
+        lockout=bool(word >> 13 & 1),
+        wait=bool(word >> 12 & 1),
+        retransmit=bool(word >> 11 & 1),
+        no_rf_available=bool(word >> 15 & 1),
+        no_bit_lock=bool(word >> 14 & 1),
+        farm_b_counter=word >> 9 & 0b11,
+        status=word >> 26 & 0b111,
+    )
+
+
+def idle_data(length: int) -> bytes:
+    """Fill for frames without packets: the sequence of 1 + D + D^2 + D^22 + D^32, all ones at the start.
+
+    References
+    ----------
+    CCSDS 132.0-B-3 section 4.1.4.6 and its note on the recommended generator.
+    """
+    bits = [1] * 32
+    for n in range(32, 8 * length):
+        bits.append(bits[n - 1] ^ bits[n - 2] ^ bits[n - 22] ^ bits[n - 32])
+    return np.packbits(np.array(bits[: 8 * length], dtype=np.uint8)).tobytes()
