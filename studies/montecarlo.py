@@ -35,7 +35,7 @@ from payload_emulator.flight.navigation.landmark_map import FIRST_LANDMARK_ID
 from payload_emulator.flight.navigation.outcomes import Outcome
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, in_view, landmark_map, look
 from payload_emulator.flight.vision.detections import Detections
-from payload_emulator.session.world.distortion import regional_field
+from payload_emulator.session.world.regions import regional_field
 from payload_emulator.sim.detector import SimulatedDetector
 from tmtc.dictionary.tables import (
     CatalogueTable,

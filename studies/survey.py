@@ -24,10 +24,9 @@ from payload_emulator.errors import ScenarioError
 from payload_emulator.session.archive.mission import level_of, level_text, unseen_share
 from payload_emulator.session.archive.scoring import JudgedSession, judge_session
 from payload_emulator.session.scenario import Scenario, format_scenario
-from payload_emulator.session.spacecraft.loading import network_octets
+from payload_emulator.session.spacecraft.loading import load_scenario_payload, network_octets
 from payload_emulator.session.spacecraft.loop import new_spacecraft
 from payload_emulator.session.spacecraft.schedule import fly_scenario, timeline
-from payload_emulator.session.spacecraft.starting import load_scenario_payload
 from payload_emulator.session.world.world import World, build_world, registered_share
 from payload_emulator.sim.terrain.curation import Region
 

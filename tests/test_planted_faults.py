@@ -15,7 +15,7 @@ from ground_service.passes.store import get_pass
 from lunar.datafolder import DataFolder
 from payload_emulator.session.archive.emulator import emulate
 from payload_emulator.session.scenario import Scenario, parse_scenario
-from payload_emulator.session.world import reduced
+from payload_emulator.session.world import camera
 from reports.values import PassReport
 from tests.scenarios import live_scenario
 
@@ -85,13 +85,13 @@ def test_a_planted_fault_is_flagged_in_the_first_pass_by_its_requirement(
     scenario = SCENARIO
     if fault.startswith("camera"):
         monkeypatch.setattr(
-            reduced, "_REDUCED_DETECTOR", replace(reduced._REDUCED_DETECTOR, bias_px=(0.5, 0.0))
+            camera, "_REDUCED_DETECTOR", replace(camera._REDUCED_DETECTOR, bias_px=(0.5, 0.0))
         )
     elif fault.startswith("undeclared"):
         attitude = replace(scenario.attitude, knowledge_bias_deg=0.2, declared_bias_deg=0.0)
         scenario = replace(scenario, attitude=attitude)
     elif fault.startswith("recall"):
-        monkeypatch.setattr(reduced, "_REDUCED_RECALL", 0.8 * reduced._REDUCED_RECALL)
+        monkeypatch.setattr(camera, "_REDUCED_RECALL", 0.8 * camera._REDUCED_RECALL)
     else:
         scenario = replace(scenario, faults=replace(scenario.faults, events=("clock_jump at 300 size 1.0",)))
     report = fly(scenario)

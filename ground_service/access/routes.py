@@ -34,6 +34,9 @@ access = operations("access")
 UserName = Annotated[str, Path(pattern=USER_NAME)]
 
 
+_LONGEST_TOKEN = NewToken.model_validate({})
+
+
 @access.post("/session", responses=problems(401))
 def start_session(request: Request, response: Response, ground: GroundOf, given: NewSession) -> Session:
     """Start a browser session with a token; the response sets its cookie."""
@@ -104,7 +107,9 @@ def change_user(ground: GroundOf, caller: Admin, name: UserName, given: UserChan
 
 
 @access.post("/users/{name}/tokens", status_code=201)
-def add_token(ground: GroundOf, caller: Admin, name: UserName, given: NewToken = NewToken()) -> UserWithToken:
+def add_token(
+    ground: GroundOf, caller: Admin, name: UserName, given: NewToken = _LONGEST_TOKEN
+) -> UserWithToken:
     """Create a token for a user; the response contains it, and it cannot be read again."""
     token = users.add_token(
         ground,

@@ -20,8 +20,7 @@ import numpy as np
 from ground_service.exports.tables import Column, Table
 from lunar.timescales import parse_utc
 from tmtc.errors import MissingLibrary
-from tmtc.export import Record, column_metadata, record_columns
-from tmtc.parquet import parquet_octets
+from tmtc.export import Record, column_metadata, parquet_octets, record_columns
 
 _UTC = {"utc": {"description": "time of the packet: on-board time with the time correlation of the pass"}}
 

@@ -127,7 +127,7 @@ def _detect(arguments: argparse.Namespace) -> int:
     from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
     from payload_emulator.flight.vision.picture_search import search_picture, sun_at_azimuth
     from payload_emulator.flight.vision.preprocess import quality_reason
-    from payload_emulator.session.world.picture_files import read_picture
+    from payload_emulator.session.world.external import read_picture
     from payload_emulator.training.evaluate.sheets import draw_detections, format_detections, save_png
 
     if arguments.picture and len(arguments.images) > 1:

@@ -203,7 +203,7 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
     from lunar.timescales import format_utc
     from payload_emulator.session.archive.mission import OPERATIONS, default_ports, live_mission_text
     from payload_emulator.session.live.session import LiveSession, station_names
-    from payload_emulator.session.spacecraft.starting import launch, load_scenario_payload
+    from payload_emulator.session.spacecraft.loading import launch, load_scenario_payload
     from payload_emulator.session.world.world import build_world
 
     data, operated = data_folder(), not arguments.no_operator

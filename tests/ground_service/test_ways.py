@@ -27,7 +27,7 @@ from payload_emulator.session.archive.replay import FlightBuild, replay_archive
 from payload_emulator.session.live.session import LiveSession
 from payload_emulator.session.live.station_ports import RECORD_HEADER
 from payload_emulator.session.scenario import Scenario, parse_scenario
-from payload_emulator.session.spacecraft.starting import launch, load_scenario_payload
+from payload_emulator.session.spacecraft.loading import launch, load_scenario_payload
 from payload_emulator.session.world.world import build_world, clock_ticks, open_world
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode, encode_cadus

@@ -26,7 +26,7 @@ from payload_emulator.session.archive.mission import OPERATIONS, live_mission_te
 from payload_emulator.session.live.session import LiveSession
 from payload_emulator.session.live.station_ports import RECORD_HEADER
 from payload_emulator.session.scenario import Scenario, parse_scenario
-from payload_emulator.session.spacecraft.starting import launch
+from payload_emulator.session.spacecraft.loading import launch
 from payload_emulator.session.world.world import open_world
 from tests.scenarios import commanded_scenario
 from tests.serving import wait_for

@@ -15,10 +15,9 @@ from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.vision.detector import OnnxDetector
-from payload_emulator.session.archive import sun_check
-from payload_emulator.session.archive.emulator import emulate
+from payload_emulator.session.archive import emulator
+from payload_emulator.session.archive.emulator import emulate, sun_warnings
 from payload_emulator.session.archive.replay import FlightBuild, replay_archive
-from payload_emulator.session.archive.sun_check import sun_warnings
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.world.external import load_external
 from payload_emulator.session.world.world import build_world
@@ -128,7 +127,7 @@ def test_frames_whose_sun_is_not_that_of_the_ephemeris_are_named_with_both_azimu
     for text in warnings:
         seen, known = (float(azimuth) for azimuth in re.findall(r"(?:azimuth|at) (\d+) deg", text))
         assert abs(seen - known) == pytest.approx(180.0, abs=20.0)  # of a few craters
-    monkeypatch.setattr(sun_check, "true_sun_direction", lambda world, position, *_: -position / 1.8e6)
+    monkeypatch.setattr(emulator, "true_sun_direction", lambda world, position, *_: -position / 1.8e6)
     assert len(sun_warnings(world, detector)) == 3 and "elevation -" in sun_warnings(world, detector)[0]
 
 

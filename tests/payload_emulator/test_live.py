@@ -23,15 +23,19 @@ from lunar.frames import mcmf_from_spherical
 from lunar.timescales import parse_utc
 from payload_emulator.errors import LinkError
 from payload_emulator.flight.onboard.modes import PayloadMode
-from payload_emulator.session.live.live_ports import CLIENT_LIMIT, UNSENT_LIMIT_OCTETS, Server
 from payload_emulator.session.live.session import LiveSession
-from payload_emulator.session.live.station_ports import RECORD_HEADER, TelecommandBuffer
+from payload_emulator.session.live.station_ports import (
+    CLIENT_LIMIT,
+    RECORD_HEADER,
+    UNSENT_LIMIT_OCTETS,
+    Server,
+    TelecommandBuffer,
+)
 from payload_emulator.session.live.viewing import turn_message
 from payload_emulator.session.scenario import FaultsSection, parse_scenario
-from payload_emulator.session.spacecraft.loading import LoadedPayload
+from payload_emulator.session.spacecraft.loading import LoadedPayload, load_scenario_payload
 from payload_emulator.session.spacecraft.loop import Moment, Turn, new_spacecraft
 from payload_emulator.session.spacecraft.schedule import Operator, fly_scenario
-from payload_emulator.session.spacecraft.starting import load_scenario_payload
 from payload_emulator.session.world.camera import Exposure, expose
 from payload_emulator.session.world.world import World, build_world
 from payload_emulator.sim.board.faults import FAULT_KINDS

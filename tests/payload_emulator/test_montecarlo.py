@@ -21,7 +21,7 @@ from payload_emulator.flight.navigation.filter.filter import CommonErrors
 from payload_emulator.flight.navigation.outcomes import Outcome
 from payload_emulator.session.scenario import load_scenario
 from payload_emulator.session.spacecraft import loading
-from payload_emulator.session.world.distortion import regional_field
+from payload_emulator.session.world.regions import regional_field
 from payload_emulator.sim.detector import SimulatedDetector
 from studies import montecarlo
 from studies.montecarlo import (

@@ -7,8 +7,7 @@ import pytest
 
 from lunar.datafolder import DataFolder
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.world.camera import Exposure
-from payload_emulator.session.world.reduced import craters_in_view
+from payload_emulator.session.world.camera import Exposure, craters_in_view
 from payload_emulator.session.world.world import build_world
 from tests.scenarios import still_scenario
 

@@ -17,7 +17,7 @@ from payload_emulator.session.live.station_ports import (
     load_journal,
 )
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.spacecraft.starting import launch
+from payload_emulator.session.spacecraft.loading import launch
 from tests.payload_emulator.test_continuous import SCENARIO
 
 FIRST = JournalEntry(5, "madrid", 256, b"\x01\x02")

@@ -9,9 +9,8 @@ from pyarrow import parquet
 
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import MissingLibrary, UnknownPacket
-from tmtc.export import format_onboard_time, format_records, packet_records
+from tmtc.export import format_onboard_time, format_records, packet_records, parquet_octets
 from tmtc.packets.stream import cut_packets
-from tmtc.parquet import parquet_octets
 
 
 def tables():

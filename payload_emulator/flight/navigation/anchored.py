@@ -26,14 +26,17 @@ from lunar.frames import rtn_from_inertial
 from payload_emulator.flight.navigation import landmark_map as mapping
 from payload_emulator.flight.navigation import recovery
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
-from payload_emulator.flight.navigation.association import (
+from payload_emulator.flight.navigation.correction import (
+    Fix,
     altitude_above_sphere_m,
     associate,
+    correct,
     detection_variance_px2,
+    is_usable,
+    predicted,
     search_margin_px,
     tracking_limit_m,
 )
-from payload_emulator.flight.navigation.correction import Fix, correct, is_usable, predicted
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.attitude_monitor import (
     AttitudeMonitor,

@@ -25,6 +25,9 @@ from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError, TerrainError
 from payload_emulator.flight.ports import ResetCause
+from payload_emulator.flight.vision.detector import OnnxDetector
+from payload_emulator.flight.vision.picture_search import find_sun
+from payload_emulator.flight.vision.preprocess import prepare_image
 from payload_emulator.session.archive.mission import MISSION_FILE, mission_text, save_attitudes
 from payload_emulator.session.archive.recording import (
     StepInput,
@@ -34,9 +37,12 @@ from payload_emulator.session.archive.recording import (
     step_input,
 )
 from payload_emulator.session.archive.scoring import judge_session, score_navigation
-from payload_emulator.session.archive.sun_check import sun_warnings
 from payload_emulator.session.scenario import Scenario, format_scenario
-from payload_emulator.session.spacecraft.loading import LoadedPayload, check_payload_files
+from payload_emulator.session.spacecraft.loading import (
+    LoadedPayload,
+    check_payload_files,
+    load_scenario_payload,
+)
 from payload_emulator.session.spacecraft.loop import (
     PLAYBACK_CHANNEL,
     Spacecraft,
@@ -44,8 +50,7 @@ from payload_emulator.session.spacecraft.loop import (
     new_spacecraft,
 )
 from payload_emulator.session.spacecraft.schedule import fly_scenario, timeline
-from payload_emulator.session.spacecraft.starting import load_scenario_payload
-from payload_emulator.session.world.camera import require_renderable
+from payload_emulator.session.world.camera import expose, require_renderable, true_sun_direction
 from payload_emulator.session.world.external import ExternalFrames
 from payload_emulator.session.world.world import (
     World,
@@ -64,6 +69,37 @@ from payload_emulator.sim.board.link import (
 from tmtc.dictionary.payload import APID_TIME_REPORT, DICTIONARY
 from tmtc.link.settings import LinkSettings
 from tmtc.packets.cuc import TICKS_PER_SECOND
+
+_FRAMES = 3
+_WIDEST_DEG = 45.0  # a quarter turn of the image brings no other Sun within 45 degrees of its top
+
+
+def sun_warnings(world: World, detector: OnnxDetector) -> list[str]:
+    """Return a line for each of three external frames whose Sun differs from that of the ephemeris.
+
+    A frame whose craters leave the direction of the Sun undetermined is not compared.
+    """
+    warnings = []
+    rows = np.linspace(0, world.frame_utc_ns.size - 1, _FRAMES, dtype=int)
+    for utc_ns in world.frame_utc_ns[np.unique(rows)].tolist():
+        exposure = expose(world, utc_ns)
+        seen = find_sun(detector, prepare_image(exposure.image, detector.preparation).gray)
+        if seen is None or not seen.determined:
+            continue
+        right, down = exposure.attitude[4:6]
+        azimuth_deg = float(np.degrees(np.arctan2(right, -down))) % 360.0
+        position = world.truth.positions_mcmf(utc_ns)[0]
+        sun = true_sun_direction(world, position, utc_ns, np.random.default_rng(0))
+        elevation_deg = float(np.degrees(np.arcsin(position @ sun / np.linalg.norm(position))))
+        apart_deg = abs((seen.azimuth_deg - azimuth_deg + 180.0) % 360.0 - 180.0)
+        if apart_deg > _WIDEST_DEG or elevation_deg < 0.0:
+            warnings.append(
+                f"frame of {format_utc(utc_ns, 0)}: the image shows the Sun at azimuth {seen.azimuth_deg:.0f} deg "
+                f"(clockwise from its top), the ephemeris has it at {azimuth_deg:.0f} deg, elevation "
+                f"{elevation_deg:.0f} deg; the detector turns images by the ephemeris: check times and attitudes"
+            )
+    return warnings
+
 
 _LATE_TICKS = 120 * TICKS_PER_SECOND
 _DUMP_OCTETS = 64_000

@@ -39,11 +39,11 @@ from lunar.visibility import sunlit_fraction
 from payload_emulator.errors import LinkError
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.ports import UNLIMITED
-from payload_emulator.session.live.live_ports import Server
 from payload_emulator.session.live.state import load_state, save_state
 from payload_emulator.session.live.station_ports import (
     KEPT_LIMIT_OCTETS,
     JournalEntry,
+    Server,
     StationPorts,
     TelecommandBuffer,
     add_to_journal,

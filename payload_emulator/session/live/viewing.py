@@ -12,8 +12,7 @@ from lunar.arrays import FloatArray, IntArray
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.timescales import format_utc
 from payload_emulator.session.spacecraft.loop import Spacecraft, Turn
-from payload_emulator.session.world.camera import Exposure
-from payload_emulator.session.world.reduced import craters_in_view
+from payload_emulator.session.world.camera import Exposure, craters_in_view
 from payload_emulator.session.world.world import World
 from payload_emulator.sim.render.labels import label_frame
 from tmtc.dictionary.event_texts import event_text

@@ -21,8 +21,7 @@ from payload_emulator.flight.ports import SETTINGS_OCTETS, STORE_OCTETS, UNLIMIT
 from payload_emulator.flight.vision.detections import Detections, Detector
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.spacecraft.loading import LoadedPayload
-from payload_emulator.session.world.camera import Camera, Exposure
-from payload_emulator.session.world.reduced import CatalogueDetector
+from payload_emulator.session.world.camera import Camera, CatalogueDetector, Exposure
 from payload_emulator.session.world.world import World, clock_ticks
 from payload_emulator.sim.board.faults import Fault, parse_fault
 from payload_emulator.sim.board.link import LIGHT_S, Receiver

@@ -26,7 +26,7 @@ import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray
 from payload_emulator.errors import DatasetError
-from payload_emulator.session.world.picture_files import IMAGE_SUFFIXES, read_picture
+from payload_emulator.session.world.external import IMAGE_SUFFIXES, read_picture
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,7 +27,7 @@ from lunar.messages.oem import save_oem
 from lunar.timescales import parse_utc
 from payload_emulator.session.live.session import LiveSession
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.session.spacecraft.starting import load_scenario_payload
+from payload_emulator.session.spacecraft.loading import load_scenario_payload
 from payload_emulator.session.world.world import build_world
 from tests.ground_service.conftest import circular_states
 from tests.ground_service.web.conftest import PATIENCE_S, Pictures, press, strict_page

@@ -13,7 +13,7 @@ from scipy.special import chdtri, ndtr
 from lunar.camera import nadir_camera_from_mcmf
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
-from payload_emulator.flight.navigation import anchored, association, correction, recovery
+from payload_emulator.flight.navigation import anchored, correction, recovery
 from payload_emulator.flight.navigation.anchored import (
     AnchoredReport,
     AnchoredSetup,
@@ -213,7 +213,7 @@ def test_detection_noise_is_split_between_frame_and_crater(orbit: Orbit) -> None
     sigma = np.full(count, 0.1)
     sigma[:2] = [np.nan, 1.0]
     parameters = navigator.setup.parameters
-    variance = association.detection_variance_px2(replace(found, sigma_px=sigma), parameters)
+    variance = correction.detection_variance_px2(replace(found, sigma_px=sigma), parameters)
     # Unknown: 1.5 px; given: twice what it says; never below 0.5 px.
     np.testing.assert_allclose(variance[:3], [9.0, 4.0, 0.25])
     share = correction.detection_persistence(found, parameters)
@@ -655,9 +655,9 @@ def test_what_identification_is_given_is_the_spread_of_prediction_and_catalogue(
     pose = Pose(prior.mean[:3], orbit.attitude(2), orbit.rotations[2], np.zeros(3), np.zeros(2), np.zeros(3))
     landmarks, parameters = navigator.state.landmarks, navigator.setup.parameters
     sighting = in_view(landmarks, pose, orbit.case.camera, 0.0)
-    calls = recorded(monkeypatch, association, "identify", "pairs")
+    calls = recorded(monkeypatch, correction, "identify", "pairs")
     found = orbit.detections(2)
-    pairs = association.associate(prior, sighting, found, landmarks, orbit.case.camera, parameters)
+    pairs = correction.associate(prior, sighting, found, landmarks, orbit.case.camera, parameters)
     assert pairs == "pairs"
     ((given, seen, spread, own, variance, area_px2, rules, place),) = calls
     assert given is found and seen is sighting and rules is parameters.identification
@@ -700,7 +700,7 @@ def at_altitude(altitude_m: float) -> FilterState:
 def test_the_limit_of_the_linear_search_grows_with_the_ground_in_a_pixel(
     altitude_m: float, limit_m: float
 ) -> None:
-    found = association.tracking_limit_m(at_altitude(altitude_m), AnchoredParameters())
+    found = correction.tracking_limit_m(at_altitude(altitude_m), AnchoredParameters())
     assert found == pytest.approx(limit_m)
 
 

@@ -9,7 +9,7 @@ from payload_emulator.errors import DatasetError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.preprocess import prepare_image, quality_reason
-from payload_emulator.session.world.picture_files import read_picture
+from payload_emulator.session.world.external import read_picture
 from payload_emulator.training.data.pictures import LabelledPicture, load_pictures
 from payload_emulator.training.evaluate.evaluate import open_for_evaluation
 from payload_emulator.training.evaluate.pictures import (
