@@ -58,7 +58,9 @@ def test_an_ephemeris_that_gravity_does_not_move_is_refused_with_the_acceleratio
     (one,) = load_oem(save_circle(tmp_path / "km.oem")).segments
     metres = replace(one, position_m=1e3 * one.position_m, velocity_m_s=1e3 * one.velocity_m_s)
     save_oem(Ephemeris((metres,)), tmp_path / "m.oem")
-    message = r"ephemeris, states of SELENITA: expected an acceleration of \S+ m/s2 .* found .*metres for kilo"
+    message = (
+        r"ephemeris, states of SELENITA: expected an acceleration of \S+ m/s2 .* found .*metres for kilo"
+    )
     with pytest.raises(InvalidInput, match=message):
         add_ephemeris(ground, ground.files.put_file(tmp_path / "m.oem"), name="metres")
     assert add_ephemeris(ground, ground.files.put_file(tmp_path / "km.oem"), name="km").states == 240
