@@ -50,7 +50,7 @@ def open_expanded(path: Path | str, expected: str) -> Iterator[IO[bytes]]:
             file.seek(0)
             if mark.startswith(_GZIP):
                 kind = "gzip file"
-                with gzip.GzipFile(fileobj=file) as stream:
+                with gzip.open(file) as stream:
                     yield stream
             elif mark == _ZIP:
                 kind = "zip archive"
