@@ -423,6 +423,7 @@ class Reading:
         self.is_doubted |= packets is not whole
         stored = store.store_batch(connection, vehicle, packets)
         store.note_receptions(connection, vehicle, self.piece.station, time_receptions(packets))
+        assert packets.spacecraft_id is not None
         defined = np.isin(packets.apid, self._definitions(packets.spacecraft_id).apids)
         self.unknown += packets.unknown - int(np.count_nonzero(defined))
         timed = packets.ticks[packets.ticks != NO_TICKS]

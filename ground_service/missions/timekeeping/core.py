@@ -234,8 +234,8 @@ def doubted_stations(
     units: list[IntArray] = []
     for name in sorted(set(station)):
         mine = np.flatnonzero(names == name)
-        found = clock_runs(ticks[mine], earth_utc_ns[mine], light_time_ns[mine], boot[mine])
-        units += [mine[run] for run in found if len(run)]
+        runs = clock_runs(ticks[mine], earth_utc_ns[mine], light_time_ns[mine], boot[mine])
+        units += [mine[run] for run in runs if len(run)]
     unit = np.zeros(len(ticks), dtype=np.int64)
     for number, rows in enumerate(units):
         unit[rows] = number
