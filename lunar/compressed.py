@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, cast
 
 from lunar.errors import DataFileError
 
@@ -51,7 +51,7 @@ def open_expanded(path: Path | str, expected: str) -> Iterator[IO[bytes]]:
             if mark.startswith(_GZIP):
                 kind = "gzip file"
                 with gzip.open(file) as stream:
-                    yield stream
+                    yield cast("IO[bytes]", stream)
             elif mark == _ZIP:
                 kind = "zip archive"
                 with zipfile.ZipFile(file) as archive:
