@@ -159,3 +159,13 @@ def test_the_report_of_a_pass_has_the_word_of_the_list(view):
     with view.expect_popup() as opened:
         line.get_by_role("link", name="open").click()
     expect(opened.value.locator(".verdict .word")).to_have_text(f"Verdict: {word}")
+
+
+def test_a_service_of_archives_alone_shows_the_date_of_its_data_and_the_next_step(view):
+    settled(view, "/")
+    expect(view.locator("#clock")).to_have_text(re.compile(r"^data of 20\d\d-\d\d-\d\d, recorded$"))
+    card = view.get_by_role("region", name="Spacecraft 76 flight")
+    expect(card).to_contain_text("A finished recording. Next step: open its pass and report")
+    expect(card.get_by_role("link", name="pass", exact=True)).to_have_attribute(
+        "href", re.compile("^/passes/")
+    )

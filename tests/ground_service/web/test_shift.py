@@ -287,6 +287,7 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift) -> None:
     expect(page.locator("#timeline .curve")).to_have_count(3)
     expect(page.locator("#timeline .contact.predicted").first).to_be_attached()
     assert page.evaluate(COVERED_LABELS) == []
+    expect(page.locator("#timeline line.now:not([hidden])")).to_have_count(1)
 
     # Nothing is released while the spacecraft is on hold, not even by the planner.
     spacecraft.report("housekeeping", structure_id=1, bus_voltage_v=12.0, temperature_c=21.5)
