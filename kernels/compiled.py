@@ -11,6 +11,7 @@ of the program share one folder. This is the only place that uses private parts 
 from __future__ import annotations
 
 import functools
+import gc
 import hashlib
 import inspect
 import os
@@ -25,9 +26,11 @@ import numpy as np
 os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
 
 import numba
-from numba.core.compiler import CompileResult
+from numba.core import event
+from numba.core.compiler import CompileResult, Flags
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
+from numba.core.types.misc import unliteral
 
 from kernels import cache_folder, keep, kept
 
@@ -43,18 +46,60 @@ def njit(function: Function, /) -> Function: ...
 @overload
 def njit(**options: Any) -> Callable[[Function], Function]: ...
 def njit(function: Function | None = None, /, **options: Any) -> Any:
-    """Return ``function`` compiled on first call and cached on disk; options as for ``numba.njit``."""
-    compiler = numba.njit(**options)
+    """Return ``function`` compiled on first call and cached on disk; options as for ``numba.njit``.
+
+    Only kernels call a function whose name begins with ``_``: no entry from Python is compiled for it.
+    """
 
     def compiled(source: Function) -> Any:
-        kernel = compiler(source)
+        inner = source.__name__.startswith("_")
+        kernel = numba.njit(no_cpython_wrapper=inner, no_cfunc_wrapper=True, **options)(source)
         if isinstance(kernel, Dispatcher):  # not with NUMBA_DISABLE_JIT
+            kernel.get_call_template = functools.partial(_call_template, kernel)  # type: ignore[method-assign]
             file = source.__code__.co_filename
             _texts[file] = _hash_of_file(file)  # as imported: it may change before the first call
             kernel._cache = _KernelCache(kernel)  # type: ignore[attr-defined]
         return kernel
 
     return compiled if function is None else compiled(function)
+
+
+def _call_template(kernel: Any, arguments: Any, named: Any) -> Any:
+    """Return what a kernel calls for the types of arguments: the same version for a constant and for a variable."""
+    plain = tuple(unliteral(one) for one in arguments)
+    return Dispatcher.get_call_template(kernel, plain, {name: unliteral(named[name]) for name in named})
+
+
+class _Collection(event.Listener):  # type: ignore[misc]
+    """Pause of the garbage collection while a kernel compiles: it takes a third of that time and finds little."""
+
+    depth = 0
+    was_on = False
+
+    def on_start(self, _: Any) -> None:
+        if not self.depth:
+            self.was_on = gc.isenabled()
+            gc.disable()
+        self.depth += 1
+
+    def on_end(self, _: Any) -> None:
+        self.depth -= 1
+        if not self.depth and self.was_on:
+            gc.enable()
+
+
+event.register("numba:compile", _Collection())
+
+
+_DEFAULTS = {name: option.default for name, option in Flags.options.items()}
+
+
+def _values(flags: Any) -> Any:
+    """Return all options of a kernel; numba compares them for each operation, with a slower function of its own."""
+    return _DEFAULTS | flags._values
+
+
+Flags.values = _values
 
 
 class _KernelCache:

@@ -463,9 +463,11 @@ def integrate(
             if estimate <= 1.0:
                 rejected = False
                 t = t_new
-                y[:] = new
+                for d in range(6):
+                    y[d] = new[d]
+                for d in range(3):
+                    k[0, d] = k[last, d]
                 known = True  # the last stage is the first of the next step
-                k[0] = k[last]
                 signed, stage = 0.0, 0
                 continue
             if h < SHORTEST_STEP_S:

@@ -1,5 +1,6 @@
 """The cache of compiled functions is shared by processes and clones, and never gives code of other sources."""
 
+import gc
 import importlib
 import os
 import subprocess
@@ -57,6 +58,14 @@ def of_intrinsic(x):
 @njit
 def of_pair(pair):
     return pair.first
+
+@njit
+def _sum(x, y, is_twice):
+    return x + y * (2 if is_twice else 1)
+
+@njit
+def of_constants(x):
+    return _sum(x, 1, True) + _sum(x, x, x > 1)
 """
 KERNELS = ("outer", "of_array", "of_intrinsic", "of_pair")
 CALL = "import caller; print(caller.outer(1), sum(caller.outer.stats.cache_hits.values()))"
@@ -201,3 +210,14 @@ def test_the_order_of_the_fields_of_a_tuple_counts(tmp_path: Path, monkeypatch: 
         names.append(module.of_pair._cache._name(signature, cpu_target.target_context.codegen()))
     assert names[0] != names[1]
     assert names[0].startswith("of_pair-")
+
+
+def test_constants_and_variables_call_one_version_without_an_entry_from_python(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    module = imported(write(tmp_path / "code"), monkeypatch)
+    assert module.of_constants(1) == 5
+    (version,) = module._sum.overloads.values()
+    assert "cpython" not in version.library.get_llvm_str()
+    assert gc.isenabled()  # switched off while the kernels compiled

@@ -507,6 +507,8 @@ class _Compiled:
             counts = raw[group.count].astype(np.int64)
             sizes = definition.item_length * counts
             found = np.empty(int(sizes.sum()), dtype=np.uint8)
+            octets = octets.view()
+            octets.flags.writeable = False  # as mostly: a kernel for both kinds would be compiled twice
             _cutting.copy_spans(octets, starts + (definition.base_length - CRC_LENGTH), sizes, found)
             items_raw, items = _columns(group.fields, found.view(self.item_dtype))
             owner = np.repeat(np.arange(counts.size), counts)
