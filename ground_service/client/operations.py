@@ -204,7 +204,7 @@ class Operations(Connection):
     def list_ingests(self) -> Listing[ingest.Ingest]:
         """List the ingests, newest first."""
 
-    @operation("GET /implausible-packets", reads="ingest.doubts.list_implausible")
+    @operation("GET /implausible-packets", reads="ingest.doubt_store.list_implausible")
     def list_implausible(
         self, *, spacecraft_id: int | None = None, instance: str | None = None, ingest_id: int | None = None
     ) -> Listing[ingest.ImplausiblePacket]:

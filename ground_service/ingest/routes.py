@@ -18,7 +18,7 @@ from ground_service.http.common import (
     upload_body,
 )
 from ground_service.http.requests import operations, problems
-from ground_service.ingest import doubts, service, store
+from ground_service.ingest import doubt_store, service, store
 from ground_service.ingest.model import Ingest, IngestAccepted, Withdrawal
 from ground_service.ingest.service import Place, enter_ingest
 from ground_service.jobs.dispatcher import DispatcherOf
@@ -104,7 +104,7 @@ async def upload_telemetry(
 add_list(ingests, "/ingests", store.list_ingests)
 
 
-add_list(ingests, "/implausible-packets", doubts.list_implausible)
+add_list(ingests, "/implausible-packets", doubt_store.list_implausible)
 
 
 @ingests.post("/ingests/{ingest_id}/withdraw", responses=problems(409))

@@ -17,7 +17,7 @@ from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.errors import PASSING, Conflict, GroundError, InvalidInput, StateConflict
 from ground_service.ground import Ground
-from ground_service.ingest import doubts, store
+from ground_service.ingest import doubt_store, store
 from ground_service.ingest.model import IngestResult
 from ground_service.ingest.parameters import decode_declared, definitions_in_force
 from ground_service.ingest.reception import Progress, Reading
@@ -255,7 +255,7 @@ def derive_without(ground: Ground, ingest_id: int) -> int:
             vehicles = [] if found.accounting is None else list(found.accounting.vehicle_ids)
             for vehicle in vehicles:
                 lock_vehicle(connection, vehicle)
-                doubts.withdraw_packets(
+                doubt_store.withdraw_packets(
                     connection, vehicle, telemetry.packets_before(connection, vehicle, 2**62, NO_TICKS)
                 )
                 store.forget_rest(connection, vehicle, ingest_id)

@@ -38,7 +38,7 @@ from ground_service.events import (
     publish,
 )
 from ground_service.ground import Ground
-from ground_service.ingest.doubts import needs_review, review_times
+from ground_service.ingest.doubt_store import needs_review, review_times
 from ground_service.ingest.service import undecoded_vehicles
 from ground_service.jobs.service import add_job
 from ground_service.jobs.store import queued_arguments

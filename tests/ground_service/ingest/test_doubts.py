@@ -21,7 +21,7 @@ from ground_service.contacts.links import store as links
 from ground_service.errors import Conflict, StateConflict
 from ground_service.ground import Ground
 from ground_service.ingest.core import fits_between, implausible_times
-from ground_service.ingest.doubts import list_implausible
+from ground_service.ingest.doubt_store import list_implausible
 from ground_service.ingest.model import ImplausibleFilter
 from ground_service.ingest.service import ingest_file, withdraw_ingest
 from ground_service.ingest.store import get_ingest
