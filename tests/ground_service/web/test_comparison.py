@@ -166,4 +166,6 @@ def test_a_service_of_archives_alone_shows_the_date_of_its_data_and_the_next_ste
     expect(view.locator("#clock")).to_have_text(re.compile(r"^data of 20\d\d-\d\d-\d\d, recorded$"))
     card = view.get_by_role("region", name="Spacecraft 76 flight")
     expect(card).to_contain_text("A finished recording. Next step: open its pass and report")
-    expect(card.get_by_role("link", name="pass", exact=True)).to_have_attribute("href", re.compile("^/passes/"))
+    expect(card.get_by_role("link", name="pass", exact=True)).to_have_attribute(
+        "href", re.compile("^/passes/")
+    )
