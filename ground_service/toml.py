@@ -32,9 +32,10 @@ _TEXT = re.compile(
 )
 """Strings and comments; without its end, one takes the rest, as for the parser."""
 
-_DEEP = re.compile(rf"(?:[\w-]*[ \t]*\.[ \t]*){{{DEPTH_LIMIT}}}")
+# Possessive, and begun once in a run of characters: their time grows with the length of the text alone.
+_DEEP = re.compile(rf"(?<![\w\- \t.])[ \t]*+(?:[\w-]*+[ \t]*+\.[ \t]*+){{{DEPTH_LIMIT}}}")
 _BRACKET = re.compile(r"[\[\]{}]")
-_LONG = re.compile(rf"[\w-]{{{KEY_LIMIT + 1}}}")
+_LONG = re.compile(rf"(?<![\w-])[\w-]{{{KEY_LIMIT + 1},}}+[ \t]*+[=.\]]")
 
 Model = TypeVar("Model", bound=BaseModel)
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,6 +18,7 @@ from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from linna.cli import GROUPS, run
+from linna.commands import user
 from linna.parser import LinnaParser
 from lunar.timescales import format_utc, ticks_from_utc_ns
 from tests.ground_service.conftest import START, event_packet, save_circle, write_manifest
@@ -317,3 +319,14 @@ def test_an_unusable_file_does_not_keep_the_others_from_being_ingested(
     first, bad, last = json.loads(capsys.readouterr().out)["ingested"]
     assert "noise.cadu" in bad["error"]
     assert first["packets"] == last["packets"] > 0 and last["packets_new"] == 0
+
+
+def test_a_user_of_an_unknown_mission_is_warned_of(capsys: pytest.CaptureFixture[str]) -> None:
+    service: Any = SimpleNamespace(
+        list_missions=lambda: [SimpleNamespace(mission="selenita")],
+        add_user=lambda *_, **__: SimpleNamespace(token="T"),
+    )
+    assert user._add(service, "ann", "viewer", missions=["selenito", "selenita"])["token"] == "T"
+    assert capsys.readouterr().err == (
+        "linna: warning: no spacecraft has the mission 'selenito'; known: selenita\n"
+    )
