@@ -20,7 +20,12 @@ LATTICE_SHIFT = 32768.37
 """Keeps lattice coordinates positive down to waves of 53 m, and the planes of the lattice off the axes."""
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(
+    fastmath=True,
+    error_model="numpy",
+    nogil=True,
+    ahead="f4[:, ::1], *4 * [f8[::1]], f8, f8, i8, f4[:, ::1]",
+)
 def add_noise(
     out: Float32Array,
     cos_lat: FloatArray,
@@ -112,7 +117,7 @@ def _component(h: np.uint32, shift: int) -> np.float32:
     return np.float32(np.int32(bits)) - np.float32(511.0)
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(fastmath=True, error_model="numpy", nogil=True, ahead="f4[:, ::1], *4 * [f8], f4[:, ::1]")
 def resample_cubic(
     source: Float32Array,
     first_row: float,
@@ -151,7 +156,7 @@ def resample_cubic(
             out[i, j] = w0 * line[m - 1] + w1 * line[m] + w2 * line[m + 1] + w3 * line[m + 2]
 
 
-@njit(error_model="numpy", nogil=True)
+@njit(error_model="numpy", nogil=True, ahead="f4[:, ::1], f4[::1]")
 def smooth(values: Float32Array, weights: Float32Array) -> Float32Array:
     """Rows and then columns of ``values`` under symmetric ``weights`` (2 n + 1); the outer n pixels are left.
 
@@ -185,7 +190,12 @@ def smooth(values: Float32Array, weights: Float32Array) -> Float32Array:
     return out
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(
+    fastmath=True,
+    error_model="numpy",
+    nogil=True,
+    ahead="f4[:, ::1], *6 * [f8[::1]], i8[::1], f8[:, ::1], f4[:, ::1]",
+)
 def stamp_craters(
     out: Float32Array,
     latitude_rad: FloatArray,
@@ -265,7 +275,7 @@ def stamp_craters(
                     out[i, j] += depth * (row[k] + f * (row[k + 1] - row[k]))
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(fastmath=True, error_model="numpy", nogil=True, ahead="f4[:, :, ::1], i4[:, ::1], i8, *3 * [f8[::1]]")
 def sample_pool(
     pool: Float32Array,
     table: Int32Array,
