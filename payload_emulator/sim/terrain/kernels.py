@@ -167,7 +167,8 @@ def smooth(values: Float32Array, weights: Float32Array) -> Float32Array:
     out = values.copy()
     line = np.empty(columns, np.float32)
     for i in range(rows):
-        line[:] = values[i]
+        for j in range(columns):  # not a slice: numba compiles the message of its error for seconds
+            line[j] = values[i, j]
         if reach <= i < rows - reach:
             source = values[i - reach]
             for j in range(columns):
@@ -185,8 +186,8 @@ def smooth(values: Float32Array, weights: Float32Array) -> Float32Array:
             weight = weights[k]
             for j in range(inner.size):
                 inner[j] += weight * source[j]
-        out[i, :reach] = line[:reach]
-        out[i, columns - reach :] = line[columns - reach :]
+        for j in range(reach):
+            out[i, j], out[i, columns - 1 - j] = line[j], line[columns - 1 - j]
     return out
 
 
