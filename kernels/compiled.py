@@ -13,10 +13,14 @@ from __future__ import annotations
 import functools
 import gc
 import hashlib
+import importlib
 import inspect
 import os
 import pickle
-from collections.abc import Callable, Iterator
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any, TypeVar, overload
@@ -26,29 +30,33 @@ import numpy as np
 os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
 
 import numba
-from numba.core import event
+from numba.core import event, types
 from numba.core.compiler import CompileResult, Flags
 from numba.core.dispatcher import Dispatcher
+from numba.core.registry import cpu_target
 from numba.core.serialize import dumps
+from numba.core.types.containers import BaseTuple
 from numba.core.types.misc import unliteral
 
 from kernels import cache_folder, keep, kept
 
-__all__ = ["njit"]
+__all__ = ["compiling_ahead", "njit"]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _texts: dict[str, str] = {}
+_ahead: dict[str, list[tuple[Any, str]]] = {}
 
 
 @overload
 def njit(function: Function, /) -> Function: ...
 @overload
 def njit(**options: Any) -> Callable[[Function], Function]: ...
-def njit(function: Function | None = None, /, **options: Any) -> Any:
+def njit(function: Function | None = None, /, *, ahead: str = "", **options: Any) -> Any:
     """Return ``function`` compiled on first call and cached on disk; options as for ``numba.njit``.
 
-    Only kernels call a function whose name begins with ``_``: no entry from Python is compiled for it.
+    Only kernels call a function whose name begins with ``_``: no entry from Python is compiled for it.  ``ahead``
+    has the types with which a flight calls it, in numba's notation, for `compiling_ahead`.
     """
 
     def compiled(source: Function) -> Any:
@@ -59,6 +67,8 @@ def njit(function: Function | None = None, /, **options: Any) -> Any:
             file = source.__code__.co_filename
             _texts[file] = _hash_of_file(file)  # as imported: it may change before the first call
             kernel._cache = _KernelCache(kernel)  # type: ignore[attr-defined]
+            if ahead:
+                _ahead.setdefault(source.__module__, []).append((kernel, ahead))
         return kernel
 
     return compiled if function is None else compiled(function)
@@ -100,6 +110,74 @@ def _values(flags: Any) -> Any:
 
 
 Flags.values = _values
+
+
+@contextmanager
+def compiling_ahead(
+    groups: Sequence[Sequence[str]], log: Callable[[str], None]
+) -> Iterator[Callable[[], None]]:
+    """Compile the kernels of groups of modules that have no file, each group in a process of its own.
+
+    Yields a function that waits for them and logs how many are done.  A kernel that fails there is compiled on its
+    first call, as all are if files cannot be kept.
+    """
+    counts = [len(_not_kept(group)) for group in groups]
+    keep("ahead-", b"")
+    total = sum(counts) if kept("ahead-") is not None else 0
+    reader, writer = os.pipe()
+    processes = [
+        _compiler(group, writer) for group, count in zip(groups, counts, strict=True) if total and count
+    ]
+    os.close(writer)
+
+    def wait() -> None:
+        for done, _ in enumerate(lines, 1):
+            log(f"compiling, once: {done} of {total}")
+
+    with os.fdopen(reader) as lines:
+        try:
+            yield wait
+        finally:
+            for process in processes:
+                process.kill()
+                process.wait()
+
+
+def _compiler(group: Sequence[str], output: int) -> subprocess.Popen[bytes]:
+    code = f"from kernels.compiled import compile_declared; compile_declared({list(group)})"
+    path = os.pathsep.join(one or "." for one in sys.path)
+    return subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdout=output,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+
+
+def compile_declared(group: Sequence[str]) -> None:
+    """Compile the kernels of modules that have no file, and print a line after each."""
+    for kernel, signature in _not_kept(group):
+        kernel.compile(signature)
+        print(flush=True)
+
+
+def _not_kept(group: Sequence[str]) -> list[tuple[Any, tuple[Any, ...]]]:
+    """Return the kernels of modules, with the types declared for them, of which there is no file."""
+    codegen = cpu_target.target_context.codegen()
+    found = []
+    for module in group:
+        importlib.import_module(module)
+        for kernel, text in _ahead.get(module, []):
+            signature = declared(kernel, text)
+            if not (cache_folder() / kernel._cache._name(signature, codegen)).exists():
+                found.append((kernel, signature))
+    return found
+
+
+def declared(kernel: Any, text: str) -> tuple[Any, ...]:
+    """Return the types that a text names; a tuple of the kernel's module stands for its numba type."""
+    values = eval(f"[{text}]", {**kernel.py_func.__globals__, **vars(types)})
+    return tuple(BaseTuple.from_types(one, type(one)) if isinstance(one, tuple) else one for one in values)
 
 
 class _KernelCache:

@@ -516,7 +516,12 @@ def _force_gradient(
     g[1, 0], g[2, 0], g[2, 1] = g[0, 1], g[0, 2], g[1, 2]
 
 
-@njit(error_model="numpy", boundscheck=False, nogil=True)
+@njit(
+    error_model="numpy",
+    boundscheck=False,
+    nogil=True,
+    ahead="f8[::1], f8, i8, *3 * [f8[::1]], f8[:, :, ::1], i8, f8[:, :], f8[::1], f8[::1]",
+)
 def transition(
     y0: FloatArray,
     duration_s: float,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,21 @@ from linna.commands._ground import event_of_signals, local_actor
 from linna.commands.pass_ import requirement_lines
 from linna.output import emit, finish, log, progress, watched_rims
 from linna.parser import option
+
+KERNELS = (
+    [
+        "payload_emulator.sim.terrain.kernels",
+        *(f"payload_emulator.sim.render._{part}_kernel" for part in ("grid", "trace", "shade", "sensor")),
+    ],
+    [
+        "payload_emulator.flight.navigation._dynamics_kernel",
+        "tmtc._cutting",
+        "tmtc._rs_kernel",
+        "tmtc._markers",
+        "lunar._dynamics_kernel",
+    ],
+)
+"""Modules of kernels that are compiled at the same time, while the orbit is propagated."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -32,6 +48,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from ground_service.client.local import local_client
     from ground_service.ground import open_ground
+    from kernels.compiled import compiling_ahead
     from linna.data import data_folder
     from payload_emulator.session.archive.emulator import emulate
     from payload_emulator.session.scenario import load_scenario
@@ -50,13 +67,13 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     archive = arguments.out / "pass"
     log("emulating the payload ...")
-    emulated = emulate(
-        scenario,
-        data,
-        archive,
-        frames_kept=8,
-        progress=lambda frames, total: progress(frames, total, "frames", "frame"),
-    )
+    with compiling_ahead(KERNELS, log) as wait:
+
+        def frames(items: Iterable[Any], total: int) -> Iterator[Any]:
+            wait()
+            return progress(items, total, "frames", "frame")
+
+        emulated = emulate(scenario, data, archive, frames_kept=8, progress=frames)
     log("ingesting the downlink, aligning, reporting ...")
     home = arguments.out / "ground"
     with local_client(open_ground(home, data), local_actor()) as service:

@@ -22,7 +22,7 @@ def tables() -> RecordArray:
     return np.stack([np.bitwise_count(words ^ np.uint16(half)) for half in (_HIGH, _LOW)])
 
 
-@njit(nogil=True)
+@njit(nogil=True, ahead="u1[::1].copy(readonly=True), i8, i8, i8, u1[:, ::1], i8[::1]")
 def find_markers(
     octets: RecordArray, first: int, stop: int, tolerance: int, distance: RecordArray, found: RecordArray
 ) -> tuple[int, int]:
@@ -67,7 +67,7 @@ def second_octets() -> RecordArray:
     return result
 
 
-@njit(nogil=True)
+@njit(nogil=True, ahead="u1[::1].copy(readonly=True), i8, i8, u1[::1], i8[::1]")
 def find_undamaged(
     octets: RecordArray, first: int, stop: int, second: RecordArray, found: RecordArray
 ) -> tuple[int, int]:

@@ -24,7 +24,7 @@ CODEWORD = 255
 _GROUP = 16
 
 
-@njit(nogil=True)
+@njit(nogil=True, ahead="u1[:, :, ::1].copy(readonly=True), i8, i8, u8[:, :, ::1], u8[:, :, ::1]")
 def add_checks(words: RecordArray, first: int, symbols: int, table: RecordArray, check: RecordArray) -> None:
     """Add the check symbols of each codeword to `check` (n, interleave, parity / 8) uint64.
 

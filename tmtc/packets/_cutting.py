@@ -83,14 +83,14 @@ def _crc(buffer: RecordArray, start: int, stop: int, tables: RecordArray) -> int
     return _after(crc, buffer, i, end - i - _U(1), tables)
 
 
-@njit(nogil=True)
+@njit(nogil=True, ahead="u1[:, ::1].copy(readonly=True), u2[:, ::1], b1[::1]")
 def checksums_hold(rows: RecordArray, tables: RecordArray, holds: RecordArray) -> None:
     """Write whether the last two octets of each row (n, length) are the checksum of those before."""
     for n in range(rows.shape[0]):
         holds[n] = _crc(rows[n], 0, rows.shape[1], tables) == 0
 
 
-@njit(nogil=True)
+@njit(nogil=True, ahead="u1[::1].copy(readonly=True), i8[::1], i8[::1], u1[::1]")
 def copy_spans(buffer: RecordArray, starts: RecordArray, sizes: RecordArray, out: RecordArray) -> None:
     """Copy the `sizes` (n,) octets from each of `starts` (n,) into `out`, one span after another."""
     end = _U(0)
@@ -176,7 +176,7 @@ def _stands(
     return is_idle(buffer, p) or _prefix_holds(buffer, p, length, prefix, known, tables, powers)
 
 
-@njit(nogil=True)
+@njit(nogil=True, ahead="u1[::1].copy(readonly=True), i8, i8, i8, u2[::1], i8[::1], u2[:, ::1], i4[::1]")
 def chain_start(
     buffer: RecordArray, first: int, end: int, packet_type: int,
     prefix: RecordArray, known: RecordArray, tables: RecordArray, powers: RecordArray,
@@ -380,7 +380,7 @@ def follows(
     return False
 
 
-@njit(nogil=True)
+@njit(nogil=True, ahead="u1[::1].copy(readonly=True), i8, i8, i8, u2[:, ::1], i8[:, ::1], i8, u1[::1], b1")
 def walk(
     buffer: RecordArray, p: int, stop: int, packet_type: int, tables: RecordArray, rows: RecordArray, count: int,
     unchecked: RecordArray, open_end: bool,

@@ -65,7 +65,12 @@ class Tiles(NamedTuple):
     shift: int
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(
+    fastmath=True,
+    error_model="numpy",
+    nogil=True,
+    ahead="f4[:, ::1], Nodes(*4 * [f4[:, ::1]]), Tiles(f4[:, :, ::1], i4[:, ::1], i8), Grid(f8, f8, f8)",
+)
 def fill_grid(heights: Float32Array, nodes: Nodes, tiles: Tiles, grid: Grid) -> None:
     """Fill ``heights`` with z of the ground in the tangent frame.
 
@@ -168,7 +173,12 @@ def _bend_row(heights: Float32Array, work: Float32Array, i: int, grid: Grid) -> 
         heights[i, j] = h - half * u * (one + half * half * v * (one + half * v))
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(
+    fastmath=True,
+    error_model="numpy",
+    nogil=True,
+    ahead="f4[:, ::1], f4[::1], f4[::1], f8, f8, f8, f4[:, ::1]",
+)
 def sweep_shadows(
     heights: Float32Array,
     shadow: Float32Array,
@@ -201,7 +211,7 @@ def sweep_shadows(
             distance[j] = zero if free else away
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(fastmath=True, error_model="numpy", nogil=True, ahead="f4[:, ::1]")
 def block_peaks(heights: Float32Array) -> Float32Array:
     """Return the highest z of every block of 8 x 8 grid cells (their borders included)."""
     rows, columns = heights.shape

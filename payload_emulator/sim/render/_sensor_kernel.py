@@ -11,7 +11,12 @@ from kernels.compiled import njit
 from lunar.arrays import Float32Array
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(
+    fastmath=True,
+    error_model="numpy",
+    nogil=True,
+    ahead="f4[:, ::1], f4[:, :, ::1], f4[::1], *4 * [f8], u1[::1], u1[:, :, ::1]",
+)
 def read_out(
     signal: Float32Array,
     noise: Float32Array,

@@ -88,7 +88,16 @@ class Steps(NamedTuple):
     node_stride: np.int32
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(
+    fastmath=True,
+    error_model="numpy",
+    nogil=True,
+    ahead=(
+        "f4[:, ::1], Grid(f8, f8, f8), Eye(f8, f8[:, ::1], f8, f8, f8), Light(f8, f8, f4[:, ::1], b1), "
+        "Nodes(*4 * [f4[:, ::1]]), Tiles(f4[:, :, ::1], i4[:, ::1], i8), Surface(f4[:, :, ::1], i8, f8, f8), "
+        "none, none, *3 * [f4[:, ::1]]"
+    ),
+)
 def shade_pixels(
     depth: Float32Array,
     grid: Grid,

@@ -182,7 +182,12 @@ def find_hit(
     return -1.0
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(
+    fastmath=True,
+    error_model="numpy",
+    nogil=True,
+    ahead="f4[:, ::1], f4[:, ::1], Grid(f8, f8, f8), Eye(f8, f8[:, ::1], f8, f8, f8), f4[:, ::1]",
+)
 def trace_pixels(
     heights: Float32Array, peaks: Float32Array, grid: Grid, eye: Eye, depth_along: Float32Array
 ) -> None:

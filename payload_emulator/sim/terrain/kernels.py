@@ -20,7 +20,12 @@ LATTICE_SHIFT = 32768.37
 """Keeps lattice coordinates positive down to waves of 53 m, and the planes of the lattice off the axes."""
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(
+    fastmath=True,
+    error_model="numpy",
+    nogil=True,
+    ahead="f4[:, ::1], *4 * [f8[::1]], f8, f8, i8, f4[:, ::1]",
+)
 def add_noise(
     out: Float32Array,
     cos_lat: FloatArray,
@@ -112,7 +117,7 @@ def _component(h: np.uint32, shift: int) -> np.float32:
     return np.float32(np.int32(bits)) - np.float32(511.0)
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(fastmath=True, error_model="numpy", nogil=True, ahead="f4[:, ::1], *4 * [f8], f4[:, ::1]")
 def resample_cubic(
     source: Float32Array,
     first_row: float,
@@ -151,7 +156,7 @@ def resample_cubic(
             out[i, j] = w0 * line[m - 1] + w1 * line[m] + w2 * line[m + 1] + w3 * line[m + 2]
 
 
-@njit(error_model="numpy", nogil=True)
+@njit(error_model="numpy", nogil=True, ahead="f4[:, ::1], f4[::1]")
 def smooth(values: Float32Array, weights: Float32Array) -> Float32Array:
     """Rows and then columns of ``values`` under symmetric ``weights`` (2 n + 1); the outer n pixels are left.
 
@@ -162,7 +167,8 @@ def smooth(values: Float32Array, weights: Float32Array) -> Float32Array:
     out = values.copy()
     line = np.empty(columns, np.float32)
     for i in range(rows):
-        line[:] = values[i]
+        for j in range(columns):  # not a slice: numba compiles the message of its error for seconds
+            line[j] = values[i, j]
         if reach <= i < rows - reach:
             source = values[i - reach]
             for j in range(columns):
@@ -180,12 +186,17 @@ def smooth(values: Float32Array, weights: Float32Array) -> Float32Array:
             weight = weights[k]
             for j in range(inner.size):
                 inner[j] += weight * source[j]
-        out[i, :reach] = line[:reach]
-        out[i, columns - reach :] = line[columns - reach :]
+        for j in range(reach):
+            out[i, j], out[i, columns - 1 - j] = line[j], line[columns - 1 - j]
     return out
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(
+    fastmath=True,
+    error_model="numpy",
+    nogil=True,
+    ahead="f4[:, ::1], *6 * [f8[::1]], i8[::1], f8[:, ::1], f4[:, ::1]",
+)
 def stamp_craters(
     out: Float32Array,
     latitude_rad: FloatArray,
@@ -265,7 +276,7 @@ def stamp_craters(
                     out[i, j] += depth * (row[k] + f * (row[k + 1] - row[k]))
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(fastmath=True, error_model="numpy", nogil=True, ahead="f4[:, :, ::1], i4[:, ::1], i8, *3 * [f8[::1]]")
 def sample_pool(
     pool: Float32Array,
     table: Int32Array,

@@ -161,7 +161,10 @@ def _add_noise(
             noise[3 + i, 3 + j] += density * length_s
 
 
-@njit(error_model="numpy")
+@njit(
+    error_model="numpy",
+    ahead="f8[::1], f8, i8, f8[:, ::1], *4 * [f8[::1]], f8[:, ::1], f8[::1], f8, f8[::1], f8[::1]",
+)
 def propagate_arc(
     start: FloatArray,
     duration_s: float,
