@@ -67,20 +67,6 @@ def test_every_service_is_confined(name: str) -> None:
     assert not any("docker.sock" in volume for volume in service["volumes"])
 
 
-@pytest.mark.parametrize("name", sorted(set(SERVICES) - {"migrate", "backup"}))
-def test_every_service_that_stays_is_watched_and_comes_back(name: str) -> None:
-    service = SERVICES[name]
-    assert service["restart"] == "unless-stopped"
-    assert {"test", "interval", "timeout", "retries"} <= set(service["healthcheck"])
-
-
-def test_nothing_starts_before_what_it_needs() -> None:
-    for name in ("api", "worker", "scheduler"):
-        assert SERVICES[name]["depends_on"]["migrate"]["condition"] == "service_completed_successfully"
-        assert SERVICES[name]["depends_on"]["broker"]["condition"] == "service_healthy"
-    assert SERVICES["migrate"]["depends_on"]["db"]["condition"] == "service_healthy"
-
-
 def test_images_are_exact_versions() -> None:
     for name in ("db", "broker", "proxy"):
         assert EXACT.fullmatch(default_of(SERVICES[name]["image"]))
@@ -90,22 +76,6 @@ def test_images_are_exact_versions() -> None:
         assert given == written and EXACT.fullmatch(written)
     images = set(re.findall(r"^FROM (\S+)", DOCKERFILE, re.MULTILINE)) - {"sources"}
     assert images == {"${PYTHON_IMAGE}", "${NODE_IMAGE}"}
-
-
-def test_the_image_holds_the_displays_and_no_source_maps() -> None:
-    stage = DOCKERFILE.split("\nFROM ${NODE_IMAGE} AS displays\n")[1].split("\nFROM ")[0]
-    assert "npm ci --ignore-scripts" in stage and "find openmct -name '*.map' -delete" in stage
-    last = DOCKERFILE.split("\nFROM ")[-1]
-    (folder,) = re.findall(r"^COPY --from=displays /displays/openmct (\S+)$", last, re.MULTILINE)
-    assert f"LINNA_OPENMCT={folder}" in last
-
-
-def test_the_image_builds_the_documentation_into_the_package() -> None:
-    stage = DOCKERFILE.split(" AS help\n")[1].split("\nFROM ")[0]
-    assert "mkdocs build" in stage and "COPY docs docs\n" in stage
-    site = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["site_dir"]
-    copied = DOCKERFILE.index(f"COPY --from=help /src/{site} {site}\n")
-    assert copied < DOCKERFILE.index("pip install --no-deps .") < DOCKERFILE.index("COPY --from=build")
 
 
 def test_the_lock_file_of_the_displays_names_no_host_and_has_checksums() -> None:
@@ -440,33 +410,12 @@ def test_an_api_process_drains_before_it_ends_and_the_proxy_has_another_one() ->
         assert idle_s < drain_s and drain_s + 20 < int(SERVICES[name]["stop_grace_period"].removesuffix("s"))
 
 
-def test_the_documented_reload_names_the_configuration_of_the_proxy() -> None:
-    """The default configuration of nginx names another file with the number of the process."""
-    program, flag, configuration, *_ = SERVICES["proxy"]["entrypoint"]
-    reload = f"`docker compose exec proxy {program} {flag} {configuration} -s reload`"
-    for name in ("docs/deployment.md", "deploy/prometheus/linna.rules.yml"):
-        text = (ROOT / name).read_text()
-        assert reload in text and text.count("-s reload") == text.count(reload), name
-    assert f"./deploy/nginx.conf:{configuration}:ro" in SERVICES["proxy"]["volumes"]
-
-
 def test_a_renewed_certificate_is_seen_by_the_proxy() -> None:
     """A mount of one file keeps the old file when a new one takes its place."""
     (mount,) = (one for one in SERVICES["proxy"]["volumes"] if one.endswith(":/run/tls:ro"))
     assert mount == "${LINNA_SECRETS_DIR:-./secrets}/tls:/run/tls:ro"
     used = re.findall(r"ssl_certificate(?:_key)? (\S+);", (ROOT / "deploy/nginx.conf").read_text())
     assert used == [f"/run/tls/{name}" for name in CERTIFICATE]
-
-
-def test_the_documented_restore_uses_services_volumes_and_folders_that_exist() -> None:
-    text = (ROOT / "docs/deployment.md").read_text()
-    (volume, folder) = re.findall(r"--volume linna_(\w+):(/\w+):ro worker db restore /\w+/", text)[0]
-    assert COMPOSE["name"] == "linna" and volume in COMPOSE["volumes"]
-    assert f"{volume}:{folder}" in SERVICES["backup"]["volumes"]
-    assert "--no-deps --entrypoint linna migrate db upgrade\n" in text
-    # The worker writes the archive and has the role of the service, the migration that of the owner.
-    assert "archive:/var/lib/linna" in SERVICES["worker"]["volumes"]
-    assert "LINNA_MIGRATION_DATABASE_URL" in SERVICES["migrate"]["environment"]
 
 
 def test_the_image_runs_as_nobody_in_particular() -> None:

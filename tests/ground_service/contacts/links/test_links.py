@@ -6,15 +6,10 @@ correlation of a spacecraft whose telemetry comes over a link with reception tim
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import socket
 import struct
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -766,64 +761,6 @@ def test_the_next_owner_knows_when_a_contact_was_heard_last(
         station.accept()
         wait_for(lambda: either.read(store.open_contact, "lab") is None, "the end of the contact")
     assert service.silent_contacts(either) == []
-
-
-@pytest.mark.campaign
-def test_a_killed_owner_is_replaced_and_nothing_is_lost_or_sent_twice(
-    migrated_postgres: Callable[[], str], tmp_path: Path, station: Station, synthetic_pass: Any
-) -> None:
-    url = migrated_postgres()
-    stream = (synthetic_pass.folder / "downlink.cadu").read_bytes()
-    environment = os.environ | {
-        "LINNA_DATABASE_URL": url,
-        "LINNA_HOME": str(tmp_path / "home"),
-        "LINNA_ALLOW_DATABASE_OWNER": "true",
-    }
-    with open_ground(tmp_path / "home", database_url=url) as ground:
-        declare(ground, station.link("acknowledge = true"))
-        command = [sys.executable, "-m", "linna", "link", "run"]
-        processes = [subprocess.Popen(command, env=environment, stderr=subprocess.PIPE) for _ in range(2)]
-        try:
-            first = station.accept(60.0)
-            wait_for(lambda: service.get_link(ground, "lab").owner is not None, "an owner")
-            owner = service.get_link(ground, "lab").owner or ""
-            (killed,) = [one for one in processes if f":{one.pid}:" in owner]
-            before = released(ground, 2)
-            first.sendall(stream[: 6 * CADU + 100])
-            first.settimeout(20.0)
-            stored = 0
-            while stored < 6 * CADU + 100:
-                stored = int.from_bytes(first.recv(8), "big")
-            wait_for(
-                lambda: packets_of(bytes(station.telecommands)) == octets_of(ground, before),
-                "the telecommands",
-            )
-            os.kill(killed.pid, signal.SIGKILL)
-            killed.wait(20)
-            after = released(ground)
-            second = station.accept(60.0)
-            second.sendall(stream[stored:])
-            wait_for(
-                lambda: hash_of(ground) == expected_hash(tmp_path, synthetic_pass), "the same archive", 60.0
-            )
-            wait_for(
-                lambda: packets_of(bytes(station.telecommands))[2:] == octets_of(ground, after),
-                "the later telecommand",
-            )
-            assert f":{killed.pid}:" not in (service.get_link(ground, "lab").owner or "")
-        finally:
-            for one in processes:
-                one.terminate()
-                one.communicate(timeout=60)
-
-
-def expected_hash(tmp_path: Path, synthetic_pass: Any) -> str:
-    from ground_service.ingest.service import ingest_file
-
-    with open_ground(tmp_path / "whole") as ground:
-        if not hash_of(ground):
-            ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
-        return hash_of(ground)
 
 
 NS = 1_000_000_000
