@@ -116,6 +116,13 @@ def test_the_manifest_hashes_what_lies_in_the_archive(demo) -> None:
         assert (len(octets), hashlib.sha256(octets).hexdigest()) == (entry["bytes"], entry["sha256"])
 
 
+def test_the_same_scenario_gives_the_same_octets(demo, scenario_file: Path, tmp_path: Path) -> None:
+    _, out = demo
+    assert cli.run(["emulate", str(scenario_file), "--out", str(tmp_path / "again"), "--json"]) == 0
+    for name in ("downlink.cadu", "reference.oem", "catalogue.csv"):
+        assert (tmp_path / "again" / name).read_bytes() == (out / "pass" / name).read_bytes(), name
+
+
 def test_an_archive_is_not_written_over_something_else(scenario_file: Path, tmp_path: Path, capsys) -> None:
     (tmp_path / "precious.txt").write_text("do not touch")
     assert cli.run(["emulate", str(scenario_file), "--out", str(tmp_path)]) == 2

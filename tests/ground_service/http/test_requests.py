@@ -19,6 +19,7 @@ from fastapi.routing import APIRoute
 from pydantic import BaseModel
 from starlette.requests import ClientDisconnect
 
+from ground_service import tracing
 from ground_service.app import create_app
 from ground_service.errors import DatabaseUnavailable, FileDamaged, StorageFull, StorageReadOnly
 from ground_service.ground import open_ground
@@ -275,10 +276,13 @@ def test_a_log_entry_is_one_json_object_with_what_was_passed() -> None:
             "linna", logging.ERROR, "f.py", 1, "job %s\nfailed", ("7",), sys.exc_info()
         )
     record.job = "7"
-    line = JsonFormatter().format(record)
-    assert "\n" not in line
+    assert "trace_id" not in json.loads(JsonFormatter().format(record))
+    with tracing.span("request"):
+        line, trace_id = JsonFormatter().format(record), tracing.trace_id()
+    assert "\n" not in line and trace_id is not None
     entry = json.loads(line)
     assert (entry["level"], entry["message"], entry["job"]) == ("error", "job 7\nfailed", "7")
+    assert entry["trace_id"] == trace_id
     assert "ValueError: broken" in entry["trace"]
     assert entry["time"].endswith("+00:00")
     for style in ("text", "json"):
