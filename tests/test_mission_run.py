@@ -1,7 +1,5 @@
 """A simulated mission from end to end: spacecraft, stations, ground, reports; and what goes on after a stop."""
 
-from __future__ import annotations
-
 import json
 import sqlite3
 from contextlib import closing, nullcontext

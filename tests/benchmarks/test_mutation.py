@@ -3,8 +3,6 @@ healthy passes, against the published factors of one-sided normal tolerance boun
 rows with peers, what is missing on the machine, and rows that contradict the expectation.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The compose file and the image as a reviewer reads them; there is no container engine to start them with here."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

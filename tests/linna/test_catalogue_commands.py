@@ -3,8 +3,6 @@ proposals, contradictions with a mission description, and unknown settings. Comm
 scripts rely keep their names.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """The spacecraft commanded by the ground: windows, contacts, storage, clock, state."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import selectors

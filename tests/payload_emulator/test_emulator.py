@@ -2,8 +2,6 @@
 finds.  Errors of the reference: their sizes, their dynamics, and that shipped scenarios have them.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

@@ -2,8 +2,6 @@
 killed session repeats them from.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import struct

@@ -2,8 +2,6 @@
 the scores of a session count, on errors made by hand.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -2,8 +2,6 @@
 form of a report. Content of figures, checked by the drawn geometry.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -4,8 +4,6 @@ of telecommands by name, with units and ranges. Estimates of the filter in packe
 triangle) and of today (upper triangle).  Thumbnails: the octets, and what is refused.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import math

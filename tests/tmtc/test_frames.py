@@ -1,7 +1,5 @@
 """Telecommand channels as control words of a downlink show them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from spacepackets.ccsds.tm_frame import TmFramePrimaryHeader

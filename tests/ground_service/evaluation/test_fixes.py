@@ -2,8 +2,6 @@
 beside the catalogue.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -6,8 +6,6 @@ tables of the chi-square distribution, hand-computed quadratics. Projection into
 over high terrain, against a projection written out here.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from types import SimpleNamespace

@@ -2,8 +2,6 @@
 reports from the records of a station.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 from itertools import pairwise

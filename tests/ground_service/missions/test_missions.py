@@ -2,8 +2,6 @@
 Automation and receivers of notifications in a mission description, and those of earlier versions.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 from concurrent.futures import ThreadPoolExecutor

@@ -2,8 +2,6 @@
 Links and resources of a mission description: valid ones, and one clear line for each fault.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@ of both packet versions in the archive, and their consistency in the report. Ima
 downlinked thumbnails and frames of pass archives, on spacecraft time.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@ builds on the flight code are checked in the sandbox before registration. Verdic
 and why the verdict is not pass.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import subprocess
 import tempfile

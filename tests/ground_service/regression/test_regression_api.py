@@ -1,7 +1,5 @@
 """Builds, archives and regressions over HTTP."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Callable

@@ -3,8 +3,6 @@ Samples of the gates: figures of one estimator by frame, units of the evidence. 
 and Holm's procedure: against printed examples and simulation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any

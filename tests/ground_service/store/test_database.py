@@ -2,8 +2,6 @@
 database cannot hold are refused in one line on both databases, without the address of the database.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import sqlite3

@@ -3,8 +3,6 @@ one for each replay and one for the verdict. Verification derives everything aga
 their first ingest, and compares.
 """
 
-from __future__ import annotations
-
 import itertools
 import threading
 from collections.abc import Callable

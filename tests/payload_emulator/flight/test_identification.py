@@ -2,8 +2,6 @@
 Craters projected from the on-board catalogue, and the derivatives the filter lives on.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -5,8 +5,6 @@ The reference holds all states in one vector, differentiates its own measurement
 Gauss-Newton on the least-squares problem and inverts the normal matrix: none of it shares code or form with the filter.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@ by telecommand, and what each mode allows. Settings that survive resets, interru
 The document about the payload's ports, modes, parameters and faults is the current one, and complete.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from typing import Any

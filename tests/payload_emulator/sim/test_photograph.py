@@ -2,8 +2,6 @@
 Kidnaps and burns of the true flight.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

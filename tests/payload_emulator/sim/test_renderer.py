@@ -2,8 +2,6 @@
 its confusion table says.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -2,8 +2,6 @@
 processor time of the simulated board; faults as text.
 """
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np

@@ -3,8 +3,6 @@ persons: from the effects of telecommands, raised or relaxed by a mission descri
 telecommand for every set of reports that can come down about it (ECSS-E-ST-70-41C, service 1).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import combinations
 from pathlib import Path

@@ -3,8 +3,6 @@ processes on PostgreSQL: one operates the link; after it is killed, the other ta
 correlation of a spacecraft whose telemetry comes over a link with reception times.
 """
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import struct

@@ -1,7 +1,5 @@
 """Landmarks learned from synthetic passes whose ground catalogue lacks known craters."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import threading
