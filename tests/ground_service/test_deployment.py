@@ -408,12 +408,33 @@ def test_an_api_process_drains_before_it_ends_and_the_proxy_has_another_one() ->
         assert idle_s < drain_s and drain_s + 20 < int(SERVICES[name]["stop_grace_period"].removesuffix("s"))
 
 
+def test_the_documented_reload_names_the_configuration_of_the_proxy() -> None:
+    """The default configuration of nginx names another file with the number of the process."""
+    program, flag, configuration, *_ = SERVICES["proxy"]["entrypoint"]
+    reload = f"`docker compose exec proxy {program} {flag} {configuration} -s reload`"
+    for name in ("docs/deployment.md", "deploy/prometheus/linna.rules.yml"):
+        text = (ROOT / name).read_text()
+        assert reload in text and text.count("-s reload") == text.count(reload), name
+    assert f"./deploy/nginx.conf:{configuration}:ro" in SERVICES["proxy"]["volumes"]
+
+
 def test_a_renewed_certificate_is_seen_by_the_proxy() -> None:
     """A mount of one file keeps the old file when a new one takes its place."""
     (mount,) = (one for one in SERVICES["proxy"]["volumes"] if one.endswith(":/run/tls:ro"))
     assert mount == "${LINNA_SECRETS_DIR:-./secrets}/tls:/run/tls:ro"
     used = re.findall(r"ssl_certificate(?:_key)? (\S+);", (ROOT / "deploy/nginx.conf").read_text())
     assert used == [f"/run/tls/{name}" for name in CERTIFICATE]
+
+
+def test_the_documented_restore_uses_services_volumes_and_folders_that_exist() -> None:
+    text = (ROOT / "docs/deployment.md").read_text()
+    (volume, folder) = re.findall(r"--volume linna_(\w+):(/\w+):ro worker db restore /\w+/", text)[0]
+    assert COMPOSE["name"] == "linna" and volume in COMPOSE["volumes"]
+    assert f"{volume}:{folder}" in SERVICES["backup"]["volumes"]
+    assert "--no-deps --entrypoint linna migrate db upgrade\n" in text
+    # The worker writes the archive and has the role of the service, the migration that of the owner.
+    assert "archive:/var/lib/linna" in SERVICES["worker"]["volumes"]
+    assert "LINNA_MIGRATION_DATABASE_URL" in SERVICES["migrate"]["environment"]
 
 
 def test_the_image_runs_as_nobody_in_particular() -> None:

@@ -115,6 +115,14 @@ def test_every_metric_of_the_condition_is_drawn_or_has_an_alert(samples: dict[st
     assert families == {re.sub(r"_(bucket|total)$", "", name) for name in used}
 
 
+def test_every_alert_has_a_severity_a_summary_and_an_action() -> None:
+    names = [rule["alert"] for rule in alerts()]
+    assert len(set(names)) == len(names) >= 10
+    for rule in alerts():
+        assert rule["labels"]["severity"] in ("page", "ticket")
+        assert set(rule["annotations"]) == {"summary", "action"}
+
+
 def test_the_limits_of_the_status_are_those_of_the_alerts() -> None:
     limits = {
         rule["alert"]: [float(word) for word in re.findall(r"[<>] ([0-9.]+)", rule["expr"])]
