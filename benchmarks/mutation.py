@@ -116,10 +116,7 @@ GROUPS = {
     ),
     "gates": Group(
         ("ground_service/regression/gates/core.py", "ground_service/regression/gates/statistics.py"),
-        (
-            f"{_GROUND_TESTS}/regression/test_regression_gates.py",
-            f"{_GROUND_TESTS}/regression/test_regression_statistics.py",
-        ),
+        (f"{_GROUND_TESTS}/regression/test_regression_gates.py",),
     ),
     "filter": Group(
         tuple(
@@ -168,7 +165,6 @@ GROUPS = {
         ),
         (
             f"{_GROUND_TESTS}/contacts/commanding/test_commanding.py",
-            f"{_GROUND_TESTS}/contacts/commanding/test_verification.py",
             f"{_FLIGHT_TESTS}/test_commanding.py",
         ),
     ),

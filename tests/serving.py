@@ -1,7 +1,5 @@
 """Waiting for a condition, and a service on a private port, for all tests."""
 
-from __future__ import annotations
-
 import threading
 import time
 import warnings

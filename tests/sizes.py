@@ -3,8 +3,6 @@
 `python tests/sizes.py` prints the sizes, and what the uncommitted change adds; `--write` lowers the table to them.
 """
 
-from __future__ import annotations
-
 import ast
 import csv
 import io

@@ -1,7 +1,10 @@
 """The cost of the suite: collection without heavy libraries, and folders compared with the table."""
 
 import csv
+from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -24,9 +27,22 @@ def test_a_new_folder_may_cost_little() -> None:
     assert cost.grown({}, {"small": 19.0, "large": 21.0}) == ["large: 21 turns, limit 20"]
 
 
-def test_the_table_is_read_as_it_was_written(tmp_path: Path) -> None:
-    cost.write(tmp_path / "cost.csv", {"tests/b": 2.4, "tests/a": 10.0})
-    assert cost.read(tmp_path / "cost.csv") == {"tests/a": 10.0, "tests/b": 2.0}
+def test_what_was_measured_is_written_and_read_as_turns_by_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = tmp_path / "build" / "cost.csv"
+    monkeypatch.setattr(cost, "MEASURED", written)
+    monkeypatch.setattr(cost, "turn_s", lambda: 0.5)
+    measured, lines = cost.Cost(), []
+    measured.files = Counter({"tests/b/test_x.py": 0.7, "tests/b/test_y.py": 0.5, "tests/a/test_z.py": 5.0})
+    report: Any = SimpleNamespace(section=lines.append, write_line=lines.append)
+    config: Any = SimpleNamespace(
+        args_source=pytest.Config.ArgsSource.TESTPATHS,
+        getoption={"keyword": "", "markexpr": "not campaign"}.get,
+    )
+    measured.pytest_terminal_summary(report, config)
+    assert cost.read(written) == {"tests/a": 10.0, "tests/b": 2.0}
+    assert [line.split()[-1] for line in lines[1:3]] == ["tests/a", "tests/b"]
 
 
 def test_every_entry_of_the_campaigns_is_a_test_with_a_twin() -> None:

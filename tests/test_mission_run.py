@@ -1,7 +1,5 @@
 """A simulated mission from end to end: spacecraft, stations, ground, reports; and what goes on after a stop."""
 
-from __future__ import annotations
-
 import json
 import sqlite3
 from contextlib import closing, nullcontext
@@ -18,20 +16,17 @@ from ground_service.clock import mission_now_ns, set_mission_clock
 from ground_service.ground import open_ground
 from ground_service.http.times import UtcTime
 from ground_service.planning.request_model import PlannedCandidate, RequestPlan
-from ground_service.store import telemetry
-from ground_service.store.vehicles import vehicle_id
 from linna import cli
 from lunar.boxes import Box, inside_box
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
 from lunar.messages.ephemeris_files import load_ephemeris
-from lunar.timescales import format_utc, parse_utc
+from lunar.timescales import parse_utc
 from payload_emulator.errors import LinkError, ScenarioError
-from payload_emulator.session.archive.emulator import emulate
 from payload_emulator.session.archive.mission import live_mission_text
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.world.regions import observed_boxes
-from payload_emulator.session.world.world import first_utc_ns, open_world
+from payload_emulator.session.world.world import open_world
 from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.disturbances import UNDISTURBED, ReferenceDisturbances, load_disturbances
 from studies.mission_run.dynamics import FlightDynamics
@@ -40,16 +35,11 @@ from studies.mission_run.ground import EmbeddedGround
 from studies.mission_run.run import MissionRun, RunTerms, _take_turns, read_progress, run_fleet, run_mission
 from tests.mission_reports import figures_of
 from tests.scenarios import commanded_scenario
-from tmtc.dictionary.payload import APID_DETECTIONS, DICTIONARY
-from tmtc.downlink import decode
-from tmtc.packets.space_packets import unpack_primary_header
-from tmtc.packets.stream import cut_packets
 
 SCENARIO = commanded_scenario("half-a-day", "[clock]\noffset_s = 0.4\ndrift_ppm = 5.0\n")
 SECOND = f'spacecraft = "Second"\nspacecraft_id = 77{SCENARIO.replace("seed = 3", "seed = 4")}'
 DRIFT_PPM = 5.0
 
-NS = 1_000_000_000
 
 Figures = dict[str, Any]
 TERMS = RunTerms(days=0.5, windows_per_day=1, window_s=600.0)
@@ -60,11 +50,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Figures]:
     """Folder and figures of a run without a stop."""
     folder = tmp_path_factory.mktemp("whole")
     return folder, run_mission(parse_scenario(SCENARIO), DataFolder(None), folder, TERMS, lambda line: None)
-
-
-def images_of(octets: bytes) -> Any:
-    """Return the reports of detections in packets that are end to end."""
-    return DICTIONARY.unpack_many(octets, cut_packets(octets))["detections"]
 
 
 @pytest.mark.slow
@@ -100,43 +85,6 @@ def test_half_a_day_is_planned_flown_received_and_reported_without_a_person(
         run_mission(
             parse_scenario(SCENARIO), DataFolder(None), folder, replace(TERMS, days=0.75), said.append
         )
-
-
-@pytest.mark.slow
-def test_a_window_of_the_run_has_the_images_and_detections_of_an_archive(
-    whole: tuple[Path, Figures], tmp_path: Path
-) -> None:
-    folder, _ = whole
-    with open_ground(folder / "ground") as ground, ground.database.reading() as connection:
-        vehicle = vehicle_id(connection, 76, "flight")
-        received = images_of(telemetry.packet_octets(connection, vehicle, APID_DETECTIONS, 0, 2**62))
-    world = open_world(parse_scenario(SCENARIO), DataFolder(None))
-    start = first_utc_ns(world, int(received.columns["image_ticks"][0]))
-    # The images of the board are 15 s of its clock apart, which is fast by 5 ppm.
-    text = (
-        SCENARIO.replace(
-            'search = "none"', f'search = "none"\nstart = "{format_utc(start)[:19]}.{start % NS:09d}Z"'
-        )
-        .replace("duration_s = 60.0", "duration_s = 610.0")
-        .replace("[camera]", f"[camera]\nframe_interval_s = {15.0 * (1.0 - 1e-6 * DRIFT_PPM)}")
-        .replace("[clock]", '[clock]\nreference = "2029-08-07T00:00:00Z"')
-    )
-    emulate(parse_scenario(text), DataFolder(None), tmp_path / "archive", frames_kept=0)
-    found = decode((tmp_path / "archive" / "downlink.cadu").read_bytes())
-    assert found.complete
-    packets = found.cut.packets(found.buffer)
-    archived = images_of(
-        b"".join(one for one in packets if unpack_primary_header(one).apid == APID_DETECTIONS)
-    )
-    assert len(archived.columns["count"]) > 38
-    for name, values in archived.columns.items():
-        # Times are rounded to ticks of 15 us here and there, which can move a centre by its smallest unit.
-        different = values.astype(np.int64) - received.columns[name].astype(np.int64)
-        assert np.max(np.abs(different)) <= (name == "image_ticks"), name
-    for name, values in archived.items.items():
-        other = np.abs(values.astype(float) - received.items[name])
-        assert np.count_nonzero(other) <= 0.01 * other.size * (name in ("u_px", "v_px")), name
-        assert np.max(other) <= 1 / 64, name
 
 
 def assert_same_figures(one: dict[str, Any], other: dict[str, Any]) -> None:

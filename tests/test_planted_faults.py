@@ -1,7 +1,5 @@
 """Faults that are planted in short flights are flagged by the requirement that they break, and by no other."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 

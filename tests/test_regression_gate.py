@@ -4,8 +4,6 @@ The passes are made here, on the procedural Moon (level 2): a few frames in the 
 of the shipped suite.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

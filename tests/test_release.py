@@ -1,7 +1,5 @@
 """Signature of a release: what was changed after it was signed is refused."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,13 +1,23 @@
-"""Groups of the mutation tests, and excluded mutants."""
+"""Groups of the mutation tests, and excluded mutants. The figures of how two renderings agree. Limits from
+healthy passes, against the published factors of one-sided normal tolerance bounds. The list of benchmarks:
+rows with peers, what is missing on the machine, and rows that contradict the expectation.
+"""
 
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from benchmarks import mutation, mutation_plugin
+from benchmarks import _rows, mutation, mutation_plugin
+from benchmarks.__main__ import NAMES, main
+from benchmarks._rows import NotMeasured, Row, line, needs, report
+from benchmarks.render import compare_renderings, thinned
+from benchmarks.requirement_bounds import tolerance_bound
+from payload_emulator.sim.render.renderer import Rendering
 
 
 @pytest.mark.parametrize("name", sorted(mutation.GROUPS))
@@ -100,3 +110,109 @@ def test_the_fastest_files_are_run_first_and_their_tests_stay_in_order(
     path.write_text(json.dumps({"duration_by_test": durations}))
     mutation_plugin.pytest_collection_modifyitems(items)
     assert [item.nodeid for item in items] == [names[3], names[2], names[4], names[0], names[1]]
+
+
+def rendering(dark_columns, radiance=0.02, size=16):
+    lit = np.ones((size, size), np.float32)
+    lit[:, :dark_columns] = 0.0
+    bright = np.linspace(0.5, 1.5, size, dtype=np.float32)[:, None] * np.float32(radiance)
+    return Rendering(
+        np.where(lit > 0, bright, 0.0).astype(np.float32), lit, np.full((size, size), 2e4, np.float32)
+    )
+
+
+def test_the_iou_of_shadows_is_counted_over_all_views():
+    found = compare_renderings([rendering(4), rendering(8)], [rendering(6), rendering(8)])
+    # 4 of 6 columns and 8 of 8: 12 of 14.
+    assert found.shadow_iou == pytest.approx(12.0 / 14.0)
+    assert found.dark_pixels == 14 * 16 and found.views == 2
+
+
+def test_radiance_is_compared_with_the_references_mean():
+    found = compare_renderings([rendering(0, 0.02)], [rendering(0, 0.022)])
+    # A tenth too bright everywhere: 0.1 sqrt(mean b^2) / mean b for b even from 0.5 to 1.5.
+    b = np.linspace(0.5, 1.5, 16)
+    assert found.radiance_rmse == pytest.approx(0.1 * math.sqrt(np.mean(b**2)), rel=1e-4)
+    assert found.correlation == pytest.approx(1.0)
+
+
+def test_without_shadow_there_is_no_iou():
+    assert math.isnan(compare_renderings([rendering(0)], [rendering(0)]).shadow_iou)
+    assert math.isnan(compare_renderings([], []).correlation)
+
+
+def test_thinning_takes_the_pixels_that_the_march_takes():
+    thin = thinned(rendering(4), 4)
+    assert thin.lit.shape == (4, 4) and thin.lit[0].tolist() == [0.0, 1.0, 1.0, 1.0]
+
+
+VALUES = np.tile([-1.0, 1.0], 5)
+
+
+@pytest.mark.parametrize(("confidence", "factor"), [(0.95, 2.911), (0.90, 2.568)])
+def test_the_bound_of_ten_values_has_the_published_factor(confidence: float, factor: float) -> None:
+    values = list(3.0 + 2.0 * VALUES / np.std(VALUES, ddof=1))
+    assert tolerance_bound(values, True, 0.95, confidence) == pytest.approx(3.0 + 2.0 * factor, abs=2e-3)
+    assert tolerance_bound(values, False, 0.95, confidence) == pytest.approx(3.0 - 2.0 * factor, abs=2e-3)
+
+
+def test_one_pass_gives_no_bound() -> None:
+    assert np.isnan(tolerance_bound([1.0], True, 0.95, 0.9))
+
+
+@pytest.mark.parametrize(("unit", "ratio"), [("packets/s", 2.0), ("s", 0.5), ("packets", 2.0), ("MiB", 0.5)])
+def test_a_ratio_above_one_is_better_than_the_peer(unit: str, ratio: float) -> None:
+    assert Row("job", 10.0, unit, "peer", 5.0).ratio == ratio
+    assert Row("job", 10.0, unit).ratio is None
+
+
+def test_a_line_names_the_peer_and_the_contradiction() -> None:
+    text = line(Row("job", 10.0, "s", "other program", 5.0, "values differ"))
+    assert "0.50 x" in text and "other program: 5" in text and text.endswith("DIFFERENT: values differ")
+    assert "no peer" in line(Row("job", 10.0, "s")) and "DIFFERENT" not in line(Row("job", 10.0, "s"))
+
+
+def test_a_missing_program_is_named() -> None:
+    with pytest.raises(NotMeasured, match=r"^Thing is not installed$"):
+        needs("Thing", "no-such-program-1", "no-such-program-2")
+    assert needs("a shell", "no-such-program-1", "sh").endswith("sh")
+
+
+@pytest.mark.parametrize(
+    ("rows", "fault", "status"),
+    [
+        ([Row("job", 1.0, "s")], "", 0),
+        ([], "not measured: Chromium is not installed", 0),
+        ([Row("job", 1.0, "s", wrong="values differ")], "", 1),
+        ([], "exit status 1", 1),
+        ([Row("job", 1.0, "s")], "did not finish in 300 s", 1),
+    ],
+)
+def test_the_status_tells_contradictions_from_missing_programs(
+    rows: list[Row],
+    fault: str,
+    status: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(_rows, "run", lambda names: iter([(names[0], rows, fault)]))
+    assert report(["tmtc"], as_json=True) == status
+    found = json.loads(capsys.readouterr().out)
+    assert [one["benchmark"] for one in found] == ["tmtc"] and found[0]["fault"] == fault
+    assert report(["tmtc"], as_json=False) == status
+    assert fault in capsys.readouterr().out
+
+
+def test_an_unknown_name_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["year"]) == 2
+    assert capsys.readouterr().err.startswith("benchmarks: expected tmtc, ")
+
+
+def test_every_benchmark_of_the_list_yields_rows_in_a_process_of_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    import importlib
+
+    assert all(callable(importlib.import_module(f"benchmarks.{name}").rows) for name in NAMES)
+    monkeypatch.setattr(_rows, "LIMIT_S", 0.01)
+    assert list(_rows.run(["tmtc"])) == [("tmtc", [], "did not finish in 0 s")]

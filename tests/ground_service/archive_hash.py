@@ -1,7 +1,5 @@
 """One hash of everything a vehicle's archive holds, independent of the order in which it was filled."""
 
-from __future__ import annotations
-
 import hashlib
 import struct
 from typing import Any

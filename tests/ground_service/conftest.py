@@ -4,8 +4,6 @@ The orbit is an exact circle, the craters are placed by chance, the detections a
 noise and known faults, and the navigation states carry errors put in on purpose, so every figure is known beforehand.
 """
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json

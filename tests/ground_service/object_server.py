@@ -1,7 +1,5 @@
 """Object store for tests: a local server with the S3 interface, which can be stopped and started with its objects."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Schema of a database as plain values, to compare two databases."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from sqlalchemy import inspect, text

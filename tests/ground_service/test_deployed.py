@@ -1,7 +1,5 @@
 """The processes of the compose file without containers, from its one declaration: a pass through each overlay."""
 
-from __future__ import annotations
-
 import os
 import re
 import ssl

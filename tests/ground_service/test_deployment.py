@@ -1,7 +1,5 @@
 """The compose file and the image as a reviewer reads them; there is no container engine to start them with here."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -67,20 +65,6 @@ def test_every_service_is_confined(name: str) -> None:
     assert not any("docker.sock" in volume for volume in service["volumes"])
 
 
-@pytest.mark.parametrize("name", sorted(set(SERVICES) - {"migrate", "backup"}))
-def test_every_service_that_stays_is_watched_and_comes_back(name: str) -> None:
-    service = SERVICES[name]
-    assert service["restart"] == "unless-stopped"
-    assert {"test", "interval", "timeout", "retries"} <= set(service["healthcheck"])
-
-
-def test_nothing_starts_before_what_it_needs() -> None:
-    for name in ("api", "worker", "scheduler"):
-        assert SERVICES[name]["depends_on"]["migrate"]["condition"] == "service_completed_successfully"
-        assert SERVICES[name]["depends_on"]["broker"]["condition"] == "service_healthy"
-    assert SERVICES["migrate"]["depends_on"]["db"]["condition"] == "service_healthy"
-
-
 def test_images_are_exact_versions() -> None:
     for name in ("db", "broker", "proxy"):
         assert EXACT.fullmatch(default_of(SERVICES[name]["image"]))
@@ -90,22 +74,6 @@ def test_images_are_exact_versions() -> None:
         assert given == written and EXACT.fullmatch(written)
     images = set(re.findall(r"^FROM (\S+)", DOCKERFILE, re.MULTILINE)) - {"sources"}
     assert images == {"${PYTHON_IMAGE}", "${NODE_IMAGE}"}
-
-
-def test_the_image_holds_the_displays_and_no_source_maps() -> None:
-    stage = DOCKERFILE.split("\nFROM ${NODE_IMAGE} AS displays\n")[1].split("\nFROM ")[0]
-    assert "npm ci --ignore-scripts" in stage and "find openmct -name '*.map' -delete" in stage
-    last = DOCKERFILE.split("\nFROM ")[-1]
-    (folder,) = re.findall(r"^COPY --from=displays /displays/openmct (\S+)$", last, re.MULTILINE)
-    assert f"LINNA_OPENMCT={folder}" in last
-
-
-def test_the_image_builds_the_documentation_into_the_package() -> None:
-    stage = DOCKERFILE.split(" AS help\n")[1].split("\nFROM ")[0]
-    assert "mkdocs build" in stage and "COPY docs docs\n" in stage
-    site = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["site_dir"]
-    copied = DOCKERFILE.index(f"COPY --from=help /src/{site} {site}\n")
-    assert copied < DOCKERFILE.index("pip install --no-deps .") < DOCKERFILE.index("COPY --from=build")
 
 
 def test_the_lock_file_of_the_displays_names_no_host_and_has_checksums() -> None:

@@ -1,7 +1,5 @@
 """Documents of others are read with limits of depth, digits, size and count: each fault is one line."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

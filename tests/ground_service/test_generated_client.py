@@ -1,7 +1,5 @@
 """A client generated from the OpenAPI document by openapi-python-client works against the service."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

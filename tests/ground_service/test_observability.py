@@ -1,7 +1,6 @@
 """Alert rules and dashboard name metrics that exist; alerts fire; a request and its job have one trace."""
 
 import json
-import logging
 import re
 import shutil
 import subprocess
@@ -24,7 +23,6 @@ from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import enter_job
 from ground_service.jobs.store import get_job
-from ground_service.logs import JsonFormatter
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from ground_service.store import repository
@@ -123,16 +121,6 @@ def test_every_alert_has_a_severity_a_summary_and_an_action() -> None:
     for rule in alerts():
         assert rule["labels"]["severity"] in ("page", "ticket")
         assert set(rule["annotations"]) == {"summary", "action"}
-
-
-def test_the_panels_of_the_dashboard_do_not_overlap() -> None:
-    covered: set[tuple[int, int]] = set()
-    for panel in panels():
-        place = panel["gridPos"]
-        cells = {(place["x"] + x, place["y"] + y) for x in range(place["w"]) for y in range(place["h"])}
-        assert not cells & covered and max(x for x, _ in cells) < 24
-        covered |= cells
-    assert len({panel["id"] for panel in panels()}) == len(panels())
 
 
 def test_the_limits_of_the_status_are_those_of_the_alerts() -> None:
@@ -401,51 +389,8 @@ def test_the_newest_complete_backup_counts(ground: Ground, tmp_path: Path) -> No
     assert newest_backup_utc_ns(tmp_path / "backups") == 3000 * S
 
 
-class Lines(logging.Handler):
-    """Log entries as they are written."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.entries: list[dict[str, Any]] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.entries.append(json.loads(JsonFormatter().format(record)))
-
-
-@pytest.fixture
-def lines() -> Iterator[Lines]:
-    handler = Lines()
-    loggers = [logging.getLogger(name) for name in ("ground_service", "ground_service.worker")]
-    levels = [logger.level for logger in loggers]
-    loggers[0].addHandler(handler)
-    for logger in loggers:
-        logger.setLevel(logging.INFO)
-    yield handler
-    loggers[0].removeHandler(handler)
-    for logger, level in zip(loggers, levels, strict=True):
-        logger.setLevel(level)
-
-
 TRACE = "4bf92f3577b34da6a3ce929d0e0e4736"
 PARENT = f"00-{TRACE}-00f067aa0ba902b7-01"
-
-
-def test_the_log_of_a_request_and_of_its_job_have_the_trace_of_the_caller(
-    tmp_path: Path, synthetic_pass: Any, lines: Lines
-) -> None:
-    with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as client:
-        pass_id = import_archive(client.app.state.ground, synthetic_pass.folder)
-        lines.entries.clear()
-        asked = client.post(f"/api/v1/passes/{pass_id}/reports", headers={"traceparent": PARENT})
-        assert asked.status_code in (201, 202), asked.text
-        client.get("/api/v1/passes", headers={"traceparent": "00-" + 32 * "0" + "-00f067aa0ba902b7-01"})
-        client.get("/api/v1/passes")
-    told = {entry["message"].split(" (")[0].split()[0]: entry.get("trace_id") for entry in lines.entries}
-    assert told["POST"] == told["job"] == TRACE
-    mine = [entry["trace_id"] for entry in lines.entries if entry["message"].startswith("GET")]
-    assert (
-        len(set(mine)) == 2 and TRACE not in mine and all(re.fullmatch("[0-9a-f]{32}", one) for one in mine)
-    )
 
 
 def test_a_job_that_another_process_does_later_belongs_to_the_trace(ground: Ground) -> None:

@@ -1,7 +1,5 @@
 """Description of the HTTP API: names, summaries, errors, times, page links and query keys of all operations."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from datetime import datetime, timedelta

@@ -1,4 +1,6 @@
-"""Starting and ending the server: what is imported, refused addresses, draining."""
+"""Starting and ending the server: what is imported, refused addresses, draining. Names and reasons are one
+printable line.
+"""
 
 import contextlib
 import os
@@ -13,13 +15,15 @@ from pathlib import Path
 import httpx
 import pytest
 import uvicorn
+from pydantic import BaseModel, Field, ValidationError
 
 from ground_service.access.service import add_user
 from ground_service.app import create_app
-from ground_service.errors import ServerError
+from ground_service.errors import InvalidInput, ServerError
 from ground_service.ground import open_ground
 from ground_service.server import _server, bind, serve
 from ground_service.settings import Settings
+from ground_service.text import LINE_PATTERN_JSON, require_line
 from studies.harness.parts import listens
 from tests.ground_service.conftest import free_port, wait_for
 
@@ -107,3 +111,32 @@ def test_a_terminated_server_drains_before_it_ends(tmp_path: Path) -> None:
     running.join(60)
     with pytest.raises(httpx.ConnectError):
         ask("/readyz")
+
+
+BAD = ["a\nb", "\x1b[31m", "\x00", "tab\t", "\x7f", "\x85", "\u2028", "\u202e", "\u2066"]
+
+
+class Named(BaseModel):
+    """A model with a name, as requests have them."""
+
+    name: str = Field(pattern=LINE_PATTERN_JSON)
+
+
+@pytest.mark.parametrize("text", ["evening pass", "Überflug 7", "\u6708 \U0001f315", "a/b: c=1"])
+def test_a_printable_line_is_taken_as_it_is(text: str) -> None:
+    assert require_line(text, "window", "name") == Named(name=text).name == text
+
+
+@pytest.mark.parametrize("text", BAD)
+def test_control_characters_are_refused_and_shown_by_their_codes(text: str) -> None:
+    with pytest.raises(InvalidInput, match="window, name: expected a line of 1 to 200 characters") as refused:
+        require_line(text, "window", "name")
+    assert str(refused.value).isprintable()
+    with pytest.raises(ValidationError):
+        Named(name=text)
+
+
+@pytest.mark.parametrize("text", ["", "x" * 201, "\ud800", 7, None])
+def test_what_is_no_line_is_refused(text: object) -> None:
+    with pytest.raises(InvalidInput):
+        require_line(text, "pass", "name")

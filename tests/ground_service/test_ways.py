@@ -1,7 +1,5 @@
 """One window flown in every way: an archive, its replay, live with the operator, live and commanded by the ground."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import socket

@@ -1,6 +1,7 @@
-"""Commands about catalogues and identification: figures as JSON, bad input in one line."""
-
-from __future__ import annotations
+"""Commands about catalogues and identification: figures as JSON, bad input in one line. `linna link check`:
+proposals, contradictions with a mission description, and unknown settings. Commands and options on which
+scripts rely keep their names.
+"""
 
 import hashlib
 import json
@@ -10,11 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from linna.cli import run
+from linna.cli import GROUPS, run
+from linna.help import example
+from linna.parser import command_parser
 from lunar.catalogue import make_catalogue, save_catalogue
 from payload_emulator.sim.terrain.registration import parse_registration
 from tests.payload_emulator.sim.rasters import write_raster
+from tests.tmtc.test_downlink import make_packets
 from tmtc.dictionary.payload import DICTIONARY
+from tmtc.downlink import encode_cadus
+from tmtc.link.cadu import ASM
+from tmtc.packets.space_packets import pack_packet
 
 METRES_PER_DEG = math.radians(1.0) * 1_737_400.0
 
@@ -113,3 +120,121 @@ def test_bad_input_is_one_line_that_names_it(
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert expected in error
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    path = tmp_path / "station.cadu"
+    path.write_bytes(encode_cadus(make_packets(120), spacecraft_id=76))
+    return path
+
+
+def figures(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict]:
+    status = run(["link", "check", *arguments, "--json"])
+    return status, json.loads(capsys.readouterr().out)
+
+
+def test_settings_come_with_their_evidence(recording, capsys):
+    status, found = figures(capsys, str(recording))
+    assert status == 0 and not found["ambiguous"]
+    assert found["settings"]["frame_length"] == 1115 and found["settings"]["randomiser"] == "legacy"
+    best = found["evidence"][0]
+    assert best["codewords_clean"] == best["checksums_hold"] == best["headers_regular"] == 1.0
+    assert best["packets"] > 100
+
+
+@pytest.mark.parametrize(("randomiser", "status"), [("legacy", 0), ("long", 1)])
+def test_a_mission_description_is_compared(recording, capsys, tmp_path, randomiser, status):
+    mission = tmp_path / "mission.toml"
+    mission.write_text(f'name = "test"\n[link]\nframe_length = 1115\nrandomiser = "{randomiser}"\n')
+    code, found = figures(capsys, str(recording), "--mission", str(mission))
+    assert code == status
+    expected = ["randomiser: the mission states long, the recording has legacy"] if status else []
+    assert found["contradicts_mission"] == expected
+
+
+def test_frames_that_nothing_proves_are_inconclusive(capsys, tmp_path):
+    noise = np.random.default_rng(3).integers(0, 256, (30, 700), dtype=np.uint8)
+    noise[:, :4] = np.frombuffer(ASM, dtype=np.uint8)
+    path = tmp_path / "noise.cadu"
+    path.write_bytes(noise.tobytes())
+    status, found = figures(capsys, str(path))
+    assert status == 3 and found["settings"] is None and found["distances"]["700"] == 29
+
+
+def test_packets_without_frames_are_told_and_noise_is_refused(capsys, tmp_path):
+    path = tmp_path / "packets.bin"
+    path.write_bytes(b"".join(make_packets(20)))
+    status, found = figures(capsys, str(path))
+    assert status == 0 and found["packets_without_frames"] == 42
+    path.write_bytes(np.random.default_rng(1).integers(0, 256, 5000, dtype=np.uint8).tobytes())
+    assert run(["link", "check", str(path)]) == 2
+    assert "expected CADUs or space packets, found none in its 5000 octets" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("prefix", [0, 3])
+def test_the_form_of_packets_without_checksum_is_proposed(capsys, tmp_path, prefix):
+    packets = [bytes(prefix) + pack_packet(0x200, bytes(range(60)), sequence_count=k) for k in range(30)]
+    path = tmp_path / "foreign.bin"
+    path.write_bytes(b"".join(packets))
+    assert run(["link", "check", str(path)]) == 0
+    shown = capsys.readouterr().out
+    assert "30 space packets without checksum" in shown and 'packet_checksum = "none"' in shown
+    assert (f"packet_prefix_octets = {prefix}" in shown) == (prefix > 0)
+
+
+RELIED_ON = """
+demo --out D
+orbit propagate S --days 1 --step 30 --out F.oem --gravity G --degree 8 --no-maneuvers
+orbit compare A B
+orbit interpolate F --epochs E
+catalogue stats F
+catalogue curate C --terrain T --out F
+camera fov-study --ephemeris F --catalogue C
+render S --epoch 2029-08-07T00:00:00Z --out F.png --renderer raymarch
+dataset build S --out D --frames 5 --workers 2 --renderer fast
+dataset check D
+dataset stats D
+detector train D --out R
+detector export R --out M.onnx
+detector evaluate --model M --dataset D --split test
+detector evaluate --model M --coco D --altitude-km 30
+detector detect I.png --altitude-km 30 --fov-deg 120
+detector bench --threads 2
+emulate S --out D --mode anchored
+replay A --build B --out D
+tm decode F --format parquet --out G
+tm check F
+tm icd
+tm xtce --out F.xml
+tm yamcs --out D
+serve --host 127.0.0.1 --port 1
+worker
+db upgrade
+user add NAME --role viewer
+ingest --recording R F G
+pass list
+pass show 1
+report 1 --out D
+regress run --archive A --build B --baseline C --junit J
+regress suite low --out D
+data verify
+mission write S --out M.toml
+mission check M
+mission run S --days 1 --speed max
+verify --rebuild
+navigation survey --region 0,10,0,10 --seeds 3
+export 1 --format tum --out F
+paper --out D
+link check F --mission M
+"""
+
+
+@pytest.mark.parametrize("line", RELIED_ON.strip().splitlines())
+def test_a_documented_command_is_understood(line: str) -> None:
+    words = line.split()
+    command_parser(GROUPS, words[0]).parse_args(words)
+
+
+def test_the_example_of_a_telecommand_is_one_of_the_dictionary() -> None:
+    assert example("linna command enter").split()[3] in {one.name for one in DICTIONARY.telecommands}

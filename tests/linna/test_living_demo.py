@@ -1,7 +1,5 @@
 """`linna demo --live`: the parts start, documents are posted, and all end with the command or with a part."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from threading import Event

@@ -1,6 +1,9 @@
-"""Rotations against SPICE, pymap3d, ERFA and a published example of NAIF."""
+"""Rotations against SPICE, pymap3d, ERFA and a published example of NAIF. Ground tracks of an orbit in closed
+form: altitude, period, speed and passes. What is found in a data folder, and what is used in its place.
+"""
 
 import json
+import math
 from pathlib import Path
 
 import erfa
@@ -11,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lunar.constants import MOON_RADIUS_M
+from lunar.datafolder import DataFolder, default_orientation, find_data
 from lunar.errors import DataFileError, EphemerisCoverageError
 from lunar.frames import (
     PA_FROM_ME_DE421,
@@ -26,6 +30,9 @@ from lunar.frames import (
     rtn_from_inertial,
     spherical_from_mcmf,
 )
+from lunar.ground_track import even_epochs, ground_track
+from lunar.timescales import NS
+from tests.lunar.orbits import polar_orbit
 
 SPICE = json.loads(
     Path(__file__).parents[1].joinpath("references/lunar/spice_moon_rotations.json").read_text()
@@ -235,3 +242,65 @@ def test_signs_of_successive_quaternions_do_not_flip(count):
     smooth = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle, 0.0 * angle], axis=1)
     flipped = smooth * np.where(np.arange(count) % 3 == 1, -1.0, 1.0)[:, None]
     np.testing.assert_array_equal(continuous_quaternions(flipped), smooth)
+
+
+@pytest.fixture(scope="module")
+def day():
+    """A circular polar orbit of the paper's semi-major axis, one day in 15 s steps."""
+    return polar_orbit(23.999, 15.0)
+
+
+def test_a_pass_within_sixty_degrees_lasts_37_minutes(day):
+    track = ground_track(day, IauOrientation())
+    inside = np.abs(track.latitude_rad) <= math.radians(60)
+    edges = np.flatnonzero(np.diff(inside.astype(int)))
+    lengths = (
+        np.diff(edges)[0::2] * 15.0 / 60.0 if not inside[edges[0]] else np.diff(edges)[1::2] * 15.0 / 60.0
+    )
+    assert np.mean(lengths) == pytest.approx(111.20 / 3, abs=0.1)
+
+
+def test_epochs_and_steps_can_be_chosen(day):
+    epochs = even_epochs(day, 60.0)
+    assert np.all(np.diff(epochs) == 60 * NS)
+    track = ground_track(day, IauOrientation(), epochs)
+    assert len(track.utc_ns) == 1440
+    assert np.all((track.longitude_rad >= 0.0) & (track.longitude_rad < 2 * np.pi))
+
+
+def test_without_a_folder_nothing_is_found_and_the_iau_series_is_used():
+    data = find_data(None)
+    assert data == DataFolder()
+    assert data.names() == ()
+    assert default_orientation(data).name == "IAU WGCCRE 2009"
+
+
+def test_an_empty_folder_holds_nothing(tmp_path):
+    data = find_data(tmp_path)
+    assert data.root == tmp_path
+    assert data.names() == ()
+
+
+@pytest.mark.parametrize("name", ["absent", "file"])
+def test_what_is_no_folder_is_refused(tmp_path, name):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataFileError, match="expected a data folder"):
+        find_data(tmp_path / name)
+
+
+@pytest.mark.real_data
+def test_the_whole_data_folder_is_recognised(data_path):
+    data = find_data(data_path)
+    missing = [name for name in DataFolder.__slots__ if not getattr(data, name)]
+    # What `linna data fetch` adds: a finer height model and a calibrated albedo.
+    assert missing == ["dem_sldem", "albedo_tiles"]
+    assert len(data.names()) == 10
+    assert default_orientation(data).name == "DE421"
+    assert len(data.dem_tiles) == len(list((data_path / "dem").glob("*ppd_*E_*.jp2")))
+
+
+def test_heights_and_craters_of_a_user_are_named_by_their_files(tmp_path):
+    for name in ("dem/own-pole.tif", "craters/own.csv"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).touch()
+    assert find_data(tmp_path).names() == ("crater catalogue own.csv", "own heights own-pole.tif")

@@ -1,7 +1,5 @@
 """A small world for navigation: a rough gravity field, craters of the paper's density, the paper's orbit."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Curation against a raster whose craters are known exactly."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

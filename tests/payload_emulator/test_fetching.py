@@ -1,7 +1,5 @@
 """Downloads from a server on this machine that breaks off, sends other octets and is overloaded."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

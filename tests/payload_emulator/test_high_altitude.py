@@ -1,7 +1,5 @@
 """Navigation from 150 km with simulated detections: from the first frame, with an initial error of 2 km."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from lunar.datafolder import DataFolder

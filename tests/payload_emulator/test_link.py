@@ -1,7 +1,5 @@
 """The radio link: what it says of itself is what the ground finds, to the octet."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

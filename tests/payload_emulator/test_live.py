@@ -1,7 +1,5 @@
 """The payload as a process: commanded and watched over TCP; and a fault."""
 
-from __future__ import annotations
-
 import base64
 import json
 import selectors

@@ -1,7 +1,5 @@
 """Anchored navigation over many simulated frames: accuracy, honesty, recovery, and what it does with bad input."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

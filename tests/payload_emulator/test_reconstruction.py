@@ -1,7 +1,5 @@
 """Images and inputs of a live pass, made again from the declared world, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """An archived pass flown again: from its frames, from its scenario, by another build, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

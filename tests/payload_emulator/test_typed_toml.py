@@ -1,7 +1,5 @@
 """Tables read into frozen values: what is converted, what is refused and in which words."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum

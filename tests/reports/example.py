@@ -5,8 +5,6 @@ that walk from a reset at the start of each arc, a catalogue filter that coasts 
 a single-frame fix.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

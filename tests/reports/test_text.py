@@ -1,10 +1,25 @@
-"""Numbers, times and names as they are printed."""
+"""Numbers, times and names as they are printed. Names of housekeeping parameters as panels print them. The JSON
+form of a report. Content of figures, checked by the drawn geometry.
+"""
 
+import hashlib
+import json
 import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
+import numpy as np
 import pytest
 
 from reports.document import evidence_label, evidence_number, evidence_text
+from reports.figures import consistency, navigation
+from reports.figures.canvas import Canvas, TimeScale
+from reports.figures.housekeeping import parameter_title
+from reports.figures.theme import REFERENCE, color, series_styles
+from reports.json_form import to_json
+from reports.render import render_html
 from reports.text import (
     NOT_A_VALUE,
     count_text,
@@ -17,6 +32,17 @@ from reports.text import (
     significant_text,
     utc_text,
 )
+from reports.values import (
+    BinScore,
+    GalleryFrame,
+    HousekeepingParameter,
+    NavigationSeries,
+    PassReport,
+    TrackSeries,
+)
+from tests.lazy import Lazy
+from tests.reports import example
+from tests.reports.page import Page
 
 
 @pytest.mark.parametrize(
@@ -119,3 +145,169 @@ def test_what_is_next_to_nothing_is_said_so_on_the_first_page(value: float, text
 
 def test_a_rate_of_zero_has_no_power_of_ten() -> None:
     assert [rate_text(rate) for rate in (None, 0.0, 2.5e-5)] == [NOT_A_VALUE, "0", "2.5e-05"]
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "title"),
+    [
+        ("bus_voltage_v", "V", "bus voltage, V"),
+        ("temperature_c", "°C", "temperature, °C"),
+        ("storage_used_permille", "‰", "storage used, ‰"),
+        ("vitamin_c", "", "vitamin c"),
+        ("v", "V", "v, V"),
+    ],
+)
+def test_a_unit_is_named_once(name: str, unit: str, title: str) -> None:
+    nothing = np.zeros(0)
+    assert parameter_title(HousekeepingParameter(name, unit, nothing.astype(np.int64), nothing)) == title
+
+
+def test_the_same_value_gives_the_same_text(whole_pass: PassReport) -> None:
+    assert to_json(whole_pass) == to_json(example.pass_report(gallery=3, worst=5))
+
+
+def test_all_fields_are_there_under_their_own_names(whole_pass: PassReport) -> None:
+    body = json.loads(to_json(whole_pass))
+    assert body["kind"] == "PassReport" and body["schema_version"] == 1
+    assert set(PassReport.__dataclass_fields__) <= set(body)
+    assert [s["name"] for s in body["navigation"]][:3] == ["paper", "spherical", "anchored"]
+    assert body["packets"]["by_apid"]["160"]["name"] == "housekeeping"
+
+
+def test_times_stay_whole_nanoseconds(whole_pass: PassReport) -> None:
+    body = json.loads(to_json(whole_pass))
+    assert body["reference"]["utc_ns"][0] == int(whole_pass.navigation[0].utc_ns[0])
+    assert isinstance(body["reference"]["utc_ns"][0], int)
+
+
+def test_numbers_come_back_to_nine_digits(whole_pass: PassReport) -> None:
+    assert whole_pass.reference is not None
+    back = np.array(json.loads(to_json(whole_pass))["reference"]["latitude_deg"])
+    np.testing.assert_allclose(back, whole_pass.reference.latitude_deg, rtol=5.1e-9, atol=0)
+
+
+def test_every_number_with_a_fraction_has_at_most_nine_digits_and_is_the_nearest_such() -> None:
+    signs = np.random.default_rng(1).choice((-1.0, 1.0), 2000)
+    values = signs * 10.0 ** np.random.default_rng(2).uniform(-11, 8, 2000)
+    edges = [0.1, 1 / 3, 9.9999999996, 0.99999999951, 123456.7890123, 1e-5, 99999999.96]
+    ours = np.concatenate([values, edges])
+    report = PassReport("a", "b", configuration={"x": {"y": ours}})
+    text = to_json(report).split('"y":[', 1)[1].split("]", 1)[0].split(",")
+    assert [float(one) for one in text] == [float(f"{value:.9g}") for value in ours]
+    assert max(len(one.split("e")[0].removesuffix(".0").replace(".", "").lstrip("-0")) for one in text) == 9
+
+
+def test_whole_numbers_and_the_very_small_stay_as_they_are() -> None:
+    values = [1.8e18 + 256.0, 2_000_000_001.0, 0.0, 1.2345678912345e-13]
+    report = PassReport("a", "b", configuration={"x": {"y": np.array(values), "z": 2_000_000_001.0}})
+    assert json.loads(to_json(report))["configuration"]["x"] == {"y": values, "z": values[1]}
+
+
+def test_values_that_are_no_number_become_null(whole_pass: PassReport) -> None:
+    text = to_json(whole_pass)
+    assert "NaN" not in text and "Infinity" not in text
+    snapshot = next(s for s in json.loads(text)["navigation"] if s["name"] == "snapshot fix")
+    assert any(row == [None, None, None] for row in snapshot["error_rtn_m"])
+    assert snapshot["statistics"]["drift_percent"] is None
+
+
+def test_images_are_named_by_their_hash(whole_pass: PassReport) -> None:
+    frame: GalleryFrame = whole_pass.gallery[0]
+    image = json.loads(to_json(whole_pass))["gallery"][0]["image"]
+    assert image == {"shape": [512, 512], "sha256": hashlib.sha256(frame.image.tobytes()).hexdigest()}
+
+
+N = 240
+STEP_NS = 15_000_000_000
+TIMES = example.START_UTC_NS + np.arange(N, dtype=np.int64) * STEP_NS
+TIME = TimeScale(int(TIMES[0]), int(TIMES[-1]))
+
+
+def series(name: str = "anchored", **more: object) -> NavigationSeries:
+    fields: dict[str, object] = {
+        "name": name,
+        "kind": "estimate",
+        "utc_ns": TIMES,
+        "latitude_deg": np.linspace(-10.0, 10.0, N),
+        "longitude_deg": np.full(N, 300.0),
+        "altitude_m": np.linspace(20_000.0, 30_000.0, N),
+        "error_rtn_m": np.full((N, 3), 20.0),
+        **more,
+    }
+    return NavigationSeries(**fields)
+
+
+TRACK = TrackSeries(TIMES, np.linspace(-10.0, 10.0, N), np.full(N, 300.0), np.linspace(20_000.0, 30_000.0, N))
+
+
+def drawn(draw: Callable[[Canvas], None], height_in: float = 3.6) -> Any:
+    """Return the figure that a function draws."""
+    figure = Lazy("matplotlib.figure").Figure(figsize=(9.0, height_in))
+    draw(Canvas(figure, 9.0, height_in))
+    return figure
+
+
+@pytest.mark.parametrize("sigma_m", [0.5, 8.0, 40.0, 4_000.0])
+def test_the_edges_of_three_sigma_are_inside_the_axis(sigma_m: float) -> None:
+    rng = np.random.default_rng(1)
+    one = series(error_rtn_m=20.0 * rng.standard_normal((N, 3)), sigma_rtn_m=np.full((N, 3), sigma_m))
+    styles = series_styles([("anchored", "estimate")])
+    figure = drawn(lambda canvas: navigation.draw_rtn(canvas, one, styles, TIME, ()))
+    assert len(figure.axes) == 3
+    for axes in figure.axes:
+        low, high = axes.get_ylim()
+        edges = [line for line in axes.lines if line.get_color() == color("gray2")]
+        heights = sorted(float(np.mean(np.asarray(line.get_ydata(), dtype=float))) for line in edges)
+        assert len(heights) == 2
+        factor = 1000.0 if 3 * sigma_m * 1.15 >= 1500 else 1.0
+        assert heights == pytest.approx([-3 * sigma_m / factor, 3 * sigma_m / factor])
+        assert low < heights[0] and heights[1] < high
+
+
+def test_no_estimate_has_the_colour_of_the_reference() -> None:
+    names = ["paper", "spherical", "anchored", "smoothed", "another", "third", "fourth", "fifth"]
+    styles = series_styles([(name, "estimate") for name in names] + [(f"b{i}", "baseline") for i in range(9)])
+    assert color(REFERENCE) not in {tint for tint, _ in styles.values()}
+    shown = [series(name) for name in ("anchored", "smoothed")]
+    figure = drawn(lambda canvas: navigation.draw_altitude(canvas, shown, TRACK, styles, TIME, ()), 3.9)
+    wide = [line for line in figure.axes[0].lines if line.get_linewidth() > 3.0]
+    assert [line.get_color() for line in wide] == [color(REFERENCE)]
+
+
+def test_errors_are_binned_by_the_altitude_of_the_reference() -> None:
+    """An estimate whose altitude is wrong by ten kilometres belongs to the bin of the true altitude."""
+    one = series(altitude_m=np.linspace(20_000.0, 30_000.0, N) + 10_000.0)
+    ((name, label, bins),) = consistency.dependences(one, TRACK)
+    assert (name, label) == ("altitude", "reference altitude, km")
+    assert bins.centre.min() > 19.0 and bins.centre.max() < 31.0
+    assert consistency.dependences(one, None) == []
+
+
+def test_a_quantity_with_one_bin_is_a_sentence_and_no_plot() -> None:
+    report = example.pass_report()
+    assert report.detector is not None
+    one = (BinScore(15.0, 20.0, 300, 0.8, 0.7), BinScore(20.0, 25.0, 0, float("nan"), float("nan")))
+    score = replace(report.detector, by_altitude_km=one)
+    words = Page(render_html(replace(report, detector=score))).text
+    assert "All craters were expected at one altitude, 15 to 20 km" in words
+    assert "Precision and recall by light, over the craters" in words
+    score = replace(report.detector, by_altitude_km=one, by_sun_elevation_deg=())
+    words = Page(render_html(replace(report, detector=score))).text
+    assert "over the craters expected in each bin" not in words
+
+
+def test_no_column_is_without_a_name() -> None:
+    for kind in ("pass", "regression", "detector"):
+        text = render_html(getattr(example, f"{kind}_report")())
+        heads = [part.split("</thead>")[0] for part in text.split("<thead>")[1:]]
+        assert heads
+        assert not [head for head in heads if re.search(r"<th[^>]*></th>", head)], kind
+
+
+def test_a_line_is_broken_where_nothing_was_estimated() -> None:
+    x = np.array([0.0, 15.0, 30.0, 45.0, 1000.0, 1015.0])
+    at, error = navigation.broken(x, np.arange(6.0))
+    assert at.tolist() == [0.0, 15.0, 30.0, 45.0, 45.0, 1000.0, 1015.0]
+    assert np.isnan(error[4]) and np.nansum(error) == 15.0
+    even = np.arange(0.0, 100.0, 15.0)
+    assert navigation.broken(even, even)[1].tolist() == even.tolist()

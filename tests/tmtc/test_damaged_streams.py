@@ -3,8 +3,6 @@
 For each stream the packets that a decoder with known settings can find at best follow from the construction.
 """
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

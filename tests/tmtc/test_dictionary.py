@@ -1,4 +1,16 @@
+"""A dictionary written down and read again. Effects of telecommands: stated for all, inherited by scheduling
+telecommands, most severe if unknown. Texts of event values: what operators read in place of codes. Arguments
+of telecommands by name, with units and ranges. Estimates of the filter in packets of old payloads (lower
+triangle) and of today (upper triangle).  Thumbnails: the octets, and what is refused.
+"""
+
+import ast
+import json
 import math
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -6,7 +18,16 @@ from ccsdspy import FixedLength, PacketArray, PacketField, VariableLength
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import payload_emulator.flight
+from tmtc.dictionary.arguments import FUNCTION_ARGUMENTS, argument_text, arguments_by_number
+from tmtc.dictionary.codes import EVENTS, FUNCTIONS
+from tmtc.dictionary.definitions import format_dictionary, parse_dictionary
+from tmtc.dictionary.effects import CARRIER, EFFECTS, FUNCTION, Effect, effect_of
+from tmtc.dictionary.estimates import filter_estimates
+from tmtc.dictionary.event_texts import EVENT_TEXTS, event_text
 from tmtc.dictionary.fields import Field
+from tmtc.dictionary.icd import format_icd
+from tmtc.dictionary.onboard_parameters import PARAMETERS
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import (
     ALARM,
@@ -20,6 +41,7 @@ from tmtc.dictionary.schema import (
 )
 from tmtc.errors import ChecksumError, MalformedPacket, TruncatedPacket, UnknownPacket, ValueRefused
 from tmtc.packets.stream import cut_packets
+from tmtc.packets.thumbnails import HEADER, Thumbnail, pack_thumbnail, unpack_thumbnail
 
 HOUSEKEEPING = {
     "structure_id": 1, "boot_count": 3, "mode": "observing", "frames_processed": 148, "frames_bad": 2,
@@ -382,3 +404,328 @@ def test_limits_tell_warning_from_alarm():
         WITHIN_LIMITS,
     ]
     assert limit_states(DICTIONARY.packet("housekeeping").field("mode"), [3]).tolist() == [WITHIN_LIMITS]
+
+
+def test_a_dictionary_survives_being_written_down() -> None:
+    again = parse_dictionary(format_dictionary(DICTIONARY))
+    assert (again.version, again.hash) == (DICTIONARY.version, DICTIONARY.hash)
+    assert (again.telemetry, again.telecommands) == (DICTIONARY.telemetry, DICTIONARY.telecommands)
+
+
+def test_a_packet_of_today_is_read_with_the_dictionary_of_the_archive() -> None:
+    packet = DICTIONARY.pack("connection_report", {}, ticks=7, sequence_count=1)
+    assert parse_dictionary(format_dictionary(DICTIONARY)).unpack(packet)[0] == "connection_report"
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"version": 1, "telemetry": [{}], "telecommands": []}'])
+def test_something_else_is_refused(text: str) -> None:
+    with pytest.raises(MalformedPacket, match="expected a packet dictionary"):
+        parse_dictionary(text, "old.json")
+
+
+def test_a_changed_definition_is_refused() -> None:
+    content = json.loads(format_dictionary(DICTIONARY))
+    content["telemetry"][0]["fields"][0]["type"] = "u32"
+    with pytest.raises(MalformedPacket, match="expected a dictionary with hash"):
+        parse_dictionary(json.dumps(content))
+
+
+def effect(name: str, **arguments: Any) -> Effect:
+    return effect_of(DICTIONARY, name, arguments, packed(name, arguments)).effect
+
+
+def packed(name: str, arguments: dict[str, Any]) -> bytes:
+    return DICTIONARY.pack_command(name, arguments, sequence_count=0)
+
+
+def function(name: Any) -> dict[str, Any]:
+    return {"function_id": name, "argument_1": 0.0, "argument_2": 0.0}
+
+
+def carried(octets: bytes) -> dict[str, Any]:
+    return {"release_ticks": 1, "items": [{"octet": octet} for octet in octets]}
+
+
+def test_every_telecommand_and_every_function_has_an_effect_with_a_reason_and_nothing_else_has() -> None:
+    names = {one.name for one in DICTIONARY.telecommands} - {FUNCTION, CARRIER}
+    functions = {f"{FUNCTION}/{name}" for _, name in FUNCTIONS}
+    assert set(EFFECTS) == names | functions
+    assert all(one.reason and one.subject == subject for subject, one in EFFECTS.items())
+
+
+def test_a_parameter_and_the_table_that_holds_it_have_the_same_effect() -> None:
+    part = {"transaction": 1, "part": 1, "table": "parameters", "items": [{"octet": 0}]}
+    assert effect("set_parameter", parameter_id=1, value=1.0) == effect("uplink_first", **part)
+    assert effect("set_parameter", parameter_id=1, value=1.0) is Effect.CHANGES_STATE
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "expected"),
+    [
+        ("set_mode", 1, Effect.CHANGES_STATE),
+        ("start_observation", 2, Effect.ROUTINE),
+        ("reboot", 7, Effect.DESTROYS_DATA),
+        ("synchronise_clock", 9, Effect.CHANGES_STATE),
+    ],
+)
+def test_a_function_has_its_effect_by_name_and_by_code(name: str, code: int, expected: Effect) -> None:
+    assert effect(FUNCTION, **function(name)) is effect(FUNCTION, **function(code)) is expected
+
+
+def test_an_activity_has_the_effect_of_what_it_carries_however_deep() -> None:
+    for inner, expected in (
+        (function("start_observation"), Effect.ROUTINE),
+        (function("reboot"), Effect.DESTROYS_DATA),
+    ):
+        once = carried(packed(FUNCTION, inner))
+        assert effect(CARRIER, **once) is expected
+        assert effect(CARRIER, **carried(packed(CARRIER, once))) is expected
+
+
+def test_what_carries_no_telecommand_and_what_is_not_known_counts_as_the_gravest() -> None:
+    assert effect(CARRIER, **carried(b"\x00" * 12)) is Effect.DESTROYS_DATA
+    for name, arguments in ((FUNCTION, {"function_id": 999}), ("new_command", {})):
+        assert effect_of(DICTIONARY, name, arguments, b"").effect is Effect.DESTROYS_DATA
+
+
+FLIGHT = Path(next(iter(payload_emulator.flight.__path__)))
+
+
+def test_values_of_events_are_read_as_names() -> None:
+    assert event_text("mode_changed", 1.0, 2.0) == "from standby to observing"
+    assert event_text("table_loaded", 3.0, float(0xDF7F5779)) == "gravity, hash df7f5779"
+    assert event_text("camera_fault", 82.0, 3.0) == "82 frames without image, camera switched 3 times"
+    assert (
+        event_text("telecommand_rejected", 5.0, float(0x1885C007))
+        == "telecommand with sequence count 7: wrong mode"
+    )
+    seconds = (29 * 365 + 8 + 218) * 86_400 + 6 * 3600 + 37
+    assert event_text("observation_started", seconds * 65_536.0, 15 * 65_536.0) == (
+        "until 2029-08-07T06:00:37 TAI, every 15 s"
+    )
+
+
+@pytest.mark.parametrize("value", [None, math.nan])
+def test_unknown_values_are_not_invented(value: float | None) -> None:
+    assert event_text("mode_changed", 1.0, value) == "1"
+    assert event_text("no_such_event", 4.0, 0.5) == "4, 0.5"
+    assert event_text("attitude_missing", 0.0, 0.0) == ""
+
+
+def test_unknown_codes_remain_numbers() -> None:
+    assert event_text("mode_changed", 9.0, 2.0) == "from 9 to observing"
+
+
+def test_every_event_of_the_flight_software_is_described_with_its_values() -> None:
+    """The number of values in the code of the flight software is that of the description."""
+    found = {}
+    for path in FLIGHT.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if (
+                isinstance(node, ast.Call)
+                and isinstance(node.func, ast.Attribute)
+                and node.func.attr == "event"
+            ):
+                name = node.args[1]
+                if isinstance(name, ast.Constant):
+                    found[name.value] = len(node.args) - 2
+    assert len(found) > 30
+    assert set(found) <= {name for _, name in EVENTS}
+    assert {name: len(EVENT_TEXTS[name].values) if name in EVENT_TEXTS else 0 for name in found} == found
+
+
+def test_the_interface_document_states_the_values() -> None:
+    assert "| mode_changed | mode before | mode after |" in format_icd()
+
+
+OBSERVATION = {"function_id": "start_observation", "argument_1": 2227.5, "argument_2": 15.0}
+
+
+def test_the_numbers_of_a_function_have_its_names_and_units() -> None:
+    assert (
+        argument_text("perform_function", OBSERVATION)
+        == "function start observation, duration 2227.5 s, cadence 15 s"
+    )
+    assert (
+        argument_text("perform_function", {"function_id": 7, "argument_1": 0.0, "argument_2": 0.0})
+        == "function reboot"
+    )
+    widened = {"function_id": 11, "argument_1": 250.0, "argument_2": 0.25}
+    assert (
+        argument_text("perform_function", widened)
+        == "function widen estimate, position 250 m, velocity 0.25 m/s"
+    )
+    assert set(FUNCTION_ARGUMENTS) <= {name for _, name in FUNCTIONS}
+
+
+def test_names_are_entered_in_place_of_numbers() -> None:
+    given = {"function_id": "start_observation", "duration_s": 2227.5, "cadence_s": 15}
+    assert arguments_by_number("perform_function", given) == OBSERVATION
+    assert arguments_by_number("perform_function", OBSERVATION) == OBSERVATION
+    mode = arguments_by_number("perform_function", {"function_id": "set_mode", "mode": "standby"})
+    assert (mode["argument_1"], mode["argument_2"]) == (1, 0.0)
+    changed = arguments_by_number("set_parameter", {"parameter_id": "temperature_high_c", "value": 55})
+    assert changed == {"parameter_id": 7, "value": 55}
+    between = {"function_id": "set_mode", "argument_1": 1.5}
+    assert argument_text("perform_function", between) == "function set mode, mode 1.5"
+    assert argument_text("set_parameter", changed) == "parameter temperature high c, value 55 degC"
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "expected"),
+    [
+        ("perform_function", {"function_id": "start_observation", "duration_s": -1.0}, "start_observation.duration_s"),
+        ("perform_function", {"function_id": "set_mode", "mode": "asleep"}, r"0 \(safe\)"),
+        ("set_parameter", {"parameter_id": "temperature_high_c", "value": 101}, "20 to 100 degC"),
+        ("set_parameter", {"parameter_id": 5, "value": 1.5}, "a whole number of 1 to 1000"),
+    ],
+)  # fmt: skip
+def test_a_value_outside_its_range_is_refused_with_the_range(
+    name: str, given: dict[str, object], expected: str
+) -> None:
+    with pytest.raises(ValueRefused, match=expected):
+        arguments_by_number(name, given)
+
+
+def test_a_carried_telecommand_is_written_out_with_its_time() -> None:
+    octets = DICTIONARY.pack_command("perform_function", OBSERVATION, sequence_count=3)
+    carrying = {"release_ticks": 65_536, "items": [{"octet": octet} for octet in octets]}
+    assert argument_text("insert_activity", carrying, lambda ticks: f"{ticks / 65_536:g} s") == (
+        "perform function (function start observation, duration 2227.5 s, cadence 15 s) at 1 s of the on-board clock"
+    )
+    assert argument_text("insert_activity", {**carrying, "items": [{"octet": 1}]}).startswith(
+        "1 octets at 2000-01-01"
+    )
+
+
+def test_every_telecommand_has_a_text_for_its_least_values() -> None:
+    for definition in DICTIONARY.telecommands:
+        counted = definition.group.count if definition.group else None
+        values: dict[str, object] = {
+            field.name: field.labels[0][0] if field.labels else int(field.minimum or 0)
+            for field in definition.fields
+            if field.name != counted
+        }
+        if definition.group:
+            item = {
+                field.name: field.labels[0][0] if field.labels else 0 for field in definition.group.fields
+            }
+            values[definition.group.name] = [item]
+        octets = DICTIONARY.pack_command(definition.name, values, sequence_count=1)
+        unpacked = DICTIONARY.unpack_command(octets).values
+        text = argument_text(definition.name, unpacked)
+        assert text == argument_text(definition.name, values)
+        assert bool(text) == bool(definition.fields), definition.name
+    assert len({one.number for one in PARAMETERS}) == len(PARAMETERS)
+
+
+RNG = np.random.default_rng(3)
+STATES = RNG.standard_normal((2, 9)) * np.repeat([1.7e6, 1.6e3, 1e-6], 3)
+_ROOTS = RNG.standard_normal((2, 9, 9)) * np.repeat([40.0, 0.05, 1e-6], 3)[:, None]
+COVARIANCES = _ROOTS @ np.swapaxes(_ROOTS, 1, 2)
+
+
+def packet(name: str, row: int, ticks: int) -> bytes:
+    covariance = COVARIANCES[row]
+    # Element by element, so that the order of the triangle is that of the interface and not of a library.
+    if name == "filter_state":
+        extra: dict[str, Any] = {"covariance": [covariance[i, j] for i in range(9) for j in range(i + 1)]}
+    else:
+        triangle = [covariance[i, j] for i in range(9) for j in range(i, 9)]
+        extra = {"covariance": triangle, "innovation_degrees": 22}
+    values = {
+        "frame_number": 5 + row,
+        "image_ticks": ticks,
+        "position_icrf_m": STATES[row, :3],
+        "velocity_icrf_m_s": STATES[row, 3:6],
+        "acceleration_rtn_m_s2": STATES[row, 6:],
+        **extra,
+    }
+    return DICTIONARY.pack(name, values, ticks=ticks + 9, sequence_count=row)
+
+
+def estimates_of(octets: bytes) -> Any:
+    return filter_estimates(DICTIONARY.unpack_many(octets, cut_packets(octets)))
+
+
+@pytest.mark.parametrize("name, degrees", [("filter_state", -1), ("filter_estimate", 22)])
+def test_state_and_covariance_come_back_within_single_precision(name: str, degrees: int) -> None:
+    octets = b"".join(packet(name, row, 100 + row) for row in (0, 1))
+    found = estimates_of(octets)
+    assert found.image_ticks.tolist() == [100, 101] and found.packet_ticks.tolist() == [109, 110]
+    assert found.frame_number.tolist() == [5, 6] and found.packet_index.tolist() == [0, 1]
+    assert found.innovation_degrees.tolist() == [degrees, degrees]
+    np.testing.assert_array_equal(found.state[:, :6], STATES[:, :6])
+    np.testing.assert_allclose(found.state[:, 6:], STATES[:, 6:], rtol=1e-7)
+    np.testing.assert_allclose(found.covariance, COVARIANCES, rtol=1.2e-7)
+
+
+def test_a_stream_may_hold_packets_of_both_versions_and_other_ones() -> None:
+    other = DICTIONARY.pack("connection_report", {}, ticks=1, sequence_count=1)
+    octets = packet("filter_estimate", 0, 7) + other + packet("filter_state", 1, 8)
+    found = estimates_of(octets)
+    assert dict(zip(found.image_ticks.tolist(), found.packet_index.tolist(), strict=True)) == {7: 0, 8: 2}
+    assert len(estimates_of(other)) == 0 and estimates_of(other).covariance.shape == (0, 9, 9)
+
+
+def test_single_precision_keeps_the_normalised_error_and_half_precision_does_not() -> None:
+    """The choice of the interface, on a covariance of a fix: position 20 to 40 m, velocity 2 to 5 cm/s, correlated."""
+    sigma = np.array([22.0, 43.0, 33.0, 0.03, 0.02, 0.05])
+    correlation = np.eye(6)
+    for i, j, value in ((0, 4, -0.93), (1, 3, -0.95), (0, 1, 0.2), (2, 5, 0.6)):
+        correlation[i, j] = correlation[j, i] = value
+    covariance = correlation * sigma[:, None] * sigma[None]
+    error = sigma * np.array([1.0, -1.0, 0.5, 1.5, -0.5, 1.0])
+
+    def squared(matrix: np.ndarray) -> float:
+        return float(error @ np.linalg.solve(matrix, error))
+
+    exact = squared(covariance)
+    single = covariance.astype(np.float32).astype(np.float64)
+    half = correlation.astype(np.float16).astype(np.float64) * sigma[:, None] * sigma[None]
+    assert abs(squared(single) / exact - 1.0) < 1e-6
+    assert abs(squared(half) / exact - 1.0) > 1e-4
+
+
+def test_every_packet_field_and_label_is_in_the_document():
+    text = format_icd()
+    for definition in DICTIONARY.telemetry + DICTIONARY.telecommands:
+        assert f"### {definition.name}\n" in text
+        for field in definition.fields + (definition.group.fields if definition.group else ()):
+            assert f"| {field.name} |" in text
+            assert all(f"| {code} | {label} |" in text for code, label in field.labels)
+
+
+def test_enumerations_of_one_name_are_the_same_everywhere():
+    # the document lists each enumeration once
+    seen = {}
+    for definition in DICTIONARY.telemetry + DICTIONARY.telecommands:
+        for field in definition.fields:
+            if field.labels:
+                assert seen.setdefault(field.name, field.labels) == field.labels
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (1, 1), (0, 0)])
+def test_a_thumbnail_reads_back(shape: tuple[int, int]) -> None:
+    levels = np.arange(shape[0] * shape[1], dtype=np.uint8).reshape(shape)
+    octets = pack_thumbnail(Thumbnail(7, 2**40 + 1, levels))
+    assert octets[:16] == struct.pack(">IQHH", 7, 2**40 + 1, *shape)
+    found = unpack_thumbnail(octets)
+    assert (found.frame_number, found.ticks) == (7, 2**40 + 1)
+    np.testing.assert_array_equal(found.levels, levels)
+
+
+@pytest.mark.parametrize(
+    "octets",
+    [
+        b"",
+        bytes(15),
+        HEADER.pack(1, 2, 3, 4) + b"no zlib",
+        HEADER.pack(1, 2, 3, 4) + zlib.compress(bytes(11)),
+        HEADER.pack(1, 2, 3, 4) + zlib.compress(bytes(13)),
+        HEADER.pack(1, 2, 3, 4) + zlib.compress(bytes(12))[:-5],
+    ],
+)
+def test_what_is_no_thumbnail_is_refused(octets: bytes) -> None:
+    with pytest.raises(ValueRefused, match="thumbnail"):
+        unpack_thumbnail(octets)

@@ -1,7 +1,5 @@
 """Packets without error control and with other secondary headers, compared with readers of other projects."""
 
-from __future__ import annotations
-
 import io
 import logging
 import struct

@@ -1,8 +1,11 @@
+"""Telecommand channels as control words of a downlink show them."""
+
 import numpy as np
 import pytest
 from spacepackets.ccsds.tm_frame import TmFramePrimaryHeader
 
-from tmtc.errors import FrameError
+from tmtc.errors import ChecksumError, FrameError, LinkFormatError, TruncatedPacket
+from tmtc.link.clcw import uplink_seen
 from tmtc.link.frames import (
     Clcw,
     append_frame_checksums,
@@ -12,6 +15,8 @@ from tmtc.link.frames import (
     pack_clcw,
     unpack_clcw,
 )
+from tmtc.link.randomiser import randomise, sequence
+from tmtc.packets.crc import append_crc, check_crc, crc16
 
 HEADERS = (
     # version 00, spacecraft 0001001100, channel 010, OCF 1 | 5 | 6 | flags 000, segment length id 11, pointer 10
@@ -86,3 +91,105 @@ def test_idle_data_starts_with_the_register_of_ones():
     bits = np.unpackbits(np.frombuffer(data, dtype=np.uint8)).astype(int)
     n = np.arange(32, bits.size)
     assert np.array_equal(bits[n], (bits[n - 1] + bits[n - 2] + bits[n - 22] + bits[n - 32]) % 2)
+
+
+def test_the_checksum_has_the_published_check_value():
+    # CRC-16/IBM-3740, the "CRC-16/CCITT-FALSE" of ECSS-E-ST-70-41C annex B: check value of "123456789"
+    assert crc16(b"123456789") == 0x29B1
+
+
+@pytest.mark.parametrize(
+    ("data", "checksum"),
+    # ECSS-E-ST-70-41C annex B.1.5 (verification of compliance)
+    [("0000", 0x1D0F), ("000000", 0xCC9C), ("ABCDEF01", 0x04A2), ("1456F89A0001", 0x7FD5)],
+)
+def test_the_checksum_agrees_with_the_vectors_of_the_standard(data, checksum):
+    assert crc16(bytes.fromhex(data)) == checksum
+
+
+def test_octets_with_their_checksum_leave_no_remainder():
+    assert crc16(append_crc(b"any octets")) == 0
+    check_crc(append_crc(b"any octets"), "test")
+
+
+def test_a_wrong_checksum_is_told_with_both_values():
+    with pytest.raises(ChecksumError, match="expected checksum 0x29B1, found 0x0000"):
+        check_crc(b"123456789\0\0", "test")
+    with pytest.raises(TruncatedPacket):
+        check_crc(b"\0", "test")
+
+
+@pytest.mark.parametrize(
+    ("name", "start"),
+    [
+        # CCSDS 131.0-B-3 section 9.4.2: first 40 bits of the 255-bit sequence; more octets from its register
+        ("legacy", "FF480EC09A0D70BC8E2C"),
+        # CCSDS 131.0-B-5 section 10: first 40 bits of the 131071-bit sequence
+        ("long", "1C71B91BA9"),
+        # CCSDS 231.0-B section 6: first 40 bits of the telecommand sequence
+        ("telecommand", "FF399E5A68"),
+    ],
+)
+def test_sequences_begin_as_the_standards_print_them(name, start):
+    assert sequence(name, len(start) // 2).tobytes().hex().upper() == start
+
+
+@pytest.mark.parametrize(("name", "bits"), [("legacy", 255), ("long", 131_071), ("telecommand", 255)])
+def test_sequences_repeat_after_their_full_period_and_not_before(name, bits):
+    stream = np.unpackbits(sequence(name, (2 * bits + 7) // 8 + 1))
+    assert np.array_equal(stream[:bits], stream[bits : 2 * bits])
+    assert (
+        np.count_nonzero(stream[:bits]) == (bits + 1) // 2
+    )  # a maximal sequence has one more one than zeros
+    for divisor in (3, 5, 17):
+        if bits % divisor == 0:
+            assert not np.array_equal(stream[: bits - bits // divisor], stream[bits // divisor : bits])
+
+
+@pytest.mark.parametrize("name", ["none", "legacy", "long", "telecommand"])
+def test_randomising_twice_gives_the_frames_back(name):
+    frames = np.random.default_rng(0).integers(0, 256, (3, 1275), dtype=np.uint8)
+    assert np.array_equal(randomise(randomise(frames, name), name), frames)
+
+
+def test_an_unknown_randomiser_is_refused():
+    with pytest.raises(LinkFormatError, match="expected one of none, legacy, long, telecommand, found 'xyz'"):
+        sequence("xyz", 4)
+
+
+TYPE_TWO_REPORT = 0x8000_0001
+
+
+def words(*clcws: Clcw | int) -> np.ndarray:
+    return np.array(
+        [one if isinstance(one, int) else int.from_bytes(pack_clcw(one), "big") for one in clcws],
+        dtype=np.uint32,
+    )
+
+
+def test_a_stretch_is_summed_up_and_its_newest_word_is_shown() -> None:
+    locked = Clcw(0, 7, lockout=True, retransmit=True, farm_b_counter=2)
+    (seen,) = uplink_seen(words(Clcw(0, 7), Clcw(0, 7), locked, locked, Clcw(0, 8, farm_b_counter=3)))
+    assert (seen.frames, seen.changes) == (5, 2)
+    assert (seen.frames_lockout, seen.frames_retransmit, seen.frames_wait, seen.frames_no_rf) == (2, 2, 0, 0)
+    assert (seen.report_value, seen.farm_b_counter, seen.lockout) == (8, 3, False)
+
+
+def test_channels_are_kept_apart_and_what_is_no_control_word_is_passed_over() -> None:
+    seen = uplink_seen(words(Clcw(3, 1), 0, Clcw(0, 9), TYPE_TWO_REPORT, Clcw(3, 2), Clcw(0, 9)))
+    assert [(one.virtual_channel, one.frames, one.changes, one.report_value) for one in seen] == [
+        (0, 2, 0, 9),
+        (3, 2, 1, 2),
+    ]
+    assert uplink_seen(words(0, TYPE_TWO_REPORT)) == () == uplink_seen(words())
+
+
+def test_overlapping_stretches_add_up_to_the_whole() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        stream = words(*(Clcw(0, int(n), lockout=bool(n == 1)) for n in rng.integers(0, 3, 60)))
+        first, last = sorted(rng.choice(np.arange(1, 60), 2, replace=False).tolist())
+        (whole,), (head,), (tail,), (both,) = (
+            uplink_seen(part) for part in (stream, stream[:last], stream[first:], stream[first:last])
+        )
+        assert head.followed_by(both, sign=-1).followed_by(tail) == whole

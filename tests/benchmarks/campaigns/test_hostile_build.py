@@ -1,7 +1,5 @@
 """Hostile build against the sandbox: two kinds of attack in the suite, every kind with each profile as campaign."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

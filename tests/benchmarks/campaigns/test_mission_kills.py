@@ -1,7 +1,5 @@
 """The distributed form of a mission run: processes are killed, and the figures are those of the embedded form."""
 
-from __future__ import annotations
-
 import json
 import socket
 import sys

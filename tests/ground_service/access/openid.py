@@ -1,7 +1,5 @@
 """OpenID provider for tests: real HTTP, real keys and signatures; every value of its tokens can be changed."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Callers who are limited to missions: every operation has a decision, and none reaches another spacecraft."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass

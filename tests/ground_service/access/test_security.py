@@ -1,7 +1,5 @@
 """Who a request comes from, and which role it needs."""
 
-from __future__ import annotations
-
 import asyncio
 from types import SimpleNamespace
 from typing import Any

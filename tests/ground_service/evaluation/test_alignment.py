@@ -1,7 +1,5 @@
 """Errors against a reference over a Moon that turns at a rate of its own, with every place worked out by hand."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The start state flown on, against the circle of two bodies and against SciPy's integration of J2, Earth and Sun."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -130,7 +130,9 @@ def test_a_whole_pass(make_pass: Maker, ground: Ground) -> None:
     assert (budget.observed_rms_m, budget.reference_rms_m) == (pytest.approx(130.0, abs=2e-3), 5.0)
     assert budget.estimate_rms_m == pytest.approx(math.sqrt(130.0**2 - 25.0), abs=2e-3)
     assert report.headline[0].value == table["accuracy.median"].value
-    assert report.remarks == ()
+    assert report.remarks == () and len(report.events) == 1
+    triggers = next(s for s in report.navigation if s.name == "paper").reset_trigger
+    assert triggers[:2] == ("initialization", "none")
     page = render_html(report)
     assert "Requirements of the mission description" in page and "not met" in page and "Error budget" in page
     assert {one["key"]: one["status"] for one in summary_of(report)["requirements"]} == {

@@ -3,7 +3,6 @@
 import json
 import math
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,9 @@ import numpy as np
 import pytest
 
 from ground_service.errors import EvaluationError, InvalidInput
-from ground_service.evaluation.core import evaluate_pass
 from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.inputs import load_pass_inputs, orientation_of
 from ground_service.evaluation.service import evaluate
-from ground_service.evaluation.verdict import Limits
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions import frames as declared
@@ -56,26 +53,6 @@ def test_a_report_does_not_depend_on_the_data_of_the_machine(synthetic_pass: Any
     without = report_text(tmp_path / "a", DataFolder(), synthetic_pass.folder)
     assert report_text(tmp_path / "b", MISSING_FILES, synthetic_pass.folder) == without
     assert json.loads(without)["provenance"]["lunar orientation"] == "IAU WGCCRE 2009"
-
-
-@pytest.mark.parametrize("sources", [["orientation DE421"], ["circular orbit"]])
-def test_without_the_declared_orientation_no_figure_that_needs_it_is_given(
-    synthetic_pass: Any, ground: Ground, tmp_path: Path, sources: list[str]
-) -> None:
-    folder = changed_archive(synthetic_pass, tmp_path / "a", data_sources=sources)
-    report = evaluate(ground, import_archive(ground, folder))
-    reason = "declares the lunar orientation DE421, which is not available on this machine"
-    if sources == ["circular orbit"]:
-        reason = "does not state the lunar orientation (frames.orientation)"
-    assert reason in report.not_available["error"] and reason in report.not_available["detector"]
-    assert report.detector is None and report.reference is None
-    assert {one.kind for one in report.navigation} == {"estimate"}
-    assert all(np.isnan(one.error_rtn_m).all() for one in report.navigation)
-    assert report.verdict_level != "met"
-    inputs = load_pass_inputs(ground, int(report.pass_id))
-    declared_one = evaluate_pass(replace(inputs, limits=Limits(estimator="spherical")))
-    assert declared_one.headline[0].note == "spherical; no error is known"
-    assert declared_one.headline[3].note == "not evaluated"
 
 
 def test_a_pass_of_a_spacecraft_without_a_mission_description_says_so_and_how_to_enter_one(

@@ -5,8 +5,6 @@ east, normal north. Each frame sees three craters of its own: 6 km below, 12 km 
 south.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

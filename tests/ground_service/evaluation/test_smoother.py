@@ -1,7 +1,5 @@
 """The smoother against a batch solution of the same measurements, and on what it was not told of."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

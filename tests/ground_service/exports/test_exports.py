@@ -1,4 +1,7 @@
-"""Exports of a pass, read back with the tools that they are made for."""
+"""Exports of a pass, read back with the tools that they are made for. Exports over HTTP, with the client, and on
+the command line. Lines and rings at the 180th meridian and around the poles, and the geometry that GDAL makes
+of them.
+"""
 
 import csv
 import importlib.util
@@ -16,15 +19,26 @@ import pyarrow.parquet
 import pyogrio
 import pytest
 import spiceypy
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 
+from ground_service.access.service import add_user
+from ground_service.app import create_app
+from ground_service.client import ServiceProblem
+from ground_service.client.local import local_client
 from ground_service.errors import EvaluationError, FileDamaged, NotFound
 from ground_service.exports import service
 from ground_service.exports.formats import FORMATS
+from ground_service.exports.layers import Feature, Layer, cut_line, cut_ring
+from ground_service.exports.maps import format_geojson, geopackage_octets
 from ground_service.exports.model import ExportRequest
 from ground_service.exports.service import export_pass, list_formats
-from ground_service.ground import Ground
+from ground_service.ground import Ground, open_ground
 from ground_service.missions import frames as declared
+from ground_service.passes.archive_import import import_archive
+from ground_service.settings import Settings
+from linna.cli import run
 from lunar.camera import PinholeCamera
 from lunar.catalogue import load_catalogue
 from lunar.frames import IauOrientation, mcmf_from_spherical, rtn_from_inertial
@@ -38,6 +52,7 @@ from tests.ground_service.conftest import FILTER_ERROR_RTN_M, SPACECRAFT, SPHERI
 from tests.ground_service.evaluation.still import TurnedOrientation
 from tests.ground_service.exports.conftest import COVARIANCE, FRAMES, RichPass
 from tests.lazy import Lazy
+from tests.serving import TestClient
 from tmtc.errors import MissingLibrary
 
 CRAFT = spacecraft_id(SPACECRAFT)
@@ -473,3 +488,156 @@ def test_a_missing_library_is_one_line_with_its_extra(
     with pytest.raises(MissingLibrary, match=expected):
         export(rich_ground, kind)
     assert not next(one for one in list_formats() if one.name == kind).available
+
+
+@pytest.fixture(scope="module")
+def home(rich_ground: Ground) -> Path:
+    return rich_ground.home
+
+
+def linna(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    status = run([str(one) for one in arguments])
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def test_the_command_writes_one_file(home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "pass.oem"
+    status, text, _ = linna(capsys, "export", 1, "--format", "oem", "--out", out, "--home", home, "--json")
+    assert status == 0
+    assert json.loads(text)["files"] == [str(out)]
+    assert parse_oem(out.read_text()).segments[0].object_name == "SELENITA"
+
+
+def test_the_command_writes_several_files_into_a_folder_or_a_zip(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, packed = tmp_path / "tables", tmp_path / "tables.zip"
+    status, text, _ = linna(capsys, "export", 1, "--format", "csv", "--out", folder, "--home", home, "--json")
+    assert status == 0
+    files = json.loads(text)["files"]
+    assert len((folder / "frames.csv").read_text().splitlines()) == 1 + FRAMES
+    assert linna(capsys, "export", 1, "--format", "csv", "--out", packed, "--home", home)[0] == 0
+    with zipfile.ZipFile(packed) as archive:
+        assert sorted(archive.namelist()) == sorted(Path(file).name for file in files)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("1", "--format", "aem", "--out", "{folder}"), "--out: expected a file for aem, found a folder"),
+        (("1", "--format", "csv", "--out", "{file}"), "--out: expected a folder for csv, found a file"),
+        (("7", "--format", "aem", "--out", "{new}"), "pass 7: not found"),
+        (("1", "--format", "oem", "--states", "paper", "--out", "{new}"), "expected reference or anchored"),
+    ],
+)
+def test_faults_of_the_command_are_one_line(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], message: str
+) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("")
+    places = {name: str(tmp_path / name) for name in ("folder", "file", "new")}
+    status, text, errors = linna(
+        capsys, "export", *(one.format(**places) for one in arguments), "--home", home
+    )
+    assert (status, text) == (2, "")
+    assert message in errors.splitlines()[-1]
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_client_lists_formats_and_names_a_fault(rich_ground: Ground, tmp_path: Path) -> None:
+    with local_client(open_ground(rich_ground.home), "test") as client:
+        assert {"oem", "gpkg", "netcdf"} <= {one.name for one in client.list_export_formats()}
+        with pytest.raises(ServiceProblem, match=r"expected .*reference"):
+            client.export_pass(1, "oem", out=tmp_path / "pass.oem", states="truth")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_server_gives_the_file_with_its_name(rich_pass: RichPass, tmp_path: Path) -> None:
+    with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as client:
+        ground = client.app.state.ground
+        import_archive(ground, rich_pass.folder)
+        headers = {"Authorization": f"Bearer {add_user(ground, 'viewer', 'viewer')}"}
+        assert client.post("/api/v1/exports", json={"pass_id": 1, "format": "aem"}).status_code == 401
+        asked = {"pass_id": 1, "format": "aem", "version": "1.0"}
+        answer = client.post("/api/v1/exports", json=asked, headers=headers)
+        assert answer.status_code == 200
+        assert answer.headers["Content-Disposition"] == 'attachment; filename="pass-1.aem"'
+        assert answer.content.startswith(b"CCSDS_AEM_VERS = 1.0")
+        for wrong in ({"pass_id": 1, "format": "doc"}, {"pass_id": 1}, {"pass_id": "1", "format": "aem"}):
+            assert client.post("/api/v1/exports", json=wrong, headers=headers).status_code == 422
+        assert client.get("/api/v1/exports/formats", headers=headers).json()[0]["name"] == "oem"
+
+
+def area(ring: np.ndarray) -> float:
+    x, y = ring.T
+    return float(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) / 2.0
+
+
+def test_a_line_across_the_meridian_is_cut_on_it() -> None:
+    parts = cut_line(np.array([[178.0, 10.0], [-178.0, 20.0], [-170.0, 20.0]]))
+    np.testing.assert_allclose(parts[0], [[178.0, 10.0], [180.0, 15.0]])
+    np.testing.assert_allclose(parts[1], [[-180.0, 15.0], [-178.0, 20.0], [-170.0, 20.0]])
+
+
+def test_a_line_that_stays_in_the_world_is_one_part() -> None:
+    line = np.array([[-10.0, 0.0], [0.0, 5.0], [170.0, 0.0]])
+    (part,) = cut_line(line)
+    np.testing.assert_allclose(part, line)
+
+
+def test_a_ring_across_the_meridian_becomes_two() -> None:
+    parts = cut_ring(np.array([[178.0, 0.0], [178.0, 10.0], [-176.0, 10.0], [-176.0, 0.0]]))
+    spans = sorted((float(part[:, 0].min()), float(part[:, 0].max())) for part in parts)
+    np.testing.assert_allclose(spans, [(-180.0, -176.0), (178.0, 180.0)])
+    assert sum(area(part) for part in parts) == pytest.approx(60.0)
+
+
+@given(
+    east=st.floats(-180.0, 180.0),
+    north=st.floats(-60.0, 60.0),
+    size=st.floats(0.5, 20.0),
+    points=st.integers(3, 40),
+    backwards=st.booleans(),
+)
+def test_cut_rings_keep_the_area_and_turn_counterclockwise(
+    east: float, north: float, size: float, points: int, backwards: bool
+) -> None:
+    angle = np.arange(points) / points * 2.0 * np.pi
+    ring = np.column_stack([east + size * np.cos(angle), north + size * np.sin(angle)])
+    wrapped = np.column_stack([(ring[:, 0] + 180.0) % 360.0 - 180.0, ring[:, 1]])
+    parts = cut_ring(wrapped[::-1] if backwards else wrapped)
+    whole = abs(area(np.concatenate([ring, ring[:1]])))
+    assert sum(area(part) for part in parts) == pytest.approx(whole, rel=1e-6)
+    for part in parts:
+        assert (np.abs(part[:, 0]) <= 180.0 + 1e-9).all()
+        np.testing.assert_array_equal(part[0], part[-1])
+
+
+@pytest.mark.parametrize("pole", [90.0, -90.0])
+def test_a_ring_around_a_pole_is_closed_over_it(pole: float) -> None:
+    east = np.arange(-170.0, 180.0, 20.0)
+    parts = cut_ring(np.column_stack([east, np.full(len(east), np.sign(pole) * 85.0)]))
+    assert sum(area(part) for part in parts) == pytest.approx(360.0 * 5.0)
+    assert any((part[:, 1] == pole).any() for part in parts)
+
+
+def test_gdal_reads_the_geometries_as_written(tmp_path) -> None:
+    rings = cut_ring(np.array([[178.0, 0.0], [178.0, 10.0], [-176.0, 10.0], [-176.0, 0.0]]))
+    lines = cut_line(np.array([[178.0, 10.0], [-178.0, 20.0]]))
+    layers = (
+        Layer("footprints", "MultiPolygon", ("frame",), (Feature(rings, {"frame": 3}),)),
+        Layer("tracks", "MultiLineString", ("states",), (Feature(lines, {"states": "é"}),)),
+        Layer("craters", "Point", ("d",), (Feature((np.array([[7.0, 8.0]]),), {"d": float("nan")}),)),
+        Layer("landmarks", "Point", ("d",), ()),
+    )
+    path = tmp_path / "map.gpkg"
+    path.write_bytes(geopackage_octets(layers))
+    assert {str(name) for name, _ in pyogrio.list_layers(path)} == {"footprints", "tracks", "craters"}
+    bounds = pyogrio.read_bounds(path, layer="footprints")[1][:, 0]
+    np.testing.assert_allclose(bounds, [-180.0, 0.0, 180.0, 10.0])
+    assert pyogrio.raw.read(path, layer="tracks")[3][0][0] == "é"
+    collection = tmp_path / "map.geojson"
+    collection.write_text(format_geojson(layers, "map"))
+    assert pyogrio.read_info(collection)["features"] == 3
+    np.testing.assert_allclose(pyogrio.read_bounds(collection)[1][:, 0], [-180.0, 0.0, 180.0, 10.0])

@@ -1,16 +1,35 @@
-"""Reading a downlink in windows: no packet lost at a border, the same accounting as read at once."""
+"""Reading a downlink in windows: no packet lost at a border, the same accounting as read at once. Any split,
+order and repetition of recordings, by any number of processes, gives the same archive. What may happen to a
+running ingest, and archives decoded again.
+"""
 
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
 import tracemalloc
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from sqlalchemy import func, select
 
+from benchmarks.campaigns.cuts import KINDS, ORDERS, Archive, Piece, archive, case_of, ingest
+from ground_service.ground import Ground, open_ground
 from ground_service.ingest.bare import PacketReader
 from ground_service.ingest.frames import FrameReader, Section
 from ground_service.ingest.quality import NO_RECORD, Found
+from ground_service.ingest.reception import Reading, Run
+from ground_service.ingest.redecode import redecode
+from ground_service.ingest.service import Place, ingest_file
+from ground_service.store import repository
+from tests.ground_service.archive_hash import hash_of
 from tmtc.arrays import as_octets
+from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import DownlinkEncoder, LinkSettings, decode, encode_cadus, plan_of
 from tmtc.link.frames import Clcw, pack_clcw
 
@@ -132,3 +151,160 @@ def test_the_uplinks_of_two_spacecraft_in_one_file_are_told_apart(packets: list[
     )
     _, accounting, _ = read(stream, 1 << 20)
     assert {key: seen.report_value for key, seen in accounting.uplink.items()} == {(76, 0): 5, (33, 0): 200}
+
+
+FEW = 2 * len(KINDS)
+"""Cases of a run in one process; the campaign has 500."""
+
+
+@pytest.fixture(scope="module")
+def one_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Archive]:
+    with archive(tmp_path_factory.mktemp("pieces") / "home") as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def several_processes(
+    tmp_path_factory: pytest.TempPathFactory, new_postgres_database: Callable[[], str]
+) -> Iterator[Archive]:
+    with archive(tmp_path_factory.mktemp("pieces") / "home", new_postgres_database(), 3) as found:
+        yield found
+
+
+def test_each_kind_meets_each_order_and_each_piece_is_of_its_recording() -> None:
+    cases = [case_of(number) for number in range(len(KINDS) * len(ORDERS))]
+    assert {(case.kind, case.order) for case in cases} == {
+        (kind, order) for kind in KINDS for order in ORDERS
+    }
+    for case in cases:
+        for recording in case.recordings:
+            octets = bytearray(len(recording.octets))
+            for piece in case.pieces:
+                if piece.recording is recording:
+                    octets[piece.start : piece.stop] = b"\1" * (piece.stop - piece.start)
+            assert all(octets)
+
+
+@pytest.mark.parametrize("number", [k * len(ORDERS) + k for k in range(FEW)])
+def test_any_split_order_and_repetition_gives_the_same_archive(one_process: Archive, number: int) -> None:
+    assert one_process.difference(case_of(number)) == ""
+
+
+@pytest.mark.parametrize("number", [200 + k * (len(ORDERS) + 1) for k in range(len(KINDS))])
+def test_any_number_of_processes_gives_the_same_archive(several_processes: Archive, number: int) -> None:
+    assert several_processes.difference(case_of(number)) == ""
+
+
+def test_a_piece_that_proved_nothing_is_read_with_a_later_one_around_it(one_process: Archive) -> None:
+    assert one_process.difference(case_of(10, ["without checksum", "foreign"])) == ""
+
+
+def test_a_packet_that_ends_with_the_last_frame_of_its_channel_is_completed(one_process: Archive) -> None:
+    assert one_process.difference(case_of(121, ("channels",) * 13)) == ""
+
+
+def test_frames_that_a_piece_did_not_show_are_read_with_a_later_one_around_it(one_process: Archive) -> None:
+    assert one_process.difference(case_of(229, ("damaged",) * 13)) == ""
+
+
+@pytest.mark.parametrize(("number", "kind"), [(227, "stations"), (305, "stations"), (384, "records")])
+def test_parts_that_share_frames_and_headers_cut_from_their_frames_are_used(
+    one_process: Archive, number: int, kind: str
+) -> None:
+    assert one_process.difference(case_of(number, (kind,) * 13)) == ""
+
+
+def test_a_piece_that_became_readable_while_it_was_read_is_read_again(
+    one_process: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (recording,) = case_of(3, ["without proof"]).recordings
+    rest, ground = Piece(recording, 600, len(recording.octets)), one_process.ground
+
+    def just_before_the_rest(_reading: Reading, _run: Run) -> list[object]:
+        monkeypatch.undo()
+        ingest(ground, rest, "late", "rest")
+        return []
+
+    monkeypatch.setattr(Reading, "_links_of_recording", just_before_the_rest)
+    path = ground.home / "first"
+    path.write_bytes(recording.octets[:600])
+    result = ingest_file(ground, path, instance="late", place=Place("r", 0))
+    assert (result.frames, result.octets_pending) == (2, 80)
+
+
+def test_a_lost_piece_is_a_difference(one_process: Archive) -> None:
+    case = case_of(200 * len(ORDERS), ["short frames"])
+    case.pieces.pop()
+    assert "packets" in one_process.difference(case)
+
+
+KILLS = 4
+
+INGEST = """
+import sys
+from pathlib import Path
+from ground_service.ingest import reception
+from ground_service.store import files
+from ground_service.ground import open_ground
+from ground_service.ingest.service import ingest_file
+files.BLOCK_OCTETS = 4_000
+reception.WINDOW_OCTETS = 4_000
+with open_ground(Path(sys.argv[1])) as ground:
+    print("ready", flush=True)
+    ingest_file(ground, Path(sys.argv[2]))
+"""
+
+
+def rows_of(ground: Ground, version: int) -> dict[str, int]:
+    with ground.database.reading() as connection:
+        return {
+            name: connection.execute(
+                select(func.count()).select_from(table).where(table.c.dictionary_version == version)
+            ).scalar_one()
+            for name, table in repository.SAMPLES.items()
+        }
+
+
+@pytest.fixture(scope="module")
+def downlink(make_pass: Callable[..., Any]) -> Path:
+    return Path(make_pass(frames=30, seed=4).folder) / "downlink.cadu"
+
+
+@pytest.mark.campaign
+def test_an_ingest_killed_at_any_moment_loses_and_doubles_nothing(downlink: Path, tmp_path: Path) -> None:
+    """The stream is stored in about ten transactions; the process is killed outright at random moments among them."""
+    with open_ground(tmp_path / "whole") as ground:
+        result = ingest_file(ground, downlink)
+        expected = hash_of(ground)
+    home = tmp_path / "killed"
+    rng = np.random.default_rng(11)
+    for _ in range(KILLS):
+        process = subprocess.Popen(
+            [sys.executable, "-c", INGEST, str(home), str(downlink)],
+            stdout=subprocess.PIPE,
+            env=dict(os.environ),
+        )
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(float(rng.uniform(0.0, 0.4)))
+        process.send_signal(signal.SIGKILL)
+        process.wait(60)
+        process.stdout.close()
+    with open_ground(home) as ground:
+        again = ingest_file(ground, downlink)
+        assert again.packets == result.packets
+        assert hash_of(ground) == expected
+
+
+def test_decoding_again_puts_rows_beside_the_old_ones(downlink: Path, ground: Ground) -> None:
+    result = ingest_file(ground, downlink)
+    before = rows_of(ground, DICTIONARY.version)
+    newer = dataclasses.replace(DICTIONARY, version=DICTIONARY.version + 1)
+    assert result.vehicle_id is not None
+    assert redecode(ground, result.vehicle_id, newer) == sum(before.values()) == result.samples
+    assert rows_of(ground, DICTIONARY.version) == before
+    assert rows_of(ground, newer.version) == before
+    archive = hash_of(ground)
+    redecode(ground, result.vehicle_id, newer)
+    redecode(ground, result.vehicle_id, DICTIONARY)
+    assert hash_of(ground) == archive

@@ -1,7 +1,13 @@
-"""Ingest of whole recordings and of pieces: what is stored, counted, refused and made up for after a failure."""
+"""Ingest of whole recordings and of pieces: what is stored, counted, refused and made up for after a failure. An
+archive that an older dictionary decoded: never empty, decoded again by itself, whatever happens meanwhile. An
+archive of a version that joined pieces by content: fragments are kept, waiting pieces are listed.
+"""
 
 import contextlib
-from collections.abc import Callable
+import json
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,16 +15,28 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from sqlalchemy import event, func, select
+from sqlalchemy import event, func, select, text
 
+from ground_service.app import create_app
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
+from ground_service.ingest import redecode as redecoding
+from ground_service.ingest.packets import batch_of_cut
+from ground_service.ingest.redecode import catch_up, redecode, vehicles_behind
 from ground_service.ingest.service import Place, ingest_file
+from ground_service.ingest.store import store_batch
+from ground_service.passes.service import list_events, parameter_series, state_series
+from ground_service.settings import Settings
+from ground_service.store import database as stores
 from ground_service.store import repository
+from ground_service.store.database import open_database
 from ground_service.store.vehicles import vehicle_id
-from tests.ground_service.archive_hash import hash_of
-from tmtc.downlink import encode_cadus
+from tests.ground_service.archive_hash import archive_hash, hash_of
+from tests.ground_service.conftest import define_pass_of
+from tests.serving import TestClient
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.downlink import decode, encode_cadus
 from tmtc.packets.crc import append_crc
 
 SPACECRAFT = 76
@@ -343,3 +361,176 @@ def test_an_ingest_that_ends_after_any_commit_is_made_up_for_by_the_next(
 def written(folder: Path, octets: bytes) -> Path:
     (folder / "piece").write_bytes(octets)
     return folder / "piece"
+
+
+OLD = replace(DICTIONARY, version=DICTIONARY.version - 1)
+
+
+def fill_with_the_old(home: Path, made: Any) -> None:
+    """What the program before this one left: all packets, decoded by its dictionary."""
+    found = decode((made.folder / "downlink.cadu").read_bytes())
+    with open_ground(home) as ground:
+        with ground.database.writing() as connection:
+            vehicle = vehicle_id(connection, 76, "flight")
+            store_batch(connection, vehicle, batch_of_cut(found.buffer, found.cut, OLD, 76))
+            repository.change(connection, repository.VEHICLES, vehicle, decoded_version=OLD.version)
+        define_pass_of(ground, made)
+
+
+@pytest.fixture
+def old(tmp_path: Path, synthetic_pass: Any) -> Iterator[Ground]:
+    fill_with_the_old(tmp_path / "home", synthetic_pass)
+    with open_ground(tmp_path / "home") as ground:
+        yield ground
+
+
+def looked_at(ground: Ground) -> tuple[int, int, int]:
+    return (
+        list_events(ground, 1, Paging(limit=1)).total,
+        parameter_series(ground, 1, "power_w", 1000).samples,
+        state_series(ground, 1, "spherical", ("altitude_m",), 100)[0].samples,
+    )
+
+
+def versions(ground: Ground) -> set[int]:
+    table = repository.SAMPLES["housekeeping"]
+    with ground.database.reading() as connection:
+        return set(connection.execute(select(table.c.dictionary_version).distinct()).scalars())
+
+
+def test_an_archive_of_the_old_dictionary_is_read_and_then_decoded_again(old: Ground) -> None:
+    before = looked_at(old)
+    assert before == (1, 40, 40)
+    assert vehicles_behind(old) == [1]
+    assert catch_up(old, 1) > 0
+    assert looked_at(old) == before
+    assert vehicles_behind(old) == []
+    assert versions(old) == {OLD.version, DICTIONARY.version}
+    assert catch_up(old, 1) == 0
+
+
+def test_serving_enters_the_job_that_decodes_again(tmp_path: Path, synthetic_pass: Any) -> None:
+    fill_with_the_old(tmp_path / "home", synthetic_pass)
+    with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as client:
+        (job,) = client.get("/api/v1/jobs").json()["items"]
+        assert (job["kind"], job["state"]) == ("redecode", "done")
+        assert len(client.get("/api/v1/passes/1/events").json()["items"]) == 1
+    with open_ground(tmp_path / "home") as ground:
+        assert vehicles_behind(ground) == []
+
+
+def test_what_comes_in_meanwhile_and_a_kill_in_the_middle_change_nothing(
+    old: Ground, tmp_path: Path, make_pass: Any, synthetic_pass: Any, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(redecoding, "BLOCK_PACKETS", 50)
+    more = make_pass(frames=3, seed=5).folder / "downlink.cadu"
+    whole_block = redecoding._block
+    blocks = 0
+
+    def killed(*given: Any) -> Any:
+        nonlocal blocks
+        blocks += 1
+        if blocks == 3:
+            raise KeyboardInterrupt
+        return whole_block(*given)
+
+    monkeypatch.setattr(redecoding, "_block", killed)
+    with pytest.raises(KeyboardInterrupt):
+        ingest_file(old, more)
+    assert looked_at(old)[0] >= 1  # still as the old dictionary decoded it
+    ingest_file(old, more)
+    with open_ground(tmp_path / "fresh") as fresh:
+        for path in (more, synthetic_pass.folder / "downlink.cadu"):
+            ingest_file(fresh, path)
+        redecode(fresh, 1, OLD)
+        redecode(old, 1, OLD)
+        hashes = []
+        for ground in (old, fresh):
+            with ground.database.reading() as connection:
+                hashes.append(archive_hash(connection, 1))
+    assert hashes[0] == hashes[1]
+
+
+ZONE = 1107
+"""Octets of a frame for packets."""
+
+FILE = "INSERT INTO files (sha256, kind, name, octets, received_utc_ns) VALUES (:sha256, 'downlink', 'a', 600, 1)"
+EDGE = (
+    "INSERT INTO stream_edges"
+    " (domain, identity, role, open, count, next_count, fit, file_sha256, start, length, octets)"
+    " VALUES (:domain, :identity, :role, 1, :count, :next_count, :fit, :sha256, :start, :length, :octets)"
+)
+INGEST = (
+    "INSERT INTO ingests (id, file_sha256, state, dictionary_version, received_utc_ns, accounting)"
+    " VALUES (:id, :sha256, 'done', 1, 1, :accounting)"
+)
+PIECE = (
+    "INSERT INTO pieces (ingest_id, scope, file_sha256, octets, stream, position, links_tried, station,"
+    " packets_stored, packets_joined, samples_stored) VALUES (:id, 'flight', :sha256, 600, :stream, 0, 2, '', 0, 0, 0)"
+)
+
+
+@pytest.fixture
+def begun(synthetic_pass: Any) -> tuple[int, bytes]:
+    """Octets of a packet in the first frame of the downlink and behind it."""
+    at = 0
+    for packet in synthetic_pass.packets:
+        if at + len(packet) > ZONE:
+            return at + len(packet) - ZONE, packet[: ZONE - at]
+        at += len(packet)
+    raise AssertionError
+
+
+@pytest.fixture
+def upgraded(begun: tuple[int, bytes], tmp_path: Path, caplog: pytest.LogCaptureFixture) -> Ground:
+    """An archive in which the beginning of a packet waits, and two pieces of 600 octets, one without a position."""
+    home = tmp_path / "home"
+    home.mkdir()
+    database = open_database(f"sqlite:///{home / 'linna.db'}")
+    stores.upgrade_database(database, "1.1")
+    with database.engine.begin() as connection:
+        connection.execute(text("INSERT INTO vehicles (id, ccsds_id, instance) VALUES (1, 76, 'flight')"))
+        for number, stream in ((1, ""), (2, "s")):
+            ids = {"id": number, "sha256": str(number) * 64}
+            connection.execute(text(FILE), ids)
+            connection.execute(text(INGEST), ids | {"accounting": json.dumps({"octets_pending": 5})})
+            connection.execute(text(PIECE), ids | {"stream": stream})
+            raw = {"role": 1, "count": -1, "next_count": -1, "fit": 600, "octets": bytes(600)}
+            for domain in ("cadus a flight", "packets 76 flight"):
+                edge = {"domain": domain, "identity": ids["sha256"].encode()[:16], "start": 0, "length": 600}
+                connection.execute(text(EDGE), raw | edge | {"sha256": ids["sha256"]})
+        missing, octets = begun
+        opener = {
+            "domain": "channel 1 0 6 1113",
+            "identity": b"x" * 16,
+            "role": 0,
+            "count": 1,
+            "next_count": 1,
+        }
+        opener |= {"fit": missing, "octets": octets, "length": len(octets), "start": None, "sha256": None}
+        connection.execute(text(EDGE), opener)
+    database.engine.dispose()
+    with caplog.at_level(logging.WARNING):
+        return open_ground(home)
+
+
+def test_the_beginning_of_a_packet_is_kept(upgraded: Ground, synthetic_pass: Any, tmp_path: Path) -> None:
+    stream = (synthetic_pass.folder / "downlink.cadu").read_bytes()
+    (tmp_path / "rest.cadu").write_bytes(stream[1279:])
+    with upgraded as ground:
+        assert ingest_file(ground, tmp_path / "rest.cadu").packets_joined == 1
+
+
+def test_waiting_pieces_without_a_position_are_listed(
+    upgraded: Ground, caplog: pytest.LogCaptureFixture
+) -> None:
+    said = [one.getMessage() for one in caplog.get_records("setup")]
+    assert [one for one in said if "--recording NAME FILE" in one] == [
+        f"ingest 1, file {'1' * 64}: 600 octets wait for others without a position; ingest the files of its "
+        "recording again with 'linna ingest --recording NAME FILE...'"
+    ]
+    with upgraded as ground, ground.database.reading() as connection:
+        rows = connection.execute(text("SELECT accounting FROM ingests ORDER BY id")).scalars().all()
+        waits = connection.execute(text("SELECT waits FROM pieces ORDER BY ingest_id")).scalars().all()
+    assert [json.loads(one)["octets_pending"] for one in rows] == [600, 600]
+    assert waits == [None, 1]

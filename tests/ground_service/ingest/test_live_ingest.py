@@ -1,6 +1,9 @@
-"""Telemetry in a spool and as files that appear: every packet once, also after a crash."""
+"""Telemetry in a spool and as files that appear: every packet once, also after a crash. Reception times of time
+reports from the records of a station.
+"""
 
 import os
+import struct
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -9,10 +12,26 @@ import numpy as np
 import pytest
 
 from ground_service.errors import InvalidInput, StorageFull
+from ground_service.events import read_events
 from ground_service.ground import Ground
+from ground_service.ingest import store
+from ground_service.ingest.frames import FrameReader, Section
 from ground_service.ingest.live import Spool, WatchedFolder
+from ground_service.ingest.packets import CLOCKS_AGREE_NS, PacketBatch, batch_of_cut, time_receptions
+from ground_service.ingest.quality import NO_TIME, Found, RecordFormat
 from ground_service.ingest.service import Place, ingest_file
+from ground_service.store.repository import RECEPTIONS
+from ground_service.store.vehicles import vehicle_id
+from lunar.arrays import IntArray
+from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service.archive_hash import hash_of
+from tmtc.arrays import as_octets
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.downlink import encode_cadus
+from tmtc.link.frames import FRAME_HEADER_LENGTH
+from tmtc.link.settings import LinkSettings
+from tmtc.packets.crc import CRC_LENGTH
+from tmtc.packets.stream import cut_packets
 
 
 @pytest.fixture
@@ -140,3 +159,85 @@ def test_files_that_appear_are_ingested_once_when_they_are_whole(tmp_path: Path)
     assert [one["file"] for one in seen] == ["a.cadu", "b.cadu", "a.cadu"]
     with pytest.raises(InvalidInput, match="expected a folder to watch"):
         WatchedFolder(tmp_path / "no", tmp_path / "l", lambda _: {}, lambda *_: None).look(0.0)
+
+
+NS = 1_000_000_000
+START = parse_utc("2029-08-07T06:00:00Z")
+SETTINGS = LinkSettings().explicit
+RECORD = RecordFormat(header_octets=8, time_code="unix_ns")
+
+
+def report(ticks: int, count: int) -> bytes:
+    values = {"reported_ticks": ticks, "rate_exponent": 4}
+    return DICTIONARY.pack("time_report", values, ticks=ticks, sequence_count=count)
+
+
+def batch_of(packets: list[bytes], received: IntArray | None) -> PacketBatch:
+    octets = b"".join(packets)
+    return batch_of_cut(octets, cut_packets(octets), DICTIONARY, 76, received)
+
+
+@pytest.mark.parametrize("window_octets", [1 << 20, 3_000])
+def test_a_packet_has_the_reception_time_of_the_frame_in_which_it_begins(window_octets: int) -> None:
+    ticks = int(ticks_from_utc_ns(START))
+    packets = [report(ticks + k, k) for k in range(400)]
+    cadus = encode_cadus(packets, spacecraft_id=76)
+    length = SETTINGS.cadu_length
+    rows = [cadus[at : at + length] for at in range(0, len(cadus), length)]
+    times = START + np.arange(len(rows), dtype=np.int64) * NS
+    stream = b"".join(struct.pack(">q", time) + row for time, row in zip(times.tolist(), rows, strict=True))
+    section = Section(SETTINGS, 0, len(stream), 0, len(stream))
+    reader = FrameReader(section, SETTINGS, Found(), spacecraft_id=76, record=RECORD)
+    blocks = [stream[at : at + window_octets] for at in range(0, len(stream), window_octets)]
+    found: dict[int, int] = {}
+    for batch in reader.batches((as_octets(one), one is blocks[-1]) for one in blocks):
+        assert batch.received_utc_ns is not None
+        found |= dict(zip(batch.sequence_count.tolist(), batch.received_utc_ns.tolist(), strict=True))
+    starts = np.cumsum([0, *map(len, packets)])
+    zone = SETTINGS.frame_length - FRAME_HEADER_LENGTH - CRC_LENGTH
+    assert len(rows) >= 8 and len(found) == len(packets)
+    for k in range(len(packets)):
+        first, last = int(starts[k]) // zone, (int(starts[k + 1]) - 1) // zone
+        # A packet that is continued in a later window of the reader has the time of its end.
+        expected = (
+            {int(times[first])} if window_octets > len(stream) else {int(times[first]), int(times[last])}
+        )
+        assert found[k] in expected
+    assert reader.found.first_utc_ns == times[0]
+    assert reader.found.last_utc_ns == times[-1]
+
+
+def test_reports_of_clocks_that_differ_are_left_out() -> None:
+    ticks = int(ticks_from_utc_ns(START))
+    packets = [report(ticks, k) for k in range(6)]
+    later = np.array([1.3, 60.0, 60.1, -60.0, 3600.0, 0.0])
+    received = START + np.rint(later * NS).astype(np.int64)
+    received[5] = NO_TIME
+    assert CLOCKS_AGREE_NS == 60 * NS
+    found = time_receptions(batch_of(packets, received))
+    assert found == {(ticks, k): int(received[k]) for k in (0, 1, 3)}
+    assert time_receptions(batch_of(packets, None)) == {}
+
+
+def noted(ground: Ground) -> list[tuple[Any, ...]]:
+    names = ("ticks", "sequence_count", "station", "earth_utc_ns")
+    with ground.database.reading() as connection:
+        rows = connection.execute(RECEPTIONS.select().order_by(*(RECEPTIONS.c[name] for name in names)))
+        return [tuple(getattr(row, name) for name in names) for row in rows]
+
+
+def test_the_first_reception_counts_in_any_order(either: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+    with either.database.writing() as connection:
+        vehicle = vehicle_id(connection, 76, "flight")
+        for received in ({(7, 1): 500, (8, 2): 600}, {(7, 1): 400}, {(7, 1): 450}):
+            store.note_receptions(connection, vehicle, "madrid", received)
+        store.note_receptions(connection, vehicle, "canberra", {(7, 1): 700})
+    expected = [(7, 1, "canberra", 700), (7, 1, "madrid", 400), (8, 2, "madrid", 600)]
+    assert noted(either) == expected
+    logged = read_events(either.database, 0)
+    reports = [one.payload["reports"] for one in logged if one.kind == "receptions"]
+    assert reports == [2, 1, 1]  # the later reception of the same report changes nothing
+    monkeypatch.setattr(store, "RECEPTIONS_LIMIT", 3)
+    with either.database.writing() as connection:
+        store.note_receptions(connection, vehicle, "madrid", {(9, 3): 800})
+    assert noted(either) == expected

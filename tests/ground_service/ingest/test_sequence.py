@@ -1,12 +1,23 @@
-"""Counting packets: wraps, gaps, restarts, late and stray packets."""
+"""Counting packets: wraps, gaps, restarts, late and stray packets. Decoded columns as the store takes them.
+Ingests are found by the on-board times of their packets.
+"""
+
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ground_service.ground import Ground
 from ground_service.ingest.core import COUNT_MODULUS, account_sequence
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from ground_service.ingest.packets import batch_of_cut
+from ground_service.ingest.service import ingest_file
+from ground_service.ingest.store import recordings_of_vehicle
+from ground_service.store import repository
+from tmtc.dictionary.payload import DICTIONARY
+from tmtc.packets.cuc import NO_TICKS, TICKS_PER_SECOND
+from tmtc.packets.stream import cut_packets
 
 SECOND = TICKS_PER_SECOND
 
@@ -124,3 +135,40 @@ def test_counts_go_on_from_the_first_of_each_run() -> None:
     account = account_sequence(np.r_[before, after], np.r_[counts_before, 0, 1, 2])
     assert account.run.tolist() == [0] * 5 + [1] * 3
     assert account.count.tolist() == [16_382, 16_383, 16_384, 16_385, 16_386, 0, 1, 2]
+
+
+def test_an_impossible_on_board_time_is_none_and_never_negative_garbage():
+    octets = b"".join(
+        DICTIONARY.pack(
+            "time_report", {"reported_ticks": ticks, "rate_exponent": 0}, ticks=9, sequence_count=k
+        )
+        for k, ticks in enumerate((0, 2**48 - 1, 2**48, 2**63, 2**64 - 1))
+    )
+    rows = batch_of_cut(octets, cut_packets(octets)).rows
+    reported = next(columns["reported_ticks"] for columns in rows.values() if "reported_ticks" in columns)
+    assert reported.dtype == "int64"
+    assert reported.tolist() == [0, 2**48 - 1, NO_TICKS, NO_TICKS, NO_TICKS]
+
+
+def test_only_ingests_with_packets_in_the_time_are_returned(either: Ground, synthetic_pass: Any) -> None:
+    result = ingest_file(either, synthetic_pass.folder / "downlink.cadu")
+    first, last = result.first_ticks, result.last_ticks
+    assert first is not None and last is not None and first < last and result.vehicle_id is not None
+
+    def found(start_ticks: int, stop_ticks: int) -> int:
+        with either.database.reading() as connection:
+            return len(recordings_of_vehicle(connection, result.vehicle_id or 0, start_ticks, stop_ticks))
+
+    assert found(first, last) == found(first - 9, first) == found(last, last + 9) == 1
+    assert found(first + 1, first + 2) == 1
+    assert found(first - 9, first - 1) == found(last + 1, last + 9) == 0
+
+    def without_times(**counts: int) -> int:
+        accounting = {"packets": 0, "vehicle_ids": [result.vehicle_id], **counts}
+        changed = repository.INGESTS.update().values(first_ticks=None, last_ticks=None, accounting=accounting)
+        with either.database.writing() as connection:
+            connection.execute(changed)
+        return found(last + 1, last + 9)
+
+    assert without_times(frames=2) == 0  # without a packet, and without octets that could be of one
+    assert without_times(packets=1) == without_times(frames_bad=1) == without_times(octets_pending=9) == 1

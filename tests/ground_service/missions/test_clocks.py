@@ -1,7 +1,5 @@
 """Mission time from the descriptions in force, in every form of the service."""
 
-from __future__ import annotations
-
 import time
 from argparse import Namespace
 from pathlib import Path

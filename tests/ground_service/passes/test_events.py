@@ -1,20 +1,41 @@
-"""Event reports and craters across the passes of a spacecraft."""
+"""Event reports and craters across the passes of a spacecraft. Newest values of the parameters of a spacecraft.
+Housekeeping structures without a table of their own: live values, series, limits and drawing from packets.
+Data of the wrong time: yesterday's in the middle of today's, and references that do not reach the pass. The
+list of passes by the verdict of their newest report, on each database.
+"""
 
+import random
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from ground_service.client.local import local_client
+from ground_service.clock import set_mission_clock
+from ground_service.contacts.commanding.service import enter_command, reject_command
 from ground_service.errors import NotFound
+from ground_service.evaluation import inputs, store
+from ground_service.evaluation.model import StoredReport
+from ground_service.evaluation.service import make_report, pass_summary
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.http.times import UtcTime
 from ground_service.ingest.service import ingest_file
+from ground_service.missions.ephemerides.service import add_ephemeris
+from ground_service.missions.service import add_mission
 from ground_service.passes import service
 from ground_service.passes.archive_import import import_archive
-from ground_service.passes.model import EventFilter
+from ground_service.passes.live import list_spacecraft, live_parameters
+from ground_service.passes.model import EventFilter, PassFilter
+from ground_service.passes.service import completeness, define_pass
+from ground_service.passes.store import list_passes
+from ground_service.store.stored_files import register_file
 from lunar.catalogue import load_catalogue
-from lunar.timescales import utc_ns_from_ticks
+from lunar.ephemeris import ephemeris_from_states
+from lunar.messages.ephemeris_files import load_ephemeris
+from lunar.messages.oem import save_oem
+from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns, utc_ns_from_ticks
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -107,3 +128,219 @@ def test_the_craters_of_a_pass_are_listed_the_largest_first(ground: Ground, synt
 
 def test_a_pass_without_a_catalogue_has_no_craters(passed: Ground) -> None:
     assert service.craters(passed, 1, Paging(limit=10)).total == 0
+
+
+def receive(ground: Ground, tmp_path: Path, second: int, **values: float) -> None:
+    zeros: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
+    packet = DICTIONARY.pack(
+        "housekeeping",
+        zeros | values | {"structure_id": 1},
+        ticks=TICKS + second * 65_536,
+        sequence_count=second,
+    )
+    file = tmp_path / f"{second}.cadu"
+    file.write_bytes(encode_cadus([packet], spacecraft_id=76))
+    ingest_file(ground, file)
+
+
+def test_the_newest_packet_by_on_board_time_counts(either: Ground, tmp_path: Path) -> None:
+    receive(either, tmp_path, 10, temperature_c=70.25, bus_voltage_v=12.0, mode=2, model_hash=0xDF7F5779)
+    receive(either, tmp_path, 5, temperature_c=20.0)  # arrives later, and is older
+    found = {one.name: one for one in live_parameters(either, 76, "flight")}
+    temperature = found["temperature_c"]
+    assert (temperature.value, temperature.text, temperature.limit_state) == (70.25, "70.25", "warning")
+    assert (temperature.limits, temperature.packet) == ("-20 to 60", "housekeeping")
+    assert (found["mode"].text, found["mode"].limit_state) == ("observing", "none")
+    assert found["model_hash"].text == "df7f5779"
+    assert temperature.time.utc_ns == int(utc_ns_from_ticks(TICKS + 10 * 65_536))
+    (listed,) = list_spacecraft(either)
+    assert (listed.spacecraft_id, listed.instance, listed.name) == (76, "flight", None)
+    add_mission(either, b'name = "m"\n[spacecraft]\nid = 76\nname = "SelenITA"\n')
+    assert list_spacecraft(either)[0].name == "SelenITA"
+
+
+@pytest.mark.parametrize(("later_s", "age_s"), [(42.5, 42.5), (-1e8, 0.0)])
+def test_ages_are_those_of_mission_time_and_count_from_the_newest_packet_where_that_is_later(
+    ground: Ground, tmp_path: Path, later_s: float, age_s: float
+) -> None:
+    receive(ground, tmp_path, 0)
+    now = int(utc_ns_from_ticks(TICKS)) + round(later_s * 1e9)
+    set_mission_clock(lambda: now)
+    try:
+        assert {one.age_s for one in live_parameters(ground, 76, "flight")} == {age_s}
+    finally:
+        set_mission_clock(None)
+
+
+def test_an_unknown_spacecraft_is_not_found(ground: Ground) -> None:
+    with pytest.raises(NotFound, match="spacecraft 5"):
+        live_parameters(ground, 5, "flight")
+
+
+def test_a_mistyped_spacecraft_is_listed_until_its_telecommand_is_rejected(either: Ground) -> None:
+    command = enter_command(either, "test_connection", {}, spacecraft_id=67, actor="ann")
+    assert [one.spacecraft_id for one in list_spacecraft(either)] == [67]
+    reject_command(either, command, actor="ann", reason="mistyped")
+    assert list_spacecraft(either) == []
+
+
+HOT_C = 61.25
+
+
+def test_a_parameter_of_a_further_structure_has_a_series_a_live_value_an_alarm_and_a_drawing(
+    ground: Ground, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    zeros = {field.name: 0 for field in DICTIONARY.packet("performance").fields} | {"structure_id": 2}
+    values = [10.0, HOT_C, 20.0]
+    packets = [
+        DICTIONARY.pack(
+            "performance",
+            zeros | {"camera_temperature_c": value},
+            ticks=TICKS + (second << 16),
+            sequence_count=second,
+        )
+        for second, value in enumerate(values)
+    ]
+    with local_client(ground, "ann") as client:
+        client.ingest_file(encode_cadus(packets[::-1], spacecraft_id=76))
+        start, stop = (format_utc(int(utc_ns_from_ticks(TICKS + (s << 16)))) for s in (-60, 60))
+        pass_id = client.define_pass("pass", start, stop, 76).id
+        listed = {one.name: one for one in client.list_parameters(pass_id).parameters}
+        assert (listed["camera_temperature_c"].packet, listed["camera_temperature_c"].unit) == (
+            "performance",
+            "degC",
+        )
+        series = client.get_parameter(pass_id, "camera_temperature_c")
+        assert [bucket.mean for bucket in series.buckets] == values
+        live = {one.name: one for one in client.list_live_parameters(76)}["camera_temperature_c"]
+        assert (live.value, live.limit_state) == (20.0, "within")
+        [alarm] = client.list_alarms()
+        assert (alarm.name, alarm.severity, alarm.value, alarm.active) == (
+            "camera_temperature_c",
+            "alarm",
+            HOT_C,
+            False,
+        )
+        monkeypatch.setattr(inputs, "DRAWN", ("camera_temperature_c",))
+        [drawn] = inputs.load_pass_inputs(ground, pass_id).housekeeping
+        assert (drawn.name, drawn.unit, drawn.values.tolist()) == ("camera_temperature_c", "°C", values)
+
+
+NS = 1_000_000_000
+DAY = 86_400
+START = parse_utc("2029-08-07T06:00:00Z")
+FRAMES = 200
+MISSION = b"""
+name = "test"
+[spacecraft]
+id = 76
+[frames]
+orientation = "IAU WGCCRE 2009"
+"""
+
+
+def housekeeping(day: int) -> list[bytes]:
+    """A packet every ten seconds; the counts of a day go on where those of the day before ended."""
+    values: dict[str, Any] = {field.name: 1 for field in DICTIONARY.packet("housekeeping").fields}
+    first = int(ticks_from_utc_ns(START + day * DAY * NS))
+    return [
+        DICTIONARY.pack(
+            "housekeeping",
+            {**values, "frames_processed": k},
+            ticks=first + k * 10 * 65_536,
+            sequence_count=(16_300 + (day + 1) * FRAMES + k) % 16_384,
+        )
+        for k in range(FRAMES)
+    ]
+
+
+def day_pass(ground: Ground, day: int) -> int:
+    start = START + day * DAY * NS
+    return define_pass(
+        ground, name=str(day), start_utc_ns=start, stop_utc_ns=start + 10 * FRAMES * NS, spacecraft_id=76
+    )
+
+
+def test_bursts_of_yesterday_in_todays_stream_fall_into_their_own_day(ground: Ground, tmp_path: Path) -> None:
+    rng = random.Random(1)
+    today, yesterday = housekeeping(0), housekeeping(-1)
+    stream: list[bytes] = []
+    while today or yesterday:
+        burst = yesterday if yesterday and (not today or rng.random() < 0.3) else today
+        for _ in range(min(rng.randint(1, 25), len(burst))):
+            stream.append(burst.pop(0))
+    (tmp_path / "d.cadu").write_bytes(encode_cadus(stream, spacecraft_id=76))
+    assert ingest_file(ground, tmp_path / "d.cadu").packets_new == 2 * FRAMES
+    for day in (0, -1):
+        found = completeness(ground, day_pass(ground, day))
+        assert (found.packets, found.lost, found.conflicts) == (FRAMES, 0, 0)
+
+
+@pytest.mark.parametrize(("share", "covered"), [(0.0, False), (0.5, True)])
+def test_a_reference_that_does_not_cover_gives_figures_where_it_does(
+    ground: Ground, synthetic_pass: Any, tmp_path: Path, share: float, covered: bool
+) -> None:
+    whole = load_ephemeris(synthetic_pass.folder / "reference.oem")
+    first, last = int(synthetic_pass.utc_ns[0]), int(synthetic_pass.utc_ns[-1])
+    stop = first + int(share * (last - first))
+    times = np.arange(first - 3600 * NS if share == 0.0 else first - 300 * NS, stop - 60 * NS, 15 * NS)
+    times = times[(times >= whole.start_utc_ns) & (times <= whole.stop_utc_ns)]
+    save_oem(ephemeris_from_states(times, *whole.at(times)), tmp_path / "part.oem")
+    add_ephemeris(ground, ground.files.put_file(tmp_path / "part.oem"), name="part")
+    add_mission(ground, MISSION)
+    ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
+    key = define_pass(ground, name="p", start_utc_ns=first, stop_utc_ns=last, spacecraft_id=76)
+    figures = pass_summary(ground, key)["navigation"]
+    found = figures.get("spherical", {"median_3d_m": None})["median_3d_m"]
+    assert found == (pytest.approx(130.0, abs=1.0) if covered else None)
+    assert make_report(ground, key).report_id
+
+
+def add_report(ground: Ground, pass_id: int, level: str, created_utc_ns: int) -> None:
+    stored = ground.files.put_octets(b"report")
+    with ground.database.writing() as connection:
+        register_file(connection, stored, "report", "report", created_utc_ns)
+        store.add_report(
+            connection,
+            StoredReport(
+                id=f"{pass_id:016x}{created_utc_ns:016x}",
+                pass_id=pass_id,
+                html_sha256=stored.sha256,
+                json_sha256=stored.sha256,
+                pdf_sha256=None,
+                summary={"verdict_level": level},
+                mission_id=None,
+                event_number=None,
+                previous_id=None,
+                changes=None,
+                created_utc_ns=created_utc_ns,
+            ),
+        )
+
+
+def listed(ground: Ground, **terms: Any) -> tuple[list[int], int]:
+    page = ground.read(list_passes, PassFilter(**terms))
+    found, total = page.items, page.total
+    return sorted(one.id for one in found), total
+
+
+def test_passes_are_listed_by_the_verdict_of_their_newest_report(either: Ground) -> None:
+    for hour in range(3):
+        start = (1_900_000_000 + 3600 * hour) * NS
+        define_pass(
+            either,
+            name=f"pass {hour}",
+            start_utc_ns=start,
+            stop_utc_ns=start + 60 * NS,
+            spacecraft_id=76,
+        )
+    add_report(either, 1, "met", 2 * NS)
+    add_report(either, 1, "not met", 1 * NS)  # older
+    add_report(either, 2, "met", 1 * NS)
+    add_report(either, 2, "not met", 3 * NS)
+    assert listed(either, verdict="met") == ([1], 1)
+    assert listed(either, verdict="not met") == ([2], 1)
+    assert listed(either, verdict="unknown") == ([], 0)
+    assert listed(either, verdict="none") == ([3], 1)
+    assert listed(either, verdict="met", search="pass 1") == ([], 0)
+    assert listed(either) == ([1, 2, 3], 3)

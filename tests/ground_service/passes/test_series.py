@@ -1,23 +1,53 @@
-"""Series from roll-ups: the same as from the samples, in whatever order they came, gaps marked."""
+"""Series from roll-ups: the same as from the samples, in whatever order they came, gaps marked. Filter estimates
+of both packet versions in the archive, and their consistency in the report. Images of a spacecraft:
+downlinked thumbnails and frames of pass archives, on spacecraft time.
+"""
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from sqlalchemy import event, select
 
-from ground_service.errors import NotFound
+from ground_service.errors import InvalidInput, NotFound
+from ground_service.evaluation.core import evaluate_pass
+from ground_service.evaluation.inputs import filter_states, load_pass_inputs
 from ground_service.ground import Ground
-from ground_service.ingest.store import store_samples
-from ground_service.passes import series
-from ground_service.passes.parameters import series_source
-from ground_service.passes.service import trend_series
-from ground_service.passes.span import PassSpan
-from ground_service.store import rollups
+from ground_service.http.model import Paging
+from ground_service.ingest.packets import batch_of_cut
+from ground_service.ingest.redecode import catch_up
+from ground_service.ingest.service import ingest_file
+from ground_service.ingest.store import store_batch, store_samples
+from ground_service.missions.service import add_mission
+from ground_service.passes import images, series, store
+from ground_service.passes.archive_import import import_archive
+from ground_service.passes.live import list_spacecraft
+from ground_service.passes.parameters import series_source, spacecraft_parameters
+from ground_service.passes.service import detections, trend_series
+from ground_service.passes.span import PassSpan, pass_span
+from ground_service.passes.store import get_pass
+from ground_service.store import repository, rollups
 from ground_service.store.models import ROLLUPS
 from ground_service.store.rollups import BASE_TICKS, HOUSEKEEPING_VALUES, STATE_VALUES
+from ground_service.store.stored_files import register_file
 from ground_service.store.vehicles import vehicle_id
+from lunar.timescales import parse_utc, ticks_from_utc_ns
+from tests.ground_service.conftest import (
+    NS,
+    SPACECRAFT,
+    SyntheticPass,
+    define_pass_of,
+    encode_downlink,
+    enter_files,
+)
 from tmtc.dictionary.payload import DICTIONARY
+from tmtc.downlink import encode_cadus
+from tmtc.packets.large_data import split
+from tmtc.packets.stream import cut_packets
+from tmtc.packets.thumbnails import Thumbnail, pack_thumbnail
 
 SECOND = 1 << 16
 FIRST = 900_000_000 * SECOND
@@ -199,3 +229,297 @@ def test_a_misspelled_parameter_is_refused_with_the_nearest_one(ground: Ground) 
     span = PassSpan(1, FIRST, FIRST + SECOND, (), DICTIONARY.version)
     with pytest.raises(NotFound, match=r"parameter temprature_c \(nearest: temperature_c\): not found"):
         ground.read(series_source, span, "temprature_c")
+
+
+ERROR_RTN_M = np.array([30.0, -40.0, 10.0])
+SIGMA_M = np.array([20.0, 50.0, 10.0])
+CORRELATION = 0.6
+# Radial and transverse errors of 1.5 and -0.8 sigma, correlated by 0.6: (2.25 + 0.64 + 1.44) / 0.64, normal 1.
+NEES = (1.5**2 + 0.8**2 + 2.0 * CORRELATION * 1.5 * 0.8) / (1.0 - CORRELATION**2) + 1.0
+DIAGONAL = 1.5**2 + 0.8**2 + 1.0
+
+
+def anchored_packets(made: Any, version: int) -> list[bytes]:
+    """States and estimates of an anchored filter on the orbit of the synthetic pass, erring by `ERROR_RTN_M`."""
+    from lunar.frames import IauOrientation, rtn_from_inertial, spherical_from_mcmf
+    from lunar.messages.oem import load_oem
+    from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
+
+    reference = load_oem(made.folder / "reference.oem")
+    packets = []
+    for k, utc_ns in enumerate(made.utc_ns.tolist()):
+        state = np.concatenate([np.ravel(part) for part in reference.at(np.array([utc_ns]))])
+        axes = rtn_from_inertial(state[:3], state[3:])
+        position = state[:3] + axes.T @ ERROR_RTN_M
+        rotation = IauOrientation().mcmf_from_icrf(float(tdb_s_from_utc_ns(utc_ns)))
+        latitude, longitude, altitude = (float(x) for x in spherical_from_mcmf(rotation @ position))
+        along = np.diag(SIGMA_M**2)
+        along[0, 1] = along[1, 0] = CORRELATION * SIGMA_M[0] * SIGMA_M[1]
+        covariance = np.diag([0.0] * 3 + [1e-4] * 3 + [1e-12] * 3)
+        covariance[:3, :3] = axes.T @ along @ axes
+        ticks = int(ticks_from_utc_ns(utc_ns))
+        frame = {"frame_number": k, "image_ticks": ticks}
+        triangle = np.tril_indices(9) if version == 2 else np.triu_indices(9)
+        values = {
+            **frame,
+            "position_icrf_m": position,
+            "velocity_icrf_m_s": state[3:],
+            "acceleration_rtn_m_s2": np.zeros(3),
+            "covariance": covariance[triangle],
+        }
+        name = "filter_state" if version == 2 else "filter_estimate"
+        if version != 2:
+            values["innovation_degrees"] = 24
+        packets.append(DICTIONARY.pack(name, values, ticks=ticks + 5, sequence_count=1_000 + 2 * k))
+        state_values = {
+            **frame, "estimator": 2, "outcome": "fixed", "latitude_deg": np.degrees(latitude),
+            "longitude_deg": np.degrees(longitude) % 360.0, "altitude_m": altitude,
+            "velocity_icrf_m_s": state[3:], "sigma_rtn_m": SIGMA_M, "nis": 12.0, "matched": 12,
+        }  # fmt: skip
+        packets.append(
+            DICTIONARY.pack("navigation_state", state_values, ticks=ticks + 6, sequence_count=1_001 + 2 * k)
+        )
+    return packets
+
+
+@pytest.fixture(params=[2, 3])
+def flown(request: Any, tmp_path: Path, make_pass: Any) -> tuple[Path, Any, int]:
+    made = make_pass(frames=8, seed=3)
+    path = tmp_path / "anchored.cadu"
+    path.write_bytes(encode_cadus(anchored_packets(made, request.param), spacecraft_id=SPACECRAFT))
+    return path, made, request.param
+
+
+def archive_with(made: Any, packets: list[bytes]) -> Path:
+    """The archive of the synthetic pass with further packets in its downlink."""
+    folder: Path = made.folder
+    octets = encode_cadus([*made.packets, *packets], spacecraft_id=SPACECRAFT)
+    (folder / "downlink.cadu").write_bytes(octets)
+    enter_files(folder)
+    return folder
+
+
+def states_of(ground: Ground, pass_id: int) -> Any:
+    with ground.database.reading() as connection:
+        return filter_states(connection, pass_span(connection, get_pass(connection, pass_id)))
+
+
+def test_estimates_of_either_version_are_stored_with_covariance_and_degrees(
+    flown: tuple[Path, Any, int], ground: Ground
+) -> None:
+    path, made, version = flown
+    ingest_file(ground, path)
+    found = states_of(ground, define_pass_of(ground, made))
+    assert len(found) == 8
+    # The axes are those of the estimate, 40 m in 1,767 km (2e-5 rad) from those of the orbit.
+    np.testing.assert_allclose(found.sigma_rtn_m, np.broadcast_to(SIGMA_M, (8, 3)), rtol=1e-4)
+    block = found.position_covariance_rtn_m2
+    np.testing.assert_allclose(block[:, 0, 1], CORRELATION * 20.0 * 50.0, rtol=2e-4)
+    assert found.innovation_degrees.tolist() == [-1 if version == 2 else 24] * 8
+    with ground.database.reading() as connection:
+        table = repository.SAMPLES["filter_states"]
+        assert set(connection.execute(select(table.c.dictionary_version)).scalars()) == {DICTIONARY.version}
+
+
+def test_what_version_2_decoded_is_decoded_again_to_the_same_states(ground: Ground, make_pass: Any) -> None:
+    made = make_pass(frames=8, seed=3)
+    octets = b"".join(anchored_packets(made, 2))
+    with ground.database.writing() as connection:
+        vehicle = vehicle_id(connection, SPACECRAFT, "flight")
+        batch = batch_of_cut(octets, cut_packets(octets), replace(DICTIONARY, version=2), SPACECRAFT)
+        store_batch(connection, vehicle, batch)
+        repository.change(connection, repository.VEHICLES, vehicle, decoded_version=2)
+    pass_id = define_pass_of(ground, made)
+    before = states_of(ground, pass_id)
+    assert catch_up(ground, vehicle) > 0
+    after = states_of(ground, pass_id)
+    assert len(before) == len(after) == 8
+    np.testing.assert_array_equal(before.state, after.state)
+    np.testing.assert_array_equal(before.covariance, after.covariance)
+    with ground.database.reading() as connection:
+        table = repository.SAMPLES["filter_states"]
+        versions = set(connection.execute(select(table.c.dictionary_version)).scalars())
+    assert versions == {2, DICTIONARY.version}
+
+
+def test_the_report_weighs_errors_with_the_whole_covariance(
+    flown: tuple[Path, Any, int], ground: Ground
+) -> None:
+    _, made, version = flown
+    folder = archive_with(made, anchored_packets(made, version))
+    report = evaluate_pass(load_pass_inputs(ground, import_archive(ground, folder)))
+    series = next(one for one in report.navigation if one.name == "anchored")
+    # A hundredth of the error: the reference is interpolated, and places are reported on the sphere.
+    np.testing.assert_allclose(series.nees, NEES, rtol=0.01)
+    assert series.squared_normalised_errors is None
+    assert pytest.approx(DIAGONAL, rel=0.3) != NEES
+    assert series.nis_dof is not None and series.nis_dof.tolist() == [24] * 8
+
+
+def test_sigmas_alone_give_a_sum_of_another_name(ground: Ground, make_pass: Any) -> None:
+    made = make_pass(frames=8, seed=3)
+    octets = b"".join(anchored_packets(made, 3))
+    states = [
+        packet
+        for packet in cut_packets(octets).packets(octets)
+        if DICTIONARY.unpack(packet)[0] == "navigation_state"
+    ]
+    folder = archive_with(made, states)
+    report = evaluate_pass(load_pass_inputs(ground, import_archive(ground, folder)))
+    series = next(one for one in report.navigation if one.name == "anchored")
+    assert series.nees is None
+    np.testing.assert_allclose(series.squared_normalised_errors, DIAGONAL, rtol=0.01)
+    # Two pixel coordinates for each of twelve craters.
+    assert series.nis_dof is not None and series.nis_dof.tolist() == [24] * 8
+
+
+START = parse_utc("2029-08-07T06:00:00Z")
+TICKS = int(ticks_from_utc_ns(START))
+HOUR_NS = 3600 * NS
+
+
+def thumbnail(frame_number: int, ticks: int) -> tuple[Thumbnail, bytes]:
+    levels = np.random.default_rng(frame_number).integers(0, 256, (8, 12), dtype=np.uint8)
+    made = Thumbnail(frame_number, ticks, levels)
+    return made, pack_thumbnail(made)
+
+
+def large_data(octets: bytes, transaction: int, ticks: int, table: str = "thumbnail") -> list[bytes]:
+    """Packets of a transfer; their sequence counts continue those of earlier transfers."""
+    parts = split(octets, transaction=transaction, table=table, part_length=50)
+    return [
+        DICTIONARY.pack(name, values, ticks=ticks + k, sequence_count=100 * transaction + k)
+        for k, (name, values) in enumerate(parts)
+    ]
+
+
+def receive(ground: Ground, folder: Path, packets: list[bytes]) -> None:
+    file = folder / "downlink.cadu"
+    file.write_bytes(encode_downlink(packets))
+    ingest_file(ground, file, spacecraft_id=SPACECRAFT)
+
+
+def test_complete_thumbnails_are_listed_at_the_time_of_their_frame(ground: Ground, tmp_path: Path) -> None:
+    first, octets = thumbnail(1, TICKS)
+    second, others = thumbnail(2, TICKS + 15 * SECOND)
+    _, incomplete = thumbnail(3, TICKS + 30 * SECOND)
+    later = TICKS + 600 * SECOND
+    receive(
+        ground,
+        tmp_path,
+        [
+            *large_data(octets, 1, later),
+            *large_data(thumbnail(9, TICKS + SECOND)[1], 2, later + 100, table="landmark_map"),
+            *large_data(others, 3, later + 200),
+            *large_data(incomplete, 4, later + 300)[:-1],
+        ],
+    )
+    found = images.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
+    assert [(one.frame_number, one.time.utc_ns, one.source) for one in found] == [
+        (1, START, "thumbnail"),
+        (2, START + 15 * NS, "thumbnail"),
+    ]
+    assert images.list_images(ground, SPACECRAFT, "flight", START + NS, START + HOUR_NS) == found[1:]
+    for one, levels in ((found[0], first.levels), (found[1], second.levels)):
+        ticks = int(one.address.split("/thumbnails/")[1].split("?")[0])
+        png = images.thumbnail_image(ground, SPACECRAFT, "flight", ticks)
+        decoded = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(decoded, levels)
+    with pytest.raises(NotFound):
+        images.thumbnail_image(ground, SPACECRAFT, "flight", TICKS + 30 * SECOND)
+    with pytest.raises(InvalidInput, match="at most 31 days"):
+        images.list_images(ground, SPACECRAFT, "flight", START, START + 32 * 24 * HOUR_NS)
+
+
+def test_frames_of_an_archive_are_listed_and_read(ground: Ground, synthetic_pass: SyntheticPass) -> None:
+    pass_id = import_archive(ground, synthetic_pass.folder)
+    _, png = cv2.imencode(".png", np.full((1024, 1024), 77, np.uint8))
+    stored = ground.files.put_octets(png.tobytes())
+    with ground.database.writing() as connection:
+        register_file(connection, stored, "frame", "3.png", START)
+        store.add_frames(connection, pass_id, {3: stored.sha256})
+        record = store.get_pass(connection, pass_id)
+    (vehicle,) = {one.instance for one in list_spacecraft(ground)}
+    (found,) = images.list_images(ground, SPACECRAFT, vehicle, record.start_utc_ns, record.stop_utc_ns)
+    assert (found.frame_number, found.source, found.pass_id) == (3, "archive", pass_id)
+    assert record.start_utc_ns < found.time.utc_ns < record.stop_utc_ns
+    assert found.address == f"/api/v1/passes/{pass_id}/images/3"
+    assert found.overlay == f"{found.address}?detections=true"
+    assert images.archived_image(ground, pass_id, 3) == png.tobytes()
+    items = detections(ground, pass_id, Paging(limit=1000)).items
+    own = [one for one in items if one.frame_number == 3]
+    drawn = images.archived_image(ground, pass_id, 3, detections=True)
+    picture = cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR)
+    assert own and set(map(tuple, picture.reshape(-1, 3).tolist())) == {(77, 77, 77), images.ORANGE_BGR}
+    for one in own:
+        rim = (round(one.v_px), round(one.u_px) + max(round(one.diameter_px / 2), 1))
+        if max(rim) < 1024:
+            assert tuple(picture[rim].tolist()) == images.ORANGE_BGR
+    with pytest.raises(NotFound, match="image of frame"):
+        images.archived_image(ground, pass_id, 4)
+
+
+MISSION = 'name = "camera"\n[spacecraft]\nid = 76\n[camera]\nwidth_px = 96\nheight_px = 64\n'
+
+
+def detection(frame_number: int, ticks: int, count: int = 1) -> bytes:
+    """A report with detections at u = 55.5 and v = 31.5, with a diameter of 16 pixels."""
+    shape = {"u_px": 55.5, "v_px": 31.5, "diameter_px": 16.0, "score": 0.9, "size_class": 0, "sigma_px": 1.0}
+    items = {name: np.full(count, value) for name, value in shape.items()}
+    frame = {"frame_number": frame_number, "image_ticks": ticks, "image_quality": 0, "items": items}
+    return DICTIONARY.pack("detections", frame, ticks=ticks + 100, sequence_count=frame_number)
+
+
+def test_detections_are_drawn_on_an_enlarged_thumbnail_of_a_known_camera(
+    ground: Ground, tmp_path: Path
+) -> None:
+    made, octets = thumbnail(1, TICKS)  # 12 by 8: one pixel for 8 by 8 of the camera
+    later = TICKS + 600 * SECOND
+    others = large_data(thumbnail(2, TICKS + 15 * SECOND)[1], 2, later + 200)
+    # A report of the same frame number from another time belongs to another frame.
+    reports = [detection(1, TICKS), detection(2, TICKS + 40 * SECOND)]
+    receive(ground, tmp_path, [*reports, *large_data(octets, 1, later), *others])
+    found = images.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
+    assert [one.overlay for one in found] == [None, None]
+    with pytest.raises(InvalidInput, match=r"camera\.width_px"):
+        images.thumbnail_image(ground, SPACECRAFT, "flight", TICKS, detections=True)
+    add_mission(ground, MISSION.encode(), actor="ann")
+    found = images.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
+    assert [one.overlay for one in found] == [f"{found[0].address}&detections=true", None]
+    png = images.thumbnail_image(ground, SPACECRAFT, "flight", TICKS, detections=True)
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape == (8 * 43, 12 * 43, 3)  # at least 512 wide
+    rim = np.argwhere((picture == images.ORANGE_BGR).all(axis=2))
+    scale = 43 / 8
+    np.testing.assert_allclose(rim.mean(axis=0)[::-1], [56.0 * scale - 0.5, 32.0 * scale - 0.5], atol=1.0)
+    np.testing.assert_allclose(np.ptp(rim, axis=0) + 1, 16.0 * scale, atol=2.0)
+    grey = picture[::43, ::43, 0]
+    np.testing.assert_array_equal(grey[:2], made.levels[:2])  # far from the circle
+
+
+def test_a_thumbnail_of_a_dark_frame_is_enlarged_without_circles(ground: Ground, tmp_path: Path) -> None:
+    add_mission(ground, MISSION.encode(), actor="ann")
+    made, octets = thumbnail(1, TICKS)
+    receive(ground, tmp_path, [detection(1, TICKS, count=0), *large_data(octets, 1, TICKS + SECOND)])
+    (found,) = images.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
+    assert found.overlay
+    png = images.thumbnail_image(ground, SPACECRAFT, "flight", TICKS, detections=True)
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(picture[::43, ::43, 0], made.levels)
+
+
+def test_states_of_each_estimator_are_parameters_of_the_spacecraft(
+    ground: Ground, synthetic_pass: SyntheticPass
+) -> None:
+    import_archive(ground, synthetic_pass.folder)
+    (one,) = list_spacecraft(ground)
+    listed = {found.name: found for found in spacecraft_parameters(ground, SPACECRAFT, one.instance)}
+    name = "navigation_state.spherical.altitude_m"
+    assert listed[name].unit == "m" and listed["temperature_c"].packet == "housekeeping"
+    assert listed["navigation_state.spherical.velocity_x_m_s"].unit == "m/s"
+    found = trend_series(ground, SPACECRAFT, one.instance, name, 1000)
+    assert found.samples == 40 and 20e3 < found.buckets.mean.min() < 40e3
+    none = trend_series(ground, SPACECRAFT, one.instance, "navigation_state.anchored.altitude_m", 1000)
+    assert none.samples == 0
+    with pytest.raises(NotFound):
+        spacecraft_parameters(ground, SPACECRAFT, "flight")

@@ -1,7 +1,5 @@
 """Choice of windows within battery, storage, downlink, duty limit and quotas, compared with all sets of windows."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Forecast of a plan: conditions, resources and conflicts over time; density of craters."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

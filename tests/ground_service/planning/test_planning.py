@@ -1,15 +1,25 @@
-"""Candidate windows: every sample of a candidate fulfils the constraints, computed here a second time by hand."""
+"""Candidate windows: every sample of a candidate fulfils the constraints, computed here a second time by hand.
+Windows outside the reference ephemerides: refused where the ground needs the ephemeris.
+"""
 
 import re
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from ground_service.access.model import AuditFilter
+from ground_service.access.store import list_audit
 from ground_service.contacts.links.core import PredictedContact
+from ground_service.errors import InvalidInput, PlanConflicts
+from ground_service.ground import Ground
+from ground_service.missions.ephemerides.service import add_ephemeris, withdraw_ephemeris
+from ground_service.missions.ephemerides.store import covering_ephemerides
+from ground_service.missions.service import add_mission
 from ground_service.planning.core import (
     Constraints,
     Planner,
@@ -19,6 +29,8 @@ from ground_service.planning.core import (
     storage_peak,
 )
 from ground_service.planning.filling import Option
+from ground_service.planning.service import WindowEntry, add_window
+from ground_service.planning.store import get_record
 from ground_service.planning.window_states import (
     PlannedSpan,
     WindowFacts,
@@ -29,8 +41,10 @@ from lunar.camera import PinholeCamera
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.frames import IauOrientation
+from lunar.messages.oem import load_oem, save_oem
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
+from tests.ground_service.conftest import add_reference, save_circle
 
 NS = 1_000_000_000
 START = parse_utc("2029-08-07T06:00:00Z")
@@ -269,3 +283,82 @@ def test_the_state_follows_from_the_facts(facts: WindowFacts, expected: str) -> 
 def test_a_window_that_failed_names_the_telecommand_and_its_failure() -> None:
     facts = WindowFacts("approved", command_states=("failed",), failure="insert_activity not accepted: busy")
     assert state_of(facts)[1] == "a telecommand of it failed: insert_activity not accepted: busy"
+
+
+OUTSIDE = parse_utc("2031-01-01T00:00:00Z")
+MISSION = """name = "covered"
+[spacecraft]
+id = 76
+"""
+
+
+def window(ephemeris_id: int | None = None) -> WindowEntry:
+    return WindowEntry("w", OUTSIDE, OUTSIDE + 600 * 10**9, 15.0, 76, ephemeris_id=ephemeris_id)
+
+
+def test_a_window_outside_the_ephemerides_has_no_prediction(ground: Ground, synthetic_pass: Any) -> None:
+    add_reference(ground, synthetic_pass.folder / "reference.oem")
+    predicted = add_window(ground, window(), actor="ann").predicted
+    assert (predicted.frames, predicted.battery_minimum, predicted.downlinked_by) == (40, None, None)
+
+
+def test_a_window_whose_tables_need_the_ephemeris_is_refused_outside_it(
+    ground: Ground, synthetic_pass: Any
+) -> None:
+    add_reference(ground, synthetic_pass.folder / "reference.oem")
+    add_mission(ground, (MISSION + "[uploads]\n").encode())
+    with pytest.raises(PlanConflicts, match="expected a time that a reference ephemeris covers"):
+        add_window(ground, window(), actor="ann")
+
+
+def test_a_window_must_lie_in_the_ephemeris_that_it_names(ground: Ground, synthetic_pass: Any) -> None:
+    file = ground.files.put_file(synthetic_pass.folder / "reference.oem")
+    named = add_ephemeris(ground, file, name="reference")
+    with pytest.raises(PlanConflicts, match="expected a time that a reference ephemeris covers"):
+        add_window(ground, window(named.id), actor="ann")
+
+
+def test_an_ephemeris_that_gravity_does_not_move_is_refused_with_the_accelerations(
+    ground: Ground, tmp_path: Path
+) -> None:
+    (one,) = load_oem(save_circle(tmp_path / "km.oem")).segments
+    metres = replace(one, position_m=1e3 * one.position_m, velocity_m_s=1e3 * one.velocity_m_s)
+    save_oem(Ephemeris((metres,)), tmp_path / "m.oem")
+    message = (
+        r"ephemeris, states of SELENITA: expected an acceleration of \S+ m/s2 .* found .*metres for kilo"
+    )
+    with pytest.raises(InvalidInput, match=message):
+        add_ephemeris(ground, ground.files.put_file(tmp_path / "m.oem"), name="metres")
+    assert add_ephemeris(ground, ground.files.put_file(tmp_path / "km.oem"), name="km").states == 240
+
+
+def test_an_ephemeris_belongs_to_a_spacecraft_and_can_be_withdrawn(
+    ground: Ground, synthetic_pass: Any, tmp_path: Path
+) -> None:
+    text = (synthetic_pass.folder / "reference.oem").read_text()
+    (tmp_path / "other.oem").write_text(text.replace("OBJECT_NAME = SELENITA", "OBJECT_NAME = OTHER"))
+    own = add_ephemeris(ground, ground.files.put_file(synthetic_pass.folder / "reference.oem"), name="own")
+    add_mission(ground, (MISSION + 'name = "SelenITA"\n').encode())
+    other = ground.files.put_file(tmp_path / "other.oem")
+    with pytest.raises(
+        InvalidInput, match=r"OBJECT_NAME: expected a spacecraft .* \(SelenITA, .*, found OTHER"
+    ):
+        add_ephemeris(ground, other, name="other", precedence=9)
+    add_mission(ground, b'name = "second"\n[spacecraft]\nid = 77\nobject_names = ["Other"]\n')
+    foreign = add_ephemeris(ground, other, name="other", precedence=9)
+
+    def used(spacecraft: int) -> list[int]:
+        found = covering_ephemerides
+        return [one.id for one in ground.read(found, own.start.utc_ns, own.stop.utc_ns, spacecraft)]
+
+    assert (used(76), used(77)) == ([own.id], [foreign.id])
+    withdraw_ephemeris(ground, foreign.id, actor="ann")
+    assert (used(76), used(77)) == ([own.id], [])
+    assert ground.files.path(other.sha256).exists()
+    (entry,) = [one for one in ground.read(list_audit, AuditFilter()).items if "withdraw" in one.action]
+    assert (entry.actor, entry.target) == ("ann", "other") and entry.detail["sha256"] == other.sha256
+    span = own.start.utc_ns + 60 * 10**9, own.start.utc_ns + 120 * 10**9
+    window = add_window(ground, WindowEntry("w", *span, 15.0, 76, ephemeris_id=own.id), actor="ann")
+    withdraw_ephemeris(ground, own.id, actor="ann")  # one action, also while a window names it
+    assert ground.read(get_record, window.id).entry().ephemeris_id is None
+    assert used(76) == []

@@ -1,7 +1,5 @@
 """Tables of a window: what they hold, when they are taken on board, and what is refused."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

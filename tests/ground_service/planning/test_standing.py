@@ -1,7 +1,5 @@
 """Standing requests: filling, explaining, replacing, approval, and one plan of several processes, on both databases."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise

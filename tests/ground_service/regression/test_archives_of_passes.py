@@ -1,7 +1,5 @@
 """Regression archives of passes: kept by a rule, named by the pass, rendered or without frames."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

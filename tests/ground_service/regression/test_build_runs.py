@@ -1,6 +1,7 @@
-"""Builds as programs inside limits: what becomes of those that behave and of those that do not."""
-
-from __future__ import annotations
+"""Builds as programs inside limits: what becomes of those that behave and of those that do not. Parameters of
+builds on the flight code are checked in the sandbox before registration. Verdicts in lists: names of builds,
+and why the verdict is not pass.
+"""
 
 import dataclasses
 import subprocess
@@ -9,13 +10,22 @@ import time
 import venv
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from ground_service.errors import InvalidInput
+from ground_service.errors import BuildNotChecked, InvalidInput
+from ground_service.ground import Ground, open_ground
+from ground_service.http.model import Paging
+from ground_service.http.times import UtcTime
+from ground_service.regression import builds
 from ground_service.regression.build_runs import BuildRun, run_build
-from ground_service.regression.builds import Build, changes, load_build
+from ground_service.regression.builds import Build, changes, load_build, register_build
+from ground_service.regression.model import REASONS_LIMIT, JudgedGate, Regression, Verdict
 from ground_service.regression.sandbox import host
+from ground_service.regression.sandbox.host import SandboxRefused
+from ground_service.regression.store import list_builds
+from linna.cli import run as run_command
 
 LIMITS = "\n[limits]\nwall_s = 20\ncpu_s = 10\nmemory_mib = 300\nfile_mib = 4\nfolder_mib = 12\n"
 
@@ -274,3 +284,180 @@ def test_what_differs_between_two_builds_on_the_flight_code_is_named(
     older = dataclasses.replace(load_build("current"), flight_code="0" * 64)
     assert changes(older, load_build("current")) == ["flight code"]
     assert changes(good, load_build(make_build("program", program="pass"))) == []
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Ground:
+    return open_ground(tmp_path / "home")
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[str], str]:
+    def build(parameters: str) -> str:
+        (tmp_path / "p.toml").write_text(parameters)
+        (tmp_path / "build.toml").write_text('name = "b"\nparameters = "p.toml"\n')
+        return str(tmp_path / "build.toml")
+
+    return build
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (
+            "flight.anchored.gravity_degre = 60",
+            "p.toml, flight.anchored.gravity_degre: expected gravity_degree (nearest known key), "
+            "found an unknown key",
+        ),
+        (
+            "detector.score_threshold = 7.0",
+            "p.toml, detector.score_threshold: expected a finite number from 0 to 1, found 7.0",
+        ),
+    ],
+)
+def test_a_wrong_parameter_is_refused_in_one_line_and_nothing_is_registered(
+    home: Ground, write: Callable[[str], str], text: str, told: str
+) -> None:
+    with pytest.raises(InvalidInput) as error:
+        register_build(home, load_build(write(text)))
+    assert str(error.value) == told
+    assert home.read(list_builds, Paging()).items == []
+    assert not list((home.home / "regression" / "builds").glob("*"))
+
+
+def test_right_parameters_are_registered_and_checked_once(
+    home: Ground, write: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = write("flight.anchored.gravity_degree = 60")
+    first = register_build(home, load_build(file))
+    assert [one.digest for one in home.read(list_builds, Paging()).items] == [first.digest]
+    monkeypatch.setattr(builds, "run_confined", None)
+    assert register_build(home, load_build(file)).digest == first.digest
+
+
+def _refused(*_: Any, **__: Any) -> dict[str, Any]:
+    raise SandboxRefused("no user namespaces")
+
+
+def _ended(**changes: Any) -> Callable[..., dict[str, Any]]:
+    def run(request: Any, staged: Path, written: Path, printed: Path, **_: Any) -> dict[str, Any]:
+        printed.write_text("Traceback\nMemoryError\n")
+        return {"cause": "", "exit_status": 0} | changes
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("run", "told"),
+    [
+        (_refused, "no user namespaces"),
+        (_ended(exit_status=1), "status 1: MemoryError"),
+        (_ended(exit_status=2), "status 2: MemoryError"),
+        (_ended(exit_status=137), "status 137"),
+        (_ended(cause="timeout"), "ended with timeout"),
+    ],
+)
+def test_a_build_that_cannot_be_checked_is_not_registered(
+    home: Ground,
+    write: Callable[[str], str],
+    monkeypatch: pytest.MonkeyPatch,
+    run: Callable[..., dict[str, Any]],
+    told: str,
+) -> None:
+    monkeypatch.setattr(builds, "run_confined", run)
+    with pytest.raises(BuildNotChecked, match=told):
+        register_build(home, load_build(write("flight.anchored.gravity_degree = 60")))
+    assert home.read(list_builds, Paging()).items == []
+
+
+def test_the_command_checks_a_build_file(
+    write: Callable[[str], str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(["replay", "--check-build", write("detector.max_detection = 3")]) == 2
+    assert "expected max_detections (nearest known key), found an unknown key" in capsys.readouterr().out
+    file = write("detector.max_detections = 3")
+    assert run_command(["replay", "--check-build", file]) == 0
+    text = Path(file).read_text()
+    for wrong, told in (("schema_version = 7", "expected 1, found 7"), ("modle = 'x'", "expected 'model'")):
+        Path(file).write_text(f"{wrong}\n{text.replace('schema_version = 1', '')}")
+        capsys.readouterr()
+        assert run_command(["replay", "--check-build", file]) == 2
+        assert told in capsys.readouterr().out
+    assert run_command(["replay", "--out", "x"]) == 2
+    assert "expected ARCHIVE, or --check-build BUILD" in capsys.readouterr().err
+
+
+BUILD = {"version": "1.2", "digest": "ab" * 32, "flight_code": None, "provenance": {}}
+POLICY = {"version": "1", "sha256": "00", "confidence": 0.95, "power": 0.8}  # of an earlier version
+
+
+def gate(name: str, outcome: str, **values: Any) -> JudgedGate:
+    known = {
+        "pass_name": None,
+        "passed": outcome == "pass",
+        "baseline": 0.9,
+        "candidate": 0.7,
+        "margin": None,
+        "limit": 0.05,
+        "unit": "",
+        "change_bounds": (None, None),
+        "p_value": None,
+        "level": None,
+        "resolution": None,
+        "frames": 10,
+        "frames_needed": None,
+        "reason": None,
+    }
+    return JudgedGate(name=name, outcome=outcome, **known | values)
+
+
+def regression(verdict: str, gates: list[JudgedGate], **values: Any) -> Regression:
+    result = Verdict(
+        verdict=verdict,
+        baseline={"name": "old", **BUILD},
+        candidate={"name": "new", **BUILD},
+        policy=POLICY,
+        headline=f"{verdict}: no loss",
+        frames=10,
+        frames_needed=None,
+        gates=gates,
+        passes=values.get("passes", []),
+        remarks=["builds were isolated"],
+    )
+    return Regression(id="1", verdict=verdict, created=UtcTime(0), result=result)
+
+
+def test_a_list_names_builds_and_not_only_their_hashes() -> None:
+    summary = regression("pass", [gate("recall", "pass")]).summary()
+    assert summary.candidate_title == "new 1.2 (abababababab)"
+    assert summary.baseline_title == "old 1.2 (abababababab)"
+    assert (summary.reasons, summary.headline) == ([], "pass: no loss")
+
+
+def test_a_gate_that_was_waived_in_an_earlier_verdict_does_not_count() -> None:
+    found = regression("pass", [gate("other", "fail", waived="known"), gate("recall", "pass", waived=None)])
+    assert found.result.gates[0].text == "other: waived: known"
+    assert found.summary().gates_failed == 0
+
+
+def test_reasons_are_failed_gates_then_open_ones_then_passes_without_a_comparison() -> None:
+    open_gate = gate("drift", "inconclusive", reason="too few frames")
+    failed = gate("recall", "fail", pass_name="pass 1", unit="m")
+    lost = {"name": "pass 2", "archive": "x", "state": "candidate failed", "detail": "exit status 4"}
+    found = regression("fail", [open_gate, failed], passes=[lost])
+    assert found.summary().reasons == [
+        "recall on pass 1: 0.9 to 0.7 m",
+        "drift: 0.9 to 0.7, too few frames",
+        "pass 2: exit status 4",
+    ]
+
+
+@pytest.mark.parametrize("candidate", [None, 0.7])
+def test_a_gate_without_figures_states_its_reason_or_outcome(candidate: float | None) -> None:
+    text = gate("recall", "fail", candidate=candidate, limit=None, reason="no detections").text
+    assert text == ("recall: no detections" if candidate is None else "recall: 0.9 to 0.7, no detections")
+
+
+def test_a_list_has_the_first_reasons_only() -> None:
+    gates = [gate(f"gate {k}", "fail") for k in range(9)]
+    assert len(regression("fail", gates).summary().reasons) == REASONS_LIMIT

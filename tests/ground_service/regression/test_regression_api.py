@@ -1,7 +1,5 @@
 """Builds, archives and regressions over HTTP."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Callable
@@ -111,30 +109,6 @@ def test_only_an_administrator_registers_a_program(
         for role, one in heads.items()
     }
     assert found == {"viewer": 403, "operator": 403, "admin": 201}
-
-
-def test_commands_keep_pin_and_remove_archives(
-    make_flyable: Callable, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    flown = make_flyable(frames=12, seed=52)
-
-    def archive(*words: str, status: int = 0) -> Any:
-        assert run(["regress", "archive", *words, "--home", str(tmp_path / "home"), "--json"]) == status
-        printed = capsys.readouterr()
-        return json.loads(printed.out) if status == 0 else printed.err
-
-    (kept,) = archive("add", str(flown.folder))["archives"]
-    assert (kept["frames"], kept["pinned"]) == (12, False)
-    assert archive("pin", kept["digest"])["archives"] == [{**kept, "pinned": True}]
-    assert archive("prune", "--unused-days", "0") == {"archives": [{**kept, "pinned": True}], "removed": []}
-    assert archive("unpin", kept["digest"][:16])["archives"] == [kept]
-    assert archive("prune", "--unused-days", "1") == {"archives": [kept], "removed": []}
-    assert archive("prune", "--unused-days", "0") == {"archives": [], "removed": [kept["digest"]]}
-    assert archive("pin", kept["digest"], status=2) == f"linna: error: archive {kept['digest']}: not found\n"
-    (flown.folder / "catalogue.csv").write_text("damaged")
-    assert f"error: {flown.folder}/catalogue.csv: expected SHA-256" in archive(
-        "add", str(flown.folder), status=2
-    )
 
 
 def test_commands_compare_and_analyse_builds_over_archives(

@@ -1,6 +1,7 @@
-"""Gates on simulated passes of known recall, false detections, fixes and errors: what they claim, and what not."""
-
-from __future__ import annotations
+"""Gates on simulated passes of known recall, false detections, fixes and errors: what they claim, and what not.
+Samples of the gates: figures of one estimator by frame, units of the evidence. Paired statistics over units
+and Holm's procedure: against printed examples and simulation.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ground_service.evaluation.detection.recall import ExpectedCraters
 from ground_service.regression.gates.calibration import calibrations, gate_noise, pass_noise
 from ground_service.regression.gates.core import (
     COSTS,
@@ -22,13 +24,33 @@ from ground_service.regression.gates.core import (
 from ground_service.regression.gates.policy import load_policy, read_policy
 from ground_service.regression.gates.power import detectable, power_text
 from ground_service.regression.gates.samples import (
+    KINDS,
+    VISIT_GAP_FRAMES,
     CraterRows,
     DetectionRows,
     EstimatorFrames,
     PassFrames,
     TimeTags,
+    _cells,
     _estimator,
+    _tracks,
+    terrain_kinds,
 )
+from ground_service.regression.gates.statistics import (
+    UnitSums,
+    aligned,
+    frames_needed,
+    holm_levels,
+    joined_sums,
+    mean_change,
+    ratio_change,
+    ratio_error,
+    student_upper_tail,
+    unit_sums,
+)
+from lunar.catalogue import make_catalogue
+from lunar.constants import MOON_RADIUS_M
+from lunar.frames import mcmf_from_spherical
 from reports.text import loss_text
 from tests.lazy import Lazy
 
@@ -519,3 +541,123 @@ def test_what_the_frames_can_detect_is_stated_before_a_run() -> None:
         "all passes together (80 frames, 0.4 minutes of a core for the candidate) find with a power of 0.8 a loss of: "
     )
     assert detectable(POLICY, 0, 0) == []
+
+
+def test_squared_normalised_errors_are_summed_over_the_axes_and_unknown_without_every_sigma() -> None:
+    error = np.array([[3.0, 8.0, 10.0], [3.0, 8.0, 10.0], [3.0, 8.0, 10.0], [np.nan, 8.0, 10.0]])
+    sigma = np.array([[1.0, 2.0, 5.0], [1.0, 2.0, np.nan], [1.0, 0.0, 5.0], [1.0, 2.0, 5.0]])
+    frames = _estimator(np.ones(4, np.bool_), error, sigma, {})
+    # 3^2 + 4^2 + 2^2; a sigma of zero is no claim that can be judged.
+    assert frames.squared_normalised_error[0] == pytest.approx(29.0)
+    assert np.isnan(frames.squared_normalised_error[1:]).all()
+    assert not hasattr(frames, "nees")
+
+
+def test_a_track_is_one_crater_in_one_visit() -> None:
+    crater = np.array([7, 3, 7, 7, 3, 7])
+    frame = np.array([0, 0, 1, 2 + VISIT_GAP_FRAMES, 1, 1 + VISIT_GAP_FRAMES])
+    # Crater 7 is out of view for as long as a visit may have gaps, and is then seen twice: still one track.
+    assert _tracks(crater, frame).tolist() == [1, 0, 1, 1, 0, 1]
+    frame[[3, 5]] += 1
+    assert _tracks(crater, frame).tolist() == [1, 0, 1, 2, 0, 2]
+
+
+def test_a_ground_cell_is_where_the_line_of_sight_meets_the_sphere() -> None:
+    """From 100 km above 10.1 N 20 E: nadir, 3 degrees off nadir (5.2 km, below a cell), and above the horizon."""
+    up = mcmf_from_spherical(np.radians(10.1), np.radians(20.0))
+    up = up / np.linalg.norm(up)
+    east = np.cross([0.0, 0.0, 1.0], up) / np.linalg.norm(np.cross([0.0, 0.0, 1.0], up))
+    tilt = np.radians(3.0)
+    lines = np.array([-up, -np.cos(tilt) * up + np.sin(tilt) * east, east])
+    cells = _cells(np.tile((MOON_RADIUS_M + 100e3) * up, (3, 1)), lines)
+    # Rows of 0.25 degrees; columns of 0.25 degrees of arc, 20 cos 10 at this latitude.
+    assert cells.tolist() == [40 * 100_000 + 78, 40 * 100_000 + 79, -1]
+
+
+def test_terrain_is_cratered_by_the_density_of_catalogued_craters() -> None:
+    """Forty craters of 6 km around 0 N 0 E, 32 within 100 km are the limit; one alone at 0 N 90 E."""
+    around = np.linspace(-1.0, 1.0, 40)
+    longitude = np.radians(np.append(around, 90.0))
+    catalogue = make_catalogue(0.0 * longitude, longitude, np.full(41, 6_000.0), source="test")
+    expected = ExpectedCraters(*(np.array([5, 40]) for _ in range(7)))
+    kinds = terrain_kinds(catalogue, expected, np.array([0, 1]))
+    assert [KINDS[kind] for kind in kinds] == ["cratered", "sparse"]
+
+
+def test_holm_steps_down_as_in_the_textbook_example() -> None:
+    """Four p-values at 0.05: 0.005 and 0.01 are refused (0.0125, 0.0167), 0.03 is kept at 0.025, all after it too."""
+    p_values = [0.01, 0.04, 0.03, 0.005]
+    levels = holm_levels(p_values, 0.05)
+    assert [p <= level for p, level in zip(p_values, levels, strict=True)] == [True, False, False, True]
+    assert levels == pytest.approx([0.05 / 3, 0.025, 0.025, 0.0125])
+    assert holm_levels([], 0.05) == []
+
+
+def sums(unit: list[int], numerator: list[float], denominator: list[float], stratum: int = 0) -> UnitSums:
+    return unit_sums(
+        np.array(unit), np.full(len(unit), stratum), np.array(numerator, float), np.array(denominator, float)
+    )
+
+
+def test_rows_are_summed_by_unit_and_units_of_either_build_are_aligned() -> None:
+    before, after = sums([7, 3, 7], [1, 1, 0], [1, 1, 1]), sums([3, 9], [1, 0], [1, 1])
+    assert (before.unit.tolist(), before.numerator.tolist(), before.denominator.tolist()) == (
+        [3, 7],
+        [1, 1],
+        [1, 2],
+    )
+    first, second = aligned(before, after)
+    assert first.unit.tolist() == second.unit.tolist() == [3, 7, 9]
+    assert (first.denominator.tolist(), second.denominator.tolist()) == ([1, 2, 0], [1, 0, 1])
+    assert joined_sums([first, second]).value == pytest.approx(3 / 5)
+    assert np.isnan(sums([], [], []).value)
+
+
+def test_the_error_of_a_ratio_of_equal_units_is_that_of_a_mean() -> None:
+    values = np.random.default_rng(1).standard_normal(400)
+    one = UnitSums(np.arange(400), np.zeros(400, np.int64), values, np.ones(400))
+    assert ratio_error(one) == pytest.approx(np.std(values, ddof=1) / 20.0)
+    assert np.isnan(ratio_error(sums([1], [1], [1])))
+
+
+def test_a_difference_between_kinds_of_terrain_is_no_chance() -> None:
+    """All units of one kind change by 1, all of the other by 0: within each kind nothing varies."""
+    kind = np.repeat([0, 1], 50)
+    before = UnitSums(np.arange(100), kind, np.zeros(100), np.ones(100))
+    after = UnitSums(np.arange(100), kind, kind.astype(float), np.ones(100))
+    change = ratio_change(before, after)
+    assert (change.estimate, change.error, change.units) == (0.5, pytest.approx(1.8 / 100), 100)
+
+
+@pytest.mark.parametrize("correlated", [False, True])
+def test_a_one_sided_test_is_wrong_as_often_as_it_says(correlated: bool) -> None:
+    """400 pairs of equal builds, rows of a track alike or independent, at 5 %."""
+    rng, wrong = np.random.default_rng(3), 0
+    size = rng.integers(1, 8, 120)
+    track = np.repeat(np.arange(120), size)
+    for _ in range(400):
+        draws = rng.random((2, 120))[:, track] if correlated else rng.random((2, len(track)))
+        before, after = (
+            unit_sums(track, np.zeros_like(track), (row < 0.7).astype(float), np.ones(len(track)))
+            for row in draws
+        )
+        change = ratio_change(before, after)
+        wrong += student_upper_tail(-change.estimate / change.error, change.units - 1) < 0.05
+    assert 0 < wrong <= stats.binom.isf(1e-4, 400, 0.05)
+
+
+def test_the_mean_change_of_passes_is_a_ratio_for_lengths_and_a_difference_for_shares() -> None:
+    before, after = np.array([1.0, 2.0, 4.0, np.nan]), np.array([2.0, 4.0, 8.0, 1.0])
+    assert mean_change(before, after, relative=True).estimate == pytest.approx(np.log(2.0))
+    change = mean_change(before, after, relative=False)
+    assert (change.estimate, change.units) == (pytest.approx(7.0 / 3.0), 3)
+    assert change.error == pytest.approx(np.std([1.0, 2.0, 4.0], ddof=1) / np.sqrt(3.0))
+    assert (change.baseline, change.candidate) == (2.0, 3.0)
+    assert mean_change(before[3:], after[3:], relative=True).units == 0
+
+
+def test_the_frames_needed_follow_the_square_of_error_over_distance() -> None:
+    assert frames_needed(100, 0.05, 0.01, 1.0) == 2500
+    assert frames_needed(100, 0.05, 0.0, 1.0) is None
+    assert frames_needed(10, 1.0, 1e-6, 1.0) is None
+    assert frames_needed(0, 0.05, 0.01, 1.0) is None

@@ -1,7 +1,5 @@
 """Builds judged over archived passes: good ones, planted bad ones, and everything that can be wrong with either."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

@@ -1,7 +1,5 @@
 """Rule of upgrades without interruption: what a migration may change while the version before it runs."""
 
-from __future__ import annotations
-
 from sqlalchemy import MetaData, Table
 
 RULE = "an expansion only adds tables, indexes that are not unique, and columns that are nullable or have a default"

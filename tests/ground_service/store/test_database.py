@@ -1,10 +1,13 @@
-"""The database: migrations, versions, and what goes wrong with disks, each in one clear line."""
+"""The database: migrations, versions, and what goes wrong with disks, each in one clear line. Values that a
+database cannot hold are refused in one line on both databases, without the address of the database.
+"""
 
 import errno
 import os
 import sqlite3
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from alembic.autogenerate import compare_metadata
@@ -12,17 +15,24 @@ from alembic.migration import MigrationContext
 from sqlalchemy import delete, insert, inspect, select, text
 
 from ground_service.errors import (
+    DatabaseBusy,
     DatabaseNotMigrated,
     DatabaseTooNew,
     DatabaseTooOld,
     DatabaseUnavailable,
     FileDamaged,
+    InvalidInput,
     NotFound,
     StorageFull,
     StorageReadOnly,
+    public_text,
     storage_error,
 )
+from ground_service.ground import Ground, open_ground
+from ground_service.http.model import Paging
+from ground_service.store import repository
 from ground_service.store.database import (
+    database_error,
     open_database,
     prepare_database,
     schema_revisions,
@@ -240,3 +250,54 @@ def test_a_database_of_another_encoding_is_refused_in_one_line(
     engine.dispose()
     with pytest.raises(DatabaseUnavailable, match=r"octets: .* encoding UTF8, found SQL_ASCII$"):
         prepare_database(url.rpartition("/")[0] + "/octets", upgrade=True)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"result": {"value": float("nan")}},
+        {"result": {"value": [1.0, float("inf")]}},
+        {"attempts": 10**20},
+        {"created_utc_ns": -(2**70)},
+        {"error": "half of a pair \ud800"},
+    ],
+)
+def test_a_value_that_no_database_can_hold_is_refused(either: Ground, values: dict[str, Any]) -> None:
+    row = {
+        "id": "j", "kind": "report", "state": "queued", "arguments": {}, "progress": 0.0, "attempts": 0,
+        "created_utc_ns": 1, **values,
+    }  # fmt: skip
+    with (
+        pytest.raises(
+            InvalidInput, match="request: expected text and numbers that the database can hold"
+        ) as refused,
+        either.database.writing() as connection,
+    ):
+        repository.add(connection, repository.JOBS, **row)
+    assert "://" not in public_text(refused.value)
+    with either.database.reading() as connection:
+        assert repository.newest(connection, repository.JOBS, Paging())[1] == 0
+
+
+def test_text_with_nul_is_refused_by_postgresql_as_input(migrated_postgres: Any, tmp_path: Path) -> None:
+    url = migrated_postgres()
+    with (
+        open_ground(tmp_path, database_url=url) as ground,
+        pytest.raises(InvalidInput, match="can hold"),
+        ground.database.reading() as connection,
+    ):
+        repository.find(connection, repository.JOBS, id="a\x00")
+
+
+@pytest.mark.parametrize("sqlstate", ["40001", "40P01", "55P03"])
+def test_a_transaction_that_the_database_gave_up_may_be_tried_again(sqlstate: str) -> None:
+    class Original(Exception):
+        pass
+
+    from sqlalchemy.exc import DBAPIError
+
+    original = Original("deadlock detected")
+    original.sqlstate = sqlstate
+    error = database_error(DBAPIError("UPDATE", {}, original), "postgresql://secret@db/linna")
+    assert isinstance(error, DatabaseBusy)
+    assert "secret" not in str(error)

@@ -1,7 +1,5 @@
 """Privileges of the database role of the service with PostgreSQL."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Compare-and-set of states, counters of telecommands, and locks, on both databases."""
 
-from __future__ import annotations
-
 import ast
 import threading
 from concurrent.futures import ThreadPoolExecutor

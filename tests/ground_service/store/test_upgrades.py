@@ -1,7 +1,5 @@
 """Upgrades without interruption: expansions of the schema, versions side by side, locks, databases of version 1.0."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

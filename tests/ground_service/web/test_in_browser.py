@@ -324,23 +324,6 @@ def test_a_list_has_the_columns_and_filters_of_its_operation(page):
     expect(page.locator("#items")).to_have_text("No entry.")
 
 
-def test_a_mission_description_that_is_not_entered_is_told(page):
-    page.goto("/missions/" + "0" * 16)
-    shows(page, "#notices .bad", "mission revision")
-
-
-def test_a_chart_is_zoomed_with_the_keyboard(page):
-    settled(page, "/telemetry")
-    chart = page.locator(".chart").first
-    expect(chart.locator("canvas")).to_be_visible()
-    before = chart.screenshot()
-    chart.focus()
-    page.keyboard.press("+")
-    expect(page).to_have_url(re.compile("zoom="))
-    wait_for(lambda: chart.screenshot() != before, "the chart has not changed")
-    page.keyboard.press("0")
-
-
 def test_a_telecommand_goes_from_entry_to_release(page):
     settled(page, "/commands")
     page.locator("#name").select_option("test_connection")

@@ -1,7 +1,5 @@
 """Follow-up of a live pass without a request: evaluated, reported, kept and processed."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

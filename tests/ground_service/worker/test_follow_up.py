@@ -1,7 +1,5 @@
 """Events and their follow-up work: nothing lost, nothing done twice, re-evaluation after late data."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path

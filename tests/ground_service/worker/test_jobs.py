@@ -1,7 +1,5 @@
 """Jobs: each ends exactly once, and reports its error in one public line."""
 
-from __future__ import annotations
-
 import errno
 from pathlib import Path
 from typing import Any

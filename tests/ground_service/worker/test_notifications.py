@@ -1,7 +1,5 @@
 """Notifications by webhook and e-mail, received by small servers on this machine."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The whole path with an object store: hosts that share no folder, loss of the store, integrity, backup."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

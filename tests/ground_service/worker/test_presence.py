@@ -1,7 +1,5 @@
 """Processes of a deployment compare what they work with, and `linna doctor` names what is wrong."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable, Iterator

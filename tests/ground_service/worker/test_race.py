@@ -1,7 +1,5 @@
 """Shortest race campaign: two API processes over HTTP and one PostgreSQL database."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Point-in-time recovery with the scripts of the compose file: every table is deleted, then restored to a second."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Search by votes on constructed scenes: craters by chance on a sphere, detections by a projection written here."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The anchored estimator behind the payload's door: no truth, no anchor reads, and nothing that can stop it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

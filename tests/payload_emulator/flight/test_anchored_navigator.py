@@ -1,7 +1,5 @@
 """The anchored navigator with its shipped parameters, frame by frame, against the true orbit and hand-made limits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

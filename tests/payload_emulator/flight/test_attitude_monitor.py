@@ -1,7 +1,5 @@
 """Innovation monitoring of the attitude: variance from innovations, decisions, and what the estimator makes of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

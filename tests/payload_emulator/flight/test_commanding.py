@@ -1,7 +1,5 @@
 """Telecommands cut from octets, and the memory of those that came before; packets are built here octet by octet."""
 
-from __future__ import annotations
-
 import binascii
 
 import pytest

@@ -1,7 +1,5 @@
 """The on-board orbit model against the library's integrator, and its transition matrix against differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

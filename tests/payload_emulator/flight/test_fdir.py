@@ -1,7 +1,5 @@
 """Faults of the machine: each is told by an event, and answered."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

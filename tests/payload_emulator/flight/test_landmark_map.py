@@ -1,7 +1,5 @@
 """The map of uncatalogued craters: placed where they are, as uncertain as they are, bounded in number."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

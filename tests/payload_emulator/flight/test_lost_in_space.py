@@ -1,7 +1,5 @@
 """A place without a prior: found, or refused, on a map small enough to search in moments."""
 
-from __future__ import annotations
-
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The observer: what of a frame reaches the estimators, what is reported, and how reads and troubles are counted."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

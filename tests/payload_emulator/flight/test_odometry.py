@@ -1,7 +1,5 @@
 """The paper's odometry: what it gets right, what its plane costs, and every outcome and reset it can have."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,16 +1,24 @@
-"""The payload's door: frames and telecommands in, packets of the dictionary out."""
+"""The payload's door: frames and telecommands in, packets of the dictionary out. Every transition between modes,
+by telecommand, and what each mode allows. Settings that survive resets, interrupted writing and flipped bits.
+The document about the payload's ports, modes, parameters and faults is the current one, and complete.
+"""
 
-from __future__ import annotations
-
+import re
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
 from payload_emulator.flight.navigation.outcomes import Mode
+from payload_emulator.flight.onboard.icd import format_interfaces
+from payload_emulator.flight.onboard.modes import ALLOWED, TRANSITIONS, PayloadMode
+from payload_emulator.flight.onboard.settings import Recovery, Settings
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload
+from payload_emulator.flight.ports import Board
 from payload_emulator.flight.vision.detections import Detections, no_detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
+from tmtc.dictionary.onboard_parameters import PARAMETERS
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.tables import pack_anchor_table, table_hash
 
@@ -186,3 +194,166 @@ def test_parameters_have_a_hash_that_changes_with_them() -> None:
     one, two = FlightParameters(), FlightParameters(modes=(Mode.paper,))
     assert one.hash == FlightParameters().hash != two.hash
     assert one.sha256.startswith(f"{one.hash:08x}")
+
+
+SAFE, STANDBY, OBSERVING, DOWNLINKING = PayloadMode
+# Written out here a second time on purpose: who may follow whom.
+ALLOWED_CHANGES = {
+    (SAFE, SAFE), (SAFE, STANDBY),
+    (STANDBY, SAFE), (STANDBY, STANDBY), (STANDBY, OBSERVING), (STANDBY, DOWNLINKING),
+    (OBSERVING, SAFE), (OBSERVING, STANDBY), (OBSERVING, OBSERVING),
+    (DOWNLINKING, SAFE), (DOWNLINKING, STANDBY), (DOWNLINKING, DOWNLINKING),
+}  # fmt: skip
+PATHS = {SAFE: [SAFE], STANDBY: [], OBSERVING: [OBSERVING], DOWNLINKING: [DOWNLINKING]}
+
+
+def in_mode(make_rig: Callable[..., Any], mode: PayloadMode) -> Any:
+    rig = make_rig()
+    rig.step(b"".join(rig.function("set_mode", step) for step in PATHS[mode]))
+    assert rig.payload.mode is mode
+    return rig
+
+
+@pytest.mark.parametrize("present", PayloadMode)
+@pytest.mark.parametrize("wanted", PayloadMode)
+def test_a_mode_follows_another_only_as_the_table_says(
+    make_rig: Callable[..., Any], present: PayloadMode, wanted: PayloadMode
+) -> None:
+    rig = in_mode(make_rig, present)
+    packets = rig.step(rig.function("set_mode", wanted))
+    if (present, wanted) in ALLOWED_CHANGES:
+        assert rig.payload.mode is wanted
+        assert rig.refusals(packets) == []
+        assert ("mode_changed" in rig.events(packets)) is (present is not wanted)
+    else:
+        assert rig.payload.mode is present
+        assert rig.refusals(packets) == ["wrong_mode"]
+    assert (wanted in TRANSITIONS[present]) is ((present, wanted) in ALLOWED_CHANGES)
+
+
+COMMANDS = {
+    "start_observation": ("perform_function", {"function_id": "start_observation"}),
+    "stop_observation": ("perform_function", {"function_id": "stop_observation"}),
+    "manual_step": ("perform_function", {"function_id": "manual_step"}),
+    "reset_estimators": ("perform_function", {"function_id": "reset_estimators"}),
+    "widen_estimate": ("perform_function", {"function_id": "widen_estimate"}),
+    "clear_store": ("perform_function", {"function_id": "clear_store"}),
+    "downlink_thumbnail": ("perform_function", {"function_id": "downlink_thumbnail"}),
+    "downlink_map": ("perform_function", {"function_id": "downlink_map"}),
+    "replay_store": ("replay_store", {"start_ticks": 1, "stop_ticks": 2}),
+    "delete_store": ("delete_store", {"stop_ticks": 1}),
+    "uplink_first": ("uplink_first", {"transaction": 1, "part": 1, "table": 1, "items": {"octet": [1]}}),
+    "uplink_middle": ("uplink_middle", {"transaction": 1, "part": 2, "table": 1, "items": {"octet": [1]}}),
+}
+
+
+@pytest.mark.parametrize("name", sorted(ALLOWED))
+@pytest.mark.parametrize("mode", PayloadMode)
+def test_a_command_out_of_its_mode_is_refused_and_does_nothing(
+    make_rig: Callable[..., Any], name: str, mode: PayloadMode
+) -> None:
+    if name == "uplink_last":
+        kind, values = "uplink_last", {"transaction": 1, "part": 3, "table": 1, "items": {"octet": [1]}}
+    else:
+        kind, values = COMMANDS[name]
+    if kind == "perform_function":
+        values = {**values, "argument_1": 0.0, "argument_2": 0.0}
+    rig = in_mode(make_rig, mode)
+    packets = rig.step(rig.command(kind, **values))
+    refused = rig.refusals(packets)
+    assert ("wrong_mode" in refused) is (mode not in ALLOWED[name])
+    if refused:
+        assert rig.payload.mode is mode
+        assert not rig.named(packets, "verification_completed")
+
+
+def test_the_table_names_only_what_the_dictionary_has() -> None:
+    functions = set(DICTIONARY.labels("perform_function", "function_id").values())
+    commands = {definition.name for definition in DICTIONARY.telecommands}
+    assert set(ALLOWED) <= functions | commands
+    assert set(TRANSITIONS) == set(PayloadMode)
+
+
+VALUES = {"boot_count": 3, "parameters": {"scrub_interval_s": 5.0}, "schedule": [[17, "18a0"]]}
+
+
+def written(*every: dict) -> np.ndarray:
+    memory = np.zeros(1000, dtype=np.uint8)
+    settings = Settings(memory)
+    for values in every:
+        assert settings.write(values)
+    return memory
+
+
+def test_new_memory_is_blank() -> None:
+    assert Settings(np.zeros(1000, dtype=np.uint8)).read() == (Recovery.blank, {})
+
+
+def test_the_newest_of_many_is_read() -> None:
+    memory = written({"a": 1}, {"a": 2}, VALUES)
+    settings = Settings(memory)
+    assert settings.read() == (Recovery.whole, VALUES)
+    assert settings.write({"a": 4})
+    assert Settings(memory).read() == (Recovery.whole, {"a": 4})
+
+
+@pytest.mark.parametrize("half", [0, 1])
+@pytest.mark.parametrize("octet", [0, 5, 9, 13, 20, 60])
+def test_a_flipped_bit_in_either_copy_costs_nothing(half: int, octet: int) -> None:
+    memory = written({"a": 1}, VALUES)
+    memory[500 * half + octet] ^= 0x04
+    assert Settings(memory).read() == (Recovery.older, VALUES)
+
+
+def test_writing_interrupted_anywhere_leaves_the_old_or_the_new() -> None:
+    before, after = written(VALUES), written(VALUES, {"a": 2})
+    changed = np.flatnonzero(before != after)
+    # The copy with the lower generation is written first: the half that held generation 1.
+    order = np.concatenate([changed[changed >= 500], changed[changed < 500]])
+    for stop in range(order.size + 1):
+        memory = before.copy()
+        memory[order[:stop]] = after[order[:stop]]
+        verdict, values = Settings(memory).read()
+        assert values in (VALUES, {"a": 2}), stop
+        assert verdict in (Recovery.whole, Recovery.older)
+
+
+def test_two_damaged_copies_are_lost_and_what_does_not_fit_is_refused() -> None:
+    memory = written(VALUES)
+    memory[[20, 520]] ^= 1
+    assert Settings(memory).read() == (Recovery.lost, {})
+    memory = written(VALUES)
+    settings = Settings(memory)
+    settings.read()
+    assert not settings.write({"much": "x" * 500})
+    assert Settings(memory).read() == (Recovery.whole, VALUES)
+
+
+def test_a_set_of_settings_knows_the_generation_that_it_wrote() -> None:
+    memory = np.zeros(1000, dtype=np.uint8)
+    settings = Settings(memory)
+    for _ in range(3):
+        assert settings.write(VALUES)
+        found = Settings(memory)
+        found.read()
+        assert found.generation == settings.generation
+
+
+def test_every_port_parameter_and_restricted_command_is_in_it() -> None:
+    text = format_interfaces()
+    ports = [name for name in vars(Board) if not name.startswith("_") and callable(getattr(Board, name))]
+    assert len(ports) > 8
+    for name in ports:
+        assert f"| `{name}(" in text
+    for parameter in PARAMETERS:
+        assert f"| {parameter.number} | {parameter.name} |" in text
+    for name in ALLOWED:
+        assert f"| {name} |" in text
+
+
+def test_the_events_of_the_table_of_faults_are_those_of_the_dictionary() -> None:
+    known = set(DICTIONARY.labels("event_info", "event_id").values())
+    rows = format_interfaces().split("## Faults")[1].splitlines()[4:]
+    named = {event for row in rows if row for event in re.findall(r"\w+", row.split("|")[2])}
+    assert len(named) > 25
+    assert named <= known

@@ -1,7 +1,5 @@
 """A navigator that finds itself elsewhere notices, and finds its place again."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The services of the payload as a machine: what telecommands do, and why some do nothing."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable

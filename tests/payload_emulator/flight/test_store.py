@@ -1,7 +1,5 @@
 """The packet store: order, priorities, overflow, playback, recovery from memory that was hit."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

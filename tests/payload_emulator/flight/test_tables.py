@@ -1,7 +1,5 @@
 """On-board tables: what is packed comes back, and nothing damaged is taken for a table."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How far labels lie from the rims that rays find: the measure of whether labels sit where craters are."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

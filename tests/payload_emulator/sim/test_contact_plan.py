@@ -1,7 +1,5 @@
 """Contacts of stations: against the geometry in local horizon coordinates by pymap3d, handover, outages."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""The EXR reader against files written after the format's description, field by field."""
+
 import math
 
 import numpy as np
@@ -7,12 +9,15 @@ from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import make_catalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import axis_rotation, mcmf_from_spherical
+from payload_emulator.errors import RendererError
 from payload_emulator.sim.render import raymarch
+from payload_emulator.sim.render.cycles import read_exr
 from payload_emulator.sim.render.labels import (
     label_frame,
     project_craters,
 )
 from payload_emulator.sim.render.light import sun_direction_mcmf
+from tests.payload_emulator.sim.exr_file import exr_octets
 
 CAMERA = PinholeCamera()
 
@@ -169,3 +174,38 @@ def test_the_ellipse_of_a_crater_at_the_edge_is_that_of_perspective():
     assert label.minor_px[0] == pytest.approx(flat, rel=0.02)
     # The ground leans away by 0.66 degrees there: 1.2 % at 45 degrees.
     assert label.major_px[0] == pytest.approx(flat, rel=0.02)
+
+
+PLANES = {
+    "A.Position.X": np.arange(12, dtype=np.float32).reshape(3, 4),
+    "A.Combined.R": np.arange(12, dtype=np.float32).reshape(3, 4) * -0.5,
+}
+
+
+@pytest.mark.parametrize("options", [{}, {"first_line": 7}, {"upward": True}, {"version": 2 | 0x400}])
+def test_planes_come_back_by_name(tmp_path, options):
+    file = tmp_path / "a.exr"
+    file.write_bytes(exr_octets(PLANES, **options))
+    read = read_exr(file)
+    assert sorted(read) == sorted(PLANES)
+    for name, plane in PLANES.items():
+        np.testing.assert_array_equal(read[name], plane)
+
+
+@pytest.mark.parametrize(
+    ("octets", "message"),
+    [
+        (exr_octets(PLANES)[:-5], "expected 3 lines"),
+        (exr_octets(PLANES, kind=1), "32-bit floats"),
+        (exr_octets(PLANES, compression=3), "uncompressed EXR, found method 3"),
+        (exr_octets(PLANES, version=2 | 0x1000), "single-part EXR"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(40), "single-part EXR"),
+        (exr_octets(PLANES)[:30], "damaged"),
+        (b"", "damaged"),
+    ],
+)
+def test_anything_else_is_refused_with_what_is_wrong(tmp_path, octets, message):
+    file = tmp_path / "b.exr"
+    file.write_bytes(octets)
+    with pytest.raises(RendererError, match=message):
+        read_exr(file)

@@ -1,7 +1,5 @@
 """Registration of a catalogue to terrain: fit from rims, product, use when a terrain is opened."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

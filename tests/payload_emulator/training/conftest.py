@@ -1,7 +1,5 @@
 """Crude data sets for the tests: bright-and-dark blobs on a plain, drawn without any renderer."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

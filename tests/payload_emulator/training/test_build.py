@@ -63,12 +63,6 @@ def built(tmp_path_factory):
     return folder, steps
 
 
-def test_progress_ends_with_every_frame_and_the_folder_is_whole(built):
-    folder, steps = built
-    assert steps[0] == (0, 4) and steps[-1] == (4, 4)
-    assert check(folder) == []
-
-
 def test_a_shard_does_not_depend_on_what_was_made_before(built, tmp_path):
     folder, _ = built
     for name in ("images", "metadata", "shards"):

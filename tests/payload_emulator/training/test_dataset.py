@@ -1,20 +1,34 @@
-"""Data sets on disk: what is written can be read, checked and refused."""
+"""Data sets on disk: what is written can be read, checked and refused. A crop shows its craters where it says
+they are. Targets and what the flight decoder makes of a network that says exactly what it was told to.
+Recipes: what is refused, and that splits cannot touch. An exported network made trainable again: the same
+outputs, and a normalisation that fits the data.
+"""
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
+from lunar.boxes import Box, inside_box
 from lunar.catalogue import size_class
-from payload_emulator.errors import DatasetError
+from payload_emulator.errors import DatasetError, ModelError
+from payload_emulator.flight.models import load_shipped_model
+from payload_emulator.flight.vision.detector import OnnxDetector, decode
+from payload_emulator.session.world.recipe import Source, load_recipe, procedural_recipe
 from payload_emulator.training.data import dataset as store
+from payload_emulator.training.data.build import plan_shards
+from payload_emulator.training.data.feeder import AugmentParameters, make_crop
 from payload_emulator.training.data.finishing import clipped, ellipse_polygon, polygon_area
 from payload_emulator.training.data.integrity import check, summarise
-from payload_emulator.training.data.targets import Tier
+from payload_emulator.training.data.shots import allowed
+from payload_emulator.training.data.targets import Tier, make_targets
 from payload_emulator.training.evaluate.sheets import CLASS_COLOURS, draw_frame, draw_sheet
+from payload_emulator.training.model.export import keep_blocked, onnx_model
+from tests.lazy import Lazy
 
 
 @pytest.fixture
@@ -308,3 +322,384 @@ def test_pycocotools_reads_the_annotations_and_scores_them_as_perfect(blob_datas
     scores.accumulate()
     precision = scores.eval["precision"][..., -1]  # with every detection of an image
     assert precision[precision > -1.0].min() > 0.999
+
+
+QUIET = AugmentParameters(noise=0.0, shade=0.0, unsharp=(0.0, 0.0))
+
+
+def spot_image(u, v):
+    row, column = np.mgrid[0:512, 0:512]
+    image = np.zeros((512, 512))
+    for x, y in zip(u, v, strict=True):
+        image += 255 * np.exp(-((column - x) ** 2 + (row - y) ** 2) / (2 * 3.0**2))
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("sun", [(0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.1, 0.0)])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_spot_lands_where_the_label_says(sun, seed):
+    u, v = np.array([250.0, 330.0]), np.array([200.0, 280.0])
+    crop = make_crop(
+        spot_image(u, v),
+        np.array(sun),
+        u,
+        v,
+        np.full(2, 20.0),
+        np.array([True, True]),
+        384,
+        QUIET,
+        np.random.default_rng(seed),
+    )
+    for x, y in zip(crop.u_px, crop.v_px, strict=True):
+        if not (12 < x < 371 and 12 < y < 371):
+            continue
+        i, j = round(float(y)), round(float(x))
+        window = crop.image[i - 8 : i + 9, j - 8 : j + 9].astype(float)
+        weight = np.clip(window - np.median(crop.image), 0, None)
+        rows, columns = np.mgrid[i - 8 : i + 9, j - 8 : j + 9]
+        # Half a pixel: rounding to 8 bits and clipping of the spot's core shift its centroid by less.
+        assert (columns * weight).sum() / weight.sum() == pytest.approx(x, abs=0.5)
+        assert (rows * weight).sum() / weight.sum() == pytest.approx(y, abs=0.5)
+
+
+def test_the_sun_is_at_the_top_of_every_crop():
+    row, _ = np.mgrid[0:512, 0:512]
+    bright_right = np.rot90((255 * (1 - row / 511)).astype(np.uint8), 3).copy()
+    assert bright_right[:, -1].mean() > bright_right[:, 0].mean()
+    crop = make_crop(
+        bright_right,
+        np.array([1.0, 0.0, 0.0]),
+        np.zeros(0),
+        np.zeros(0),
+        np.zeros(0),
+        np.zeros(0, bool),
+        384,
+        QUIET,
+        np.random.default_rng(3),
+    )
+    assert crop.image[:40].mean() > crop.image[-40:].mean() + 0.5
+
+
+def test_one_seed_gives_one_crop():
+    image = spot_image([100, 300], [100, 300])
+    arguments = (
+        image,
+        np.array([0.0, -1.0, 0.0]),
+        np.array([100.0]),
+        np.array([100.0]),
+        np.array([20.0]),
+        np.array([True]),
+        256,
+        AugmentParameters(),
+    )
+    first = make_crop(*arguments, np.random.default_rng(9))
+    second = make_crop(*arguments, np.random.default_rng(9))
+    assert np.array_equal(first.image, second.image)
+    assert np.array_equal(first.u_px, second.u_px)
+
+
+def perfect_maps(u, v, diameter):
+    n = len(u)
+    t = make_targets(
+        512,
+        512,
+        np.array(u, float),
+        np.array(v, float),
+        np.array(diameter, float),
+        np.full(n, Tier.LABEL, np.int8),
+        np.ones(n),
+    )
+    geometry = np.concatenate([t.geometry, np.zeros((1, 128, 128), np.float32)])
+    return t, geometry
+
+
+def test_decoding_the_targets_returns_the_craters():
+    rng = np.random.default_rng(1)
+    u = np.array([20.3, 100.0, 255.5, 333.9, 480.2])
+    v = np.array([30.7, 200.1, 255.5, 90.4, 470.9])
+    diameter = rng.uniform(12.0, 120.0, 5)
+    t, geometry = perfect_maps(u, v, diameter)
+    found = decode(t.heat[0], geometry, 0.99)
+    order = np.argsort(found.u_px)
+    # The mean over nine cells is exact where all nine point at one centre; float32 offsets leave 1e-5 px.
+    assert found.u_px[order] == pytest.approx(u, abs=1e-3)
+    assert found.v_px[order] == pytest.approx(v, abs=1e-3)
+    assert found.diameter_px[order] == pytest.approx(diameter, rel=1e-4)
+
+
+def test_an_ignored_crater_takes_the_loss_away_around_it_and_adds_no_heat():
+    t = make_targets(
+        512,
+        512,
+        np.array([200.0]),
+        np.array([100.0]),
+        np.array([60.0]),
+        np.array([Tier.IGNORE], np.int8),
+        np.ones(1),
+    )
+    assert t.heat.max() == 0.0 and t.weight.max() == 0.0 and t.regressed.max() == 0.0
+    assert t.negative[0, 25, 50] == 0.0
+    assert t.negative[0, 25, 80] == 1.0
+
+
+def test_a_label_beside_an_ignored_crater_keeps_its_own_weight():
+    t = make_targets(
+        512,
+        512,
+        np.array([200.0, 206.0]),
+        np.array([100.0, 100.0]),
+        np.array([60.0, 40.0]),
+        np.array([Tier.IGNORE, Tier.LABEL], np.int8),
+        np.array([1.0, 0.7]),
+    )
+    assert t.weight.max() == pytest.approx(0.7)
+
+
+def test_class_heatmaps_follow_the_common_one():
+    t = make_targets(
+        512,
+        512,
+        np.array([100.0, 300.0]),
+        np.array([100.0, 300.0]),
+        np.array([40.0, 60.0]),
+        np.full(2, Tier.LABEL, np.int8),
+        np.ones(2),
+        np.array([0, 3], np.int8),
+    )
+    assert t.heat.shape[0] == 4
+    assert t.heat[1].max() == 1.0 and t.heat[2].max() == 0.0 and t.heat[3].max() == 0.0
+    assert (t.heat[0] == 1.0).sum() == 2
+
+
+def test_no_craters_give_a_plain_background():
+    t, _ = perfect_maps([], [], [])
+    assert t.heat.max() == 0.0 and t.negative.min() == 1.0
+
+
+def test_heat_falls_with_distance_in_units_of_the_radius():
+    t, _ = perfect_maps([257.5], [257.5], [80.0])
+    # sigma = 0.22 R = 2.2 cells: one sigma away exp(-1/2).
+    assert t.heat[0, 64, 64] == 1.0
+    assert t.heat[0, 64, 66] == pytest.approx(np.exp(-0.5 * (2 / 2.2) ** 2), rel=1e-5)
+
+
+ROOT = Path(__file__).parents[3]
+
+
+def write(tmp_path, text):
+    path = tmp_path / "recipe.toml"
+    path.write_text(text)
+    return path
+
+
+GOOD = """[dataset]
+name = "a"
+seed = 1
+[[dataset.source]]
+name = "x"
+split = "train"
+terrain = "procedural"
+share = 1.0
+"""
+
+
+def test_an_unknown_key_is_refused_with_the_nearest_known_one(tmp_path):
+    with pytest.raises(DatasetError, match=r"unknown key 'sead' \(did you mean 'seed'\?\)"):
+        load_recipe(write(tmp_path, GOOD.replace("seed = 1", "seed = 1\nsead = 2")))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('split = "train"', 'split = "trane"', "expected one of train, val, test"),
+        ('terrain = "procedural"', 'terrain = "mars"', "expected one of 'procedural', 'real'"),
+        ("share = 1.0", "share = 1.0\nboxes = [[1, 2, 3]]", "west, east, south, north"),
+        ('name = "a"\n', "", "dataset.name"),
+        ("[dataset]", "[dataset", "expected a TOML file"),
+    ],
+)
+def test_a_wrong_recipe_is_refused_in_one_line_that_says_where(tmp_path, old, new, message):
+    with pytest.raises(DatasetError, match=message) as caught:
+        load_recipe(write(tmp_path, GOOD.replace(old, new, 1)))
+    assert "recipe.toml" in str(caught.value)
+
+
+def test_a_plain_scenario_gives_the_procedural_recipe_of_its_seed(tmp_path):
+    assert load_recipe(write(tmp_path, "seed = 5\n")).digest == procedural_recipe(5).digest
+
+
+def test_procedural_splits_share_no_world():
+    seeds = [seed for source in procedural_recipe().sources for seed in source.seeds]
+    assert len(seeds) == len(set(seeds))
+
+
+def test_the_shipped_recipe_keeps_every_test_and_validation_box_away_from_training():
+    recipe = load_recipe(ROOT / "scenarios" / "detector-dataset.toml")
+    train = [s for s in recipe.sources if s.split == "train" and s.terrain == "real"]
+    held = [box for s in recipe.sources if s.split != "train" and s.terrain == "real" for box in s.boxes]
+    assert held
+    for source in train:
+        assert set(held) <= set(source.avoid)
+        assert source.buffer_km >= 60.0
+    seeds = {}
+    for source in recipe.sources:
+        if source.terrain == "procedural":
+            for seed in source.seeds:
+                assert seeds.setdefault(seed, source.split) == source.split
+
+
+def test_a_footprint_within_the_buffer_of_a_forbidden_box_is_refused():
+    source = Source("x", "train", "real", 1.0, avoid=(Box(285.0, 300.0, -60.0, 60.0),), buffer_km=60.0)
+    world = Box(180.0, 330.0, -60.0, 60.0)
+    # One degree of longitude is 30.3 km at the equator and half of that at 60 degrees.
+    assert not allowed(source, world, np.array([0.0]), np.array([284.0]))
+    assert not allowed(source, world, np.array([0.0]), np.array([283.1]))
+    assert allowed(source, world, np.array([0.0]), np.array([282.9]))
+    assert not allowed(source, world, np.array([58.0]), np.array([281.5]))
+
+
+def test_boxes_join_over_the_zero_meridian():
+    box = Box(350.0, 370.0, -10.0, 10.0)
+    inside = inside_box(box, np.zeros(4), np.array([355.0, 5.0, 12.0, 349.0]), 0.0)
+    assert inside.tolist() == [True, True, False, False]
+
+
+def test_shards_hold_every_frame_once_and_each_source_its_share():
+    recipe = procedural_recipe()
+    shards = plan_shards(recipe, 300)
+    numbers = [n for s in shards for n in s.frame_numbers]
+    assert numbers == list(range(300))
+    train = sum(s.frames for s in shards if s.source.split == "train")
+    assert train == 240
+
+
+def test_real_terrain_may_be_taken_without_what_is_stamped_on_it(tmp_path):
+    path = tmp_path / "r.toml"
+    text = '[dataset]\nname = "a"\nseed = 1\n[[dataset.source]]\nname = "x"\nsplit = "train"\nshare = 1.0\n'
+    path.write_text(text + 'terrain = "real"\n')
+    sharpened = load_recipe(path)
+    path.write_text(text + 'terrain = "real"\nsharpen = false\n')
+    plain = load_recipe(path)
+    assert sharpened.sources[0].sharpen and not plain.sources[0].sharpen
+    # What is as it always was keeps the identity that data sets carry.
+    assert "sharpen" not in sharpened.to_dict()["sources"][0]
+    assert plain.digest != sharpened.digest
+    for terrain, value in (("procedural", "false"), ("real", "3")):
+        path.write_text(f'{text}terrain = "{terrain}"\nsharpen = {value}\n')
+        with pytest.raises(DatasetError, match="sharpen: expected true or false"):
+            load_recipe(path)
+
+
+torch = Lazy("torch")
+networks = Lazy("payload_emulator.training.model.model")
+restoring = Lazy("payload_emulator.training.model.restore")
+
+
+class Crops:
+    """Stands in for the feeder: seeded images of another brightness than unit deviation."""
+
+    def batch(self, first: int, count: int) -> dict[str, np.ndarray]:
+        rng = np.random.default_rng(first)
+        return {"image": 1.7 * rng.standard_normal((count, 1, 64, 64)).astype(np.float32) + 0.4}
+
+
+@pytest.fixture()
+def shipped(tmp_path):
+    path = tmp_path / "m.onnx"
+    path.write_bytes(load_shipped_model())
+    return path
+
+
+def outputs(network, image):
+    with torch.no_grad():
+        heat, geometry = network(torch.from_numpy(image))
+    return torch.sigmoid(heat).numpy(), geometry.numpy()
+
+
+def test_the_restored_network_gives_what_the_exported_one_gives(shipped) -> None:
+    network, document = restoring.network_from_onnx(shipped)
+    image = np.random.default_rng(1).standard_normal((1, 1, 512, 512)).astype(np.float32)
+    heat, geometry = outputs(network, image)
+    expected = OnnxDetector(shipped.read_bytes()).run_network(image)
+    # Single precision through 67 layers: the limit that the export itself holds to.
+    np.testing.assert_allclose(heat, expected[0], atol=2e-4)
+    np.testing.assert_allclose(geometry, expected[1], atol=2e-4)
+    assert document["progress"]["step"] == 5095  # in the metadata of the shipped network
+
+
+def test_counted_statistics_leave_outputs_and_make_training_mode_agree(shipped) -> None:
+    network, _ = restoring.network_from_onnx(shipped)
+    average, _ = restoring.network_from_onnx(shipped)
+    image = Crops().batch(1, 16)["image"]
+    before = outputs(network, image)
+    restoring.count_statistics(network, Crops(), average, crops=32)
+    after = outputs(network, image)
+    np.testing.assert_allclose(after[0], before[0], atol=2e-4)
+    np.testing.assert_allclose(after[1], before[1], atol=2e-3)
+    np.testing.assert_allclose(outputs(average, image)[0], after[0], atol=1e-6)
+    first = network.stem[1]
+    with torch.no_grad():
+        seen = network.stem[0](
+            torch.from_numpy(np.concatenate([Crops().batch(k, 1)["image"] for k in range(32)]))
+        )
+    np.testing.assert_allclose(first.running_mean.numpy(), seen.mean((0, 2, 3)).numpy(), atol=1e-4)
+    np.testing.assert_allclose(
+        first.running_var.numpy(), seen.var((0, 2, 3), unbiased=False).numpy(), rtol=1e-3
+    )
+
+
+def test_what_is_no_exported_network_is_refused(tmp_path) -> None:
+    with pytest.raises(ModelError, match="expected an exported network, found no file"):
+        restoring.network_from_onnx(tmp_path / "none.onnx")
+    (tmp_path / "text.onnx").write_text("no model")
+    with pytest.raises(ModelError, match="expected an exported network"):
+        restoring.network_from_onnx(tmp_path / "text.onnx")
+
+
+def test_an_enlarging_network_gives_maps_of_half_the_stride_and_flies() -> None:
+    network = networks.CraterNet(networks.ModelConfig(16, depth=True, enlarge=2)).eval()
+    assert network.config.cell_px == 2
+    import onnx
+
+    model = keep_blocked(onnx_model(networks.ExportedCraterNet(network).eval()))
+    detector = OnnxDetector(model.SerializeToString())
+    assert onnx.checker.check_model(model) is None
+    assert detector.stride_px == 2
+    image = np.random.default_rng(2).standard_normal((1, 1, 512, 512)).astype(np.float32)
+    heat, geometry = detector.run_network(image)
+    assert heat.shape == (1, 1, 256, 256) and geometry.shape == (1, 5, 256, 256)
+    np.testing.assert_allclose(heat, outputs(network, image)[0], atol=2e-4)
+    with pytest.raises(ModelError, match="expected a divisor of the stride 4, found 3"):
+        networks.ModelConfig(enlarge=3)
+
+
+def test_older_networks_name_the_only_backbone_and_stride() -> None:
+    assert networks.parse_config({"enlarge": 2, "backbone": "small", "stride_px": 4}) == networks.ModelConfig(
+        enlarge=2
+    )
+    with pytest.raises(ModelError, match="expected backbone small, found 'large'"):
+        networks.parse_config({"backbone": "large"})
+    with pytest.raises(ModelError, match="expected stride_px 4, found 2"):
+        networks.parse_config({"stride_px": 2})
+
+
+def test_a_peak_of_a_fine_map_lies_in_the_middle_of_its_cell() -> None:
+    heat = np.zeros((256, 256), np.float32)
+    heat[10, 20] = 0.9
+    found = decode(heat, np.zeros((5, 256, 256), np.float32), 0.5, 2)
+    # Cell 20 of two pixels covers pixels 40 and 41.
+    assert (found.u_px[0], found.v_px[0]) == (pytest.approx(40.5), pytest.approx(20.5))
+
+
+def test_an_enlarging_copy_sees_the_enlarged_image_and_tells_pixels_of_the_image(shipped) -> None:
+    network, _ = restoring.network_from_onnx(shipped)
+    image = np.random.default_rng(5).standard_normal((1, 1, 128, 128)).astype(np.float32)
+    large = torch.nn.functional.interpolate(
+        torch.from_numpy(image), scale_factor=2.0, mode="bilinear", align_corners=False
+    ).numpy()
+    heat, geometry = outputs(restoring.enlarging(network, 2), image)
+    expected_heat, expected = outputs(network, large)
+    np.testing.assert_allclose(heat, expected_heat, atol=1e-5)
+    np.testing.assert_allclose(geometry[:, 2], expected[:, 2] - np.log(2.0), atol=1e-4)
+    np.testing.assert_allclose(geometry[:, 3], expected[:, 3] - np.log(2.0), atol=1e-4)
+    np.testing.assert_allclose(geometry[:, :2], expected[:, :2], atol=1e-4)

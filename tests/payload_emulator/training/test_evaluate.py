@@ -1,12 +1,23 @@
-"""Evaluation from data set to figures and report: what is refused, what every answer holds."""
+"""Evaluation from data set to figures and report: what is refused, what every answer holds. What is exported is
+what was trained: parity, origin, the paper's variant, eight bits. Learned craters as labels of a training:
+where they are in view, and how their file is read. Signed bias by the Sun's azimuth, in the axes of the image
+and of the Sun; distances from measured rims. The parallax of crater walls is found where it was put in, and
+taken out by the flight code. Figures by altitude, light, place and state, against scenes whose answer is
+known.
+"""
 
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.flight.models import load_shipped_model
+from payload_emulator.flight.vision.detector import OnnxDetector
+from payload_emulator.training.data.feeder import TrainParameters
+from payload_emulator.training.data.landmarks import load_landmarks, with_landmarks
+from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate.evaluate import (
     detect_by_class,
     evaluate,
@@ -16,7 +27,13 @@ from payload_emulator.training.evaluate.evaluate import (
     run,
     summary,
 )
+from payload_emulator.training.evaluate.localisation import bias_by_octant, bias_overall
+from payload_emulator.training.evaluate.metrics import Scene, Thresholds, score
 from payload_emulator.training.evaluate.report import detector_report
+from payload_emulator.training.evaluate.scoring import FrameDetections, average_precision, tally
+from payload_emulator.training.model.calibrate import fit_parallax, paper_threshold, without_parallax
+from payload_emulator.training.model.export import PARITY_LIMIT, export
+from payload_emulator.training.model.train import train
 from reports.json_form import to_json
 from reports.render import render_html
 
@@ -104,3 +121,321 @@ def test_real_terrain_that_fixed_thresholds_or_weights_counts_as_seen(blob_datas
         assert level((test, False), (seen, False)).startswith("3s")
         assert level((test, True), (seen, False)).startswith("2 and 3s mixed")
     assert level((test, True)) == "2 (procedural Moon, held out)"
+
+
+ONE_STEP = TrainParameters(
+    minutes=0.0, steps=1, batch=2, crop_px=96, validation_frames=1, replicas=1, detail_blocks=0
+)
+
+
+@pytest.fixture(scope="module")
+def exported(blob_dataset, tmp_path_factory):
+    run = tmp_path_factory.mktemp("export")
+    train([blob_dataset], run, ONE_STEP)
+    path = run / "m.onnx"
+    figures = export(
+        run / "checkpoint.pt", path, [blob_dataset], revision="abc", paper_classes=True, test=True
+    )
+    return path.read_bytes(), figures
+
+
+def test_an_exported_network_agrees_with_torch_and_carries_its_origin(exported, blob_dataset):
+    octets, figures = exported
+    assert figures["parity_max_abs"] <= PARITY_LIMIT
+    metadata = OnnxDetector(octets).metadata
+    assert metadata["git_revision"] == "abc"
+    assert metadata["training_seed"] == "1"
+    assert json.loads(metadata["data"])[0]["labels_sha256"] == blob_dataset.digest
+    assert float(metadata["score_threshold"]) == figures["score_threshold"]
+    tested = json.loads(metadata["test_figures"])["test"]
+    assert set(tested) == {"frames", "level", "strict", "ignore_aware"}
+
+
+def test_the_papers_variant_keeps_its_class_heatmaps_and_is_scored_by_them(exported, blob_dataset):
+    octets, _ = exported
+    detector = OnnxDetector(octets)
+    heatmap, geometry = detector.run_network(np.zeros((1, 1, 512, 512), np.float32))
+    assert heatmap.shape[1] == 4 and geometry.shape[1] == 5
+    scored = evaluate(octets, blob_dataset, threshold=0.01, paper_classes=True)
+    assert [row["size_class"] for row in scored["per_class"]] == [0, 1, 2]
+
+
+def test_a_network_without_class_heatmaps_is_no_papers_variant(blob_dataset, tmp_path):
+    train([blob_dataset], tmp_path, replace(ONE_STEP, paper_classes=False, depth=False))
+    with pytest.raises(ModelError, match="expected a network with the paper's class heatmaps"):
+        export(tmp_path / "checkpoint.pt", tmp_path / "p.onnx", [], paper_classes=True)
+
+
+HEADER = "latitude_deg,longitude_deg,height_m,diameter_m,sightings,looks,score\n"
+
+
+@pytest.fixture
+def landmarks(tmp_path):
+    # 30 km over latitude and longitude 0: 203 m to the pixel, u to the east, v to the south, 30,323 m to the degree.
+    place = f"{(255.5 - 150.0) * 203.0 / 30_323:.6f},{(200.0 - 255.5) * 203.0 / 30_323:.6f}"
+    path = tmp_path / "labels.csv"
+    path.write_text(f"{HEADER}{place},0,8119,4,5,0.800\n")
+    return load_landmarks(path)
+
+
+def test_landmarks_become_labels_where_they_are_in_view(blob_dataset, landmarks):
+    frame = blob_dataset.frames("train")[0]
+    bare = replace(frame, craters={key: values[:0] for key, values in frame.craters.items()})
+    taught = with_landmarks(blob_dataset, bare, landmarks)
+    # 21 and 11 km from the point below, the ground lies 167 m lower: 0.6 % closer to the middle.
+    assert taught.craters["u_px"][-1] == pytest.approx(255.5 - 55.5 * 0.9944, abs=0.05)
+    assert taught.craters["v_px"][-1] == pytest.approx(255.5 - 105.5 * 0.9944, abs=0.05)
+    assert taught.craters["diameter_px"][-1] == pytest.approx(40.0, rel=0.02)
+    assert taught.craters["id"][-1] > 1_000_000_000
+    assert bare.craters["u_px"].size == 0
+    away = replace(bare, position_mcmf_m=bare.position_mcmf_m + np.array([0.0, 90_000.0, 0.0]))
+    assert with_landmarks(blob_dataset, away, landmarks).craters["u_px"].size == 0
+
+
+def test_a_file_that_holds_no_landmarks_is_refused(tmp_path):
+    path = tmp_path / "l.csv"
+    path.write_text("a,b\n1,2\n")
+    with pytest.raises(DatasetError, match="expected landmarks"):
+        load_landmarks(path)
+
+
+def shifted_scene(azimuth_deg, shift, number=0):
+    """Craters on a grid under a Sun at an image azimuth, every detection off by the same shift (right, down)."""
+    u, v = (part.ravel() for part in np.meshgrid(np.arange(60.0, 460.0, 80.0), np.arange(60.0, 460.0, 80.0)))
+    size = np.full(u.size, 30.0)
+    truth = FrameTruth(
+        u, v, size, np.full(u.size, 7_000.0), np.full(u.size, 0.1), np.arange(u.size) + 100 * number, 512, 512,
+        np.radians(azimuth_deg), number,
+    )  # fmt: skip
+    found = FrameDetections(
+        u + shift[0], v + shift[1], size, truth.diameter_m, np.full(u.size, 0.9), np.ones(u.size)
+    )
+    return truth, found
+
+
+def bias_of(*scenes):
+    truths = [truth for truth, _ in scenes]
+    tallied = tally(truths, [found for _, found in scenes])
+    octants = bias_by_octant(tallied, 0.5, truths)
+    return octants, bias_overall(tallied, 0.5, truths, octants)
+
+
+@pytest.mark.parametrize(
+    ("azimuth_deg", "shift"),
+    # Toward a Sun at the top, right, bottom, left: up, right, down, left in an image whose v grows downward.
+    [(1.0, (0.0, -0.5)), (91.0, (0.5, 0.0)), (181.0, (0.0, 0.5)), (271.0, (-0.5, 0.0))],
+)
+def test_a_pull_toward_the_sun_is_told_as_such_wherever_the_sun_is(azimuth_deg, shift):
+    octants, overall = bias_of(shifted_scene(azimuth_deg, shift))
+    row = octants[int(azimuth_deg // 45)]
+    assert row["pairs"] == overall["pairs"] == 25
+    assert (row["du_px"], row["dv_px"]) == pytest.approx(shift)
+    # The Sun is one degree past the axis: 0.5 cos 1 and 0.5 sin 1.
+    assert row["toward_sun_px"] == pytest.approx(0.49992, abs=1e-5)
+    assert row["across_sun_px"] == pytest.approx(-0.00873, abs=1e-5)
+    assert row["length_px"] == overall["worst_octant_px"] == pytest.approx(0.5)
+
+
+def test_pulls_that_cancel_over_all_suns_remain_in_their_octants():
+    octants, overall = bias_of(shifted_scene(10.0, (0.3, 0.0)), shifted_scene(190.0, (-0.3, 0.0), 1))
+    assert overall["length_px"] == pytest.approx(0.0, abs=1e-12)
+    assert overall["worst_octant_px"] == pytest.approx(0.3)
+    # Frames pull in opposite directions: resampling two frames gives anything from -0.3 to 0.3.
+    assert overall["interval_95"]["du_px"] == pytest.approx([-0.3, 0.3])
+    assert octants[0]["interval_95"]["du_px"] == pytest.approx([0.3, 0.3])
+    assert octants[2]["pairs"] == 0 and np.isnan(octants[2]["du_px"])
+
+
+def test_octants_of_a_few_craters_name_no_worst_one():
+    truth, found = shifted_scene(10.0, (2.0, 0.0))
+    columns = ("u_px", "v_px", "diameter_px", "diameter_m", "depth_ratio", "ids")
+    few = replace(truth, **{name: getattr(truth, name)[:5] for name in columns})
+    _, overall = bias_of((few, found))
+    assert overall["pairs"] == 5 and overall["worst_octant"] is None
+
+
+SHARE = 4e-4
+
+
+def frames(count=12, share=SHARE, depth_said=True, noise=0.0, seed=0):
+    """Frames whose detections lie inward of the rims by a share of the depth, as parallax has it."""
+    rng = np.random.default_rng(seed)
+    pairs = []
+    for _ in range(count):
+        n = 30
+        place = np.arange(40.0, 480.0, 80.0)
+        u, v = (part.ravel()[:n] for part in np.meshgrid(place, place))
+        diameter, ratio = rng.uniform(12, 60, n), rng.uniform(0.06, 0.2, n)
+        truth = FrameTruth(u, v, diameter, np.full(n, 7e3), ratio, np.arange(n), 512, 512, 0.0, 0)
+        inward = 1.0 / (1.0 + share * ratio * diameter)
+        found = FrameDetections(
+            255.5 + (u - 255.5) * inward + rng.normal(0, noise + 1e-12, n),
+            255.5 + (v - 255.5) * inward + rng.normal(0, noise + 1e-12, n),
+            diameter,
+            np.full(n, 7e3),
+            np.full(n, 0.9),
+            np.ones(n),
+            ratio if depth_said else None,
+        )
+        pairs.append((truth, found))
+    return pairs
+
+
+def test_the_share_put_in_is_the_share_found():
+    share, error = fit_parallax(frames())
+    assert share == pytest.approx(SHARE, rel=1e-6)
+    assert error < 1e-9
+
+
+def test_the_standard_error_covers_the_scatter_of_the_fit():
+    fits = np.array([fit_parallax(frames(noise=0.5, seed=seed)) for seed in range(12)])
+    assert np.abs(fits[:, 0].mean() - SHARE) < 3 * fits[:, 1].mean() / np.sqrt(12)
+    # Twelve fits know their spread to a factor of about 1.5.
+    assert fits[:, 0].std() == pytest.approx(fits[:, 1].mean(), rel=0.6)
+
+
+def test_detections_come_back_onto_the_rims():
+    for truth, found in frames(2):
+        put_right = without_parallax(found, SHARE, truth)
+        assert put_right.u_px == pytest.approx(truth.u_px, abs=1e-6)
+        assert put_right.v_px == pytest.approx(truth.v_px, abs=1e-6)
+
+
+def test_a_network_that_tells_no_depth_is_corrected_on_the_whole():
+    share, _ = fit_parallax(frames(depth_said=False))
+    truth, found = frames(1, depth_said=False)[0]
+    before = np.hypot(found.u_px - truth.u_px, found.v_px - truth.v_px)
+    fixed = without_parallax(found, share, truth)
+    after = np.hypot(fixed.u_px - truth.u_px, fixed.v_px - truth.v_px)
+    assert after.mean() < 0.5 * before.mean()
+
+
+def test_too_few_craters_give_no_correction():
+    share, error = fit_parallax(frames(1)[:1])
+    assert share == 0.0 and np.isnan(error)
+
+
+def test_the_papers_threshold_is_chosen_over_its_classes_together():
+    # One crater of class 0 found at 0.7, a false detection of class 1 at 0.5: anything in between is best.
+    one = np.array([100.0])
+    truth = FrameTruth(
+        one, one, np.array([30.0]), np.array([7e3]), np.array([0.1]), np.array([1]), 512, 512, 0.0, 0
+    )
+    found = FrameDetections(
+        np.array([100.0, 300.0]),
+        np.array([100.0, 300.0]),
+        np.full(2, 30.0),
+        np.array([7e3, 12e3]),
+        np.array([0.7, 0.5]),
+        np.ones(2),
+        size_class=np.array([0, 1], np.int8),
+    )
+    assert 0.5 < paper_threshold([truth], [found]) <= 0.7
+
+
+THRESHOLDS = Thresholds(0.5, 0.3, 0.7)
+
+
+def scene(u, v, *, shift=(0.0, 0.0), scale=0.0, sigma=1.0, said=0.15, depth=0.15, azimuth=0.0, found=None):
+    """Craters at (u, v) and detections of all (or of a mask), moved by a shift and a scale about the middle."""
+    u, v = np.array(u, float), np.array(v, float)
+    n = u.size
+    truth = FrameTruth(
+        u, v, np.full(n, 30.0), np.full(n, 7_000.0), np.full(n, depth), np.arange(n), 512, 512, azimuth, 0
+    )
+    keep = np.ones(n, bool) if found is None else np.array(found)
+    detections = FrameDetections(
+        (u + shift[0] + scale * (u - 255.5))[keep],
+        (v + shift[1] + scale * (v - 255.5))[keep],
+        np.full(keep.sum(), 30.0),
+        np.full(keep.sum(), 7_000.0),
+        np.full(keep.sum(), 0.8),
+        np.full(keep.sum(), sigma),
+        np.full(keep.sum(), said),
+    )
+    return truth, detections
+
+
+def figures_of(parts, scenes):
+    return score([t for t, _ in parts], [d for _, d in parts], THRESHOLDS, scenes)
+
+
+GRID = np.meshgrid(np.arange(40.0, 500.0, 60.0), np.arange(40.0, 500.0, 60.0))
+LOW = Scene(16.0, 5.0, -2_000.0, "mare")
+HIGH = Scene(42.0, 12.0, 500.0, "hills")
+
+
+def test_groups_hold_their_own_frames_and_no_others():
+    everything = scene(GRID[0].ravel(), GRID[1].ravel())
+    nothing = scene(GRID[0].ravel(), GRID[1].ravel(), found=np.zeros(64, bool))
+    figures = figures_of([everything, nothing], [LOW, HIGH])
+    assert [row["strict"]["recall"] for row in figures["by_altitude_km"]] == [1.0, 0.0]
+    assert {row["name"]: row["strict"]["recall"] for row in figures["by_terrain"]} == {
+        "lowland": 1.0,
+        "upland": 0.0,
+    }
+    assert {row["name"]: row["ignore_aware"]["recall"] for row in figures["by_source"]} == {
+        "mare": 1.0,
+        "hills": 0.0,
+    }
+    assert [(row["low"], row["strict"]["recall"]) for row in figures["by_sun_elevation_deg"]] == [
+        (3.0, 1.0),
+        (12.0, 0.0),
+    ]
+
+
+def test_a_common_shift_is_the_bias_of_its_sun_octant():
+    part = scene(GRID[0].ravel(), GRID[1].ravel(), shift=(0.4, -0.2), azimuth=np.radians(100.0))
+    figures = figures_of([part], [LOW])
+    biased = [row for row in figures["bias_px_by_sun_octant"] if row["pairs"]]
+    assert [row["octant"] for row in biased] == [2]
+    assert (biased[0]["du_px"], biased[0]["dv_px"]) == pytest.approx((0.4, -0.2))
+
+
+def test_sigma_is_called_calibrated_where_errors_follow_it():
+    rng = np.random.default_rng(4)
+    u, v = rng.uniform(30, 480, 4000), rng.uniform(30, 480, 4000)
+    parts = []
+    for k in range(40):
+        truth, found = scene(u[[100 * k]], v[[100 * k]], sigma=0.7)
+        error_u, error_v = rng.normal(0, 0.7, (2, 1))
+        parts.append((truth, replace(found, u_px=found.u_px + error_u, v_px=found.v_px + error_v)))
+    calibration = figures_of(parts, [LOW] * 40)["sigma_calibration"]
+    # 80 draws: the rms of a unit Gaussian is known to 1 / sqrt(160) = 0.08.
+    assert calibration["rms"] == pytest.approx(1.0, abs=0.25)
+    assert calibration["by_altitude_km"][0]["pairs"] == 40
+
+
+def test_states_said_are_counted_against_the_terrains_own():
+    fresh = scene([100, 200], [100, 200], depth=0.15, said=0.15)
+    wrong = scene([100], [100], depth=0.15, said=0.03)
+    state = figures_of([fresh, wrong], [LOW, LOW])["degradation_state"]
+    assert state["confusion"] == [[0, 0, 0], [0, 0, 0], [1, 0, 2]]
+    assert state["agreement"] == pytest.approx(2 / 3)
+
+
+def test_thresholds_of_three_purposes_are_scored_side_by_side():
+    figures = figures_of([scene([100], [100])], [LOW])
+    assert figures["micro"]["recall"] == 1.0
+    assert figures["balanced"]["strict"]["recall"] == 1.0
+    assert figures["navigation"]["threshold"] == 0.7
+
+
+def test_no_detections_at_all_give_nan_and_zero_rather_than_an_error():
+    figures = figures_of([scene([100], [100], found=[False])], [LOW])
+    assert figures["micro"]["recall"] == 0.0
+    assert figures["sigma_calibration"]["pairs"] == 0
+
+
+def test_average_precision_of_a_ranking_done_by_hand():
+    # Ranked right, wrong, right over 2 craters: areas 0.5 * 1 + 0.5 * 2/3.
+    truth, _ = scene([100, 200], [100, 200])
+    found = FrameDetections(
+        np.array([100.0, 400.0, 200.0]),
+        np.array([100.0, 400.0, 200.0]),
+        np.full(3, 30.0),
+        np.full(3, 7_000.0),
+        np.array([0.9, 0.8, 0.7]),
+        np.ones(3),
+    )
+    assert average_precision(tally([truth], [found])) == pytest.approx(0.5 + 0.5 * 2 / 3)

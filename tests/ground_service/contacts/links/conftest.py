@@ -1,7 +1,5 @@
 """A ground station on two TCP ports that does what a test tells it."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import threading

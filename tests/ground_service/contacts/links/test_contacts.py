@@ -1,7 +1,5 @@
 """Contacts from the geometry of a station, and decisions of a link."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Faults of the database and the disk, and two owners at a time: nothing is lost, recorded twice, or sent twice."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

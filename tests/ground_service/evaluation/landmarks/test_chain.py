@@ -1,7 +1,5 @@
 """The chain from passes to a new catalogue and table on board."""
 
-from __future__ import annotations
-
 import io
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Landmarks learned from synthetic passes whose ground catalogue lacks known craters."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import threading
@@ -161,25 +159,6 @@ def test_a_place_is_in_view_of_every_frame_that_saw_it(
     update_landmarks(ground, first)
     found = ground.read(list_landmarks, LandmarkFilter(limit=1000)).items
     assert found and all(one.looks == one.sightings > 0 for one in found)
-
-
-def test_a_pass_that_is_searched_again_counts_once(ground: Ground, thinned) -> None:
-    folder, _, _ = thinned
-    first, second = both_passes(ground, folder)
-    for one in (first, second, first, second, second):
-        update_landmarks(ground, one)
-    again = [
-        one.model_dump(exclude={"id", "changed", "created"})
-        for one in ground.read(list_landmarks, LandmarkFilter(limit=1000)).items
-    ]
-    with open_ground(ground.home.parent / "other") as other:
-        for one in both_passes(other, folder):
-            update_landmarks(other, one)
-        once = [
-            one.model_dump(exclude={"id", "changed", "created"})
-            for one in other.read(list_landmarks, LandmarkFilter(limit=1000)).items
-        ]
-    assert again == once and len(once) > 30
 
 
 def test_the_same_pass_from_two_processes_adds_each_landmark_once(either: Ground, thinned) -> None:

@@ -1,7 +1,5 @@
 """Means, change points and shares over passes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Performance over stored reports, and monthly reports by operation, command, rule and nightly job."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
