@@ -80,7 +80,7 @@ GROUPS = {
             "ground_service/evaluation/navigation/reference_error.py",
             "ground_service/evaluation/detection/viewing.py",
         ),
-        tuple(f"{_GROUND_TESTS}/evaluation/test_{name}.py" for name in ("verdict", "viewing")),
+        tuple(f"{_GROUND_TESTS}/evaluation/test_{name}.py" for name in ("verdict", "pass_data")),
     ),
     "evaluation": Group(
         (
@@ -97,14 +97,10 @@ GROUPS = {
                 f"{_GROUND_TESTS}/evaluation/test_{name}.py"
                 for name in (
                     "pass_evaluation",
-                    "worst_frames",
                     "alignment",
-                    "drift",
                     "recall",
                     "baseline",
                     "fixes",
-                    "viewing",
-                    "trajectory",
                 )
             ),
             f"{_GROUND_TESTS}/evaluation/test_golden_reports.py",
@@ -122,13 +118,12 @@ GROUPS = {
         tuple(
             f"{_FLIGHT}/{name}.py"
             for name in (
-                "navigation/filter",
+                "navigation/filter/filter",
                 "navigation/anchored",
-                "navigation/association",
                 "navigation/correction",
                 "navigation/recovery",
                 "onboard/observer",
-                "navigation/acquisition",
+                "navigation/search/acquisition",
             )
         ),
         tuple(
@@ -139,7 +134,6 @@ GROUPS = {
                 "anchored_navigator",
                 "observer",
                 "acquisition",
-                "burns",
                 "landmark_map",
             )
         ),

@@ -19,10 +19,10 @@ KERNELS = (
         *(f"payload_emulator.sim.render._{part}_kernel" for part in ("grid", "trace", "shade", "sensor")),
     ],
     [
-        "payload_emulator.flight.navigation._dynamics_kernel",
-        "tmtc._cutting",
-        "tmtc._rs_kernel",
-        "tmtc._markers",
+        "payload_emulator.flight.navigation.filter._dynamics_kernel",
+        "tmtc.packets._cutting",
+        "tmtc.link._rs_kernel",
+        "tmtc.link._markers",
         "lunar._dynamics_kernel",
     ],
 )
