@@ -14,17 +14,15 @@ from linna.output import emit, finish, log, progress
 from linna.parser import option
 
 KERNELS = (
-    [
+    (
         "payload_emulator.sim.terrain.kernels",
         *(f"payload_emulator.sim.render._{part}_kernel" for part in ("grid", "trace", "shade", "sensor")),
-    ],
-    [
+    ),
+    (
         "payload_emulator.flight.navigation._dynamics_kernel",
-        "tmtc._cutting",
-        "tmtc._rs_kernel",
-        "tmtc._markers",
+        *(f"tmtc.{part}" for part in ("_cutting", "_rs_kernel", "_markers")),
         "lunar._dynamics_kernel",
-    ],
+    ),
 )
 """Modules of kernels that are compiled at the same time, while the orbit is propagated."""
 
