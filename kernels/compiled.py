@@ -40,12 +40,15 @@ from numba.core.types.misc import unliteral
 
 from kernels import cache_folder, keep, kept
 
-__all__ = ["compiling_ahead", "njit"]
+__all__ = ["FAST", "compiling_ahead", "njit"]
+
+FAST: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "nogil": True}
+"""Options of kernels whose sums may be reordered."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _texts: dict[str, str] = {}
-_ahead: dict[str, list[tuple[Any, str]]] = {}
+_ahead: dict[str, dict[str, tuple[Any, str]]] = {}
 
 
 @overload
@@ -68,7 +71,7 @@ def njit(function: Function | None = None, /, *, ahead: str = "", **options: Any
             _texts[file] = _hash_of_file(file)  # as imported: it may change before the first call
             kernel._cache = _KernelCache(kernel)  # type: ignore[attr-defined]
             if ahead:
-                _ahead.setdefault(source.__module__, []).append((kernel, ahead))
+                _ahead.setdefault(source.__module__, {})[source.__name__] = kernel, ahead
         return kernel
 
     return compiled if function is None else compiled(function)
@@ -125,8 +128,16 @@ def compiling_ahead(
     keep("ahead-", b"")
     total = sum(counts) if kept("ahead-") is not None else 0
     reader, writer = os.pipe()
+    code = "import sys; from kernels.compiled import compile_declared; compile_declared(sys.argv[1:])"
     processes = [
-        _compiler(group, writer) for group, count in zip(groups, counts, strict=True) if total and count
+        subprocess.Popen(
+            [sys.executable, "-c", code, *group],
+            stdout=writer,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+        for group, count in zip(groups, counts, strict=True)
+        if total and count
     ]
     os.close(writer)
 
@@ -143,17 +154,6 @@ def compiling_ahead(
                 process.wait()
 
 
-def _compiler(group: Sequence[str], output: int) -> subprocess.Popen[bytes]:
-    code = f"from kernels.compiled import compile_declared; compile_declared({list(group)})"
-    path = os.pathsep.join(one or "." for one in sys.path)
-    return subprocess.Popen(
-        [sys.executable, "-c", code],
-        stdout=output,
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONPATH": path},
-    )
-
-
 def compile_declared(group: Sequence[str]) -> None:
     """Compile the kernels of modules that have no file, and print a line after each."""
     for kernel, signature in _not_kept(group):
@@ -162,22 +162,25 @@ def compile_declared(group: Sequence[str]) -> None:
 
 
 def _not_kept(group: Sequence[str]) -> list[tuple[Any, tuple[Any, ...]]]:
-    """Return the kernels of modules, with the types declared for them, of which there is no file."""
+    """Return the declared versions of which there is no file."""
     codegen = cpu_target.target_context.codegen()
-    found = []
+    return [
+        (kernel, signature)
+        for kernel, signature in declared(group)
+        if not (cache_folder() / kernel._cache._name(signature, codegen)).exists()
+    ]
+
+
+def declared(group: Sequence[str]) -> Iterator[tuple[Any, tuple[Any, ...]]]:
+    """Yield the kernels of modules with the types declared for them; a named tuple stands for its numba type."""
     for module in group:
         importlib.import_module(module)
-        for kernel, text in _ahead.get(module, []):
-            signature = declared(kernel, text)
-            if not (cache_folder() / kernel._cache._name(signature, codegen)).exists():
-                found.append((kernel, signature))
-    return found
-
-
-def declared(kernel: Any, text: str) -> tuple[Any, ...]:
-    """Return the types that a text names; a tuple of the kernel's module stands for its numba type."""
-    values = eval(f"[{text}]", {**kernel.py_func.__globals__, **vars(types)})
-    return tuple(BaseTuple.from_types(one, type(one)) if isinstance(one, tuple) else one for one in values)
+        for kernel, text in _ahead.get(module, {}).values():
+            values = eval(f"[{text}]", {**vars(types), **kernel.py_func.__globals__})
+            yield (
+                kernel,
+                tuple(BaseTuple.from_types(v, type(v)) if isinstance(v, tuple) else v for v in values),
+            )
 
 
 class _KernelCache:

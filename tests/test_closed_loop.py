@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from kernels.compiled import declared
 from linna import cli
+from linna.commands.demo import KERNELS
 from tests.scenarios import still_scenario
 
 SCENARIO = (
@@ -121,6 +123,13 @@ def test_the_same_scenario_gives_the_same_octets(demo, scenario_file: Path, tmp_
     assert cli.run(["emulate", str(scenario_file), "--out", str(tmp_path / "again"), "--json"]) == 0
     for name in ("downlink.cadu", "reference.oem", "catalogue.csv"):
         assert (tmp_path / "again" / name).read_bytes() == (out / "pass" / name).read_bytes(), name
+    # What the demo compiles at the same time is what a flight calls, each with the types declared for it.
+    rendering, (propagation, *_) = KERNELS
+    called = {
+        kernel.py_func.__name__: types in kernel.overloads
+        for kernel, types in declared([*rendering, propagation])
+    }
+    assert all(called.values()), called
 
 
 def test_an_archive_is_not_written_over_something_else(scenario_file: Path, tmp_path: Path, capsys) -> None:

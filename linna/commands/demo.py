@@ -14,17 +14,16 @@ from linna.output import emit, finish, log, progress, watched_rims
 from linna.parser import option
 
 KERNELS = (
-    [
+    (
         "payload_emulator.sim.terrain.kernels",
         *(f"payload_emulator.sim.render._{part}_kernel" for part in ("grid", "trace", "shade", "sensor")),
-    ],
-    [
+    ),
+    (
         "payload_emulator.flight.navigation.filter._dynamics_kernel",
         "tmtc.packets._cutting",
-        "tmtc.link._rs_kernel",
-        "tmtc.link._markers",
+        *(f"tmtc.link.{part}" for part in ("_rs_kernel", "_markers")),
         "lunar._dynamics_kernel",
-    ],
+    ),
 )
 """Modules of kernels that are compiled at the same time, while the orbit is propagated."""
 

@@ -40,10 +40,10 @@ def inner(x, by=1):
 """
 CALLER = """
 import callee
-from callee import OPTIONS, STEP, STEPS, inner, same
+from callee import OPTIONS, STEP, STEPS, Pair, inner, same
 from kernels.compiled import njit
 
-@njit(**OPTIONS)
+@njit(**OPTIONS, ahead="i8")
 def outer(x):
     return inner(x) * 10 + callee.STEP - STEP
 
@@ -55,7 +55,7 @@ def of_array(x):
 def of_intrinsic(x):
     return same(x)
 
-@njit
+@njit(ahead="Pair(f8, f8)")
 def of_pair(pair):
     return pair.first
 
@@ -221,3 +221,29 @@ def test_constants_and_variables_call_one_version_without_an_entry_from_python(
     (version,) = module._sum.overloads.values()
     assert "cpython" not in version.library.get_llvm_str()
     assert gc.isenabled()  # switched off while the kernels compiled
+
+
+def test_declared_versions_are_compiled_at_the_same_time_and_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from kernels.compiled import compiling_ahead
+
+    folder, cache, said = write(tmp_path / "code"), tmp_path / "cache", list[str]()
+    monkeypatch.syspath_prepend(folder)
+    for variable, value in (("NUMBA_CACHE_DIR", cache), ("PYTHONDONTWRITEBYTECODE", "1")):
+        monkeypatch.setenv(variable, str(value))
+    module = imported(folder, monkeypatch)
+    monkeypatch.setitem(sys.modules, "caller", module)
+    for _ in range(2):
+        with compiling_ahead([["caller"], ["callee"]], said.append) as wait:
+            wait()
+    assert said == ["compiling, once: 1 of 2", "compiling, once: 2 of 2"]
+    assert module.outer(1) == 20
+    assert module.of_pair(module.Pair(2.0, 3.0)) == 2.0
+    assert [len(kernel.stats.cache_hits) for kernel in (module.outer, module.of_pair)] == [1, 1]
+    monkeypatch.setenv(
+        "NUMBA_CACHE_DIR", str(folder / "caller.py")
+    )  # not a folder: no process could keep a file
+    with compiling_ahead([["caller"]], said.append) as wait:
+        wait()
+    assert len(said) == 2

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kernels.compiled import njit
+from kernels.compiled import FAST, njit
 from lunar.arrays import Float32Array, Int32Array
 from lunar.constants import MOON_RADIUS_M
 
@@ -36,7 +36,7 @@ _WORK = 7 * LINE
 _TILE_ROW, _TILE_COLUMN, _PIXEL = (LINE * k for k in range(3))
 _PLACES = 3 * LINE
 
-INLINED: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "nogil": True, "inline": "always"}
+INLINED: dict[str, Any] = {**FAST, "inline": "always"}
 """Options of functions that are part of a loop: compiled in one piece, sums are ordered as if written there."""
 
 
@@ -66,10 +66,8 @@ class Tiles(NamedTuple):
 
 
 @njit(
-    fastmath=True,
-    error_model="numpy",
-    nogil=True,
     ahead="f4[:, ::1], Nodes(*4 * [f4[:, ::1]]), Tiles(f4[:, :, ::1], i4[:, ::1], i8), Grid(f8, f8, f8)",
+    **FAST,
 )
 def fill_grid(heights: Float32Array, nodes: Nodes, tiles: Tiles, grid: Grid) -> None:
     """Fill ``heights`` with z of the ground in the tangent frame.
@@ -87,7 +85,7 @@ def fill_grid(heights: Float32Array, nodes: Nodes, tiles: Tiles, grid: Grid) -> 
         _bend_row(heights, work, i, grid)
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**FAST)
 def _place_row(
     work: Float32Array, places: Int32Array, nodes: Nodes, i: int, columns: int, tile_side: int, shift: int
 ) -> None:
@@ -127,7 +125,7 @@ def _place_row(
             places[j + _PIXEL] = ((a & mask) + 1) * size + (b & mask) + 1
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**FAST)
 def _read_row(
     work: Float32Array, places: Int32Array, pool: Float32Array, table: Int32Array, columns: int
 ) -> None:
@@ -152,7 +150,7 @@ def _read_row(
         work[j + _HEIGHT] = top + fr * (low - top)
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**FAST)
 def _bend_row(heights: Float32Array, work: Float32Array, i: int, grid: Grid) -> None:
     """Put z of a grid row into ``heights``: the height less the sagitta of the sphere below the tangent plane.
 
@@ -173,12 +171,7 @@ def _bend_row(heights: Float32Array, work: Float32Array, i: int, grid: Grid) -> 
         heights[i, j] = h - half * u * (one + half * half * v * (one + half * v))
 
 
-@njit(
-    fastmath=True,
-    error_model="numpy",
-    nogil=True,
-    ahead="f4[:, ::1], f4[::1], f4[::1], f8, f8, f8, f4[:, ::1]",
-)
+@njit(ahead="f4[:, ::1], f4[::1], f4[::1], f8, f8, f8, f4[:, ::1]", **FAST)
 def sweep_shadows(
     heights: Float32Array,
     shadow: Float32Array,
@@ -211,7 +204,7 @@ def sweep_shadows(
             distance[j] = zero if free else away
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True, ahead="f4[:, ::1]")
+@njit(ahead="f4[:, ::1]", **FAST)
 def block_peaks(heights: Float32Array) -> Float32Array:
     """Return the highest z of every block of 8 x 8 grid cells (their borders included)."""
     rows, columns = heights.shape

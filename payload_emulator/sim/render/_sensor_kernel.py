@@ -7,16 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from kernels.compiled import njit
+from kernels.compiled import FAST, njit
 from lunar.arrays import Float32Array
 
 
-@njit(
-    fastmath=True,
-    error_model="numpy",
-    nogil=True,
-    ahead="f4[:, ::1], f4[:, :, ::1], f4[::1], *4 * [f8], u1[::1], u1[:, :, ::1]",
-)
+@njit(ahead="f4[:, ::1], f4[:, :, ::1], f4[::1], *4 * [f8], u1[::1], u1[:, :, ::1]", **FAST)
 def read_out(
     signal: Float32Array,
     noise: Float32Array,

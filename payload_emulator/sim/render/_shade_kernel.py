@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kernels.compiled import njit
+from kernels.compiled import FAST, njit
 from lunar.arrays import Float32Array, Int32Array
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.sim.render._grid_kernel import INLINED, LINE, NODE_STEP, Grid, Nodes, Tiles
@@ -89,14 +89,12 @@ class Steps(NamedTuple):
 
 
 @njit(
-    fastmath=True,
-    error_model="numpy",
-    nogil=True,
     ahead=(
         "f4[:, ::1], Grid(f8, f8, f8), Eye(f8, f8[:, ::1], f8, f8, f8), Light(f8, f8, f4[:, ::1], b1), "
         "Nodes(*4 * [f4[:, ::1]]), Tiles(f4[:, :, ::1], i4[:, ::1], i8), Surface(f4[:, :, ::1], i8, f8, f8), "
         "none, none, *3 * [f4[:, ::1]]"
     ),
+    **FAST,
 )
 def shade_pixels(
     depth: Float32Array,

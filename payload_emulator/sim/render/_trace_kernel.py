@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.compiled import njit
+from kernels.compiled import FAST, njit
 from lunar.arrays import Float32Array, FloatArray, Int32Array
 from payload_emulator.sim.render._grid_kernel import BLOCK_SHIFT, INLINED, LINE, Grid
 
@@ -76,7 +76,7 @@ class Sector(NamedTuple):
     cross_size: int
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**FAST)
 def _clearance(heights: Float32Array, i: float, j: float, z: float) -> float:
     """Return how far a point lies above the ground, bilinear."""
     a = np.uint64(i)
@@ -90,7 +90,7 @@ def _clearance(heights: Float32Array, i: float, j: float, z: float) -> float:
     return above
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**FAST)
 def _bracketed_hit(
     heights: Float32Array,
     i0: float,
@@ -123,7 +123,7 @@ def _bracketed_hit(
     return begin + (end - begin) * above / (above - under)
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**FAST)
 def find_hit(
     heights: Float32Array,
     peaks: Float32Array,
@@ -182,12 +182,7 @@ def find_hit(
     return -1.0
 
 
-@njit(
-    fastmath=True,
-    error_model="numpy",
-    nogil=True,
-    ahead="f4[:, ::1], f4[:, ::1], Grid(f8, f8, f8), Eye(f8, f8[:, ::1], f8, f8, f8), f4[:, ::1]",
-)
+@njit(ahead="f4[:, ::1], f4[:, ::1], Grid(f8, f8, f8), Eye(f8, f8[:, ::1], f8, f8, f8), f4[:, ::1]", **FAST)
 def trace_pixels(
     heights: Float32Array, peaks: Float32Array, grid: Grid, eye: Eye, depth_along: Float32Array
 ) -> None:
@@ -425,7 +420,7 @@ def _settle(
         inner_z[begin + k] = z0 + t * (az * c + bz) if t > zero else high_z
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**FAST)
 def trace_shifted(
     heights: Float32Array,
     peaks: Float32Array,
@@ -455,7 +450,7 @@ def trace_shifted(
             depth_along[v, u] = _search(heights, peaks, i0, j0, eye.altitude_m, di, dj, dz, 0.0, top, low)
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True)
+@njit(**FAST)
 def _search(
     heights: Float32Array,
     peaks: Float32Array,

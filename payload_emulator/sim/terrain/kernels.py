@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from kernels.compiled import njit
+from kernels.compiled import FAST, njit
 from lunar.arrays import Float32Array, FloatArray, Int32Array, IntArray
 
 PROFILE_REACH = 2.6
@@ -20,12 +20,7 @@ LATTICE_SHIFT = 32768.37
 """Keeps lattice coordinates positive down to waves of 53 m, and the planes of the lattice off the axes."""
 
 
-@njit(
-    fastmath=True,
-    error_model="numpy",
-    nogil=True,
-    ahead="f4[:, ::1], *4 * [f8[::1]], f8, f8, i8, f4[:, ::1]",
-)
+@njit(ahead="f4[:, ::1], *4 * [f8[::1]], f8, f8, i8, f4[:, ::1]", **FAST)
 def add_noise(
     out: Float32Array,
     cos_lat: FloatArray,
@@ -117,7 +112,7 @@ def _component(h: np.uint32, shift: int) -> np.float32:
     return np.float32(np.int32(bits)) - np.float32(511.0)
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True, ahead="f4[:, ::1], *4 * [f8], f4[:, ::1]")
+@njit(ahead="f4[:, ::1], *4 * [f8], f4[:, ::1]", **FAST)
 def resample_cubic(
     source: Float32Array,
     first_row: float,
@@ -191,12 +186,7 @@ def smooth(values: Float32Array, weights: Float32Array) -> Float32Array:
     return out
 
 
-@njit(
-    fastmath=True,
-    error_model="numpy",
-    nogil=True,
-    ahead="f4[:, ::1], *6 * [f8[::1]], i8[::1], f8[:, ::1], f4[:, ::1]",
-)
+@njit(ahead="f4[:, ::1], *6 * [f8[::1]], i8[::1], f8[:, ::1], f4[:, ::1]", **FAST)
 def stamp_craters(
     out: Float32Array,
     latitude_rad: FloatArray,
@@ -276,7 +266,7 @@ def stamp_craters(
                     out[i, j] += depth * (row[k] + f * (row[k + 1] - row[k]))
 
 
-@njit(fastmath=True, error_model="numpy", nogil=True, ahead="f4[:, :, ::1], i4[:, ::1], i8, *3 * [f8[::1]]")
+@njit(ahead="f4[:, :, ::1], i4[:, ::1], i8, *3 * [f8[::1]]", **FAST)
 def sample_pool(
     pool: Float32Array,
     table: Int32Array,
