@@ -251,7 +251,7 @@ def test_a_link_is_taken_at_once_from_an_owner_that_has_ended_and_not_from_other
 ) -> None:
     declare(ground, station.link())
     declared = service.declared_links(ground)["lab"]
-    assert service.acquire(ground, declared, "killed", 3_600 * NS)
+    assert service.acquire(ground, declared, "killed", 70 * NS)
     supervisor = LinkSupervisor(ground)
     folder = ground.home / "incoming" / "link-lab"
     folder.mkdir(parents=True)
