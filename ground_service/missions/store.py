@@ -192,9 +192,9 @@ def mission_in_force(connection: Connection, ccsds_id: int | None) -> Mission | 
 
 
 def stations_in_force(connection: Connection, ccsds_id: int | None) -> set[str]:
-    """Return the stations in the descriptions in force of a spacecraft; None: of all."""
-    found = missions_in_force(connection, ccsds_id)
-    return {name for one in found.values() for name in one.link.stations or {}}
+    """Return the stations that descriptions in force (of a spacecraft; None: of all) state; none if one states none."""
+    found = [one.link.stations or {} for one in missions_in_force(connection, ccsds_id).values()]
+    return {name for stations in found for name in stations} if all(found) else set()
 
 
 def mission_of_vehicle(connection: Connection, vehicle: int) -> Mission | None:

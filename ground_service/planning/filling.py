@@ -7,7 +7,7 @@ and have to be down within a given time. All planners are checked by the same si
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -183,8 +183,9 @@ def choose(
 
     Options are taken in several fixed orders; the best result is improved by exchanges of one window for others.
     """
+    options = sorted(options, key=astuple)  # equal values keep an order of their own, not that of the call
     orders = (
-        sorted(options, key=lambda one: (one.start_utc_ns, one.stop_utc_ns)),
+        options,
         sorted(
             options, key=lambda one: (-one.value / (one.stop_utc_ns - one.start_utc_ns), one.start_utc_ns)
         ),

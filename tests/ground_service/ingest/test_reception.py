@@ -271,7 +271,7 @@ def test_two_spacecraft_have_the_same_archives_whatever_the_split(tmp_path: Path
 def test_the_link_quality_of_both_stations_is_shown_with_the_merged_packets_of_the_pass(
     ground: Ground, tmp_path: Path
 ) -> None:
-    add_mission(ground, MISSION.encode())
+    add_mission(ground, f"{MISSION}\n[link.stations.goldstone]\n".encode())
     stream = two_receivers(one_file=False)
     for station, octets in zip(("madrid", "goldstone"), stream.files, strict=True):
         rows = np.frombuffer(octets, dtype=np.uint8).reshape(-1, 1279)

@@ -139,11 +139,11 @@ def test_a_window_is_predicted_with_the_camera_of_its_spacecraft(
     monkeypatch.setattr(
         planning, "planner_of", lambda *given: planners.append(made_planner(*given)) or planners[-1]
     )
-    for spacecraft in (76, 77, 78):
+    for spacecraft in (76, 77):
         entry = planning.WindowEntry("w", START, STOP - 60_000_000_000, 15.0, spacecraft)
         planning.add_window(ground, entry, actor="ann")
     cameras = [planner.camera for planner in planners]
-    assert cameras == [camera_of(Camera(fov_deg=fov)) for fov in (120.0, 40.0)] + [camera_of(Camera())]
+    assert cameras == [camera_of(Camera(fov_deg=fov)) for fov in (120.0, 40.0)]
     assert {planner.orientation.name for planner in planners[:2]} == {IauOrientation().name}
 
 
