@@ -160,9 +160,8 @@ def _add(
         raise InvalidInput("telemetry", "link", "link settings", str(error)) from error
     stations = stations_in_force(connection, spacecraft_id)
     if station and stations and station not in stations:
-        known = ", ".join(sorted(stations))
         raise Conflict(
-            f"telemetry, station: expected one of the mission description ({known}), found {station[:64]}"
+            f"station: expected one of the mission description ({', '.join(sorted(stations))}), found {station[:64]}"
         )
     now = utc_now_ns()
     register_file(connection, stored, "downlink", name, now)
