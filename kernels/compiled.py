@@ -31,7 +31,7 @@ os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
 
 import numba
 from numba.core import event, types
-from numba.core.compiler import CompileResult, Flags
+from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 from numba.core.registry import cpu_target
 from numba.core.serialize import dumps
@@ -102,17 +102,6 @@ class _Collection(event.Listener):  # type: ignore[misc]
 
 
 event.register("numba:compile", _Collection())
-
-
-_DEFAULTS = {name: option.default for name, option in Flags.options.items()}
-
-
-def _values(flags: Any) -> Any:
-    """Return all options of a kernel; numba compares them for each operation, with a slower function of its own."""
-    return _DEFAULTS | flags._values
-
-
-Flags.values = _values
 
 
 @contextmanager
