@@ -158,7 +158,7 @@ def _add(
         assert link is None or LinkSettings.parse(link)
     except TmtcError as error:
         raise InvalidInput("telemetry", "link", "link settings", str(error)) from error
-    stations = stations_in_force(connection, spacecraft_id) if station else ()
+    stations = station and stations_in_force(connection, spacecraft_id)
     if stations and station not in stations:
         raise Conflict(
             f"station: expected one of the mission description ({', '.join(sorted(stations))}), found {station[:64]}"
