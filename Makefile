@@ -30,9 +30,8 @@ HASHED  := $(SHIPPED:requirements/%=requirements/hashed/%)
 demo: $(DEMO_STAMPS)
 	$(BIN)/linna demo --out $(DEMO_OUT)
 
-# Compiled modules are kept, whatever the environment says: many tests start processes. Three processes on two cores:
-# browsers and servers are waited for.
-SUITE = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+# Compiled modules are kept, whatever the environment says: many tests start processes.
+SUITE = PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test: $(VENV)/.dev
 	$(SUITE)
