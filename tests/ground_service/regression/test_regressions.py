@@ -151,7 +151,9 @@ def test_a_bias_of_seven_tenths_of_a_pixel_fails_as_a_centre_error(judge, packet
     assert told.endswith("navigation holds: share of fixes 1 to 1, median position error 30 to 30 m")
 
 
-def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge) -> None:
+def test_processor_times_are_compared_only_of_replays_at_the_same_time(
+    judge, monkeypatch: pytest.MonkeyPatch
+) -> None:
     judge()  # the baseline is replayed before
     outcome = judge(network_ms=20.0)
     (latency,) = [gate for gate in outcome.gates if gate.name == "latency.total"]
@@ -159,16 +161,18 @@ def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge) ->
     assert verdict_document(outcome).headline.endswith("; latency was not judged")
     told = "no latency is compared on 2 of 2 passes: the builds were not replayed at the same time"
     assert told in outcome.remarks
+    one = KeptReplay(outcome="ok", detail="", machine="a", wall_s=8.0)
+    changed = ({"created_utc_ns": at} for at in (3 * 10**9, 5 * 10**9))
+    beside = [one.beside(one.model_copy(update=values)) for values in (*changed, {"machine": "b"})]
+    assert beside == [True, False, False]
+    # Short replays of a loaded machine may miss each other.
+    monkeypatch.setattr(KeptReplay, "beside", lambda _one, _other: True)
     again = judge(network_ms=20.0, repeated=True)
     assert (
         {gate.name for gate in again.gates if gate.name.startswith("latency.")}
         >= failed(again)
         >= {"latency.total"}
     )
-    one = KeptReplay(outcome="ok", detail="", machine="a", wall_s=8.0)
-    changed = ({"created_utc_ns": at} for at in (3 * 10**9, 5 * 10**9))
-    beside = [one.beside(one.model_copy(update=values)) for values in (*changed, {"machine": "b"})]
-    assert beside == [True, False, False]
 
 
 @pytest.mark.parametrize(
