@@ -45,7 +45,7 @@ from payload_emulator.flight.navigation.filter.attitude_monitor import (
     monitored,
 )
 from payload_emulator.flight.navigation.filter.dynamics import OrbitModel, process_noise
-from payload_emulator.flight.navigation.filter.filter import FilterState
+from payload_emulator.flight.navigation.filter.filter import FilterState, KalmanFilter
 from payload_emulator.flight.navigation.landmark_map import (
     FIRST_LANDMARK_ID,
     Landmark,
@@ -98,6 +98,8 @@ class AnchoredSetup:
         Planned burns.
     initial
         Estimate that starts the filter.
+    method
+        Filter that predicts and corrects.
     """
 
     parameters: AnchoredParameters
@@ -107,6 +109,7 @@ class AnchoredSetup:
     markov_sigma_m_s2: tuple[float, float, float]
     burns: BurnTable
     initial: FilterState
+    method: KalmanFilter
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -248,6 +251,7 @@ def start(
     camera: PinholeCamera,
     parameters: AnchoredParameters,
     burns: BurnTable | None = None,
+    method: KalmanFilter = kalman,
 ) -> tuple[AnchoredSetup, AnchoredState]:
     """Return set-up and first state from uploaded tables, the calibrated camera and the parameters."""
     degree = min(parameters.gravity_degree, gravity.c_bar.shape[0] - 1)
@@ -270,6 +274,7 @@ def start(
         noise.markov_sigma_m_s2,
         no_burns() if burns is None else burns,
         estimate,
+        method,
     )
     return setup, AnchoredState(estimate, landmark_map(catalogue), MapState(), initial_state.ticks)
 
@@ -287,10 +292,14 @@ def step(
     setup = _with_attitude_sigma(setup, state.attitude.sigma_rad(declared_rad))
     parameters = setup.parameters
     mcmf_from_icrf = setup.model.mcmf_from_icrf(observation.ticks)
-    prior = predicted(state.estimate, observation.ticks, setup.model, setup.burns, parameters.errors)
+    prior = predicted(
+        state.estimate, observation.ticks, setup.model, setup.burns, parameters.errors, setup.method
+    )
     if prior is not None and not is_usable(prior, parameters.limits):
         state = replace(state, estimate=setup.initial, fixed_ticks=None, trusted=())
-        prior = predicted(setup.initial, observation.ticks, setup.model, setup.burns, parameters.errors)
+        prior = predicted(
+            setup.initial, observation.ticks, setup.model, setup.burns, parameters.errors, setup.method
+        )
     if prior is None or mcmf_from_icrf is None or not is_usable(prior, parameters.limits):
         return state, _report(state, setup, Outcome.refused, None, _Decisions())
     state, decided = _entered(state, prior, observation, setup)
@@ -377,7 +386,9 @@ def search_around(state: AnchoredState, pose: Pose, found: Detections, setup: An
     sigma_m = prior.position_sigma_m
     if sigma_m > tracking_limit_m(prior, parameters):
         expected = len(in_view(landmarks, pose, camera, 0.0))
-        fix = recovery.search_by_votes(prior, pose, found, landmarks, camera, parameters, sigma_m)
+        fix = recovery.search_by_votes(
+            prior, pose, found, landmarks, camera, parameters, sigma_m, method=setup.method
+        )
         # A search that found no safe place is a fix refused, and counts the detections it was tried with.
         tried = len(found) if len(found) >= SEARCHABLE_DETECTIONS else 0
         return Search(prior, fix, tried if fix is None else fix.identification.candidates, expected)
@@ -392,7 +403,7 @@ def search_around(state: AnchoredState, pose: Pose, found: Detections, setup: An
     if identification.believed:
         fix = correct(
             prior, pose, found, identification, sighting, landmarks, camera, parameters,
-            altitude_above_sphere_m(prior), reacquired=False,
+            altitude_above_sphere_m(prior), reacquired=False, method=setup.method,
         )  # fmt: skip
     return Search(prior, fix, identification.candidates, expected)
 
@@ -446,7 +457,9 @@ def with_judged_attitude(
         return replace(state, attitude=judged, trusted=() if judged.degraded else trusted)
     estimate = state.estimate
     if trusted:
-        carried = predicted(trusted[0], estimate.ticks, setup.model, setup.burns, parameters.errors)
+        carried = predicted(
+            trusted[0], estimate.ticks, setup.model, setup.burns, parameters.errors, setup.method
+        )
         if carried is not None and is_usable(carried, parameters.limits):
             estimate = carried
     if len(trusted) <= len(before.window) and len(trusted) < parameters.monitor.window_frames:
@@ -468,12 +481,22 @@ def recovered(
     unseen_s = math.inf
     if state.fixed_ticks is not None:
         unseen_s = (prior.ticks - state.fixed_ticks) / TICKS_PER_SECOND
-    fix = recovery.search_widely(prior, pose, found, state.landmarks, camera, parameters, unseen_s)
+    fix = recovery.search_widely(
+        prior, pose, found, state.landmarks, camera, parameters, unseen_s, setup.method
+    )
     if fix is None and recovery.is_lost_search_due(state.disagreements, parameters):
         places = place_index(state.landmarks) if state.places is None else state.places
         state = replace(state, places=places)
         fix = recovery.search_everywhere(
-            prior, pose, found, state.landmarks, camera, parameters, setup.markov_sigma_m_s2, places
+            prior,
+            pose,
+            found,
+            state.landmarks,
+            camera,
+            parameters,
+            setup.markov_sigma_m_s2,
+            places,
+            setup.method,
         )
     return state, fix
 

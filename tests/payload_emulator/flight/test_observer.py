@@ -113,7 +113,7 @@ def detections(count: int) -> Detections:
 def rig(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     eye, telemetry, clock, navigator = Eye(), Recorder(), Clock(), Navigator()
     observer = Observer(eye, FlightParameters(modes=(Mode.anchored,)), telemetry, clock)
-    observer._setup, observer._anchored = "the tables", navigator.start
+    observer._states[Mode.anchored] = ("the tables", navigator.start)
     monkeypatch.setattr(anchored, "step", navigator.step)
     monkeypatch.setattr(anchored, "widened", navigator.widen)
     return SimpleNamespace(eye=eye, telemetry=telemetry, clock=clock, navigator=navigator, observer=observer)
@@ -315,7 +315,7 @@ def test_a_frame_of_odometry_is_reported_in_full(
     """Longitude -0.3 rad is 342.8 degrees east; velocities, sigmas and NIS do not exist for odometry."""
     observer = Observer(rig.eye, FlightParameters(modes=(Mode.spherical,)), rig.telemetry, rig.clock)
     anchor: Any = object()
-    observer._anchor = anchor
+    observer._states[Mode.spherical] = (anchor, None)
     observer.manual_step = True
     state = SimpleNamespace(
         latitude_rad=0.2, longitude_rad=-0.3, altitude_m=31e3, altitude_reads=7, resets=2,
@@ -379,7 +379,7 @@ def test_odometry_without_a_position_reports_its_outcome_alone(
         "shift_north_m": nothing, "anchor_reads": 0,
     }  # fmt: skip
     assert rig.telemetry.named("frame_outcome") == [expected]
-    observer._anchor = object()
+    observer._states[Mode.paper] = (object(), None)
     report = SimpleNamespace(
         outcome=Outcome.rejected, reset_trigger=ResetTrigger.none, candidate_pairs=3, pairs=0, shift_east_m=np.nan,
         shift_north_m=np.nan,
@@ -479,7 +479,7 @@ def test_detections_are_reported_within_the_range_of_their_fields_and_with_their
 
 
 def test_without_an_altitude_no_detection_has_a_class(rig: SimpleNamespace) -> None:
-    rig.observer._setup = rig.observer._anchored = None
+    rig.observer._states.clear()
     look(rig)
     (sent,) = rig.telemetry.named("detections")
     assert set(sent["items"]["size_class"].tolist()) == {-1}
@@ -492,16 +492,15 @@ def test_a_damaged_table_is_told_by_its_number_and_its_hash(rig: SimpleNamespace
     assert rig.telemetry.events == [
         ("high", "table_refused", float(number), float(table_hash(octets))) for number in (1, 2, 10)
     ]
-    assert observer._setup is None and observer._anchored is None
+    assert observer._states == {Mode.anchored: None}
 
 
 def test_a_widened_orbit_and_a_reset_reach_the_navigator(rig: SimpleNamespace) -> None:
     calls = rig.navigator.widened
     rig.observer.widen(500.0, 0.5)
     assert calls == [(500.0, 0.5)]
-    rig.observer._odometry[Mode.paper] = "remembered"
     rig.observer.reset()
     # There are no tables to start a new one from.
-    assert rig.observer._setup is None and rig.observer._anchored is None and rig.observer._odometry == {}
+    assert rig.observer._states == {Mode.anchored: None}
     rig.observer.widen(500.0, 0.5)
     assert len(calls) == 1

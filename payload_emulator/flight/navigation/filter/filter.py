@@ -12,6 +12,7 @@ it as noise about the measured attitude.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -163,6 +164,27 @@ class Update:
     attitude_sigma_rad: float
     rotation: RotationEvidence
     contradiction: FloatArray
+
+
+class KalmanFilter(Protocol):
+    """Prediction and correction of a filter state, as in this module; a replacement is a module with the same two."""
+
+    def predict(
+        self, state: FilterState, ticks: int, model: OrbitModel, errors: CommonErrors
+    ) -> FilterState | None: ...
+
+    def update(
+        self,
+        prior: FilterState,
+        camera_from_icrf: FloatArray,
+        mcmf_from_icrf: FloatArray,
+        landmarks: LandmarkMap,
+        index: IntArray,
+        uv_px: FloatArray,
+        variance_px2: FloatArray,
+        camera: PinholeCamera,
+        errors: CommonErrors,
+    ) -> Update | None: ...
 
 
 def initial_filter_state(
