@@ -46,6 +46,7 @@ from payload_emulator.flight.navigation.filter.attitude_monitor import (
 )
 from payload_emulator.flight.navigation.filter.dynamics import OrbitModel, process_noise
 from payload_emulator.flight.navigation.filter.filter import FilterState, KalmanFilter
+from payload_emulator.flight.navigation.filter.map_offset import OffsetSize, first_size, learned
 from payload_emulator.flight.navigation.landmark_map import (
     FIRST_LANDMARK_ID,
     Landmark,
@@ -139,6 +140,8 @@ class AnchoredState:
         without craters; none while the attitude is degraded.
     places
         Search index of `landmarks`; None before the first search.
+    offset
+        Size of the catalogue's common offset as learned; None where it is not.
     """
 
     estimate: FilterState
@@ -151,6 +154,7 @@ class AnchoredState:
     attitude: AttitudeMonitor = field(default_factory=AttitudeMonitor)
     trusted: tuple[FilterState, ...] = ()
     places: PlaceIndex | None = None
+    offset: OffsetSize | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,6 +198,8 @@ class AnchoredReport:
         Landmarks that were made or improved.
     attitude_declared_rad, attitude_noise_rad
         Standard deviation of the attitude per axis as declared, and as estimated if it is noisier, else 0.
+    offset
+        Size of the catalogue's common offset; None where it is not learned.
     """
 
     outcome: Outcome
@@ -212,6 +218,7 @@ class AnchoredReport:
     new_landmarks: tuple[Landmark, ...] = ()
     attitude_declared_rad: float = 0.0
     attitude_noise_rad: float = 0.0
+    offset: OffsetSize | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -252,8 +259,17 @@ def start(
     parameters: AnchoredParameters,
     burns: BurnTable | None = None,
     method: KalmanFilter = kalman,
+    offset: OffsetSize | None = None,
 ) -> tuple[AnchoredSetup, AnchoredState]:
-    """Return set-up and first state from uploaded tables, the calibrated camera and the parameters."""
+    """Return set-up and first state from uploaded tables, the calibrated camera and the parameters.
+
+    `offset` is what was learned of the same catalogue before; None starts from the prior.
+    """
+    if parameters.offset is None:
+        offset = None
+    elif offset is None:
+        offset = first_size(parameters.offset)
+    parameters = _with_errors(parameters, parameters.errors.attitude_noise_rad, offset)
     degree = min(parameters.gravity_degree, gravity.c_bar.shape[0] - 1)
     noise = process_noise(degree, gravity.name) if parameters.noise is None else parameters.noise
     model = OrbitModel(gravity, orientation, degree, noise)
@@ -265,6 +281,7 @@ def start(
         initial_state.sigma_velocity_m_s,
         noise.markov_sigma_m_s2,
         parameters.errors,
+        offset is not None,
     )
     setup = AnchoredSetup(
         parameters,
@@ -276,7 +293,8 @@ def start(
         estimate,
         method,
     )
-    return setup, AnchoredState(estimate, landmark_map(catalogue), MapState(), initial_state.ticks)
+    landmarks = landmark_map(catalogue)
+    return setup, AnchoredState(estimate, landmarks, MapState(), initial_state.ticks, offset=offset)
 
 
 def step(
@@ -289,8 +307,8 @@ def step(
     """
     found, camera_from_icrf = observation.found, observation.camera_from_icrf
     declared_rad = setup.parameters.errors.attitude_noise_rad
-    setup = _with_attitude_sigma(setup, state.attitude.sigma_rad(declared_rad))
-    parameters = setup.parameters
+    parameters = _with_errors(setup.parameters, state.attitude.sigma_rad(declared_rad), state.offset)
+    setup = replace(setup, parameters=parameters)
     mcmf_from_icrf = setup.model.mcmf_from_icrf(observation.ticks)
     prior = predicted(
         state.estimate, observation.ticks, setup.model, setup.burns, parameters.errors, setup.method
@@ -323,8 +341,7 @@ def step(
         state, fix = recovered(state, pose, found, setup)
     if fix is not None:
         state = replace(state, estimate=fix.update.state, fixed_ticks=observation.ticks)
-        if fix.reacquired:
-            state = replace(state, trusted=())
+        state = replace(state, trusted=()) if fix.reacquired else _with_learned_offset(state, fix, parameters)
     state = with_judged_attitude(state, judged, None if evidence is None else search.prior, setup)
     decided = replace(decided, candidates=search.candidates, expected=search.expected, fix=fix)
     if parameters.map_landmarks:
@@ -347,9 +364,24 @@ def is_lost(state: AnchoredState, parameters: AnchoredParameters) -> bool:
     return not state.estimate.finite or state.estimate.position_sigma_m > parameters.divergence_limit_m
 
 
-def _with_attitude_sigma(setup: AnchoredSetup, sigma_rad: float) -> AnchoredSetup:
-    errors = replace(setup.parameters.errors, attitude_noise_rad=sigma_rad)
-    return replace(setup, parameters=replace(setup.parameters, errors=errors))
+def _with_errors(
+    parameters: AnchoredParameters, attitude_rad: float, offset: OffsetSize | None
+) -> AnchoredParameters:
+    """Return the parameters with the noise of the attitude and the offset of the catalogue that are in use."""
+    errors = replace(parameters.errors, attitude_noise_rad=attitude_rad)
+    if offset is not None:
+        size_m = (offset.sigma_m, offset.sigma_m, errors.catalogue_offset_m[2])
+        errors = replace(errors, catalogue_offset_m=size_m)
+    return replace(parameters, errors=errors)
+
+
+def _with_learned_offset(state: AnchoredState, fix: Fix, parameters: AnchoredParameters) -> AnchoredState:
+    """Return the state after the size of the catalogue's offset was learned from a fix."""
+    if state.offset is None or parameters.offset is None or state.estimate.slope is None:
+        return state
+    offset = learned(state.offset, fix.update.score, parameters.offset)
+    estimate = state.estimate.with_offset(state.offset.sigma_m, offset.sigma_m)
+    return replace(state, estimate=estimate, offset=offset)
 
 
 def _entered(
@@ -429,7 +461,8 @@ def rotation_evidence(
             prior, parameters
         ):
             return None
-        fix = search_around(state, pose, found, _with_attitude_sigma(setup, trial_rad)).fix
+        tried = _with_errors(parameters, trial_rad, state.offset)
+        fix = search_around(state, pose, found, replace(setup, parameters=tried)).fix
     if fix is None or len(fix.index) < parameters.monitor.least_craters:
         return None
     return replace(fix.update.rotation, trial=disagrees)
@@ -585,4 +618,5 @@ def _report(
         decided.new_landmarks,
         decided.attitude_declared_rad,
         state.attitude.noise_rad,
+        state.offset,
     )

@@ -7,7 +7,7 @@ is a module with the functions of `KalmanFilter` and its row `AnchoredEstimator(
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -28,7 +28,7 @@ from payload_emulator.flight.navigation.odometry import odometry
 from payload_emulator.flight.navigation.odometry.odometry import OdometryParameters, OdometryState
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.vision.detections import Detections
-from tmtc.dictionary.tables import AnchorTable
+from tmtc.dictionary.tables import AnchorTable, CatalogueTable
 
 _NAN = float("nan")
 _UNKNOWN = (_NAN, _NAN, _NAN)
@@ -112,8 +112,10 @@ class Estimator(Protocol):
     tables: ClassVar[tuple[str, ...]]
     outcomes: ClassVar[tuple[Outcome, ...]]
 
-    def start(self, tables: Mapping[str, Any], parameters: NavigationParameters) -> Any | None:
-        """Return the first state; None where a table is missing."""
+    def start(
+        self, tables: Mapping[str, Any], parameters: NavigationParameters, before: Any | None
+    ) -> Any | None:
+        """Return the first state, with what a state `before` learned of the same tables; None without a table."""
 
     def step(
         self, state: Any | None, frame: Frame, parameters: NavigationParameters
@@ -136,7 +138,7 @@ class OdometryEstimator:
     outcomes: ClassVar[tuple[Outcome, ...]] = tuple(Outcome)[: Outcome.fixed]
 
     def start(
-        self, tables: Mapping[str, Any], parameters: NavigationParameters
+        self, tables: Mapping[str, Any], parameters: NavigationParameters, before: Any | None
     ) -> tuple[AnchorTable, OdometryState | None] | None:
         anchor = tables["anchor_ephemeris"]
         return None if anchor is None else (anchor, None)
@@ -190,11 +192,15 @@ class AnchoredEstimator:
     outcomes: ClassVar[tuple[Outcome, ...]] = tuple(Outcome)[Outcome.fixed :]
 
     def start(
-        self, tables: Mapping[str, Any], parameters: NavigationParameters
+        self,
+        tables: Mapping[str, Any],
+        parameters: NavigationParameters,
+        before: tuple[AnchoredSetup, AnchoredState] | None,
     ) -> tuple[AnchoredSetup, AnchoredState] | None:
         catalogue, gravity, orientation, initial, burns = (tables[name] for name in self.tables)
         if not (catalogue and gravity and orientation and initial):
             return None
+        known = None if before is None or not _same(before[0].catalogue, catalogue) else before[1].offset
         return anchored.start(
             catalogue,
             gravity,
@@ -204,6 +210,7 @@ class AnchoredEstimator:
             parameters.anchored,
             burns,
             self.method,
+            known,
         )
 
     def step(
@@ -239,6 +246,10 @@ class AnchoredEstimator:
 
     def summary(self, state: tuple[AnchoredSetup, AnchoredState] | None) -> tuple[int, int]:
         return 0, 0
+
+
+def _same(one: CatalogueTable, other: CatalogueTable) -> bool:
+    return all(np.array_equal(getattr(one, item.name), getattr(other, item.name)) for item in fields(one))
 
 
 ESTIMATORS: dict[Mode, Estimator] = {

@@ -181,6 +181,7 @@ def search_everywhere(
         ORBITAL_RATE_RAD_S * float(np.linalg.norm(new - old)) + limits.found_velocity_m_s,
         markov_sigma_m_s2,
         parameters.errors,
+        prior.slope is not None,
     )
     there = replace(pose, position_icrf_m=new)
     sighting = look(landmarks, place.index, there, camera)

@@ -91,6 +91,7 @@ class Observer:
         self._states: dict[Mode, Any] = {}
         self._loaded: dict[str, Any] = {}
         self._in_trouble: set[str] = set()
+        self._map_offset: tuple[float, float] | None = None
         self._tables = FlightTables()
 
     @property
@@ -102,10 +103,12 @@ class Observer:
         """Start again with these tables; a damaged one is reported and not used."""
         self._tables = tables
         self._loaded["anchor_ephemeris"] = self._load("anchor_ephemeris", unpack_anchor_table)
-        self.reset()
+        for mode in self._parameters.modes:
+            self._start(mode)
 
     def reset(self) -> None:
-        """Forget all estimates; each estimator starts from its tables."""
+        """Forget all estimates and what was learned of the tables; each estimator starts from its tables."""
+        self._states.clear()
         for mode in self._parameters.modes:
             self._start(mode)
 
@@ -224,10 +227,11 @@ class Observer:
         return quality, found
 
     def _start(self, mode: Mode) -> None:
+        """Start an estimator from its tables; what it learned of the same tables is kept."""
         estimator = ESTIMATORS[mode]
         for name in estimator.tables:
             self._loaded[name] = self._load(name, _UNPACK[name])
-        self._states[mode] = estimator.start(self._loaded, self._parameters)
+        self._states[mode] = estimator.start(self._loaded, self._parameters, self._states.get(mode))
 
     def _estimate(self, mode: Mode, given: Frame) -> float:
         """Run an estimator on one frame, report it, and return the altitude that scales the frame."""
@@ -292,6 +296,10 @@ class Observer:
         self._trouble("fix_refused", refused, float(report.candidates), float(report.expected))
         self._trouble("filter_divergence", report.lost, sigma_m, 0.0)
         self._report_attitude(report)
+        offset = None if report.offset is None else (report.offset.sigma_m, float(report.offset.fixes))
+        if offset is not None and offset != self._map_offset:
+            self._telemetry.event("info", "map_offset", *offset)
+            self._map_offset = offset
 
     def _send_filter(self, state: AnchoredState, report: AnchoredReport, found: Detections | None) -> None:
         """Send what the ground needs to judge and to smooth the filter: its orbit in full, the pairs of its fix."""

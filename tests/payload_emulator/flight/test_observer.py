@@ -8,6 +8,7 @@ import pytest
 
 from payload_emulator.flight.navigation import anchored
 from payload_emulator.flight.navigation.anchored import AnchoredReport, Observation
+from payload_emulator.flight.navigation.filter.map_offset import OffsetSize
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.onboard.loads import FlightParameters, FlightTables
 from payload_emulator.flight.onboard.observer import Observer
@@ -74,7 +75,7 @@ class Navigator:
         self.given: list[tuple[int, Detections | None, Any]] = []
         self.outcome, self.lost, self.fix, self.new_landmarks = Outcome.coasted, False, None, ()
         self.breaks = self.reacquired = False
-        self.attitude_noise_rad = 0.0
+        self.attitude_noise_rad, self.offset = 0.0, None
         root = RNG.standard_normal((18, 18))
         self.start = SimpleNamespace(estimate=None, landmarks=None)
         self.state = SimpleNamespace(
@@ -90,7 +91,7 @@ class Navigator:
             raise np.linalg.LinAlgError
         return self.state, AnchoredReport(
             self.outcome, 0.1, -0.2, 30e3, (1.0, 2.0, 3.0), (4.0, 6.0, 5.0), 7.0, 3, 9, 11, self.reacquired,
-            self.lost, self.fix, self.new_landmarks, np.radians(0.01), self.attitude_noise_rad,
+            self.lost, self.fix, self.new_landmarks, np.radians(0.01), self.attitude_noise_rad, self.offset,
         )  # fmt: skip
 
     def widen(self, state: Any, position_m: float, velocity_m_s: float) -> Any:
@@ -265,6 +266,14 @@ def test_an_attitude_noisier_than_declared_is_reported_at_its_beginning_and_end(
         ("medium", "attitude_degraded"),
     ]
     np.testing.assert_allclose([event[2:] for event in found], [(0.2, 0.01), (0.01, 0.0), (1.0, 0.01)])
+
+
+def test_the_size_of_the_map_offset_is_sent_when_it_changes(rig: SimpleNamespace) -> None:
+    for sigma_m, fixes, pending in ((60.0, 0, 0), (60.0, 0, 7), (31.0, 40, 0), (31.0, 40, 9), (31.0, 80, 0)):
+        rig.navigator.offset = OffsetSize(sigma_m, 0.5, fixes, pending=pending)
+        look(rig)
+    sent = [event[2:] for event in rig.telemetry.events if event[:2] == ("info", "map_offset")]
+    assert sent == [(60.0, 0.0), (31.0, 40.0), (31.0, 80.0)]
 
 
 def test_a_reset_of_the_filter_is_told_and_counted(rig: SimpleNamespace) -> None:
