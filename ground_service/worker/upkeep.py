@@ -16,8 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ground_service.access.audit_log import audit_head
-from ground_service.access.store import delete_answers, delete_ended_sessions
+from ground_service.access.store import audit_head, delete_answers, delete_ended_sessions
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.performance.service import make_due_reports

@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from ground_service.access.audit_log import audit_head
+from ground_service.access.store import audit_head
 from ground_service.errors import InvalidInput
 from ground_service.events import (
     AlarmChanged,
