@@ -15,8 +15,13 @@ from sqlalchemy import func, select
 from ground_service.clock import mission_now_ns
 from ground_service.contacts.links import runner as runners
 from ground_service.contacts.links import service, store
-from ground_service.contacts.links.runner import LinkRunner, ended_holder
-from ground_service.contacts.links.stream import ACKNOWLEDGEMENT, DISCARDED_BLOCKS, Connector
+from ground_service.contacts.links.runner import (
+    ACKNOWLEDGEMENT,
+    DISCARDED_BLOCKS,
+    Connector,
+    LinkRunner,
+    ended_holder,
+)
 from ground_service.contacts.links.supervisor import LinkSupervisor
 from ground_service.errors import DatabaseBusy, Stopping, StorageFull
 from ground_service.events import read_events

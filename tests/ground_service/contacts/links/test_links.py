@@ -25,9 +25,8 @@ from ground_service.contacts.commanding.service import (
     resume_spacecraft,
 )
 from ground_service.contacts.links import service, store
-from ground_service.contacts.links.runner import LinkRunner
+from ground_service.contacts.links.runner import ACKNOWLEDGEMENT, TRANSMISSION, LinkRunner
 from ground_service.contacts.links.store import TransmissionRow
-from ground_service.contacts.links.stream import ACKNOWLEDGEMENT, TRANSMISSION
 from ground_service.errors import Conflict, NotFound
 from ground_service.events import read_events
 from ground_service.ground import Ground, open_ground
