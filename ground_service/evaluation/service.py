@@ -10,13 +10,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ground_service.clock import utc_now_ns
 from ground_service.errors import storage_error
 from ground_service.evaluation import store
-from ground_service.evaluation.conditions import conditions_of
 from ground_service.evaluation.core import PassInputs, evaluate_pass, summary_of
+from ground_service.evaluation.extras import sun_angles
 from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.model import StoredReport, changed_figures
+from ground_service.evaluation.navigation.alignment import reference_states
 from ground_service.evaluation.preparation import align_pass
 from ground_service.evaluation.surface import surface_map
 from ground_service.events import PassEvaluated, publish
@@ -24,9 +27,35 @@ from ground_service.ground import Ground
 from ground_service.passes.store import get_pass
 from ground_service.store.files import make_durable_folder, replace_durably
 from ground_service.store.stored_files import register_file
+from lunar.arrays import FloatArray
 from lunar.timescales import format_utc
 from reports.document import evidence_number
 from reports.values import PassReport
+
+SAMPLES = 61
+"""Epochs of the reference over the pass, from which the medians are computed."""
+
+
+def conditions_of(inputs: PassInputs) -> dict[str, Any]:
+    """Return median altitude and elevation of the Sun along the reference, the build, and the judged estimator.
+
+    Altitude is above the sphere, elevation at the sub-satellite point; both are None where the reference or the
+    orientation is unknown, the elevation also where the images had another light than that of the ephemeris.
+    """
+    utc_ns = np.linspace(inputs.start_utc_ns, inputs.stop_utc_ns, SAMPLES).astype(np.int64)
+    track = reference_states(inputs.reference, inputs.orientation, utc_ns)
+    return {
+        "altitude_km": _median(track.altitude_m / 1e3),
+        "sun_elevation_deg": _median(sun_angles(track).elevation_deg) if inputs.sun_known else None,
+        "build": inputs.build,
+        "estimator": inputs.limits.estimator,
+    }
+
+
+def _median(values: FloatArray) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else None
+
 
 REAL_TERRAIN_LEVEL = 3
 """Lowest evidence level with real terrain."""
