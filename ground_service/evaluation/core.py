@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from ground_service.evaluation.detection.fixes import (
     IdentificationSamples,
+    MappedCraters,
     join_pairs,
+    payload_map,
 )
-from ground_service.evaluation.detection.landmarks import MappedCraters, payload_map
 from ground_service.evaluation.detection.recall import (
     ExpectedCraters,
     Matches,
