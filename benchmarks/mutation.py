@@ -78,7 +78,7 @@ GROUPS = {
         (
             "ground_service/evaluation/verdict.py",
             "ground_service/evaluation/navigation/reference_error.py",
-            "ground_service/evaluation/detection/viewing.py",
+            "ground_service/evaluation/detection/recall.py",
         ),
         tuple(f"{_GROUND_TESTS}/evaluation/test_{name}.py" for name in ("verdict", "pass_data")),
     ),

@@ -18,11 +18,11 @@ from ground_service.evaluation.detection.fixes import (
 from ground_service.evaluation.detection.recall import (
     ExpectedCraters,
     Matches,
+    Viewing,
     expected_craters,
     match_detections,
     score_detections,
 )
-from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.extras import (
     FILTER,
     snapshot_series,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ground_service.evaluation.detection.fixes import Pairs, snapshot_positions, wrong_fixes
-from ground_service.evaluation.detection.viewing import Viewing
+from ground_service.evaluation.detection.recall import Viewing
 from ground_service.evaluation.navigation.alignment import ReferenceStates, error_of_places_rtn_m
 from ground_service.evaluation.navigation.drift import navigation_statistics
 from ground_service.passes.samples import NavigationSamples

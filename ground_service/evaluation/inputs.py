@@ -15,7 +15,7 @@ from sqlalchemy import Connection
 from ground_service.errors import EvaluationError, InvalidInput
 from ground_service.evaluation.core import PassInputs
 from ground_service.evaluation.detection.fixes import IdentificationSamples, MappedCraters, mapped_craters
-from ground_service.evaluation.detection.viewing import Viewing
+from ground_service.evaluation.detection.recall import Viewing
 from ground_service.evaluation.model import changed_figures
 from ground_service.evaluation.navigation.alignment import ReferenceStates, reference_states
 from ground_service.evaluation.navigation.baselines import StartState

@@ -11,10 +11,10 @@ import numpy as np
 from ground_service.evaluation.detection.recall import (
     SCORED_CLASSES,
     ExpectedCraters,
+    Viewing,
     expected_craters,
     match_detections,
 )
-from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.navigation.alignment import (
     ReferenceStates,
     error_of_places_rtn_m,

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from ground_service.evaluation.core import PassInputs, _imaging_arcs, _joined, evaluate_pass, summary_of
 from ground_service.evaluation.detection.fixes import IdentificationSamples, MappedCraters
-from ground_service.evaluation.detection.viewing import Viewing
+from ground_service.evaluation.detection.recall import Viewing
 from ground_service.evaluation.model import PassFigures
 from ground_service.evaluation.navigation.baselines import StartState
 from ground_service.evaluation.navigation.smoother import ONBOARD, FilterStates
