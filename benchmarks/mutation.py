@@ -88,7 +88,7 @@ GROUPS = {
             "ground_service/evaluation/navigation/alignment.py",
             "ground_service/evaluation/navigation/drift.py",
             "ground_service/evaluation/detection/recall.py",
-            "ground_service/evaluation/navigation/baselines.py",
+            "ground_service/evaluation/navigation/smoother.py",
             "ground_service/evaluation/detection/fixes.py",
             "ground_service/evaluation/navigation/trajectory.py",
         ),

@@ -40,7 +40,6 @@ from ground_service.evaluation.navigation.alignment import (
     places_of_positions,
     reference_states,
 )
-from ground_service.evaluation.navigation.baselines import BASELINE_DEGREE, StartState, propagated_positions
 from ground_service.evaluation.navigation.consistency import nees, squared_normalised_errors
 from ground_service.evaluation.navigation.drift import (
     drift_by_length,
@@ -49,7 +48,13 @@ from ground_service.evaluation.navigation.drift import (
 )
 from ground_service.evaluation.navigation.reference_error import error_budget, reference_covariance_m2
 from ground_service.evaluation.navigation.smoothed_series import SMOOTHED, smoothed_series, smoother_model
-from ground_service.evaluation.navigation.smoother import CommandedBurn, FilterStates
+from ground_service.evaluation.navigation.smoother import (
+    BASELINE_DEGREE,
+    CommandedBurn,
+    FilterStates,
+    StartState,
+    propagated_positions,
+)
 from ground_service.evaluation.verdict import (
     Evaluated,
     Limits,

@@ -18,8 +18,13 @@ from ground_service.evaluation.detection.fixes import IdentificationSamples, Map
 from ground_service.evaluation.detection.recall import Viewing
 from ground_service.evaluation.model import changed_figures
 from ground_service.evaluation.navigation.alignment import ReferenceStates, reference_states
-from ground_service.evaluation.navigation.baselines import StartState
-from ground_service.evaluation.navigation.smoother import ONBOARD, SIZE, CommandedBurn, FilterStates
+from ground_service.evaluation.navigation.smoother import (
+    ONBOARD,
+    SIZE,
+    CommandedBurn,
+    FilterStates,
+    StartState,
+)
 from ground_service.evaluation.verdict import Limits, StartOrbit
 from ground_service.ground import Ground
 from ground_service.missions.catalogues import read_catalogue

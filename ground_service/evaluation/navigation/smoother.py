@@ -17,8 +17,9 @@ from ground_service.errors import EvaluationError
 from lunar.arrays import FloatArray, IntArray
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.frames import ICRF, Orientation, icrf_from_onboard, rtn_from_inertial
+from lunar.gravity import GravityField
 from lunar.gravity_omission import FieldNoise, densities_at
-from lunar.propagation import ForceModel, propagate_with_stm
+from lunar.propagation import ForceModel, propagate, propagate_with_stm
 from lunar.timescales import tdb_s_from_utc_ns
 
 SIZE = 9
@@ -276,3 +277,56 @@ def _divided(left: FloatArray, covariance: FloatArray) -> FloatArray:
     correlation = covariance / (scale[:, :, None] * scale[:, None, :])
     solved = np.linalg.solve(correlation, _turned(left / scale[:, None, :]))
     return np.asarray(_turned(solved) / scale[:, None, :], dtype=np.float64)
+
+
+BASELINE_DEGREE = 50
+"""Degree of the propagate-only baseline: what a flight computer can afford."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StartState:
+    """The state that the estimators were started from, Moon-centred ICRF."""
+
+    utc_ns: int
+    position_icrf_m: FloatArray
+    velocity_icrf_m_s: FloatArray
+
+
+def propagated_positions(
+    start: StartState,
+    utc_ns: IntArray,
+    gravity: GravityField,
+    degree: int,
+    orientation: Orientation,
+    *,
+    third_bodies: bool = True,
+) -> FloatArray:
+    """Return the ICRF positions (n, 3) of the start state flown on to `utc_ns` (n,), ascending; NaN before the start.
+
+    Degree 0 without third bodies is the two-body (Kepler) orbit.
+
+    Raises
+    ------
+    ImpactError
+        If the orbit meets the ground.
+    """
+    positions = np.full((len(utc_ns), 3), np.nan)
+    after = np.asarray(utc_ns) >= start.utc_ns
+    if not after.any():
+        return positions
+    epoch = float(tdb_s_from_utc_ns(start.utc_ns))
+    tdb_s = np.asarray(tdb_s_from_utc_ns(np.asarray(utc_ns)[after]), dtype=np.float64)
+    duration_s = float(tdb_s[-1] - epoch)
+    if duration_s <= 0.0:
+        positions[after] = start.position_icrf_m
+        return positions
+    model = ForceModel(
+        gravity=gravity,
+        degree=min(degree, gravity.degree),
+        orientation=orientation,
+        earth=third_bodies,
+        sun=third_bodies,
+    )
+    trajectory = propagate(epoch, start.position_icrf_m, start.velocity_icrf_m_s, duration_s, model)
+    positions[after] = trajectory.state(np.minimum(tdb_s, trajectory.stop_tdb_s))[:, :3]
+    return positions

@@ -18,8 +18,7 @@ from ground_service.evaluation.core import PassInputs, _imaging_arcs, _joined, e
 from ground_service.evaluation.detection.fixes import IdentificationSamples, MappedCraters
 from ground_service.evaluation.detection.recall import Viewing
 from ground_service.evaluation.model import PassFigures
-from ground_service.evaluation.navigation.baselines import StartState
-from ground_service.evaluation.navigation.smoother import ONBOARD, FilterStates
+from ground_service.evaluation.navigation.smoother import ONBOARD, FilterStates, StartState
 from ground_service.evaluation.verdict import Limits
 from ground_service.passes.samples import DetectionSamples, NavigationSamples, OutcomeSamples, no_detections
 from lunar.camera import PinholeCamera
