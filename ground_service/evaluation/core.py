@@ -37,10 +37,11 @@ from ground_service.evaluation.navigation.alignment import (
     error_of_places_rtn_m,
     error_of_positions_rtn_m,
     ground_path_m,
+    nees,
     places_of_positions,
     reference_states,
+    squared_normalised_errors,
 )
-from ground_service.evaluation.navigation.consistency import nees, squared_normalised_errors
 from ground_service.evaluation.navigation.drift import (
     drift_by_length,
     error_before_reset_m,

@@ -7,9 +7,9 @@ import numpy as np
 from ground_service.evaluation.navigation.alignment import (
     ReferenceStates,
     error_of_positions_rtn_m,
+    nees,
     places_of_positions,
 )
-from ground_service.evaluation.navigation.consistency import nees
 from ground_service.evaluation.navigation.drift import drift_by_length, navigation_statistics
 from ground_service.evaluation.navigation.smoother import CommandedBurn, FilterStates, SmootherModel, smooth
 from lunar.arrays import FloatArray

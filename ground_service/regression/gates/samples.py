@@ -19,8 +19,8 @@ from ground_service.evaluation.navigation.alignment import (
     ReferenceStates,
     error_of_places_rtn_m,
     reference_states,
+    squared_normalised_errors,
 )
-from ground_service.evaluation.navigation.consistency import squared_normalised_errors
 from ground_service.passes.samples import DetectionSamples, NavigationSamples
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf

@@ -22,7 +22,7 @@ from ground_service.evaluation.core import WORST_FRAMES, _choose_frames, attitud
 from ground_service.evaluation.detection.fixes import Pairs, snapshot_positions, wrong_fixes
 from ground_service.evaluation.detection.recall import ExpectedCraters, Matches, Viewing, expected_craters
 from ground_service.evaluation.extras import dark_limit, with_terrain
-from ground_service.evaluation.navigation.consistency import (
+from ground_service.evaluation.navigation.alignment import (
     bounds,
     bounds_per_degree,
     independent_samples,
