@@ -86,7 +86,7 @@ GROUPS = {
         (
             "ground_service/evaluation/core.py",
             "ground_service/evaluation/navigation/alignment.py",
-            "ground_service/evaluation/navigation/drift.py",
+            "ground_service/evaluation/navigation/alignment.py",
             "ground_service/evaluation/detection/recall.py",
             "ground_service/evaluation/navigation/smoother.py",
             "ground_service/evaluation/detection/fixes.py",

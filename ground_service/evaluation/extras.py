@@ -8,8 +8,11 @@ import numpy as np
 
 from ground_service.evaluation.detection.fixes import Pairs, snapshot_positions, wrong_fixes
 from ground_service.evaluation.detection.recall import Viewing
-from ground_service.evaluation.navigation.alignment import ReferenceStates, error_of_places_rtn_m
-from ground_service.evaluation.navigation.drift import navigation_statistics
+from ground_service.evaluation.navigation.alignment import (
+    ReferenceStates,
+    error_of_places_rtn_m,
+    navigation_statistics,
+)
 from ground_service.passes.samples import NavigationSamples
 from lunar.arrays import FloatArray
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf

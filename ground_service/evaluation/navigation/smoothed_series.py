@@ -6,11 +6,12 @@ import numpy as np
 
 from ground_service.evaluation.navigation.alignment import (
     ReferenceStates,
+    drift_by_length,
     error_of_positions_rtn_m,
+    navigation_statistics,
     nees,
     places_of_positions,
 )
-from ground_service.evaluation.navigation.drift import drift_by_length, navigation_statistics
 from ground_service.evaluation.navigation.smoother import CommandedBurn, FilterStates, SmootherModel, smooth
 from lunar.arrays import FloatArray
 from lunar.frames import Orientation

@@ -25,15 +25,13 @@ from ground_service.evaluation.extras import dark_limit, with_terrain
 from ground_service.evaluation.navigation.alignment import (
     bounds,
     bounds_per_degree,
-    independent_samples,
-    nees,
-    squared_normalised_errors,
-)
-from ground_service.evaluation.navigation.drift import (
     drift_by_length,
     drift_percent,
     error_before_reset_m,
+    independent_samples,
     navigation_statistics,
+    nees,
+    squared_normalised_errors,
 )
 from ground_service.evaluation.navigation.trajectory import format_tum
 from ground_service.evaluation.surface import surface_map
