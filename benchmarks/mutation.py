@@ -77,7 +77,7 @@ GROUPS = {
     "verdicts": Group(
         (
             "ground_service/evaluation/verdict.py",
-            "ground_service/evaluation/navigation/reference_error.py",
+            "ground_service/evaluation/navigation/alignment.py",
             "ground_service/evaluation/detection/recall.py",
         ),
         tuple(f"{_GROUND_TESTS}/evaluation/test_{name}.py" for name in ("verdict", "pass_data")),

@@ -36,16 +36,17 @@ from ground_service.evaluation.navigation.alignment import (
     angle_from_meridian_deg,
     drift_by_length,
     error_before_reset_m,
+    error_budget,
     error_of_places_rtn_m,
     error_of_positions_rtn_m,
     ground_path_m,
     navigation_statistics,
     nees,
     places_of_positions,
+    reference_covariance_m2,
     reference_states,
     squared_normalised_errors,
 )
-from ground_service.evaluation.navigation.reference_error import error_budget, reference_covariance_m2
 from ground_service.evaluation.navigation.smoothed_series import SMOOTHED, smoothed_series, smoother_model
 from ground_service.evaluation.navigation.smoother import (
     BASELINE_DEGREE,

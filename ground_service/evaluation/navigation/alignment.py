@@ -16,7 +16,7 @@ from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation, mcmf_from_spherical, rtn_from_inertial, spherical_from_mcmf
 from lunar.timescales import tdb_s_from_utc_ns
-from reports.values import DriftSample, NavigationStatistics
+from reports.values import DriftSample, ErrorBudget, NavigationStatistics
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -325,3 +325,22 @@ def error_before_reset_m(error_rtn_m: FloatArray, is_reset: BoolArray) -> FloatA
     at = at[at > 0]
     before[at] = np.hypot(error_rtn_m[at - 1, 1], error_rtn_m[at - 1, 2])
     return before
+
+
+Sigma = tuple[float, float, float]
+
+
+def reference_covariance_m2(sigma_rtn_m: Sigma | None) -> FloatArray:
+    """Return the covariance (3, 3) of the reference in R/T/N; zero if its error is not declared."""
+    return np.diag(np.square(sigma_rtn_m or (0.0, 0.0, 0.0)))
+
+
+def error_budget(error_rtn_m: FloatArray, reference_sigma_rtn_m: Sigma | None) -> ErrorBudget | None:
+    """Return the error budget of an observed error (n, 3); None without errors or a declared reference error."""
+    known = np.isfinite(error_rtn_m).all(axis=1)
+    if reference_sigma_rtn_m is None or not known.any():
+        return None
+    observed = float(np.mean(np.sum(error_rtn_m[known] ** 2, axis=1)))
+    reference = float(np.sum(np.square(reference_sigma_rtn_m)))
+    rest = observed - reference
+    return ErrorBudget(observed**0.5, reference**0.5, rest**0.5 if rest >= 0.0 else float("nan"))
