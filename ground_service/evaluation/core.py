@@ -47,13 +47,15 @@ from ground_service.evaluation.navigation.alignment import (
     reference_states,
     squared_normalised_errors,
 )
-from ground_service.evaluation.navigation.smoothed_series import SMOOTHED, smoothed_series, smoother_model
 from ground_service.evaluation.navigation.smoother import (
     BASELINE_DEGREE,
+    SMOOTHED,
     CommandedBurn,
     FilterStates,
     StartState,
     propagated_positions,
+    smoothed_series,
+    smoother_model,
 )
 from ground_service.evaluation.verdict import (
     Evaluated,
