@@ -90,7 +90,7 @@ GROUPS = {
             "ground_service/evaluation/detection/recall.py",
             "ground_service/evaluation/navigation/smoother.py",
             "ground_service/evaluation/detection/fixes.py",
-            "ground_service/evaluation/navigation/trajectory.py",
+            "ground_service/evaluation/navigation/alignment.py",
         ),
         (
             *(

@@ -22,7 +22,7 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import EvaluationError, storage_error
 from ground_service.evaluation.core import PassInputs, evaluate_pass
 from ground_service.evaluation.inputs import load_pass_inputs
-from ground_service.evaluation.navigation.trajectory import format_tum
+from ground_service.evaluation.navigation.alignment import format_tum
 from ground_service.exports import messages
 from ground_service.exports.formats import FORMATS, Format
 from ground_service.exports.maps import MAPS, map_octets

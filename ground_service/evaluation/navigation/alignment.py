@@ -13,8 +13,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
+from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.ephemeris import Ephemeris
-from lunar.frames import Orientation, mcmf_from_spherical, rtn_from_inertial, spherical_from_mcmf
+from lunar.frames import (
+    Orientation,
+    continuous_quaternions,
+    mcmf_from_spherical,
+    quaternion_from_matrix,
+    rtn_from_inertial,
+    spherical_from_mcmf,
+)
 from lunar.timescales import tdb_s_from_utc_ns
 from reports.values import DriftSample, ErrorBudget, NavigationStatistics
 
@@ -344,3 +352,28 @@ def error_budget(error_rtn_m: FloatArray, reference_sigma_rtn_m: Sigma | None) -
     reference = float(np.sum(np.square(reference_sigma_rtn_m)))
     rest = observed - reference
     return ErrorBudget(observed**0.5, reference**0.5, rest**0.5 if rest >= 0.0 else float("nan"))
+
+
+def format_tum(utc_ns: IntArray, position_m: FloatArray, reference_m: FloatArray) -> str:
+    """A trajectory in TUM form: a line "t x y z qx qy qz qw" per pose, seconds past the Unix epoch, metres.
+
+    Parameters
+    ----------
+    position_m
+        Mean-Earth axes, shape (n, 3).
+    reference_m
+        Positions of the reference at the same times, which give the orientation; n is at least 2.
+    """
+    seconds = (utc_ns - utc_ns[0]) / NANOSECONDS_PER_SECOND
+    velocity = np.gradient(reference_m, seconds, axis=0)
+    turns = quaternion_from_matrix(np.swapaxes(rtn_from_inertial(reference_m, velocity), 1, 2))
+    lines = [
+        f"{int(t) // NANOSECONDS_PER_SECOND}.{int(t) % NANOSECONDS_PER_SECOND:09d} "
+        + " ".join(f"{value:.6f}" for value in position)
+        + " "
+        + " ".join(f"{value:.12f}" for value in turn)
+        for t, position, turn in zip(
+            utc_ns, position_m, np.roll(continuous_quaternions(turns), -1, axis=1), strict=True
+        )
+    ]
+    return "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines) + "\n"

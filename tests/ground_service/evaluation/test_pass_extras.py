@@ -28,12 +28,12 @@ from ground_service.evaluation.navigation.alignment import (
     drift_by_length,
     drift_percent,
     error_before_reset_m,
+    format_tum,
     independent_samples,
     navigation_statistics,
     nees,
     squared_normalised_errors,
 )
-from ground_service.evaluation.navigation.trajectory import format_tum
 from ground_service.evaluation.surface import surface_map
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import find_data
