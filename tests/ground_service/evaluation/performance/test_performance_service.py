@@ -12,13 +12,13 @@ from ground_service.clock import set_mission_clock, utc_now_ns
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.model import StoredReport
 from ground_service.evaluation.performance import service
-from ground_service.evaluation.performance.documents import monthly_value
 from ground_service.evaluation.performance.model import MonthlyReportFilter
 from ground_service.evaluation.performance.service import (
     last_month,
     make_due_report,
     make_monthly_report,
     month_span,
+    monthly_value,
     performance,
 )
 from ground_service.evaluation.performance.store import list_monthly_reports
