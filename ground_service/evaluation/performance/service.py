@@ -36,7 +36,7 @@ from ground_service.evaluation.performance.model import (
     RollingRequirement,
     StoredMonthlyReport,
 )
-from ground_service.evaluation.report_overview import PREFERRED_ESTIMATORS
+from ground_service.evaluation.service import PREFERRED_ESTIMATORS
 from ground_service.ground import Ground
 from ground_service.http.model import Entity
 from ground_service.http.times import UtcTime
