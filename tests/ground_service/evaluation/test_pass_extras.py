@@ -21,7 +21,7 @@ from ground_service.errors import InvalidInput
 from ground_service.evaluation.core import WORST_FRAMES, _choose_frames, attitude_remarks
 from ground_service.evaluation.detection.fixes import Pairs, snapshot_positions, wrong_fixes
 from ground_service.evaluation.detection.recall import ExpectedCraters, Matches, Viewing, expected_craters
-from ground_service.evaluation.extras import dark_limit, with_terrain
+from ground_service.evaluation.extras import dark_limit, surface_map, with_terrain
 from ground_service.evaluation.navigation.alignment import (
     bounds,
     bounds_per_degree,
@@ -34,7 +34,6 @@ from ground_service.evaluation.navigation.alignment import (
     nees,
     squared_normalised_errors,
 )
-from ground_service.evaluation.surface import surface_map
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import find_data
 from lunar.frames import quaternion_from_matrix
