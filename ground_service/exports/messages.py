@@ -9,7 +9,7 @@ import numpy as np
 
 from ground_service.errors import EvaluationError
 from ground_service.evaluation.core import PassInputs
-from ground_service.exports.formats import REFERENCE
+from ground_service.exports.model import REFERENCE
 from ground_service.exports.poses import no_such_states, states_names
 from ground_service.missions.timekeeping.core import TimeCorrelation, ticks_of_utc_ns
 from lunar.arrays import IntArray

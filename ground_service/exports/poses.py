@@ -11,7 +11,7 @@ import numpy as np
 
 from ground_service.errors import EvaluationError
 from ground_service.evaluation.core import PassInputs
-from ground_service.exports.formats import REFERENCE
+from ground_service.exports.model import REFERENCE
 from lunar.arrays import FloatArray, IntArray
 from lunar.frames import mcmf_from_spherical
 from lunar.timescales import tdb_s_from_utc_ns
