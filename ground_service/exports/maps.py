@@ -26,7 +26,7 @@ import numpy as np
 
 from ground_service.errors import EvaluationError
 from ground_service.evaluation.core import PassInputs
-from ground_service.exports.poses import Poses, poses_of
+from ground_service.exports.messages import Poses, poses_of
 from ground_service.exports.tables import identified_craters
 from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera, ground_point_sphere
