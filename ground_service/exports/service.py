@@ -26,8 +26,7 @@ from ground_service.evaluation.navigation.alignment import format_tum
 from ground_service.exports import messages
 from ground_service.exports.maps import MAPS, map_octets
 from ground_service.exports.model import FORMATS, ExportFormatInfo, ExportRequest, Format
-from ground_service.exports.table_files import csv_files, netcdf_octets, parquet_files
-from ground_service.exports.tables import pass_tables
+from ground_service.exports.tables import csv_files, netcdf_octets, parquet_files, pass_tables
 from ground_service.ground import Ground
 from ground_service.missions.timekeeping.store import load_correlations
 from ground_service.passes import store
