@@ -20,9 +20,8 @@ from ground_service.contacts.links.supervisor import LinkSupervisor
 from ground_service.ground import ground_from_settings
 from ground_service.http import problems
 from ground_service.http.common import API_PREFIX
-from ground_service.http.limits import BodyLimit, HeadersAndTags, LastRequests
+from ground_service.http.limits import LOOPBACK, BodyLimit, HeadersAndTags, LastRequests, SameOrigin
 from ground_service.http.model import Problem
-from ground_service.http.origins import LOOPBACK, SameOrigin
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
 from ground_service.missions.clocks import mission_clock

@@ -15,7 +15,7 @@ from ground_service.access.store import has_users
 from ground_service.app import create_app
 from ground_service.errors import ServerError
 from ground_service.ground import ground_from_settings
-from ground_service.http.origins import LOOPBACK
+from ground_service.http.limits import LOOPBACK
 from ground_service.http.uploads import UPLOADS_AT_ONCE
 from ground_service.logs import logging_config
 from ground_service.settings import Settings
