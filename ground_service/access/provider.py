@@ -32,7 +32,7 @@ from ground_service.access.model import ProviderIdentity, Role, Session, UserRec
 from ground_service.clock import is_recorded, mission_now_ns, utc_now_ns
 from ground_service.errors import InvalidInput, ProviderUnavailable, SettingsError, SignInRefused
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 
 if TYPE_CHECKING:
     from ground_service.settings import Settings

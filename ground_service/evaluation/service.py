@@ -31,7 +31,7 @@ from ground_service.evaluation.navigation.alignment import reference_states
 from ground_service.evaluation.preparation import align_pass
 from ground_service.events import PassEvaluated, publish
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 from ground_service.passes.core import downsample
 from ground_service.passes.store import get_pass
 from ground_service.store.files import FileArchive, make_durable_folder, replace_durably

@@ -23,9 +23,8 @@ from ground_service.http.common import (
     linked,
     upload_body,
 )
-from ground_service.http.model import PageOf
+from ground_service.http.model import GivenTime, PageOf, ns_of
 from ground_service.http.requests import operations, problems
-from ground_service.http.times import GivenTime, ns_of
 from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
 from ground_service.jobs.store import get_job

@@ -8,8 +8,15 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
-from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber
-from ground_service.http.times import GivenTime, UtcTime
+from ground_service.http.model import (
+    Entity,
+    Given,
+    GivenTime,
+    InstanceName,
+    Paging,
+    SpacecraftNumber,
+    UtcTime,
+)
 from ground_service.planning import core
 from ground_service.planning.core import Constraints
 from ground_service.text import LINE_PATTERN_JSON

@@ -7,8 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from ground_service.http.model import Entity, Given, InstanceName, SpacecraftNumber
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Entity, Given, InstanceName, SpacecraftNumber, UtcTime
 from ground_service.planning.core import Constraints
 from ground_service.planning.model import Finite, Limits, Name, Time
 

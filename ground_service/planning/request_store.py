@@ -10,8 +10,7 @@ from typing import Any
 from sqlalchemy import Connection, func, select, update
 
 from ground_service.errors import NotFound
-from ground_service.http.model import PageOf, Paging
-from ground_service.http.times import UtcTime
+from ground_service.http.model import PageOf, Paging, UtcTime
 from ground_service.planning.model import WindowRecord
 from ground_service.planning.request_model import RequestPlan, RequestTerms, StandingRequest
 from ground_service.planning.store import records_where

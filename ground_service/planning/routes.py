@@ -18,10 +18,9 @@ from ground_service.http.common import (
     OnceKey,
     PassId,
 )
-from ground_service.http.model import PageOf
+from ground_service.http.model import GivenTime, PageOf
 from ground_service.http.problems import PreconditionFailed
 from ground_service.http.requests import operations, problems
-from ground_service.http.times import GivenTime
 from ground_service.missions import service as missions
 from ground_service.missions.model import MissionCheck
 from ground_service.missions.routes import Text

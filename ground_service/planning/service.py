@@ -18,8 +18,7 @@ from ground_service.contacts.commanding import store as commands
 from ground_service.errors import Conflict, InvalidInput, NotFound, PlanConflict, PlanConflicts, StateConflict
 from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
-from ground_service.http.model import Paging
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Paging, UtcTime
 from ground_service.missions import store as missions
 from ground_service.missions.catalogues import catalogue_of
 from ground_service.missions.ephemerides import store as ephemerides

@@ -23,7 +23,7 @@ from ground_service.contacts.links import service as links
 from ground_service.errors import PASSING, GroundError, InvalidInput, NotFound, PlanConflicts, StateConflict
 from ground_service.events import PlanChanged, RequestChanged, publish
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 from ground_service.missions.ephemerides import store as ephemerides
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.model import Mission

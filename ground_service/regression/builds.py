@@ -26,7 +26,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt
 from ground_service.clock import utc_now_ns
 from ground_service.errors import BuildNotChecked, InvalidInput, NotFound, storage_error
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 from ground_service.regression import model, store
 from ground_service.regression.runner import RunRequest, run_confined
 from ground_service.regression.sandbox.host import SandboxRefused, tail

@@ -22,7 +22,7 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, InvalidInput, Stopping
 from ground_service.events import RegressionJudged, publish
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 from ground_service.regression import store
 from ground_service.regression.archives import (
     DETECTIONS,

@@ -39,8 +39,8 @@ from ground_service.events import (
     read_events,
 )
 from ground_service.ground import Ground
+from ground_service.http.model import time_text
 from ground_service.http.problems import problem
-from ground_service.http.times import time_text
 from ground_service.passes.live import newest_packets
 from ground_service.store.events import LoggedEvent
 from ground_service.store.vehicles import all_vehicles

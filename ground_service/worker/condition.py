@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 from ground_service.store import leases
 from ground_service.worker.backup import MANIFEST
 from ground_service.worker.model import CorrelationAge, ServiceStatus

@@ -19,9 +19,8 @@ from pydantic import BaseModel
 
 from ground_service.client.connection import API_PREFIX
 from ground_service.http.common import IDEMPOTENCY_HEADER, IF_MATCH_HEADER
-from ground_service.http.model import PageOf, Paging
+from ground_service.http.model import PageOf, Paging, UtcTime
 from ground_service.http.requests import header_names
-from ground_service.http.times import UtcTime
 from ground_service.routers import OPERATIONS
 
 TARGET = Path(__file__).parents[2] / "ground_service" / "client" / "operations.py"

@@ -25,7 +25,7 @@ from ground_service.contacts.links.store import ContactRow, LinkRow, Transmissio
 from ground_service.errors import Conflict, InvalidInput, NotFound
 from ground_service.events import ContactEnded, ContactMissed, ContactStarted, LinkChanged, publish
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 from ground_service.missions import store as missions
 from ground_service.missions.ephemerides import store as ephemerides
 from ground_service.missions.ephemerides.service import open_ephemeris

@@ -39,7 +39,7 @@ from ground_service.evaluation.landmarks.model import (
 from ground_service.evaluation.navigation.alignment import reference_states
 from ground_service.events import LandmarkChanged, publish
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 from ground_service.missions.catalogues import listed_craters
 from ground_service.missions.service import mission_of_pass
 from ground_service.passes import store as passes

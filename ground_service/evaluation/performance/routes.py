@@ -10,9 +10,8 @@ from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.evaluation.performance import service, store
 from ground_service.evaluation.performance.model import MonthlyReport, Performance
 from ground_service.http.common import GroundOf, Key
-from ground_service.http.model import InstanceName
+from ground_service.http.model import GivenTime, InstanceName, ns_of
 from ground_service.http.requests import operations
-from ground_service.http.times import GivenTime, ns_of
 from ground_service.store.vehicles import FLOWN
 
 REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}

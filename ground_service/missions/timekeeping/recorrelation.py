@@ -28,7 +28,7 @@ from ground_service.events import (
     publish_once,
 )
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime, time_of
+from ground_service.http.model import UtcTime, time_of
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.ephemerides.store import covering_ephemerides
 from ground_service.missions.places import stations_of

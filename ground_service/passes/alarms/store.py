@@ -9,7 +9,7 @@ from sqlalchemy import Connection, and_, func, insert, or_, select, update
 from sqlalchemy.engine import RowMapping
 
 from ground_service.errors import NotFound
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 from ground_service.passes.alarms.core import Condition
 from ground_service.passes.alarms.model import AlarmChange, AlarmFilter
 from ground_service.store import models, states

@@ -19,8 +19,7 @@ from ground_service.evaluation import inputs, store
 from ground_service.evaluation.model import StoredReport
 from ground_service.evaluation.service import make_report, pass_summary
 from ground_service.ground import Ground
-from ground_service.http.model import Paging
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Paging, UtcTime
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.service import add_mission

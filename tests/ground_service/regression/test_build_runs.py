@@ -16,8 +16,7 @@ import pytest
 
 from ground_service.errors import BuildNotChecked, InvalidInput
 from ground_service.ground import Ground, open_ground
-from ground_service.http.model import Paging
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Paging, UtcTime
 from ground_service.regression import builds
 from ground_service.regression.build_runs import BuildRun, run_build
 from ground_service.regression.builds import Build, changes, load_build, register_build

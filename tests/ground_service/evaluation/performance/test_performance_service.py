@@ -26,7 +26,7 @@ from ground_service.evaluation.service import make_report
 from ground_service.evaluation.store import add_report
 from ground_service.events import WindowChanged, publish, read_events
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
