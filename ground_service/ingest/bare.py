@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from ground_service.ingest.fragments import Fragment
+from ground_service.ingest.core import Fragment
 from ground_service.ingest.frames import Known, Section
 from ground_service.ingest.packets import PacketBatch, batch_of_cut
 from ground_service.ingest.quality import Found

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.ingest.fragments import COUNTS, UNKNOWN, Channel, Fragment, is_idle
+from ground_service.ingest.core import COUNTS, UNKNOWN, Channel, Fragment, is_idle
 from ground_service.ingest.packets import PacketBatch, batch_of_cut
 from ground_service.ingest.quality import Found, RecordFormat
 from lunar.arrays import BoolArray, IntArray, OctetArray

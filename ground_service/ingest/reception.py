@@ -21,8 +21,8 @@ from ground_service.ground import Ground
 from ground_service.ingest import bare, frames, store
 from ground_service.ingest import recording_store as recordings
 from ground_service.ingest.bare import PacketReader
+from ground_service.ingest.core import Fragment, complete, join
 from ground_service.ingest.doubt_store import count_implausible, plausible_part
-from ground_service.ingest.fragments import Fragment, complete, join
 from ground_service.ingest.frames import CADU_MAX_OCTETS, FrameReader, Section
 from ground_service.ingest.link_settings import known_before, packet_form
 from ground_service.ingest.model import IngestResult, ReceivedControlWords, ReceivedLink, ReceivedSection
