@@ -9,10 +9,9 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from ground_service.ingest.core import Fragment
+from ground_service.ingest.core import Found, Fragment
 from ground_service.ingest.frames import Known, Section
 from ground_service.ingest.packets import PacketBatch, batch_of_cut
-from ground_service.ingest.quality import Found
 from lunar.arrays import IntArray, OctetArray
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Dictionary

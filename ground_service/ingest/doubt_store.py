@@ -16,13 +16,13 @@ from ground_service.http.model import PageOf
 from ground_service.ingest import store
 from ground_service.ingest.core import (
     LONGEST_STEP,
+    NO_TIME,
     UNSET_TICKS,
     fits_between,
     implausible_times,
 )
 from ground_service.ingest.model import ImplausibleFilter, ImplausiblePacket
 from ground_service.ingest.packets import PacketBatch, batch_of_cut
-from ground_service.ingest.quality import NO_TIME
 from ground_service.store import repository, telemetry
 from ground_service.store.vehicles import get_vehicle, lock_vehicle
 from lunar.arrays import IntArray

@@ -21,14 +21,13 @@ from ground_service.ground import Ground
 from ground_service.ingest import bare, frames, store
 from ground_service.ingest import recording_store as recordings
 from ground_service.ingest.bare import PacketReader
-from ground_service.ingest.core import Fragment, complete, join
+from ground_service.ingest.core import Found, Fragment, complete, join
 from ground_service.ingest.doubt_store import count_implausible, plausible_part
 from ground_service.ingest.frames import CADU_MAX_OCTETS, FrameReader, Section
 from ground_service.ingest.link_settings import known_before, packet_form
 from ground_service.ingest.model import IngestResult, ReceivedControlWords, ReceivedLink, ReceivedSection
 from ground_service.ingest.packets import PacketBatch, batch_of_cut, time_receptions
 from ground_service.ingest.parameters import decode_declared, definitions_of_spacecraft
-from ground_service.ingest.quality import Found
 from ground_service.ingest.recording_store import Part, Piece
 from ground_service.ingest.redecode import catch_up, note_dictionary
 from ground_service.ingest.store import Stored
