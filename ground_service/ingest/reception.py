@@ -27,9 +27,13 @@ from ground_service.ingest.frames import CADU_MAX_OCTETS, FrameReader, Section
 from ground_service.ingest.link_settings import known_before, packet_form
 from ground_service.ingest.model import IngestResult, ReceivedControlWords, ReceivedLink, ReceivedSection
 from ground_service.ingest.packets import PacketBatch, batch_of_cut, time_receptions
-from ground_service.ingest.parameters import decode_declared, definitions_of_spacecraft
+from ground_service.ingest.parameters import (
+    catch_up,
+    decode_declared,
+    definitions_of_spacecraft,
+    note_dictionary,
+)
 from ground_service.ingest.recording_store import Part, Piece
-from ground_service.ingest.redecode import catch_up, note_dictionary
 from ground_service.ingest.store import Stored
 from ground_service.missions.definitions import PacketDefinitions
 from ground_service.store.files import FileArchive, mapped_octets, read_blocks

@@ -19,10 +19,9 @@ from ground_service.errors import PASSING, Conflict, GroundError, InvalidInput, 
 from ground_service.ground import Ground
 from ground_service.ingest import doubt_store, store
 from ground_service.ingest.model import IngestResult
-from ground_service.ingest.parameters import decode_declared, definitions_in_force
+from ground_service.ingest.parameters import decode_declared, definitions_in_force, redecode
 from ground_service.ingest.reception import Progress, Reading
 from ground_service.ingest.recording_store import Piece, add_piece, get_piece
-from ground_service.ingest.redecode import redecode
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import OTHER_REQUEST, add_job
 from ground_service.jobs.store import find_job

@@ -13,7 +13,7 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf, Paging, UtcTime, ns_of
-from ground_service.ingest.redecode import readable_version
+from ground_service.ingest.parameters import readable_version
 from ground_service.ingest.store import results_state
 from ground_service.missions import store as missions
 from ground_service.missions.catalogues import read_catalogue

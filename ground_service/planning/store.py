@@ -11,7 +11,7 @@ from sqlalchemy.sql import Select
 from ground_service.contacts.commanding.store import ids_of_windows
 from ground_service.errors import NotFound
 from ground_service.http.model import PageOf
-from ground_service.ingest.redecode import readable_version
+from ground_service.ingest.parameters import readable_version
 from ground_service.passes import store as passes
 from ground_service.planning.filling import Option
 from ground_service.planning.model import (

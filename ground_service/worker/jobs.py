@@ -23,7 +23,7 @@ from ground_service.errors import (
 from ground_service.evaluation.service import make_report, reevaluate
 from ground_service.events import JobChanged, publish
 from ground_service.ground import Ground
-from ground_service.ingest.redecode import catch_up, redecode_job_id, vehicles_behind
+from ground_service.ingest.parameters import catch_up, redecode_job_id, vehicles_behind
 from ground_service.ingest.service import apply_definition, derive_without, run_ingest
 from ground_service.jobs import store
 from ground_service.jobs.model import Job

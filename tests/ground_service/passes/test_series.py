@@ -18,7 +18,7 @@ from ground_service.evaluation.inputs import filter_states, load_pass_inputs
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.packets import batch_of_cut
-from ground_service.ingest.redecode import catch_up
+from ground_service.ingest.parameters import catch_up
 from ground_service.ingest.service import ingest_file
 from ground_service.ingest.store import store_batch, store_samples
 from ground_service.missions.service import add_mission
