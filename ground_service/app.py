@@ -24,7 +24,7 @@ from ground_service.http.limits import LOOPBACK, BodyLimit, HeadersAndTags, Last
 from ground_service.http.model import Problem
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
-from ground_service.missions.clocks import mission_clock
+from ground_service.missions.places import mission_clock
 from ground_service.routers import OPERATIONS
 from ground_service.settings import Settings, start_tracing
 from ground_service.store.wakeups import is_redis
