@@ -16,8 +16,8 @@ from ground_service.errors import Forbidden, InvalidInput
 from ground_service.events import MissionAdded, publish
 from ground_service.ground import Ground
 from ground_service.missions import store
-from ground_service.missions.declared import mission_of_manifest
 from ground_service.missions.definitions import definition_faults, read_mission_file
+from ground_service.missions.frames import mission_of_manifest
 from ground_service.missions.model import (
     MISSION_LIMIT_OCTETS,
     Approval,

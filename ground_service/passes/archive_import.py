@@ -12,9 +12,9 @@ from ground_service.errors import InvalidInput, storage_error
 from ground_service.events import ArchiveImported, publish_once
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_stored
-from ground_service.missions.declared import mission_of_manifest
 from ground_service.missions.ephemerides.attitudes import attitude_file, load_attitudes
 from ground_service.missions.ephemerides.store import add_ephemeris
+from ground_service.missions.frames import mission_of_manifest
 from ground_service.missions.model import Mission
 from ground_service.missions.service import enter, read_mission
 from ground_service.missions.timekeeping.recorrelation import enter_receptions, read_receptions
