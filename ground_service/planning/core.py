@@ -17,7 +17,7 @@ import numpy as np
 
 from ground_service.contacts.links.core import PredictedContact, predict_contacts
 from ground_service.evaluation.detection.recall import expected_craters
-from ground_service.missions.stations import STATIONS
+from ground_service.missions.places import STATIONS
 from ground_service.planning.filling import Option
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera

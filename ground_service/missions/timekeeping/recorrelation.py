@@ -31,8 +31,7 @@ from ground_service.ground import Ground
 from ground_service.http.model import UtcTime, time_of
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.ephemerides.store import covering_ephemerides
-from ground_service.missions.places import stations_of
-from ground_service.missions.stations import STATIONS
+from ground_service.missions.places import STATIONS, stations_of
 from ground_service.missions.store import mission_of_vehicle
 from ground_service.missions.timekeeping import store
 from ground_service.missions.timekeeping.core import (
