@@ -33,7 +33,7 @@ from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.timekeeping import recorrelation
-from ground_service.missions.timekeeping.service import spacecraft_correlations, spacecraft_time_reports
+from ground_service.missions.timekeeping.recorrelation import spacecraft_correlations, spacecraft_time_reports
 from ground_service.store import repository
 from ground_service.store.vehicles import all_vehicles
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
