@@ -27,8 +27,7 @@ from ground_service.errors import InvalidInput, NotFound, StoreError, storage_er
 from ground_service.evaluation.inputs import read_image
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime
-from ground_service.passes.archive_import import checked_files, read_manifest
-from ground_service.passes.archive_zip import unpacked
+from ground_service.passes.archive_import import checked_files, read_manifest, unpacked
 from ground_service.regression import store
 from ground_service.regression.model import (
     COMPLETE,

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ground_service.errors import GroundError, InvalidInput
 from ground_service.ground import Ground
-from ground_service.passes.archive_zip import unpacked
+from ground_service.passes.archive_import import unpacked
 from ground_service.regression import store
 from ground_service.regression.archives import (
     DETECTIONS,

@@ -29,7 +29,7 @@ from ground_service.jobs import store
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import enter_job
 from ground_service.jobs.store import FINISHED
-from ground_service.passes.archive_zip import import_zip
+from ground_service.passes.archive_import import import_zip
 from ground_service.planning.standing import plan_tick
 from ground_service.regression.jobs import analysis_job, regression_job, rendering_job, replay_job
 from ground_service.tracing import span
