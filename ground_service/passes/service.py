@@ -20,7 +20,6 @@ from ground_service.missions.catalogues import read_catalogue
 from ground_service.missions.timekeeping.core import ticks_of_utc_ns
 from ground_service.missions.timekeeping.store import load_correlations
 from ground_service.passes import sample_store, store
-from ground_service.passes.cache import Cache
 from ground_service.passes.core import Buckets
 from ground_service.passes.model import (
     Crater,
@@ -38,6 +37,7 @@ from ground_service.passes.sample_store import detection_frames, detection_sampl
 from ground_service.passes.series import (
     PARAMETERS,
     STATE_VALUES,
+    Cache,
     Series,
     SeriesReading,
     kind_samples,
