@@ -43,7 +43,7 @@ from ground_service.http.model import UtcTime
 from ground_service.missions.catalogues import listed_craters
 from ground_service.missions.service import mission_of_pass
 from ground_service.passes import store as passes
-from ground_service.passes.images import list_images
+from ground_service.passes.archive_import import list_images
 from ground_service.passes.sample_store import sample_arrays
 from ground_service.passes.samples import DetectionSamples
 from ground_service.passes.span import pass_span
