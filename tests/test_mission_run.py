@@ -15,7 +15,7 @@ from ground_service.client.local import local_client
 from ground_service.clock import mission_now_ns, set_mission_clock
 from ground_service.ground import open_ground
 from ground_service.http.model import UtcTime
-from ground_service.planning.request_model import PlannedCandidate, RequestPlan
+from ground_service.planning.model import PlannedCandidate, RequestPlan
 from linna import cli
 from lunar.boxes import Box, inside_box
 from lunar.catalogue import make_catalogue

@@ -23,8 +23,7 @@ from ground_service.missions.ephemerides.store import covering_ephemerides
 from ground_service.missions.service import add_mission, read_mission
 from ground_service.planning import request_store, standing, store
 from ground_service.planning import service as planning
-from ground_service.planning.model import Window, WindowFilter
-from ground_service.planning.request_model import StandingRequestIn
+from ground_service.planning.model import StandingRequestIn, Window, WindowFilter
 from ground_service.toml import parse_table, read_json
 from lunar.datafolder import DataFolder
 from lunar.errors import LunarError

@@ -9,7 +9,7 @@ from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.http.common import API_PREFIX, GroundOf, OnceKey, PassId
 from ground_service.http.requests import operations, problems
 from ground_service.planning import request_store, standing
-from ground_service.planning.request_model import (
+from ground_service.planning.model import (
     RequestPlan,
     StandingRequest,
     StandingRequestChange,

@@ -11,8 +11,7 @@ from sqlalchemy import Connection, func, select, update
 
 from ground_service.errors import NotFound
 from ground_service.http.model import PageOf, Paging, UtcTime
-from ground_service.planning.model import WindowRecord
-from ground_service.planning.request_model import RequestPlan, RequestTerms, StandingRequest
+from ground_service.planning.model import RequestPlan, RequestTerms, StandingRequest, WindowRecord
 from ground_service.planning.store import records_where
 from ground_service.store import repository
 from ground_service.store.vehicles import get_vehicle

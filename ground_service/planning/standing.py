@@ -31,17 +31,18 @@ from ground_service.planning import request_store as store
 from ground_service.planning import service as planning
 from ground_service.planning.core import Constraints, Planner, data_octets, frames_between
 from ground_service.planning.filling import NS, Option, ResourceGrid, choose
-from ground_service.planning.model import WindowEntry, WindowRecord
-from ground_service.planning.preparation import gap_ns
-from ground_service.planning.progress import note_reason
-from ground_service.planning.request_model import (
+from ground_service.planning.model import (
     PlannedCandidate,
     RequestPlan,
     RequestTerms,
     StandingRequest,
     StandingRequestChange,
     StandingRequestIn,
+    WindowEntry,
+    WindowRecord,
 )
+from ground_service.planning.preparation import gap_ns
+from ground_service.planning.progress import note_reason
 from ground_service.planning.request_store import RequestRecord
 from ground_service.planning.window_states import COMMITTED
 from ground_service.store.counters import lock_spacecraft

@@ -31,7 +31,7 @@ from ground_service.ground import Ground
 from ground_service.http.common import API_PREFIX, Key
 from ground_service.missions.model import Approval, StationConnection, StationLink
 from ground_service.passes.series import STATE_VALUES
-from ground_service.planning.request_model import StandingRequestIn
+from ground_service.planning.model import StandingRequestIn
 from ground_service.regression.store import get_report as get_regression_report
 from tmtc.dictionary.arguments import FUNCTION_ARGUMENTS
 from tmtc.dictionary.onboard_parameters import PARAMETERS

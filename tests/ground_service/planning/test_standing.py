@@ -15,9 +15,15 @@ from ground_service.ground import Ground, open_ground
 from ground_service.missions.service import add_mission
 from ground_service.planning import request_store, standing, store
 from ground_service.planning import service as planning
-from ground_service.planning.model import Window, WindowEntry, WindowFilter
+from ground_service.planning.model import (
+    RequestTerms,
+    StandingRequestChange,
+    StandingRequestIn,
+    Window,
+    WindowEntry,
+    WindowFilter,
+)
 from ground_service.planning.progress import advance_windows
-from ground_service.planning.request_model import RequestTerms, StandingRequestChange, StandingRequestIn
 from ground_service.planning.request_store import get_plan, get_request
 from ground_service.planning.store import get_window, list_windows
 from ground_service.worker.follow_up import follow_in_process

@@ -26,9 +26,8 @@ from ground_service.passes.alarms.service import (
     list_alarms,
     shelve_alarm,
 )
-from ground_service.planning.model import WindowEntry
+from ground_service.planning.model import StandingRequestIn, WindowEntry
 from ground_service.planning.progress import note_reason
-from ground_service.planning.request_model import StandingRequestIn
 from ground_service.planning.service import add_window, change_window
 from ground_service.planning.standing import add_request, plan_tick
 from ground_service.store import repository
