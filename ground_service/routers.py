@@ -40,7 +40,7 @@ OPERATIONS = (
     Router("ground_service.missions.timekeeping.routes", "timekeeping", "spacecraft"),
     Router("ground_service.planning.routes", "planning", "windows"),
     Router("ground_service.contacts.links.routes", "links", "links"),
-    Router("ground_service.planning.request_routes", "requests", "requests"),
+    Router("ground_service.planning.routes", "requests", "requests"),
     Router("ground_service.contacts.commanding.routes", "telecommands", "telecommands"),
     Router("ground_service.passes.alarms.routes", "alarms", "alarms"),
     Router("ground_service.regression.routes", "regressions", "regressions"),
