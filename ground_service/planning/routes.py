@@ -24,7 +24,7 @@ from ground_service.http.requests import operations, problems
 from ground_service.missions import service as missions
 from ground_service.missions.model import MissionCheck
 from ground_service.missions.routes import Text
-from ground_service.planning import forecast, request_store, service, standing, store
+from ground_service.planning import forecast, service, standing, store
 from ground_service.planning.dry_run import rehearsed
 from ground_service.planning.model import (
     CraterDensity,
@@ -189,7 +189,7 @@ def _expect(found: Window, if_match: str | None) -> None:
 requests = operations("requests")
 
 
-add_list(requests, "/requests", request_store.list_requests)
+add_list(requests, "/requests", store.list_requests)
 
 
 @requests.post("/requests", status_code=201)
@@ -213,7 +213,7 @@ def add_request(
 @requests.get("/requests/{request_id}")
 def get_request(ground: GroundOf, _: Viewer, request_id: PassId) -> StandingRequest:
     """Show a standing request with the numbers of its windows."""
-    return ground.read(request_store.get_request, request_id)
+    return ground.read(store.get_request, request_id)
 
 
 @requests.patch("/requests/{request_id}", responses=problems(409))
@@ -234,4 +234,4 @@ def delete_request(ground: GroundOf, caller: Operator, request_id: PassId) -> Re
 @requests.get("/requests/{request_id}/plan")
 def get_request_plan(ground: GroundOf, _: Viewer, request_id: PassId) -> RequestPlan:
     """Show the last plan: every candidate window, planned or rejected with the reason."""
-    return ground.read(request_store.get_plan, request_id)
+    return ground.read(store.get_plan, request_id)

@@ -27,8 +27,8 @@ from ground_service.http.model import UtcTime
 from ground_service.missions.ephemerides import store as ephemerides
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.model import Mission
-from ground_service.planning import request_store as store
 from ground_service.planning import service as planning
+from ground_service.planning import store
 from ground_service.planning.core import Constraints, Planner, data_octets, frames_between
 from ground_service.planning.filling import NS, Option, ResourceGrid, choose
 from ground_service.planning.model import (
@@ -43,7 +43,7 @@ from ground_service.planning.model import (
 )
 from ground_service.planning.preparation import gap_ns
 from ground_service.planning.progress import note_reason
-from ground_service.planning.request_store import RequestRecord
+from ground_service.planning.store import RequestRecord
 from ground_service.planning.window_states import COMMITTED
 from ground_service.store.counters import lock_spacecraft
 from ground_service.store.vehicles import get_vehicle, vehicle_id

@@ -11,7 +11,7 @@ from ground_service.contacts.links.service import list_links
 from ground_service.ground import Ground
 from ground_service.missions.store import missions_in_force
 from ground_service.passes.alarms.service import note_operations
-from ground_service.planning import request_store
+from ground_service.planning import store
 from ground_service.planning.store import WINDOWS, records_where
 
 HOLDS_S = 300.0
@@ -66,7 +66,7 @@ class Watch:
             yield from ((one.spacecraft_id, "window_not_released") for one in refused)
             late = WINDOWS.c.state.in_(("executed", "downlinked")), WINDOWS.c.stop_utc_ns < now - OVERDUE_NS
             yield from ((one.spacecraft_id, "report_overdue") for one in records_where(connection, *late))
-            for key in request_store.active_requests(connection):
-                plan = request_store.get_plan(connection, key)
+            for key in store.active_requests(connection):
+                plan = store.get_plan(connection, key)
                 if plan.planned is not None and not plan.candidates:
-                    yield request_store.get_request_record(connection, key).spacecraft_id, "plan_empty"
+                    yield store.get_request_record(connection, key).spacecraft_id, "plan_empty"
