@@ -15,7 +15,6 @@ from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
 from ground_service.jobs.store import set_progress
 from ground_service.regression.archives import kept_archives
-from ground_service.regression.baseline import baseline_figures
 from ground_service.regression.builds import CURRENT, Build, load_build, register_build, registered_build
 from ground_service.regression.gates.policy import PolicyFile, load_policy, read_policy
 from ground_service.regression.model import COMPLETE, Comparison
@@ -24,6 +23,7 @@ from ground_service.regression.pass_archives import archive_of_pass
 from ground_service.regression.placebo import run_placebo
 from ground_service.regression.rendering import settle_archive
 from ground_service.regression.service import (
+    baseline_figures,
     do_replay,
     find_replay,
     is_done,

@@ -171,7 +171,7 @@ def _sandbox(arguments: argparse.Namespace) -> int:
 
 
 def _baseline(arguments: argparse.Namespace) -> int:
-    from ground_service.regression.baseline import baseline_text
+    from ground_service.regression.service import baseline_text
 
     with ground_client(arguments, background=True) as service:
         request = _comparison(service, arguments, arguments.build, arguments.build)
