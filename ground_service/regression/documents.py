@@ -22,8 +22,7 @@ from ground_service.missions.model import weakest_evidence
 from ground_service.regression import store
 from ground_service.regression.archives import store_of
 from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, INFORMS, NOT_JUDGED, PASS, Gate
-from ground_service.regression.gates.faults import first_difference
-from ground_service.regression.gates.metrics import metrics_of
+from ground_service.regression.gates.metrics import first_difference, metrics_of
 from ground_service.regression.gates.samples import cell_places_deg
 from ground_service.regression.headline import NAMES, headline
 from ground_service.regression.model import Verdict

@@ -39,8 +39,7 @@ from ground_service.regression.builds import Build, changes
 from ground_service.regression.documents import regression_html, verdict_document
 from ground_service.regression.gates.calibration import calibrations
 from ground_service.regression.gates.core import NOT_JUDGED, judge
-from ground_service.regression.gates.faults import first_difference
-from ground_service.regression.gates.metrics import metrics_of
+from ground_service.regression.gates.metrics import first_difference, metrics_of
 from ground_service.regression.gates.policy import PolicyFile, load_policy
 from ground_service.regression.gates.samples import PassFrames
 from ground_service.regression.gates.statistics import joined_sums, ratio_error

@@ -27,22 +27,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ground_service.regression.gates.faults import (
-    FRAMES,
-    TIMES,
-    UNDECODABLE,
-    WRONG_FIXES,
-    counts,
-    identical,
-)
 from ground_service.regression.gates.metrics import (
+    FRAMES,
     LATENCY,
     MEMORY,
     PRECISION,
     RECALL,
     RUN,
     START,
+    TIMES,
+    UNDECODABLE,
+    WRONG_FIXES,
     Metric,
+    counts,
+    identical,
     metrics_of,
 )
 from ground_service.regression.gates.samples import KINDS, PassFrames
