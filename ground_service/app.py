@@ -8,10 +8,13 @@ import logging
 import re
 from collections.abc import AsyncIterator
 from contextlib import ExitStack, asynccontextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 from anyio import to_thread
-from fastapi import FastAPI
+from fastapi import APIRouter, FastAPI
 from starlette.routing import Route
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
@@ -25,7 +28,6 @@ from ground_service.http.model import Problem
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
 from ground_service.missions.places import mission_clock
-from ground_service.routers import OPERATIONS
 from ground_service.settings import Settings, start_tracing
 from ground_service.store.wakeups import is_redis
 from ground_service.web.displays import FOLDER, displays
@@ -41,6 +43,48 @@ from ground_service.worker.jobs import enter_redecoding
 from ground_service.worker.metrics import Metrics, Watch
 from ground_service.worker.routes import operations
 from ground_service.worker.scheduler import Scheduler
+
+
+@dataclass(frozen=True, slots=True)
+class Router:
+    """Router `name` in the module `module`; most of its operations are under the path `segment` of the API."""
+
+    module: str
+    name: str
+    segment: str
+
+    def imported(self) -> ModuleType:
+        """Return the module."""
+        return import_module(self.module)
+
+    def load(self) -> APIRouter:
+        """Return the router."""
+        router: APIRouter = getattr(self.imported(), self.name)
+        return router
+
+
+OPERATIONS = (
+    Router("ground_service.passes.routes", "passes", "passes"),
+    Router("ground_service.ingest.routes", "ingests", "telemetry"),
+    Router("ground_service.evaluation.routes", "evaluation", "reports"),
+    Router("ground_service.evaluation.performance.routes", "reports", "monthly-reports"),
+    Router("ground_service.evaluation.landmarks.routes", "landmarks", "landmarks"),
+    Router("ground_service.exports.routes", "exports", "exports"),
+    Router("ground_service.missions.ephemerides.routes", "ephemerides", "ephemerides"),
+    Router("ground_service.jobs.routes", "jobs", "jobs"),
+    Router("ground_service.missions.routes", "missions", "missions"),
+    Router("ground_service.missions.timekeeping.routes", "timekeeping", "spacecraft"),
+    Router("ground_service.planning.routes", "planning", "windows"),
+    Router("ground_service.contacts.links.routes", "links", "links"),
+    Router("ground_service.planning.routes", "requests", "requests"),
+    Router("ground_service.contacts.commanding.routes", "telecommands", "telecommands"),
+    Router("ground_service.passes.alarms.routes", "alarms", "alarms"),
+    Router("ground_service.regression.routes", "regressions", "regressions"),
+    Router("ground_service.access.routes", "access", "users"),
+    Router("ground_service.worker.status_routes", "status", "status"),
+)
+"""Operations of the HTTP API."""
+
 
 _PAGE = re.compile(r"PageOf_(\w+?)_(?=\")")
 
