@@ -47,8 +47,8 @@ from ground_service.passes.samples import (
     OutcomeSamples,
 )
 from ground_service.passes.span import PassSpan, pass_span
-from ground_service.store.codec import unpack_filter_states, unpack_identifications
 from ground_service.store.files import FileArchive
+from ground_service.store.telemetry import unpack_filter_states, unpack_identifications
 from ground_service.store.vehicles import Vehicle, get_vehicle
 from ground_service.toml import read_table
 from lunar.boxes import share_outside
