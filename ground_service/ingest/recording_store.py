@@ -14,7 +14,6 @@ from sqlalchemy import Connection, and_, bindparam, delete, func, insert, select
 from sqlalchemy.dialects import postgresql, sqlite
 
 from ground_service.ingest.core import UNKNOWN, Fragment, fits
-from ground_service.store.counters import hold
 from ground_service.store.repository import (
     FRAGMENTS,
     INGESTS,
@@ -24,6 +23,7 @@ from ground_service.store.repository import (
     PIECES,
     VEHICLES,
 )
+from ground_service.store.vehicles import hold
 
 DIGEST_OCTETS = 16
 BLOCK = 64

@@ -19,7 +19,7 @@ from ground_service.errors import Conflict, InvalidInput
 from ground_service.events import JobChanged, publish
 from ground_service.ground import Ground
 from ground_service.jobs import store
-from ground_service.store.counters import hold
+from ground_service.store.vehicles import hold
 
 KINDS = (
     "report",

@@ -22,7 +22,7 @@ from ground_service.planning import store
 from ground_service.planning.model import WindowRecord
 from ground_service.planning.window_states import WindowFacts, state_of
 from ground_service.store import telemetry
-from ground_service.store.counters import lock_spacecraft
+from ground_service.store.vehicles import lock_spacecraft
 
 REASON_LENGTH = 500
 DELETE = "delete_activity"

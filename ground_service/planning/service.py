@@ -61,8 +61,7 @@ from ground_service.planning.preparation import (
     prepare_window,
 )
 from ground_service.planning.window_states import PlannedSpan, span_conflicts
-from ground_service.store.counters import lock_spacecraft
-from ground_service.store.vehicles import vehicle_id
+from ground_service.store.vehicles import lock_spacecraft, vehicle_id
 from ground_service.text import REASON_LIMIT, require_line
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import NANOSECONDS_PER_SECOND

@@ -45,8 +45,7 @@ from ground_service.planning.preparation import gap_ns
 from ground_service.planning.progress import note_reason
 from ground_service.planning.store import RequestRecord
 from ground_service.planning.window_states import COMMITTED
-from ground_service.store.counters import lock_spacecraft
-from ground_service.store.vehicles import get_vehicle, vehicle_id
+from ground_service.store.vehicles import get_vehicle, lock_spacecraft, vehicle_id
 from lunar.errors import EphemerisCoverageError, LunarError
 
 log = logging.getLogger(__name__)

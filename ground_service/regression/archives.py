@@ -36,7 +36,6 @@ from ground_service.regression.model import (
     ArchiveRecord,
     KeptArchive,
 )
-from ground_service.store.counters import hold
 from ground_service.store.files import (
     FileArchive,
     StoredFile,
@@ -44,6 +43,7 @@ from ground_service.store.files import (
     replace_durably,
     unfinished_prefix,
 )
+from ground_service.store.vehicles import hold
 from ground_service.toml import read_json, read_table
 
 _log = logging.getLogger(__name__)

@@ -34,8 +34,14 @@ from ground_service.events import CommandsSent, CommandStateChanged, HandoverCha
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf
 from ground_service.missions.store import approval_in_force, in_force
-from ground_service.store.counters import lock_spacecraft, next_telecommand
-from ground_service.store.vehicles import FLOWN, find_vehicle, get_vehicle, vehicle_id
+from ground_service.store.vehicles import (
+    FLOWN,
+    find_vehicle,
+    get_vehicle,
+    lock_spacecraft,
+    next_telecommand,
+    vehicle_id,
+)
 from ground_service.text import REASON_LIMIT, require_line
 from tmtc.dictionary.arguments import argument_text, arguments_by_number
 from tmtc.dictionary.effects import CommandEffect, effect_of

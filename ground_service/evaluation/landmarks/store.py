@@ -10,8 +10,8 @@ from sqlalchemy import Connection, delete, func, select
 from ground_service.evaluation.landmarks.model import Landmark, LandmarkDetail, LandmarkFilter, PassSightings
 from ground_service.http.model import PageOf
 from ground_service.store import repository
-from ground_service.store.counters import lock_spacecraft
 from ground_service.store.states import LANDMARK, change_if, move
+from ground_service.store.vehicles import lock_spacecraft
 
 _LANDMARKS, _VEHICLES = repository.LANDMARKS, repository.VEHICLES
 
