@@ -22,7 +22,7 @@ from ground_service.missions.service import mission_of_pass
 from ground_service.passes import store as passes
 from ground_service.passes.model import PassRecord
 from ground_service.passes.span import pass_span
-from ground_service.store.stored_files import register_file
+from ground_service.store.files import register_file
 from lunar.catalogue import CraterCatalogue, format_catalogue
 from lunar.constants import MOON_RADIUS_M, NANOSECONDS_PER_SECOND
 from lunar.ephemeris import Ephemeris

@@ -34,8 +34,7 @@ from ground_service.ground import Ground
 from ground_service.http.model import UtcTime
 from ground_service.passes.core import downsample
 from ground_service.passes.store import get_pass
-from ground_service.store.files import FileArchive, make_durable_folder, replace_durably
-from ground_service.store.stored_files import register_file
+from ground_service.store.files import FileArchive, make_durable_folder, register_file, replace_durably
 from lunar.arrays import FloatArray
 from lunar.timescales import format_utc
 from reports.document import evidence_number

@@ -36,8 +36,7 @@ from ground_service.ingest.parameters import (
 from ground_service.ingest.recording_store import Part, Piece
 from ground_service.ingest.store import Stored
 from ground_service.missions.definitions import PacketDefinitions
-from ground_service.store.files import FileArchive, mapped_octets, read_blocks
-from ground_service.store.stored_files import recorded_name
+from ground_service.store.files import FileArchive, mapped_octets, read_blocks, recorded_name
 from ground_service.store.vehicles import vehicle_id
 from lunar.arrays import OctetArray
 from tmtc.arrays import as_octets

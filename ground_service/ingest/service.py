@@ -27,8 +27,7 @@ from ground_service.jobs.service import OTHER_REQUEST, add_job
 from ground_service.jobs.store import find_job
 from ground_service.missions.store import stations_in_force
 from ground_service.store import parameters, telemetry
-from ground_service.store.files import StoredFile
-from ground_service.store.stored_files import register_file
+from ground_service.store.files import StoredFile, register_file
 from ground_service.store.vehicles import FLOWN, all_vehicles, hold, lock_vehicle
 from ground_service.text import REASON_LIMIT, require_line
 from tmtc.dictionary.payload import DICTIONARY

@@ -50,8 +50,7 @@ from ground_service.passes.span import (
     vehicle_span,
 )
 from ground_service.store import rollups
-from ground_service.store.files import StoredFile
-from ground_service.store.stored_files import register_file
+from ground_service.store.files import StoredFile, register_file
 from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
 from ground_service.text import require_line
 from reports.values import PacketAccounting

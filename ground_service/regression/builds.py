@@ -30,8 +30,7 @@ from ground_service.http.model import UtcTime
 from ground_service.regression import model, store
 from ground_service.regression.runner import RunRequest, run_confined
 from ground_service.regression.sandbox.host import SandboxRefused, tail
-from ground_service.store.files import make_durable_folder, replace_durably
-from ground_service.store.stored_files import register_file
+from ground_service.store.files import make_durable_folder, register_file, replace_durably
 from ground_service.text import require_line
 from ground_service.toml import parse_table, read_table
 

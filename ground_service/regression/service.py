@@ -69,7 +69,7 @@ from ground_service.regression.replay_samples import (
     read_downlink,
 )
 from ground_service.regression.runner import PERFORMANCE
-from ground_service.store.stored_files import register_file
+from ground_service.store.files import register_file
 from lunar.errors import LunarError
 from reports.text import counted
 

@@ -47,7 +47,7 @@ from ground_service.passes.archive_import import list_images
 from ground_service.passes.sample_store import sample_arrays
 from ground_service.passes.samples import DetectionSamples
 from ground_service.passes.span import pass_span
-from ground_service.store.stored_files import files_beginning
+from ground_service.store.files import files_beginning
 from ground_service.store.vehicles import get_vehicle
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.tables import table_hash, unpack_catalogue_table

@@ -40,7 +40,7 @@ from ground_service.evaluation.service import PREFERRED_ESTIMATORS
 from ground_service.ground import Ground
 from ground_service.http.model import Entity, UtcTime
 from ground_service.passes.model import PassRecord
-from ground_service.store.stored_files import register_file
+from ground_service.store.files import register_file
 from ground_service.store.vehicles import FLOWN, get_vehicle
 from lunar.timescales import format_utc, parse_utc
 from reports.values import (

@@ -15,8 +15,7 @@ from ground_service.ground import Ground
 from ground_service.missions.ephemerides import store
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.store import missions_in_force
-from ground_service.store.files import StoredFile
-from ground_service.store.stored_files import register_file
+from ground_service.store.files import StoredFile, register_file
 from ground_service.store.vehicles import hold
 from lunar.comparison import check_gravity
 from lunar.ephemeris import Ephemeris as States

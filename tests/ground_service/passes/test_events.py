@@ -29,7 +29,7 @@ from ground_service.passes.live import list_spacecraft, live_parameters
 from ground_service.passes.model import EventFilter, PassFilter
 from ground_service.passes.service import completeness, define_pass
 from ground_service.passes.store import list_passes
-from ground_service.store.stored_files import register_file
+from ground_service.store.files import register_file
 from lunar.catalogue import load_catalogue
 from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.ephemeris_files import load_ephemeris

@@ -30,9 +30,9 @@ from ground_service.passes.service import detections, trend_series
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.passes.store import get_pass
 from ground_service.store import repository, rollups
+from ground_service.store.files import register_file
 from ground_service.store.models import ROLLUPS
 from ground_service.store.rollups import BASE_TICKS, HOUSEKEEPING_VALUES, STATE_VALUES
-from ground_service.store.stored_files import register_file
 from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service.conftest import (

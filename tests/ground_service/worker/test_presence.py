@@ -16,7 +16,7 @@ from ground_service.ingest.service import ingest_file
 from ground_service.missions.service import add_mission
 from ground_service.settings import Settings
 from ground_service.store import leases
-from ground_service.store.stored_files import file_names
+from ground_service.store.files import file_names
 from ground_service.worker import presence
 from ground_service.worker.condition import complaints, read_condition
 from ground_service.worker.doctor import examine

@@ -31,7 +31,7 @@ from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
 from ground_service.store import repository
-from ground_service.store.stored_files import register_file
+from ground_service.store.files import register_file
 from ground_service.store.vehicles import FLOWN, vehicle_id
 from ground_service.worker import upkeep
 from ground_service.worker.upkeep import nightly
