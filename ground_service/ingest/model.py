@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import ConfigDict, Field
 
 from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber, UtcTime
-from ground_service.text import LINE_PATTERN_JSON
+from ground_service.toml import LINE_PATTERN_JSON
 
 
 class IngestAccepted(Entity):

@@ -29,7 +29,7 @@ from ground_service.missions.store import stations_in_force
 from ground_service.store import parameters, telemetry
 from ground_service.store.files import StoredFile, register_file
 from ground_service.store.vehicles import FLOWN, all_vehicles, hold, lock_vehicle
-from ground_service.text import REASON_LIMIT, require_line
+from ground_service.toml import REASON_LIMIT, require_line
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import TmtcError
 from tmtc.link.settings import LinkSettings

@@ -38,8 +38,7 @@ from ground_service.passes.model import Image
 from ground_service.passes.span import PassSpan, pass_span, vehicle_span
 from ground_service.store.files import UNPACKING, StoredFile, register_file, unfinished_prefix
 from ground_service.store.vehicles import ARCHIVE_ACTOR, SPACECRAFT_ID_MAX, find_vehicle, hold, vehicle_id
-from ground_service.text import require_line
-from ground_service.toml import read_json
+from ground_service.toml import read_json, require_line
 from lunar.arrays import FloatArray
 from lunar.catalogue import load_catalogue
 from lunar.errors import LunarError

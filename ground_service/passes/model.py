@@ -18,7 +18,7 @@ from ground_service.http.model import (
     UtcTime,
 )
 from ground_service.store.vehicles import FLOWN
-from ground_service.text import LINE_PATTERN_JSON
+from ground_service.toml import LINE_PATTERN_JSON
 
 if TYPE_CHECKING:
     from reports.values import PacketAccounting

@@ -52,7 +52,7 @@ from ground_service.passes.span import (
 from ground_service.store import rollups
 from ground_service.store.files import StoredFile, register_file
 from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
-from ground_service.text import require_line
+from ground_service.toml import require_line
 from reports.values import PacketAccounting
 from tmtc.dictionary.fields import Field
 from tmtc.dictionary.payload import DICTIONARY

@@ -19,7 +19,7 @@ from ground_service.http.model import (
 )
 from ground_service.planning import core
 from ground_service.planning.core import Constraints
-from ground_service.text import LINE_PATTERN_JSON
+from ground_service.toml import LINE_PATTERN_JSON
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1, max_length=200, pattern=LINE_PATTERN_JSON)]

@@ -62,7 +62,7 @@ from ground_service.planning.preparation import (
 )
 from ground_service.planning.window_states import PlannedSpan, span_conflicts
 from ground_service.store.vehicles import lock_spacecraft, vehicle_id
-from ground_service.text import REASON_LIMIT, require_line
+from ground_service.toml import REASON_LIMIT, require_line
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.datafolder import DataFolder

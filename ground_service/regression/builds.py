@@ -31,8 +31,7 @@ from ground_service.regression import model, store
 from ground_service.regression.runner import RunRequest, run_confined
 from ground_service.regression.sandbox.host import SandboxRefused, tail
 from ground_service.store.files import make_durable_folder, register_file, replace_durably
-from ground_service.text import require_line
-from ground_service.toml import parse_table, read_table
+from ground_service.toml import parse_table, read_table, require_line
 
 CURRENT = "current"
 BUILD_FILE = "build.toml"

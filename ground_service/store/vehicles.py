@@ -12,7 +12,7 @@ from sqlalchemy.exc import IntegrityError
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.store import repository
 from ground_service.store.repository import COMMAND_COUNTERS, add_new
-from ground_service.text import require_line
+from ground_service.toml import require_line
 
 ARCHIVE_ACTOR = "archive"
 """Actor of mission descriptions that are imported with pass archives."""

@@ -23,7 +23,7 @@ from ground_service.errors import InvalidInput, ServerError
 from ground_service.ground import open_ground
 from ground_service.server import _server, bind, serve
 from ground_service.settings import Settings
-from ground_service.text import LINE_PATTERN_JSON, require_line
+from ground_service.toml import LINE_PATTERN_JSON, require_line
 from studies.harness.parts import listens
 from tests.ground_service.conftest import free_port, wait_for
 

@@ -42,7 +42,7 @@ from ground_service.store.vehicles import (
     next_telecommand,
     vehicle_id,
 )
-from ground_service.text import REASON_LIMIT, require_line
+from ground_service.toml import REASON_LIMIT, require_line
 from tmtc.dictionary.arguments import argument_text, arguments_by_number
 from tmtc.dictionary.effects import CommandEffect, effect_of
 from tmtc.dictionary.payload import DICTIONARY
