@@ -31,11 +31,10 @@ from ground_service.missions.places import mission_clock
 from ground_service.settings import Settings, start_tracing
 from ground_service.store.wakeups import is_redis
 from ground_service.web.displays import FOLDER, displays
-from ground_service.web.live import live
 from ground_service.web.pages import documentation, pages
 from ground_service.web.payload_console import payload_console
 from ground_service.web.sign_in import sign_in
-from ground_service.web.sockets import Sockets
+from ground_service.web.sockets import Sockets, live
 from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.jobs import enter_redecoding
