@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ground_service.planning import model
     from ground_service.planning import model as planning
     from ground_service.regression import model as regression
-    from ground_service.worker import model as worker
+    from ground_service.worker import condition
 else:
     import_lazily(
         globals(),
@@ -770,5 +770,5 @@ class Operations(Connection):
     # status
 
     @operation("GET /status")
-    def get_status(self) -> worker.ServiceStatus:
+    def get_status(self) -> condition.ServiceStatus:
         """Show the condition of the deployment: waiting work, disk, backups, time correlations, scheduler."""

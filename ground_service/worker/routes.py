@@ -8,7 +8,7 @@ from ground_service.errors import Draining
 from ground_service.http.common import GroundOf
 from ground_service.jobs import store
 from ground_service.jobs.model import JobFilter
-from ground_service.worker.model import Health
+from ground_service.worker.condition import Health
 
 operations = APIRouter(include_in_schema=False)
 

@@ -7,8 +7,7 @@ from fastapi import Request
 from ground_service.access.security import Viewer
 from ground_service.http.common import GroundOf
 from ground_service.http.requests import operations
-from ground_service.worker.condition import service_status
-from ground_service.worker.model import ServiceStatus
+from ground_service.worker.condition import ServiceStatus, service_status
 
 status = operations("status")
 
