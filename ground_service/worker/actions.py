@@ -38,8 +38,7 @@ from ground_service.planning.progress import HEARD_TICKS, close_window, note_rea
 from ground_service.regression.pass_archives import keep_pass
 from ground_service.store.events import LoggedEvent, read_events
 from ground_service.store.vehicles import get_vehicle
-from ground_service.worker.notifications import send
-from ground_service.worker.outgoing import NotDelivered
+from ground_service.worker.notifications import NotDelivered, send
 from lunar.timescales import format_utc
 
 

@@ -20,7 +20,7 @@ from ground_service.store import leases
 from ground_service.store.database import schema_revisions
 from ground_service.store.files import file_names
 from ground_service.worker.condition import broker_answers
-from ground_service.worker.outgoing import permitted_address
+from ground_service.worker.notifications import permitted_address
 from ground_service.worker.presence import (
     CLOCK_LIMIT_MS,
     disagreements,

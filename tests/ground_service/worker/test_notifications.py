@@ -38,13 +38,13 @@ from ground_service.missions.service import add_mission
 from ground_service.settings import load_settings
 from ground_service.store.audit import Head
 from ground_service.store.models import METADATA
-from ground_service.worker import actions, outgoing
+from ground_service.worker import actions
+from ground_service.worker import notifications as outgoing
 from ground_service.worker.actions import send_messages
 from ground_service.worker.dispatch import ThreadDispatcher
 from ground_service.worker.follow_up import follow_in_process
-from ground_service.worker.notifications import ATTEMPTS, signature
+from ground_service.worker.notifications import ATTEMPTS, NotDelivered, permitted_address, signature
 from ground_service.worker.notifications import send as send_to
-from ground_service.worker.outgoing import NotDelivered, permitted_address
 from ground_service.worker.upkeep import kept_heads, nightly
 from tests.ground_service.access.test_missions_of_callers import row_of
 from tests.ground_service.conftest import wait_for
