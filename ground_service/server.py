@@ -19,7 +19,7 @@ from ground_service.http.limits import LOOPBACK
 from ground_service.http.uploads import UPLOADS_AT_ONCE
 from ground_service.logs import logging_config
 from ground_service.settings import Settings
-from ground_service.worker.presence import present
+from ground_service.worker.condition import present
 from kernels.memory import limit_heaps
 
 if TYPE_CHECKING:
