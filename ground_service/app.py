@@ -79,7 +79,7 @@ OPERATIONS = (
     Router("ground_service.passes.alarms.routes", "alarms", "alarms"),
     Router("ground_service.regression.routes", "regressions", "regressions"),
     Router("ground_service.access.routes", "access", "users"),
-    Router("ground_service.worker.status_routes", "status", "status"),
+    Router("ground_service.worker.metrics", "status", "status"),
 )
 """Operations of the HTTP API."""
 

@@ -8,6 +8,7 @@ import secrets
 import time
 from pathlib import Path
 
+from fastapi import Request
 from prometheus_client import (
     CONTENT_TYPE_LATEST,
     CollectorRegistry,
@@ -20,10 +21,13 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from ground_service.access.security import Viewer
 from ground_service.ground import Ground
+from ground_service.http.common import GroundOf
+from ground_service.http.requests import operations
 from ground_service.jobs.service import KINDS
 from ground_service.tracing import span
-from ground_service.worker.condition import read_condition
+from ground_service.worker.condition import ServiceStatus, read_condition, service_status
 
 BUCKETS = (0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 30.0)
 
@@ -182,3 +186,12 @@ class Watch:
             "http.route": route,
             "http.response.status_code": status,
         }
+
+
+status = operations("status")
+
+
+@status.get("/status")
+def get_status(request: Request, ground: GroundOf, _: Viewer) -> ServiceStatus:
+    """Show the condition of the deployment: waiting work, disk, backups, time correlations, scheduler."""
+    return service_status(ground, request.app.state.backups, request.app.state.broker)
