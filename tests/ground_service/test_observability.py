@@ -28,9 +28,8 @@ from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.worker import condition
 from ground_service.worker.backup import backup
-from ground_service.worker.condition import newest_backup_utc_ns, read_condition
+from ground_service.worker.condition import WorkCounts, newest_backup_utc_ns, read_condition
 from ground_service.worker.jobs import run_job
-from ground_service.worker.store import WorkCounts
 from tests.serving import TestClient
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
