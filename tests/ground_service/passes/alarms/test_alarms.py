@@ -31,7 +31,7 @@ from ground_service.planning.progress import note_reason
 from ground_service.planning.service import add_window, change_window
 from ground_service.planning.standing import add_request, plan_tick
 from ground_service.store import repository
-from ground_service.worker.watch import Watch
+from ground_service.worker.scheduler import Watch
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
