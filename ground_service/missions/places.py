@@ -138,11 +138,3 @@ def mission_clock(ground: Ground) -> Iterator[None]:
         stopping.set()
         thread.join()
         follow_missions(None)
-
-
-STATIONS = (
-    GroundStation("Goldstone", math.radians(35.4267), math.radians(243.1100), 1000.0),
-    GroundStation("Canberra", math.radians(-35.4024), math.radians(148.9813), 690.0),
-    GroundStation("Madrid", math.radians(40.4314), math.radians(355.7520), 830.0),
-)
-"""Sites of the Deep Space Network, to a kilometre (DSN 810-005, module 301); the Moon is always visible from one."""

@@ -31,7 +31,7 @@ from ground_service.ground import Ground
 from ground_service.http.model import UtcTime, time_of
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.ephemerides.store import covering_ephemerides
-from ground_service.missions.places import STATIONS, stations_of
+from ground_service.missions.places import stations_of
 from ground_service.missions.store import mission_of_vehicle
 from ground_service.missions.timekeeping import store
 from ground_service.missions.timekeeping.core import (
@@ -52,7 +52,7 @@ from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.plausible import CORRELATION_RMS_NS
 from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import tai_ns_from_utc_ns, tdb_s_from_utc_ns
-from lunar.visibility import GroundStation, link
+from lunar.visibility import DSN_STATIONS, GroundStation, link
 
 AUTOMATIC = "time reports, light time"
 """Method of correlations that are fitted again by themselves."""
@@ -101,7 +101,7 @@ def received_reports(given: Sequence[Mapping[str, Any]]) -> list[ReceivedReport]
     InvalidInput
         If a value is missing or cannot be read, or a station is not known.
     """
-    known = {station.name.lower(): station.name for station in STATIONS}
+    known = {station.name.lower(): station.name for station in DSN_STATIONS}
     reports = []
     for number, one in enumerate(given):
         place = f"receptions.{number}"
@@ -305,7 +305,7 @@ def _light_time_ns(
     if len(earth_utc_ns) == 0:
         return np.zeros(0, dtype=np.int64)
     light_s = np.full(len(earth_utc_ns), np.nan)
-    known = {station.name: station for station in STATIONS}
+    known = {station.name: station for station in DSN_STATIONS}
     mission = mission_of_vehicle(connection, vehicle)
     if mission is not None:
         known |= {station.name: station for station in stations_of(mission.link)}
