@@ -23,8 +23,7 @@ from ground_service.ingest.parameters import decode_declared, definitions_in_for
 from ground_service.ingest.reception import Progress, Reading
 from ground_service.ingest.recording_store import Piece, add_piece, get_piece
 from ground_service.jobs.model import Job
-from ground_service.jobs.service import OTHER_REQUEST, add_job
-from ground_service.jobs.store import find_job
+from ground_service.jobs.service import OTHER_REQUEST, add_job, find_job
 from ground_service.missions.store import stations_in_force
 from ground_service.store import parameters, telemetry
 from ground_service.store.files import StoredFile, register_file

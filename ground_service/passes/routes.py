@@ -27,7 +27,7 @@ from ground_service.http.model import GivenTime, PageOf, ns_of
 from ground_service.http.requests import operations, problems
 from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
-from ground_service.jobs.store import get_job
+from ground_service.jobs.service import get_job
 from ground_service.passes import archive_import, parameters, service, store
 from ground_service.passes import live as newest
 from ground_service.passes.model import (

@@ -15,7 +15,7 @@ from typing import Any
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
-from ground_service.jobs.store import set_progress
+from ground_service.jobs.service import set_progress
 from ground_service.regression import store
 from ground_service.regression.archives import kept_archives, remove_unheld
 from ground_service.regression.builds import CURRENT, Build, load_build, register_build, registered_build

@@ -40,8 +40,7 @@ from ground_service.events import (
 from ground_service.ground import Ground
 from ground_service.ingest.doubt_store import needs_review, review_times
 from ground_service.ingest.service import undecoded_vehicles
-from ground_service.jobs.service import add_job
-from ground_service.jobs.store import queued_arguments
+from ground_service.jobs.service import add_job, queued_arguments
 from ground_service.missions.timekeeping.recorrelation import recorrelate
 from ground_service.missions.timekeeping.store import vehicles_with_receptions
 from ground_service.passes.alarms.service import examine_again, examine_packets, note_finding

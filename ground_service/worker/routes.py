@@ -6,7 +6,7 @@ from fastapi import APIRouter, Request, Response
 
 from ground_service.errors import Draining
 from ground_service.http.common import GroundOf
-from ground_service.jobs import store
+from ground_service.jobs import service
 from ground_service.jobs.model import JobFilter
 from ground_service.worker.condition import Health
 
@@ -24,7 +24,7 @@ def readyz(request: Request, ground: GroundOf) -> Health:
     """Report that the service can be used: its database and archive can be read and written, and it is not draining."""
     if request.app.state.draining:
         raise Draining
-    ground.read(store.list_jobs, JobFilter(limit=1))
+    ground.read(service.list_jobs, JobFilter(limit=1))
     ground.database.require_writable()
     ground.files.require_writable()
     return Health(status="ok")

@@ -22,7 +22,7 @@ from ground_service.errors import InvalidInput
 from ground_service.evaluation.performance.service import make_due_reports
 from ground_service.events import LimitsBroken, publish
 from ground_service.ground import Ground
-from ground_service.jobs.store import delete_finished, find_job
+from ground_service.jobs.service import delete_finished, find_job
 from ground_service.missions.automation import Channel
 from ground_service.missions.store import channels_in_force
 from ground_service.passes.service import vehicle_trends

@@ -21,8 +21,7 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import SettingsError
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
-from ground_service.jobs.service import enter_job
-from ground_service.jobs.store import get_job
+from ground_service.jobs.service import enter_job, get_job
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from ground_service.store import repository

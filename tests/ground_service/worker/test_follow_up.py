@@ -26,7 +26,7 @@ from ground_service.events import (
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
-from ground_service.jobs.store import unfinished_jobs
+from ground_service.jobs.service import unfinished_jobs
 from ground_service.passes.service import define_pass
 from ground_service.settings import Settings
 from ground_service.store import events as log

@@ -32,7 +32,7 @@ from ground_service.events import (
 )
 from ground_service.ground import Ground, open_ground
 from ground_service.jobs.model import Job, JobFilter
-from ground_service.jobs.store import get_job, list_jobs
+from ground_service.jobs.service import get_job, list_jobs
 from ground_service.missions.automation import Channel
 from ground_service.missions.service import add_mission
 from ground_service.settings import load_settings
