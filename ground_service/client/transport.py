@@ -21,7 +21,7 @@ from ground_service.ground import Ground
 from ground_service.http import problems
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
-from ground_service.jobs.dispatcher import Dispatcher
+from ground_service.jobs.service import Dispatcher
 from ground_service.store.events import Notify
 
 LOCAL_UPLOADS = 2

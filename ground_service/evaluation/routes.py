@@ -21,9 +21,8 @@ from ground_service.http.common import (
 )
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
-from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
-from ground_service.jobs.service import get_job
+from ground_service.jobs.service import DispatcherOf, get_job
 from ground_service.passes.service import get_pass
 
 REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}

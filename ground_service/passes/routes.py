@@ -25,9 +25,8 @@ from ground_service.http.common import (
 )
 from ground_service.http.model import GivenTime, PageOf, ns_of
 from ground_service.http.requests import operations, problems
-from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
-from ground_service.jobs.service import get_job
+from ground_service.jobs.service import DispatcherOf, get_job
 from ground_service.passes import archive_import, parameters, service, store
 from ground_service.passes import live as newest
 from ground_service.passes.model import (

@@ -20,8 +20,7 @@ from ground_service.contacts.links.service import list_links
 from ground_service.contacts.links.supervisor import process_name
 from ground_service.errors import GroundError, fault_of
 from ground_service.ground import Ground
-from ground_service.jobs.dispatcher import Dispatcher
-from ground_service.jobs.service import repeat_failed
+from ground_service.jobs.service import Dispatcher, repeat_failed
 from ground_service.missions.store import missions_in_force
 from ground_service.passes.alarms.service import note_operations
 from ground_service.planning import store
