@@ -27,7 +27,7 @@ from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_stored
 from ground_service.missions import store as missions
 from ground_service.missions.ephemerides.attitudes import attitude_file, load_attitudes
-from ground_service.missions.ephemerides.store import add_ephemeris
+from ground_service.missions.ephemerides.service import insert_ephemeris
 from ground_service.missions.frames import mission_of_manifest
 from ground_service.missions.model import Mission
 from ground_service.missions.service import enter, read_mission
@@ -286,7 +286,7 @@ def _register(
             register_file(connection, file, "frame", f"frame {number}", now)
         ephemeris_id = None
         if reference is not None:
-            ephemeris_id = add_ephemeris(
+            ephemeris_id = insert_ephemeris(
                 connection,
                 stored["reference.oem"],
                 reference,

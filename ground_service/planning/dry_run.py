@@ -18,8 +18,7 @@ from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.missions.catalogues import add_catalogue
 from ground_service.missions.definitions import read_mission_file
-from ground_service.missions.ephemerides.service import add_ephemeris
-from ground_service.missions.ephemerides.store import covering_ephemerides
+from ground_service.missions.ephemerides.service import add_ephemeris, covering_ephemerides
 from ground_service.missions.service import add_mission, read_mission
 from ground_service.planning import service as planning
 from ground_service.planning import standing, store

@@ -24,7 +24,7 @@ from ground_service.errors import PASSING, GroundError, InvalidInput, NotFound, 
 from ground_service.events import PlanChanged, RequestChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime
-from ground_service.missions.ephemerides import store as ephemerides
+from ground_service.missions.ephemerides import service
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.model import Mission
 from ground_service.planning import service as planning
@@ -161,7 +161,7 @@ def planned_with(ground: Ground, ephemeris_id: int) -> list[int]:
     with ground.database.reading() as connection:
         vehicles = store.planned_vehicles(connection)
         try:
-            name = ephemerides.get_ephemeris(connection, ephemeris_id).object_name
+            name = service.get_ephemeris(connection, ephemeris_id).object_name
         except NotFound:
             return vehicles
         numbers = {one: get_vehicle(connection, one).ccsds_id for one in vehicles}
@@ -253,7 +253,7 @@ def _fill(ground: Ground, request_id: int, now: int) -> int:
         situation = _Situation(
             request,
             planning.mission_of(connection, request.spacecraft_id),
-            tuple(ephemerides.covering_ephemerides(connection, now, end, request.spacecraft_id)),
+            tuple(service.covering_ephemerides(connection, now, end, request.spacecraft_id)),
             tuple(one for one in windows if one.request_id == request_id),
             tuple(one for one in windows if one.state in COMMITTED or one.state == "draft"),
         )
@@ -280,7 +280,7 @@ def _fill(ground: Ground, request_id: int, now: int) -> int:
 
 
 def _basis(situation: _Situation) -> str:
-    """Return a hash of the revision, the ephemerides, the request and the windows that are not in the plan any more."""
+    """Return a hash of the revision, the service, the request and the windows that are not in the plan any more."""
     parts = [
         situation.mission.revision,
         str(situation.request.version),

@@ -27,7 +27,7 @@ from ground_service.events import ContactEnded, ContactMissed, ContactStarted, L
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime
 from ground_service.missions import store as missions
-from ground_service.missions.ephemerides import store as ephemerides
+from ground_service.missions.ephemerides import service
 from ground_service.missions.ephemerides.service import open_ephemeris
 from ground_service.missions.model import Link as LinkSection
 from ground_service.missions.model import StationConnection
@@ -171,9 +171,7 @@ def predict(
     station = station_of(declared.stations, declared.link.station)
     if station is None:
         return (), "the mission description states no place of the station"
-    references = ground.read(
-        ephemerides.covering_ephemerides, start_utc_ns, stop_utc_ns, declared.spacecraft_id
-    )
+    references = ground.read(service.covering_ephemerides, start_utc_ns, stop_utc_ns, declared.spacecraft_id)
     if not references:
         return (), "no reference ephemeris covers the time"
     outages = outages_of(declared.stations)

@@ -30,7 +30,7 @@ from ground_service.events import (
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime, time_of
 from ground_service.missions.ephemerides.model import Ephemeris
-from ground_service.missions.ephemerides.store import covering_ephemerides
+from ground_service.missions.ephemerides.service import covering_ephemerides
 from ground_service.missions.places import stations_of
 from ground_service.missions.store import mission_of_vehicle
 from ground_service.missions.timekeeping import store
