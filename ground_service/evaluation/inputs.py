@@ -28,9 +28,14 @@ from ground_service.evaluation.navigation.smoother import (
 from ground_service.evaluation.verdict import Limits, StartOrbit
 from ground_service.ground import Ground
 from ground_service.missions.catalogues import read_catalogue
-from ground_service.missions.ephemerides.attitudes import AttitudeTable, load_attitudes, no_attitudes
 from ground_service.missions.ephemerides.model import Ephemeris as EphemerisEntry
-from ground_service.missions.ephemerides.service import covering_ephemerides, get_ephemeris
+from ground_service.missions.ephemerides.service import (
+    AttitudeTable,
+    covering_ephemerides,
+    get_ephemeris,
+    load_attitudes,
+    no_attitudes,
+)
 from ground_service.missions.frames import DeclaredFrames, assumed_camera, camera_of, declared_frames
 from ground_service.missions.model import Camera, Catalogue, Evidence, Mission
 from ground_service.missions.service import mission_of_pass

@@ -26,8 +26,7 @@ from ground_service.events import ArchiveImported, publish_once
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_stored
 from ground_service.missions import store as missions
-from ground_service.missions.ephemerides.attitudes import attitude_file, load_attitudes
-from ground_service.missions.ephemerides.service import insert_ephemeris
+from ground_service.missions.ephemerides.service import attitude_file, insert_ephemeris, load_attitudes
 from ground_service.missions.frames import mission_of_manifest
 from ground_service.missions.model import Mission
 from ground_service.missions.service import enter, read_mission

@@ -17,7 +17,7 @@ from ground_service.evaluation.detection.recall import Viewing
 from ground_service.evaluation.extras import sun_angles
 from ground_service.evaluation.inputs import evidence_of_frames, orientation_of
 from ground_service.evaluation.navigation.alignment import reference_states
-from ground_service.missions.ephemerides.attitudes import (
+from ground_service.missions.ephemerides.service import (
     ATTITUDE_FILES,
     attitude_file,
     load_attitudes,

@@ -16,7 +16,7 @@ from ground_service.evaluation.service import evaluate
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions import frames as declared
-from ground_service.missions.ephemerides.attitudes import HEADER, load_attitudes
+from ground_service.missions.ephemerides.service import HEADER, load_attitudes
 from ground_service.missions.frames import camera_of, declared_frames
 from ground_service.missions.model import Camera, Frames, Mission
 from ground_service.missions.service import add_mission
