@@ -30,7 +30,7 @@ from ground_service.access.scopes import check_scope
 from ground_service.access.security import caller_of
 from ground_service.errors import InvalidInput, NotAuthorised, NotFound
 from ground_service.evaluation.extras import albedo_picture
-from ground_service.evaluation.performance.store import get_monthly_report
+from ground_service.evaluation.performance.service import get_monthly_report
 from ground_service.evaluation.store import get_report
 from ground_service.ground import Ground
 from ground_service.http.common import API_PREFIX, Key

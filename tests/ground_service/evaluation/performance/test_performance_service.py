@@ -15,13 +15,13 @@ from ground_service.evaluation.performance import service
 from ground_service.evaluation.performance.model import MonthlyReportFilter
 from ground_service.evaluation.performance.service import (
     last_month,
+    list_monthly_reports,
     make_due_report,
     make_monthly_report,
     month_span,
     monthly_value,
     performance,
 )
-from ground_service.evaluation.performance.store import list_monthly_reports
 from ground_service.evaluation.service import make_report
 from ground_service.evaluation.store import add_report
 from ground_service.events import WindowChanged, publish, read_events
@@ -270,7 +270,7 @@ def test_passes_without_a_report_are_counted_and_the_month_is_not_good(ground: G
 
 
 def test_too_many_passes_are_one_clear_error(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ground_service.evaluation.performance.store.PASSES_LIMIT", 2)
+    monkeypatch.setattr("ground_service.evaluation.performance.service.PASSES_LIMIT", 2)
     for number in range(3):
         add_pass(ground, number)
     with pytest.raises(InvalidInput, match=r"expected at most 2 passes .* found 3 passes"):
