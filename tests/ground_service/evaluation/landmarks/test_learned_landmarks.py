@@ -20,18 +20,16 @@ from ground_service.evaluation.landmarks.core import (
     places_of_pass,
     same_place,
 )
-from ground_service.evaluation.landmarks.documents import (
+from ground_service.evaluation.landmarks.model import Landmark, LandmarkFilter
+from ground_service.evaluation.landmarks.service import (
     FIRST_ID,
+    decide_landmark,
     extended_catalogue,
     extended_table,
     format_labels,
-    upload_entries,
-)
-from ground_service.evaluation.landmarks.model import Landmark, LandmarkFilter
-from ground_service.evaluation.landmarks.service import (
-    decide_landmark,
     get_landmark,
     update_landmarks,
+    upload_entries,
 )
 from ground_service.evaluation.landmarks.store import list_landmarks
 from ground_service.ground import Ground, open_ground
