@@ -14,7 +14,7 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, StorageFull
 from ground_service.evaluation import service as evaluation
 from ground_service.evaluation.landmarks.model import LandmarkFilter
-from ground_service.evaluation.landmarks.store import list_landmarks
+from ground_service.evaluation.landmarks.service import list_landmarks
 from ground_service.evaluation.store import newest_report
 from ground_service.events import ContactEnded, PassEvaluated, RegressionJudged, publish
 from ground_service.ground import Ground, open_ground

@@ -28,10 +28,10 @@ from ground_service.evaluation.landmarks.service import (
     extended_table,
     format_labels,
     get_landmark,
+    list_landmarks,
     update_landmarks,
     upload_entries,
 )
-from ground_service.evaluation.landmarks.store import list_landmarks
 from ground_service.ground import Ground, open_ground
 from ground_service.missions.catalogues import add_catalogue
 from ground_service.passes.archive_import import import_archive
