@@ -30,8 +30,7 @@ from ground_service.http.uploads import UploadPool
 from ground_service.missions.places import mission_clock
 from ground_service.settings import Settings, start_tracing
 from ground_service.store.wakeups import is_redis
-from ground_service.web.displays import FOLDER, displays
-from ground_service.web.pages import documentation, pages
+from ground_service.web.pages import FOLDER, displays, documentation, pages
 from ground_service.web.payload_console import payload_console
 from ground_service.web.sign_in import sign_in
 from ground_service.web.sockets import Sockets, live

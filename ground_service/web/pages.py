@@ -6,11 +6,12 @@ Nothing here needs a token: pages hold no data but the telemetry dictionary, whi
 from __future__ import annotations
 
 import base64
+import gzip
 import hashlib
 import json
 import posixpath
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
 from itertools import pairwise
@@ -422,3 +423,81 @@ def policy(page: bytes) -> str:
         f"default-src 'none'; script-src 'self' {hashes}; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
         "connect-src 'self'; worker-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
     )
+
+
+FOLDER = Path(__file__).parents[2] / "deploy" / "openmct" / "node_modules" / "openmct"
+"""Where `make openmct` installs the npm package `openmct`."""
+
+DISPLAY_POLICY = (
+    "default-src 'none'; script-src 'self' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; worker-src 'self'; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+
+_COMPRESSED = (".css", ".js", ".md", ".svg")
+
+displays = APIRouter(include_in_schema=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Installation:
+    """Files of an installed package `openmct` by path: plain, and compressed with gzip where this is smaller."""
+
+    version: str
+    plain: Mapping[str, bytes]
+    compressed: Mapping[str, bytes]
+
+
+@displays.get("/mct", name="page mct")
+@displays.head("/mct", name="page mct head")
+def displays_page(request: Request) -> Response:
+    """The displays; without Open MCT a page that says how to install it. Without a session: the sign-in dialog."""
+    found = installation(request.app.state.openmct)
+    if found is None:
+        return page_response(rendered(DISPLAYS))
+    try:
+        caller_of(request, None)
+    except NotAuthorised:
+        return RedirectResponse("/?next=/mct", status_code=303)
+    return page_response(rendered(DISPLAYS, "displays", openmct=found.version), DISPLAY_POLICY)
+
+
+@displays.get("/mct/{version}/{path:path}")
+def displays_file(request: Request, version: str, path: str) -> Response:
+    """A file of Open MCT; addresses contain the version, so browsers keep files for good."""
+    found = installation(request.app.state.openmct)
+    body = None if found is None or found.version != version else found.plain.get(path)
+    if found is None or body is None:
+        raise NotFound("file", f"{version[:20]}/{path[:80]}")
+    headers = {
+        "Cache-Control": "public, max-age=31536000, immutable",
+        "Content-Security-Policy": DISPLAY_POLICY,
+        "Vary": "Accept-Encoding",
+    }
+    if path in found.compressed and "gzip" in request.headers.get("accept-encoding", ""):
+        body = found.compressed[path]
+        headers["Content-Encoding"] = "gzip"
+    return Response(body, media_type=MEDIA[Path(path).suffix], headers=headers)
+
+
+@cache
+def installation(folder: Path) -> Installation | None:
+    """Return the files of the package in a folder, read once; None if it is not installed there."""
+    try:
+        version = json.loads((folder / "package.json").read_bytes())["version"]
+        licence = (folder / "LICENSE.md").read_bytes()
+        script = (folder / "dist" / "openmct.js").is_file()
+    except (OSError, ValueError, KeyError):
+        return None
+    if not script:
+        return None
+    plain = {"LICENSE.md": licence} | {
+        file.relative_to(folder / "dist").as_posix(): file.read_bytes()
+        for file in sorted((folder / "dist").rglob("*"))
+        if file.suffix in MEDIA and file.is_file()
+    }
+    packed = {
+        path: gzip.compress(body, 6, mtime=0) for path, body in plain.items() if path.endswith(_COMPRESSED)
+    }
+    smaller = {path: body for path, body in packed.items() if len(body) < len(plain[path])}
+    return Installation(str(version), plain, smaller)
