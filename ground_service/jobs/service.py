@@ -15,7 +15,7 @@ from typing import Annotated, Any
 from fastapi import Depends, Request
 from sqlalchemy import Connection, and_, delete, or_, select
 
-from ground_service import tracing
+from ground_service import logs
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput, StateConflict
 from ground_service.events import JobChanged, publish
@@ -259,7 +259,7 @@ def add_job(
     if kind not in KINDS:
         raise InvalidInput("job", "kind", " or ".join(KINDS), kind)
     identity = job_id or uuid.uuid4().hex
-    if insert_job(connection, identity, kind, arguments, utc_now_ns(), tracing.current()):
+    if insert_job(connection, identity, kind, arguments, utc_now_ns(), logs.current()):
         publish(connection, JobChanged(id=identity, kind=kind, state="queued"))
     else:
         known = get_job(connection, identity)

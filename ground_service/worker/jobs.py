@@ -28,10 +28,10 @@ from ground_service.ingest.service import apply_definition, derive_without, run_
 from ground_service.jobs import service
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import FINISHED, enter_job
+from ground_service.logs import span
 from ground_service.passes.archive_import import import_zip
 from ground_service.planning.standing import plan_tick
 from ground_service.regression.jobs import analysis_job, regression_job, rendering_job, replay_job
-from ground_service.tracing import span
 from ground_service.worker.actions import run_steps, send_messages
 from ground_service.worker.upkeep import nightly
 from kernels.memory import give_back

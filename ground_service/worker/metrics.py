@@ -26,7 +26,7 @@ from ground_service.ground import Ground
 from ground_service.http.common import GroundOf
 from ground_service.http.requests import operations
 from ground_service.jobs.service import KINDS
-from ground_service.tracing import span
+from ground_service.logs import span
 from ground_service.worker.condition import ServiceStatus, read_condition, service_status
 
 BUCKETS = (0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 30.0)
