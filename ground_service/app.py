@@ -47,8 +47,7 @@ from ground_service.worker.condition import present
 from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.jobs import enter_redecoding
-from ground_service.worker.metrics import Metrics, Watch
-from ground_service.worker.routes import operations
+from ground_service.worker.metrics import Metrics, Watch, operations
 from ground_service.worker.scheduler import Scheduler
 from kernels.memory import limit_heaps
 
