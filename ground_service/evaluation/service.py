@@ -19,7 +19,7 @@ from ground_service.errors import storage_error
 from ground_service.evaluation import store
 from ground_service.evaluation.core import PassInputs, evaluate_pass, summary_of
 from ground_service.evaluation.extras import sun_angles, surface_map
-from ground_service.evaluation.inputs import load_pass_inputs
+from ground_service.evaluation.inputs import align_pass, load_pass_inputs
 from ground_service.evaluation.model import (
     PassFigures,
     ReportOverview,
@@ -28,7 +28,6 @@ from ground_service.evaluation.model import (
     changed_figures,
 )
 from ground_service.evaluation.navigation.alignment import reference_states
-from ground_service.evaluation.preparation import align_pass
 from ground_service.events import PassEvaluated, publish
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime

@@ -15,9 +15,9 @@ from typing import Any
 from sqlalchemy import Connection
 
 from ground_service.errors import EvaluationError, GroundError, NotFound, fault_of, public_text
+from ground_service.evaluation.inputs import align_pass
 from ground_service.evaluation.landmarks.service import update_landmarks
 from ground_service.evaluation.performance.service import due_report_of_vehicle
-from ground_service.evaluation.preparation import align_pass
 from ground_service.evaluation.service import make_report, reevaluate
 from ground_service.evaluation.store import get_report, newest_report
 from ground_service.events import (
