@@ -98,7 +98,7 @@ def dangling_references(connection: Connection) -> Iterator[tuple[str, Any, str]
                 yield table.name, " ".join(map(str, key)), parent.name
 
 
-def files(connection: Connection) -> list[tuple[str, int]]:
+def stored_files(connection: Connection) -> list[tuple[str, int]]:
     """Return hash and octets of the files of the archive."""
     table = models.FILES
     rows = connection.execute(select(table.c.sha256, table.c.octets).order_by(table.c.sha256))
@@ -333,7 +333,7 @@ def _check_audit(connection: Connection, heads: Sequence[audit.Head], found: _Fi
 def _check_files(connection: Connection, files: FileArchive, found: _Findings) -> set[str]:
     """Check every file against its row; return the hashes of undamaged files."""
     good, known = set(), set()
-    for sha256, octets in files(connection):
+    for sha256, octets in stored_files(connection):
         known.add(sha256)
         found.count("octets of files", octets)
         size = files.octets(sha256)
