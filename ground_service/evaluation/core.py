@@ -9,29 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.evaluation.detection.fixes import (
-    IdentificationSamples,
-    MappedCraters,
-    join_pairs,
-    payload_map,
-)
-from ground_service.evaluation.detection.recall import (
-    ExpectedCraters,
-    Matches,
-    Viewing,
-    expected_craters,
-    match_detections,
-    score_detections,
-)
-from ground_service.evaluation.extras import (
-    FILTER,
-    snapshot_series,
-    sun_angles,
-    with_sun,
-    with_terrain,
-    with_wrong_fixes,
-)
-from ground_service.evaluation.navigation.alignment import (
+from ground_service.evaluation.alignment import (
     ReferenceStates,
     angle_from_meridian_deg,
     drift_by_length,
@@ -47,7 +25,29 @@ from ground_service.evaluation.navigation.alignment import (
     reference_states,
     squared_normalised_errors,
 )
-from ground_service.evaluation.navigation.smoother import (
+from ground_service.evaluation.extras import (
+    FILTER,
+    snapshot_series,
+    sun_angles,
+    with_sun,
+    with_terrain,
+    with_wrong_fixes,
+)
+from ground_service.evaluation.fixes import (
+    IdentificationSamples,
+    MappedCraters,
+    join_pairs,
+    payload_map,
+)
+from ground_service.evaluation.recall import (
+    ExpectedCraters,
+    Matches,
+    Viewing,
+    expected_craters,
+    match_detections,
+    score_detections,
+)
+from ground_service.evaluation.smoother import (
     BASELINE_DEGREE,
     SMOOTHED,
     CommandedBurn,

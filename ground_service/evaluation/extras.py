@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.errors import InvalidInput
-from ground_service.evaluation.detection.fixes import Pairs, snapshot_positions, wrong_fixes
-from ground_service.evaluation.detection.recall import Viewing
-from ground_service.evaluation.navigation.alignment import (
+from ground_service.evaluation.alignment import (
     ReferenceStates,
     error_of_places_rtn_m,
     navigation_statistics,
 )
+from ground_service.evaluation.fixes import Pairs, snapshot_positions, wrong_fixes
+from ground_service.evaluation.recall import Viewing
 from ground_service.passes.samples import NavigationSamples
 from lunar.arrays import FloatArray
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf

@@ -14,12 +14,12 @@ from sqlalchemy import Connection
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import EvaluationError, GroundError, InvalidInput
+from ground_service.evaluation.alignment import ReferenceStates, reference_states
 from ground_service.evaluation.core import PassInputs
-from ground_service.evaluation.detection.fixes import IdentificationSamples, MappedCraters, mapped_craters
-from ground_service.evaluation.detection.recall import Viewing
+from ground_service.evaluation.fixes import IdentificationSamples, MappedCraters, mapped_craters
 from ground_service.evaluation.model import changed_figures
-from ground_service.evaluation.navigation.alignment import ReferenceStates, reference_states
-from ground_service.evaluation.navigation.smoother import (
+from ground_service.evaluation.recall import Viewing
+from ground_service.evaluation.smoother import (
     ONBOARD,
     SIZE,
     CommandedBurn,

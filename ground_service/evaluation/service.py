@@ -17,6 +17,7 @@ import numpy as np
 from ground_service.clock import utc_now_ns
 from ground_service.errors import storage_error
 from ground_service.evaluation import store
+from ground_service.evaluation.alignment import reference_states
 from ground_service.evaluation.core import PassInputs, evaluate_pass, summary_of
 from ground_service.evaluation.extras import sun_angles, surface_map
 from ground_service.evaluation.inputs import align_pass, load_pass_inputs
@@ -27,7 +28,6 @@ from ground_service.evaluation.model import (
     StoredReport,
     changed_figures,
 )
-from ground_service.evaluation.navigation.alignment import reference_states
 from ground_service.events import PassEvaluated, publish
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime

@@ -20,9 +20,9 @@ import numpy as np
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import EvaluationError, storage_error
+from ground_service.evaluation.alignment import format_tum
 from ground_service.evaluation.core import PassInputs, evaluate_pass
 from ground_service.evaluation.inputs import load_pass_inputs
-from ground_service.evaluation.navigation.alignment import format_tum
 from ground_service.exports import messages
 from ground_service.exports.maps import MAPS, map_octets
 from ground_service.exports.model import FORMATS, ExportFormatInfo, ExportRequest, Format

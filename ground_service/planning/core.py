@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ground_service.contacts.links.core import PredictedContact, predict_contacts
-from ground_service.evaluation.detection.recall import expected_craters
+from ground_service.evaluation.recall import expected_craters
 from ground_service.planning.filling import Option
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera

@@ -29,7 +29,7 @@ from ground_service.ground import Ground
 from ground_service.http.model import UtcTime
 from ground_service.regression import model, store
 from ground_service.regression.runner import RunRequest, run_confined
-from ground_service.regression.sandbox.host import SandboxRefused, tail
+from ground_service.regression.sandbox import SandboxRefused, tail
 from ground_service.store.files import make_durable_folder, register_file, replace_durably
 from ground_service.toml import parse_table, read_table, require_line
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ground_service.evaluation.alignment import reference_states
 from ground_service.evaluation.core import gallery_frame
-from ground_service.evaluation.detection.recall import expected_craters, match_detections
 from ground_service.evaluation.inputs import read_image
-from ground_service.evaluation.navigation.alignment import reference_states
+from ground_service.evaluation.recall import expected_craters, match_detections
 from ground_service.evaluation.service import plain
 from ground_service.ground import Ground
 from ground_service.missions.model import weakest_evidence

@@ -143,7 +143,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _sandbox(arguments: argparse.Namespace) -> int:
     from ground_service.regression.runner import alive
-    from ground_service.regression.sandbox.host import SandboxRefused, protection
+    from ground_service.regression.sandbox import SandboxRefused, protection
     from ground_service.settings import load_settings
 
     exchange = load_settings().runner_exchange

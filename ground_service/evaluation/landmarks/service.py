@@ -17,8 +17,8 @@ from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.contacts.commanding.store import sent_parts
 from ground_service.errors import EvaluationError, InvalidInput, NotFound
+from ground_service.evaluation.alignment import reference_states
 from ground_service.evaluation.core import PassInputs
-from ground_service.evaluation.detection.recall import expected_craters, match_detections
 from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.landmarks.core import (
     Frames,
@@ -39,7 +39,7 @@ from ground_service.evaluation.landmarks.model import (
     PassSightings,
     Sighting,
 )
-from ground_service.evaluation.navigation.alignment import reference_states
+from ground_service.evaluation.recall import expected_craters, match_detections
 from ground_service.events import LandmarkChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf, UtcTime

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from ground_service.evaluation.detection.fixes import (
+from ground_service.evaluation.fixes import (
     FIRST_LANDMARK_ID,
     IdentificationSamples,
     MappedCraters,

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ground_service.errors import EvaluationError, InvalidInput
-from ground_service.evaluation.detection.recall import Viewing
 from ground_service.evaluation.inputs import load_pass_inputs, orientation_of
+from ground_service.evaluation.recall import Viewing
 from ground_service.evaluation.service import evaluate
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file

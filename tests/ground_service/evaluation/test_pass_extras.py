@@ -18,11 +18,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from ground_service.errors import InvalidInput
-from ground_service.evaluation.core import WORST_FRAMES, _choose_frames, attitude_remarks
-from ground_service.evaluation.detection.fixes import Pairs, snapshot_positions, wrong_fixes
-from ground_service.evaluation.detection.recall import ExpectedCraters, Matches, Viewing, expected_craters
-from ground_service.evaluation.extras import dark_limit, surface_map, with_terrain
-from ground_service.evaluation.navigation.alignment import (
+from ground_service.evaluation.alignment import (
     bounds,
     bounds_per_degree,
     drift_by_length,
@@ -34,6 +30,10 @@ from ground_service.evaluation.navigation.alignment import (
     nees,
     squared_normalised_errors,
 )
+from ground_service.evaluation.core import WORST_FRAMES, _choose_frames, attitude_remarks
+from ground_service.evaluation.extras import dark_limit, surface_map, with_terrain
+from ground_service.evaluation.fixes import Pairs, snapshot_positions, wrong_fixes
+from ground_service.evaluation.recall import ExpectedCraters, Matches, Viewing, expected_craters
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import find_data
 from lunar.frames import quaternion_from_matrix

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ground_service.errors import EvaluationError
-from ground_service.evaluation.navigation.smoother import (
+from ground_service.evaluation.smoother import (
     ONBOARD,
     CommandedBurn,
     FilterStates,

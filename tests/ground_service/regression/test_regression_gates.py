@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service.evaluation.detection.recall import ExpectedCraters
+from ground_service.evaluation.recall import ExpectedCraters
 from ground_service.regression.gates.calibration import calibrations, gate_noise, pass_noise
 from ground_service.regression.gates.core import (
     COSTS,

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from ground_service.errors import EvaluationError, InvalidInput, NotFound, StateConflict
-from ground_service.evaluation.detection.recall import expected_craters, match_detections
 from ground_service.evaluation.landmarks.core import (
     Frames,
     Place,
@@ -32,6 +31,7 @@ from ground_service.evaluation.landmarks.service import (
     update_landmarks,
     upload_entries,
 )
+from ground_service.evaluation.recall import expected_craters, match_detections
 from ground_service.ground import Ground, open_ground
 from ground_service.missions.catalogues import add_catalogue
 from ground_service.passes.archive_import import import_archive

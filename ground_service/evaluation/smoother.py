@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.errors import EvaluationError
-from ground_service.evaluation.navigation.alignment import (
+from ground_service.evaluation.alignment import (
     ReferenceStates,
     drift_by_length,
     error_of_positions_rtn_m,
