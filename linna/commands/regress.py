@@ -200,8 +200,8 @@ def _placebo(arguments: argparse.Namespace) -> int:
 
 
 def _suite(arguments: argparse.Namespace) -> int:
+    from ground_service.regression.gates.core import detectable, power_text
     from ground_service.regression.gates.policy import load_policy
-    from ground_service.regression.gates.power import detectable, power_text
     from linna.data import data_folder
     from payload_emulator.session.archive.suite import suite_scenarios, write_suite
 

@@ -18,11 +18,12 @@ from ground_service.regression.gates.core import (
     FEWEST_TRACKS,
     PASS_SPREAD,
     Gate,
+    detectable,
     judge,
+    power_text,
     verdict_of,
 )
 from ground_service.regression.gates.policy import load_policy, read_policy
-from ground_service.regression.gates.power import detectable, power_text
 from ground_service.regression.gates.samples import (
     KINDS,
     VISIT_GAP_FRAMES,
