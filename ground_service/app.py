@@ -47,7 +47,7 @@ from ground_service.worker.condition import present
 from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.jobs import enter_redecoding
-from ground_service.worker.metrics import Metrics, Watch, operations
+from ground_service.worker.metrics import Metrics, Watch, probes
 from ground_service.worker.scheduler import Scheduler
 from kernels.memory import limit_heaps
 
@@ -191,7 +191,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         lifespan=lifespan,
     )
     _set_state(app, settings)
-    routers = (*(one.load() for one in OPERATIONS), operations, pages, sign_in, displays, documentation)
+    routers = (*(one.load() for one in OPERATIONS), probes, pages, sign_in, displays, documentation)
     for one in (*routers, live, payload_console):
         app.include_router(one)
     app.state.operations = [route for one in routers for route in one.routes if isinstance(route, Route)]

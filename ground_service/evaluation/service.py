@@ -28,11 +28,11 @@ from ground_service.evaluation.model import (
     StoredReport,
     changed_figures,
 )
-from ground_service.events import PassEvaluated, publish
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime
 from ground_service.passes.core import downsample
 from ground_service.passes.store import get_pass
+from ground_service.store.event_kinds import PassEvaluated, publish
 from ground_service.store.files import FileArchive, make_durable_folder, register_file, replace_durably
 from lunar.arrays import FloatArray
 from lunar.timescales import format_utc

@@ -18,11 +18,11 @@ from sqlalchemy import Connection, and_, delete, or_, select
 from ground_service import logs
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput, StateConflict
-from ground_service.events import JobChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf
 from ground_service.jobs.model import Job, JobFilter
 from ground_service.store import repository
+from ground_service.store.event_kinds import JobChanged, publish
 from ground_service.store.states import JOB, change_if, move, move_all
 from ground_service.store.vehicles import hold
 

@@ -22,7 +22,6 @@ from sqlalchemy import Connection
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound, storage_error
-from ground_service.events import ArchiveImported, publish_once
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_stored
 from ground_service.missions import store as missions
@@ -35,6 +34,7 @@ from ground_service.missions.timekeeping.recorrelation import enter_receptions, 
 from ground_service.passes import sample_store, store
 from ground_service.passes.model import Image
 from ground_service.passes.span import PassSpan, pass_span, vehicle_span
+from ground_service.store.event_kinds import ArchiveImported, publish_once
 from ground_service.store.files import UNPACKING, StoredFile, register_file, unfinished_prefix
 from ground_service.store.vehicles import ARCHIVE_ACTOR, SPACECRAFT_ID_MAX, find_vehicle, hold, vehicle_id
 from ground_service.toml import read_json, require_line

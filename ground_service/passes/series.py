@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, Engine
 
-from ground_service.events import CorrelationChanged, TelemetryReceived
 from ground_service.ground import Ground
 from ground_service.missions.timekeeping.core import IDEAL_CLOCK, utc_ns_of_ticks
 from ground_service.passes.core import (
@@ -28,6 +27,7 @@ from ground_service.passes.core import (
 from ground_service.passes.span import LAST_TICKS, PassSpan
 from ground_service.passes.store import decoding_state
 from ground_service.store import rollups, telemetry
+from ground_service.store.event_kinds import CorrelationChanged, TelemetryReceived
 from ground_service.store.events import LoggedEvent, newest_event, read_events
 from ground_service.store.rollups import HOUSEKEEPING_VALUES as PARAMETERS
 from ground_service.store.rollups import STATE_VALUES

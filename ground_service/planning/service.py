@@ -16,7 +16,6 @@ from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.contacts.commanding import service as commanding
 from ground_service.contacts.commanding import store as commands
 from ground_service.errors import Conflict, InvalidInput, NotFound, PlanConflict, PlanConflicts, StateConflict
-from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.model import Paging, UtcTime
 from ground_service.missions import store as missions
@@ -61,6 +60,7 @@ from ground_service.planning.preparation import (
     prepare_window,
 )
 from ground_service.planning.window_states import PlannedSpan, span_conflicts
+from ground_service.store.event_kinds import WindowChanged, publish
 from ground_service.store.vehicles import lock_spacecraft, vehicle_id
 from ground_service.toml import REASON_LIMIT, require_line
 from lunar.catalogue import CraterCatalogue

@@ -21,7 +21,6 @@ from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.contacts.commanding import store as commands
 from ground_service.contacts.links import service as links
 from ground_service.errors import PASSING, GroundError, InvalidInput, NotFound, PlanConflicts, StateConflict
-from ground_service.events import PlanChanged, RequestChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime
 from ground_service.missions.ephemerides import service
@@ -45,6 +44,7 @@ from ground_service.planning.preparation import gap_ns
 from ground_service.planning.progress import note_reason
 from ground_service.planning.store import RequestRecord
 from ground_service.planning.window_states import COMMITTED
+from ground_service.store.event_kinds import PlanChanged, RequestChanged, publish
 from ground_service.store.vehicles import get_vehicle, lock_spacecraft, vehicle_id
 from lunar.errors import EphemerisCoverageError, LunarError
 

@@ -21,7 +21,6 @@ from typing import Any
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, InvalidInput, Stopping
 from ground_service.evaluation.service import plain
-from ground_service.events import RegressionJudged, publish
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime
 from ground_service.regression import store
@@ -69,6 +68,7 @@ from ground_service.regression.replay_samples import (
     read_downlink,
 )
 from ground_service.regression.runner import PERFORMANCE
+from ground_service.store.event_kinds import RegressionJudged, publish
 from ground_service.store.files import register_file
 from lunar.errors import LunarError
 from reports.text import counted

@@ -28,7 +28,13 @@ from ground_service.access.service import LOCAL_CALLER, Caller, authenticate
 from ground_service.access.store import has_users, owner_of
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, NotAuthorised, NotFound
-from ground_service.events import (
+from ground_service.ground import Ground
+from ground_service.http.common import API_PREFIX
+from ground_service.http.model import time_text
+from ground_service.http.problems import problem
+from ground_service.http.requests import query_is_known
+from ground_service.passes.live import newest_packets
+from ground_service.store.event_kinds import (
     CommandStateChanged,
     LinkChanged,
     PlanChanged,
@@ -38,12 +44,6 @@ from ground_service.events import (
     last_number,
     read_events,
 )
-from ground_service.ground import Ground
-from ground_service.http.common import API_PREFIX
-from ground_service.http.model import time_text
-from ground_service.http.problems import problem
-from ground_service.http.requests import query_is_known
-from ground_service.passes.live import newest_packets
 from ground_service.store.events import LoggedEvent
 from ground_service.store.vehicles import all_vehicles
 from ground_service.store.wakeups import listen

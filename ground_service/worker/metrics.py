@@ -199,16 +199,16 @@ def get_status(request: Request, ground: GroundOf, _: Viewer) -> ServiceStatus:
     return service_status(ground, request.app.state.backups, request.app.state.broker)
 
 
-operations = APIRouter(include_in_schema=False)
+probes = APIRouter(include_in_schema=False)
 
 
-@operations.get("/healthz")
+@probes.get("/healthz")
 async def healthz() -> Health:
     """Report that the process is alive."""
     return Health(status="ok")
 
 
-@operations.get("/readyz")
+@probes.get("/readyz")
 def readyz(request: Request, ground: GroundOf) -> Health:
     """Report that the service can be used: its database and archive can be read and written, and it is not draining."""
     if request.app.state.draining:
@@ -219,7 +219,7 @@ def readyz(request: Request, ground: GroundOf) -> Health:
     return Health(status="ok")
 
 
-@operations.get("/metrics")
+@probes.get("/metrics")
 def metrics(request: Request, ground: GroundOf) -> Response:
     """Figures for Prometheus."""
     answer: Response = request.app.state.metrics.answer(ground)

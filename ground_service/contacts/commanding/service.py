@@ -30,10 +30,10 @@ from ground_service.contacts.commanding.model import (
     onboard_time,
 )
 from ground_service.errors import Conflict, InvalidInput
-from ground_service.events import CommandsSent, CommandStateChanged, HandoverChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf
 from ground_service.missions.store import approval_in_force, in_force
+from ground_service.store.event_kinds import CommandsSent, CommandStateChanged, HandoverChanged, publish
 from ground_service.store.vehicles import (
     FLOWN,
     find_vehicle,

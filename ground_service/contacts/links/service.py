@@ -23,7 +23,6 @@ from ground_service.contacts.links.core import NS, PredictedContact
 from ground_service.contacts.links.model import Contacts, LinkContact, LinkState, LinkStatus
 from ground_service.contacts.links.store import ContactRow, LinkRow, TransmissionRow
 from ground_service.errors import Conflict, InvalidInput, NotFound
-from ground_service.events import ContactEnded, ContactMissed, ContactStarted, LinkChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime
 from ground_service.missions import store as missions
@@ -32,6 +31,7 @@ from ground_service.missions.ephemerides.service import open_ephemeris
 from ground_service.missions.model import Link as LinkSection
 from ground_service.missions.model import StationConnection
 from ground_service.missions.places import outages_of, station_of
+from ground_service.store.event_kinds import ContactEnded, ContactMissed, ContactStarted, LinkChanged, publish
 from ground_service.store.vehicles import get_vehicle, vehicle_id
 from lunar.errors import LunarError
 

@@ -40,7 +40,6 @@ from ground_service.evaluation.landmarks.model import (
     Sighting,
 )
 from ground_service.evaluation.recall import expected_craters, match_detections
-from ground_service.events import LandmarkChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf, UtcTime
 from ground_service.missions.catalogues import listed_craters
@@ -51,6 +50,7 @@ from ground_service.passes.sample_store import sample_arrays
 from ground_service.passes.samples import DetectionSamples
 from ground_service.passes.span import pass_span
 from ground_service.store import repository
+from ground_service.store.event_kinds import LandmarkChanged, publish
 from ground_service.store.files import files_beginning
 from ground_service.store.states import LANDMARK, change_if, move
 from ground_service.store.vehicles import get_vehicle, lock_spacecraft

@@ -15,12 +15,12 @@ from sqlalchemy import Connection, select, update
 from ground_service.access.service import LOCAL_CALLER, Caller, audit
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Forbidden, InvalidInput
-from ground_service.events import EphemerisAdded, publish
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf, Paging
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.store import mission_in_force, missions_in_force
 from ground_service.store import repository
+from ground_service.store.event_kinds import EphemerisAdded, publish
 from ground_service.store.files import StoredFile, register_file
 from ground_service.store.vehicles import hold
 from lunar import ephemeris

@@ -20,13 +20,6 @@ from sqlalchemy import Connection
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput
-from ground_service.events import (
-    ClockDoubted,
-    CorrelationChanged,
-    ReceptionsEntered,
-    publish,
-    publish_once,
-)
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime, time_of
 from ground_service.missions.ephemerides.model import Ephemeris
@@ -43,6 +36,13 @@ from ground_service.missions.timekeeping.core import (
     utc_ns_of_ticks,
 )
 from ground_service.missions.timekeeping.model import RECEPTIONS_LIMIT, Correlation, TimeReport
+from ground_service.store.event_kinds import (
+    ClockDoubted,
+    CorrelationChanged,
+    ReceptionsEntered,
+    publish,
+    publish_once,
+)
 from ground_service.store.vehicles import find_vehicle, get_vehicle, lock_vehicle, vehicle_id
 from lunar.arrays import BoolArray, IntArray
 from lunar.constants import SPEED_OF_LIGHT_M_S

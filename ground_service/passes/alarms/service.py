@@ -18,7 +18,6 @@ from sqlalchemy.engine import RowMapping
 from ground_service.access.service import audit
 from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.errors import Conflict, InvalidInput, NotFound
-from ground_service.events import AlarmChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf, UtcTime
 from ground_service.missions.store import mission_in_force
@@ -34,6 +33,7 @@ from ground_service.passes.alarms.model import (
     AlarmFilter,
 )
 from ground_service.store import models, parameters, states, telemetry
+from ground_service.store.event_kinds import AlarmChanged, publish
 from ground_service.store.repository import VEHICLES, Row, add_new, page
 from ground_service.store.states import StateMachine
 from ground_service.store.vehicles import FLOWN, lock_vehicle, vehicle_id

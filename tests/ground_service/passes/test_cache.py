@@ -6,11 +6,11 @@ from collections.abc import Callable, Hashable
 import pytest
 from sqlalchemy import delete
 
-from ground_service.events import CorrelationChanged, LinkChanged, TelemetryReceived, publish
-from ground_service.events import Event as Published
 from ground_service.ground import Ground
 from ground_service.passes import series
 from ground_service.passes.series import Cache
+from ground_service.store.event_kinds import CorrelationChanged, LinkChanged, TelemetryReceived, publish
+from ground_service.store.event_kinds import Event as Published
 from ground_service.store.models import EVENT_LOG
 from ground_service.store.vehicles import change_vehicle, vehicle_id
 

@@ -10,7 +10,6 @@ import pytest
 from ground_service.contacts.commanding.model import TelecommandFilter
 from ground_service.contacts.commanding.service import get_command, list_telecommands
 from ground_service.errors import InvalidInput, NotFound, PlanConflicts
-from ground_service.events import read_events
 from ground_service.ground import Ground, open_ground
 from ground_service.missions.service import add_mission
 from ground_service.planning import service as planning
@@ -25,6 +24,7 @@ from ground_service.planning.model import (
 )
 from ground_service.planning.progress import advance_windows
 from ground_service.planning.store import get_plan, get_request, get_window, list_windows
+from ground_service.store.event_kinds import read_events
 from ground_service.worker.follow_up import follow_in_process
 from tests.ground_service.conftest import START, Clock, add_reference, save_circle
 from tests.scenarios import SELENITA

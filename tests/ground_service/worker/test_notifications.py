@@ -21,7 +21,14 @@ import pytest
 
 from ground_service.access.store import audit_head
 from ground_service.errors import InvalidInput
-from ground_service.events import (
+from ground_service.ground import Ground, open_ground
+from ground_service.jobs.model import Job, JobFilter
+from ground_service.jobs.service import get_job, list_jobs
+from ground_service.missions.automation import Channel
+from ground_service.missions.service import add_mission
+from ground_service.settings import load_settings
+from ground_service.store.audit import Head
+from ground_service.store.event_kinds import (
     AlarmChanged,
     Event,
     LimitsBroken,
@@ -30,13 +37,6 @@ from ground_service.events import (
     WindowChanged,
     publish,
 )
-from ground_service.ground import Ground, open_ground
-from ground_service.jobs.model import Job, JobFilter
-from ground_service.jobs.service import get_job, list_jobs
-from ground_service.missions.automation import Channel
-from ground_service.missions.service import add_mission
-from ground_service.settings import load_settings
-from ground_service.store.audit import Head
 from ground_service.store.models import METADATA
 from ground_service.worker import actions
 from ground_service.worker import notifications as outgoing

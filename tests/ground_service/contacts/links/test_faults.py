@@ -24,11 +24,11 @@ from ground_service.contacts.links.runner import (
 )
 from ground_service.contacts.links.supervisor import LinkSupervisor
 from ground_service.errors import DatabaseBusy, Stopping, StorageFull
-from ground_service.events import read_events
 from ground_service.ground import Ground
 from ground_service.ingest.live import SETTLED_S, Spool, WatchedFolder
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.store import repository
+from ground_service.store.event_kinds import read_events
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.messages.oem import save_oem
 from tests.ground_service.conftest import START, Clock, circular_states

@@ -24,13 +24,13 @@ from ground_service.evaluation.performance.service import (
 )
 from ground_service.evaluation.service import make_report
 from ground_service.evaluation.store import add_report
-from ground_service.events import WindowChanged, publish, read_events
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime
 from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
 from ground_service.store import repository
+from ground_service.store.event_kinds import WindowChanged, publish, read_events
 from ground_service.store.files import register_file
 from ground_service.store.vehicles import FLOWN, vehicle_id
 from ground_service.worker import upkeep
