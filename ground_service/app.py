@@ -1,4 +1,4 @@
-"""The application: `create_app` joins the service, its dispatcher and the routes."""
+"""The application and its server: `create_app` joins the service, its dispatcher and the routes; `serve` runs it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is stored about a pass, read into the plain arrays that the evaluation takes."""
+"""Stored data of a pass, prepared and read into the plain arrays that the evaluation takes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Places and outages of the ground stations of a mission description."""
+"""Clocks, places and outages of the ground stations of a mission description."""
 
 from __future__ import annotations
 
