@@ -29,6 +29,7 @@ from payload_emulator.session.spacecraft.loop import new_spacecraft
 from payload_emulator.session.spacecraft.schedule import fly_scenario, timeline
 from payload_emulator.session.world.world import World, build_world, registered_share
 from payload_emulator.sim.terrain.curation import Region
+from reports.statistics import sigma_remark
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
@@ -249,6 +250,7 @@ def summary(sessions: Sequence[SurveySession]) -> dict[str, Any]:
         "coast_end_p95_m": float(np.percentile(coasts, 95.0)) if coasts else None,
         "nees_mean": float(nees.mean()),
         "bounds": [float(low), float(high)],
+        "nees_remark": sigma_remark(float(nees.mean()) / 6.0, float(low) / 6.0, float(high) / 6.0),
         "nees_trend": float(np.polyfit(order, nees, 1)[0]) if np.ptp(order) > 0 else None,
         "nees_above_12_6_share": float((nees > 12.6).mean()),
         "bias_rtn_m": bias.tolist(),
@@ -295,7 +297,7 @@ def format_survey(figures: dict[str, Any]) -> str:
             + ("" if coast is None else f"; end of coast 95 % {coast:.0f} m"),
             f"mean NEES(6) {figures['nees_mean']:.2f}, bounds {least:.2f} to {most:.2f} for {len(figures['windows'])} "
             f"windows; within 2 sigma {', '.join(f'{axis.upper()} {share:.2f}' for axis, share in inside.items())}; "
-            f"NIS {nis}",
+            f"NIS {nis}" + (f"; {wrong}" if (wrong := figures["nees_remark"]) else ""),
             f"fixed {100 * figures['fixed_share']:.1f} %; wrong pairs {100 * figures['wrong_pairs_share']:.2f} %, "
             f"wrong fixes {figures['wrong_fixes']}; crater list {stated}",
             f"{100 * figures['catalogued_share']:.0f} % of the detections are catalogued craters; detected of the "

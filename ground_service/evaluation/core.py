@@ -61,6 +61,7 @@ from ground_service.evaluation.verdict import (
     Evaluated,
     Limits,
     StartOrbit,
+    consistency_remarks,
     requirements,
     verdict_of,
     without_mission,
@@ -231,6 +232,7 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
         inputs.clock_step_s,
     )
     table = requirements(inputs.limits, evaluated)
+    remarks += consistency_remarks(table)
     if inputs.no_mission:
         table = without_mission(table, inputs.no_mission)
     verdict, level = verdict_of(table)
