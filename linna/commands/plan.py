@@ -40,6 +40,7 @@ def _search(
     sunlit: bool = False,
     minimum_duration_s: float | None = None,
     maximum_duration_s: float | None = None,
+    first_coast_m: float | None = None,
     minimum_battery: float | None = None,
     needs_contact: bool = False,
     cadence_s: float | None = None,
