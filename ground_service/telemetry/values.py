@@ -1,4 +1,4 @@
-"""SQL of packets that mission descriptions define: definitions, progress of decoding, and values."""
+"""Values of parameters of declared packets: stored, read, and forgotten with their definition."""
 
 from __future__ import annotations
 
