@@ -238,6 +238,7 @@ COMMANDS: Commands = {
             "altitude_km": Option(metavar=RANGE),
             "sun_elevation_deg": Option(metavar=RANGE),
             "latitude_deg": Option(metavar=RANGE),
+            "first_coast_m": "1 sigma along the track that the coast after a first window may end with",
             "craters_per_frame": Option("minimum number of catalogued craters in a frame", "N"),
             "sunlit": "require that the spacecraft is in full sunlight",
             "minimum_battery": Option(metavar="SHARE"),
