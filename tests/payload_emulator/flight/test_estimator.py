@@ -64,7 +64,7 @@ def test_what_was_learned_of_a_catalogue_is_kept_until_another_one_is_loaded() -
         return float(state.offset.sigma_m)
 
     setup, state = estimator.start(tables, parameters, None)
-    assert state.offset == OffsetSize(60.0, 0.5)
+    assert state.offset == OffsetSize(60.0, 1.0)
     learned = setup, replace(state, offset=OffsetSize(22.0, 3.0, 80))
     assert size_m(learned, catalogue=replace(catalogue)) == 22.0
     assert size_m(learned, catalogue=replace(catalogue, latitude_rad=catalogue.latitude_rad + 1e-9)) == 60.0

@@ -20,7 +20,7 @@ class OffsetRule:
     ----------
     prior_m, prior_information
         Size at the start, wide enough for the worst map that was considered (60 m over 10 degrees), and its information
-        in x: 0.5 is a factor of 2 in the size at 1 sigma.
+        in x: 1 is a factor of 1.6 in the size at 1 sigma. A window of 37 frames gives a tenth of that to 1.
     fixes
         Fixes of one step: from fewer nothing is learned.
     smallest_m, largest_m
@@ -32,7 +32,7 @@ class OffsetRule:
     """
 
     prior_m: float = 60.0
-    prior_information: float = 0.5
+    prior_information: float = 1.0
     fixes: int = 40
     smallest_m: float = 15.0
     largest_m: float = 100.0
