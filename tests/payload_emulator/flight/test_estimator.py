@@ -64,6 +64,7 @@ def test_what_was_learned_of_a_catalogue_is_kept_until_another_one_is_loaded() -
     def size_m(before: Any, **changed: Any) -> float:
         setup, state = estimator.start(tables | changed, parameters, before)
         assert setup.initial.covariance[14, 14] == state.offset.sigma_m**2
+        assert setup.parameters.errors.catalogue_correlation_rad == OffsetRule().correlation_rad
         return float(state.offset.sigma_m)
 
     setup, state = estimator.start(tables, parameters, None)
