@@ -50,7 +50,7 @@ FULLY_LIT = 0.95
 
 @dataclasses.dataclass(frozen=True)
 class Region:
-    """Where random poses are drawn: latitudes and longitudes in degrees; the place of the timed frames."""
+    """Region of random poses: latitudes and longitudes in degrees; the place of the timed frames."""
 
     latitude_deg: tuple[float, float]
     longitude_deg: tuple[float, float]

@@ -216,7 +216,7 @@ def _struct_loop_variable(octets: bytes) -> list[Any]:
 
 
 def _compare(fixed: bytes, variable: bytes, ours_fixed: Any, ours_variable: Any, packets: int) -> bool:
-    """Whether all decoders read the same values."""
+    """Return whether all decoders read the same values."""
     columns = ours_fixed["fixed"].columns
     theirs = _ccsdspy_fixed(fixed)
     same = all(np.array_equal(columns[f.name], theirs[f.name]) for f in FIXED.fields)

@@ -1,4 +1,4 @@
-"""When an orbit is in shadow, over the night side, hidden from the Earth, and in contact with ground stations."""
+"""Spans of shadow, night side, occultation and contacts of an orbit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where an orbiter was over the Moon."""
+"""Ground track of an orbiter over the Moon."""
 
 from __future__ import annotations
 

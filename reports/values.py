@@ -1,4 +1,4 @@
-"""What a report is made of: frozen values of plain arrays, numbers and text.
+"""Values of a report: frozen values of plain arrays, numbers and text.
 
 Conventions: times are ``utc_ns`` (int64, POSIX nanoseconds), angles are degrees, lengths metres, image
 coordinates pixels with pixel centres at integers, speeds metres per second. Vectors in R/T/N are radial,
@@ -84,7 +84,7 @@ class ErrorBudget:
 
 @dataclass(frozen=True, slots=True)
 class FrameAccounting:
-    """Where the frames of a pass went; None where a count is not known."""
+    """Accounting of the frames of a pass; None if a count is unknown."""
 
     expected: int | None = None
     acquired: int | None = None
@@ -559,7 +559,7 @@ class ScoreGroup:
 
 @dataclass(frozen=True, slots=True)
 class SigmaBin:
-    """How centre errors compare with the sigma predicted for them: rms of error over sigma, shares inside."""
+    """Centre errors compared with their predicted sigma: rms of error over sigma, shares inside."""
 
     label: str
     pairs: int

@@ -190,7 +190,7 @@ class NavigationRun:
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """Whether errors and claims of some runs agree; imaging frames after the settling time.
+    """Consistency of errors and claims of some runs; imaging frames after the settling time.
 
     Attributes
     ----------
@@ -304,7 +304,7 @@ def anees_bounds(runs: int) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether the claims of a filter hold over independent runs, and where they do not."""
+    """Verdict on the claims of a filter over independent runs."""
 
     consistent: bool
     anees_bounds: tuple[float, float]

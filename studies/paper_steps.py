@@ -84,7 +84,7 @@ QUICK = Effort(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Workshop:
-    """Where the steps work and with what.
+    """Working folder and inputs of the steps.
 
     `model` is a class-only network made elsewhere; None: it is trained, if torch is installed.
     """

@@ -1,4 +1,4 @@
-"""What can be wrong with octets, or with values that shall become octets.
+"""Errors of octets, and of values that are packed into octets.
 
 TmtcError
 ├── TruncatedPacket       fewer octets than the header or the definition asks for

@@ -275,7 +275,7 @@ def ask_for_reports(session: Session, packets: int, reports: int, ledger: Ledger
 
 
 def ends_of(session: Session, jobs: Sequence[str]) -> tuple[Counter[str], int]:
-    """How the jobs ended, and how often they were begun."""
+    """Count the final states of the jobs and their starts."""
     states: Counter[str] = Counter()
     attempts = 0
     for job in jobs:
@@ -306,7 +306,7 @@ def totals(runs: Sequence[Mapping[str, Any]]) -> Figures:
 
 
 def holds(figures: Mapping[str, Any]) -> bool:
-    """Whether nothing was lost or doubled and every job and ingest came to a good end."""
+    """Return whether nothing was lost or doubled and every job and ingest came to a good end."""
     return (
         figures["archives_identical"] == figures["runs"]
         and figures["lost"] == figures["doubled"] == 0

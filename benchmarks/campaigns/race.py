@@ -95,7 +95,7 @@ class Answer:
 
     @property
     def won(self) -> bool:
-        """Whether the request took effect."""
+        """Return whether the request took effect."""
         return 200 <= self.status < 300
 
     def json(self) -> Any:

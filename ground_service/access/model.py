@@ -45,7 +45,7 @@ class User(Entity):
 
 
 class ProviderIdentity(Entity):
-    """Who signed in with an OpenID provider."""
+    """Identity of a user who signed in with an OpenID provider."""
 
     issuer: str
     subject: str = Field(max_length=255)

@@ -1,4 +1,4 @@
-"""What is stored about a pass, read into the plain arrays that the evaluation takes."""
+"""Stored data of a pass, read into the plain arrays of the evaluation."""
 
 from __future__ import annotations
 
@@ -244,7 +244,7 @@ def filter_states(connection: Connection, span: PassSpan) -> FilterStates | None
 
 
 def identification_samples(connection: Connection, span: PassSpan) -> IdentificationSamples | None:
-    """Which crater each used detection was taken for, in time order; None where nothing came down about it."""
+    """Return the identified crater of each used detection, in time order; None without telemetry about it."""
     rows = sample_store.samples(connection, span, "identifications", ("ticks", "items"))
     if not rows["ticks"]:
         return None
@@ -266,7 +266,7 @@ def landmark_reports(connection: Connection, span: PassSpan) -> MappedCraters:
 
 
 def outcome_samples(connection: Connection, span: PassSpan) -> tuple[OutcomeSamples, ...]:
-    """What every estimator made of every frame, in time order."""
+    """Return the outcome of every estimator by frame, in time order."""
     names = (
         "ticks", "estimator", "frame_number", "outcome", "reset_trigger", "candidate_pairs", "anchor_reads",
     )  # fmt: skip

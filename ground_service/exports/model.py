@@ -33,7 +33,7 @@ class Format:
 
     @property
     def several_files(self) -> bool:
-        """Whether an export has several files."""
+        """Return whether an export has several files."""
         return self.ending == "zip"
 
 

@@ -60,7 +60,7 @@ class UnsupportedEncoding(GroundError):
 
 
 class PreconditionFailed(GroundError):
-    """What is stored is no longer what the caller saw."""
+    """Stored object that differs from the one that the caller read."""
 
 
 STATUSES: tuple[tuple[type[Exception], int, str], ...] = (

@@ -92,7 +92,7 @@ class FrameBlock:
 
     @property
     def good(self) -> BoolArray:
-        """Which frames (n,) can be used."""
+        """Return which frames (n,) can be used."""
         good: BoolArray = self.found.valid & (self.found.header.version == 0)
         return good
 
@@ -549,7 +549,7 @@ class PacketReader:
 
     @property
     def _is_start(self) -> bool:
-        """Whether a packet begins where the section begins."""
+        """Return whether a packet begins where the section begins."""
         return self.section.position + self.section.start == 0
 
     def _batch(self, octets: OctetArray, cut: PacketCut, at: int) -> PacketBatch:

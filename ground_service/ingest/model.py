@@ -126,7 +126,7 @@ class IngestResult(Entity):
 
 
 class Withdrawal(Given):
-    """Why an ingest is withdrawn."""
+    """Reason for the withdrawal of an ingest."""
 
     reason: str = Field(min_length=1, max_length=500, pattern=LINE_PATTERN_JSON, examples=["another flight"])
 

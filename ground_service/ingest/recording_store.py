@@ -56,7 +56,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Neighbours:
-    """What earlier pieces of a recording have around a piece: octets before and behind it, in order, without a gap.
+    """Octets of earlier pieces directly before and behind a piece of a recording.
 
     `new`: ranges [start, stop) of the piece, as positions in the recording, that no earlier piece has; all of it if the
     piece itself was entered before. Pieces with other statements of their sender and those that failed do not count.

@@ -61,7 +61,7 @@ _IN_RANGE = select(_PACKETS.c.digest).where(
 
 
 class Batch(Protocol):
-    """What is stored: see `ground_service.ingest.packets.PacketBatch`."""
+    """Batch to store: see `ground_service.ingest.packets.PacketBatch`."""
 
     @property
     def apid(self) -> IntArray: ...
@@ -98,7 +98,7 @@ RETURNING id, digest
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """What storing a batch changed."""
+    """Changes by the storage of a batch."""
 
     new: int
     repeated: int

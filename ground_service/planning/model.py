@@ -206,7 +206,7 @@ class SearchResult(Entity):
 
 
 class WindowConflict(Entity):
-    """What stands in the way of a planned window."""
+    """Conflict of a planned window."""
 
     window_id: int
     reasons: list[str]
@@ -350,7 +350,7 @@ class StartedOrbit(Entity):
 
 
 class WindowUploads(Entity):
-    """What the telecommands of a window load on board, as the manifest of a pass states it."""
+    """Tables that the telecommands of a window load on board, as in the manifest of a pass."""
 
     start_state: UploadedState | None = None
     burns: list[UploadedBurn] | None = None
@@ -399,7 +399,7 @@ class Region(Given):
 
 
 class RequestTerms(Given):
-    """What is requested; a constraint that is not stated does not apply."""
+    """Terms of a request; a constraint that is not stated does not apply."""
 
     windows: int = Field(ge=1, le=1000, description="Windows in each period", examples=[10])
     period_days: Finite = Field(default=7.0, ge=0.1, le=366.0)

@@ -689,7 +689,7 @@ def _prediction(
     mission: Mission,
     commitments: Sequence[Option],
 ) -> Candidate | None:
-    """What the window would be like, where a reference ephemeris covers it."""
+    """Predict the window if a reference ephemeris covers it."""
     candidates = (
         [service.get_ephemeris(connection, entry.ephemeris_id)]
         if entry.ephemeris_id is not None
@@ -829,7 +829,7 @@ def _check_entry(entry: WindowEntry) -> None:
 
 @functools.lru_cache(maxsize=2)
 def _mare(data: DataFolder) -> Any:
-    """Whether the ground is mare: darker than the value that best parts the albedo map in two (Otsu 1979)."""
+    """Return whether the ground is mare: darker than the value that best parts the albedo map in two (Otsu 1979)."""
     if data.albedo is None:
         return None
     from PIL import Image

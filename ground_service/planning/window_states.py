@@ -1,4 +1,4 @@
-"""Where a planned window has come, from what people decided and what telemetry says; and what stands in its way.
+"""State of a planned window, from decisions and telemetry, and its conflicts.
 
 draft → approved → uplinked → executing → executed → downlinked → processed, or failed; a window whose telecommands were
 sent is cancelled by others that delete them on board: it is cancelling until their verification, then failed
@@ -28,7 +28,7 @@ REPLACED = "it failed, and another window has its time"
 
 @dataclass(frozen=True, slots=True)
 class WindowFacts:
-    """What is known about a window.
+    """Known facts about a window.
 
     Attributes
     ----------

@@ -102,7 +102,7 @@ class PassArchive:
 
     @property
     def has_inputs(self) -> bool:
-        """Whether the archive contains the inputs of the payload."""
+        """Return whether the archive contains the inputs of the payload."""
         return INPUTS in self.manifest["files"]
 
 
@@ -485,7 +485,7 @@ def _shown(record: ArchiveRecord) -> KeptArchive:
 
 
 def frame_inputs(folder: Path, *, steps: bool = False) -> list[dict[str, Any]]:
-    """What the payload was given with each frame, a row per frame; steps without one only with `steps`."""
+    """Return the inputs of the payload, a row per frame; steps without one only with `steps`."""
     path = folder / INPUTS
     rows = []
     try:

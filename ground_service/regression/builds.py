@@ -171,7 +171,7 @@ class Build:
 
     @property
     def folder_needed(self) -> bool:
-        """Whether the build has its own files; the flight code of this installation has none."""
+        """Return whether the build has its own files; the flight code of this installation has none."""
         return str(self.file) != CURRENT
 
     def stage(self, folder: Path) -> None:

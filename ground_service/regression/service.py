@@ -221,7 +221,7 @@ def _replayed(ground: Ground, digest: str, build: Build) -> tuple[KeptReplay, st
 
 
 def find_replay(ground: Ground, digest: str, build: Build) -> KeptReplay | None:
-    """What was kept of a replay; None where it was not done, or something of it is lost."""
+    """Return the stored replay; None if it was not done, or a part of it is lost."""
     replay = ground.read(store.find_replay, digest, build.digest)
     if replay is None:
         return None
@@ -231,7 +231,7 @@ def find_replay(ground: Ground, digest: str, build: Build) -> KeptReplay | None:
 
 
 def is_done(replay: KeptReplay | None) -> bool:
-    """Whether a replay need not be done again: what failed once may have failed for want of time or space."""
+    """Return whether a replay need not be done again: what failed once may have failed for want of time or space."""
     return replay is not None and replay.outcome == OK
 
 
@@ -403,7 +403,7 @@ def _read(ground: Ground, context: PassContext, replay: KeptReplay) -> ReadDownl
 
 
 def _other_camera(build: Build, archive: PassArchive) -> str:
-    """Why a build made for one camera cannot fly this archive; empty where it can."""
+    """Return why a build made for one camera cannot fly this archive; empty where it can."""
     given: Mapping[str, Any] = archive.manifest.get("camera") or {}
     for key, value in build.camera:
         if key in given and abs(float(given[key]) - value) > 1e-6:
@@ -420,7 +420,7 @@ def _unique_names(passes: Sequence[PassVerdict]) -> list[str]:
 
 
 def _machine() -> str:
-    """What a latency was measured on."""
+    """Return the machine on which a latency was measured."""
     return f"{platform.node()}, {platform.machine()}"
 
 

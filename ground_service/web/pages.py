@@ -294,7 +294,7 @@ def _environment() -> Environment:
 
 @cache
 def _dictionary() -> dict[str, Any]:
-    """What pages need to know of the dictionary: telecommands to enter, parameters to look at."""
+    """Return the parts of the dictionary for pages: telecommands to enter, parameters to look at."""
     second = Approval().needs_second_person
     return {
         "version": DICTIONARY.version,
@@ -426,7 +426,7 @@ def policy(page: bytes) -> str:
 
 
 FOLDER = Path(__file__).parents[2] / "deploy" / "openmct" / "node_modules" / "openmct"
-"""Where `make openmct` installs the npm package `openmct`."""
+"""Folder in which `make openmct` installs the npm package `openmct`."""
 
 DISPLAY_POLICY = (
     "default-src 'none'; script-src 'self' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "

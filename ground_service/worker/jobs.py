@@ -197,7 +197,7 @@ def _progress_of(ground: Ground, job_id: str) -> Callable[[float], None]:
 
 @contextmanager
 def _alone_here(job_id: str) -> Iterator[bool]:
-    """Whether no other thread of this process does the job."""
+    """Return whether no other thread of this process does the job."""
     with _doing_lock:
         alone = job_id not in _doing
         _doing.add(job_id)

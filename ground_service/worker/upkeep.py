@@ -54,7 +54,7 @@ def plan_job_id(utc_ns: int) -> str:
 
 
 def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> dict[str, Any]:
-    """What was taken away, and trends and due reports of every spacecraft.
+    """Remove expired rows; compute trends and due reports of every spacecraft.
 
     The removal is first, so that a failure of the rest does not make the archive grow. Without a nightly job of the day
     before, nothing is removed: a clock that has jumped ahead would make everything old.

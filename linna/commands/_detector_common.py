@@ -1,4 +1,4 @@
-"""What the verbs of `linna detector` share: the model option and torch."""
+"""Common parts of the verbs of `linna detector`: the model option and torch."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def as_json(entity: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """What a person sees of an argument: help, name of its value, and another name of the option."""
+    """Presentation of an argument: help, name of its value, and another name of the option."""
 
     help: str = ""
     metavar: str | tuple[str, str] | None = None

@@ -202,7 +202,7 @@ class Payload:
 
     @property
     def has_cadence(self) -> bool:
-        """Whether the observation was commanded with an interval of frames; else every image is looked at."""
+        """Return whether the observation was commanded with an interval of frames; else every image is looked at."""
         return self._machine.observation.cadence_ticks > 0
 
     def will_look(self, ticks: int, telecommand_octets: bytes) -> bool:
@@ -485,7 +485,7 @@ class Payload:
     # Downlink
 
     def _downlink(self) -> list[bytes]:
-        """What TM/TC takes of the store; a time report at the commanded interval of frames."""
+        """Return the packets that are sent from the store; a time report at the commanded interval of frames."""
         machine = self._machine
         takes = machine.board.downlink_octets()
         sends_all = machine.mode in (PayloadMode.observing, PayloadMode.downlinking)

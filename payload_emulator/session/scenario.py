@@ -41,7 +41,7 @@ SHIPPED = Path(__file__).resolve().parents[2] / "scenarios"
 
 @dataclass(frozen=True, slots=True)
 class OrbitSection:
-    """Where the spacecraft is at the epoch: osculating Keplerian elements, a Cartesian state, or an OEM file.
+    """State of the spacecraft at the epoch: osculating Keplerian elements, a Cartesian state, or an OEM file.
 
     `position_km` and `velocity_km_s` (three numbers each, axes of `frame`) replace the elements. An OEM file gives the
     whole trajectory.
@@ -92,7 +92,7 @@ class ManeuverSection:
 
 @dataclass(frozen=True, slots=True)
 class WindowSection:
-    """When the payload observes.
+    """Observation windows of the payload.
 
     `search`: "terrain" takes the first window of the wanted direction that lies entirely over the available terrain,
     no earlier than `start` (the orbit's epoch when empty), between the two longitudes (east-positive; the second may
@@ -233,7 +233,7 @@ class AttitudeSection:
 
 @dataclass(frozen=True, slots=True)
 class DisturbancesSection:
-    """What happens on the way; times in seconds after the first frame, nothing happens where a size is zero.
+    """Disturbances of the flight; times in seconds after the first frame, nothing happens where a size is zero.
 
     - kidnap: the spacecraft is found elsewhere, turned about the Moon's centre by a distance on the ground; `told`: the
       payload is told by telecommand that its estimate is worth no more than that distance;
@@ -262,7 +262,7 @@ class ClockSection:
 
 @dataclass(frozen=True, slots=True)
 class FaultsSection:
-    """What breaks: a line each, `KIND at SECONDS [for SECONDS] [size NUMBER]`; the kinds are in `sim.faults`."""
+    """Faults: a line each, `KIND at SECONDS [for SECONDS] [size NUMBER]`; the kinds are in `sim.faults`."""
 
     events: tuple[str, ...] = ()
 
@@ -354,7 +354,7 @@ class Scenario:
 
     @property
     def has_flat_ground(self) -> bool:
-        """Whether the ground is the sphere: no image is rendered, and no estimator needs heights."""
+        """Return whether the ground is the sphere: no image is rendered, and no estimator needs heights."""
         return self.camera.images == "reduced" and "anchored" not in self.navigation.estimators
 
     @property

@@ -35,7 +35,7 @@ class Photo:
 
 @dataclass(frozen=True, slots=True)
 class Canvas:
-    """What a drawing function draws on: a (sub)figure of ``width_in`` by ``height_in`` design inches.
+    """Canvas of a drawing function: a (sub)figure of ``width_in`` by ``height_in`` design inches.
 
     Where ``photos`` is a list, images are collected there in the order of drawing and only a place is kept in the
     drawing.

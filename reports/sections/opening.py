@@ -1,4 +1,4 @@
-"""What every report begins and ends with: verdict, figures, provenance, data, configuration."""
+"""Opening and closing sections of every report: verdict, figures, provenance, data, configuration."""
 
 from __future__ import annotations
 

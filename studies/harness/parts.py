@@ -108,7 +108,7 @@ class Part:
 
     @property
     def has_ended(self) -> bool:
-        """Whether it was started and has ended by itself."""
+        """Return whether it was started and has ended by itself."""
         return not self._ended and self._process is not None and self._process.poll() is not None
 
     def revive(self) -> None:

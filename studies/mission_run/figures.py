@@ -24,7 +24,7 @@ FLOWN = ("executing", "executed", "downlinked", "processed")
 
 @dataclass(slots=True)
 class Progress:
-    """What the runner has seen; kept in the folder of the run and in its checkpoints.
+    """Progress of a run; kept in the folder of the run and in its checkpoints.
 
     Attributes
     ----------

@@ -33,7 +33,7 @@ class CommandEntry(Given):
 
 
 class Rejection(Given):
-    """Why a telecommand is not to be sent."""
+    """Reason for the rejection of a telecommand."""
 
     reason: str = Field(min_length=1, max_length=500, pattern=LINE_PATTERN_JSON, examples=["wrong cadence"])
 
@@ -141,7 +141,7 @@ class CommandView:
 
     @property
     def remark(self) -> str:
-        """Why the telecommand failed, was rejected or timed out."""
+        """Reason why the telecommand failed, was rejected or timed out."""
         if self.fate is None:
             return self.record.reason or ""
         stages = [STAGES.get(report.subtype, str(report.subtype)) for report in self.fate.reports]
@@ -184,7 +184,7 @@ class CommandView:
 
 
 class Handover(Entity):
-    """What a shift hands over to the next one about a spacecraft: a note, and the hold of its telecommands."""
+    """Handover of a spacecraft to the next shift: a note, and the hold of its telecommands."""
 
     spacecraft_id: int = Field(examples=[76])
     instance: str = Field(examples=["flight"])

@@ -68,7 +68,7 @@ class Connector:
 
     @property
     def connected(self) -> bool:
-        """Whether the connection is open."""
+        """Return whether the connection is open."""
         return self._socket is not None
 
     def connect(self) -> bool:
@@ -248,7 +248,7 @@ class LinkRunner:
 
     @property
     def waits_for_others(self) -> bool:
-        """Whether telecommands wait for earlier ones of another link."""
+        """Return whether telecommands wait for earlier ones of another link."""
         return self._waits_s is not None
 
     @property
@@ -258,7 +258,7 @@ class LinkRunner:
 
     @property
     def alive(self) -> bool:
-        """Whether the link is operated: started, not stopped, and owned."""
+        """Return whether the link is operated: started, not stopped, and owned."""
         return bool(self._threads) and all(one.is_alive() for one in self._threads)
 
     def start(self) -> None:

@@ -64,7 +64,7 @@ class DeclaredLink:
 
 @dataclass(frozen=True, slots=True)
 class SendDue:
-    """Whether a transmission was requested, the number of the request, and whether transmissions are pending."""
+    """Requested transmission, the number of the request, and whether transmissions are pending."""
 
     requested: bool
     request: int

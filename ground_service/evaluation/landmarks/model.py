@@ -80,7 +80,7 @@ class LandmarkDetail(Landmark):
 
 
 class LandmarkDecision(Given):
-    """Why a landmark is accepted or rejected."""
+    """Reason for accepting or rejecting a landmark."""
 
     reason: str = Field(
         default="", max_length=500, pattern=LINE_PATTERN_JSON, examples=["crater in all images"]
@@ -88,7 +88,7 @@ class LandmarkDecision(Given):
 
 
 class LandmarkUpdate(Entity):
-    """What a pass has contributed to the landmarks."""
+    """Contribution of a pass to the landmarks."""
 
     pass_id: int
     detections: int

@@ -204,7 +204,7 @@ class Gate:
 
     @property
     def passed(self) -> bool:
-        """Whether the gate passed."""
+        """Return whether the gate passed."""
         return self.outcome == PASS
 
 

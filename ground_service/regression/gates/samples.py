@@ -1,4 +1,4 @@
-"""What one build did with one archived pass, frame by frame: the numbers that gates are made of."""
+"""Results of one build on one archived pass, frame by frame: the inputs of the gates."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class CraterRows:
 
     @property
     def hit(self) -> BoolArray:
-        """Whether the build detected it (m,)."""
+        """Return whether the build detected it (m,)."""
         return np.isfinite(self.du_px)
 
 

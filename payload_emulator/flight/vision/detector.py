@@ -71,7 +71,7 @@ GEOMETRY_NAME = "geometry"
 
 @dataclass(frozen=True, slots=True)
 class DetectorParameters:
-    """What may be changed on board without a new network.
+    """Parameters of the detector that may change on board without a new network.
 
     score_threshold : None takes the threshold that the network's own metadata carry (fixed on its validation set).
     max_detections : the detections packet counts in one octet; 120 exceeds the craters of any frame seen.

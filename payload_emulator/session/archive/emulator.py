@@ -307,7 +307,7 @@ def _summary(
 
 
 def _manifest(world: World, loaded: LoadedPayload, folder: Path) -> dict[str, Any]:
-    """What the ground needs to know of a pass, with the hash of every file of the archive but itself."""
+    """Return the manifest of a pass, with the hash of every file of the archive but itself."""
     scenario, camera = world.scenario, world.scenario.camera
     return {
         "schema_version": 1,

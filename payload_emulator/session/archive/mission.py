@@ -208,7 +208,7 @@ def _track_utc_ns(world: World) -> IntArray:
 
 
 def _registration(world: World) -> dict[str, float | int]:
-    """Where the catalogue is registered to the terrain, and its shift near the frames."""
+    """Return the registered share of the catalogue and its shift near the frames."""
     registration = world.terrain.registration
     share = registered_share(world.terrain, world.truth, world.frame_utc_ns)
     if registration is None or not share:

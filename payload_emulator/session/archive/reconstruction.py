@@ -70,7 +70,7 @@ _UNKNOWN_SENSORS = np.full(4, np.nan)
 
 @dataclass(frozen=True, slots=True)
 class ImageReport:
-    """What telemetry states of one image."""
+    """Telemetry about one image."""
 
     ticks: int
     values: Mapping[str, int]

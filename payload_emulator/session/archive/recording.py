@@ -1,4 +1,4 @@
-"""What a payload was given during a pass, kept so that another build can be given the same.
+"""Recorded inputs of a payload during a pass, from which another build can be replayed.
 
 In a pass archive this is the folder `payload/`: `inputs.jsonl` (one line per step: on-board time, message of the ADCS,
 telecommands, hash of the image, what the board said), `parameters.toml`, `tables/*.bin` as uploaded, and
@@ -46,7 +46,7 @@ Image = NDArray[Any]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepInput:
-    """What one call of `Payload.step` was given, the image by its hash.
+    """Inputs of one call of `Payload.step`, the image by its hash.
 
     Attributes
     ----------

@@ -75,7 +75,7 @@ class FlightBuild:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay:
-    """What a replay gave: packets, counts of the payload, and CPU milliseconds of stages by frame."""
+    """Results of a replay: packets, counts of the payload, and CPU milliseconds of stages by frame."""
 
     packets: list[bytes]
     summary: dict[str, Any]

@@ -81,7 +81,7 @@ class FlownErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedSession:
-    """What the anchored estimator did in a session, judged by the truth; a row per frame of the session.
+    """Errors of the anchored estimator in a session against the truth; a row per frame of the session.
 
     Attributes
     ----------
@@ -419,7 +419,7 @@ def frames_to_recover(error_m: FloatArray) -> int | None:
 
 
 def _recovery(world: World, errors: FlownErrors, imaging: BoolArray) -> dict[str, Any] | None:
-    """How many frames with an image it took to be back after a kidnap or an outage; None without either."""
+    """Return the number of frames with an image to recovery after a kidnap or an outage; None without either."""
     section = world.scenario.disturbances
     if section.kidnap_distance_km > 0.0:
         event = "kidnap told" if section.kidnap_told else "silent kidnap"

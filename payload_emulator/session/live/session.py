@@ -94,7 +94,7 @@ _EXACT = (
 
 @dataclass(slots=True)
 class Account:
-    """What a session has done since its start.
+    """Counts of a session since its start.
 
     Attributes
     ----------
@@ -410,7 +410,7 @@ class LiveSession:
 
     @property
     def _is_behind(self) -> bool:
-        """Whether the ground has fallen so far behind that time must not go on."""
+        """Return whether the ground has fallen so far behind that time must not go on."""
         return any(one.waiting > KEPT_LIMIT_OCTETS // 16 for one in self.stations.values())
 
     def _hold(self, selector: selectors.BaseSelector) -> None:

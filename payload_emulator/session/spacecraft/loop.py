@@ -85,7 +85,7 @@ class Turn:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Given:
-    """What the payload was given in a step: at its door, and by its board.
+    """Inputs of the payload in a step: by its interface, and by its board.
 
     Attributes
     ----------
@@ -221,7 +221,7 @@ class Spacecraft:
         sunlit: float = 1.0,
         downlink_octets: int = UNLIMITED,
     ) -> list[bytes]:
-        """What goes down after a step; None for an image: nobody looks now. Faults change what comes in."""
+        """Return the downlink of a step; image None: no image is taken. Faults change the inputs."""
         board = self.board
         if self._last_utc_ns is not None:
             board.advance((utc_ns - self._last_utc_ns) / _NS, sunlit)
@@ -269,7 +269,7 @@ class Spacecraft:
 
     @property
     def clock_error_ticks(self) -> int:
-        """How far clock jumps have set the on-board clock ahead of the clock of the scenario."""
+        """Return the offset of the on-board clock by clock jumps from the clock of the scenario."""
         return self._clock_error_ticks
 
     def _boot(self) -> Payload:
@@ -309,7 +309,7 @@ class Spacecraft:
         return image, attitude
 
     def _strike(self, fault: Fault) -> None:
-        """What happens once, when a fault begins."""
+        """Apply the effect of a fault at its beginning."""
         board, bits = self.board, int(fault.size)
         if fault.kind in _REGIONS:
             region = _REGIONS[fault.kind]

@@ -75,7 +75,7 @@ def arcs(world: World) -> list[tuple[int, int]]:
 
 @dataclass(slots=True, eq=False)
 class Operator:
-    """What the ground sends: the observation windows for the schedule, modes around contacts, requests for playback.
+    """Telecommands of the ground: windows for the schedule, modes around contacts, requests for playback.
 
     What arrives at a moment was sent a light time before, by somebody who had seen telemetry of two light times before.
     """
@@ -104,7 +104,7 @@ class Operator:
         return self.command("perform_function", function_id=name, argument_1=first, argument_2=second)
 
     def orders(self, moment: Moment, mode: PayloadMode) -> bytes:
-        """What arrives at a moment; `mode` is the payload's since the moment before."""
+        """Return the telecommands that arrive in a step; `mode` is the payload's since the step before."""
         mode = self._mode_seen(moment, mode)
         first = not self._started
         self._started = True

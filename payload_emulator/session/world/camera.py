@@ -61,7 +61,7 @@ class Exposure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scene:
-    """What lies before the camera at one frame, and the draws that are still to come.
+    """Scene of the camera at one frame, and the random draws that remain.
 
     Attributes
     ----------

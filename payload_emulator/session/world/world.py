@@ -376,7 +376,7 @@ def _fly_to_windows(
 
 
 def _no_band(crossings: list[Crossing], window: WindowSection) -> str:
-    """Which latitudes lack terrain on the crossing that lacks the least of it."""
+    """Return the latitudes without terrain on the crossing that lacks the least of it."""
     band = f"latitudes {_degrees(window.latitude_band_deg)}"
     near = [one for one in crossings if one.in_reach and one.missing_rad.size]
     if not near:

@@ -44,7 +44,7 @@ STATIONS = {
 
 @dataclass(frozen=True, slots=True)
 class LinkSection:
-    """What the link does to the downlink, frame by frame, and when there is one.
+    """Errors of the link, frame by frame, and its contacts.
 
     Losses and bit errors have two states: a burst begins and ends with the given probabilities per frame. What is sent
     at once (a dump) comes again with probability `repeat_share`, and behind the next one with `reorder_share`.
@@ -183,7 +183,7 @@ class Transmitter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reception:
-    """What arrived.
+    """Received octets with their accounting.
 
     Attributes
     ----------
@@ -292,7 +292,7 @@ def station(name: str, minimum_elevation_deg: float = 10.0) -> GroundStation:
 
 
 def contacts(ephemeris: Ephemeris, utc_ns: IntArray, section: LinkSection) -> tuple[BoolArray, FloatArray]:
-    """Whether any station hears the spacecraft at emission epochs (n,), and the light time to there in s.
+    """Return whether any station hears the spacecraft at emission epochs (n,), and the light time to there in s.
 
     Without stations it is always heard, by the Earth's centre. Contacts begin and end on a grid of a minute.
     """
@@ -320,7 +320,7 @@ def light_to_earth_s(position_icrf_m: FloatArray, utc_ns: IntArray) -> FloatArra
 def _bursts(
     frames: int, section: LinkSection, bursting: bool, rng: np.random.Generator
 ) -> tuple[BoolArray, bool]:
-    """Whether each frame falls into a burst, and whether one goes on behind the last."""
+    """Return whether each frame falls into a burst, and whether one goes on behind the last."""
     states = np.zeros(frames, dtype=np.bool_)
     for k, draw in enumerate(rng.random(frames).tolist()):
         bursting = draw >= section.burst_end if bursting else draw < section.burst_start

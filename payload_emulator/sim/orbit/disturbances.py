@@ -1,4 +1,4 @@
-"""What happens to the true flight on the way: it is found elsewhere, it burns, its camera falls silent."""
+"""Disturbances of the true flight: displacement, burns, outage of the camera."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ Not larger: ground of cosine 0.01, which the Sun still sees whole, edges every b
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CyclesPicture:
-    """What Cycles made of a scene.
+    """Image of a scene by Cycles.
 
     Attributes
     ----------

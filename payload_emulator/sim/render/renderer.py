@@ -336,7 +336,7 @@ def _reach(rays: FloatArray, altitude_m: float, height_m: npt.ArrayLike) -> Floa
 
 
 def _border_hits(rays: FloatArray, view: View, patch: TerrainPatch) -> list[FloatArray]:
-    """Where the rays meet the ground, (n, 2) per round of a fixed-point search, the settled rounds only."""
+    """Return where the rays meet the ground, (n, 2) per round of a fixed-point search, the settled rounds only."""
     from payload_emulator.sim.terrain import kernels
 
     height = np.zeros(rays.shape[0])

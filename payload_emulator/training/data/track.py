@@ -103,7 +103,7 @@ def split_track(split: str, count: int, seed: int) -> tuple[str, ...]:
 
 
 def _can_look(source: Source, camera: PinholeCamera, terrain: Any, position: FloatArray) -> BoolArray:
-    """Whether the nadir footprint from each place (n, 3) is on the terrain and where the source may look."""
+    """Return whether the nadir footprint from each place (n, 3) is on the terrain and where the source may look."""
     rotation = nadir_camera_from_mcmf(position)
     ground = ground_point_sphere(camera, rotation[:, None], position[:, None], edge_pixels(camera))
     latitude, longitude, _ = spherical_from_mcmf(ground)

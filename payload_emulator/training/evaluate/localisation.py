@@ -20,7 +20,7 @@ FEWEST_PAIRS = 20
 
 
 def right(tallied: Tally, threshold: float) -> BoolArray:
-    """Which detections are right at a threshold."""
+    """Return which detections are right at a threshold."""
     chosen: BoolArray = (tallied.score >= threshold) & (tallied.outcome == 1)
     return chosen
 

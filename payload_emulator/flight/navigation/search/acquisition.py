@@ -1,4 +1,4 @@
-"""Where the camera is when the prediction is off by kilometres to tens of kilometres: votes over position and height.
+"""Search for the camera if the prediction is wrong by up to tens of kilometres: votes over position and height.
 
 Attitude is known to the ADCS's accuracy. A detection and a crater, taken as a pair, put the camera on the line of
 sight through the crater; at an assumed altitude that is one point. True pairs agree on the point, chance pairs

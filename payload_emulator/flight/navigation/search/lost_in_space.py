@@ -1,4 +1,4 @@
-"""Where the camera is when nothing is known of its place.
+"""Search for the pose of the camera without any prior position.
 
 The camera looks down with a known heading, both only as well as the ADCS holds them; altitude is known to lie in an
 interval, and the place anywhere over the map. Every pair of a detection and a crater puts the camera on one place for
