@@ -1,4 +1,4 @@
-"""The application: `create_app` joins the service, its dispatcher and the routes."""
+"""The application and its server: `create_app` joins the service, its dispatcher and the routes; `serve` runs it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from ground_service.http.model import Problem
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UPLOADS_AT_ONCE, UploadPool
 from ground_service.logs import logging_config
-from ground_service.missions.places import mission_clock
+from ground_service.missions.clocks import mission_clock
 from ground_service.settings import Settings, start_tracing
 from ground_service.store.wakeups import is_redis
 from ground_service.web.pages import FOLDER, displays, documentation, pages

@@ -1,4 +1,4 @@
-"""Logs of the service: one line an entry, as text or as JSON objects that a log store can read."""
+"""Logs and traces of the service: one line an entry, as text or as JSON objects that a log store can read."""
 
 from __future__ import annotations
 

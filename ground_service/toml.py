@@ -1,4 +1,4 @@
-"""TOML and JSON of others: each fault is one line with its place, what was expected and what was found."""
+"""TOML and JSON of external documents: each fault is one line with its place, what was expected and what was found."""
 
 from __future__ import annotations
 

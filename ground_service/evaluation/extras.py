@@ -1,4 +1,4 @@
-"""Additional contents of a pass report: Sun geometry, wrong fixes, and positions from single frames."""
+"""Additional contents of a pass report: Sun geometry, ground track, wrong fixes, and positions from single frames."""
 
 from __future__ import annotations
 

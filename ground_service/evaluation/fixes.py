@@ -1,4 +1,4 @@
-"""Ground evaluation of fixes from telemetered identifications: wrong fixes, and the snapshot baseline.
+"""Ground evaluation of fixes from telemetered identifications: wrong fixes, snapshot baseline, own landmarks.
 
 A fix is wrong when at least half of its identifications name a crater that, seen from the reference position, lies
 further from the detection than the detector's own tolerance. The snapshot baseline solves each frame for its position

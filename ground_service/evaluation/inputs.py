@@ -1,4 +1,4 @@
-"""Stored data of a pass, read into the plain arrays of the evaluation."""
+"""Stored data of a pass, prepared and read into the plain arrays of the evaluation."""
 
 from __future__ import annotations
 

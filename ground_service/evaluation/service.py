@@ -1,4 +1,4 @@
-"""Reports of passes: evaluated from the archive as it is now, rendered, and kept."""
+"""Evaluation of passes: conditions, report and overview of reports, rendered and kept."""
 
 from __future__ import annotations
 

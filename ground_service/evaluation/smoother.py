@@ -1,4 +1,4 @@
-"""Rauch-Tung-Striebel smoother of the states of the on-board filter.
+"""Rauch-Tung-Striebel smoother of the states of the on-board filter, and the baselines without images.
 
 The recursion runs backwards over the downlinked states and covariances of the filter. The ground uses its own dynamics:
 a gravity field with Earth and Sun, an empirical acceleration that decays exponentially (the last three elements of a

@@ -1,4 +1,4 @@
-"""Orbit, attitude and SPICE kernels of a pass."""
+"""Orbit, attitude, poses and SPICE kernels of a pass."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Entities of exports."""
+"""Entities and formats of exports."""
 
 from __future__ import annotations
 

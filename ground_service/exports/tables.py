@@ -1,4 +1,4 @@
-"""A pass as tables of samples: columns of one length with unit and description, times in UTC."""
+"""A pass as tables of samples and as table files: columns of one length with unit and description, times in UTC."""
 
 from __future__ import annotations
 

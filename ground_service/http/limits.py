@@ -1,4 +1,4 @@
-"""Guards around the application: size of bodies, secure headers, entity tags."""
+"""Guards around the application: origins, size of bodies, secure headers, entity tags."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Base classes of entities, pages of lists, and problem documents."""
+"""Base classes of entities, pages of lists, problem documents, and formats of times."""
 
 from __future__ import annotations
 

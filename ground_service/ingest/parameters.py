@@ -1,4 +1,4 @@
-"""Decoding of packets that the mission description defines, after they are stored, and again after a new revision.
+"""Decoding of packets that the mission description defines, after ingest and again after a new revision.
 
 Each block of packets is one transaction with the note of the last packet, so a decoding that is cut off continues
 where it was. A new definition decodes all packets from the first one on. Until it has reached the last one, the values

@@ -1,4 +1,4 @@
-"""Job queue: named work in the database, added by any capability and run by `worker`.
+"""Job queue: rows, use cases and dispatcher of named work, added by any capability and run by `worker`.
 
 A job is a row, so it is visible from the request on, whether it runs in this process, in a thread of the server or in a
 worker on another machine.

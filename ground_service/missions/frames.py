@@ -1,4 +1,4 @@
-"""Camera, lunar orientation and gravity fields declared by a mission description.
+"""Camera, lunar orientation, gravity fields and packets declared by a mission description.
 
 The local data folder decides only whether a declared model is available, never which model is used.
 """

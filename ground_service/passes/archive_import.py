@@ -1,4 +1,4 @@
-"""Import of a pass archive: manifest, reference ephemeris, catalogue, images and downlink become a pass."""
+"""Import of a pass archive (folder or ZIP): manifest, reference, catalogue, images and downlink become a pass."""
 
 from __future__ import annotations
 

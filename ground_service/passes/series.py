@@ -1,4 +1,4 @@
-"""Series read for plots: from samples where there are few, from roll-ups where there are many."""
+"""Series read for plots, with their cache: from samples where there are few, from roll-ups where there are many."""
 
 from __future__ import annotations
 

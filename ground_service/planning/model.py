@@ -1,4 +1,4 @@
-"""Entities of plans: constraints, candidates, windows, whole plans."""
+"""Entities of plans: constraints, candidates, windows, whole plans, standing requests."""
 
 from __future__ import annotations
 

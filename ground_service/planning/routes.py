@@ -1,4 +1,4 @@
-"""HTTP operations on planned windows."""
+"""HTTP operations on planned windows and standing requests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SQL of planned windows."""
+"""SQL of planned windows and standing requests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A verdict written down: JSON for scripts, JUnit XML for continuous integration, a page for people."""
+"""A verdict as documents: headline, JSON for scripts, JUnit XML for continuous integration, a page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables and generic queries, for store modules only.
+"""Tables, generic and bulk queries, for store modules only.
 
 Every function takes the connection of the caller's transaction. Rows are dictionaries of column values, which a store
 turns into the entities of its capability.

@@ -1,4 +1,4 @@
-"""SQL of stored packets and of the samples that the dictionary decodes from them."""
+"""SQL and codec of stored packets and of the samples that the dictionary decodes from them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SQL of vehicles: spacecraft in one instance, a domain of time and sequence counts each."""
+"""SQL of vehicles and their counters: spacecraft in one instance, a domain of time and sequence counts each."""
 
 from __future__ import annotations
 

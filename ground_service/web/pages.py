@@ -1,4 +1,4 @@
-"""Pages and their files. A page is a frame of HTML; its script fills it from the API with the caller's token.
+"""Pages, displays, help and their files. A page is a frame of HTML; its script fills it from the API.
 
 Nothing here needs a token: pages hold no data but the telemetry dictionary, which is no secret.
 """

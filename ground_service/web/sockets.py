@@ -1,4 +1,4 @@
-"""Open WebSockets: their callers and limits, periodic authorisation, and the event log.
+"""Open WebSockets and the live feed: callers and limits, periodic authorisation, and the event log.
 
 The event log is read once for all sockets of a process, as soon as events were committed: by this process, or by
 another one that sends a wake-up over Redis. Without Redis the events of other processes are found by polling. Newest

@@ -1,4 +1,4 @@
-"""Condition of a deployment: waiting work, disk, backups, time correlations, scheduler."""
+"""Condition of a deployment: processes, waiting work, disk, backups, time correlations, scheduler."""
 
 from __future__ import annotations
 

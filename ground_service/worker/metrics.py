@@ -1,4 +1,4 @@
-"""Figures for Prometheus: what was asked of the service, how long it took, and how its work stands."""
+"""Metrics, health and status operations: requests, their time, and the state of the work."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recurring work of a deployment, done by the one process that has the lease `scheduler`.
+"""Recurring work and watching of a deployment, done by the one process that has the lease `scheduler`.
 
 Every API process and every `linna scheduler` takes part. If the process with the lease is killed, another one continues
 after `LEASE_NS`. All work may be done twice without harm: a process that was stopped for longer than its lease, and the

@@ -1,4 +1,4 @@
-"""Use cases of landmarks: those of a pass, decisions of persons, images of the sightings."""
+"""Use cases and documents of landmarks: those of a pass, decisions of persons, images of the sightings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reference ephemerides: uploaded, versioned by content, chosen by precedence and coverage."""
+"""Reference ephemerides and attitudes: uploaded, versioned by content, chosen by precedence and coverage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Time correlations that keep themselves: from the time reports in the archive and the times of their reception.
+"""Automatic time correlation from archived time reports and the times of their reception.
 
 What is fitted depends on the time reports, receptions, boots and reference ephemerides that are there, not on the order
 in which they came. Fitting again without anything new changes nothing.

@@ -1,4 +1,4 @@
-"""Metrics of a build over passes: ratios of sums by unit of the evidence, and values of whole passes."""
+"""Metrics of a build over passes: ratios of sums by unit of the evidence, values of whole passes, and fault counts."""
 
 from __future__ import annotations
 
