@@ -114,7 +114,7 @@ def bench(packets: int = PACKETS) -> dict[str, Any]:
 
 
 def rows() -> Iterator[Row]:
-    """Yield rates of decoding beside the quickest rivals; different values are an error."""
+    """Yield rates of decoding compared with the fastest peers; different values are an error."""
     figures = bench()
     wrong = "" if figures["values_equal"] else "values of the decoders differ"
     for kind in ("fixed_62_octets", "variable_mean_267_octets"):

@@ -173,7 +173,7 @@ class Settings(BaseSettings):
     archive_days: int = Field(
         default=0,
         ge=0,
-        description="Days after their last use for which regression archives are kept; 0: for good",
+        description="Days after their last use for which regression archives are kept; 0: without limit",
     )
     archive_limit_mib: int = Field(
         default=0,

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lunar.arrays import FloatArray, IntArray
-from lunar.constants import GM_EARTH_M3_S2, GM_MOON_M3_S2
+from lunar.constants import GM_EARTH_M3_S2, GM_MOON_M3_S2, NS
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import EphemerisCoverageError, UnmovedByGravity
 from lunar.frames import rtn_from_inertial
 from lunar.third_bodies import earth_position_icrf_m
-from lunar.timescales import NS, format_utc, tdb_s_from_tai_ns
+from lunar.timescales import format_utc, tdb_s_from_tai_ns
 
 GRAVITY_TOLERANCE = 2.5e-3
 """Largest median deviation of states from the motion about a point mass, as a part of the fall: see `check_gravity`."""

@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
-from lunar.constants import EARTH_RADIUS_M, MOON_RADIUS_M, SPEED_OF_LIGHT_M_S, SUN_RADIUS_M
+from lunar.constants import EARTH_RADIUS_M, MOON_RADIUS_M, NS, SPEED_OF_LIGHT_M_S, SUN_RADIUS_M
 from lunar.ephemeris import Ephemeris
 from lunar.errors import LunarError
 from lunar.frames import Orientation, enu_from_mcmf, mcmf_from_spherical, spherical_from_mcmf
-from lunar.timescales import NS, TT_MINUS_TAI_NS, tai_ns_from_utc_ns, tdb_s_from_utc_ns
+from lunar.timescales import TT_MINUS_TAI_NS, tai_ns_from_utc_ns, tdb_s_from_utc_ns
 
 
 @dataclass(frozen=True, slots=True)

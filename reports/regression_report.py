@@ -82,14 +82,14 @@ def _changed(report: RegressionReport) -> list[Block]:
     craters = report.craters
     if craters is not None and len(craters.change):
         lost, gained = int((craters.change < 0).sum()), int((craters.change > 0).sum())
-        told = f"{lost} of {len(craters.change)} tracks of craters lost, {gained} gained"
+        counts = f"{lost} of {len(craters.change)} tracks of craters lost, {gained} gained"
         blocks.append(
             Picture(
                 "craters",
-                f"{told}. Vermillion: the candidate detects the crater in fewer frames; blue: in more; gray: in as "
+                f"{counts}. Vermillion: the candidate detects the crater in fewer frames; blue: in more; gray: in as "
                 f"many. Crosses: {len(craters.false_latitude_deg)} places where the candidate alone has a detection "
                 "without a crater.",
-                told,
+                counts,
                 3.6,
                 lambda c: draw_changed_craters(c, craters),
             )

@@ -320,7 +320,7 @@ def decode(
     form: PacketForm = CHECKED,
     plan: LinkPlan | None = None,
 ) -> DownlinkDecode:
-    """Everything that a downlink file holds: a stream of CADUs or of bare packets, told apart by their
+    """Everything that a downlink file holds: a stream of CADUs or of bare packets, distinguished by their
     content.
 
     Parameters

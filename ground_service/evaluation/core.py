@@ -68,7 +68,7 @@ from ground_service.evaluation.verdict import (
 from ground_service.passes.samples import DetectionSamples, NavigationSamples, OutcomeSamples
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
-from lunar.constants import MOON_RADIUS_M, NANOSECONDS_PER_SECOND
+from lunar.constants import MOON_RADIUS_M, NS
 from lunar.ephemeris import Ephemeris
 from lunar.errors import LunarError
 from lunar.frames import Orientation
@@ -501,8 +501,8 @@ def _consistency(
         return None, degrees
     covariance = np.where(same[:, None, None], filtered.position_covariance_rtn_m2[at], np.nan)
     if degrees is not None and filtered.innovation_degrees is not None:
-        told = filtered.innovation_degrees[at]
-        degrees = np.where(known & same & (told >= 0), told, degrees).astype(np.int64)
+        reported = filtered.innovation_degrees[at]
+        degrees = np.where(known & same & (reported >= 0), reported, degrees).astype(np.int64)
     return nees(error_rtn_m, covariance + reference_covariance), degrees
 
 
@@ -569,7 +569,7 @@ def _time_since_fix_s(samples: NavigationSamples) -> FloatArray | None:
     if not fixed.any():
         return None
     last = np.maximum.accumulate(np.where(fixed, np.arange(len(fixed)), -1))
-    since = (samples.utc_ns - samples.utc_ns[np.maximum(last, 0)]) / NANOSECONDS_PER_SECOND
+    since = (samples.utc_ns - samples.utc_ns[np.maximum(last, 0)]) / NS
     return np.where(last >= 0, since, np.nan)
 
 
@@ -826,7 +826,7 @@ def _gaps(inputs: PassInputs) -> tuple[TimeSpan, ...]:
     times = inputs.detections.utc_ns
     if inputs.cadence_s is None or len(times) < 2:
         return ()
-    limit = 1.5 * inputs.cadence_s * NANOSECONDS_PER_SECOND
+    limit = 1.5 * inputs.cadence_s * NS
     return tuple(
         TimeSpan(int(times[i]), int(times[i + 1]), "no frames")
         for i in np.flatnonzero(np.diff(times) > limit)

@@ -60,7 +60,7 @@ from ground_service.toml import read_table
 from lunar.boxes import share_outside
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, format_catalogue
-from lunar.constants import MOON_RADIUS_M, NANOSECONDS_PER_SECOND
+from lunar.constants import MOON_RADIUS_M, NS
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation
@@ -637,7 +637,7 @@ def _store_catalogue(ground: Ground, mission: Mission, reference: Ephemeris, rec
         raise InvalidInput(mission.name, "frames.orientation", "an available lunar orientation", "none")
     half_diagonal = math.sqrt(2.0) * math.tan(camera_of(mission.camera).fov_rad / 2.0)
     reach = half_diagonal + math.tan(math.radians(abs(mission.camera.tilt_deg or 0.0)))
-    step_ns = round(TRACK_STEP_S * NANOSECONDS_PER_SECOND)
+    step_ns = round(TRACK_STEP_S * NS)
     utc_ns = np.arange(record.start_utc_ns, record.stop_utc_ns + step_ns, step_ns, dtype=np.int64)
     track = reference_states(reference, orientation, utc_ns)
     octets = format_catalogue(along_track(catalogue, track, reach)).encode("ascii")

@@ -14,7 +14,7 @@ import numpy as np
 
 from ground_service.evaluation.alignment import bounds_per_degree, independent_samples
 from lunar.arrays import FloatArray
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from reports.statistics import per_degree
 from reports.text import count_text, significant_text
 from reports.values import (
@@ -321,7 +321,7 @@ def _convergence_s(series: NavigationSeries, limit_m: float) -> float | None:
         return None
     lasting = np.asarray(np.lib.stride_tricks.sliding_window_view(good, LASTING).all(axis=1))
     first = int(np.argmax(lasting))
-    return float(series.utc_ns[first] - series.utc_ns[0]) / NANOSECONDS_PER_SECOND if lasting[first] else None
+    return float(series.utc_ns[first] - series.utc_ns[0]) / NS if lasting[first] else None
 
 
 def _consistency(limits: Limits, found: Evaluated) -> Iterable[Requirement]:

@@ -421,7 +421,7 @@ NO_RECORD = RecordFormat()
 
 
 @dataclass(slots=True)
-class Found:
+class LinkContent:
     """Counts of what a piece of a recording has completed: frames, packets, link quality, octets.
 
     Attributes

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.ingest.core import COUNTS, UNKNOWN, Channel, Found, Fragment, RecordFormat, is_idle
+from ground_service.ingest.core import COUNTS, UNKNOWN, Channel, Fragment, LinkContent, RecordFormat, is_idle
 from ground_service.ingest.packets import PacketBatch, batch_of_cut
 from lunar.arrays import BoolArray, IntArray, OctetArray
 from tmtc.dictionary.payload import DICTIONARY
@@ -132,7 +132,7 @@ class FrameReader:
         self,
         section: Section,
         settings: LinkSettings,
-        found: Found,
+        found: LinkContent,
         *,
         spacecraft_id: int | None = None,
         dictionary: Dictionary = DICTIONARY,
@@ -496,7 +496,7 @@ class PacketReader:
     def __init__(
         self,
         section: Section,
-        found: Found,
+        found: LinkContent,
         form: PacketForm = CHECKED,
         *,
         spacecraft_id: int | None = None,

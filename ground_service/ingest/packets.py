@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ground_service.ingest.core import NO_TIME
 from lunar.arrays import IntArray
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from lunar.timescales import utc_ns_from_ticks
 from tmtc.arrays import Octets, as_octets
 from tmtc.dictionary.estimates import ESTIMATE_PACKETS, filter_estimates
@@ -25,7 +25,7 @@ Columns = dict[str, Any]
 
 DIGEST_OCTETS = 16
 
-CLOCKS_AGREE_NS = 60 * NANOSECONDS_PER_SECOND
+CLOCKS_AGREE_NS = 60 * NS
 """Largest difference of the on-board clock from the reception time of its report, light time included.
 
 Two independent clocks that agree are believed. A larger difference is a wrong clock of the station, or a report that

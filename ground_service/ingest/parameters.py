@@ -30,8 +30,8 @@ from ground_service.store.vehicles import (
     lock_vehicle,
 )
 from lunar.arrays import FloatArray, IntArray
+from lunar.constants import NS
 from lunar.timescales import (
-    NS,
     ONBOARD_EPOCH_TAI_NS,
     TICKS_PER_SECOND,
     parse_utc,

@@ -20,7 +20,7 @@ from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
 from ground_service.ingest import frames, store
 from ground_service.ingest import recording_store as recordings
-from ground_service.ingest.core import Found, Fragment, complete, join
+from ground_service.ingest.core import Fragment, LinkContent, complete, join
 from ground_service.ingest.doubt_store import count_implausible, plausible_part
 from ground_service.ingest.frames import CADU_MAX_OCTETS, FrameReader, PacketReader, Section
 from ground_service.ingest.link_settings import known_before, packet_form
@@ -176,7 +176,7 @@ class Reading:
         self.forms: dict[int, PacketForm] = {}
         if piece.spacecraft_id is not None:
             self.forms[piece.spacecraft_id] = self.expected.form
-        self.found = Found()
+        self.found = LinkContent()
         self.unknown = 0
         self.ticks: list[int] = []
         self.sections: list[Section] = []
@@ -525,7 +525,7 @@ class Reading:
         framed = [(one, one.settings) for one in self.sections if one.settings is not None]
         if not framed:
             return None
-        names = {one.name for one in fields(Found)} & set(ReceivedLink.model_fields)
+        names = {one.name for one in fields(LinkContent)} & set(ReceivedLink.model_fields)
         return ReceivedLink(
             station=self.piece.station,
             bit_error_rate=self.found.bit_error_rate,

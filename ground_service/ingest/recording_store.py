@@ -290,7 +290,7 @@ def surroundings(connection: Connection, piece: Piece) -> Surroundings:
 
 
 def _surroundings_query() -> Any:
-    """Return the query of `surroundings`: aggregates of one row each, beside the vehicle if it exists."""
+    """Return the query of `surroundings`: aggregates of one row each, with the vehicle if it exists."""
     scope: Any = bindparam("scope")
     missions = select(func.count().label("missions"), func.max(MISSIONS.c.id).label("last_mission"))
     vehicles = VEHICLES.alias()

@@ -478,7 +478,7 @@ def ingests_of_vehicles(connection: Connection, vehicles: Sequence[int], but: in
 
 
 def forget_rest(connection: Connection, vehicle: int, ingest_id: int) -> None:
-    """Remove what an ingest has left besides packets of a vehicle: fragments, doubts, its place, and its marks.
+    """Remove what an ingest has left except packets of a vehicle: fragments, doubts, its place, and its marks.
 
     Telecommands that were sent after it are verified from where those before it were.
     """

@@ -50,7 +50,7 @@ CommandSubject = Annotated[str, AfterValidator(_known_subject)]
 
 
 class Spacecraft(Section):
-    """Spacecraft identification; `object_names` are those in ephemerides (OBJECT_NAME), besides `name`."""
+    """Spacecraft identification; `object_names` are those in ephemerides (OBJECT_NAME), in addition to `name`."""
 
     id: Annotated[int, Field(ge=0, le=1023)] | None = None
     name: str | None = None

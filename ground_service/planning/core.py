@@ -21,7 +21,7 @@ from ground_service.planning.filling import Option
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation, spherical_from_mcmf
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
@@ -33,7 +33,6 @@ Range = tuple[float, float]
 TerrainAt = Callable[[FloatArray, FloatArray], BoolArray]
 """Latitudes and longitudes (n,) in rad to whether the ground there is mare (n,)."""
 
-NS = NANOSECONDS_PER_SECOND
 CONTACT_HORIZON_S = 86_400.0
 """Data that are not down a day after their window are taken to stay on board."""
 

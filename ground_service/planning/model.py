@@ -10,10 +10,10 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from ground_service.http.model import (
     Entity,
-    Given,
-    GivenTime,
     InstanceName,
     Paging,
+    RequestModel,
+    RequestTime,
     SpacecraftNumber,
     UtcTime,
 )
@@ -23,7 +23,7 @@ from ground_service.toml import LINE_PATTERN_JSON
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1, max_length=200, pattern=LINE_PATTERN_JSON)]
-Time = Annotated[GivenTime, AfterValidator(lambda time: UtcTime(time.utc_ns // 1000 * 1000))]
+Time = Annotated[RequestTime, AfterValidator(lambda time: UtcTime(time.utc_ns // 1000 * 1000))]
 """Time of a plan, in whole microseconds, so that an exported plan states it exactly."""
 
 WindowState = Literal[
@@ -54,7 +54,7 @@ class WindowEntry:
     ephemeris_id: int | None = None
 
 
-class Limits(Given):
+class Limits(RequestModel):
     """A minimum and a maximum."""
 
     min: Finite = Field(examples=[30.0])
@@ -71,7 +71,7 @@ class Limits(Given):
         return self.min * factor, self.max * factor
 
 
-class WindowSearch(Given):
+class WindowSearch(RequestModel):
     """Constraints that a window must fulfil throughout; a constraint that is not stated does not apply."""
 
     start: Time | None = Field(default=None, description="Default: where the ephemeris begins")
@@ -250,7 +250,7 @@ class CraterDensity(Entity):
     rows: list[list[float]]
 
 
-class WindowIn(Given):
+class WindowIn(RequestModel):
     """A window to be planned."""
 
     name: Name = Field(default="observation", examples=["evening pass"])
@@ -268,7 +268,7 @@ class WindowIn(Given):
         return WindowEntry(start_utc_ns=self.start.utc_ns, stop_utc_ns=self.stop.utc_ns, **stated)
 
 
-class WindowChange(Given):
+class WindowChange(RequestModel):
     """Changes of a draft, or a decision on a window; fields that are not stated do not change."""
 
     name: Name | None = None
@@ -390,7 +390,7 @@ class WindowFilter(Paging):
 RequestState = Literal["active", "paused"]
 
 
-class Region(Given):
+class Region(RequestModel):
     """Sub-satellite points between two latitudes and two longitudes; from `min` to the east to `max`."""
 
     latitude_deg: Limits = Limits(min=-90.0, max=90.0)
@@ -398,7 +398,7 @@ class Region(Given):
     east_deg: Annotated[Finite, Field(ge=-180.0, le=360.0)] = 180.0
 
 
-class RequestTerms(Given):
+class RequestTerms(RequestModel):
     """Terms of a request; a constraint that is not stated does not apply."""
 
     windows: int = Field(ge=1, le=1000, description="Windows in each period", examples=[10])
@@ -453,7 +453,7 @@ class StandingRequestIn(RequestTerms):
         return RequestTerms(**{name: getattr(self, name) for name in RequestTerms.model_fields})
 
 
-class StandingRequestChange(Given):
+class StandingRequestChange(RequestModel):
     """Changes of a standing request; what is not stated does not change."""
 
     state: RequestState | None = None

@@ -64,13 +64,11 @@ from ground_service.store.event_kinds import WindowChanged, publish
 from ground_service.store.vehicles import lock_spacecraft, vehicle_id
 from ground_service.toml import REASON_LIMIT, require_line
 from lunar.catalogue import CraterCatalogue
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris as States
 from lunar.errors import EphemerisCoverageError
 from tmtc.dictionary.arguments import argument_text
-
-NS = NANOSECONDS_PER_SECOND
 
 SEARCH_LIMIT_S = 31 * 86_400
 STEPS_LIMIT = 100_000

@@ -1,4 +1,4 @@
-"""Pass archives to fly again: folders and zips of them, checked, kept by content, pinned and let go.
+"""Pass archives to fly again: folders and zips of them, checked, kept by content, pinned and removed.
 
 Whatever an archive says, nothing outside the folder it is unpacked into is written, nothing unreasonably large is
 unpacked, and no file is used whose hash is not the one in the manifest.
@@ -133,7 +133,7 @@ def check_archive(folder: Path) -> PassArchive:
     Raises
     ------
     InvalidInput
-        The archive is damaged, lacks an input of the payload, or has detections besides all its frames.
+        The archive is damaged, lacks an input of the payload, or has detections in addition to all its frames.
     """
     manifest, digest = read_manifest(folder)
     names = set(checked_files(folder, manifest))

@@ -98,8 +98,8 @@ def _reason(outcome: RegressionOutcome) -> str:
             return "no gate was judged"
         needed = outcome.frames_needed
         more = f"; about {needed:,} frames decide, {outcome.frames_judged:,} were compared" if needed else ""
-        told = "; ".join(f"{_name(gate)} {_figures(gate)}, {gate.reason}" for gate in open_gates[:2])
-        return told + more
+        message = "; ".join(f"{_name(gate)} {_figures(gate)}, {gate.reason}" for gate in open_gates[:2])
+        return message + more
     if any(gate.reason.startswith(IDENTICAL) for gate in gates):
         return f"{IDENTICAL} on {outcome.frames_judged} frames"
     better = [gate for gate in gates if gate.outcome == PASS and gate.change_high < 0.0]
@@ -192,9 +192,9 @@ def regression_text(verdict: Verdict) -> str:
         if not gate.passed and not (gate.pass_name and gate.name in whole):
             # The headline names the passes on which a metric fails that fails over all of them.
             lines.append(f"{gate.outcome}: {gate.text}")
-    told = ("worse", "better")
+    words = ("worse", "better")
     informing = [gate for gate in verdict.gates if gate.outcome == INFORMS]
-    lines += [f"informs: {gate.text}" for gate in informing if (gate.reason or "").startswith(told)]
+    lines += [f"informs: {gate.text}" for gate in informing if (gate.reason or "").startswith(words)]
     if len(lines) > SCREEN_LINES:
         lines[SCREEN_LINES:] = [f"and {len(lines) - SCREEN_LINES} further facts in the JSON document"]
     counts = {name: sum(gate.outcome == name for gate in deciding) for name in order}

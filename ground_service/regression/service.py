@@ -258,7 +258,7 @@ def judge_regression(
     for name, one in zip(names, judged, strict=True):
         assert one.baseline_read and one.candidate_read and one.baseline and one.candidate
         old, new = one.baseline_read.frames, one.candidate_read.frames
-        if not one.baseline.beside(one.candidate):
+        if not one.baseline.overlaps(one.candidate):
             apart += baseline != candidate
             old, new = (replace(frames, latency_ms={}, cpu_s=math.nan) for frames in (old, new))
         before[name], after[name] = old, new
@@ -377,10 +377,10 @@ def _pass_verdict(ground: Ground, archive: PassArchive, candidate: Build, baseli
         return PassVerdict(archive.name, archive.digest, "unusable", "it was not flown", old, new)
     for replay, build, state in ((new, candidate, "candidate failed"), (old, baseline, "baseline failed")):
         if replay.outcome != OK:
-            told = f"{build.name} {OUTCOMES[replay.outcome]}" + (
+            message = f"{build.name} {OUTCOMES[replay.outcome]}" + (
                 f": {replay.detail}" if replay.detail else ""
             )
-            return PassVerdict(archive.name, archive.digest, state, told, old, new)
+            return PassVerdict(archive.name, archive.digest, state, message, old, new)
     try:
         context = _context(ground, archive.digest)
         read = [_read(ground, context, replay) for replay in (old, new)]

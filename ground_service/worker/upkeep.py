@@ -1,6 +1,6 @@
 """Nightly job: removal of what is no longer needed, trends with limit checks, reports of the last complete month.
 
-The raw telemetry, what is decoded from it, reports and the audit log are kept for good. What is watched and forgotten
+Raw and decoded telemetry, reports and the audit log are kept without limit. Data of the operation
 (the feed, finished jobs, answers to idempotency keys, what broken uploads left) goes after `retention_days`, tokens of
 expired browser sessions at once. Regression archives go by their age since the last use and by their total size, if the
 settings say so; the audit log has a record of each.

@@ -215,14 +215,14 @@ class Payload:
             return ticks >= window.next_ticks
         schedule = machine.schedule
         due = [one.packet for one in schedule.activities if schedule.enabled and one.release_ticks <= ticks]
-        orders = [*parse_commands(telecommand_octets), *parse_commands(b"".join(due))]
+        telecommands = [*parse_commands(telecommand_octets), *parse_commands(b"".join(due))]
         return any(
             not isinstance(order, Refusal)
             and (
                 name_of(order) == "start_observation"
                 or (name_of(order) == "set_mode" and order.values["argument_1"] == PayloadMode.observing)
             )
-            for order in orders
+            for order in telecommands
         )
 
     def summary(self) -> dict[str, Any]:

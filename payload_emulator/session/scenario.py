@@ -80,7 +80,7 @@ class DynamicsSection:
 class ManeuverSection:
     """The paper's orbit maintenance (section V-B.1).
 
-    The payload is told of planned burns; what is carried out differs from the plan by a share of it (1 sigma per axis).
+    The payload receives planned burns; what is carried out differs from the plan by a share of it (1 sigma per axis).
     """
 
     enabled: bool = True
@@ -235,8 +235,8 @@ class AttitudeSection:
 class DisturbancesSection:
     """Disturbances of the flight; times in seconds after the first frame, nothing happens where a size is zero.
 
-    - kidnap: the spacecraft is found elsewhere, turned about the Moon's centre by a distance on the ground; `told`: the
-      payload is told by telecommand that its estimate is worth no more than that distance;
+    - kidnap: the spacecraft is displaced, turned about the Moon's centre by a distance on the ground; `kidnap_told`:
+      the payload is notified by telecommand that its estimate is worth no more than that distance;
     - outage: the camera gives no image;
     - burn: along the velocity; `declared`: the payload has it in its burn table. `maneuvers` gives its execution error.
     """

@@ -237,7 +237,7 @@ def end_labels(
     line_width: float,
     axes_width_in: float,
 ) -> None:
-    """Names of lines, each after a short sample of it, beside their right ends, moved apart where they would touch.
+    """Names of lines, each after a short sample of it, at their right ends, moved apart where they would touch.
 
     Parameters
     ----------

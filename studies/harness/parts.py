@@ -123,7 +123,7 @@ class Part:
         return self._process.pid
 
     def end(self, number: signal.Signals | None = None) -> None:
-        """End it for good, with a signal first if one is given: it is not started again."""
+        """End it permanently, with a signal first if one is given: it is not started again."""
         self._ended = True
         if self._process is None:
             return

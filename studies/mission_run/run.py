@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ground_service.clock import ClockFile, set_mission_clock
-from lunar.constants import NANOSECONDS_PER_SECOND as NS
+from lunar.constants import NS as NS
 from lunar.datafolder import DataFolder
 from lunar.timescales import format_utc, parse_utc
 from payload_emulator.errors import LinkError, ScenarioError

@@ -129,7 +129,7 @@ class XtceDecode:
 
 
 def choose_roots(definition: Definition, names: Sequence[str] = ()) -> tuple[Container, ...]:
-    """The containers that packets begin with: those named, or all without a base if they can be told apart.
+    """The containers that packets begin with: those named, or all without a base if they can be distinguished.
 
     Raises
     ------

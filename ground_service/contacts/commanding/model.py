@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from ground_service.contacts.commanding.core import DUPLICATE, OUT_OF_SEQUENCE, STAGES, CommandFate
-from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber, UtcTime
+from ground_service.http.model import Entity, InstanceName, Paging, RequestModel, SpacecraftNumber, UtcTime
 from ground_service.ingest.model import ControlWords
 from ground_service.toml import LINE_PATTERN_JSON
 from lunar.timescales import format_utc, utc_ns_from_ticks
@@ -19,7 +19,7 @@ _FAILURES = dict(FAILURES)
 REMEDY = "; the payload expects other sequence counts: send perform_function resynchronise_commands first"
 
 
-class CommandEntry(Given):
+class CommandEntry(RequestModel):
     """A telecommand to be queued."""
 
     name: str = Field(max_length=64, examples=["perform_function"])
@@ -32,7 +32,7 @@ class CommandEntry(Given):
     timeout_s: int = Field(default=600, ge=1, le=86_400 * 30)
 
 
-class Rejection(Given):
+class Rejection(RequestModel):
     """Reason for the rejection of a telecommand."""
 
     reason: str = Field(min_length=1, max_length=500, pattern=LINE_PATTERN_JSON, examples=["wrong cadence"])
@@ -198,7 +198,7 @@ class Handover(Entity):
     hold_reason: str = ""
 
 
-class HandoverNote(Given):
+class HandoverNote(RequestModel):
     """Note for the next shift; replaces the one before, which the audit log keeps."""
 
     note: str = Field(max_length=2000, examples=["Camera warm since orbit 12, see alarm 3."])

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from ground_service.http.model import Entity, Given, Paging, SpacecraftNumber, UtcTime
+from ground_service.http.model import Entity, Paging, RequestModel, SpacecraftNumber, UtcTime
 from ground_service.toml import LINE_PATTERN_JSON
 
 LandmarkState = Literal["seen", "proposed", "accepted", "rejected"]
@@ -79,7 +79,7 @@ class LandmarkDetail(Landmark):
     evidence: list[PassSightings]
 
 
-class LandmarkDecision(Given):
+class LandmarkDecision(RequestModel):
     """Reason for accepting or rejecting a landmark."""
 
     reason: str = Field(

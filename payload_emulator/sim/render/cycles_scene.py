@@ -90,7 +90,7 @@ class CyclesSettings:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CyclesScene:
-    """Everything that Blender is told; lengths in km, east-north-up axes.
+    """Complete input of Blender; lengths in km, east-north-up axes.
 
     Attributes
     ----------

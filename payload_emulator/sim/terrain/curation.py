@@ -246,7 +246,7 @@ def curate(
 
 
 def measured_rims(catalogue: CraterCatalogue, heights: Heights, region: Region) -> Rims:
-    """Return the clear rims of a region beside the listed craters, of the sizes whose centres are known best."""
+    """Return the clear rims of a region with their listed craters, of the sizes whose centres are known best."""
     chosen = region.holds(catalogue.latitude_rad, catalogue.longitude_rad)
     chosen &= (catalogue.diameter_m >= REGISTERED_M[0]) & (catalogue.diameter_m <= REGISTERED_M[1])
     craters = catalogue.select(chosen)

@@ -345,7 +345,7 @@ class Terrain(ABC):
         self.listed = self.catalogue = self.catalogue.select(slice(0))
 
     def release_thread(self) -> None:
-        """Let go of the thread that asked for ground so far: the next one that asks is kept to."""
+        """Release the thread that has requested ground so far; the next one that requests some owns it."""
         self._owner = None
 
     def _made(self, key: tuple[int, int, int]) -> int:

@@ -325,7 +325,7 @@ def _needed(
 ) -> int:
     """Return how many explained detections a fix of this search needs.
 
-    A fit has three free numbers, so besides the pair that fixes the place the second only fixes the altitude: the
+    A fit has three free numbers, so beyond the pair that fixes the place the second only fixes the altitude: the
     number of independent places is that of the cells of the search at the final tolerance, times altitude steps.
     """
     sighting = in_view(landmarks, best.pose, camera, 0.0)
