@@ -6,13 +6,11 @@ arrays, counts and octets cross these interfaces, so that no simulated truth can
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray, OctetArray
 
@@ -22,35 +20,6 @@ UNLIMITED = 1 << 62
 SENSORS = ("bus_voltage_v", "bus_current_a", "temperature_c", "camera_temperature_c")
 STORE_OCTETS = 4 << 20
 SETTINGS_OCTETS = 64 << 10
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PayloadInput:
-    """Inputs of one call of `Payload.step`, the image by its hash.
-
-    Attributes
-    ----------
-    number
-        Frame of the pass; -1 for a step without one.
-    boot
-        Cause of the start of the processor before this step, None without one.
-    sensors, uptime_ticks, downlink_octets
-        State of the board: readings (4,), time since power-on, room on the link.
-    image_shape, image_sha256
-        Shape of the pixels and SHA-256 of their octets, row by row; an empty shape and hash for a camera that gave
-        none.
-    """
-
-    number: int
-    clock_ticks: int
-    attitude: FloatArray
-    telecommands: bytes
-    image_shape: tuple[int, ...]
-    image_sha256: str
-    boot: int | None
-    sensors: FloatArray
-    uptime_ticks: int
-    downlink_octets: int
 
 
 class ResetCause(IntEnum):
@@ -175,8 +144,3 @@ class BareBoard:
 
     def request_reset(self, cause: int) -> None:
         self.reset_cause = cause
-
-
-def pixel_hash(image: NDArray[Any]) -> str:
-    """SHA-256 of the pixels, row by row; empty for an image without any."""
-    return hashlib.sha256(np.ascontiguousarray(image).data).hexdigest() if image.size else ""

@@ -41,7 +41,7 @@ SHIPPED = Path(__file__).resolve().parents[2] / "scenarios"
 
 @dataclass(frozen=True, slots=True)
 class OrbitSection:
-    """State of the spacecraft at the epoch: osculating Keplerian elements, a Cartesian state, or an OEM file.
+    """Where the spacecraft is at the epoch: osculating Keplerian elements, a Cartesian state, or an OEM file.
 
     `position_km` and `velocity_km_s` (three numbers each, axes of `frame`) replace the elements. An OEM file gives the
     whole trajectory.
@@ -80,7 +80,7 @@ class DynamicsSection:
 class ManeuverSection:
     """The paper's orbit maintenance (section V-B.1).
 
-    The payload receives planned burns; what is carried out differs from the plan by a share of it (1 sigma per axis).
+    The payload is told of planned burns; what is carried out differs from the plan by a share of it (1 sigma per axis).
     """
 
     enabled: bool = True
@@ -92,7 +92,7 @@ class ManeuverSection:
 
 @dataclass(frozen=True, slots=True)
 class WindowSection:
-    """Observation windows of the payload.
+    """When the payload observes.
 
     `search`: "terrain" takes the first window of the wanted direction that lies entirely over the available terrain,
     no earlier than `start` (the orbit's epoch when empty), between the two longitudes (east-positive; the second may
@@ -233,10 +233,10 @@ class AttitudeSection:
 
 @dataclass(frozen=True, slots=True)
 class DisturbancesSection:
-    """Disturbances of the flight; times in seconds after the first frame, nothing happens where a size is zero.
+    """What happens on the way; times in seconds after the first frame, nothing happens where a size is zero.
 
-    - kidnap: the spacecraft is displaced, turned about the Moon's centre by a distance on the ground; `kidnap_told`:
-      the payload is notified by telecommand that its estimate is worth no more than that distance;
+    - kidnap: the spacecraft is found elsewhere, turned about the Moon's centre by a distance on the ground; `told`: the
+      payload is told by telecommand that its estimate is worth no more than that distance;
     - outage: the camera gives no image;
     - burn: along the velocity; `declared`: the payload has it in its burn table. `maneuvers` gives its execution error.
     """
@@ -262,7 +262,7 @@ class ClockSection:
 
 @dataclass(frozen=True, slots=True)
 class FaultsSection:
-    """Faults: a line each, `KIND at SECONDS [for SECONDS] [size NUMBER]`; the kinds are in `sim.faults`."""
+    """What breaks: a line each, `KIND at SECONDS [for SECONDS] [size NUMBER]`; the kinds are in `sim.faults`."""
 
     events: tuple[str, ...] = ()
 
@@ -354,7 +354,7 @@ class Scenario:
 
     @property
     def has_flat_ground(self) -> bool:
-        """Return whether the ground is the sphere: no image is rendered, and no estimator needs heights."""
+        """Whether the ground is the sphere: no image is rendered, and no estimator needs heights."""
         return self.camera.images == "reduced" and "anchored" not in self.navigation.estimators
 
     @property

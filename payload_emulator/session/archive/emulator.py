@@ -24,15 +24,17 @@ from lunar.frames import spherical_from_mcmf
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError, TerrainError
-from payload_emulator.flight.ports import PayloadInput, ResetCause
+from payload_emulator.flight.ports import ResetCause
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.flight.vision.picture_search import find_sun
 from payload_emulator.flight.vision.preprocess import prepare_image
 from payload_emulator.session.archive.mission import MISSION_FILE, mission_text, save_attitudes
 from payload_emulator.session.archive.recording import (
+    StepInput,
     save_frame_times,
     save_image,
     save_record,
+    step_input,
 )
 from payload_emulator.session.archive.scoring import judge_session, score_navigation
 from payload_emulator.session.scenario import Scenario, format_scenario
@@ -44,7 +46,7 @@ from payload_emulator.session.spacecraft.loading import (
 from payload_emulator.session.spacecraft.loop import (
     PLAYBACK_CHANNEL,
     Spacecraft,
-    StepResult,
+    Turn,
     new_spacecraft,
 )
 from payload_emulator.session.spacecraft.schedule import fly_scenario, timeline
@@ -180,18 +182,18 @@ class Sender:
     def __post_init__(self) -> None:
         self.transmitter = Transmitter(self.world.scenario.spacecraft_id, self.settings)
 
-    def take(self, result: StepResult) -> None:
-        """Take the packets of a step, and send what is complete."""
-        self._utc_ns, self._light_s = result.step.utc_ns, result.step.light_s
+    def take(self, turn: Turn) -> None:
+        """Take the packets of a turn, and send what is complete."""
+        self._utc_ns, self._light_s = turn.moment.utc_ns, turn.moment.light_s
         stations = bool(self.world.scenario.link.stations)
-        now = clock_ticks(self.world, result.step.utc_ns)
-        for packet in result.packets:
+        now = clock_ticks(self.world, turn.moment.utc_ns)
+        for packet in turn.packets:
             late = stations and now - int.from_bytes(packet[14:20], "big") > _LATE_TICKS
-            self._waiting.setdefault(PLAYBACK_CHANNEL if late else 0, []).append((packet, result.clcw))
+            self._waiting.setdefault(PLAYBACK_CHANNEL if late else 0, []).append((packet, turn.clcw))
             if not late and int.from_bytes(packet[:2], "big") & 0x7FF == APID_TIME_REPORT:
-                self.time_reports.append((packet, result.step.utc_ns))
+                self.time_reports.append((packet, turn.moment.utc_ns))
         waiting = sum(len(packet) for packets in self._waiting.values() for packet, _ in packets)
-        if stations and (not result.step.in_contact or waiting > _DUMP_OCTETS):
+        if stations and (not turn.moment.heard or waiting > _DUMP_OCTETS):
             self.flush()
 
     def flush(self) -> None:
@@ -222,21 +224,21 @@ def _emulate_into(
     )
     spacecraft = new_spacecraft(world, loaded)
     sender = Sender(world, LinkSettings(coding=scenario.link.coding))
-    inputs: list[PayloadInput] = []
+    inputs: list[StepInput] = []
     attitudes = np.full((total, 3, 3), np.nan)
     flown = fly_scenario(world, spacecraft)
-    for result in progress(flown, len(timeline(world))) if progress else flown:
-        sender.take(result)
-        given, number = spacecraft.last_input, result.step.frame
-        if result.exposure is not None:
-            if result.exposure.fault:
-                raise TerrainError(result.exposure.fault)
-            attitudes[number] = result.exposure.camera_from_mcmf
+    for turn in progress(flown, len(timeline(world))) if progress else flown:
+        sender.take(turn)
+        given, number = spacecraft.given, turn.moment.frame
+        if turn.exposure is not None:
+            if turn.exposure.fault:
+                raise TerrainError(turn.exposure.fault)
+            attitudes[number] = turn.exposure.camera_from_mcmf
         if given is None:
             continue
-        inputs.append(given)
+        inputs.append(step_input(number, given))
         if number in kept:
-            save_image(folder, number, spacecraft.last_image)
+            save_image(folder, number, given.image)
     sender.flush()
     reception = transmit(sender.transmitter.dumps, sender.transmitter.settings, scenario.link, scenario.seed)
     save_record(folder, inputs, loaded.parameters, loaded.tables)
@@ -305,7 +307,7 @@ def _summary(
 
 
 def _manifest(world: World, loaded: LoadedPayload, folder: Path) -> dict[str, Any]:
-    """Return the manifest of a pass, with the hash of every file of the archive but itself."""
+    """What the ground needs to know of a pass, with the hash of every file of the archive but itself."""
     scenario, camera = world.scenario, world.scenario.camera
     return {
         "schema_version": 1,

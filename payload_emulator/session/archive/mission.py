@@ -18,13 +18,13 @@ import numpy as np
 from lunar.arrays import IntArray
 from lunar.boxes import Region, share_outside
 from lunar.constants import MOON_RADIUS_M
-from lunar.constants import NS as NS
+from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation, spherical_from_mcmf
 from lunar.timescales import format_utc
 from payload_emulator.flight.models import NETWORKS
-from payload_emulator.flight.ports import PayloadInput
 from payload_emulator.flight.vision.detector import OnnxDetector
+from payload_emulator.session.archive.recording import StepInput
 from payload_emulator.session.live.station_ports import RECORD_HEADER
 from payload_emulator.session.scenario import (
     SHIPPED,
@@ -86,7 +86,7 @@ ORBIT_AGE_H = 24.0
 
 _TRACK_STEP_S = 60.0
 _ALTITUDE_MARGIN = 1.3
-"""Altitudes of the mission in addition to those of the flight so far."""
+"""Altitudes of the mission beside those of the flight so far."""
 
 CLOCK_EPOCH = "2000-01-01T00:00:00 TAI"
 
@@ -208,7 +208,7 @@ def _track_utc_ns(world: World) -> IntArray:
 
 
 def _registration(world: World) -> dict[str, float | int]:
-    """Return the registered share of the catalogue and its shift near the frames."""
+    """Where the catalogue is registered to the terrain, and its shift near the frames."""
     registration = world.terrain.registration
     share = registered_share(world.terrain, world.truth, world.frame_utc_ns)
     if registration is None or not share:
@@ -325,7 +325,7 @@ def _uploaded_tables(scenario: Scenario) -> list[str]:
     return [*anchored, *odometry, *(["initial_state"] if anchored else [])]
 
 
-def save_attitudes(folder: Path, inputs: Iterable[PayloadInput]) -> None:
+def save_attitudes(folder: Path, inputs: Iterable[StepInput]) -> None:
     """Write the attitude of every frame, as attitude control gave it, into an archive."""
     rows = []
     for item in inputs:

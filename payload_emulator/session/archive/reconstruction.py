@@ -24,11 +24,13 @@ from lunar.catalogue import load_catalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import RecordError
 from payload_emulator.flight.onboard.commanding import Refusal, parse_commands
-from payload_emulator.flight.ports import UNLIMITED, PayloadInput, ResetCause, pixel_hash
+from payload_emulator.flight.ports import UNLIMITED, ResetCause
 from payload_emulator.flight.telemetry.products import image_report
 from payload_emulator.session.archive.emulator import Progress, file_entries
 from payload_emulator.session.archive.mission import save_attitudes
 from payload_emulator.session.archive.recording import (
+    StepInput,
+    pixel_hash,
     save_frame_times,
     save_image,
     save_record,
@@ -68,7 +70,7 @@ _UNKNOWN_SENSORS = np.full(4, np.nan)
 
 @dataclass(frozen=True, slots=True)
 class ImageReport:
-    """Telemetry about one image."""
+    """What telemetry states of one image."""
 
     ticks: int
     values: Mapping[str, int]
@@ -103,7 +105,7 @@ def reconstruct(
     _check_loads(archive, telemetry.get("housekeeping"), loaded, telecommands)
     world = flown_until(world, first_utc_ns(world, reports[-1].ticks))
     shutil.copytree(archive, out)
-    steps: dict[int, PayloadInput] = {}
+    steps: dict[int, StepInput] = {}
     times = []
     for number, (report, exposure) in enumerate(
         progress(_exposures(world, reports), len(reports)) if progress else _exposures(world, reports)
@@ -143,7 +145,7 @@ def flown_until(world: World, utc_ns: int) -> World:
     return world
 
 
-def with_telecommands(steps: Mapping[int, PayloadInput], telecommands: bytes) -> list[PayloadInput]:
+def with_telecommands(steps: Mapping[int, StepInput], telecommands: bytes) -> list[StepInput]:
     """Return the steps of a pass: a boot that receives the telecommands, and one at each time of release or image."""
     releases = [
         int(command.values["release_ticks"])
@@ -173,12 +175,12 @@ def _exposures(world: World, reports: Sequence[ImageReport]) -> Iterator[tuple[I
         yield report, exposure
 
 
-def _step(ticks: int) -> PayloadInput:
+def _step(ticks: int) -> StepInput:
     """Return a step without an image."""
-    return PayloadInput(-1, ticks, _NO_ATTITUDE, b"", (0, 0), "", None, _UNKNOWN_SENSORS, 0, UNLIMITED)
+    return StepInput(-1, ticks, _NO_ATTITUDE, b"", (0, 0), "", None, _UNKNOWN_SENSORS, 0, UNLIMITED)
 
 
-def _frame_step(number: int, ticks: int, exposure: Exposure) -> PayloadInput:
+def _frame_step(number: int, ticks: int, exposure: Exposure) -> StepInput:
     return replace(
         _step(ticks),
         number=number,

@@ -1,4 +1,4 @@
-"""Recorded inputs of a payload during a pass, from which another build can be replayed.
+"""What a payload was given during a pass, kept so that another build can be given the same.
 
 In a pass archive this is the folder `payload/`: `inputs.jsonl` (one line per step: on-board time, message of the ADCS,
 telecommands, hash of the image, what the board said), `parameters.toml`, `tables/*.bin` as uploaded, and
@@ -9,12 +9,13 @@ here.
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,6 @@ from numpy.typing import NDArray
 from lunar.arrays import FloatArray, IntArray
 from payload_emulator.errors import RecordError
 from payload_emulator.flight.payload import FlightTables
-from payload_emulator.flight.ports import PayloadInput, pixel_hash
 from payload_emulator.session.spacecraft.parameter_file import (
     BuildParameters,
     format_parameters,
@@ -30,6 +30,9 @@ from payload_emulator.session.spacecraft.parameter_file import (
 )
 from tmtc.dictionary.definitions import format_dictionary
 from tmtc.dictionary.payload import DICTIONARY
+
+if TYPE_CHECKING:
+    from payload_emulator.session.spacecraft.loop import Given
 
 FOLDER = "payload"
 INPUTS = f"{FOLDER}/inputs.jsonl"
@@ -42,6 +45,35 @@ Image = NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class StepInput:
+    """What one call of `Payload.step` was given, the image by its hash.
+
+    Attributes
+    ----------
+    number
+        Frame of the pass; -1 for a step without one.
+    boot
+        Cause of the start of the processor before this step, None without one.
+    sensors, uptime_ticks, downlink_octets
+        What the board said: readings (4,), time since power-on, room on the link.
+    image_shape, image_sha256
+        Shape of the pixels and SHA-256 of their octets, row by row; an empty shape and hash for a camera that gave
+        none.
+    """
+
+    number: int
+    clock_ticks: int
+    attitude: FloatArray
+    telecommands: bytes
+    image_shape: tuple[int, ...]
+    image_sha256: str
+    boot: int | None
+    sensors: FloatArray
+    uptime_ticks: int
+    downlink_octets: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PassRecord:
     """Everything but the images that a payload was given during a pass.
 
@@ -51,14 +83,35 @@ class PassRecord:
         Parameters and tables of the record that the present flight code no longer has.
     """
 
-    inputs: tuple[PayloadInput, ...]
+    inputs: tuple[StepInput, ...]
     parameters: BuildParameters
     tables: FlightTables
     dropped: tuple[str, ...] = ()
 
 
+def step_input(number: int, given: Given) -> StepInput:
+    """The record of one step."""
+    return StepInput(
+        number,
+        given.clock_ticks,
+        np.asarray(given.attitude, np.float64),
+        given.telecommands,
+        given.image.shape,
+        pixel_hash(given.image) if number >= 0 else "",
+        given.boot,
+        np.asarray(given.sensors, np.float64),
+        given.uptime_ticks,
+        given.downlink_octets,
+    )
+
+
+def pixel_hash(image: NDArray[Any]) -> str:
+    """SHA-256 of the pixels, row by row; empty for an image without any."""
+    return hashlib.sha256(np.ascontiguousarray(image).data).hexdigest() if image.size else ""
+
+
 def save_record(
-    folder: Path, inputs: Iterable[PayloadInput], parameters: BuildParameters, tables: FlightTables
+    folder: Path, inputs: Iterable[StepInput], parameters: BuildParameters, tables: FlightTables
 ) -> None:
     """Write the record of a pass into its archive `folder`."""
     (folder / TABLES).mkdir(parents=True, exist_ok=True)
@@ -116,7 +169,7 @@ def frame_path(number: int) -> str:
     return f"frames/{number:06d}.png"
 
 
-def missing_frames(folder: Path, inputs: Sequence[PayloadInput]) -> list[int]:
+def missing_frames(folder: Path, inputs: Sequence[StepInput]) -> list[int]:
     """Frames that had an image which is not in the archive."""
     return [
         item.number
@@ -139,7 +192,7 @@ def save_image(folder: Path, number: int, image: Image) -> None:
     path.write_bytes(encoded.tobytes())
 
 
-def load_image(folder: Path, item: PayloadInput) -> Image:
+def load_image(folder: Path, item: StepInput) -> Image:
     """The image of a frame as the payload was given it, checked against its hash; no pixels where it had none.
 
     Raises
@@ -164,7 +217,7 @@ def load_image(folder: Path, item: PayloadInput) -> Image:
     return image
 
 
-def check_image(item: PayloadInput, image: Image, source: str) -> None:
+def check_image(item: StepInput, image: Image, source: str) -> None:
     """Refuse an image that is not the one that the payload was given."""
     if image.shape != item.image_shape:
         raise RecordError(
@@ -183,7 +236,7 @@ def _size(shape: tuple[int, ...]) -> str:
     return " x ".join(map(str, shape)) + " pixels"
 
 
-def _line(item: PayloadInput) -> str:
+def _line(item: StepInput) -> str:
     row = {
         "frame": item.number,
         "ticks": item.clock_ticks,
@@ -208,7 +261,7 @@ def _array(values: list[float | None]) -> FloatArray:
     return np.array([math.nan if value is None else float(value) for value in values], dtype=np.float64)
 
 
-def _parse(line: str, path: Path, index: int) -> PayloadInput:
+def _parse(line: str, path: Path, index: int) -> StepInput:
     try:
         row = json.loads(line)
         if "instruments" in row:
@@ -217,7 +270,7 @@ def _parse(line: str, path: Path, index: int) -> PayloadInput:
                 f"{', '.join(row['instruments'])}: other instruments were withdrawn; the version that recorded "
                 "this pass can replay it"
             )
-        return PayloadInput(
+        return StepInput(
             int(row["frame"]),
             int(row["ticks"]),
             _array(row["attitude"]),

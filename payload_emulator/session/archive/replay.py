@@ -27,13 +27,14 @@ from payload_emulator.errors import ModelError, ParameterError, RecordError, Ter
 from payload_emulator.flight.models import DEFAULT_NETWORK, NETWORKS, load_shipped_model
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.payload import Payload
-from payload_emulator.flight.ports import UNLIMITED, BareBoard, PayloadInput, ResetCause
+from payload_emulator.flight.ports import UNLIMITED, BareBoard, ResetCause
 from payload_emulator.flight.vision.detections import Detections, no_detections
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.archive.recording import (
     INPUTS,
     PassRecord,
+    StepInput,
     check_image,
     load_image,
     load_record,
@@ -74,7 +75,7 @@ class FlightBuild:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay:
-    """Results of a replay: packets, counts of the payload, and CPU milliseconds of stages by frame."""
+    """What a replay gave: packets, counts of the payload, and CPU milliseconds of stages by frame."""
 
     packets: list[bytes]
     summary: dict[str, Any]
@@ -237,7 +238,7 @@ def replay(
     payload = started()
     packets: list[bytes] = []
     rows: list[tuple[float, float, float]] = []
-    pairs: Iterable[tuple[PayloadInput, Image]] = zip(record.inputs, images, strict=True)
+    pairs: Iterable[tuple[StepInput, Image]] = zip(record.inputs, images, strict=True)
     for item, image in progress(pairs, len(record.inputs)) if progress else pairs:
         if board.enter_step(item) and item is not record.inputs[0]:
             payload = started()
@@ -284,7 +285,7 @@ def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iter
     world.terrain.release_thread()
     absent = set(missing_frames(archive, record.inputs))
 
-    def image_of(item: PayloadInput) -> Image:
+    def image_of(item: StepInput) -> Image:
         if item.number not in absent or not item.image_sha256:
             return load_image(archive, item)
         if item.number >= world.frame_utc_ns.size:
@@ -378,7 +379,7 @@ class RecordedBoard(BareBoard):
     downlink: int = UNLIMITED
     asked_to_reset: bool = False
 
-    def enter_step(self, item: PayloadInput) -> bool:
+    def enter_step(self, item: StepInput) -> bool:
         """Take the place of the board in a step; whether the processor restarts before it."""
         self.uptime, self.downlink = item.uptime_ticks, item.downlink_octets
         if np.isfinite(item.sensors).all():
@@ -442,7 +443,7 @@ class _TimedDetector:
         return found
 
 
-def _ahead(load: Callable[[PayloadInput], Image], inputs: tuple[PayloadInput, ...]) -> Iterator[Image]:
+def _ahead(load: Callable[[StepInput], Image], inputs: tuple[StepInput, ...]) -> Iterator[Image]:
     with ThreadPoolExecutor(max_workers=1) as reader:
         pending = [reader.submit(load, item) for item in inputs[:2]]
         for number in range(len(inputs)):

@@ -1,7 +1,7 @@
 """Anchored navigation of an emulated session against the truth, from what came down and nothing else of the payload.
 
 Positions are compared in mean-Earth axes, since the payload flies its own orientation of the Moon, and split along
-the true orbit (radial, transverse, normal). Every figure is compared with what propagation of the start state alone
+the true orbit (radial, transverse, normal). Beside every figure stands what propagation of the start state alone
 would have given.
 """
 
@@ -15,7 +15,6 @@ import numpy as np
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import project_mcmf
 from lunar.catalogue import CraterCatalogue
-from lunar.constants import NS
 from lunar.frames import icrf_from_onboard, rtn_from_inertial, spherical_from_mcmf
 from lunar.timescales import format_utc, tdb_s_from_utc_ns
 from payload_emulator.flight.navigation.filter.dynamics import OrbitModel, flown, process_noise
@@ -36,8 +35,9 @@ from tmtc.dictionary.tables import (
 )
 from tmtc.packets.stream import cut_packets
 
+_NS = 1_000_000_000
 # Frames further apart than this belong to different arcs: the shortest gap, over a pole, takes 18 minutes.
-_ARC_GAP_NS = 600 * NS
+_ARC_GAP_NS = 600 * _NS
 # A session of several arcs is judged from the third on, a single one after this many frames.
 _SETTLED_ARC, _SETTLED_FRAMES = 2, 20
 # A pair is right if the crater truly lies within this of the detection: six pixels, or a quarter of its diameter.
@@ -81,7 +81,7 @@ class FlownErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedSession:
-    """Errors of the anchored estimator in a session against the truth; a row per frame of the session.
+    """What the anchored estimator did in a session, judged by the truth; a row per frame of the session.
 
     Attributes
     ----------
@@ -419,7 +419,7 @@ def frames_to_recover(error_m: FloatArray) -> int | None:
 
 
 def _recovery(world: World, errors: FlownErrors, imaging: BoolArray) -> dict[str, Any] | None:
-    """Return the number of frames with an image to recovery after a kidnap or an outage; None without either."""
+    """How many frames with an image it took to be back after a kidnap or an outage; None without either."""
     section = world.scenario.disturbances
     if section.kidnap_distance_km > 0.0:
         event = "kidnap told" if section.kidnap_told else "silent kidnap"
@@ -429,7 +429,7 @@ def _recovery(world: World, errors: FlownErrors, imaging: BoolArray) -> dict[str
     else:
         return None
     utc_ns = world.frame_utc_ns
-    since = (utc_ns[errors.frame] >= utc_ns[0] + round(after_s * NS)) & imaging[errors.frame]
+    since = (utc_ns[errors.frame] >= utc_ns[0] + round(after_s * _NS)) & imaging[errors.frame]
     frames = frames_to_recover(errors.position_m[since])
     return {"after": event, "frames_with_image": int(np.sum(since)), "frames_until_below_500_m": frames}
 

@@ -5,14 +5,14 @@ only where the payload looks at them, in commanded windows; in between, time pas
 housekeeping, power, heat and the Sun of the orbit. Contacts follow from the geometry of the stations: telecommands
 reach the spacecraft in contacts alone, at the rate of the uplink; telemetry leaves it at the rate of the downlink.
 Without stations, one that always sees the spacecraft takes their place. With its operator, the spacecraft flies the
-steps of the scenario, as in an archive of it.
+moments of the scenario, as in an archive of it.
 
 Ports: a telemetry and a telecommand port for each station (`StationPorts`), the mission description, and a console with
 one JSON object a line out and one word a line in: `run`, `pause`, `step`, `state`, `watch`, `save`, `until UTC`,
 `rate X`, `quit`. With `holds`, simulated time stands still at the beginning and at the end of each contact until `run`,
 so that a ground service can send its telecommands and finish its work however fast the simulation is. A step by hand,
 or going on after `pause`, breaks the continuity of time for those who watch: as in the simulator of the paper, the
-odometries are commanded to start again (trigger `manual_step`).
+odometries are told to start again (trigger `manual_step`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from typing import Any
 import numpy as np
 
 from kernels.memory import give_back
-from lunar.constants import NS
 from lunar.errors import LunarError
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns
@@ -50,10 +49,10 @@ from payload_emulator.session.live.station_ports import (
     add_to_journal,
     load_journal,
 )
-from payload_emulator.session.live.viewing import rims_in_view, step_message
+from payload_emulator.session.live.viewing import rims_in_view, turn_message
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.session.spacecraft.loading import LoadedPayload
-from payload_emulator.session.spacecraft.loop import Spacecraft, StepInput, StepResult, fly, new_spacecraft
+from payload_emulator.session.spacecraft.loop import Moment, Spacecraft, Turn, fly, new_spacecraft
 from payload_emulator.session.spacecraft.schedule import Operator, timeline
 from payload_emulator.session.world.world import (
     CHUNK_S,
@@ -69,13 +68,14 @@ from payload_emulator.sim.orbit.truth import Spliced, Truth
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.link.settings import LinkSettings
 
-ALWAYS_IN_CONTACT = "earth"
+ALWAYS_HEARD = "earth"
 """Station that always sees the spacecraft, at the light time to the Earth's centre, with no limit of its rates."""
 
 STEP_S = 60.0
 """Longest step."""
 
 _AHEAD_S = 4.0 * 3600.0
+_NS = 1_000_000_000
 _POLL_S = 0.05
 # Two steps at one reading of the on-board clock would look like a clock that stands still.
 _LEAST_STEP_NS = 20_000_000
@@ -86,7 +86,7 @@ _CONSOLE_SOURCE = 2
 _CONSOLE_COUNTS = 1 << 13  # the ground's counts begin at 0: reports name a telecommand by its count
 _EXACT = (
     "utc_ns", "spacecraft", "account", "contact", "_contacts", "_planned_until_ns", "_transmitter", "_uplinks",
-    "_uplinked", "_last_reception_ns", "_last_image_ns", "_waiting", "_sent_up", "_operator", "_discontinuous",
+    "_uplinked", "_last_heard_ns", "_last_image_ns", "_waiting", "_sent_up", "_operator", "_discontinuous",
     "_console_count",
 )  # fmt: skip
 """Fields of a session that make up its exact state outside of observations, with the flight."""
@@ -94,7 +94,7 @@ _EXACT = (
 
 @dataclass(slots=True)
 class Account:
-    """Counts of a session since its start.
+    """What a session has done since its start.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class Account:
 
 @dataclass(slots=True, eq=False)
 class LiveSession:
-    """A spacecraft that flies until it is stopped.
+    """A spacecraft that flies until it is told to stop.
 
     Attributes
     ----------
@@ -174,7 +174,7 @@ class LiveSession:
     stations: dict[str, StationPorts] = field(default_factory=dict)
     console: Server = field(init=False)
     mission_server: Server = field(init=False)
-    _slots: deque[StepInput] = field(default_factory=deque)
+    _slots: deque[Moment] = field(default_factory=deque)
     _operator: Operator | None = None
     _contacts: deque[StationContact] = field(default_factory=deque)
     _planned_until_ns: int = 0
@@ -189,7 +189,7 @@ class LiveSession:
     _steps: int = 0
     _discontinuous: bool = False
     _console_count: int = _CONSOLE_COUNTS
-    _last_reception_ns: int = 0
+    _last_heard_ns: int = 0
     _last_image_ns: int = 0
     _waiting: int = 0
     _until_ns: int | None = None
@@ -213,7 +213,7 @@ class LiveSession:
             )
             if not self._is_continued:
                 self.utc_ns = self._slots[0].utc_ns
-        if self._names == (ALWAYS_IN_CONTACT,) and not self._is_continued:
+        if self._names == (ALWAYS_HEARD,) and not self._is_continued:
             self._begin_contact(self._always())
         if self.journal_file is not None:
             left = [one for one in load_journal(self.journal_file) if one.number not in self._sent_up]
@@ -231,13 +231,13 @@ class LiveSession:
         return found
 
     def run(self) -> None:
-        """Fly until the end, or until it is stopped; then keep the state and close everything."""
+        """Fly until the end, or until told to stop; then keep the state and close everything."""
         with selectors.DefaultSelector() as selector:
             for server in self._servers():
                 server.attach(selector)
             try:
-                for result in fly(self.spacecraft, self._steps(selector)):
-                    self._take(result)
+                for turn in fly(self.spacecraft, self._moments(selector)):
+                    self._take(turn)
             finally:
                 self._save()
                 self._send_message({"kind": "end", "utc": format_utc(self.utc_ns)})
@@ -251,8 +251,8 @@ class LiveSession:
 
     # Time
 
-    def _steps(self, selector: selectors.BaseSelector) -> Iterator[StepInput]:
-        """Yield the steps when their time has come, and serve the ports in between."""
+    def _moments(self, selector: selectors.BaseSelector) -> Iterator[Moment]:
+        """Yield the moments when their time has come, and serve the ports in between."""
         is_first = not self._is_continued
         while not self.stopping.is_set():
             is_over = self.ends_with_scenario and self.has_operator and not self._slots
@@ -270,59 +270,59 @@ class LiveSession:
             before = self.contact
             if slot is not None:
                 self._slots.popleft()
-            yield self._ground_step() if slot is None else self._scenario_step(slot)
+            yield self._ground_moment() if slot is None else self._scenario_moment(slot)
             if self.contact is not before:
                 self._hold(selector)
             elif self._until_ns is not None and self.utc_ns >= self._until_ns:
                 self._until_ns, self.paused = None, True
                 self._send_message({"kind": "paused", "utc": format_utc(self.utc_ns)})
 
-    def _scenario_step(self, slot: StepInput) -> StepInput:
-        """Return a step of the scenario with the telecommands of its operator, and with those that came by hand."""
+    def _scenario_moment(self, slot: Moment) -> Moment:
+        """Return a moment of the scenario with the telecommands of its operator, and with those that came by hand."""
         assert self._operator is not None
-        if not slot.in_contact:
+        if not slot.heard:
             self._end_contact()
         elif self.contact is None:
             self._begin_contact(self._always())
         receiver = self.spacecraft.receiver
-        receiver.carrier = receiver.bit_lock = slot.in_contact
-        telecommands = receiver.take(self._operator.telecommands(slot, self.spacecraft.payload.mode))
-        by_hand = self._take_telecommands(None) if slot.in_contact else b""
-        return replace(slot, telecommands=telecommands + by_hand + self._manual_step())
+        receiver.carrier = receiver.bit_lock = slot.heard
+        orders = receiver.take(self._operator.orders(slot, self.spacecraft.payload.mode))
+        by_hand = self._take_orders(None) if slot.heard else b""
+        return replace(slot, orders=orders + by_hand + self._manual_step())
 
-    def _ground_step(self) -> StepInput:
+    def _ground_moment(self) -> Moment:
         """Return what is due now where the ground commands."""
         utc_ns, spacecraft, link = self.utc_ns, self.spacecraft, self.world.scenario.link
         seconds = self._change_contact(utc_ns)
         contact = self.contact
-        limited = self._names != (ALWAYS_IN_CONTACT,)
-        in_contact = contact is not None and (seconds > 0.0 or not limited)
-        telecommands = self._take_telecommands(seconds if limited else None) if in_contact else b""
-        telecommands += self._manual_step()
+        limited = self._names != (ALWAYS_HEARD,)
+        heard = contact is not None and (seconds > 0.0 or not limited)
+        orders = self._take_orders(seconds if limited else None) if heard else b""
+        orders += self._manual_step()
         octets = int(link.rate_bps / 8.0 * seconds) if limited else UNLIMITED
-        spacecraft.receiver.carrier = spacecraft.receiver.bit_lock = in_contact
+        spacecraft.receiver.carrier = spacecraft.receiver.bit_lock = heard
         position, _ = self.world.truth.states(utc_ns)
         sun = sun_position_icrf_m(float(tdb_s_from_utc_ns(utc_ns)))
-        image_ns = self._image_ns(utc_ns, telecommands)
-        return StepInput(
+        image_ns = self._image_ns(utc_ns, orders)
+        return Moment(
             utc_ns,
             -1,
             float(sunlit_fraction(position[0], sun)),
-            in_contact,
-            octets if in_contact else 0,
+            heard,
+            octets if heard else 0,
             0.0 if contact is None else self._light_s(contact, utc_ns),
             image_ns,
             None if image_ns is None else self._next_image_ns(utc_ns),
-            telecommands,
+            orders,
         )
 
-    def _image_ns(self, utc_ns: int, telecommands: bytes) -> int | None:
+    def _image_ns(self, utc_ns: int, orders: bytes) -> int | None:
         """Return the time of the image that is due; None without one.
 
         It is that of the tick: what the telemetry says of its time is enough to make it again.
         """
         payload, ticks = self.spacecraft.payload, self._ticks(utc_ns)
-        if not payload.will_look(ticks, telecommands):
+        if not payload.will_look(ticks, orders):
             return None
         observing = payload.mode is PayloadMode.observing
         if observing and not payload.has_cadence and utc_ns < self._last_image_ns + self._interval_ns:
@@ -359,16 +359,16 @@ class LiveSession:
         self._held = self.holds or self.ends_with_console
         message = {**self._contact_message(), "kind": "finished"}
         self._send_message(message)
-        served = set(self.console.clients)
+        told = set(self.console.clients)
         while self._held and not self.stopping.is_set():
             self._serve(selector, _POLL_S)
-            if not served.issuperset(self.console.clients):
-                served.update(self.console.clients)
+            if not told.issuperset(self.console.clients):
+                told.update(self.console.clients)
                 self._send_message(message)
 
     def _next_turn_ns(self) -> int:
         """Return the time of the next step: of the payload, of the link, or the longest step there is."""
-        step_ns, epoch_ns = round(STEP_S * NS), self.world.scenario.epoch_utc_ns
+        step_ns, epoch_ns = round(STEP_S * _NS), self.world.scenario.epoch_utc_ns
         due = [epoch_ns + ((self.utc_ns - epoch_ns) // step_ns + 1) * step_ns]
         if self.contact is not None:
             due.append(self.contact.stop_utc_ns)
@@ -385,7 +385,7 @@ class LiveSession:
 
     @property
     def _interval_ns(self) -> int:
-        return round(self.world.scenario.camera.frame_interval_s * NS)
+        return round(self.world.scenario.camera.frame_interval_s * _NS)
 
     def _ticks(self, utc_ns: int) -> int:
         return clock_ticks(self.world, utc_ns) + self.spacecraft.clock_error_ticks
@@ -393,7 +393,7 @@ class LiveSession:
     def _wait(self, selector: selectors.BaseSelector, due_ns: int) -> bool:
         """Serve the ports until it is time for the next step; False where the session is to stop."""
         self._repeat_journal()
-        due = time.monotonic() + (due_ns - self.utc_ns) / NS / self.rate if self.rate > 0.0 else 0.0
+        due = time.monotonic() + (due_ns - self.utc_ns) / _NS / self.rate if self.rate > 0.0 else 0.0
         self._serve(selector, 0.0)
         while not self.stopping.is_set():
             left = due - time.monotonic()
@@ -410,7 +410,7 @@ class LiveSession:
 
     @property
     def _is_behind(self) -> bool:
-        """Return whether the ground has fallen so far behind that time must not go on."""
+        """Whether the ground has fallen so far behind that time must not go on."""
         return any(one.waiting > KEPT_LIMIT_OCTETS // 16 for one in self.stations.values())
 
     def _hold(self, selector: selectors.BaseSelector) -> None:
@@ -440,12 +440,12 @@ class LiveSession:
         world = self.world
         if world.scenario.orbit.oem:
             return
-        while world.truth.stop_utc_ns < self.utc_ns + round(_AHEAD_S * NS) + NS * 600:
+        while world.truth.stop_utc_ns < self.utc_ns + round(_AHEAD_S * _NS) + _NS * 600:
             truth, burns = extended_flight(world, CHUNK_S)
             world = replace(world, truth=pruned(truth, _ARCS_KEPT), burns=(*world.burns, *burns))
         if world is not self.world:
             self._enter(world)
-        if self._planned_until_ns < self.utc_ns + round(_AHEAD_S * NS / 2):
+        if self._planned_until_ns < self.utc_ns + round(_AHEAD_S * _NS / 2):
             self._plan_contacts()
 
     def _enter(self, world: World) -> None:
@@ -455,13 +455,13 @@ class LiveSession:
             self._operator.world = world
 
     def _plan_contacts(self) -> None:
-        if self._names == (ALWAYS_IN_CONTACT,):
+        if self._names == (ALWAYS_HEARD,):
             return
-        stop_ns = self.world.truth.stop_utc_ns - 300 * NS
+        stop_ns = self.world.truth.stop_utc_ns - 300 * _NS
         # A contact that was cut off by the end of the plan is found again as a whole.
-        while self._contacts and self._contacts[-1].stop_utc_ns >= self._planned_until_ns - NS:
+        while self._contacts and self._contacts[-1].stop_utc_ns >= self._planned_until_ns - _NS:
             self._planned_until_ns = self._contacts.pop().start_utc_ns
-        start_ns = max(self._planned_until_ns, self.world.truth.start_utc_ns + 300 * NS)
+        start_ns = max(self._planned_until_ns, self.world.truth.start_utc_ns + 300 * _NS)
         if self.contact is not None:
             start_ns = max(start_ns, self.contact.stop_utc_ns)
         ephemeris = sample_truth(self.world.truth, np.array([start_ns, stop_ns], dtype=np.int64))
@@ -470,34 +470,30 @@ class LiveSession:
 
     # Link
 
-    def _take(self, result: StepResult) -> None:
+    def _take(self, turn: Turn) -> None:
         """Count what a step has done, and hand it to the station of the contact and to those who watch."""
-        self._count(result)
+        self._count(turn)
         contact = self.contact
         if contact is not None:
-            self._send(contact, result)
+            self._send(contact, turn)
             if self.utc_ns >= contact.stop_utc_ns:
                 self._end_contact()
         camera = self.spacecraft.camera
         if self._watching:
-            message = step_message(self.spacecraft, result, camera.shown)
+            message = turn_message(self.spacecraft, turn, camera.shown)
             message |= {"paused": self.paused, "rate": self.rate}
             line = json.dumps(message).encode() + b"\n"
             for number in self._watching:
                 self.console.reply(number, line)
         rendered = self.world.scenario.camera.images != "reduced"
-        camera.overlay = rims_in_view if self._watching and rendered else None
+        camera.beside = rims_in_view if self._watching and rendered else None
 
-    def _count(self, result: StepResult) -> None:
+    def _count(self, turn: Turn) -> None:
         account = self.account
-        if result.exposure is not None and result.exposure.fault:
+        if turn.exposure is not None and turn.exposure.fault:
             account.images_lost += 1
             self._send_message(
-                {
-                    "kind": "fault",
-                    "utc": format_utc(self.utc_ns),
-                    "text": f"no image: {result.exposure.fault}",
-                }
+                {"kind": "fault", "utc": format_utc(self.utc_ns), "text": f"no image: {turn.exposure.fault}"}
             )
         account.frames, account.resets = self.spacecraft.frames, len(self.spacecraft.resets)
 
@@ -507,7 +503,7 @@ class LiveSession:
 
     def _always(self) -> StationContact:
         empty = np.zeros(0)
-        return StationContact(ALWAYS_IN_CONTACT, self.utc_ns, UNLIMITED, empty.astype(np.int64), empty)
+        return StationContact(ALWAYS_HEARD, self.utc_ns, UNLIMITED, empty.astype(np.int64), empty)
 
     def _light_s(self, contact: StationContact, utc_ns: int) -> float:
         if contact.light_utc_ns.size:
@@ -522,15 +518,15 @@ class LiveSession:
             return _FIRST_DOWNLINK_S
         if self.contact is None:
             return 0.0
-        seconds = (utc_ns - self._last_reception_ns) / NS
-        self._last_reception_ns = utc_ns
+        seconds = (utc_ns - self._last_heard_ns) / _NS
+        self._last_heard_ns = utc_ns
         return seconds
 
     def _begin_contact(self, contact: StationContact) -> None:
         self.contact = contact
         self._waiting = self.spacecraft.payload.waiting
         self.account.contacts += 1
-        self._last_reception_ns = self.utc_ns
+        self._last_heard_ns = self.utc_ns
 
     def _end_contact(self) -> None:
         """End a contact: telecommands that are still on their way are lost. Free memory goes back to the system."""
@@ -540,7 +536,7 @@ class LiveSession:
         self.contact = None
         give_back()
 
-    def _take_telecommands(self, seconds: float | None) -> bytes:
+    def _take_orders(self, seconds: float | None) -> bytes:
         """Return the telecommand packets that reach the spacecraft in some seconds of uplink; None: all that wait."""
         allowed = UNLIMITED if seconds is None else int(self.world.scenario.link.uplink_bps / 8.0 * seconds)
         packets: list[bytes] = []
@@ -555,25 +551,25 @@ class LiveSession:
         self.account.telecommands += len(packets)
         return b"".join(packets)
 
-    def _send(self, contact: StationContact, result: StepResult) -> None:
+    def _send(self, contact: StationContact, turn: Turn) -> None:
         """Send packets, or an idle frame, to the station of the contact, over the link of the scenario."""
         transmitter, account = self._transmitter, self.account
-        scenario, light_s = self.world.scenario, result.step.light_s
-        if result.packets:
-            transmitter.send(result.packets, self.utc_ns, light_s=light_s, clcw=result.clcw)
+        scenario, light_s = self.world.scenario, turn.moment.light_s
+        if turn.packets:
+            transmitter.send(turn.packets, self.utc_ns, light_s=light_s, clcw=turn.clcw)
             dump = transmitter.dumps.pop()
             reception = transmit(
                 [dump], transmitter.settings, scenario.link, scenario.seed + account.frames_sent
             )
             octets = reception.octets
-            account.packets += len(result.packets)
+            account.packets += len(turn.packets)
             account.packets_lost_on_link += reception.account["packets_lost"]
             account.frames_lost += reception.account["frames_lost_on_link"]
             account.frames_sent += reception.account["frames_sent"]
         else:
-            octets = transmitter.idle(result.clcw)
+            octets = transmitter.idle(turn.clcw)
         stated = dict(map(parse_clock_error, scenario.link.clock_errors))
-        received_ns = self.utc_ns + round(light_s * NS) + stated.get(contact.station, 0)
+        received_ns = self.utc_ns + round(light_s * _NS) + stated.get(contact.station, 0)
         self.stations[contact.station].send(received_ns, octets, transmitter.settings.cadu_length)
 
     # Ports
@@ -741,7 +737,7 @@ class LiveSession:
 
 def station_names(scenario: Scenario, has_operator: bool) -> tuple[str, ...]:
     """Return the stations that have ports: those of the scenario, which the schedule of an operator includes."""
-    return (ALWAYS_IN_CONTACT,) if has_operator else scenario.link.stations or (ALWAYS_IN_CONTACT,)
+    return (ALWAYS_HEARD,) if has_operator else scenario.link.stations or (ALWAYS_HEARD,)
 
 
 def pruned(truth: Truth, days: int) -> Truth:
@@ -750,7 +746,7 @@ def pruned(truth: Truth, days: int) -> Truth:
     if not isinstance(arcs, Spliced) or len(arcs.arcs) <= days:
         return truth
     joints = arcs.joints_tdb_s[-days + 1 :]
-    start_ns = truth.stop_utc_ns - round(days * CHUNK_S * NS)
+    start_ns = truth.stop_utc_ns - round(days * CHUNK_S * _NS)
     breaks = tuple(one for one in truth.breaks_utc_ns if one >= start_ns)
     return Truth(Spliced(joints, arcs.arcs[-days:]), start_ns, truth.stop_utc_ns, truth.orientation, breaks)
 

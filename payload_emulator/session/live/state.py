@@ -29,7 +29,7 @@ import numpy as np
 from lunar.propagation import Trajectory
 from payload_emulator.errors import RecordError
 
-VERSION = 8
+VERSION = 7
 _HEADER = re.compile(rb"LINNA spacecraft state, version (\d{1,9}), SHA-256 ([0-9a-f]{64})\n")
 _EXPECTED = "the state of a spacecraft process (linna emulate --live --state)"
 _PACKAGES = ("payload_emulator", "lunar", "tmtc")

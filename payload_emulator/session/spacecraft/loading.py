@@ -1,4 +1,4 @@
-"""Uploads to the payload before a window: model, parameters, tables.
+"""What is uploaded to the payload before a window: model, parameters, tables.
 
 It is made by the ground from the ground's own knowledge (reference ephemeris, catalogue, gravity field). Nothing of the
 simulated truth passes through here except what a scenario declares to be known.
@@ -252,7 +252,7 @@ def _gravity_octets(field: GravityField) -> bytes:
 
 
 def _attitude_errors(scenario: Scenario) -> CommonErrors:
-    """Return the attitude errors of the ADCS by its data sheet: as flown, no better than flight believes as shipped."""
+    """How well the ADCS knows the attitude, by its data sheet: as flown, no better than flight believes as shipped."""
     errors, attitude = CommonErrors(), scenario.attitude
     noise_deg = attitude.declared_noise_deg
     if noise_deg < 0.0:

@@ -1,6 +1,6 @@
 """The spacecraft: the payload on its simulated board, its camera and receiver, and the loop that flies it.
 
-Every way to fly is `fly` over a schedule of steps: a scenario with its operator, a process commanded by the ground.
+Every way to fly is `fly` over a schedule of moments: a scenario with its operator, a process commanded by the ground.
 Time, power, faults and resets are around `Payload.step`.
 """
 
@@ -14,18 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray, OctetArray
-from lunar.constants import NS
 from payload_emulator.flight.onboard.loads import MODEL_NUMBER, TABLE_NUMBERS
 from payload_emulator.flight.onboard.machine import PARAMETERS_NUMBER
 from payload_emulator.flight.payload import Payload
-from payload_emulator.flight.ports import (
-    SETTINGS_OCTETS,
-    STORE_OCTETS,
-    UNLIMITED,
-    PayloadInput,
-    ResetCause,
-    pixel_hash,
-)
+from payload_emulator.flight.ports import SETTINGS_OCTETS, STORE_OCTETS, UNLIMITED, ResetCause
 from payload_emulator.flight.vision.detections import Detections, Detector
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.spacecraft.loading import LoadedPayload
@@ -40,6 +32,7 @@ from tmtc.packets.cuc import TICKS_PER_SECOND
 PLAYBACK_CHANNEL = 1
 """Virtual channel of packets that are sent long after they were made."""
 
+_NS = 1_000_000_000
 _NO_ATTITUDE = np.full(7, np.nan)
 _NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
 _PLATFORM = PlatformModel()
@@ -52,42 +45,64 @@ _REGIONS = {
 
 
 @dataclass(frozen=True, slots=True)
-class StepInput:
+class Moment:
     """One step of the spacecraft.
 
     Attributes
     ----------
     frame
         Number of the frame of the scenario; -1 where it has none.
-    in_contact
-        Whether a station receives the spacecraft.
+    heard
+        Whether a station listens.
     light_s
         Light time to there.
     image_utc_ns, next_image_utc_ns
         Time of the image that the camera takes in this step, None without one, and of the one that probably follows.
-    telecommands
+    orders
         Telecommand packets that reach the payload.
     """
 
     utc_ns: int
     frame: int
     sunlit: float
-    in_contact: bool
+    heard: bool
     downlink_octets: int
     light_s: float = LIGHT_S
     image_utc_ns: int | None = None
     next_image_utc_ns: int | None = None
-    telecommands: bytes = b""
+    orders: bytes = b""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StepResult:
+class Turn:
     """Outcome of one step; `clcw` is the state of the telecommand receiver after it, as frames carry it."""
 
-    step: StepInput
+    moment: Moment
     exposure: Exposure | None
     packets: list[bytes]
     clcw: bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Given:
+    """What the payload was given in a step: at its door, and by its board.
+
+    Attributes
+    ----------
+    boot
+        Cause of the start of the processor before this step, None without one.
+    sensors
+        Readings of the board (4,), NaN before the first.
+    """
+
+    image: NDArray[Any]
+    attitude: FloatArray
+    clock_ticks: int
+    telecommands: bytes
+    boot: int | None
+    sensors: FloatArray
+    uptime_ticks: int
+    downlink_octets: int
 
 
 class ProcessorHang(BaseException):
@@ -136,8 +151,8 @@ class Spacecraft:
         Belongs to the platform: a restart of the payload leaves it as it is.
     resets
         Starts of the processor after the first, by cause.
-    last_input, last_image
-        Inputs of the payload in the last step, None while the processor was down; the image of it.
+    given
+        Inputs of the payload in the last step; None while the processor was down.
     truth_reads
         Number of reads of the simulated truth during payload steps; the payload must not have access to it.
     """
@@ -151,8 +166,7 @@ class Spacecraft:
     detector: Detector | None = None
     resets: list[int] = field(default_factory=list)
     payload: Payload = field(init=False)
-    last_input: PayloadInput | None = None
-    last_image: NDArray[Any] = field(default_factory=lambda: _NO_IMAGE)
+    given: Given | None = None
     truth_reads: ReadCount = field(default_factory=ReadCount)
     _booted: int | None = None
     _breakable: BreakableDetector = field(init=False)
@@ -178,24 +192,23 @@ class Spacecraft:
     def world(self, world: World) -> None:
         self.camera.world = world
 
-    def advance(self, step: StepInput) -> StepResult:
-        """Let the spacecraft do what is due at a step."""
+    def turn(self, moment: Moment) -> Turn:
+        """Let the spacecraft do what is due at a moment."""
         exposure = None
-        if step.image_utc_ns is not None:
-            exposure = self.camera.take(step.image_utc_ns, step.next_image_utc_ns)
+        if moment.image_utc_ns is not None:
+            exposure = self.camera.take(moment.image_utc_ns, moment.next_image_utc_ns)
             if isinstance(self.detector, CatalogueDetector):
                 self.detector.show(self.world, exposure)
         packets = self.step(
-            step.utc_ns,
+            moment.utc_ns,
             None if exposure is None else exposure.image,
             _NO_ATTITUDE if exposure is None else exposure.attitude,
-            clock_ticks(self.world, step.utc_ns),
-            step.telecommands,
-            sunlit=step.sunlit,
-            downlink_octets=step.downlink_octets,
-            number=step.frame,
+            clock_ticks(self.world, moment.utc_ns),
+            moment.orders,
+            sunlit=moment.sunlit,
+            downlink_octets=moment.downlink_octets,
         )
-        return StepResult(step, exposure, packets, self.receiver.clcw)
+        return Turn(moment, exposure, packets, self.receiver.clcw)
 
     def step(
         self,
@@ -207,14 +220,13 @@ class Spacecraft:
         *,
         sunlit: float = 1.0,
         downlink_octets: int = UNLIMITED,
-        number: int = -1,
     ) -> list[bytes]:
-        """Return the downlink of a step; image None: no image is taken. Faults change the inputs."""
+        """What goes down after a step; None for an image: nobody looks now. Faults change what comes in."""
         board = self.board
         if self._last_utc_ns is not None:
-            board.advance((utc_ns - self._last_utc_ns) / NS, sunlit)
+            board.advance((utc_ns - self._last_utc_ns) / _NS, sunlit)
         self._last_utc_ns = utc_ns
-        self.last_input = None
+        self.given = None
         board.downlink = downlink_octets
         picture, message = self._break(utc_ns, image, attitude)
         if self._down_until_ns is not None:
@@ -230,18 +242,15 @@ class Spacecraft:
             with counted_reads(self.truth_reads):
                 packets = self.payload.step(picture, message, ticks, telecommands)
         except ProcessorHang:
-            self._down_until_ns = utc_ns + round(board.model.watchdog_s * NS)
+            self._down_until_ns = utc_ns + round(board.model.watchdog_s * _NS)
             packets = []
-        self.last_image = pixels = _NO_IMAGE if picture is None else picture
-        self.last_input = PayloadInput(
-            number,
+        self.given = Given(
+            _NO_IMAGE if picture is None else picture,
+            message,
             ticks,
-            np.asarray(message, np.float64),
             telecommands,
-            pixels.shape,
-            pixel_hash(pixels),
             cause,
-            np.asarray(board.readings, np.float64),
+            board.readings,
             board.uptime_ticks(),
             downlink_octets,
         )
@@ -260,7 +269,7 @@ class Spacecraft:
 
     @property
     def clock_error_ticks(self) -> int:
-        """Return the offset of the on-board clock by clock jumps from the clock of the scenario."""
+        """How far clock jumps have set the on-board clock ahead of the clock of the scenario."""
         return self._clock_error_ticks
 
     def _boot(self) -> Payload:
@@ -276,8 +285,8 @@ class Spacecraft:
     def _break(
         self, utc_ns: int, image: NDArray[Any] | None, attitude: FloatArray
     ) -> tuple[NDArray[Any] | None, FloatArray]:
-        """Let the faults of this step act; what is left of the image and of the message of the ADCS."""
-        second = (utc_ns - self.first_utc_ns) / NS
+        """Let the faults of this moment act; what is left of the image and of the message of the ADCS."""
+        second = (utc_ns - self.first_utc_ns) / _NS
         present = {fault.kind: fault for fault in self.faults if fault.present(second)}
         for fault in self.faults:
             if fault.at_s <= second and fault not in self._begun:
@@ -300,7 +309,7 @@ class Spacecraft:
         return image, attitude
 
     def _strike(self, fault: Fault) -> None:
-        """Apply the effect of a fault at its beginning."""
+        """What happens once, when a fault begins."""
         board, bits = self.board, int(fault.size)
         if fault.kind in _REGIONS:
             region = _REGIONS[fault.kind]
@@ -333,10 +342,10 @@ class Spacecraft:
             memory[at] ^= 1 << int(self._rng.integers(0, 8))
 
 
-def fly(spacecraft: Spacecraft, schedule: Iterable[StepInput]) -> Iterator[StepResult]:
-    """Fly the steps of a schedule, which may look at the spacecraft before each."""
-    for step in schedule:
-        yield spacecraft.advance(step)
+def fly(spacecraft: Spacecraft, schedule: Iterable[Moment]) -> Iterator[Turn]:
+    """Fly the moments of a schedule, which may look at the spacecraft before each."""
+    for moment in schedule:
+        yield spacecraft.turn(moment)
 
 
 def new_spacecraft(world: World, loaded: LoadedPayload, first_utc_ns: int | None = None) -> Spacecraft:

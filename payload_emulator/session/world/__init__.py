@@ -1,1 +1,1 @@
-"""Simulated world: orbit, terrain regions, light, camera frames, external images, recipes of data sets."""
+"""What is simulated: orbit, terrain regions, light, camera frames, external images, recipes of data sets."""

@@ -151,7 +151,7 @@ def window_epochs(scenario: Scenario, data: DataFolder, count: int) -> tuple[Wor
 
 
 def view_at(world: World, utc_ns: int) -> View:
-    """Return position, camera attitude and Sun direction at an epoch."""
+    """Where the spacecraft is at an epoch, how its camera points, where the Sun stands."""
     position = world.truth.positions_mcmf(utc_ns)[0]
     rng = np.random.default_rng((world.scenario.seed, utc_ns))
     sun = true_sun_direction(world, position, utc_ns, rng)
@@ -189,7 +189,7 @@ def take_frame(
 
 
 def metadata_of(world: World, view: View) -> dict[str, Any]:
-    """Return the metadata of a view, angles in degrees; the same keys as in the metadata of data sets."""
+    """How a view is taken, angles in degrees; the same keys as in the metadata of data sets."""
     camera, section, scenario = world.true_camera, world.scenario.camera, world.scenario
     position, rotation, sun = view.position_mcmf_m, view.camera_from_mcmf, view.sun_mcmf
     latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))

@@ -1,4 +1,4 @@
-"""Contents of a data set: sources of terrain by split, where frames may look, under which light and from where.
+"""What a data set is made of: sources of terrain by split, where frames may look, under which light and from where.
 
 A recipe is a TOML file with a `[dataset]` table and one `[[dataset.source]]` table per source. Angles are degrees and
 lengths kilometres in the file. Splits are separated by footprint: every pixel of a frame looks into one of its source's
