@@ -29,10 +29,10 @@ from payload_emulator.session.live.station_ports import (
     Server,
     TelecommandBuffer,
 )
-from payload_emulator.session.live.viewing import turn_message
+from payload_emulator.session.live.viewing import step_message
 from payload_emulator.session.scenario import FaultsSection, parse_scenario
 from payload_emulator.session.spacecraft.loading import LoadedPayload, load_scenario_payload
-from payload_emulator.session.spacecraft.loop import Moment, Turn, new_spacecraft
+from payload_emulator.session.spacecraft.loop import StepInput, StepResult, new_spacecraft
 from payload_emulator.session.spacecraft.schedule import Operator, fly_scenario
 from payload_emulator.session.world.camera import Exposure, expose
 from payload_emulator.session.world.world import World, build_world
@@ -119,11 +119,11 @@ def ping(count: int) -> bytes:
     return DICTIONARY.pack_command("test_connection", {}, sequence_count=count)
 
 
-def seen_from(world: World, utc_ns: int, packets: list[bytes]) -> Turn:
+def seen_from(world: World, utc_ns: int, packets: list[bytes]) -> StepResult:
     """A step with a nadir image that is not rendered."""
     position = world.truth.positions_mcmf(utc_ns)[0]
     exposure = Exposure(utc_ns, np.zeros((0, 0), np.uint8), np.zeros(9), 0, world.camera_from_mcmf(position))
-    return Turn(Moment(utc_ns, 0, 1.0, True, 0), exposure, packets, b"")
+    return StepResult(StepInput(utc_ns, 0, 1.0, True, 0), exposure, packets, b"")
 
 
 def test_rings_of_the_catalogue_lie_on_the_rims_of_the_rendered_ground() -> None:
@@ -158,7 +158,7 @@ def test_detections_that_the_payload_identified_have_their_craters(
         for name, values in (("identifications", pairs), ("detections", detections))
     ]
     turn = seen_from(world, int(world.frame_utc_ns[0]), packets)
-    message = turn_message(new_spacecraft(world, loaded), turn)
+    message = step_message(new_spacecraft(world, loaded), turn)
     assert [one.get("crater_id") for one in message["detections"]] == [None, 4711, None]
     assert message["terrain"] == {"name": world.terrain.name, "real": False}
 
@@ -228,7 +228,7 @@ def test_the_operator_answers_to_telemetry_of_two_light_times_ago(flown: tuple[W
         operator = Operator(flown[0])
         # What the payload is in before moment k it was in telemetry of moment k - 1.
         seen = [
-            operator._mode_seen(Moment(EPOCH + k * step_s * second, -1, 1.0, True, 0, 1.28), mode)
+            operator._mode_seen(StepInput(EPOCH + k * step_s * second, -1, 1.0, True, 0, 1.28), mode)
             for k, mode in enumerate(modes)
         ]
         assert seen[behind:] == modes[: len(modes) - behind]
@@ -417,7 +417,9 @@ def test_a_processor_that_hangs_is_reset_and_the_payload_goes_on(flown: tuple[Wo
     flights = []
     for _ in range(2):
         spacecraft = new_spacecraft(replace(world, scenario=scenario), loaded)
-        packets = [packet for turn in fly_scenario(spacecraft.world, spacecraft) for packet in turn.packets]
+        packets = [
+            packet for result in fly_scenario(spacecraft.world, spacecraft) for packet in result.packets
+        ]
         flights.append(packets)
         assert len(spacecraft.resets) == 1 and spacecraft.payload.mode is PayloadMode.standby
     unpacked = list(map(DICTIONARY.unpack, flights[0]))

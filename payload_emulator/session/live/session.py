@@ -49,10 +49,10 @@ from payload_emulator.session.live.station_ports import (
     add_to_journal,
     load_journal,
 )
-from payload_emulator.session.live.viewing import rims_in_view, turn_message
+from payload_emulator.session.live.viewing import rims_in_view, step_message
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.session.spacecraft.loading import LoadedPayload
-from payload_emulator.session.spacecraft.loop import Moment, Spacecraft, Turn, fly, new_spacecraft
+from payload_emulator.session.spacecraft.loop import Spacecraft, StepInput, StepResult, fly, new_spacecraft
 from payload_emulator.session.spacecraft.schedule import Operator, timeline
 from payload_emulator.session.world.world import (
     CHUNK_S,
@@ -174,7 +174,7 @@ class LiveSession:
     stations: dict[str, StationPorts] = field(default_factory=dict)
     console: Server = field(init=False)
     mission_server: Server = field(init=False)
-    _slots: deque[Moment] = field(default_factory=deque)
+    _slots: deque[StepInput] = field(default_factory=deque)
     _operator: Operator | None = None
     _contacts: deque[StationContact] = field(default_factory=deque)
     _planned_until_ns: int = 0
@@ -236,8 +236,8 @@ class LiveSession:
             for server in self._servers():
                 server.attach(selector)
             try:
-                for turn in fly(self.spacecraft, self._moments(selector)):
-                    self._take(turn)
+                for result in fly(self.spacecraft, self._steps_due(selector)):
+                    self._take(result)
             finally:
                 self._save()
                 self._send_message({"kind": "end", "utc": format_utc(self.utc_ns)})
@@ -251,7 +251,7 @@ class LiveSession:
 
     # Time
 
-    def _moments(self, selector: selectors.BaseSelector) -> Iterator[Moment]:
+    def _steps_due(self, selector: selectors.BaseSelector) -> Iterator[StepInput]:
         """Yield the moments when their time has come, and serve the ports in between."""
         is_first = not self._is_continued
         while not self.stopping.is_set():
@@ -277,52 +277,52 @@ class LiveSession:
                 self._until_ns, self.paused = None, True
                 self._send_message({"kind": "paused", "utc": format_utc(self.utc_ns)})
 
-    def _scenario_moment(self, slot: Moment) -> Moment:
+    def _scenario_moment(self, slot: StepInput) -> StepInput:
         """Return a moment of the scenario with the telecommands of its operator, and with those that came by hand."""
         assert self._operator is not None
-        if not slot.heard:
+        if not slot.in_contact:
             self._end_contact()
         elif self.contact is None:
             self._begin_contact(self._always())
         receiver = self.spacecraft.receiver
-        receiver.carrier = receiver.bit_lock = slot.heard
-        orders = receiver.take(self._operator.orders(slot, self.spacecraft.payload.mode))
-        by_hand = self._take_orders(None) if slot.heard else b""
-        return replace(slot, orders=orders + by_hand + self._manual_step())
+        receiver.carrier = receiver.bit_lock = slot.in_contact
+        telecommands = receiver.take(self._operator.telecommands(slot, self.spacecraft.payload.mode))
+        by_hand = self._uplinked_telecommands(None) if slot.in_contact else b""
+        return replace(slot, telecommands=telecommands + by_hand + self._manual_step())
 
-    def _ground_moment(self) -> Moment:
+    def _ground_moment(self) -> StepInput:
         """Return what is due now where the ground commands."""
         utc_ns, spacecraft, link = self.utc_ns, self.spacecraft, self.world.scenario.link
         seconds = self._change_contact(utc_ns)
         contact = self.contact
         limited = self._names != (ALWAYS_HEARD,)
-        heard = contact is not None and (seconds > 0.0 or not limited)
-        orders = self._take_orders(seconds if limited else None) if heard else b""
-        orders += self._manual_step()
+        in_contact = contact is not None and (seconds > 0.0 or not limited)
+        telecommands = self._uplinked_telecommands(seconds if limited else None) if in_contact else b""
+        telecommands += self._manual_step()
         octets = int(link.rate_bps / 8.0 * seconds) if limited else UNLIMITED
-        spacecraft.receiver.carrier = spacecraft.receiver.bit_lock = heard
+        spacecraft.receiver.carrier = spacecraft.receiver.bit_lock = in_contact
         position, _ = self.world.truth.states(utc_ns)
         sun = sun_position_icrf_m(float(tdb_s_from_utc_ns(utc_ns)))
-        image_ns = self._image_ns(utc_ns, orders)
-        return Moment(
+        image_ns = self._image_ns(utc_ns, telecommands)
+        return StepInput(
             utc_ns,
             -1,
             float(sunlit_fraction(position[0], sun)),
-            heard,
-            octets if heard else 0,
+            in_contact,
+            octets if in_contact else 0,
             0.0 if contact is None else self._light_s(contact, utc_ns),
             image_ns,
             None if image_ns is None else self._next_image_ns(utc_ns),
-            orders,
+            telecommands,
         )
 
-    def _image_ns(self, utc_ns: int, orders: bytes) -> int | None:
+    def _image_ns(self, utc_ns: int, telecommands: bytes) -> int | None:
         """Return the time of the image that is due; None without one.
 
         It is that of the tick: what the telemetry says of its time is enough to make it again.
         """
         payload, ticks = self.spacecraft.payload, self._ticks(utc_ns)
-        if not payload.will_look(ticks, orders):
+        if not payload.will_look(ticks, telecommands):
             return None
         observing = payload.mode is PayloadMode.observing
         if observing and not payload.has_cadence and utc_ns < self._last_image_ns + self._interval_ns:
@@ -470,17 +470,17 @@ class LiveSession:
 
     # Link
 
-    def _take(self, turn: Turn) -> None:
+    def _take(self, result: StepResult) -> None:
         """Count what a step has done, and hand it to the station of the contact and to those who watch."""
-        self._count(turn)
+        self._count(result)
         contact = self.contact
         if contact is not None:
-            self._send(contact, turn)
+            self._send(contact, result)
             if self.utc_ns >= contact.stop_utc_ns:
                 self._end_contact()
         camera = self.spacecraft.camera
         if self._watching:
-            message = turn_message(self.spacecraft, turn, camera.shown)
+            message = step_message(self.spacecraft, result, camera.shown)
             message |= {"paused": self.paused, "rate": self.rate}
             line = json.dumps(message).encode() + b"\n"
             for number in self._watching:
@@ -488,12 +488,16 @@ class LiveSession:
         rendered = self.world.scenario.camera.images != "reduced"
         camera.beside = rims_in_view if self._watching and rendered else None
 
-    def _count(self, turn: Turn) -> None:
+    def _count(self, result: StepResult) -> None:
         account = self.account
-        if turn.exposure is not None and turn.exposure.fault:
+        if result.exposure is not None and result.exposure.fault:
             account.images_lost += 1
             self._send_message(
-                {"kind": "fault", "utc": format_utc(self.utc_ns), "text": f"no image: {turn.exposure.fault}"}
+                {
+                    "kind": "fault",
+                    "utc": format_utc(self.utc_ns),
+                    "text": f"no image: {result.exposure.fault}",
+                }
             )
         account.frames, account.resets = self.spacecraft.frames, len(self.spacecraft.resets)
 
@@ -536,7 +540,7 @@ class LiveSession:
         self.contact = None
         give_back()
 
-    def _take_orders(self, seconds: float | None) -> bytes:
+    def _uplinked_telecommands(self, seconds: float | None) -> bytes:
         """Return the telecommand packets that reach the spacecraft in some seconds of uplink; None: all that wait."""
         allowed = UNLIMITED if seconds is None else int(self.world.scenario.link.uplink_bps / 8.0 * seconds)
         packets: list[bytes] = []
@@ -551,23 +555,23 @@ class LiveSession:
         self.account.telecommands += len(packets)
         return b"".join(packets)
 
-    def _send(self, contact: StationContact, turn: Turn) -> None:
+    def _send(self, contact: StationContact, result: StepResult) -> None:
         """Send packets, or an idle frame, to the station of the contact, over the link of the scenario."""
         transmitter, account = self._transmitter, self.account
-        scenario, light_s = self.world.scenario, turn.moment.light_s
-        if turn.packets:
-            transmitter.send(turn.packets, self.utc_ns, light_s=light_s, clcw=turn.clcw)
+        scenario, light_s = self.world.scenario, result.step.light_s
+        if result.packets:
+            transmitter.send(result.packets, self.utc_ns, light_s=light_s, clcw=result.clcw)
             dump = transmitter.dumps.pop()
             reception = transmit(
                 [dump], transmitter.settings, scenario.link, scenario.seed + account.frames_sent
             )
             octets = reception.octets
-            account.packets += len(turn.packets)
+            account.packets += len(result.packets)
             account.packets_lost_on_link += reception.account["packets_lost"]
             account.frames_lost += reception.account["frames_lost_on_link"]
             account.frames_sent += reception.account["frames_sent"]
         else:
-            octets = transmitter.idle(turn.clcw)
+            octets = transmitter.idle(result.clcw)
         stated = dict(map(parse_clock_error, scenario.link.clock_errors))
         received_ns = self.utc_ns + round(light_s * _NS) + stated.get(contact.station, 0)
         self.stations[contact.station].send(received_ns, octets, transmitter.settings.cadu_length)

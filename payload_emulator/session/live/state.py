@@ -40,6 +40,12 @@ _SEQUENCES: dict[str, type] = {
 _PLAIN_NEW: object = object.__new__
 _MAPPINGS = (dict, Counter, OrderedDict)
 _UNSET = object()
+_LOOP = "payload_emulator.session.spacecraft.loop"
+RENAMED = {
+    f"{_LOOP}:Given": f"{_LOOP}:PayloadInput",
+    f"{_LOOP}:Spacecraft.given": "payload_input",
+}
+"""Present names of classes, and of attributes of classes, that states of this version may have by a former name."""
 
 
 def pack_state(scenario: str, values: Mapping[str, Any], known: Mapping[str, object]) -> bytes:
@@ -270,7 +276,7 @@ class _Reader:
         made = _class(name, object)
         one = self._made[at] = object.__new__(made)
         for attribute, node in attributes:
-            object.__setattr__(one, attribute, self.value(node))
+            object.__setattr__(one, RENAMED.get(f"{name}.{attribute}", attribute), self.value(node))
         return one
 
 
@@ -285,6 +291,7 @@ def _name(kind: type) -> str:
 
 def _class(name: str, base: type) -> Any:
     """Return a class that a module of this program defines."""
+    name = RENAMED.get(name, name)
     module_name, _, place = name.partition(":")
     if module_name.partition(".")[0] not in _PACKAGES:
         raise ValueError(f"expected a class of this program, found {name}")
