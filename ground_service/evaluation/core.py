@@ -59,12 +59,12 @@ from ground_service.evaluation.smoother import (
 )
 from ground_service.evaluation.verdict import (
     Evaluated,
-    Limits,
     StartOrbit,
     requirements,
     verdict_of,
     without_mission,
 )
+from ground_service.missions.model import Requirements
 from ground_service.passes.samples import DetectionSamples, NavigationSamples, OutcomeSamples
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
@@ -170,7 +170,7 @@ class PassInputs:
     onboard_gravity: GravityField | None = None
     refused: Mapping[str, str] = field(default_factory=dict)
     reference_sigma_rtn_m: tuple[float, float, float] | None = None
-    limits: Limits = field(default_factory=Limits)
+    limits: Requirements = field(default_factory=Requirements)
     experiment: StartOrbit | None = None
     clock_step_s: float | None = None
     no_mission: str = ""

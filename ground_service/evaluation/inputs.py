@@ -26,7 +26,7 @@ from ground_service.evaluation.smoother import (
     FilterStates,
     StartState,
 )
-from ground_service.evaluation.verdict import Limits, StartOrbit
+from ground_service.evaluation.verdict import StartOrbit
 from ground_service.ground import Ground
 from ground_service.missions.catalogues import catalogue_of, read_catalogue
 from ground_service.missions.ephemerides.model import Ephemeris as EphemerisEntry
@@ -157,7 +157,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             onboard_gravity=declared.onboard_gravity,
             refused=_refused(declared, mission.camera),
             reference_sigma_rtn_m=mission.reference.sigma_rtn_m,
-            limits=Limits(**mission.requirements.model_dump()),
+            limits=mission.requirements,
             experiment=_experiment(mission, manifest),
             clock_step_s=_clock_step_s(connection, record, span),
             no_mission="" if record.mission_id is not None else _no_mission(vehicle.ccsds_id),

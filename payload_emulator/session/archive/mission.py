@@ -86,7 +86,7 @@ ORBIT_AGE_H = 24.0
 
 _TRACK_STEP_S = 60.0
 _ALTITUDE_MARGIN = 1.3
-"""Altitudes of the mission beside those of the flight so far."""
+"""Altitudes of the mission in addition to those of the flight so far."""
 
 CLOCK_EPOCH = "2000-01-01T00:00:00 TAI"
 
