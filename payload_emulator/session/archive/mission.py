@@ -18,7 +18,7 @@ import numpy as np
 from lunar.arrays import IntArray
 from lunar.boxes import Region, share_outside
 from lunar.constants import MOON_RADIUS_M
-from lunar.constants import NANOSECONDS_PER_SECOND as NS
+from lunar.constants import NS as NS
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation, spherical_from_mcmf
 from lunar.timescales import format_utc
