@@ -9,7 +9,7 @@ from reports.figures.regression import draw_changed_craters
 from reports.sections.detection import gallery_picture
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
 from reports.text import count_text, loss_text, number_text, significant_text
-from reports.values import RegressionGate, RegressionReport
+from reports.values import Gate, RegressionReport
 
 _ORDER = ("fail", "inconclusive", "not judged", "pass")
 _SWATCHES = {"pass": "green", "inconclusive": "orange", "fail": "vermillion", "not judged": ""}
@@ -66,7 +66,7 @@ def _gates(report: RegressionReport) -> Table:
     )
 
 
-def _outcome_text(gate: RegressionGate) -> str:
+def _outcome_text(gate: Gate) -> str:
     """Return the outcome of a gate with its reason and evidence."""
     parts = [{"pass": "passed", "fail": "failed"}.get(gate.outcome, gate.outcome), gate.reason, gate.evidence]
     if gate.outcome == "inconclusive" and gate.frames_needed is not None:

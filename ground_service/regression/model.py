@@ -210,7 +210,7 @@ class JudgedGate(Entity):
     model_config = ConfigDict(validate_by_name=True, serialize_by_alias=True)
 
     name: str = Field(examples=["detector.recall"])
-    pass_name: str | None = Field(alias="pass", description="null: the whole suite")
+    pass_id: str | None = Field(alias="pass", description="null: the whole suite")
     outcome: str = Field(
         description="pass, fail, inconclusive, not judged, or informs: a metric that never decides",
         examples=["pass"],
@@ -246,7 +246,7 @@ class JudgedGate(Entity):
     @property
     def text(self) -> str:
         """The gate as one line: the change, its bounds and its evidence, or the reason of its outcome."""
-        place = "" if self.pass_name is None else f" on {self.pass_name}"
+        place = "" if self.pass_id is None else f" on {self.pass_id}"
         if self.baseline is None or self.candidate is None or self.outcome == "not judged":
             return f"{self.name}{place}: {self.reason or self.outcome}"
         unit = f" {self.unit}" if self.unit else ""

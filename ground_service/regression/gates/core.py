@@ -58,6 +58,7 @@ from ground_service.regression.gates.statistics import (
     student_upper_tail,
 )
 from reports.text import counted, loss_text
+from reports.values import Gate
 
 PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
 NOT_JUDGED, INFORMS = "not judged", "informs"
@@ -151,61 +152,6 @@ class GatePolicy:
     fail_level: float
     rules: tuple[GateRule, ...]
     inconclusive: str = "failure"
-
-
-@dataclass(frozen=True, slots=True)
-class Gate:
-    """Decision of one gate, or the change of a metric that informs.
-
-    Attributes
-    ----------
-    outcome
-        "pass", "fail", "inconclusive", "not judged" or "informs".
-    pass_name
-        Pass or kind of terrain; empty for all passes.
-    baseline, candidate
-        Values of the metric; NaN where unknown.
-    margin, limit
-        Tolerated loss, and the baseline with this loss.
-    change_low, change_high
-        One-sided 95 % bounds of the loss: a difference, or a share of the baseline. Positive is worse.
-    p_value, level
-        Of the test against no loss, and the level of the fail claim; NaN for exact gates.
-    resolution
-        Loss that these frames find with a power of 0.8; infinite if none.
-    frames, frames_needed
-        Number of compared frames, and number that decides an inconclusive gate; None if unknown.
-    evidence
-        Number and name of the units.
-    reason
-        The fact in words, where the figures alone do not state it.
-    relative
-        Whether margin, change and resolution are shares of the baseline.
-    """
-
-    name: str
-    outcome: str
-    baseline: float
-    candidate: float
-    margin: float
-    limit: float
-    unit: str = ""
-    pass_name: str = ""
-    change_low: float = math.nan
-    change_high: float = math.nan
-    p_value: float = math.nan
-    level: float = math.nan
-    resolution: float = 0.0
-    frames: int = 0
-    frames_needed: int | None = None
-    evidence: str = ""
-    reason: str = ""
-    relative: bool = False
-
-    @property
-    def passed(self) -> bool:
-        """Return whether the gate passed."""
-        return self.outcome == PASS
 
 
 def judge(

@@ -615,7 +615,7 @@ def test_a_build_that_differs_on_few_frames_is_inconclusive_with_the_frames_need
         dataclasses.replace(policy, policy=dataclasses.replace(policy.policy, rules=strict)),
     )
     assert (outcome.verdict, verdict_document(outcome).exit_status) == ("inconclusive", 3)
-    recall = next(gate for gate in outcome.gates if gate.name == "detector.recall" and not gate.pass_name)
+    recall = next(gate for gate in outcome.gates if gate.name == "detector.recall" and not gate.pass_id)
     assert (recall.outcome, recall.frames) == ("inconclusive", 60)
     assert recall.change_high > recall.margin == 0.045 > recall.change_low
     assert outcome.frames_judged == 60
