@@ -67,7 +67,6 @@ class Router:
     segment: str
 
     def imported(self) -> ModuleType:
-        """Return the module."""
         return import_module(self.module)
 
     def load(self) -> APIRouter:

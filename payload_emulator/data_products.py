@@ -275,5 +275,4 @@ PRODUCTS: tuple[Product, ...] = (
 
 
 def find_product(name: str) -> Product | None:
-    """The product of a name."""
     return next((product for product in PRODUCTS if product.name == name), None)

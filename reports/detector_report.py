@@ -23,7 +23,6 @@ from reports.values import BiasBin, DetectorReport, NamedScore, ResidualSeries, 
 
 
 def detector_document(report: DetectorReport) -> Document:
-    """The document of a detector."""
     blocks: list[Block] = [*judgement(report), Heading("Scores")]
     found = detector_blocks(report.score) if report.score is not None else []
     blocks += found or [absent(report, "score", "Scores", "the detector was not evaluated")]

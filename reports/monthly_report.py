@@ -19,7 +19,6 @@ METRICS = {
 
 
 def monthly_document(report: MonthlyReportValue) -> Document:
-    """Return the document of a monthly report."""
     blocks: list[Block] = [*judgement(report), Heading("Passes over time")]
     if report.passes:
         blocks.append(_trend(report))

@@ -16,7 +16,6 @@ _SWATCHES = {"pass": "green", "inconclusive": "orange", "fail": "vermillion", "n
 
 
 def regression_document(report: RegressionReport) -> Document:
-    """The document of a regression."""
     counts = {outcome: sum(g.outcome == outcome for g in report.gates) for outcome in _ORDER}
     blocks: list[Block] = [*judgement(report), Heading("Craters that changed"), *_changed(report)]
     blocks += [Heading("Passes"), _passes(report), Heading("Gates")]

@@ -21,7 +21,6 @@ def utc_fields(utc_ns: int) -> tuple[int, int, int, int, int, int]:
 
 
 def month_name(month: int) -> str:
-    """Name of a month, 1 to 12."""
     return _MONTHS[month - 1]
 
 

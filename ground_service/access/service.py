@@ -187,7 +187,6 @@ def list_users(ground: Ground) -> list[User]:
 
 
 def get_user(ground: Ground, name: str) -> User:
-    """Return one user."""
     with ground.database.reading() as connection:
         return User.of(dict(store.get_user(connection, name)))
 

@@ -89,7 +89,6 @@ def poses_of(inputs: PassInputs, states: str = REFERENCE) -> Poses:
 
 
 def states_names(inputs: PassInputs) -> list[str]:
-    """Return the names of the states of a pass."""
     names = [one.estimator for one in inputs.navigation if len(one.utc_ns)]
     return [*([REFERENCE] if inputs.reference is not None else []), *names]
 

@@ -101,7 +101,6 @@ class Run:
         return self.read(0, self.octets)
 
     def read(self, start: int, stop: int) -> OctetArray:
-        """Return the octets [start, stop)."""
         return as_octets(b"".join(self._blocks(start, stop)))
 
     def windows(self, start: int, stop: int) -> Iterator[tuple[OctetArray, bool]]:
@@ -315,7 +314,6 @@ class Reading:
         return reader
 
     def _form_of(self, spacecraft: int) -> PacketForm:
-        """Return the form of the packets of a spacecraft."""
         if spacecraft not in self.forms:
             with self.ground.database.reading() as connection:
                 found = packet_form(connection, spacecraft, self.piece.scope, self.piece.station)

@@ -89,7 +89,6 @@ def add_piece(connection: Connection, piece: Piece) -> None:
 
 
 def get_piece(connection: Connection, ingest_id: int) -> Piece:
-    """Return the piece of an ingest."""
     (piece,) = _pieces(connection, PIECES.c.ingest_id == ingest_id)
     return piece
 

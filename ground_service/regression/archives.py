@@ -321,7 +321,6 @@ def kept_archives(ground: Ground) -> list[KeptArchive]:
 
 
 def kept_archive(ground: Ground, digest: str) -> KeptArchive:
-    """Return a kept archive."""
     with ground.database.reading() as connection:
         return _shown(store.get_archive(connection, digest))
 

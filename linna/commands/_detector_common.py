@@ -10,7 +10,6 @@ from linna.parser import option
 
 
 def add_model(parser: argparse.ArgumentParser) -> None:
-    """Add --model."""
     from payload_emulator.flight.models import NETWORKS
 
     option(

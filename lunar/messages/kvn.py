@@ -141,7 +141,6 @@ def is_number(token: str) -> bool:
 
 
 def comment_lines(comments: Iterable[str]) -> list[str]:
-    """Return the COMMENT lines of comments."""
     return [f"COMMENT {line}".rstrip() for comment in comments for line in (comment.splitlines() or [""])]
 
 

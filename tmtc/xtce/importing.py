@@ -530,7 +530,6 @@ class _Importer:
         return made, self.values[id(found)]
 
     def aggregate(self, system: _System, node: Node) -> tuple[DataType, int]:
-        """An aggregate type."""
         node.only((*_DESCRIPTION, "MemberList"), _NAMED)
         listed = node.required("MemberList")
         listed.only(("Member",))

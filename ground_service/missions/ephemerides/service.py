@@ -67,7 +67,6 @@ def find_ephemeris(connection: Connection, *, sha256: str, precedence: int, name
 
 
 def get_ephemeris(connection: Connection, ephemeris_id: int) -> Ephemeris:
-    """Return an ephemeris."""
     return _ephemeris(repository.get(connection, EPHEMERIDES, ephemeris_id, "ephemeris"))
 
 

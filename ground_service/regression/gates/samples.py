@@ -323,7 +323,6 @@ def cell_places_deg(cell: IntArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _sums(owner: IntArray, values: FloatArray, frames: int) -> FloatArray:
-    """Sum of the values of each frame (frames,)."""
     return np.asarray(np.bincount(owner, weights=values, minlength=frames)[:frames], dtype=np.float64)
 
 

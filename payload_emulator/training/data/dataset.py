@@ -303,7 +303,6 @@ def write_shard(folder: Path, name: str, labels: ShardLabels) -> str:
 
 
 def load_shard(path: Path) -> ShardLabels:
-    """Labels of one shard."""
     try:
         # Opened here: numpy leaves a damaged file open.
         with path.open("rb") as stream, np.load(stream) as stored:
