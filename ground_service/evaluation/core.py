@@ -65,7 +65,7 @@ from ground_service.evaluation.verdict import (
     without_mission,
 )
 from ground_service.missions.model import Requirements
-from ground_service.passes.samples import DetectionSamples, NavigationSamples, OutcomeSamples
+from ground_service.telemetry.samples import DetectionSamples, NavigationSamples, OutcomeSamples
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M, NS
