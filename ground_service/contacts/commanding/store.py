@@ -411,9 +411,9 @@ def _fates(
             VERIFICATIONS.c.request_id.in_(requests),
         )
     )
-    reports: dict[int, list[VerificationReport]] = {}
+    by_request: dict[int, list[VerificationReport]] = {}
     for row in reports:
-        reports.setdefault(row.request_id, []).append(VerificationReport(*row))
+        by_request.setdefault(row.request_id, []).append(VerificationReport(*row))
     copies = connection.execute(
         select(TELECOMMANDS.c.request_id, TELECOMMANDS.c.id, TELECOMMANDS.c.sent_after_ticks).where(
             TELECOMMANDS.c.vehicle_id == vehicle,
@@ -426,7 +426,7 @@ def _fates(
         later = [ticks for request, number, ticks in copies if request == one.request_id and number > key]
         fates[key] = fate_of(
             replace(one, repeated_after_ticks=min(later, default=None)),
-            reports.get(one.request_id, ()),
+            by_request.get(one.request_id, ()),
             now_utc_ns,
         )
     return fates
