@@ -156,9 +156,9 @@ def test_no_import_cycles_also_in_functions_and_for_type_checking() -> None:
     ("module", "planted", "cycle"),
     [
         (
-            "ground_service/telemetry/packets.py",
+            "ground_service/ingest/frames.py",
             "def late():\n    from ground_service.ingest import service",
-            "ground_service.telemetry.packets",
+            "ground_service.ingest.frames",
         ),
         (
             "ground_service/store/files.py",
