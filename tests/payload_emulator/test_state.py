@@ -17,7 +17,13 @@ from lunar.datafolder import DataFolder
 from payload_emulator.errors import RecordError
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.session.live.session import LiveSession
-from payload_emulator.session.live.state import VERSION, load_state, pack_state, save_state, unpack_state
+from payload_emulator.session.live.state import (
+    VERSION,
+    load_state,
+    pack_state,
+    save_state,
+    unpack_state,
+)
 from payload_emulator.session.live.station_ports import (
     JournalEntry,
     StationPorts,
@@ -271,16 +277,20 @@ def test_a_session_repeats_the_newer_transmissions_of_its_journal_at_their_times
     session = LiveSession(
         *launch(parse_scenario(SCENARIO), DataFolder(None)), keeps=True, journal_file=journal
     )
+    contacts = session.contacts
     try:
-        assert session.stations["madrid"].taken == {256, 512}
-        session._repeat_journal()
-        assert [octets for _, octets in session._uplinked] == [b"now"] and session._sent_up == {256}
+        assert contacts.stations["madrid"].taken == {256, 512}
+        contacts.repeat_journal(session.utc_ns)
+        assert [octets for _, octets in contacts._uplink] == [b"now"] and contacts._sent_up == {256}
         session.utc_ns += 10
-        session._repeat_journal()
-        session._repeat_journal()
-        assert [octets for _, octets in session._uplinked] == [b"now", b"later"]
+        contacts.repeat_journal(session.utc_ns)
+        contacts.repeat_journal(session.utc_ns)
+        assert [octets for _, octets in contacts._uplink] == [b"now", b"later"]
         # Without a contact nothing is taken, and nothing is written.
-        assert not session._take_telecommands("madrid", 768, b"new") and len(load_journal(journal)) == 2
+        assert (
+            not contacts.receive(lambda: session.utc_ns, "madrid", 768, b"new")
+            and len(load_journal(journal)) == 2
+        )
     finally:
         session.close()
 

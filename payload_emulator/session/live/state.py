@@ -16,8 +16,10 @@ import importlib
 import json
 import os
 import re
+import struct
 from collections import Counter, OrderedDict, deque
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import Enum
 from io import BytesIO
 from pathlib import Path
@@ -40,10 +42,12 @@ _SEQUENCES: dict[str, type] = {
 _PLAIN_NEW: object = object.__new__
 _MAPPINGS = (dict, Counter, OrderedDict)
 _UNSET = object()
+_CLOCK = struct.Struct("<q")
 _LOOP = "payload_emulator.session.spacecraft.loop"
 RENAMED = {
     f"{_LOOP}:Given": f"{_LOOP}:PayloadInput",
     f"{_LOOP}:Spacecraft.given": "payload_input",
+    "payload_emulator.session.live.session:Account": "payload_emulator.session.live.contacts:Account",
 }
 """Present names of classes, and of attributes of classes, that states of this version may have by a former name."""
 
@@ -132,6 +136,26 @@ def load_state(path: Path, scenario: str, known: Mapping[str, object]) -> dict[s
         return unpack_state(octets, scenario, known)
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from None
+
+
+@dataclass(slots=True)
+class ClockFile:
+    """File of the mission time, which other processes map into memory; without a path, none."""
+
+    path: Path | None
+    _map: Any = None
+
+    def write(self, utc_ns: int) -> None:
+        """Write the time."""
+        if self.path is None:
+            return
+        if self._map is None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            # Other processes have mapped the file of an earlier session: it must not become shorter.
+            with self.path.open("r+b" if self.path.exists() else "w+b") as file:
+                file.write(_CLOCK.pack(utc_ns))
+            self._map = np.memmap(self.path, dtype="<i8", mode="r+", shape=(1,))
+        self._map[0] = utc_ns
 
 
 class _Writer:

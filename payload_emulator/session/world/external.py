@@ -137,7 +137,7 @@ class ExternalFrames:
     evidence: World = ""
 
     def image(self, utc_ns: int) -> Picture:
-        """Pixels of the frame of a time, 8 or 16 bits.
+        """Return the pixels of the frame of a time, 8 or 16 bits.
 
         Raises
         ------
