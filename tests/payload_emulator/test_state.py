@@ -18,6 +18,7 @@ from payload_emulator.errors import RecordError
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.session.live.session import LiveSession
 from payload_emulator.session.live.state import (
+    RENAMED,
     VERSION,
     load_state,
     pack_state,
@@ -193,6 +194,25 @@ def test_a_document_names_octets_by_their_numbers_and_equal_ones_are_written_onc
     assert unpack_state(sealed(["a", root, [3, 5]]), "a", {}) == {"one": [b"\0\1\2", b"\3\4\5\6\7"]}
     once = len(pack_state("a", {"one": bytes(50_000)}, {}))
     assert len(pack_state("a", {"one": bytes(50_000), "two": bytearray(50_000)}, {})) < once + 100
+
+
+NAMES = json.loads(Path(__file__).with_name("state_names.json").read_text())
+"""Attributes of the classes in a state of version 7, as it was written before names changed."""
+
+
+@pytest.mark.parametrize("former", NAMES)
+def test_a_state_that_an_earlier_program_wrote_is_read(former: str) -> None:
+    attributes = {name: RENAMED.get(f"{former}.{name}", name) for name in NAMES[former].split()}
+    node = ["object", former, *([name, position] for position, name in enumerate(attributes))]
+    found = unpack_state(sealed(["a", ["dict", ["one", node]], [8]]), "a", {})["one"]
+    assert [getattr(found, name) for name in attributes.values()] == [*range(len(attributes))]
+    assert not [name for name in getattr(type(found), "__slots__", ()) if not hasattr(found, name)]
+
+
+def test_a_field_that_a_state_lacks_has_its_default() -> None:
+    node = ["object", "tmtc.link.uplink:Farm", ["virtual_channel", 2]]
+    found = unpack_state(sealed(["a", ["dict", ["one", node]], [8]]), "a", {})["one"]
+    assert found == Farm(2)
 
 
 FIRST = JournalEntry(5, "madrid", 256, b"\x01\x02")

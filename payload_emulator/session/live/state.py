@@ -6,7 +6,8 @@ list that begins with its kind; a value that occurs again is `["ref", n]`, the n
 the last item of the document has their lengths, and equal ones are written once. Arrays keep their views: flight
 software holds views of the memory of its board, and a later fault of the memory has to reach it.
 
-Nothing in the file is executed: it names classes of this program, whose attributes are set without a call.
+Nothing in the file is executed: it names classes of this program, whose attributes are set without a call. A class or
+attribute that gets another name needs an entry in `RENAMED`, a new field a default; other changes a new `VERSION`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import re
 import struct
 from collections import Counter, OrderedDict, deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import MISSING, Field, dataclass
 from enum import Enum
 from io import BytesIO
 from pathlib import Path
@@ -301,6 +302,13 @@ class _Reader:
         one = self._made[at] = object.__new__(made)
         for attribute, node in attributes:
             object.__setattr__(one, RENAMED.get(f"{name}.{attribute}", attribute), self.value(node))
+        known: dict[str, Field[Any]] = getattr(made, "__dataclass_fields__", {})
+        if len(attributes) < len(known):
+            for key, field in known.items():  # fields that were added since the state was written
+                factory = field.default_factory
+                value = field.default if factory is MISSING else factory()
+                if value is not MISSING and not hasattr(one, key):
+                    object.__setattr__(one, key, value)
         return one
 
 
