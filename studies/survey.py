@@ -123,10 +123,10 @@ def _flown(world: World, data: DataFolder, progress: Progress) -> SurveySession:
     spacecraft = new_spacecraft(world, loaded)
     attitudes = np.full((world.frame_utc_ns.size, 3, 3), np.nan)
     packets: list[bytes] = []
-    for turn in progress(fly_scenario(world, spacecraft), len(timeline(world))):
-        packets += turn.packets
-        if turn.exposure is not None:
-            attitudes[turn.moment.frame] = turn.exposure.camera_from_mcmf
+    for result in progress(fly_scenario(world, spacecraft), len(timeline(world))):
+        packets += result.packets
+        if result.exposure is not None:
+            attitudes[result.step.frame] = result.exposure.camera_from_mcmf
     judged = judge_session(world, loaded, catalogue, attitudes, b"".join(packets))
     if judged is None:
         raise ScenarioError(

@@ -202,7 +202,8 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
     from linna.data import data_folder
     from lunar.timescales import format_utc
     from payload_emulator.session.archive.mission import OPERATIONS, default_ports, live_mission_text
-    from payload_emulator.session.live.session import LiveSession, station_names
+    from payload_emulator.session.live.contacts import station_names
+    from payload_emulator.session.live.session import LiveSession
     from payload_emulator.session.spacecraft.loading import launch, load_scenario_payload
     from payload_emulator.session.world.world import build_world
 

@@ -41,7 +41,7 @@ SHIPPED = Path(__file__).resolve().parents[2] / "scenarios"
 
 @dataclass(frozen=True, slots=True)
 class OrbitSection:
-    """Where the spacecraft is at the epoch: osculating Keplerian elements, a Cartesian state, or an OEM file.
+    """Orbit at the epoch: osculating Keplerian elements, a Cartesian state, or an OEM file.
 
     `position_km` and `velocity_km_s` (three numbers each, axes of `frame`) replace the elements. An OEM file gives the
     whole trajectory.
@@ -80,7 +80,7 @@ class DynamicsSection:
 class ManeuverSection:
     """The paper's orbit maintenance (section V-B.1).
 
-    The payload is told of planned burns; what is carried out differs from the plan by a share of it (1 sigma per axis).
+    The payload knows the planned burns; what is carried out differs from the plan by a share of it (1 sigma per axis).
     """
 
     enabled: bool = True
@@ -92,7 +92,7 @@ class ManeuverSection:
 
 @dataclass(frozen=True, slots=True)
 class WindowSection:
-    """When the payload observes.
+    """Observation windows of the payload.
 
     `search`: "terrain" takes the first window of the wanted direction that lies entirely over the available terrain,
     no earlier than `start` (the orbit's epoch when empty), between the two longitudes (east-positive; the second may
@@ -233,10 +233,10 @@ class AttitudeSection:
 
 @dataclass(frozen=True, slots=True)
 class DisturbancesSection:
-    """What happens on the way; times in seconds after the first frame, nothing happens where a size is zero.
+    """Disturbances of the flight; times in seconds after the first frame, none where a size is zero.
 
     - kidnap: the spacecraft is found elsewhere, turned about the Moon's centre by a distance on the ground; `told`: the
-      payload is told by telecommand that its estimate is worth no more than that distance;
+      payload is informed by telecommand that its estimate is worth no more than that distance;
     - outage: the camera gives no image;
     - burn: along the velocity; `declared`: the payload has it in its burn table. `maneuvers` gives its execution error.
     """
@@ -262,7 +262,7 @@ class ClockSection:
 
 @dataclass(frozen=True, slots=True)
 class FaultsSection:
-    """What breaks: a line each, `KIND at SECONDS [for SECONDS] [size NUMBER]`; the kinds are in `sim.faults`."""
+    """Faults: a line each, `KIND at SECONDS [for SECONDS] [size NUMBER]`; the kinds are in `sim.faults`."""
 
     events: tuple[str, ...] = ()
 
@@ -368,7 +368,7 @@ class Scenario:
         seed: int | None = None,
         anchoring_catalogue: Path | None = None,
     ) -> Scenario:
-        """The same scenario with other estimators, seed or table of craters; None keeps what it has."""
+        """Return the same scenario with other estimators, seed or table of craters; None keeps what it has."""
         navigation = self.navigation
         if modes is not None:
             navigation = dataclasses.replace(navigation, estimators=tuple(dict.fromkeys(modes)))
@@ -388,7 +388,7 @@ def shipped_file(path: Path) -> Path:
 
 
 def load_scenario(path: Path | str) -> Scenario:
-    """The scenario in a TOML file; a bare name means one of those shipped (`scenarios/NAME.toml`).
+    """Load the scenario of a TOML file; a bare name means one of those shipped (`scenarios/NAME.toml`).
 
     Raises
     ------
@@ -412,7 +412,7 @@ def load_scenario(path: Path | str) -> Scenario:
 
 
 def parse_scenario(text: str, source: str = "scenario") -> Scenario:
-    """The scenario written in `text`; `source` names it in error messages.
+    """Parse the scenario in `text`; `source` names it in error messages.
 
     Archives state every key, so keys without effect are allowed.
     """
@@ -437,7 +437,7 @@ def parse_scenario(text: str, source: str = "scenario") -> Scenario:
 
 
 def format_scenario(scenario: Scenario) -> str:
-    """TOML text that parses to an equal scenario (every key written out)."""
+    """Return TOML text that parses to an equal scenario (every key written out)."""
     lines: list[str] = []
     sections: list[str] = []
     for item in dataclasses.fields(scenario):

@@ -24,7 +24,7 @@ from lunar.frames import IauOrientation, spherical_from_mcmf
 from lunar.timescales import format_utc
 from payload_emulator.flight.models import NETWORKS
 from payload_emulator.flight.vision.detector import OnnxDetector
-from payload_emulator.session.archive.recording import StepInput
+from payload_emulator.session.archive.recording import RecordedStep
 from payload_emulator.session.live.station_ports import RECORD_HEADER
 from payload_emulator.session.scenario import (
     SHIPPED,
@@ -208,7 +208,7 @@ def _track_utc_ns(world: World) -> IntArray:
 
 
 def _registration(world: World) -> dict[str, float | int]:
-    """Where the catalogue is registered to the terrain, and its shift near the frames."""
+    """Return the terrain that the catalogue is registered to, and its shift near the frames."""
     registration = world.terrain.registration
     share = registered_share(world.terrain, world.truth, world.frame_utc_ns)
     if registration is None or not share:
@@ -295,7 +295,7 @@ def _section(title: str, values: Mapping[str, Value]) -> list[str]:
 
 
 def _station(name: str, link: LinkSection) -> dict[str, Value]:
-    """Place, rates and outages of a station of the scenario, and its records."""
+    """Return place, rates and outages of a station of the scenario, and its records."""
     records: dict[str, Value] = {
         "header_octets": RECORD_HEADER.size,
         "time_code": "unix_ns",
@@ -318,14 +318,14 @@ def _station(name: str, link: LinkSection) -> dict[str, Value]:
 
 
 def _uploaded_tables(scenario: Scenario) -> list[str]:
-    """Tables that the estimators of a scenario need for each window."""
+    """Return the tables that the estimators of a scenario need for each window."""
     estimators = scenario.navigation.estimators
     anchored = ["orientation"] if "anchored" in estimators else []
     odometry = ["anchor_ephemeris"] if set(estimators) - {"anchored"} else []
     return [*anchored, *odometry, *(["initial_state"] if anchored else [])]
 
 
-def save_attitudes(folder: Path, inputs: Iterable[StepInput]) -> None:
+def save_attitudes(folder: Path, inputs: Iterable[RecordedStep]) -> None:
     """Write the attitude of every frame, as attitude control gave it, into an archive."""
     rows = []
     for item in inputs:

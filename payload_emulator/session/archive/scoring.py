@@ -81,7 +81,7 @@ class FlownErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedSession:
-    """What the anchored estimator did in a session, judged by the truth; a row per frame of the session.
+    """Performance of the anchored estimator in a session, judged by the truth; a row per frame of the session.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class JudgedSession:
 
     @property
     def wrong_fixes(self) -> int:
-        """Fixes most of whose pairs are wrong."""
+        """Fixes with mostly wrong pairs."""
         return int(np.sum(self.fixed & (self.pairs[:, 1] > self.pairs[:, 0])))
 
     def nis_per_degree(self, chosen: BoolArray) -> float | None:
@@ -258,7 +258,7 @@ def _errors(
 
 
 def turns(rotation: FloatArray, orientation: OrientationTable, ticks: IntArray) -> FloatArray:
-    """Rotations (n, 3, 3) from the payload's inertial axes to the true ones, by way of the Moon both look at."""
+    """Return the rotations (n, 3, 3) from the payload's inertial axes to the true ones, by way of the Moon."""
     own = [orientation.at(int(tick)) for tick in ticks]
     known = np.array([np.full((3, 3), np.nan) if matrix is None else matrix for matrix in own])
     return icrf_from_onboard(rotation, known)
@@ -274,7 +274,7 @@ def turned(states: FloatArray, turn: FloatArray) -> FloatArray:
 
 
 def rtn_errors(states: FloatArray, truth: FloatArray, turn: FloatArray, rtn: FloatArray) -> FloatArray:
-    """Errors (n, 6) of the payload's states along the axes of the true orbit."""
+    """Return the errors (n, 6) of the payload's states along the axes of the true orbit."""
     return turned(turned(states, turn) - truth, rtn)
 
 
@@ -288,7 +288,7 @@ def normalised_squares(error: FloatArray, block: FloatArray) -> FloatArray:
 
 
 def _propagated(loaded: LoadedPayload, model: OrbitModel, burns: BurnTable, ticks: IntArray) -> FloatArray:
-    """States (n, 6) of the start state flown on without any image, NaN where the orbit model ends."""
+    """Return the states (n, 6) of the start state propagated without any image, NaN where the orbit model ends."""
     start = unpack_initial_state(loaded.tables.initial_state)
     state: FloatArray | None = np.concatenate([start.position_icrf_m, start.velocity_icrf_m_s, np.zeros(3)])
     at, states = start.ticks, np.full((ticks.size, 6), np.nan)
@@ -419,7 +419,7 @@ def frames_to_recover(error_m: FloatArray) -> int | None:
 
 
 def _recovery(world: World, errors: FlownErrors, imaging: BoolArray) -> dict[str, Any] | None:
-    """How many frames with an image it took to be back after a kidnap or an outage; None without either."""
+    """Return the number of frames with an image until recovery from a kidnap or an outage; None without either."""
     section = world.scenario.disturbances
     if section.kidnap_distance_km > 0.0:
         event = "kidnap told" if section.kidnap_told else "silent kidnap"

@@ -36,7 +36,7 @@ _HOT = 4.0
 
 
 def read_picture(path: Path) -> tuple[NDArray[np.generic], str]:
-    """Pixels of an image file (PNG, JPEG, TIFF, NPY), and what was wrong with some of them; colours in RGB order.
+    """Read the pixels of an image file (PNG, JPEG, TIFF, NPY) and the faults of some; colours in RGB order.
 
     Pixels are 8 or 16 bits or float in 0..1, turned as EXIF states. Those without data (not finite, far below zero)
     become black. A 16-bit file whose greatest value would fit into 12 or 14 bits is taken for one of so many. Float
@@ -137,7 +137,7 @@ class ExternalFrames:
     evidence: World = ""
 
     def image(self, utc_ns: int) -> Picture:
-        """Pixels of the frame of a time, 8 or 16 bits.
+        """Return the pixels of the frame of a time, 8 or 16 bits.
 
         Raises
         ------
@@ -177,7 +177,7 @@ class ExternalFrames:
 
 
 def load_external(folder: Path, scenario: Scenario, evidence: World = "") -> ExternalFrames:
-    """The frames of a folder for the camera of a scenario.
+    """Load the frames of a folder for the camera of a scenario.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def load_external(folder: Path, scenario: Scenario, evidence: World = "") -> Ext
 
 
 def external_scenario(scenario: Scenario, frames: ExternalFrames) -> Scenario:
-    """The scenario with the orbit and times of external frames, the real Sun, and without pointing errors."""
+    """Return the scenario with the orbit and times of external frames, the real Sun, and without pointing errors."""
     duration_s = float(frames.utc_ns[-1] - frames.utc_ns[0]) / 1e9
     return replace(
         scenario,

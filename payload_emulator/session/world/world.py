@@ -125,7 +125,7 @@ _parsed_utc = functools.lru_cache(maxsize=16)(parse_utc)
 
 
 def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames | None = None) -> World:
-    """The world of a scenario, flown as far as its observation windows reach.
+    """Build the world of a scenario, flown as far as its observation windows reach.
 
     With external frames, their ephemeris is the flight and their times are the frames.
 
@@ -291,7 +291,7 @@ def extended_flight(world: World, duration_s: float) -> tuple[Truth, tuple[TrueB
 def _disturbed(
     scenario: Scenario, truth: Truth, burns: tuple[TrueBurn, ...], first_utc_ns: int, model: ForceModel
 ) -> tuple[Truth, tuple[TrueBurn, ...]]:
-    """The flight with the disturbances of the scenario, and all its burns."""
+    """Return the flight with the disturbances of the scenario, and all its burns."""
     section = scenario.disturbances
     if section.burn_delta_v_m_s != 0.0:
         utc_ns = first_utc_ns + round(section.burn_at_s * _NS)
@@ -312,7 +312,7 @@ def _disturbed(
 
 
 def clock_ticks(world: World, utc_ns: int) -> int:
-    """The on-board clock's reading: ideal ticks, an offset, and a drift since the reference of the clock."""
+    """Return the on-board clock's reading: ideal ticks, an offset, and a drift since the reference of the clock."""
     clock = world.scenario.clock
     elapsed_s = (utc_ns - world.clock_utc_ns) / _NS
     error_s = clock.offset_s + clock.drift_ppm * 1e-6 * elapsed_s
@@ -376,7 +376,7 @@ def _fly_to_windows(
 
 
 def _no_band(crossings: list[Crossing], window: WindowSection) -> str:
-    """Which latitudes lack terrain on the crossing that lacks the least of it."""
+    """Return the latitudes that lack terrain on the crossing that lacks the least."""
     band = f"latitudes {_degrees(window.latitude_band_deg)}"
     near = [one for one in crossings if one.in_reach and one.missing_rad.size]
     if not near:
@@ -466,7 +466,7 @@ def _truth_of_ephemeris(ephemeris: Ephemeris, orientation: Orientation) -> Truth
 
 
 def sample_truth(truth: Truth, frame_utc_ns: IntArray, object_name: str = "SELENITA") -> Ephemeris:
-    """The true trajectory over the frames and a margin: a state each ten seconds, a segment between jumps."""
+    """Sample the true trajectory over the frames and a margin: a state each ten seconds, a segment between jumps."""
     start = max(int(frame_utc_ns[0]) - _EPHEMERIS_MARGIN_NS, truth.start_utc_ns)
     stop = min(int(frame_utc_ns[-1]) + _EPHEMERIS_MARGIN_NS, truth.stop_utc_ns)
     grid = np.append(np.arange(start, stop, _EPHEMERIS_STEP_NS, dtype=np.int64), stop)
@@ -537,7 +537,7 @@ def with_reference_error(ephemeris: Ephemeris, section: ReferenceSection, seed: 
 
 
 def catalogue_near_track(world: World) -> CraterCatalogue:
-    """The craters of 3 to 30 km that any frame could see, with the heights of their rims."""
+    """Return the craters of 3 to 30 km that any frame could see, with the heights of their rims."""
     positions = world.truth.positions_mcmf(world.frame_utc_ns)
     latitude, longitude, altitude = spherical_from_mcmf(positions)
     half_diagonal = np.sqrt(2.0) * np.tan(np.radians(world.scenario.camera.fov_deg) / 2.0)
