@@ -20,7 +20,7 @@ from ground_service.errors import GroundError, fault_of
 from ground_service.ground import Ground
 from ground_service.jobs.dispatcher import Dispatcher
 from ground_service.jobs.store import repeat_failed
-from ground_service.planning.standing import needs_plan
+from ground_service.planning.standing import fail_late, needs_plan
 from ground_service.regression.jobs import nightly_placebo
 from ground_service.store import leases
 from ground_service.worker.upkeep import DAY_NS, nightly_job_id, plan_job_id
@@ -54,7 +54,7 @@ class Scheduler:
     kept
         Arguments of the nightly job: for how long what is kept (`upkeep.nightly`).
     plan_hourly
-        Whether the job of the plan is entered once an hour of mission time.
+        Whether windows that can no longer begin fail, and the job of the plan is entered once an hour of mission time.
     """
 
     def __init__(
@@ -118,6 +118,7 @@ class Scheduler:
             self._watch_s = time.monotonic() + WATCH_S
             self._do("watch", self._watch.tick)
         if self._plan_hourly:
+            self._do("windows that did not begin", lambda: fail_late(self._ground))
             self._do("plan", self._enter_plan)
         self._do("nightly job", self._enter_night)
         return True
