@@ -35,7 +35,11 @@ class Diary:
         """Record a step, and a wrong turn if what the documents state did not happen."""
         self.steps += 1
         word = "ok" if held else f"wrong turn ({kind})"
-        print(f"[{self.name} {time.monotonic() - self.started:5.0f} s] {word}: {step}", file=sys.stderr, flush=True)
+        print(
+            f"[{self.name} {time.monotonic() - self.started:5.0f} s] {word}: {step}",
+            file=sys.stderr,
+            flush=True,
+        )
         if not held:
             print(f"    found: {str(found)[:600]}", file=sys.stderr, flush=True)
             self.turns.append((kind, f"{step}; found {str(found)[:300]}"))
@@ -49,7 +53,9 @@ class Diary:
                     "hour": self.name,
                     "seconds": round(time.monotonic() - self.started),
                     "steps": self.steps,
-                    "wrong_turns": {kind: [text for one, text in self.turns if one == kind] for kind in "ABC"},
+                    "wrong_turns": {
+                        kind: [text for one, text in self.turns if one == kind] for kind in "ABC"
+                    },
                 }
             )
         )

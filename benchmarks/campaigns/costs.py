@@ -353,7 +353,10 @@ def measured(only: Sequence[str]) -> Iterator[Cost]:
 
 def table(costs: Sequence[Cost]) -> str:
     """Return the table, the largest first."""
-    lines = ["| operation | input | status | memory, MiB | kept, MiB | processor, s |", "|---|---|---|---|---|---|"]
+    lines = [
+        "| operation | input | status | memory, MiB | kept, MiB | processor, s |",
+        "|---|---|---|---|---|---|",
+    ]
     for one in sorted(costs, key=lambda one: (-one.memory_mib, -one.processor_s)):
         lines.append(
             f"| `{one.operation}` | {one.what} | {one.status} | {one.memory_mib:.0f} | {one.kept_mib:.0f} | {one.processor_s:.1f} |"

@@ -38,7 +38,12 @@ class Shell:
         )
         environment.pop("LINNA_DATA", None)
         done = subprocess.run(
-            ["bash", "-c", line], cwd=self.folder, env=environment, capture_output=True, text=True, check=False
+            ["bash", "-c", line],
+            cwd=self.folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
         )
         return done.returncode, done.stdout + done.stderr
 
@@ -66,7 +71,12 @@ def main(words: Sequence[str] | None = None) -> int:
             status, told = shell.run(line.replace("--frames 40", f"--frames {given.frames}"))
             diary.expect("B", f"as printed: {line[:60]}", status in (0, 1), f"{status}: {told}")
         first = next((one for one in told.splitlines() if re.match("(fail|pass|inconclusive):", one)), "")
-        diary.expect("A", "the worse detector fails, and the line says what fell", first.startswith("fail: recall falls"), told)
+        diary.expect(
+            "A",
+            "the worse detector fails, and the line says what fell",
+            first.startswith("fail: recall falls"),
+            told,
+        )
         diary.expect("B", "the report exists", (shell.folder / "gate.html").exists())
         programs(diary, shell)
         mistakes(diary, shell)
@@ -78,14 +88,31 @@ def programs(diary: Diary, shell: Shell) -> None:
     run = "linna regress run --archive passes --baseline current --home gate-ground --build"
     template(shell.folder / "same")
     status, told = shell.run(f"{run} same/build.toml")
-    diary.expect("A", "the template is identical in every octet", status == 0 and "identical in every octet" in told, told)
-    template(shell.folder / "slow", BUSY.format(seconds=120), program="slow")
+    diary.expect(
+        "A",
+        "the template is identical in every octet",
+        status == 0 and "identical in every octet" in told,
+        told,
+    )
+    template(shell.folder / "slow", BUSY.format(seconds=30), program="slow")
     status, told = shell.run(f"{run} slow/build.toml --repeat-baseline --junit slow.xml")
     is_named = "processor time" in told or "latency" in told
-    diary.expect("A", "a program with more processor time does not pass in silence", status != 0 and is_named, f"{status}: {told}")
-    template(shell.folder / "crash", "def stop():\n    raise ValueError('wrong turn')\nstop()\n", program="crash")
+    diary.expect(
+        "A",
+        "a program with more processor time does not pass in silence",
+        status != 0 and is_named,
+        f"{status}: {told}",
+    )
+    template(
+        shell.folder / "crash", "def stop():\n    raise ValueError('wrong turn')\nstop()\n", program="crash"
+    )
     status, told = shell.run(f"{run} crash/build.toml --junit crash.xml")
-    diary.expect("B", "the traceback of a crash is in the text", status != 0 and "wrong turn" in told, f"{status}: {told}")
+    diary.expect(
+        "B",
+        "the traceback of a crash is in the text",
+        status != 0 and "wrong turn" in told,
+        f"{status}: {told}",
+    )
     junit = shell.folder / "crash.xml"
     text = junit.read_text() if junit.exists() else "no file"
     diary.expect("B", "and in JUnit", "system-err" in text and "wrong turn" in text, text)
@@ -101,13 +128,18 @@ def mistakes(diary: Diary, shell: Shell) -> None:
     ):
         folder = shell.folder / what.replace(" ", "-")
         template(folder, **{old: new})
-        for command in (f"linna replay --check-build {folder.name}/build.toml", f"{run} {folder.name}/build.toml"):
+        for command in (
+            f"linna replay --check-build {folder.name}/build.toml",
+            f"{run} {folder.name}/build.toml",
+        ):
             status, told = shell.run(command)
             held = status == 2 and "Traceback" not in told and "expected" in told
             diary.expect("B", f"{what} is refused by {command.split()[1]}", held, f"{status}: {told}")
     (shell.folder / "parameters.toml").write_text("detector.score_treshold = 0.8\n")
     status, told = shell.run("linna replay --check-build build.toml")
-    diary.expect("B", "a misspelled parameter is named", status == 2 and "score_threshold" in told, f"{status}: {told}")
+    diary.expect(
+        "B", "a misspelled parameter is named", status == 2 and "score_threshold" in told, f"{status}: {told}"
+    )
     status, told = shell.run(f"{run} build.toml --archive nowhere")
     diary.expect("B", "a missing archive is one line", status == 2 and "nowhere" in told, f"{status}: {told}")
 

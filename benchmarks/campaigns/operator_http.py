@@ -37,7 +37,9 @@ def main(words: Sequence[str] | None = None) -> int:
         folder = Path(name)
         api, hook = free_port(), free_port()
         lines = [
-            line.replace("--rate 120", f"--rate {given.rate:g}").replace("linna serve", f"linna serve --port {api}")
+            line.replace("--rate 120", f"--rate {given.rate:g}").replace(
+                "linna serve", f"linna serve --port {api}"
+            )
             for line in commands_of("tutorials/first-spacecraft.md", folder)
             if not line.startswith("kill ")
         ]
@@ -52,7 +54,9 @@ def main(words: Sequence[str] | None = None) -> int:
         )
         environment.pop("LINNA_DATA", None)
         with (folder / "log").open("w") as log:
-            shell = subprocess.Popen(["bash", "-c", script], cwd=folder, env=environment, stdout=log, stderr=log)
+            shell = subprocess.Popen(
+                ["bash", "-c", script], cwd=folder, env=environment, stdout=log, stderr=log
+            )
             try:
                 wait_until(lambda: (folder / "report-is-here").exists() or shell.poll() is not None)
                 spent = time.monotonic() - diary.started
@@ -87,7 +91,12 @@ def wait_until(reached: Callable[[], Any], seconds: float = WAIT_S) -> bool:
 def shift(diary: Diary, client: httpx.Client, folder: Path) -> None:
     """Operate the spacecraft: look, command, take a window back, and make mistakes."""
     status = client.get("status").json()
-    diary.expect("B", "the status names mission time and time of day", {"mission_time", "time"} <= status.keys(), status)
+    diary.expect(
+        "B",
+        "the status names mission time and time of day",
+        {"mission_time", "time"} <= status.keys(),
+        status,
+    )
     now = parse_utc(status["mission_time"])
     refusals(diary, client, folder, now)
     telecommands(diary, client)
@@ -123,10 +132,19 @@ def refusals(diary: Diary, client: httpx.Client, folder: Path, now: int) -> None
     refused(diary, "A", "metres for kilometres are refused", answer, 422, "kilometres")
     renamed = "\n".join("OBJECT_NAME = OTHER" if one.startswith("OBJECT_NAME") else one for one in lines)
     answer = client.post("ephemerides", content=renamed.encode())
-    diary.expect("A", "an ephemeris of another object is refused", answer.status_code in (409, 422), answer.text)
+    diary.expect(
+        "A", "an ephemeris of another object is refused", answer.status_code in (409, 422), answer.text
+    )
     answer = client.post("telemetry?spacecraft_id=76&station=kourou", content=b"x" * 100)
     diary.expect("A", "an unknown station is refused", answer.status_code in (409, 422), answer.text)
-    refused(diary, "B", "a misspelled parameter is named", client.get("passes?spacecraft=76"), 422, "spacecraft_id")
+    refused(
+        diary,
+        "B",
+        "a misspelled parameter is named",
+        client.get("passes?spacecraft=76"),
+        422,
+        "spacecraft_id",
+    )
     deep = b"a" + b".a" * 40 + b" = 1\n"
     refused(diary, "B", "too deep TOML is one line", client.post("missions/check", content=deep), 422, "body")
 

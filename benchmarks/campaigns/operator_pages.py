@@ -22,7 +22,13 @@ from benchmarks.pages import open_chromium, served
 from lunar.timescales import format_utc, parse_utc
 
 WIDTHS = (1280, 390)
-PAGES = {"shift": "/", "planner": "/planner", "pass": "/passes/1", "help": "/help/", "regression": "/regression"}
+PAGES = {
+    "shift": "/",
+    "planner": "/planner",
+    "pass": "/passes/1",
+    "help": "/help/",
+    "regression": "/regression",
+}
 QUIET_MS = 3000
 
 
@@ -38,7 +44,9 @@ def main(words: Sequence[str] | None = None) -> int:
         if given.demo is None:
             command = [sys.executable, "-m", "linna", "demo", "--out", str(demo)]
             made = subprocess.run(command, capture_output=True, text=True, check=False)
-            if not diary.expect("B", "the demo ends with next steps", "next steps" in made.stdout, made.stderr):
+            if not diary.expect(
+                "B", "the demo ends with next steps", "next steps" in made.stdout, made.stderr
+            ):
                 return diary.close()
         with served(demo / "ground") as url, open_chromium() as chromium:
             for width in WIDTHS:
@@ -71,7 +79,9 @@ def look(diary: Diary, chromium: Any, url: str, width: int, pictures: Path | Non
             if name == "shift":
                 for word in ("SelenITA", "recorded", "Next step"):
                     diary.expect("B", f"the shift says {word!r}", word in text, text)
-                diary.expect("B", "its clock is that of the data", "2029-" in page.locator("header").inner_text())
+                diary.expect(
+                    "B", "its clock is that of the data", "2029-" in page.locator("header").inner_text()
+                )
             if name == "help":
                 diary.expect("B", "help has the first pass", "first pass" in text.lower(), text)
             else:
@@ -99,7 +109,9 @@ def operate(diary: Diary, page: Any) -> None:
     page.get_by_text("Enter a window").click()
     enter(page, now - 7200 * 10**9)
     told = page.locator("body").inner_text()
-    diary.expect("A", "a window in the past is refused in words", "after the mission time" in told, told[-500:])
+    diary.expect(
+        "A", "a window in the past is refused in words", "after the mission time" in told, told[-500:]
+    )
     enter(page, now + 7200 * 10**9)
     windows = page.request.get("/api/v1/windows").json()["items"]
     if not diary.expect("A", "a window is entered", [one["state"] for one in windows] == ["draft"], windows):
@@ -120,11 +132,15 @@ def operate(diary: Diary, page: Any) -> None:
     diary.expect("A", "the window is approved", state() == "approved")
     chosen.get_by_role("button", name=re.compile("^Uplink")).click()
     page.wait_for_timeout(QUIET_MS)
-    diary.expect("A", "the page lists what it releases", "insert activity" in dialog.inner_text(), dialog.count())
+    diary.expect(
+        "A", "the page lists what it releases", "insert activity" in dialog.inner_text(), dialog.count()
+    )
     dialog.get_by_role("button", name="Release", exact=True).click()
     page.wait_for_timeout(QUIET_MS)
     carried = page.request.get("/api/v1/telecommands").json()["items"]
-    diary.expect("A", "its telecommands are released", bool(carried) and carried[0]["state"] != "queued", carried)
+    diary.expect(
+        "A", "its telecommands are released", bool(carried) and carried[0]["state"] != "queued", carried
+    )
     chosen.get_by_role("button", name=re.compile("^(Cancel|Declare)")).first.click()
     page.wait_for_timeout(QUIET_MS)
     if dialog.count():
@@ -132,7 +148,9 @@ def operate(diary: Diary, page: Any) -> None:
     diary.expect("A", "it can be taken back", state() in ("failed", "cancelling"))
     page.goto("/passes/1")
     page.wait_for_timeout(QUIET_MS)
-    diary.expect("B", "the pass leads to its report", page.get_by_role("link", name=re.compile("eport")).count() > 0)
+    diary.expect(
+        "B", "the pass leads to its report", page.get_by_role("link", name=re.compile("eport")).count() > 0
+    )
 
 
 if __name__ == "__main__":

@@ -760,7 +760,9 @@ def ephemerides_for(
     last = stop if stop is not None else 2**62
     found = service.covering_ephemerides(connection, first, last, spacecraft_id)
     if not found:
-        raise NotFound("ephemeris", "over the span of the search")
+        known = service.covering_ephemerides(connection, -(2**62), 2**62, spacecraft_id)
+        spans = "; ".join(f"{one.name}, {one.start} to {one.stop}" for one in known[:3])
+        raise NotFound("ephemeris", f"over the span of the search (known: {spans or 'none'})")
 
     def covered(one: Ephemeris) -> int:
         return min(one.stop.utc_ns, last) - max(one.start.utc_ns, first)

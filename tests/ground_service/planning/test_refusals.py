@@ -195,7 +195,11 @@ def test_a_window_that_has_begun_on_board_cannot_be_cancelled(
             Conflict, match="too late to delete its activities; perform_function stop_observation"
         ):
             decided(either, window, "failed")
-        receive(either, tmp_path, event_packet(int(ticks_from_utc_ns(window.start.utc_ns)), 0, "observation_started"))
+        receive(
+            either,
+            tmp_path,
+            event_packet(int(ticks_from_utc_ns(window.start.utc_ns)), 0, "observation_started"),
+        )
 
 
 def save_with_hole(path: Path) -> Path:
