@@ -3,7 +3,7 @@
 `python -m benchmarks.campaigns.costs [--only NAME ...] [--write]`: an API process on PostgreSQL without workers, so
 that jobs are added and not run, answers each operation of the API and each page. An operation without a case is
 called with the largest value of each of its parameters, and one that the table of values does not know is an error.
-Memory is anonymous memory of the process and its children, processor time theirs as well. The exit status is 1 if an
+Memory is anonymous memory of the process, processor time with that of its ended children. The exit status is 1 if an
 answer is above `MEMORY_MIB` or `PROCESSOR_S`, or is no answer of the expected kind. `--write` stores the table in
 `docs/results/requests.md`.
 """
@@ -32,7 +32,7 @@ import numpy as np
 
 from benchmarks._servers import PostgresServer
 from benchmarks.campaigns._deployment import ManyApis
-from benchmarks.ground import START, STEP_NS, definition, mixed_downlink
+from benchmarks.ground import START, definition, mixed_downlink
 from ground_service.access.service import add_user
 from ground_service.contacts.commanding.service import enter_command
 from ground_service.evaluation.service import make_report
@@ -49,13 +49,12 @@ from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import STATES_LIMIT, format_oem
 from lunar.timescales import format_utc, parse_utc
-from studies.harness.parts import descendants
 
 MEMORY_MIB = 256
 PROCESSOR_S = 10.0
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "requests.md"
-PACKETS = int(os.environ.get("P", 100_000))
-ROWS = int(os.environ.get("R", 300))
+PACKETS = 100_000
+ROWS = 300
 MISSION = """
 name = "largest"
 [spacecraft]
@@ -72,12 +71,11 @@ DAY_NS = 86_400 * 10**9
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A request: what is largest about it, path with query, body, and other headers."""
+    """A request: what is largest about it, path with query, and body."""
 
     what: str
     path: str
-    body: bytes | Callable[[], Iterator[bytes]] | Mapping[str, Any] | None = None
-    key: str = ""
+    body: bytes | Callable[[], bytes | Iterator[bytes]] | Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +119,7 @@ def catalogue(rows: int) -> Iterator[bytes]:
     for start in range(0, rows, 50_000):
         numbers = range(start, min(start + 50_000, rows))
         yield "".join(
-            f"{k + 1},{(k * 7919 % 1_780_001) / 1e4 - 89:.6f},{k * 104_729 % 3_599_999 / 1e4:.6f},{1000 + k % 30_000}.25\n"
+            f"{k + 1},{k * 7919 % 1_780_001 / 1e4 - 89:.6f},{k * 104_729 % 3_599_999 / 1e4:.6f},{1000 + k % 30_000}\n"
             for k in numbers
         ).encode()
 
@@ -164,7 +162,28 @@ def at(days: float) -> str:
     return format_utc(START + int(days * DAY_NS), 0)
 
 
-def cases(folder: Path) -> dict[str, list[Case]]:
+def archive() -> bytes:
+    """Return a zipped pass archive of many files."""
+    listed = {f"images/{k}.png": {"sha256": f"{k:064x}", "bytes": 1} for k in range(15_000)}
+    manifest = {
+        "schema_version": 1,
+        "pass_name": "p",
+        "spacecraft_id": 76,
+        "start_utc": at(0),
+        "stop_utc": at(0.1),
+        "cadence_s": 15.0,
+        "frames_expected": 0,
+        "files": listed,
+    }
+    return zipped({"manifest.json": json.dumps(manifest).encode(), "noise": os.urandom(64 << 20)})
+
+
+def build() -> bytes:
+    """Return a zipped build with a large network."""
+    return zipped({"build.toml": b'schema_version = 1\nname = "b"\n', "model.onnx": os.urandom(256 << 20)})
+
+
+def cases() -> dict[str, list[Case]]:
     """Return the requests with the largest bodies, by operation."""
     region = {"latitude_deg": {"min": -60.0, "max": 60.0}, "west_deg": 300.0, "east_deg": 40.0}
     points = [
@@ -178,26 +197,26 @@ def cases(folder: Path) -> dict[str, list[Case]]:
     formats += ("parquet", "netcdf", "csv", "tum", "images")
     search = {"spacecraft_id": 76, "start": at(0), "stop": at(31), "step_s": 30.0}
     window = {"spacecraft_id": 76, "start": at(20), "stop": at(20.4), "cadence_s": 0.1}
-    request = {"name": "r", "spacecraft_id": 76, "windows": 100, "period_days": 1.0, "regions": [region] * 50}
-    manifest = {
-        "schema_version": 1,
-        "pass_name": "p",
+    terms = {"windows": 100, "period_days": 1.0, "regions": [region] * 50}
+    request = {"name": "r", "spacecraft_id": 76, **terms}
+    receptions = [{"ticks": one["ticks"], "received": one["received"]} for one in points]
+    entered = {
+        "name": "test_connection",
         "spacecraft_id": 76,
-        "start_utc": at(0),
-        "stop_utc": at(0.1),
-        "cadence_s": 15.0,
-        "frames_expected": 0,
-        "files": {f"images/{k}.png": {"sha256": f"{k:064x}", "bytes": 1} for k in range(15_000)},
+        "arguments": {f"k{k}": k for k in range(60_000)},
     }
-    archive = zipped({"manifest.json": json.dumps(manifest).encode(), "noise": os.urandom(64 << 20)})
-    build = zipped({"build.toml": b'schema_version = 1\nname = "b"\n', "model.onnx": os.urandom(256 << 20)})
-    digests = [f"{k:064x}" for k in range(14_000)]
+    compared = {
+        "candidate": "current",
+        "baseline": "current",
+        "archives": [f"{k:064x}" for k in range(14_000)],
+    }
+    contacts = {**search, "needs_contact": True, "minimum_battery": 0.3}
     return {
         "upload_archive": [Case("256 MiB", "archives", filling(256 << 20))],
         "upload_telemetry": [Case("1 GiB", "telemetry?spacecraft_id=76", filling(1 << 30))],
         "add_ephemeris": [
-            Case(f"{STATES_LIMIT:,} states", "ephemerides", circle(STATES_LIMIT, 2.0)),
-            Case("96 MiB in one line", "ephemerides", b"X" * (96 << 20)),
+            Case(f"{STATES_LIMIT:,} states", "ephemerides", lambda: circle(STATES_LIMIT, 2.0)),
+            Case("96 MiB in one line", "ephemerides", lambda: b"X" * (96 << 20)),
         ],
         "add_catalogue": [Case(f"{ROWS_LIMIT:,} rows", "catalogues", lambda: catalogue(ROWS_LIMIT))],
         "add_mission": [Case("1 MiB, 14,000 links", "missions", many_keys.encode()[: 1 << 20])],
@@ -209,22 +228,22 @@ def cases(folder: Path) -> dict[str, list[Case]]:
         "export_pass": [Case(one, "exports", {"pass_id": 1, "format": one}) for one in formats],
         "search_windows": [
             Case("31 days", "windows/search", search),
-            Case("31 days, contacts", "windows/search", {**search, "needs_contact": True, "minimum_battery": 0.3}),
+            Case("31 days, contacts", "windows/search", contacts),
             Case("craters", "windows/search", {**search, "craters_per_frame": 5.0}),
         ],
         "add_window": [Case("10 h at 10 Hz", "windows", window)],
         "change_window": [Case("a draft", "windows/1", {"state": "approved"})],
         "add_request": [Case("50 regions", "requests", request)],
-        "change_request": [Case("50 regions", "requests/1", {"terms": {k: request[k] for k in ("windows", "period_days", "regions")}})],
+        "change_request": [Case("50 regions", "requests/1", {"terms": terms})],
         "add_correlations": [Case("9,000 points", "spacecraft/76/correlations", {"points": points})],
-        "add_receptions": [Case("9,000 times", "spacecraft/76/receptions", {"receptions": [{"ticks": one["ticks"], "received": one["received"]} for one in points]})],
+        "add_receptions": [Case("9,000 times", "spacecraft/76/receptions", {"receptions": receptions})],
         "get_forecast": [Case("8 days", f"plan/forecast?spacecraft_id=76&start={at(0)}&stop={at(8)}")],
         "list_contacts": [Case("31 days", f"contacts?since={at(0)}&until={at(31)}")],
-        "enter_telecommand": [Case("1 MiB", "telecommands", {"name": "test_connection", "spacecraft_id": 76, "arguments": {f"k{k}": k for k in range(60_000)}})],
+        "enter_telecommand": [Case("1 MiB", "telecommands", entered)],
         "add_build": [Case("256 MiB", "builds", build)],
         "keep_archive": [Case("15,000 files", "regression-archives", archive)],
-        "start_regression": [Case("14,000 archives", "regressions", {"candidate": "current", "baseline": "current", "archives": digests})],
-        "start_analysis": [Case("14,000 archives", "analyses", {"candidate": "current", "archives": digests})],
+        "start_regression": [Case("14,000 archives", "regressions", compared)],
+        "start_analysis": [Case("14,000 archives", "analyses", compared)],
         "get_packets": [
             Case(f"{PACKETS // 4:,} packets as {one}", f"passes/1/packets/{kind}?format={one}")
             for kind in ("housekeeping", "detections") for one in ("json", "csv")
@@ -263,19 +282,15 @@ def derived(path: str, operation: Mapping[str, Any], values: Mapping[str, Any]) 
 
 
 class Watch:
-    """Anonymous memory and processor time of a process and its children."""
+    """Anonymous memory of a process, and processor time with that of its ended children."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
 
     def memory_mib(self) -> float:
         """Return the anonymous memory now."""
-        total = 0
-        for pid in (self.pid, *descendants(self.pid)):
-            with contextlib.suppress(OSError, StopIteration):
-                lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-                total += int(next(one for one in lines if one.startswith("RssAnon")).split()[1])
-        return total / 1024
+        lines = Path(f"/proc/{self.pid}/status").read_text().splitlines()
+        return int(next(one for one in lines if one.startswith("RssAnon")).split()[1]) / 1024
 
     def processor_s(self) -> float:
         """Return the processor time so far, that of ended children included."""
@@ -333,7 +348,7 @@ def measured(only: Sequence[str]) -> Iterator[Cost]:
                 with httpx.Client(base_url=f"{base}/api/v1/", headers=headers, timeout=900.0) as client:
                     paths = client.get("openapi.json").json()["paths"]
                     client.get("status")
-                    special = cases(folder)
+                    special = cases()
                     found = [
                         (one["operationId"], method.upper(), path.removeprefix("/api/v1/"), one)
                         for path, methods in paths.items()
@@ -358,9 +373,14 @@ def table(costs: Sequence[Cost]) -> str:
         "|---|---|---|---|---|---|",
     ]
     for one in sorted(costs, key=lambda one: (-one.memory_mib, -one.processor_s)):
-        lines.append(
-            f"| `{one.operation}` | {one.what} | {one.status} | {one.memory_mib:.0f} | {one.kept_mib:.0f} | {one.processor_s:.1f} |"
+        cells = (
+            f"`{one.operation}`",
+            one.what,
+            str(one.status),
+            f"{one.memory_mib:.0f}",
+            f"{one.kept_mib:.0f}",
         )
+        lines.append(f"| {' | '.join(cells)} | {one.processor_s:.1f} |")
     return "\n".join(lines)
 
 
@@ -373,7 +393,9 @@ def main(words: Sequence[str] | None = None) -> int:
     costs = []
     for one in measured(given.only):
         costs.append(one)
-        print(f"{one.operation:28} {one.what:26} {one.status} {one.memory_mib:7.0f} MiB {one.kept_mib:6.0f} kept {one.processor_s:6.1f} s  {one.wall_s:6.1f} s wall  {one.fault} {one.detail}", flush=True)  # fmt: skip
+        figures = f"{one.memory_mib:7.0f} MiB {one.kept_mib:6.0f} kept {one.processor_s:6.1f} s {one.wall_s:5.0f} wall"
+        found = f"{figures}  {one.fault} {one.detail}"
+        print(f"{one.operation:28} {one.what:26} {one.status} {found}", flush=True)
     if given.write:
         head = PAGE.read_text().split("| operation |")[0]
         PAGE.write_text(head + table(costs) + "\n")

@@ -124,10 +124,7 @@ def refusals(diary: Diary, client: httpx.Client, folder: Path, now: int) -> None
     oem = (folder / "reference.oem").read_text()
     lines = oem.splitlines()
     first = next(k for k, line in enumerate(lines) if line.startswith("META_STOP")) + 1
-    metres = [
-        line if k < first or not line[:4].isdigit() else " ".join([line.split()[0], *(f"{float(x) * 1e3:.6f}" for x in line.split()[1:])])
-        for k, line in enumerate(lines)
-    ]  # fmt: skip
+    metres = lines[:first] + [_in_metres(line) for line in lines[first:]]
     answer = client.post("ephemerides", content="\n".join(metres).encode())
     refused(diary, "A", "metres for kilometres are refused", answer, 422, "kilometres")
     renamed = "\n".join("OBJECT_NAME = OTHER" if one.startswith("OBJECT_NAME") else one for one in lines)
@@ -147,6 +144,12 @@ def refusals(diary: Diary, client: httpx.Client, folder: Path, now: int) -> None
     )
     deep = b"a" + b".a" * 40 + b" = 1\n"
     refused(diary, "B", "too deep TOML is one line", client.post("missions/check", content=deep), 422, "body")
+
+
+def _in_metres(line: str) -> str:
+    """Return a state of an OEM with metres in place of kilometres; other lines as they are."""
+    time, *values = line.split() or [""]
+    return " ".join([time, *(f"{float(one) * 1e3:.6f}" for one in values)]) if time[:4].isdigit() else line
 
 
 def telecommands(diary: Diary, client: httpx.Client) -> None:

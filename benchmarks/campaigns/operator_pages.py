@@ -1,8 +1,8 @@
 """An operator's hour by the pages, in Chromium, after the two commands of the README.
 
-`python -m benchmarks.campaigns.operator_pages [--demo FOLDER] [--pictures FOLDER]`: `linna demo` and `linna serve`, then
-the pages in the widths of a desk and a telephone, a window that is planned, approved, released and taken back, and
-mistakes. The exit status is 1 if there was a wrong turn of the classes A or B.
+`python -m benchmarks.campaigns.operator_pages [--demo FOLDER] [--pictures FOLDER]`: `linna demo` and `linna serve`,
+then the pages in the widths of a desk and a telephone, a window that is planned, approved, released and taken back,
+and mistakes. The exit status is 1 if there was a wrong turn of the classes A or B.
 """
 
 from __future__ import annotations

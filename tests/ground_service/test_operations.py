@@ -209,7 +209,9 @@ def shift(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TestClient
         }
         add_mission(ground, b'name = "m"\n[spacecraft]\nid = 76\nname = "SelenITA"\n')
         add_reference(ground, save_circle(home / "a.oem"))
-        planning.add_window(ground, WindowEntry("w", START + HOUR, START + HOUR + HOUR // 6, 15.0, 76), actor="ann")
+        planning.add_window(
+            ground, WindowEntry("w", START + HOUR, START + HOUR + HOUR // 6, 15.0, 76), actor="ann"
+        )
         planning.change_window(ground, 1, actor="ann", changes={}, decision="approved")
         reboot = {"function_id": "reboot"}
         for name, arguments in (("test_connection", {}), ("perform_function", reboot)):
@@ -230,7 +232,7 @@ def test_each_mistake_of_the_documents_is_refused_with_its_line(shift: Any) -> N
             sent["Content-Type"] = "application/json"
         if header:
             sent |= [header.split(": ", 1)]
-        content = body.encode() if body or method == "POST" and "telemetry" in path else None
+        content = body.encode() if body or (method == "POST" and "telemetry" in path) else None
         answer = client.request(method, f"/api/v1/{path}", headers=sent, content=content)
         found = answer.json()["detail"]
         assert (answer.status_code, mistake) == (int(status), mistake), found
