@@ -47,7 +47,7 @@ from ground_service.store.database import prepare_database
 from lunar.catalogue import ROWS_LIMIT
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
-from lunar.messages.oem import STATES_LIMIT, format_oem
+from lunar.messages.oem import format_oem
 from lunar.timescales import format_utc, parse_utc
 
 MEMORY_MIB = 256
@@ -115,11 +115,11 @@ def circle(states: int, step_s: float, name: str = "SelenITA") -> bytes:
 
 def catalogue(rows: int) -> Iterator[bytes]:
     """Yield a crater catalogue."""
-    yield b"id,latitude_deg,longitude_deg,diameter_m\n"
+    yield b"id,latitude_deg,longitude_deg,diameter_m,depth_m\n"
     for start in range(0, rows, 50_000):
         numbers = range(start, min(start + 50_000, rows))
         yield "".join(
-            f"{k + 1},{k * 7919 % 1_780_001 / 1e4 - 89:.6f},{k * 104_729 % 3_599_999 / 1e4:.6f},{1000 + k % 30_000}\n"
+            f"{k + 1},{k * 7919 % 1_780_001 / 1e4 - 89:.6f},{k * 104_729 % 3_599_999 / 1e4:.6f},{1000 + k % 3_000},{k % 900}\n"
             for k in numbers
         ).encode()
 
@@ -215,7 +215,7 @@ def cases() -> dict[str, list[Case]]:
         "upload_archive": [Case("256 MiB", "archives", filling(256 << 20))],
         "upload_telemetry": [Case("1 GiB", "telemetry?spacecraft_id=76", filling(1 << 30))],
         "add_ephemeris": [
-            Case(f"{STATES_LIMIT:,} states", "ephemerides", lambda: circle(STATES_LIMIT, 2.0)),
+            Case("800,000 states, 96 MiB", "ephemerides", lambda: circle(800_000, 2.0)[: 96 << 20]),
             Case("96 MiB in one line", "ephemerides", lambda: b"X" * (96 << 20)),
         ],
         "add_catalogue": [Case(f"{ROWS_LIMIT:,} rows", "catalogues", lambda: catalogue(ROWS_LIMIT))],

@@ -141,10 +141,9 @@ def operate(diary: Diary, page: Any) -> None:
     diary.expect(
         "A", "its telecommands are released", bool(carried) and carried[0]["state"] != "queued", carried
     )
-    chosen.get_by_role("button", name=re.compile("^(Cancel|Declare)")).first.click()
+    chosen.get_by_role("button", name=re.compile("^Take back")).first.click()
     page.wait_for_timeout(QUIET_MS)
-    if dialog.count():
-        dialog.get_by_role("button").last.click()
+    dialog.get_by_role("button", name="Take back").click()
     diary.expect("A", "it can be taken back", state() in ("failed", "cancelling"))
     page.goto("/passes/1")
     page.wait_for_timeout(QUIET_MS)

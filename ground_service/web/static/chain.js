@@ -95,10 +95,10 @@ export async function approve(window) {
 }
 
 // Take a window back: from the plan, or from the spacecraft.
-export async function cancel(window) {
+export async function takeBack(window) {
   const onBoard = "Its activities are on board: telecommands that delete them are released now, and sent in the next contact. It is cancelling until they are verified.";
   const lines = [spanText(window), window.state === "approved" ? "Its telecommands are withdrawn." : onBoard];
-  if (await confirmed(`Take ${window.name} back?`, lines, "Cancel the window")) await send("PATCH", `windows/${window.id}`, { state: "failed", reason: "cancelled" });
+  if (await confirmed(`Take ${window.name} back?`, lines, "Take back")) await send("PATCH", `windows/${window.id}`, { state: "failed", reason: "cancelled" });
 }
 
 // Release the telecommands of a window after a look at them, and send them with `others` where that is chosen.

@@ -3,7 +3,7 @@ import { get, request, send } from "./api.js";
 import { acting, button, byId, element, figure, isoText, later, lengthText, loading, mayOperate, missionNow, notice, on, plural, seconds, session, show, showTable, stateMark, svg, table, timeText, trouble, watch } from "./page.js";
 import { bandLegend, conflictsOf, drawLanes, drawTrack, lanesHeight, loadForecast, showMap, valuesAt } from "./forecast.js";
 import { loadRequests } from "./requests.js";
-import { approve, cancel, sequenceTable, uplink } from "./chain.js";
+import { approve, sequenceTable, takeBack, uplink } from "./chain.js";
 
 const ROW_PX = 34;
 const HEAD_PX = 24;
@@ -270,8 +270,8 @@ function showChosen() {
   const path = `windows/${row.id}`;
   const deeds = {
     draft: [deed("Approve…", () => approve(row), "primary"), deed("Delete", () => send("DELETE", path))],
-    approved: [deed(row.telecommands.length ? "Send now…" : "Uplink…", () => uplink(row), "primary"), deed("Back to draft", () => send("PATCH", path, { state: "draft" })), deed("Cancel…", () => cancel(row))],
-    uplinked: [deed("Cancel…", () => cancel(row))],
+    approved: [deed(row.telecommands.length ? "Send now…" : "Uplink…", () => uplink(row), "primary"), deed("Back to draft", () => send("PATCH", path, { state: "draft" })), deed("Take back…", () => takeBack(row))],
+    uplinked: [deed("Take back…", () => takeBack(row))],
   }[row.state] ?? [];
   const span = (value, unit) => (value ? `${figure(value.min)} to ${figure(value.max)} ${unit}` : "–");
   const predicted = row.predicted ?? {};
