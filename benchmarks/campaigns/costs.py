@@ -119,7 +119,7 @@ def catalogue(rows: int) -> Iterator[bytes]:
     for start in range(0, rows, 50_000):
         numbers = range(start, min(start + 50_000, rows))
         yield "".join(
-            f"{k + 1},{k * 7919 % 1_780_001 / 1e4 - 89:.6f},{k * 104_729 % 3_599_999 / 1e4:.6f},{1000 + k % 3_000},{k % 900}\n"
+            f"{k + 1},{k * 7919 % 1_780_001 / 1e4 - 89:.6f},{k * 104_729 % 3_599_999 / 1e4:.6f},{1000 + k % 3_000},0\n"
             for k in numbers
         ).encode()
 
