@@ -133,7 +133,7 @@ def operate(diary: Diary, page: Any) -> None:
     chosen.get_by_role("button", name=re.compile("^Uplink")).click()
     page.wait_for_timeout(QUIET_MS)
     diary.expect(
-        "A", "the page lists what it releases", "insert activity" in dialog.inner_text(), dialog.count()
+        "A", "the page lists what it releases", "start observation" in dialog.inner_text(), dialog.count()
     )
     dialog.get_by_role("button", name="Release", exact=True).click()
     page.wait_for_timeout(QUIET_MS)
