@@ -394,6 +394,9 @@ def test_a_window_is_found_moved_approved_and_uplinked(page, day_of_orbits):
     expect(page.locator("#windows tbody td").nth(1)).not_to_have_text(start)
 
     press(page, "Approve")
+    expect(page.get_by_role("dialog")).to_contain_text("an image every 15 s")
+    shows(page, "#selected", "draft")
+    page.get_by_role("dialog").get_by_role("button", name="Approve").click()
     shows(page, "#selected", "approved")
     press(page, "Uplink")
     question = page.get_by_role("dialog", name=re.compile("^Release the telecommands of"))
@@ -421,6 +424,11 @@ def test_a_window_is_found_moved_approved_and_uplinked(page, day_of_orbits):
     expect(sequence.last).to_contain_text("2030-01-01 05:10:00")
     settled(page, "/commands")
     expect(page.locator("#commands tbody tr", has_text="insert activity").first).to_contain_text("released")
+    approved = page.request.get("/api/v1/windows?state=approved").json()["items"]
+    settled(page, f"/planner?window={approved[0]['id']}")
+    press(page, "Take back")
+    page.get_by_role("dialog").get_by_role("button", name="Take back").click()
+    shows(page, "#selected", "failed")
 
 
 def test_a_draft_is_dragged_and_taken_off_the_plan(page, day_of_orbits):
