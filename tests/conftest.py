@@ -12,6 +12,18 @@ from hypothesis import settings
 
 from tests.cost import Cost
 
+
+def _keep_temporary_files_in_memory() -> None:
+    """Use a folder in memory, if there is one with room: a disk takes milliseconds for each commit of a database."""
+    place = Path("/dev/shm")
+    if not os.access(place, os.W_OK):
+        return
+    found = os.statvfs(place)
+    if found.f_bavail * found.f_frsize >= 4 << 30 and not found.f_flag & os.ST_NOEXEC:
+        os.environ.setdefault("TMPDIR", str(place))
+
+
+_keep_temporary_files_in_memory()
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
@@ -87,9 +99,8 @@ def _campaigns() -> set[str]:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark campaigns; run slow files first, browser tests last, the largest file first; real data only with LINNA_DATA.
+    """Mark campaigns; run browser tests and slow files first, the largest first; real data only with LINNA_DATA.
 
-    A driven browser keeps an event loop in the thread of the tests, in which `asyncio.run` is then refused.
     With several processes this needs `--no-loadscope-reorder`.
     """
     moved = _campaigns()
@@ -103,7 +114,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     driven = {item.path for item in items if "browser" in getattr(item, "fixturenames", ())}
     sizes = Counter(item.path for item in items if item.path in driven)
     slow = Counter(item.path for item in items if "slow" in item.keywords)
-    items.sort(key=lambda item: (item.path in driven, -slow[item.path], -sizes[item.path]))
+    items.sort(key=lambda item: (-sizes[item.path], -slow[item.path]))
     if os.environ.get("LINNA_DATA"):
         return
     skip = pytest.mark.skip(reason="LINNA_DATA is not set: no real data on this machine")

@@ -265,9 +265,12 @@ class Pictures:
         picture.quantize(256).save(self.folder / f"{name}.png", optimize=True)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """The system's Chromium, without a screen; a state that is reached ends the wait for it."""
+    """The system's Chromium, without a screen; a state that is reached ends the wait for it.
+
+    While it is driven, `asyncio.run` is refused in the thread of the tests, so it ends with its file.
+    """
     sync_api = Lazy("playwright.sync_api")
     sync_api.expect.set_options(timeout=PATIENCE_S * 1e3)
     with sync_api.sync_playwright() as playwright:
