@@ -10,6 +10,7 @@ import pytest
 from _pytest.assertion import rewrite
 from hypothesis import settings
 
+from ground_service import clock
 from tests.cost import Cost
 
 
@@ -121,6 +122,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if "real_data" in item.keywords:
             item.add_marker(skip)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call():
+    """Forget the mission clock of a command that a test has run in this process: its home may be removed."""
+    stated = clock._mission.stated
+    yield
+    clock.follow_missions(stated)
 
 
 @pytest.fixture(scope="session")
