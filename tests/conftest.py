@@ -25,6 +25,7 @@ def _keep_temporary_files_in_memory() -> None:
 
 
 _keep_temporary_files_in_memory()
+os.environ.setdefault("MALLOC_ARENA_MAX", "2")  # memory that threads of ended tests have used is used again
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
@@ -38,7 +39,17 @@ settings.load_profile("linna")
 
 
 # Libraries that no test needs before it runs: they cost each process seconds and hundreds of megabytes.
-HEAVY = ("torch", "astropy", "scipy.stats", "matplotlib", "onnxscript", "playwright")
+HEAVY = (
+    "torch",
+    "astropy",
+    "scipy.stats",
+    "matplotlib",
+    "onnxscript",
+    "playwright",
+    "pandas",
+    "pyarrow",
+    "rasterio",
+)
 IMPORTED = pytest.StashKey[list[str]]()
 
 

@@ -4,6 +4,7 @@ The orbit is an exact circle, the craters are placed by chance, the detections a
 noise and known faults, and the navigation states carry errors put in on purpose, so every figure is known beforehand.
 """
 
+import functools
 import hashlib
 import itertools
 import json
@@ -21,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from httpx._transports import default as httpx_transports
 from sqlalchemy import create_engine, text
 
 from ground_service.access.service import add_user
@@ -62,6 +64,15 @@ def name_of_the_test_client() -> Iterator[None]:
     """Allow the host name that the test client of the web framework gives itself."""
     with pytest.MonkeyPatch.context() as environment:
         environment.setenv("LINNA_ALLOWED_HOSTS", "testserver")
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_tls_context() -> Iterator[None]:
+    """Read the trusted certificates once: each HTTP client would read them."""
+    with pytest.MonkeyPatch.context() as patch:
+        made = functools.cache(httpx_transports.create_ssl_context)
+        patch.setattr(httpx_transports, "create_ssl_context", made)
         yield
 
 

@@ -17,7 +17,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -30,6 +29,8 @@ from lunar.messages.oem import format_oem
 from lunar.timescales import parse_utc
 from tests.lazy import Lazy, expect
 from tests.serving import wait_for
+
+cv2 = Lazy("cv2")
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, BrowserContext, Page
