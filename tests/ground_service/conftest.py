@@ -26,7 +26,7 @@ from httpx._transports import default as httpx_transports
 from sqlalchemy import create_engine, text
 
 from ground_service.access.service import add_user
-from ground_service.app import create_app
+from ground_service.app import DescribedApi, create_app
 from ground_service.clock import set_mission_clock, utc_now_ns
 from ground_service.ground import Ground, open_ground
 from ground_service.missions.ephemerides.service import add_ephemeris
@@ -73,6 +73,20 @@ def one_tls_context() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         made = functools.cache(httpx_transports.create_ssl_context)
         patch.setattr(httpx_transports, "create_ssl_context", made)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_description() -> Iterator[None]:
+    """Make the OpenAPI document, which is the same for every application, once: it takes two seconds."""
+    describe, made = DescribedApi.openapi, list[dict[str, Any]]()
+
+    def openapi(app: DescribedApi) -> dict[str, Any]:
+        made[:] = made or [describe(app)]
+        return made[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(DescribedApi, "openapi", openapi)
         yield
 
 
