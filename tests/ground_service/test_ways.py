@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -27,9 +26,12 @@ from payload_emulator.session.live.station_ports import RECORD_HEADER
 from payload_emulator.session.scenario import Scenario, parse_scenario
 from payload_emulator.session.spacecraft.loading import launch, load_scenario_payload
 from payload_emulator.session.world.world import build_world, clock_ticks, open_world
+from tests.lazy import Lazy
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode, encode_cadus
 from tmtc.link.settings import LinkSettings
+
+cv2 = Lazy("cv2")
 
 NO_DATA = DataFolder(None)
 NS = 1_000_000_000
