@@ -368,8 +368,9 @@ class _Importer:
         """Return an entry that is repeated, as an array; the repetitions of a container are aggregates."""
         node.only(("Count", "Offset"))
         offset = node.child("Offset")
-        gap = Size(fixed=0) if offset is None else self.size(offset, system, least=0)
-        _expect(node, gap.fixed == 0, "repetitions without an Offset", "one")
+        gap = 0 if offset is None else self.size(offset, system, least=0).fixed
+        if offset is not None and gap is None:
+            raise offset.error("a FixedValue between repetitions", offset.children[0].tag)
         count = self.size(node.required("Count"), system, least=0)
         if isinstance(item, Container):
             plain = [
@@ -385,7 +386,7 @@ class _Importer:
             last = replace(count, lookup=tuple((condition, value - 1) for condition, value in count.lookup))
         else:
             last = replace(count, intercept=count.intercept - 1)
-        return replace(item, type=ArrayType(item.type.name, item.type, Size(fixed=0), last))
+        return replace(item, type=ArrayType(item.type.name, item.type, Size(fixed=0), last, gap or 0))
 
     # references
 
@@ -694,7 +695,7 @@ class _Importer:
             dynamic = holder.child("DynamicValue")
             name_of = dynamic.required("ParameterInstanceRef") if dynamic is not None else None
             if name_of is None or name_of.attributes.get("parameterRef") != _NO_PARAMETER:
-                size = self.size(holder, system, least=0, others=("TerminationChar", "LeadingSize"))
+                size = self.size(holder, system, 0, ("TerminationChar", "LeadingSize"), ("maxSizeInBits",))
         terminator, tag_bits, unit = b"", 0, 1
         if end is not None:
             try:
@@ -716,10 +717,17 @@ class _Importer:
         _expect(holder, size is not None or end is not None or tag is not None, "a size of the text", "none")
         return StringEncoding(charset, size, terminator, tag_bits, most, unit)
 
-    def size(self, node: Node, system: _System, least: int | None, others: tuple[str, ...] = ()) -> Size:
+    def size(
+        self,
+        node: Node,
+        system: _System,
+        least: int | None,
+        others: tuple[str, ...] = (),
+        attributes: tuple[str, ...] = (),
+    ) -> Size:
         """A fixed or dynamic number; a fixed one is not below `least`."""
         kinds = ("FixedValue", "DynamicValue", "DiscreteLookupList")
-        node.only((*kinds, *others), ("maxSizeInBits",) if others else ())
+        node.only((*kinds, *others), attributes)
         listed = [child for child in node.children if child.tag in kinds]
         _expect(node, len(listed) == 1, f"one of {', '.join(kinds)}", f"{len(listed)}")
         value = listed[0]
@@ -847,14 +855,15 @@ class _Importer:
             (*attributes, "shortDescription", "lastEntryForThisArrayInstance"),
         )
         location, condition = node.child("LocationInContainerInBits"), node.child("IncludeCondition")
-        offset, from_start = 0, False
+        offset: int | Size = 0
+        from_start = False
         if location is not None:
-            location.only(("FixedValue",), ("referenceLocation",))
             where = location.attributes.get("referenceLocation", "previousEntry")
             places = ("previousEntry", "containerStart")
             _expect(location, where in places, f"referenceLocation {' or '.join(places)}", where)
             from_start = where == "containerStart"
-            offset = _fixed(location.required("FixedValue"), 0 if from_start else None)
+            place = self.size(location, system, 0 if from_start else None, attributes=("referenceLocation",))
+            offset = place if place.fixed is None else place.fixed
         return Entry(
             item, offset, from_start, None if condition is None else self.condition(condition, system)
         )
@@ -884,6 +893,7 @@ def _check_order(root: Container, document: str) -> None:
 def _check_entries(entries: tuple[Entry, ...], names: dict[str, bool], place: str) -> None:
     """Add the parameters of entries to `names`, with whether they have one value; refuse references to others."""
     for entry in entries:
+        _check_known(references(entry.offset), names, place)
         if entry.condition is not None:
             _check_known(references(entry.condition), names, place)
             twice = sorted(_names_of(entry.item) & names.keys())
