@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from tmtc.xtce.decode import XtceDecode
     from tmtc.xtce.definition import Definition
 
-_PAUSE_S = 0.005
+_PAUSE_S = 0.03
 """Time between two frames of a file, so that a receiver loses none."""
 
 

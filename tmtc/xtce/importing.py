@@ -559,10 +559,8 @@ class _Importer:
             _expect(node, chain[-1][1].tag == node.tag, f"a base type that is a {node.tag}", chain[-1][1].tag)
         is_time = "Time" in node.tag
         for _, one in chain:
-            children = (
-                (*_DESCRIPTION, "Encoding", "ReferenceTime", *_ENCODINGS) if is_time else _TYPE_CHILDREN
-            )
-            one.only(children, _TYPE_ATTRIBUTES)
+            extra = ("Encoding", "ReferenceTime") if is_time else ()
+            one.only((*_TYPE_CHILDREN, *extra), _TYPE_ATTRIBUTES)
         encoding, place, home = None, node, system
         scale: tuple[float, float] | None = None
         for home, one in chain:
@@ -615,7 +613,7 @@ class _Importer:
             _expect(node, scale is None, "a number where scale and offset are given", "octets")
             return self.binary(node, system)
         node.only(
-            ("DefaultCalibrator", "ContextCalibratorList"),
+            ("ErrorDetectCorrect", "DefaultCalibrator", "ContextCalibratorList"),
             ("bitOrder", "byteOrder", "encoding", "sizeInBits", "changeThreshold"),
         )
         calibration = self.calibration(node, system)
@@ -647,7 +645,7 @@ class _Importer:
     def binary(self, node: Node, system: _System) -> BinaryEncoding:
         """Return the encoding of octets; of the algorithms, only a size in octets before them is supported."""
         children = ("SizeInBits", "FromBinaryTransformAlgorithm", "ToBinaryTransformAlgorithm")
-        node.only(children, ("bitOrder", "byteOrder"))
+        node.only((*children, "ErrorDetectCorrect"), ("bitOrder", "byteOrder"))
         _expect(node, not _is_little(node, 8), "octets in their order", "leastSignificantByteFirst")
         algorithm = node.child(children[1])
         if algorithm is None:
@@ -665,7 +663,7 @@ class _Importer:
 
     def string(self, node: Node, system: _System) -> StringEncoding:
         """A text: its buffer, and what says where the text ends in it."""
-        node.only(("SizeInBits", "Variable"), ("bitOrder", "byteOrder", "encoding"))
+        node.only(("SizeInBits", "Variable", "ErrorDetectCorrect"), ("bitOrder", "byteOrder", "encoding"))
         name = node.attributes.get("encoding", "UTF-8")
         _expect(node, name in _CHARSETS, f"encoding {', '.join(_CHARSETS)}", name)
         charset = _CHARSETS[name]
@@ -984,6 +982,9 @@ def _calibrator(node: Node, extrapolate: bool) -> Calibrator:
     )
     order = _integer(inner, "order", 1)
     _expect(inner, order in (0, 1), "order 0 or 1", f"{order}")
+    for point in inner.all("SplinePoint"):
+        own = _integer(point, "order", order)
+        _expect(point, own == order, f"order {order}, that of the calibrator", f"{own}")
     _expect(inner, len(points) >= 2, "two points or more", f"{len(points)}")
     rising = all(a[0] < b[0] for a, b in itertools.pairwise(points))
     _expect(inner, rising, "one calibrated value for each raw value", "two")
@@ -1124,5 +1125,6 @@ def _number(node: Node, name: str, default: float | None) -> float:
 def _boolean(node: Node, name: str, default: bool) -> bool:
     text = node.attributes.get(name, "true" if default else "false")
     known = {"true": True, "1": True, "false": False, "0": False}
-    _expect(node, text.lower() in known, f"true or false as {name}", repr(text))
-    return known[text.lower()]
+    plain = text.strip().lower()
+    _expect(node, plain in known, f"true or false as {name}", repr(text))
+    return known[plain]
