@@ -50,7 +50,7 @@ class Row:
 
 
 ROWS = (
-    Row("Yamcs", "yamcs.py", "yamcs", "yamcs", ("fprime-yamcs-bundle",)),
+    Row("Yamcs", "yamcs_server.py", "yamcs", "yamcs", ("fprime-yamcs-bundle",)),
     Row("Orekit", "orbits.py", "orekit", "orekit", ("orekit_jpype",)),
     Row("ANISE", "orbits.py", "anise", "orbits", ("anise",)),
     Row("brahe", "orbits.py", "brahe", "orbits", ("brahe",)),
@@ -85,6 +85,9 @@ ROWS = (
     Row("cfdp-py", "packets.py", "cfdp_py", "packets", ("cfdp-py",)),
     Row("Open MCT", "openmct.py", "openmct", "node", ("openmct",)),
 )
+
+WITH_OURS = ("yamcs_server.py", "openmct.py")
+"""Scripts that also run programs of this project; they run with its interpreter."""
 
 WITHOUT = {"reads": "no common format that we write", "writes": "no common format that we read"}
 """Content of a cell without an entry."""
@@ -227,8 +230,7 @@ def read_attitude(path: Path, entry: dict[str, Any]) -> list[list[float]]:
 
 def read_packets(path: Path, entry: dict[str, Any]) -> list[dict[str, Any]]:
     """Packets of `path` with a suffix `.bin`, through the XTCE documents of the entry."""
-    from tmtc.packets.packet_headers import primary_headers
-    from tmtc.packets.stream import PacketForm, cut_packets
+    from tmtc.packets.stream import PacketForm, cut_packets, primary_headers
     from tmtc.xtce.decode import Decoder
     from tmtc.xtce.importing import parse_xtce
     from tmtc.xtce.records import xtce_records
@@ -269,7 +271,7 @@ READERS: dict[str, Callable[[Path, dict[str, Any]], Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Content of a cell, and whether it needs a reason."""
+    """Content of a cell, and whether it needs no reason."""
 
     text: str
     good: bool
@@ -326,8 +328,9 @@ def _leaves(expected: Any, found: Any, path: str) -> Iterator[tuple[str, Any, An
 
 
 def _same(right: Any, other: Any) -> bool:
+    right, other = (None if isinstance(one, float) and math.isnan(one) else one for one in (right, other))
     if isinstance(right, float) and isinstance(other, (int, float)):
-        return bool(np.float32(right) == np.float32(other)) or (math.isnan(right) and math.isnan(other))
+        return bool(np.float32(right) == np.float32(other))
     return bool(right == other)
 
 
@@ -343,7 +346,7 @@ def prepare(name: str) -> Path:
         If a package cannot be installed.
     """
     folder, is_node = BUILD / "environments" / name, name == "node"
-    pins = NEIGHBOURS / "requirements" / (f"{name}.json" if is_node else f"{name}.txt")
+    pins = _pins(name)
     marker = folder / "pins"
     interpreter = Path(shutil.which("node") or "node") if is_node else folder / "bin" / "python"
     if marker.is_file() and marker.read_bytes() == pins.read_bytes():
@@ -367,12 +370,11 @@ def _run(command: list[str], folder: Path) -> None:
 
 def versions(row: Row) -> str:
     """Versions of the packages of a row, from the pins of its environment."""
-    pins = NEIGHBOURS / "requirements"
+    text = _pins(row.environment).read_text()
     if row.environment == "node":
-        stated = json.loads((pins / "node.json").read_text())["dependencies"]
+        stated = json.loads(text)["dependencies"]
     else:
-        lines = (pins / f"{row.environment}.txt").read_text().split()
-        stated = dict(line.split("==") for line in lines)
+        stated = dict(line.split("==") for line in text.split())
     found = [stated[package] for package in row.packages]
     if len(found) == 1:
         return str(found[0])
@@ -382,21 +384,19 @@ def versions(row: Row) -> str:
 # rows
 
 
-def run_row(row: Row, samples: Path) -> list[dict[str, str]]:
-    """Run a program and return its cells; one that does not run has one that says why."""
-    out = BUILD / "files" / row.function
+def run_row(row: Row, samples: Path, out: Path) -> list[dict[str, Any]]:
+    """Run a program and return its entries; one that does not run has one that says why."""
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     try:
         interpreter = prepare(row.environment)
     except (subprocess.SubprocessError, OSError) as error:
         return _not_tried(f"not installed: {_last_line(error)}")
-    environment = {**os.environ, "PYTHONPATH": "", "PYTHONWARNINGS": "ignore"}
-    environment |= {"NODE_PATH": str(BUILD / "environments" / "node" / "node_modules"), "LINNA_ROOT": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": "", "PYTHONWARNINGS": "ignore", "NEIGHBOUR": str(interpreter)}
+    environment["NODE_PATH"] = str(BUILD / "environments" / "node" / "node_modules")
+    if row.script in WITH_OURS:
+        interpreter, environment["PYTHONPATH"] = Path(sys.executable), str(ROOT)
     command = [str(interpreter), str(NEIGHBOURS / row.script), row.function, str(samples), str(out)]
-    if row.script in ("openmct.py", "yamcs.py"):  # these run programs of this project, too
-        command[0] = sys.executable
-        environment |= {"PYTHONPATH": str(ROOT), "NEIGHBOUR": str(interpreter)}
     with (out / "log.txt").open("w") as log:
         try:
             _run_group(command, log, environment, out)
@@ -404,8 +404,8 @@ def run_row(row: Row, samples: Path) -> list[dict[str, str]]:
             if not (out / "cells.json").is_file():
                 lines = (out / "log.txt").read_text().strip().splitlines()
                 return _not_tried(lines[-1][:160] if lines else str(error))
-    expected = json.loads((samples / "expected.json").read_text())
-    return [_judge(entry, expected) for entry in json.loads((out / "cells.json").read_text())]
+    entries: list[dict[str, Any]] = json.loads((out / "cells.json").read_text())
+    return entries
 
 
 def _run_group(command: list[str], log: IO[str], environment: dict[str, str], folder: Path) -> None:
@@ -420,8 +420,8 @@ def _run_group(command: list[str], log: IO[str], environment: dict[str, str], fo
                 os.killpg(process.pid, signal.SIGTERM)
 
 
-def _not_tried(reason: str) -> list[dict[str, str]]:
-    return [{"way": way, "what": "", "text": f"not tried: {reason}", "good": ""} for way in WITHOUT]
+def _not_tried(reason: str) -> list[dict[str, Any]]:
+    return [{"way": way, "what": "", "not_tried": reason} for way in WITHOUT]
 
 
 def _last_line(error: Exception) -> str:
@@ -451,21 +451,24 @@ def _judge(entry: dict[str, Any], expected: dict[str, Any]) -> dict[str, str]:
 
 
 def result(row: Row, samples: Path, *, again: bool) -> list[dict[str, str]]:
-    """Cells of a row, from the run before if nothing changed since."""
-    pins = NEIGHBOURS / "requirements" / f"{row.environment}.{'json' if row.environment == 'node' else 'txt'}"
-    parts = [NEIGHBOURS / row.script, NEIGHBOURS / "_cells.py", pins, samples / "expected.json"]
+    """Cells of a row; the program is not run again if nothing changed since it was."""
+    parts = [NEIGHBOURS / row.script, NEIGHBOURS / "_cells.py", _pins(row.environment), samples / "expected.json"]
     digest = hashlib.sha256(b"".join(part.read_bytes() for part in parts)).hexdigest()
+    out = BUILD / "files" / row.function
     kept = BUILD / "results" / f"{row.function}.json"
-    if not again and kept.is_file():
-        stored = json.loads(kept.read_text())
-        if stored["digest"] == digest and not any("not tried: not installed" in one["text"] for one in stored["cells"]):
-            cells: list[dict[str, str]] = stored["cells"]
-            return cells
-    print(f"{row.name} ...", file=sys.stderr, flush=True)
-    cells = run_row(row, samples)
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    kept.write_text(json.dumps({"digest": digest, "cells": cells}, indent=1))
-    return cells
+    stored = json.loads(kept.read_text()) if kept.is_file() and not again else {}
+    entries = stored.get("entries")
+    if entries is None or stored["digest"] != digest or any("not_tried" in one for one in entries):
+        print(f"{row.name} ...", file=sys.stderr, flush=True)
+        entries = run_row(row, samples, out)
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        kept.write_text(json.dumps({"digest": digest, "entries": entries}, indent=1))
+    expected = json.loads((samples / "expected.json").read_text())
+    return [_judge(entry, expected) for entry in entries]
+
+
+def _pins(environment: str) -> Path:
+    return NEIGHBOURS / "requirements" / f"{environment}.{'json' if environment == 'node' else 'txt'}"
 
 
 def format_page(results: dict[str, list[dict[str, str]]]) -> str:

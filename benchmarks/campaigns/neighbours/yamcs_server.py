@@ -116,7 +116,7 @@ class Server:
 
     def values(self, packet):
         """Return the parameters that Yamcs extracts from an archived packet."""
-        parts = packet["id"]["name"], packet["generationTime"], packet["sequenceNumber"]
+        parts = _key(packet)
         path = "/".join(urllib.parse.quote(str(part), safe="") for part in parts)
         answer = self.get(f"/archive/{INSTANCE}/packets/{path}:extract")
         values = {one["parameter"]["name"]: _value(one["engValue"]) for one in answer["parameterValues"]}
@@ -149,6 +149,10 @@ def _until(condition, limit_s, what):
         if time.monotonic() > end:
             raise TimeoutError(f"waited {limit_s} s for {what}")
         time.sleep(STEP_S)
+
+
+def _key(packet):
+    return packet["id"]["name"], packet["generationTime"], packet["sequenceNumber"]
 
 
 def _by_count(records):
@@ -222,7 +226,7 @@ def command_payload(cells, server, frame_port, live_ports):
         "--tc-port", telecommands, "--console-port", console, "--mission-port", mission,
     )  # fmt: skip
     relay = _linna("tm", "frames", f"127.0.0.1:{telemetry}", "--to", f"127.0.0.1:{frame_port}")
-    before = {json.dumps(one["id"]) for one in server.packets()}
+    before = {_key(one) for one in server.packets()}
     with contextlib.ExitStack() as stack:
 
         def start(command):
@@ -241,9 +245,11 @@ def command_payload(cells, server, frame_port, live_ports):
 
         def fresh():
             names = [f"/LINNA/{kind}" for kind in ("housekeeping", *_reports())]
-            return [one for one in server.packets(*names) if json.dumps(one["id"]) not in before]
+            return [one for one in server.packets(*names) if _key(one) not in before]
 
         _until(fresh, ANSWER_S, "telemetry of the live payload")
+        link = f"/links/{INSTANCE}/telecommands"
+        _until(lambda: server.get(link)["status"] == "OK", ANSWER_S, "the link of telecommands")
         now = max(server.values(one)["TIME_COARSE"] for one in fresh()) << 16
         sent, octets = {}, []
         for name, arguments in _telecommands(now):
