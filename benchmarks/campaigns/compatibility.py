@@ -124,6 +124,7 @@ def make_samples(folder: Path, demo: Path) -> None:
             "tm", "decode", demo / "pass" / "downlink.cadu", "--xtce", folder / f"{name}.xml",
             "--out", folder / f"{name}.json",
         )  # fmt: skip
+    linna("dataset", "build", "detector-validation", "--out", folder / "dataset", "--frames", "3")
     shutil.copy(demo / "pass" / "downlink.cadu", folder)
     shutil.copy(demo / "pass" / "catalogue.csv", folder)
     (folder / "packets.bin").write_bytes(_packets(folder / "downlink.cadu"))
@@ -239,8 +240,10 @@ def read_packets(path: Path, entry: dict[str, Any]) -> list[dict[str, Any]]:
     octets = path.read_bytes()
     cut = cut_packets(octets, form=PacketForm(error_control=False))
     found = Decoder(parse_xtce(documents)).decode(octets, cut, primary_headers(octets, cut))
-    kept = entry.get("parameters")
     records = xtce_records(found)
+    if entry.get("subset"):  # of each packet, the parameters that the other program states
+        return [{key: one.get(key) for key in stated} for one, stated in zip(records, entry["values"], strict=True)]
+    kept = entry.get("parameters")
     return [{key: one[key] for key in kept} if kept else one for one in records]
 
 
@@ -251,11 +254,19 @@ def read_telecommands(path: Path, entry: dict[str, Any]) -> list[Any]:
     return [DICTIONARY.unpack_command(bytes.fromhex(one)).name for one in json.loads(path.read_text())]
 
 
-def read_terrain(path: Path, entry: dict[str, Any]) -> list[list[float]]:
-    """Heights of an elevation raster."""
-    from payload_emulator.sim.terrain.raster import load_dem  # pragma: no cover
+def read_raster(path: Path, entry: dict[str, Any]) -> list[list[float]]:
+    """Heights of an elevation raster, from the pixel of its corner on."""
+    from payload_emulator.sim.terrain.rasters import open_layers
 
-    return load_dem(path)  # type: ignore[no-any-return]
+    heights: list[list[float]] = open_layers([path])[0].read(*entry["window"]).tolist()
+    return heights
+
+
+def read_labels(path: Path, entry: dict[str, Any]) -> list[list[float]]:
+    """Boxes of craters in the folder of a COCO file."""
+    from payload_emulator.training.data.pictures import load_pictures
+
+    return sorted(list(map(float, box)) for one in load_pictures(path.parent) for box in one.box_px)
 
 
 READERS: dict[str, Callable[[Path, dict[str, Any]], Any]] = {
@@ -263,6 +274,8 @@ READERS: dict[str, Callable[[Path, dict[str, Any]], Any]] = {
     "attitude": read_attitude,
     "packets": read_packets,
     "telecommands": read_telecommands,
+    "raster": read_raster,
+    "labels": read_labels,
 }
 
 

@@ -36,6 +36,10 @@ class Cells:
         path = self.out / file
         self._record("writes", what, lambda: function(str(path)), file=str(path), reader=reader, **more)
 
+    def not_tried(self, way, what, reason):
+        """Record why something was not tried."""
+        self.entries.append({"way": way, "what": what, "not_tried": reason})
+
     def _record(self, way, what, function, **more):
         entry = {"way": way, "what": what, **more}
         try:

@@ -92,7 +92,7 @@ def spiceypy(cells):
 
 def anise(cells):
     from anise import Almanac
-    from anise.astro import Ephemeris
+    from anise.astro import DataType, Ephemeris
     from anise.constants import Frames
     from anise.time import Duration, Epoch
 
@@ -122,7 +122,8 @@ def anise(cells):
         return cells.expected("states")
 
     def bsp(path):
-        Ephemeris.from_ccsds_oem_file(cells.sample("pass.oem")).write_spice_bsp(_CRAFT, path)
+        kind = DataType.Type13HermiteUnequalStep
+        Ephemeris.from_ccsds_oem_file(cells.sample("pass.oem")).write_spice_bsp(_CRAFT, path, kind)
         return cells.expected("states")
 
     empty = Almanac(cells.sample("pass.bsp"))
@@ -253,18 +254,17 @@ def oem(cells):
 
 
 def gmat(cells):
-    import gmat_run
-    from gmat_run import parsers
+    """Readers of the files that GMAT exchanges; GMAT itself is in no package registry."""
+    from gmat_run.parsers import ephemeris, stk_ephemeris
 
-    def states(reader, name):
-        frame = reader(cells.sample(name))
-        columns = [next(c for c in frame.columns if str(c).lower() in names) for names in (
-            ("epoch", "time", "utc"), ("x", "x_km"), ("y", "y_km"), ("z", "z_km"), ("vx", "vx_km_s"), ("vy", "vy_km_s"), ("vz", "vz_km_s"))]
-        return _rows([str(t) for t in frame[columns[0]]], frame[columns[1:]].to_numpy().tolist())
+    def states(parser, name, scale):
+        frame = parser.parse(cells.sample(name))
+        parts = frame[["X", "Y", "Z", "VX", "VY", "VZ"]].to_numpy() * scale
+        return _rows([str(t).replace(" ", "T") for t in frame["Epoch"]], parts.tolist())
 
-    print(gmat_run.__version__, dir(parsers))
-    cells.reads("OEM (gmat-run)", "states", lambda: states(parsers.ephemeris.parse_oem, "pass.oem"))
-    cells.reads("STK `.e` (gmat-run)", "arc", lambda: states(parsers.ephemeris.parse_stk, "pass.e"))
+    cells.reads("OEM", "states", lambda: states(ephemeris, "pass.oem", 1.0))
+    cells.reads("STK `.e`", "arc", lambda: states(stk_ephemeris, "pass.e", 1e-3))
+    cells.not_tried("writes", "OEM, STK `.e`", "GMAT and STK are in no package registry")
 
 
 def orekit(cells):

@@ -83,6 +83,10 @@ def yamcs_pymdb(cells):
     cells.writes("XTCE", "pymdb.bin", "packets", written, xtce=["pymdb.xml"], parameters=names)
 
 
+def _alias(name, kind):
+    return {"kind": "alias", "qualifiedName": name, "type": kind, "underlyingType": kind}
+
+
 def fprime_xtce(cells):
     """A dictionary of F Prime with a channel of each kind and a packet of several."""
 
@@ -94,10 +98,11 @@ def fprime_xtce(cells):
             "kind": "enum", "qualifiedName": "Bus.Mode", "representationType": number("U8", 8),
             "enumeratedConstants": [{"name": "OFF", "value": 0}, {"name": "ON", "value": 1}], "default": "Bus.Mode.OFF",
         }  # fmt: skip
-        size = {
-            "kind": "alias", "qualifiedName": "FwSizeStoreType", "type": number("U16", 16),
-            "underlyingType": number("U16", 16),
-        }  # fmt: skip
+        size = _alias("FwSizeStoreType", number("U16", 16))
+        parts = {"timeBase": number("U16", 16), "timeContext": number("U8", 8), "seconds": number("U32", 32)}
+        parts["useconds"] = number("U32", 32)
+        members = {name: {"type": kind, "index": k} for k, (name, kind) in enumerate(parts.items())}
+        stamp = {"kind": "struct", "qualifiedName": "Fw.TimeValue", "members": members, "default": {}}
         kinds = {
             "Bus.count": number("U32", 32), "Bus.level": number("I16", 16, signed=True),
             "Bus.volts": number("F32", 32, kind="float"), "Bus.mode": {"name": "Bus.Mode", "kind": "qualifiedIdentifier"},
@@ -111,20 +116,33 @@ def fprime_xtce(cells):
         dictionary = {
             "metadata": {"deploymentName": "Bus", "projectVersion": "1", "frameworkVersion": "1", "libraryVersions": [],
                          "dictionarySpecVersion": "1.0.0"},
-            "typeDefinitions": [mode, size], "constants": [], "commands": [], "parameters": [], "events": [],
+            "typeDefinitions": [mode, size, _alias("FwTlmPacketizeIdType", number("U16", 16)), stamp], "constants": [], "commands": [], "parameters": [], "events": [],
             "records": [], "containers": [], "telemetryChannels": channels,
             "telemetryPacketSets": [{"name": "Set", "members": packets, "omitted": []}],
         }  # fmt: skip
         source = cells.out / "dictionary.json"
         source.write_text(json.dumps(dictionary))
         subprocess.run([sys.executable, "-m", "fprime_xtce", str(source), "-o", str(cells.out / "fprime.xml")], check=True)
-        return _fprime_packets(path)
 
-    cells.writes("XTCE", "fprime.bin", "packets", written, xtce=["fprime.xml"], parameters=None, optional=True)
+    def sent(path):
+        """Return the values of a packet of each channel and of the set, packed as F Prime does."""
+        written(path)
+        stamp = struct.pack(">HBII", 2, 0, 1000, 250)
+        at = {"timeBase": 2, "timeContext": 0, "seconds": 1000, "useconds": 250}
+        channels = [
+            ("count", struct.pack(">I", 77), 77), ("level", struct.pack(">h", -5), -5), ("volts", struct.pack(">f", 1.25), 1.25),
+            ("mode", b"\x01", "ON"), ("label", b"\x00\x05HELLO", "HELLO"),
+        ]  # fmt: skip
+        packets, right = [], []
+        for k, (name, octets, value) in enumerate(channels):
+            packets.append(_space_packet(1, struct.pack(">HI", 1, 16 + k) + stamp + octets, k))
+            right.append({"packet": name, "FPrimeTime": at, name: value})
+        packets.append(_space_packet(4, struct.pack(">HH", 4, 4) + stamp + struct.pack(">IB", 78, 0)))
+        right.append({"packet": "Sets", "FPrimeTime": at, "count": 78, "mode": "OFF"})
+        Path(path).write_bytes(b"".join(packets))
+        return right
 
-
-def _fprime_packets(path):
-    raise NotImplementedError(path)
+    cells.writes("XTCE", "fprime.bin", "packets", sent, xtce=["fprime.xml"], subset=True)
 
 
 def openc3(cells):
@@ -174,6 +192,7 @@ def openc3(cells):
             for (apid, count, length), body in zip(heads, bodies, strict=True)
         ]  # fmt: skip
 
+    cells.not_tried("reads", "XTCE", "its reader of XTCE is not in the Python package")
     cells.writes("XTCE", "openc3.bin", "packets", written, xtce=["openc3.xml"])
 
 
@@ -237,18 +256,11 @@ def ccsdspy(cells):
         layout = [ccs.PacketField("a", "uint", 16), ccs.PacketField("b", "int", 32)]
         packets = ccs.FixedLength(layout, apid=77)
         values = {"a": np.array([1, 2, 65535]), "b": np.array([-1, 0, 123456])}
-        packets.to_file(path, 0, 77, 0, 3, values) if False else _ccsdspy_write(packets, path, values)
+        packets.to_file(path, pkt_type=0, apid=77, sec_header_flag=0, seq_flag=3, data=values)
         (cells.out / "ccsdspy.xml").write_text(_two_fields())
         return [{"a": int(a), "b": int(b)} for a, b in zip(values["a"], values["b"], strict=True)]
 
     cells.writes("packets", "ccsdspy.bin", "packets", written, xtce=["ccsdspy.xml"], parameters=["a", "b"])
-
-
-def _ccsdspy_write(packets, path, values):
-    import inspect
-
-    print(inspect.signature(packets.to_file))
-    packets.to_file(path, pkt_type=0, apid=77, sec_header_flag=0, seq_flag=3, data=values)
 
 
 def _two_fields():
