@@ -125,6 +125,7 @@ def make_samples(folder: Path, demo: Path) -> None:
             "--out", folder / f"{name}.json",
         )  # fmt: skip
     linna("dataset", "build", "detector-validation", "--out", folder / "dataset", "--frames", "3")
+    shutil.copytree(demo / "ground", folder / "ground")
     shutil.copy(demo / "pass" / "downlink.cadu", folder)
     shutil.copy(demo / "pass" / "catalogue.csv", folder)
     (folder / "packets.bin").write_bytes(_packets(folder / "downlink.cadu"))

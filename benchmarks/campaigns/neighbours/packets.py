@@ -131,7 +131,7 @@ def fprime_xtce(cells):
         at = {"timeBase": 2, "timeContext": 0, "seconds": 1000, "useconds": 250}
         channels = [
             ("count", struct.pack(">I", 77), 77), ("level", struct.pack(">h", -5), -5), ("volts", struct.pack(">f", 1.25), 1.25),
-            ("mode", b"\x01", "ON"), ("label", b"\x00\x05HELLO", "HELLO"),
+            ("mode", b"\x01", "ON"), ("label", b"\x00\x05HELLO" + bytes(35), "HELLO"),
         ]  # fmt: skip
         packets, right = [], []
         for k, (name, octets, value) in enumerate(channels):
