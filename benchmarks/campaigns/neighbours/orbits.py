@@ -131,7 +131,7 @@ def anise(cells):
     cells.reads("OEM", "states", lambda: listed(Ephemeris.from_ccsds_oem_file(cells.sample("pass.oem")), empty, "states"))
     cells.reads("STK `.e`", "arc", lambda: listed(Ephemeris.from_stk_e_file(cells.sample("pass.e")), empty, "arc"))
     cells.writes("OEM", "anise.oem", "orbit", oem)
-    cells.writes("SPK", "anise.bsp", "orbit", bsp, step=10)
+    cells.writes("SPK", "anise.bsp", "orbit", bsp, step=10, why="it states frame 22, which SPICE does not know")
 
 
 def brahe(cells):
@@ -163,7 +163,7 @@ def brahe(cells):
     cells.reads("OEM", "states", lambda: states("pass.oem"))
     cells.reads("OEM in XML", "states", lambda: states("pass.xml"))
     cells.reads("AEM 2.0", "attitude", lambda: attitudes("pass.aem"))
-    cells.reads("AEM 1.0", "attitude", lambda: attitudes("pass-1.0.aem"))
+    cells.reads("AEM 1.0", "attitude", lambda: attitudes("pass-1.0.aem"), why="it reads AEM 2.0 only, which is our default")
     cells.writes("OEM", "brahe.oem", "orbit", written(OEM, "pass.oem", "states", "KVN"))
     cells.writes("OEM in XML", "brahe.xml", "orbit", written(OEM, "pass.oem", "states", "XML"))
     cells.writes("AEM", "brahe.aem", "attitude", written(AEM, "pass.aem", "attitude", "KVN"))
@@ -201,7 +201,7 @@ def ccsds_ndm(cells):
 
     cells.reads("OEM", "states", lambda: states("pass.oem"))
     cells.reads("OEM in XML", "states", lambda: states("pass.xml"))
-    cells.reads("AEM 2.0", "attitude", lambda: attitudes("pass.aem"))
+    cells.reads("AEM 2.0", "attitude", lambda: attitudes("pass.aem"), why="it reads AEM 1.0 only: `--version 1.0`")
     cells.reads("AEM 1.0", "attitude", lambda: attitudes("pass-1.0.aem"))
     cells.writes("OEM", "ndm.oem", "orbit", written("pass.oem", "states", "KVN"))
     cells.writes("OEM in XML", "ndm.xml", "orbit", written("pass.oem", "states", "XML"))
@@ -230,7 +230,7 @@ def ccsds_ndm_py(cells):
     cells.reads("OEM", "states", lambda: states("pass.oem"))
     cells.reads("OEM in XML", "states", lambda: states("pass.xml"))
     cells.reads("AEM 2.0", "attitude", lambda: attitudes("pass.aem"))
-    cells.reads("AEM 1.0", "attitude", lambda: attitudes("pass-1.0.aem"))
+    cells.reads("AEM 1.0", "attitude", lambda: attitudes("pass-1.0.aem"), why="it reads AEM 2.0 only, which is our default")
     cells.writes("OEM", "ndmpy.oem", "orbit", written("pass.oem", "states", "kvn"))
     cells.writes("OEM in XML", "ndmpy.xml", "orbit", written("pass.oem", "states", "xml"))
     cells.writes("AEM", "ndmpy.aem", "attitude", written("pass.aem", "attitude", "kvn"))
