@@ -2,8 +2,8 @@
 
     python -m benchmarks.campaigns.compatibility [--row NAME ...] [--again] [--write]
 
-Each row runs in an environment of its own, with the versions of `neighbours/requirements`, under `build/compatibility`. A
-program that cannot be installed, or fails, does not stop the others. Rows that have results are not run again unless
+Each row runs in an environment of its own, with the versions of `neighbours/requirements`, under `build/compatibility`.
+A program that cannot be installed, or fails, does not stop the others. Rows that have results are not run again unless
 their script, versions or files of ours changed; `--again` runs them all. `--write` writes `docs/compatibility.md`.
 
 Exit status 1 if a value differs or a file is refused without a reason that the script of the row states.
@@ -40,7 +40,7 @@ ENOUGH_DIGITS = 6
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Program of a row: the script and function that run it in an environment, and the packages whose versions count."""
+    """Program of a row: the script and function that run it in an environment, and packages whose versions count."""
 
     name: str
     script: str
@@ -99,7 +99,9 @@ WITHOUT = {"reads": "no common format that we write", "writes": "no common forma
 def linna(*arguments: str | Path, **environment: str) -> None:
     """Run a command of this project."""
     command = [sys.executable, "-m", "linna", *map(str, arguments)]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=ROOT, env={**os.environ, **environment})
+    subprocess.run(
+        command, check=True, stdout=subprocess.DEVNULL, cwd=ROOT, env={**os.environ, **environment}
+    )
 
 
 def make_samples(folder: Path, demo: Path) -> None:
@@ -174,7 +176,9 @@ def _leap_line(date: str, offset: int) -> str:
     day = np.datetime64(date)
     jd = float((day - np.datetime64("1972-01-01")).astype(int)) + 2441317.5
     name = day.astype(object).strftime("%b").upper()
-    text = f" {day.astype(object).year} {name} {day.astype(object).day:2d} =JD {jd:.1f}  TAI-UTC= {offset:5.1f}"
+    text = (
+        f" {day.astype(object).year} {name} {day.astype(object).day:2d} =JD {jd:.1f}  TAI-UTC= {offset:5.1f}"
+    )
     return f"{text}       S + (MJD - 41317.) X 0.0      S\n"
 
 
@@ -243,7 +247,10 @@ def read_packets(path: Path, entry: dict[str, Any]) -> list[dict[str, Any]]:
     found = Decoder(parse_xtce(documents)).decode(octets, cut, primary_headers(octets, cut))
     records = xtce_records(found)
     if entry.get("subset"):  # of each packet, the parameters that the other program states
-        return [{key: one.get(key) for key in stated} for one, stated in zip(records, entry["values"], strict=True)]
+        return [
+            {key: one.get(key) for key in stated}
+            for one, stated in zip(records, entry["values"], strict=True)
+        ]
     kept = entry.get("parameters")
     return [{key: one[key] for key in kept} if kept else one for one in records]
 
@@ -467,7 +474,12 @@ def _judge(entry: dict[str, Any], expected: dict[str, Any]) -> dict[str, str]:
 
 def result(row: Row, samples: Path, *, again: bool) -> list[dict[str, str]]:
     """Cells of a row; the program is not run again if nothing changed since it was."""
-    parts = [NEIGHBOURS / row.script, NEIGHBOURS / "_cells.py", _pins(row.environment), samples / "expected.json"]
+    parts = [
+        NEIGHBOURS / row.script,
+        NEIGHBOURS / "_cells.py",
+        _pins(row.environment),
+        samples / "expected.json",
+    ]
     digest = hashlib.sha256(b"".join(part.read_bytes() for part in parts)).hexdigest()
     out = BUILD / "files" / row.function
     kept = BUILD / "results" / f"{row.function}.json"
@@ -491,9 +503,9 @@ def format_page(results: dict[str, list[dict[str, str]]]) -> str:
     lines = [
         "# Compatibility",
         "",
-        "Each cell is the result of a run: the program read a file of ours, or we read a file of the program, and the values",
-        "were compared. `python -m benchmarks.campaigns.compatibility --write` runs the programs in environments of their own",
-        "and writes this page. `make campaigns` does the same.",
+        "Each cell is the result of a run: the program read a file of ours, or we read a file of the program, and the",
+        "values were compared. `python -m benchmarks.campaigns.compatibility --write` runs the programs in environments",
+        "of their own and writes this page. `make campaigns` does the same.",
         "",
         "*Equal to n digits*: the largest difference is 10⁻ⁿ of the largest value of its column.",
         "",
@@ -509,7 +521,9 @@ def format_page(results: dict[str, list[dict[str, str]]]) -> str:
 
 
 def _cell(cells: list[dict[str, str]], way: str) -> str:
-    found = [f"{one['what']}: {one['text']}" if one["what"] else one["text"] for one in cells if one["way"] == way]
+    found = [
+        f"{one['what']}: {one['text']}" if one["what"] else one["text"] for one in cells if one["way"] == way
+    ]
     return "<br>".join(found) or WITHOUT[way]
 
 
@@ -532,7 +546,8 @@ def main(arguments: list[str] | None = None) -> int:
     for name, cells in results.items():
         for one in cells:
             bad += not one["good"]
-            print(f"{name} | {one['way']} | {one['what']} | {one['text']}{'' if one['good'] else '   <-- no reason stated'}")
+            mark = "" if one["good"] else "   <-- no reason stated"
+            print(f"{name} | {one['way']} | {one['what']} | {one['text']}{mark}")
     if options.write:
         PAGE.write_text(format_page(results))
     return 1 if bad else 0

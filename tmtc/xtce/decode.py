@@ -197,11 +197,11 @@ class Decoder:
         Parameters
         ----------
         headers
-            Primary headers: the parts of a segmented packet are joined, unless the definition asks for the sequence
+            Primary headers: parts of segmented packets are not decoded, unless the definition asks for the sequence
             flags.
         whole_stream
-            With `headers`: of an APID whose packets have a secondary header, packets without one are not decoded,
-            unless the definition asks for the flag.
+            With `headers`: the parts of a segmented packet are joined. Of an APID whose packets have a secondary
+            header, packets without one are not decoded, unless the definition asks for the flag.
         checksum_octets
             Octets of the checksum at the end of a packet, which each part of a segmented packet has.
         """
@@ -210,7 +210,7 @@ class Decoder:
         sources = [_Source(octets, cut.offsets, cut.lengths, np.empty(0, dtype=np.int64))]
         if headers is not None and not self._reads_segments:
             verdict[cut.crc_ok & (headers.sequence_flags != FLAGS_WHOLE)] = SEGMENT
-            if (verdict == SEGMENT).any():
+            if whole_stream and (verdict == SEGMENT).any():
                 sources.append(_join_segments(octets, cut, headers, verdict, checksum_octets))
         if headers is not None and whole_stream and not self._reads_header_flag:
             whole = verdict == DECODED
@@ -428,7 +428,8 @@ def _compile(entries: Sequence[Entry], mark: str) -> list[_Step]:
         encoding = None if kind is None else kind.encoding
         offset = entry.offset
         plain = not entry.from_start and entry.condition is None
-        if plain and isinstance(offset, int) and bits is not None and isinstance(encoding, (IntegerEncoding, FloatEncoding)):
+        is_number = bits is not None and isinstance(encoding, (IntegerEncoding, FloatEncoding))
+        if plain and isinstance(offset, int) and is_number:
             assert kind is not None
             if fields and encoding.calibration.contexts:  # they may ask for fields of the same stretch
                 close()
@@ -789,9 +790,7 @@ def _read_fixed_elements(
     return ArrayColumn(counts[index], column.take(stays)), at[index], kept
 
 
-def _read_open_elements(
-    run: _Run, data_type: ArrayType, rows: _Rows, counts: IntArray, name: str
-) -> _Found:
+def _read_open_elements(run: _Run, data_type: ArrayType, rows: _Rows, counts: IntArray, name: str) -> _Found:
     """Elements whose width depends on the packet: the k-th of all packets together."""
     element = data_type.element
     at = rows.at.copy()

@@ -209,8 +209,8 @@ class Parameter:
 class Entry:
     """A parameter, or the entries of another container, in a container.
 
-    It begins `offset` bits, or as many as the packet states, after the entry before it (`from_start` False) or after the
-    beginning of the container.
+    It begins `offset` bits, or as many as the packet states, after the entry before it (`from_start` False) or after
+    the beginning of the container.
     """
 
     item: Parameter | Container

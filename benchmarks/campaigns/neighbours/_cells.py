@@ -2,8 +2,8 @@
 
     python SCRIPT.py FUNCTION SAMPLES OUT
 
-A function gets `Cells`. `reads` records what the program found in a file of ours, `writes` which values it wrote to a file
-for us. The campaign compares both with the values of this project. One cell that fails does not stop the others.
+A function gets `Cells`. `reads` records what the program found in a file of ours, `writes` which values it wrote to a
+file for us. The campaign compares both with the values of this project. One cell that fails does not stop the others.
 """
 
 import json

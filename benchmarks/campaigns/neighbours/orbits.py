@@ -1,4 +1,4 @@
-"""Orbits and attitudes in other programs. States are [seconds, x, y, z (km), vx, vy, vz (km/s)] from the first one on."""
+"""Orbits and attitudes in other programs. States are [seconds since the first one, x, y, z (km), vx, vy, vz (km/s)]."""
 
 import datetime as dt
 import os
@@ -18,7 +18,9 @@ def _utc(text):
 
 
 def _rows(epochs, values):
-    return [[at, *map(float, one)] for at, one in zip(_seconds([_utc(e) for e in epochs]), values, strict=True)]
+    return [
+        [at, *map(float, one)] for at, one in zip(_seconds([_utc(e) for e in epochs]), values, strict=True)
+    ]
 
 
 def skyfield(cells):
@@ -78,9 +80,7 @@ def spiceypy(cells):
         ets = cells.expected("arc_et")
         states = [row[1:] for row in cells.expected("arc")]
         handle = spice.spkopn(path, "spiceypy", 0)
-        spice.spkw13(
-            handle, _CRAFT, _MOON, "J2000", ets[0], ets[-1], "spiceypy", 7, len(ets), states, ets
-        )
+        spice.spkw13(handle, _CRAFT, _MOON, "J2000", ets[0], ets[-1], "spiceypy", 7, len(ets), states, ets)
         spice.spkcls(handle)
         return cells.expected("arc")
 
@@ -100,9 +100,13 @@ def anise(cells):
         found = []
         start = Epoch(cells.expected(f"{rows}_utc")[0] + " UTC")
         for at, *_ in cells.expected(rows):
-            orbit = ephemeris.nearest_orbit_before(start + Duration.from_total_nanoseconds(round(at * 1e9)), almanac)
+            orbit = ephemeris.nearest_orbit_before(
+                start + Duration.from_total_nanoseconds(round(at * 1e9)), almanac
+            )
             offset = (orbit.epoch - start).to_seconds()
-            found.append([offset, orbit.x_km, orbit.y_km, orbit.z_km, orbit.vx_km_s, orbit.vy_km_s, orbit.vz_km_s])
+            found.append(
+                [offset, orbit.x_km, orbit.y_km, orbit.z_km, orbit.vx_km_s, orbit.vy_km_s, orbit.vz_km_s]
+            )
         return found
 
     def kernel(name):
@@ -112,7 +116,9 @@ def anise(cells):
         craft = Frame(_CRAFT, 1)
         start, found = Epoch(cells.expected("arc_utc")[0] + " UTC"), []
         for at, *_ in cells.expected("arc"):
-            one = almanac.translate_geometric(craft, Frames.MOON_J2000, start + Duration.from_total_nanoseconds(round(at * 1e9)))
+            one = almanac.translate_geometric(
+                craft, Frames.MOON_J2000, start + Duration.from_total_nanoseconds(round(at * 1e9))
+            )
             found.append([at, one.x_km, one.y_km, one.z_km, one.vx_km_s, one.vy_km_s, one.vz_km_s])
         return found
 
@@ -128,10 +134,18 @@ def anise(cells):
 
     empty = Almanac(cells.sample("pass.bsp"))
     cells.reads("SPK type 3", "arc", lambda: kernel("pass.bsp"))
-    cells.reads("OEM", "states", lambda: listed(Ephemeris.from_ccsds_oem_file(cells.sample("pass.oem")), empty, "states"))
-    cells.reads("STK `.e`", "arc", lambda: listed(Ephemeris.from_stk_e_file(cells.sample("pass.e")), empty, "arc"))
+    cells.reads(
+        "OEM",
+        "states",
+        lambda: listed(Ephemeris.from_ccsds_oem_file(cells.sample("pass.oem")), empty, "states"),
+    )
+    cells.reads(
+        "STK `.e`", "arc", lambda: listed(Ephemeris.from_stk_e_file(cells.sample("pass.e")), empty, "arc")
+    )
     cells.writes("OEM", "anise.oem", "orbit", oem)
-    cells.writes("SPK", "anise.bsp", "orbit", bsp, step=10, why="it states frame 22, which SPICE does not know")
+    cells.writes(
+        "SPK", "anise.bsp", "orbit", bsp, step=10, why="it states frame 22, which SPICE does not know"
+    )
 
 
 def brahe(cells):
@@ -140,7 +154,13 @@ def brahe(cells):
     def states(name):
         found = []
         for one in OEM.from_file(cells.sample(name)).segments[0].states:
-            found.append([_day_s(one.epoch), *(value / 1000 for value in one.position), *(value / 1000 for value in one.velocity)])
+            found.append(
+                [
+                    _day_s(one.epoch),
+                    *(value / 1000 for value in one.position),
+                    *(value / 1000 for value in one.velocity),
+                ]
+            )
         first = found[0][0]
         return [[row[0] - first, *row[1:]] for row in found]
 
@@ -163,7 +183,12 @@ def brahe(cells):
     cells.reads("OEM", "states", lambda: states("pass.oem"))
     cells.reads("OEM in XML", "states", lambda: states("pass.xml"))
     cells.reads("AEM 2.0", "attitude", lambda: attitudes("pass.aem"))
-    cells.reads("AEM 1.0", "attitude", lambda: attitudes("pass-1.0.aem"), why="it reads AEM 2.0 only, which is our default")
+    cells.reads(
+        "AEM 1.0",
+        "attitude",
+        lambda: attitudes("pass-1.0.aem"),
+        why="it reads AEM 2.0 only, which is our default",
+    )
     cells.writes("OEM", "brahe.oem", "orbit", written(OEM, "pass.oem", "states", "KVN"))
     cells.writes("OEM in XML", "brahe.xml", "orbit", written(OEM, "pass.oem", "states", "XML"))
     cells.writes("AEM", "brahe.aem", "attitude", written(AEM, "pass.aem", "attitude", "KVN"))
@@ -177,7 +202,7 @@ def _day_s(epoch):
 
 
 def ccsds_ndm(cells):
-    from ccsds_ndm.ndm_io import NdmIo, NDMFileFormats
+    from ccsds_ndm.ndm_io import NDMFileFormats, NdmIo
 
     def load(name):
         return NdmIo().from_path(Path(cells.sample(name)))
@@ -201,7 +226,9 @@ def ccsds_ndm(cells):
 
     cells.reads("OEM", "states", lambda: states("pass.oem"))
     cells.reads("OEM in XML", "states", lambda: states("pass.xml"))
-    cells.reads("AEM 2.0", "attitude", lambda: attitudes("pass.aem"), why="it reads AEM 1.0 only: `--version 1.0`")
+    cells.reads(
+        "AEM 2.0", "attitude", lambda: attitudes("pass.aem"), why="it reads AEM 1.0 only: `--version 1.0`"
+    )
     cells.reads("AEM 1.0", "attitude", lambda: attitudes("pass-1.0.aem"))
     cells.writes("OEM", "ndm.oem", "orbit", written("pass.oem", "states", "KVN"))
     cells.writes("OEM in XML", "ndm.xml", "orbit", written("pass.oem", "states", "XML"))
@@ -230,7 +257,12 @@ def ccsds_ndm_py(cells):
     cells.reads("OEM", "states", lambda: states("pass.oem"))
     cells.reads("OEM in XML", "states", lambda: states("pass.xml"))
     cells.reads("AEM 2.0", "attitude", lambda: attitudes("pass.aem"))
-    cells.reads("AEM 1.0", "attitude", lambda: attitudes("pass-1.0.aem"), why="it reads AEM 2.0 only, which is our default")
+    cells.reads(
+        "AEM 1.0",
+        "attitude",
+        lambda: attitudes("pass-1.0.aem"),
+        why="it reads AEM 2.0 only, which is our default",
+    )
     cells.writes("OEM", "ndmpy.oem", "orbit", written("pass.oem", "states", "kvn"))
     cells.writes("OEM in XML", "ndmpy.xml", "orbit", written("pass.oem", "states", "xml"))
     cells.writes("AEM", "ndmpy.aem", "attitude", written("pass.aem", "attitude", "kvn"))
@@ -291,31 +323,33 @@ def orekit(cells):
         """A body without ephemeris: values are compared in the frame of the file."""
 
         @JOverride
-        def getName(self):  # noqa: N802
+        def getName(self):
             return "Moon"
 
         @JOverride
-        def getGM(self):  # noqa: N802
+        def getGM(self):
             return 4.9028001184575496e12
 
         @JOverride
-        def getInertiallyOrientedFrame(self):  # noqa: N802
+        def getInertiallyOrientedFrame(self):
             return FramesFactory.getGCRF()
 
         @JOverride
-        def getBodyOrientedFrame(self):  # noqa: N802
+        def getBodyOrientedFrame(self):
             return FramesFactory.getGCRF()
 
         @JOverride
-        def toExtendedPositionProvider(self):  # noqa: N802
+        def toExtendedPositionProvider(self):
             raise NotImplementedError
 
-        getPVCoordinates = getPosition = getVelocity = toFieldPVCoordinatesProvider = toExtendedPositionProvider  # noqa: N815
+        getPVCoordinates = getPosition = getVelocity = toFieldPVCoordinatesProvider = (
+            toExtendedPositionProvider
+        )
 
     @JImplements("org.orekit.bodies.CelestialBodyLoader")
     class Loader:
         @JOverride
-        def loadCelestialBody(self, name):  # noqa: N802, ARG002
+        def loadCelestialBody(self, name):
             return Body()
 
     for name in ("SOLAR_SYSTEM_BARYCENTER", "EARTH_MOON", "MOON", "EARTH"):
@@ -362,14 +396,20 @@ def orekit(cells):
         def written(path):
             from java.io import FileWriter
             from org.orekit.files.ccsds.utils.generation import KvnGenerator, XmlGenerator
-            from org.orekit.files.ccsds.ndm.odm.oem import OemWriter
 
             out = FileWriter(path)
             kind = KvnGenerator if form == "kvn" else XmlGenerator
-            extra = ("https://sanaregistry.org/r/ndmxml_unqualified/ndmxml-3.0.0-master-3.0.xsd",) if form == "xml" else ()
+            extra = (
+                ("https://sanaregistry.org/r/ndmxml_unqualified/ndmxml-3.0.0-master-3.0.xsd",)
+                if form == "xml"
+                else ()
+            )
             sizes = (25,) if form == "kvn" else (2,)
-            generator = kind(out, *sizes, "out", float("nan"), True, *extra) if form == "xml" else kind(
-                out, 25, "out", float("nan"), 60)
+            generator = (
+                kind(out, *sizes, "out", float("nan"), True, *extra)
+                if form == "xml"
+                else kind(out, 25, "out", float("nan"), 60)
+            )
             writer().writeMessage(generator, message())
             generator.close()
             out.close()
@@ -383,10 +423,30 @@ def orekit(cells):
     cells.reads("AEM 2.0", "attitude", lambda: attitudes("pass.aem"))
     cells.reads("AEM 1.0", "attitude", lambda: attitudes("pass-1.0.aem"))
     cells.reads("STK `.e`", "arc", stk)
-    cells.writes("OEM", "orekit.oem", "orbit", write(builder.buildOemWriter, lambda: load_oem("pass.oem"), "states", "kvn"))
-    cells.writes("OEM in XML", "orekit.xml", "orbit", write(builder.buildOemWriter, lambda: load_oem("pass.oem"), "states", "xml"))
-    cells.writes("AEM", "orekit.aem", "attitude", write(builder.buildAemWriter, lambda: load_aem("pass.aem"), "attitude", "kvn"))
-    cells.writes("AEM in XML", "orekit-aem.xml", "attitude", write(builder.buildAemWriter, lambda: load_aem("pass.aem"), "attitude", "xml"))
+    cells.writes(
+        "OEM",
+        "orekit.oem",
+        "orbit",
+        write(builder.buildOemWriter, lambda: load_oem("pass.oem"), "states", "kvn"),
+    )
+    cells.writes(
+        "OEM in XML",
+        "orekit.xml",
+        "orbit",
+        write(builder.buildOemWriter, lambda: load_oem("pass.oem"), "states", "xml"),
+    )
+    cells.writes(
+        "AEM",
+        "orekit.aem",
+        "attitude",
+        write(builder.buildAemWriter, lambda: load_aem("pass.aem"), "attitude", "kvn"),
+    )
+    cells.writes(
+        "AEM in XML",
+        "orekit-aem.xml",
+        "attitude",
+        write(builder.buildAemWriter, lambda: load_aem("pass.aem"), "attitude", "xml"),
+    )
 
 
 run(globals())

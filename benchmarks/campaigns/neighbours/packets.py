@@ -1,15 +1,15 @@
-"""Packets and packet definitions in other programs: they decode our packets, and write definitions or packets for us."""
+"""Packets and packet definitions in other programs: they decode our packets, and write definitions or packets."""
 
 import json
 import struct
 import subprocess
 import sys
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 
 from _cells import run
 
-OWN_HEADER = "VERSION TYPE SEC_HDR_FLG PKT_APID SEQ_FLGS SRC_SEQ_CTR PKT_LEN".split()
+OWN_HEADER = ["VERSION", "TYPE", "SEC_HDR_FLG", "PKT_APID", "SEQ_FLGS", "SRC_SEQ_CTR", "PKT_LEN"]
 
 
 def _space_packet(apid, data, count=0, *, secondary=False):
@@ -45,7 +45,7 @@ def yamcs_pymdb(cells):
         agg = y.AggregateParameter(s, "agg", members=members)
         element = y.IntegerDataType(signed=False, encoding=y.uint16_t)
         arr = y.ArrayParameter(s, "arr", data_type=element, length=y.ParameterValue(n))
-        start = datetime(2000, 1, 1, tzinfo=timezone.utc)
+        start = datetime(2000, 1, 1, tzinfo=UTC)
         at = y.AbsoluteTimeParameter(s, "at", reference=start, encoding=y.FloatTimeEncoding(bits=64))
         short = y.StringParameter(s, "short", encoding=y.StringEncoding(bits=64, termination=b"\0"))
         long = y.StringParameter(s, "long", encoding=y.StringEncoding(length_bits=16, max_bits=800))
@@ -66,7 +66,9 @@ def yamcs_pymdb(cells):
             body = bytes((k, 7)) + struct.pack(">fB", 1.5 * k, (k % 2) << 7)
             body += b"".join(struct.pack(">H", 100 + i) for i in range(k))
             text = "z" * (k + 1)
-            body += struct.pack(">d", 86400.25 + k) + b"ABCDEFGH" + struct.pack(">H", len(text)) + text.encode()
+            body += (
+                struct.pack(">d", 86400.25 + k) + b"ABCDEFGH" + struct.pack(">H", len(text)) + text.encode()
+            )
             body += bytes((2, 0xAB, k)) + bytes((10 + 5 * k, k % 2)) + bytes((1, 2, k))
             packets.append(_space_packet(100, body, k))
             right.append(
@@ -105,7 +107,8 @@ def fprime_xtce(cells):
         stamp = {"kind": "struct", "qualifiedName": "Fw.TimeValue", "members": members, "default": {}}
         kinds = {
             "Bus.count": number("U32", 32), "Bus.level": number("I16", 16, signed=True),
-            "Bus.volts": number("F32", 32, kind="float"), "Bus.mode": {"name": "Bus.Mode", "kind": "qualifiedIdentifier"},
+            "Bus.volts": number("F32", 32, kind="float"),
+            "Bus.mode": {"name": "Bus.Mode", "kind": "qualifiedIdentifier"},
             "Bus.label": {"name": "string", "kind": "string", "size": 40},
         }  # fmt: skip
         channels = [
@@ -116,13 +119,17 @@ def fprime_xtce(cells):
         dictionary = {
             "metadata": {"deploymentName": "Bus", "projectVersion": "1", "frameworkVersion": "1", "libraryVersions": [],
                          "dictionarySpecVersion": "1.0.0"},
-            "typeDefinitions": [mode, size, _alias("FwTlmPacketizeIdType", number("U16", 16)), stamp], "constants": [], "commands": [], "parameters": [], "events": [],
+            "typeDefinitions": [mode, size, _alias("FwTlmPacketizeIdType", number("U16", 16)), stamp],
+            "constants": [], "commands": [], "parameters": [], "events": [],
             "records": [], "containers": [], "telemetryChannels": channels,
             "telemetryPacketSets": [{"name": "Set", "members": packets, "omitted": []}],
         }  # fmt: skip
         source = cells.out / "dictionary.json"
         source.write_text(json.dumps(dictionary))
-        subprocess.run([sys.executable, "-m", "fprime_xtce", str(source), "-o", str(cells.out / "fprime.xml")], check=True)
+        subprocess.run(
+            [sys.executable, "-m", "fprime_xtce", str(source), "-o", str(cells.out / "fprime.xml")],
+            check=True,
+        )
 
     def sent(path):
         """Return the values of a packet of each channel and of the set, packed as F Prime does."""
@@ -130,7 +137,8 @@ def fprime_xtce(cells):
         stamp = struct.pack(">HBII", 2, 0, 1000, 250)
         at = {"timeBase": 2, "timeContext": 0, "seconds": 1000, "useconds": 250}
         channels = [
-            ("count", struct.pack(">I", 77), 77), ("level", struct.pack(">h", -5), -5), ("volts", struct.pack(">f", 1.25), 1.25),
+            ("count", struct.pack(">I", 77), 77), ("level", struct.pack(">h", -5), -5),
+            ("volts", struct.pack(">f", 1.25), 1.25),
             ("mode", b"\x01", "ON"), ("label", b"\x00\x05HELLO" + bytes(35), "HELLO"),
         ]  # fmt: skip
         packets, right = [], []
@@ -160,7 +168,11 @@ def openc3(cells):
             "  APPEND_ITEM CCSDSSEQFLAGS 2 UINT\n  APPEND_ITEM CCSDSSEQCNT 14 UINT\n  APPEND_ITEM CCSDSLENGTH 16 UINT\n"
             f"{items}"
             for name, apid, items in (
-                ("HK", 1, "  APPEND_ITEM TEMP 16 INT\n    POLY_READ_CONVERSION 10.0 0.5\n  APPEND_ITEM VOLT 32 FLOAT\n"),
+                (
+                    "HK",
+                    1,
+                    "  APPEND_ITEM TEMP 16 INT\n    POLY_READ_CONVERSION 10.0 0.5\n  APPEND_ITEM VOLT 32 FLOAT\n",
+                ),
                 ("EVENT", 2, "  APPEND_ITEM CODE 8 UINT\n    STATE OFF 0\n    STATE ON 1\n"),
                 ("IMAGE", 3, "  APPEND_ARRAY_ITEM PIXELS 8 UINT 32\n"),
             )
@@ -202,7 +214,9 @@ def space_packet_parser(cells):
     def plain(value):
         if isinstance(value, (bytes, bytearray)):
             return bytes(value).hex()
-        return float(value) if isinstance(value, float) else int(value) if isinstance(value, int) else str(value)
+        return (
+            float(value) if isinstance(value, float) else int(value) if isinstance(value, int) else str(value)
+        )
 
     def decoded(definition, kept):
         found = []
@@ -231,13 +245,21 @@ def space_packet_parser(cells):
 
 def ccsdspy(cells):
     """The housekeeping of a pass with a fixed layout."""
-    import numpy as np
-
     import ccsdspy as ccs
+    import numpy as np
 
     records = [one for one in cells.expected("packets") if one["packet"] == "housekeeping"]
     apid = records[0]["PKT_APID"]
-    fields = (("PUS", 8), ("SERVICE", 8), ("SUBTYPE", 8), ("COUNTER", 16), ("DESTINATION", 16), ("P_FIELD", 8), ("COARSE", 32), ("FINE", 16))
+    fields = (
+        ("PUS", 8),
+        ("SERVICE", 8),
+        ("SUBTYPE", 8),
+        ("COUNTER", 16),
+        ("DESTINATION", 16),
+        ("P_FIELD", 8),
+        ("COARSE", 32),
+        ("FINE", 16),
+    )
 
     def read():
         kept = [one for one in _octets_of(cells, None) if (one[0] & 7) << 8 | one[1] == apid]
@@ -246,10 +268,28 @@ def ccsdspy(cells):
         layout = [ccs.PacketField(name, "uint", bits) for name, bits in fields]
         layout.append(ccs.PacketArray(name="REST", data_type="uint", bit_length=8, array_shape="expand"))
         found = ccs.VariableLength(layout).load(str(source), include_primary_header=True)
-        names = ("CCSDS_APID", "CCSDS_SEQUENCE_COUNT", "CCSDS_PACKET_LENGTH", "SERVICE", "SUBTYPE", "COUNTER", "COARSE", "FINE")
+        names = (
+            "CCSDS_APID",
+            "CCSDS_SEQUENCE_COUNT",
+            "CCSDS_PACKET_LENGTH",
+            "SERVICE",
+            "SUBTYPE",
+            "COUNTER",
+            "COARSE",
+            "FINE",
+        )
         return np.column_stack([found[name].astype(float) for name in names]).tolist()
 
-    names = ("PKT_APID", "SRC_SEQ_CTR", "PKT_LEN", "SERVICE", "SUBTYPE", "MESSAGE_COUNTER", "TIME_COARSE", "TIME_FINE")
+    names = (
+        "PKT_APID",
+        "SRC_SEQ_CTR",
+        "PKT_LEN",
+        "SERVICE",
+        "SUBTYPE",
+        "MESSAGE_COUNTER",
+        "TIME_COARSE",
+        "TIME_FINE",
+    )
     cells.reads("headers of packets", [[float(one[name]) for name in names] for one in records], read)
 
     def written(path):
@@ -267,8 +307,8 @@ def _two_fields():
     """Return XTCE with a primary header, an unsigned and a signed integer."""
     widths = dict(zip(OWN_HEADER, (3, 1, 1, 11, 2, 14, 16), strict=True)) | {"a": 16, "b": 32}
     types = "".join(
-        f'<IntegerParameterType name="{n}_T" signed="{"true" if n == "b" else "false"}"><IntegerDataEncoding sizeInBits="{w}"'
-        f' encoding="{"twosComplement" if n == "b" else "unsigned"}"/></IntegerParameterType>'
+        f'<IntegerParameterType name="{n}_T" signed="{"true" if n == "b" else "false"}"><IntegerDataEncoding'
+        f' sizeInBits="{w}" encoding="{"twosComplement" if n == "b" else "unsigned"}"/></IntegerParameterType>'
         for n, w in widths.items()
     )
     names = "".join(f'<Parameter name="{n}" parameterTypeRef="{n}_T"/>' for n in widths)
@@ -293,12 +333,26 @@ def spacepackets(cells):
             one = PusTm.unpack(octets, timestamp_len=7)
             stamp = one.timestamp
             found.append(
-                [one.apid, one.seq_count, one.service, one.subservice, int.from_bytes(stamp[1:5], "big"), len(one.source_data)]
+                [
+                    one.apid,
+                    one.seq_count,
+                    one.service,
+                    one.subservice,
+                    int.from_bytes(stamp[1:5], "big"),
+                    len(one.source_data),
+                ]
             )
         return [list(map(float, row)) for row in found]
 
     right = [
-        [one["PKT_APID"], one["SRC_SEQ_CTR"], one["SERVICE"], one["SUBTYPE"], one["TIME_COARSE"], one["PKT_LEN"] + 1 - 14 - 2]
+        [
+            one["PKT_APID"],
+            one["SRC_SEQ_CTR"],
+            one["SERVICE"],
+            one["SUBTYPE"],
+            one["TIME_COARSE"],
+            one["PKT_LEN"] + 1 - 14 - 2,
+        ]
         for one in records
     ]
     cells.reads("PUS telemetry with checksum", [list(map(float, row)) for row in right], read)
@@ -306,7 +360,8 @@ def spacepackets(cells):
     def written(path):
         commands = [
             (17, 1, b"", "test_connection"), (3, 5, struct.pack(">H", 1), "enable_housekeeping"),
-            (8, 1, struct.pack(">Hdd", 8, 0, 0), "perform_function"), (20, 3, struct.pack(">Hd", 1, 5.0), "set_parameter"),
+            (8, 1, struct.pack(">Hdd", 8, 0, 0), "perform_function"),
+            (20, 3, struct.pack(">Hd", 1, 5.0), "set_parameter"),
         ]  # fmt: skip
         packets = [
             PusTc(apid=160, service=service, subservice=subtype, app_data=data, seq_count=k).pack().hex()
@@ -337,10 +392,9 @@ def cfdp_py(cells):
     """Protocol data units of a transaction in space packets, described by XTCE."""
     from spacepackets.cfdp import CfdpLv  # noqa: F401
     from spacepackets.cfdp.conf import PduConfig
-    from spacepackets.cfdp.defs import TransmissionMode
+    from spacepackets.cfdp.defs import ChecksumType, TransmissionMode
     from spacepackets.cfdp.pdu import MetadataParams, MetadataPdu
     from spacepackets.cfdp.pdu.file_data import FileDataParams, FileDataPdu
-    from spacepackets.cfdp.defs import ChecksumType
     from spacepackets.util import ByteFieldU16
 
     def written(path):
@@ -352,28 +406,43 @@ def cfdp_py(cells):
             closure_requested=False, checksum_type=ChecksumType.CRC_32, file_size=11, source_file_name="a.bin",
             dest_file_name="b.bin",
         )  # fmt: skip
-        units = [MetadataPdu(conf, params).pack(), FileDataPdu(conf, FileDataParams(b"hello world", 0)).pack()]
+        units = [
+            MetadataPdu(conf, params).pack(),
+            FileDataPdu(conf, FileDataParams(b"hello world", 0)).pack(),
+        ]
         Path(path).write_bytes(b"".join(_space_packet(500, bytes(one), k) for k, one in enumerate(units)))
         (cells.out / "cfdp.xml").write_text(_cfdp_xtce())
         heads = [(0, units[0]), (1, units[1])]
         return [
             {
-                "pdu_type": kind, "length": int.from_bytes(one[1:3], "big"), "source": 1, "transaction": 9, "destination": 2,
-                "data": bytes(one[10:]).hex(),
+                "pdu_type": kind, "length": int.from_bytes(one[1:3], "big"), "source": 1, "transaction": 9,
+                "destination": 2, "data": bytes(one[10:]).hex(),
             }
             for kind, one in heads
         ]  # fmt: skip
 
     names = ["pdu_type", "length", "source", "transaction", "destination", "data"]
-    cells.writes("CFDP units in packets, by XTCE", "cfdp.bin", "packets", written, xtce=["cfdp.xml"], parameters=names)
+    cells.writes(
+        "CFDP units in packets, by XTCE", "cfdp.bin", "packets", written, xtce=["cfdp.xml"], parameters=names
+    )
 
 
 def _cfdp_xtce():
     """Return XTCE of the fixed header of a PDU with identifiers of two octets, and its data."""
     widths = dict(zip(OWN_HEADER, (3, 1, 1, 11, 2, 14, 16), strict=True))
-    widths |= {"version": 3, "pdu_type": 1, "flags": 4, "length": 16, "sizes": 8, "source": 16, "transaction": 16, "destination": 16}
+    widths |= {
+        "version": 3,
+        "pdu_type": 1,
+        "flags": 4,
+        "length": 16,
+        "sizes": 8,
+        "source": 16,
+        "transaction": 16,
+        "destination": 16,
+    }
     types = "".join(
-        f'<IntegerParameterType name="{n}_T" signed="false"><IntegerDataEncoding sizeInBits="{w}"/></IntegerParameterType>'
+        f'<IntegerParameterType name="{n}_T" signed="false"><IntegerDataEncoding sizeInBits="{w}"/>'
+        "</IntegerParameterType>"
         for n, w in widths.items()
     )
     names = "".join(f'<Parameter name="{n}" parameterTypeRef="{n}_T"/>' for n in (*widths, "data"))
@@ -381,7 +450,7 @@ def _cfdp_xtce():
     return (
         '<SpaceSystem xmlns="http://www.omg.org/spec/XTCE/20180204" name="CFDP"><TelemetryMetaData>'
         f'<ParameterTypeSet>{types}<BinaryParameterType name="data_T"><BinaryDataEncoding><SizeInBits><DynamicValue>'
-        '<ParameterInstanceRef parameterRef="length"/><LinearAdjustment slope="8" intercept="0"/></DynamicValue></SizeInBits>'
+        '<ParameterInstanceRef parameterRef="length"/><LinearAdjustment slope="8"/></DynamicValue></SizeInBits>'
         f"</BinaryDataEncoding></BinaryParameterType></ParameterTypeSet><ParameterSet>{names}</ParameterSet><ContainerSet>"
         f'<SequenceContainer name="PDU"><EntryList>{entries}</EntryList></SequenceContainer></ContainerSet>'
         "</TelemetryMetaData></SpaceSystem>"

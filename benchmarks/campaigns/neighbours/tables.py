@@ -36,7 +36,9 @@ def _table(cells, what, table, load):
         cells.reads(what, [], refuse)
         return
     names, right = _columns(cells, table, set(found))
-    cells.reads(what, right, lambda: [list(map(_plain, row)) for row in zip(*(found[n] for n in names), strict=True)])
+    cells.reads(
+        what, right, lambda: [list(map(_plain, row)) for row in zip(*(found[n] for n in names), strict=True)]
+    )
 
 
 def _parquet(cells):
@@ -52,7 +54,9 @@ def pyarrow(cells):
 def fastparquet(cells):
     import fastparquet as fp
 
-    _table(cells, "Parquet", "housekeeping", lambda: dict(fp.ParquetFile(_parquet(cells)).to_pandas().items()))
+    _table(
+        cells, "Parquet", "housekeeping", lambda: dict(fp.ParquetFile(_parquet(cells)).to_pandas().items())
+    )
 
 
 def duckdb(cells):
@@ -69,8 +73,15 @@ def duckdb(cells):
 def polars(cells):
     import polars as pl
 
-    _table(cells, "Parquet", "housekeeping", lambda: pl.read_parquet(_parquet(cells)).to_dict(as_series=False))
-    _table(cells, "CSV", "residuals", lambda: pl.read_csv(cells.sample("csv/residuals.csv")).to_dict(as_series=False))
+    _table(
+        cells, "Parquet", "housekeeping", lambda: pl.read_parquet(_parquet(cells)).to_dict(as_series=False)
+    )
+    _table(
+        cells,
+        "CSV",
+        "residuals",
+        lambda: pl.read_csv(cells.sample("csv/residuals.csv")).to_dict(as_series=False),
+    )
 
 
 def pandas(cells):
@@ -85,7 +96,12 @@ def xarray(cells):
 
     tree = xr.open_datatree(cells.sample("pass.nc"))
     for table in ("residuals", "reference", "detections"):
-        _table(cells, f"netCDF, {table}", table, lambda table=table: {k: v.values for k, v in tree[table].items()})
+        _table(
+            cells,
+            f"netCDF, {table}",
+            table,
+            lambda table=table: {k: v.values for k, v in tree[table].items()},
+        )
 
 
 def compliance_checker(cells):
@@ -95,7 +111,12 @@ def compliance_checker(cells):
         CheckSuite.load_all_available_checkers()
         out = cells.out / "cf.json"
         ComplianceChecker.run_checker(
-            cells.sample("pass.nc"), ["cf:1.11"], verbose=0, criteria="normal", output_filename=str(out), output_format="json"
+            cells.sample("pass.nc"),
+            ["cf:1.11"],
+            verbose=0,
+            criteria="normal",
+            output_filename=str(out),
+            output_format="json",
         )
         report = json.loads(out.read_text())
         report = report[next(iter(report))] if "high_priorities" not in report else report
@@ -124,7 +145,12 @@ def evo(cells):
         pair = sync.associate_trajectories(load("anchored-reference"), load("anchored"))
         ape = metrics.APE(metrics.PoseRelation.translation_part)
         ape.process_data(pair)
-        return [[float(ape.get_statistic(metrics.StatisticsType.rmse)), float(ape.get_statistic(metrics.StatisticsType.max))]]
+        return [
+            [
+                float(ape.get_statistic(metrics.StatisticsType.rmse)),
+                float(ape.get_statistic(metrics.StatisticsType.max)),
+            ]
+        ]
 
     header, *rows = cells.expected("tables")["residuals"]
     place = header.index("error_3d_m")
@@ -160,17 +186,31 @@ def gdal(cells):
 
     def listed():
         layers = sorted(str(name) for name, _ in pyogrio.list_layers(cells.sample("pass.gpkg")))
-        return {name: int(pyogrio.read_info(cells.sample("pass.gpkg"), layer=name)["features"]) for name in layers}
+        return {
+            name: int(pyogrio.read_info(cells.sample("pass.gpkg"), layer=name)["features"]) for name in layers
+        }
 
     def types():
         info = pyogrio.read_info(cells.sample("pass.gpkg"), layer="footprints")
-        return {str(k): str(v) for k, v in zip(info["fields"], info["dtypes"], strict=True) if k in ("utc", "complete")}
+        return {
+            str(k): str(v)
+            for k, v in zip(info["fields"], info["dtypes"], strict=True)
+            if k in ("utc", "complete")
+        }
 
     cells.reads("GeoPackage, layers", counts, listed)
-    cells.reads("GeoPackage, detections", points("detections", "crater_id"), lambda: read("detections", "crater_id"))
+    cells.reads(
+        "GeoPackage, detections", points("detections", "crater_id"), lambda: read("detections", "crater_id")
+    )
     cells.reads("GeoPackage, craters", points("craters", "crater"), lambda: read("craters", "crater"))
-    cells.reads("GeoPackage, types for the temporal controller", {"utc": "datetime64[ms]", "complete": "bool"}, types)
-    cells.reads("GeoJSON, features", [len(features)], lambda: [int(pyogrio.read_info(cells.sample("pass.geojson"))["features"])])
+    cells.reads(
+        "GeoPackage, types for the temporal controller", {"utc": "datetime64[ms]", "complete": "bool"}, types
+    )
+    cells.reads(
+        "GeoJSON, features",
+        [len(features)],
+        lambda: [int(pyogrio.read_info(cells.sample("pass.geojson"))["features"])],
+    )
 
     def raster(path):
         crs = "IAU_2015:30100"
@@ -187,9 +227,8 @@ def gdal(cells):
 
 
 def craterpy(cells):
-    import pandas as pd
-
     import craterpy as cp
+    import pandas as pd
 
     table = pd.read_csv(cells.sample("catalogue.csv"))
 
@@ -197,7 +236,10 @@ def craterpy(cells):
         found = cp.CraterDatabase(
             table, "Moon", units="m", lat_col="latitude_deg", lon_col="longitude_deg", diam_col="diameter_m"
         )
-        return [[float(a), float(b) % 360, float(r)] for a, b, r in zip(found.lat, found.lon, found.rad, strict=True)]
+        return [
+            [float(a), float(b) % 360, float(r)]
+            for a, b, r in zip(found.lat, found.lon, found.rad, strict=True)
+        ]
 
     right = [
         [float(a), float(b) % 360, float(d) / 2]
@@ -206,20 +248,25 @@ def craterpy(cells):
     cells.reads("crater catalogue (CSV)", right, values)
 
 
-def _labels(cells, COCO, COCOeval):  # noqa: N803
+def _labels(cells, COCO, COCOeval):
     """Read our labels, score them against themselves, and write labels of our own kind."""
     source = Path(cells.sample("dataset")) / "coco_val.json"
     right = json.loads(source.read_text())
     boxes = sorted((one["id"], *map(float, one["bbox"])) for one in right["annotations"])
     cells.reads(
         "labels of a data set", [list(map(float, one)) for one in boxes],
-        lambda: [[float(one["id"]), *map(float, one["bbox"])] for one in sorted(COCO(str(source)).anns.values(), key=lambda a: a["id"])],
+        lambda: [[float(k), *map(float, one["bbox"])] for k, one in sorted(COCO(str(source)).anns.items())],
     )  # fmt: skip
 
     def score():
         truth = COCO(str(source))
         results = [
-            {"image_id": one["image_id"], "category_id": one["category_id"], "bbox": one["bbox"], "score": 1.0}
+            {
+                "image_id": one["image_id"],
+                "category_id": one["category_id"],
+                "bbox": one["bbox"],
+                "score": 1.0,
+            }
             for one in right["annotations"]
         ]
         judged = COCOeval(truth, truth.loadRes(results), "bbox")
@@ -233,13 +280,20 @@ def _labels(cells, COCO, COCOeval):  # noqa: N803
 
     def written(path):
         results = [
-            {"image_id": one["image_id"], "category_id": one["category_id"], "bbox": one["bbox"], "score": 1.0}
+            {
+                "image_id": one["image_id"],
+                "category_id": one["category_id"],
+                "bbox": one["bbox"],
+                "score": 1.0,
+            }
             for one in right["annotations"]
         ]
         made = COCO(str(source)).loadRes(results).dataset
         made = {name: made[name] for name in ("images", "annotations", "categories")}
         Path(path).write_text(json.dumps(made))
-        shutil.copytree(Path(cells.sample("dataset")) / "images", Path(path).parent / "images", dirs_exist_ok=True)
+        shutil.copytree(
+            Path(cells.sample("dataset")) / "images", Path(path).parent / "images", dirs_exist_ok=True
+        )
         return sorted(list(map(float, one["bbox"])) for one in made["annotations"])
 
     cells.writes("labels made of results", "labels.json", "labels", written)

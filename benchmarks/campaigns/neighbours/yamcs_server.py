@@ -1,4 +1,4 @@
-"""Yamcs as a ground system of ours: started with what `linna tm yamcs` writes, fed with a pass, commanding the live payload.
+"""Yamcs as our ground system: started with what `linna tm yamcs` writes, receives a pass, commands the live payload.
 
 The campaign runs this with the interpreter of this project; `NEIGHBOUR` names the one with the jars of Yamcs and a JDK.
 """
@@ -14,7 +14,6 @@ import time
 import urllib.error
 import urllib.parse
 import urllib.request
-from pathlib import Path
 
 import numpy as np
 from _cells import run
@@ -164,8 +163,12 @@ def receive_pass(cells, server, frame_port):
     """Send the frames of the pass and return all values of all packets."""
     expected = _by_count(cells.expected("packets"))
     to = f"127.0.0.1:{frame_port}"
-    subprocess.run(_linna("tm", "frames", cells.sample("downlink.cadu"), "--to", to), check=True, stdout=sys.stderr)
-    _until(lambda: len(server.packets()) >= len(expected), ANSWER_S, f"{len(expected)} packets in the archive")
+    subprocess.run(
+        _linna("tm", "frames", cells.sample("downlink.cadu"), "--to", to), check=True, stdout=sys.stderr
+    )
+    _until(
+        lambda: len(server.packets()) >= len(expected), ANSWER_S, f"{len(expected)} packets in the archive"
+    )
     return _by_count(server.values(one) for one in server.packets())
 
 
@@ -181,7 +184,13 @@ def _telecommands(now_ticks):
 
     def part(number):
         octets = thirds[number - 1]
-        return {"transaction": 7, "part": number, "table": "burns", "count": len(octets), "items": octets.hex()}
+        return {
+            "transaction": 7,
+            "part": number,
+            "table": "burns",
+            "count": len(octets),
+            "items": octets.hex(),
+        }
 
     structure = {"structure_id": 16, "interval_s": 60, "count": 2, "items": "0001000c"}
     activity = {"release_ticks": ahead, "count": len(inner), "items": inner.hex()}
@@ -269,7 +278,10 @@ def command_payload(cells, server, frame_port, live_ports):
                     number = server.values(one)[f"{kind}_request_id"]
                     if number in sent and stage not in stages[sent[number]]:
                         stages[sent[number]].append(stage)
-            return all("completed" in one or any("not" in part or "failed" in part for part in one) for one in stages.values())
+            return all(
+                "completed" in one or any("not" in part or "failed" in part for part in one)
+                for one in stages.values()
+            )
 
         with contextlib.suppress(TimeoutError):
             _until(complete, ANSWER_S, "the verification of all telecommands")
@@ -287,10 +299,14 @@ def yamcs(cells):
     http, frames, telecommands, *live = _ports(6)
     folder = cells.out / "instance"
     station = f"127.0.0.1:{telecommands}"
-    subprocess.run(_linna("tm", "yamcs", "--out", folder, "--frame-port", frames, "--station", station), check=True)
+    subprocess.run(
+        _linna("tm", "yamcs", "--out", folder, "--frame-port", frames, "--station", station), check=True
+    )
     with Server(folder, http) as server:
         right = _by_count(cells.expected("packets"))
-        cells.reads("frames and XTCE, all values of a pass", right, lambda: receive_pass(cells, server, frames))
+        cells.reads(
+            "frames and XTCE, all values of a pass", right, lambda: receive_pass(cells, server, frames)
+        )
         ports = (live[0], telecommands, *live[1:])
         names = [name for name, _ in _telecommands(0)]
         verified = {name: sorted(STAGES) for name in names}
