@@ -562,28 +562,23 @@ def test_descriptions_alarms_algorithms_and_commands_change_nothing():
 
 def test_what_the_schema_allows_and_no_value_depends_on_is_no_reason_to_refuse():
     time = (
-        '<RelativeTimeParameterType name="t"><Encoding units="s"><IntegerDataEncoding sizeInBits="8"><ErrorDetectCorrect>'
-        "<Parity type='Even' bitsFromReference='0' reference='start'/></ErrorDetectCorrect></IntegerDataEncoding></Encoding>"
-        "<DefaultAlarm><StaticAlarmRanges/></DefaultAlarm></RelativeTimeParameterType>"
+        '<RelativeTimeParameterType name="t"><Encoding units="s"><IntegerDataEncoding sizeInBits="8">'
+        '<ErrorDetectCorrect><Parity type="Even" bitsFromReference="0" reference="start"/></ErrorDetectCorrect>'
+        "</IntegerDataEncoding></Encoding><DefaultAlarm><StaticAlarmRanges/></DefaultAlarm>"
+        "</RelativeTimeParameterType>"
     )
     octets = (
         '<BinaryParameterType name="o"><BinaryDataEncoding><ErrorDetectCorrect/><SizeInBits><FixedValue>8</FixedValue>'
         "</SizeInBits></BinaryDataEncoding></BinaryParameterType>"
     )
     body = container("P", ["a", "b"]).replace('abstract="false"', 'abstract=" false "')
-    found = Decoder(parse_xtce(document(time + octets, {"a": "t", "b": "o"}, body))).decode(
-        *whole([b"\x05\x06"])
-    )
-    assert {name: column.to_list() for name, column in found.tables["P"].columns.items()} == {
-        "a": [5],
-        "b": [b"\x06"],
-    }
+    definition = parse_xtce(document(time + octets, {"a": "t", "b": "o"}, body))
+    columns = Decoder(definition).decode(*whole([b"\x05\x06"])).tables["P"].columns
+    assert columns["a"].to_list() == [5] and columns["b"].to_list() == [b"\x06"]
 
 
 def test_points_of_a_spline_of_another_order_are_refused():
-    spline = '<SplineCalibrator order="0"><SplinePoint raw="0" calibrated="1"/><SplinePoint order="1" raw="9" calibrated="2"/>'
-    types = calibrated(
-        "u8", 8, "unsigned", f"<DefaultCalibrator>{spline}</SplineCalibrator></DefaultCalibrator>"
-    )
-    words = refused(document(types, {"a": "u8"}, container("P", ["a"])))
+    points = '<SplinePoint raw="0" calibrated="1"/><SplinePoint order="1" raw="9" calibrated="2"/>'
+    spline = f'<DefaultCalibrator><SplineCalibrator order="0">{points}</SplineCalibrator></DefaultCalibrator>'
+    words = refused(document(calibrated("u8", 8, "unsigned", spline), {"a": "u8"}, container("P", ["a"])))
     assert "SplinePoint: expected order 0, that of the calibrator, found 1" in words
