@@ -1223,7 +1223,7 @@ def _applied(calibrator: Calibrator, raw: RecordArray) -> tuple[RecordArray, Boo
         total = np.zeros(len(x))
         with np.errstate(all="ignore"):
             for coefficient, exponent in calibrator.terms:
-                total = total + coefficient * (x if exponent == 1 else x**exponent)
+                total += coefficient * (x**exponent if exponent > 1 else x if exponent else 1.0)
         return total, None
     return _splined(calibrator, x)
 
@@ -1231,13 +1231,12 @@ def _applied(calibrator: Calibrator, raw: RecordArray) -> tuple[RecordArray, Boo
 def _splined(spline: Spline, x: RecordArray) -> tuple[RecordArray, BoolArray | None]:
     raws = np.array([point[0] for point in spline.points])
     calibrated = np.array([point[1] for point in spline.points])
-    place = np.clip(np.searchsorted(raws, x, side="right") - 1, 0, len(raws) - 1)
     if spline.order == 0:
-        values = calibrated[place]
+        values = calibrated[np.searchsorted(raws[1:], x, side="right")]
     else:
-        left = np.minimum(place, len(raws) - 2)
-        slope = (calibrated[left + 1] - calibrated[left]) / (raws[left + 1] - raws[left])
-        values = slope * (x - raws[left]) + calibrated[left]
+        left = np.searchsorted(raws[1:-1], x, side="right")
+        slopes = np.diff(calibrated) / np.diff(raws)
+        values = slopes[left] * (x - raws[left]) + calibrated[left]
     inside = (x >= raws[0]) & (x <= raws[-1])
     if spline.extrapolate:
         inside = ~np.isnan(x)
