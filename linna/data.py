@@ -34,14 +34,24 @@ def data_folder() -> DataFolder:
     return find_data(default if default.is_dir() else None)
 
 
-def load_orbit(path: Path) -> Ephemeris:
-    """Return the ephemeris in a file for figures of its states, which must move as gravity moves them."""
-    from lunar.comparison import check_gravity
-    from lunar.messages.ephemeris_files import load_ephemeris
+def load_orbit(path: Path, spice_id: int | None = None, step_s: float | None = None) -> Ephemeris:
+    """Return the ephemeris in a file, whose states must move as gravity moves them.
 
-    ephemeris = load_ephemeris(path)
+    Of an SPK, body `spice_id` is taken, with a state every `step_s` seconds.
+    """
+    from lunar.comparison import check_gravity
+    from lunar.messages.ephemeris_files import is_spk, load_ephemeris
+    from lunar.messages.spice import READ_STEP_S, load_spk
+
+    ephemeris = load_spk(path, spice_id, step_s or READ_STEP_S) if is_spk(path) else load_ephemeris(path)
     check_gravity(ephemeris)
     return ephemeris
+
+
+def orbit_words(ephemeris: Ephemeris) -> str:
+    """Return the object of an ephemeris and the time scales of its file, as printed with figures of it."""
+    systems = dict.fromkeys(one.time_system for one in ephemeris.segments)
+    return f"{ephemeris.segments[0].object_name}, epochs in {' and '.join(systems)}"
 
 
 def blender_python() -> str:
