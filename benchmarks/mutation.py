@@ -77,20 +77,20 @@ GROUPS = {
     "verdicts": Group(
         (
             "ground_service/evaluation/verdict.py",
-            "ground_service/evaluation/navigation/reference_error.py",
-            "ground_service/evaluation/detection/viewing.py",
+            "ground_service/evaluation/alignment.py",
+            "ground_service/evaluation/recall.py",
         ),
         tuple(f"{_GROUND_TESTS}/evaluation/test_{name}.py" for name in ("verdict", "pass_data")),
     ),
     "evaluation": Group(
         (
             "ground_service/evaluation/core.py",
-            "ground_service/evaluation/navigation/alignment.py",
-            "ground_service/evaluation/navigation/drift.py",
-            "ground_service/evaluation/detection/recall.py",
-            "ground_service/evaluation/navigation/baselines.py",
-            "ground_service/evaluation/detection/fixes.py",
-            "ground_service/evaluation/navigation/trajectory.py",
+            "ground_service/evaluation/alignment.py",
+            "ground_service/evaluation/alignment.py",
+            "ground_service/evaluation/recall.py",
+            "ground_service/evaluation/smoother.py",
+            "ground_service/evaluation/fixes.py",
+            "ground_service/evaluation/alignment.py",
         ),
         (
             *(
@@ -107,7 +107,7 @@ GROUPS = {
         ),
     ),
     "smoother": Group(
-        ("ground_service/evaluation/navigation/smoother.py",),
+        ("ground_service/evaluation/smoother.py",),
         (f"{_GROUND_TESTS}/evaluation/test_smoother.py", f"{_GROUND_TESTS}/exports/test_exports.py"),
     ),
     "gates": Group(

@@ -14,7 +14,7 @@ from urllib.parse import quote, urlsplit
 from pydantic import BeforeValidator, Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
-from ground_service import tracing
+from ground_service import logs
 from ground_service.errors import SettingsError
 
 URLS = ("database_url", "migration_database_url", "broker_url")
@@ -317,7 +317,7 @@ def start_tracing(settings: Settings) -> None:
         If OpenTelemetry is not installed.
     """
     try:
-        tracing.configure(settings.traces)
+        logs.configure(settings.traces)
     except ImportError as error:
         raise SettingsError("LINNA_TRACES", "the extra 'traces' to be installed", str(error)) from None
 

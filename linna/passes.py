@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ground_service.client import Client
 from ground_service.evaluation.model import PassFigures
 from ground_service.exports.model import FormatName
-from ground_service.exports.table_files import CSV_METADATA
+from ground_service.exports.tables import CSV_METADATA
 from linna.errors import UsageError
 from tmtc.errors import MissingLibrary
 

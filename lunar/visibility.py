@@ -40,6 +40,14 @@ class GroundStation:
     minimum_elevation_rad: float = math.radians(10.0)
 
 
+DSN_STATIONS = (
+    GroundStation("Goldstone", math.radians(35.4267), math.radians(243.1100), 1000.0),
+    GroundStation("Canberra", math.radians(-35.4024), math.radians(148.9813), 690.0),
+    GroundStation("Madrid", math.radians(40.4314), math.radians(355.7520), 830.0),
+)
+"""Sites of the Deep Space Network, to a kilometre (DSN 810-005, module 301); the Moon is always visible from one."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Link:
     """Geometry of a radio link at epochs ``(...)`` of reception on the Earth.

@@ -10,10 +10,9 @@ from typing import Any
 import uvicorn
 
 from ground_service.access.service import add_user, authenticate
-from ground_service.app import create_app
+from ground_service.app import bind, create_app
 from ground_service.errors import NotAuthorised
 from ground_service.ground import Ground, ground_from_settings
-from ground_service.server import bind
 from ground_service.settings import Settings
 
 with warnings.catch_warnings():

@@ -162,7 +162,7 @@ def test_no_import_cycles_also_in_functions_and_for_type_checking() -> None:
         ),
         (
             "ground_service/store/files.py",
-            "if TYPE_CHECKING:\n    from ground_service.store.stored_files import register_file",
+            "if TYPE_CHECKING:\n    from ground_service.store.files import register_file",
             "ground_service.store.files",
         ),
         ("lunar/constants.py", "import lunar.frames", "lunar.constants"),

@@ -13,7 +13,7 @@ import yaml
 from PIL import Image
 
 import docs_site
-from ground_service.web import documentation, pages
+from ground_service.web import pages
 from linna.cli import GROUPS
 from linna.parser import all_commands, command_parser
 
@@ -57,12 +57,12 @@ def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
 
 
 def test_the_service_shows_the_site_under_its_policy(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(documentation, "HELP", Path("absent"))
-    monkeypatch.setattr(documentation, "DOCS", Path("absent"))
-    absent = documentation.documentation_file("index.html")
+    monkeypatch.setattr(pages, "HELP", Path("absent"))
+    monkeypatch.setattr(pages, "DOCS", Path("absent"))
+    absent = pages.documentation_file("index.html")
     assert absent.status_code == 404 and b"make docs" in absent.body
-    monkeypatch.setattr(documentation, "HELP", site)
-    answer = documentation.documentation_file("index.html")
+    monkeypatch.setattr(pages, "HELP", site)
+    answer = pages.documentation_file("index.html")
     policy = answer.headers["Content-Security-Policy"]
     assert answer.media_type == "text/html; charset=utf-8" and "default-src 'none'" in policy
     inline = re.findall(rb"<script>(.*?)</script>", bytes(answer.body), re.DOTALL)
@@ -70,24 +70,24 @@ def test_the_service_shows_the_site_under_its_policy(site: Path, monkeypatch: py
         inline and policy.count("'sha256-") == len(set(inline)) and "script-src 'self' 'unsafe" not in policy
     )
     for path in ("../pages.py", "no.html", "/etc/passwd"):
-        with pytest.raises(documentation.NotFound):
-            documentation.documentation_file(path)
+        with pytest.raises(pages.NotFound):
+            pages.documentation_file(path)
 
 
 def test_every_page_links_to_help_and_help_needs_no_build(monkeypatch: pytest.MonkeyPatch) -> None:
     assert {pages.rendered.__wrapped__(one).count('href="/help"') for one in pages.PAGES} == {1}
-    monkeypatch.setattr(documentation, "HELP", Path("absent"))
-    answer = documentation.documentation_file("index.html")
+    monkeypatch.setattr(pages, "HELP", Path("absent"))
+    answer = pages.documentation_file("index.html")
     assert answer.headers["Content-Security-Policy"] == pages.POLICY
     assert b'<a href="tutorials/first-pass.html">first pass</a>' in answer.body
-    assert documentation.documentation_file("pictures/tour.gif").media_type == "image/gif"
-    warned = bytes(documentation.documentation_file("tutorials/first-pass.html").body)
+    assert pages.documentation_file("pictures/tour.gif").media_type == "image/gif"
+    warned = bytes(pages.documentation_file("tutorials/first-pass.html").body)
     assert b"<strong>What went wrong</strong>" in warned and b"!!!" not in warned
 
 
 def test_links_and_anchors_of_help_lead_to_what_is_there() -> None:
     found = {
-        one.relative_to(DOCS).as_posix(): documentation.page_of(one.relative_to(DOCS).as_posix())
+        one.relative_to(DOCS).as_posix(): pages.page_of(one.relative_to(DOCS).as_posix())
         for one in DOCS.rglob("*.md")
     }
     for source, page in found.items():

@@ -14,8 +14,8 @@ import pytest
 from ground_service.client.local import local_client
 from ground_service.clock import mission_now_ns, set_mission_clock
 from ground_service.ground import open_ground
-from ground_service.http.times import UtcTime
-from ground_service.planning.request_model import PlannedCandidate, RequestPlan
+from ground_service.http.model import UtcTime
+from ground_service.planning.model import PlannedCandidate, RequestPlan
 from linna import cli
 from lunar.boxes import Box, inside_box
 from lunar.catalogue import make_catalogue
@@ -397,7 +397,7 @@ def test_windows_are_requested_where_rasters_and_catalogue_describe_the_ground()
     # Part of the height is not enough.
     assert observed_boxes(flat_terrain(listed, [(0.0, 0.0)]), 13.0) == equator
     everywhere = SimpleNamespace(is_real=False)
-    assert observed_boxes(cast(Any, everywhere), 13.0) == [Box(-180.0, 180.0, -13.0, 13.0)]
+    assert observed_boxes(cast("Any", everywhere), 13.0) == [Box(-180.0, 180.0, -13.0, 13.0)]
     widened = Box(-5.0, 15.0, -13.0, 13.0).widened(5.0)
     places = np.array([0.0, 17.0, 19.0]), np.array([352.0, 19.0, 0.0])
     assert inside_box(widened, *places).tolist() == [True, True, False]

@@ -6,8 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from ground_service.http.model import Entity, Given, Paging
-from ground_service.http.times import GivenTime, UtcTime
+from ground_service.http.model import Entity, Given, GivenTime, Paging, UtcTime
 
 DAYS_LIMIT = 36_500.0
 

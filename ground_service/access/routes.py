@@ -6,8 +6,8 @@ from typing import Annotated
 
 from fastapi import Path, Query, Request, Response
 
-from ground_service.access import audit_log, store
 from ground_service.access import service as users
+from ground_service.access import store
 from ground_service.access.model import (
     USER_NAME,
     AuditEntry,
@@ -147,4 +147,4 @@ def list_audit(
 @access.get("/audit/head")
 def get_audit_head(ground: GroundOf, _: Operator) -> AuditHead:
     """Show number and hash of the newest entry, to be stored elsewhere."""
-    return audit_log.audit_head(ground)
+    return store.audit_head(ground)

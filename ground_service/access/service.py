@@ -22,7 +22,7 @@ from ground_service.access.model import DAYS_LIMIT, Role, Session, Token, User, 
 from ground_service.clock import is_recorded, mission_now_ns, utc_now_ns
 from ground_service.errors import Conflict, InvalidInput, NotAuthorised, StoreError
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 from ground_service.store import audit as audit_log
 from ground_service.store.vehicles import spacecraft_of_missions
 

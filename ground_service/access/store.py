@@ -8,9 +8,19 @@ from typing import Any, Literal
 from sqlalchemy import Connection, String, delete, false, func, null, or_, select, update
 from sqlalchemy.sql import Select
 
-from ground_service.access.model import AuditEntry, AuditFilter, StoredAnswer, TokenRecord, User, UserRecord
-from ground_service.errors import Conflict, NotFound
+from ground_service.access.model import (
+    AuditEntry,
+    AuditFilter,
+    AuditHead,
+    StoredAnswer,
+    TokenRecord,
+    User,
+    UserRecord,
+)
+from ground_service.errors import AuditBroken, Conflict, NotFound
+from ground_service.ground import Ground
 from ground_service.http.model import PageOf
+from ground_service.store import audit as chain
 from ground_service.store import repository
 from ground_service.store.models import METADATA
 from ground_service.store.repository import page, spacecraft_of
@@ -277,3 +287,17 @@ def _names(missions: Sequence[str] | None) -> Any:
 
 def _user(row: Mapping[str, Any]) -> UserRecord:
     return UserRecord.of(row, provider=row["issuer"])
+
+
+def audit_head(ground: Ground) -> AuditHead:
+    """Return the head of the chain.
+
+    Raises
+    ------
+    AuditBroken
+        If its row is missing.
+    """
+    head = ground.read(chain.read_head)
+    if head is None:
+        raise AuditBroken("the head of the audit chain is missing; run 'linna verify'")
+    return AuditHead(number=head.number, sha256=head.sha256)

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from ground_service.missions.timekeeping import model as timekeeping
     from ground_service.passes import model as passes
     from ground_service.passes.alarms import model as alarms
+    from ground_service.planning import model
     from ground_service.planning import model as planning
-    from ground_service.planning import request_model as request_model
     from ground_service.regression import model as regression
-    from ground_service.worker import model as worker
+    from ground_service.worker import condition
 else:
     import_lazily(
         globals(),
@@ -505,19 +505,19 @@ class Operations(Connection):
     # requests
 
     @operation("GET /requests", reads="planning.request_store.list_requests")
-    def list_requests(self) -> Listing[request_model.StandingRequest]:
+    def list_requests(self) -> Listing[model.StandingRequest]:
         """List the standing requests, newest first."""
 
     @operation("POST /requests", body="request")
-    def add_request(self, request: Document, *, key: str | None = None) -> request_model.StandingRequest:
+    def add_request(self, request: Document, *, key: str | None = None) -> model.StandingRequest:
         """Add a standing request; the planner fills the coming days from then on."""
 
     @operation("GET /requests/{request_id}")
-    def get_request(self, request_id: int) -> request_model.StandingRequest:
+    def get_request(self, request_id: int) -> model.StandingRequest:
         """Show a standing request with the numbers of its windows."""
 
     @operation("PATCH /requests/{request_id}", body="change")
-    def change_request(self, request_id: int, change: Document) -> request_model.StandingRequest:
+    def change_request(self, request_id: int, change: Document) -> model.StandingRequest:
         """Pause or resume a standing request, or replace its terms; planned windows stay."""
 
     @operation("DELETE /requests/{request_id}")
@@ -525,7 +525,7 @@ class Operations(Connection):
         """Delete a standing request; its windows stay in the plan."""
 
     @operation("GET /requests/{request_id}/plan")
-    def get_request_plan(self, request_id: int) -> request_model.RequestPlan:
+    def get_request_plan(self, request_id: int) -> model.RequestPlan:
         """Show the last plan: every candidate window, planned or rejected with the reason."""
 
     # telecommands
@@ -770,5 +770,5 @@ class Operations(Connection):
     # status
 
     @operation("GET /status")
-    def get_status(self) -> worker.ServiceStatus:
+    def get_status(self) -> condition.ServiceStatus:
         """Show the condition of the deployment: waiting work, disk, backups, time correlations, scheduler."""

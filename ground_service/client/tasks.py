@@ -52,7 +52,7 @@ class Client(Operations):
     def _import_archive(self, archive: Path) -> int:
         if archive.is_file():
             return int(self._result(self.upload_archive(archive))["pass_id"])
-        from ground_service.passes.archive_zip import zip_folder
+        from ground_service.passes.archive_import import zip_folder
 
         if not (archive / "manifest.json").is_file():
             raise InvalidInput(str(archive), "", "a pass archive with manifest.json", "no manifest.json")

@@ -15,13 +15,13 @@ from starlette.routing import Match
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from ground_service.access.service import Caller
+from ground_service.app import OPERATIONS
 from ground_service.client.connection import API_PREFIX
 from ground_service.ground import Ground
 from ground_service.http import problems
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
-from ground_service.jobs.dispatcher import Dispatcher
-from ground_service.routers import OPERATIONS
+from ground_service.jobs.service import Dispatcher
 from ground_service.store.events import Notify
 
 LOCAL_UPLOADS = 2

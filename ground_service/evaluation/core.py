@@ -9,19 +9,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.evaluation.detection.fixes import (
-    IdentificationSamples,
-    join_pairs,
+from ground_service.evaluation.alignment import (
+    ReferenceStates,
+    angle_from_meridian_deg,
+    drift_by_length,
+    error_before_reset_m,
+    error_budget,
+    error_of_places_rtn_m,
+    error_of_positions_rtn_m,
+    ground_path_m,
+    navigation_statistics,
+    nees,
+    places_of_positions,
+    reference_covariance_m2,
+    reference_states,
+    squared_normalised_errors,
 )
-from ground_service.evaluation.detection.landmarks import MappedCraters, payload_map
-from ground_service.evaluation.detection.recall import (
-    ExpectedCraters,
-    Matches,
-    expected_craters,
-    match_detections,
-    score_detections,
-)
-from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.extras import (
     FILTER,
     snapshot_series,
@@ -30,25 +33,30 @@ from ground_service.evaluation.extras import (
     with_terrain,
     with_wrong_fixes,
 )
-from ground_service.evaluation.navigation.alignment import (
-    ReferenceStates,
-    angle_from_meridian_deg,
-    error_of_places_rtn_m,
-    error_of_positions_rtn_m,
-    ground_path_m,
-    places_of_positions,
-    reference_states,
+from ground_service.evaluation.fixes import (
+    IdentificationSamples,
+    MappedCraters,
+    join_pairs,
+    payload_map,
 )
-from ground_service.evaluation.navigation.baselines import BASELINE_DEGREE, StartState, propagated_positions
-from ground_service.evaluation.navigation.consistency import nees, squared_normalised_errors
-from ground_service.evaluation.navigation.drift import (
-    drift_by_length,
-    error_before_reset_m,
-    navigation_statistics,
+from ground_service.evaluation.recall import (
+    ExpectedCraters,
+    Matches,
+    Viewing,
+    expected_craters,
+    match_detections,
+    score_detections,
 )
-from ground_service.evaluation.navigation.reference_error import error_budget, reference_covariance_m2
-from ground_service.evaluation.navigation.smoothed_series import SMOOTHED, smoothed_series, smoother_model
-from ground_service.evaluation.navigation.smoother import CommandedBurn, FilterStates
+from ground_service.evaluation.smoother import (
+    BASELINE_DEGREE,
+    SMOOTHED,
+    CommandedBurn,
+    FilterStates,
+    StartState,
+    propagated_positions,
+    smoothed_series,
+    smoother_model,
+)
 from ground_service.evaluation.verdict import (
     Evaluated,
     Limits,

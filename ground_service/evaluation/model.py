@@ -7,8 +7,7 @@ from typing import Any
 
 from pydantic import ConfigDict, Field
 
-from ground_service.http.model import Entity
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Entity, UtcTime
 
 
 class ReportErrors(Entity):

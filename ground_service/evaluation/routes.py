@@ -8,7 +8,7 @@ from fastapi import Query, Request, Response
 
 from ground_service.access.security import Operator, Viewer, idempotent_id
 from ground_service.errors import NotFound
-from ground_service.evaluation import report_overview, service, store
+from ground_service.evaluation import service, store
 from ground_service.evaluation.model import PassFigures, Report, ReportOverview, ReportSummary
 from ground_service.http.common import (
     API_PREFIX,
@@ -21,9 +21,8 @@ from ground_service.http.common import (
 )
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
-from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
-from ground_service.jobs.store import get_job
+from ground_service.jobs.service import DispatcherOf, get_job
 from ground_service.passes.service import get_pass
 
 REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}
@@ -102,7 +101,7 @@ def list_newest_reports(
     pass_id: Annotated[list[int], Query(min_length=1, max_length=200, description="Passes; can be repeated")],
 ) -> PageOf[ReportSummary]:
     """List verdict and main figures of the newest report of each of these passes that has one."""
-    return PageOf.all_of(report_overview.newest_reports(ground, pass_id))
+    return PageOf.all_of(service.newest_reports(ground, pass_id))
 
 
 @evaluation.get("/passes/{pass_id}/reports")
@@ -127,4 +126,4 @@ def get_report_overview(
     max_points: Annotated[int, Query(ge=1, le=10_000)] = 600,
 ) -> ReportOverview:
     """Return the verdict and headline figures of a report, and the 3-D error of every solution over time."""
-    return report_overview.report_overview(ground, report_id, max_points)
+    return service.report_overview(ground, report_id, max_points)

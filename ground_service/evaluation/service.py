@@ -1,32 +1,68 @@
-"""Reports of passes: evaluated from the archive as it is now, rendered, and kept."""
+"""Evaluation of passes: conditions, report and overview of reports, rendered and kept."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import storage_error
 from ground_service.evaluation import store
-from ground_service.evaluation.conditions import conditions_of
+from ground_service.evaluation.alignment import reference_states
 from ground_service.evaluation.core import PassInputs, evaluate_pass, summary_of
-from ground_service.evaluation.inputs import load_pass_inputs
-from ground_service.evaluation.model import StoredReport, changed_figures
-from ground_service.evaluation.preparation import align_pass
-from ground_service.evaluation.surface import surface_map
-from ground_service.events import PassEvaluated, publish
+from ground_service.evaluation.extras import sun_angles, surface_map
+from ground_service.evaluation.inputs import align_pass, load_pass_inputs
+from ground_service.evaluation.model import (
+    PassFigures,
+    ReportOverview,
+    ReportSummary,
+    StoredReport,
+    changed_figures,
+)
 from ground_service.ground import Ground
+from ground_service.http.model import UtcTime
+from ground_service.passes.core import downsample
 from ground_service.passes.store import get_pass
-from ground_service.store.files import make_durable_folder, replace_durably
-from ground_service.store.stored_files import register_file
+from ground_service.store.event_kinds import PassEvaluated, publish
+from ground_service.store.files import FileArchive, make_durable_folder, register_file, replace_durably
+from lunar.arrays import FloatArray
 from lunar.timescales import format_utc
 from reports.document import evidence_number
 from reports.values import PassReport
+
+SAMPLES = 61
+"""Epochs of the reference over the pass, from which the medians are computed."""
+
+
+def conditions_of(inputs: PassInputs) -> dict[str, Any]:
+    """Return median altitude and elevation of the Sun along the reference, the build, and the judged estimator.
+
+    Altitude is above the sphere, elevation at the sub-satellite point; both are None where the reference or the
+    orientation is unknown, the elevation also where the images had another light than that of the ephemeris.
+    """
+    utc_ns = np.linspace(inputs.start_utc_ns, inputs.stop_utc_ns, SAMPLES).astype(np.int64)
+    track = reference_states(inputs.reference, inputs.orientation, utc_ns)
+    return {
+        "altitude_km": _median(track.altitude_m / 1e3),
+        "sun_elevation_deg": _median(sun_angles(track).elevation_deg) if inputs.sun_known else None,
+        "build": inputs.build,
+        "estimator": inputs.limits.estimator,
+    }
+
+
+def _median(values: FloatArray) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else None
+
 
 REAL_TERRAIN_LEVEL = 3
 """Lowest evidence level with real terrain."""
@@ -203,3 +239,71 @@ def _write_whole(path: Path, octets: bytes) -> None:
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise storage_error(error, path.parent) from None
+
+
+PREFERRED_ESTIMATORS = ("anchored", "spherical", "paper")
+"""Order in which the estimator of the main figures is chosen."""
+
+_TEXTS = ("title", "verdict", "verdict_level", "evidence_level", "created_utc", "headline", "not_available")
+
+
+def report_overview(ground: Ground, report_id: str, max_points: int) -> ReportOverview:
+    """Return the header of a report and the 3-D error of each navigation solution in at most `max_points` intervals.
+
+    The columns of a series have equal length: UTC in seconds at the middle of each interval, minimum, maximum and mean
+    error in metres, and whether a gap precedes the interval.
+    """
+    sha256 = ground.read(store.get_report, report_id).json_sha256
+    return ReportOverview(report_id=report_id, **_overview(ground.files, sha256, max_points))
+
+
+def newest_reports(ground: Ground, pass_ids: Sequence[int]) -> list[ReportSummary]:
+    """Return verdict and main figures of the newest report of each of these passes that has one."""
+    with ground.database.reading() as connection:
+        return [_report_overview_summary(one) for one in store.newest_reports(connection, pass_ids)]
+
+
+def _report_overview_summary(report: StoredReport) -> ReportSummary:
+    figures = PassFigures.model_validate(report.summary)
+    names = [name for name in PREFERRED_ESTIMATORS if name in figures.navigation]
+    estimator = names[0] if names else None
+    return ReportSummary(
+        id=report.id,
+        pass_id=report.pass_id,
+        created=UtcTime(report.created_utc_ns),
+        verdict=figures.verdict,
+        verdict_level=figures.verdict_level,
+        evidence_level=figures.evidence_level,
+        estimator=estimator,
+        median_error_m=None if estimator is None else figures.navigation[estimator].median_3d_m,
+        recall=figures.detector.recall,
+        frames=figures.frames,
+    )
+
+
+@lru_cache(maxsize=64)
+def _overview(files: FileArchive, sha256: str, max_points: int) -> dict[str, Any]:
+    """Return the overview of a stored document; documents never change, so results are cached."""
+    document = json.loads(files.get(sha256))
+    return {
+        **{name: document.get(name) for name in _TEXTS},
+        # Reports of earlier versions have no table.
+        "requirements": document.get("requirements") or [],
+        "navigation": [_series(one, max_points) for one in document["navigation"]],
+    }
+
+
+def _series(one: Mapping[str, Any], max_points: int) -> dict[str, Any]:
+    error = np.array(one["error_rtn_m"], dtype=np.float64).reshape(-1, 3)
+    times = np.array(one["utc_ns"], dtype=np.int64)
+    buckets = downsample(times, np.sqrt(np.sum(error**2, axis=1)), max_points)
+    middle = (buckets.start_utc_ns // 2 + buckets.stop_utc_ns // 2) / 1e9
+    return {
+        "name": one["name"],
+        "kind": one["kind"],
+        "time_s": np.round(middle, 3).tolist(),
+        "min_m": np.round(buckets.low, 3).tolist(),
+        "max_m": np.round(buckets.high, 3).tolist(),
+        "mean_m": np.round(buckets.mean, 3).tolist(),
+        "after_gap": buckets.after_gap.tolist(),
+    }

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ground_service.evaluation.navigation.consistency import bounds_per_degree, independent_samples
+from ground_service.evaluation.alignment import bounds_per_degree, independent_samples
 from lunar.arrays import FloatArray
 from lunar.constants import NANOSECONDS_PER_SECOND
 from reports.statistics import per_degree

@@ -20,15 +20,13 @@ import numpy as np
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import EvaluationError, storage_error
+from ground_service.evaluation.alignment import format_tum
 from ground_service.evaluation.core import PassInputs, evaluate_pass
 from ground_service.evaluation.inputs import load_pass_inputs
-from ground_service.evaluation.navigation.trajectory import format_tum
 from ground_service.exports import messages
-from ground_service.exports.formats import FORMATS, Format
 from ground_service.exports.maps import MAPS, map_octets
-from ground_service.exports.model import ExportFormatInfo, ExportRequest
-from ground_service.exports.table_files import csv_files, netcdf_octets, parquet_files
-from ground_service.exports.tables import pass_tables
+from ground_service.exports.model import FORMATS, ExportFormatInfo, ExportRequest, Format
+from ground_service.exports.tables import csv_files, netcdf_octets, parquet_files, pass_tables
 from ground_service.ground import Ground
 from ground_service.missions.timekeeping.store import load_correlations
 from ground_service.passes import store

@@ -8,7 +8,7 @@ from fastapi import Depends, Header, Path, Query, Request
 
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf, Paging
-from ground_service.text import LINE_PATTERN_JSON
+from ground_service.toml import LINE_PATTERN_JSON
 
 Item = TypeVar("Item")
 

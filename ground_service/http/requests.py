@@ -21,8 +21,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from ground_service.http.common import API_PREFIX, IDEMPOTENCY_HEADER, IF_MATCH_HEADER
+from ground_service.http.limits import refuse
 from ground_service.http.model import Paging
-from ground_service.http.origins import refuse
 from ground_service.http.problems import problem
 
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f]")

@@ -10,20 +10,20 @@ import numpy as np
 from sqlalchemy import Connection, delete, func, insert, select
 
 from ground_service.clock import independent_now_ns
-from ground_service.events import TelemetryWithdrawn, TimesDoubted, publish
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf
 from ground_service.ingest import store
 from ground_service.ingest.core import (
     LONGEST_STEP,
+    NO_TIME,
     UNSET_TICKS,
     fits_between,
     implausible_times,
 )
 from ground_service.ingest.model import ImplausibleFilter, ImplausiblePacket
 from ground_service.ingest.packets import PacketBatch, batch_of_cut
-from ground_service.ingest.quality import NO_TIME
 from ground_service.store import repository, telemetry
+from ground_service.store.event_kinds import TelemetryWithdrawn, TimesDoubted, publish
 from ground_service.store.vehicles import get_vehicle, lock_vehicle
 from lunar.arrays import IntArray
 from lunar.plausible import AGREEING_PACKETS

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pydantic import ConfigDict, Field
 
-from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber
-from ground_service.http.times import UtcTime
-from ground_service.text import LINE_PATTERN_JSON
+from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber, UtcTime
+from ground_service.toml import LINE_PATTERN_JSON
 
 
 class IngestAccepted(Entity):

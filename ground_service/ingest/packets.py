@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.ingest.quality import NO_TIME
+from ground_service.ingest.core import NO_TIME
 from lunar.arrays import IntArray
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.timescales import utc_ns_from_ticks

@@ -18,23 +18,24 @@ from sqlalchemy import Connection
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
-from ground_service.ingest import bare, frames, store
+from ground_service.ingest import frames, store
 from ground_service.ingest import recording_store as recordings
-from ground_service.ingest.bare import PacketReader
+from ground_service.ingest.core import Found, Fragment, complete, join
 from ground_service.ingest.doubt_store import count_implausible, plausible_part
-from ground_service.ingest.fragments import Fragment, complete, join
-from ground_service.ingest.frames import CADU_MAX_OCTETS, FrameReader, Section
+from ground_service.ingest.frames import CADU_MAX_OCTETS, FrameReader, PacketReader, Section
 from ground_service.ingest.link_settings import known_before, packet_form
 from ground_service.ingest.model import IngestResult, ReceivedControlWords, ReceivedLink, ReceivedSection
 from ground_service.ingest.packets import PacketBatch, batch_of_cut, time_receptions
-from ground_service.ingest.parameters import decode_declared, definitions_of_spacecraft
-from ground_service.ingest.quality import Found
+from ground_service.ingest.parameters import (
+    catch_up,
+    decode_declared,
+    definitions_of_spacecraft,
+    note_dictionary,
+)
 from ground_service.ingest.recording_store import Part, Piece
-from ground_service.ingest.redecode import catch_up, note_dictionary
 from ground_service.ingest.store import Stored
 from ground_service.missions.definitions import PacketDefinitions
-from ground_service.store.files import FileArchive, mapped_octets, read_blocks
-from ground_service.store.stored_files import recorded_name
+from ground_service.store.files import FileArchive, mapped_octets, read_blocks, recorded_name
 from ground_service.store.vehicles import vehicle_id
 from lunar.arrays import OctetArray
 from tmtc.arrays import as_octets
@@ -212,7 +213,7 @@ class Reading:
 
     def _run(self) -> Run:
         """Return the run around the piece, and set the sections of it that are read."""
-        for reach in (frames.REACH_OCTETS, bare.REACH_OCTETS):
+        for reach in (frames.REACH_OCTETS, frames.FRAME_REACH_OCTETS):
             with self.ground.database.reading() as connection:
                 run = run_around(connection, self.ground.files, self.piece, reach)
             self.octets_new = sum(stop - start for start, stop in run.new)

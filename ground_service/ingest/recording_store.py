@@ -13,8 +13,7 @@ from typing import Any
 from sqlalchemy import Connection, and_, bindparam, delete, func, insert, select, true, update
 from sqlalchemy.dialects import postgresql, sqlite
 
-from ground_service.ingest.fragments import UNKNOWN, Fragment, fits
-from ground_service.store.counters import hold
+from ground_service.ingest.core import UNKNOWN, Fragment, fits
 from ground_service.store.repository import (
     FRAGMENTS,
     INGESTS,
@@ -24,6 +23,7 @@ from ground_service.store.repository import (
     PIECES,
     VEHICLES,
 )
+from ground_service.store.vehicles import hold
 
 DIGEST_OCTETS = 16
 BLOCK = 64

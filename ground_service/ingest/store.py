@@ -12,17 +12,17 @@ from pydantic import ValidationError
 from sqlalchemy import ColumnElement, Connection, bindparam, delete, func, or_, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
-from ground_service.events import ReceptionsEntered, TelemetryReceived, publish
 from ground_service.http.model import PageOf, Paging
 from ground_service.ingest.model import Ingest, IngestResult
 from ground_service.missions.timekeeping.model import RECEPTIONS_LIMIT
 from ground_service.store import repository
-from ground_service.store.bulk import insert_columns
-from ground_service.store.codec import pack_detections, pack_filter_states, pack_identifications
+from ground_service.store.event_kinds import ReceptionsEntered, TelemetryReceived, publish
 from ground_service.store.models import NO_TICKS, PACKETS, SAMPLE_TABLES, VEHICLES
 from ground_service.store.parameters import forget_others
+from ground_service.store.repository import insert_columns
 from ground_service.store.rollups import add_to_rollups, forget_rollups, rebuild_rollups
 from ground_service.store.states import change_if
+from ground_service.store.telemetry import pack_detections, pack_filter_states, pack_identifications
 from lunar.arrays import IntArray
 
 RANGE_GAP_TICKS = 600 << 16

@@ -6,8 +6,7 @@ from typing import Any
 
 from pydantic import Field
 
-from ground_service.http.model import Entity, Paging
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Entity, Paging, UtcTime
 
 
 class Job(Entity):

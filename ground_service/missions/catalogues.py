@@ -13,8 +13,7 @@ from ground_service.errors import Conflict, InvalidInput
 from ground_service.ground import Ground
 from ground_service.missions import store
 from ground_service.missions.model import HeldCatalogue, Mission
-from ground_service.store.files import StoredFile
-from ground_service.store.stored_files import register_file
+from ground_service.store.files import StoredFile, register_file
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.datafolder import DataFolder
 from lunar.errors import LunarError

@@ -15,8 +15,7 @@ from typing import Annotated, Any, Final, Literal, get_args
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
 from ground_service.errors import InvalidInput
-from ground_service.http.model import Entity, InstanceName
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Entity, InstanceName, UtcTime
 from ground_service.missions.automation import Automation, Channel, ChannelName, without_rules
 from ground_service.missions.section import Array, Section
 from ground_service.toml import faults, read_table

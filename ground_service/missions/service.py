@@ -13,11 +13,10 @@ from sqlalchemy import Connection
 from ground_service.access.service import LOCAL_CALLER, Caller, audit
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Forbidden, InvalidInput
-from ground_service.events import MissionAdded, publish
 from ground_service.ground import Ground
 from ground_service.missions import store
-from ground_service.missions.declared import mission_of_manifest
 from ground_service.missions.definitions import definition_faults, read_mission_file
+from ground_service.missions.frames import mission_of_manifest
 from ground_service.missions.model import (
     MISSION_LIMIT_OCTETS,
     Approval,
@@ -28,6 +27,7 @@ from ground_service.missions.model import (
     parse_mission,
     read_document,
 )
+from ground_service.store.event_kinds import MissionAdded, publish
 
 COMPARED_LIMIT = 1_000_000
 """Largest product of the numbers of lines that are compared; the comparison of lines that repeat takes seconds."""

@@ -10,7 +10,7 @@ from sqlalchemy import Connection
 
 from ground_service.clock import mission_now_ns
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 from ground_service.missions.store import mission_of_vehicle
 from ground_service.missions.timekeeping.core import TimeCorrelation, utc_ns_of_ticks
 from ground_service.missions.timekeeping.store import load_correlations

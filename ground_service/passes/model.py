@@ -8,10 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber
-from ground_service.http.times import GivenTime, UtcTime
+from ground_service.http.model import (
+    Entity,
+    Given,
+    GivenTime,
+    InstanceName,
+    Paging,
+    SpacecraftNumber,
+    UtcTime,
+)
 from ground_service.store.vehicles import FLOWN
-from ground_service.text import LINE_PATTERN_JSON
+from ground_service.toml import LINE_PATTERN_JSON
 
 if TYPE_CHECKING:
     from reports.values import PacketAccounting

@@ -23,13 +23,11 @@ from ground_service.http.common import (
     linked,
     upload_body,
 )
-from ground_service.http.model import PageOf
+from ground_service.http.model import GivenTime, PageOf, ns_of
 from ground_service.http.requests import operations, problems
-from ground_service.http.times import GivenTime, ns_of
-from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
-from ground_service.jobs.store import get_job
-from ground_service.passes import images, parameters, service, store
+from ground_service.jobs.service import DispatcherOf, get_job
+from ground_service.passes import archive_import, parameters, service, store
 from ground_service.passes import live as newest
 from ground_service.passes.model import (
     Completeness,
@@ -256,7 +254,9 @@ def list_images(
     instance: Instance = FLOWN,
 ) -> PageOf[Image]:
     """List the images of an interval: downlinked thumbnails, and frames of pass archives; at most 2000."""
-    return PageOf.all_of(images.list_images(ground, spacecraft_id, instance, start.utc_ns, stop.utc_ns))
+    return PageOf.all_of(
+        archive_import.list_images(ground, spacecraft_id, instance, start.utc_ns, stop.utc_ns)
+    )
 
 
 @passes.get("/spacecraft/{spacecraft_id}/thumbnails/{ticks}", response_class=Response, responses=PNG)
@@ -271,7 +271,7 @@ def get_thumbnail(
     ] = False,
 ) -> Response:
     """Return a downlinked thumbnail as PNG."""
-    octets = images.thumbnail_image(ground, spacecraft_id, instance, ticks, detections=detections)
+    octets = archive_import.thumbnail_image(ground, spacecraft_id, instance, ticks, detections=detections)
     return Response(octets, media_type="image/png")
 
 
@@ -284,7 +284,7 @@ def get_image(
     detections: Annotated[bool, Query(description="Draw the detections of the payload")] = False,
 ) -> Response:
     """Return a frame of a pass archive as PNG."""
-    octets = images.archived_image(ground, pass_id, frame_number, detections=detections)
+    octets = archive_import.archived_image(ground, pass_id, frame_number, detections=detections)
     return Response(octets, media_type="image/png")
 
 

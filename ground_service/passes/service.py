@@ -12,16 +12,14 @@ from sqlalchemy import Connection
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
-from ground_service.http.model import PageOf, Paging
-from ground_service.http.times import UtcTime, ns_of
-from ground_service.ingest.redecode import readable_version
+from ground_service.http.model import PageOf, Paging, UtcTime, ns_of
+from ground_service.ingest.parameters import readable_version
 from ground_service.ingest.store import results_state
 from ground_service.missions import store as missions
 from ground_service.missions.catalogues import read_catalogue
 from ground_service.missions.timekeeping.core import ticks_of_utc_ns
 from ground_service.missions.timekeeping.store import load_correlations
 from ground_service.passes import sample_store, store
-from ground_service.passes.cache import Cache
 from ground_service.passes.core import Buckets
 from ground_service.passes.model import (
     Crater,
@@ -39,6 +37,7 @@ from ground_service.passes.sample_store import detection_frames, detection_sampl
 from ground_service.passes.series import (
     PARAMETERS,
     STATE_VALUES,
+    Cache,
     Series,
     SeriesReading,
     kind_samples,
@@ -51,10 +50,9 @@ from ground_service.passes.span import (
     vehicle_span,
 )
 from ground_service.store import rollups
-from ground_service.store.files import StoredFile
-from ground_service.store.stored_files import register_file
+from ground_service.store.files import StoredFile, register_file
 from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
-from ground_service.text import require_line
+from ground_service.toml import require_line
 from reports.values import PacketAccounting
 from tmtc.dictionary.fields import Field
 from tmtc.dictionary.payload import DICTIONARY

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from sqlalchemy import Connection
 
-from ground_service.ingest.redecode import readable_version
+from ground_service.ingest.parameters import readable_version
 from ground_service.missions.timekeeping.core import TimeCorrelation, ticks_of_utc_ns, utc_ns_of_ticks
 from ground_service.missions.timekeeping.store import load_correlations
 from ground_service.passes import store

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from ground_service.contacts.links.core import PredictedContact, predict_contacts
-from ground_service.evaluation.detection.recall import expected_craters
-from ground_service.missions.stations import STATIONS
+from ground_service.evaluation.recall import expected_craters
 from ground_service.planning.filling import Option
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
@@ -27,7 +26,7 @@ from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation, spherical_from_mcmf
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns
-from lunar.visibility import GroundStation, find_windows, sun_elevation_azimuth, sunlit_fraction
+from lunar.visibility import DSN_STATIONS, GroundStation, find_windows, sun_elevation_azimuth, sunlit_fraction
 from tmtc.dictionary.payload import DICTIONARY
 
 Range = tuple[float, float]
@@ -96,7 +95,7 @@ class Resources:
     observing_w: float = 8.0
     estimators: int = 3
     detections_per_frame: float = 25.0
-    stations: tuple[GroundStation, ...] = STATIONS
+    stations: tuple[GroundStation, ...] = DSN_STATIONS
 
 
 @dataclass(frozen=True, slots=True)

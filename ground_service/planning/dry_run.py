@@ -18,13 +18,11 @@ from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.missions.catalogues import add_catalogue
 from ground_service.missions.definitions import read_mission_file
-from ground_service.missions.ephemerides.service import add_ephemeris
-from ground_service.missions.ephemerides.store import covering_ephemerides
+from ground_service.missions.ephemerides.service import add_ephemeris, covering_ephemerides
 from ground_service.missions.service import add_mission, read_mission
-from ground_service.planning import request_store, standing, store
 from ground_service.planning import service as planning
-from ground_service.planning.model import Window, WindowFilter
-from ground_service.planning.request_model import StandingRequestIn
+from ground_service.planning import standing, store
+from ground_service.planning.model import StandingRequestIn, Window, WindowFilter
 from ground_service.toml import parse_table, read_json
 from lunar.datafolder import DataFolder
 from lunar.errors import LunarError
@@ -61,7 +59,7 @@ def rehearsed(ground: Ground, octets: bytes) -> DryRun:
     craft, now = read_mission(octets)[0].spacecraft, mission_now_ns()
     with ground.database.reading() as connection:
         held = covering_ephemerides(connection, now, 1 << 62, craft.id)
-        listed = request_store.list_requests(connection, Paging(limit=1000)).items
+        listed = store.list_requests(connection, Paging(limit=1000)).items
     mine = [one.sha256 for one in held if craft.is_object(one.object_name)]
     if not mine:
         return DryRun(faults=(NO_EPHEMERIS,))
@@ -130,7 +128,7 @@ def _faults(ground: Ground, mission: Path, requests: list[int], now: int) -> Ite
     if (reason := _no_uplink(ground, now)) is not None:
         yield str(InvalidInput(str(mission), "links", "contacts of a link with an uplink", reason))
     with ground.database.reading() as connection:
-        plans = [request_store.get_plan(connection, one) for one in requests]
+        plans = [store.get_plan(connection, one) for one in requests]
         windows = store.list_windows(connection, WindowFilter()).items
     if not windows:
         reasons = Counter(one.reason for plan in plans for one in plan.candidates if one.reason is not None)

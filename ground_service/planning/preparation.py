@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ground_service.errors import Conflict
-from ground_service.evaluation.navigation.baselines import StartState
+from ground_service.evaluation.smoother import StartState
 from ground_service.missions.model import Uploads
 from lunar.constants import NANOSECONDS_PER_SECOND as NS
 from lunar.ephemeris import Ephemeris

@@ -12,7 +12,6 @@ from sqlalchemy import Connection
 
 from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.contacts.commanding.store import views_of_window
-from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
 from ground_service.ingest.core import account_sequence
 from ground_service.missions import store as missions
@@ -22,7 +21,8 @@ from ground_service.planning import store
 from ground_service.planning.model import WindowRecord
 from ground_service.planning.window_states import WindowFacts, state_of
 from ground_service.store import telemetry
-from ground_service.store.counters import lock_spacecraft
+from ground_service.store.event_kinds import WindowChanged, publish
+from ground_service.store.vehicles import lock_spacecraft
 
 REASON_LENGTH = 500
 DELETE = "delete_activity"

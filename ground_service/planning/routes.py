@@ -1,4 +1,4 @@
-"""HTTP operations on planned windows."""
+"""HTTP operations on planned windows and standing requests."""
 
 from __future__ import annotations
 
@@ -18,20 +18,23 @@ from ground_service.http.common import (
     OnceKey,
     PassId,
 )
-from ground_service.http.model import PageOf
+from ground_service.http.model import GivenTime, PageOf
 from ground_service.http.problems import PreconditionFailed
 from ground_service.http.requests import operations, problems
-from ground_service.http.times import GivenTime
 from ground_service.missions import service as missions
 from ground_service.missions.model import MissionCheck
 from ground_service.missions.routes import Text
-from ground_service.planning import forecast, service, store
+from ground_service.planning import forecast, service, standing, store
 from ground_service.planning.dry_run import rehearsed
 from ground_service.planning.model import (
     CraterDensity,
     PlanForecast,
     PlannedTelecommand,
+    RequestPlan,
     SearchResult,
+    StandingRequest,
+    StandingRequestChange,
+    StandingRequestIn,
     Window,
     WindowChange,
     WindowIn,
@@ -181,3 +184,54 @@ def _tagged(response: Response, window: Window) -> Window:
 def _expect(found: Window, if_match: str | None) -> None:
     if if_match is not None and if_match.strip() != "*" and _tag(found) not in if_match:
         raise PreconditionFailed(f"window {found.id}: expected {if_match[:80]}, found {_tag(found)}")
+
+
+requests = operations("requests")
+
+
+add_list(requests, "/requests", store.list_requests)
+
+
+@requests.post("/requests", status_code=201)
+def add_request(
+    response: Response,
+    ground: GroundOf,
+    caller: Operator,
+    request: StandingRequestIn,
+    idempotency_key: OnceKey = None,
+) -> StandingRequest:
+    """Add a standing request; the planner fills the coming days from then on."""
+
+    def add() -> StandingRequest:
+        return standing.add_request(ground, request, actor=caller.name)
+
+    added = added_once(ground, StandingRequest, caller.name, idempotency_key, request, add)
+    response.headers["Location"] = f"{API_PREFIX}/requests/{added.id}"
+    return added
+
+
+@requests.get("/requests/{request_id}")
+def get_request(ground: GroundOf, _: Viewer, request_id: PassId) -> StandingRequest:
+    """Show a standing request with the numbers of its windows."""
+    return ground.read(store.get_request, request_id)
+
+
+@requests.patch("/requests/{request_id}", responses=problems(409))
+def change_request(
+    ground: GroundOf, caller: Operator, request_id: PassId, change: StandingRequestChange
+) -> StandingRequest:
+    """Pause or resume a standing request, or replace its terms; planned windows stay."""
+    return standing.change_request(ground, request_id, change, actor=caller.name)
+
+
+@requests.delete("/requests/{request_id}", status_code=204)
+def delete_request(ground: GroundOf, caller: Operator, request_id: PassId) -> Response:
+    """Delete a standing request; its windows stay in the plan."""
+    standing.delete_request(ground, request_id, actor=caller.name)
+    return Response(status_code=204)
+
+
+@requests.get("/requests/{request_id}/plan")
+def get_request_plan(ground: GroundOf, _: Viewer, request_id: PassId) -> RequestPlan:
+    """Show the last plan: every candidate window, planned or rejected with the reason."""
+    return ground.read(store.get_plan, request_id)

@@ -16,13 +16,11 @@ from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.contacts.commanding import service as commanding
 from ground_service.contacts.commanding import store as commands
 from ground_service.errors import Conflict, InvalidInput, NotFound, PlanConflict, PlanConflicts, StateConflict
-from ground_service.events import WindowChanged, publish
 from ground_service.ground import Ground
-from ground_service.http.model import Paging
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Paging, UtcTime
 from ground_service.missions import store as missions
 from ground_service.missions.catalogues import catalogue_of
-from ground_service.missions.ephemerides import store as ephemerides
+from ground_service.missions.ephemerides import service
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.ephemerides.service import open_ephemeris
 from ground_service.missions.frames import camera_of, declared_frames
@@ -62,9 +60,9 @@ from ground_service.planning.preparation import (
     prepare_window,
 )
 from ground_service.planning.window_states import PlannedSpan, span_conflicts
-from ground_service.store.counters import lock_spacecraft
-from ground_service.store.vehicles import vehicle_id
-from ground_service.text import REASON_LIMIT, require_line
+from ground_service.store.event_kinds import WindowChanged, publish
+from ground_service.store.vehicles import lock_spacecraft, vehicle_id
+from ground_service.toml import REASON_LIMIT, require_line
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.datafolder import DataFolder
@@ -473,7 +471,7 @@ def _preparation(
     if mission is None or mission.uploads is None:
         return [], None
     start, stop = window.start.utc_ns, window.stop.utc_ns
-    found = ephemerides.covering_ephemerides(
+    found = service.covering_ephemerides(
         connection, start - MARGIN_NS, stop + MARGIN_NS, window.spacecraft_id
     )
     whole = [
@@ -693,9 +691,9 @@ def _prediction(
 ) -> Candidate | None:
     """What the window would be like, where a reference ephemeris covers it."""
     candidates = (
-        [ephemerides.get_ephemeris(connection, entry.ephemeris_id)]
+        [service.get_ephemeris(connection, entry.ephemeris_id)]
         if entry.ephemeris_id is not None
-        else ephemerides.covering_ephemerides(
+        else service.covering_ephemerides(
             connection, entry.start_utc_ns, entry.stop_utc_ns, entry.spacecraft_id
         )
     )
@@ -724,12 +722,10 @@ def _coverage_conflict(connection: Connection, entry: WindowEntry, mission: Miss
     """
     if entry.ephemeris_id is None and mission.uploads is None:
         return None
-    known = ephemerides.list_ephemerides(connection, Paging(limit=1)).items
+    known = service.list_ephemerides(connection, Paging(limit=1)).items
     if not known:
         return None
-    newest = (
-        known[0] if entry.ephemeris_id is None else ephemerides.get_ephemeris(connection, entry.ephemeris_id)
-    )
+    newest = known[0] if entry.ephemeris_id is None else service.get_ephemeris(connection, entry.ephemeris_id)
     return PlanConflict(
         "ephemeris",
         None,
@@ -759,10 +755,10 @@ def ephemerides_for(
 ) -> list[Ephemeris]:
     """Return the ephemerides that cover a span, the best first: all of it, then by precedence and coverage."""
     if ephemeris_id is not None:
-        return [ephemerides.get_ephemeris(connection, ephemeris_id)]
+        return [service.get_ephemeris(connection, ephemeris_id)]
     first = start if start is not None else -(2**62)
     last = stop if stop is not None else 2**62
-    found = ephemerides.covering_ephemerides(connection, first, last, spacecraft_id)
+    found = service.covering_ephemerides(connection, first, last, spacecraft_id)
     if not found:
         raise NotFound("ephemeris", "over the span of the search")
 

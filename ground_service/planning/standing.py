@@ -21,31 +21,31 @@ from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.contacts.commanding import store as commands
 from ground_service.contacts.links import service as links
 from ground_service.errors import PASSING, GroundError, InvalidInput, NotFound, PlanConflicts, StateConflict
-from ground_service.events import PlanChanged, RequestChanged, publish
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
-from ground_service.missions.ephemerides import store as ephemerides
+from ground_service.http.model import UtcTime
+from ground_service.missions.ephemerides import service
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.model import Mission
-from ground_service.planning import request_store as store
 from ground_service.planning import service as planning
+from ground_service.planning import store
 from ground_service.planning.core import Constraints, Planner, data_octets, frames_between
 from ground_service.planning.filling import NS, Option, ResourceGrid, choose
-from ground_service.planning.model import WindowEntry, WindowRecord
-from ground_service.planning.preparation import gap_ns
-from ground_service.planning.progress import note_reason
-from ground_service.planning.request_model import (
+from ground_service.planning.model import (
     PlannedCandidate,
     RequestPlan,
     RequestTerms,
     StandingRequest,
     StandingRequestChange,
     StandingRequestIn,
+    WindowEntry,
+    WindowRecord,
 )
-from ground_service.planning.request_store import RequestRecord
+from ground_service.planning.preparation import gap_ns
+from ground_service.planning.progress import note_reason
+from ground_service.planning.store import RequestRecord
 from ground_service.planning.window_states import COMMITTED
-from ground_service.store.counters import lock_spacecraft
-from ground_service.store.vehicles import get_vehicle, vehicle_id
+from ground_service.store.event_kinds import PlanChanged, RequestChanged, publish
+from ground_service.store.vehicles import get_vehicle, lock_spacecraft, vehicle_id
 from lunar.errors import EphemerisCoverageError, LunarError
 
 log = logging.getLogger(__name__)
@@ -161,7 +161,7 @@ def planned_with(ground: Ground, ephemeris_id: int) -> list[int]:
     with ground.database.reading() as connection:
         vehicles = store.planned_vehicles(connection)
         try:
-            name = ephemerides.get_ephemeris(connection, ephemeris_id).object_name
+            name = service.get_ephemeris(connection, ephemeris_id).object_name
         except NotFound:
             return vehicles
         numbers = {one: get_vehicle(connection, one).ccsds_id for one in vehicles}
@@ -253,7 +253,7 @@ def _fill(ground: Ground, request_id: int, now: int) -> int:
         situation = _Situation(
             request,
             planning.mission_of(connection, request.spacecraft_id),
-            tuple(ephemerides.covering_ephemerides(connection, now, end, request.spacecraft_id)),
+            tuple(service.covering_ephemerides(connection, now, end, request.spacecraft_id)),
             tuple(one for one in windows if one.request_id == request_id),
             tuple(one for one in windows if one.state in COMMITTED or one.state == "draft"),
         )
@@ -280,7 +280,7 @@ def _fill(ground: Ground, request_id: int, now: int) -> int:
 
 
 def _basis(situation: _Situation) -> str:
-    """Return a hash of the revision, the ephemerides, the request and the windows that are not in the plan any more."""
+    """Return a hash of the revision, the service, the request and the windows that are not in the plan any more."""
     parts = [
         situation.mission.revision,
         str(situation.request.version),

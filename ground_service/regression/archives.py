@@ -26,9 +26,8 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound, StoreError, storage_error
 from ground_service.evaluation.inputs import read_image
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
-from ground_service.passes.archive_import import checked_files, read_manifest
-from ground_service.passes.archive_zip import unpacked
+from ground_service.http.model import UtcTime
+from ground_service.passes.archive_import import checked_files, read_manifest, unpacked
 from ground_service.regression import store
 from ground_service.regression.model import (
     COMPLETE,
@@ -37,7 +36,6 @@ from ground_service.regression.model import (
     ArchiveRecord,
     KeptArchive,
 )
-from ground_service.store.counters import hold
 from ground_service.store.files import (
     FileArchive,
     StoredFile,
@@ -45,6 +43,7 @@ from ground_service.store.files import (
     replace_durably,
     unfinished_prefix,
 )
+from ground_service.store.vehicles import hold
 from ground_service.toml import read_json, read_table
 
 _log = logging.getLogger(__name__)

@@ -19,7 +19,7 @@ from ground_service.regression.runner import (
     RunRequest,
     run_confined,
 )
-from ground_service.regression.sandbox.host import SandboxRefused, tail
+from ground_service.regression.sandbox import SandboxRefused, tail
 from ground_service.toml import read_json
 
 PERFORMANCE_LIMIT_OCTETS = 8 << 20

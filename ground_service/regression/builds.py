@@ -26,14 +26,12 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt
 from ground_service.clock import utc_now_ns
 from ground_service.errors import BuildNotChecked, InvalidInput, NotFound, storage_error
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 from ground_service.regression import model, store
 from ground_service.regression.runner import RunRequest, run_confined
-from ground_service.regression.sandbox.host import SandboxRefused, tail
-from ground_service.store.files import make_durable_folder, replace_durably
-from ground_service.store.stored_files import register_file
-from ground_service.text import require_line
-from ground_service.toml import parse_table, read_table
+from ground_service.regression.sandbox import SandboxRefused, tail
+from ground_service.store.files import make_durable_folder, register_file, replace_durably
+from ground_service.toml import parse_table, read_table, require_line
 
 CURRENT = "current"
 BUILD_FILE = "build.toml"

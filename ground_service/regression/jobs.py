@@ -6,24 +6,28 @@ do at the same time is kept once.
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
-from ground_service.jobs.store import set_progress
-from ground_service.regression.archives import kept_archives
-from ground_service.regression.baseline import baseline_figures
+from ground_service.jobs.service import set_progress
+from ground_service.regression import store
+from ground_service.regression.archives import kept_archives, remove_unheld
 from ground_service.regression.builds import CURRENT, Build, load_build, register_build, registered_build
+from ground_service.regression.gates.calibration import gate_noise, pass_noise
 from ground_service.regression.gates.policy import PolicyFile, load_policy, read_policy
 from ground_service.regression.model import COMPLETE, Comparison
-from ground_service.regression.outcome import RegressionOutcome
+from ground_service.regression.outcome import JUDGED, RegressionOutcome
 from ground_service.regression.pass_archives import archive_of_pass
-from ground_service.regression.placebo import run_placebo
 from ground_service.regression.rendering import settle_archive
+from ground_service.regression.replay_samples import condition_of
 from ground_service.regression.service import (
+    baseline_figures,
     do_replay,
     find_replay,
     is_done,
@@ -31,6 +35,32 @@ from ground_service.regression.service import (
     may_be_replayed,
     run_regression,
 )
+
+
+def run_placebo(
+    ground: Ground, archives: Sequence[str], build: Build, policy: PolicyFile, seed: int, **options: Any
+) -> RegressionOutcome:
+    """Replay kept archives twice with one build, with noise of two seeds in the images, and judge.
+
+    The outcome has the noise of each metric. No replay is kept. `options` are those of `run_regression`.
+    """
+    # Seeds of one placebo are of no other.
+    sides = [
+        replace(build, noise=one, digest=hashlib.sha256(f"{build.digest} noise {one}".encode()).hexdigest())
+        for one in (2 * seed, 2 * seed + 1)
+    ]
+    outcome = run_regression(ground, archives, sides[1], sides[0], policy, **options)
+    remove_unheld(ground, ground.write(store.remove_replays, [one.digest for one in sides]))
+    noise = gate_noise(outcome.gates, policy.policy)
+    for one in outcome.passes:
+        if one.state == JUDGED and one.context and one.baseline_read and one.candidate_read:
+            frames = (one.baseline_read.frames, one.candidate_read.frames)
+            noise += pass_noise(*frames, policy.policy, condition_of(one.context))
+    told = f"placebo: the baseline against itself with other noise in the images, seed {seed}"
+    return replace(
+        outcome, baseline=build, candidate=build, noise=tuple(noise), remarks=(*outcome.remarks, told)
+    )
+
 
 log = logging.getLogger(__name__)
 

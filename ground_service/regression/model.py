@@ -6,8 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, model_validator
 
-from ground_service.http.model import Entity, Given
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Entity, Given, UtcTime
 from reports.text import loss_text
 
 UNUSABLE_STATES = ("unusable", "baseline failed")

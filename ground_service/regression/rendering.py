@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ground_service.errors import GroundError, InvalidInput
 from ground_service.ground import Ground
-from ground_service.passes.archive_zip import unpacked
+from ground_service.passes.archive_import import unpacked
 from ground_service.regression import store
 from ground_service.regression.archives import (
     DETECTIONS,
@@ -42,7 +42,7 @@ from ground_service.regression.archives import (
 from ground_service.regression.builds import Limits
 from ground_service.regression.model import COMPLETE, TELEMETRY_ONLY, TO_RENDER, KeptArchive
 from ground_service.regression.runner import RunRequest, run_confined
-from ground_service.regression.sandbox.host import SandboxRefused, tail
+from ground_service.regression.sandbox import SandboxRefused, tail
 from tmtc.dictionary.definitions import parse_dictionary
 from tmtc.downlink import decode
 from tmtc.errors import TmtcError

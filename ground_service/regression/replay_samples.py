@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.errors import InvalidInput
-from ground_service.evaluation.detection.viewing import Viewing
+from ground_service.evaluation.alignment import reference_states
 from ground_service.evaluation.extras import sun_angles
 from ground_service.evaluation.inputs import evidence_of_frames, orientation_of
-from ground_service.evaluation.navigation.alignment import reference_states
-from ground_service.missions.ephemerides.attitudes import (
+from ground_service.evaluation.recall import Viewing
+from ground_service.missions.ephemerides.service import (
     ATTITUDE_FILES,
     attitude_file,
     load_attitudes,

@@ -20,10 +20,8 @@ from ground_service.http.common import (
     upload_body,
 )
 from ground_service.http.requests import operations, problems
-from ground_service.jobs.dispatcher import DispatcherOf
 from ground_service.jobs.model import Job
-from ground_service.jobs.service import enter_jobs
-from ground_service.jobs.store import get_job
+from ground_service.jobs.service import DispatcherOf, enter_jobs, get_job
 from ground_service.regression import archives as archive_service
 from ground_service.regression import service, store
 from ground_service.regression.builds import (

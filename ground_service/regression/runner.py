@@ -31,8 +31,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
-from ground_service.regression.sandbox import host
-from ground_service.regression.sandbox.host import Run, SandboxRefused
+from ground_service.regression import sandbox as host
+from ground_service.regression.sandbox import Run, SandboxRefused
 from kernels import cache_folder
 
 DOWNLINKS = ("downlink.cadu", "downlink.packets")

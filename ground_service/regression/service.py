@@ -20,9 +20,9 @@ from typing import Any
 
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, InvalidInput, Stopping
-from ground_service.events import RegressionJudged, publish
+from ground_service.evaluation.service import plain
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 from ground_service.regression import store
 from ground_service.regression.archives import (
     DETECTIONS,
@@ -38,9 +38,10 @@ from ground_service.regression.builds import Build, changes
 from ground_service.regression.documents import regression_html, verdict_document
 from ground_service.regression.gates.calibration import calibrations
 from ground_service.regression.gates.core import NOT_JUDGED, judge
-from ground_service.regression.gates.faults import first_difference
+from ground_service.regression.gates.metrics import first_difference, metrics_of
 from ground_service.regression.gates.policy import PolicyFile, load_policy
 from ground_service.regression.gates.samples import PassFrames
+from ground_service.regression.gates.statistics import joined_sums, ratio_error
 from ground_service.regression.model import (
     COMPLETE,
     OK,
@@ -55,6 +56,7 @@ from ground_service.regression.outcome import (
     TELEMETRY_JUDGED,
     PassVerdict,
     RegressionOutcome,
+    pass_figures,
 )
 from ground_service.regression.pass_archives import NO_INPUTS
 from ground_service.regression.rendering import LIVE_BEGINNING, settle_archive
@@ -66,8 +68,10 @@ from ground_service.regression.replay_samples import (
     read_downlink,
 )
 from ground_service.regression.runner import PERFORMANCE
-from ground_service.store.stored_files import register_file
+from ground_service.store.event_kinds import RegressionJudged, publish
+from ground_service.store.files import register_file
 from lunar.errors import LunarError
+from reports.text import counted
 
 Progress = Callable[[Iterable[Any], int], Iterator[Any]]
 
@@ -418,3 +422,54 @@ def _unique_names(passes: Sequence[PassVerdict]) -> list[str]:
 def _machine() -> str:
     """What a latency was measured on."""
     return f"{platform.node()}, {platform.machine()}"
+
+
+def baseline_figures(outcome: RegressionOutcome) -> dict[str, Any]:
+    """Every metric over the suite and over each pass; ratios with the 95 % interval by units of the evidence."""
+    judged = [(one.name, one.baseline_read.frames) for one in outcome.passes if one.baseline_read is not None]
+    result: dict[str, Any] = plain(
+        {
+            "build": {"name": outcome.baseline.name, "digest": outcome.baseline.digest},
+            "suite": _figures([frames for _, frames in judged]) if judged else {},
+            "passes": [
+                {
+                    "name": name,
+                    "frames": len(frames),
+                    "figures": _figures([frames]),
+                    **pass_figures(frames),
+                }
+                for name, frames in judged
+            ],
+            "not_flown": [
+                {"name": one.name, "detail": one.detail}
+                for one in outcome.passes
+                if one.baseline_read is None
+            ],
+        }
+    )
+    return result
+
+
+def baseline_text(figures: dict[str, Any]) -> str:
+    """The figures of the suite as lines."""
+    lines = [f"{figures['build']['name']} over {counted(len(figures['passes']), 'passes')}"]
+    for name, row in figures["suite"].items():
+        if row["value"] is None:
+            continue
+        low, high = row["interval_95"]
+        between = "" if low is None else f"  ({low:.4g} to {high:.4g})"
+        lines.append(f"  {name:<34}{row['value']:>12.4g} {row['unit']}{between}")
+    lines += [f"  {one['name']}: {one['detail']}" for one in figures["not_flown"]]
+    return "\n".join(lines)
+
+
+def _figures(passes: list[PassFrames]) -> dict[str, Any]:
+    found = {}
+    for metric in metrics_of(passes):
+        value, low, high = metric.over(passes), math.nan, math.nan
+        if metric.sums is not None:
+            sums = joined_sums([metric.sums(one) for one in passes])
+            reach = 1.96 * ratio_error(sums)
+            low, high = value - reach, value + reach
+        found[metric.name] = {"value": value, "interval_95": [low, high], "unit": metric.unit}
+    return found

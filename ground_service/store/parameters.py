@@ -10,7 +10,7 @@ import numpy as np
 from sqlalchemy import Connection, LargeBinary, delete, func, select, update
 
 from ground_service.store import repository, rollups
-from ground_service.store.bulk import insert_columns
+from ground_service.store.repository import insert_columns
 from lunar.arrays import FloatArray, IntArray
 from tmtc.packets.cuc import NO_TICKS
 

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from sqlalchemy import ColumnElement, Connection, LargeBinary, and_, bindparam, delete, func, or_, select
 
-from ground_service.store.bulk import FEW_ROWS, insert_columns
-from ground_service.store.counters import hold
 from ground_service.store.models import HOUSEKEEPING, NAVIGATION_STATES, ROLLUPS
+from ground_service.store.repository import FEW_ROWS, insert_columns
 from ground_service.store.telemetry import sample_arrays
+from ground_service.store.vehicles import hold
 from lunar.arrays import FloatArray, IntArray
 
 HOUSEKEEPING_VALUES = tuple(one.name for one in HOUSEKEEPING.c if not one.primary_key)

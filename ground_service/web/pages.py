@@ -1,15 +1,20 @@
-"""Pages and their files. A page is a frame of HTML; its script fills it from the API with the caller's token.
+"""Pages, displays, help and their files. A page is a frame of HTML; its script fills it from the API.
 
 Nothing here needs a token: pages hold no data but the telemetry dictionary, which is no secret.
 """
 
 from __future__ import annotations
 
+import base64
+import gzip
 import hashlib
 import json
-from collections.abc import Callable, Iterable
+import posixpath
+import re
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
 from urllib.parse import quote
@@ -18,20 +23,21 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import RedirectResponse
 from fastapi.routing import APIRoute
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+from markdown_it import MarkdownIt
 from pydantic import BaseModel
 from starlette.routing import Route
 
 from ground_service.access.scopes import check_scope
 from ground_service.access.security import caller_of
 from ground_service.errors import InvalidInput, NotAuthorised, NotFound
-from ground_service.evaluation.performance.store import get_monthly_report
+from ground_service.evaluation.extras import albedo_picture
+from ground_service.evaluation.performance.service import get_monthly_report
 from ground_service.evaluation.store import get_report
-from ground_service.evaluation.surface import albedo_picture
 from ground_service.ground import Ground
 from ground_service.http.common import API_PREFIX, Key
 from ground_service.missions.model import Approval, StationConnection, StationLink
 from ground_service.passes.series import STATE_VALUES
-from ground_service.planning.request_model import StandingRequestIn
+from ground_service.planning.model import StandingRequestIn
 from ground_service.regression.store import get_report as get_regression_report
 from tmtc.dictionary.arguments import FUNCTION_ARGUMENTS
 from tmtc.dictionary.onboard_parameters import PARAMETERS
@@ -320,3 +326,178 @@ def basemap_jpeg(path: Path) -> bytes:
     if not good:
         raise InvalidInput(str(path), "", "a map that can be written as JPEG", str(picture.shape))
     return octets.tobytes()
+
+
+DOCS = Path(__file__).parents[2] / "docs"
+"""Folder of the Markdown files; absent in wheels, which contain the site."""
+
+_INLINE_SCRIPT = re.compile(rb"<script>(.*?)</script>", re.DOTALL)
+_ADMONITION = re.compile(r'^( *)!!! \w+ "(.*)"$\n((?:\1    .*\n|\n)*)', re.MULTILINE)
+_ABSENT = """<!doctype html><html lang="en"><meta name="viewport" content="width=device-width"><title>LINNA</title>
+<h1>No documentation</h1><p>This installation was made without its documentation. Released wheels and the image have it.
+In a checkout, <code>make docs</code> builds it; restart the service afterwards.</p><p><a href="/">Overview</a></p>"""
+"""Answer to every path where there is neither."""
+
+documentation = APIRouter(include_in_schema=False)
+
+
+@documentation.get("/help")
+@documentation.get("/help/")
+def documentation_start() -> Response:
+    """The first page of the documentation."""
+    return RedirectResponse("/help/index.html")
+
+
+@documentation.get("/help/{path:path}")
+def documentation_file(path: str) -> Response:
+    """A file of the documentation.
+
+    Raises
+    ------
+    NotFound
+        There is no such file. Without any documentation, every path has a page that says so.
+    """
+    files = files_of(HELP)
+    rendered = not files
+    files = files or files_of(DOCS)
+    if not files:
+        return Response(_ABSENT, 404, media_type="text/html")
+    source = path.removesuffix(".html") + ".md" if rendered and path.endswith(".html") else path
+    body = files.get(source)
+    if body is None:
+        raise NotFound("documentation page", path[:80])
+    media = MEDIA[Path(path).suffix]
+    headers = {"Cache-Control": "no-cache"}
+    if rendered:
+        headers["Content-Security-Policy"] = POLICY
+        body = page_of(source).encode() if source != path else body
+    else:
+        headers["Content-Security-Policy"] = policy(body if media[:9] == "text/html" else b"")
+    return Response(body, media_type=media, headers=headers)
+
+
+@lru_cache(maxsize=16)
+def page_of(source: str) -> str:
+    """Return a Markdown file of the documentation as a page.
+
+    Headings have the anchors of the site. Links to pages that only the site has are plain text.
+    """
+    files = files_of(DOCS)
+    text = _ADMONITION.sub(lambda found: _quoted(*found.groups()), files[source].decode())
+    markdown = MarkdownIt("commonmark").enable("table")
+    tokens = markdown.parse(text)
+    title = source
+    for token, inline in pairwise(tokens):
+        if token.type == "heading_open":
+            token.attrSet("id", slug(inline.content))
+            title = inline.content if token.tag == "h1" else title
+    for link in (one for token in tokens for one in token.children or () if one.type == "link_open"):
+        target, _, anchor = str(link.attrGet("href")).partition("#")
+        if target.endswith(".md") and ":" not in target:
+            known = posixpath.normpath(posixpath.join(posixpath.dirname(source), target)) in files
+            link.attrs = (
+                {"href": target.removesuffix(".md") + ".html" + ("#" + anchor if anchor else "")}
+                if known
+                else {"title": "a page of the built documentation: make docs"}
+            )
+    return help_page(title, markdown.renderer.render(tokens, markdown.options, {}))
+
+
+def slug(heading: str) -> str:
+    """Return the anchor of a heading, as the site has it."""
+    return re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", heading).strip().lower())
+
+
+def _quoted(indent: str, title: str, text: str) -> str:
+    lines = [f"**{title}**", "", *(line.removeprefix(indent + "    ") for line in text.splitlines())]
+    return "".join(f"{indent}> {line}\n" for line in lines) + "\n"
+
+
+def policy(page: bytes) -> str:
+    """Return the content security policy of a page: only files of this service, and the page's own inline scripts."""
+    hashes = " ".join(
+        f"'sha256-{base64.b64encode(hashlib.sha256(script).digest()).decode()}'"
+        for script in dict.fromkeys(_INLINE_SCRIPT.findall(page))
+    )
+    return (
+        f"default-src 'none'; script-src 'self' {hashes}; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
+        "connect-src 'self'; worker-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+    )
+
+
+FOLDER = Path(__file__).parents[2] / "deploy" / "openmct" / "node_modules" / "openmct"
+"""Where `make openmct` installs the npm package `openmct`."""
+
+DISPLAY_POLICY = (
+    "default-src 'none'; script-src 'self' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; worker-src 'self'; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+
+_COMPRESSED = (".css", ".js", ".md", ".svg")
+
+displays = APIRouter(include_in_schema=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Installation:
+    """Files of an installed package `openmct` by path: plain, and compressed with gzip where this is smaller."""
+
+    version: str
+    plain: Mapping[str, bytes]
+    compressed: Mapping[str, bytes]
+
+
+@displays.get("/mct", name="page mct")
+@displays.head("/mct", name="page mct head")
+def displays_page(request: Request) -> Response:
+    """The displays; without Open MCT a page that says how to install it. Without a session: the sign-in dialog."""
+    found = installation(request.app.state.openmct)
+    if found is None:
+        return page_response(rendered(DISPLAYS))
+    try:
+        caller_of(request, None)
+    except NotAuthorised:
+        return RedirectResponse("/?next=/mct", status_code=303)
+    return page_response(rendered(DISPLAYS, "displays", openmct=found.version), DISPLAY_POLICY)
+
+
+@displays.get("/mct/{version}/{path:path}")
+def displays_file(request: Request, version: str, path: str) -> Response:
+    """A file of Open MCT; addresses contain the version, so browsers keep files for good."""
+    found = installation(request.app.state.openmct)
+    body = None if found is None or found.version != version else found.plain.get(path)
+    if found is None or body is None:
+        raise NotFound("file", f"{version[:20]}/{path[:80]}")
+    headers = {
+        "Cache-Control": "public, max-age=31536000, immutable",
+        "Content-Security-Policy": DISPLAY_POLICY,
+        "Vary": "Accept-Encoding",
+    }
+    if path in found.compressed and "gzip" in request.headers.get("accept-encoding", ""):
+        body = found.compressed[path]
+        headers["Content-Encoding"] = "gzip"
+    return Response(body, media_type=MEDIA[Path(path).suffix], headers=headers)
+
+
+@cache
+def installation(folder: Path) -> Installation | None:
+    """Return the files of the package in a folder, read once; None if it is not installed there."""
+    try:
+        version = json.loads((folder / "package.json").read_bytes())["version"]
+        licence = (folder / "LICENSE.md").read_bytes()
+        script = (folder / "dist" / "openmct.js").is_file()
+    except (OSError, ValueError, KeyError):
+        return None
+    if not script:
+        return None
+    plain = {"LICENSE.md": licence} | {
+        file.relative_to(folder / "dist").as_posix(): file.read_bytes()
+        for file in sorted((folder / "dist").rglob("*"))
+        if file.suffix in MEDIA and file.is_file()
+    }
+    packed = {
+        path: gzip.compress(body, 6, mtime=0) for path, body in plain.items() if path.endswith(_COMPRESSED)
+    }
+    smaller = {path: body for path, body in packed.items() if len(body) < len(plain[path])}
+    return Installation(str(version), plain, smaller)

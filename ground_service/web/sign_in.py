@@ -14,8 +14,14 @@ from fastapi import APIRouter, Form, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
 from ground_service.access import service as users
-from ground_service.access.provider import SIGN_IN_S, Begun, Provider, own_page
-from ground_service.access.provider_sessions import end_provider_sessions, start_provider_session
+from ground_service.access.provider import (
+    SIGN_IN_S,
+    Begun,
+    Provider,
+    end_provider_sessions,
+    own_page,
+    start_provider_session,
+)
 from ground_service.access.security import SESSION_COOKIE
 from ground_service.errors import GroundError, NotFound, ProviderUnavailable, SignInRefused
 from ground_service.web.pages import page_response, sign_in_page

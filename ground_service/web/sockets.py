@@ -1,4 +1,4 @@
-"""Open WebSockets: their callers and limits, periodic authorisation, and the event log.
+"""Open WebSockets and the live feed: callers and limits, periodic authorisation, and the event log.
 
 The event log is read once for all sockets of a process, as soon as events were committed: by this process, or by
 another one that sends a wake-up over Redis. Without Redis the events of other processes are found by polling. Newest
@@ -17,9 +17,9 @@ from collections import Counter, deque
 from collections.abc import AsyncIterator, Iterable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import WebSocket, WebSocketDisconnect
+from fastapi import APIRouter, Query, WebSocket, WebSocketDisconnect
 from starlette.concurrency import run_in_threadpool
 
 from ground_service.access.scopes import ROWS, SPACECRAFT
@@ -28,7 +28,13 @@ from ground_service.access.service import LOCAL_CALLER, Caller, authenticate
 from ground_service.access.store import has_users, owner_of
 from ground_service.clock import utc_now_ns
 from ground_service.errors import GroundError, NotAuthorised, NotFound
-from ground_service.events import (
+from ground_service.ground import Ground
+from ground_service.http.common import API_PREFIX
+from ground_service.http.model import time_text
+from ground_service.http.problems import problem
+from ground_service.http.requests import query_is_known
+from ground_service.passes.live import newest_packets
+from ground_service.store.event_kinds import (
     CommandStateChanged,
     LinkChanged,
     PlanChanged,
@@ -38,10 +44,6 @@ from ground_service.events import (
     last_number,
     read_events,
 )
-from ground_service.ground import Ground
-from ground_service.http.problems import problem
-from ground_service.http.times import time_text
-from ground_service.passes.live import newest_packets
 from ground_service.store.events import LoggedEvent
 from ground_service.store.vehicles import all_vehicles
 from ground_service.store.wakeups import listen
@@ -390,3 +392,36 @@ def text_of(item: LoggedEvent) -> str:
         "payload": item.payload,
     }
     return json.dumps(message, separators=(",", ":"), ensure_ascii=False)
+
+
+live = APIRouter()
+
+
+@live.websocket(f"{API_PREFIX}/live")
+async def watch(
+    socket: WebSocket,
+    after: Annotated[
+        int | None, Query(ge=0, le=2**63 - 1, description="First send the messages after this number")
+    ] = None,
+    values: Annotated[
+        bool, Query(description="Send the newest values of all spacecraft as well, as messages `values`")
+    ] = False,
+) -> None:
+    """Messages ``{sequence, time, kind, payload}``: the events of the log, each with the next number.
+
+    Messages ``values`` (`NewestPacket`) have the number of the event before them. If packets arrive faster than the
+    client reads, it gets the newest values only.
+
+    The token is expected in the Authorization header, or as the second value of the sub-protocol ``bearer`` (which
+    is all that a browser can send).
+    """
+    if not await query_is_known(socket, "after", "values"):
+        return
+    sockets: Sockets = socket.app.state.sockets
+    async with sockets.admitted(socket) as session:
+        if session is not None:
+            newest = await sockets.open(
+                session, values=values
+            )  # before `until_gone`, so that one task at a time receives
+            number = newest if after is None else after
+            await until_over(session, sockets.follow(session, number), until_gone(socket))

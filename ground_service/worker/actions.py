@@ -15,12 +15,19 @@ from typing import Any
 from sqlalchemy import Connection
 
 from ground_service.errors import EvaluationError, GroundError, NotFound, fault_of, public_text
+from ground_service.evaluation.inputs import align_pass
 from ground_service.evaluation.landmarks.service import update_landmarks
 from ground_service.evaluation.performance.service import due_report_of_vehicle
-from ground_service.evaluation.preparation import align_pass
 from ground_service.evaluation.service import make_report, reevaluate
 from ground_service.evaluation.store import get_report, newest_report
-from ground_service.events import (
+from ground_service.ground import Ground
+from ground_service.missions import store as missions
+from ground_service.missions.automation import Automation, Channel
+from ground_service.planning import store as planning
+from ground_service.planning.model import WindowRecord
+from ground_service.planning.progress import HEARD_TICKS, close_window, note_reason, span_of
+from ground_service.regression.pass_archives import keep_pass
+from ground_service.store.event_kinds import (
     AlarmChanged,
     ArchiveImported,
     ContactEnded,
@@ -29,17 +36,9 @@ from ground_service.events import (
     RegressionJudged,
     WindowChanged,
 )
-from ground_service.ground import Ground
-from ground_service.missions import store as missions
-from ground_service.missions.automation import Automation, Channel
-from ground_service.planning import store as planning
-from ground_service.planning.model import WindowRecord
-from ground_service.planning.progress import HEARD_TICKS, close_window, note_reason, span_of
-from ground_service.regression.pass_archives import keep_pass
 from ground_service.store.events import LoggedEvent, read_events
 from ground_service.store.vehicles import get_vehicle
-from ground_service.worker.notifications import send
-from ground_service.worker.outgoing import NotDelivered
+from ground_service.worker.notifications import NotDelivered, send
 from lunar.timescales import format_utc
 
 

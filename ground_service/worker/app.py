@@ -19,11 +19,11 @@ from kombu.exceptions import OperationalError
 from ground_service.errors import PASSING, SettingsError
 from ground_service.ground import Ground, ground_from_settings
 from ground_service.logs import logging_config
-from ground_service.missions.clocks import read_mission_clock
+from ground_service.missions.places import read_mission_clock
 from ground_service.settings import Settings, start_tracing
+from ground_service.worker.condition import present
 from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.jobs import run_job
-from ground_service.worker.presence import present
 from kernels.memory import limit_heaps
 
 RUN_JOB = "ground_service.run_job"

@@ -26,11 +26,11 @@ from ground_service.store.database import Database, open_database, prepare_datab
 from ground_service.store.files import (
     FileArchive,
     StoredFile,
+    file_names,
     make_durable_folder,
     read_blocks,
     replace_durably,
 )
-from ground_service.store.stored_files import file_names
 from lunar.timescales import format_utc
 
 SCHEMA_VERSION = 2

@@ -9,8 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from ground_service.errors import PASSING
 from ground_service.ground import Ground
-from ground_service.jobs.dispatcher import Dispatcher
-from ground_service.jobs.store import get_job, unfinished_jobs
+from ground_service.jobs.service import Dispatcher, get_job, unfinished_jobs
 from ground_service.settings import Settings
 from ground_service.worker.jobs import run_job
 

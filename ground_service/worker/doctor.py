@@ -18,15 +18,15 @@ from ground_service.missions.store import channels_in_force
 from ground_service.settings import Settings
 from ground_service.store import leases
 from ground_service.store.database import schema_revisions
-from ground_service.store.stored_files import file_names
-from ground_service.worker.condition import broker_answers
-from ground_service.worker.outgoing import permitted_address
-from ground_service.worker.presence import (
+from ground_service.store.files import file_names
+from ground_service.worker.condition import (
     CLOCK_LIMIT_MS,
+    broker_answers,
     disagreements,
     running_processes,
     statement_of,
 )
+from ground_service.worker.notifications import permitted_address
 from ground_service.worker.scheduler import has_scheduler
 from ground_service.worker.upkeep import CHANNEL, channel_of_heads
 

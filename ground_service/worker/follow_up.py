@@ -19,7 +19,20 @@ from contextlib import suppress
 from sqlalchemy import Connection
 
 from ground_service.errors import PASSING, NotFound, fault_of
-from ground_service.events import (
+from ground_service.ground import Ground
+from ground_service.ingest.doubt_store import needs_review, review_times
+from ground_service.ingest.service import undecoded_vehicles
+from ground_service.jobs.service import add_job, queued_arguments
+from ground_service.missions.timekeeping.recorrelation import recorrelate
+from ground_service.missions.timekeeping.store import vehicles_with_receptions
+from ground_service.passes.alarms.service import examine_again, examine_packets, note_finding
+from ground_service.passes.span import REACH_NS, PassSpan, pass_span, vehicle_span
+from ground_service.passes.store import passes_of_vehicle, reported_without_ephemeris
+from ground_service.planning.progress import advance_windows
+from ground_service.planning.standing import needs_plan, planned_with
+from ground_service.planning.store import get_record
+from ground_service.store import events
+from ground_service.store.event_kinds import (
     ClockDoubted,
     CommandsSent,
     ContactEnded,
@@ -37,20 +50,6 @@ from ground_service.events import (
     WindowChanged,
     publish,
 )
-from ground_service.ground import Ground
-from ground_service.ingest.doubt_store import needs_review, review_times
-from ground_service.ingest.service import undecoded_vehicles
-from ground_service.jobs.service import add_job
-from ground_service.jobs.store import queued_arguments
-from ground_service.missions.timekeeping.recorrelation import recorrelate
-from ground_service.missions.timekeeping.store import vehicles_with_receptions
-from ground_service.passes.alarms.service import examine_again, examine_packets, note_finding
-from ground_service.passes.span import REACH_NS, PassSpan, pass_span, vehicle_span
-from ground_service.passes.store import passes_of_vehicle, reported_without_ephemeris
-from ground_service.planning.progress import advance_windows
-from ground_service.planning.standing import needs_plan, planned_with
-from ground_service.planning.store import get_record
-from ground_service.store import events
 from ground_service.store.events import LoggedEvent
 from ground_service.worker.actions import MESSAGES, STEPS, messages_after, steps_after
 from ground_service.worker.jobs import run_job

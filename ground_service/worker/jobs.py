@@ -21,18 +21,17 @@ from ground_service.errors import (
     storage_error,
 )
 from ground_service.evaluation.service import make_report, reevaluate
-from ground_service.events import JobChanged, publish
 from ground_service.ground import Ground
-from ground_service.ingest.redecode import catch_up, redecode_job_id, vehicles_behind
+from ground_service.ingest.parameters import catch_up, redecode_job_id, vehicles_behind
 from ground_service.ingest.service import apply_definition, derive_without, run_ingest
-from ground_service.jobs import store
+from ground_service.jobs import service
 from ground_service.jobs.model import Job
-from ground_service.jobs.service import enter_job
-from ground_service.jobs.store import FINISHED
-from ground_service.passes.archive_zip import import_zip
+from ground_service.jobs.service import FINISHED, enter_job
+from ground_service.logs import span
+from ground_service.passes.archive_import import import_zip
 from ground_service.planning.standing import plan_tick
 from ground_service.regression.jobs import analysis_job, regression_job, rendering_job, replay_job
-from ground_service.tracing import span
+from ground_service.store.event_kinds import JobChanged, publish
 from ground_service.worker.actions import run_steps, send_messages
 from ground_service.worker.upkeep import nightly
 from kernels.memory import give_back
@@ -127,12 +126,12 @@ def run_job(ground: Ground, job_id: str) -> Job:
     """
     with _alone_here(job_id) as here, ground.database.alone(job_id) as alone:
         if not (here and alone):
-            return ground.read(store.get_job, job_id)
+            return ground.read(service.get_job, job_id)
         return _run_alone(ground, job_id)
 
 
 def _run_alone(ground: Ground, job_id: str) -> Job:
-    job = ground.read(store.get_job, job_id)
+    job = ground.read(service.get_job, job_id)
     if job.state in FINISHED:
         return job
     with span(f"job {job.kind}", parent=job.traceparent, attributes={"linna.job": job_id}) as further:
@@ -146,13 +145,13 @@ def _run_alone(ground: Ground, job_id: str) -> Job:
 
 def _attempt(ground: Ground, job_id: str) -> Job:
     with ground.database.writing() as connection:
-        job = store.get_job(connection, job_id)
+        job = service.get_job(connection, job_id)
         if job.state in FINISHED:
             return job
         try:
-            attempt = store.start_attempt(connection, job, utc_now_ns())
+            attempt = service.start_attempt(connection, job, utc_now_ns())
         except StateConflict:  # another process has started the job since it was read
-            return store.get_job(connection, job_id)
+            return service.get_job(connection, job_id)
         publish(connection, JobChanged(id=job_id, kind=job.kind, state="running"))
     if attempt > ATTEMPTS_LIMIT:
         error = f"given up after {ATTEMPTS_LIMIT} attempts that did not come to an end"
@@ -180,7 +179,7 @@ def _attempt(ground: Ground, job_id: str) -> Job:
 def _put_back(ground: Ground, job_id: str, attempt: int) -> None:
     """Queue a job again that something else broke off; that is no attempt of its own. Not being able to is no harm."""
     with suppress(*PASSING, StateConflict), ground.database.writing() as connection:
-        store.requeue(connection, job_id, attempt)
+        service.requeue(connection, job_id, attempt)
 
 
 def _progress_of(ground: Ground, job_id: str) -> Callable[[float], None]:
@@ -191,7 +190,7 @@ def _progress_of(ground: Ground, job_id: str) -> Callable[[float], None]:
         nonlocal kept
         if share - kept >= PROGRESS_STEP and share < 1.0:
             kept = share
-            ground.write(store.set_progress, job_id, share)
+            ground.write(service.set_progress, job_id, share)
 
     return keep
 
@@ -226,13 +225,13 @@ def _finish(
     with ground.database.writing() as connection:
         finished = utc_now_ns()
         try:
-            store.end_attempt(connection, job_id, attempt, finished, result=result, error=error)
+            service.end_attempt(connection, job_id, attempt, finished, result=result, error=error)
         except StateConflict as conflict:
             log.warning(
                 "job %s: attempt %d ended after another one had started: %s", job_id, attempt, conflict
             )
-            return store.get_job(connection, job_id)
-        job = store.get_job(connection, job_id)
+            return service.get_job(connection, job_id)
+        job = service.get_job(connection, job_id)
         publish(connection, JobChanged(id=job_id, kind=job.kind, state=job.state, result=job.result))
     took_s = 0.0 if job.started is None else (finished - job.started.utc_ns) / 1e9
     told = {"job": job_id, "kind": job.kind, "state": job.state, "seconds": round(took_s, 3)}

@@ -1,4 +1,4 @@
-"""Figures for Prometheus: what was asked of the service, how long it took, and how its work stands."""
+"""Metrics, health and status operations: requests, their time, and the state of the work."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import secrets
 import time
 from pathlib import Path
 
+from fastapi import APIRouter, Request, Response
 from prometheus_client import (
     CONTENT_TYPE_LATEST,
     CollectorRegistry,
@@ -17,13 +18,18 @@ from prometheus_client import (
     generate_latest,
 )
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from ground_service.access.security import Viewer
+from ground_service.errors import Draining
 from ground_service.ground import Ground
+from ground_service.http.common import GroundOf
+from ground_service.http.requests import operations
+from ground_service.jobs import service
+from ground_service.jobs.model import JobFilter
 from ground_service.jobs.service import KINDS
-from ground_service.tracing import span
-from ground_service.worker.condition import read_condition
+from ground_service.logs import span
+from ground_service.worker.condition import Health, ServiceStatus, read_condition, service_status
 
 BUCKETS = (0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 30.0)
 
@@ -182,3 +188,39 @@ class Watch:
             "http.route": route,
             "http.response.status_code": status,
         }
+
+
+status = operations("status")
+
+
+@status.get("/status")
+def get_status(request: Request, ground: GroundOf, _: Viewer) -> ServiceStatus:
+    """Show the condition of the deployment: waiting work, disk, backups, time correlations, scheduler."""
+    return service_status(ground, request.app.state.backups, request.app.state.broker)
+
+
+probes = APIRouter(include_in_schema=False)
+
+
+@probes.get("/healthz")
+async def healthz() -> Health:
+    """Report that the process is alive."""
+    return Health(status="ok")
+
+
+@probes.get("/readyz")
+def readyz(request: Request, ground: GroundOf) -> Health:
+    """Report that the service can be used: its database and archive can be read and written, and it is not draining."""
+    if request.app.state.draining:
+        raise Draining
+    ground.read(service.list_jobs, JobFilter(limit=1))
+    ground.database.require_writable()
+    ground.files.require_writable()
+    return Health(status="ok")
+
+
+@probes.get("/metrics")
+def metrics(request: Request, ground: GroundOf) -> Response:
+    """Figures for Prometheus."""
+    answer: Response = request.app.state.metrics.answer(ground)
+    return answer

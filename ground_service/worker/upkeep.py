@@ -16,20 +16,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ground_service.access.audit_log import audit_head
-from ground_service.access.store import delete_answers, delete_ended_sessions
+from ground_service.access.store import audit_head, delete_answers, delete_ended_sessions
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.performance.service import make_due_reports
-from ground_service.events import LimitsBroken, publish
 from ground_service.ground import Ground
-from ground_service.jobs.store import delete_finished, find_job
+from ground_service.jobs.service import delete_finished, find_job
 from ground_service.missions.automation import Channel
 from ground_service.missions.store import channels_in_force
 from ground_service.passes.service import vehicle_trends
 from ground_service.regression.archives import let_go, remove_unfinished
 from ground_service.regression.service import condition_of_archive
 from ground_service.store import audit, events
+from ground_service.store.event_kinds import LimitsBroken, publish
 from ground_service.store.files import UNPACKING, remove_leftovers
 from ground_service.store.vehicles import all_vehicles, get_vehicle
 from ground_service.worker.notifications import key_of, send, signature

@@ -17,7 +17,7 @@ def configure(landmarks: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from ground_service.evaluation.detection.landmarks import compare_map, latest, mapped_craters
+    from ground_service.evaluation.fixes import compare_map, latest, mapped_craters
     from linna.commands._choices import open_catalogue
     from tmtc.dictionary.payload import DICTIONARY
     from tmtc.downlink import decode

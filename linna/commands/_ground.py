@@ -53,7 +53,7 @@ def ground_client(arguments: argparse.Namespace, *, background: bool = False) ->
         from ground_service.clock import follow_missions, mission_now_ns
 
         def read_clock() -> int:
-            from ground_service.missions.clocks import read_mission_clock
+            from ground_service.missions.places import read_mission_clock
 
             read_mission_clock(ground)
             return mission_now_ns()
@@ -112,7 +112,7 @@ def settings_of(arguments: argparse.Namespace, **given: object) -> Settings:
 
 def open_service(arguments: argparse.Namespace) -> Ground:
     """Return the opened service of this machine, which handles its events in this process."""
-    from ground_service.missions.clocks import read_mission_clock
+    from ground_service.missions.places import read_mission_clock
     from ground_service.worker.follow_up import follow_in_process
 
     ground = open_ground_only(arguments)

@@ -13,7 +13,7 @@ from linna.parser import RawFormatter, option
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    from ground_service.exports.formats import FORMATS, REFERENCE
+    from ground_service.exports.model import FORMATS, REFERENCE
 
     parser.formatter_class = RawFormatter
     parser.epilog = "formats:\n" + "\n".join(f"  {one.name:<8} {one.description}" for one in FORMATS.values())
@@ -39,7 +39,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from ground_service.exports.formats import FORMATS
+    from ground_service.exports.model import FORMATS
     from linna.errors import UsageError
 
     out: Path = arguments.out

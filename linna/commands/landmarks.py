@@ -27,7 +27,7 @@ def _export(
     out: Path,
     spacecraft_id: int | None = None,
 ) -> dict[str, Any]:
-    from ground_service.evaluation.landmarks.documents import (
+    from ground_service.evaluation.landmarks.service import (
         extended_catalogue,
         extended_table,
         format_labels,
@@ -65,7 +65,7 @@ def _table(service: Client, pass_id: int, *, out: Path) -> dict[str, Any]:
 def _upload(
     service: Client, table: Path, *, transaction: int = 1, instance: str = "flight", spacecraft_id: int
 ) -> dict[str, Any]:
-    from ground_service.evaluation.landmarks.documents import upload_entries
+    from ground_service.evaluation.landmarks.service import upload_entries
     from tmtc.dictionary.tables import unpack_catalogue_table
 
     octets = _octets(table)

@@ -10,8 +10,7 @@ from linna.commands._table import Command, Commands, Group, Option, add_commands
 
 if TYPE_CHECKING:
     from ground_service.client import Client
-    from ground_service.planning.model import SearchResult, Window
-    from ground_service.planning.request_model import RequestPlan, StandingRequest
+    from ground_service.planning.model import RequestPlan, SearchResult, StandingRequest, Window
 
 Limits = tuple[float, float] | None
 RANGE = ("MIN", "MAX")

@@ -143,7 +143,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _sandbox(arguments: argparse.Namespace) -> int:
     from ground_service.regression.runner import alive
-    from ground_service.regression.sandbox.host import SandboxRefused, protection
+    from ground_service.regression.sandbox import SandboxRefused, protection
     from ground_service.settings import load_settings
 
     exchange = load_settings().runner_exchange
@@ -171,7 +171,7 @@ def _sandbox(arguments: argparse.Namespace) -> int:
 
 
 def _baseline(arguments: argparse.Namespace) -> int:
-    from ground_service.regression.baseline import baseline_text
+    from ground_service.regression.service import baseline_text
 
     with ground_client(arguments, background=True) as service:
         request = _comparison(service, arguments, arguments.build, arguments.build)
@@ -200,8 +200,8 @@ def _placebo(arguments: argparse.Namespace) -> int:
 
 
 def _suite(arguments: argparse.Namespace) -> int:
+    from ground_service.regression.gates.core import detectable, power_text
     from ground_service.regression.gates.policy import load_policy
-    from ground_service.regression.gates.power import detectable, power_text
     from linna.data import data_folder
     from payload_emulator.session.archive.suite import suite_scenarios, write_suite
 

@@ -22,7 +22,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from ground_service.logs import logging_config
     from ground_service.regression.runner import alive, serve_exchange
-    from ground_service.regression.sandbox.host import SandboxRefused, protection
+    from ground_service.regression.sandbox import SandboxRefused, protection
     from ground_service.settings import load_settings
     from linna.errors import UsageError
 

@@ -24,10 +24,10 @@ def run(arguments: argparse.Namespace) -> int:
 
     from ground_service.ground import ground_from_settings
     from ground_service.logs import logging_config
-    from ground_service.missions.clocks import mission_clock
+    from ground_service.missions.places import mission_clock
+    from ground_service.worker.condition import present
     from ground_service.worker.dispatch import dispatcher_for
     from ground_service.worker.follow_up import follow_in_process
-    from ground_service.worker.presence import present
     from ground_service.worker.scheduler import Scheduler, has_scheduler
     from linna.data import data_folder
 

@@ -16,7 +16,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from ground_service.server import serve
+    from ground_service.app import serve
     from linna.data import data_folder
 
     serve(settings_of(arguments, host=arguments.host, port=arguments.port, data=data_folder().root))

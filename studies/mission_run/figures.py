@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ground_service.evaluation.performance.model import PassPerformance
-from ground_service.planning.request_model import RequestPlan
+from ground_service.planning.model import RequestPlan
 from lunar.constants import NANOSECONDS_PER_SECOND
 from studies.mission_run.ground import MissionGround
 

@@ -24,7 +24,7 @@ from ground_service.contacts.links.supervisor import LinkSupervisor
 from ground_service.errors import PASSING, GroundError
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.live import spooled_octets
-from ground_service.jobs.store import unfinished_jobs as unfinished
+from ground_service.jobs.service import unfinished_jobs as unfinished
 from ground_service.planning.model import Window
 from ground_service.store.events import position_of, read_events
 from ground_service.store.telemetry import packet_headers

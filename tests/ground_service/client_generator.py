@@ -17,12 +17,11 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from fastapi.routing import APIRoute
 from pydantic import BaseModel
 
+from ground_service.app import OPERATIONS
 from ground_service.client.connection import API_PREFIX
 from ground_service.http.common import IDEMPOTENCY_HEADER, IF_MATCH_HEADER
-from ground_service.http.model import PageOf, Paging
+from ground_service.http.model import PageOf, Paging, UtcTime
 from ground_service.http.requests import header_names
-from ground_service.http.times import UtcTime
-from ground_service.routers import OPERATIONS
 
 TARGET = Path(__file__).parents[2] / "ground_service" / "client" / "operations.py"
 BY_HAND = {"take_uplink"}

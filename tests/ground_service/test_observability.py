@@ -15,22 +15,20 @@ import yaml
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from prometheus_client.parser import text_string_to_metric_families
 
-from ground_service import tracing
+from ground_service import logs
 from ground_service.app import create_app
 from ground_service.clock import utc_now_ns
 from ground_service.errors import SettingsError
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
-from ground_service.jobs.service import enter_job
-from ground_service.jobs.store import get_job
+from ground_service.jobs.service import enter_job, get_job
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.worker import condition
 from ground_service.worker.backup import backup
-from ground_service.worker.condition import newest_backup_utc_ns, read_condition
+from ground_service.worker.condition import WorkCounts, newest_backup_utc_ns, read_condition
 from ground_service.worker.jobs import run_job
-from ground_service.worker.store import WorkCounts
 from tests.serving import TestClient
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
@@ -394,25 +392,25 @@ PARENT = f"00-{TRACE}-00f067aa0ba902b7-01"
 
 
 def test_a_job_that_another_process_does_later_belongs_to_the_trace(ground: Ground) -> None:
-    assert tracing.current() is None
-    with tracing.span("request", parent=PARENT):
+    assert logs.current() is None
+    with logs.span("request", parent=PARENT):
         job = enter_job(ground, "plan", {})
-        inner = tracing.current()
-    assert tracing.current() is None
+        inner = logs.current()
+    assert logs.current() is None
     stored = ground.read(get_job, job).traceparent
-    assert stored == inner != PARENT and tracing.trace_id_of(stored) == TRACE
+    assert stored == inner != PARENT and logs.trace_id_of(stored) == TRACE
 
 
 def test_spans_of_a_request_its_job_and_its_report_are_one_tree(tmp_path: Path, synthetic_pass: Any) -> None:
     exporter = InMemorySpanExporter()
-    tracing.configure(None, exporter=exporter)
+    logs.configure(None, exporter=exporter)
     try:
         with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as client:
             pass_id = import_archive(client.app.state.ground, synthetic_pass.folder)
             exporter.clear()
             client.post(f"/api/v1/passes/{pass_id}/reports", headers={"traceparent": PARENT})
     finally:
-        tracing.stop()
+        logs.stop()
     spans = {one.name: one for one in exporter.get_finished_spans()}
     request = spans["POST /api/v1/passes/{pass_id}/reports"]
     job, report = spans["job report"], spans["report"]

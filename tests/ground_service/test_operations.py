@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from ground_service.app import create_app
+from ground_service.http.model import UtcTime
 from ground_service.http.requests import ALWAYS
-from ground_service.http.times import UtcTime
 from ground_service.passes.service import define_pass
 from ground_service.settings import Settings
 from tests.serving import TestClient

@@ -18,12 +18,11 @@ import uvicorn
 from pydantic import BaseModel, Field, ValidationError
 
 from ground_service.access.service import add_user
-from ground_service.app import create_app
+from ground_service.app import _server, bind, create_app, serve
 from ground_service.errors import InvalidInput, ServerError
 from ground_service.ground import open_ground
-from ground_service.server import _server, bind, serve
 from ground_service.settings import Settings
-from ground_service.text import LINE_PATTERN_JSON, require_line
+from ground_service.toml import LINE_PATTERN_JSON, require_line
 from studies.harness.parts import listens
 from tests.ground_service.conftest import free_port, wait_for
 
@@ -82,7 +81,7 @@ def test_the_listener_names_its_protocol_so_that_answers_are_not_held_back_by_na
 
 def test_the_service_starts_without_libraries_that_only_computations_need() -> None:
     code = (
-        "import sys, ground_service.server; "
+        "import sys, ground_service.app; "
         "print([m for m in sys.modules if m in ('scipy', 'matplotlib', 'cv2', 'numba', 'torch', 'celery')])"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

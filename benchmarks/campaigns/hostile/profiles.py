@@ -19,7 +19,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from ground_service.regression.sandbox.kernel import seccomp_filter
+from ground_service.regression.sandbox import seccomp_filter
 
 PROFILES = {
     "user": "the user that runs the campaign, unchanged",

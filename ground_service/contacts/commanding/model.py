@@ -8,10 +8,9 @@ from typing import Any, Literal
 from pydantic import Field
 
 from ground_service.contacts.commanding.core import DUPLICATE, OUT_OF_SEQUENCE, STAGES, CommandFate
-from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber, UtcTime
 from ground_service.ingest.model import ControlWords
-from ground_service.text import LINE_PATTERN_JSON
+from ground_service.toml import LINE_PATTERN_JSON
 from lunar.timescales import format_utc, utc_ns_from_ticks
 from tmtc.dictionary.arguments import argument_text
 from tmtc.dictionary.codes import FAILURES

@@ -30,13 +30,19 @@ from ground_service.contacts.commanding.model import (
     onboard_time,
 )
 from ground_service.errors import Conflict, InvalidInput
-from ground_service.events import CommandsSent, CommandStateChanged, HandoverChanged, publish
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf
 from ground_service.missions.store import approval_in_force, in_force
-from ground_service.store.counters import lock_spacecraft, next_telecommand
-from ground_service.store.vehicles import FLOWN, find_vehicle, get_vehicle, vehicle_id
-from ground_service.text import REASON_LIMIT, require_line
+from ground_service.store.event_kinds import CommandsSent, CommandStateChanged, HandoverChanged, publish
+from ground_service.store.vehicles import (
+    FLOWN,
+    find_vehicle,
+    get_vehicle,
+    lock_spacecraft,
+    next_telecommand,
+    vehicle_id,
+)
+from ground_service.toml import REASON_LIMIT, require_line
 from tmtc.dictionary.arguments import argument_text, arguments_by_number
 from tmtc.dictionary.effects import CommandEffect, effect_of
 from tmtc.dictionary.payload import DICTIONARY

@@ -22,7 +22,7 @@ from ground_service.contacts.commanding.model import (
 from ground_service.http.model import PageOf
 from ground_service.ingest.core import LONGEST_SILENCE, LONGEST_STEP
 from ground_service.ingest.doubt_store import latest_ticks
-from ground_service.ingest.redecode import readable_version
+from ground_service.ingest.parameters import readable_version
 from ground_service.store import repository, telemetry
 from ground_service.store.states import TELECOMMAND, change_if, move, move_all
 from ground_service.store.vehicles import get_vehicle

@@ -6,8 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from ground_service.http.model import Entity
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Entity, UtcTime
 
 LinkState = Literal["waiting", "connected", "contact", "failed"]
 ContactState = Literal["predicted", "open", "ended", "missed"]

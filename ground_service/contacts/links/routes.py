@@ -12,9 +12,8 @@ from ground_service.contacts.links import service
 from ground_service.contacts.links.core import NS
 from ground_service.contacts.links.model import Contacts, LinkStatus
 from ground_service.http.common import GroundOf
-from ground_service.http.model import PageOf
+from ground_service.http.model import GivenTime, PageOf
 from ground_service.http.requests import operations, problems
-from ground_service.http.times import GivenTime
 
 links = operations("links")
 

@@ -23,15 +23,15 @@ from ground_service.contacts.links.core import NS, PredictedContact
 from ground_service.contacts.links.model import Contacts, LinkContact, LinkState, LinkStatus
 from ground_service.contacts.links.store import ContactRow, LinkRow, TransmissionRow
 from ground_service.errors import Conflict, InvalidInput, NotFound
-from ground_service.events import ContactEnded, ContactMissed, ContactStarted, LinkChanged, publish
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 from ground_service.missions import store as missions
-from ground_service.missions.ephemerides import store as ephemerides
+from ground_service.missions.ephemerides import service
 from ground_service.missions.ephemerides.service import open_ephemeris
 from ground_service.missions.model import Link as LinkSection
 from ground_service.missions.model import StationConnection
 from ground_service.missions.places import outages_of, station_of
+from ground_service.store.event_kinds import ContactEnded, ContactMissed, ContactStarted, LinkChanged, publish
 from ground_service.store.vehicles import get_vehicle, vehicle_id
 from lunar.errors import LunarError
 
@@ -171,9 +171,7 @@ def predict(
     station = station_of(declared.stations, declared.link.station)
     if station is None:
         return (), "the mission description states no place of the station"
-    references = ground.read(
-        ephemerides.covering_ephemerides, start_utc_ns, stop_utc_ns, declared.spacecraft_id
-    )
+    references = ground.read(service.covering_ephemerides, start_utc_ns, stop_utc_ns, declared.spacecraft_id)
     if not references:
         return (), "no reference ephemeris covers the time"
     outages = outages_of(declared.stations)

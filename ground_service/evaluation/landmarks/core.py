@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ground_service.evaluation.detection.recall import ExpectedCraters, Matches
+from ground_service.evaluation.recall import ExpectedCraters, Matches
 from ground_service.passes.samples import DetectionSamples
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, above_horizon, intersect_sphere

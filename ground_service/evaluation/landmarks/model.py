@@ -6,9 +6,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from ground_service.http.model import Entity, Given, Paging, SpacecraftNumber
-from ground_service.http.times import UtcTime
-from ground_service.text import LINE_PATTERN_JSON
+from ground_service.http.model import Entity, Given, Paging, SpacecraftNumber, UtcTime
+from ground_service.toml import LINE_PATTERN_JSON
 
 LandmarkState = Literal["seen", "proposed", "accepted", "rejected"]
 

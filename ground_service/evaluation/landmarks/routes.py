@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import Response
 
 from ground_service.access.security import Operator, Viewer, add_list
-from ground_service.evaluation.landmarks import service, store
+from ground_service.evaluation.landmarks import service
 from ground_service.evaluation.landmarks.model import (
     LandmarkDecision,
     LandmarkDetail,
@@ -17,7 +17,7 @@ from ground_service.http.requests import operations, problems
 landmarks = operations("landmarks")
 
 
-add_list(landmarks, "/landmarks", store.list_landmarks)
+add_list(landmarks, "/landmarks", service.list_landmarks)
 
 
 @landmarks.get("/landmarks/{landmark_id}", responses=problems(404))

@@ -1,23 +1,25 @@
-"""Use cases of landmarks: those of a pass, decisions of persons, images of the sightings."""
+"""Use cases and documents of landmarks: those of a pass, decisions of persons, images of the sightings."""
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection
+from sqlalchemy import Connection, delete, func, select
 
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.contacts.commanding.store import sent_parts
-from ground_service.errors import EvaluationError, NotFound
+from ground_service.errors import EvaluationError, InvalidInput, NotFound
+from ground_service.evaluation.alignment import reference_states
 from ground_service.evaluation.core import PassInputs
-from ground_service.evaluation.detection.recall import expected_craters, match_detections
 from ground_service.evaluation.inputs import load_pass_inputs
-from ground_service.evaluation.landmarks import store
 from ground_service.evaluation.landmarks.core import (
     Frames,
     PassPlaces,
@@ -32,29 +34,132 @@ from ground_service.evaluation.landmarks.core import (
 from ground_service.evaluation.landmarks.model import (
     Landmark,
     LandmarkDetail,
+    LandmarkFilter,
     LandmarkUpdate,
     PassSightings,
     Sighting,
 )
-from ground_service.evaluation.navigation.alignment import reference_states
-from ground_service.events import LandmarkChanged, publish
+from ground_service.evaluation.recall import expected_craters, match_detections
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import PageOf, UtcTime
 from ground_service.missions.catalogues import listed_craters
 from ground_service.missions.service import mission_of_pass
 from ground_service.passes import store as passes
-from ground_service.passes.images import list_images
+from ground_service.passes.archive_import import list_images
 from ground_service.passes.sample_store import sample_arrays
 from ground_service.passes.samples import DetectionSamples
 from ground_service.passes.span import pass_span
-from ground_service.store.stored_files import files_beginning
-from ground_service.store.vehicles import get_vehicle
+from ground_service.store import repository
+from ground_service.store.event_kinds import LandmarkChanged, publish
+from ground_service.store.files import files_beginning
+from ground_service.store.states import LANDMARK, change_if, move
+from ground_service.store.vehicles import get_vehicle, lock_spacecraft
+from lunar.arrays import FloatArray
+from lunar.catalogue import CraterCatalogue, make_catalogue
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.dictionary.tables import table_hash, unpack_catalogue_table
+from tmtc.dictionary.tables import CatalogueTable, table_hash, unpack_catalogue_table
 from tmtc.errors import TmtcError
-from tmtc.packets.large_data import LargeDataReceiver
+from tmtc.packets.large_data import LargeDataReceiver, split
 from tmtc.packets.space_packets import TYPE_TELECOMMAND
 from tmtc.packets.stream import cut_packets
+
+_LANDMARKS, _VEHICLES = repository.LANDMARKS, repository.VEHICLES
+
+
+def lock_landmarks(connection: Connection, spacecraft_id: int) -> None:
+    """Keep other processes from changing the landmarks of a spacecraft until the transaction ends."""
+    query = select(func.min(_VEHICLES.c.id)).where(_VEHICLES.c.ccsds_id == spacecraft_id)
+    lock_spacecraft(connection, int(connection.execute(query).scalar_one()))
+
+
+def landmarks_of_spacecraft(connection: Connection, spacecraft_id: int) -> list[LandmarkDetail]:
+    """Return all landmarks of a spacecraft with their sightings, in the order in which they were found."""
+    query = select(_LANDMARKS).where(_LANDMARKS.c.spacecraft_id == spacecraft_id).order_by(_LANDMARKS.c.id)
+    return [LandmarkDetail.of(row) for row in connection.execute(query).mappings()]
+
+
+def select_landmark(connection: Connection, landmark_id: int) -> LandmarkDetail:
+    """Return a landmark with its sightings."""
+    return LandmarkDetail.of(repository.get(connection, _LANDMARKS, landmark_id, "landmark"))
+
+
+def list_landmarks(connection: Connection, asked: LandmarkFilter) -> PageOf[Landmark]:
+    """List the landmarks learned from flight, most passes first."""
+    query = select(*(one for one in _LANDMARKS.c if one.name != "evidence"))
+    order = (_LANDMARKS.c.passes.desc(), _LANDMARKS.c.sightings.desc(), _LANDMARKS.c.id)
+    rows, total = repository.page(connection, query, asked, *order)
+    return asked.page(map(Landmark.of, rows), total)
+
+
+def add_landmark(
+    connection: Connection,
+    spacecraft_id: int,
+    state: str,
+    evidence: Sequence[PassSightings],
+    now_utc_ns: int,
+    **figures: Any,
+) -> int:
+    """Add a landmark; return its id."""
+    values = {"created_utc_ns": now_utc_ns, "changed_utc_ns": now_utc_ns, **figures}
+    key = repository.add(
+        connection, _LANDMARKS, spacecraft_id=spacecraft_id, state=state, evidence=_rows(evidence), **values
+    )
+    return int(key)
+
+
+def change_landmark(
+    connection: Connection,
+    landmark_id: int,
+    found: str,
+    state: str,
+    evidence: Sequence[PassSightings],
+    now_utc_ns: int,
+    **figures: Any,
+) -> None:
+    """Replace the sightings of a landmark; one that was decided since it was found in a state stays decided."""
+    values = {"evidence": _rows(evidence), "changed_utc_ns": now_utc_ns, **figures}
+    if not change_if(connection, _LANDMARKS, landmark_id, {"state": found}, state=state, **values):
+        repository.change(connection, _LANDMARKS, landmark_id, **values)
+
+
+def delete_landmark(connection: Connection, landmark_id: int) -> None:
+    """Delete a landmark without sightings."""
+    connection.execute(delete(_LANDMARKS).where(_LANDMARKS.c.id == landmark_id))
+
+
+def set_decision(
+    connection: Connection, landmark_id: int, state: str, *, actor: str, reason: str, now_utc_ns: int
+) -> None:
+    """Accept or reject a landmark.
+
+    Raises
+    ------
+    StateConflict
+        It is not proposed, or decided in the same way already.
+    """
+    move(
+        connection,
+        LANDMARK,
+        landmark_id,
+        state,
+        decided_by=actor,
+        decided_utc_ns=now_utc_ns,
+        reason=reason,
+        changed_utc_ns=now_utc_ns,
+    )
+
+
+def count_proposed(connection: Connection, spacecraft_id: int) -> int:
+    """Return the number of landmarks that wait for a decision."""
+    query = select(func.count()).where(
+        _LANDMARKS.c.spacecraft_id == spacecraft_id, _LANDMARKS.c.state == "proposed"
+    )
+    return int(connection.execute(query).scalar_one())
+
+
+def _rows(evidence: Sequence[PassSightings]) -> list[dict[str, Any]]:
+    return [one.model_dump(mode="json") for one in evidence]
+
 
 DECIDED = ("accepted", "rejected")
 
@@ -78,9 +183,9 @@ def update_landmarks(ground: Ground, pass_id: int) -> LandmarkUpdate:
     found = replace(found, places=new)
     with ground.database.writing() as connection:
         spacecraft = get_vehicle(connection, record.vehicle_id).ccsds_id
-        store.lock_landmarks(connection, spacecraft)
+        lock_landmarks(connection, spacecraft)
         added = _entered(connection, spacecraft, pass_id, found, frames, inputs.detections)
-        proposed = store.count_proposed(connection, spacecraft)
+        proposed = count_proposed(connection, spacecraft)
         publish(connection, LandmarkChanged(spacecraft_id=spacecraft, pass_id=pass_id, proposed=proposed))
     east, north, _ = found.offset_m
     return LandmarkUpdate(
@@ -100,7 +205,7 @@ def update_landmarks(ground: Ground, pass_id: int) -> LandmarkUpdate:
 def get_landmark(ground: Ground, landmark_id: int) -> LandmarkDetail:
     """Return a landmark with its sightings and the addresses of their images."""
     with ground.database.reading() as connection:
-        landmark = store.get_landmark(connection, landmark_id)
+        landmark = select_landmark(connection, landmark_id)
     return landmark.model_copy(update={"evidence": [_with_images(ground, one) for one in landmark.evidence]})
 
 
@@ -119,11 +224,11 @@ def decide_landmark(
     state = "accepted" if accept else "rejected"
     with ground.database.writing() as connection:
         now = utc_now_ns()
-        store.decide_landmark(connection, landmark_id, state, actor=actor, reason=reason, now_utc_ns=now)
+        set_decision(connection, landmark_id, state, actor=actor, reason=reason, now_utc_ns=now)
         verb = "accept" if accept else "reject"
         audit(connection, actor, f"{verb} landmark", str(landmark_id), {"reason": reason})
-        decided = store.get_landmark(connection, landmark_id)
-        proposed = store.count_proposed(connection, decided.spacecraft_id)
+        decided = select_landmark(connection, landmark_id)
+        proposed = count_proposed(connection, decided.spacecraft_id)
         publish(
             connection,
             LandmarkChanged(spacecraft_id=decided.spacecraft_id, pass_id=None, proposed=proposed),
@@ -200,7 +305,7 @@ def _entered(
     """Replace what a pass says of the landmarks of its spacecraft; return the number of new ones."""
     now = utc_now_ns()
     left = list(found.places)
-    for landmark in store.landmarks_of_spacecraft(connection, spacecraft):
+    for landmark in landmarks_of_spacecraft(connection, spacecraft):
         others = [one for one in landmark.evidence if one.pass_id != pass_id]
         near = [place for place in left if same_place(place, place_of(landmark))]
         evidence = list(others)
@@ -215,12 +320,12 @@ def _entered(
                     _evidence(pass_id, _unseen(place_of(landmark), looks), found.controls, frames, detections)
                 )
         if not any(one.sightings for one in evidence) and landmark.state not in DECIDED:
-            store.delete_landmark(connection, landmark.id)
+            delete_landmark(connection, landmark.id)
         elif evidence != landmark.evidence:
             _changed(connection, landmark, sorted(evidence, key=lambda one: one.pass_id), now)
     for place in left:
         evidence = [_evidence(pass_id, place, found.controls, frames, detections)]
-        store.add_landmark(connection, spacecraft, "seen", evidence, now, **_figures(evidence))
+        add_landmark(connection, spacecraft, "seen", evidence, now, **_figures(evidence))
     return len(left)
 
 
@@ -233,7 +338,7 @@ def _changed(
     if state not in DECIDED:
         sightings, looks = sum(len(one.sightings) for one in seen), sum(one.looks for one in evidence)
         state = "proposed" if is_persistent(len(seen), sightings, looks) else "seen"
-    store.change_landmark(connection, landmark.id, landmark.state, state, evidence, now, **figures)
+    change_landmark(connection, landmark.id, landmark.state, state, evidence, now, **figures)
 
 
 def place_of(one: Landmark | PassSightings) -> Place:
@@ -326,3 +431,99 @@ def _with_images(ground: Ground, evidence: PassSightings) -> PassSightings:
         one.model_copy(update={"image": address.get(one.frame_number)}) for one in evidence.sightings
     ]
     return evidence.model_copy(update={"sightings": sightings})
+
+
+FIRST_ID = 2_000_000_000
+"""Learned craters have identities from here on; catalogues have lower ones, the map of the payload has higher ones."""
+
+PART_OCTETS = 16_000
+LABEL_COLUMNS = ("latitude_deg", "longitude_deg", "height_m", "diameter_m", "sightings", "looks", "score")
+LIMIT_SIGMA_M = 32_000.0
+
+
+def extended_catalogue(catalogue: CraterCatalogue, landmarks: Sequence[Landmark]) -> CraterCatalogue:
+    """Return a catalogue with the accepted landmarks; those that it has already are not added again."""
+    new = _new(catalogue.ids.tolist(), landmarks)
+    added = make_catalogue(
+        np.radians(_column(new, "latitude_deg")),
+        np.radians(_column(new, "longitude_deg")),
+        _column(new, "diameter_m"),
+        source=catalogue.source,
+        ids=np.array([FIRST_ID + one.id for one in new], dtype=np.int64),
+        rim_height_m=_column(new, "height_m"),
+        complete=True,
+    )
+    return replace(
+        catalogue,
+        ids=np.concatenate([catalogue.ids, added.ids]),
+        latitude_rad=np.concatenate([catalogue.latitude_rad, added.latitude_rad]),
+        longitude_rad=np.concatenate([catalogue.longitude_rad, added.longitude_rad]),
+        diameter_m=np.concatenate([catalogue.diameter_m, added.diameter_m]),
+        rim_height_m=np.concatenate([catalogue.rim_height_m, added.rim_height_m]),
+        depth_m=np.concatenate([catalogue.depth_m, added.depth_m]),
+        complete=np.concatenate([catalogue.complete, added.complete]),
+    )
+
+
+def extended_table(table: CatalogueTable, landmarks: Sequence[Landmark]) -> CatalogueTable:
+    """Return an anchoring table with the accepted landmarks and their uncertainties."""
+    new = _new(table.ids.tolist(), landmarks)
+    sigma = np.column_stack([_column(new, f"sigma_{axis}_m") for axis in ("east", "north", "up")])
+    return CatalogueTable(
+        np.concatenate([table.ids, np.array([FIRST_ID + one.id for one in new], dtype=np.int64)]),
+        np.concatenate([table.latitude_rad, np.radians(_column(new, "latitude_deg"))]),
+        np.concatenate([table.longitude_rad, np.radians(_column(new, "longitude_deg"))]),
+        np.concatenate([table.diameter_m, _column(new, "diameter_m")]),
+        np.concatenate([table.rim_height_m, _column(new, "height_m")]),
+        np.concatenate([table.sigma_m, np.minimum(sigma, LIMIT_SIGMA_M)]),
+    )
+
+
+def format_labels(landmarks: Sequence[Landmark]) -> str:
+    """Return CSV of accepted landmarks for `linna detector train --landmarks`."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(LABEL_COLUMNS)
+    for one in sorted(_accepted(landmarks), key=lambda found: found.id):
+        writer.writerow(
+            (
+                f"{one.latitude_deg:.6f}", f"{one.longitude_deg % 360.0:.6f}", f"{one.height_m:.0f}",
+                f"{one.diameter_m:.0f}", one.sightings, one.looks, f"{one.score:.3f}",
+            )
+        )  # fmt: skip
+    return buffer.getvalue()
+
+
+def upload_entries(octets: bytes, transaction: int) -> list[tuple[str, dict[str, object]]]:
+    """Return names and arguments of the telecommands (PUS 13) that upload an anchoring table."""
+    entries = []
+    for name, values in split(
+        octets, transaction=transaction, table="catalogue", part_length=PART_OCTETS, link="uplink"
+    ):
+        items = values["items"]
+        assert isinstance(items, dict)
+        entries.append((name, {**values, "items": [{"octet": octet} for octet in items["octet"].tolist()]}))
+    return entries
+
+
+def _accepted(landmarks: Sequence[Landmark]) -> list[Landmark]:
+    return [one for one in landmarks if one.state == "accepted"]
+
+
+def _new(ids: Sequence[int], landmarks: Sequence[Landmark]) -> list[Landmark]:
+    """Return the accepted landmarks that a catalogue with these identities lacks.
+
+    Raises
+    ------
+    InvalidInput
+        No landmark is accepted.
+    """
+    accepted = _accepted(landmarks)
+    if not accepted:
+        raise InvalidInput("landmarks", "", "accepted landmarks", f"none among {len(landmarks)}")
+    known = set(ids)
+    return [one for one in sorted(accepted, key=lambda found: found.id) if FIRST_ID + one.id not in known]
+
+
+def _column(landmarks: Sequence[Landmark], name: str) -> FloatArray:
+    return np.array([getattr(one, name) for one in landmarks], dtype=np.float64)

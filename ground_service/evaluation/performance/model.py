@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from ground_service.http.model import Entity, Paging, SpacecraftNumber
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Entity, Paging, SpacecraftNumber, UtcTime
 
 
 class PassPerformance(Entity):

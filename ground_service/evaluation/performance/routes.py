@@ -7,12 +7,11 @@ from typing import Annotated, Literal
 from fastapi import Path, Query, Response
 
 from ground_service.access.security import Operator, Viewer, add_list
-from ground_service.evaluation.performance import service, store
+from ground_service.evaluation.performance import service
 from ground_service.evaluation.performance.model import MonthlyReport, Performance
 from ground_service.http.common import GroundOf, Key
-from ground_service.http.model import InstanceName
+from ground_service.http.model import GivenTime, InstanceName, ns_of
 from ground_service.http.requests import operations
-from ground_service.http.times import GivenTime, ns_of
 from ground_service.store.vehicles import FLOWN
 
 REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}
@@ -57,7 +56,7 @@ def add_monthly_report(
     return service.make_monthly_report(ground, spacecraft_id, month, instance=instance)
 
 
-add_list(reports, "/monthly-reports", store.list_monthly_reports)
+add_list(reports, "/monthly-reports", service.list_monthly_reports)
 
 
 @reports.get(
@@ -69,6 +68,6 @@ def get_monthly_report(
     ground: GroundOf, _: Viewer, report_id: Key, format: Literal["html", "pdf", "json"] = "html"
 ) -> Response:
     """Return a monthly report as HTML, PDF or JSON."""
-    sha256 = str(getattr(ground.read(store.get_monthly_report, report_id), f"{format}_sha256"))
+    sha256 = str(getattr(ground.read(service.get_monthly_report, report_id), f"{format}_sha256"))
     media = REPORT_MEDIA[format] + ("; charset=utf-8" if format == "html" else "")
     return Response(ground.files.get(sha256), media_type=media)

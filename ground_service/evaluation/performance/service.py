@@ -8,12 +8,14 @@ import logging
 import math
 import re
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import fields
+from typing import Any, TypeVar
+
+from sqlalchemy import Connection, func, select
 
 from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.errors import DatabaseBusy, InvalidInput, NotFound, Stopping, fault_of
 from ground_service.evaluation.model import PassFigures, StoredReport
-from ground_service.evaluation.performance import store
 from ground_service.evaluation.performance.core import (
     ALTITUDE_EDGES_KM,
     FALSE_ALARM_RATE,
@@ -26,23 +28,196 @@ from ground_service.evaluation.performance.core import (
     rolling_counts,
     wilson,
 )
-from ground_service.evaluation.performance.documents import monthly_value
 from ground_service.evaluation.performance.model import (
     ChangePoint,
     GroupFigures,
     MonthlyReport,
+    MonthlyReportFilter,
     PassPerformance,
     Performance,
     RollingRequirement,
     StoredMonthlyReport,
 )
-from ground_service.evaluation.report_overview import PREFERRED_ESTIMATORS
+from ground_service.evaluation.service import PREFERRED_ESTIMATORS
+from ground_service.evaluation.store import newest_reports
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Entity, PageOf, UtcTime
 from ground_service.passes.model import PassRecord
-from ground_service.store.stored_files import register_file
+from ground_service.store import repository
+from ground_service.store.files import register_file
 from ground_service.store.vehicles import FLOWN, get_vehicle
 from lunar.timescales import format_utc, parse_utc
+from reports.values import (
+    HeadlineFigure,
+    LevelChange,
+    MeanByGroup,
+    MonthlyReportValue,
+    MonthPass,
+    RequirementOverTime,
+)
+
+_PASSES, _VEHICLES = repository.PASSES, repository.VEHICLES
+_MONTHLY = repository.MONTHLY_REPORTS
+_BLOCK = 500
+PASSES_LIMIT = 5000
+"""Largest number of passes in a span."""
+
+
+def reported_passes(
+    connection: Connection,
+    spacecraft_id: int,
+    instance: str | None,
+    start_utc_ns: int | None,
+    stop_utc_ns: int | None,
+) -> tuple[list[tuple[PassRecord, StoredReport]], int]:
+    """Return the passes of a spacecraft that begin in a span and have a report, with the newest one, by time.
+
+    The second value is the number of all passes in the span.
+
+    Raises
+    ------
+    InvalidInput
+        There are too many passes in the span.
+    """
+    query = (
+        select(_PASSES)
+        .join(_VEHICLES, _VEHICLES.c.id == _PASSES.c.vehicle_id)
+        .where(_VEHICLES.c.ccsds_id == spacecraft_id)
+        .order_by(_PASSES.c.start_utc_ns, _PASSES.c.id)
+    )
+    if instance is not None:
+        query = query.where(_VEHICLES.c.instance == instance)
+    if start_utc_ns is not None:
+        query = query.where(_PASSES.c.start_utc_ns >= start_utc_ns)
+    if stop_utc_ns is not None:
+        query = query.where(_PASSES.c.start_utc_ns < stop_utc_ns)
+    total = int(connection.execute(select(func.count()).select_from(query.subquery())).scalar_one())
+    if total > PASSES_LIMIT:
+        expected = f"at most {PASSES_LIMIT} passes in the span from start to stop"
+        raise InvalidInput(f"performance of spacecraft {spacecraft_id}", "", expected, f"{total} passes")
+    records = [PassRecord.of(row) for row in connection.execute(query).mappings()]
+    reports: dict[int, StoredReport] = {}
+    for first in range(0, len(records), _BLOCK):
+        ids = [one.id for one in records[first : first + _BLOCK]]
+        reports |= {one.pass_id: one for one in newest_reports(connection, ids)}
+    return [(one, reports[one.id]) for one in records if one.id in reports], total
+
+
+def spacecraft_with_passes(connection: Connection, instance: str) -> list[int]:
+    """Return the spacecraft that have passes in an instance."""
+    query = select(_VEHICLES.c.ccsds_id).join(_PASSES, _PASSES.c.vehicle_id == _VEHICLES.c.id).distinct()
+    query = query.where(_VEHICLES.c.instance == instance)
+    return [int(one) for one in connection.execute(query.order_by(_VEHICLES.c.ccsds_id)).scalars()]
+
+
+def add_monthly_report(connection: Connection, report: StoredMonthlyReport) -> bool:
+    """Add a monthly report; return False if one with this id exists."""
+    values = report.model_dump(exclude={"created"})
+    added = repository.add_new(connection, _MONTHLY, **values, created_utc_ns=report.created.utc_ns)
+    return added is not None
+
+
+def get_monthly_report(connection: Connection, report_id: str) -> StoredMonthlyReport:
+    """Return a monthly report."""
+    return StoredMonthlyReport.of(repository.get(connection, _MONTHLY, report_id, "monthly report"))
+
+
+def list_monthly_reports(connection: Connection, asked: MonthlyReportFilter) -> PageOf[MonthlyReport]:
+    """List the monthly reports, newest month first."""
+    order = (_MONTHLY.c.month.desc(), _MONTHLY.c.created_utc_ns.desc(), _MONTHLY.c.id)
+    rows, total = repository.page(connection, select(_MONTHLY), asked, *order)
+    return asked.page((_shown(StoredMonthlyReport.of(row)) for row in rows), total)
+
+
+def _shown(report: StoredMonthlyReport) -> MonthlyReport:
+    return MonthlyReport.model_validate(report.model_dump(include=set(MonthlyReport.model_fields)))
+
+
+Value = TypeVar("Value", MonthPass, MeanByGroup, LevelChange, RequirementOverTime)
+
+
+def monthly_value(found: Performance, month: str) -> MonthlyReportValue:
+    """Return the report of a month as a value; it follows from the performance alone."""
+    verdict, level = _verdict(found)
+    if found.changes:
+        count = len(found.changes)
+        verdict += f"; {count} {'change' if count == 1 else 'changes'} of level"
+    levels = sorted({one.terrain for one in found.passes})
+    return MonthlyReportValue(
+        title=f"Spacecraft {found.spacecraft_id} ({found.instance or 'all instances'}), {month}",
+        month=month,
+        verdict=verdict,
+        verdict_level=level,
+        evidence_level=levels[0] if len(levels) == 1 else "",
+        headline=_headline(found),
+        passes=tuple(
+            _value(MonthPass, one, start_utc_ns=one.start.utc_ns, estimator=one.estimator or "")
+            for one in found.passes
+        ),
+        groups=tuple(_value(MeanByGroup, one) for one in found.groups),
+        changes=tuple(_value(LevelChange, one, utc_ns=one.time.utc_ns) for one in found.changes),
+        requirements=tuple(_value(RequirementOverTime, one, limit=one.limit) for one in found.requirements),
+        window_days=found.window_days,
+        false_alarm_rate=found.false_alarm_rate,
+        provenance={
+            "reports": f"{_coverage(found)}; the newest report of each",
+            "evidence levels": "; ".join(one or "not stated" for one in levels),
+        },
+        not_available={"data_sources": "stated in the reports of the passes"},
+    )
+
+
+def _verdict(found: Performance) -> tuple[str, str]:
+    """Return verdict and level; "met" only if every pass is judged on every requirement with a limit."""
+    failed = sum(one.not_met > 0 for one in found.requirements)
+    judged = [one for one in found.requirements if one.met + one.not_met]
+    unknown = [one for one in found.requirements if one.limit is not None and one.unknown]
+    missing = found.passes_in_span - len(found.passes)
+    if failed:
+        verdict, level = f"requirements not met in every pass: {failed} of {len(judged)} judged", "not met"
+    elif judged and not unknown and not missing:
+        verdict, level = f"requirements met in every pass: {len(judged)} of {len(judged)} judged", "met"
+    else:
+        verdict, level = (
+            f"requirements judged: {len(judged)} of {len(found.requirements)}, none missed",
+            "unknown",
+        )
+    if unknown:
+        worst = max(unknown, key=lambda one: one.unknown)
+        verdict += f"; {worst.name} not judged on {worst.unknown} of {worst.passes} passes"
+    if len(unknown) > 1:
+        verdict += f", {len(unknown) - 1} more not judged on every pass"
+    if missing:
+        verdict += f"; {_coverage(found)}"
+    return verdict, level
+
+
+def _coverage(found: Performance) -> str:
+    return f"{len(found.passes)} of {found.passes_in_span} passes have a report"
+
+
+def _headline(found: Performance) -> tuple[HeadlineFigure, ...]:
+    def mean(name: str) -> float | None:
+        known = [float(value) for one in found.passes if (value := getattr(one, name)) is not None]
+        return sum(known) / len(known) if known else None
+
+    recall = mean("recall")
+    return (
+        HeadlineFigure("Passes", len(found.passes)),
+        HeadlineFigure("Packets lost", sum(one.packets_lost for one in found.passes)),
+        HeadlineFigure("Recall", None if recall is None else 100.0 * recall, "%", "mean of the passes"),
+        HeadlineFigure("Drift", mean("drift_percent"), "% of path", "mean of the passes"),
+        HeadlineFigure("Median error", mean("median_error_m"), "m", "mean of the passes"),
+    )
+
+
+def _value(kind: type[Value], entity: Entity, **values: Any) -> Value:
+    """Return the fields of an entity as a value of a report, NaN where unknown; `values` replace them."""
+    names = (one.name for one in fields(kind))
+    found = {name: values[name] if name in values else getattr(entity, name) for name in names}
+    unknown = {name: math.nan for name, value in found.items() if value is None and name not in values}
+    return kind(**found | unknown)
+
 
 WINDOW_DAYS = 7.0
 DAY_NS = 86_400_000_000_000
@@ -78,9 +253,9 @@ def performance(
         There are too many passes in the span.
     """
     with ground.database.reading() as connection:
-        if instance is None and spacecraft_id in store.spacecraft_with_passes(connection, FLOWN):
+        if instance is None and spacecraft_id in spacecraft_with_passes(connection, FLOWN):
             instance = FLOWN
-        stored, total = store.reported_passes(connection, spacecraft_id, instance, start_utc_ns, stop_utc_ns)
+        stored, total = reported_passes(connection, spacecraft_id, instance, start_utc_ns, stop_utc_ns)
     found = [(record, report, PassFigures.model_validate(report.summary)) for record, report in stored]
     passes = [_pass_performance(*one) for one in found]
     return Performance(
@@ -261,7 +436,7 @@ def _keep_monthly_report(ground: Ground, found: Performance, instance: str, mont
     identity = hashlib.blake2b(said + data, digest_size=16).hexdigest()
     with ground.database.reading() as connection:
         try:
-            return _entity(store.get_monthly_report(connection, identity))
+            return _entity(get_monthly_report(connection, identity))
         except NotFound:
             pass
     page, printed = render_pages(value)
@@ -285,8 +460,8 @@ def _keep_monthly_report(ground: Ground, found: Performance, instance: str, mont
             pdf_sha256=stored["pdf"].sha256,
             json_sha256=stored["json"].sha256,
         )
-        store.add_monthly_report(connection, report)
-        return _entity(store.get_monthly_report(connection, identity))
+        add_monthly_report(connection, report)
+        return _entity(get_monthly_report(connection, identity))
 
 
 def make_due_report(ground: Ground, spacecraft_id: int, instance: str = FLOWN) -> MonthlyReport | None:
@@ -304,7 +479,7 @@ def make_due_reports(ground: Ground) -> tuple[list[dict[str, Any]], list[int]]:
 
     The first value has the reports. The second has the spacecraft whose report failed; the log states why.
     """
-    spacecraft = ground.read(store.spacecraft_with_passes, FLOWN)
+    spacecraft = ground.read(spacecraft_with_passes, FLOWN)
     made: list[dict[str, Any]] = []
     failed = []
     for one in spacecraft:

@@ -9,7 +9,7 @@ from fastapi import Query, Response
 from ground_service.access.security import Operator, UploadOf, add_list
 from ground_service.http.common import API_PREFIX, GroundOf, Name, RowId, upload_body
 from ground_service.http.requests import operations, problems
-from ground_service.missions.ephemerides import service, store
+from ground_service.missions.ephemerides import service
 from ground_service.missions.ephemerides.model import Ephemeris
 
 EPHEMERIS_FILE = "CCSDS OEM (text or XML), STK .e or Horizons CSV file; also as .gz or .zip"
@@ -41,7 +41,7 @@ async def add_ephemeris(
     return await upload.run(add)
 
 
-add_list(ephemerides, "/ephemerides", store.list_ephemerides)
+add_list(ephemerides, "/ephemerides", service.list_ephemerides)
 
 
 @ephemerides.delete("/ephemerides/{ephemeris_id}", status_code=204, responses=problems(404))

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from ground_service.http.model import Entity, Given
-from ground_service.http.times import GivenTime, UtcTime
+from ground_service.http.model import Entity, Given, GivenTime, UtcTime
 
 RECEPTIONS_LIMIT = 100_000
 """Largest number of reception times of time reports of a vehicle."""

@@ -1,4 +1,4 @@
-"""Time correlations that keep themselves: from the time reports in the archive and the times of their reception.
+"""Automatic time correlation from archived time reports and the times of their reception.
 
 What is fitted depends on the time reports, receptions, boots and reference ephemerides that are there, not on the order
 in which they came. Fitting again without anything new changes nothing.
@@ -19,20 +19,12 @@ from sqlalchemy import Connection
 
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
-from ground_service.errors import InvalidInput
-from ground_service.events import (
-    ClockDoubted,
-    CorrelationChanged,
-    ReceptionsEntered,
-    publish,
-    publish_once,
-)
+from ground_service.errors import Conflict, InvalidInput
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime, time_of
+from ground_service.http.model import UtcTime, time_of
 from ground_service.missions.ephemerides.model import Ephemeris
-from ground_service.missions.ephemerides.store import covering_ephemerides
+from ground_service.missions.ephemerides.service import covering_ephemerides
 from ground_service.missions.places import stations_of
-from ground_service.missions.stations import STATIONS
 from ground_service.missions.store import mission_of_vehicle
 from ground_service.missions.timekeeping import store
 from ground_service.missions.timekeeping.core import (
@@ -44,7 +36,14 @@ from ground_service.missions.timekeeping.core import (
     utc_ns_of_ticks,
 )
 from ground_service.missions.timekeeping.model import RECEPTIONS_LIMIT, Correlation, TimeReport
-from ground_service.store.vehicles import get_vehicle, lock_vehicle, vehicle_id
+from ground_service.store.event_kinds import (
+    ClockDoubted,
+    CorrelationChanged,
+    ReceptionsEntered,
+    publish,
+    publish_once,
+)
+from ground_service.store.vehicles import find_vehicle, get_vehicle, lock_vehicle, vehicle_id
 from lunar.arrays import BoolArray, IntArray
 from lunar.constants import SPEED_OF_LIGHT_M_S
 from lunar.ephemeris import Ephemeris as States
@@ -53,7 +52,7 @@ from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.plausible import CORRELATION_RMS_NS
 from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import tai_ns_from_utc_ns, tdb_s_from_utc_ns
-from lunar.visibility import GroundStation, link
+from lunar.visibility import DSN_STATIONS, GroundStation, link
 
 AUTOMATIC = "time reports, light time"
 """Method of correlations that are fitted again by themselves."""
@@ -102,7 +101,7 @@ def received_reports(given: Sequence[Mapping[str, Any]]) -> list[ReceivedReport]
     InvalidInput
         If a value is missing or cannot be read, or a station is not known.
     """
-    known = {station.name.lower(): station.name for station in STATIONS}
+    known = {station.name.lower(): station.name for station in DSN_STATIONS}
     reports = []
     for number, one in enumerate(given):
         place = f"receptions.{number}"
@@ -306,7 +305,7 @@ def _light_time_ns(
     if len(earth_utc_ns) == 0:
         return np.zeros(0, dtype=np.int64)
     light_s = np.full(len(earth_utc_ns), np.nan)
-    known = {station.name: station for station in STATIONS}
+    known = {station.name: station for station in DSN_STATIONS}
     mission = mission_of_vehicle(connection, vehicle)
     if mission is not None:
         known |= {station.name: station for station in stations_of(mission.link)}
@@ -351,3 +350,103 @@ def _light_times_s(
 @functools.lru_cache(maxsize=2)
 def _load(path: Path) -> States:
     return load_ephemeris(path)
+
+
+MANUAL = "least squares of time reports"
+"""Method of correlations that an operator entered."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimePoint:
+    """A time report as received: what the clock showed, when that reached the Earth, the light time, the boot."""
+
+    ticks: int
+    earth_utc_ns: int
+    light_time_ns: int
+    boot_count: int = 0
+
+
+def correlate(
+    ground: Ground, vehicle: int, points: Sequence[TimePoint], *, actor: str = "local"
+) -> list[CorrelationFit]:
+    """Fit a correlation for every boot among the points; they replace those in force, which stay on record.
+
+    Raises
+    ------
+    InvalidInput
+        If there are no points.
+    """
+    if not points:
+        raise InvalidInput("time correlation", "points", "at least one time report", "none")
+    fits: dict[int, CorrelationFit] = {}
+    for boot in sorted({point.boot_count for point in points}):
+        mine = [point for point in points if point.boot_count == boot]
+        fits[boot] = fit_correlation(
+            np.array([point.ticks for point in mine], dtype=np.int64),
+            np.array([point.earth_utc_ns for point in mine], dtype=np.int64),
+            np.array([point.light_time_ns for point in mine], dtype=np.int64),
+        )
+    with ground.database.writing() as connection:
+        lock_vehicle(connection, vehicle)
+        store.replace_correlations(connection, vehicle, fits.items(), method=MANUAL, now_utc_ns=utc_now_ns())
+        audit(connection, actor, "correlate time", str(vehicle), {"boots": len(fits), "points": len(points)})
+        publish(connection, CorrelationChanged(vehicle_id=vehicle, segments=len(fits)))
+    return list(fits.values())
+
+
+def correlate_spacecraft(
+    ground: Ground, spacecraft_id: int, instance: str, points: Sequence[TimePoint], *, actor: str
+) -> list[Correlation]:
+    """As `correlate`, of a spacecraft by its number; the correlations now in force."""
+    vehicle = _vehicle(ground, spacecraft_id, instance)
+    correlate(ground, vehicle, points, actor=actor)
+    return [one for one in ground.read(store.correlations_on_record, vehicle) if one.in_force]
+
+
+def spacecraft_correlations(ground: Ground, spacecraft_id: int, instance: str) -> list[Correlation]:
+    """All correlations that a spacecraft ever had, the newest first."""
+    return ground.read(store.correlations_on_record, _vehicle(ground, spacecraft_id, instance))
+
+
+def correlate_again(ground: Ground, spacecraft_id: int, instance: str, *, actor: str) -> list[Correlation]:
+    """Correlate a spacecraft from its received time reports, also over what was entered; the correlations in force."""
+    vehicle = _vehicle(ground, spacecraft_id, instance)
+    if recorrelate(ground, vehicle, over_manual=True):
+        ground.write(audit, actor, "correlate time", str(vehicle), {"from": "time reports"})
+    return ground.read(store.correlations_in_force, vehicle)
+
+
+def withdraw_correlations(
+    ground: Ground, spacecraft_id: int, instance: str, *, actor: str
+) -> list[Correlation]:
+    """Withdraw the correlations in force that a person entered, and correlate again; the correlations then in force.
+
+    The withdrawn ones stay on record.
+
+    Raises
+    ------
+    Conflict
+        None in force was entered by a person.
+    """
+    vehicle = _vehicle(ground, spacecraft_id, instance)
+    with ground.database.writing() as connection:
+        lock_vehicle(connection, vehicle)
+        entered = [one.id for one in store.correlations_in_force(connection, vehicle) if one.method == MANUAL]
+        if not entered:
+            raise Conflict(
+                f"spacecraft {spacecraft_id}: expected correlations in force that a person entered, found none"
+            )
+        store.replace_correlations(connection, vehicle, (), method=MANUAL, now_utc_ns=utc_now_ns())
+        audit(connection, actor, "withdraw correlations", str(vehicle), {"ids": entered})
+        publish(connection, CorrelationChanged(vehicle_id=vehicle, segments=0))
+    recorrelate(ground, vehicle)
+    return ground.read(store.correlations_in_force, vehicle)
+
+
+def spacecraft_time_reports(ground: Ground, spacecraft_id: int, instance: str) -> list[TimeReport]:
+    """The received time reports of a spacecraft with what the correlations in force leave of them."""
+    return residuals(ground, _vehicle(ground, spacecraft_id, instance))
+
+
+def _vehicle(ground: Ground, spacecraft_id: int, instance: str) -> int:
+    return ground.read(find_vehicle, spacecraft_id, instance).id

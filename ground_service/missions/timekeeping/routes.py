@@ -6,13 +6,14 @@ from ground_service.access.security import Operator, Viewer
 from ground_service.http.common import GroundOf, Instance, SpacecraftId
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations, problems
-from ground_service.missions.timekeeping import service
+from ground_service.missions.timekeeping import recorrelation
 from ground_service.missions.timekeeping.model import Correlation, Receptions, TimePoints, TimeReport
-from ground_service.missions.timekeeping.recorrelation import enter_receptions, received_reports
-from ground_service.missions.timekeeping.service import (
+from ground_service.missions.timekeeping.recorrelation import (
     TimePoint,
     correlate_again,
     correlate_spacecraft,
+    enter_receptions,
+    received_reports,
     spacecraft_correlations,
     spacecraft_time_reports,
 )
@@ -53,7 +54,7 @@ def withdraw_correlations(
 
     The withdrawn ones stay in the list.
     """
-    found = service.withdraw_correlations(ground, spacecraft_id, instance, actor=caller.name)
+    found = recorrelation.withdraw_correlations(ground, spacecraft_id, instance, actor=caller.name)
     return PageOf.all_of(found)
 
 

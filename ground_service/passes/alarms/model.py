@@ -6,8 +6,15 @@ from typing import Literal
 
 from pydantic import Field
 
-from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber
-from ground_service.http.times import GivenTime, UtcTime
+from ground_service.http.model import (
+    Entity,
+    Given,
+    GivenTime,
+    InstanceName,
+    Paging,
+    SpacecraftNumber,
+    UtcTime,
+)
 
 AlarmState = Literal["raised", "acknowledged", "cleared", "shelved"]
 Severity = Literal["warning", "alarm"]

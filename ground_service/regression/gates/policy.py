@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from ground_service.errors import InvalidInput, storage_error
 from ground_service.regression.gates.core import EXACT_METRICS, GatePolicy, GateRule
-from ground_service.regression.gates.faults import FRAMES, TIMES, UNDECODABLE
+from ground_service.regression.gates.metrics import FRAMES, TIMES, UNDECODABLE
 from ground_service.toml import parse_table, read_table
 
 SHIPPED = {"ci": Path(__file__).with_name("ci.toml")}

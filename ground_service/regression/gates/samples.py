@@ -8,19 +8,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ground_service.evaluation.detection.recall import (
-    SCORED_CLASSES,
-    ExpectedCraters,
-    expected_craters,
-    match_detections,
-)
-from ground_service.evaluation.detection.viewing import Viewing
-from ground_service.evaluation.navigation.alignment import (
+from ground_service.evaluation.alignment import (
     ReferenceStates,
     error_of_places_rtn_m,
     reference_states,
+    squared_normalised_errors,
 )
-from ground_service.evaluation.navigation.consistency import squared_normalised_errors
+from ground_service.evaluation.recall import (
+    SCORED_CLASSES,
+    ExpectedCraters,
+    Viewing,
+    expected_craters,
+    match_detections,
+)
 from ground_service.passes.samples import DetectionSamples, NavigationSamples
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf

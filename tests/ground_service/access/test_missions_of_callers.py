@@ -15,7 +15,10 @@ from ground_service.access.scopes import DECIDED, ROWS, Scope, check_scope, scop
 from ground_service.access.service import Caller, add_token, add_user, authenticate, change_user
 from ground_service.app import create_app
 from ground_service.errors import Forbidden
-from ground_service.events import (
+from ground_service.missions.service import add_mission
+from ground_service.settings import Settings
+from ground_service.store import repository
+from ground_service.store.event_kinds import (
     CommandStateChanged,
     CorrelationChanged,
     Event,
@@ -26,9 +29,6 @@ from ground_service.events import (
     WindowChanged,
     publish,
 )
-from ground_service.missions.service import add_mission
-from ground_service.settings import Settings
-from ground_service.store import repository
 from ground_service.store.events import LoggedEvent
 from ground_service.store.models import METADATA
 from ground_service.web.sockets import event_owner

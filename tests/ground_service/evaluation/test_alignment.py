@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from ground_service.evaluation.navigation.alignment import (
+from ground_service.evaluation.alignment import (
     ReferenceStates,
     angle_from_meridian_deg,
     error_of_places_rtn_m,

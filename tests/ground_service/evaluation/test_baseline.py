@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from ground_service.evaluation.navigation.baselines import BASELINE_DEGREE, StartState, propagated_positions
+from ground_service.evaluation.smoother import BASELINE_DEGREE, StartState, propagated_positions
 from lunar.errors import ImpactError
 from lunar.gravity import GravityField
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m

@@ -7,20 +7,18 @@ import math
 import numpy as np
 import pytest
 
-from ground_service.evaluation.detection.fixes import (
-    IdentificationSamples,
-    Pairs,
-    join_pairs,
-    snapshot_positions,
-    wrong_fixes,
-)
-from ground_service.evaluation.detection.landmarks import (
+from ground_service.evaluation.fixes import (
     FIRST_LANDMARK_ID,
+    IdentificationSamples,
     MappedCraters,
+    Pairs,
     compare_map,
+    join_pairs,
     latest,
     mapped_craters,
     payload_map,
+    snapshot_positions,
+    wrong_fixes,
 )
 from ground_service.passes.samples import DetectionSamples
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from ground_service.errors import EvaluationError, InvalidInput
-from ground_service.evaluation.detection.viewing import Viewing
 from ground_service.evaluation.inputs import load_pass_inputs, orientation_of
+from ground_service.evaluation.recall import Viewing
 from ground_service.evaluation.service import evaluate
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions import frames as declared
-from ground_service.missions.ephemerides.attitudes import HEADER, load_attitudes
+from ground_service.missions.ephemerides.service import HEADER, load_attitudes
 from ground_service.missions.frames import camera_of, declared_frames
 from ground_service.missions.model import Camera, Frames, Mission
 from ground_service.missions.service import add_mission

@@ -15,12 +15,10 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ground_service.evaluation.core import PassInputs, _imaging_arcs, _joined, evaluate_pass, summary_of
-from ground_service.evaluation.detection.fixes import IdentificationSamples
-from ground_service.evaluation.detection.landmarks import MappedCraters
-from ground_service.evaluation.detection.viewing import Viewing
+from ground_service.evaluation.fixes import IdentificationSamples, MappedCraters
 from ground_service.evaluation.model import PassFigures
-from ground_service.evaluation.navigation.baselines import StartState
-from ground_service.evaluation.navigation.smoother import ONBOARD, FilterStates
+from ground_service.evaluation.recall import Viewing
+from ground_service.evaluation.smoother import ONBOARD, FilterStates, StartState
 from ground_service.evaluation.verdict import Limits
 from ground_service.passes.samples import DetectionSamples, NavigationSamples, OutcomeSamples, no_detections
 from lunar.camera import PinholeCamera

@@ -18,26 +18,22 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from ground_service.errors import InvalidInput
-from ground_service.evaluation.core import WORST_FRAMES, _choose_frames, attitude_remarks
-from ground_service.evaluation.detection.fixes import Pairs, snapshot_positions, wrong_fixes
-from ground_service.evaluation.detection.recall import ExpectedCraters, Matches, expected_craters
-from ground_service.evaluation.detection.viewing import Viewing
-from ground_service.evaluation.extras import dark_limit, with_terrain
-from ground_service.evaluation.navigation.consistency import (
+from ground_service.evaluation.alignment import (
     bounds,
     bounds_per_degree,
-    independent_samples,
-    nees,
-    squared_normalised_errors,
-)
-from ground_service.evaluation.navigation.drift import (
     drift_by_length,
     drift_percent,
     error_before_reset_m,
+    format_tum,
+    independent_samples,
     navigation_statistics,
+    nees,
+    squared_normalised_errors,
 )
-from ground_service.evaluation.navigation.trajectory import format_tum
-from ground_service.evaluation.surface import surface_map
+from ground_service.evaluation.core import WORST_FRAMES, _choose_frames, attitude_remarks
+from ground_service.evaluation.extras import dark_limit, surface_map, with_terrain
+from ground_service.evaluation.fixes import Pairs, snapshot_positions, wrong_fixes
+from ground_service.evaluation.recall import ExpectedCraters, Matches, Viewing, expected_craters
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import find_data
 from lunar.frames import quaternion_from_matrix
@@ -138,7 +134,7 @@ def test_the_worst_frames_are_chosen_from_all_frames_and_not_from_those_with_an_
         images={0: None, 10: None, 39: None},
     )
     matches = Matches(np.zeros(0, dtype=np.int64), found.ravel())
-    spread, worst = _choose_frames(cast(Any, inputs), expected, matches)
+    spread, worst = _choose_frames(cast("Any", inputs), expected, matches)
     assert spread == [0, 10, 39]
     assert worst == list(range(20, 20 + WORST_FRAMES))
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service.evaluation.detection.recall import (
+from ground_service.evaluation.recall import (
     ExpectedCraters,
     Matches,
     expected_craters,

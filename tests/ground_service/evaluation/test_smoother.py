@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ground_service.errors import EvaluationError
-from ground_service.evaluation.navigation.smoothed_series import smoother_model
-from ground_service.evaluation.navigation.smoother import (
+from ground_service.evaluation.smoother import (
     ONBOARD,
     CommandedBurn,
     FilterStates,
@@ -15,6 +14,7 @@ from ground_service.evaluation.navigation.smoother import (
     _carried,
     _legs,
     smooth,
+    smoother_model,
 )
 from lunar.frames import ICRF, IauOrientation, rtn_from_inertial
 from lunar.gravity import GravityField, builtin_gravity

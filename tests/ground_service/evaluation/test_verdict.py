@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from ground_service.evaluation.navigation.reference_error import error_budget, reference_covariance_m2
+from ground_service.evaluation.alignment import error_budget, reference_covariance_m2
 from ground_service.evaluation.verdict import (
     Evaluated,
     Limits,

@@ -29,10 +29,8 @@ from ground_service.client import ServiceProblem
 from ground_service.client.local import local_client
 from ground_service.errors import EvaluationError, FileDamaged, NotFound
 from ground_service.exports import service
-from ground_service.exports.formats import FORMATS
-from ground_service.exports.layers import Feature, Layer, cut_line, cut_ring
-from ground_service.exports.maps import format_geojson, geopackage_octets
-from ground_service.exports.model import ExportRequest
+from ground_service.exports.maps import Feature, Layer, cut_line, cut_ring, format_geojson, geopackage_octets
+from ground_service.exports.model import FORMATS, ExportRequest
 from ground_service.exports.service import export_pass, list_formats
 from ground_service.ground import Ground, open_ground
 from ground_service.missions import frames as declared

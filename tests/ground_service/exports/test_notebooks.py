@@ -18,7 +18,7 @@ import linna
 from ground_service.access.service import add_user
 from ground_service.app import create_app
 from ground_service.ground import Ground
-from ground_service.passes.archive_zip import zip_folder
+from ground_service.passes.archive_import import zip_folder
 from ground_service.settings import Settings
 from linna.errors import UsageError
 from linna.passes import Archive

@@ -19,7 +19,7 @@ from fastapi.routing import APIRoute
 from pydantic import BaseModel
 from starlette.requests import ClientDisconnect
 
-from ground_service import tracing
+from ground_service import logs
 from ground_service.app import create_app
 from ground_service.errors import DatabaseUnavailable, FileDamaged, StorageFull, StorageReadOnly
 from ground_service.ground import open_ground
@@ -277,8 +277,8 @@ def test_a_log_entry_is_one_json_object_with_what_was_passed() -> None:
         )
     record.job = "7"
     assert "trace_id" not in json.loads(JsonFormatter().format(record))
-    with tracing.span("request"):
-        line, trace_id = JsonFormatter().format(record), tracing.trace_id()
+    with logs.span("request"):
+        line, trace_id = JsonFormatter().format(record), logs.trace_id()
     assert "\n" not in line and trace_id is not None
     entry = json.loads(line)
     assert (entry["level"], entry["message"], entry["job"]) == ("error", "job 7\nfailed", "7")

@@ -20,11 +20,10 @@ from sqlalchemy import func, select
 
 from benchmarks.campaigns.cuts import KINDS, ORDERS, Archive, Piece, archive, case_of, ingest
 from ground_service.ground import Ground, open_ground
-from ground_service.ingest.bare import PacketReader
-from ground_service.ingest.frames import FrameReader, Section
-from ground_service.ingest.quality import NO_RECORD, Found
+from ground_service.ingest.core import NO_RECORD, Found
+from ground_service.ingest.frames import FrameReader, PacketReader, Section
+from ground_service.ingest.parameters import redecode
 from ground_service.ingest.reception import Reading, Run
-from ground_service.ingest.redecode import redecode
 from ground_service.ingest.service import Place, ingest_file
 from ground_service.store import repository
 from tests.ground_service.archive_hash import hash_of

@@ -21,9 +21,9 @@ from ground_service.app import create_app
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
-from ground_service.ingest import redecode as redecoding
+from ground_service.ingest import parameters
 from ground_service.ingest.packets import batch_of_cut
-from ground_service.ingest.redecode import catch_up, redecode, vehicles_behind
+from ground_service.ingest.parameters import catch_up, redecode, vehicles_behind
 from ground_service.ingest.service import Place, ingest_file
 from ground_service.ingest.store import store_batch
 from ground_service.passes.service import list_events, parameter_series, state_series
@@ -422,9 +422,9 @@ def test_serving_enters_the_job_that_decodes_again(tmp_path: Path, synthetic_pas
 def test_what_comes_in_meanwhile_and_a_kill_in_the_middle_change_nothing(
     old: Ground, tmp_path: Path, make_pass: Any, synthetic_pass: Any, monkeypatch: Any
 ) -> None:
-    monkeypatch.setattr(redecoding, "BLOCK_PACKETS", 50)
+    monkeypatch.setattr(parameters, "BLOCK_PACKETS", 50)
     more = make_pass(frames=3, seed=5).folder / "downlink.cadu"
-    whole_block = redecoding._block
+    whole_block = parameters._block
     blocks = 0
 
     def killed(*given: Any) -> Any:
@@ -434,7 +434,7 @@ def test_what_comes_in_meanwhile_and_a_kill_in_the_middle_change_nothing(
             raise KeyboardInterrupt
         return whole_block(*given)
 
-    monkeypatch.setattr(redecoding, "_block", killed)
+    monkeypatch.setattr(parameters, "_block", killed)
     with pytest.raises(KeyboardInterrupt):
         ingest_file(old, more)
     assert looked_at(old)[0] >= 1  # still as the old dictionary decoded it

@@ -18,9 +18,9 @@ from ground_service.clock import (
 )
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
-from ground_service.missions import clocks
-from ground_service.missions.clocks import mission_clock, read_mission_clock
+from ground_service.missions import places
 from ground_service.missions.model import parse_mission
+from ground_service.missions.places import mission_clock, read_mission_clock
 from ground_service.missions.service import add_mission
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
@@ -127,7 +127,7 @@ def test_several_stated_clocks_are_none(ground: Ground, caplog: pytest.LogCaptur
 
 
 def test_a_running_service_takes_a_new_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clocks, "REFRESH_S", 0.05)
+    monkeypatch.setattr(places, "REFRESH_S", 0.05)
     with TestClient(create_app(Settings(home=tmp_path))) as client:
         state(client.app.state.ground, simulated())
         wait_for(lambda: abs(seconds_after_start()) < 600.0, "mission time in 2029")

@@ -16,7 +16,7 @@ from ground_service.errors import Conflict, Forbidden, InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.missions import store
-from ground_service.missions.declared import mission_of_manifest
+from ground_service.missions.frames import mission_of_manifest
 from ground_service.missions.model import (
     Evidence,
     Mission,

@@ -10,8 +10,8 @@ import pytest
 
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
-from ground_service.passes import archive_zip
-from ground_service.passes.archive_zip import import_zip, unpacked, zip_folder
+from ground_service.passes import archive_import
+from ground_service.passes.archive_import import import_zip, unpacked, zip_folder
 
 
 def zipped(path: Path, entries: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
@@ -77,7 +77,7 @@ def test_too_many_files_files_twice_and_no_zip_at_all_are_refused(
     whole.write_bytes(damaged)
     with pytest.raises(InvalidInput, match="expected a whole file"), unpacked(whole, tmp_path, "whole.zip"):
         pass
-    monkeypatch.setattr(archive_zip, "ENTRIES_LIMIT", 3)
+    monkeypatch.setattr(archive_import, "ENTRIES_LIMIT", 3)
     with pytest.raises(InvalidInput, match="expected at most 3 files, found 4"):
         import_zip(ground, zipped(tmp_path / "many.zip", {str(i): b"" for i in range(4)}))
 

@@ -6,11 +6,11 @@ from collections.abc import Callable, Hashable
 import pytest
 from sqlalchemy import delete
 
-from ground_service.events import CorrelationChanged, LinkChanged, TelemetryReceived, publish
-from ground_service.events import Event as Published
 from ground_service.ground import Ground
-from ground_service.passes import cache as module
-from ground_service.passes.cache import Cache
+from ground_service.passes import series
+from ground_service.passes.series import Cache
+from ground_service.store.event_kinds import CorrelationChanged, LinkChanged, TelemetryReceived, publish
+from ground_service.store.event_kinds import Event as Published
 from ground_service.store.models import EVENT_LOG
 from ground_service.store.vehicles import change_vehicle, vehicle_id
 
@@ -106,7 +106,7 @@ def test_a_gap_in_the_events_forgets_all_answers(archive: Archive) -> None:
 def test_more_new_events_than_are_looked_at_forget_all_answers(archive: Archive) -> None:
     assert archive.ask() == 1
     for _ in range(2):
-        archive.happens(*[LinkChanged(link="first", state="open")] * (module.CHANGES_KEPT // 2))
+        archive.happens(*[LinkChanged(link="first", state="open")] * (series.CHANGES_KEPT // 2))
     assert archive.ask() == 2
 
 
@@ -144,7 +144,7 @@ def test_an_answer_that_many_need_at_once_is_made_once(archive: Archive) -> None
     others = [threading.Thread(target=ask, args=(archive.make,)) for _ in range(3)]
     for one in others:
         one.start()
-    turns = module._databases[archive.ground.database.engine]._turns
+    turns = series._databases[archive.ground.database.engine]._turns
     while max(turn.threads for turn in list(turns.values())) < 4:
         assert all(one.is_alive() for one in others)
     go_on.set()

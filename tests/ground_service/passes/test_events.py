@@ -19,8 +19,7 @@ from ground_service.evaluation import inputs, store
 from ground_service.evaluation.model import StoredReport
 from ground_service.evaluation.service import make_report, pass_summary
 from ground_service.ground import Ground
-from ground_service.http.model import Paging
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Paging, UtcTime
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.service import add_mission
@@ -30,7 +29,7 @@ from ground_service.passes.live import list_spacecraft, live_parameters
 from ground_service.passes.model import EventFilter, PassFilter
 from ground_service.passes.service import completeness, define_pass
 from ground_service.passes.store import list_passes
-from ground_service.store.stored_files import register_file
+from ground_service.store.files import register_file
 from lunar.catalogue import load_catalogue
 from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.ephemeris_files import load_ephemeris

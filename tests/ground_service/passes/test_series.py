@@ -18,11 +18,11 @@ from ground_service.evaluation.inputs import filter_states, load_pass_inputs
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.packets import batch_of_cut
-from ground_service.ingest.redecode import catch_up
+from ground_service.ingest.parameters import catch_up
 from ground_service.ingest.service import ingest_file
 from ground_service.ingest.store import store_batch, store_samples
 from ground_service.missions.service import add_mission
-from ground_service.passes import images, series, store
+from ground_service.passes import archive_import, series, store
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.live import list_spacecraft
 from ground_service.passes.parameters import series_source, spacecraft_parameters
@@ -30,9 +30,9 @@ from ground_service.passes.service import detections, trend_series
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.passes.store import get_pass
 from ground_service.store import repository, rollups
+from ground_service.store.files import register_file
 from ground_service.store.models import ROLLUPS
 from ground_service.store.rollups import BASE_TICKS, HOUSEKEEPING_VALUES, STATE_VALUES
-from ground_service.store.stored_files import register_file
 from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service.conftest import (
@@ -414,21 +414,21 @@ def test_complete_thumbnails_are_listed_at_the_time_of_their_frame(ground: Groun
             *large_data(incomplete, 4, later + 300)[:-1],
         ],
     )
-    found = images.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
+    found = archive_import.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
     assert [(one.frame_number, one.time.utc_ns, one.source) for one in found] == [
         (1, START, "thumbnail"),
         (2, START + 15 * NS, "thumbnail"),
     ]
-    assert images.list_images(ground, SPACECRAFT, "flight", START + NS, START + HOUR_NS) == found[1:]
+    assert archive_import.list_images(ground, SPACECRAFT, "flight", START + NS, START + HOUR_NS) == found[1:]
     for one, levels in ((found[0], first.levels), (found[1], second.levels)):
         ticks = int(one.address.split("/thumbnails/")[1].split("?")[0])
-        png = images.thumbnail_image(ground, SPACECRAFT, "flight", ticks)
+        png = archive_import.thumbnail_image(ground, SPACECRAFT, "flight", ticks)
         decoded = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(decoded, levels)
     with pytest.raises(NotFound):
-        images.thumbnail_image(ground, SPACECRAFT, "flight", TICKS + 30 * SECOND)
+        archive_import.thumbnail_image(ground, SPACECRAFT, "flight", TICKS + 30 * SECOND)
     with pytest.raises(InvalidInput, match="at most 31 days"):
-        images.list_images(ground, SPACECRAFT, "flight", START, START + 32 * 24 * HOUR_NS)
+        archive_import.list_images(ground, SPACECRAFT, "flight", START, START + 32 * 24 * HOUR_NS)
 
 
 def test_frames_of_an_archive_are_listed_and_read(ground: Ground, synthetic_pass: SyntheticPass) -> None:
@@ -440,23 +440,28 @@ def test_frames_of_an_archive_are_listed_and_read(ground: Ground, synthetic_pass
         store.add_frames(connection, pass_id, {3: stored.sha256})
         record = store.get_pass(connection, pass_id)
     (vehicle,) = {one.instance for one in list_spacecraft(ground)}
-    (found,) = images.list_images(ground, SPACECRAFT, vehicle, record.start_utc_ns, record.stop_utc_ns)
+    (found,) = archive_import.list_images(
+        ground, SPACECRAFT, vehicle, record.start_utc_ns, record.stop_utc_ns
+    )
     assert (found.frame_number, found.source, found.pass_id) == (3, "archive", pass_id)
     assert record.start_utc_ns < found.time.utc_ns < record.stop_utc_ns
     assert found.address == f"/api/v1/passes/{pass_id}/images/3"
     assert found.overlay == f"{found.address}?detections=true"
-    assert images.archived_image(ground, pass_id, 3) == png.tobytes()
+    assert archive_import.archived_image(ground, pass_id, 3) == png.tobytes()
     items = detections(ground, pass_id, Paging(limit=1000)).items
     own = [one for one in items if one.frame_number == 3]
-    drawn = images.archived_image(ground, pass_id, 3, detections=True)
+    drawn = archive_import.archived_image(ground, pass_id, 3, detections=True)
     picture = cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR)
-    assert own and set(map(tuple, picture.reshape(-1, 3).tolist())) == {(77, 77, 77), images.ORANGE_BGR}
+    assert own and set(map(tuple, picture.reshape(-1, 3).tolist())) == {
+        (77, 77, 77),
+        archive_import.ORANGE_BGR,
+    }
     for one in own:
         rim = (round(one.v_px), round(one.u_px) + max(round(one.diameter_px / 2), 1))
         if max(rim) < 1024:
-            assert tuple(picture[rim].tolist()) == images.ORANGE_BGR
+            assert tuple(picture[rim].tolist()) == archive_import.ORANGE_BGR
     with pytest.raises(NotFound, match="image of frame"):
-        images.archived_image(ground, pass_id, 4)
+        archive_import.archived_image(ground, pass_id, 4)
 
 
 MISSION = 'name = "camera"\n[spacecraft]\nid = 76\n[camera]\nwidth_px = 96\nheight_px = 64\n'
@@ -479,17 +484,17 @@ def test_detections_are_drawn_on_an_enlarged_thumbnail_of_a_known_camera(
     # A report of the same frame number from another time belongs to another frame.
     reports = [detection(1, TICKS), detection(2, TICKS + 40 * SECOND)]
     receive(ground, tmp_path, [*reports, *large_data(octets, 1, later), *others])
-    found = images.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
+    found = archive_import.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
     assert [one.overlay for one in found] == [None, None]
     with pytest.raises(InvalidInput, match=r"camera\.width_px"):
-        images.thumbnail_image(ground, SPACECRAFT, "flight", TICKS, detections=True)
+        archive_import.thumbnail_image(ground, SPACECRAFT, "flight", TICKS, detections=True)
     add_mission(ground, MISSION.encode(), actor="ann")
-    found = images.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
+    found = archive_import.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
     assert [one.overlay for one in found] == [f"{found[0].address}&detections=true", None]
-    png = images.thumbnail_image(ground, SPACECRAFT, "flight", TICKS, detections=True)
+    png = archive_import.thumbnail_image(ground, SPACECRAFT, "flight", TICKS, detections=True)
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape == (8 * 43, 12 * 43, 3)  # at least 512 wide
-    rim = np.argwhere((picture == images.ORANGE_BGR).all(axis=2))
+    rim = np.argwhere((picture == archive_import.ORANGE_BGR).all(axis=2))
     scale = 43 / 8
     np.testing.assert_allclose(rim.mean(axis=0)[::-1], [56.0 * scale - 0.5, 32.0 * scale - 0.5], atol=1.0)
     np.testing.assert_allclose(np.ptp(rim, axis=0) + 1, 16.0 * scale, atol=2.0)
@@ -501,9 +506,9 @@ def test_a_thumbnail_of_a_dark_frame_is_enlarged_without_circles(ground: Ground,
     add_mission(ground, MISSION.encode(), actor="ann")
     made, octets = thumbnail(1, TICKS)
     receive(ground, tmp_path, [detection(1, TICKS, count=0), *large_data(octets, 1, TICKS + SECOND)])
-    (found,) = images.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
+    (found,) = archive_import.list_images(ground, SPACECRAFT, "flight", START, START + HOUR_NS)
     assert found.overlay
-    png = images.thumbnail_image(ground, SPACECRAFT, "flight", TICKS, detections=True)
+    png = archive_import.thumbnail_image(ground, SPACECRAFT, "flight", TICKS, detections=True)
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     np.testing.assert_array_equal(picture[::43, ::43, 0], made.levels)
 

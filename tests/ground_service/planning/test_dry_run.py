@@ -12,7 +12,7 @@ from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.store import list_missions
 from ground_service.planning import dry_run, standing
 from ground_service.planning.dry_run import NO_EPHEMERIS, TOO_LONG, DryRun, fly, rehearsed
-from ground_service.planning.request_model import StandingRequestIn
+from ground_service.planning.model import StandingRequestIn
 from lunar.datafolder import DataFolder
 from tests.ground_service.conftest import START, Clock, save_circle
 from tests.ground_service.planning.test_standing import AUTOMATIC, LINKS, MISSION

@@ -17,8 +17,11 @@ from ground_service.access.store import list_audit
 from ground_service.contacts.links.core import PredictedContact
 from ground_service.errors import InvalidInput, PlanConflicts
 from ground_service.ground import Ground
-from ground_service.missions.ephemerides.service import add_ephemeris, withdraw_ephemeris
-from ground_service.missions.ephemerides.store import covering_ephemerides
+from ground_service.missions.ephemerides.service import (
+    add_ephemeris,
+    covering_ephemerides,
+    withdraw_ephemeris,
+)
 from ground_service.missions.service import add_mission
 from ground_service.planning.core import (
     Constraints,

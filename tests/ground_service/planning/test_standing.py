@@ -10,16 +10,21 @@ import pytest
 from ground_service.contacts.commanding.model import TelecommandFilter
 from ground_service.contacts.commanding.service import get_command, list_telecommands
 from ground_service.errors import InvalidInput, NotFound, PlanConflicts
-from ground_service.events import read_events
 from ground_service.ground import Ground, open_ground
 from ground_service.missions.service import add_mission
-from ground_service.planning import request_store, standing, store
 from ground_service.planning import service as planning
-from ground_service.planning.model import Window, WindowEntry, WindowFilter
+from ground_service.planning import standing, store
+from ground_service.planning.model import (
+    RequestTerms,
+    StandingRequestChange,
+    StandingRequestIn,
+    Window,
+    WindowEntry,
+    WindowFilter,
+)
 from ground_service.planning.progress import advance_windows
-from ground_service.planning.request_model import RequestTerms, StandingRequestChange, StandingRequestIn
-from ground_service.planning.request_store import get_plan, get_request
-from ground_service.planning.store import get_window, list_windows
+from ground_service.planning.store import get_plan, get_request, get_window, list_windows
+from ground_service.store.event_kinds import read_events
 from ground_service.worker.follow_up import follow_in_process
 from tests.ground_service.conftest import START, Clock, add_reference, save_circle
 from tests.scenarios import SELENITA
@@ -200,11 +205,11 @@ def test_windows_of_the_present_period_count_long_after_they_ended(
     key = request(ground, windows=1)
     standing.plan_tick(ground, now.utc_ns)
     with ground.database.writing() as connection:
-        (window,) = request_store.windows_around(connection, 1, now.utc_ns)
+        (window,) = store.windows_around(connection, 1, now.utc_ns)
         assert store.change_window(connection, window, state="processed")
     later = window.stop.utc_ns + 30 * HOUR
     with ground.database.reading() as connection:
-        assert request_store.windows_around(connection, 1, later) == []
+        assert store.windows_around(connection, 1, later) == []
     assert standing.plan_tick(ground, later)["added"] == 0
     terms = RequestTerms(windows=1, period_days=1.0, horizon_days=1.0)
     standing.change_request(ground, key, StandingRequestChange(terms=terms), actor="ann")
@@ -355,6 +360,6 @@ def test_processes_that_plan_at_the_same_time_make_one_plan(
         added = list(pool.map(lambda one: standing.plan_tick(one, now.utc_ns)["added"], grounds))
     assert sorted(added) == [0, 0, 0, 2] and len(windows_of(grounds[0])) == 2
     with grounds[0].database.reading() as connection:
-        assert request_store.get_request_record(connection, key).plans == 1
+        assert store.get_request_record(connection, key).plans == 1
     for one in grounds:
         one.close()

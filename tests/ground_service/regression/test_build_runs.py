@@ -16,14 +16,13 @@ import pytest
 
 from ground_service.errors import BuildNotChecked, InvalidInput
 from ground_service.ground import Ground, open_ground
-from ground_service.http.model import Paging
-from ground_service.http.times import UtcTime
+from ground_service.http.model import Paging, UtcTime
 from ground_service.regression import builds
+from ground_service.regression import sandbox as host
 from ground_service.regression.build_runs import BuildRun, run_build
 from ground_service.regression.builds import Build, changes, load_build, register_build
 from ground_service.regression.model import REASONS_LIMIT, JudgedGate, Regression, Verdict
-from ground_service.regression.sandbox import host
-from ground_service.regression.sandbox.host import SandboxRefused
+from ground_service.regression.sandbox import SandboxRefused
 from ground_service.regression.store import list_builds
 from linna.cli import run as run_command
 

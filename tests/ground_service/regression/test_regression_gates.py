@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service.evaluation.detection.recall import ExpectedCraters
+from ground_service.evaluation.recall import ExpectedCraters
 from ground_service.regression.gates.calibration import calibrations, gate_noise, pass_noise
 from ground_service.regression.gates.core import (
     COSTS,
@@ -18,11 +18,12 @@ from ground_service.regression.gates.core import (
     FEWEST_TRACKS,
     PASS_SPREAD,
     Gate,
+    detectable,
     judge,
+    power_text,
     verdict_of,
 )
 from ground_service.regression.gates.policy import load_policy, read_policy
-from ground_service.regression.gates.power import detectable, power_text
 from ground_service.regression.gates.samples import (
     KINDS,
     VISIT_GAP_FRAMES,

@@ -38,9 +38,9 @@ from ground_service.regression.documents import (
 )
 from ground_service.regression.gates.policy import load_policy
 from ground_service.regression.gates.samples import cell_places_deg
+from ground_service.regression.jobs import run_placebo
 from ground_service.regression.model import TELEMETRY_ONLY, ArchiveRecord, KeptReplay
 from ground_service.regression.outcome import RegressionOutcome
-from ground_service.regression.placebo import run_placebo
 from ground_service.regression.service import (
     calibrations_of,
     condition_of_archive,

@@ -11,9 +11,8 @@ import ground_service
 from ground_service.errors import NotFound, StateConflict
 from ground_service.ground import Ground
 from ground_service.store import repository
-from ground_service.store.counters import hold, next_telecommand
 from ground_service.store.states import JOB, TELECOMMAND, change_if, move, move_all
-from ground_service.store.vehicles import vehicle_id
+from ground_service.store.vehicles import hold, next_telecommand, vehicle_id
 
 
 def add_command(ground: Ground, state: str = "queued") -> int:

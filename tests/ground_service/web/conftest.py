@@ -24,7 +24,7 @@ from PIL import Image
 
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
-from ground_service.web import displays
+from ground_service.web import pages
 from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import format_oem
 from lunar.timescales import parse_utc
@@ -236,8 +236,8 @@ def serve() -> type[Service]:
 @pytest.fixture(scope="session")
 def openmct(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The npm package: that of `make openmct`, else installed from the lock file for these tests."""
-    if displays.FOLDER.is_dir():
-        return displays.FOLDER
+    if pages.FOLDER.is_dir():
+        return pages.FOLDER
     folder = tmp_path_factory.mktemp("openmct")
     for name in ("package.json", "package-lock.json"):
         shutil.copy(OPENMCT / name, folder)

@@ -15,7 +15,7 @@ from PIL import Image
 
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
-from ground_service.web import displays
+from ground_service.web import pages
 from ground_service.web.pages import POLICY
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service.web.conftest import press, strict_page
@@ -40,7 +40,7 @@ def ask(url, body=None, **headers):
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory, synthetic_pass, serve, openmct):
-    """A service with the displays, the synthetic pass imported."""
+    """A service with the pages, the synthetic pass imported."""
     home = tmp_path_factory.mktemp("displays") / "home"
     with open_ground(home) as ground:
         import_archive(ground, synthetic_pass.folder)
@@ -100,8 +100,8 @@ def test_without_open_mct_the_page_says_how_to_install_it(service):
 
 def test_only_the_page_of_the_displays_permits_eval(shown):
     _, body, headers = ask(shown.url + "/mct")
-    assert headers["Content-Security-Policy"] == displays.POLICY
-    assert displays.POLICY.count("unsafe-eval") == 1 and "http" not in displays.POLICY
+    assert headers["Content-Security-Policy"] == pages.DISPLAY_POLICY
+    assert pages.DISPLAY_POLICY.count("unsafe-eval") == 1 and "http" not in pages.DISPLAY_POLICY
     for source in re.findall(rb'src="([^"]+)"', body):
         assert ask(shown.url + source.decode())[0] == 200, source
     assert ask(shown.url + "/")[2]["Content-Security-Policy"] == POLICY

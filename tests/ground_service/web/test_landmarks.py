@@ -7,8 +7,7 @@ import pytest
 
 from ground_service.access.service import add_user
 from ground_service.evaluation.landmarks.model import LandmarkFilter
-from ground_service.evaluation.landmarks.service import update_landmarks
-from ground_service.evaluation.landmarks.store import list_landmarks
+from ground_service.evaluation.landmarks.service import list_landmarks, update_landmarks
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
 from lunar.catalogue import load_catalogue, save_catalogue

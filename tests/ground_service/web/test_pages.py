@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ground_service.errors import InvalidInput
-from ground_service.evaluation.surface import WIDTH_PX
+from ground_service.evaluation.extras import WIDTH_PX
 from ground_service.web.pages import PAGES, POLICY, basemap_jpeg
 from tests.ground_service.web.test_displays import ask
 

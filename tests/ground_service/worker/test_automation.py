@@ -9,20 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ground_service import events
 from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, StorageFull
 from ground_service.evaluation import service as evaluation
 from ground_service.evaluation.landmarks.model import LandmarkFilter
-from ground_service.evaluation.landmarks.store import list_landmarks
+from ground_service.evaluation.landmarks.service import list_landmarks
 from ground_service.evaluation.store import newest_report
-from ground_service.events import ContactEnded, PassEvaluated, RegressionJudged, publish
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.model import Job, JobFilter
-from ground_service.jobs.service import enter_job
-from ground_service.jobs.store import list_jobs, repeat_failed, unfinished_jobs
+from ground_service.jobs.service import enter_job, list_jobs, repeat_failed, unfinished_jobs
 from ground_service.missions.catalogues import add_catalogue, catalogue_of
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.model import parse_mission
@@ -35,6 +32,8 @@ from ground_service.planning.service import WindowEntry, add_window, change_wind
 from ground_service.planning.store import get_window
 from ground_service.regression.archives import kept_archives
 from ground_service.regression.pass_archives import LIVE
+from ground_service.store import event_kinds as events
+from ground_service.store.event_kinds import ContactEnded, PassEvaluated, RegressionJudged, publish
 from ground_service.worker import actions
 from ground_service.worker.dispatch import InlineDispatcher
 from ground_service.worker.follow_up import FollowUp, follow_in_process

@@ -27,8 +27,7 @@ from ground_service.store.models import ROLLUPS
 from ground_service.store.rows import table_digests
 from ground_service.worker import dispatch
 from ground_service.worker.dispatch import ThreadDispatcher, dispatcher_for
-from ground_service.worker.integrity import verify
-from ground_service.worker.integrity_store import same_values
+from ground_service.worker.integrity import same_values, verify
 from ground_service.worker.jobs import run_job
 from tests.ground_service.archive_hash import hash_of
 from tests.ground_service.conftest import event_packet

@@ -10,27 +10,27 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import select, update
 
-from ground_service import events
 from ground_service.app import create_app
 from ground_service.errors import StorageFull
 from ground_service.evaluation.model import ChangedFigure, changed_figures
 from ground_service.evaluation.service import make_report
 from ground_service.evaluation.store import list_reports
-from ground_service.events import (
+from ground_service.ground import Ground, open_ground
+from ground_service.http.model import Paging
+from ground_service.ingest.service import ingest_file
+from ground_service.jobs.service import unfinished_jobs
+from ground_service.passes.service import define_pass
+from ground_service.settings import Settings
+from ground_service.store import event_kinds as events
+from ground_service.store import events as log
+from ground_service.store import repository
+from ground_service.store.event_kinds import (
     CommandsSent,
     FollowUpFailed,
     PassEvaluated,
     TelemetryReceived,
     publish,
 )
-from ground_service.ground import Ground, open_ground
-from ground_service.http.model import Paging
-from ground_service.ingest.service import ingest_file
-from ground_service.jobs.store import unfinished_jobs
-from ground_service.passes.service import define_pass
-from ground_service.settings import Settings
-from ground_service.store import events as log
-from ground_service.store import repository
 from ground_service.worker import follow_up
 from ground_service.worker.follow_up import FollowUp, follow_in_process
 from lunar.timescales import parse_utc

@@ -20,8 +20,7 @@ from ground_service.errors import (
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import enter_ingest
-from ground_service.jobs.service import add_job, enter_job
-from ground_service.jobs.store import unfinished_jobs
+from ground_service.jobs.service import add_job, enter_job, unfinished_jobs
 from ground_service.store import repository
 from ground_service.store.states import JOB, move
 from ground_service.worker import jobs

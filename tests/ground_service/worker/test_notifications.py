@@ -19,9 +19,16 @@ from typing import Any
 
 import pytest
 
-from ground_service.access.audit_log import audit_head
+from ground_service.access.store import audit_head
 from ground_service.errors import InvalidInput
-from ground_service.events import (
+from ground_service.ground import Ground, open_ground
+from ground_service.jobs.model import Job, JobFilter
+from ground_service.jobs.service import get_job, list_jobs
+from ground_service.missions.automation import Channel
+from ground_service.missions.service import add_mission
+from ground_service.settings import load_settings
+from ground_service.store.audit import Head
+from ground_service.store.event_kinds import (
     AlarmChanged,
     Event,
     LimitsBroken,
@@ -30,21 +37,14 @@ from ground_service.events import (
     WindowChanged,
     publish,
 )
-from ground_service.ground import Ground, open_ground
-from ground_service.jobs.model import Job, JobFilter
-from ground_service.jobs.store import get_job, list_jobs
-from ground_service.missions.automation import Channel
-from ground_service.missions.service import add_mission
-from ground_service.settings import load_settings
-from ground_service.store.audit import Head
 from ground_service.store.models import METADATA
-from ground_service.worker import actions, outgoing
+from ground_service.worker import actions
+from ground_service.worker import notifications as outgoing
 from ground_service.worker.actions import send_messages
 from ground_service.worker.dispatch import ThreadDispatcher
 from ground_service.worker.follow_up import follow_in_process
-from ground_service.worker.notifications import ATTEMPTS, signature
+from ground_service.worker.notifications import ATTEMPTS, NotDelivered, permitted_address, signature
 from ground_service.worker.notifications import send as send_to
-from ground_service.worker.outgoing import NotDelivered, permitted_address
 from ground_service.worker.upkeep import kept_heads, nightly
 from tests.ground_service.access.test_missions_of_callers import row_of
 from tests.ground_service.conftest import wait_for

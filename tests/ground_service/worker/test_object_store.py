@@ -17,8 +17,7 @@ from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import enter_job
-from ground_service.passes.archive_import import import_archive
-from ground_service.passes.archive_zip import zip_folder
+from ground_service.passes.archive_import import import_archive, zip_folder
 from ground_service.regression.archives import keep_archive, let_go, store_of
 from ground_service.regression.builds import load_build, register_build, registered_build
 from ground_service.regression.jobs import missing_replays, prepared

@@ -16,11 +16,17 @@ from ground_service.ingest.service import ingest_file
 from ground_service.missions.service import add_mission
 from ground_service.settings import Settings
 from ground_service.store import leases
-from ground_service.store.stored_files import file_names
-from ground_service.worker import presence
-from ground_service.worker.condition import complaints, read_condition
+from ground_service.store.files import file_names
+from ground_service.worker import condition
+from ground_service.worker.condition import (
+    all_disagreements,
+    complaints,
+    present,
+    read_condition,
+    running_processes,
+    statement_of,
+)
 from ground_service.worker.doctor import examine
-from ground_service.worker.presence import all_disagreements, present, running_processes, statement_of
 from linna import cli
 from tests.ground_service.access.openid import running_provider
 
@@ -39,16 +45,16 @@ def opened(settings: Settings) -> Iterator[Ground]:
 def test_a_process_is_known_while_it_runs(
     opened: Ground, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(presence, "BEAT_S", 0.05)
+    monkeypatch.setattr(condition, "BEAT_S", 0.05)
     assert not running_processes(opened.database)
     with present(opened, settings, "worker"):
         [one] = running_processes(opened.database)
         assert one.kind == "worker" and one.statement
         assert replace(one.statement, clock_ms=0) == statement_of(opened, settings)
-        assert abs(one.statement.clock_ms) < presence.CLOCK_LIMIT_MS
+        assert abs(one.statement.clock_ms) < condition.CLOCK_LIMIT_MS
         assert read_condition(opened, None).processes == {"worker": 1}
         with opened.database.writing() as connection:  # of a process that was killed
-            leases.state(connection, f"{presence.PREFIX}api gone:1", one.statement.text(), 0)
+            leases.state(connection, f"{condition.PREFIX}api gone:1", one.statement.text(), 0)
         time.sleep(0.2)
         assert str(*running_processes(opened.database)) == str(one)
     assert not running_processes(opened.database)
@@ -88,12 +94,12 @@ def test_another_home_folder_and_other_data_are_noticed(
     (tmp_path / "elsewhere").mkdir()
     other = replace(opened, home=tmp_path / "elsewhere")
     assert [a == b for a, b in zip(mine.digests, statement_of(other, settings).digests, strict=True)] == [
-        group != "files" for group in presence.GROUPS
+        group != "files" for group in condition.GROUPS
     ]
     processes = [
-        presence.Process("api", "a:1", mine),
-        presence.Process("worker", "b:2", statement_of(other, settings)),
-        presence.Process("worker", "c:3", None),
+        condition.Process("api", "a:1", mine),
+        condition.Process("worker", "b:2", statement_of(other, settings)),
+        condition.Process("worker", "c:3", None),
     ]
     assert all_disagreements(processes) == ["worker b:2: other files than api a:1"]
 
@@ -148,12 +154,12 @@ def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
         assert api.statement is not None
         with opened.database.writing() as connection:
             late = replace(api.statement, clock_ms=90_000, runner="no")
-            leases.state(connection, f"{presence.PREFIX}worker late:1", late.text(), 60_000_000_000)
+            leases.state(connection, f"{condition.PREFIX}worker late:1", late.text(), 60_000_000_000)
         found = faults(opened, given)
         assert found["clocks"] == "worker late:1: expected within 2000 ms of the database, found 90000 ms"
         assert "expected a runner" in found["processes"]
         with opened.database.writing() as connection:
-            leases.remove(connection, f"{presence.PREFIX}worker late:1")
+            leases.remove(connection, f"{condition.PREFIX}worker late:1")
 
         # 5. A channel leads to an address that is not permitted.
         text = 'name = "m"\n[spacecraft]\nid = 76\n[notify.people]\nemail = ["a@b.example"]\n'
@@ -187,7 +193,7 @@ def test_the_command_has_an_exit_status_and_json(
 
 
 def test_the_statement_fits_into_its_column() -> None:
-    digests = tuple("f" * presence.DIGITS for _ in presence.GROUPS)
-    text = presence.Statement("10.10.10.dev1000", digests, -86_400_000, "yes").text()
-    assert len(text) <= 96 and presence.Statement.of_text(text).digests == digests
-    assert presence.Statement.of_text("1.0 aa bb 0 -") is None
+    digests = tuple("f" * condition.DIGITS for _ in condition.GROUPS)
+    text = condition.Statement("10.10.10.dev1000", digests, -86_400_000, "yes").text()
+    assert len(text) <= 96 and condition.Statement.of_text(text).digests == digests
+    assert condition.Statement.of_text("1.0 aa bb 0 -") is None

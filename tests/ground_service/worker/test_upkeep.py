@@ -13,7 +13,6 @@ from ground_service.access import service as users
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.evaluation.service import make_report
-from ground_service.events import read_events
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
@@ -23,6 +22,7 @@ from ground_service.passes.core import downsample
 from ground_service.passes.service import spacecraft_trends, trend_of
 from ground_service.regression.archives import working_folder
 from ground_service.store import repository
+from ground_service.store.event_kinds import read_events
 from ground_service.store.events import publish
 from ground_service.store.models import METADATA
 from ground_service.worker.jobs import run_job

@@ -35,7 +35,6 @@ from ground_service.contacts.commanding.service import (
 )
 from ground_service.contacts.commanding.store import list_handovers
 from ground_service.errors import Conflict, InvalidInput, NotFound
-from ground_service.events import read_events
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
@@ -49,6 +48,7 @@ from ground_service.planning.service import (
 )
 from ground_service.planning.store import list_windows
 from ground_service.store import repository
+from ground_service.store.event_kinds import read_events
 from lunar.timescales import parse_utc
 from tmtc.dictionary.effects import EFFECTS, Effect
 from tmtc.dictionary.payload import DICTIONARY

@@ -15,15 +15,20 @@ from sqlalchemy import func, select
 from ground_service.clock import mission_now_ns
 from ground_service.contacts.links import runner as runners
 from ground_service.contacts.links import service, store
-from ground_service.contacts.links.runner import LinkRunner, ended_holder
-from ground_service.contacts.links.stream import ACKNOWLEDGEMENT, DISCARDED_BLOCKS, Connector
+from ground_service.contacts.links.runner import (
+    ACKNOWLEDGEMENT,
+    DISCARDED_BLOCKS,
+    Connector,
+    LinkRunner,
+    ended_holder,
+)
 from ground_service.contacts.links.supervisor import LinkSupervisor
 from ground_service.errors import DatabaseBusy, Stopping, StorageFull
-from ground_service.events import read_events
 from ground_service.ground import Ground
 from ground_service.ingest.live import SETTLED_S, Spool, WatchedFolder
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.store import repository
+from ground_service.store.event_kinds import read_events
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.messages.oem import save_oem
 from tests.ground_service.conftest import START, Clock, circular_states

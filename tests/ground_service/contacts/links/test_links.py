@@ -25,17 +25,16 @@ from ground_service.contacts.commanding.service import (
     resume_spacecraft,
 )
 from ground_service.contacts.links import service, store
-from ground_service.contacts.links.runner import LinkRunner
+from ground_service.contacts.links.runner import ACKNOWLEDGEMENT, TRANSMISSION, LinkRunner
 from ground_service.contacts.links.store import TransmissionRow
-from ground_service.contacts.links.stream import ACKNOWLEDGEMENT, TRANSMISSION
 from ground_service.errors import Conflict, NotFound
-from ground_service.events import read_events
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.timekeeping import recorrelation
-from ground_service.missions.timekeeping.service import spacecraft_correlations, spacecraft_time_reports
+from ground_service.missions.timekeeping.recorrelation import spacecraft_correlations, spacecraft_time_reports
 from ground_service.store import repository
+from ground_service.store.event_kinds import read_events
 from ground_service.store.vehicles import all_vehicles
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.messages.oem import save_oem

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from ground_service.errors import EvaluationError, InvalidInput, NotFound, StateConflict
-from ground_service.evaluation.detection.recall import expected_craters, match_detections
 from ground_service.evaluation.landmarks.core import (
     Frames,
     Place,
@@ -20,20 +19,19 @@ from ground_service.evaluation.landmarks.core import (
     places_of_pass,
     same_place,
 )
-from ground_service.evaluation.landmarks.documents import (
+from ground_service.evaluation.landmarks.model import Landmark, LandmarkFilter
+from ground_service.evaluation.landmarks.service import (
     FIRST_ID,
+    decide_landmark,
     extended_catalogue,
     extended_table,
     format_labels,
+    get_landmark,
+    list_landmarks,
+    update_landmarks,
     upload_entries,
 )
-from ground_service.evaluation.landmarks.model import Landmark, LandmarkFilter
-from ground_service.evaluation.landmarks.service import (
-    decide_landmark,
-    get_landmark,
-    update_landmarks,
-)
-from ground_service.evaluation.landmarks.store import list_landmarks
+from ground_service.evaluation.recall import expected_craters, match_detections
 from ground_service.ground import Ground, open_ground
 from ground_service.missions.catalogues import add_catalogue
 from ground_service.passes.archive_import import import_archive

@@ -12,26 +12,26 @@ from ground_service.clock import set_mission_clock, utc_now_ns
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.model import StoredReport
 from ground_service.evaluation.performance import service
-from ground_service.evaluation.performance.documents import monthly_value
 from ground_service.evaluation.performance.model import MonthlyReportFilter
 from ground_service.evaluation.performance.service import (
     last_month,
+    list_monthly_reports,
     make_due_report,
     make_monthly_report,
     month_span,
+    monthly_value,
     performance,
 )
-from ground_service.evaluation.performance.store import list_monthly_reports
 from ground_service.evaluation.service import make_report
 from ground_service.evaluation.store import add_report
-from ground_service.events import WindowChanged, publish, read_events
 from ground_service.ground import Ground
-from ground_service.http.times import UtcTime
+from ground_service.http.model import UtcTime
 from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
 from ground_service.store import repository
-from ground_service.store.stored_files import register_file
+from ground_service.store.event_kinds import WindowChanged, publish, read_events
+from ground_service.store.files import register_file
 from ground_service.store.vehicles import FLOWN, vehicle_id
 from ground_service.worker import upkeep
 from ground_service.worker.upkeep import nightly
@@ -270,7 +270,7 @@ def test_passes_without_a_report_are_counted_and_the_month_is_not_good(ground: G
 
 
 def test_too_many_passes_are_one_clear_error(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ground_service.evaluation.performance.store.PASSES_LIMIT", 2)
+    monkeypatch.setattr("ground_service.evaluation.performance.service.PASSES_LIMIT", 2)
     for number in range(3):
         add_pass(ground, number)
     with pytest.raises(InvalidInput, match=r"expected at most 2 passes .* found 3 passes"):

@@ -22,15 +22,13 @@ from ground_service.missions.timekeeping.core import clock_runs, fit_correlation
 from ground_service.missions.timekeeping.model import Correlation
 from ground_service.missions.timekeeping.recorrelation import (
     ReceivedReport,
+    TimePoint,
+    correlate,
+    correlate_again,
     enter_receptions,
     read_receptions,
     recorrelate,
     residuals,
-)
-from ground_service.missions.timekeeping.service import (
-    TimePoint,
-    correlate,
-    correlate_again,
     withdraw_correlations,
 )
 from ground_service.missions.timekeeping.store import correlations_in_force, correlations_on_record

@@ -8,7 +8,7 @@ import pytest
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
-from ground_service.missions.timekeeping.service import TimePoint, correlate
+from ground_service.missions.timekeeping.recorrelation import TimePoint, correlate
 from ground_service.missions.timekeeping.store import correlations_on_record
 from ground_service.passes.service import define_pass, parameter_series
 from lunar.timescales import ticks_from_utc_ns

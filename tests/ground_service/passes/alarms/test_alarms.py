@@ -13,7 +13,6 @@ from ground_service.access.store import list_audit
 from ground_service.clock import set_mission_clock, utc_now_ns
 from ground_service.contacts.links.service import acquire, change_state, declared_links
 from ground_service.errors import Conflict, InvalidInput, NotFound
-from ground_service.events import AlarmChanged, read_events
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.service import add_mission
@@ -26,13 +25,13 @@ from ground_service.passes.alarms.service import (
     list_alarms,
     shelve_alarm,
 )
-from ground_service.planning.model import WindowEntry
+from ground_service.planning.model import StandingRequestIn, WindowEntry
 from ground_service.planning.progress import note_reason
-from ground_service.planning.request_model import StandingRequestIn
 from ground_service.planning.service import add_window, change_window
 from ground_service.planning.standing import add_request, plan_tick
 from ground_service.store import repository
-from ground_service.worker.watch import Watch
+from ground_service.store.event_kinds import AlarmChanged, read_events
+from ground_service.worker.scheduler import Watch
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 

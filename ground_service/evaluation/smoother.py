@@ -1,4 +1,4 @@
-"""Rauch-Tung-Striebel smoother of the states of the on-board filter.
+"""Rauch-Tung-Striebel smoother of the states of the on-board filter, and the baselines without images.
 
 The recursion runs backwards over the downlinked states and covariances of the filter. The ground uses its own dynamics:
 a gravity field with Earth and Sun, an empirical acceleration that decays exponentially (the last three elements of a
@@ -14,12 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.errors import EvaluationError
+from ground_service.evaluation.alignment import (
+    ReferenceStates,
+    drift_by_length,
+    error_of_positions_rtn_m,
+    navigation_statistics,
+    nees,
+    places_of_positions,
+)
 from lunar.arrays import FloatArray, IntArray
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.frames import ICRF, Orientation, icrf_from_onboard, rtn_from_inertial
-from lunar.gravity_omission import FieldNoise, densities_at
-from lunar.propagation import ForceModel, propagate_with_stm
+from lunar.gravity import GravityField
+from lunar.gravity_omission import FieldNoise, densities_at, field_noise
+from lunar.propagation import ForceModel, propagate, propagate_with_stm
 from lunar.timescales import tdb_s_from_utc_ns
+from reports.values import NavigationSeries
 
 SIZE = 9
 ONBOARD = "inertial axes of the payload"
@@ -276,3 +286,125 @@ def _divided(left: FloatArray, covariance: FloatArray) -> FloatArray:
     correlation = covariance / (scale[:, :, None] * scale[:, None, :])
     solved = np.linalg.solve(correlation, _turned(left / scale[:, None, :]))
     return np.asarray(_turned(solved) / scale[:, None, :], dtype=np.float64)
+
+
+BASELINE_DEGREE = 50
+"""Degree of the propagate-only baseline: what a flight computer can afford."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StartState:
+    """The state that the estimators were started from, Moon-centred ICRF."""
+
+    utc_ns: int
+    position_icrf_m: FloatArray
+    velocity_icrf_m_s: FloatArray
+
+
+def propagated_positions(
+    start: StartState,
+    utc_ns: IntArray,
+    gravity: GravityField,
+    degree: int,
+    orientation: Orientation,
+    *,
+    third_bodies: bool = True,
+) -> FloatArray:
+    """Return the ICRF positions (n, 3) of the start state flown on to `utc_ns` (n,), ascending; NaN before the start.
+
+    Degree 0 without third bodies is the two-body (Kepler) orbit.
+
+    Raises
+    ------
+    ImpactError
+        If the orbit meets the ground.
+    """
+    positions = np.full((len(utc_ns), 3), np.nan)
+    after = np.asarray(utc_ns) >= start.utc_ns
+    if not after.any():
+        return positions
+    epoch = float(tdb_s_from_utc_ns(start.utc_ns))
+    tdb_s = np.asarray(tdb_s_from_utc_ns(np.asarray(utc_ns)[after]), dtype=np.float64)
+    duration_s = float(tdb_s[-1] - epoch)
+    if duration_s <= 0.0:
+        positions[after] = start.position_icrf_m
+        return positions
+    model = ForceModel(
+        gravity=gravity,
+        degree=min(degree, gravity.degree),
+        orientation=orientation,
+        earth=third_bodies,
+        sun=third_bodies,
+    )
+    trajectory = propagate(epoch, start.position_icrf_m, start.velocity_icrf_m_s, duration_s, model)
+    positions[after] = trajectory.state(np.minimum(tdb_s, trajectory.stop_tdb_s))[:, :3]
+    return positions
+
+
+SMOOTHED = "smoothed"
+SMOOTHER_DEGREE = 100
+MAP_SIGMA_RTN_M, MAP_CORRELATION_RAD = (10.0, 40.0, 40.0), float(np.radians(30.0))
+"""Remainder of the registration of the catalogue, as in the filter (`CommonErrors`)."""
+
+
+def smoother_model(
+    gravity: GravityField, orientation: Orientation, burns: tuple[CommandedBurn, ...]
+) -> SmootherModel:
+    """Return the smoother's model of the motion, with gravity to `SMOOTHER_DEGREE` or the degree of the field.
+
+    The process noise is that of the filter: of the field, by its name, and of the map.
+    """
+    degree = min(SMOOTHER_DEGREE, gravity.degree)
+    return SmootherModel(
+        ForceModel(gravity, orientation, degree),
+        burns=burns,
+        field_noise=field_noise(gravity.name, degree),
+        map_sigma_rtn_m=MAP_SIGMA_RTN_M,
+        map_correlation_rad=MAP_CORRELATION_RAD,
+    )
+
+
+def smoothed_series(
+    filtered: FilterStates,
+    track: ReferenceStates,
+    path_m: FloatArray,
+    model: SmootherModel,
+    reference_covariance_m2: FloatArray,
+) -> NavigationSeries | None:
+    """Return the errors of the smoothed orbit relative to the reference; None with fewer than two states.
+
+    Parameters
+    ----------
+    filtered
+        States in ICRF.
+    track
+        Reference at the times of `filtered`.
+    path_m
+        Length of the ground path up to each time (n,).
+    reference_covariance_m2
+        Covariance of the reference (3, 3), R/T/N, which the NEES adds to that of the estimate.
+    """
+    if len(filtered) < 2:
+        return None
+    smoothed = smooth(filtered, model)
+    position = smoothed.state[:, :3]
+    latitude, longitude, altitude = places_of_positions(track, position)
+    error = error_of_positions_rtn_m(track, position)
+    never = np.zeros(len(filtered), dtype=np.bool_)
+    return NavigationSeries(
+        name=SMOOTHED,
+        kind=SMOOTHED,
+        utc_ns=filtered.utc_ns,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        altitude_m=altitude,
+        error_rtn_m=error,
+        sigma_rtn_m=smoothed.sigma_rtn_m,
+        statistics=navigation_statistics(error, path_m, never),
+        description=(
+            f"the filter smoothed on the ground with {model.forces.gravity.name} to degree "
+            f"{model.forces.degree}, Earth and Sun"
+        ),
+        nees=nees(error, smoothed.position_covariance_rtn_m2 + reference_covariance_m2),
+        drift_by_length=drift_by_length(error, path_m, never),
+    )

@@ -1,1 +1,0 @@
-"""Detections against the catalogue: viewing geometry, recall, identifications, mapped craters."""

@@ -1,1 +1,0 @@
-"""Accuracy of navigation: errors against the reference, drift, baselines, consistency, smoother."""
