@@ -40,18 +40,14 @@ def load_orbit(path: Path, spice_id: int | None = None, step_s: float | None = N
     Of an SPK, body `spice_id` is taken, with a state every `step_s` seconds.
     """
     from lunar.comparison import check_gravity
-    from lunar.messages.ephemeris_files import is_spk, load_ephemeris
+    from lunar.messages import ephemeris_files
     from lunar.messages.spice import READ_STEP_S, load_spk
 
-    ephemeris = load_spk(path, spice_id, step_s or READ_STEP_S) if is_spk(path) else load_ephemeris(path)
+    if not ephemeris_files.is_spk(path):
+        return ephemeris_files.load_orbit(path)
+    ephemeris = load_spk(path, spice_id, step_s or READ_STEP_S)
     check_gravity(ephemeris)
     return ephemeris
-
-
-def orbit_words(ephemeris: Ephemeris) -> str:
-    """Return the object of an ephemeris and the time scales of its file, as printed with figures of it."""
-    systems = dict.fromkeys(one.time_system for one in ephemeris.segments)
-    return f"{ephemeris.segments[0].object_name}, epochs in {' and '.join(systems)}"
 
 
 def blender_python() -> str:

@@ -12,7 +12,8 @@ from lunar.arrays import FloatArray, IntArray
 from lunar.constants import GM_EARTH_M3_S2, GM_MOON_M3_S2
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import EphemerisCoverageError, EphemerisError, UnmovedByGravity
-from lunar.frames import rtn_from_inertial
+from lunar.frames import matrix_from_quaternion, rtn_from_inertial
+from lunar.plausible import OFF_NADIR_DEG, VIEWS_OF_MOON
 from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import NS, format_tai, format_utc, tdb_s_from_tai_ns
 
@@ -108,6 +109,34 @@ def check_gravity(ephemeris: Ephemeris) -> None:
         tide = 3.0 * GM_EARTH_M3_S2 / GM_MOON_M3_S2 * (radius / _NEAREST_EARTH_M) ** 3
         if weighted > GRAVITY_TOLERANCE + min(tide, _MOST_TIDE):
             raise UnmovedByGravity(arc.object_name, radius, expected, found, off)
+
+
+def check_pointing(ephemeris: Ephemeris, utc_ns: IntArray, q_wxyz: FloatArray) -> None:
+    """Refuse attitudes (n, 4), ICRF to camera at epochs (n,), whose boresights mostly miss the Moon.
+
+    Raises
+    ------
+    EphemerisError
+        Where a quaternion of another direction or order, or of other axes, is likely.
+    """
+    known = ephemeris.covers(utc_ns)
+    if not known.any():
+        spans = (
+            f"{format_utc(int(a))}..{format_utc(int(b))}"
+            for a, b in ((ephemeris.start_utc_ns, ephemeris.stop_utc_ns), (utc_ns[0], utc_ns[-1]))
+        )
+        raise EphemerisError("attitudes: expected times within {}, found {}".format(*spans))
+    position = ephemeris.at(utc_ns[known])[0]
+    radius = np.linalg.norm(position, axis=1)
+    boresight = matrix_from_quaternion(q_wxyz[known])[:, 2]
+    angle = np.arccos(np.clip(-np.einsum("ni,ni->n", boresight, position) / radius, -1.0, 1.0))
+    seen, middle = float(np.mean(angle <= math.radians(OFF_NADIR_DEG))), math.degrees(float(np.median(angle)))
+    if seen < VIEWS_OF_MOON:
+        raise EphemerisError(
+            f"attitudes: expected the camera within {OFF_NADIR_DEG:g} deg of nadir in {VIEWS_OF_MOON:.0%} of them or "
+            f"more, found {seen:.0%}, {middle:.0f} deg in the median: quaternions in another order or direction, other "
+            "axes, or other times?"
+        )
 
 
 def _check_single(arc: EphemerisSegment) -> None:

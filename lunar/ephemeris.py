@@ -178,6 +178,12 @@ class Ephemeris:
                 )
 
     @property
+    def words(self) -> str:
+        """Return the object and the time scales of the file, as printed with figures of it."""
+        systems = dict.fromkeys(one.time_system for one in self.segments)
+        return f"{self.segments[0].object_name}, epochs in {' and '.join(systems)}"
+
+    @property
     def start_utc_ns(self) -> int:
         return self.segments[0].start_utc_ns
 

@@ -56,7 +56,7 @@ def configure_convert(commands: Any) -> None:
 
 
 def run_compare(arguments: argparse.Namespace) -> int:
-    from linna.data import load_orbit, orbit_words
+    from linna.data import load_orbit
     from lunar.comparison import compare
     from lunar.timescales import format_utc
 
@@ -73,8 +73,8 @@ def run_compare(arguments: argparse.Namespace) -> int:
         "samples": difference.samples,
         "start": format_utc(int(difference.utc_ns[0])),
         "stop": format_utc(int(difference.utc_ns[-1])),
-        "a": orbit_words(first),
-        "b": orbit_words(second),
+        "a": first.words,
+        "b": second.words,
     }
     rows = [
         f"{name:<4} radial {radial:.6g} m, transverse {transverse:.6g} m, normal {normal:.6g} m"
@@ -94,7 +94,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
 def run_interpolate(arguments: argparse.Namespace) -> int:
     import numpy as np
 
-    from linna.data import data_folder, load_orbit, orbit_words
+    from linna.data import data_folder, load_orbit
     from lunar.datafolder import default_orientation
     from lunar.timescales import format_tai, tdb_s_from_tai_ns
     from lunar.visibility import subsatellite
@@ -131,7 +131,7 @@ def run_interpolate(arguments: argparse.Namespace) -> int:
         arguments,
         {
             "states": states,
-            "file": orbit_words(ephemeris),
+            "file": ephemeris.words,
             "frame": "ICRF, Moon-centred",
             "orientation": orientation.name,
             "data": [f"lunar orientation {orientation.name}"],
@@ -141,7 +141,7 @@ def run_interpolate(arguments: argparse.Namespace) -> int:
 
 
 def run_convert(arguments: argparse.Namespace) -> int:
-    from linna.data import data_folder, load_orbit, orbit_words
+    from linna.data import data_folder, load_orbit
     from linna.errors import UsageError
     from lunar.datafolder import default_orientation
     from lunar.ephemeris import resampled
@@ -163,7 +163,7 @@ def run_convert(arguments: argparse.Namespace) -> int:
     if out.suffix.lower() not in writers:
         raise UsageError(f"--out: expected a name ending in {', '.join(writers)}, found {out.name!r}")
     ephemeris = load_orbit(arguments.ephemeris, arguments.spice_id, arguments.step)
-    words = orbit_words(ephemeris)
+    words = ephemeris.words
     if arguments.step or out.suffix.lower() in (".e", ".csv", ".tum"):
         ephemeris = resampled(ephemeris, arguments.step)
     written = writers[out.suffix.lower()](ephemeris)

@@ -21,7 +21,15 @@ import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.constants import MOON_RADIUS_M
-from lunar.plausible import HEIGHT_M, RADIUS_M, RELIEF_M, SPHERE_TOLERANCE
+from lunar.plausible import (
+    HEIGHT_M,
+    RADIUS_M,
+    RELIEF_M,
+    SLOPE_BASE_M,
+    SLOPE_DEG,
+    SPHERE_TOLERANCE,
+    STEEP_SHARE,
+)
 from payload_emulator.errors import TerrainError, install_hint
 from payload_emulator.sim.terrain.tiles import Heights
 
@@ -55,6 +63,9 @@ _SPIKES = 0.01
 """Share of implausible heights of a chunk, above which the unit and not a few pixels are wrong."""
 
 _RELIEF_SPAN_M = 20e3
+_NARROW = 0.05
+"""Cosine of the latitude beyond which columns are too narrow for slopes to the east."""
+
 _LIKENESS = 0.9
 """Correlation with the coarse relief from which scale and zero are compared."""
 _SCALES = (0.7, 1.4)
@@ -281,8 +292,11 @@ class RasterLayer:
         if reading is None and np.isfinite(values).any():
             pixel_m = math.radians(MOON_RADIUS_M / self.pixels_per_degree)
             _require_relief(file, chosen, values, pixel_m)
+            latitude_deg = 90.0 - (file.row + corner[0] + 0.5 * len(values)) / self.pixels_per_degree
+            _require_slopes(file, chosen, values, pixel_m, math.cos(math.radians(latitude_deg)))
             like = self._compared(file, values, corner)
-            self._readings[number] = replace(chosen, words=f"{chosen.words}{like}")
+            found = f"; heights of {np.nanmin(values):.4g} to {np.nanmax(values):.4g} m"
+            self._readings[number] = replace(chosen, words=f"{chosen.words}{found}{like}")
         return values
 
     def _compared(self, file: RasterFile, values: Heights, corner: tuple[int, int]) -> str:
@@ -420,6 +434,22 @@ def _require_relief(file: RasterFile, reading: Reading, values: Heights, pixel_m
         f"{_RELIEF_SPAN_M / 1e3:g} km, found {spread:.3g} ({good.min():.4g} to {good.max():.4g}, no unit stated): "
         f"kilometres? {_STATE_IT}"
     )
+
+
+def _require_slopes(file: RasterFile, reading: Reading, values: Heights, pixel_m: float, narrow: float) -> None:
+    """Refuse heights without a unit that are steeper than ground of the Moon is; columns are ``narrow`` pixels wide."""
+    if reading.unit or pixel_m < SLOPE_BASE_M or min(values.shape) < 2 or narrow < _NARROW:
+        return
+    south, east = np.gradient(values.astype(np.float64), pixel_m)
+    steep = np.hypot(south, east / narrow)
+    good = np.isfinite(steep)
+    share = float(np.mean(steep[good] > math.tan(math.radians(SLOPE_DEG)))) if good.any() else 0.0
+    if share > STEEP_SHARE:
+        raise TerrainError(
+            f"{file.path}: expected at most {STEEP_SHARE:.1%} of the pixels steeper than {SLOPE_DEG:g} deg, found "
+            f"{share:.1%} (heights of {np.nanmin(values):.4g} to {np.nanmax(values):.4g} m, no unit stated): half "
+            f"metres, feet or another scale? {_STATE_IT}"
+        )
 
 
 def _has_mask(source: Any) -> bool:
