@@ -46,6 +46,9 @@ RELIEF_M = 3.0
 """Least standard deviation of heights over ground of 20 km: the flattest of all 136,000 cells of that size of GLD100
 has 4.6 m, the median 300 m."""
 
+RASTER_PIXEL_M = Limit(0.2, 500_000.0, "m")
+"""Size of the pixels of a map: images from orbit have 0.25 m and more, ten pixels about the Moon 1,100 km."""
+
 SLOPE_DEG, STEEP_SHARE, SLOPE_BASE_M = 45.0, 0.01, 50.0
 """Slope that at most this share of the ground exceeds over a pixel of this size or more: of 608 windows of 121 km on
 GLD100 at 237 m none has 38 degrees on more than 0.06 %; the angle of repose is 32 to 37 degrees (Kreslavsky & Head
@@ -82,6 +85,9 @@ ORBIT_RADIUS_M = Limit(MOON_RADIUS_M, 66_000_000.0, "m")
 ORBIT_SPEED_M_S = Limit(0.0, 3_500.0, "m/s")
 """Arrivals from the Earth pass low over the Moon with 2.3 to 2.6 km/s; escape at the ground is at 2.376 km/s."""
 
+ORIENTATION_RAD = 2e-4
+"""Greatest difference of an orientation of the Moon from the IAU series: DE421 has 9e-5 at most from 1900 to 2050."""
+
 GRAVITY_ALIKE, GRAVITY_ALIKE_DEGREE = 0.3, 6
 """Greatest relative difference of the terms of each degree up to this one from GRAIL's: LP165P differs by 0.7 %."""
 
@@ -101,6 +107,12 @@ CAMERA_PIXELS = Limit(16, 8192, "pixels")
 OFF_NADIR_DEG, VIEWS_OF_MOON = 60.0, 0.9
 """Angle from nadir within which a camera looks in this share of the frames of a pass: from 30 km the horizon is 79
 degrees from nadir.  Quaternions of another order or direction turn it through all directions."""
+
+EXPOSURE_S = Limit(0.0, 60.0, "s")
+"""Exposure of an image of the sunlit ground, which moves by 1.6 km in a second, or of the night side."""
+
+REFERENCE_SIGMA_M = Limit(0.0, 100_000.0, "m")
+"""Error of an orbit determination that is used as a reference."""
 
 CLOCK_ERROR_S = 3600.0
 """Largest error of a clock in use: time zones, leap seconds and unset offsets of stations stay below, a wrong date does

@@ -114,7 +114,16 @@ def import_archive(ground: Ground, folder: Path) -> int:
     stored[MANIFEST_FILE] = ground.files.put_file(folder / MANIFEST_FILE)
     images = {number: ground.files.put_file(folder / name) for number, name in _chosen_frames(names)}
     pass_id = _register(
-        ground, folder, manifest, digest, start_utc_ns, stop_utc_ns, stored, images, (mission, text), reference
+        ground,
+        folder,
+        manifest,
+        digest,
+        start_utc_ns,
+        stop_utc_ns,
+        stored,
+        images,
+        (mission, text),
+        reference,
     )
     if receptions is not None:
         enter_receptions(

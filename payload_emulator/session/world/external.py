@@ -275,7 +275,9 @@ def _attitudes(folder: Path) -> tuple[IntArray, FloatArray, tuple[str, ...]]:
         if one.frame_a not in _INERTIAL:
             raise ScenarioError(f"{path}: expected REF_FRAME_A {' or '.join(_INERTIAL)}, found {one.frame_a}")
         if not one.frame_b.upper().startswith(CAMERA_NAMES):
-            raise ScenarioError(f"{path}: expected REF_FRAME_B INSTRUMENT_1 (the camera), found {one.frame_b}")
+            raise ScenarioError(
+                f"{path}: expected REF_FRAME_B INSTRUMENT_1 (the camera), found {one.frame_b}"
+            )
     scales = tuple(dict.fromkeys(one.time_system for one in segments))
     return (
         np.concatenate([one.utc_ns for one in segments]),

@@ -24,6 +24,7 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.plausible import (
     HEIGHT_M,
     RADIUS_M,
+    RASTER_PIXEL_M,
     RELIEF_M,
     SLOPE_BASE_M,
     SLOPE_DEG,
@@ -295,7 +296,13 @@ class RasterLayer:
             latitude_deg = 90.0 - (file.row + corner[0] + 0.5 * len(values)) / self.pixels_per_degree
             _require_slopes(file, chosen, values, pixel_m, math.cos(math.radians(latitude_deg)))
             like = self._compared(file, values, corner)
-            found = f"; heights of {np.nanmin(values):.4g} to {np.nanmax(values):.4g} m"
+            ppd = self.pixels_per_degree
+            north, west = 90.0 - file.row / ppd, file.column / ppd
+            found = (
+                f"; {north - file.rows / ppd:.4g} to {north:.4g} deg north, {west:.4g} to "
+                f"{west + file.columns / ppd:.4g} deg east, heights of {np.nanmin(values):.4g} to "
+                f"{np.nanmax(values):.4g} m"
+            )
             self._readings[number] = replace(chosen, words=f"{chosen.words}{found}{like}")
         return values
 
@@ -436,7 +443,9 @@ def _require_relief(file: RasterFile, reading: Reading, values: Heights, pixel_m
     )
 
 
-def _require_slopes(file: RasterFile, reading: Reading, values: Heights, pixel_m: float, narrow: float) -> None:
+def _require_slopes(
+    file: RasterFile, reading: Reading, values: Heights, pixel_m: float, narrow: float
+) -> None:
     """Refuse heights without a unit that are steeper than ground of the Moon is; columns are ``narrow`` pixels wide."""
     if reading.unit or pixel_m < SLOPE_BASE_M or min(values.shape) < 2 or narrow < _NARROW:
         return
@@ -576,10 +585,18 @@ def _placed(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tupl
     if across and not transform.b and not transform.d:
         wide, high = transform.a / across, -transform.e / down
         if wide > 0.0 and abs(wide - high) <= 1e-6 * wide:
+            _require_pixel(file, math.radians(MOON_RADIUS_M * wide))
             ppd = round(1.0 / wide, 6)
             west_deg = (middle_deg + west / across) % 360.0
             return ppd, replace(file, row=(90.0 - north / down) * ppd, column=west_deg * ppd)
     return _warped(file, crs, transform, radius_m)
+
+
+def _require_pixel(file: RasterFile, pixel_m: float) -> None:
+    if not RASTER_PIXEL_M.holds(pixel_m):
+        raise TerrainError(
+            f"{file.path}: expected pixels of {RASTER_PIXEL_M}, found {pixel_m:.3g} m: coordinates in another unit?"
+        )
 
 
 def _unit_m(values: dict[str, Any]) -> float:
@@ -595,6 +612,7 @@ def _warped(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tupl
     rows, columns = file.shape
     pixel = math.sqrt(abs(transform.determinant))
     pixel_deg = pixel if crs.is_geographic else pixel * _unit_m(crs.to_dict()) / math.radians(radius_m)
+    _require_pixel(file, math.radians(MOON_RADIUS_M * pixel_deg))
     ppd = round(1.0 / pixel_deg, 6)
     y, x = np.meshgrid(np.linspace(0, rows, 65), np.linspace(0, columns, 65), indexing="ij")
     east, north = _transformed(crs, sphere, *_applied(transform, x.ravel(), y.ravel()))
