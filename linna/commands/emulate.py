@@ -185,13 +185,16 @@ def _check(arguments: argparse.Namespace, scenario: Scenario, external: External
         "unknown": list(mission.unknown),
         "ends": world.ends,
         "data": list(world.data_names),
+        "stated": scenario.words,
+        "registration": "" if world.terrain.registration is None else world.terrain.registration.words,
     }
     return emit(
         arguments,
         figures,
         text=f"{scenario.name}: {len(times)} frames, {figures['start_utc']} to {figures['stop_utc']}, estimators "
         f"{', '.join(scenario.navigation.estimators)}\n{f'{world.ends}{chr(10)}' if world.ends else ''}"
-        f"data: {'; '.join(world.data_names)}",
+        f"data: {'; '.join(world.data_names)}\nstated: {scenario.words}"
+        + (f"\nregistration: {figures['registration']}" if figures["registration"] else ""),
     )
 
 

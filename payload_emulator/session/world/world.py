@@ -13,6 +13,7 @@ import numpy as np
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
+from lunar.comparison import check_pointing
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris, EphemerisSegment
@@ -21,7 +22,7 @@ from lunar.frames import Orientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.gravity import GravityField
 from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from lunar.maneuvers import Maneuver
-from lunar.messages.oem import load_oem
+from lunar.messages.ephemeris_files import load_orbit
 from lunar.plausible import HEIGHT_M
 from lunar.propagation import ForceModel
 from lunar.timescales import (
@@ -162,17 +163,20 @@ def _external_world(
     scenario: Scenario, external: ExternalFrames, terrain: Terrain, model: ForceModel
 ) -> World:
     """Return the world of external frames."""
-    truth = _truth_of_ephemeris(load_oem(external.ephemeris), model.orientation)
+    ephemeris = load_orbit(external.ephemeris)
+    truth = _truth_of_ephemeris(ephemeris, model.orientation)
     first, last = int(external.utc_ns[0]), int(external.utc_ns[-1])
     if first < truth.start_utc_ns or last > truth.stop_utc_ns:
         raise ScenarioError(
             f"{external.ephemeris}: expected states from {format_utc(first)} to {format_utc(last)}, found "
             f"{format_utc(truth.start_utc_ns)} to {format_utc(truth.stop_utc_ns)}"
         )
+    if external.attitude_utc_ns.size:
+        check_pointing(ephemeris, external.attitude_utc_ns, external.q_wxyz)
     _register(terrain, truth, external.utc_ns)
     require_above_ground(truth, external.utc_ns, terrain.height_m, HEIGHT_M.high)
     names = (
-        f"external images {external.files[0].parent.name}",
+        f"external images {external.files[0].parent.name} ({external.words}), orbit of {ephemeris.words}",
         *_names(terrain, model, truth, external.utc_ns),
     )
     return World(scenario, truth, terrain, model, (), external.utc_ns, names, external)
@@ -348,7 +352,7 @@ def _fly_to_windows(
     window = scenario.window
     not_before = parse_utc(window.start) if window.start else scenario.epoch_utc_ns
     if scenario.orbit.oem:
-        truth = _truth_of_ephemeris(load_oem(Path(scenario.orbit.oem)), model.orientation)
+        truth = _truth_of_ephemeris(load_orbit(Path(scenario.orbit.oem)), model.orientation)
         return truth, (), _windows(scenario, truth, terrain, max(not_before, truth.start_utc_ns)), ""
     reach_days = min(_SEARCH_CHUNK_DAYS, window.search_days)
     if window.search == "none":
