@@ -270,6 +270,8 @@ class Catalogue(Section):
     registration is the mean shift from the listed craters to the terrain near the frames, with its standard deviation
     per axis and the number of rims that it was fitted to; it is contained in the positions of an archive's catalogue.
     `registered_share` is the share of frames over ground where there is one: 0 if the catalogue is not registered.
+    `offset_sigma_m` (east, north, up) is the 1-sigma offset that all craters have in common, as the payload assumes it
+    at its start, `offset_correlation_deg` the arc over which it is similar (1/e).
     """
 
     source: str | None = None
@@ -279,6 +281,8 @@ class Catalogue(Section):
     registration_sigma_m: NotNegative | None = None
     registration_rims: Annotated[int, Field(ge=0)] | None = None
     registered_share: Share | None = None
+    offset_sigma_m: Annotated[tuple[NotNegative, NotNegative, NotNegative], Array] | None = None
+    offset_correlation_deg: Positive | None = None
 
 
 class Detector(Section):
