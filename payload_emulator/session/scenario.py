@@ -18,7 +18,9 @@ from lunar.errors import LunarError
 from lunar.plausible import (
     CAMERA_FIELD_DEG,
     CAMERA_PIXELS,
+    CRATER_DIAMETER_M,
     MAP_SHIFT_M,
+    OFF_NADIR_DEG,
     ORBIT_RADIUS_M,
     ORBIT_SPEED_M_S,
     UTC_NS,
@@ -361,6 +363,18 @@ class Scenario:
     def epoch_utc_ns(self) -> int:
         return parse_utc(self.orbit.epoch)
 
+    @property
+    def words(self) -> str:
+        """Return the values that differ from the defaults, as printed with figures of the scenario."""
+        default, listed = Scenario(""), []
+        for item in dataclasses.fields(self):
+            section, plain = getattr(self, item.name), getattr(default, item.name)
+            if dataclasses.is_dataclass(section):
+                names = (key.name for key in dataclasses.fields(section))
+                changed = [name for name in names if getattr(section, name) != getattr(plain, name)]
+                listed += [f"{item.name}.{name} {toml_text(getattr(section, name))}" for name in changed]
+        return ", ".join(listed)
+
     def with_choices(
         self,
         *,
@@ -559,8 +573,13 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "camera.width_px": (CAMERA_PIXELS.low, CAMERA_PIXELS.high),
     "camera.height_px": (CAMERA_PIXELS.low, CAMERA_PIXELS.high),
     "camera.fov_deg": (CAMERA_FIELD_DEG.low, CAMERA_FIELD_DEG.high),
-    "camera.tilt_deg": (-60.0, 60.0),
+    "camera.tilt_deg": (-OFF_NADIR_DEG, OFF_NADIR_DEG),
     "camera.frame_interval_s": (_POSITIVE, _ANY),
+    "clock.drift_ppm": (-1e5, 1e5),
+    "navigation.initial_position_error_m": (0.0, MOON_RADIUS_M),
+    "navigation.initial_velocity_error_m_s": (0.0, ORBIT_SPEED_M_S.high),
+    "navigation.catalogue_min_diameter_km": (CRATER_DIAMETER_M.low / 1e3, CRATER_DIAMETER_M.high / 1e3),
+    "navigation.catalogue_max_diameter_km": (CRATER_DIAMETER_M.low / 1e3, CRATER_DIAMETER_M.high / 1e3),
     "window.passes": (1, _ANY),
     "window.arc_interval": (1, _ANY),
     "detector.max_detections": (1, 255),
@@ -771,6 +790,11 @@ def _check_light(scenario: Scenario, require: Require) -> None:
 
 
 def _check_navigation(scenario: Scenario, require: Require) -> None:
+    require(
+        scenario.navigation.catalogue_min_diameter_km < scenario.navigation.catalogue_max_diameter_km,
+        "navigation.catalogue_min_diameter_km",
+        "less than navigation.catalogue_max_diameter_km",
+    )
     for name in scenario.navigation.estimators:
         require(name in ESTIMATORS, "navigation.estimators", f"of {', '.join(ESTIMATORS)}", name)
     require(len(scenario.navigation.estimators) > 0, "navigation.estimators", "at least one estimator", ())

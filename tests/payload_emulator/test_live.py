@@ -62,7 +62,9 @@ class Watcher:
 
     def __init__(self, live: LiveSession) -> None:
         self.telemetry = socket.create_connection(("127.0.0.1", live.ports["telemetry earth"]), timeout=900.0)
-        self.orders = socket.create_connection(("127.0.0.1", live.ports["telecommand earth"]), timeout=900.0)
+        self.telecommands = socket.create_connection(
+            ("127.0.0.1", live.ports["telecommand earth"]), timeout=900.0
+        )
         self.console = socket.create_connection(("127.0.0.1", live.ports["console"]), timeout=900.0)
         self.lines = self.console.makefile("r")
         self.say("watch")
@@ -89,7 +91,7 @@ class Watcher:
 
     def close(self) -> None:
         self.lines.close()
-        for connection in (self.telemetry, self.orders, self.console):
+        for connection in (self.telemetry, self.telecommands, self.console):
             connection.close()
 
 
@@ -179,9 +181,9 @@ def test_a_session_of_watching_stepping_and_commanding(running: tuple[LiveSessio
     assert second["estimates"]["spherical"]["reset_trigger"] == "manual_step"
     # Telecommands, as CLTU and bare, in pieces.
     cltu = UplinkEncoder(0x4C).encode([ping(7)])
-    watcher.orders.sendall(cltu[:11])
-    watcher.orders.sendall(cltu[11:] + ping(8)[:5])
-    watcher.orders.sendall(ping(8)[5:] + ping(8))
+    watcher.telecommands.sendall(cltu[:11])
+    watcher.telecommands.sendall(cltu[11:] + ping(8)[:5])
+    watcher.telecommands.sendall(ping(8)[5:] + ping(8))
     watcher.say("sideways")
     watcher.until(lambda message: message["kind"] == "error")
     watcher.say("run")
@@ -289,7 +291,7 @@ def test_hundreds_of_short_half_open_and_reset_connections_do_not_stop_the_paylo
         connection.close()
     # Parts of packets and words that were broken off do not run into those of others.
     wanted = int.from_bytes(ping(1005)[:4], "big")
-    watcher.orders.sendall(ping(1005))
+    watcher.telecommands.sendall(ping(1005))
     watcher.say("rate 0")
     watcher.say("run")
     watcher.until(
@@ -388,19 +390,21 @@ def test_no_more_connections_are_held_than_the_limit() -> None:
 def test_telecommands_come_out_of_any_noise_whole_or_not_at_all() -> None:
     rng = np.random.default_rng(6)
     for trial in range(200):
-        orders = [ping(k) for k in range(4)]
-        noise = [bytes(rng.integers(0x30, 0x80, int(rng.integers(0, 9))).astype(np.uint8)) for _ in orders]
+        telecommands = [ping(k) for k in range(4)]
+        noise = [
+            bytes(rng.integers(0x30, 0x80, int(rng.integers(0, 9))).astype(np.uint8)) for _ in telecommands
+        ]
         encoder = UplinkEncoder(0x4C)
         parts = [
-            quiet + (encoder.encode([order]) if (trial >> k) & 1 else order)
-            for k, (quiet, order) in enumerate(zip(noise, orders, strict=True))
+            quiet + (encoder.encode([telecommand]) if (trial >> k) & 1 else telecommand)
+            for k, (quiet, telecommand) in enumerate(zip(noise, telecommands, strict=True))
         ]
         stream, buffer, found = b"".join(parts), TelecommandBuffer(Receiver(0x4C)), []
         while stream:
             cut = int(rng.integers(1, 40))
             found += buffer.take(stream[:cut])
             stream = stream[cut:]
-        assert found == orders
+        assert found == telecommands
         assert buffer.dropped >= sum(map(len, noise))
 
 

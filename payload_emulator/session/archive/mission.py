@@ -23,6 +23,8 @@ from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation, spherical_from_mcmf
 from lunar.timescales import format_utc
 from payload_emulator.flight.models import NETWORKS
+from payload_emulator.flight.navigation.filter.filter import CommonErrors
+from payload_emulator.flight.navigation.filter.map_offset import OffsetRule
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.session.archive.recording import RecordedStep
 from payload_emulator.session.live.station_ports import RECORD_HEADER
@@ -119,6 +121,7 @@ def mission_text(world: World, data: DataFolder, orbit_age_h: float | None = Non
     """
     scenario, camera = world.scenario, world.scenario.camera
     link = LinkSettings(coding=scenario.link.coding)
+    errors, rule = CommonErrors(), OffsetRule()
     flown_field = filter_field(scenario.navigation.filter_gravity, scenario.navigation.filter_degree, data)
     sections: dict[str, dict[str, Value]] = {
         "spacecraft": {"id": scenario.spacecraft_id, "name": scenario.spacecraft},
@@ -157,6 +160,8 @@ def mission_text(world: World, data: DataFolder, orbit_age_h: float | None = Non
         "catalogue": {
             "source": world.terrain.catalogue.source,
             **_registration(world),
+            "offset_sigma_m": [rule.prior_m, rule.prior_m, errors.catalogue_offset_m[2]],
+            "offset_correlation_deg": round(math.degrees(errors.catalogue_correlation_rad), 6),
         },
         "detector": _detector(scenario),
         "reference": {

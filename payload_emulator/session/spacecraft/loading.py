@@ -27,6 +27,7 @@ from payload_emulator.errors import ModelError
 from payload_emulator.flight.models import NETWORKS, load_shipped_model
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.flight.navigation.filter.filter import CommonErrors
+from payload_emulator.flight.navigation.filter.map_offset import OffsetRule
 from payload_emulator.flight.navigation.odometry.odometry import OdometryParameters
 from payload_emulator.flight.navigation.outcomes import Mode
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload, PayloadMode
@@ -202,7 +203,9 @@ def _build(scenario: Scenario, camera: PinholeCamera, data: DataFolder, is_launc
             camera=camera,
             modes=tuple(Mode[name] for name in navigation.estimators),
             odometry=OdometryParameters(safety_timeout_s=navigation.safety_timeout_s or None),
-            anchored=AnchoredParameters(gravity_degree=field.degree, errors=_attitude_errors(scenario)),
+            anchored=AnchoredParameters(
+                gravity_degree=field.degree, errors=_attitude_errors(scenario), offset=OffsetRule()
+            ),
             image_reports=is_launched,
             time_reports=is_launched,
             scrub_interval_s=_SCRUB_S if is_launched else FlightParameters().scrub_interval_s,

@@ -17,7 +17,7 @@ from lunar.camera import ground_point_sphere
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
 from lunar.lens import BrownCamera
-from lunar.messages.oem import load_oem
+from lunar.messages.ephemeris_files import load_orbit
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import Scenario
@@ -134,7 +134,7 @@ def _require_covered(scenario: Scenario, first_utc_ns: int, last_utc_ns: int) ->
                 f"found {format_utc(first_utc_ns)}"
             )
         return
-    ephemeris = load_oem(Path(scenario.orbit.oem))
+    ephemeris = load_orbit(Path(scenario.orbit.oem))
     for utc_ns in (first_utc_ns, last_utc_ns):
         if not ephemeris.start_utc_ns <= utc_ns < ephemeris.stop_utc_ns:
             raise ScenarioError(
