@@ -48,14 +48,14 @@ from ground_service.passes import store as passes
 from ground_service.passes.model import PassRecord
 from ground_service.passes.packet_accounting import packet_accounting
 from ground_service.passes.sample_store import code_labels, detection_samples, event_list
-from ground_service.passes.samples import (
+from ground_service.passes.span import PassSpan, pass_span
+from ground_service.store.files import FileArchive, register_file
+from ground_service.store.vehicles import Vehicle, get_vehicle
+from ground_service.telemetry.samples import (
     NavigationSamples,
     OutcomeSamples,
 )
-from ground_service.passes.span import PassSpan, pass_span
-from ground_service.store.files import FileArchive, register_file
-from ground_service.store.telemetry import unpack_filter_states, unpack_identifications
-from ground_service.store.vehicles import Vehicle, get_vehicle
+from ground_service.telemetry.store import unpack_filter_states, unpack_identifications
 from ground_service.toml import read_table
 from lunar.boxes import share_outside
 from lunar.camera import PinholeCamera

@@ -15,6 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from ground_service.telemetry.packets import NO_TIME
 from lunar.arrays import IntArray, OctetArray
 from lunar.plausible import AGREEING_PACKETS, CLOCK_ERROR_S, SILENCE_S, UNSET_CLOCK_S
 from tmtc.link.clcw import UplinkSeen
@@ -378,10 +379,6 @@ def is_idle(octets: bytes) -> bool:
 DAY_NS = 86_400_000_000_000
 CDS_EPOCH_DAYS = 4383
 """Days from 1958-01-01 to 1970-01-01."""
-
-
-NO_TIME = -1
-"""Reception time of a CADU whose record states none."""
 
 
 @dataclass(frozen=True, slots=True)

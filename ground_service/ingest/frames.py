@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.ingest.core import COUNTS, UNKNOWN, Channel, Found, Fragment, RecordFormat, is_idle
-from ground_service.ingest.packets import PacketBatch, batch_of_cut
+from ground_service.telemetry.packets import PacketBatch, batch_of_cut
 from lunar.arrays import BoolArray, IntArray, OctetArray
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Dictionary

@@ -25,18 +25,18 @@ from ground_service.ingest.doubt_store import count_implausible, plausible_part
 from ground_service.ingest.frames import CADU_MAX_OCTETS, FrameReader, PacketReader, Section
 from ground_service.ingest.link_settings import known_before, packet_form
 from ground_service.ingest.model import IngestResult, ReceivedControlWords, ReceivedLink, ReceivedSection
-from ground_service.ingest.packets import PacketBatch, batch_of_cut, time_receptions
-from ground_service.ingest.parameters import (
-    catch_up,
-    decode_declared,
-    definitions_of_spacecraft,
-    note_dictionary,
-)
 from ground_service.ingest.recording_store import Part, Piece
 from ground_service.ingest.store import Stored
 from ground_service.missions.definitions import PacketDefinitions
 from ground_service.store.files import FileArchive, mapped_octets, read_blocks, recorded_name
 from ground_service.store.vehicles import vehicle_id
+from ground_service.telemetry.decoding import (
+    catch_up,
+    decode_declared,
+    definitions_of_spacecraft,
+    note_dictionary,
+)
+from ground_service.telemetry.packets import PacketBatch, batch_of_cut, time_receptions
 from lunar.arrays import OctetArray
 from tmtc.arrays import as_octets
 from tmtc.dictionary.payload import DICTIONARY

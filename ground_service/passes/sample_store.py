@@ -12,11 +12,12 @@ from sqlalchemy import Connection, func, select
 
 from ground_service.http.model import Paging
 from ground_service.missions.timekeeping.core import utc_ns_of_ticks
-from ground_service.passes.samples import DetectionSamples, no_detections
 from ground_service.passes.span import PassSpan
-from ground_service.store import repository, telemetry
+from ground_service.store import repository
 from ground_service.store.models import TELECOMMANDS
-from ground_service.store.telemetry import DETECTION_ITEM, unpack_detections
+from ground_service.telemetry import store as telemetry
+from ground_service.telemetry.samples import DetectionSamples, no_detections
+from ground_service.telemetry.store import DETECTION_ITEM, unpack_detections
 from lunar.arrays import IntArray
 from lunar.timescales import format_utc
 from reports.values import PassEvent

@@ -20,9 +20,9 @@ from ground_service.passes.store import received_frames
 from ground_service.planning import store
 from ground_service.planning.model import WindowRecord
 from ground_service.planning.window_states import WindowFacts, state_of
-from ground_service.store import telemetry
 from ground_service.store.event_kinds import WindowChanged, publish
 from ground_service.store.vehicles import lock_spacecraft
+from ground_service.telemetry import store as telemetry
 
 REASON_LENGTH = 500
 DELETE = "delete_activity"

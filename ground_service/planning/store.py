@@ -13,7 +13,6 @@ from sqlalchemy.sql import Select
 from ground_service.contacts.commanding.store import ids_of_windows
 from ground_service.errors import NotFound
 from ground_service.http.model import PageOf, Paging, UtcTime
-from ground_service.ingest.parameters import readable_version
 from ground_service.passes import store as passes
 from ground_service.planning.filling import Option
 from ground_service.planning.model import (
@@ -32,6 +31,7 @@ from ground_service.store import repository
 from ground_service.store.repository import page, within
 from ground_service.store.states import change_if
 from ground_service.store.vehicles import get_vehicle
+from ground_service.telemetry.decoding import readable_version
 
 WINDOWS, VEHICLES = repository.WINDOWS, repository.VEHICLES
 

@@ -26,10 +26,10 @@ from ground_service.missions.ephemerides.service import (
 from ground_service.missions.frames import camera_of
 from ground_service.missions.model import Camera, Evidence, Mission
 from ground_service.passes.archive_import import archived_mission
-from ground_service.passes.samples import DetectionSamples, NavigationSamples, no_detections
 from ground_service.regression.archives import PassArchive, frame_inputs
 from ground_service.regression.builds import flat
 from ground_service.regression.gates.samples import KINDS, CraterRows, PassFrames, TimeTags, pass_frames
+from ground_service.telemetry.samples import DetectionSamples, NavigationSamples, no_detections
 from ground_service.toml import read_table
 from lunar.arrays import IntArray
 from lunar.camera import PinholeCamera

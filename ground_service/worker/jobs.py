@@ -22,7 +22,6 @@ from ground_service.errors import (
 )
 from ground_service.evaluation.service import make_report, reevaluate
 from ground_service.ground import Ground
-from ground_service.ingest.parameters import catch_up, redecode_job_id, vehicles_behind
 from ground_service.ingest.service import apply_definition, derive_without, run_ingest
 from ground_service.jobs import service
 from ground_service.jobs.model import Job
@@ -32,6 +31,7 @@ from ground_service.passes.archive_import import import_zip
 from ground_service.planning.standing import plan_tick
 from ground_service.regression.jobs import analysis_job, regression_job, rendering_job, replay_job
 from ground_service.store.event_kinds import JobChanged, publish
+from ground_service.telemetry.decoding import catch_up, redecode_job_id, vehicles_behind
 from ground_service.worker.actions import run_steps, send_messages
 from ground_service.worker.upkeep import nightly
 from kernels.memory import give_back

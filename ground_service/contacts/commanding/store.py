@@ -22,10 +22,11 @@ from ground_service.contacts.commanding.model import (
 from ground_service.http.model import PageOf
 from ground_service.ingest.core import LONGEST_SILENCE, LONGEST_STEP
 from ground_service.ingest.doubt_store import latest_ticks
-from ground_service.ingest.parameters import readable_version
-from ground_service.store import repository, telemetry
+from ground_service.store import repository
 from ground_service.store.states import TELECOMMAND, change_if, move, move_all
 from ground_service.store.vehicles import get_vehicle
+from ground_service.telemetry import store as telemetry
+from ground_service.telemetry.decoding import readable_version
 from lunar.constants import NANOSECONDS_PER_SECOND
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.packets.stream import cut_packets

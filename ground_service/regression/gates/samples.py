@@ -21,7 +21,7 @@ from ground_service.evaluation.recall import (
     expected_craters,
     match_detections,
 )
-from ground_service.passes.samples import DetectionSamples, NavigationSamples
+from ground_service.telemetry.samples import DetectionSamples, NavigationSamples
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue, size_class

@@ -20,7 +20,12 @@ from ground_service.evaluation.model import PassFigures
 from ground_service.evaluation.recall import Viewing
 from ground_service.evaluation.smoother import ONBOARD, FilterStates, StartState
 from ground_service.evaluation.verdict import Limits
-from ground_service.passes.samples import DetectionSamples, NavigationSamples, OutcomeSamples, no_detections
+from ground_service.telemetry.samples import (
+    DetectionSamples,
+    NavigationSamples,
+    OutcomeSamples,
+    no_detections,
+)
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, make_catalogue
 from lunar.ephemeris import Ephemeris, ephemeris_from_states

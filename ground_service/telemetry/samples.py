@@ -1,4 +1,4 @@
-"""What the evaluation works on: decoded samples of one pass as plain arrays, on correlated UTC."""
+"""Decoded samples of one pass as plain arrays, on correlated UTC: the input of the evaluation."""
 
 from __future__ import annotations
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.ingest.core import NO_TIME
 from lunar.arrays import IntArray
 from lunar.constants import NANOSECONDS_PER_SECOND
 from lunar.timescales import utc_ns_from_ticks
@@ -30,6 +29,9 @@ CLOCKS_AGREE_NS = 60 * NANOSECONDS_PER_SECOND
 
 Two independent clocks that agree are believed. A larger difference is a wrong clock of the station, or a report that
 was played back from the store."""
+
+NO_TIME = -1
+"""Reception time of a CADU whose record states none."""
 
 _TIMED_HEADER = np.dtype(
     [("primary", "V6"), ("pus", "u1"), ("kind", "V6"), ("p_field", "u1"), ("coarse", ">u4"), ("fine", ">u2")]
