@@ -40,6 +40,7 @@ test: $(VENV)/.dev
 # that have not passed; `make campaigns-left` lists them, and `make clean-campaigns` forgets what has passed.
 campaigns: $(VENV)/.dev
 	$(SUITE) -m campaign --resume
+	$(BIN)/python -m benchmarks.campaigns.compatibility --write
 	$(MAKE) test-cost
 
 campaigns-left: $(VENV)/.dev
