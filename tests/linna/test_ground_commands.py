@@ -77,11 +77,8 @@ def synthetic_archive(tmp_path: Path, downlink: Path, reference: Path) -> Path:
     for path in (downlink, reference):
         (folder / path.name).write_bytes(path.read_bytes())
     manifest = {
-        "schema_version": 1,
-        "pass_name": "small",
-        "spacecraft_id": 76,
-        "start_utc": format_utc(START),
-    }
+        "schema_version": 1, "pass_name": "small", "spacecraft_id": 76, "start_utc": format_utc(START),
+    }  # fmt: skip
     write_manifest(folder, manifest | {"stop_utc": format_utc(START + 600 * NS)})
     return folder
 
@@ -180,13 +177,8 @@ def test_every_command_of_the_ground_prints_the_same_here_and_on_a_server(
             ask("plan", "withdraw", 99)
             ask("plan", "search", "--altitude-km", 30, 50, "--maximum-duration-s", 900)
             window = [
-                "--start",
-                "2029-08-07T06:10:00Z",
-                "--stop",
-                "2029-08-07T06:20:00Z",
-                "--spacecraft-id",
-                "76",
-            ]
+                "--start", "2029-08-07T06:10:00Z", "--stop", "2029-08-07T06:20:00Z", "--spacecraft-id", "76",
+            ]  # fmt: skip
             number = do("plan", "add", *window)["id"]
             ask("plan", "add", *window)
             do("plan", "approve", number)

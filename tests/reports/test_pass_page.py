@@ -30,16 +30,12 @@ def _series(n: int, **more: object) -> NavigationSeries:
     """A navigation series of n samples at ten seconds, every value finite unless replaced."""
     return NavigationSeries(
         **{
-            "name": "anchored",
-            "kind": "estimate",
+            "name": "anchored", "kind": "estimate",
             "utc_ns": example.START_UTC_NS + np.arange(n, dtype=np.int64) * 10_000_000_000,
-            "latitude_deg": np.linspace(-10.0, 10.0, n),
-            "longitude_deg": np.full(n, 300.0),
-            "altitude_m": np.full(n, 30_000.0),
-            "error_rtn_m": np.full((n, 3), 20.0),
-            **more,
+            "latitude_deg": np.linspace(-10.0, 10.0, n), "longitude_deg": np.full(n, 300.0),
+            "altitude_m": np.full(n, 30_000.0), "error_rtn_m": np.full((n, 3), 20.0), **more,
         }
-    )
+    )  # fmt: skip
 
 
 def test_the_page_asks_for_nothing_outside_itself(page: Page, whole_page: str) -> None:

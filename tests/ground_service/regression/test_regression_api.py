@@ -83,12 +83,10 @@ def test_a_build_is_registered_held_against_another_and_judged(
 @pytest.mark.parametrize(
     "body",
     [
-        {"candidate": "../../etc/passwd"},
-        {"candidate": "0" * 64},
-        {"candidate": "current", "archives": ["0" * 64]},
-        {},
+        {"candidate": "../../etc/passwd"}, {"candidate": "0" * 64},
+        {"candidate": "current", "archives": ["0" * 64]}, {},
     ],
-)
+)  # fmt: skip
 def test_a_regression_of_nothing_known_is_refused(client: TestClient, body: dict[str, Any]) -> None:
     assert client.post(f"{V1}/regressions", json=body).status_code == 422
 

@@ -170,13 +170,11 @@ def test_a_backup_of_version_1_0_is_restored(tmp_path: Path) -> None:
     database.engine.dispose()
     assert head is not None
     manifest = {
-        "schema_version": 2,
-        "rows": {name: one.rows for name, one in tables.items()},
-        "tables": {name: one.sha256 for name, one in tables.items()},
-        "files": 0,
+        "schema_version": 2, "rows": {name: one.rows for name, one in tables.items()},
+        "tables": {name: one.sha256 for name, one in tables.items()}, "files": 0,
         "files_sha256": hashlib.sha256(b"").hexdigest(),
         "audit_head": {"number": head.number, "sha256": head.sha256},
-    }
+    }  # fmt: skip
     assert "row_digests" not in tables
     (saved / "backup.json").write_text(json.dumps(manifest))
     (saved / "linna.db").chmod(0o400)
