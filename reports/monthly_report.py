@@ -4,7 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from reports.document import VERDICT_ROLES, Block, Cell, Column, Document, Heading, Paragraph, Picture, Table
+from reports.document import (
+    VERDICT_ROLES,
+    Block,
+    Bullets,
+    Cell,
+    Column,
+    Document,
+    Heading,
+    Paragraph,
+    Picture,
+    Table,
+)
 from reports.figures import monthly
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
 from reports.text import count_text, number_text, percent_text, significant_text, utc_text
@@ -120,7 +131,9 @@ def _requirements(report: MonthlyReportValue) -> list[Block]:
         Column("share met"),
         Column("95 % interval"),
     )
-    return [Table(f"Requirements over the last {report.window_days:g} days of passes.", columns, tuple(rows))]
+    table = Table(f"Requirements over the last {report.window_days:g} days of passes.", columns, tuple(rows))
+    remarks = tuple(f"{one.name}, {one.remark}" for one in report.requirements if one.remark)
+    return [table, Bullets(remarks)] if remarks else [table]
 
 
 def _groups(report: MonthlyReportValue) -> list[Block]:

@@ -741,7 +741,10 @@ class LevelChange:
 
 @dataclass(frozen=True, slots=True)
 class RequirementOverTime:
-    """Requirement over the passes of a rolling window; the share of met ones is NaN where none was judged."""
+    """Requirement over the passes of a rolling window; the share of met ones is NaN where none was judged.
+
+    ``remark`` says that the mean of a NEES or NIS over the passes is outside its bounds.
+    """
 
     name: str
     unit: str
@@ -753,6 +756,7 @@ class RequirementOverTime:
     share_met: float
     low: float
     high: float
+    remark: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from lunar.frames import IauOrientation
 from lunar.gravity import GravityField, builtin_gravity, load_gravity
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
+from payload_emulator.flight.navigation.filter.map_offset import OffsetRule
 from payload_emulator.flight.navigation.filter.dynamics import process_noise
 from payload_emulator.sim.detector import SimulatedDetector
 from studies.montecarlo import CatalogueErrors, NavigationCase
@@ -119,7 +120,7 @@ def standard_case(data: DataFolder, track: Track, hours: float, catalogued: floa
         float(tdb_s_from_utc_ns(epoch_utc_ns)),
         gravity.gm_m3_s2,
     )
-    parameters = AnchoredParameters(gravity_degree=_FILTER_DEGREE)
+    parameters = AnchoredParameters(gravity_degree=_FILTER_DEGREE, offset=OffsetRule())
     errors, shipped = parameters.errors, process_noise(_FILTER_DEGREE, other.name)
     frames = round(hours * 240.0)
     # Two arcs of 37 minutes in each period of 111, with gaps of 18 over the poles.

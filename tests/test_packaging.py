@@ -121,7 +121,7 @@ def installed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (wheel,) = built.glob("*.whl")
     home = tmp_path_factory.mktemp("installed") / "venv"
     venv.create(home, with_pip=not has_base_pip())
-    done = pip_of(home / "bin", "install", "--no-deps", "--no-index", str(wheel))
+    done = pip_of(home / "bin", "install", "--no-deps", "--no-index", "--no-compile", str(wheel))
     assert done.returncode == 0, done.stdout + done.stderr
     packages = Path(sysconfig.get_path("purelib", vars={"base": str(home), "platbase": str(home)}))
     (packages / "shared.pth").write_text(sysconfig.get_path("purelib") + "\n")

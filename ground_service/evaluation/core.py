@@ -52,6 +52,7 @@ from ground_service.evaluation.smoother import (
     SMOOTHED,
     CommandedBurn,
     FilterStates,
+    MapOffset,
     StartState,
     propagated_positions,
     smoothed_series,
@@ -61,6 +62,7 @@ from ground_service.evaluation.verdict import (
     Evaluated,
     Limits,
     StartOrbit,
+    consistency_remarks,
     requirements,
     verdict_of,
     without_mission,
@@ -133,6 +135,8 @@ class PassInputs:
         Reasons for models that are None, by name.
     reference_sigma_rtn_m
         Declared 1-sigma error of the reference in radial, transverse and normal.
+    map_offset
+        Offset of the crater list that the payload uses; None where neither it nor the mission description states one.
     limits
         Limits of the verdict.
     experiment
@@ -170,6 +174,7 @@ class PassInputs:
     onboard_gravity: GravityField | None = None
     refused: Mapping[str, str] = field(default_factory=dict)
     reference_sigma_rtn_m: tuple[float, float, float] | None = None
+    map_offset: MapOffset | None = None
     limits: Limits = field(default_factory=Limits)
     experiment: StartOrbit | None = None
     clock_step_s: float | None = None
@@ -217,7 +222,7 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
     detector, gallery, worst, craters = _detector(inputs, missing, remarks)
     if not inputs.images:
         missing["gallery"] = missing["worst_frames"] = "no images came down with this pass"
-    remarks += attitude_remarks(inputs.events)
+    remarks += event_remarks(inputs.events)
     accounting = _frame_accounting(inputs)
     evaluated = Evaluated(
         navigation,
@@ -231,6 +236,7 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
         inputs.clock_step_s,
     )
     table = requirements(inputs.limits, evaluated)
+    remarks += consistency_remarks(table)
     if inputs.no_mission:
         table = without_mission(table, inputs.no_mission)
     verdict, level = verdict_of(table)
@@ -277,9 +283,11 @@ def _reference_px(inputs: PassInputs, reference: TrackSeries | None) -> float:
     )
 
 
-def attitude_remarks(events: Sequence[PassEvent]) -> list[str]:
-    """Return a remark for each time in which the payload judged its attitude noisier than declared."""
-    found: list[str] = []
+def event_remarks(events: Sequence[PassEvent]) -> list[str]:
+    """Return remarks on the newest offset of the list, and on times of an attitude noisier than declared."""
+    sizes = [one for one in events if one.name == "map_offset"]
+    newest = sorted(sizes, key=lambda event: event.utc_ns)[-1:]
+    found = [f"offset of the crater list used on board, 1 sigma: {one.detail}" for one in newest]
     lasting = False
     for one in sorted(events, key=lambda event: event.utc_ns):
         if one.name == "attitude_degraded":
@@ -530,7 +538,7 @@ def _smoothed(
     rows = np.minimum(np.searchsorted(track.utc_ns, filtered.utc_ns), len(track.utc_ns) - 1)
     kept = track.covered[rows] & (track.utc_ns[rows] == filtered.utc_ns)
     filtered, rows = filtered.select(kept).in_icrf(inputs.orientation, onboard), rows[kept]
-    model = smoother_model(gravity, inputs.orientation, inputs.burns)
+    model = smoother_model(gravity, inputs.orientation, inputs.burns, inputs.map_offset)
     series = smoothed_series(
         filtered,
         track.at_rows(rows),

@@ -24,6 +24,7 @@ from ground_service.evaluation.smoother import (
     SIZE,
     CommandedBurn,
     FilterStates,
+    MapOffset,
     StartState,
 )
 from ground_service.evaluation.verdict import Limits, StartOrbit
@@ -47,7 +48,7 @@ from ground_service.passes import sample_store
 from ground_service.passes import store as passes
 from ground_service.passes.model import PassRecord
 from ground_service.passes.packet_accounting import packet_accounting
-from ground_service.passes.sample_store import code_labels, detection_samples, event_list
+from ground_service.passes.sample_store import code_labels, detection_samples, event_list, learned_offset_m
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.store.files import FileArchive, register_file
 from ground_service.store.vehicles import Vehicle, get_vehicle
@@ -157,6 +158,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             onboard_gravity=declared.onboard_gravity,
             refused=_refused(declared, mission.camera),
             reference_sigma_rtn_m=mission.reference.sigma_rtn_m,
+            map_offset=_map_offset(mission.catalogue, learned_offset_m(connection, span)),
             limits=Limits(**mission.requirements.model_dump()),
             experiment=_experiment(mission, manifest),
             clock_step_s=_clock_step_s(connection, record, span),
@@ -523,6 +525,16 @@ def _provenance(
         "archive": str(record.archive_digest or "")[:16],
     }
     return {name: value for name, value in entries.items() if value}
+
+
+def _map_offset(stated: Catalogue, learned_m: float | None) -> MapOffset | None:
+    """Return the offset of the crater list as stated, with the size that the payload learned by the end of the pass."""
+    if stated.offset_sigma_m is None or stated.offset_correlation_deg is None:
+        return None
+    east_m, north_m, up_m = stated.offset_sigma_m
+    if learned_m is not None:
+        east_m = north_m = learned_m
+    return MapOffset((east_m, north_m, up_m), stated.offset_correlation_deg)
 
 
 def _registration_text(catalogue: Catalogue) -> str:

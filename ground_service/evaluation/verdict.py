@@ -15,7 +15,7 @@ import numpy as np
 from ground_service.evaluation.alignment import bounds_per_degree, independent_samples
 from lunar.arrays import FloatArray
 from lunar.constants import NANOSECONDS_PER_SECOND
-from reports.statistics import per_degree
+from reports.statistics import per_degree, sigma_remark
 from reports.text import count_text, significant_text
 from reports.values import (
     DetectorScore,
@@ -325,9 +325,9 @@ def _convergence_s(series: NavigationSeries, limit_m: float) -> float | None:
 
 
 def _consistency(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
-    """Yield the mean NEES and NIS against the upper bound for the number of independent draws in the pass.
+    """Yield the mean NEES and NIS against the bounds for the number of independent draws in the pass.
 
-    A pass alone shows a filter that is too confident. A mean below the lower bound is a matter of many passes.
+    Above the upper bound the requirement is not met; below the lower one it is met, with a remark.
     """
     series = _declared(limits, found)
     nees = nis = None
@@ -349,6 +349,8 @@ def _consistency(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
                 degrees = float(values[1][values[1] > 0].mean())
                 low, bound = bounds_per_degree(degrees, values[2], share / 100.0)
                 note += f"; {low:.2f} to {bound:.2f} with {share:g} % for {values[2]:.3g} independent draws"
+                wrong = sigma_remark(mean, low, bound)
+                note += f"; {wrong}" if wrong else ""
         yield _row(
             f"consistency.{key}",
             f"mean {key.upper()} per degree of freedom",
@@ -359,6 +361,12 @@ def _consistency(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
             judged=share is not None,
             note=note,
         )
+
+
+def consistency_remarks(table: Sequence[Requirement]) -> list[str]:
+    """Return a remark for each mean NEES or NIS that shows a filter that is too cautious."""
+    wrong = ((one, one.note.rpartition("; ")[2]) for one in table if one.key.startswith("consistency."))
+    return [f"{one.name} {one.value:.2f}: {told}" for one, told in wrong if told.endswith("too large")]
 
 
 def _completeness(limits: Limits, found: Evaluated) -> Iterable[Requirement]:

@@ -135,6 +135,14 @@ def event_list(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
     return tuple(sorted(events, key=lambda event: (event.utc_ns, event.name, event.detail)))
 
 
+def learned_offset_m(connection: Connection, span: PassSpan) -> float | None:
+    """Return the newest size of the offset of the crater list that the payload reported; None without one."""
+    labels = DICTIONARY.labels("event_info", "event_id")
+    rows = samples(connection, span, "events", ("ticks", "event_id", "value_1"))
+    found = (row for row in zip(*rows.values(), strict=True) if labels.get(row[1]) == "map_offset")
+    return max(((ticks, size_m) for ticks, _, size_m in found if size_m is not None), default=(0, None))[1]
+
+
 def event_page(
     connection: Connection,
     span: PassSpan,

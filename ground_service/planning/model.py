@@ -20,6 +20,7 @@ from ground_service.http.model import (
 from ground_service.planning import core
 from ground_service.planning.core import Constraints
 from ground_service.toml import LINE_PATTERN_JSON
+from lunar.constants import NANOSECONDS_PER_SECOND
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1, max_length=200, pattern=LINE_PATTERN_JSON)]
@@ -92,6 +93,13 @@ class WindowSearch(Given):
     sunlit: bool = Field(default=False, description="The spacecraft has to be in full sunlight")
     minimum_duration_s: Finite = Field(default=300.0, ge=0.0, le=86_400.0)
     maximum_duration_s: Finite = Field(default=2400.0, ge=30.0, le=86_400.0)
+    first_coast_m: Finite | None = Field(
+        default=None,
+        ge=500.0,
+        le=1e6,
+        description="Along-track error, 1 sigma, that a coast of one revolution after a first window may end with: the "
+        "window has to be as long as this requires",
+    )
     minimum_battery: Finite | None = Field(default=None, ge=0.0, le=1.0, description="Share of its capacity")
     needs_contact: bool = Field(default=False, description="Its data must be downlinked within the span")
 
@@ -101,6 +109,7 @@ class WindowSearch(Given):
         def angles(limits: Limits | None) -> tuple[float, float] | None:
             return None if limits is None else limits.scaled(math.pi / 180.0)
 
+        needed_s = 0.0 if self.first_coast_m is None else core.COAST_M_S / self.first_coast_m
         return Constraints(
             altitude_m=None if self.altitude_km is None else self.altitude_km.scaled(1e3),
             sun_elevation_rad=angles(self.sun_elevation_deg),
@@ -109,7 +118,7 @@ class WindowSearch(Given):
             crater_diameter_m=self.crater_diameter_km.scaled(1e3),
             mare=None if self.terrain is None else self.terrain == "mare",
             sunlit=self.sunlit,
-            minimum_duration_s=self.minimum_duration_s,
+            minimum_duration_s=max(self.minimum_duration_s, needed_s),
             maximum_duration_s=self.maximum_duration_s,
             minimum_battery=self.minimum_battery,
             needs_contact=self.needs_contact,
@@ -143,6 +152,10 @@ class WindowPrediction(Entity):
     sunlit_share: float | None = None
     craters_per_frame: Span | None = None
     mare_share: float | None = None
+    first_coast_m: float | None = Field(
+        default=None,
+        description="Along-track error, 1 sigma, after a coast of one revolution, if this is the first window",
+    )
     data_octets: int | None = None
     energy_wh: float | None = None
     battery_minimum: float | None = Field(
@@ -166,8 +179,10 @@ class Candidate(WindowPrediction):
     def from_core(cls, found: core.Candidate) -> Candidate:
         """Return the entity of a candidate of the planner."""
         craters = found.craters_per_frame
+        duration_s = (found.stop_utc_ns - found.start_utc_ns) / NANOSECONDS_PER_SECOND
         return cls.of(
             asdict(found),
+            first_coast_m=core.COAST_M_S / duration_s,
             altitude_km=Span(min=found.altitude_m[0] / 1e3, max=found.altitude_m[1] / 1e3),
             sun_elevation_deg=Span.degrees(found.sun_elevation_rad),
             latitude_deg=Span.degrees(found.latitude_rad),

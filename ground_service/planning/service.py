@@ -262,7 +262,7 @@ def change_window(
             commands.withdraw_window(connection, window_id, actor=actor, now_utc_ns=utc_now_ns())
         if (
             decision == "failed"
-            and window.state == "uplinked"
+            and window.state in ("approved", "uplinked", "executing")
             and _delete_on_board(connection, window, actor)
         ):
             decision = wanted = "cancelling"
@@ -298,8 +298,8 @@ def _delete_on_board(connection: Connection, window: WindowRecord, actor: str) -
     Conflict
         If the observation has begun.
     """
-    now = mission_now_ns()
-    if window.start.utc_ns <= now < window.stop.utc_ns:
+    now, on_board = mission_now_ns(), commands.activities_on_board(connection, window.id)
+    if on_board and window.start.utc_ns <= now < window.stop.utc_ns:
         raise Conflict(
             f"window {window.id}: began at {window.start}, too late to delete its activities; "
             "perform_function stop_observation ends the observation"
@@ -317,7 +317,7 @@ def _delete_on_board(connection: Connection, window: WindowRecord, actor: str) -
             window_id=window.id,
             approval=approval,
         )
-        for request in commands.activities_on_board(connection, window.id)
+        for request in on_board
     ]
     commands.limit_sending(connection, ids, window.start.utc_ns)
     return ids
@@ -760,7 +760,9 @@ def ephemerides_for(
     last = stop if stop is not None else 2**62
     found = service.covering_ephemerides(connection, first, last, spacecraft_id)
     if not found:
-        raise NotFound("ephemeris", "over the span of the search")
+        known = service.covering_ephemerides(connection, -(2**62), 2**62, spacecraft_id)
+        spans = "; ".join(f"{one.name}, {one.start} to {one.stop}" for one in known[:3])
+        raise NotFound("ephemeris", f"over the span of the search (known: {spans or 'none'})")
 
     def covered(one: Ephemeris) -> int:
         return min(one.stop.utc_ns, last) - max(one.start.utc_ns, first)

@@ -136,7 +136,7 @@ def plan_tick(ground: Ground, now_utc_ns: int | None = None, vehicle_id: int | N
         Numbers of windows `failed`, `added`, `approved` and `released`.
     """
     now = mission_now_ns() if now_utc_ns is None else now_utc_ns
-    done = {"failed": _fail_late(ground, now, vehicle_id), "added": 0, "approved": 0, "released": 0}
+    done = {"failed": fail_late(ground, now, vehicle_id), "added": 0, "approved": 0, "released": 0}
     requests = ground.read(store.active_requests, vehicle_id)
     for request_id in requests:
         ground.check_stopping()
@@ -148,6 +148,25 @@ def plan_tick(ground: Ground, now_utc_ns: int | None = None, vehicle_id: int | N
             log.warning("standing request %d: %s", request_id, error)
     approved, released = _advance(ground, now, vehicle_id)
     return done | {"approved": approved, "released": released}
+
+
+def fail_late(ground: Ground, now_utc_ns: int | None = None, vehicle_id: int | None = None) -> int:
+    """Fail windows that began without their telecommands being sent, or without approval; return their number."""
+    now = mission_now_ns() if now_utc_ns is None else now_utc_ns
+    with ground.database.reading() as connection:
+        late = store.unfinished_windows(connection, now, vehicle_id)
+        waiting = [
+            one
+            for one in late
+            if one.state == "draft" or not ({"sent"} & commands.states_of_window(connection, one.id))
+        ]
+    failed = 0
+    for window in waiting:
+        reason = NO_CONTACT if window.telecommands else NOT_RELEASED
+        if window.state == "draft":
+            reason = NOT_APPROVED
+        failed += _decided(ground, window, "failed", reason)
+    return failed
 
 
 def needs_plan(ground: Ground) -> bool:
@@ -170,24 +189,6 @@ def planned_with(ground: Ground, ephemeris_id: int) -> list[int]:
             for one, number in numbers.items()
             if planning.mission_of(connection, number).spacecraft.is_object(name)
         ]
-
-
-def _fail_late(ground: Ground, now: int, vehicle_id: int | None) -> int:
-    """Fail windows that began without their telecommands being sent, or without approval."""
-    with ground.database.reading() as connection:
-        late = store.unfinished_windows(connection, now, vehicle_id)
-        waiting = [
-            one
-            for one in late
-            if one.state == "draft" or not ({"sent"} & commands.states_of_window(connection, one.id))
-        ]
-    failed = 0
-    for window in waiting:
-        reason = NO_CONTACT if window.telecommands else NOT_RELEASED
-        if window.state == "draft":
-            reason = NOT_APPROVED
-        failed += _decided(ground, window, "failed", reason)
-    return failed
 
 
 def _advance(ground: Ground, now: int, vehicle_id: int | None) -> tuple[int, int]:

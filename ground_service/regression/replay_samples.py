@@ -37,7 +37,7 @@ from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation
-from lunar.messages.ephemeris_files import load_ephemeris
+from lunar.messages.ephemeris_files import load_orbit
 from lunar.timescales import TICKS_PER_SECOND, utc_ns_from_ticks
 from tmtc.dictionary.definitions import parse_dictionary
 from tmtc.dictionary.schema import Dictionary, Table
@@ -98,7 +98,7 @@ def pass_context(archive: PassArchive, data: DataFolder) -> PassContext:
     text = (folder / "payload/dictionary.json").read_text(encoding="utf-8")
     utc_ns = _frame_times(folder, [row["frame"] for row in rows], ticks)
     camera = camera_of(mission.camera)
-    orientation, reference = orientation_of(mission, data), load_ephemeris(folder / "reference.oem")
+    orientation, reference = orientation_of(mission, data), load_orbit(folder / "reference.oem")
     return PassContext(
         name=archive.name,
         manifest=archive.manifest,

@@ -7,10 +7,8 @@ turns into the entities of its capability.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
 from sqlalchemy import (
     BigInteger,
     ColumnElement,
@@ -31,6 +29,9 @@ from sqlalchemy.sql import Select
 
 from ground_service.errors import NotFound
 from ground_service.store import models
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 Row = dict[str, Any]
 
@@ -207,7 +208,7 @@ def within(table: Table, where: tuple[int, int, int, int]) -> ColumnElement[bool
 
 FEW_ROWS = 64
 
-Column = Sequence[Any] | NDArray[Any]
+Column: TypeAlias = "Sequence[Any] | NDArray[Any]"
 
 _COPY_TYPES = (
     (SmallInteger, "int2"),
@@ -267,9 +268,9 @@ def _on_conflict(table: Table, columns: Mapping[str, Column]) -> str:
 
 def plain_column(column: Column) -> list[Any]:
     """A column as Python values, NaN as None (SQL has no other word for "not known")."""
-    if not isinstance(column, np.ndarray):
+    if isinstance(column, Sequence):
         return list(column)
     values: list[Any] = column.tolist()
-    if column.dtype.kind == "f" and np.isnan(column).any():
+    if column.dtype.kind == "f" and (column != column).any():
         return [None if value != value else value for value in values]
     return values

@@ -130,6 +130,7 @@ def _figures(mission: Any) -> dict[str, Any]:
     return {
         "mission": mission.name,
         "revision": mission.revision,
+        "stated": mission.words,
         "unknown": list(mission.unknown),
         "remarks": definition_remarks(mission),
     }
@@ -137,7 +138,10 @@ def _figures(mission: Any) -> dict[str, Any]:
 
 def _described(figures: Mapping[str, Any]) -> str:
     unknown = figures["unknown"]
-    lines = [f"mission {figures['mission']}, revision {figures['revision'][:16]}"]
+    lines = [
+        f"mission {figures['mission']}, revision {figures['revision'][:16]}",
+        *figures["stated"].splitlines(),
+    ]
     if unknown:
         lines.append(f"not stated ({len(unknown)}): {', '.join(unknown)}")
     return "\n".join([*lines, *figures.get("remarks", ())])

@@ -349,6 +349,9 @@ def _describe_definition(found: XtceDecode, definition: Definition) -> str:
     unknown = ", ".join(f"{name} {count}" for name, count in found.values_unknown().items())
     if unknown:
         lines.append(f"  values not known (outside their calibrator, or no text): {unknown}")
+    behind = ", ".join(f"{name} {low} to {high}" for name, (low, high) in found.bits_not_read().items())
+    if behind:
+        lines.append(f"  bits behind the last entry, not read: {behind}")
     return "\n".join([*lines, *(f"  {remark}" for remark in definition.remarks)])
 
 

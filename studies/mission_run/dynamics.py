@@ -18,7 +18,8 @@ from lunar.datafolder import DataFolder
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc
 from payload_emulator.session.archive.mission import OPERATIONS, default_ports, live_mission_text
-from payload_emulator.session.live.session import pruned, station_names
+from payload_emulator.session.live.contacts import station_names
+from payload_emulator.session.live.session import pruned
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.session.world.regions import observed_boxes, observed_craters
 from payload_emulator.session.world.rims import Watched

@@ -14,7 +14,7 @@ from ground_service.clock import ClockFile
 from ground_service.errors import GroundError
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import ScenarioError
-from payload_emulator.session.live.session import station_names
+from payload_emulator.session.live.contacts import station_names
 from payload_emulator.session.scenario import Scenario, format_scenario
 from payload_emulator.session.world.rims import Watched
 from payload_emulator.session.world.world import open_world

@@ -211,8 +211,8 @@ def generate() -> str:
         sections.append(f"    # {router.tags[0]}\n\n" + "\n\n".join(methods))
     modules = sorted(spelling.modules.items())
     imports = [
-        f"    from {name.rpartition('.')[0]} import {name.rpartition('.')[2]} as {alias}"
-        for alias, name in modules
+        f"    from {package} import {last}{'' if last == alias else f' as {alias}'}"
+        for alias, (package, _, last) in ((alias, name.rpartition(".")) for alias, name in modules)
     ]
     names = textwrap.wrap(" ".join(name.removeprefix("ground_service.") for _, name in modules), 90)
     text = HEADER + "\n".join(

@@ -134,6 +134,11 @@ class XtceDecode:
         """Values of decoded packets that are not known, by parameter."""
         return {name: len(packets) for name, packets in self.unknown.items() if len(packets)}
 
+    def bits_not_read(self) -> dict[str, tuple[int, int]]:
+        """Return least and most bits behind the last entry of packets, by container; without those that have none."""
+        spans = {name: one.unread_bits for name, one in self.tables.items() if len(one)}
+        return {name: (int(bits.min()), int(bits.max())) for name, bits in spans.items() if bits.max() > 0}
+
 
 def choose_roots(definition: Definition, names: Sequence[str] = ()) -> tuple[Container, ...]:
     """The containers that packets begin with: those named, or all without a base if they can be told apart.

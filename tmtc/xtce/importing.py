@@ -975,6 +975,8 @@ def _calibrator(node: Node, extrapolate: bool) -> Calibrator:
             _expect(term, 0 <= exponent <= MAX_EXPONENT, f"an exponent of 0 to {MAX_EXPONENT}", f"{exponent}")
             terms.append((_number(term, "coefficient", None), exponent))
         _expect(inner, bool(terms), "a Term", "none")
+        exponents = [exponent for _, exponent in terms]
+        _expect(inner, len(set(exponents)) == len(exponents), "each exponent once", str(exponents))
         return Polynomial(tuple(terms))
     inner.only(("SplinePoint", "AncillaryDataSet"), (*_NAMED, "order", "extrapolate"))
     points = sorted(

@@ -6,7 +6,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
-from sqlalchemy import BigInteger, ColumnElement, Connection, and_, cast, func, or_, select, update
+from sqlalchemy import (
+    BigInteger,
+    ColumnElement,
+    Connection,
+    ScalarSelect,
+    and_,
+    cast,
+    func,
+    or_,
+    select,
+    update,
+)
 from sqlalchemy.sql import Select
 
 from ground_service.contacts.commanding.core import CommandFate, SentCommand, VerificationReport, fate_of
@@ -405,7 +416,10 @@ def _fates(
         return {}
     requests = {one.request_id for one in sent.values()}
     reports = connection.execute(
-        select(*(VERIFICATIONS.c[one.name] for one in fields(VerificationReport))).where(
+        select(
+            *(VERIFICATIONS.c[one.name] for one in fields(VerificationReport) if one.name != "boot"),
+            _boot_at(vehicle, VERIFICATIONS.c.ticks),
+        ).where(
             *_readable_reports(connection, vehicle),
             VERIFICATIONS.c.ticks > min(one.sent_after_ticks for one in sent.values()),
             VERIFICATIONS.c.request_id.in_(requests),
@@ -415,7 +429,12 @@ def _fates(
     for row in reports:
         told.setdefault(row.request_id, []).append(VerificationReport(*row))
     copies = connection.execute(
-        select(TELECOMMANDS.c.request_id, TELECOMMANDS.c.id, TELECOMMANDS.c.sent_after_ticks).where(
+        select(
+            TELECOMMANDS.c.request_id,
+            TELECOMMANDS.c.id,
+            TELECOMMANDS.c.sent_after_ticks,
+            _boot_at(vehicle, TELECOMMANDS.c.sent_after_ticks),
+        ).where(
             TELECOMMANDS.c.vehicle_id == vehicle,
             TELECOMMANDS.c.request_id.in_(requests),
             TELECOMMANDS.c.sent_after_ticks.is_not(None),
@@ -423,13 +442,21 @@ def _fates(
     ).all()
     fates = {}
     for key, one in sent.items():
-        later = [ticks for request, number, ticks in copies if request == one.request_id and number > key]
+        later = [row[2] for row in copies if row[0] == one.request_id and row[1] > key]
+        boot = next((row[3] for row in copies if row[1] == key), None)
         fates[key] = fate_of(
-            replace(one, repeated_after_ticks=min(later, default=None)),
+            replace(one, repeated_after_ticks=min(later, default=None), boot=boot),
             told.get(one.request_id, ()),
             now_utc_ns,
         )
     return fates
+
+
+def _boot_at(vehicle: int, ticks: ColumnElement[int]) -> ScalarSelect[int]:
+    """Return the boot of the newest housekeeping of a vehicle at or before a time."""
+    known = repository.SAMPLES["housekeeping"]
+    query = select(known.c.boot_count).where(known.c.vehicle_id == vehicle, known.c.ticks <= ticks)
+    return query.order_by(known.c.ticks.desc()).limit(1).scalar_subquery()
 
 
 def _sent(record: CommandRecord) -> SentCommand | None:

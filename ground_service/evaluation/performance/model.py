@@ -68,6 +68,11 @@ class RollingRequirement(Entity):
     low: float | None = Field(description="Lower limit of the 95 % confidence interval of the share")
     high: float | None = Field(description="Upper limit of the 95 % confidence interval of the share")
     lowest_share: float | None = Field(description="Smallest share of all windows that end at a pass")
+    remark: str = Field(
+        default="",
+        description="Mean over the passes of a NEES or NIS outside either bound; empty: inside, or no such requirement",
+        examples=["mean 0.31 of 12 passes: sigmas 1.8 times too large"],
+    )
 
 
 class Performance(Entity):

@@ -86,13 +86,28 @@ export async function order(link) {
   notice(`Link ${link.name} sends what is released.`);
 }
 
+const spanText = (window) => `${timeText(window.start)} to ${timeText(window.stop)}, an image every ${figure(window.cadence_s)} s.`;
+
+// Approve a window, after a question: the planner may release its telecommands at once.
+export async function approve(window) {
+  const lines = [spanText(window), "Back to draft takes this back until its telecommands are sent."];
+  if (await confirmed(`Approve ${window.name}?`, lines, "Approve")) await send("PATCH", `windows/${window.id}`, { state: "approved" });
+}
+
+// Take a window back: from the plan, or from the spacecraft.
+export async function takeBack(window) {
+  const onBoard = "Its activities are on board: telecommands that delete them are released now, and sent in the next contact. It is cancelling until they are verified.";
+  const lines = [spanText(window), window.state === "approved" ? "Its telecommands are withdrawn." : onBoard];
+  if (await confirmed(`Take ${window.name} back?`, lines, "Take back")) await send("PATCH", `windows/${window.id}`, { state: "failed", reason: "cancelled" });
+}
+
 // Release the telecommands of a window after a look at them, and send them with `others` where that is chosen.
 async function release(window, link, isOpen, others) {
   const { items } = await get(`windows/${window.id}/telecommands`);
   const deeds = [isOpen ? null : "Release", isOpen || link?.send === "manual" ? SEND : null].filter(Boolean);
   const also = `Link ${link?.name} is ${isOpen ? "" : "not "}in contact. ${SEND} also sends what is released already: ${others.join("; ") || "nothing"}.`;
   const then = deeds.includes(SEND) ? also : link ? `Link ${link.name} sends them in its next contact.` : "They wait for Send now.";
-  const lines = [`${timeText(window.start)} to ${timeText(window.stop)}, an image every ${figure(window.cadence_s)} s.`, sequenceTable(items), then];
+  const lines = [spanText(window), sequenceTable(items), then];
   const chosen = await confirmed(`Release the telecommands of ${window.name}?`, lines, ...deeds);
   if (!chosen) return;
   const released = await send("POST", `windows/${window.id}/uplink`);

@@ -82,7 +82,8 @@ class FlightParameters:
     def sha256(self) -> str:
         """SHA-256 of the parameters as text, hexadecimal."""
         reports = "image_reports" if self.image_reports else ""
-        return hashlib.sha256((repr(self) + reports).encode()).hexdigest()
+        learned = "" if self.anchored.offset is None else repr(self.anchored.offset)
+        return hashlib.sha256((repr(self) + reports + learned).encode()).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)

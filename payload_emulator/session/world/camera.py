@@ -61,7 +61,7 @@ class Exposure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scene:
-    """What lies before the camera at one frame, and the draws that are still to come.
+    """Scene before the camera at one frame, and its generator of random draws.
 
     Attributes
     ----------
@@ -226,7 +226,7 @@ def _exposed(world: World, scene: _Scene) -> Exposure:
 def _seen(
     world: World, utc_ns: int, position_mcmf_m: FloatArray, camera_from_mcmf: FloatArray, sun_mcmf: FloatArray
 ) -> tuple[NDArray[np.float32] | None, Picture | None]:
-    """The light on the sensor, none of it in deep night; in an outage no light but a picture without pixels."""
+    """Return the light on the sensor, none of it in deep night; in an outage no light but a picture without pixels."""
     section, camera = world.scenario.disturbances, world.true_camera
     elapsed_s = (utc_ns - int(world.frame_utc_ns[0])) / _NS
     if section.outage_at_s <= elapsed_s < section.outage_at_s + section.outage_duration_s:

@@ -13,6 +13,7 @@ import numpy as np
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
+from lunar.comparison import check_pointing
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris, EphemerisSegment
@@ -21,7 +22,7 @@ from lunar.frames import Orientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.gravity import GravityField
 from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from lunar.maneuvers import Maneuver
-from lunar.messages.oem import load_oem
+from lunar.messages.ephemeris_files import load_orbit
 from lunar.plausible import HEIGHT_M
 from lunar.propagation import ForceModel
 from lunar.timescales import (
@@ -125,7 +126,7 @@ _parsed_utc = functools.lru_cache(maxsize=16)(parse_utc)
 
 
 def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames | None = None) -> World:
-    """The world of a scenario, flown as far as its observation windows reach.
+    """Build the world of a scenario, flown as far as its observation windows reach.
 
     With external frames, their ephemeris is the flight and their times are the frames.
 
@@ -162,17 +163,20 @@ def _external_world(
     scenario: Scenario, external: ExternalFrames, terrain: Terrain, model: ForceModel
 ) -> World:
     """Return the world of external frames."""
-    truth = _truth_of_ephemeris(load_oem(external.ephemeris), model.orientation)
+    ephemeris = load_orbit(external.ephemeris)
+    truth = _truth_of_ephemeris(ephemeris, model.orientation)
     first, last = int(external.utc_ns[0]), int(external.utc_ns[-1])
     if first < truth.start_utc_ns or last > truth.stop_utc_ns:
         raise ScenarioError(
             f"{external.ephemeris}: expected states from {format_utc(first)} to {format_utc(last)}, found "
             f"{format_utc(truth.start_utc_ns)} to {format_utc(truth.stop_utc_ns)}"
         )
+    if external.attitude_utc_ns.size:
+        check_pointing(ephemeris, external.attitude_utc_ns, external.q_wxyz)
     _register(terrain, truth, external.utc_ns)
     require_above_ground(truth, external.utc_ns, terrain.height_m, HEIGHT_M.high)
     names = (
-        f"external images {external.files[0].parent.name}",
+        f"external images {external.files[0].parent.name} ({external.words}), orbit of {ephemeris.words}",
         *_names(terrain, model, truth, external.utc_ns),
     )
     return World(scenario, truth, terrain, model, (), external.utc_ns, names, external)
@@ -291,7 +295,7 @@ def extended_flight(world: World, duration_s: float) -> tuple[Truth, tuple[TrueB
 def _disturbed(
     scenario: Scenario, truth: Truth, burns: tuple[TrueBurn, ...], first_utc_ns: int, model: ForceModel
 ) -> tuple[Truth, tuple[TrueBurn, ...]]:
-    """The flight with the disturbances of the scenario, and all its burns."""
+    """Return the flight with the disturbances of the scenario, and all its burns."""
     section = scenario.disturbances
     if section.burn_delta_v_m_s != 0.0:
         utc_ns = first_utc_ns + round(section.burn_at_s * _NS)
@@ -312,7 +316,7 @@ def _disturbed(
 
 
 def clock_ticks(world: World, utc_ns: int) -> int:
-    """The on-board clock's reading: ideal ticks, an offset, and a drift since the reference of the clock."""
+    """Return the on-board clock's reading: ideal ticks, an offset, and a drift since the reference of the clock."""
     clock = world.scenario.clock
     elapsed_s = (utc_ns - world.clock_utc_ns) / _NS
     error_s = clock.offset_s + clock.drift_ppm * 1e-6 * elapsed_s
@@ -348,7 +352,7 @@ def _fly_to_windows(
     window = scenario.window
     not_before = parse_utc(window.start) if window.start else scenario.epoch_utc_ns
     if scenario.orbit.oem:
-        truth = _truth_of_ephemeris(load_oem(Path(scenario.orbit.oem)), model.orientation)
+        truth = _truth_of_ephemeris(load_orbit(Path(scenario.orbit.oem)), model.orientation)
         return truth, (), _windows(scenario, truth, terrain, max(not_before, truth.start_utc_ns)), ""
     reach_days = min(_SEARCH_CHUNK_DAYS, window.search_days)
     if window.search == "none":
@@ -376,7 +380,7 @@ def _fly_to_windows(
 
 
 def _no_band(crossings: list[Crossing], window: WindowSection) -> str:
-    """Which latitudes lack terrain on the crossing that lacks the least of it."""
+    """Return the latitudes that lack terrain on the crossing that lacks the least."""
     band = f"latitudes {_degrees(window.latitude_band_deg)}"
     near = [one for one in crossings if one.in_reach and one.missing_rad.size]
     if not near:
@@ -466,7 +470,7 @@ def _truth_of_ephemeris(ephemeris: Ephemeris, orientation: Orientation) -> Truth
 
 
 def sample_truth(truth: Truth, frame_utc_ns: IntArray, object_name: str = "SELENITA") -> Ephemeris:
-    """The true trajectory over the frames and a margin: a state each ten seconds, a segment between jumps."""
+    """Sample the true trajectory over the frames and a margin: a state each ten seconds, a segment between jumps."""
     start = max(int(frame_utc_ns[0]) - _EPHEMERIS_MARGIN_NS, truth.start_utc_ns)
     stop = min(int(frame_utc_ns[-1]) + _EPHEMERIS_MARGIN_NS, truth.stop_utc_ns)
     grid = np.append(np.arange(start, stop, _EPHEMERIS_STEP_NS, dtype=np.int64), stop)
@@ -537,7 +541,7 @@ def with_reference_error(ephemeris: Ephemeris, section: ReferenceSection, seed: 
 
 
 def catalogue_near_track(world: World) -> CraterCatalogue:
-    """The craters of 3 to 30 km that any frame could see, with the heights of their rims."""
+    """Return the craters of 3 to 30 km that any frame could see, with the heights of their rims."""
     positions = world.truth.positions_mcmf(world.frame_utc_ns)
     latitude, longitude, altitude = spherical_from_mcmf(positions)
     half_diagonal = np.sqrt(2.0) * np.tan(np.radians(world.scenario.camera.fov_deg) / 2.0)

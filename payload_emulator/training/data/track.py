@@ -120,9 +120,9 @@ def _can_look(source: Source, camera: PinholeCamera, terrain: Any, position: Flo
 def _places(source: Source, data: DataFolder) -> tuple[IntArray, FloatArray]:
     """Epochs (n,) every `step_s` and places (n, 3) in MCMF m of an ephemeris file or a scenario's orbit."""
     if source.ephemeris.endswith((".oem", ".e")):
-        from lunar.messages.ephemeris_files import load_ephemeris
+        from lunar.messages.ephemeris_files import load_orbit
 
-        ephemeris, orientation = load_ephemeris(Path(source.ephemeris)), default_orientation(data)
+        ephemeris, orientation = load_orbit(Path(source.ephemeris)), default_orientation(data)
     else:
         from payload_emulator.session.scenario import load_scenario
         from payload_emulator.session.world.orbit import force_model, propagate_scenario, sample

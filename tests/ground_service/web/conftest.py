@@ -17,7 +17,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -30,6 +29,8 @@ from lunar.messages.oem import format_oem
 from lunar.timescales import parse_utc
 from tests.lazy import Lazy, expect
 from tests.serving import wait_for
+
+cv2 = Lazy("cv2")
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, BrowserContext, Page
@@ -265,9 +266,12 @@ class Pictures:
         picture.quantize(256).save(self.folder / f"{name}.png", optimize=True)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """The system's Chromium, without a screen; a state that is reached ends the wait for it."""
+    """The system's Chromium, without a screen; a state that is reached ends the wait for it.
+
+    While it is driven, `asyncio.run` is refused in the thread of the tests, so it ends with its file.
+    """
     sync_api = Lazy("playwright.sync_api")
     sync_api.expect.set_options(timeout=PATIENCE_S * 1e3)
     with sync_api.sync_playwright() as playwright:

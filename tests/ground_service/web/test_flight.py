@@ -147,7 +147,7 @@ def flown(
                 lambda: sum(len(one) for _, one in payload._uplinked) == octets,
                 "no telecommands have arrived",
             )
-            clients = payload.stations["earth"].telemetry.clients
+            clients = payload.contacts.stations["earth"].telemetry.clients
             wait_for(lambda: bool(clients), "the link is not connected")
             found = Flown(service.url, layout, live)
             follow(found)
