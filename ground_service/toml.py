@@ -122,7 +122,7 @@ def _fault(kind: type[BaseModel], error: Any, source: str) -> InvalidInput:
         return InvalidInput(source, place, "a value", "nothing")
     if error["type"] == "extra_forbidden":
         key = str(error["loc"][-1])
-        known = _keys(kind, error["loc"][:-1])
+        known = keys_at(kind, error["loc"][:-1])
         near = difflib.get_close_matches(key, known, n=1)
         return InvalidInput(
             source, place, f"'{near[0]}'" if near else ", ".join(known), f"unknown key '{key}'"
@@ -139,20 +139,20 @@ def _fault(kind: type[BaseModel], error: Any, source: str) -> InvalidInput:
     return InvalidInput(source, place, expected, found)
 
 
-def _keys(kind: type[BaseModel], place: Sequence[int | str]) -> list[str]:
+def keys_at(kind: type[BaseModel], place: Sequence[int | str]) -> list[str]:
     """Return the keys of the table at a place; numbers in lists and names in tables of tables lead to no field."""
     for part in place:
         field = next((one for name, one in kind.model_fields.items() if part in (name, one.alias)), None)
         if field is not None:
-            kind = _table_in(field.annotation) or kind
+            kind = model_in(field.annotation) or kind
     return [one.alias or name for name, one in kind.model_fields.items()]
 
 
-def _table_in(annotation: Any) -> type[BaseModel] | None:
+def model_in(annotation: Any) -> type[BaseModel] | None:
     """Return the model in an annotation such as ``tuple[Model, ...] | None``."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
-    return next(filter(None, map(_table_in, get_args(annotation))), None)
+    return next(filter(None, map(model_in, get_args(annotation))), None)
 
 
 LINE_PATTERN = r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]*$"

@@ -31,7 +31,6 @@ _DRAWN = METRICS | {"map_offset_m": ("offset of the list", "m", 1.0, 0)}
 
 
 def monthly_document(report: MonthlyReportValue) -> Document:
-    """Return the document of a monthly report."""
     blocks: list[Block] = [*judgement(report), Heading("Passes over time")]
     if report.passes:
         blocks.append(_trend(report))

@@ -134,10 +134,10 @@ def _flown(world: World, data: DataFolder, progress: Progress) -> SurveySession:
     spacecraft = new_spacecraft(world, loaded)
     attitudes = np.full((world.frame_utc_ns.size, 3, 3), np.nan)
     packets: list[bytes] = []
-    for turn in progress(fly_scenario(world, spacecraft), len(timeline(world))):
-        packets += turn.packets
-        if turn.exposure is not None:
-            attitudes[turn.moment.frame] = turn.exposure.camera_from_mcmf
+    for result in progress(fly_scenario(world, spacecraft), len(timeline(world))):
+        packets += result.packets
+        if result.exposure is not None:
+            attitudes[result.step.frame] = result.exposure.camera_from_mcmf
     judged = judge_session(world, loaded, catalogue, attitudes, b"".join(packets))
     if judged is None:
         raise ScenarioError(
@@ -287,7 +287,7 @@ def _coasts(windows: Sequence[SurveyWindow]) -> list[dict[str, Any]]:
     for least, most in zip(COAST_FRAMES, (*COAST_FRAMES[1:], math.inf), strict=True):
         mine = [one for one in windows if one.coast_sigmas is not None and least <= one.coast_frames < most]
         if mine:
-            inside = np.abs([one.coast_sigmas for one in mine]) <= 2.0
+            inside = np.abs([one.coast_sigmas or () for one in mine]) <= 2.0
             largest_m = max(one.coast_end_m or 0.0 for one in mine)
             share = float(np.mean(inside))
             rows.append(

@@ -23,18 +23,16 @@ if TYPE_CHECKING:
     from ground_service.missions.timekeeping import model as timekeeping
     from ground_service.passes import model as passes
     from ground_service.passes.alarms import model as alarms
-    from ground_service.planning import model
     from ground_service.planning import model as planning
     from ground_service.regression import model as regression
     from ground_service.worker import condition
 else:
     import_lazily(
         globals(),
-        "access.model passes.alarms.model contacts.commanding.model missions.ephemerides.model "
-        "evaluation.model exports.model ingest.model jobs.model evaluation.landmarks.model "
-        "contacts.links.model missions.model passes.model evaluation.performance.model "
-        "planning.model regression.model planning.request_model missions.timekeeping.model "
-        "worker.model ",
+        "access.model passes.alarms.model contacts.commanding.model worker.condition "
+        "missions.ephemerides.model evaluation.model exports.model ingest.model jobs.model "
+        "evaluation.landmarks.model contacts.links.model missions.model passes.model "
+        "evaluation.performance.model planning.model regression.model missions.timekeeping.model ",
     )
 
 
@@ -270,7 +268,7 @@ class Operations(Connection):
     ) -> performance.MonthlyReport:
         """Add the report of a month of one instance; the same content gives the same report."""
 
-    @operation("GET /monthly-reports", reads="evaluation.performance.store.list_monthly_reports")
+    @operation("GET /monthly-reports", reads="evaluation.performance.service.list_monthly_reports")
     def list_monthly_reports(self, *, spacecraft_id: int | None = None) -> Listing[performance.MonthlyReport]:
         """List the monthly reports, newest month first."""
 
@@ -282,7 +280,7 @@ class Operations(Connection):
 
     # landmarks
 
-    @operation("GET /landmarks", reads="evaluation.landmarks.store.list_landmarks")
+    @operation("GET /landmarks", reads="evaluation.landmarks.service.list_landmarks")
     def list_landmarks(
         self, *, spacecraft_id: int | None = None, state: landmarks.LandmarkState | None = None
     ) -> Listing[landmarks.Landmark]:
@@ -334,7 +332,7 @@ class Operations(Connection):
     ) -> ephemerides.Ephemeris:
         """Add a reference ephemeris: OEM (text or XML), STK .e or Horizons CSV as the body, also compressed."""
 
-    @operation("GET /ephemerides", reads="missions.ephemerides.store.list_ephemerides")
+    @operation("GET /ephemerides", reads="missions.ephemerides.service.list_ephemerides")
     def list_ephemerides(self) -> Listing[ephemerides.Ephemeris]:
         """List the reference ephemerides, newest first."""
 
@@ -344,7 +342,7 @@ class Operations(Connection):
 
     # jobs
 
-    @operation("GET /jobs", reads="jobs.store.list_jobs")
+    @operation("GET /jobs", reads="jobs.service.list_jobs")
     def list_jobs(self, *, kind: str | None = None) -> Listing[jobs.Job]:
         """List the jobs, newest first; `kind` selects jobs of one kind."""
 
@@ -504,20 +502,20 @@ class Operations(Connection):
 
     # requests
 
-    @operation("GET /requests", reads="planning.request_store.list_requests")
-    def list_requests(self) -> Listing[model.StandingRequest]:
+    @operation("GET /requests", reads="planning.store.list_requests")
+    def list_requests(self) -> Listing[planning.StandingRequest]:
         """List the standing requests, newest first."""
 
     @operation("POST /requests", body="request")
-    def add_request(self, request: Document, *, key: str | None = None) -> model.StandingRequest:
+    def add_request(self, request: Document, *, key: str | None = None) -> planning.StandingRequest:
         """Add a standing request; the planner fills the coming days from then on."""
 
     @operation("GET /requests/{request_id}")
-    def get_request(self, request_id: int) -> model.StandingRequest:
+    def get_request(self, request_id: int) -> planning.StandingRequest:
         """Show a standing request with the numbers of its windows."""
 
     @operation("PATCH /requests/{request_id}", body="change")
-    def change_request(self, request_id: int, change: Document) -> model.StandingRequest:
+    def change_request(self, request_id: int, change: Document) -> planning.StandingRequest:
         """Pause or resume a standing request, or replace its terms; planned windows stay."""
 
     @operation("DELETE /requests/{request_id}")
@@ -525,7 +523,7 @@ class Operations(Connection):
         """Delete a standing request; its windows stay in the plan."""
 
     @operation("GET /requests/{request_id}/plan")
-    def get_request_plan(self, request_id: int) -> model.RequestPlan:
+    def get_request_plan(self, request_id: int) -> planning.RequestPlan:
         """Show the last plan: every candidate window, planned or rejected with the reason."""
 
     # telecommands

@@ -203,12 +203,13 @@ def reevaluate(ground: Ground, pass_id: int, *, report_id: str, event: int) -> M
 
 def _documents(report: PassReport, *, pdf: bool) -> dict[str, bytes]:
     """Return the octets of a report by kind."""
+    from reports.drawings import KeptDrawings
     from reports.render import render_html, render_pages, to_json
 
     data = to_json(report).encode()
     if not pdf:
-        return {"html": render_html(report).encode(), "json": data}
-    page, printed = render_pages(report)
+        return {"html": render_html(report, KeptDrawings()).encode(), "json": data}
+    page, printed = render_pages(report, KeptDrawings())
     return {"html": page.encode(), "json": data, "pdf": printed}
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import re
+from difflib import get_close_matches
 from http import HTTPStatus
 from typing import Any
 
@@ -31,12 +33,15 @@ from ground_service.errors import (
     StoreError,
     public_text,
 )
+from ground_service.toml import keys_at, model_in
 from lunar.errors import LunarError
 from lunar.errors import MissingLibrary as MissingLunarLibrary
 from reports.errors import ReportError
 from tmtc.errors import MissingLibrary, TmtcError
 
 log = logging.getLogger(__name__)
+
+_SHOULD = re.compile(r"^(?:Input|String|List|Tuple|Value) should (?:be|have) ")
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -60,7 +65,7 @@ class UnsupportedEncoding(GroundError):
 
 
 class PreconditionFailed(GroundError):
-    """What is stored is no longer what the caller saw."""
+    """Stored object that differs from the one that the caller read."""
 
 
 STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
@@ -88,7 +93,7 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (GroundError, 400, "bad request"),
 )
 
-TOLD: tuple[tuple[type[Exception], str], ...] = (
+PUBLIC_TEXTS: tuple[tuple[type[Exception], str], ...] = (
     (StorageFull, "no space left; the data were not stored"),
     (StorageReadOnly, "the archive or the database cannot be written"),
     (FileDamaged, "the content of a stored file has changed"),
@@ -133,13 +138,28 @@ def _allowed(app: FastAPI, request: Request) -> list[str]:
     return sorted(methods)
 
 
-def _expected(fault: dict[str, Any]) -> str:
+def _unknown_path(app: FastAPI, request: Request) -> str:
+    """Return the path of the operation that is nearest to an unknown path."""
+    path = request.url.path
+    near = get_close_matches(path, [route.path for route in app.state.operations], n=1)
+    such = f" such as {near[0]}" if near else ""
+    return f"path: expected an operation of /api/v1/openapi.json{such}, found {path[:80]}"
+
+
+def _expected(fault: dict[str, Any], request: Request) -> str:
     """Return what was expected of a part of a request, and what was found."""
     if fault["type"] == "missing":
         return "expected a value, found none"
     if fault["type"] == "extra_forbidden":
-        return "expected no such field"
+        body = getattr(request.scope.get("route"), "body_field", None)
+        kind = None if body is None else model_in(body.field_info.annotation)
+        known = [] if kind is None else keys_at(kind, fault["loc"][1:-1])
+        near = get_close_matches(str(fault["loc"][-1]), known, n=1)
+        return f"expected {near[0] if near else ', '.join(known) or 'no field'}, found an unknown field"
+    if fault["type"] in ("model_attributes_type", "dict_type"):
+        return "expected a JSON object, sent with Content-Type: application/json"
     message = str(fault["msg"]).removeprefix("Value error, ")
+    message = _SHOULD.sub("expected ", message).replace("String should match pattern", "expected text like")
     value = fault.get("input")
     if "found" in message or not isinstance(value, (str, int, float, bool)):
         return message
@@ -153,22 +173,22 @@ def install(app: FastAPI) -> None:
         if isinstance(error, Busy):
             return busy(str(error), request)
         is_local = getattr(request.app.state, "local_caller", None) is not None
-        told = str(error) if is_local else public_text(error)  # the log contains the complete text
+        message = str(error) if is_local else public_text(error)  # the log contains the complete text
         if isinstance(error, PlanConflicts):
             found = [
                 {"where": f"window {one.window_id}" if one.window_id else one.kind, "detail": one.detail}
                 for one in error.conflicts
             ]
-            return problem(409, "conflict", told, request, errors=found)
+            return problem(409, "conflict", message, request, errors=found)
         if isinstance(error, StateConflict):
-            return problem(409, "conflict", told, request, state=error.found)
+            return problem(409, "conflict", message, request, state=error.found)
         status, title = next((s, t) for kind, s, t in STATUSES if isinstance(error, kind))
         if status < 500 or is_local or status == HTTPStatus.NOT_IMPLEMENTED:  # names a library, no path
-            return problem(status, title, told, request)
+            return problem(status, title, message, request)
         # The message may contain paths or addresses: it is logged with the id of the request.
         request_id = getattr(request.state, "request_id", None)
         log.error("%s %s: %s", request.method, request.url.path, error, extra={"request_id": request_id})
-        detail = next(text for kind, text in TOLD if isinstance(error, kind))
+        detail = next(text for kind, text in PUBLIC_TEXTS if isinstance(error, kind))
         return problem(status, title, detail, request, request_id=request_id)
 
     async def http(request: Request, error: Exception) -> JSONResponse:
@@ -177,23 +197,28 @@ def install(app: FastAPI) -> None:
             detail = "body: expected JSON of ordinary depth with numbers of ordinary length, found none"
             return problem(400, "invalid request", detail, request)
         title = HTTPStatus(error.status_code).phrase.lower()
-        answer = problem(error.status_code, title, str(error.detail), request)
+        allowed, detail = ", ".join(_allowed(app, request)), str(error.detail)
         if error.status_code == 405:
-            answer.headers["Allow"] = ", ".join(_allowed(app, request))
+            detail = f"method: expected {allowed}, found {request.method}"
+        elif error.status_code == 404 and detail == HTTPStatus.NOT_FOUND.phrase:
+            detail = _unknown_path(app, request)
+        answer = problem(error.status_code, title, detail, request)
+        if error.status_code == 405:
+            answer.headers["Allow"] = allowed
         return answer
 
     async def invalid(request: Request, error: Exception) -> JSONResponse:
         assert isinstance(error, RequestValidationError)
         found = [
-            {"where": ".".join(str(part) for part in item["loc"]), "expected": _expected(item)}
+            {"where": ".".join(str(part) for part in item["loc"]), "expected": _expected(item, request)}
             for item in error.errors()
         ]
         detail = "; ".join(f"{item['where']}: {item['expected']}" for item in found[:5])
         return problem(422, "invalid request", detail, request, errors=found)
 
     async def unexpected(request: Request, error: Exception) -> JSONResponse:
-        told = {"request_id": getattr(request.state, "request_id", None)}
-        log.exception("%s %s", request.method, request.url.path, exc_info=error, extra=told)
+        fields = {"request_id": getattr(request.state, "request_id", None)}
+        log.exception("%s %s", request.method, request.url.path, exc_info=error, extra=fields)
         return problem(500, "internal error", "internal error; see the log of the service", request)
 
     for kind in (GroundError, TmtcError, LunarError, ReportError):

@@ -53,6 +53,7 @@ from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
 from ground_service.telemetry import rollups
 from ground_service.telemetry.decoding import readable_version
 from ground_service.toml import require_line
+from lunar.timescales import format_utc
 from reports.values import PacketAccounting
 from tmtc.dictionary.fields import Field
 from tmtc.dictionary.payload import DICTIONARY
@@ -90,7 +91,7 @@ def define_pass(
     """
     require_line(name, "pass", "name")
     if stop_utc_ns <= start_utc_ns:
-        raise InvalidInput("pass", "stop", "a time after the start", str(stop_utc_ns))
+        raise InvalidInput("pass", "stop", "a time after the start", format_utc(stop_utc_ns))
     with ground.database.writing() as connection:
         return store.add_pass(
             connection,

@@ -64,13 +64,11 @@ from ground_service.store.event_kinds import WindowChanged, publish
 from ground_service.store.vehicles import lock_spacecraft, vehicle_id
 from ground_service.toml import REASON_LIMIT, require_line
 from lunar.catalogue import CraterCatalogue
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris as States
 from lunar.errors import EphemerisCoverageError
 from tmtc.dictionary.arguments import argument_text
-
-NS = NANOSECONDS_PER_SECOND
 
 SEARCH_LIMIT_S = 31 * 86_400
 STEPS_LIMIT = 100_000
@@ -262,7 +260,7 @@ def change_window(
             commands.withdraw_window(connection, window_id, actor=actor, now_utc_ns=utc_now_ns())
         if (
             decision == "failed"
-            and window.state == "uplinked"
+            and window.state in ("approved", "uplinked", "executing")
             and _delete_on_board(connection, window, actor)
         ):
             decision = wanted = "cancelling"
@@ -298,8 +296,8 @@ def _delete_on_board(connection: Connection, window: WindowRecord, actor: str) -
     Conflict
         If the observation has begun.
     """
-    now = mission_now_ns()
-    if window.start.utc_ns <= now < window.stop.utc_ns:
+    now, on_board = mission_now_ns(), commands.activities_on_board(connection, window.id)
+    if on_board and window.start.utc_ns <= now < window.stop.utc_ns:
         raise Conflict(
             f"window {window.id}: began at {window.start}, too late to delete its activities; "
             "perform_function stop_observation ends the observation"
@@ -317,7 +315,7 @@ def _delete_on_board(connection: Connection, window: WindowRecord, actor: str) -
             window_id=window.id,
             approval=approval,
         )
-        for request in commands.activities_on_board(connection, window.id)
+        for request in on_board
     ]
     commands.limit_sending(connection, ids, window.start.utc_ns)
     return ids
@@ -689,7 +687,7 @@ def _prediction(
     mission: Mission,
     commitments: Sequence[Option],
 ) -> Candidate | None:
-    """What the window would be like, where a reference ephemeris covers it."""
+    """Predict the window if a reference ephemeris covers it."""
     candidates = (
         [service.get_ephemeris(connection, entry.ephemeris_id)]
         if entry.ephemeris_id is not None
@@ -760,7 +758,9 @@ def ephemerides_for(
     last = stop if stop is not None else 2**62
     found = service.covering_ephemerides(connection, first, last, spacecraft_id)
     if not found:
-        raise NotFound("ephemeris", "over the span of the search")
+        known = service.covering_ephemerides(connection, -(2**62), 2**62, spacecraft_id)
+        spans = "; ".join(f"{one.name}, {one.start} to {one.stop}" for one in known[:3])
+        raise NotFound("ephemeris", f"over the span of the search (known: {spans or 'none'})")
 
     def covered(one: Ephemeris) -> int:
         return min(one.stop.utc_ns, last) - max(one.start.utc_ns, first)
@@ -829,7 +829,7 @@ def _check_entry(entry: WindowEntry) -> None:
 
 @functools.lru_cache(maxsize=2)
 def _mare(data: DataFolder) -> Any:
-    """Whether the ground is mare: darker than the value that best parts the albedo map in two (Otsu 1979)."""
+    """Return whether the ground is mare: darker than the value that best parts the albedo map in two (Otsu 1979)."""
     if data.albedo is None:
         return None
     from PIL import Image

@@ -29,7 +29,7 @@ from ground_service.missions.model import Mission
 from ground_service.planning import service as planning
 from ground_service.planning import store
 from ground_service.planning.core import Constraints, Planner, data_octets, frames_between
-from ground_service.planning.filling import NS, Option, ResourceGrid, choose
+from ground_service.planning.filling import Option, ResourceGrid, choose
 from ground_service.planning.model import (
     PlannedCandidate,
     RequestPlan,
@@ -46,6 +46,7 @@ from ground_service.planning.store import RequestRecord
 from ground_service.planning.window_states import COMMITTED
 from ground_service.store.event_kinds import PlanChanged, RequestChanged, publish
 from ground_service.store.vehicles import get_vehicle, lock_spacecraft, vehicle_id
+from lunar.constants import NS
 from lunar.errors import EphemerisCoverageError, LunarError
 
 log = logging.getLogger(__name__)
@@ -136,7 +137,7 @@ def plan_tick(ground: Ground, now_utc_ns: int | None = None, vehicle_id: int | N
         Numbers of windows `failed`, `added`, `approved` and `released`.
     """
     now = mission_now_ns() if now_utc_ns is None else now_utc_ns
-    done = {"failed": _fail_late(ground, now, vehicle_id), "added": 0, "approved": 0, "released": 0}
+    done = {"failed": fail_late(ground, now, vehicle_id), "added": 0, "approved": 0, "released": 0}
     requests = ground.read(store.active_requests, vehicle_id)
     for request_id in requests:
         ground.check_stopping()
@@ -148,6 +149,25 @@ def plan_tick(ground: Ground, now_utc_ns: int | None = None, vehicle_id: int | N
             log.warning("standing request %d: %s", request_id, error)
     approved, released = _advance(ground, now, vehicle_id)
     return done | {"approved": approved, "released": released}
+
+
+def fail_late(ground: Ground, now_utc_ns: int | None = None, vehicle_id: int | None = None) -> int:
+    """Fail windows that began without their telecommands being sent, or without approval; return their number."""
+    now = mission_now_ns() if now_utc_ns is None else now_utc_ns
+    with ground.database.reading() as connection:
+        late = store.unfinished_windows(connection, now, vehicle_id)
+        waiting = [
+            one
+            for one in late
+            if one.state == "draft" or not ({"sent"} & commands.states_of_window(connection, one.id))
+        ]
+    failed = 0
+    for window in waiting:
+        reason = NO_CONTACT if window.telecommands else NOT_RELEASED
+        if window.state == "draft":
+            reason = NOT_APPROVED
+        failed += _decided(ground, window, "failed", reason)
+    return failed
 
 
 def needs_plan(ground: Ground) -> bool:
@@ -170,24 +190,6 @@ def planned_with(ground: Ground, ephemeris_id: int) -> list[int]:
             for one, number in numbers.items()
             if planning.mission_of(connection, number).spacecraft.is_object(name)
         ]
-
-
-def _fail_late(ground: Ground, now: int, vehicle_id: int | None) -> int:
-    """Fail windows that began without their telecommands being sent, or without approval."""
-    with ground.database.reading() as connection:
-        late = store.unfinished_windows(connection, now, vehicle_id)
-        waiting = [
-            one
-            for one in late
-            if one.state == "draft" or not ({"sent"} & commands.states_of_window(connection, one.id))
-        ]
-    failed = 0
-    for window in waiting:
-        reason = NO_CONTACT if window.telecommands else NOT_RELEASED
-        if window.state == "draft":
-            reason = NOT_APPROVED
-        failed += _decided(ground, window, "failed", reason)
-    return failed
 
 
 def _advance(ground: Ground, now: int, vehicle_id: int | None) -> tuple[int, int]:
@@ -234,7 +236,7 @@ def _decided(ground: Ground, window: WindowRecord, decision: str, reason: str | 
 
 @dataclass(frozen=True, slots=True)
 class _Situation:
-    """What a plan depends on."""
+    """Inputs of a plan."""
 
     request: RequestRecord
     mission: Mission

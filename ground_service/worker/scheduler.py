@@ -24,7 +24,7 @@ from ground_service.jobs.service import Dispatcher, repeat_failed
 from ground_service.missions.store import missions_in_force
 from ground_service.passes.alarms.service import note_operations
 from ground_service.planning import store
-from ground_service.planning.standing import needs_plan
+from ground_service.planning.standing import fail_late, needs_plan
 from ground_service.planning.store import WINDOWS, records_where
 from ground_service.regression.jobs import nightly_placebo
 from ground_service.store import leases
@@ -116,7 +116,7 @@ class Scheduler:
     kept
         Arguments of the nightly job: for how long what is kept (`upkeep.nightly`).
     plan_hourly
-        Whether the job of the plan is entered once an hour of mission time.
+        Whether windows that can no longer begin fail, and the job of the plan is entered once an hour of mission time.
     """
 
     def __init__(
@@ -180,6 +180,7 @@ class Scheduler:
             self._watch_s = time.monotonic() + WATCH_S
             self._do("watch", self._watch.tick)
         if self._plan_hourly:
+            self._do("windows that did not begin", lambda: fail_late(self._ground))
             self._do("plan", self._enter_plan)
         self._do("nightly job", self._enter_night)
         return True

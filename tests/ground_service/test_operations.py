@@ -1,18 +1,29 @@
 """Description of the HTTP API: names, summaries, errors, times, page links and query keys of all operations."""
 
+import html
 import re
 from collections.abc import Iterator
 from datetime import datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from ground_service.access.service import add_user
 from ground_service.app import create_app
+from ground_service.clock import set_mission_clock
+from ground_service.contacts.commanding.service import enter_command, release_command
 from ground_service.http.model import UtcTime
 from ground_service.http.requests import ALWAYS
+from ground_service.missions.service import add_mission
 from ground_service.passes.service import define_pass
+from ground_service.planning import service as planning
+from ground_service.planning.model import WindowEntry
 from ground_service.settings import Settings
+from tests.ground_service.conftest import START, add_reference, save_circle
 from tests.serving import TestClient
+
+HOUR = 3600 * 10**9
 
 VERBS = {
     "accept", "acknowledge", "add", "approve", "change", "check", "define", "delete", "end", "enter",
@@ -126,10 +137,10 @@ def test_an_impossible_time_is_answered_with_the_expected_form(client: TestClien
     [
         (
             {"spacecraft_id": 1024},
-            "body.spacecraft_id: Input should be less than or equal to 1023, found '1024'",
+            "body.spacecraft_id: expected less than or equal to 1023, found '1024'",
         ),
-        ({"spacecraft": 76}, "body.spacecraft: expected no such field"),
-        ({"name": None}, "body.name: Input should be a valid string"),
+        ({"spacecraft": 76}, "body.spacecraft: expected spacecraft_id, found an unknown field"),
+        ({"name": None}, "body.name: expected a valid string"),
         ({"start": 5}, "body.start: expected a time such as 2029-08-07T06:00:00Z, found '5'"),
         ({"start": "1815-12-10"}, "body.start: expected a time between 1970 and 2130, found '1815-12-10'"),
     ],
@@ -175,3 +186,54 @@ def test_links_keep_the_filter_of_a_list(client: TestClient) -> None:
     page = client.get("/api/v1/telecommands?state=queued&limit=1").json()
     assert page["next"] == "/api/v1/telecommands?state=queued&limit=1&offset=1"
     assert client.get(page["next"]).json()["next"] is None
+
+
+REFUSALS = re.findall(
+    r"^\| (?P<mistake>[^|]+) \| `(?P<request>[A-Z]+ [^` ]+)`(?: `(?P<body>[^`]*)`)?(?: with `(?P<header>[^`]+)`)? "
+    r"\| (?P<status>\d{3}) \| (?P<line>.+) \|$",
+    (Path(__file__).parents[2] / "docs" / "http.md").read_text(),
+    re.MULTILINE,
+)
+
+
+@pytest.fixture(scope="module")
+def shift(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TestClient, dict[str, dict[str, str]]]]:
+    """A service with an approved window, a released and a critical telecommand; headers of each role."""
+    home = tmp_path_factory.mktemp("shift")
+    set_mission_clock(lambda: START)
+    with TestClient(create_app(Settings(home=home), inline_jobs=True)) as opened:
+        ground = opened.app.state.ground
+        headers = {
+            role: {"Authorization": f"Bearer {add_user(ground, role, role)}"}
+            for role in ("viewer", "operator", "admin")
+        }
+        add_mission(ground, b'name = "m"\n[spacecraft]\nid = 76\nname = "SelenITA"\n')
+        add_reference(ground, save_circle(home / "a.oem"))
+        planning.add_window(
+            ground, WindowEntry("w", START + HOUR, START + HOUR + HOUR // 6, 15.0, 76), actor="ann"
+        )
+        planning.change_window(ground, 1, actor="ann", changes={}, decision="approved")
+        reboot = {"function_id": "reboot"}
+        for name, arguments in (("test_connection", {}), ("perform_function", reboot)):
+            enter_command(ground, name, arguments, spacecraft_id=76, actor="operator")
+        release_command(ground, 1, actor="operator")
+        yield opened, headers
+    set_mission_clock()
+
+
+def test_each_mistake_of_the_documents_is_refused_with_its_line(shift: Any) -> None:
+    client, headers = shift
+    assert len(REFUSALS) >= 40
+    for mistake, request, body, header, status, line in REFUSALS:
+        method, path = request.split(" ", 1)
+        role = next((one for one in ("viewer", "admin") if one in mistake.split()), "operator")
+        sent = {} if mistake == "no token" else dict(headers[role])
+        if body.startswith("{"):
+            sent["Content-Type"] = "application/json"
+        if header:
+            sent |= [header.split(": ", 1)]
+        content = body.encode() if body or (method == "POST" and "telemetry" in path) else None
+        answer = client.request(method, f"/api/v1/{path}", headers=sent, content=content)
+        found = answer.json()["detail"]
+        assert (answer.status_code, mistake) == (int(status), mistake), found
+        assert re.fullmatch(re.escape(html.unescape(line)).replace("…", ".*"), found), f"{mistake}: {found}"

@@ -1,8 +1,9 @@
 """Verification state of a telecommand, from its received verification reports (PUS service 1).
 
 A report names its telecommand by the first four octets of the packet, and those return after 16384 commands. So a
-report counts for a command only when it was made after the command was sent and before the same octets were sent
-again. Reports that come late, even after a time-out was declared, still count; the time-out stays on record.
+report counts for a command only when it was made after the command was sent, not in an earlier boot, and before the
+same octets were sent again. Reports that come late, even after a time-out was declared, still count; the time-out
+stays on record.
 """
 
 from __future__ import annotations
@@ -39,29 +40,31 @@ FAILURES = (NOT_ACCEPTED, NOT_STARTED, PROGRESS_FAILED, NOT_COMPLETED, NOT_ROUTE
 
 @dataclass(frozen=True, slots=True)
 class VerificationReport:
-    """One report as it came down."""
+    """One report as it was received, in the boot of the newest housekeeping before it (None: unknown)."""
 
     subtype: int
     request_id: int
     ticks: int
     step: int | None
     failure_code: int | None
+    boot: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class SentCommand:
-    """A telecommand that was sent when the newest on-board time known was `sent_after_ticks`."""
+    """A telecommand that was sent in `boot`, when the newest on-board time known was `sent_after_ticks`."""
 
     request_id: int
     sent_utc_ns: int
     sent_after_ticks: int
     repeated_after_ticks: int | None
     timeout_ns: int
+    boot: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class CommandFate:
-    """How far a command is known to have come: sent, accepted, started, completed or failed, and its reports."""
+    """Latest known stage of a command: sent, accepted, started, completed or failed, and its reports."""
 
     state: str
     timed_out: bool
@@ -69,7 +72,7 @@ class CommandFate:
 
 
 def fate_of(command: SentCommand, reports: Sequence[VerificationReport], now_utc_ns: int) -> CommandFate:
-    """What the reports say about a command; `timed_out` when its end is overdue at `now_utc_ns`."""
+    """Return the fate of a command by its reports; `timed_out` when its end is overdue at `now_utc_ns`."""
     mine = tuple(
         sorted(
             (
@@ -78,6 +81,7 @@ def fate_of(command: SentCommand, reports: Sequence[VerificationReport], now_utc
                 if report.request_id == command.request_id
                 and report.ticks > command.sent_after_ticks
                 and (command.repeated_after_ticks is None or report.ticks <= command.repeated_after_ticks)
+                and (command.boot is None or report.boot is None or report.boot >= command.boot)
             ),
             key=lambda report: (report.ticks, report.subtype, report.step or 0),
         )

@@ -6,7 +6,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
-from sqlalchemy import BigInteger, ColumnElement, Connection, and_, cast, func, or_, select, update
+from sqlalchemy import (
+    BigInteger,
+    ColumnElement,
+    Connection,
+    ScalarSelect,
+    and_,
+    cast,
+    func,
+    or_,
+    select,
+    update,
+)
 from sqlalchemy.sql import Select
 
 from ground_service.contacts.commanding.core import CommandFate, SentCommand, VerificationReport, fate_of
@@ -27,7 +38,7 @@ from ground_service.store.states import TELECOMMAND, change_if, move, move_all
 from ground_service.store.vehicles import get_vehicle
 from ground_service.telemetry import store as telemetry
 from ground_service.telemetry.decoding import readable_version
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.packets.stream import cut_packets
 
@@ -233,7 +244,7 @@ def views_of_unnoted_timeouts(
     connection: Connection, since_utc_ns: int, until_utc_ns: int, now_utc_ns: int
 ) -> list[CommandView]:
     """Return the sent telecommands whose timeout ends in an interval and is not recorded."""
-    due = TELECOMMANDS.c.sent_utc_ns + cast(TELECOMMANDS.c.timeout_s, BigInteger) * NANOSECONDS_PER_SECOND
+    due = TELECOMMANDS.c.sent_utc_ns + cast(TELECOMMANDS.c.timeout_s, BigInteger) * NS
     query = select(TELECOMMANDS).where(
         TELECOMMANDS.c.state == "sent",
         TELECOMMANDS.c.timeout_noted_utc_ns.is_(None),
@@ -405,17 +416,25 @@ def _fates(
         return {}
     requests = {one.request_id for one in sent.values()}
     reports = connection.execute(
-        select(*(VERIFICATIONS.c[one.name] for one in fields(VerificationReport))).where(
+        select(
+            *(VERIFICATIONS.c[one.name] for one in fields(VerificationReport) if one.name != "boot"),
+            _boot_at(vehicle, VERIFICATIONS.c.ticks),
+        ).where(
             *_readable_reports(connection, vehicle),
             VERIFICATIONS.c.ticks > min(one.sent_after_ticks for one in sent.values()),
             VERIFICATIONS.c.request_id.in_(requests),
         )
     )
-    told: dict[int, list[VerificationReport]] = {}
+    by_request: dict[int, list[VerificationReport]] = {}
     for row in reports:
-        told.setdefault(row.request_id, []).append(VerificationReport(*row))
+        by_request.setdefault(row.request_id, []).append(VerificationReport(*tuple(row)))
     copies = connection.execute(
-        select(TELECOMMANDS.c.request_id, TELECOMMANDS.c.id, TELECOMMANDS.c.sent_after_ticks).where(
+        select(
+            TELECOMMANDS.c.request_id,
+            TELECOMMANDS.c.id,
+            TELECOMMANDS.c.sent_after_ticks,
+            _boot_at(vehicle, TELECOMMANDS.c.sent_after_ticks),
+        ).where(
             TELECOMMANDS.c.vehicle_id == vehicle,
             TELECOMMANDS.c.request_id.in_(requests),
             TELECOMMANDS.c.sent_after_ticks.is_not(None),
@@ -423,13 +442,21 @@ def _fates(
     ).all()
     fates = {}
     for key, one in sent.items():
-        later = [ticks for request, number, ticks in copies if request == one.request_id and number > key]
+        later = [row[2] for row in copies if row[0] == one.request_id and row[1] > key]
+        boot = next((row[3] for row in copies if row[1] == key), None)
         fates[key] = fate_of(
-            replace(one, repeated_after_ticks=min(later, default=None)),
-            told.get(one.request_id, ()),
+            replace(one, repeated_after_ticks=min(later, default=None), boot=boot),
+            by_request.get(one.request_id, ()),
             now_utc_ns,
         )
     return fates
+
+
+def _boot_at(vehicle: int, ticks: ColumnElement[int]) -> ScalarSelect[int]:
+    """Return the boot of the newest housekeeping of a vehicle at or before a time."""
+    known = repository.SAMPLES["housekeeping"]
+    query = select(known.c.boot_count).where(known.c.vehicle_id == vehicle, known.c.ticks <= ticks)
+    return query.order_by(known.c.ticks.desc()).limit(1).scalar_subquery()
 
 
 def _sent(record: CommandRecord) -> SentCommand | None:
@@ -441,5 +468,5 @@ def _sent(record: CommandRecord) -> SentCommand | None:
         sent_utc_ns=record.sent_utc_ns,
         sent_after_ticks=record.sent_after_ticks,
         repeated_after_ticks=None,
-        timeout_ns=record.timeout_s * NANOSECONDS_PER_SECOND,
+        timeout_ns=record.timeout_s * NS,
     )

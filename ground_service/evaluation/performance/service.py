@@ -122,7 +122,6 @@ def add_monthly_report(connection: Connection, report: StoredMonthlyReport) -> b
 
 
 def get_monthly_report(connection: Connection, report_id: str) -> StoredMonthlyReport:
-    """Return a monthly report."""
     return StoredMonthlyReport.of(repository.get(connection, _MONTHLY, report_id, "monthly report"))
 
 

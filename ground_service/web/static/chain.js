@@ -86,13 +86,28 @@ export async function order(link) {
   notice(`Link ${link.name} sends what is released.`);
 }
 
+const spanText = (window) => `${timeText(window.start)} to ${timeText(window.stop)}, an image every ${figure(window.cadence_s)} s.`;
+
+// Approve a window, after a question: the planner may release its telecommands at once.
+export async function approve(window) {
+  const lines = [spanText(window), "Back to draft takes this back until its telecommands are sent."];
+  if (await confirmed(`Approve ${window.name}?`, lines, "Approve")) await send("PATCH", `windows/${window.id}`, { state: "approved" });
+}
+
+// Take a window back: from the plan, or from the spacecraft.
+export async function takeBack(window) {
+  const onBoard = "Its activities are on board: telecommands that delete them are released now, and sent in the next contact. It is cancelling until they are verified.";
+  const lines = [spanText(window), window.state === "approved" ? "Its telecommands are withdrawn." : onBoard];
+  if (await confirmed(`Take ${window.name} back?`, lines, "Take back")) await send("PATCH", `windows/${window.id}`, { state: "failed", reason: "cancelled" });
+}
+
 // Release the telecommands of a window after a look at them, and send them with `others` where that is chosen.
 async function release(window, link, isOpen, others) {
   const { items } = await get(`windows/${window.id}/telecommands`);
   const deeds = [isOpen ? null : "Release", isOpen || link?.send === "manual" ? SEND : null].filter(Boolean);
   const also = `Link ${link?.name} is ${isOpen ? "" : "not "}in contact. ${SEND} also sends what is released already: ${others.join("; ") || "nothing"}.`;
   const then = deeds.includes(SEND) ? also : link ? `Link ${link.name} sends them in its next contact.` : "They wait for Send now.";
-  const lines = [`${timeText(window.start)} to ${timeText(window.stop)}, an image every ${figure(window.cadence_s)} s.`, sequenceTable(items), then];
+  const lines = [spanText(window), sequenceTable(items), then];
   const chosen = await confirmed(`Release the telecommands of ${window.name}?`, lines, ...deeds);
   if (!chosen) return;
   const released = await send("POST", `windows/${window.id}/uplink`);
@@ -106,9 +121,9 @@ export async function uplink(window) {
   const contact = contactOf(window, ahead.contacts);
   const link = uplinkOf(window, links.items, contact);
   const waiting = released.items.filter((one) => one.spacecraft_id === window.spacecraft_id && one.instance === window.instance && one.carrier_id === null);
-  const told = waiting.map((one) => `${one.id}  ${named(one)}${one.window_id ? `, window ${one.window_id}` : ""}`).reverse();
-  if (!window.telecommands.length) return release(window, link, contact?.state === "open" && contact.link === link?.name, told);
+  const listed = waiting.map((one) => `${one.id}  ${named(one)}${one.window_id ? `, window ${one.window_id}` : ""}`).reverse();
+  if (!window.telecommands.length) return release(window, link, contact?.state === "open" && contact.link === link?.name, listed);
   if (!link) throw new Error("No link can send: linna command uplink writes the octets to a file.");
-  if (!told.length) throw new Error("No telecommand is released: those in the queue wait for a second person, see Commands.");
-  if (await confirmed(`Send ${told.length} telecommands over ${link.name} now?`, told, "Send")) await order(link);
+  if (!listed.length) throw new Error("No telecommand is released: those in the queue wait for a second person, see Commands.");
+  if (await confirmed(`Send ${listed.length} telecommands over ${link.name} now?`, listed, "Send")) await order(link);
 }

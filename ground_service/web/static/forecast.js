@@ -79,7 +79,7 @@ export function drawLanes(drawn, x, width, top) {
     if (one.behind) lane.append(svg("polyline", { points: points(one.behind), class: "behind" }));
     lane.append(svg("polyline", { points: points(one.values) }));
     if (one.limit !== undefined && one.limit <= one.top) lane.append(svg("line", { x1: 0, x2: width, y1: y(one.limit), y2: y(one.limit), class: "limit" }));
-    lane.append(text(4, high - 5, `${one.name}, ${one.unit} (to ${figure(one.top)})${found.assumed.includes(one.name) ? ", assumed: not stated by the mission description" : ""}`, "lane"));
+    lane.append(text(4, high - 5, `${one.name}, ${one.unit} (to ${figure(one.top)})${found.assumed.includes(one.name) ? ", assumed" : ""}`, "lane"));
     drawn.append(lane);
   });
 }

@@ -3,7 +3,7 @@ import { get, request, send } from "./api.js";
 import { acting, button, byId, element, figure, isoText, later, lengthText, loading, mayOperate, missionNow, notice, on, plural, seconds, session, show, showTable, stateMark, svg, table, timeText, trouble, watch } from "./page.js";
 import { bandLegend, conflictsOf, drawLanes, drawTrack, lanesHeight, loadForecast, showMap, valuesAt } from "./forecast.js";
 import { loadRequests } from "./requests.js";
-import { sequenceTable, uplink } from "./chain.js";
+import { approve, sequenceTable, takeBack, uplink } from "./chain.js";
 
 const ROW_PX = 34;
 const HEAD_PX = 24;
@@ -135,7 +135,7 @@ function drawTimeline() {
   drawn.append(cursor, svg("line", { y1: HEAD_PX - 6, y2: height, class: "now" }), svg("text", { y: height - 4, class: "now" }, "now"));
   show(place, drawn);
   markNow();
-  readAt(view[0] + readShare * (view[1] - view[0]));
+  readAt(readShare === null ? missionNow() : view[0] + readShare * (view[1] - view[0]));
   drawTrack(windows.map((row) => ({ id: row.id, ...selectable(row) })), chosen);
 }
 
@@ -150,7 +150,7 @@ function markNow() {
 setInterval(markNow, 5000);
 
 // The values of the forecast at the pointer, or at the time of the slider.
-let readShare = 0.5; // of the view
+let readShare = null; // of the view; null: at the mission time
 function readAt(time) {
   readShare = Math.min(Math.max((time - view[0]) / (view[1] - view[0]), 0), 1);
   const readTime = view[0] + readShare * (view[1] - view[0]);
@@ -269,8 +269,9 @@ function showChosen() {
   }
   const path = `windows/${row.id}`;
   const deeds = {
-    draft: [deed("Approve", () => send("PATCH", path, { state: "approved" }), "primary"), deed("Delete", () => send("DELETE", path))],
-    approved: [deed(row.telecommands.length ? "Send now…" : "Uplink…", () => uplink(row), "primary"), deed("Back to draft", () => send("PATCH", path, { state: "draft" }))],
+    draft: [deed("Approve…", () => approve(row), "primary"), deed("Delete", () => send("DELETE", path))],
+    approved: [deed(row.telecommands.length ? "Send now…" : "Uplink…", () => uplink(row), "primary"), deed("Back to draft", () => send("PATCH", path, { state: "draft" })), deed("Take back…", () => takeBack(row))],
+    uplinked: [deed("Take back…", () => takeBack(row))],
   }[row.state] ?? [];
   const span = (value, unit) => (value ? `${figure(value.min)} to ${figure(value.max)} ${unit}` : "–");
   const predicted = row.predicted ?? {};

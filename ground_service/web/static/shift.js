@@ -1,6 +1,6 @@
 // The shift: for each spacecraft its time, contact, windows with the step that waits, alarms, verdicts, note and hold.
 import { finished, get, request, send } from "./api.js";
-import { chainOf, contactOf, inTime, uplink } from "./chain.js";
+import { approve, chainOf, contactOf, inTime, uplink } from "./chain.js";
 import { acting, button, buttons, byId, element, lengthText, loading, missionNow, notice, on, parameterName, seconds, show, showTable, stateMark, table, textOf, timeText, watch } from "./page.js";
 
 const OPEN = ["draft", "approved", "uplinked", "cancelling", "executing", "executed", "downlinked"];
@@ -39,7 +39,7 @@ function ageFigure(newest, recorded) {
 
 function continuation(window, chain) {
   const named = (label) => `${label} ${window.name}`;
-  if (chain.waiting === "approved") return deed("Approve", () => send("PATCH", `windows/${window.id}`, { state: "approved" }), named("Approve"));
+  if (chain.waiting === "approved") return deed("Approve…", () => approve(window), named("Approve"));
   if (chain.waiting === "released") return deed("Release…", () => uplink(window), named("Release"));
   if (chain.waiting === "sent") return deed("Send now…", () => uplink(window), named("Send"));
   if (chain.waiting === "reported" && window.pass_id) return deed("Make a report", () => send("POST", `passes/${window.pass_id}/reports`), named("Report"));

@@ -83,7 +83,7 @@ _NO_CRATERS = np.empty(0, dtype=np.int64)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnchoredSetup:
-    """What the estimator works with from one start to the next.
+    """Parts of the estimator that stay from one start to the next.
 
     Attributes
     ----------

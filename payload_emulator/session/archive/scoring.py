@@ -15,6 +15,7 @@ import numpy as np
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import project_mcmf
 from lunar.catalogue import CraterCatalogue
+from lunar.constants import NS
 from lunar.frames import icrf_from_onboard, rtn_from_inertial, spherical_from_mcmf
 from lunar.timescales import format_utc, tdb_s_from_utc_ns
 from payload_emulator.flight.navigation.filter.dynamics import OrbitModel, coasted, flown, process_noise
@@ -35,9 +36,8 @@ from tmtc.dictionary.tables import (
 )
 from tmtc.packets.stream import cut_packets
 
-_NS = 1_000_000_000
 # Frames further apart than this belong to different arcs: the shortest gap, over a pole, takes 18 minutes.
-_ARC_GAP_NS = 600 * _NS
+_ARC_GAP_NS = 600 * NS
 # A session of several arcs is judged from the third on, a single one after this many frames.
 _SETTLED_ARC, _SETTLED_FRAMES = 2, 20
 # A pair is right if the crater truly lies within this of the detection: six pixels, or a quarter of its diameter.
@@ -83,7 +83,7 @@ class FlownErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedSession:
-    """What the anchored estimator did in a session, judged by the truth; a row per frame of the session.
+    """Performance of the anchored estimator in a session, judged by the truth; a row per frame of the session.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class JudgedSession:
 
     @property
     def wrong_fixes(self) -> int:
-        """Fixes most of whose pairs are wrong."""
+        """Fixes with mostly wrong pairs."""
         return int(np.sum(self.fixed & (self.pairs[:, 1] > self.pairs[:, 0])))
 
     def nis_per_degree(self, chosen: BoolArray) -> float | None:
@@ -261,7 +261,7 @@ def _errors(
 
 
 def turns(rotation: FloatArray, orientation: OrientationTable, ticks: IntArray) -> FloatArray:
-    """Rotations (n, 3, 3) from the payload's inertial axes to the true ones, by way of the Moon both look at."""
+    """Return the rotations (n, 3, 3) from the payload's inertial axes to the true ones, by way of the Moon."""
     own = [orientation.at(int(tick)) for tick in ticks]
     known = np.array([np.full((3, 3), np.nan) if matrix is None else matrix for matrix in own])
     return icrf_from_onboard(rotation, known)
@@ -277,7 +277,7 @@ def turned(states: FloatArray, turn: FloatArray) -> FloatArray:
 
 
 def rtn_errors(states: FloatArray, truth: FloatArray, turn: FloatArray, rtn: FloatArray) -> FloatArray:
-    """Errors (n, 6) of the payload's states along the axes of the true orbit."""
+    """Return the errors (n, 6) of the payload's states along the axes of the true orbit."""
     return turned(turned(states, turn) - truth, rtn)
 
 
@@ -291,7 +291,7 @@ def normalised_squares(error: FloatArray, block: FloatArray) -> FloatArray:
 
 
 def _propagated(loaded: LoadedPayload, model: OrbitModel, burns: BurnTable, ticks: IntArray) -> FloatArray:
-    """States (n, 6) of the start state flown on without any image, NaN where the orbit model ends."""
+    """Return the states (n, 6) of the start state propagated without any image, NaN where the orbit model ends."""
     start = unpack_initial_state(loaded.tables.initial_state)
     state: FloatArray | None = np.concatenate([start.position_icrf_m, start.velocity_icrf_m_s, np.zeros(3)])
     at, states = start.ticks, np.full((ticks.size, 6), np.nan)
@@ -422,7 +422,7 @@ def frames_to_recover(error_m: FloatArray) -> int | None:
 
 
 def _recovery(world: World, errors: FlownErrors, imaging: BoolArray) -> dict[str, Any] | None:
-    """How many frames with an image it took to be back after a kidnap or an outage; None without either."""
+    """Return the number of frames with an image until recovery from a kidnap or an outage; None without either."""
     section = world.scenario.disturbances
     if section.kidnap_distance_km > 0.0:
         event = "kidnap told" if section.kidnap_told else "silent kidnap"
@@ -432,7 +432,7 @@ def _recovery(world: World, errors: FlownErrors, imaging: BoolArray) -> dict[str
     else:
         return None
     utc_ns = world.frame_utc_ns
-    since = (utc_ns[errors.frame] >= utc_ns[0] + round(after_s * _NS)) & imaging[errors.frame]
+    since = (utc_ns[errors.frame] >= utc_ns[0] + round(after_s * NS)) & imaging[errors.frame]
     frames = frames_to_recover(errors.position_m[since])
     return {"after": event, "frames_with_image": int(np.sum(since)), "frames_until_below_500_m": frames}
 

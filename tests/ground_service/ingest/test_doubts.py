@@ -50,14 +50,14 @@ def clock() -> Iterator[None]:
     set_mission_clock()
 
 
-def report(ticks: int, count: int, temperature_c: float = 20.0) -> bytes:
-    values = _housekeeping(1) | {"temperature_c": temperature_c}
+def report(ticks: int, count: int, temperature_c: float = 20.0, boot: int = 1) -> bytes:
+    values = _housekeeping(1) | {"temperature_c": temperature_c, "boot_count": boot}
     return DICTIONARY.pack("housekeeping", values, ticks=ticks, sequence_count=count)
 
 
-def contact(start: int = TICKS, count: int = 0, number: int = 12) -> bytes:
+def contact(start: int = TICKS, count: int = 0, number: int = 12, boot: int = 1) -> bytes:
     """Reports of a contact, one a minute, the last one at `start` plus their time."""
-    return b"".join(report(start + (60 << 16) * k, count + k) for k in range(number))
+    return b"".join(report(start + (60 << 16) * k, count + k, boot=boot) for k in range(number))
 
 
 def receive(ground: Ground, path: Path, octets: bytes) -> int:
@@ -226,6 +226,27 @@ def test_reports_from_before_the_release_do_not_verify_a_telecommand(either: Gro
         DICTIONARY.pack("verification_completed", late, ticks=TICKS - 2 * HOUR, sequence_count=1),
     )
     assert get_command(either, key).state == "sent"
+
+
+def test_reports_of_an_earlier_boot_do_not_verify_a_telecommand(either: Ground, tmp_path: Path) -> None:
+    def completed(ticks: int) -> bytes:
+        return DICTIONARY.pack(
+            "verification_completed", {"request_id": request}, ticks=ticks, sequence_count=1
+        )
+
+    request = 5
+    receive(either, tmp_path, contact(boot=3) + completed(TICKS + HOUR // 2))
+    key = enter_command(either, "test_connection", {}, spacecraft_id=76, actor="ann")
+    release_command(either, key, actor="ann")
+    take_uplink(either, spacecraft_id=76, actor="ann")
+    request = get_command(either, key).record.request_id or 0
+    later = TICKS + HOUR
+    receive(either, tmp_path, report(later, 900, boot=1) + completed(later + 9))  # of another flight
+    assert get_command(either, key).state == "sent"
+    receive(
+        either, tmp_path, report(later + HOUR, 13, boot=4) + completed(later + HOUR + 9)
+    )  # after a reboot
+    assert get_command(either, key).state == "completed"
 
 
 def test_commanding_starts_from_the_count_that_the_payload_reports(either: Ground, tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from sqlalchemy import event, select
@@ -45,11 +44,14 @@ from tests.ground_service.conftest import (
     encode_downlink,
     enter_files,
 )
+from tests.lazy import Lazy
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.packets.large_data import split
 from tmtc.packets.stream import cut_packets
 from tmtc.packets.thumbnails import Thumbnail, pack_thumbnail
+
+cv2 = Lazy("cv2")
 
 SECOND = 1 << 16
 FIRST = 900_000_000 * SECOND

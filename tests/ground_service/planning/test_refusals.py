@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from ground_service.planning import standing
 from ground_service.planning.forecast import get_forecast
 from ground_service.planning.model import Window, WindowEntry, WindowSearch
 from ground_service.planning.store import get_window
+from ground_service.worker.scheduler import Scheduler
 from linna.cli import run
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.messages.oem import save_oem
@@ -101,9 +103,13 @@ def test_a_window_that_has_begun_is_neither_entered_nor_approved_nor_released(
 def test_a_draft_whose_time_has_come_ends(either: Ground, now: Clock) -> None:
     add_mission(either, MISSION)
     window = planning.add_window(either, entry(), actor="ann")
-    assert standing.needs_plan(either)
-    standing.plan_tick(either, now_utc_ns=START + 61 * MINUTE)
-    assert either.read(get_window, window.id).state == "failed"
+    scheduler = Scheduler(either, MagicMock(), lambda: None, {})
+    scheduler.tick()
+    assert either.read(get_window, window.id).state == "draft"
+    now.utc_ns += 61 * MINUTE
+    scheduler.tick()
+    ended = either.read(get_window, window.id)
+    assert (ended.state, ended.reason) == ("failed", standing.NOT_APPROVED)
 
 
 def test_nothing_to_send_is_status_2_and_no_file(
@@ -178,13 +184,22 @@ def test_a_cancelled_window_that_flies_all_the_same_becomes_a_pass_with_a_remark
     assert made.name == "w (it was flown although it was cancelled)"
 
 
-def test_a_window_that_has_begun_on_board_cannot_be_cancelled(either: Ground, now: Clock) -> None:
+def test_a_window_that_has_begun_on_board_cannot_be_cancelled(
+    either: Ground, tmp_path: Path, now: Clock
+) -> None:
     window = on_board(either)
     now.utc_ns += 61 * MINUTE
-    with pytest.raises(
-        Conflict, match="too late to delete its activities; perform_function stop_observation"
-    ):
-        decided(either, window, "failed")
+    for state in ("uplinked", "executing"):
+        assert either.read(get_window, window.id).state == state
+        with pytest.raises(
+            Conflict, match="too late to delete its activities; perform_function stop_observation"
+        ):
+            decided(either, window, "failed")
+        receive(
+            either,
+            tmp_path,
+            event_packet(int(ticks_from_utc_ns(window.start.utc_ns)), 0, "observation_started"),
+        )
 
 
 def save_with_hole(path: Path) -> Path:

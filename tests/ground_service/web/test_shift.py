@@ -27,7 +27,7 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import save_oem
 from lunar.timescales import ticks_from_utc_ns
 from tests.ground_service.conftest import circular_states
-from tests.ground_service.web.conftest import PATIENCE_S, end_socket, press, shows, strict_page
+from tests.ground_service.web.conftest import TIMEOUT_S, end_socket, press, shows, strict_page
 from tests.lazy import expect
 from tests.scenarios import SELENITA
 from tests.serving import wait_for
@@ -174,7 +174,7 @@ class Spacecraft:
         for one in (self.down, self.up, *self._listeners, *self._connections):
             end_socket(one)
         for task in self._tasks:
-            task.join(PATIENCE_S)
+            task.join(TIMEOUT_S)
 
 
 @dataclass
@@ -299,6 +299,7 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift) -> None:
     window = craft.locator("tbody tr", has_text="low Sun").first
     expect(window).to_contain_text("waits for approval")
     window.get_by_role("button", name=re.compile("^Approve")).click()
+    page.get_by_role("dialog", name=re.compile("^Approve")).get_by_role("button", name="Approve").click()
     expect(window).to_contain_text("waits for the release of its telecommands")
     page.reload()
     expect(craft).to_contain_text("On hold by ann since")
@@ -322,7 +323,7 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift) -> None:
     expect(window.locator(".chain .now")).to_have_text("executed")  # all telecommands are verified
     expect(window).to_contain_text("begins in")
 
-    # Five clicks lead from the search to telecommands that are sent, outside of a contact and in one.
+    # Six clicks lead from the search to telecommands that are sent, outside of a contact and in one.
     for during, window in ((nullcontext(), 0), (telemetry(spacecraft), -1)):
         go(page, "Shift", "Planner")
         expect(page.locator("#spacecraft")).to_have_value("76 flight")
@@ -331,10 +332,11 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift) -> None:
             press(page, "Search")
             page.locator("#candidates").get_by_role("button", name="Plan").nth(window).click()
             page.locator("#selected").get_by_role("button", name="Approve").click()
+            page.get_by_role("dialog").get_by_role("button", name="Approve").click()
             page.locator("#selected").get_by_role("button", name="Uplink").click()
             press(page, "Release and send")
             shows(page, "#notices", "sends what is released")
-        assert int(page.evaluate("sessionStorage.n")) - before == 5
+        assert int(page.evaluate("sessionStorage.n")) - before == 6
     go(page, "Shift", "Commands")
     # The planner uplinks approved windows that begin soon: the page has the name that the service recorded.
     recorded = json.loads(page.request.get("/api/v1/telecommands?limit=100").body())["items"]

@@ -1,0 +1,67 @@
+"""Hours of new users and the cost of requests: campaigns; here their records and tables."""
+
+import pytest
+
+from benchmarks.campaigns import costs, engineer, operator_http, operator_pages
+from benchmarks.campaigns._strangers import Diary, commands_of
+from ground_service.app import create_app
+from ground_service.settings import Settings
+
+
+@pytest.mark.campaign
+def test_an_operator_comes_from_an_empty_folder_to_a_report_by_http() -> None:
+    assert operator_http.main([]) == 0
+
+
+@pytest.mark.campaign
+def test_an_operator_spends_an_hour_with_the_pages() -> None:
+    assert operator_pages.main([]) == 0
+
+
+@pytest.mark.campaign
+def test_an_engineer_judges_builds_by_command_line() -> None:
+    assert engineer.main([]) == 0
+
+
+@pytest.mark.campaign
+def test_no_request_costs_more_than_the_rule_allows() -> None:
+    assert costs.main([]) == 0
+
+
+def test_a_wrong_turn_that_harms_or_misleads_fails_the_hour(capsys: pytest.CaptureFixture[str]) -> None:
+    for kind, status in (("A", 1), ("B", 1), ("C", 0)):
+        diary = Diary("an hour")
+        assert diary.expect(kind, "what holds", True) and not diary.expect(kind, "what does not", False, 7)
+        assert diary.close() == status
+        assert f'"{kind}": ["what does not; found 7"]' in capsys.readouterr().out
+
+
+def test_commands_and_files_are_those_of_the_page(tmp_path) -> None:
+    lines = list(commands_of("tutorials/own-build.md", tmp_path))
+    assert 'linna regress suite || [[ ",0,1," == *",$?,"* ]]' in lines
+    assert (tmp_path / "parameters.toml").read_text() == "detector.score_threshold = 0.8\n"
+
+
+def test_every_operation_has_a_request_and_every_request_an_operation(tmp_path) -> None:
+    paths = create_app(Settings(home=tmp_path)).openapi()["paths"]
+    found = {one["operationId"]: (path, one) for path, methods in paths.items() for one in methods.values()}
+    special = costs.cases()
+    assert set(special) <= set(found)
+    for name, (path, described) in found.items():
+        if name not in special:
+            assert "{" not in costs.derived(path, described, costs.VALUES).path
+
+
+@pytest.mark.parametrize(
+    ("status", "memory_mib", "processor_s", "kept"),
+    [
+        (200, 256.0, 10.0, True), (200, 257.0, 1.0, False), (200, 1.0, 10.1, False), (500, 1.0, 1.0, False),
+        (422, 1.0, 1.0, True),
+    ],
+)  # fmt: skip
+def test_a_request_is_judged_by_memory_processor_time_and_status(
+    status: int, memory_mib: float, processor_s: float, kept: bool
+) -> None:
+    cost = costs.Cost("get_status", "", status, memory_mib, 0.0, processor_s, 0.0)
+    assert (cost.fault == "") is kept
+    assert "| `get_status` |" in costs.table([cost])
