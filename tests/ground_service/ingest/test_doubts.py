@@ -285,3 +285,23 @@ def test_a_lease_that_ended_in_a_standstill_is_renewed_with_its_state(either: Gr
         assert found is not None and (found.state, found.lease_utc_ns) == ("contact", 55)
         assert links.acquire(connection, "l", 76, "flight", wall_utc_ns=70, **given | {"owner": "b"})
         assert not links.acquire(connection, "l", 76, "flight", wall_utc_ns=10, **given)
+
+
+@pytest.mark.parametrize("ahead", [26 * HOUR, YEARS, 100 * (1 << 16) - TICKS])
+def test_a_detection_of_an_image_at_another_time_is_kept_apart(
+    ground: Ground, tmp_path: Path, ahead: int
+) -> None:
+    def detections(image_ticks: int, count: int) -> bytes:
+        none = {
+            name: np.zeros(0) for name in ("u_px", "v_px", "diameter_px", "score", "size_class", "sigma_px")
+        }
+        values = {"frame_number": count, "image_ticks": image_ticks, "image_quality": 0, "items": none}
+        return DICTIONARY.pack("detections", values, ticks=TICKS + (11 << 16), sequence_count=count)
+
+    assert receive(ground, tmp_path, contact() + detections(TICKS, 0)) == 0
+    before = hash_of(ground)
+    assert receive(ground, tmp_path, detections(TICKS + ahead, 1)) == 1
+    assert hash_of(ground) == before and alarms(ground) == {"implausible_time": 1}
+    assert reasons(ground)[0].startswith("the time of its image is ")
+    receive(ground, tmp_path, report(TICKS + 12 * (60 << 16), 12))
+    assert len(reasons(ground)) == 1
