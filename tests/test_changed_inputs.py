@@ -35,6 +35,7 @@ from linna.cli import run as linna
 from linna.data import load_orbit
 from lunar.catalogue import catalogue_words, load_catalogue, make_catalogue
 from lunar.comparison import check_pointing
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris, clipped, ephemeris_from_states
 from lunar.errors import LunarError
 from lunar.frames import (
@@ -49,7 +50,7 @@ from lunar.messages.oem import format_oem
 from lunar.messages.oem_xml import format_oem_xml
 from lunar.messages.spice import spk_kernel
 from lunar.messages.stk import format_stk
-from lunar.timescales import NS, format_utc, from_tai_ns, ticks_from_utc_ns, utc_ns_from_ticks
+from lunar.timescales import format_utc, from_tai_ns, ticks_from_utc_ns, utc_ns_from_ticks
 from payload_emulator.errors import PayloadError
 from payload_emulator.flight.vision.preprocess import prepare_image, quality_reason
 from payload_emulator.session.scenario import Scenario, load_scenario
