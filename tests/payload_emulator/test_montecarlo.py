@@ -16,6 +16,7 @@ from payload_emulator.flight.navigation import landmark_map
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.flight.navigation.filter.dynamics import ProcessNoise, process_noise
 from payload_emulator.flight.navigation.filter.filter import CommonErrors
+from payload_emulator.flight.navigation.filter.map_offset import OffsetRule
 from payload_emulator.flight.navigation.outcomes import Outcome
 from payload_emulator.session.scenario import load_scenario
 from payload_emulator.session.spacecraft import loading
@@ -180,7 +181,7 @@ def shipped() -> Any:
     """The standard case with everything as shipped: bias states, catalogue offset, scale, persistence, noise."""
     case = standard_case(DataFolder(), "tuning", SHIPPED_HOURS)
     assert case.parameters == replace(
-        AnchoredParameters(), noise=case.parameters.noise
+        AnchoredParameters(), noise=case.parameters.noise, offset=OffsetRule()
     ) and case.parameters.noise == process_noise(100, case.filter_gravity.name)
     return case
 

@@ -298,7 +298,7 @@ class Observer:
         self._report_attitude(report)
         offset = None if report.offset is None else (report.offset.sigma_m, float(report.offset.fixes))
         if offset is not None and offset != self._map_offset:
-            self._telemetry.event("info", "map_offset", *offset)
+            self._telemetry.event("info", "map_offset", offset[0], offset[1])
             self._map_offset = offset
 
     def _send_filter(self, state: AnchoredState, report: AnchoredReport, found: Detections | None) -> None:
