@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from reports.document import Block, Column, Document, Facts, Heading, Picture, Table
+from reports.document import Block, Column, Document, Heading, Picture, Properties, Table
 from reports.figures import training
 from reports.figures.detector import OCTANTS, octant_bias
 from reports.sections.detection import detector_blocks, gallery_picture
@@ -24,7 +24,6 @@ from reports.values import BiasBin, DetectorReport, NamedScore, ResidualSeries, 
 
 
 def detector_document(report: DetectorReport) -> Document:
-    """The document of a detector."""
     blocks: list[Block] = [*judgement(report), Heading("Scores")]
     found = detector_blocks(report.score) if report.score is not None else []
     blocks += found or [absent(report, "score", "Scores", "the detector was not evaluated")]
@@ -70,7 +69,7 @@ def detector_document(report: DetectorReport) -> Document:
         ]
     blocks.append(Heading("Cost on board"))
     if report.cost:
-        blocks.append(Facts(tuple(report.cost.items())))
+        blocks.append(Properties(tuple(report.cost.items())))
     else:
         blocks.append(absent(report, "cost", "Latency and memory", "they were not measured"))
     blocks.append(Heading("Detections over the images"))

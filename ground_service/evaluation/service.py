@@ -56,6 +56,7 @@ def conditions_of(inputs: PassInputs) -> dict[str, Any]:
         "sun_elevation_deg": _median(sun_angles(track).elevation_deg) if inputs.sun_known else None,
         "build": inputs.build,
         "estimator": inputs.limits.estimator,
+        "map_offset_m": None if inputs.map_offset is None else inputs.map_offset.sigma_enu_m[0],
     }
 
 

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from reports.document import Block, Column, Facts, Heading, Paragraph, Picture, Table
+from reports.document import Block, Column, Heading, Paragraph, Picture, Properties, Table
 from reports.figures import accounting
 from reports.sections.common import PassView, arc_words
 from reports.text import (
@@ -86,7 +86,7 @@ def frames_and_packets(view: PassView) -> list[Block]:
     packets = report.packets
     if packets is None:
         return [*blocks, view.absent("packets", "Packet accounting")]
-    blocks += [Heading("Downlink", 3), _downlink_facts(packets)]
+    blocks += [Heading("Downlink", 3), _downlink_properties(packets)]
     if packets.completeness is not None and len(packets.completeness.expected):
         blocks.append(_completeness(view, packets.completeness))
     if packets.by_apid:
@@ -122,8 +122,8 @@ def _frame_blocks(view: PassView) -> list[Block]:
     return blocks
 
 
-def _downlink_facts(packets: PacketAccounting) -> Facts:
-    return Facts(
+def _downlink_properties(packets: PacketAccounting) -> Properties:
+    return Properties(
         (
             (
                 "Packets received",

@@ -1,4 +1,4 @@
-"""What the payload mapped itself."""
+"""Section on the craters that the payload mapped."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ import pytest
 from pypdf import PdfReader
 
 from reports import drawings
-from reports.document import Column, Document, Facts, Heading, Listing, Paragraph, Picture, Table
+from reports.document import Column, Document, Heading, Listing, Paragraph, Picture, Properties, Table
 from reports.drawings import KeptDrawings, drawing_hash
 from reports.pass_report import pass_document
 from reports.pdf_pages import _typeset, pdf_pages
@@ -115,7 +115,7 @@ def test_a_wide_table_is_set_in_smaller_type() -> None:
 
 
 def test_a_long_word_is_broken_inside_the_width() -> None:
-    pages = pages_of(pdf_pages(document(Paragraph("x" * 400), Facts((("path", "/" + "long" * 80),)))))
+    pages = pages_of(pdf_pages(document(Paragraph("x" * 400), Properties((("path", "/" + "long" * 80),)))))
     lines = [line for line in pages[0].splitlines() if "xxxx" in line or "longlong" in line]
     assert len(lines) > 6
     assert sum(line.count("x") for line in lines) == 400
