@@ -396,14 +396,14 @@ def acceleration_gradient(
     zeta = rho * z * inverse_r
     rho2 = rho * rho
     u = complex(rho * x * inverse_r, rho * y * inverse_r)
-    harmonic = np.zeros((size, size + 2), dtype=np.complex128)  # column m + 2
+    harmonic = np.empty((size, size + 2), dtype=np.complex128)  # column m + 2
     sectorial = complex(rho, 0.0)
     for m in range(size):
         if m:
             sectorial *= (2 * m - 1) * u
         harmonic[m, m + 2] = sectorial
         for n in range(m + 1, size):
-            older = harmonic[n - 2, m + 2] if n >= 2 else 0.0j
+            older = harmonic[n - 2, m + 2] if n > m + 1 else 0.0j
             harmonic[n, m + 2] = (2 * n - 1) * zeta * harmonic[n - 1, m + 2] - (
                 (n - 1) ** 2 - m * m
             ) * rho2 * older

@@ -183,13 +183,21 @@ def find_hit(
 
 
 @njit(
-    ahead="f4[:, ::1], f4[:, ::1], Grid(f8, f8, f8), Viewpoint(f8, f8[:, ::1], f8, f8, f8), f4[:, ::1]",
+    ahead="f4[:, ::1], f4[:, ::1], f8, f8, Grid(f8, f8, f8), Viewpoint(f8, f8[:, ::1], f8, f8, f8), f4[:, ::1]",
     **FAST,
 )
 def trace_pixels(
-    heights: Float32Array, peaks: Float32Array, grid: Grid, viewpoint: Viewpoint, depth_along: Float32Array
+    heights: Float32Array,
+    peaks: Float32Array,
+    low: float,
+    top: float,
+    grid: Grid,
+    viewpoint: Viewpoint,
+    depth_along: Float32Array,
 ) -> None:
     """Fill ``depth_along`` (H, W) with the distance of the first hit along the boresight; -1 where there is none.
+
+    All heights lie between ``low`` and ``top``.
 
     The image is walked outward from the nadir, in lines of four sectors. The ray of a pixel passes above those of its
     two neighbours nearer the nadir, so the ground up to their hits is clear and the search starts at the nearer of
@@ -206,8 +214,6 @@ def trace_pixels(
         np.float32(rows - 2.01),
         np.float32(columns - 2.01),
     )
-    top = float(peaks.max()) + 1.0
-    low = float(heights.min()) - 1.0
     close = np.float32(CLOSE_TEXELS * grid.texel_m)
     nadir_u, nadir_v = _nadir_pixel(viewpoint, high, wide)
     inner = np.empty(high + wide, np.float32)
@@ -431,6 +437,8 @@ def _settle(
 def trace_shifted(
     heights: Float32Array,
     peaks: Float32Array,
+    low: float,
+    top: float,
     grid: Grid,
     viewpoint: Viewpoint,
     shift_u: Float32Array,
@@ -444,8 +452,6 @@ def trace_shifted(
     inverse = 1.0 / grid.texel_m
     i0 = -grid.x0_m * inverse
     j0 = -grid.y0_m * inverse
-    top = float(peaks.max()) + 1.0
-    low = float(heights.min()) - 1.0
     rotation = viewpoint.tangent_from_camera
     for v in range(depth_along.shape[0]):
         for u in range(depth_along.shape[1]):

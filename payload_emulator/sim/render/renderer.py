@@ -199,10 +199,12 @@ def _render_grid(
         camera.centre_px[1],
     )
     shift_u, shift_v = pixel_shifts(camera) if isinstance(camera, BrownCamera) else (None, None)
+    peaks = block_peaks(heights)
+    ground = (heights, peaks, float(heights.min()) - 1.0, float(peaks.max()) + 1.0, place, viewpoint)
     if shift_u is None or shift_v is None:
-        trace_pixels(heights, block_peaks(heights), place, viewpoint, range_m)
+        trace_pixels(*ground, range_m)
     else:
-        trace_shifted(heights, block_peaks(heights), place, viewpoint, shift_u, shift_v, range_m)
+        trace_shifted(*ground, shift_u, shift_v, range_m)
     shade_pixels(
         lit,
         place,
