@@ -432,10 +432,9 @@ def _compile(entries: Sequence[Entry], mark: str) -> list[_Step]:
         bits = None if kind is None else kind.bits
         encoding = None if kind is None else kind.encoding
         offset = entry.offset
-        plain = not entry.from_start and entry.condition is None
-        is_number = bits is not None and isinstance(encoding, (IntegerEncoding, FloatEncoding))
-        if plain and isinstance(offset, int) and is_number:
-            assert kind is not None
+        is_here = not entry.from_start and entry.condition is None and isinstance(offset, int)
+        if is_here and bits is not None and isinstance(encoding, (IntegerEncoding, FloatEncoding)):
+            assert kind is not None and isinstance(offset, int)
             if fields and encoding.calibration.contexts:  # they may ask for fields of the same stretch
                 close()
             if cursor + offset >= 0:

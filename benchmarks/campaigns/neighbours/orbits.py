@@ -7,6 +7,7 @@ from pathlib import Path
 from _cells import run
 
 _MOON, _CRAFT = 301, -85
+SCHEMA = "https://sanaregistry.org/r/ndmxml_unqualified/ndmxml-3.0.0-master-3.0.xsd"
 
 
 def _seconds(times):
@@ -92,7 +93,7 @@ def spiceypy(cells):
 
 def anise(cells):
     from anise import Almanac
-    from anise.astro import DataType, Ephemeris
+    from anise.astro import DataType, Ephemeris, Frame
     from anise.constants import Frames
     from anise.time import Duration, Epoch
 
@@ -111,8 +112,6 @@ def anise(cells):
 
     def kernel(name):
         almanac = Almanac(cells.sample(name))
-        from anise.astro import Frame
-
         craft = Frame(_CRAFT, 1)
         start, found = Epoch(cells.expected("arc_utc")[0] + " UTC"), []
         for at, *_ in cells.expected("arc"):
@@ -397,18 +396,11 @@ def orekit(cells):
             from java.io import FileWriter
             from org.orekit.files.ccsds.utils.generation import KvnGenerator, XmlGenerator
 
-            out = FileWriter(path)
-            kind = KvnGenerator if form == "kvn" else XmlGenerator
-            extra = (
-                ("https://sanaregistry.org/r/ndmxml_unqualified/ndmxml-3.0.0-master-3.0.xsd",)
-                if form == "xml"
-                else ()
-            )
-            sizes = (25,) if form == "kvn" else (2,)
+            out, gap = FileWriter(path), float("nan")
             generator = (
-                kind(out, *sizes, "out", float("nan"), True, *extra)
+                XmlGenerator(out, 2, "out", gap, True, SCHEMA)
                 if form == "xml"
-                else kind(out, 25, "out", float("nan"), 60)
+                else KvnGenerator(out, 25, "out", gap, 60)
             )
             writer().writeMessage(generator, message())
             generator.close()

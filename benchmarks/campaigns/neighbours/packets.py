@@ -390,7 +390,6 @@ def satnogs_decoders(cells):
 
 def cfdp_py(cells):
     """Protocol data units of a transaction in space packets, described by XTCE."""
-    from spacepackets.cfdp import CfdpLv  # noqa: F401
     from spacepackets.cfdp.conf import PduConfig
     from spacepackets.cfdp.defs import ChecksumType, TransmissionMode
     from spacepackets.cfdp.pdu import MetadataParams, MetadataPdu
