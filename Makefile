@@ -90,7 +90,7 @@ pictures: $(VENV)/.dev
 
 # Table of the pages by width, colours, font and data, written by the test of all pages.
 page-table: $(VENV)/.dev
-	LINNA_PAGE_TABLE=docs/reference/pages.md $(BIN)/python -m pytest -q -m campaign tests/ground_service/web/test_matrix.py
+	LINNA_PAGE_TABLE=docs/results/pages.md $(BIN)/python -m pytest -q -m campaign tests/ground_service/web/test_matrix.py
 
 # Bill of materials of what is shipped (CycloneDX): hashes, licences, dependencies, telemetry displays. STATUS names a
 # copy of /var/lib/dpkg/status of the image, for its Debian packages.

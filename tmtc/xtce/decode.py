@@ -141,7 +141,7 @@ class XtceDecode:
 
 
 def choose_roots(definition: Definition, names: Sequence[str] = ()) -> tuple[Container, ...]:
-    """The containers that packets begin with: those named, or all without a base if they can be told apart.
+    """The containers that packets begin with: those named, or all without a base if they can be distinguished.
 
     Raises
     ------
@@ -432,9 +432,14 @@ def _compile(entries: Sequence[Entry], mark: str) -> list[_Step]:
         bits = None if kind is None else kind.bits
         encoding = None if kind is None else kind.encoding
         offset = entry.offset
-        is_here = not entry.from_start and entry.condition is None and isinstance(offset, int)
-        if is_here and bits is not None and isinstance(encoding, (IntegerEncoding, FloatEncoding)):
-            assert kind is not None and isinstance(offset, int)
+        plain = not entry.from_start and entry.condition is None
+        if (
+            plain
+            and isinstance(offset, int)
+            and kind is not None
+            and bits is not None
+            and isinstance(encoding, (IntegerEncoding, FloatEncoding))
+        ):
             if fields and encoding.calibration.contexts:  # they may ask for fields of the same stretch
                 close()
             if cursor + offset >= 0:
@@ -1007,7 +1012,7 @@ def _text(octets: bytes, encoding: StringEncoding) -> str:
 
 
 def _terminated(octets: bytes, terminator: bytes) -> int:
-    """Where the terminator stands, at a whole character; -1 without one."""
+    """Return the position of the terminator, at a whole character; -1 without one."""
     place = octets.find(terminator)
     while place > 0 and place % len(terminator):
         place = octets.find(terminator, place + 1)
@@ -1281,7 +1286,7 @@ def _known(values: RecordArray) -> BoolArray:
 
 
 def _holds(condition: Condition, rows: _Rows) -> BoolArray:
-    """Where a condition holds (n,); a comparison with a parameter that a packet does not have does not."""
+    """Return where a condition holds (n,); a comparison with a parameter that a packet does not have does not."""
     if isinstance(condition, (AllOf, AnyOf)):
         parts = [_holds(one, rows) for one in condition.conditions]
         joined: BoolArray = np.all(parts, axis=0) if isinstance(condition, AllOf) else np.any(parts, axis=0)
