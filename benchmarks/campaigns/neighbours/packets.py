@@ -227,7 +227,7 @@ def space_packet_parser(cells):
 
     right = [
         {key: value for key, value in one.items() if key != "packet" and not isinstance(value, (list, dict))}
-        for one in cells.expected("unrolled")
+        for one in cells.expected["unrolled"]
     ]
 
     def read():
@@ -237,7 +237,7 @@ def space_packet_parser(cells):
         definition = spp.load_xtce(cells.sample("unrolled.xml"))
         definition.write_xml(str(cells.out / "spp.xml"))
         Path(path).write_bytes(Path(cells.sample("packets.bin")).read_bytes())
-        return cells.expected("unrolled")
+        return cells.expected["unrolled"]
 
     cells.reads("XTCE (unrolled), packets", right, read)
     cells.writes("XTCE", "spp.bin", "packets", written, xtce=["spp.xml"])
@@ -248,7 +248,7 @@ def ccsdspy(cells):
     import ccsdspy as ccs
     import numpy as np
 
-    records = [one for one in cells.expected("packets") if one["packet"] == "housekeeping"]
+    records = [one for one in cells.expected["packets"] if one["packet"] == "housekeeping"]
     apid = records[0]["PKT_APID"]
     fields = (
         ("PUS", 8),
@@ -325,7 +325,7 @@ def spacepackets(cells):
     from spacepackets.ecss.tc import PusTc
     from spacepackets.ecss.tm import PusTm
 
-    records = cells.expected("packets")
+    records = cells.expected["packets"]
 
     def read():
         found = []

@@ -10,7 +10,7 @@ from _cells import run
 
 def _columns(cells, table, available):
     """Return names of columns of numbers that a program has, and their values by row."""
-    header, *rows = cells.expected("tables")[table]
+    header, *rows = cells.expected["tables"][table]
     chosen = [
         k
         for k, name in enumerate(header)
@@ -152,7 +152,7 @@ def evo(cells):
             ]
         ]
 
-    header, *rows = cells.expected("tables")["residuals"]
+    header, *rows = cells.expected["tables"]["residuals"]
     place = header.index("error_3d_m")
     errors = [row[place] for row in rows if row[1] == "anchored" and row[2] == "estimate"]
     right = [[math.sqrt(sum(one * one for one in errors) / len(errors)), max(errors)]]

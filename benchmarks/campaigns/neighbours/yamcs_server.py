@@ -161,7 +161,7 @@ def _by_count(records):
 
 def receive_pass(cells, server, frame_port):
     """Send the frames of the pass and return all values of all packets."""
-    expected = _by_count(cells.expected("packets"))
+    expected = _by_count(cells.expected["packets"])
     to = f"127.0.0.1:{frame_port}"
     subprocess.run(
         _linna("tm", "frames", cells.sample("downlink.cadu"), "--to", to), check=True, stdout=sys.stderr
@@ -303,7 +303,7 @@ def yamcs(cells):
         _linna("tm", "yamcs", "--out", folder, "--frame-port", frames, "--station", station), check=True
     )
     with Server(folder, http) as server:
-        right = _by_count(cells.expected("packets"))
+        right = _by_count(cells.expected["packets"])
         cells.reads(
             "frames and XTCE, all values of a pass", right, lambda: receive_pass(cells, server, frames)
         )
