@@ -235,7 +235,7 @@ def compare(expected, found, *, rotations=False):
         digits = math.inf if error == 0 else math.floor(-math.log10(error))
         if digits < ENOUGH_DIGITS:
             return f"differs by {error:.2g} of the greatest value", False
-        return f"equal{f' to {digits} digits' * (error > 0)} ({right.size} values)", True
+        return f"equal{f' to {digits} digits' * bool(error)} ({right.size} values)", True
     pairs = list(_leaves(expected, found, ""))
     wrong = [one for one in pairs if not _same(*one[1:])]
     if not wrong:
