@@ -92,17 +92,8 @@ def yamcs_pymdb(cells):
             body += struct.pack(">H", len(long)) + long.encode()
             bodies.append(body + bytes((2, 0xAB, k, 10 + 5 * k, k % 2, 1, 2, k)))
             agg = {"x": 7, "y": 1.5 * k, "z": {"ok": bool(k % 2)}}
-            values = (
-                k,
-                agg,
-                arr,
-                86400.25 + k,
-                "ABCDEFGH",
-                long,
-                f"ab{k:02x}",
-                1 + 0.5 * k,
-                ("OFF", "ON")[k % 2],
-            )
+            texts = ("ABCDEFGH", long, f"ab{k:02x}")
+            values = (k, agg, arr, 86400.25 + k, *texts, 1 + 0.5 * k, ("OFF", "ON")[k % 2])
             names = [one.name for one in parameters]
             right.append({**dict(zip(names, values, strict=True)), "rep": [1, 2, k]})
         _save(path, 100, bodies)
@@ -113,12 +104,7 @@ def yamcs_pymdb(cells):
 
 def fprime_xtce(cells):
     def number(name, size, kind="integer"):
-        return {
-            "name": name,
-            "kind": kind,
-            "size": size,
-            **({"signed": name[0] == "I"} if kind == "integer" else {}),
-        }
+        return {"name": name, "kind": kind, "size": size, "signed": name[0] == "I"}
 
     def alias(name):
         kind = number("U16", 16)
@@ -137,32 +123,27 @@ def fprime_xtce(cells):
         mode = {"kind": "enum", "qualifiedName": "Bus.Mode", "representationType": number("U8", 8)}
         mode |= {"enumeratedConstants": codes, "default": "Bus.Mode.OFF"}
         sizes = {"timeBase": 16, "timeContext": 8, "seconds": 32, "useconds": 32}
-        members = {
-            name: {"type": number(f"U{bits}", bits), "index": k}
-            for k, (name, bits) in enumerate(sizes.items())
-        }
+        types = [number(f"U{bits}", bits) for bits in sizes.values()]
+        members = {name: {"type": types[k], "index": k} for k, name in enumerate(sizes)}
         stamp = {"kind": "struct", "qualifiedName": "Fw.TimeValue", "members": members, "default": {}}
         names = ("constants", "commands", "parameters", "events", "records", "containers")
-        dictionary = {name: [] for name in names}
-        dictionary |= {
+        kinds = [(f"Bus.{name}", kind) for name, (kind, *_) in channels.items()]
+        dictionary = {name: [] for name in names} | {
             "metadata": {"deploymentName": "Bus"},
             "typeDefinitions": [mode, alias("FwSizeStoreType"), alias("FwTlmPacketizeIdType"), stamp],
             "telemetryChannels": [
-                {"name": f"Bus.{name}", "type": kind, "id": 16 + k}
-                for k, (name, (kind, *_)) in enumerate(channels.items())
+                {"name": n, "type": kind, "id": 16 + k} for k, (n, kind) in enumerate(kinds)
             ],
             "telemetryPacketSets": [
                 {"members": [{"name": "Sets", "id": 4, "members": ["Bus.count", "Bus.mode"]}]}
             ],
         }
         (cells.out / "bus.json").write_text(json.dumps(dictionary))
-        subprocess.run(
-            [sys.executable, "-m", "fprime_xtce", "bus.json", "-o", "fprime.xml"], check=True, cwd=cells.out
-        )
+        command = [sys.executable, "-m", "fprime_xtce", "bus.json", "-o", "fprime.xml"]
+        subprocess.run(command, check=True, cwd=cells.out)
         at, octets = dict(zip(sizes, (2, 0, 1000, 250), strict=True)), struct.pack(">HBII", 2, 0, 1000, 250)
-        bodies = [
-            struct.pack(">HI", 1, 16 + k) + octets + body for k, (_, body, _) in enumerate(channels.values())
-        ]
+        parts = enumerate(channels.values())
+        bodies = [struct.pack(">HI", 1, 16 + k) + octets + body for k, (_, body, _) in parts]
         _save(path, 1, bodies)
         with Path(path).open("ab") as file:
             file.write(_packet(4, struct.pack(">HH", 4, 4) + octets + struct.pack(">IB", 78, 0)))
@@ -197,17 +178,9 @@ def openc3(cells):
         bodies = [struct.pack(">hf", -4, 1.5), b"\x01", bytes((1, 2, 3, 4)), struct.pack(">hf", 8, 2.5)]
         apids = (1, 2, 3, 1)
         Path(path).write_bytes(b"".join(map(_packet, apids, bodies)))
-        values = (
-            {"TEMP": 8.0, "VOLT": 1.5},
-            {"CODE": "ON"},
-            {"PIXELS": [1, 2, 3, 4]},
-            {"TEMP": 14.0, "VOLT": 2.5},
-        )
-        names = list(kinds)
-        return [
-            {"packet": names[apid - 1], "APID": apid, "LENGTH": len(body) - 1, **one}
-            for apid, body, one in zip(apids, bodies, values, strict=True)
-        ]
+        other = {"CODE": "ON"}, {"PIXELS": [1, 2, 3, 4]}
+        values = {"TEMP": 8.0, "VOLT": 1.5}, *other, {"TEMP": 14.0, "VOLT": 2.5}
+        return [{"packet": [*kinds][k - 1], "APID": k, **one} for k, one in zip(apids, values, strict=True)]
 
     cells.not_tried("reads", "XTCE", "its reader of XTCE is not in the Python package")
     cells.writes("XTCE", "openc3.bin", "packets", written, xtce=["openc3.xml"])
@@ -217,15 +190,11 @@ def space_packet_parser(cells):
     import space_packet_parser as spp
 
     expected, definition = cells.expected["unrolled"], spp.load_xtce(cells.sample("unrolled.xml"))
-    right = [
-        {k: v for k, v in one.items() if k != "packet" and not isinstance(v, (list, dict))}
-        for one in expected
-    ]
+    kinds = (str, float, int, type(None))
+    right = [{k: v for k, v in one.items() if k != "packet" and isinstance(v, kinds)} for one in expected]
 
     def plain(value):
-        return (
-            float(value) if isinstance(value, float) else int(value) if isinstance(value, int) else str(value)
-        )
+        return next((kind(value) for kind in (float, int) if isinstance(value, kind)), str(value))
 
     def read():
         packets = map(definition.parse_bytes, _stored(cells))
@@ -245,20 +214,13 @@ def ccsdspy(cells):
     import numpy as np
 
     records = [one for one in cells.expected["packets"] if one["packet"] == "housekeeping"]
-    fields = {
-        "PUS": 8,
-        "SERVICE": 8,
-        "SUBTYPE": 8,
-        "MESSAGE": 16,
-        "DESTINATION": 16,
-        "P": 8,
-        "COARSE": 32,
-        "FINE": 16,
-    }
+    fields = {"PUS": 8, "SERVICE": 8, "SUBTYPE": 8, "MESSAGE": 16, "TO": 16, "P": 8, "COARSE": 32, "FINE": 16}
     names = {
-        "CCSDS_APID": "PKT_APID", "CCSDS_SEQUENCE_COUNT": "SRC_SEQ_CTR", "CCSDS_PACKET_LENGTH": "PKT_LEN",
-        "SERVICE": "SERVICE", "SUBTYPE": "SUBTYPE", "COARSE": "TIME_COARSE", "FINE": "TIME_FINE",
-    }  # fmt: skip
+        "CCSDS_APID": "PKT_APID",
+        "CCSDS_SEQUENCE_COUNT": "SRC_SEQ_CTR",
+        "CCSDS_PACKET_LENGTH": "PKT_LEN",
+    }
+    names |= {"SERVICE": "SERVICE", "SUBTYPE": "SUBTYPE", "COARSE": "TIME_COARSE", "FINE": "TIME_FINE"}
 
     def read():
         apid, source = records[0]["PKT_APID"], cells.out / "housekeeping.bin"
@@ -269,17 +231,15 @@ def ccsdspy(cells):
         return np.column_stack([found[name].astype(float) for name in names]).tolist()
 
     def written(path):
-        packets = ccs.FixedLength(
-            [ccs.PacketField("a", "uint", 16), ccs.PacketField("b", "int", 32)], apid=77
-        )
+        layout = [ccs.PacketField("a", "uint", 16), ccs.PacketField("b", "int", 32)]
+        packets = ccs.FixedLength(layout, apid=77)
         values = {"a": np.array([1, 2, 65535]), "b": np.array([-1, 0, 123456])}
         packets.to_file(path, pkt_type=0, apid=77, sec_header_flag=0, seq_flag=3, data=values)
         (cells.out / "ccsdspy.xml").write_text(_xtce({"a": 16, "b": 32}, signed=("b",)))
         return [{"a": int(a), "b": int(b)} for a, b in zip(*values.values(), strict=True)]
 
-    cells.reads(
-        "headers of packets", [[float(one[name]) for name in names.values()] for one in records], read
-    )
+    right = [[float(one[name]) for name in names.values()] for one in records]
+    cells.reads("headers of packets", right, read)
     cells.writes("packets", "ccsdspy.bin", "packets", written, xtce=["ccsdspy.xml"])
 
 
@@ -301,9 +261,7 @@ def spacepackets(cells):
             "perform_function": (8, 1, struct.pack(">Hdd", 8, 0, 0)),
             "set_parameter": (20, 3, struct.pack(">Hd", 1, 5.0)),
         }
-        packets = [
-            PusTc(apid=160, service=a, subservice=b, app_data=data) for a, b, data in commands.values()
-        ]
+        packets = [PusTc(apid=160, service=a, subservice=b, app_data=d) for a, b, d in commands.values()]
         Path(path).write_text(json.dumps([one.pack().hex() for one in packets]))
         return list(commands)
 
@@ -316,12 +274,10 @@ def satnogs_decoders(cells):
     from satnogsdecoders.decoder import Ax25frames
 
     octets = _stored(cells)[0]
-    stations = [
-        bytes(ord(c) << 1 for c in name) + end for name, end in (("LINNA ", b"\x60"), ("GROUND", b"\x61"))
-    ]
+    head = b"\x60".join(bytes(ord(c) << 1 for c in name) for name in ("LINNA ", "GROUND"))
 
     def read():
-        frame = Ax25frames.from_bytes(b"".join(stations) + b"\x03\xf0" + octets)
+        frame = Ax25frames.from_bytes(head + b"\x61\x03\xf0" + octets)
         return [frame.ax25_frame.payload.ax25_info.hex()]
 
     cells.reads("packet in an AX.25 frame", [octets.hex()], read)
@@ -342,10 +298,8 @@ def cfdp_py(cells):
         conf = PduConfig(*numbers, TransmissionMode.UNACKNOWLEDGED)
         conf.source_entity_id, conf.dest_entity_id, conf.transaction_seq_num = numbers
         metadata = MetadataParams(False, ChecksumType.CRC_32, 11, "a.bin", "b.bin")
-        units = [
-            MetadataPdu(conf, metadata).pack(),
-            FileDataPdu(conf, FileDataParams(b"hello world", 0)).pack(),
-        ]
+        data = FileDataParams(b"hello world", 0)
+        units = [MetadataPdu(conf, metadata).pack(), FileDataPdu(conf, data).pack()]
         _save(path, 500, map(bytes, units))
         (cells.out / "cfdp.xml").write_text(_xtce(fields, octets="length"))
         same = {"source": 1, "transaction": 9, "destination": 2}
