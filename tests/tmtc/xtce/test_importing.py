@@ -205,7 +205,7 @@ def test_long_chains_of_inheritance_are_read_and_endless_ones_refused():
         (integer("t", 12, order=foreign.LITTLE), "whole octets"),
         (integer("t", 8, order="middle"), "byteOrder"),
         (integer("t", 8).replace("encoding=", 'bitOrder="leastSignificantBitFirst" encoding='), "bitOrder"),
-        (integer("t", 8, inner="<ErrorDetectCorrect/>"), "ErrorDetectCorrect, which is not"),
+        (integer("t", 8, inner="<Checksum/>"), "Checksum, which is not"),
         (integer("t", 8).replace("IntegerDataEncoding", "StringDataEncoding"), "expected one of IntegerDataEncoding"),
         (floating("t", 80), "sizeInBits 16, 32 or 64"),
         (floating("t", 64, "MILSTD_1750A"), "sizeInBits 32 or 48"),
