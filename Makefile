@@ -47,7 +47,7 @@ campaigns-left: $(VENV)/.dev
 	$(BIN)/python -m pytest -m campaign --resume --collect-only -q
 
 clean-campaigns:
-	rm -f build/campaigns.txt
+	rm -rf build/campaigns.txt build/compatibility/results
 
 # Processor time of the newest complete `make test` by folder, compared with tests/cost.csv.
 test-cost: $(VENV)/.dev

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -63,7 +64,7 @@ def detector_document(report: DetectorReport) -> Document:
                 "Quantities over the training run.",
                 "Training curves: " + ", ".join(c.name for c in curves),
                 0.78 + rows * 1.25 + (rows - 1) * 0.75,
-                lambda c: training.draw_training(c, curves),
+                partial(training.draw_training, curves=curves),
             ),
         ]
     blocks.append(Heading("Cost on board"))
@@ -115,7 +116,7 @@ def _named(key: str, scores: Sequence[NamedScore], caption: str) -> list[Block]:
         ),
     )
     picture = Picture(
-        key, caption, caption, 0.85 + 0.3 * len(scores), lambda c: training.draw_named_scores(c, scores)
+        key, caption, caption, 0.85 + 0.3 * len(scores), partial(training.draw_named_scores, scores=scores)
     )
     return [picture, table]
 

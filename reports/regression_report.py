@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 from reports.document import Block, Cell, Column, Document, Heading, Picture, Table
 from reports.figures.regression import draw_changed_craters
@@ -90,7 +91,7 @@ def _changed(report: RegressionReport) -> list[Block]:
                 "without a crater.",
                 counts,
                 3.6,
-                lambda c: draw_changed_craters(c, craters),
+                partial(draw_changed_craters, craters=craters),
             )
         )
     if not report.changed_tracks:

@@ -11,6 +11,7 @@ A report reads no clock: the same value gives the same octets.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
@@ -728,6 +729,7 @@ class MonthPass:
     packets: int
     packets_lost: int
     verdict_level: str
+    map_offset_m: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)

@@ -148,6 +148,9 @@ class PassConditions(Entity):
     sun_elevation_deg: float | None = Field(description="Median at the sub-satellite point")
     build: str = Field(description="Hashes of model and parameters in the last housekeeping packet")
     estimator: str | None = Field(description="Estimator that the mission description judges")
+    map_offset_m: float | None = Field(
+        default=None, description="Offset of the crater list that the payload uses, 1 sigma east and north"
+    )
 
 
 class PassFigures(Entity):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -112,7 +113,7 @@ def _frame_blocks(view: PassView) -> list[Block]:
             f"({percent_text(last[1], steps[0][1])}) are {last[0]}.{bad}",
             "Bars: " + ", ".join(f"{name} {n}" for name, n in steps),
             0.28 + 0.27 * len(steps),
-            lambda c: accounting.draw_frame_steps(c, steps),
+            partial(accounting.draw_frame_steps, steps=steps),
         )
     ]
     if count.quality:
@@ -163,7 +164,13 @@ def _completeness(view: PassView, completeness: CompletenessSeries) -> Picture:
         f"vermillion.{arc_words(view.time, report.imaging_arcs)}",
         f"Completeness over time. {said}",
         1.85,
-        lambda c: accounting.draw_completeness(c, completeness, view.time, report.imaging_arcs, report.gaps),
+        partial(
+            accounting.draw_completeness,
+            series=completeness,
+            time=view.time,
+            arcs=report.imaging_arcs,
+            gaps=report.gaps,
+        ),
     )
 
 

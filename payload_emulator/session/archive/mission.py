@@ -161,7 +161,7 @@ def mission_text(world: World, data: DataFolder, orbit_age_h: float | None = Non
             "source": world.terrain.catalogue.source,
             **_registration(world),
             "offset_sigma_m": [rule.prior_m, rule.prior_m, errors.catalogue_offset_m[2]],
-            "offset_correlation_deg": round(math.degrees(errors.catalogue_correlation_rad), 6),
+            "offset_correlation_deg": round(math.degrees(rule.correlation_rad), 6),
         },
         "detector": _detector(scenario),
         "reference": {
