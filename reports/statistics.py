@@ -1,7 +1,5 @@
 """Small statistics of error series: lengths, quantiles, shares, bins, chi-squared bounds. NaN samples never count."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

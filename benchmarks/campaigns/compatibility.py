@@ -9,8 +9,6 @@ their script, versions or files of ours changed; `--again` runs them all. `--wri
 Exit status 1 if a value differs or a file is refused without a reason that the script of the row states.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import csv

@@ -1,7 +1,5 @@
 """Authentication of requests, and roles that operations require."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import inspect

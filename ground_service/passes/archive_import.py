@@ -1,7 +1,5 @@
 """Import of a pass archive (folder or ZIP): manifest, reference, catalogue, images and downlink become a pass."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """Planned observation windows: searched, entered, decided on, and carried up as time-tagged telecommands."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence

@@ -9,8 +9,6 @@ An uploaded archive is not trusted: whatever its scenario names, the renderer se
 products only.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

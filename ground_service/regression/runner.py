@@ -9,8 +9,6 @@ The service does not trust the results: it accepts only requested names, regular
 limits, opened without following symbolic links, and it validates every field of the report.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import json

@@ -6,8 +6,6 @@ it. Every step is a compare-and-set in the database (`store.states`) and
 goes into the audit log in the transaction that makes it.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

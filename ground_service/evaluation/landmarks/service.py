@@ -1,7 +1,5 @@
 """Use cases and documents of landmarks: those of a pass, decisions of persons, images of the sightings."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

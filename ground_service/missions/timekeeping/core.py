@@ -4,8 +4,6 @@ A correlation is a straight line over a stretch of on-board time. Ticks outside 
 without any, the clock is taken as ideal (correlation 0).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

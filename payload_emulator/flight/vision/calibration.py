@@ -10,8 +10,6 @@ elevation of the Sun above the image plane and distance from the middle of the i
 board is not included.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

@@ -10,8 +10,6 @@ Nothing in the file is executed: it names classes of this program, whose attribu
 attribute that gets another name needs an entry in `RENAMED`, a new field a default; other changes a new `VERSION`.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import json

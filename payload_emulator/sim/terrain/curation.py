@@ -9,8 +9,6 @@ where the raster shows the rims, and a rim counts as that of a listed crater if 
 Frame: mean-Earth (ME), as the raster is georeferenced. Heights are metres above the sphere of the maps.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
