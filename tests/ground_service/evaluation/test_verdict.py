@@ -148,7 +148,7 @@ def test_the_declared_estimator_is_judged_and_not_the_best_one() -> None:
     assert (row("accuracy.median", limits, evaluated).value, verdict_of(requirements(limits, evaluated))[1]) == (
         70.0, "not met",
     )  # fmt: skip
-    undeclared = row("accuracy.median", replace(limits, estimator=None), evaluated)
+    undeclared = row("accuracy.median", limits.model_copy(update={"estimator": None}), evaluated)
     assert (undeclared.value, undeclared.status) == (None, "unknown")
     assert undeclared.note == "the mission description declares no estimator"
 
@@ -179,7 +179,7 @@ def test_every_baseline_is_shown_and_one_that_is_missing_is_unknown() -> None:
     for name in ("Kepler", "smoothed"):
         shown = row(f"better_than.{name}", limits, evaluated)
         assert (shown.status, shown.value, shown.limit) == ("not judged", 50.0, 1.0)
-    rival = replace(limits, better_than=("Kepler",))
+    rival = limits.model_copy(update={"better_than": ("Kepler",)})
     assert row("better_than.Kepler", rival, evaluated).status == "not judged"  # from the best known orbit
     assert (
         row("better_than.Kepler", rival, replace(evaluated, experiment=StartOrbit(1e3))).status == "not met"
@@ -410,7 +410,7 @@ def test_the_first_sample_is_no_reset_and_a_series_without_outcomes_has_no_count
 
 @pytest.mark.parametrize("limit", [float("nan"), float("inf")])
 def test_a_limit_that_is_no_number_judges_nothing_as_met(limit: float) -> None:
-    one = row("accuracy.median", replace(EVERY_LIMIT, median_error_m=limit), found())
+    one = row("accuracy.median", EVERY_LIMIT.model_copy(update={"median_error_m": limit}), found())
     assert (one.limit, one.status) == (None, "unknown")
 
 
