@@ -133,13 +133,7 @@ def _settled(ground: Ground, archive: PassArchive, out: Path, renders: bool) -> 
 
 
 def _render(ground: Ground, archive: PassArchive, out: Path) -> str:
-    """Write a complete copy of an archive; return why the renderer refuses it, otherwise an empty text.
-
-    Raises
-    ------
-    RenderingFailed
-        The renderer failed without refusing the archive.
-    """
+    """Write a complete copy of an archive; return why the renderer refuses it, otherwise an empty text."""
     work = archive.folder.parent
     written, printed = work / "written", work / "printed.txt"
     for folder in (work / "build", written):

@@ -375,13 +375,7 @@ def _taken(result: Path, request: RunRequest, written: Path, printed: Path) -> d
 
 
 def _octets(folder: int, name: str, limit: int) -> bytes | None:
-    """Return the content of a regular file with a single link and a permitted size; None if there is no file.
-
-    Raises
-    ------
-    SandboxRefused
-        The name is not such a file.
-    """
+    """Return the content of a regular file with a single link and a permitted size; None if there is no file."""
     try:
         descriptor = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=folder)
     except FileNotFoundError:

@@ -508,13 +508,7 @@ def _accepted(landmarks: Sequence[Landmark]) -> list[Landmark]:
 
 
 def _new(ids: Sequence[int], landmarks: Sequence[Landmark]) -> list[Landmark]:
-    """Return the accepted landmarks that a catalogue with these identities lacks.
-
-    Raises
-    ------
-    InvalidInput
-        No landmark is accepted.
-    """
+    """Return the accepted landmarks that a catalogue with these identities lacks."""
     accepted = _accepted(landmarks)
     if not accepted:
         raise InvalidInput("landmarks", "", "accepted landmarks", f"none among {len(landmarks)}")
