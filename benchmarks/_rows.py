@@ -1,7 +1,5 @@
 """Rows of a benchmark: a figure, its peer of the same run, and whether it contradicts the expectation."""
 
-from __future__ import annotations
-
 import importlib
 import io
 import json

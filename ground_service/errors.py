@@ -27,8 +27,6 @@ GroundError
 └── ServerError              the HTTP server cannot start (port in use, unsafe address)
 """
 
-from __future__ import annotations
-
 import errno
 import logging
 import re

@@ -3,8 +3,6 @@
 Nothing below the command line, the API factory and the worker reads the environment.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """TOML and JSON of external documents: each fault is one line with its place, what was expected and what was found."""
 
-from __future__ import annotations
-
 import difflib
 import json
 import re

@@ -8,8 +8,6 @@ A file of the cache is named after the hash of all that its machine code depends
 of the program share one folder. This is the only place that uses private parts of numba.
 """
 
-from __future__ import annotations
-
 import functools
 import gc
 import hashlib

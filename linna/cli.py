@@ -3,8 +3,6 @@
 Exit status: 0 done, 1 a gate or requirement not met, 2 bad usage or bad input, 3 inconclusive, 130 interrupted.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json

@@ -1,7 +1,5 @@
 """Output of commands: one JSON object or plain text on stdout, progress on stderr."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -5,8 +5,6 @@ from one table of polynomials in -1..1, ``table[segment, term, column]``: nine e
 then Earth and Sun positions.  ``force`` holds the scalars, at the places named below.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -21,8 +21,6 @@ index: `plain_sums`, the same in numba, takes about nine times as long (``python
 only file of the project that writes instructions for the compiler.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -8,8 +8,6 @@ References
 Dormand, El-Mikkawy, Prince, IMA J. Numer. Anal. 7:235 (1987).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -5,8 +5,6 @@ coordinates, so 512 pixels reach from -0.5 to 511.5 and their centre is at 255.5
 with image up to the north: x = east, y = south, z = down.  All lengths in m, angles in rad.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

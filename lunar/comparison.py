@@ -1,7 +1,5 @@
 """Ephemerides compared: with each other, in radial, transverse and normal axes of the first, and with gravity."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Spans of shadow, night side, occultation and contacts of an orbit."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

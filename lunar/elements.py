@@ -8,8 +8,6 @@ References
 Montenbruck and Gill, Satellite Orbits (2000), sections 2.2.3 and 2.2.4.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -14,8 +14,6 @@ CCSDS 502.0-B-3, Orbit Data Messages, section 5 and annex on interpolation: Herm
 k - 1 uses k states.  Newton's form with repeated nodes: Burden and Faires, Numerical Analysis, section 3.4.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property

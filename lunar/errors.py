@@ -15,8 +15,6 @@ LunarError
     └── ImpactError          the orbit intersects the ground, with epoch and place
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from pathlib import Path

@@ -22,8 +22,6 @@ Archinal et al. 2011, Report of the IAU WGCCRE 2009, table 2 (the Moon), as prin
 Williams, Boggs, Folkner 2008, JPL IOM 335-JW,DB,WF-20080314-001: DE421 lunar orientation, and ME from PA.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from dataclasses import dataclass

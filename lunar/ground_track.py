@@ -1,7 +1,5 @@
 """Ground track of an orbiter over the Moon."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

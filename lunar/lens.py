@@ -8,8 +8,6 @@ The undistorted image plane has x = X / Z, y = Y / Z in camera axes and r^2 = x^
 (Brown 1966, Photogrammetric Engineering 32, 444-462, with the coefficients in the order of common calibration tools).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

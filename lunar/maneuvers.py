@@ -6,8 +6,6 @@ periselene one along track that brings the aposelene to a (1 + e).  Each burn le
 are the zeros of radial speed on the dense output of the propagation: burns lie at apsides of the perturbed orbit.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

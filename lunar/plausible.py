@@ -3,8 +3,6 @@
 Readers of files compare what they find with these limits; no other module repeats one of them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -10,8 +10,6 @@ References
 ERFA (BSD re-issue of IAU SOFA), functions eraMoon98 and eraEpv00, with their accuracy statements.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -16,8 +16,6 @@ was not kept in whole seconds of TAI; those epochs use 10 s. TDB - TT: Kaplan 20
 equation 2.6 (good to 10 us from 1600 to 2200).
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any, overload
 

@@ -1,7 +1,5 @@
 """UTC as text: ISO 8601 and nanoseconds of 86,400 s days since 1970, without arrays."""
 
-from __future__ import annotations
-
 import re
 from datetime import UTC, datetime, timedelta
 

@@ -12,8 +12,6 @@ References
 Montenbruck and Gill 2000, Satellite Orbits, section 3.4.2: conical shadow, overlap of two discs.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

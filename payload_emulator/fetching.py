@@ -4,8 +4,6 @@ A download takes its place in one move once its size and checksum hold. What arr
 the folder, so that damage is found even where no checksum is published.
 """
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 import zipfile

@@ -1,7 +1,5 @@
 """The report of a detector: scores by class, curves, calibration, bias, cost, galleries."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 

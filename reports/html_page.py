@@ -1,7 +1,5 @@
 """A document as one self-contained HTML page: no script, no outside host, the same bytes every time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from html import escape
 from itertools import groupby

@@ -1,7 +1,5 @@
 """Report of a month of a spacecraft: performance over the passes, by condition, changes, requirements."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from reports.document import (

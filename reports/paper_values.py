@@ -1,7 +1,5 @@
 """Values of the document that repeats the figures and tables of the LINNA paper; conventions as in `reports.values`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 

@@ -1,7 +1,5 @@
 """The report of one pass: a `PassReport` laid out as a document."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -5,8 +5,6 @@ drawings of the HTML page in the light colours. Fonts are those that matplotlib 
 used, so the same document gives the same octets.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

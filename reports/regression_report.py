@@ -1,7 +1,5 @@
 """The report of a regression: a candidate build against a baseline over the same archived passes."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

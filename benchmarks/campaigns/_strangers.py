@@ -1,7 +1,5 @@
 """Record of an hour of a new user: what the documents state and what happened."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

@@ -8,8 +8,6 @@ answer is above `MEMORY_MIB` or `PROCESSOR_S`, or is no answer of the expected k
 `docs/results/requests.md`.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import io

@@ -5,8 +5,6 @@ of some frames, then programs after the template of `build-contract.md`. The exi
 of the classes A or B.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import re

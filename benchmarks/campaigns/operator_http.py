@@ -5,8 +5,6 @@ at 20 times real time, then telecommands, a window that is taken back, and reque
 exit status is 1 if there was a wrong turn of the classes A or B, or the report took more than `LIMIT_S`.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import subprocess

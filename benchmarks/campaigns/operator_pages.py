@@ -5,8 +5,6 @@ then the pages in the widths of a desk and a telephone, a window that is planned
 and mistakes. The exit status is 1 if there was a wrong turn of the classes A or B.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import subprocess

@@ -4,8 +4,6 @@ A key is stored before the work starts. If a crash leaves it without a response,
 done: the key is then refused, and the caller must check the state.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Entities of users, tokens and the audit log."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal
 
 from pydantic import Field

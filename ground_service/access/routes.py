@@ -1,7 +1,5 @@
 """HTTP operations on users, tokens and the audit log."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from fastapi import Path, Query, Request, Response

@@ -4,8 +4,6 @@ Most decisions follow from the parameters: the spacecraft, or the row of a table
 the decisions that do not. An operation without a decision is refused to a limited caller.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, Literal

@@ -4,8 +4,6 @@ Every change compares the expected state with the stored state and fails with a 
 Nothing is cached: every process refuses a disabled user or a revoked token as soon as the change is committed.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import re

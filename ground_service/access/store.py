@@ -1,7 +1,5 @@
 """SQL of users, tokens, stored responses and the audit log."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 

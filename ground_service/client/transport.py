@@ -1,7 +1,5 @@
 """HTTPX transport to the operations of the ground service in this process."""
 
-from __future__ import annotations
-
 import asyncio
 import sys
 import threading

@@ -1,7 +1,5 @@
 """One pass, evaluated: decoded samples, reference, catalogue and camera in, a `PassReport` out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any

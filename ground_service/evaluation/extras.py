@@ -1,7 +1,5 @@
 """Additional contents of a pass report: Sun geometry, ground track, wrong fixes, and positions from single frames."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path

@@ -5,8 +5,6 @@ further from the detection than the detector's own tolerance. The snapshot basel
 alone, from the same identifications and the attitude, without dynamics and without earlier frames.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

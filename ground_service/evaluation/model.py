@@ -1,7 +1,5 @@
 """Entities of reports."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -6,8 +6,6 @@ pixel limit, with at most one detection per crater. Detections of craters outsid
 counted.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """HTTP operations on evaluations and reports."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from fastapi import Query, Request, Response

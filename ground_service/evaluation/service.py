@@ -1,7 +1,5 @@
 """Evaluation of passes: conditions, report and overview of reports, rendered and kept."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -4,8 +4,6 @@ Limits are those of the mission description. A requirement without a limit is sh
 not known never counts as met. The accuracy is that of the declared estimator, also if another one is better.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace

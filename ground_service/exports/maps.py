@@ -12,8 +12,6 @@ References
 CZML Guide of AnalyticalGraphicsInc, CZML structure and content.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 import tempfile

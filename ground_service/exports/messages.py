@@ -1,7 +1,5 @@
 """Orbit, attitude, poses and SPICE kernels of a pass."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Entities and formats of exports."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """HTTP operations on exports."""
 
-from __future__ import annotations
-
 from fastapi import Response
 from fastapi.responses import StreamingResponse
 

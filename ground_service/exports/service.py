@@ -4,8 +4,6 @@ Formats of several files are written to a temporary file, one file of the format
 export needs is therefore that of its largest file.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import io
 import tempfile

@@ -1,7 +1,5 @@
 """A pass as tables of samples and as table files: columns of one length with unit and description, times in UTC."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

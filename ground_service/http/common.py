@@ -1,7 +1,5 @@
 """Routers of the HTTP operations; parameters, error responses and pages that they share."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType

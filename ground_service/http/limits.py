@@ -1,7 +1,5 @@
 """Guards around the application: origins, size of bodies, secure headers, entity tags."""
 
-from __future__ import annotations
-
 import hashlib
 import ipaddress
 from collections.abc import Iterable

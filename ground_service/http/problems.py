@@ -1,7 +1,5 @@
 """Errors as RFC 9457 problem details: one handler turns every error of the packages into a status and a document."""
 
-from __future__ import annotations
-
 import logging
 import re
 from difflib import get_close_matches

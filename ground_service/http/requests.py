@@ -1,7 +1,5 @@
 """Operations of the API: their description, and validation of requests before they run."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import math

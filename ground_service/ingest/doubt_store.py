@@ -4,8 +4,6 @@ A batch is judged before it is stored. What follows can change the judgement: pa
 supports their time, and taken out of the archive when telemetry that came later shows that it was wrong.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -5,8 +5,6 @@ They are never inferred from the octets. Descriptions are only ever added: they 
 one query shows that something was added.
 """
 
-from __future__ import annotations
-
 import threading
 from dataclasses import dataclass, replace
 from typing import Any

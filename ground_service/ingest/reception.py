@@ -330,13 +330,7 @@ class Reading:
         return self.definitions[spacecraft]
 
     def _refuse(self) -> NoReturn:
-        """Refuse a whole recording without a frame and a packet.
-
-        Raises
-        ------
-        InvalidInput
-            Always.
-        """
+        """Refuse a whole recording without a frame and a packet."""
         with self.ground.database.reading() as connection:
             name = recorded_name(connection, self.piece.file_sha256)
         found = f"{self.piece.octets} octets with no frame or packet of the declared link; {CHECK}"

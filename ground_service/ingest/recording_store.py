@@ -3,8 +3,6 @@
 Every query uses an index and returns a bounded number of rows, so its cost does not depend on the number of pieces.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, replace

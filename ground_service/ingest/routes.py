@@ -1,7 +1,5 @@
 """HTTP operations on telemetry uploads and ingests."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from fastapi import Query, Response

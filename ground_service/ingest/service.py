@@ -4,8 +4,6 @@ The archive that results depends only on the octets of the recordings, not on th
 pieces or on how often they came. An ingest that was cut off can simply be run again.
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ A job is a row, so it is visible from the request on, whether it runs in this pr
 worker on another machine.
 """
 
-from __future__ import annotations
-
 import hashlib
 import uuid
 from abc import ABC, abstractmethod

@@ -1,7 +1,5 @@
 """Crater catalogues that the ground holds, and the one that a mission description names."""
 
-from __future__ import annotations
-
 import functools
 from contextlib import suppress
 from dataclasses import replace

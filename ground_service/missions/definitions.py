@@ -1,7 +1,5 @@
 """Definitions of the packets that a mission description declares: XTCE documents, time codes and error control."""
 
-from __future__ import annotations
-
 import base64
 import binascii
 import gzip

@@ -1,7 +1,5 @@
 """HTTP operations on mission descriptions."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from fastapi import Body, Path, Query, Response

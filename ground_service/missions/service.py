@@ -1,7 +1,5 @@
 """Use cases of mission descriptions: add, list, show, and find the description of a pass."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterator, Mapping
 from pathlib import Path

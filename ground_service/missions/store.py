@@ -1,7 +1,5 @@
 """Database access for mission descriptions."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any
 

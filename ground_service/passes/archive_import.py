@@ -1,7 +1,5 @@
 """Import of a pass archive (folder or ZIP): manifest, reference, catalogue, images and downlink become a pass."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os
@@ -393,13 +391,7 @@ _ENTRY_OCTETS = 46
 
 
 def _check_directory(path: Path, name: str) -> None:
-    """Refuse a zip with a too large central directory before reading it into memory.
-
-    Raises
-    ------
-    InvalidInput
-        If the directory has too many octets or entries, also if the end record states fewer.
-    """
+    """Refuse a zip with a too large central directory before reading it into memory."""
     with path.open("rb") as stream:
         tail_start = max(stream.seek(0, os.SEEK_END) - (1 << 16) - _END.size, 0)
         stream.seek(tail_start)

@@ -1,7 +1,5 @@
 """Long series made short without hiding anything: least, greatest and mean value per stretch of time, gaps marked."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Newest values of the parameters of a spacecraft."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Literal
 

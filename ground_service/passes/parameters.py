@@ -1,7 +1,5 @@
 """Parameters of a pass: those of our housekeeping, and those of packets that the mission description defines."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from difflib import get_close_matches

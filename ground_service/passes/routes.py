@@ -1,7 +1,5 @@
 """HTTP operations on passes, their telemetry, and pass archives."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 from fastapi import Path, Query, Request, Response

@@ -1,7 +1,5 @@
 """SQL of the telemetry of a pass: samples, packets, detections and event reports in a span."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any

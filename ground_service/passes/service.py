@@ -1,7 +1,5 @@
 """Passes as a caller sees them: lists, completeness, detections, series of states and of housekeeping parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """On-board time interval of a pass: what its event reports say, and the housekeeping around it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """SQL of passes."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Mapping
 from typing import Any
 

@@ -5,8 +5,6 @@ the battery is a simple balance of generation and load, full where the search be
 they came whenever a station sees the spacecraft.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

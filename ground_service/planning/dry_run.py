@@ -1,7 +1,5 @@
 """Dry run of a mission description: the plan of its first days and its telecommands, in an empty service."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import tempfile

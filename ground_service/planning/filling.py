@@ -4,8 +4,6 @@ The battery is full where the grid begins. Data of a window are on board from it
 and have to be down within a given time. All planners are checked by the same simulation (`violation`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass
 from itertools import pairwise

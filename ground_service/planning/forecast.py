@@ -1,7 +1,5 @@
 """Conditions and resources of the plan of a spacecraft over time, and the conflicts of its windows."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 

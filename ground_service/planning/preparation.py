@@ -3,8 +3,6 @@
 The payload leaves its downlink a minute before the window, takes the tables, observes, and returns to the downlink.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

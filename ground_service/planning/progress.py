@@ -4,8 +4,6 @@ The state is worked out afresh from the archive each time (`planning.window_stat
 order. A window that has telemetry is given a pass, which its report is then made of.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from sqlalchemy import Connection

@@ -1,7 +1,5 @@
 """HTTP operations on planned windows and standing requests."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from fastapi import Header, Query, Response

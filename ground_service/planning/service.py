@@ -1,7 +1,5 @@
 """Planned observation windows: searched, entered, decided on, and carried up as time-tagged telecommands."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -290,11 +288,6 @@ def _delete_on_board(connection: Connection, window: WindowRecord, actor: str) -
     """Release telecommands that delete the activities of a window on board; return their ids.
 
     One person can do that, as one can stop an observation.
-
-    Raises
-    ------
-    Conflict
-        If the observation has begun.
     """
     now, on_board = mission_now_ns(), commands.activities_on_board(connection, window.id)
     if on_board and window.start.utc_ns <= now < window.stop.utc_ns:
@@ -525,13 +518,7 @@ def _is_of_experiment(connection: Connection, window: WindowRecord, mission: Mis
 def _assessed(
     ground: Ground, connection: Connection, vehicle: int, window_id: int, entry: WindowEntry, decision: str
 ) -> AssessedWindow:
-    """Return a request with its prediction.
-
-    Raises
-    ------
-    PlanConflicts
-        It conflicts with committed windows or resources.
-    """
+    """Return a request with its prediction."""
     mission = mission_of(connection, entry.spacecraft_id)
     conflicts = _span_conflicts(connection, vehicle, window_id, entry, mission)
     if entry.start_utc_ns <= (now := mission_now_ns()):

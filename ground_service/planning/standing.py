@@ -5,8 +5,6 @@ and the windows depend on the stored plan, the ephemeris and mission time only. 
 UTC, so that they are the same in every call.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import logging

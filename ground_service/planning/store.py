@@ -1,7 +1,5 @@
 """SQL of planned windows and standing requests."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

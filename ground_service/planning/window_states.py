@@ -7,8 +7,6 @@ The state is a function of evidence, not of the order in which they became known
 concluded without it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

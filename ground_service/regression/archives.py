@@ -4,8 +4,6 @@ Whatever an archive says, nothing outside the folder it is unpacked into is writ
 unpacked, and no file is used whose hash is not the one in the manifest.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

@@ -1,7 +1,5 @@
 """One run of a build over one archived pass: an external program with resource limits, and its outcome."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from collections.abc import Mapping, Sequence

@@ -5,8 +5,6 @@ on the installed flight code. Its identity is the hash of everything that decide
 network, parameters and the flight code itself. The limits of a program belong to it, those of the flight code do not.
 """
 
-from __future__ import annotations
-
 import datetime
 import hashlib
 import importlib.util

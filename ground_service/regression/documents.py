@@ -1,7 +1,5 @@
 """A verdict as documents: headline, JSON for scripts, JUnit XML for continuous integration, a page."""
 
-from __future__ import annotations
-
 import json
 import math
 import xml.etree.ElementTree as ET

@@ -4,8 +4,6 @@ The verdict's own job does what replays are still missing, so nothing hangs on a
 do at the same time is kept once.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 from collections.abc import Iterator, Mapping, Sequence

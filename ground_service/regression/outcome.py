@@ -1,7 +1,5 @@
 """Outcome of a regression: replays, passes and the verdict."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

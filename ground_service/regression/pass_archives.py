@@ -1,7 +1,5 @@
 """Regression archives of passes: the archive that a pass was imported from, or the received data of a live pass."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

@@ -9,8 +9,6 @@ An uploaded archive is not trusted: whatever its scenario names, the renderer se
 products only.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json
@@ -135,13 +133,7 @@ def _settled(ground: Ground, archive: PassArchive, out: Path, renders: bool) -> 
 
 
 def _render(ground: Ground, archive: PassArchive, out: Path) -> str:
-    """Write a complete copy of an archive; return why the renderer refuses it, otherwise an empty text.
-
-    Raises
-    ------
-    RenderingFailed
-        The renderer failed without refusing the archive.
-    """
+    """Write a complete copy of an archive; return why the renderer refuses it, otherwise an empty text."""
     work = archive.folder.parent
     written, printed = work / "written", work / "printed.txt"
     for folder in (work / "build", written):

@@ -1,7 +1,5 @@
 """A replay's downlink read with the dictionary of its archive, as frame samples for the gates."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """HTTP operations on payload builds, archives for replays, and regressions."""
 
-from __future__ import annotations
-
 import uuid
 from typing import Annotated, Literal
 

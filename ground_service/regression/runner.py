@@ -9,8 +9,6 @@ The service does not trust the results: it accepts only requested names, regular
 limits, opened without following symbolic links, and it validates every field of the report.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import json
@@ -377,13 +375,7 @@ def _taken(result: Path, request: RunRequest, written: Path, printed: Path) -> d
 
 
 def _octets(folder: int, name: str, limit: int) -> bytes | None:
-    """Return the content of a regular file with a single link and a permitted size; None if there is no file.
-
-    Raises
-    ------
-    SandboxRefused
-        The name is not such a file.
-    """
+    """Return the content of a regular file with a single link and a permitted size; None if there is no file."""
     try:
         descriptor = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=folder)
     except FileNotFoundError:

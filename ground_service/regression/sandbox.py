@@ -7,8 +7,6 @@ program starts, measures memory, processor time and files of the run, ends it at
 every process of the run has ended.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import functools

@@ -5,8 +5,6 @@ goes on where it stopped and a baseline is not flown again. What goes wrong with
 goes on.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import platform

@@ -1,7 +1,5 @@
 """SQL of payload builds, kept pass archives, replays and regressions."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter
 from collections.abc import Collection, Mapping

@@ -8,8 +8,6 @@ Entries are collected during a transaction and appended by its last statements, 
 during their insertion and the commit. Because of this lock, the order of the chain is the order of commits.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

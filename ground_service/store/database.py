@@ -419,13 +419,7 @@ def _note_use(_connection: Any, record: ConnectionPoolEntry) -> None:
 
 
 def _test_idle(engine: Engine, connection: Any, record: ConnectionPoolEntry, _proxy: object) -> None:
-    """Test a connection that was unused for a while.
-
-    Raises
-    ------
-    InvalidatePoolError
-        The server has closed it: the pool opens new connections.
-    """
+    """Test a connection that was unused for a while."""
     if time.monotonic() - record.info.get(_USED, math.inf) < IDLE_S:
         return
     try:

@@ -3,8 +3,6 @@
 A table with leases has the columns `name` (key), `owner` and `lease_utc_ns`, the end of the lease.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from sqlalchemy import Connection, Table, delete, or_, select, text, update

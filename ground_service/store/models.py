@@ -10,8 +10,6 @@ A vehicle is one spacecraft in one `instance`: the flown one, or one emulated or
 its own for time and sequence counts.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from sqlalchemy import (

@@ -5,8 +5,6 @@ the audit log but neither change nor remove them. Migrations run as the owner, w
 privileges.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 from sqlalchemy import Connection, text

@@ -3,8 +3,6 @@
 A row is a JSON array in the order of the columns; octets are base64, non-finite numbers are text.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -5,8 +5,6 @@ number of changed rows decides: of several concurrent requests, in any number of
 others receive a conflict with the state found. No state is read first and written afterwards.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

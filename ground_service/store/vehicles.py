@@ -1,7 +1,5 @@
 """SQL of vehicles and their counters: spacecraft in one instance, a domain of time and sequence counts each."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Collection
 from dataclasses import dataclass

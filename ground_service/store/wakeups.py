@@ -4,8 +4,6 @@ A wake-up contains no event. The event log in the database is the record, and pr
 a lost wake-up or an unavailable broker only delays the feed.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging

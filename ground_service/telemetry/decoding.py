@@ -5,8 +5,6 @@ where it was. A new definition decodes all packets from the first one on. Until 
 of the definition before it are read. Packets of APIDs without a definition stay stored as they are.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from dataclasses import replace

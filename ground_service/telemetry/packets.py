@@ -1,7 +1,5 @@
 """A batch of packets as the store takes it: headers, octets and digests, and decoded rows as columns."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ transaction that stores new samples, and a packet is stored once, so roll-ups co
 order samples come. (Sums are of floating-point numbers: their last bits may depend on the order.)
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Decoded samples of one pass as plain arrays, on correlated UTC: the input of the evaluation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """SQL and codec of stored packets and of the samples that the dictionary decodes from them."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from functools import lru_cache
 from itertools import chain, pairwise

@@ -1,7 +1,5 @@
 """Values of parameters of declared packets: stored, read, and forgotten with their definition."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

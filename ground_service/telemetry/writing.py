@@ -1,7 +1,5 @@
 """SQL that stores samples of packets with their roll-ups, and takes them away again."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

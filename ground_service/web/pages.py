@@ -3,8 +3,6 @@
 Nothing here needs a token: pages hold no data but the telemetry dictionary, which is no secret.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import hashlib

@@ -4,8 +4,6 @@ The console is another program's (`linna emulate --live`): one JSON object a lin
 it. Viewers may look, operators may also pause, run, step and set the rate. The payload cannot be stopped from here.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

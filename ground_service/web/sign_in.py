@@ -4,8 +4,6 @@ The session cookie is `SameSite=Strict`, and a browser does not send such a cook
 at another site. The answer to the provider is therefore a page of this service, which opens the next page itself.
 """
 
-from __future__ import annotations
-
 import logging
 from typing import Annotated
 

@@ -7,8 +7,6 @@ those. Callers are verified again every `VERIFY_S`: a socket is
 closed if its token was revoked or has expired, or if its user was disabled.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

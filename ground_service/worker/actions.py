@@ -4,8 +4,6 @@ A job does what follows one event, derived from the state of the database. A job
 process left, does all of it again under the same identities, so that it has one result.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress

@@ -4,8 +4,6 @@ Tasks are acknowledged when they are done and given to another worker when their
 twice without harm, that loses and doubles nothing.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging.config

@@ -5,8 +5,6 @@ every table and of the list of files and the head of the audit chain. A restore 
 and requires an empty service.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Condition of a deployment: processes, waiting work, disk, backups, time correlations, scheduler."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

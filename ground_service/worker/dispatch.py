@@ -1,7 +1,5 @@
 """Dispatch of jobs: to this process without a broker, otherwise to the workers."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Checks of a deployment from one of its processes: what `linna doctor` shows."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 from collections.abc import Callable

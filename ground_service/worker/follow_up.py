@@ -7,8 +7,6 @@ so that doing it again gives the same result: events that a killed process has l
 an event that two processes handle changes nothing twice.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import threading

@@ -5,8 +5,6 @@ With `rebuild`, what follows from the raw files is derived again in a scratch da
 who can write to the database can forge the chain; a head of the chain that was stored elsewhere detects that.
 """
 
-from __future__ import annotations
-
 import hashlib
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -4,8 +4,6 @@ A job is a row before it is anything else, so it is visible from the moment of t
 process, a thread of the server, or a worker on another machine. Doing a finished job again does nothing.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """Metrics, health and status operations: requests, their time, and the state of the work."""
 
-from __future__ import annotations
-
 import logging
 import re
 import secrets

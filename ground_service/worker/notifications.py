@@ -4,8 +4,6 @@ A message has an id that is the same in every attempt, so that receivers can dis
 Idempotency-Key of a webhook and the Message-ID of an e-mail.
 """
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import hmac

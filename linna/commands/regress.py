@@ -260,13 +260,7 @@ def _identity(service: Client, given: str) -> str:
 
 
 def _kept(service: Client, given: list[str]) -> list[str]:
-    """Return the identities of archives; those that are not kept are uploaded.
-
-    Raises
-    ------
-    InvalidInput
-        Something given is no archive.
-    """
+    """Return the identities of archives; those that are not kept are uploaded."""
     from ground_service.errors import InvalidInput
 
     known, digests = _known(service), list[str]()

@@ -9,8 +9,6 @@ References
 CCSDS 504.0-B-1 (2008) and 504.0-B-2 (2024), Attitude Data Messages, section 4 and annex on quaternions.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

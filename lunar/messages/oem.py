@@ -9,8 +9,6 @@ References
 CCSDS 502.0-B-1 (2004), 502.0-B-2 (2009) and 502.0-B-3 (2023), Orbit Data Messages, section 5.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import suppress
 from itertools import pairwise

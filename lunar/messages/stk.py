@@ -9,8 +9,6 @@ References
 Ansys STK help, "Ephemeris File Format (*.e)".
 """
 
-from __future__ import annotations
-
 import re
 from itertools import pairwise
 

@@ -6,8 +6,6 @@ TUM format: Sturm et al. 2012, a benchmark for the evaluation of RGB-D SLAM syst
 ``timestamp tx ty tz qx qy qz qw`` with the quaternion of the body in the world, scalar last.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from lunar.arrays import FloatArray, IntArray

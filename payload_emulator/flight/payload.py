@@ -5,8 +5,6 @@ it runs on. Everything it takes is an array, a count or octets; everything it sa
 dictionary. It reads no clock but the ticks it is given.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Figures of what arrived: frames step by step, packets over time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

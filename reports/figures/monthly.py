@@ -1,7 +1,5 @@
 """Figure of a month: metrics of each pass over time, with changes of level."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

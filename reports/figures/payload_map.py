@@ -1,7 +1,5 @@
 """Map made by the payload, compared with the catalogue."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from reports.figures.canvas import Canvas

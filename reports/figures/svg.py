@@ -1,7 +1,5 @@
 """A drawing as a piece of SVG for a page: colours become roles of the page's theme, ids are unique, bytes repeat."""
 
-from __future__ import annotations
-
 import base64
 import io
 import re

@@ -1,7 +1,5 @@
 """Figures of data sets and of training: shares of classes, distributions, places, curves over epochs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames and packets: what was expected, what came."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 

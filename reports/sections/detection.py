@@ -1,7 +1,5 @@
 """Detector sections: scores compared with the paper's, bias, curves and galleries."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Matching outcomes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Position error, drift, altitude, consistency of the filters, and what the error depends on."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Opening and closing sections of every report: verdict, figures, provenance, data, configuration."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The first page: verdict, figures, the errors of all solutions at a glance, what is missing."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

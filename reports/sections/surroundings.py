@@ -1,7 +1,5 @@
 """Ground track, housekeeping, events."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

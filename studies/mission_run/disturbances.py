@@ -4,8 +4,6 @@ All of them are faults that spacecraft, link and reference can have anyway; a fi
 of the run. The ground service is not informed: neither its mission description nor its requests change.
 """
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -4,8 +4,6 @@ The two numbers of `perform_function` have the names, units and ranges of its fu
 name. The packet dictionary and its hash do not contain them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Names of the codes that packets carry."""
 
-from __future__ import annotations
-
 Labels = tuple[tuple[int, str], ...]
 
 MODES: Labels = ((0, "safe"), (1, "standby"), (2, "observing"), (3, "downlinking"))

@@ -1,7 +1,5 @@
 """A packet dictionary as JSON text, so that an archive can carry the definitions that its packets were made with."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import asdict

@@ -5,8 +5,6 @@ one telecommand and for a parameter table that is uploaded in many. A telecomman
 effect of that function; a telecommand that schedules another one has the effect of the scheduled telecommand.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum

@@ -1,7 +1,5 @@
 """Estimates of the navigation filter with full covariances, from the packets of any dictionary version."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Meaning of the values of event reports, for the interface control document and for texts that people read."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

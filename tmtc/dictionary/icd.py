@@ -1,7 +1,5 @@
 """The interface control document of the link, written from the packet dictionary."""
 
-from __future__ import annotations
-
 from tmtc.dictionary.codes import EVENTS
 from tmtc.dictionary.effects import EFFECTS
 from tmtc.dictionary.event_texts import EVENT_TEXTS

@@ -4,8 +4,6 @@ Everything that crosses the link is defined here; the ICD and the XTCE export ar
 adds packets, so that it decodes the telemetry of older payloads.
 """
 
-from __future__ import annotations
-
 from tmtc.dictionary.codes import (
     ESTIMATORS,
     EVENTS,

@@ -3,8 +3,6 @@
 # numba wants numpy integers where annotations say int
 # mypy: disable-error-code="return-value,arg-type,no-any-return"
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -8,8 +8,6 @@ regular frame headers, and the number of packets with a valid checksum. A candid
 proposed only if valid packets support it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any

@@ -10,8 +10,6 @@ CCSDS 131.0-B section 4: field x^8 + x^7 + x^2 + x + 1, generator roots a^(11 j)
 annex F for the dual basis.
 """
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ CCSDS 231.0-B (CLTU: start EB90, BCH(63,56) with x^7 + x^6 + x^2 + 1 and inverte
 232.0-B (frames of at most 1024 octets, segment header), 232.1-B (FARM-1).
 """
 
-from __future__ import annotations
-
 import functools
 import struct
 from collections.abc import Iterable

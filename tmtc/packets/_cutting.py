@@ -14,8 +14,6 @@ or another header of such an APID or of an idle packet. Its content is not check
 # numba wants numpy integers where annotations say int
 # mypy: disable-error-code="return-value,arg-type,assignment,no-any-return"
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -6,8 +6,6 @@ ECSS-E-ST-70-41C section 6.13. Downlink parts are TM[13,1..3], uplink parts TC[1
 A transfer that fits into one part is sent as its last.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any

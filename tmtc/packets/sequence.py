@@ -10,8 +10,6 @@ shorter one. A sender that restarts begins to count again: a count that falls fa
 packets of other content had, is a restart.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

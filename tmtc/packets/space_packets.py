@@ -6,8 +6,6 @@ CCSDS 133.0-B-2 section 4.1. Octets of the primary header: version (3 bits), typ
 (1), APID (11) | sequence flags (2), sequence count (14) | octets of the data field minus one (16).
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass, field
 

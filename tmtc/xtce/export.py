@@ -11,8 +11,6 @@ References
 OMG XTCE 1.2, namespace http://www.omg.org/spec/XTCE/20180204; CCSDS 660.0-B-2.
 """
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Packets decoded through an imported definition as JSON, CSV or Parquet: one record for each packet."""
 
-from __future__ import annotations
-
 import json
 
 from tmtc.export import Record, format_records, plain

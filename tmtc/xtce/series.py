@@ -3,8 +3,6 @@
 Enumerations are their codes, booleans 0 and 1. Texts, octets and arrays have no column.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

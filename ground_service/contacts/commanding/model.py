@@ -1,7 +1,5 @@
 """Entities of telecommands and of the telecommand receiver."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """HTTP operations on telecommands and the uplink."""
 
-from __future__ import annotations
-
 import base64
 from typing import Annotated, Any, Literal
 

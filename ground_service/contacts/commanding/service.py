@@ -6,8 +6,6 @@ it. Every step is a compare-and-set in the database (`store.states`) and
 goes into the audit log in the transaction that makes it.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -424,13 +422,7 @@ def _second_person(
 def _require_approval(
     connection: Connection, vehicle: int, name: str, arguments: Mapping[str, Any], approval: Approval | None
 ) -> None:
-    """Refuse the immediate release of a telecommand that needs a second person if no second person approved its window.
-
-    Raises
-    ------
-    Conflict
-        If the window was not approved, or approved by the person who entered it.
-    """
+    """Refuse to release a telecommand that needs a second person if no second person approved its window."""
     effect = _second_person(connection, vehicle, name, arguments)
     if effect is None or (approval is not None and approval.entered_by != approval.approved_by):
         return

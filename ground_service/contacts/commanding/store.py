@@ -1,7 +1,5 @@
 """SQL of telecommands."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any

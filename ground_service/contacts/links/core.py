@@ -1,7 +1,5 @@
 """Contacts of a station with a spacecraft, and the decisions of a link, on plain values."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

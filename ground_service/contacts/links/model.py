@@ -1,7 +1,5 @@
 """Entities of links to ground stations and of contacts."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

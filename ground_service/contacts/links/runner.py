@@ -5,8 +5,6 @@ octets are on disk before they are acknowledged, and a full spool stops reading,
 the station back. What an ended process has left in the spool is ingested by the next owner.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import logging

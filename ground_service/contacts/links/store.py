@@ -1,7 +1,5 @@
 """Database access for links, contacts and transmissions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -11,8 +11,6 @@ with few of them keeps its offset, and the declared errors of reference and atti
 Frames: mean-Earth (MCMF), and east, north, up at the place.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Entities of landmarks learned from flight."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """HTTP operations on landmarks learned from flight."""
 
-from __future__ import annotations
-
 from fastapi import Response
 
 from ground_service.access.security import Operator, Viewer, add_list

@@ -1,7 +1,5 @@
 """Use cases and documents of landmarks: those of a pass, decisions of persons, images of the sightings."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math
@@ -510,13 +508,7 @@ def _accepted(landmarks: Sequence[Landmark]) -> list[Landmark]:
 
 
 def _new(ids: Sequence[int], landmarks: Sequence[Landmark]) -> list[Landmark]:
-    """Return the accepted landmarks that a catalogue with these identities lacks.
-
-    Raises
-    ------
-    InvalidInput
-        No landmark is accepted.
-    """
+    """Return the accepted landmarks that a catalogue with these identities lacks."""
     accepted = _accepted(landmarks)
     if not accepted:
         raise InvalidInput("landmarks", "", "accepted landmarks", f"none among {len(landmarks)}")

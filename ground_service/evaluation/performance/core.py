@@ -17,8 +17,6 @@ A. N. Pettitt, "A non-parametric approach to the change-point problem", Applied 
 E. B. Wilson, "Probable inference, the law of succession, and statistical inference", JASA 22, 1927.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence

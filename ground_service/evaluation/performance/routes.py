@@ -1,7 +1,5 @@
 """HTTP operations on the performance over many passes and on monthly reports."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from fastapi import Path, Query, Response

@@ -1,7 +1,5 @@
 """Performance of a spacecraft over many passes, and monthly reports of it."""
 
-from __future__ import annotations
-
 import calendar
 import hashlib
 import logging

@@ -1,7 +1,5 @@
 """HTTP operations on reference ephemerides."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from fastapi import Query, Response

@@ -1,7 +1,5 @@
 """Reference ephemerides and attitudes: uploaded, versioned by content, chosen by precedence and coverage."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass

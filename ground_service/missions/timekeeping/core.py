@@ -4,8 +4,6 @@ A correlation is a straight line over a stretch of on-board time. Ticks outside 
 without any, the clock is taken as ideal (correlation 0).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -126,12 +124,10 @@ class CorrelationFit:
     rejected: int
 
 
-def fit_correlation(
-    ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray, *, rejection: float = REJECTION
-) -> CorrelationFit:
+def fit_correlation(ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray) -> CorrelationFit:
     """The line through time reports: on-board ticks (n,), UTC of reception on Earth, and light time to there.
 
-    Points further off than `rejection` times the usual deviation (by the median, which outliers do not move) are
+    Points further off than `REJECTION` times the usual deviation (by the median, which outliers do not move) are
     left out. One point gives an offset without drift.
 
     Raises
@@ -155,7 +151,7 @@ def fit_correlation(
         offset, slope = _line(nominal[kept].astype(np.float64), deviation[kept])
         residual = deviation - offset - slope * nominal
         spread = 1.4826 * float(np.median(np.abs(residual[kept] - np.median(residual[kept]))))
-        still = np.abs(residual) <= max(rejection * spread, RESOLUTION_NS)
+        still = np.abs(residual) <= max(REJECTION * spread, RESOLUTION_NS)
         if (still == kept).all() or not still.any():
             break
         kept = still

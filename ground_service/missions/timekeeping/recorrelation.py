@@ -4,8 +4,6 @@ What is fitted depends on the time reports, receptions, boots and reference ephe
 in which they came. Fitting again without anything new changes nothing.
 """
 
-from __future__ import annotations
-
 import csv
 import functools
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """HTTP operations on time correlations and time reports."""
 
-from __future__ import annotations
-
 from ground_service.access.security import Operator, Viewer
 from ground_service.http.common import GroundOf, Instance, SpacecraftId
 from ground_service.http.model import PageOf

@@ -1,7 +1,5 @@
 """SQL of time correlations and of the reception of time reports."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

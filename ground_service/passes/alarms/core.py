@@ -5,8 +5,6 @@ when it has been acknowledged and its condition has ended. An alarm whose condit
 acknowledged, so that no alarm disappears unseen. The condition of an event report ends with the report.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal

@@ -5,8 +5,6 @@ in which packets arrive: its times, count and severity are those of all its pack
 from the newest housekeeping packet.
 """
 
-from __future__ import annotations
-
 from collections.abc import Set
 from dataclasses import asdict, dataclass
 from typing import Any, cast

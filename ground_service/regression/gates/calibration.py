@@ -6,8 +6,6 @@ verdict, is rejected if it fails, at the level of the policy. A gate is uncalibr
 probability below `DOUBT` (binomial test). Passes of one night have noise of their own and count as independent.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 

@@ -19,8 +19,6 @@ References
 R. L. Berger, "Multiparameter hypothesis testing and acceptance sampling", Technometrics 24, 1982.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace

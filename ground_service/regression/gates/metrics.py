@@ -1,7 +1,5 @@
 """Metrics of a build over passes: ratios of sums by unit of the evidence, values of whole passes, and fault counts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The policy file by which builds are judged."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Results of one build on one archived pass, frame by frame: the inputs of the gates."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

@@ -12,8 +12,6 @@ frame to a new state and a report of all decisions:
 A fix that fails its tests is refused: the orbit is then coasted on dynamics alone, and its uncertainty grows.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 

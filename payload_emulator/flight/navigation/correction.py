@@ -1,7 +1,5 @@
 """Correction of a predicted estimate with identified craters, and the tests that a correction must pass."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

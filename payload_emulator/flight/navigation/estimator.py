@@ -4,8 +4,6 @@ Another estimator is a module that implements `Estimator` and a row of `ESTIMATO
 is a module with the functions of `KalmanFilter` and its row `AnchoredEstimator(module)`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Protocol

@@ -13,8 +13,6 @@ holds whatever the correlation of their errors: nothing is counted twice.
 Frame: MCMF (ME). Memory is bounded: tracks, sightings per track and landmarks have limits, the poorest give way.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

@@ -1,7 +1,5 @@
 """Recovery of a lost estimate: counting of disagreeing frames, widened search, search without a prior."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Housekeeping and large data as packets."""
 
-from __future__ import annotations
-
 from payload_emulator.flight.onboard.housekeeping import PERFORMANCE, STATE
 from payload_emulator.flight.onboard.loads import TABLE_NUMBERS
 from payload_emulator.flight.onboard.machine import Machine

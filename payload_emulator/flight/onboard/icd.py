@@ -1,7 +1,5 @@
 """Payload part of the interface control document: ports, modes, parameters and faults."""
 
-from __future__ import annotations
-
 import inspect
 
 from payload_emulator.flight.onboard.modes import ALL_MODES, ALLOWED, TRANSITIONS, PayloadMode

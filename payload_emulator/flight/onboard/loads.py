@@ -1,7 +1,5 @@
 """Loads of the flight software at boot: parameters of its build, and tables."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field

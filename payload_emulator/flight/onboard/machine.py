@@ -1,7 +1,5 @@
 """The state of the payload as a machine, and what of it survives a reset."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """One frame from image to telemetry: detector, estimators, and the packets that report its outcome."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from typing import Any, TypeVar

@@ -1,7 +1,5 @@
 """Effects of the telecommands. A function returns the code of the reason why nothing was done; 0 or None: it was."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Mapping

@@ -4,8 +4,6 @@ Thumbnail: see `tmtc.packets.thumbnails`. Landmark map: for every crater, by ide
 used it (u16). Big-endian.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Mapping
 from typing import Any

@@ -6,8 +6,6 @@ packet (u32), sent mark (u8), packet; big-endian. There is no index in the memor
 by their magic and believed for their checksum, so that no single flipped bit loses more than one packet.
 """
 
-from __future__ import annotations
-
 import itertools
 import struct
 import zlib

@@ -12,8 +12,6 @@ The numbers of this module were fixed on rendered validation frames (`scenarios/
 photographs; `docs/detector.md` has the figures.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

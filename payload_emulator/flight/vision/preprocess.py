@@ -4,8 +4,6 @@ The network was trained on images whose Sun lies within 45 degrees of the top ed
 frame is known on board, so a frame is turned by quarter turns, which lose nothing. Pixel centres are integers.
 """
 
-from __future__ import annotations
-
 import enum
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Truth (trajectory, terrain, light) stays on this side of `Payload.step`; what th
 packets, becomes CADUs, and goes through the link model into `downlink.cadu`.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -8,8 +8,6 @@ of the pixels and of the attitude, housekeeping the hashes of model, parameters 
 Housekeeping values of the board (temperatures, processor time) are not known and are not made again.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence

@@ -5,8 +5,6 @@ the true orbit (radial, transverse, normal). Beside every figure stands what pro
 would have given.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

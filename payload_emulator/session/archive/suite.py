@@ -1,7 +1,5 @@
 """Small archived passes for regression tests of payload builds, emulated from the scenarios of a suite."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ the uplink; telemetry leaves it at the rate of the downlink. Without stations, o
 their place.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

@@ -12,8 +12,6 @@ service can send its telecommands and finish its work however fast the simulatio
 odometries (trigger `manual_step`).
 """
 
-from __future__ import annotations
-
 import selectors
 import threading
 import time

@@ -10,8 +10,6 @@ Nothing in the file is executed: it names classes of this program, whose attribu
 A class or attribute of the state that changes needs a new `VERSION`.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import json

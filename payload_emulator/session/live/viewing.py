@@ -1,7 +1,5 @@
 """Steps of a spacecraft for people who watch: image, detections and craters, estimates, events, and what is true."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from typing import Any

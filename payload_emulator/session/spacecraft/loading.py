@@ -4,8 +4,6 @@ It is made by the ground from the ground's own knowledge (reference ephemeris, c
 simulated truth passes through here except what a scenario declares to be known.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace

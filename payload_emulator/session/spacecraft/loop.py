@@ -4,8 +4,6 @@ Every way to fly is `fly` over a schedule of steps: a scenario with its operator
 Time, power, faults and resets are around `Payload.step`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any

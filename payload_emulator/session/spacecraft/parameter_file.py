@@ -136,13 +136,7 @@ def _bounds(name: str) -> tuple[float, float]:
 
 
 def _refuse_crossed(value: Any, table: Any, path: str) -> None:
-    """Refuse a lower limit that a table puts above its upper limit, in any section.
-
-    Raises
-    ------
-    TableFault
-        A changed limit crosses its counterpart.
-    """
+    """Refuse a lower limit that a table puts above its upper limit, in any section."""
     for key, given in table.items():
         place = f"{path}.{key}" if path else key
         if isinstance(given, dict) and dataclasses.is_dataclass(getattr(value, key)):

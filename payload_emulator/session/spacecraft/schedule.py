@@ -1,7 +1,5 @@
 """The schedule of a scenario: its frames, steps without frames, contacts, and the telecommands of its operator."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace

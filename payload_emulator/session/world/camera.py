@@ -1,7 +1,5 @@
 """Frames of a world: what camera, attitude control and clock deliver, rendered ahead while the payload works."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace

@@ -5,8 +5,6 @@ all of the size of the scenario's camera), one ephemeris `*.oem`, and at most on
 camera. Without attitudes the camera looks straight down, as the scenario points it.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from dataclasses import dataclass, replace

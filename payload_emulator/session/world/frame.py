@@ -1,7 +1,5 @@
 """Frames of a scenario at any epochs, with the metadata and labels of the data sets."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """The true orbit of a scenario: its forces, its first state, its propagation with or without burns, as an ephemeris."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

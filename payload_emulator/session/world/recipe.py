@@ -6,8 +6,6 @@ boxes and stays `buffer_km` away from every box it must avoid. A source may foll
 places, with the paper's own split: a contiguous test arc, the rest shuffled (section V-C).
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

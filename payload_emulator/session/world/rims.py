@@ -1,7 +1,5 @@
 """Craters with the heights of their rims, kept on disk: to measure them makes all the ground on which they lie."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 `KIND at SECONDS [for SECONDS] [size NUMBER]`, seconds after the first frame of the scenario.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 

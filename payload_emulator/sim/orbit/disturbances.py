@@ -1,7 +1,5 @@
 """Disturbances of the true flight: displacement, burns, outage of the camera."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

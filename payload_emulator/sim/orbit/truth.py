@@ -3,8 +3,6 @@
 Everything here is truth: it reaches flight software as images, attitude readings and clock ticks only.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

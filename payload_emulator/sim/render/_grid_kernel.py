@@ -3,8 +3,6 @@
 The grid lies in the tangent frame of `renderer`: rows run away from the Sun, z is up, metres.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -7,8 +7,6 @@ pixels: the tangent grid would blur them once more.
 # NumPy's single-precision numbers count as floats for numba.
 # mypy: disable-error-code="no-any-return"
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

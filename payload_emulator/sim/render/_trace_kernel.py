@@ -7,8 +7,6 @@ boresight.
 # NumPy's single-precision numbers count as floats for numba.
 # mypy: disable-error-code="arg-type,no-any-return,type-var,assignment"
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -7,8 +7,6 @@ File layout after the OpenEXR technical introduction (magic 20000630, version 2)
 then for every line its number, its size and the channels one after another in the order of their names.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import struct

@@ -4,8 +4,6 @@ Everything is in the east-north-up frame on the map sphere below the camera, in 
 in single precision is good to centimetres.  The scene is arrays and numbers only; Blender is not needed to make it.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path

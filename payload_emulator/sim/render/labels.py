@@ -1,7 +1,5 @@
 """Exact labels: where each catalogue crater's rim lies in a picture."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

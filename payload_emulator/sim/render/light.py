@@ -1,7 +1,5 @@
 """Direction of the Sun: drawn per frame as in the paper, or from the ephemeris."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -6,8 +6,6 @@ Radiance is in units of a white Lambert surface under a perpendicular Sun; the r
 ``albedo * phase(g) * [2 w(g) mu0 / (mu0 + mu) + (1 - w(g)) mu0]``, Hapke's with an added multiple-scattering term.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

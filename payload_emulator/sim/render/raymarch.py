@@ -5,8 +5,6 @@ no sweep, no interpolated map coordinates, double precision throughout.  Slopes 
 terrain's level in both, for that is part of what a picture of this terrain means.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -6,8 +6,6 @@ far away that its direction is one in this frame, so the shadow of a whole line 
 and a few milliseconds.  Far casters toward the Sun enter through a coarser grid first.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

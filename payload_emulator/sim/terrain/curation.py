@@ -9,8 +9,6 @@ where the raster shows the rims, and a rim counts as that of a listed crater if 
 Frame: mean-Earth (ME), as the raster is georeferenced. Heights are metres above the sphere of the maps.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -268,13 +266,7 @@ def _measured(craters: CraterCatalogue, heights: Heights) -> _Fit:
 
 
 def _require_depths(craters: CraterCatalogue, fit: _Fit) -> None:
-    """Refuse heights on which craters are deeper than any, or otherwise than listed.
-
-    Raises
-    ------
-    TerrainError
-        The heights have another scale.
-    """
+    """Refuse heights on which craters are deeper than any, or otherwise than listed."""
     with np.errstate(divide="ignore", invalid="ignore"):
         over_listed = fit.depth_m / craters.depth_m
     for share, of, limit in (

@@ -4,8 +4,6 @@ Heights are metres above the map sphere.  A *grid pixel* is an area; its centre 
 ``90 - (row + 0.5) / ppd`` and longitude ``(column + 0.5) / ppd`` degrees.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

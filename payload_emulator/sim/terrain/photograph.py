@@ -6,8 +6,6 @@ which has the brightness of the orthoimage; radiometry, which is as stretched by
 model made from the same images share their errors of position, so a world of both does not test the map.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

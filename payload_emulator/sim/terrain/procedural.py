@@ -1,7 +1,5 @@
 """A seeded Moon that needs no data: fractal relief with plains, and craters of a synthetic catalogue."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

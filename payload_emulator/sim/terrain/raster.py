@@ -4,8 +4,6 @@ Heights are metres above the map sphere (kilometres where the raster's unit says
 resolution form a layer; the finest layer that holds a place gives its height, and layers join over a feathered edge.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

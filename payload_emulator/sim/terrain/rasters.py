@@ -307,13 +307,7 @@ class RasterLayer:
         return values
 
     def _compared(self, file: RasterFile, values: Heights, corner: tuple[int, int]) -> str:
-        """Compare heights with the coarse relief of the Moon, where there is one; return words about it.
-
-        Raises
-        ------
-        TerrainError
-            They have the form of the relief, and another scale or zero.
-        """
+        """Compare heights with the coarse relief of the Moon, where there is one; return words about it."""
         if self._relief is None:
             return ""
         coarse, ppd = self._relief, self.pixels_per_degree

@@ -1,7 +1,5 @@
 """Registrations as files: found for a terrain, checked against its files, fitted and written."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 from collections.abc import Sequence

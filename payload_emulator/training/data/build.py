@@ -4,8 +4,6 @@ Resumable: a shard whose labels file exists is not made again, and that file is 
 shard, in one move. Memory: each worker keeps one terrain at a time, and of that the tiles last looked at.
 """
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json

@@ -12,8 +12,6 @@ Every catalogued crater in view of 2 km and more is listed, whatever its state; 
 decided when training (`choose_tiers`), and scoring has its own rules.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -3,8 +3,6 @@
 Everything is drawn from the generator passed in. Coordinates follow the pixels (centres at integers).
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The index and the COCO files of a finished data set."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

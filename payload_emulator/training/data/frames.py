@@ -1,7 +1,5 @@
 """One frame of a data set: picture, labels of what is in it, metadata."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Integrity check of a data set on disk: every file exists, is unchanged and can be read."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Craters learned from flight as further labels of a training (labels of `linna landmarks`)."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass, replace
 from pathlib import Path

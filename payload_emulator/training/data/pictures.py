@@ -13,8 +13,6 @@ References
 T.-Y. Lin et al., "Microsoft COCO: Common Objects in Context", 2014; data format of the COCO object detection task.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections import Counter

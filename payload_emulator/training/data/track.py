@@ -1,7 +1,5 @@
 """Places of a data set along an ephemeris, by the paper's rule (section V-B.4), and the paper's split of them (V-C)."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path

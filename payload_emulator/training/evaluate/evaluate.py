@@ -1,7 +1,5 @@
 """Figures of a detector on a data set: Table II and more, strict and ignore-aware, with the data source named."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any

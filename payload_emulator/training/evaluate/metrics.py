@@ -1,7 +1,5 @@
 """All figures of detections against truth: strict and ignore-aware side by side, by what they depend on."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ expected, a detection that takes one of them is not counted, and a detection tha
 diameter lies in the range. Labels of such sets are often incomplete, so precision is a lower bound.
 """
 
-from __future__ import annotations
-
 import enum
 import itertools
 import math

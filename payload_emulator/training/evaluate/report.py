@@ -1,7 +1,5 @@
 """The detector's report as a value: figures of `figures.score`, galleries, curves of the run, cost."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Pictures for people: labels drawn on frames as in the paper's Fig. 5, contact sheets, also of data sets."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

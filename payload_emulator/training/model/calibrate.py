@@ -1,7 +1,5 @@
 """Values fixed on the validation split before a network is used: thresholds, corrections, parallax of the walls."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """From a training run to the network that flies: ONNX, parity check, thresholds and provenance in its metadata."""
 
-from __future__ import annotations
-
 import io
 import json
 import logging

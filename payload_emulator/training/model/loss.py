@@ -5,8 +5,6 @@ References
 X. Zhou et al., "Objects as Points", 2019, equations 1 to 3 (alpha 2, beta 4).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -10,8 +10,6 @@ References
 A. Howard et al., "Searching for MobileNetV3", 2019, tables 1 and 2. X. Zhou et al., "Objects as Points", 2019.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Mapping

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ground_service.planning.filling import NS, Option, ResourceGrid, choose, take_in_order, violation
+from ground_service.planning.filling import Option, ResourceGrid, choose, take_in_order, violation
+from lunar.constants import NS
 
 HOUR = 3600 * NS
 STEP_S = 600.0

@@ -14,11 +14,12 @@ from ground_service.ground import Ground
 from ground_service.missions.catalogues import add_catalogue, withdraw_catalogue
 from ground_service.missions.service import add_mission
 from ground_service.planning import forecast, service
-from ground_service.planning.filling import NS, Option, ResourceGrid, curves
+from ground_service.planning.filling import Option, ResourceGrid, curves
 from ground_service.planning.model import WindowEntry, WindowSearch
 from ground_service.planning.service import search_windows
 from ground_service.planning.store import get_window
 from lunar.catalogue import CraterCatalogue, save_catalogue
+from lunar.constants import NS
 from lunar.timescales import parse_utc
 from tests.ground_service.conftest import add_reference
 

@@ -5,8 +5,6 @@ the Sun stand still. State: position, velocity (ICRF) and empirical acceleration
 decays as a first-order Gauss-Markov process.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

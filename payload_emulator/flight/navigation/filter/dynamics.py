@@ -4,8 +4,6 @@ Inertial axes are ICRF, centred on the Moon. Gravity is evaluated in principal a
 table relates to the inertial axes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -8,8 +8,6 @@ Places are metres east and north of the sub-satellite point of their own frame. 
 motion of the spacecraft that explains it: place in the earlier frame minus place in the later frame.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

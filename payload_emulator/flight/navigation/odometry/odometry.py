@@ -22,8 +22,6 @@ References
 Paper section VI (equations), VI-A (matching), VI-B (altitude), VI-C (error bounding), VII-A (outcomes).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

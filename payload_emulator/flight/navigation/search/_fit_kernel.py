@@ -3,8 +3,6 @@
 Places are in MCMF, offsets in the local axes east, north, up of the place; lengths in m, images in pixels.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -12,8 +12,6 @@ detections is one, so that chance exceeds 1 / p anywhere in the search with a pr
 inequality). Near a place, the average over poses follows from the fit and its normal matrix (Laplace's method).
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from dataclasses import dataclass, replace

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from ground_service.contacts.links.core import (
     BLOCK_NS,
     CLOCK_LIMIT_S,
-    NS,
     PredictedContact,
     clock_fault,
     contact_at,
@@ -19,6 +18,7 @@ from ground_service.contacts.links.core import (
 )
 from ground_service.missions.model import parse_mission
 from ground_service.missions.places import outages_of, station_of, stations_of
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.visibility import GroundStation, link
 from tests.ground_service.conftest import START, circular_states
