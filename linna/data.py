@@ -1,4 +1,4 @@
-"""Where the real data products are: $LINNA_DATA, else the user's data directory, else nowhere; and where Blender is."""
+"""Location of the real data products: $LINNA_DATA, else the user's data directory; location of Blender."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def user_data_directory() -> Path:
 
 
 def data_directory() -> Path:
-    """Where the data products lie or are to be fetched to: $LINNA_DATA, else the user's data directory."""
+    """Return the folder of the data products: $LINNA_DATA, else the user's data directory."""
     named = os.environ.get("LINNA_DATA")
     return Path(named) if named else user_data_directory()
 

@@ -638,9 +638,9 @@ def _check_ranges(path: Path, catalogue: CraterCatalogue) -> None:
             catalogue.depth_m / catalogue.diameter_m,
         ),
     )
-    for good, expected, values in checks:
-        if not np.all(good):
-            row = int(np.flatnonzero(~good)[0])
+    for valid, expected, values in checks:
+        if not np.all(valid):
+            row = int(np.flatnonzero(~valid)[0])
             raise DataFileError(path, f"line {row + 2}", expected, f"{values[row]:.10g}")
 
 

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lunar.arrays import FloatArray, IntArray
-from lunar.constants import GM_EARTH_M3_S2, GM_MOON_M3_S2
+from lunar.constants import GM_EARTH_M3_S2, GM_MOON_M3_S2, NS
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import EphemerisCoverageError, EphemerisError, UnmovedByGravity
 from lunar.frames import matrix_from_quaternion, rtn_from_inertial
 from lunar.plausible import OFF_NADIR_DEG, VIEWS_OF_MOON
 from lunar.third_bodies import earth_position_icrf_m
-from lunar.timescales import NS, format_tai, format_utc, tdb_s_from_tai_ns
+from lunar.timescales import format_tai, format_utc, tdb_s_from_tai_ns
 
 GRAVITY_TOLERANCE = 2.5e-3
 """Largest median deviation of states from the motion about a point mass, as a part of the fall: see `check_gravity`."""
@@ -155,13 +155,13 @@ def _check_single(arc: EphemerisSegment) -> None:
             if is_inner and np.all(others <= limit * least + _SINGLE_M):
                 raise EphemerisError(
                     f"ephemeris state {one + 1} of {arc.object_name}, {format_tai(int(arc.tai_ns[one]))}: expected a "
-                    f"state between those beside it, found {np.round(arc.position_m[one] / 1e3, 3).tolist()} km and "
+                    f"state between its neighbours, found {np.round(arc.position_m[one] / 1e3, 3).tolist()} km and "
                     f"{np.round(arc.velocity_m_s[one] / 1e3, 6).tolist()} km/s"
                 )
 
 
 def _apart(arc: EphemerisSegment, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return how far inner states (n - 2) lie off the curve of degree 5 through those beside them, fall, and span in s.
+    """Return how far inner states (n - 2) lie off the curve of degree 5 through their neighbours, fall, and span in s.
 
     The fall is that of a body between the two, in m.
     """

@@ -27,9 +27,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
+from lunar.constants import NS
 from lunar.errors import DataFileError, EphemerisCoverageError, EphemerisError
 from lunar.frames import ICRF
-from lunar.timescales import NS, format_tai, tai_ns_from_utc_ns, utc_ns_from_tai_ns
+from lunar.timescales import format_tai, tai_ns_from_utc_ns, utc_ns_from_tai_ns
 
 GAP_FACTOR = 10
 """A step longer than this many median steps of its segment is a gap, in which nothing is interpolated."""

@@ -27,10 +27,10 @@ METRICS = {
     "median_error_m": ("median error", "m", 1.0, 0),
 }
 """Name, unit, scale and decimals of the metrics."""
+_DRAWN = METRICS | {"map_offset_m": ("offset of the list", "m", 1.0, 0)}
 
 
 def monthly_document(report: MonthlyReportValue) -> Document:
-    """Return the document of a monthly report."""
     blocks: list[Block] = [*judgement(report), Heading("Passes over time")]
     if report.passes:
         blocks.append(_trend(report))
@@ -53,15 +53,17 @@ def _trend(report: MonthlyReportValue) -> Picture:
     }
     words = "; ".join(
         f"{label}: {number_text(scale * medians[name], decimals)} {unit}"
-        for name, (label, unit, scale, decimals) in METRICS.items()
+        for name, (label, unit, scale, decimals) in _DRAWN.items()
+        if name in medians
     )
     return Picture(
         "monthly-trend",
-        "Recall, drift and median error of each pass; vertical lines are changes of level. "
+        "Recall, drift, median error and offset of the crater list as learned on board, of each pass; vertical lines "
+        "are changes of level. "
         f"Median of the passes: {words}.",
         f"Recall, drift and median error over time. Median of the passes: {words}.",
         4.2,
-        lambda canvas: monthly.draw_trend(canvas, report, METRICS),
+        lambda canvas: monthly.draw_trend(canvas, report, _DRAWN),
     )
 
 

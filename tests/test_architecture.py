@@ -305,3 +305,23 @@ def test_a_planted_function_of_one_line_more_is_found(tmp_path: Path) -> None:
     assert long_functions(tmp_path) == []
     file.write_text("async def longer():\n" + "    pass\n" * LONGEST_FUNCTION)
     assert long_functions(tmp_path) == ["lunar.planted.longer: 81 lines"]
+
+
+DECODED = re.compile(
+    r'(?<=""")(?:What|Where|Who|How|When|Why|Whether|Which)\b'  # the start of a docstring
+    r"|(?<!kidnap )\b(?:told|heard(?!: UtcTime)|anew|at hand|beside|for good|lets? go of|came? to (?:an|no) end)\b"
+    r"|\b(?:class|def) \w*(?<![a-z])(?:told|heard|beside|anew)(?![a-z])\w*"
+    r"|\bclass (?:Moment|Turn|Given|Begun|Asked|Hand|Found|Shelving|Workshop|Patience|Craft|Facts|Eye|Told)\b"
+)
+
+
+def test_names_messages_and_docstrings_use_the_terms_of_the_field() -> None:
+    found = {
+        str(file.relative_to(ROOT)): words
+        for package in (*PACKAGES, "benchmarks")
+        for file in (ROOT / package).rglob("*.py")
+        if (words := DECODED.findall(file.read_text(encoding="utf-8")))
+    }
+    assert found == {}
+    planted = 'class Moment:\n    """Where it is beside."""\n    def _told(): raise Lost("came to no end")\n'
+    assert DECODED.findall(planted) == ["class Moment", "Where", "beside", "def _told", "came to no end"]

@@ -31,6 +31,7 @@ from linna.cli import run as linna
 from linna.data import load_orbit
 from lunar.catalogue import catalogue_words, load_catalogue, make_catalogue
 from lunar.comparison import check_pointing
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris, clipped, ephemeris_from_states
 from lunar.errors import LunarError
 from lunar.frames import icrf_from_j2000, load_orientation, matrix_from_quaternion, quaternion_from_matrix
@@ -40,7 +41,7 @@ from lunar.messages.oem import format_oem
 from lunar.messages.oem_xml import format_oem_xml
 from lunar.messages.spice import spk_kernel
 from lunar.messages.stk import format_stk
-from lunar.timescales import NS, format_utc, from_tai_ns, ticks_from_utc_ns, utc_ns_from_ticks
+from lunar.timescales import format_utc, from_tai_ns, ticks_from_utc_ns, utc_ns_from_ticks
 from payload_emulator.errors import PayloadError
 from payload_emulator.flight.vision.preprocess import prepare_image, quality_reason
 from payload_emulator.session.scenario import Scenario, load_scenario
@@ -122,8 +123,8 @@ STATES: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
     "zero: positions from the surface": lambda t, x: np.hstack(
         [x[:, :3] * (1 - 1_737_400.0 / RADIUS_M), x[:, 3:]]
     ),
-    "zero: centre of the Earth": lambda t, x: x + [3.6e8, 1e8, 5e7, -250.0, 900.0, 300.0],
-    "zero: x moved by 10 km": lambda t, x: x + [1e4, 0, 0, 0, 0, 0],
+    "zero: centre of the Earth": lambda t, x: x + np.array([3.6e8, 1e8, 5e7, -250.0, 900.0, 300.0]),
+    "zero: x moved by 10 km": lambda t, x: x + np.array([1e4, 0, 0, 0, 0, 0]),
     "scale: z one per cent greater": scaled(1, 1, 1.01, 1, 1, 1),
     "scale: velocities one per cent greater": scaled(1, 1, 1, 1.01, 1.01, 1.01),
     "scale: all one per cent greater": scaled(*(1.01,) * 6),

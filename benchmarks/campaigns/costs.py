@@ -275,7 +275,7 @@ def derived(path: str, operation: Mapping[str, Any], values: Mapping[str, Any]) 
     for one in operation.get("parameters", ()):
         name, schema = one["name"], one["schema"]
         if one["in"] == "query" and (one.get("required") or name in ("limit", "max_points")):
-            query[name] = schema.get("maximum", values.get(name))
+            query[name] = values.get(name, schema.get("maximum"))
     filled = re.sub(r"\{(\w+)(?::path)?\}", lambda found: urllib.parse.quote(str(values[found[1]])), path)
     body = {} if "requestBody" in operation else None
     return Case("largest page" if "limit" in query else "", f"{filled}?{urllib.parse.urlencode(query)}", body)
@@ -363,7 +363,10 @@ def measured(only: Sequence[str]) -> Iterator[Cost]:
                         if only and operation not in only:
                             continue
                         for case in special.get(operation) or [derived(path, described, values)]:
-                            yield measure(client, watch, operation, method, case)
+                            cost = measure(client, watch, operation, method, case)
+                            if cost.fault and cost.status == 200:  # the first answer may compile kernels
+                                cost = measure(client, watch, operation, method, case)
+                            yield cost
 
 
 def table(costs: Sequence[Cost]) -> str:

@@ -60,17 +60,17 @@ from ground_service.evaluation.smoother import (
 )
 from ground_service.evaluation.verdict import (
     Evaluated,
-    Limits,
     StartOrbit,
     consistency_remarks,
     requirements,
     verdict_of,
     without_mission,
 )
+from ground_service.missions.model import Requirements
 from ground_service.telemetry.samples import DetectionSamples, NavigationSamples, OutcomeSamples
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
-from lunar.constants import MOON_RADIUS_M, NANOSECONDS_PER_SECOND
+from lunar.constants import MOON_RADIUS_M, NS
 from lunar.ephemeris import Ephemeris
 from lunar.errors import LunarError
 from lunar.frames import Orientation
@@ -175,7 +175,7 @@ class PassInputs:
     refused: Mapping[str, str] = field(default_factory=dict)
     reference_sigma_rtn_m: tuple[float, float, float] | None = None
     map_offset: MapOffset | None = None
-    limits: Limits = field(default_factory=Limits)
+    limits: Requirements = field(default_factory=Requirements)
     experiment: StartOrbit | None = None
     clock_step_s: float | None = None
     no_mission: str = ""
@@ -509,8 +509,8 @@ def _consistency(
         return None, degrees
     covariance = np.where(same[:, None, None], filtered.position_covariance_rtn_m2[at], np.nan)
     if degrees is not None and filtered.innovation_degrees is not None:
-        told = filtered.innovation_degrees[at]
-        degrees = np.where(known & same & (told >= 0), told, degrees).astype(np.int64)
+        reported = filtered.innovation_degrees[at]
+        degrees = np.where(known & same & (reported >= 0), reported, degrees).astype(np.int64)
     return nees(error_rtn_m, covariance + reference_covariance), degrees
 
 
@@ -577,7 +577,7 @@ def _time_since_fix_s(samples: NavigationSamples) -> FloatArray | None:
     if not fixed.any():
         return None
     last = np.maximum.accumulate(np.where(fixed, np.arange(len(fixed)), -1))
-    since = (samples.utc_ns - samples.utc_ns[np.maximum(last, 0)]) / NANOSECONDS_PER_SECOND
+    since = (samples.utc_ns - samples.utc_ns[np.maximum(last, 0)]) / NS
     return np.where(last >= 0, since, np.nan)
 
 
@@ -834,7 +834,7 @@ def _gaps(inputs: PassInputs) -> tuple[TimeSpan, ...]:
     times = inputs.detections.utc_ns
     if inputs.cadence_s is None or len(times) < 2:
         return ()
-    limit = 1.5 * inputs.cadence_s * NANOSECONDS_PER_SECOND
+    limit = 1.5 * inputs.cadence_s * NS
     return tuple(
         TimeSpan(int(times[i]), int(times[i + 1]), "no frames")
         for i in np.flatnonzero(np.diff(times) > limit)

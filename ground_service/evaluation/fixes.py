@@ -236,7 +236,7 @@ class MappedCraters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapComparison:
-    """What the catalogue says of a map.
+    """Comparison of a map with the catalogue.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Stored data of a pass, prepared and read into the plain arrays that the evaluation takes."""
+"""Stored data of a pass, prepared and read into the plain arrays of the evaluation."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ground_service.evaluation.smoother import (
     MapOffset,
     StartState,
 )
-from ground_service.evaluation.verdict import Limits, StartOrbit
+from ground_service.evaluation.verdict import StartOrbit
 from ground_service.ground import Ground
 from ground_service.missions.catalogues import catalogue_of, read_catalogue
 from ground_service.missions.ephemerides.model import Ephemeris as EphemerisEntry
@@ -61,7 +61,7 @@ from ground_service.toml import read_table
 from lunar.boxes import share_outside
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, format_catalogue
-from lunar.constants import MOON_RADIUS_M, NANOSECONDS_PER_SECOND
+from lunar.constants import MOON_RADIUS_M, NS
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation
@@ -159,7 +159,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             refused=_refused(declared, mission.camera),
             reference_sigma_rtn_m=mission.reference.sigma_rtn_m,
             map_offset=_map_offset(mission.catalogue, learned_offset_m(connection, span)),
-            limits=Limits(**mission.requirements.model_dump()),
+            limits=mission.requirements,
             experiment=_experiment(mission, manifest),
             clock_step_s=_clock_step_s(connection, record, span),
             no_mission="" if record.mission_id is not None else _no_mission(vehicle.ccsds_id),
@@ -246,7 +246,7 @@ def filter_states(connection: Connection, span: PassSpan) -> FilterStates | None
 
 
 def identification_samples(connection: Connection, span: PassSpan) -> IdentificationSamples | None:
-    """Which crater each used detection was taken for, in time order; None where nothing came down about it."""
+    """Return the identified crater of each used detection, in time order; None without telemetry about it."""
     rows = sample_store.samples(connection, span, "identifications", ("ticks", "items"))
     if not rows["ticks"]:
         return None
@@ -268,7 +268,7 @@ def landmark_reports(connection: Connection, span: PassSpan) -> MappedCraters:
 
 
 def outcome_samples(connection: Connection, span: PassSpan) -> tuple[OutcomeSamples, ...]:
-    """What every estimator made of every frame, in time order."""
+    """Return the outcome of every estimator by frame, in time order."""
     names = (
         "ticks", "estimator", "frame_number", "outcome", "reset_trigger", "candidate_pairs", "anchor_reads",
     )  # fmt: skip
@@ -649,7 +649,7 @@ def _store_catalogue(ground: Ground, mission: Mission, reference: Ephemeris, rec
         raise InvalidInput(mission.name, "frames.orientation", "an available lunar orientation", "none")
     half_diagonal = math.sqrt(2.0) * math.tan(camera_of(mission.camera).fov_rad / 2.0)
     reach = half_diagonal + math.tan(math.radians(abs(mission.camera.tilt_deg or 0.0)))
-    step_ns = round(TRACK_STEP_S * NANOSECONDS_PER_SECOND)
+    step_ns = round(TRACK_STEP_S * NS)
     utc_ns = np.arange(record.start_utc_ns, record.stop_utc_ns + step_ns, step_ns, dtype=np.int64)
     track = reference_states(reference, orientation, utc_ns)
     octets = format_catalogue(along_track(catalogue, track, reach)).encode("ascii")

@@ -63,7 +63,7 @@ class ExpectedCraters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """Who matched whom: for each detection its row of `ExpectedCraters`, for each of those its detection; -1: none."""
+    """Matches: for each detection its row of `ExpectedCraters`, for each of those its detection; -1: none."""
 
     crater_of_detection: IntArray
     detection_of_crater: IntArray

@@ -24,7 +24,7 @@ from ground_service.evaluation.alignment import (
     places_of_positions,
 )
 from lunar.arrays import FloatArray, IntArray
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from lunar.frames import ICRF, Orientation, icrf_from_onboard, rtn_from_inertial
 from lunar.gravity import GravityField
 from lunar.gravity_omission import FieldNoise, densities_at, field_noise
@@ -244,8 +244,8 @@ def _legs(
     at = from_utc_ns
     between = [burn for burn in burns if from_utc_ns < burn.utc_ns <= to_utc_ns]
     for stop, burn in [*((burn.utc_ns, burn) for burn in between), (to_utc_ns, None)]:
-        count = max(1, int(np.ceil((stop - at) / (_LONGEST_STEP_S * NANOSECONDS_PER_SECOND))))
-        step_s = (stop - at) / NANOSECONDS_PER_SECOND / count
+        count = max(1, int(np.ceil((stop - at) / (_LONGEST_STEP_S * NS))))
+        step_s = (stop - at) / NS / count
         if step_s > 0.0 or burn is not None:
             if at != from_utc_ns:
                 start_s = float(tdb_s_from_utc_ns(at))

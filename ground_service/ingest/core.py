@@ -46,13 +46,13 @@ class Gap:
 
     @property
     def missing(self) -> int:
-        """How many packets are missing."""
+        """Return the number of missing packets."""
         return self.last_count - self.first_count + 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SequenceAccount:
-    """What the counts of one vehicle and APID say.
+    """Sequence accounting of one vehicle and APID.
 
     `order` sorts the packets given into on-board order; `run` and `count` (n,) are in that order: the number of the
     run since a restart, and the unwrapped count within it. `conflicts` are packets whose unwrapped count another
@@ -418,7 +418,7 @@ NO_RECORD = RecordFormat()
 
 
 @dataclass(slots=True)
-class Found:
+class LinkContent:
     """Counts of what a piece of a recording has completed: frames, packets, link quality, octets.
 
     Attributes

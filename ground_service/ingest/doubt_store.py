@@ -176,7 +176,7 @@ def review_times(ground: Ground, vehicle: int) -> None:
 
 
 def _contradicted(connection: Connection, vehicle: int) -> tuple[list[int], str] | None:
-    """Return packets of the archive whose time is implausible beside the others, and the reason."""
+    """Return packets of the archive whose time is implausible compared with the others, and the reason."""
     newest = telemetry.newest_ticks(connection, vehicle)
     if newest is None:
         return None

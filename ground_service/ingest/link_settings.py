@@ -70,7 +70,7 @@ class ExpectedLink:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Known:
-    """What is known before a piece is read; `definitions` is None for a piece of any spacecraft."""
+    """Knowledge before a piece is read; `definitions` is None for a piece of any spacecraft."""
 
     expected: ExpectedLink
     definitions: PacketDefinitions | None

@@ -56,7 +56,7 @@ _IN_RANGE = select(_PACKETS.c.digest).where(
 
 
 class Batch(Protocol):
-    """What is stored: see `ground_service.telemetry.packets.PacketBatch`."""
+    """Batch to store: see `ground_service.telemetry.packets.PacketBatch`."""
 
     @property
     def apid(self) -> IntArray: ...
@@ -93,7 +93,7 @@ RETURNING id, digest
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """What storing a batch changed."""
+    """Changes by the storage of a batch."""
 
     new: int
     repeated: int
@@ -420,7 +420,7 @@ def ingests_of_vehicles(connection: Connection, vehicles: Sequence[int], but: in
 
 
 def forget_rest(connection: Connection, vehicle: int, ingest_id: int) -> None:
-    """Remove what an ingest has left besides packets of a vehicle: fragments, doubts, its place, and its marks.
+    """Remove what an ingest has left except packets of a vehicle: fragments, doubts, its place, and its marks.
 
     Telecommands that were sent after it are verified from where those before it were.
     """

@@ -66,7 +66,7 @@ CommandSubject = Annotated[str, AfterValidator(_known_subject)]
 
 
 class Spacecraft(Section):
-    """Spacecraft identification; `object_names` are those in ephemerides (OBJECT_NAME), besides `name`."""
+    """Spacecraft identification; `object_names` are those in ephemerides (OBJECT_NAME), in addition to `name`."""
 
     id: Annotated[int, Field(ge=0, le=1023)] | None = None
     name: str | None = None
@@ -704,7 +704,7 @@ class Mission(Section):
     links: Annotated[tuple[StationConnection, ...], Array] | None = None
     packets: Annotated[tuple[PacketSource, ...], Array] | None = None
     procedures: dict[str, Annotated[str, Field(min_length=1, max_length=4000)]] = Field(default_factory=dict)
-    """What an operator does about an alarm, by the name of its event or parameter."""
+    """Procedures of the operator for alarms, by the name of event or parameter."""
 
     @model_validator(mode="after")
     def _links_once(self) -> Mission:
@@ -781,7 +781,7 @@ class MissionRevision(Entity):
 
 
 class MissionCheck(Entity):
-    """What a text would be as a mission description; it was not added."""
+    """Result of checking a text as a mission description; it was not added."""
 
     faults: tuple[str, ...] = Field(description="One line for each fault; empty if it can be added")
     unknown: tuple[str, ...] = Field(description="Keys that it does not state")

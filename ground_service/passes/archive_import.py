@@ -485,7 +485,7 @@ def _checked_name(entry: zipfile.ZipInfo, seen: set[str], name: str) -> str:
 
 
 def _root(folder: Path) -> Path:
-    """Where the manifest lies: in the folder, or in the only one within it."""
+    """Return the folder of the manifest: the folder itself, or the only one within it."""
     inside = list(folder.iterdir())
     if len(inside) == 1 and inside[0].is_dir() and not (folder / "manifest.json").exists():
         return inside[0]

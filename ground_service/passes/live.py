@@ -44,7 +44,6 @@ LIMIT_STATES: tuple[LimitState, ...] = ("within", "warning", "alarm")
 
 
 def list_spacecraft(ground: Ground) -> list[SpacecraftInstance]:
-    """Return all spacecraft in all instances."""
     with ground.database.reading() as connection:
         found = [
             SpacecraftInstance(

@@ -113,7 +113,6 @@ def packet_samples(packet: PacketDefinition, field: str, version: int) -> Sample
 
 
 def pass_parameters(ground: Ground, pass_id: int) -> PassParameters:
-    """Return the parameters of a pass."""
     with ground.database.reading() as connection:
         record = store.get_pass(connection, pass_id)
         span = pass_span(connection, record)

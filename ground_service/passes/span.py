@@ -168,9 +168,8 @@ def observed_span(
     ]
     found = observations(observation_events(connection, near))
     own = [one for one in found if belongs_to(one, mine, others, stop - mine.stop)]
-    foreign = [
-        ticks for one in found if one not in own for ticks in (one.start, one.stop) if ticks is not None
-    ]
+    rest = set(found) - set(own)
+    foreign = [ticks for one in rest for ticks in (one.start, one.stop) if ticks is not None]
     begin, end = (own[0].start, own[-1].stop) if own else (None, None)
     if begin is None:
         begin = max([start, *(ticks + 1 for ticks in foreign if ticks < (mine.start + mine.stop) // 2)])

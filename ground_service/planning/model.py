@@ -10,21 +10,21 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from ground_service.http.model import (
     Entity,
-    Given,
-    GivenTime,
     InstanceName,
     Paging,
+    RequestModel,
+    RequestTime,
     SpacecraftNumber,
     UtcTime,
 )
 from ground_service.planning import core
 from ground_service.planning.core import Constraints
 from ground_service.toml import LINE_PATTERN_JSON
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1, max_length=200, pattern=LINE_PATTERN_JSON)]
-Time = Annotated[GivenTime, AfterValidator(lambda time: UtcTime(time.utc_ns // 1000 * 1000))]
+Time = Annotated[RequestTime, AfterValidator(lambda time: UtcTime(time.utc_ns // 1000 * 1000))]
 """Time of a plan, in whole microseconds, so that an exported plan states it exactly."""
 
 WindowState = Literal[
@@ -55,7 +55,7 @@ class WindowEntry:
     ephemeris_id: int | None = None
 
 
-class Limits(Given):
+class Limits(RequestModel):
     """A minimum and a maximum."""
 
     min: Finite = Field(examples=[30.0])
@@ -72,7 +72,7 @@ class Limits(Given):
         return self.min * factor, self.max * factor
 
 
-class WindowSearch(Given):
+class WindowSearch(RequestModel):
     """Constraints that a window must fulfil throughout; a constraint that is not stated does not apply."""
 
     start: Time | None = Field(default=None, description="Default: where the ephemeris begins")
@@ -179,7 +179,7 @@ class Candidate(WindowPrediction):
     def from_core(cls, found: core.Candidate) -> Candidate:
         """Return the entity of a candidate of the planner."""
         craters = found.craters_per_frame
-        duration_s = (found.stop_utc_ns - found.start_utc_ns) / NANOSECONDS_PER_SECOND
+        duration_s = (found.stop_utc_ns - found.start_utc_ns) / NS
         return cls.of(
             asdict(found),
             first_coast_m=core.COAST_M_S / duration_s,
@@ -221,7 +221,7 @@ class SearchResult(Entity):
 
 
 class WindowConflict(Entity):
-    """What stands in the way of a planned window."""
+    """Conflict of a planned window."""
 
     window_id: int
     reasons: list[str]
@@ -265,7 +265,7 @@ class CraterDensity(Entity):
     rows: list[list[float]]
 
 
-class WindowIn(Given):
+class WindowIn(RequestModel):
     """A window to be planned."""
 
     name: Name = Field(default="observation", examples=["evening pass"])
@@ -283,7 +283,7 @@ class WindowIn(Given):
         return WindowEntry(start_utc_ns=self.start.utc_ns, stop_utc_ns=self.stop.utc_ns, **stated)
 
 
-class WindowChange(Given):
+class WindowChange(RequestModel):
     """Changes of a draft, or a decision on a window; fields that are not stated do not change."""
 
     name: Name | None = None
@@ -365,7 +365,7 @@ class StartedOrbit(Entity):
 
 
 class WindowUploads(Entity):
-    """What the telecommands of a window load on board, as the manifest of a pass states it."""
+    """Tables that the telecommands of a window load on board, as in the manifest of a pass."""
 
     start_state: UploadedState | None = None
     burns: list[UploadedBurn] | None = None
@@ -405,7 +405,7 @@ class WindowFilter(Paging):
 RequestState = Literal["active", "paused"]
 
 
-class Region(Given):
+class Region(RequestModel):
     """Sub-satellite points between two latitudes and two longitudes; from `min` to the east to `max`."""
 
     latitude_deg: Limits = Limits(min=-90.0, max=90.0)
@@ -413,8 +413,8 @@ class Region(Given):
     east_deg: Annotated[Finite, Field(ge=-180.0, le=360.0)] = 180.0
 
 
-class RequestTerms(Given):
-    """What is requested; a constraint that is not stated does not apply."""
+class RequestTerms(RequestModel):
+    """Terms of a request; a constraint that is not stated does not apply."""
 
     windows: int = Field(ge=1, le=1000, description="Windows in each period", examples=[10])
     period_days: Finite = Field(default=7.0, ge=0.1, le=366.0)
@@ -468,7 +468,7 @@ class StandingRequestIn(RequestTerms):
         return RequestTerms(**{name: getattr(self, name) for name in RequestTerms.model_fields})
 
 
-class StandingRequestChange(Given):
+class StandingRequestChange(RequestModel):
     """Changes of a standing request; what is not stated does not change."""
 
     state: RequestState | None = None

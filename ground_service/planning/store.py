@@ -105,12 +105,10 @@ def note_uploads(connection: Connection, window_id: int, uploads: WindowUploads)
 
 
 def delete_window(connection: Connection, window_id: int) -> None:
-    """Delete a window."""
     connection.execute(WINDOWS.delete().where(WINDOWS.c.id == window_id))
 
 
 def get_window(connection: Connection, window_id: int) -> Window:
-    """Return a window."""
     return _one(connection, window_id, Window)
 
 
@@ -223,7 +221,6 @@ def add_pass(connection: Connection, window: WindowRecord, mission_id: int | Non
 
 
 def has_report(connection: Connection, pass_id: int) -> bool:
-    """Return whether a pass has a report."""
     return repository.find(connection, repository.REPORTS, pass_id=pass_id) is not None
 
 
@@ -309,7 +306,6 @@ def add_request(
 
 
 def get_request(connection: Connection, request_id: int) -> StandingRequest:
-    """Return a request."""
     return _request(connection, repository.get(connection, _REQUESTS, request_id, "request"))
 
 

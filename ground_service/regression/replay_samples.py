@@ -52,7 +52,7 @@ LOW_KM, LOW_SUN_DEG = 25.0, 20.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassContext:
-    """What the ground knows of an archived pass, whichever build flies it: read once, used for every build.
+    """Data of an archived pass that are independent of the build: read once, used for every build.
 
     `mission` is the revision of the mission description of the archive, `step_ticks` the on-board time of every step of
     the payload, those without an image included.
@@ -154,7 +154,7 @@ def read_downlink(
     memory_mib: float = math.nan,
     cpu_s: float = math.nan,
 ) -> ReadDownlink:
-    """What came down, by frame of the archive.
+    """Return the received telemetry by frame of the archive.
 
     Raises
     ------

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 
 
-class Asked(Protocol):
+class ListQuery(Protocol):
     """The page of a list and the filters that are asked for."""
 
     @property
@@ -132,7 +132,7 @@ def find(connection: Connection, table: Table, **equal: Any) -> Row | None:
 
 
 def page(
-    connection: Connection, query: Select[Any], asked: Asked, *order: Any, others: Sequence[str] = ()
+    connection: Connection, query: Select[Any], asked: ListQuery, *order: Any, others: Sequence[str] = ()
 ) -> tuple[list[Row], int]:
     """Return a page of the rows of a query in an order, and the number of all rows.
 
@@ -153,7 +153,7 @@ def page(
     return [dict(row) for row in rows], int(total)
 
 
-def newest(connection: Connection, table: Table, asked: Asked, **equal: Any) -> tuple[list[Row], int]:
+def newest(connection: Connection, table: Table, asked: ListQuery, **equal: Any) -> tuple[list[Row], int]:
     """Return a page of the rows of a table with these values, newest first, and the number of all rows."""
     key = next(iter(table.primary_key.columns))
     order = [table.c.created_utc_ns, key] if "created_utc_ns" in table.c else [key]

@@ -30,8 +30,8 @@ from ground_service.telemetry import writing
 from ground_service.telemetry.packets import batch_of_cut
 from ground_service.telemetry.values import Decoding, StoredPackets, last_packet
 from lunar.arrays import FloatArray, IntArray
+from lunar.constants import NS
 from lunar.timescales import (
-    NS,
     ONBOARD_EPOCH_TAI_NS,
     TICKS_PER_SECOND,
     parse_utc,

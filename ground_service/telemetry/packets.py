@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lunar.arrays import IntArray
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from lunar.timescales import utc_ns_from_ticks
 from tmtc.arrays import Octets, as_octets
 from tmtc.dictionary.estimates import ESTIMATE_PACKETS, filter_estimates
@@ -24,7 +24,7 @@ Columns = dict[str, Any]
 
 DIGEST_OCTETS = 16
 
-CLOCKS_AGREE_NS = 60 * NANOSECONDS_PER_SECOND
+CLOCKS_AGREE_NS = 60 * NS
 """Largest difference of the on-board clock from the reception time of its report, light time included.
 
 Two independent clocks that agree are believed. A larger difference is a wrong clock of the station, or a report that

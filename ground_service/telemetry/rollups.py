@@ -188,7 +188,7 @@ def rolled_extent(
     start_ticks: int,
     stop_ticks: int,
 ) -> tuple[int, int, int]:
-    """How many samples there are in the longest buckets that touch a span, and their first and last time."""
+    """Return the number of samples in the longest buckets that touch a span, and their first and last time."""
     width = width_ticks(LEVELS - 1)
     row = connection.execute(
         select(

@@ -28,7 +28,7 @@ class NavigationSamples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutcomeSamples:
-    """What one estimator made of each frame, in time order, arrays (n,); `anchor_reads` is cumulative."""
+    """Outcomes of one estimator by frame, in time order, arrays (n,); `anchor_reads` is cumulative."""
 
     estimator: str
     frame_number: IntArray

@@ -154,7 +154,7 @@ def _attempt(ground: Ground, job_id: str) -> Job:
             return service.get_job(connection, job_id)
         publish(connection, JobChanged(id=job_id, kind=job.kind, state="running"))
     if attempt > ATTEMPTS_LIMIT:
-        error = f"given up after {ATTEMPTS_LIMIT} attempts that did not come to an end"
+        error = f"given up after {ATTEMPTS_LIMIT} attempts that did not finish"
         return _finish(ground, job_id, attempt, error=error)
     log.info("job %s (%s) begins", job_id, job.kind, extra={"job": job_id, "kind": job.kind})
     try:
@@ -197,7 +197,7 @@ def _progress_of(ground: Ground, job_id: str) -> Callable[[float], None]:
 
 @contextmanager
 def _alone_here(job_id: str) -> Iterator[bool]:
-    """Whether no other thread of this process does the job."""
+    """Return whether no other thread of this process does the job."""
     with _doing_lock:
         alone = job_id not in _doing
         _doing.add(job_id)
@@ -234,6 +234,6 @@ def _finish(
         job = service.get_job(connection, job_id)
         publish(connection, JobChanged(id=job_id, kind=job.kind, state=job.state, result=job.result))
     took_s = 0.0 if job.started is None else (finished - job.started.utc_ns) / 1e9
-    told = {"job": job_id, "kind": job.kind, "state": job.state, "seconds": round(took_s, 3)}
-    log.info("job %s (%s) is %s after %.1f s", job_id, job.kind, job.state, took_s, extra=told)
+    fields = {"job": job_id, "kind": job.kind, "state": job.state, "seconds": round(took_s, 3)}
+    log.info("job %s (%s) is %s after %.1f s", job_id, job.kind, job.state, took_s, extra=fields)
     return job

@@ -237,8 +237,8 @@ class AttitudeSection:
 class DisturbancesSection:
     """Disturbances of the flight; times in seconds after the first frame, none where a size is zero.
 
-    - kidnap: the spacecraft is found elsewhere, turned about the Moon's centre by a distance on the ground; `told`: the
-      payload is informed by telecommand that its estimate is worth no more than that distance;
+    - kidnap: the spacecraft is found elsewhere, turned about the Moon's centre by a distance on the ground;
+      `kidnap_told`: the payload is informed by telecommand that its estimate is worth no more than that distance;
     - outage: the camera gives no image;
     - burn: along the velocity; `declared`: the payload has it in its burn table. `maneuvers` gives its execution error.
     """
@@ -356,7 +356,7 @@ class Scenario:
 
     @property
     def has_flat_ground(self) -> bool:
-        """Whether the ground is the sphere: no image is rendered, and no estimator needs heights."""
+        """Return whether the ground is the sphere: no image is rendered, and no estimator needs heights."""
         return self.camera.images == "reduced" and "anchored" not in self.navigation.estimators
 
     @property

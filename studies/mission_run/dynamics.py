@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lunar.catalogue import save_catalogue
-from lunar.constants import NANOSECONDS_PER_SECOND as NS
+from lunar.constants import NS as NS
 from lunar.datafolder import DataFolder
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc
@@ -122,7 +122,7 @@ def write_flight(
     ports: dict[str, tuple[int, int]] | None = None,
     watched: Watched = iter,
 ) -> str:
-    """Write what the ground posts to fly a scenario, beside its mission description; return the description.
+    """Write what the ground posts to fly a scenario, next to its mission description; return the description.
 
     The files are `craters.csv`, `reference.oem` and `request.json`. `ports` are those of the stations for telemetry
     and telecommands (default: as `linna emulate --live` opens them). `watched` shows the progress of the longest step.

@@ -17,9 +17,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from fastapi.routing import APIRoute
 from pydantic import BaseModel
 
-from ground_service.app import OPERATIONS
 from ground_service.client.connection import API_PREFIX
-from ground_service.http.common import IDEMPOTENCY_HEADER, IF_MATCH_HEADER
+from ground_service.http.common import IDEMPOTENCY_HEADER, IF_MATCH_HEADER, OPERATIONS
 from ground_service.http.model import PageOf, Paging, UtcTime
 from ground_service.http.requests import header_names
 

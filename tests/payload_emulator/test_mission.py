@@ -97,7 +97,7 @@ def test_the_offset_of_the_list_that_the_payload_starts_with_is_stated(world) ->
     assert loaded.offset is not None
     up_m = loaded.errors.catalogue_offset_m[2]
     assert stated.offset_sigma_m == (loaded.offset.prior_m, loaded.offset.prior_m, up_m)
-    assert np.radians(stated.offset_correlation_deg) == pytest.approx(loaded.errors.catalogue_correlation_rad)
+    assert np.radians(stated.offset_correlation_deg) == pytest.approx(loaded.offset.correlation_rad)
 
 
 def test_limits_of_the_scenario_are_stated_and_negative_ones_are_not(world) -> None:

@@ -141,7 +141,7 @@ class XtceDecode:
 
 
 def choose_roots(definition: Definition, names: Sequence[str] = ()) -> tuple[Container, ...]:
-    """The containers that packets begin with: those named, or all without a base if they can be told apart.
+    """The containers that packets begin with: those named, or all without a base if they can be distinguished.
 
     Raises
     ------
@@ -1008,7 +1008,7 @@ def _text(octets: bytes, encoding: StringEncoding) -> str:
 
 
 def _terminated(octets: bytes, terminator: bytes) -> int:
-    """Where the terminator stands, at a whole character; -1 without one."""
+    """Return the position of the terminator, at a whole character; -1 without one."""
     place = octets.find(terminator)
     while place > 0 and place % len(terminator):
         place = octets.find(terminator, place + 1)
@@ -1282,7 +1282,7 @@ def _known(values: RecordArray) -> BoolArray:
 
 
 def _holds(condition: Condition, rows: _Rows) -> BoolArray:
-    """Where a condition holds (n,); a comparison with a parameter that a packet does not have does not."""
+    """Return where a condition holds (n,); a comparison with a parameter that a packet does not have does not."""
     if isinstance(condition, (AllOf, AnyOf)):
         parts = [_holds(one, rows) for one in condition.conditions]
         joined: BoolArray = np.all(parts, axis=0) if isinstance(condition, AllOf) else np.any(parts, axis=0)

@@ -37,7 +37,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class CodeIn:
-    """Whether the code of an enumerated parameter lies in one of the ranges [first, last]; `negated`: in none."""
+    """Condition that an enumerated code lies in one of the ranges [first, last]; `negated`: in none."""
 
     left: Reference
     ranges: tuple[tuple[int, int], ...]
@@ -239,7 +239,7 @@ class Container:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Definition:
-    """What a set of XTCE documents defines; `roots` are the containers without a base, by name.
+    """Definitions of a set of XTCE documents; `roots` are the containers without a base, by name.
 
     `alarms_not_read` counts the alarms of its types that change no limit here. `size_tags` says what the sizes before
     texts count (``octets``, ``bits``, or both); it is empty without any. `extrapolates`: splines that do not state it

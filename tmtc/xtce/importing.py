@@ -429,7 +429,7 @@ class _Importer:
         return start, getattr(start, kind)[name]
 
     def reference(self, node: Node, system: _System) -> tuple[Reference, ScalarType]:
-        """What a `parameterRef` names, and its type."""
+        """Return the parameter that a `parameterRef` names, and its type."""
         instance = node.attributes.get("instance", "0")
         _expect(node, instance == "0", "instance 0, the one of this packet", instance)
         text = node.attribute("parameterRef")
@@ -531,7 +531,6 @@ class _Importer:
         return made, self.values[id(found)]
 
     def aggregate(self, system: _System, node: Node) -> tuple[DataType, int]:
-        """An aggregate type."""
         node.only((*_DESCRIPTION, "MemberList"), _NAMED)
         listed = node.required("MemberList")
         listed.only(("Member",))

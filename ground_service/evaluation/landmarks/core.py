@@ -166,7 +166,6 @@ def same_place(one: Place, other: Place) -> bool:
 
 
 def is_listed(place: Place, catalogue: CraterCatalogue) -> bool:
-    """Return whether a place is a crater of a catalogue."""
     near = catalogue.near(place.latitude_rad, place.longitude_rad, REACH * place.diameter_m)
     columns = (catalogue.latitude_rad[near], catalogue.longitude_rad[near], catalogue.diameter_m[near])
     return any(

@@ -99,7 +99,6 @@ def add_landmark(
     now_utc_ns: int,
     **figures: Any,
 ) -> int:
-    """Add a landmark; return its id."""
     values = {"created_utc_ns": now_utc_ns, "changed_utc_ns": now_utc_ns, **figures}
     key = repository.add(
         connection, _LANDMARKS, spacecraft_id=spacecraft_id, state=state, evidence=_rows(evidence), **values

@@ -20,6 +20,9 @@ class PassPerformance(Entity):
     median_error_m: float | None
     altitude_km: float | None = Field(description="Median over the pass")
     sun_elevation_deg: float | None = Field(description="Median at the sub-satellite point")
+    map_offset_m: float | None = Field(
+        default=None, description="Offset of the crater list as learned on board, 1 sigma east and north"
+    )
     terrain: str = Field(description="Evidence level of the world; empty: not stated")
     build: str = Field(description="Hashes of model and parameters in housekeeping; empty: not known")
     frames: int | None

@@ -122,7 +122,6 @@ def add_monthly_report(connection: Connection, report: StoredMonthlyReport) -> b
 
 
 def get_monthly_report(connection: Connection, report_id: str) -> StoredMonthlyReport:
-    """Return a monthly report."""
     return StoredMonthlyReport.of(repository.get(connection, _MONTHLY, report_id, "monthly report"))
 
 
@@ -292,6 +291,7 @@ def _pass_performance(record: PassRecord, report: StoredReport, figures: PassFig
         median_error_m=None if errors is None else errors.median_3d_m,
         altitude_km=None if conditions is None else conditions.altitude_km,
         sun_elevation_deg=None if conditions is None else conditions.sun_elevation_deg,
+        map_offset_m=None if conditions is None else conditions.map_offset_m,
         terrain=figures.evidence_level,
         build="" if conditions is None else conditions.build,
         frames=figures.frames,

@@ -25,12 +25,13 @@ from ground_service.store.files import StoredFile, register_file
 from ground_service.store.vehicles import hold
 from lunar import ephemeris
 from lunar.comparison import check_pointing
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris as States
 from lunar.errors import EphemerisError, LunarError, UnmovedByGravity
 from lunar.frames import ICRF_NAMES
 from lunar.messages.aem import CAMERA_NAMES, parse_aem
 from lunar.messages.ephemeris_files import load_ephemeris, load_orbit
-from lunar.timescales import NS, TICKS_PER_SECOND
+from lunar.timescales import TICKS_PER_SECOND
 
 EPHEMERIDES = repository.EPHEMERIDES
 
@@ -68,7 +69,6 @@ def find_ephemeris(connection: Connection, *, sha256: str, precedence: int, name
 
 
 def get_ephemeris(connection: Connection, ephemeris_id: int) -> Ephemeris:
-    """Return an ephemeris."""
     return _ephemeris(repository.get(connection, EPHEMERIDES, ephemeris_id, "ephemeris"))
 
 

@@ -195,7 +195,6 @@ def note_change(
 
 
 def get(connection: Connection, alarm_id: int) -> AlarmRow:
-    """Return an alarm."""
     row = connection.execute(_select().where(_ALARMS.c.id == alarm_id)).mappings().first()
     if row is None:
         raise NotFound("alarm", alarm_id)

@@ -1,4 +1,4 @@
-"""What one build did with one archived pass, frame by frame: the numbers that gates are made of."""
+"""Results of one build on one archived pass, frame by frame: the inputs of the gates."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class CraterRows:
 
     @property
     def hit(self) -> BoolArray:
-        """Whether the build detected it (m,)."""
+        """Return whether the build detected it (m,)."""
         return np.isfinite(self.du_px)
 
 
@@ -323,7 +323,6 @@ def cell_places_deg(cell: IntArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _sums(owner: IntArray, values: FloatArray, frames: int) -> FloatArray:
-    """Sum of the values of each frame (frames,)."""
     return np.asarray(np.bincount(owner, weights=values, minlength=frames)[:frames], dtype=np.float64)
 
 

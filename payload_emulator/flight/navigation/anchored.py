@@ -83,7 +83,7 @@ _NO_CRATERS = np.empty(0, dtype=np.int64)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnchoredSetup:
-    """What the estimator works with from one start to the next.
+    """Parts of the estimator that stay from one start to the next.
 
     Attributes
     ----------
@@ -369,9 +369,10 @@ def _with_errors(
 ) -> AnchoredParameters:
     """Return the parameters with the noise of the attitude and the offset of the catalogue that are in use."""
     errors = replace(parameters.errors, attitude_noise_rad=attitude_rad)
-    if offset is not None:
+    if offset is not None and parameters.offset is not None:
         size_m = (offset.sigma_m, offset.sigma_m, errors.catalogue_offset_m[2])
-        errors = replace(errors, catalogue_offset_m=size_m)
+        memory_rad = parameters.offset.correlation_rad
+        errors = replace(errors, catalogue_offset_m=size_m, catalogue_correlation_rad=memory_rad)
     return replace(parameters, errors=errors)
 
 

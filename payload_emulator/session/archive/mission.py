@@ -18,7 +18,7 @@ import numpy as np
 from lunar.arrays import IntArray
 from lunar.boxes import Region, share_outside
 from lunar.constants import MOON_RADIUS_M
-from lunar.constants import NANOSECONDS_PER_SECOND as NS
+from lunar.constants import NS as NS
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation, spherical_from_mcmf
 from lunar.timescales import format_utc
@@ -88,7 +88,7 @@ ORBIT_AGE_H = 24.0
 
 _TRACK_STEP_S = 60.0
 _ALTITUDE_MARGIN = 1.3
-"""Altitudes of the mission beside those of the flight so far."""
+"""Altitudes of the mission in addition to those of the flight so far."""
 
 CLOCK_EPOCH = "2000-01-01T00:00:00 TAI"
 
@@ -161,7 +161,7 @@ def mission_text(world: World, data: DataFolder, orbit_age_h: float | None = Non
             "source": world.terrain.catalogue.source,
             **_registration(world),
             "offset_sigma_m": [rule.prior_m, rule.prior_m, errors.catalogue_offset_m[2]],
-            "offset_correlation_deg": round(math.degrees(errors.catalogue_correlation_rad), 6),
+            "offset_correlation_deg": round(math.degrees(rule.correlation_rad), 6),
         },
         "detector": _detector(scenario),
         "reference": {

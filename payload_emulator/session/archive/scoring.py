@@ -15,6 +15,7 @@ import numpy as np
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import project_mcmf
 from lunar.catalogue import CraterCatalogue
+from lunar.constants import NS
 from lunar.frames import icrf_from_onboard, rtn_from_inertial, spherical_from_mcmf
 from lunar.timescales import format_utc, tdb_s_from_utc_ns
 from payload_emulator.flight.navigation.filter.dynamics import OrbitModel, coasted, flown, process_noise
@@ -35,9 +36,8 @@ from tmtc.dictionary.tables import (
 )
 from tmtc.packets.stream import cut_packets
 
-_NS = 1_000_000_000
 # Frames further apart than this belong to different arcs: the shortest gap, over a pole, takes 18 minutes.
-_ARC_GAP_NS = 600 * _NS
+_ARC_GAP_NS = 600 * NS
 # A session of several arcs is judged from the third on, a single one after this many frames.
 _SETTLED_ARC, _SETTLED_FRAMES = 2, 20
 # A pair is right if the crater truly lies within this of the detection: six pixels, or a quarter of its diameter.
@@ -432,7 +432,7 @@ def _recovery(world: World, errors: FlownErrors, imaging: BoolArray) -> dict[str
     else:
         return None
     utc_ns = world.frame_utc_ns
-    since = (utc_ns[errors.frame] >= utc_ns[0] + round(after_s * _NS)) & imaging[errors.frame]
+    since = (utc_ns[errors.frame] >= utc_ns[0] + round(after_s * NS)) & imaging[errors.frame]
     frames = frames_to_recover(errors.position_m[since])
     return {"after": event, "frames_with_image": int(np.sum(since)), "frames_until_below_500_m": frames}
 

@@ -68,7 +68,7 @@ class Console:
 
     @property
     def is_watched(self) -> bool:
-        """Whether a connection watches the steps."""
+        """Return whether a connection watches the steps."""
         return bool(self._watching)
 
     def send(self, message: dict[str, Any]) -> None:

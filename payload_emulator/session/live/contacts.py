@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from kernels.memory import give_back
+from lunar.constants import NS
 from payload_emulator.flight.ports import UNLIMITED
 from payload_emulator.session.live.station_ports import (
     KEPT_LIMIT_OCTETS,
@@ -43,9 +44,8 @@ CONTACTS_EXACT = {
 }  # fmt: skip
 """Attributes of `Contacts` in an exact state, by their names there."""
 
-_NS = 1_000_000_000
 _FIRST_DOWNLINK_S = 2.0
-_MARGIN_NS = 300 * _NS
+_MARGIN_NS = 300 * NS
 
 
 @dataclass(slots=True)
@@ -117,7 +117,7 @@ class Contacts:
 
     @property
     def is_limited(self) -> bool:
-        """Whether contacts follow from geometry and have rates."""
+        """Return whether contacts follow from geometry and have rates."""
         return self.names != (ALWAYS_IN_CONTACT,)
 
     @property
@@ -129,7 +129,7 @@ class Contacts:
 
     @property
     def is_behind(self) -> bool:
-        """Whether the ground has fallen so far behind that time must not go on."""
+        """Return whether the ground has fallen so far behind that time must not go on."""
         return any(one.waiting > KEPT_LIMIT_OCTETS // 16 for one in self.stations.values())
 
     def plan(self, truth: Truth) -> None:
@@ -138,7 +138,7 @@ class Contacts:
             return
         stop_ns = truth.stop_utc_ns - _MARGIN_NS
         # A contact that was cut off by the end of the plan is found again as a whole.
-        while self._planned and self._planned[-1].stop_utc_ns >= self.planned_until_ns - _NS:
+        while self._planned and self._planned[-1].stop_utc_ns >= self.planned_until_ns - NS:
             self.planned_until_ns = self._planned.pop().start_utc_ns
         start_ns = max(self.planned_until_ns, truth.start_utc_ns + _MARGIN_NS)
         if self.contact is not None:
@@ -154,7 +154,7 @@ class Contacts:
             return _FIRST_DOWNLINK_S
         if self.contact is None:
             return 0.0
-        seconds = (utc_ns - self._last_step_ns) / _NS
+        seconds = (utc_ns - self._last_step_ns) / NS
         self._last_step_ns = utc_ns
         return seconds
 
@@ -220,7 +220,7 @@ class Contacts:
         else:
             octets = transmitter.idle(result.clcw)
         stated = dict(map(parse_clock_error, link.clock_errors))
-        received_ns = utc_ns + round(light_s * _NS) + stated.get(self.contact.station, 0)
+        received_ns = utc_ns + round(light_s * NS) + stated.get(self.contact.station, 0)
         self.stations[self.contact.station].send(received_ns, octets, transmitter.settings.cadu_length)
         if utc_ns >= self.contact.stop_utc_ns:
             self.end()

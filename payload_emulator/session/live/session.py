@@ -23,6 +23,7 @@ from dataclasses import InitVar, asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from lunar.constants import NS
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import format_utc, tdb_s_from_utc_ns
 from lunar.visibility import sunlit_fraction
@@ -44,7 +45,6 @@ STEP_S = 60.0
 """Longest step."""
 
 _AHEAD_S = 4.0 * 3600.0
-_NS = 1_000_000_000
 _POLL_S = 0.05
 # Two steps at one reading of the on-board clock would look like a clock that stands still.
 _LEAST_STEP_NS = 20_000_000
@@ -291,7 +291,7 @@ class LiveSession:
 
     def _next_step_ns(self) -> int:
         """Return the time of the next step: of the payload, of the link, or the longest step there is."""
-        step_ns, epoch_ns = round(STEP_S * _NS), self.world.scenario.epoch_utc_ns
+        step_ns, epoch_ns = round(STEP_S * NS), self.world.scenario.epoch_utc_ns
         due = [epoch_ns + ((self.utc_ns - epoch_ns) // step_ns + 1) * step_ns]
         payload = self.spacecraft.payload
         ticks = payload.next_turn_ticks
@@ -305,7 +305,7 @@ class LiveSession:
 
     @property
     def _interval_ns(self) -> int:
-        return round(self.world.scenario.camera.frame_interval_s * _NS)
+        return round(self.world.scenario.camera.frame_interval_s * NS)
 
     def _ticks(self, utc_ns: int) -> int:
         return clock_ticks(self.world, utc_ns) + self.spacecraft.clock_error_ticks
@@ -314,7 +314,7 @@ class LiveSession:
         """Serve the ports until it is time for the next step; False where the session is to stop."""
         console = self.console
         self.contacts.repeat_journal(self.utc_ns)
-        due = time.monotonic() + (due_ns - self.utc_ns) / _NS / console.rate if console.rate > 0.0 else 0.0
+        due = time.monotonic() + (due_ns - self.utc_ns) / NS / console.rate if console.rate > 0.0 else 0.0
         self._serve(selector, 0.0)
         while not self.stopping.is_set():
             left = due - time.monotonic()
@@ -362,12 +362,12 @@ class LiveSession:
         world = self.world
         if world.scenario.orbit.oem:
             return
-        while world.truth.stop_utc_ns < self.utc_ns + round(_AHEAD_S * _NS) + _NS * 600:
+        while world.truth.stop_utc_ns < self.utc_ns + round(_AHEAD_S * NS) + NS * 600:
             truth, burns = extended_flight(world, CHUNK_S)
             world = replace(world, truth=pruned(truth, _ARCS_KEPT), burns=(*world.burns, *burns))
         if world is not self.world:
             self._enter(world)
-        if self.contacts.planned_until_ns < self.utc_ns + round(_AHEAD_S * _NS / 2):
+        if self.contacts.planned_until_ns < self.utc_ns + round(_AHEAD_S * NS / 2):
             self.contacts.plan(world.truth)
 
     def _enter(self, world: World) -> None:
@@ -384,7 +384,7 @@ class LiveSession:
         if watched:
             self.console.show(step_message(self.spacecraft, result, camera.shown))
         rendered = self.world.scenario.camera.images != "reduced"
-        camera.beside = rims_in_view if watched and rendered else None
+        camera.overlay = rims_in_view if watched and rendered else None
 
     def _count(self, result: StepResult) -> None:
         account = self.account
@@ -469,6 +469,6 @@ def pruned(truth: Truth, days: int) -> Truth:
     if not isinstance(arcs, Spliced) or len(arcs.arcs) <= days:
         return truth
     joints = arcs.joints_tdb_s[-days + 1 :]
-    start_ns = truth.stop_utc_ns - round(days * CHUNK_S * _NS)
+    start_ns = truth.stop_utc_ns - round(days * CHUNK_S * NS)
     breaks = tuple(one for one in truth.breaks_utc_ns if one >= start_ns)
     return Truth(Spliced(joints, arcs.arcs[-days:]), start_ns, truth.stop_utc_ns, truth.orientation, breaks)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray, OctetArray
+from lunar.constants import NS
 from payload_emulator.flight.onboard.loads import MODEL_NUMBER, TABLE_NUMBERS
 from payload_emulator.flight.onboard.machine import PARAMETERS_NUMBER
 from payload_emulator.flight.payload import Payload
@@ -32,7 +33,6 @@ from tmtc.packets.cuc import TICKS_PER_SECOND
 PLAYBACK_CHANNEL = 1
 """Virtual channel of packets that are sent long after they were made."""
 
-_NS = 1_000_000_000
 _NO_ATTITUDE = np.full(7, np.nan)
 _NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
 _PLATFORM = PlatformModel()
@@ -224,7 +224,7 @@ class Spacecraft:
         """Return the packets for downlink after a step; `image` is None without one. Faults change the inputs."""
         board = self.board
         if self._last_utc_ns is not None:
-            board.advance((utc_ns - self._last_utc_ns) / _NS, sunlit)
+            board.advance((utc_ns - self._last_utc_ns) / NS, sunlit)
         self._last_utc_ns = utc_ns
         self.payload_input = None
         board.downlink = downlink_octets
@@ -242,7 +242,7 @@ class Spacecraft:
             with counted_reads(self.truth_reads):
                 packets = self.payload.step(picture, message, ticks, telecommands)
         except ProcessorHang:
-            self._down_until_ns = utc_ns + round(board.model.watchdog_s * _NS)
+            self._down_until_ns = utc_ns + round(board.model.watchdog_s * NS)
             packets = []
         self.payload_input = PayloadInput(
             _NO_IMAGE if picture is None else picture,
@@ -286,7 +286,7 @@ class Spacecraft:
         self, utc_ns: int, image: NDArray[Any] | None, attitude: FloatArray
     ) -> tuple[NDArray[Any] | None, FloatArray]:
         """Apply the present faults; return the remaining image and message of the ADCS."""
-        second = (utc_ns - self.first_utc_ns) / _NS
+        second = (utc_ns - self.first_utc_ns) / NS
         present = {fault.kind: fault for fault in self.faults if fault.present(second)}
         for fault in self.faults:
             if fault.at_s <= second and fault not in self._begun:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from lunar.constants import NS
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns
 from lunar.visibility import sunlit_fraction
@@ -19,21 +20,20 @@ from payload_emulator.sim.board.link import contacts
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.packets.cuc import TICKS_PER_SECOND
 
-_NS = 1_000_000_000
 # Source of the planned telecommands; a person who commands by hand has another one, with separate counts.
 _PLANNING_SOURCE = 1
 _TIME_RATE_EXPONENT = 1  # a clock known to be off is watched: a time report every second frame of telemetry
-_BEFORE_ARC_NS = 60 * _NS
-_IDLE_STEP_NS = 60 * _NS
+_BEFORE_ARC_NS = 60 * NS
+_IDLE_STEP_NS = 60 * NS
 _STANDBY_BEFORE_TICKS = 20 * TICKS_PER_SECOND
-_IDLE_LIMIT_NS = 600 * _NS
-_AHEAD_NS = 12 * 3_600 * _NS
+_IDLE_LIMIT_NS = 600 * NS
+_AHEAD_NS = 12 * 3_600 * NS
 
 
 def timeline(world: World) -> list[StepInput]:
     """Return the steps of a scenario: frames, a minute before and the end of each arc, each minute with stations."""
     frames, section = world.frame_utc_ns, world.scenario.link
-    interval_ns = round(world.scenario.camera.frame_interval_s * _NS)
+    interval_ns = round(world.scenario.camera.frame_interval_s * NS)
     between = []
     for first, last in arcs(world):
         between += [int(frames[first]) - _BEFORE_ARC_NS, int(frames[last]) + interval_ns]
@@ -47,7 +47,7 @@ def timeline(world: World) -> list[StepInput]:
     position, _ = world.truth.states(utc_ns)
     sunlit = sunlit_fraction(position, sun_position_icrf_m(np.asarray(tdb_s_from_utc_ns(utc_ns))))
     in_contact, light_s = contacts(sample_truth(world.truth, utc_ns), utc_ns, section)
-    seconds = np.diff(utc_ns, prepend=utc_ns[:1]) / _NS
+    seconds = np.diff(utc_ns, prepend=utc_ns[:1]) / NS
     allowed = np.floor(section.rate_bps / 8.0 * seconds).astype(np.int64)
     return [
         StepInput(
@@ -66,7 +66,7 @@ def timeline(world: World) -> list[StepInput]:
 
 def arcs(world: World) -> list[tuple[int, int]]:
     """First and last frame of every stretch of frames without a gap."""
-    interval_ns = round(world.scenario.camera.frame_interval_s * _NS)
+    interval_ns = round(world.scenario.camera.frame_interval_s * NS)
     breaks = np.flatnonzero(np.diff(world.frame_utc_ns) > 1.5 * interval_ns)
     first = np.concatenate([[0], breaks + 1])
     last = np.concatenate([breaks, [world.frame_utc_ns.size - 1]])
@@ -125,7 +125,7 @@ class Operator:
         """Return the mode in the newest telemetry that a telecommand arriving now can answer."""
         self._modes.append((self._last_utc_ns, mode))
         self._last_utc_ns = step.utc_ns
-        seen_until = step.utc_ns - round(2.0 * step.light_s * _NS)
+        seen_until = step.utc_ns - round(2.0 * step.light_s * NS)
         while len(self._modes) > 1 and self._modes[1][0] <= seen_until:
             self._modes.popleft()
         return self._modes[0][1]
@@ -139,9 +139,9 @@ class Operator:
             if start_utc_ns > step.utc_ns + _AHEAD_NS:
                 return
             self._uploaded += 1
-            duration_s = (int(world.frame_utc_ns[last]) - start_utc_ns) / _NS + 0.5 * interval_s
+            duration_s = (int(world.frame_utc_ns[last]) - start_utc_ns) / NS + 0.5 * interval_s
             if start_utc_ns <= step.utc_ns:
-                late_s = (step.utc_ns - start_utc_ns) / _NS
+                late_s = (step.utc_ns - start_utc_ns) / NS
                 if late_s < duration_s:
                     yield self.function("start_observation", duration_s - late_s)
                 continue
@@ -161,7 +161,7 @@ class Operator:
             return
         self._idle_since_ns = None
         last = next(stop for start, stop in arcs(self.world) if start <= step.frame <= stop)
-        left_s = (int(self.world.frame_utc_ns[last]) - step.utc_ns) / _NS
+        left_s = (int(self.world.frame_utc_ns[last]) - step.utc_ns) / NS
         yield self.function("start_observation", left_s + 0.5 * self.world.scenario.camera.frame_interval_s)
 
     def _at(self, ticks: int, packet: bytes) -> bytes:
@@ -194,7 +194,7 @@ class Operator:
         section, frames = self.world.scenario.disturbances, self.world.frame_utc_ns
         if not (section.kidnap_told and section.kidnap_distance_km > 0.0):
             return b""
-        moved_utc_ns = int(frames[0]) + round(section.kidnap_at_s * _NS)
+        moved_utc_ns = int(frames[0]) + round(section.kidnap_at_s * NS)
         if int(frames[number]) < moved_utc_ns or (number and int(frames[number - 1]) >= moved_utc_ns):
             return b""
         distance_m = 1e3 * section.kidnap_distance_km

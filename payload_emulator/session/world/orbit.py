@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lunar.arrays import FloatArray, IntArray
+from lunar.constants import NS
 from lunar.datafolder import DataFolder, default_gravity, default_orientation
 from lunar.elements import Elements, icrf_state_from_elements, state_from_elements
 from lunar.ephemeris import Ephemeris, EphemerisSegment
@@ -20,7 +21,6 @@ from lunar.timescales import tai_ns_from_utc_ns, tdb_minus_tt_s, tdb_s_from_utc_
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import Scenario
 
-_NS = 1_000_000_000
 _BEFORE_IMPACT_S = 1.0
 
 
@@ -123,7 +123,7 @@ def propagate_to_impact(
     try:
         return propagate_scenario(scenario, model, duration_s), None
     except ImpactError as impact:
-        lived_s = (impact.utc_ns - scenario.epoch_utc_ns) / _NS - _BEFORE_IMPACT_S
+        lived_s = (impact.utc_ns - scenario.epoch_utc_ns) / NS - _BEFORE_IMPACT_S
         if lived_s <= 0.0:
             raise
         return propagate_scenario(scenario, model, lived_s), impact
@@ -162,7 +162,7 @@ def sample(
     """Return the ephemeris on a regular grid, a segment with states at its ends between burns; its states (n, 6)."""
     last_s = float(orbit.trajectory.elapsed_s[-1])
     steps = int(np.floor(last_s / step_s + 1e-9))
-    grid = orbit.epoch_utc_ns + np.rint(np.arange(steps + 1) * (step_s * _NS)).astype(np.int64)
+    grid = orbit.epoch_utc_ns + np.rint(np.arange(steps + 1) * (step_s * NS)).astype(np.int64)
     elapsed = np.minimum(_elapsed_s(grid, orbit.epoch_utc_ns), last_s)
     edges = [int(grid[0]), *(burn.utc_ns for burn in orbit.maneuvers), int(grid[-1])]
     segments = []
@@ -186,6 +186,6 @@ def sample(
 
 def _elapsed_s(utc_ns: IntArray, epoch_utc_ns: int) -> FloatArray:
     """Return TDB seconds since an epoch; differences of integers first, so that nothing is lost to the size of TDB."""
-    tai_s = (tai_ns_from_utc_ns(utc_ns) - tai_ns_from_utc_ns(epoch_utc_ns)) / _NS
+    tai_s = (tai_ns_from_utc_ns(utc_ns) - tai_ns_from_utc_ns(epoch_utc_ns)) / NS
     start_s = tdb_s_from_utc_ns(epoch_utc_ns)
     return np.asarray(tai_s + tdb_minus_tt_s(start_s + tai_s) - tdb_minus_tt_s(start_s), dtype=np.float64)

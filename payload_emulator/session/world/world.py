@@ -14,7 +14,7 @@ from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
 from lunar.comparison import check_pointing
-from lunar.constants import MOON_RADIUS_M
+from lunar.constants import MOON_RADIUS_M, NS
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import ImpactError
@@ -56,10 +56,9 @@ from tmtc.packets.cuc import TICKS_PER_SECOND
 CHUNK_S = 86_400.0
 """Time that the orbit is propagated at once; another division gives other last digits."""
 
-_NS = 1_000_000_000
 _TICKS_NS = 200_000
-_EPHEMERIS_STEP_NS = 10 * _NS
-_EPHEMERIS_MARGIN_NS = 120 * _NS
+_EPHEMERIS_STEP_NS = 10 * NS
+_EPHEMERIS_MARGIN_NS = 120 * NS
 _BEFORE_JUMP_NS = 10_000
 _EDGE_NS = 1_000
 _SEARCH_CHUNK_DAYS = 15.0
@@ -140,7 +139,7 @@ def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames |
     if external is not None:
         return _external_world(external_scenario(scenario, external), external, terrain, model)
     truth, burns, windows, ends = _fly_to_windows(scenario, model, terrain)
-    interval_ns = round(scenario.camera.frame_interval_s * _NS)
+    interval_ns = round(scenario.camera.frame_interval_s * NS)
     band_rad = _band_rad(scenario)
     frames = [frame_times(truth, start, stop, interval_ns, band_rad) for start, stop in windows]
     frame_utc_ns = np.concatenate(frames) if frames else np.zeros(0, dtype=np.int64)
@@ -285,7 +284,7 @@ def extended_flight(world: World, duration_s: float) -> tuple[Truth, tuple[TrueB
     longer = Truth(
         spliced(truth.state_icrf, float(tdb_s_from_utc_ns(joint_utc_ns)), orbit.trajectory.state),
         truth.start_utc_ns,
-        joint_utc_ns + round(duration_s * _NS),
+        joint_utc_ns + round(duration_s * NS),
         truth.orientation,
         (*truth.breaks_utc_ns, *(burn.utc_ns for burn in burns)),
     )
@@ -298,7 +297,7 @@ def _disturbed(
     """Return the flight with the disturbances of the scenario, and all its burns."""
     section = scenario.disturbances
     if section.burn_delta_v_m_s != 0.0:
-        utc_ns = first_utc_ns + round(section.burn_at_s * _NS)
+        utc_ns = first_utc_ns + round(section.burn_at_s * NS)
         velocity = truth.states(utc_ns)[1][0]
         done = section.burn_delta_v_m_s * velocity / np.linalg.norm(velocity)
         burn = executed(utc_ns, done, scenario.maneuvers.execution_error_fraction, (scenario.seed, 2**36))
@@ -308,7 +307,7 @@ def _disturbed(
         heading = np.random.default_rng((scenario.seed, 2**37)).uniform(0.0, 2.0 * np.pi)
         truth = changed(
             truth,
-            first_utc_ns + round(section.kidnap_at_s * _NS),
+            first_utc_ns + round(section.kidnap_at_s * NS),
             lambda state: turned_state(state, 1e3 * section.kidnap_distance_km, heading),
             model,
         )
@@ -318,7 +317,7 @@ def _disturbed(
 def clock_ticks(world: World, utc_ns: int) -> int:
     """Return the on-board clock's reading: ideal ticks, an offset, and a drift since the reference of the clock."""
     clock = world.scenario.clock
-    elapsed_s = (utc_ns - world.clock_utc_ns) / _NS
+    elapsed_s = (utc_ns - world.clock_utc_ns) / NS
     error_s = clock.offset_s + clock.drift_ppm * 1e-6 * elapsed_s
     return int(ticks_from_utc_ns(utc_ns)) + round(error_s * TICKS_PER_SECOND)
 
@@ -327,7 +326,7 @@ def first_utc_ns(world: World, ticks: int) -> int:
     """Return the first time at which the clock of a scenario reads `ticks`."""
     utc_ns = world.clock_utc_ns
     for _ in range(4):
-        utc_ns += round((ticks - clock_ticks(world, utc_ns)) * _NS / TICKS_PER_SECOND)
+        utc_ns += round((ticks - clock_ticks(world, utc_ns)) * NS / TICKS_PER_SECOND)
     # The reading rises by one tick in 15 us; from a time within some ticks of it, the first is found by bisection.
     low, high = utc_ns - _TICKS_NS, utc_ns + _TICKS_NS
     while high - low > 1:
@@ -357,13 +356,13 @@ def _fly_to_windows(
     reach_days = min(_SEARCH_CHUNK_DAYS, window.search_days)
     if window.search == "none":
         reach_days = (
-            (not_before - scenario.epoch_utc_ns) / _NS / 86_400.0 + window.duration_s / 86_400.0 + 0.01
+            (not_before - scenario.epoch_utc_ns) / NS / 86_400.0 + window.duration_s / 86_400.0 + 0.01
         )
     while True:
         truth, burns, impact = _propagate(scenario, model, reach_days)
         ends = "" if impact is None else str(impact)
         if window.search == "none":
-            if impact is not None and truth.stop_utc_ns < not_before + round(window.duration_s * _NS):
+            if impact is not None and truth.stop_utc_ns < not_before + round(window.duration_s * NS):
                 raise impact
             return truth, burns, _windows(scenario, truth, terrain, not_before), ends
         crossings = _crossings(scenario, truth, terrain, not_before)
@@ -408,7 +407,7 @@ def _windows(
 ) -> list[tuple[int, int]]:
     window = scenario.window
     if window.search == "none":
-        stop_utc_ns = not_before_utc_ns + round(window.duration_s * _NS)
+        stop_utc_ns = not_before_utc_ns + round(window.duration_s * NS)
         return [(not_before_utc_ns, min(stop_utc_ns, truth.stop_utc_ns))]
     crossings = _crossings(scenario, truth, terrain, not_before_utc_ns)
     return [(one.start_utc_ns, one.stop_utc_ns) for one in crossings if one.observable][: window.passes]
@@ -437,9 +436,9 @@ def _propagate(
 ) -> tuple[Truth, tuple[TrueBurn, ...], ImpactError | None]:
     """Return the flight over some days, or up to the impact that ends it before."""
     orbit, impact = propagate_to_impact(scenario, model, days * 86_400.0)
-    stop_utc_ns = scenario.epoch_utc_ns + round(days * 86_400.0 * _NS)
+    stop_utc_ns = scenario.epoch_utc_ns + round(days * 86_400.0 * NS)
     if impact is not None:
-        stop_utc_ns = scenario.epoch_utc_ns + math.floor(orbit.trajectory.elapsed_s[-1] * _NS)
+        stop_utc_ns = scenario.epoch_utc_ns + math.floor(orbit.trajectory.elapsed_s[-1] * NS)
     burns = _executed(scenario, orbit.maneuvers)
     truth = Truth(
         orbit.trajectory.state,
@@ -482,7 +481,7 @@ def sample_truth(truth: Truth, frame_utc_ns: IntArray, object_name: str = "SELEN
         asked = times.copy()
         asked[-1] -= _BEFORE_JUMP_NS if last != stop else 0
         position, velocity = truth.states(asked)
-        position += velocity * ((times - asked) / _NS)[:, None]
+        position += velocity * ((times - asked) / NS)[:, None]
         segments.append(
             EphemerisSegment(
                 times,
@@ -519,7 +518,7 @@ def with_reference_error(ephemeris: Ephemeris, section: ReferenceSection, seed: 
     rate = float(np.linalg.norm(np.cross(first.position_m[0], first.velocity_m_s[0]))) / radius**2
 
     def displaced(segment: EphemerisSegment) -> EphemerisSegment:
-        u = rate * (segment.utc_ns - ephemeris.start_utc_ns) / _NS
+        u = rate * (segment.utc_ns - ephemeris.start_utc_ns) / NS
         cosine, sine = np.cos(u), np.sin(u)
         x, y = a * cosine + b * sine, c - 2.0 * a * sine + 2.0 * b * cosine
         z = d * cosine + e * sine

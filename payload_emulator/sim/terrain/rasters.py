@@ -75,7 +75,7 @@ _ZERO_M = 300.0
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """How the values of a file are read: ``raw * scale_m + offset_m``.
+    """Conversion of the values of a file: ``raw * scale_m + offset_m``.
 
     `unit` is what the file states, in lower case; `is_radius`: whether its zero is the Moon's centre, as it states.
     """
@@ -196,7 +196,7 @@ class RasterLayer:
 
     @property
     def readings(self) -> list[str]:
-        """What each file that was read states of its values, and how they are taken."""
+        """Return the stated and the used interpretation of the values of each file."""
         return [f"{self.files[k].path.name}: {one.words}" for k, one in sorted(self._readings.items())]
 
     def read(self, first_row: int, first_column: int, rows: int, columns: int) -> Heights:
@@ -223,7 +223,7 @@ class RasterLayer:
         return out
 
     def holds(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> BoolArray:
-        """Whether a file spans each place."""
+        """Return whether a file spans each place."""
         row = (90.0 - np.degrees(latitude_rad)) * self.pixels_per_degree
         column = np.degrees(longitude_rad) * self.pixels_per_degree
         held = np.zeros(row.shape, dtype=bool)

@@ -1,4 +1,4 @@
-"""Registration of a crater catalogue to a terrain: by how much the rims on the terrain lie beside the listed craters.
+"""Registration of a crater catalogue to a terrain: the shift from the listed craters to the rims on the terrain.
 
 Catalogues and height models are tied to the Moon by different images and orbits. Their difference is tens of metres and
 changes slowly from place to place, so no constant shift is correct. It is fitted from rims measured on the terrain:
@@ -53,7 +53,7 @@ _LARGEST_SHIFT = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rims:
-    """Rims on a terrain beside the craters of a list, arrays of length n.
+    """Rims on a terrain compared with the craters of a list, arrays of length n.
 
     Attributes
     ----------

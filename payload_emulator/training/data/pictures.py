@@ -1,9 +1,9 @@
 """Labelled image sets in COCO form, from any source.
 
-A set is a folder with one or more COCO files (`*.json`, at any depth). Image files lie beside their COCO file or in its
-folder `images`. Craters are the annotations whose category says crater in its name or supercategory, or all where the
-file has no categories. A crater is a box or one or more polygons; of a polygon, centre and diameter are those of its
-area. Equal labels count once.
+A set is a folder with one or more COCO files (`*.json`, at any depth). Image files lie in the folder of their COCO file
+or in its folder `images`. Craters are the annotations whose category says crater in its name or supercategory, or all
+if the file has no categories. A crater is a box or one or more polygons; of a polygon, centre and diameter are those
+of its area. Equal labels count once.
 Further keys are read where present: `centre` and `diameter` of an annotation (as `linna dataset build` writes them),
 `sun_azimuth_deg`, `pixel_m` and `altitude_km` of an image. Pixel centres are integers, so the centre of a box that
 starts at x and is w wide is x + w / 2 - 0.5.

@@ -48,14 +48,14 @@ SUN_RIGHT_DEG = 67.5
 
 
 class Criterion(enum.StrEnum):
-    """When a detection takes a label."""
+    """Criterion for matching a detection to a label."""
 
     strict = "strict"
     centre = "centre"
 
 
 class SunKnowledge(enum.StrEnum):
-    """What a search is told of the Sun."""
+    """Prior knowledge of the Sun for a search."""
 
     given = "given"
     found = "found"
@@ -249,7 +249,7 @@ def _overlap(picture: LabelledPicture, u_px: float, v_px: float, diameter_px: fl
 
 
 def _in_crowd(picture: LabelledPicture, found: Detections) -> BoolArray:
-    """Whether each detection's centre lies in a region that stands for many craters."""
+    """Return whether each detection's centre lies in a region that stands for many craters."""
     inside = np.zeros(len(found), bool)
     for x, y, width, height in picture.box_px[picture.crowd]:
         inside |= (np.abs(found.u_px + 0.5 - x - 0.5 * width) <= 0.5 * width) & (
@@ -339,7 +339,7 @@ def _scales_m(pictures: Sequence[LabelledPicture], options: PictureSetOptions) -
 def _sun_figures(
     pictures: Sequence[LabelledPicture], searches: Sequence[PictureSearch], azimuths: FloatArray
 ) -> dict[str, Any]:
-    """What was found of the Sun in each image, and how far from what was given."""
+    """Return the found Sun azimuth of each image and its error."""
     rows: list[dict[str, Any]] = []
     errors = []
     for picture, search, azimuth in zip(pictures, searches, azimuths, strict=True):

@@ -5,6 +5,7 @@ list of passes by the verdict of their newest report, on each database.
 """
 
 import random
+import time
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +29,15 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.passes.live import list_spacecraft, live_parameters
 from ground_service.passes.model import EventFilter, PassFilter
 from ground_service.passes.service import completeness, define_pass
-from ground_service.passes.store import list_passes
+from ground_service.passes.span import pass_span
+from ground_service.passes.store import get_pass, list_passes
 from ground_service.store.files import register_file
 from lunar.catalogue import load_catalogue
 from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns, utc_ns_from_ticks
+from tests.ground_service.conftest import event_packet
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
@@ -343,3 +346,21 @@ def test_passes_are_listed_by_the_verdict_of_their_newest_report(either: Ground)
     assert listed(either, verdict="none") == ([3], 1)
     assert listed(either, verdict="met", search="pass 1") == ([], 0)
     assert listed(either) == ([1, 2, 3], 3)
+
+
+def test_the_interval_of_a_pass_takes_time_in_proportion_to_its_starts(
+    ground: Ground, tmp_path: Path
+) -> None:
+    file = tmp_path / "starts.packets"
+    file.write_bytes(
+        b"".join(event_packet(TICKS + 65_536 * k, k, "observation_started") for k in range(4_000))
+    )
+    ingest_file(ground, file, spacecraft_id=76)
+    span = {
+        "start_utc_ns": utc_ns_from_ticks(TICKS),
+        "stop_utc_ns": utc_ns_from_ticks(TICKS + 65_536 * 4_000),
+    }
+    key = define_pass(ground, name="p", spacecraft_id=76, **span)
+    record, begun = ground.read(get_pass, key), time.process_time()
+    ground.read(pass_span, record)
+    assert time.process_time() - begun < 1.0  # 8 million comparisons take several seconds

@@ -30,7 +30,7 @@ from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.spacecraft.loading import load_scenario_payload
 from payload_emulator.session.world.world import build_world
 from tests.ground_service.conftest import circular_states
-from tests.ground_service.web.conftest import PATIENCE_S, Pictures, press, strict_page
+from tests.ground_service.web.conftest import TIMEOUT_S, Pictures, press, strict_page
 from tests.lazy import expect
 from tests.scenarios import SELENITA
 from tests.serving import wait_for
@@ -154,7 +154,7 @@ def flown(
             yield found
     finally:
         payload.stopping.set()
-        thread.join(PATIENCE_S)
+        thread.join(TIMEOUT_S)
     assert not thread.is_alive()
 
 

@@ -1,5 +1,6 @@
 """The table of estimators: another filter is a module and a row."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,10 @@ from payload_emulator.flight.navigation.estimator import ESTIMATORS, AnchoredEst
 from payload_emulator.flight.navigation.filter.map_offset import OffsetRule, OffsetSize
 from payload_emulator.flight.navigation.outcomes import Mode
 from payload_emulator.flight.onboard.loads import FlightParameters
+from payload_emulator.flight.vision.detector import DetectorParameters
 from payload_emulator.session.archive.emulator import emulate
 from payload_emulator.session.scenario import parse_scenario
+from payload_emulator.session.spacecraft.loading import BuildParameters, format_parameters, parse_parameters
 from tests.payload_emulator.flight import unscented
 from tests.scenarios import short_scenario
 from tmtc.dictionary.tables import CatalogueTable, GravityTable, InitialState, OrientationTable
@@ -61,12 +64,25 @@ def test_what_was_learned_of_a_catalogue_is_kept_until_another_one_is_loaded() -
     def size_m(before: Any, **changed: Any) -> float:
         setup, state = estimator.start(tables | changed, parameters, before)
         assert setup.initial.covariance[14, 14] == state.offset.sigma_m**2
+        assert setup.parameters.errors.catalogue_correlation_rad == OffsetRule().correlation_rad
         return float(state.offset.sigma_m)
 
     setup, state = estimator.start(tables, parameters, None)
-    assert state.offset == OffsetSize(60.0, 0.5)
+    assert state.offset == OffsetSize(60.0, 1.0)
     learned = setup, replace(state, offset=OffsetSize(22.0, 3.0, 80))
     assert size_m(learned, catalogue=replace(catalogue)) == 22.0
     assert size_m(learned, catalogue=replace(catalogue, latitude_rad=catalogue.latitude_rad + 1e-9)) == 60.0
     fixed = FlightParameters(anchored=AnchoredParameters())
     assert estimator.start(tables, fixed, learned)[1].offset is None
+
+
+def test_a_parameter_file_of_before_learns_nothing_and_keeps_its_hash() -> None:
+    learning = FlightParameters(anchored=AnchoredParameters(offset=OffsetRule()))
+    text = format_parameters(BuildParameters(DetectorParameters(), learning))
+    read = parse_parameters(text).flight
+    assert read.anchored.offset == OffsetRule() and read.sha256 == learning.sha256
+    older = re.sub(r"\[flight\.anchored\.offset\]\n(?:[^\[\n]+\n)*", "", text)
+    before = parse_parameters(older).flight
+    assert len(older) < len(text) and before.anchored.offset is None
+    assert before.sha256 == FlightParameters().sha256 != learning.sha256
+    assert "OffsetRule" not in repr(before)

@@ -580,9 +580,9 @@ def test_the_size_of_the_offset_is_learned_in_bounded_steps_and_not_from_a_few_f
     # A score that is no number is no evidence: two fixes are too few.
     assert (size.sigma_m, size.pending, size.fixes) == (60.0, 2, 0)
     size = learned(size, (-0.1, 0.115), rule)
-    # x moves by the scores over the information 0.97 * 0.5 + 0.315 = 0.8: exp(-0.5 / 1.6) of the size.
-    assert size.information == pytest.approx(0.8)
-    assert (size.sigma_m, size.pending, size.fixes) == (pytest.approx(60.0 * math.exp(-0.3125)), 0, 3)
+    # x moves by the scores over the information 0.97 * 1 + 0.315 = 1.285: exp(-0.5 / 2.57) of the size.
+    assert size.information == pytest.approx(1.285)
+    assert (size.sigma_m, size.pending, size.fixes) == (pytest.approx(60.0 * math.exp(-0.5 / 2.57)), 0, 3)
 
     def after(score: float, steps: int) -> float:
         size = first_size(rule)
