@@ -36,9 +36,7 @@ def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
 def copy_of_the_tree(tmp_path: Path) -> Path:
     for package in PACKAGES:
         shutil.copytree(
-            ROOT / package,
-            tmp_path / package,
-            ignore=shutil.ignore_patterns("__pycache__", "*.onnx", "static"),
+            ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__", "*.onnx", "static")
         )
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     return tmp_path
@@ -247,9 +245,7 @@ def compiled_functions() -> list[tuple[Path, ast.FunctionDef]]:
             if "njit" not in text:
                 continue
             for node in ast.walk(ast.parse(text)):
-                if isinstance(node, ast.FunctionDef) and any(
-                    "njit" in ast.unparse(one) for one in node.decorator_list
-                ):
+                if isinstance(node, ast.FunctionDef) and any("njit" in ast.unparse(one) for one in node.decorator_list):
                     found.append((file, node))
     return found
 

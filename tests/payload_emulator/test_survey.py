@@ -119,9 +119,7 @@ def test_windows_of_all_seeds_are_counted_together_each_by_its_frames() -> None:
 def test_recall_is_counted_by_size_and_by_depth_with_the_limits_in_their_groups() -> None:
     diameter_m = np.array([2.9e3, 3e3, 4.999e3, 5e3, 30e3, 30.1e3, 10e3, 10e3, 10e3, 10e3])
     depth_ratio = np.array([0.08, 0.08, 0.2, 0.0599, 0.06, 0.08, 0.0999, 0.10, 0.2, np.nan])
-    catalogue = make_catalogue(
-        np.zeros(10), np.zeros(10), diameter_m, source="test", depth_m=depth_ratio * diameter_m
-    )
+    catalogue = make_catalogue(np.zeros(10), np.zeros(10), diameter_m, source="test", depth_m=depth_ratio * diameter_m)
     in_image = np.array([7, 6, 4, 5, 5, 9, 4, 8, 5, 10])
     detected = np.array([7, 1, 4, 2, 1, 9, 4, 3, 5, 0])
     assert recall_counts(catalogue, np.stack([in_image, detected], axis=1)) == {

@@ -81,9 +81,7 @@ def _quantiles(error_rtn_m: Array, drift_percent: float, path_m: float) -> Navig
     if not len(length):
         return NavigationStatistics()
     p50, p68, p95, p99 = (float(v) for v in np.quantile(length, (0.5, 0.68, 0.95, 0.99)))
-    return NavigationStatistics(
-        p50, p68, p95, p99, float(length.max()), drift_percent, float(length[-1]), path_m
-    )
+    return NavigationStatistics(p50, p68, p95, p99, float(length.max()), drift_percent, float(length[-1]), path_m)
 
 
 def _series(
@@ -104,9 +102,7 @@ def _odometry(
     """Errors that walk from the start of each arc, with outcomes, reset triggers and errors before a reset."""
     n = len(imaging)
     starts = imaging & ~np.append(False, imaging[:-1])
-    outcome = rng.choice(
-        ("multi", "single", "predicted", "missed", "rejected"), n, p=(0.8, 0.02, 0.15, 0.02, 0.01)
-    )
+    outcome = rng.choice(("multi", "single", "predicted", "missed", "rejected"), n, p=(0.8, 0.02, 0.15, 0.02, 0.01))
     trigger = np.where(np.cumsum(starts) == 1, "initialization", "time_gap")
     walked = np.cumsum(rng.normal(drift_m, drift_m, (n, 3)), axis=0)
     error = walked - walked[np.maximum.accumulate(np.where(starts, np.arange(n), 0))]
@@ -171,8 +167,7 @@ def gallery_frame(seed: int, frame_number: int = 1, utc_ns: int | None = None) -
     seen = rng.random(len(u)) < 0.72
     false = int(rng.integers(0, 3))
     found_u, found_v, found_d = (
-        np.append((one + rng.normal(0.0, 1.1, len(u)))[seen], rng.uniform(20, 490, false))
-        for one in (u, v, diameter)
+        np.append((one + rng.normal(0.0, 1.1, len(u)))[seen], rng.uniform(20, 490, false)) for one in (u, v, diameter)
     )
     return GalleryFrame(
         frame_number=frame_number, utc_ns=utc_ns, image=image, detection_u_px=found_u, detection_v_px=found_v,
@@ -191,9 +186,7 @@ def detector_score(seed: int = 3) -> DetectorScore:
     du, dv = rng.normal(0.0, 1.2, (2, n)) + 0.2 * np.array([np.sin(azimuth), -np.cos(azimuth)])
     threshold = np.linspace(0.05, 0.95, 46)
     curves = tuple(
-        PrecisionRecallCurve(
-            label, threshold, 1 - 0.2 * (1.35 - threshold) ** 2.2, best * (1 - threshold**3.2)
-        )
+        PrecisionRecallCurve(label, threshold, 1 - 0.2 * (1.35 - threshold) ** 2.2, best * (1 - threshold**3.2))
         for label, best in (("5–10 km", 0.79), ("10–15 km", 0.74), ("15–30 km", 0.86))
     )
     return DetectorScore(
@@ -204,9 +197,7 @@ def detector_score(seed: int = 3) -> DetectorScore:
         ),
         micro=ClassScore(-1, "all", 2_253, 1_587, 274, 0.8528, 0.7044, 1.33),
         method="One-to-one, same class, within the larger of 10 px and half the radius.",
-        by_altitude_km=tuple(
-            BinScore(a, a + 5, 30 * a, 0.79, 0.80 - 0.007 * a, 1.2) for a in range(15, 45, 5)
-        ),
+        by_altitude_km=tuple(BinScore(a, a + 5, 30 * a, 0.79, 0.80 - 0.007 * a, 1.2) for a in range(15, 45, 5)),
         by_sun_elevation_deg=tuple(
             BinScore(e, e + 2, 420 - 18 * e, 0.8, 0.52 + 0.018 * e, 1.2) for e in range(5, 15, 2)
         ),
@@ -232,8 +223,7 @@ def pass_report(
     edges = np.flatnonzero(np.diff(np.concatenate([[0], imaging.astype(int), [0]])))
     half = int(cadence_s * 5e8)
     arcs = tuple(
-        TimeSpan(int(utc_ns[a]) - half, int(utc_ns[b - 1]) + half)
-        for a, b in zip(edges[::2], edges[1::2], strict=True)
+        TimeSpan(int(utc_ns[a]) - half, int(utc_ns[b - 1]) + half) for a, b in zip(edges[::2], edges[1::2], strict=True)
     )
     path = float(n * cadence_s * 1_636.0)
     sun = 10.0 + 4.0 * np.sin(elapsed / 300.0)
@@ -256,9 +246,7 @@ def pass_report(
             for m in lengths
         )
 
-    def flown(
-        name: str, kind: str, error_rtn_m: Array, drift_percent: float, **more: object
-    ) -> NavigationSeries:
+    def flown(name: str, kind: str, error_rtn_m: Array, drift_percent: float, **more: object) -> NavigationSeries:
         statistics = _quantiles(error_rtn_m, drift_percent, path)
         return _series(name, kind, utc_ns, elapsed, error_rtn_m, statistics=statistics, **more)
 
@@ -303,9 +291,7 @@ def pass_report(
     stripes = 128 + 40 * np.sin(np.add.outer(np.arange(180) / 7.0, np.arange(360) / 11.0))
     fast = utc_ns[:: max(1, n // 400)]
     power_w = 3.2 + 0.8 * imaging[:: max(1, n // 400)]
-    known = ReceptionQuality(
-        "madrid", "mission", 100, 99, 27, 2.5e-5, 1, 129_900, 0, START_UTC_NS, START_UTC_NS + 60
-    )
+    known = ReceptionQuality("madrid", "mission", 100, 99, 27, 2.5e-5, 1, 129_900, 0, START_UTC_NS, START_UTC_NS + 60)
     unknown = ReceptionQuality("", "default", 68, 68, 0, None, 0, 86_972, 3)
     accounting = FrameAccounting(
         expected=frames, acquired=max(0, frames - 2), lit=max(0, frames - 2), processed=max(0, frames - 3),
@@ -353,12 +339,10 @@ def pass_report(
         gaps=(TimeSpan(int(cut[bins // 2]), int(cut[bins // 2 + 1])),) if bins > 20 else (),
         detector=detector_score(seed),
         gallery=tuple(
-            gallery_frame(seed + 10 * i, 20 * i + 3, int(utc_ns[min(n - 1, 20 * i + 3)]))
-            for i in range(gallery)
+            gallery_frame(seed + 10 * i, 20 * i + 3, int(utc_ns[min(n - 1, 20 * i + 3)])) for i in range(gallery)
         ),
         worst_frames=tuple(
-            gallery_frame(seed + 500 + 10 * i, 12 * i + 5, int(utc_ns[min(n - 1, 12 * i + 5)]))
-            for i in range(worst)
+            gallery_frame(seed + 500 + 10 * i, 12 * i + 5, int(utc_ns[min(n - 1, 12 * i + 5)])) for i in range(worst)
         ),
         craters=CraterMap(
             latitude[pick] + rng.normal(0.0, 1.1, map_n),
@@ -398,9 +382,7 @@ def pass_report(
 
 
 def _regression_pass(i: int, rng: np.random.Generator) -> RegressionPass:
-    recall, precision, median = (
-        tuple(one.tolist()) for one in rng.normal((0.68, 0.84, 40.0), 0.04, (2, 3)).T
-    )
+    recall, precision, median = (tuple(one.tolist()) for one in rng.normal((0.68, 0.84, 40.0), 0.04, (2, 3)).T)
     return RegressionPass(f"W-{i:04d}", 148, i if i % 3 else None, recall, precision, median)
 
 

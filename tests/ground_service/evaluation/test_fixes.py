@@ -40,8 +40,7 @@ def pairs(noise_px: float = 0.0, seed: int = 3) -> Pairs:
     """Eight craters seen in both of two frames."""
     rng = np.random.default_rng(seed)
     uv = [
-        CAMERA.project((craters() - place) @ nadir_camera_from_mcmf(place).T)
-        + rng.normal(0.0, noise_px, (8, 2))
+        CAMERA.project((craters() - place) @ nadir_camera_from_mcmf(place).T) + rng.normal(0.0, noise_px, (8, 2))
         for place in POSITION
     ]
     frame = np.repeat([0, 1], 8)
@@ -65,9 +64,7 @@ def test_noise_of_a_pixel_moves_it_by_hundreds_of_metres_at_most() -> None:
 def test_too_few_craters_give_no_position() -> None:
     few = pairs()
     keep = np.array([0, 1, 8, 9, 10])
-    few = Pairs(
-        *(getattr(few, name)[keep] for name in ("frame", "utc_ns", "uv_px", "diameter_px", "crater_mcmf_m"))
-    )
+    few = Pairs(*(getattr(few, name)[keep] for name in ("frame", "utc_ns", "uv_px", "diameter_px", "crater_mcmf_m")))
     solved = snapshot_positions(few, CAMERA, UTC_NS, POSITION)
     assert np.isnan(solved[0]).all()
     assert np.isfinite(solved[1]).all()
@@ -132,9 +129,7 @@ def test_identifications_are_joined_by_time_place_and_number() -> None:
     ids = catalogue.ids
     found = IdentificationSamples(
         utc_ns=np.array([1000, 2000, 2000, 1500, 1000, 1000]),
-        detection=np.array(
-            [1, 0, 1, 0, 0, 0]
-        ),  # the third names a detection that is not there, the fourth a time
+        detection=np.array([1, 0, 1, 0, 0, 0]),  # the third names a detection that is not there, the fourth a time
         # the last two a crater that is not there, and one of unknown height
         crater_id=np.array([ids[2], ids[0], ids[1], ids[1], 10**6, ids[3]]),
     )
@@ -215,9 +210,7 @@ def test_an_empty_map_compares_to_nothing() -> None:
     assert math.isnan(result.median_horizontal_m)
 
 
-def test_a_report_counts_the_landmarks_the_fixes_that_used_them_and_their_distance_from_the_catalogue() -> (
-    None
-):
+def test_a_report_counts_the_landmarks_the_fixes_that_used_them_and_their_distance_from_the_catalogue() -> None:
     craters = catalogue()
     reports = mapped(craters, 100.0)
     # The catalogue's crater 7, and landmark 0 twice and landmark 1 once.

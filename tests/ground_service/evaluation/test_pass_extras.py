@@ -56,9 +56,7 @@ def series_at(latitude_deg: list[float], longitude_deg: list[float]) -> tuple[Na
     series = NavigationSeries(
         "anchored", "estimate", times, nothing, nothing, nothing, np.full((len(times), 3), np.nan)
     )
-    track = SimpleNamespace(
-        utc_ns=times, latitude_deg=np.array(latitude_deg), longitude_deg=np.array(longitude_deg)
-    )
+    track = SimpleNamespace(utc_ns=times, latitude_deg=np.array(latitude_deg), longitude_deg=np.array(longitude_deg))
     return series, track
 
 
@@ -141,8 +139,7 @@ def test_the_worst_frames_are_chosen_from_all_frames_and_not_from_those_with_an_
             return FRAMES
 
     inputs = SimpleNamespace(
-        detections=Detections(frame_number=np.arange(FRAMES), usable=usable),
-        images={0: None, 10: None, 39: None},
+        detections=Detections(frame_number=np.arange(FRAMES), usable=usable), images={0: None, 10: None, 39: None}
     )
     matches = Matches(np.zeros(0, dtype=np.int64), found.ravel())
     spread, worst = _choose_frames(cast("Any", inputs), expected, matches)
@@ -394,9 +391,7 @@ def test_a_tilted_distorted_camera_sees_craters_on_high_ground_where_they_are() 
 
 def test_a_camera_that_leans_far_sees_craters_beyond_a_nadir_footprint() -> None:
     """2.5 degrees north of the track is 76 km, past the corner of a nadir image from 30 km (73 km)."""
-    far = make_catalogue(
-        np.radians([3.0]), np.radians([0.0]), np.array([9e3]), source="made", rim_height_m=np.zeros(1)
-    )
+    far = make_catalogue(np.radians([3.0]), np.radians([0.0]), np.array([9e3]), source="made", rim_height_m=np.zeros(1))
     narrow = BrownCamera(512, 512, math.radians(60.0))
     assert len(expected_craters(far, narrow, POSITION).index) == 0
     leaning = Viewing(narrow, math.radians(65.0)).pointed(POSITION)
@@ -417,9 +412,7 @@ def test_a_telemetered_attitude_wins_over_the_declared_pointing() -> None:
 
 def test_a_frame_without_reference_expects_nothing() -> None:
     lost = np.full((1, 3), np.nan)
-    assert (
-        len(expected_craters(catalogue(), CAMERA, lost, Viewing(CAMERA, TILT_RAD).pointed(lost)).index) == 0
-    )
+    assert len(expected_craters(catalogue(), CAMERA, lost, Viewing(CAMERA, TILT_RAD).pointed(lost)).index) == 0
 
 
 @pytest.mark.parametrize("telemetered", [True, False])

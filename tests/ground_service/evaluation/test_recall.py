@@ -83,10 +83,7 @@ def test_a_crater_of_unknown_height_is_neither_missed_nor_a_false_alarm() -> Non
 def test_a_perfect_detector_scores_one() -> None:
     expected = expected_craters(field(), CAMERA, POSITION)
     found = detections(
-        (expected.u_px + 0.3).tolist(),
-        (expected.v_px - 0.4).tolist(),
-        expected.diameter_px.tolist(),
-        [0, 1, 2, 3],
+        (expected.u_px + 0.3).tolist(), (expected.v_px - 0.4).tolist(), expected.diameter_px.tolist(), [0, 1, 2, 3]
     )
     score = scored(found, expected)
     assert score.micro is not None
@@ -114,10 +111,7 @@ def test_the_limits_of_a_match(offset_px: float, width: float, hit: bool) -> Non
     """The 20 km crater is some 98 px wide: half a radius is 24 px, so the paper's 10 px decide."""
     expected = expected_craters(field(), CAMERA, POSITION)
     found = detections(
-        [float(expected.u_px[2]) - offset_px],
-        [float(expected.v_px[2])],
-        [float(expected.diameter_px[2]) * width],
-        [2],
+        [float(expected.u_px[2]) - offset_px], [float(expected.v_px[2])], [float(expected.diameter_px[2]) * width], [2]
     )
     assert bool(match_detections(found, expected).crater_of_detection[0] >= 0) is hit
 
@@ -125,10 +119,7 @@ def test_the_limits_of_a_match(offset_px: float, width: float, hit: bool) -> Non
 def test_small_craters_count_neither_for_nor_against() -> None:
     expected = expected_craters(field(), CAMERA, POSITION)
     found = detections(
-        [float(expected.u_px[3]), 3.0],
-        [float(expected.v_px[3]), 3.0],
-        [float(expected.diameter_px[3]), 15.0],
-        [3, 3],
+        [float(expected.u_px[3]), 3.0], [float(expected.v_px[3]), 3.0], [float(expected.diameter_px[3]), 15.0], [3, 3]
     )
     score = scored(found, expected)
     assert score.micro is not None
@@ -206,31 +197,18 @@ def test_scores_are_given_by_class_and_by_bins_of_altitude_and_of_the_sun() -> N
     assert score.micro.localisation_px == pytest.approx(2.0)
     assert (score.micro.size_class, score.micro.label) == (-1, "5–30 km")
     assert [
-        (one.size_class, one.label, one.expected, one.detected_true, one.false_alarms)
-        for one in score.per_class
-    ] == [
-        (0, "5–10 km", 2, 1, 0),
-        (1, "10–15 km", 2, 2, 1),
-        (2, "15–30 km", 2, 2, 0),
-    ]
+        (one.size_class, one.label, one.expected, one.detected_true, one.false_alarms) for one in score.per_class
+    ] == [(0, "5–10 km", 2, 1, 0), (1, "10–15 km", 2, 2, 1), (2, "15–30 km", 2, 2, 0)]
     assert [
         (one.low, one.high, one.expected, one.precision, one.recall, one.localisation_px)
         for one in score.by_altitude_km
-    ] == [
-        (20.0, 30.0, 5, pytest.approx(0.8), pytest.approx(0.8), pytest.approx(1.5)),
-        (30.0, 40.0, 1, 1.0, 1.0, 4.0),
-    ]
-    assert [
-        (one.low, one.high, one.expected, one.precision, one.recall) for one in score.by_sun_elevation_deg
-    ] == [
+    ] == [(20.0, 30.0, 5, pytest.approx(0.8), pytest.approx(0.8), pytest.approx(1.5)), (30.0, 40.0, 1, 1.0, 1.0, 4.0)]
+    assert [(one.low, one.high, one.expected, one.precision, one.recall) for one in score.by_sun_elevation_deg] == [
         (0.0, 5.0, 3, pytest.approx(2 / 3), pytest.approx(2 / 3)),
         (5.0, 10.0, 3, 1.0, 1.0),
     ]
     residuals = score.residuals
-    assert (
-        residuals.u_px.tolist() == [150.0, 250.0, 50.0, 150.0, 250.0]
-        and residuals.v_px.tolist() == [100.0] * 5
-    )
+    assert residuals.u_px.tolist() == [150.0, 250.0, 50.0, 150.0, 250.0] and residuals.v_px.tolist() == [100.0] * 5
     assert residuals.du_px.tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
     assert residuals.dv_px.tolist() == [0.0, 2.0, 3.0, 0.0, 4.0]
     assert residuals.sun_azimuth_deg is not None and residuals.sun_azimuth_deg.tolist() == [

@@ -132,9 +132,7 @@ def test_memory_does_not_grow_with_the_stream(packets: list[bytes]) -> None:
 @pytest.mark.parametrize("window", [1 << 20, 60_000])
 def test_the_uplink_is_seen_alike_in_windows_and_at_once(packets: list[bytes], window: int) -> None:
     encoder = DownlinkEncoder(SPACECRAFT, LinkSettings(frame_length=223))
-    clcws = [
-        pack_clcw(Clcw(0, k // 9, lockout=40 < k < 60, farm_b_counter=k % 4)) for k in range(len(packets))
-    ]
+    clcws = [pack_clcw(Clcw(0, k // 9, lockout=40 < k < 60, farm_b_counter=k % 4)) for k in range(len(packets))]
     stream = encoder.encode(packets, clcw=clcws)
     (whole,) = decode(stream).uplink
     found, accounting, _ = read(stream, window)
@@ -172,9 +170,7 @@ def several_processes(
 
 def test_each_kind_meets_each_order_and_each_piece_is_of_its_recording() -> None:
     cases = [case_of(number) for number in range(len(KINDS) * len(ORDERS))]
-    assert {(case.kind, case.order) for case in cases} == {
-        (kind, order) for kind in KINDS for order in ORDERS
-    }
+    assert {(case.kind, case.order) for case in cases} == {(kind, order) for kind in KINDS for order in ORDERS}
     for case in cases:
         for recording in case.recordings:
             octets = bytearray(len(recording.octets))
@@ -279,9 +275,7 @@ def test_an_ingest_killed_at_any_moment_loses_and_doubles_nothing(downlink: Path
     rng = np.random.default_rng(11)
     for _ in range(KILLS):
         process = subprocess.Popen(
-            [sys.executable, "-c", INGEST, str(home), str(downlink)],
-            stdout=subprocess.PIPE,
-            env=dict(os.environ),
+            [sys.executable, "-c", INGEST, str(home), str(downlink)], stdout=subprocess.PIPE, env=dict(os.environ)
         )
         assert process.stdout is not None
         process.stdout.readline()

@@ -199,9 +199,7 @@ def test_a_packet_has_the_reception_time_of_the_frame_in_which_it_begins(window_
     for k in range(len(packets)):
         first, last = int(starts[k]) // zone, (int(starts[k + 1]) - 1) // zone
         # A packet that is continued in a later window of the reader has the time of its end.
-        expected = (
-            {int(times[first])} if window_octets > len(stream) else {int(times[first]), int(times[last])}
-        )
+        expected = {int(times[first])} if window_octets > len(stream) else {int(times[first]), int(times[last])}
         assert found[k] in expected
     assert reader.found.first_utc_ns == times[0]
     assert reader.found.last_utc_ns == times[-1]

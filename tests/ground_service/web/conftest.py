@@ -134,9 +134,7 @@ def live_frame(number: int) -> dict[str, object]:
         "mode": "observing",
         "paused": False,
         "rate": 1.0,
-        "events": [
-            {"severity": "medium", "event": "image_dark", "values": [1.0, 2.0], "text": "mean grey level 1"}
-        ]
+        "events": [{"severity": "medium", "event": "image_dark", "values": [1.0, 2.0], "text": "mean grey level 1"}]
         if number == 3
         else [],
         "verifications": [],
@@ -169,11 +167,7 @@ class Service:
     """A running `linna serve`."""
 
     def __init__(
-        self,
-        home: Path,
-        console_port: int,
-        openmct: Path | None = None,
-        settings: dict[str, str] | None = None,
+        self, home: Path, console_port: int, openmct: Path | None = None, settings: dict[str, str] | None = None
     ) -> None:
         self.home = home
         environment = {key: value for key, value in os.environ.items() if not key.startswith("LINNA_")}

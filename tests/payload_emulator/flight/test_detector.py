@@ -118,15 +118,7 @@ def test_the_shipped_network_is_small_and_tells_what_it_is(detector):
     assert len(detector.model_octets) <= 6_000_000
     assert detector.model_hash == int(hashlib.sha256(detector.model_octets).hexdigest()[:8], 16)
     assert 0.1 <= detector.score_threshold <= 0.9
-    for key in (
-        "input",
-        "outputs",
-        "navigation_threshold",
-        "data",
-        "validation",
-        "git_revision",
-        "training_seed",
-    ):
+    for key in ("input", "outputs", "navigation_threshold", "data", "validation", "git_revision", "training_seed"):
         assert detector.metadata[key]
     tested = json.loads(detector.metadata["test_figures"])
     assert set(tested) == {"real-strip", "real-block", "procedural-world"}

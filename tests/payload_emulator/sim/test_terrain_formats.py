@@ -93,9 +93,7 @@ def test_sldem2015_kilometres_with_a_detached_label(tmp_path):
     ppd = 16
     values = (plane(*grid(8.0, 22.0, 160, 160, ppd)) / 1000.0).astype("<f4")
     # The labels of SLDEM2015 give OFFSET = 1737.4 and kilometres, and count longitudes from 180 degrees.
-    path = write_pds3(
-        tmp_path / "SLDEM", 8.0, 22.0, 160, 160, ppd, values, "PC_REAL", "KILOMETER", 1737.4, 180.0
-    )
+    path = write_pds3(tmp_path / "SLDEM", 8.0, 22.0, 160, 160, ppd, values, "PC_REAL", "KILOMETER", 1737.4, 180.0)
     terrain = RasterTerrain([path], NONE, **AS_IT_IS)
     # Single precision of 2 km in kilometres is 0.1 mm; pixels from projected metres are good to a millimetre.
     heights_agree(terrain, np.array([14.3, 17.1]), np.array([12.2, 15.9]), 0.05)
@@ -115,9 +113,7 @@ def test_gld100_metres_of_16_bits_with_holes(tmp_path):
     latitude, longitude = grid(8.0, 22.0, 160, 160, ppd)
     values = np.rint(plane(latitude, longitude)).astype("<i2")
     values[(np.abs(latitude - 15.0) < 0.2) & (np.abs(longitude - 13.0) < 0.2)] = -32768
-    fine = write_pds3(
-        tmp_path / "GLD", 8.0, 22.0, 160, 160, ppd, values, "LSB_INTEGER", "METER", 1_737_400, 180.0
-    )
+    fine = write_pds3(tmp_path / "GLD", 8.0, 22.0, 160, 160, ppd, values, "LSB_INTEGER", "METER", 1_737_400, 180.0)
     coarse = write_tiff(
         tmp_path / "c.tif",
         rasterio.Affine(0.25, 0, 0.0, 0, -0.25, 30.0),
@@ -136,9 +132,7 @@ def test_projected_metres_join_across_tiles_whose_pixels_do_not_divide_the_degre
     # LROC's products of 100 m have 303.23 pixels per degree; tiles of 90 degrees are 27,291.02 pixels wide.
     step, rows, columns = 100.0, 60, 27_291
     north = 0.5 * rows * step
-    values = np.repeat(np.rint(north - (np.arange(rows) + 0.5) * step)[:, None], columns, axis=1).astype(
-        "int16"
-    )
+    values = np.repeat(np.rint(north - (np.arange(rows) + 0.5) * step)[:, None], columns, axis=1).astype("int16")
     crs = "+proj=eqc +lat_ts=0 +lat_0=0 +lon_0=180 +x_0=0 +y_0=0 +R=1737400 +units=m +no_defs"
     paths = []
     for name, west in (("w", 270.0), ("e", 0.0)):
@@ -293,19 +287,13 @@ def test_a_form_of_the_same_ground_gives_the_same_heights(tmp_path, form):
     ("form", "message"),
     [
         ({"convert": lambda h: h / 1e3}, r"differ by 3 m .* found 0\.\d+ .* no unit stated\): kilometres"),
-        (
-            {"convert": lambda h: h * 1e3},
-            r"expected heights of -9200 to 10800 m .* found -\d+ to \d\.\d+e\+06",
-        ),
+        ({"convert": lambda h: h * 1e3}, r"expected heights of -9200 to 10800 m .* found -\d+ to \d\.\d+e\+06"),
         ({"convert": lambda h: h / 1e3 + 1_737.4, "unit": "m"}, None),
         ({"convert": lambda h: 30.0 * h}, "expected heights of -9200 to 10800 m"),
         ({"unit": "K"}, "in a unit of length .* found 'k'"),
         ({"count": 2}, "one band of heights of 16 bits or more, found 2 of float32"),
         ({"convert": lambda h: h / 20 + 120, "dtype": "uint8"}, "found 1 of uint8: a picture"),
-        (
-            {"crs": "+proj=longlat +a=1738100 +b=1736000 +no_defs"},
-            "found an ellipsoid of 1738.1 by 1736.0 km",
-        ),
+        ({"crs": "+proj=longlat +a=1738100 +b=1736000 +no_defs"}, "found an ellipsoid of 1738.1 by 1736.0 km"),
         ({"crs": "+proj=longlat +R=1738000 +no_defs"}, r"a sphere of 1737\.4 km, found one of 1738\.000 km"),
         ({"crs": "EPSG:4326"}, "found a body of 6378"),
     ],
@@ -377,9 +365,7 @@ def test_any_projection_that_gdal_knows_is_read_at_its_places(tmp_path, crs):
 def test_a_polar_map_holds_the_pole_and_nothing_beyond_its_edge(tmp_path):
     transform = rasterio.Affine(1e4, 0, -3e5, 0, -1e4, 3e5)
     values = np.arange(3600, dtype="float32").reshape(60, 60)
-    (layer,) = open_layers(
-        [write_tiff(tmp_path / "a.tif", transform, values, "+proj=stere +lat_0=-90 +R=1737400")]
-    )
+    (layer,) = open_layers([write_tiff(tmp_path / "a.tif", transform, values, "+proj=stere +lat_0=-90 +R=1737400")])
     latitude, longitude = np.radians([-90.0, -81.0, -79.5, -79.5]), np.radians([0.0, 271.0, 45.0, 0.0])
     assert layer.holds(latitude, longitude).tolist() == [True, True, True, False]
 

@@ -186,10 +186,7 @@ def test_the_same_month_is_stored_once_and_late_data_give_a_new_report(either: G
     add_pass(either, 5, status="not met")
     second = make_monthly_report(either, SPACECRAFT, "2029-08")
     assert second.id != first.id and second.verdict == "requirements not met in every pass: 1 of 1 judged"
-    assert {one.id for one in either.read(list_monthly_reports, MonthlyReportFilter()).items} == {
-        first.id,
-        second.id,
-    }
+    assert {one.id for one in either.read(list_monthly_reports, MonthlyReportFilter()).items} == {first.id, second.id}
     with pytest.raises(InvalidInput, match="2029-09: expected passes with a report, found none"):
         make_monthly_report(either, SPACECRAFT, "2029-09")
 
@@ -214,10 +211,7 @@ def test_a_requirement_that_is_unknown_on_some_passes_is_not_good(ground: Ground
         add_pass(ground, number, status="met" if number == 3 else "unknown")
     value = monthly_value(performance(ground, SPACECRAFT, window_days=31.0), "2029-08")
     assert value.verdict_level == "unknown"
-    assert (
-        value.verdict
-        == "requirements judged: 1 of 1, none missed; median 3-D error not judged on 3 of 4 passes"
-    )
+    assert value.verdict == "requirements judged: 1 of 1, none missed; median 3-D error not judged on 3 of 4 passes"
 
 
 def test_a_requirement_without_a_limit_may_be_unknown(ground: Ground) -> None:
@@ -374,21 +368,7 @@ def test_operations_and_commands_give_the_same_report(
     assert [one["metric"] for one in document["changes"]] == ["recall"]
     home = ("--home", str(ground.home))
     spacecraft = ("--spacecraft-id", str(SPACECRAFT))
-    assert (
-        run(
-            [
-                "performance",
-                "report",
-                *spacecraft,
-                "--month",
-                "2029-08",
-                "--out",
-                str(tmp_path / "cli"),
-                *home,
-            ]
-        )
-        == 0
-    )
+    assert run(["performance", "report", *spacecraft, "--month", "2029-08", "--out", str(tmp_path / "cli"), *home]) == 0
     assert (tmp_path / "cli/report.html").read_text() == page
     capsys.readouterr()
     assert run(["performance", "show", *spacecraft, *home]) == 0
@@ -396,9 +376,7 @@ def test_operations_and_commands_give_the_same_report(
     assert "change of recall at pass 8" in told and "14 passes with a report" in told
     assert run(["performance", "list", *home, "--json"]) == 0
     assert [one["id"] for one in json.loads(capsys.readouterr().out)["reports"]] == [made.id]
-    assert (
-        run(["performance", "report", *spacecraft, "--month", "2029-10", "--out", str(tmp_path), *home]) == 2
-    )
+    assert run(["performance", "report", *spacecraft, "--month", "2029-10", "--out", str(tmp_path), *home]) == 2
     assert "expected passes with a report, found none" in capsys.readouterr().err
 
 
@@ -417,7 +395,5 @@ def test_operations_and_commands_give_the_same_report(
         ("accuracy.median", [0.1] * 12, ""),
     ],
 )
-def test_a_filter_is_judged_over_passes_by_both_bounds(
-    key: str, values: list[float | None], remark: str
-) -> None:
+def test_a_filter_is_judged_over_passes_by_both_bounds(key: str, values: list[float | None], remark: str) -> None:
     assert _consistency_remark(key, values) == remark
