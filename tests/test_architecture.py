@@ -23,13 +23,9 @@ def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
         "--no-cache",
     ]
     return subprocess.run(
-        command,
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
+        command, cwd=folder, capture_output=True, text=True, check=False,
         env={"PYTHONPATH": str(folder), "PATH": "/usr/bin:/bin", "COLUMNS": "300"},
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture()
@@ -177,15 +173,10 @@ def test_a_planted_cycle_is_found(copy_of_the_tree: Path, module: str, planted: 
 SMALL = {
     f"ground_service.{name}"
     for name in (
-        "evaluation.landmarks.service",
-        "evaluation.performance.service",
-        "jobs.service",
-        "missions.ephemerides.service",
-        "passes.alarms.service",
-        "worker.condition",
-        "worker.integrity",
+        "evaluation.landmarks.service", "evaluation.performance.service", "jobs.service",
+        "missions.ephemerides.service", "passes.alarms.service", "worker.condition", "worker.integrity",
     )
-}
+}  # fmt: skip
 """Modules of small capabilities, which hold their SQL."""
 
 

@@ -45,16 +45,8 @@ def demo(scenario_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple
 def test_the_demo_prints_one_json_object_with_the_agreed_keys(demo) -> None:
     figures, _ = demo
     assert set(figures) >= {
-        "report",
-        "pass_id",
-        "frames",
-        "packets",
-        "packets_lost",
-        "detector",
-        "navigation",
-        "wall_s",
-        "data",
-    }
+        "report", "pass_id", "frames", "packets", "packets_lost", "detector", "navigation", "wall_s", "data",
+    }  # fmt: skip
     assert figures["frames"] == FRAMES
     assert figures["packets_lost"] == 0
     assert set(figures["detector"]) >= {"precision", "recall", "loc_px"}

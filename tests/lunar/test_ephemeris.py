@@ -280,14 +280,10 @@ def test_states_that_gravity_moves_are_accepted_also_with_an_orbit_determination
         (fixed_to_the_moon, r"found 1\.5\d+ m/s2, 0\.\d+ % off; rotating axes"),
     ],
     ids=[
-        "metres for kilometres",
-        "kilometres for metres",
-        "velocity in km/s",
-        "orbit about the Earth",
-        "scale",
+        "metres for kilometres", "kilometres for metres", "velocity in km/s", "orbit about the Earth", "scale",
         "axes",
     ],
-)
+)  # fmt: skip
 def test_states_that_gravity_does_not_move_are_refused_with_the_numbers(change, message):
     with pytest.raises(UnmovedByGravity, match=message):
         check_gravity(with_states(polar_orbit(4.0), change))

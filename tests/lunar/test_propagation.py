@@ -41,13 +41,9 @@ def kepler_place(elements: Elements, gm: float, elapsed_s: float) -> np.ndarray:
         anomaly -= (anomaly - e * math.sin(anomaly) - mean) / (1 - e * math.cos(anomaly))
     true = 2.0 * math.atan(math.sqrt((1 + e) / (1 - e)) * math.tan(anomaly / 2.0))
     moved = Elements(
-        elements.semi_major_axis_m,
-        e,
-        elements.inclination_rad,
-        elements.raan_rad,
-        elements.argument_of_perilune_rad,
-        true,
-    )
+        elements.semi_major_axis_m, e, elements.inclination_rad, elements.raan_rad,
+        elements.argument_of_perilune_rad, true,
+    )  # fmt: skip
     return state_from_elements(moved, gm)[0]
 
 

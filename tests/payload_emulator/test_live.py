@@ -206,11 +206,8 @@ def test_the_scenario_runs_through_and_the_machine_goes_on(running: tuple[LiveSe
     frames = [message["frame"] for message in messages if message["kind"] == "frame"]
     assert frames == list(range(16))
     assert {message["estimates"]["spherical"]["outcome"] for message in messages if message["kind"] == "frame"} <= {
-        "anchored",
-        "multi",
-        "single",
-        "predicted",
-    }
+        "anchored", "multi", "single", "predicted",
+    }  # fmt: skip
     watcher.say("rate 5")
     watcher.until(lambda message: message.get("rate") == 5.0)
 

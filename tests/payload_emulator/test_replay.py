@@ -69,12 +69,6 @@ def packets_of(name: str, octets: bytes) -> list[bytes]:
     return [every[i] for i in table.packet_index.tolist()]
 
 
-def test_the_same_build_gives_the_same_octets(archive: Path, tmp_path: Path) -> None:
-    for name in ("one", "two"):
-        replay_archive(archive, FlightBuild(), tmp_path / name)
-    assert (tmp_path / "one/downlink.cadu").read_bytes() == (tmp_path / "two/downlink.cadu").read_bytes()
-
-
 def test_the_service_renders_the_frames_that_an_archive_lacks(copy: Path, tmp_path: Path) -> None:
     """Of the files that a scenario can name, the renderer opens only those that the service refuses."""
     shutil.rmtree(copy / "frames")

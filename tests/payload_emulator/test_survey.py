@@ -37,20 +37,10 @@ filter_degree = 8
 
 def window(seed: int = 1, **changed: object) -> SurveyWindow:
     values = {
-        "seed": seed,
-        "longitude_deg": 10.0,
-        "altitude_km": (20.0, 30.0),
-        "frames": 4,
-        "fixed": 3,
-        "median_m": 25.0,
-        "p95_m": 40.0,
-        "bias_rtn_m": (1.0, 2.0, 3.0),
-        "inside_2_sigma": (1.0, 0.5, 0.0),
-        "nees": 6.0,
-        "nis": 1.0,
-        "coast_end_m": 100.0,
-        "position_m": (10.0, 20.0, 30.0, 40.0),
-    }
+        "seed": seed, "longitude_deg": 10.0, "altitude_km": (20.0, 30.0), "frames": 4, "fixed": 3, "median_m": 25.0,
+        "p95_m": 40.0, "bias_rtn_m": (1.0, 2.0, 3.0), "inside_2_sigma": (1.0, 0.5, 0.0), "nees": 6.0, "nis": 1.0,
+        "coast_end_m": 100.0, "position_m": (10.0, 20.0, 30.0, 40.0),
+    }  # fmt: skip
     return SurveyWindow.model_validate(values | changed)
 
 

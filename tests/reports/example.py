@@ -131,18 +131,11 @@ def _filter(rng: np.random.Generator, imaging: NDArray[np.bool_], cadence_s: flo
     fixed = np.where(rng.random(n) > 0.02, "fixed", "refused")
     outcome = np.where(matched > 0, fixed, np.where(imaging, "coasted", "no_image"))
     return {
-        "error_rtn_m": error,
-        "sigma_rtn_m": sigma,
-        "outcome": tuple(outcome.tolist()),
-        "matched": matched,
-        "nis": np.where(matched > 0, rng.chisquare(np.maximum(2 * matched, 1)), np.nan),
-        "nis_dof": 2 * matched,
-        "nees": np.sum((error / sigma) ** 2, axis=1),
-        "time_since_fix_s": age,
-        "wrong_fixes": 0,
-        "anchor_reads": 0,
+        "error_rtn_m": error, "sigma_rtn_m": sigma, "outcome": tuple(outcome.tolist()), "matched": matched,
+        "nis": np.where(matched > 0, rng.chisquare(np.maximum(2 * matched, 1)), np.nan), "nis_dof": 2 * matched,
+        "nees": np.sum((error / sigma) ** 2, axis=1), "time_since_fix_s": age, "wrong_fixes": 0, "anchor_reads": 0,
         "anchor_reads_after_start": 0,
-    }
+    }  # fmt: skip
 
 
 def crater_image(seed: int) -> tuple[NDArray[np.uint8], tuple[Array, Array, Array]]:
@@ -255,28 +248,18 @@ def pass_report(
     catalogue = "catalogue filter; never reads the anchor ephemeris"
     navigation = (
         flown(
-            "paper",
-            "estimate",
-            **paper,
-            **seen,
-            drift_percent=1.71,
-            drift_by_length=sweep(1.7, -0.05),
+            "paper", "estimate", **paper, **seen, drift_percent=1.71, drift_by_length=sweep(1.7, -0.05),
             description=planar,
         ),
         flown(
-            "spherical",
-            "estimate",
-            **rounds,
-            **seen,
-            drift_percent=0.014,
-            drift_by_length=sweep(0.05, -0.5),
+            "spherical", "estimate", **rounds, **seen, drift_percent=0.014, drift_by_length=sweep(0.05, -0.5),
             description=spherical,
         ),
         flown("anchored", "estimate", **anchored, **seen, drift_percent=0.002, description=catalogue),
         flown("Kepler", "baseline", growth * (420.0, 2_050.0, 260.0), 0.04),
         flown("propagate only, degree 50", "baseline", growth * (24.0, 118.0, 22.0), 0.003),
         flown("snapshot fix", "baseline", snapshot, float("nan")),
-    )
+    )  # fmt: skip
 
     frames = int(imaging.sum())
     bins = min(60, n)
@@ -324,9 +307,7 @@ def pass_report(
             HeadlineFigure("Packets lost", 9, "of 1 204", "one gap of 42 s"),
         ),
         provenance={
-            "Payload build": "flight 0.1.0",
-            "Model SHA-256": "7f0c" * 16,
-            "Parameters SHA-256": "91ab" * 16,
+            "Payload build": "flight 0.1.0", "Model SHA-256": "7f0c" * 16, "Parameters SHA-256": "91ab" * 16,
             "Seed": str(seed),
         },
         data_sources=("LROC GLD100 terrain, 118 m/px, longitude 270–330° E", "LU1319381 crater catalogue"),
@@ -345,12 +326,8 @@ def pass_report(
             gallery_frame(seed + 500 + 10 * i, 12 * i + 5, int(utc_ns[min(n - 1, 12 * i + 5)])) for i in range(worst)
         ),
         craters=CraterMap(
-            latitude[pick] + rng.normal(0.0, 1.1, map_n),
-            (longitude[pick] + rng.normal(0.0, 1.1, map_n)) % 360.0,
-            5_000.0 * rng.pareto(1.8, map_n) + 5_000.0,
-            seen_often,
-            rng.binomial(seen_often, 0.66),
-            "LU1319381",
+            latitude[pick] + rng.normal(0.0, 1.1, map_n), (longitude[pick] + rng.normal(0.0, 1.1, map_n)) % 360.0,
+            5_000.0 * rng.pareto(1.8, map_n) + 5_000.0, seen_often, rng.binomial(seen_often, 0.66), "LU1319381",
         ),
         payload_map=payload_map,
         terrain=TerrainMap(stripes.astype(np.uint8), 0.0, 360.0, -90.0, 90.0, "synthetic stripes"),
@@ -378,7 +355,7 @@ def pass_report(
         },
         scenario_text='name = "gld100-window"\nseed = 7\n\n[camera]\nfov_deg = 120.0\n',
         remarks=("The truth and the baseline use different gravity fields.",),
-    )
+    )  # fmt: skip
 
 
 def _regression_pass(i: int, rng: np.random.Generator) -> RegressionPass:

@@ -115,17 +115,10 @@ def test_identifications_are_joined_by_time_place_and_number() -> None:
     latitude, heights = np.radians([10.0, 11.0, 12.0, 13.0]), [0.0, 0.0, 0.0, np.nan]
     catalogue = make_catalogue(latitude, np.zeros(4), np.full(4, 5e3), source="test", rim_height_m=heights)
     detections = DetectionSamples(
-        frame_number=np.array([0, 1]),
-        utc_ns=UTC_NS,
-        usable=np.ones(2, dtype=np.bool_),
-        quality=("ok", "ok"),
-        offsets=np.array([0, 2, 3]),
-        u_px=np.array([1.0, 2.0, 3.0]),
-        v_px=np.array([4.0, 5.0, 6.0]),
-        diameter_px=np.array([7.0, 8.0, 9.0]),
-        score=np.ones(3),
-        size_class=np.zeros(3, dtype=np.int64),
-    )
+        frame_number=np.array([0, 1]), utc_ns=UTC_NS, usable=np.ones(2, dtype=np.bool_), quality=("ok", "ok"),
+        offsets=np.array([0, 2, 3]), u_px=np.array([1.0, 2.0, 3.0]), v_px=np.array([4.0, 5.0, 6.0]),
+        diameter_px=np.array([7.0, 8.0, 9.0]), score=np.ones(3), size_class=np.zeros(3, dtype=np.int64),
+    )  # fmt: skip
     ids = catalogue.ids
     found = IdentificationSamples(
         utc_ns=np.array([1000, 2000, 2000, 1500, 1000, 1000]),
@@ -158,14 +151,10 @@ def mapped(known: CraterCatalogue, sigma_m: float, seed: int = 2, shift_m: float
     latitude = np.degrees(known.latitude_rad) + (north + shift_m) / METRES_PER_DEG
     longitude = np.degrees(known.longitude_rad) + east / (METRES_PER_DEG * np.cos(known.latitude_rad))
     return MappedCraters(
-        3_000_000_000 + np.arange(len(known)),
-        latitude,
-        longitude % 360.0,
-        known.rim_height_m + up,
-        known.diameter_m * np.exp(0.05 * rng.standard_normal(len(known))),
-        np.full((len(known), 3), sigma_m),
+        3_000_000_000 + np.arange(len(known)), latitude, longitude % 360.0, known.rim_height_m + up,
+        known.diameter_m * np.exp(0.05 * rng.standard_normal(len(known))), np.full((len(known), 3), sigma_m),
         np.ones(len(known), dtype=np.int64),
-    )
+    )  # fmt: skip
 
 
 def test_landmarks_are_found_in_the_catalogue_on_both_sides_of_the_meridian_with_honest_sigmas() -> None:

@@ -78,13 +78,10 @@ def reference(stop_s: float = 600.0) -> Ephemeris:
 def catalogue() -> CraterCatalogue:
     """Craters 10 k, 10 k + 1 and 10 k + 2 below, north and south of frame k."""
     return make_catalogue(
-        np.radians(np.tile([0.0, 0.1, -0.1], FRAMES)),
-        np.radians(np.repeat(LONGITUDE_DEG, 3)),
-        np.tile([6e3, 12e3, 20e3], FRAMES),
-        source="made",
-        ids=(10 * np.arange(FRAMES)[:, None] + np.arange(3)).ravel(),
-        rim_height_m=np.zeros(3 * FRAMES),
-    )
+        np.radians(np.tile([0.0, 0.1, -0.1], FRAMES)), np.radians(np.repeat(LONGITUDE_DEG, 3)),
+        np.tile([6e3, 12e3, 20e3], FRAMES), source="made",
+        ids=(10 * np.arange(FRAMES)[:, None] + np.arange(3)).ravel(), rim_height_m=np.zeros(3 * FRAMES),
+    )  # fmt: skip
 
 
 UP_M = 3 * [ALTITUDE_M] + np.array([0.0, 1.0, 1.0]) * MOON_M * (1.0 - math.cos(math.radians(0.1)))
@@ -108,17 +105,12 @@ def detections() -> DetectionSamples:
         rows.append(seen)
     flat = [one for row in rows for one in row]
     return DetectionSamples(
-        frame_number=100 + np.arange(FRAMES),
-        utc_ns=TIMES,
-        usable=np.arange(FRAMES) != DARK,
+        frame_number=100 + np.arange(FRAMES), utc_ns=TIMES, usable=np.arange(FRAMES) != DARK,
         quality=tuple("dark" if frame == DARK else "ok" for frame in range(FRAMES)),
-        offsets=np.cumsum([0, *map(len, rows)]),
-        u_px=np.array([one[0] for one in flat]),
-        v_px=np.array([one[1] for one in flat]),
-        diameter_px=np.array([one[2] for one in flat]),
-        score=np.full(len(flat), 0.75),
-        size_class=np.array([one[3] for one in flat]),
-    )
+        offsets=np.cumsum([0, *map(len, rows)]), u_px=np.array([one[0] for one in flat]),
+        v_px=np.array([one[1] for one in flat]), diameter_px=np.array([one[2] for one in flat]),
+        score=np.full(len(flat), 0.75), size_class=np.array([one[3] for one in flat]),
+    )  # fmt: skip
 
 
 EAST_M = 200.0 * (np.arange(FRAMES) % 6)
@@ -127,17 +119,11 @@ EAST_M = 200.0 * (np.arange(FRAMES) % 6)
 
 def paper(**changed: Any) -> NavigationSamples:
     values: dict[str, Any] = {
-        "estimator": "paper",
-        "frame_number": 100 + np.arange(FRAMES),
-        "utc_ns": TIMES,
-        "latitude_deg": np.zeros(FRAMES),
-        "longitude_deg": LONGITUDE_DEG + np.degrees(EAST_M / RADIUS_M) - 360.0,
-        "altitude_m": np.full(FRAMES, ALTITUDE_M),
-        "sigma_rtn_m": np.full((FRAMES, 3), np.nan),
-        "nis": np.full(FRAMES, np.nan),
-        "matched": np.arange(FRAMES),
-        "outcome": ("matched",) * FRAMES,
-    }
+        "estimator": "paper", "frame_number": 100 + np.arange(FRAMES), "utc_ns": TIMES,
+        "latitude_deg": np.zeros(FRAMES), "longitude_deg": LONGITUDE_DEG + np.degrees(EAST_M / RADIUS_M) - 360.0,
+        "altitude_m": np.full(FRAMES, ALTITUDE_M), "sigma_rtn_m": np.full((FRAMES, 3), np.nan),
+        "nis": np.full(FRAMES, np.nan), "matched": np.arange(FRAMES), "outcome": ("matched",) * FRAMES,
+    }  # fmt: skip
     return NavigationSamples(**{**values, **changed})
 
 
@@ -145,14 +131,10 @@ def anchored(**changed: Any) -> NavigationSamples:
     """30 m too high, with a fix at the frames 1 and 4."""
     fixed = np.isin(np.arange(FRAMES), (1, 4))
     values: dict[str, Any] = {
-        "estimator": "anchored",
-        "longitude_deg": LONGITUDE_DEG,
-        "altitude_m": np.full(FRAMES, ALTITUDE_M + 30.0),
-        "sigma_rtn_m": np.tile([10.0, 20.0, 30.0], (FRAMES, 1)),
-        "nis": np.where(fixed, 7.0, np.nan),
-        "matched": np.where(fixed, 4, 0),
-        "outcome": tuple("fixed" if one else "predicted" for one in fixed),
-    }
+        "estimator": "anchored", "longitude_deg": LONGITUDE_DEG, "altitude_m": np.full(FRAMES, ALTITUDE_M + 30.0),
+        "sigma_rtn_m": np.tile([10.0, 20.0, 30.0], (FRAMES, 1)), "nis": np.where(fixed, 7.0, np.nan),
+        "matched": np.where(fixed, 4, 0), "outcome": tuple("fixed" if one else "predicted" for one in fixed),
+    }  # fmt: skip
     return paper(**{**values, **changed})
 
 
@@ -162,14 +144,9 @@ def outcomes() -> OutcomeSamples:
     triggers = ["none"] * FRAMES
     triggers[0], triggers[6] = "initialization", "safety_timeout"
     return OutcomeSamples(
-        "paper",
-        100 + kept,
-        TIMES[kept],
-        ("matched",) * len(kept),
-        tuple(triggers[k] for k in kept),
-        50 + kept,
+        "paper", 100 + kept, TIMES[kept], ("matched",) * len(kept), tuple(triggers[k] for k in kept), 50 + kept,
         np.where(kept < 6, 1, 2),
-    )
+    )  # fmt: skip
 
 
 def filter_states() -> FilterStates:
@@ -190,26 +167,14 @@ START = StartState(EPOCH, circle(0.0)[0] + np.array([100.0, 0.0, 0.0]), circle(0
 
 def inputs(**changed: Any) -> PassInputs:
     values: dict[str, Any] = {
-        "pass_id": "7",
-        "title": "a made pass",
-        "start_utc_ns": EPOCH,
-        "stop_utc_ns": EPOCH + 200 * SECOND,
-        "packets": PACKETS,
-        "viewing": Viewing(CAMERA),
-        "orientation": Still(),
-        "onboard_orientation": Still(),
-        "reference": reference(),
-        "catalogue": catalogue(),
-        "detections": detections(),
-        "navigation": (paper(), anchored()),
-        "outcomes": (outcomes(),),
-        "gravity": builtin_gravity(),
+        "pass_id": "7", "title": "a made pass", "start_utc_ns": EPOCH, "stop_utc_ns": EPOCH + 200 * SECOND,
+        "packets": PACKETS, "viewing": Viewing(CAMERA), "orientation": Still(), "onboard_orientation": Still(),
+        "reference": reference(), "catalogue": catalogue(), "detections": detections(),
+        "navigation": (paper(), anchored()), "outcomes": (outcomes(),), "gravity": builtin_gravity(),
         "reference_sigma_rtn_m": REFERENCE_SIGMA_M,
-        "limits": Requirements(estimator="paper", median_error_m=1_000.0),
-        "frames_expected": 14,
-        "cadence_s": CADENCE_S,
-        "images": IMAGES,
-    }
+        "limits": Requirements(estimator="paper", median_error_m=1_000.0), "frames_expected": 14,
+        "cadence_s": CADENCE_S, "images": IMAGES,
+    }  # fmt: skip
     return PassInputs(**{**values, **changed})
 
 
@@ -683,11 +648,8 @@ def test_the_headline_is_that_of_the_declared_estimator(report: PassReport) -> N
     p95 = float(np.percentile(size, 95.0))
     first, second, third, fourth, fifth = report.headline
     assert shown(first) == (
-        "Median position error",
-        pytest.approx(500.0, abs=0.01),
-        "m",
-        f"paper; 95 % below {p95:.0f} m",
-    )
+        "Median position error", pytest.approx(500.0, abs=0.01), "m", f"paper; 95 % below {p95:.0f} m",
+    )  # fmt: skip
     assert shown(second) == ("Propagation alone, same start", None, "m", "no start state")
     drift = pytest.approx(100.0 * 200.0 / STEP_M, rel=1e-6)
     assert shown(third) == ("Drift", drift, "% of path", "paper, horizontal")
@@ -823,14 +785,9 @@ def test_baselines_have_their_own_place_in_the_summary() -> None:
 
 def test_outcomes_are_joined_by_frame_number_in_any_order() -> None:
     found = OutcomeSamples(
-        "paper",
-        np.array([104, 101, 109]),
-        TIMES[:3],
-        ("matched",) * 3,
-        ("time_gap", "none", "manual_step"),
-        np.array([4, 1, 9]),
-        np.array([1, 1, 1]),
-    )
+        "paper", np.array([104, 101, 109]), TIMES[:3], ("matched",) * 3, ("time_gap", "none", "manual_step"),
+        np.array([4, 1, 9]), np.array([1, 1, 1]),
+    )  # fmt: skip
     triggers, candidates, reads = _joined(paper(), found)
     assert {100 + k: one for k, one in enumerate(triggers) if one != "none"} == {104: "time_gap", 109: "manual_step"}
     assert candidates is not None and candidates.tolist() == [0, 1, 0, 0, 4, 0, 0, 0, 0, 9, 0, 0]

@@ -86,13 +86,10 @@ def event(seconds: int, name: str, detail: str = "") -> PassEvent:
 def test_times_with_a_degraded_attitude_are_remarks() -> None:
     noise = "noise 0.2 deg per axis, declared 0.01 deg"
     events = (
-        event(5, "attitude_restored"),
-        event(300, "attitude_degraded", noise),
-        event(30, "attitude_degraded", noise),
-        event(40, "boot"),
-        event(90, "attitude_restored"),
+        event(5, "attitude_restored"), event(300, "attitude_degraded", noise),
+        event(30, "attitude_degraded", noise), event(40, "boot"), event(90, "attitude_restored"),
         event(95, "attitude_restored"),
-    )
+    )  # fmt: skip
     text = f"on ({noise}): the payload used the estimated noise"
     assert event_remarks(events) == [
         f"attitude judged noisier than declared from 2029-08-07T00:00:30.000Z {text}, until 2029-08-07T00:01:30.000Z",
@@ -123,14 +120,9 @@ def test_the_worst_frames_are_chosen_from_all_frames_and_not_from_those_with_an_
     found[10, 0] = -1
     m = FRAMES * CRATERS
     expected = ExpectedCraters(
-        offsets=np.arange(FRAMES + 1) * CRATERS,
-        index=np.arange(m),
-        u_px=np.zeros(m),
-        v_px=np.zeros(m),
-        diameter_px=np.ones(m),
-        size_class=np.zeros(m, dtype=np.int64),
-        complete=np.ones(m, dtype=np.bool_),
-    )
+        offsets=np.arange(FRAMES + 1) * CRATERS, index=np.arange(m), u_px=np.zeros(m), v_px=np.zeros(m),
+        diameter_px=np.ones(m), size_class=np.zeros(m, dtype=np.int64), complete=np.ones(m, dtype=np.bool_),
+    )  # fmt: skip
     usable = np.ones(FRAMES, dtype=np.bool_)
     usable[30] = False
 
@@ -419,12 +411,9 @@ def test_a_frame_without_reference_expects_nothing() -> None:
 def test_a_snapshot_of_a_tilted_distorted_camera_finds_its_place(telemetered: bool) -> None:
     craters = catalogue()
     pairs = Pairs(
-        np.zeros(4, dtype=np.int64),
-        np.zeros(4, dtype=np.int64),
-        np.array([pixel(*place, RIM_HEIGHT_M) for place in PLACES_DEG]),
-        np.full(4, 40.0),
-        craters.position_mcmf_m,
-    )
+        np.zeros(4, dtype=np.int64), np.zeros(4, dtype=np.int64),
+        np.array([pixel(*place, RIM_HEIGHT_M) for place in PLACES_DEG]), np.full(4, 40.0), craters.position_mcmf_m,
+    )  # fmt: skip
     viewing = Viewing(CAMERA, TILT_RAD)
     attitude = viewing.pointed(POSITION) if telemetered else None
     start = POSITION + np.array([[800.0, -500.0, 300.0]])

@@ -33,16 +33,9 @@ N = 10
 def series(name: str, kind: str = "estimate", median: float = 50.0, p95: float = 90.0, **more) -> NavigationSeries:
     nothing = np.zeros(N)
     return NavigationSeries(
-        name,
-        kind,
-        np.arange(N, dtype=np.int64),
-        nothing,
-        nothing,
-        nothing,
-        np.zeros((N, 3)),
-        statistics=NavigationStatistics(median_3d_m=median, p95_3d_m=p95),
-        **more,
-    )
+        name, kind, np.arange(N, dtype=np.int64), nothing, nothing, nothing, np.zeros((N, 3)),
+        statistics=NavigationStatistics(median_3d_m=median, p95_3d_m=p95), **more,
+    )  # fmt: skip
 
 
 def found(*navigation: NavigationSeries, **more) -> Evaluated:
@@ -278,26 +271,11 @@ def test_the_error_budget_takes_the_reference_off_in_squares() -> None:
 
 
 EVERY_LIMIT = Requirements(
-    estimator="anchored",
-    median_error_m=60.0,
-    p95_error_m=80.0,
-    better_than=("snapshot",),
-    consistency_inside_percent=90.0,
-    packets_percent=75.0,
-    frames_percent=90.0,
-    images_percent=25.0,
-    recall=0.25,
-    precision=0.8,
-    anchor_reads=3.0,
-    resets=1.0,
-    cpu_percent=50.0,
-    memory_mib=4.5,
-    storage_percent=20.0,
-    temperature_max_c=45.0,
-    temperature_min_c=5.0,
-    offset_px=0.3,
-    clock_step_s=0.1,
-)
+    estimator="anchored", median_error_m=60.0, p95_error_m=80.0, better_than=("snapshot",),
+    consistency_inside_percent=90.0, packets_percent=75.0, frames_percent=90.0, images_percent=25.0, recall=0.25,
+    precision=0.8, anchor_reads=3.0, resets=1.0, cpu_percent=50.0, memory_mib=4.5, storage_percent=20.0,
+    temperature_max_c=45.0, temperature_min_c=5.0, offset_px=0.3, clock_step_s=0.1,
+)  # fmt: skip
 
 
 def test_the_table_of_a_pass_in_full() -> None:

@@ -552,12 +552,9 @@ def test_a_ring_across_the_meridian_becomes_two() -> None:
 
 
 @given(
-    east=st.floats(-180.0, 180.0),
-    north=st.floats(-60.0, 60.0),
-    size=st.floats(0.5, 20.0),
-    points=st.integers(3, 40),
-    backwards=st.booleans(),
-)
+    east=st.floats(-180.0, 180.0), north=st.floats(-60.0, 60.0), size=st.floats(0.5, 20.0),
+    points=st.integers(3, 40), backwards=st.booleans(),
+)  # fmt: skip
 def test_cut_rings_keep_the_area_and_turn_counterclockwise(
     east: float, north: float, size: float, points: int, backwards: bool
 ) -> None:

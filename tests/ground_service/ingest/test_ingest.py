@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from sqlalchemy import event, func, select, text
 
 from ground_service.app import create_app
@@ -75,31 +73,6 @@ def test_every_packet_is_stored_with_its_rows(ground: Ground, packets: list[byte
     assert (result.crc_errors, result.octets_skipped, result.unknown) == (0, 0, 0)
     assert rows(ground, repository.SAMPLES["detections"]) == 6
     assert rows(ground, repository.SAMPLES["navigation_states"]) == 12
-
-
-def test_ingesting_twice_changes_nothing(ground: Ground, packets: list[bytes], expected: str, tmp_path: Path) -> None:
-    ingest(ground, b"".join(packets), tmp_path)
-    again = ingest(ground, b"".join(packets), tmp_path)
-    assert (again.packets_new, again.packets_repeated) == (0, len(packets))
-    assert hash_of(ground) == expected
-
-
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_any_order_split_and_repetition_gives_the_same_archive(
-    data: st.DataObject, packets: list[bytes], expected: str, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    folder = tmp_path_factory.mktemp("shuffled")
-    seed = data.draw(st.integers(0, 2**32 - 1))
-    rng = np.random.default_rng(seed)
-    order = rng.permutation(len(packets)).tolist() + rng.integers(0, len(packets), 5).tolist()
-    cuts = sorted(data.draw(st.lists(st.integers(0, len(order)), max_size=4)))
-    ground = open_ground(folder / "home")
-    for first, last in zip([0, *cuts], [*cuts, len(order)], strict=True):
-        if last > first:
-            ingest(ground, b"".join(packets[i] for i in order[first:last]), folder)
-    assert hash_of(ground) == expected
-    ground.close()
 
 
 def test_a_damaged_packet_is_counted_and_the_rest_is_stored(

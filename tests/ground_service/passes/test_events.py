@@ -205,11 +205,8 @@ def test_a_parameter_of_a_further_structure_has_a_series_a_live_value_an_alarm_a
         assert (live.value, live.limit_state) == (20.0, "within")
         [alarm] = client.list_alarms()
         assert (alarm.name, alarm.severity, alarm.value, alarm.active) == (
-            "camera_temperature_c",
-            "alarm",
-            HOT_C,
-            False,
-        )
+            "camera_temperature_c", "alarm", HOT_C, False,
+        )  # fmt: skip
         monkeypatch.setattr(inputs, "DRAWN", ("camera_temperature_c",))
         [drawn] = inputs.load_pass_inputs(ground, pass_id).housekeeping
         assert (drawn.name, drawn.unit, drawn.values.tolist()) == ("camera_temperature_c", "°C", values)
@@ -292,19 +289,11 @@ def add_report(ground: Ground, pass_id: int, level: str, created_utc_ns: int) ->
         store.add_report(
             connection,
             StoredReport(
-                id=f"{pass_id:016x}{created_utc_ns:016x}",
-                pass_id=pass_id,
-                html_sha256=stored.sha256,
-                json_sha256=stored.sha256,
-                pdf_sha256=None,
-                summary={"verdict_level": level},
-                mission_id=None,
-                event_number=None,
-                previous_id=None,
-                changes=None,
-                created_utc_ns=created_utc_ns,
+                id=f"{pass_id:016x}{created_utc_ns:016x}", pass_id=pass_id, html_sha256=stored.sha256,
+                json_sha256=stored.sha256, pdf_sha256=None, summary={"verdict_level": level}, mission_id=None,
+                event_number=None, previous_id=None, changes=None, created_utc_ns=created_utc_ns,
             ),
-        )
+        )  # fmt: skip
 
 
 def listed(ground: Ground, **terms: Any) -> tuple[list[int], int]:

@@ -62,13 +62,9 @@ def states(seed: int = 1) -> dict[str, Any]:
     columns["matched"] = rng.integers(0, 20, COUNT)
     columns["nis"][::7] = np.nan
     columns.update(
-        packet=np.arange(COUNT),
-        ticks=FIRST + seconds * SECOND + 11,
-        packet_ticks=FIRST + seconds * SECOND,
-        frame_number=np.arange(COUNT),
-        estimator=np.arange(COUNT) % 2,
-        outcome=np.zeros(COUNT, dtype=np.int64),
-    )
+        packet=np.arange(COUNT), ticks=FIRST + seconds * SECOND + 11, packet_ticks=FIRST + seconds * SECOND,
+        frame_number=np.arange(COUNT), estimator=np.arange(COUNT) % 2, outcome=np.zeros(COUNT, dtype=np.int64),
+    )  # fmt: skip
     return columns
 
 
@@ -248,12 +244,9 @@ def anchored_packets(made: Any, version: int) -> list[bytes]:
         frame = {"frame_number": k, "image_ticks": ticks}
         triangle = np.tril_indices(9) if version == 2 else np.triu_indices(9)
         values = {
-            **frame,
-            "position_icrf_m": position,
-            "velocity_icrf_m_s": state[3:],
-            "acceleration_rtn_m_s2": np.zeros(3),
-            "covariance": covariance[triangle],
-        }
+            **frame, "position_icrf_m": position, "velocity_icrf_m_s": state[3:],
+            "acceleration_rtn_m_s2": np.zeros(3), "covariance": covariance[triangle],
+        }  # fmt: skip
         name = "filter_state" if version == 2 else "filter_estimate"
         if version != 2:
             values["innovation_degrees"] = 24

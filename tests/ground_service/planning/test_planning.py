@@ -209,12 +209,9 @@ def test_data_of_a_frame_are_as_long_as_its_packets() -> None:
 def test_windows_conflict_where_they_overlap() -> None:
     mine = PlannedSpan(1, 100, 200, "draft")
     others = [
-        PlannedSpan(2, 50, 101, "approved"),
-        PlannedSpan(3, 200, 300, "approved"),
-        PlannedSpan(4, 120, 130, "draft"),
-        PlannedSpan(5, 120, 130, "failed"),
-        PlannedSpan(6, 199, 400, "executed"),
-    ]
+        PlannedSpan(2, 50, 101, "approved"), PlannedSpan(3, 200, 300, "approved"),
+        PlannedSpan(4, 120, 130, "draft"), PlannedSpan(5, 120, 130, "failed"), PlannedSpan(6, 199, 400, "executed"),
+    ]  # fmt: skip
     assert [one.window_id for one in span_conflicts(mine, None, others)] == [2, 6]
     near = span_conflicts(mine, None, others, gap_ns=1)
     assert [one.window_id for one in near] == [2, 3, 6]

@@ -374,37 +374,19 @@ POLICY = {"version": "1", "sha256": "00", "confidence": 0.95, "power": 0.8}  # o
 
 def gate(name: str, outcome: str, **values: Any) -> JudgedGate:
     known = {
-        "pass_id": None,
-        "passed": outcome == "pass",
-        "baseline": 0.9,
-        "candidate": 0.7,
-        "margin": None,
-        "limit": 0.05,
-        "unit": "",
-        "change_bounds": (None, None),
-        "p_value": None,
-        "level": None,
-        "resolution": None,
-        "frames": 10,
-        "frames_needed": None,
-        "reason": None,
-    }
+        "pass_id": None, "passed": outcome == "pass", "baseline": 0.9, "candidate": 0.7, "margin": None,
+        "limit": 0.05, "unit": "", "change_bounds": (None, None), "p_value": None, "level": None,
+        "resolution": None, "frames": 10, "frames_needed": None, "reason": None,
+    }  # fmt: skip
     return JudgedGate(name=name, outcome=outcome, **known | values)
 
 
 def regression(verdict: str, gates: list[JudgedGate], **values: Any) -> Regression:
     result = Verdict(
-        verdict=verdict,
-        baseline={"name": "old", **BUILD},
-        candidate={"name": "new", **BUILD},
-        policy=POLICY,
-        headline=f"{verdict}: no loss",
-        frames=10,
-        frames_needed=None,
-        gates=gates,
-        passes=values.get("passes", []),
+        verdict=verdict, baseline={"name": "old", **BUILD}, candidate={"name": "new", **BUILD}, policy=POLICY,
+        headline=f"{verdict}: no loss", frames=10, frames_needed=None, gates=gates, passes=values.get("passes", []),
         remarks=["builds were isolated"],
-    )
+    )  # fmt: skip
     return Regression(id="1", verdict=verdict, created=UtcTime(0), result=result)
 
 

@@ -146,15 +146,12 @@ def test_equal_builds_fail_once_in_a_hundred_at_most_and_pass_on_five_windows(pa
 @pytest.mark.parametrize(
     ("passes", "faults", "names"),
     [
-        (1, {"recall": 0.5}, {"detector.recall"}),
-        (5, {"recall": 0.65, "false_cells": 11}, {"detector.recall"}),
-        (5, {"false_cells": 24}, {"detector.precision"}),
-        (1, {"off_px": 0.5}, {"detector.localisation"}),
-        (5, {"fixes": 0.8}, {"navigation.anchored.fixes"}),
-        (5, {"error": 2.0}, {"navigation.anchored.p50"}),
+        (1, {"recall": 0.5}, {"detector.recall"}), (5, {"recall": 0.65, "false_cells": 11}, {"detector.recall"}),
+        (5, {"false_cells": 24}, {"detector.precision"}), (1, {"off_px": 0.5}, {"detector.localisation"}),
+        (5, {"fixes": 0.8}, {"navigation.anchored.fixes"}), (5, {"error": 2.0}, {"navigation.anchored.p50"}),
         (20, {"error": 1.25}, {"navigation.anchored.p50"}),
     ],
-)
+)  # fmt: skip
 def test_a_degraded_build_fails_by_the_metric_that_is_worse(
     passes: int, faults: dict[str, Any], names: set[str]
 ) -> None:
@@ -484,14 +481,11 @@ def gate(outcome: str, name: str = "x") -> Gate:
 @pytest.mark.parametrize(
     ("gates", "verdict"),
     [
-        ([], "inconclusive"),
-        ([gate("pass")], "pass"),
-        ([gate("pass", name="memory")], "inconclusive"),
-        ([gate("pass"), gate("inconclusive")], "inconclusive"),
-        ([gate("inconclusive"), gate("fail")], "fail"),
+        ([], "inconclusive"), ([gate("pass")], "pass"), ([gate("pass", name="memory")], "inconclusive"),
+        ([gate("pass"), gate("inconclusive")], "inconclusive"), ([gate("inconclusive"), gate("fail")], "fail"),
         ([gate("pass"), gate("not judged"), gate("informs")], "pass"),
     ],
-)
+)  # fmt: skip
 def test_the_verdict_is_that_of_the_worst_deciding_gate(gates: list[Gate], verdict: str) -> None:
     assert verdict_of(gates) == verdict
 

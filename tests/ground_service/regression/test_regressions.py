@@ -310,25 +310,17 @@ def test_a_replay_is_done_once_and_one_that_failed_again(home, judge, passes, ma
     before = find_replay(home, digest, outcome.candidate)
     flown: list[int] = []
     run_regression(
-        home,
-        [passes[0].folder],
-        outcome.candidate,
-        outcome.baseline,
-        policy,
+        home, [passes[0].folder], outcome.candidate, outcome.baseline, policy,
         progress=lambda items, total: (flown.append(total), iter(items))[1],
-    )
+    )  # fmt: skip
     assert flown == []
     assert find_replay(home, digest, outcome.candidate) == before
     broken = register_build(home, load_build(make_build("broken", program="raise SystemExit(3)")))
     for _ in range(2):
         run_regression(
-            home,
-            [passes[0].folder],
-            broken,
-            outcome.baseline,
-            policy,
+            home, [passes[0].folder], broken, outcome.baseline, policy,
             progress=lambda items, total: (flown.append(total), iter(items))[1],
-        )
+        )  # fmt: skip
     assert flown == [1, 1]
 
 
@@ -471,12 +463,9 @@ def test_the_settings_say_how_long_archives_are_kept(tmp_path: Path, monkeypatch
     monkeypatch.setenv("LINNA_ARCHIVE_LIMIT_MIB", "2000")
     kept = Settings(home=tmp_path).kept
     assert kept == {
-        "retention_days": 90,
-        "archive_days": 400,
-        "archive_limit_mib": 2000,
-        "audit_heads": None,
+        "retention_days": 90, "archive_days": 400, "archive_limit_mib": 2000, "audit_heads": None,
         "placebo_passes": 3,
-    }
+    }  # fmt: skip
     with pytest.MonkeyPatch.context() as patched:
         called = MagicMock(return_value=[])
         patched.setattr("ground_service.worker.upkeep.let_go", called)
@@ -568,12 +557,9 @@ def test_a_build_that_differs_on_few_frames_is_inconclusive_with_the_frames_need
     )
     changed = judge(with_detections(packets, changed_here_and_there))
     outcome = run_regression(
-        home,
-        [one.digest for one in changed.passes],
-        changed.candidate,
-        changed.baseline,
+        home, [one.digest for one in changed.passes], changed.candidate, changed.baseline,
         dataclasses.replace(policy, policy=dataclasses.replace(policy.policy, rules=strict)),
-    )
+    )  # fmt: skip
     assert (outcome.verdict, verdict_document(outcome).exit_status) == ("inconclusive", 3)
     recall = next(gate for gate in outcome.gates if gate.name == "detector.recall" and not gate.pass_id)
     assert (recall.outcome, recall.frames) == ("inconclusive", 60)
@@ -603,15 +589,10 @@ def test_a_regression_without_a_gate_is_never_a_pass(judge, home, policy, passes
 
 JUNIT = {
     "testsuite": {"name", "timestamp", "hostname", "tests", "failures", "errors", "skipped", "time"},
-    "properties": set(),
-    "property": {"name", "value"},
-    "testcase": {"name", "classname", "time"},
-    "failure": {"message", "type"},
-    "error": {"message", "type"},
-    "skipped": {"message"},
-    "system-out": set(),
+    "properties": set(), "property": {"name", "value"}, "testcase": {"name", "classname", "time"},
+    "failure": {"message", "type"}, "error": {"message", "type"}, "skipped": {"message"}, "system-out": set(),
     "system-err": set(),
-}
+}  # fmt: skip
 """Attributes that both the schema of the Jenkins xUnit plugin (junit-10.xsd) and that of Apache Ant permit and need."""
 
 

@@ -39,14 +39,10 @@ def ephemeris() -> Ephemeris:
         ),
     )
     second = EphemerisSegment(
-        START + np.arange(4, 9) * 60 * NS + 123_456_789,
-        rng.normal(size=(5, 3)) * 1e6,
-        rng.normal(size=(5, 3)) * 1e3,
-        time_system="TDB",
-        interpolation="LAGRANGE",
-        degree=5,
+        START + np.arange(4, 9) * 60 * NS + 123_456_789, rng.normal(size=(5, 3)) * 1e6,
+        rng.normal(size=(5, 3)) * 1e3, time_system="TDB", interpolation="LAGRANGE", degree=5,
         useable_start_utc_ns=START + 300 * NS,
-    )
+    )  # fmt: skip
     return Ephemeris((first, second), "TEST", ("two arcs",))
 
 

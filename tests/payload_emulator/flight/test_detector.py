@@ -157,13 +157,9 @@ def test_a_flat_heatmap_gives_no_detections():
 def detections(u, v, diameter=40.0, ratio=None):
     n = len(u)
     return Detections(
-        np.array(u, float),
-        np.array(v, float),
-        np.full(n, diameter),
-        np.full(n, 0.9),
-        np.ones(n),
+        np.array(u, float), np.array(v, float), np.full(n, diameter), np.full(n, 0.9), np.ones(n),
         None if ratio is None else np.array(ratio, float),
-    )
+    )  # fmt: skip
 
 
 def test_parallax_is_taken_out_radially_and_in_proportion_to_the_depth():

@@ -43,15 +43,9 @@ MCMF_FROM_ICRF = Rotation.from_rotvec([0.3, -0.2, 1.1]).as_matrix()
 CAMERA_FROM_ICRF = CAMERA_FROM_MCMF @ MCMF_FROM_ICRF
 POSITION_ICRF = MCMF_FROM_ICRF.T @ np.array([RADIUS_M + 30e3, 2_000.0, -1_500.0])
 ERRORS = CommonErrors(
-    attitude_noise_rad=4e-4,
-    attitude_bias_rad=2e-4,
-    attitude_correlation_s=1_000.0,
-    pixel_bias_px=0.25,
-    pixel_correlation_s=500.0,
-    catalogue_offset_m=(15.0, 12.0, 10.0),
-    scale=2e-4,
-    scale_sigma=5e-4,
-)
+    attitude_noise_rad=4e-4, attitude_bias_rad=2e-4, attitude_correlation_s=1_000.0, pixel_bias_px=0.25,
+    pixel_correlation_s=500.0, catalogue_offset_m=(15.0, 12.0, 10.0), scale=2e-4, scale_sigma=5e-4,
+)  # fmt: skip
 
 
 def craters(count: int = 7, seed: int = 2) -> LandmarkMap:

@@ -102,12 +102,9 @@ class Navigator:
 
 def detections(count: int) -> Detections:
     return Detections(
-        100.0 + 10.0 * np.arange(count),
-        np.full(count, 200.0),
-        np.full(count, 30.0),
-        np.linspace(0.9, 0.4, count),
+        100.0 + 10.0 * np.arange(count), np.full(count, 200.0), np.full(count, 30.0), np.linspace(0.9, 0.4, count),
         np.full(count, 0.7),
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture

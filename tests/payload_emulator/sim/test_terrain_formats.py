@@ -151,14 +151,9 @@ def test_projected_metres_join_across_tiles_whose_pixels_do_not_divide_the_degre
 def test_jpeg_2000_of_16_bits(tmp_path):
     values = np.rint(plane(*grid(8.0, 22.0, 256, 256, 16))).astype("int16")
     path = write_tiff(
-        tmp_path / "a.jp2",
-        rasterio.Affine(1 / 16, 0, 8.0, 0, -1 / 16, 22.0),
-        values,
-        "+proj=longlat +R=1737400 +no_defs",
-        driver="JP2OpenJPEG",
-        quality="100",
-        reversible="YES",
-    )
+        tmp_path / "a.jp2", rasterio.Affine(1 / 16, 0, 8.0, 0, -1 / 16, 22.0), values,
+        "+proj=longlat +R=1737400 +no_defs", driver="JP2OpenJPEG", quality="100", reversible="YES",
+    )  # fmt: skip
     heights_agree(RasterTerrain([path], NONE, **AS_IT_IS), np.array([14.3]), np.array([12.2]), 1.0)
 
 
@@ -248,34 +243,23 @@ def write_form(
 @pytest.mark.parametrize(
     "form",
     [
-        {},
-        {"convert": lambda h: h + 1_737_400.0, "dtype": "float64"},
-        {"convert": lambda h: h + 1_737_400.0},
-        {"convert": lambda h: h / 1e3 + 1_737.4, "dtype": "float64"},
-        {"convert": lambda h: h / 1e3, "unit": "km"},
-        {"convert": lambda h: h / 1e3 + 1_737.4, "unit": "km"},
-        {"convert": lambda h: h / 0.3048, "unit": "ft"},
+        {}, {"convert": lambda h: h + 1_737_400.0, "dtype": "float64"}, {"convert": lambda h: h + 1_737_400.0},
+        {"convert": lambda h: h / 1e3 + 1_737.4, "dtype": "float64"}, {"convert": lambda h: h / 1e3, "unit": "km"},
+        {"convert": lambda h: h / 1e3 + 1_737.4, "unit": "km"}, {"convert": lambda h: h / 0.3048, "unit": "ft"},
         {"convert": lambda h: h * 3937 / 1200, "unit": "US survey foot"},
         {"convert": lambda h: h * 10.0, "unit": "dm"},
         {"convert": lambda h: np.rint(2 * h), "dtype": "int16", "scales": (0.5, 0.0)},
         {"convert": lambda h: np.rint(2 * h), "dtype": "int16", "scales": (0.5, 1_737_400.0)},
         {"convert": lambda h: h / 1e3, "scales": (1.0, 1_737.4)},
-        {"convert": np.rint, "dtype": "int16", "edge": -32768},
-        {"edge": -32768.0},
-        {"edge": -99_999.0},
-        {"edge": 1e20},
-        {"edge": np.nan},
-        {"edge": 0.0, "mask": True},
-        {"edge": 5.0, "nodata": 5.0},
-        {"west": -350.0},
-        {"west": 370.0},
+        {"convert": np.rint, "dtype": "int16", "edge": -32768}, {"edge": -32768.0}, {"edge": -99_999.0},
+        {"edge": 1e20}, {"edge": np.nan}, {"edge": 0.0, "mask": True}, {"edge": 5.0, "nodata": 5.0},
+        {"west": -350.0}, {"west": 370.0},
         {"crs": "+proj=eqc +R=1737400 +units=km", "scale": METRES_PER_DEGREE / 1e3},
         {"crs": "+proj=eqc +R=1737400 +lon_0=180", "scale": METRES_PER_DEGREE, "west": -170.0},
-        {"crs": "+proj=eqc +R=1737400", "scale": METRES_PER_DEGREE, "west": -350.0},
-        {"high": 1 / 32},
+        {"crs": "+proj=eqc +R=1737400", "scale": METRES_PER_DEGREE, "west": -350.0}, {"high": 1 / 32},
         {"high": -1 / 16},
     ],
-)
+)  # fmt: skip
 def test_a_form_of_the_same_ground_gives_the_same_heights(tmp_path, form):
     terrain = RasterTerrain([write_form(tmp_path / "a.tif", **form)], NONE, **AS_IT_IS)
     found = terrain.height_m(*np.radians(PLACES))

@@ -54,25 +54,14 @@ def add_pass(ground: Ground, number: int, *, instance: str = FLOWN, **changes: A
     """Add a pass with a report, one a day."""
     start = FIRST + number * DAY_NS
     pass_id = define_pass(
-        ground,
-        name=f"pass {number}",
-        start_utc_ns=start,
-        stop_utc_ns=start + 10**12,
-        spacecraft_id=SPACECRAFT,
+        ground, name=f"pass {number}", start_utc_ns=start, stop_utc_ns=start + 10**12, spacecraft_id=SPACECRAFT,
         instance=instance,
-    )
+    )  # fmt: skip
     blob = ground.files.put_octets(b"x")
     values: dict[str, Any] = {
-        "recall": 0.70 + 0.01 * (number % 3),
-        "drift": 0.10,
-        "error": 80.0,
-        "altitude": 25.0,
-        "status": "met",
-        "build": "a",
-        "key": "accuracy.median",
-        "limit": 100.0,
-        **changes,
-    }
+        "recall": 0.70 + 0.01 * (number % 3), "drift": 0.10, "error": 80.0, "altitude": 25.0, "status": "met",
+        "build": "a", "key": "accuracy.median", "limit": 100.0, **changes,
+    }  # fmt: skip
     errors = dict.fromkeys(("p68_3d_m", "p95_3d_m", "p99_3d_m", "max_3d_m", "end_of_pass_m"))
     summary = {
         "pass_id": pass_id,
@@ -106,18 +95,10 @@ def add_pass(ground: Ground, number: int, *, instance: str = FLOWN, **changes: A
     with ground.database.writing() as connection:
         register_file(connection, blob, "report", "x", 1)
         report = StoredReport(
-            id=f"{pass_id:032x}",
-            pass_id=pass_id,
-            html_sha256=blob.sha256,
-            json_sha256=blob.sha256,
-            pdf_sha256=None,
-            summary=summary,
-            mission_id=None,
-            event_number=None,
-            previous_id=None,
-            changes=None,
+            id=f"{pass_id:032x}", pass_id=pass_id, html_sha256=blob.sha256, json_sha256=blob.sha256,
+            pdf_sha256=None, summary=summary, mission_id=None, event_number=None, previous_id=None, changes=None,
             created_utc_ns=start,
-        )
+        )  # fmt: skip
         add_report(connection, report)
     return pass_id
 
@@ -320,23 +301,11 @@ def test_the_first_processed_window_of_a_month_reports_the_last_one(ground: Grou
     with ground.database.writing() as connection:
         row = connection.execute(repository.PASSES.select()).mappings().one()
         values = {
-            "vehicle_id": row["vehicle_id"],
-            "pass_id": row["id"],
-            "name": "w",
-            "start_utc_ns": FIRST,
-            "stop_utc_ns": FIRST + 10**12,
-            "cadence_s": 15.0,
-            "state": "processed",
-            "version": 1,
-            "decision": "approved",
-            "data_octets": 1,
-            "predicted": {},
-            "closed": 0,
-            "created_by": "a",
-            "edited_by": "a",
-            "created_utc_ns": 1,
-            "changed_utc_ns": 1,
-        }
+            "vehicle_id": row["vehicle_id"], "pass_id": row["id"], "name": "w", "start_utc_ns": FIRST,
+            "stop_utc_ns": FIRST + 10**12, "cadence_s": 15.0, "state": "processed", "version": 1,
+            "decision": "approved", "data_octets": 1, "predicted": {}, "closed": 0, "created_by": "a",
+            "edited_by": "a", "created_utc_ns": 1, "changed_utc_ns": 1,
+        }  # fmt: skip
         window = repository.add(connection, repository.WINDOWS, **values)
         publish(connection, WindowChanged(id=int(window), state="processed"))
     [made] = ground.read(list_monthly_reports, MonthlyReportFilter()).items
