@@ -20,7 +20,7 @@ from sqlalchemy import func, select
 
 from benchmarks.campaigns.cuts import KINDS, ORDERS, Archive, Piece, archive, case_of, ingest
 from ground_service.ground import Ground, open_ground
-from ground_service.ingest.core import NO_RECORD, Found
+from ground_service.ingest.core import NO_RECORD, LinkContent
 from ground_service.ingest.frames import FrameReader, PacketReader, Section
 from ground_service.ingest.reception import Reading, Run
 from ground_service.ingest.service import Place, ingest_file
@@ -49,11 +49,11 @@ def reader_of(octets: bytes, spacecraft_id: int | None = None) -> FrameReader | 
     sections = plan_of(octets).sections
     section = Section(None, 0, len(octets), 0, len(octets))
     if not sections:
-        return PacketReader(section, Found(), spacecraft_id=spacecraft_id)
-    return FrameReader(section, sections[0].settings, Found(), spacecraft_id=spacecraft_id, record=NO_RECORD)
+        return PacketReader(section, LinkContent(), spacecraft_id=spacecraft_id)
+    return FrameReader(section, sections[0].settings, LinkContent(), spacecraft_id=spacecraft_id, record=NO_RECORD)
 
 
-def read(octets: bytes, window: int, spacecraft_id: int | None = None) -> tuple[list[bytes], Found, int]:
+def read(octets: bytes, window: int, spacecraft_id: int | None = None) -> tuple[list[bytes], LinkContent, int]:
     """The packets, the counts, and the octets in no frame or packet."""
     reader = reader_of(octets, spacecraft_id)
     packets = [packet for batch in reader.batches(windows(octets, window)) for packet in batch.octets]
@@ -116,7 +116,7 @@ def test_memory_does_not_grow_with_the_stream(packets: list[bytes]) -> None:
     read(stream, 1 << 20)  # imports and compiles
     section = Section(None, 0, 75 * len(stream), 0, 75 * len(stream))
     settings = LinkSettings(frame_length=223)
-    reader = FrameReader(section, settings, Found(), spacecraft_id=SPACECRAFT, record=NO_RECORD)
+    reader = FrameReader(section, settings, LinkContent(), spacecraft_id=SPACECRAFT, record=NO_RECORD)
     peaks: list[int] = []
     tracemalloc.start()
     for _ in reader.batches((as_octets(5 * stream), False) for _ in range(15)):

@@ -11,7 +11,7 @@ import pytest
 from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
 from lunar.frames import enu_from_mcmf, mcmf_from_spherical
-from payload_emulator.flight.navigation.search._fit_kernel import Found, Image, Seen, log_evidence
+from payload_emulator.flight.navigation.search._fit_kernel import DetectedCraters, Image, Seen, log_evidence
 from payload_emulator.flight.navigation.search.lost_in_space import (
     NADIR_NORTH_UP,
     LostParameters,
@@ -224,7 +224,7 @@ def evidence_of(uv_px: FloatArray, diameter_px: FloatArray, pairs: list[int], sc
     """Return the evidence of detections for four craters of 8 to 64 px predicted in an image of 100 by 100."""
     seen = Seen(PREDICTED_PX, np.log([8.0, 16.0, 32.0, 64.0]), np.zeros((4, 3)), np.zeros(4))
     score = np.full(len(uv_px), 0.5) if score is None else score
-    found = Found(uv_px, np.log(diameter_px), np.full(len(uv_px), 3.0**2), score)
+    found = DetectedCraters(uv_px, np.log(diameter_px), np.full(len(uv_px), 3.0**2), score)
     return log_evidence(np.array(pairs), seen, found, IMAGE, 0.1)
 
 
