@@ -148,6 +148,8 @@ def test_attitudes_between_two_epochs_lie_on_the_arc_between_them(flown, tmp_pat
     # A quarter of forty degrees, whatever the sign of the quaternion.
     assert np.degrees(np.arccos((np.trace(quarter) - 1.0) / 2.0)) == pytest.approx(10.0, abs=1e-6)
     assert np.trace(frames.camera_from_icrf(int(start))) == pytest.approx(3.0)
+    (folder / "attitude.aem").unlink()
+    assert load_external(folder, parse_scenario(TEXT)).camera_from_icrf(int(start)) is None
 
 
 def edited(name, old, new):
