@@ -13,12 +13,9 @@ from benchmarks.rooms import Rooms, measure
 MODULES = {
     "house": "",
     "house.attic": "import json\nfrom house.hall import (\n    door,\n)\n\n\ndef f():\n    from house import cellar\n",
-    "house.hall": "",
-    "house.hall.door": "from house.hall.key import KEY\nfrom house.cellar import STAIRS\n",
-    "house.hall.key": "KEY = 1\n",
-    "house.cellar": "STAIRS = 1\n",
-    "houses": "import house\n",
-}
+    "house.hall": "", "house.hall.door": "from house.hall.key import KEY\nfrom house.cellar import STAIRS\n",
+    "house.hall.key": "KEY = 1\n", "house.cellar": "STAIRS = 1\n", "houses": "import house\n",
+}  # fmt: skip
 
 
 def test_rooms_floors_and_arrows_are_those_of_the_imports() -> None:

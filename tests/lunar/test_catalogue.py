@@ -221,10 +221,7 @@ OWN = """id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete
     [
         (OWN, "lines 2 and 3, column id: expected an id of its own for each crater .* found 1 twice"),
         (OWN.replace("\n1,-36", "\n1.7,-36"), "line 3, column id: expected a whole number, found 1.7"),
-        (
-            OWN.replace("\n1,-36", "\n3,-36").replace(",112.0,", ",1737512.0,"),
-            "line 2: expected a rim height",
-        ),
+        (OWN.replace("\n1,-36", "\n3,-36").replace(",112.0,", ",1737512.0,"), "line 2: expected a rim height"),
         (OWN.replace("\n1,-36", "\n3,-36").replace(",1060.0,1", ",1060.0,yes"), "line 2, column complete"),
     ],
 )

@@ -72,9 +72,7 @@ def test_a_row_is_not_run_again_until_something_changed(samples, monkeypatch):
 
 def test_a_refusal_needs_a_reason(samples, monkeypatch):
     entry = {"way": "writes", "what": "SPK", "refused": "ValueError: frame"}
-    monkeypatch.setattr(
-        compatibility, "run_row", lambda *_: [entry, {**entry, "why": "a frame | of its own"}]
-    )
+    monkeypatch.setattr(compatibility, "run_row", lambda *_: [entry, {**entry, "why": "a frame | of its own"}])
     bare, stated = result(ROWS[1], samples, again=True)
     assert not bare["good"] and stated["good"]
     assert stated["text"] == "refused: ValueError: frame (a frame \\| of its own)"

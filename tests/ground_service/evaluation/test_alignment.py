@@ -48,9 +48,7 @@ def polar() -> Ephemeris:
     zero = np.zeros_like(angle)
     outward = np.stack([np.cos(angle), zero, np.sin(angle)], axis=1)
     ahead = np.stack([-np.sin(angle), zero, np.cos(angle)], axis=1)
-    return ephemeris_from_states(
-        EPOCH + (seconds * 1e9).astype(np.int64), RADIUS_M * outward, SPEED_M_S * ahead
-    )
+    return ephemeris_from_states(EPOCH + (seconds * 1e9).astype(np.int64), RADIUS_M * outward, SPEED_M_S * ahead)
 
 
 def after(*seconds: float) -> np.ndarray:
@@ -63,9 +61,7 @@ def test_the_reference_has_its_place_over_the_turned_moon() -> None:
     assert track.covered.all()
     np.testing.assert_allclose(track.latitude_deg, np.degrees(angle), atol=1e-9)
     # The ground turns to the east below it: 1e-4 rad/s over 105 and 600 s.
-    np.testing.assert_allclose(
-        track.longitude_deg, [0.0, 360.0 - math.degrees(0.0105), 360.0 - math.degrees(0.06)]
-    )
+    np.testing.assert_allclose(track.longitude_deg, [0.0, 360.0 - math.degrees(0.0105), 360.0 - math.degrees(0.06)])
     np.testing.assert_allclose(track.altitude_m, 50_000.0, atol=1e-4)
     np.testing.assert_allclose(np.linalg.norm(track.velocity_icrf_m_s, axis=1), SPEED_M_S, atol=1e-6)
 

@@ -40,8 +40,7 @@ def pairs(noise_px: float = 0.0, seed: int = 3) -> Pairs:
     """Eight craters seen in both of two frames."""
     rng = np.random.default_rng(seed)
     uv = [
-        CAMERA.project((craters() - place) @ nadir_camera_from_mcmf(place).T)
-        + rng.normal(0.0, noise_px, (8, 2))
+        CAMERA.project((craters() - place) @ nadir_camera_from_mcmf(place).T) + rng.normal(0.0, noise_px, (8, 2))
         for place in POSITION
     ]
     frame = np.repeat([0, 1], 8)
@@ -65,9 +64,7 @@ def test_noise_of_a_pixel_moves_it_by_hundreds_of_metres_at_most() -> None:
 def test_too_few_craters_give_no_position() -> None:
     few = pairs()
     keep = np.array([0, 1, 8, 9, 10])
-    few = Pairs(
-        *(getattr(few, name)[keep] for name in ("frame", "utc_ns", "uv_px", "diameter_px", "crater_mcmf_m"))
-    )
+    few = Pairs(*(getattr(few, name)[keep] for name in ("frame", "utc_ns", "uv_px", "diameter_px", "crater_mcmf_m")))
     solved = snapshot_positions(few, CAMERA, UTC_NS, POSITION)
     assert np.isnan(solved[0]).all()
     assert np.isfinite(solved[1]).all()
@@ -118,23 +115,14 @@ def test_identifications_are_joined_by_time_place_and_number() -> None:
     latitude, heights = np.radians([10.0, 11.0, 12.0, 13.0]), [0.0, 0.0, 0.0, np.nan]
     catalogue = make_catalogue(latitude, np.zeros(4), np.full(4, 5e3), source="test", rim_height_m=heights)
     detections = DetectionSamples(
-        frame_number=np.array([0, 1]),
-        utc_ns=UTC_NS,
-        usable=np.ones(2, dtype=np.bool_),
-        quality=("ok", "ok"),
-        offsets=np.array([0, 2, 3]),
-        u_px=np.array([1.0, 2.0, 3.0]),
-        v_px=np.array([4.0, 5.0, 6.0]),
-        diameter_px=np.array([7.0, 8.0, 9.0]),
-        score=np.ones(3),
-        size_class=np.zeros(3, dtype=np.int64),
-    )
+        frame_number=np.array([0, 1]), utc_ns=UTC_NS, usable=np.ones(2, dtype=np.bool_), quality=("ok", "ok"),
+        offsets=np.array([0, 2, 3]), u_px=np.array([1.0, 2.0, 3.0]), v_px=np.array([4.0, 5.0, 6.0]),
+        diameter_px=np.array([7.0, 8.0, 9.0]), score=np.ones(3), size_class=np.zeros(3, dtype=np.int64),
+    )  # fmt: skip
     ids = catalogue.ids
     found = IdentificationSamples(
         utc_ns=np.array([1000, 2000, 2000, 1500, 1000, 1000]),
-        detection=np.array(
-            [1, 0, 1, 0, 0, 0]
-        ),  # the third names a detection that is not there, the fourth a time
+        detection=np.array([1, 0, 1, 0, 0, 0]),  # the third names a detection that is not there, the fourth a time
         # the last two a crater that is not there, and one of unknown height
         crater_id=np.array([ids[2], ids[0], ids[1], ids[1], 10**6, ids[3]]),
     )
@@ -163,14 +151,10 @@ def mapped(known: CraterCatalogue, sigma_m: float, seed: int = 2, shift_m: float
     latitude = np.degrees(known.latitude_rad) + (north + shift_m) / METRES_PER_DEG
     longitude = np.degrees(known.longitude_rad) + east / (METRES_PER_DEG * np.cos(known.latitude_rad))
     return MappedCraters(
-        3_000_000_000 + np.arange(len(known)),
-        latitude,
-        longitude % 360.0,
-        known.rim_height_m + up,
-        known.diameter_m * np.exp(0.05 * rng.standard_normal(len(known))),
-        np.full((len(known), 3), sigma_m),
+        3_000_000_000 + np.arange(len(known)), latitude, longitude % 360.0, known.rim_height_m + up,
+        known.diameter_m * np.exp(0.05 * rng.standard_normal(len(known))), np.full((len(known), 3), sigma_m),
         np.ones(len(known), dtype=np.int64),
-    )
+    )  # fmt: skip
 
 
 def test_landmarks_are_found_in_the_catalogue_on_both_sides_of_the_meridian_with_honest_sigmas() -> None:
@@ -215,9 +199,7 @@ def test_an_empty_map_compares_to_nothing() -> None:
     assert math.isnan(result.median_horizontal_m)
 
 
-def test_a_report_counts_the_landmarks_the_fixes_that_used_them_and_their_distance_from_the_catalogue() -> (
-    None
-):
+def test_a_report_counts_the_landmarks_the_fixes_that_used_them_and_their_distance_from_the_catalogue() -> None:
     craters = catalogue()
     reports = mapped(craters, 100.0)
     # The catalogue's crater 7, and landmark 0 twice and landmark 1 once.

@@ -134,11 +134,7 @@ def test_a_whole_pass(make_pass: Maker, ground: Ground) -> None:
 
 @pytest.mark.parametrize(
     ("seen_frames", "level"),
-    [
-        (0, "3 (real terrain never"),
-        (8, "3s (real terrain seen in training; 33 %"),
-        (FRAMES, "3s (real terrain seen"),
-    ],
+    [(0, "3 (real terrain never"), (8, "3s (real terrain seen in training; 33 %"), (FRAMES, "3s (real terrain seen")],
 )
 def test_the_share_over_unseen_terrain_is_that_of_the_frames_of_the_pass(
     make_pass: Maker, ground: Ground, seen_frames: int, level: str
@@ -196,9 +192,7 @@ def test_frames_that_were_never_made_are_no_lost_packets(make_pass: Maker, groun
         ticks[0] -= TICKS_PER_SECOND  # the packets of an image are made after it
         events = [
             event_packet(tick, count, f"observation_{name}", number)
-            for count, (name, number, tick) in enumerate(
-                zip(("started", "stopped"), (0, 6), ticks, strict=True)
-            )
+            for count, (name, number, tick) in enumerate(zip(("started", "stopped"), (0, 6), ticks, strict=True))
         ]
         return encode_downlink([events[0], *packets[: 6 * PACKETS_PER_FRAME], events[1]])
 
@@ -250,9 +244,7 @@ def test_of_two_reports_on_one_image_one_counts(make_pass: Maker, ground: Ground
     assert [part.frame_number.tolist() for part in inputs.navigation] == 2 * [list(range(FRAMES))]
 
 
-def test_a_damaged_file_of_another_pass_changes_nothing(
-    make_pass: Maker, ground: Ground, tmp_path: Path
-) -> None:
+def test_a_damaged_file_of_another_pass_changes_nothing(make_pass: Maker, ground: Ground, tmp_path: Path) -> None:
     made = make_pass(frames=FRAMES, seed=45, mission=MISSION)
     key = import_archive(ground, made.folder)
     before = to_json(evaluate(ground, key))
@@ -316,9 +308,7 @@ def test_the_wrong_orientation_is_refused(make_pass: Maker, ground: Ground) -> N
     mission = MISSION.replace("IAU WGCCRE 2009", "DE421")
     report = evaluated(ground, make_pass(frames=FRAMES, seed=48, mission=mission).folder)
     judged = statuses(report)
-    assert {judged[k] for k in ("accuracy.median", "detector.recall", "better_than.propagate-only")} == {
-        "unknown"
-    }
+    assert {judged[k] for k in ("accuracy.median", "detector.recall", "better_than.propagate-only")} == {"unknown"}
     assert "DE421, which is not available on this machine" in render_html(report)
 
 
@@ -332,9 +322,7 @@ def test_a_tilted_camera_with_a_lens(make_pass: Maker, ground: Ground) -> None:
     tilted = MISSION.replace("k1 = 0.0", f"k1 = -0.02\np1 = 5e-4\ntilt_deg = {TILT_DEG}\nyaw_deg = 0.0")
 
     def pass_of(seed: int, mission: str) -> Any:
-        return make_pass(
-            frames=FRAMES, seed=seed, camera=LENS, tilt_rad=math.radians(TILT_DEG), mission=mission
-        )
+        return make_pass(frames=FRAMES, seed=seed, camera=LENS, tilt_rad=math.radians(TILT_DEG), mission=mission)
 
     made = pass_of(49, tilted)
     report = evaluated(ground, made.folder)
@@ -349,9 +337,7 @@ def test_a_tilted_camera_with_a_lens(make_pass: Maker, ground: Ground) -> None:
 
 
 @pytest.mark.parametrize(("nis", "mean", "status"), [(10.0, 1.0, "met"), (100.0, 10.0, "not met")])
-def test_an_overconfident_filter(
-    make_pass: Maker, ground: Ground, nis: float, mean: float, status: str
-) -> None:
+def test_an_overconfident_filter(make_pass: Maker, ground: Ground, nis: float, mean: float, status: str) -> None:
     """Five craters give ten degrees of freedom."""
     mission = MISSION.replace('"spherical"', '"anchored"').replace(
         "median_error_m = 129.0", "median_error_m = 100.0\nconsistency_inside_percent = 90.0"

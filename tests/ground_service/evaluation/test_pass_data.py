@@ -32,9 +32,7 @@ from reports.render import to_json
 from tests.ground_service.conftest import define_pass_of, enter_files
 from tests.ground_service.evaluation.still import TurnedOrientation
 
-MISSING_FILES = DataFolder(
-    orientation_bpc=Path("no.bpc"), gravity=Path("no.gfc"), gravity_alternative=Path("no.cof")
-)
+MISSING_FILES = DataFolder(orientation_bpc=Path("no.bpc"), gravity=Path("no.gfc"), gravity_alternative=Path("no.cof"))
 """A data folder with other models; none of them may even be opened."""
 
 
@@ -220,10 +218,7 @@ def test_two_attitude_files_are_refused(synthetic_pass: Any, ground: Ground, tmp
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "CCSDS_AEM_VERS = 9\n",
-            "a.csv: expected a CCSDS AEM, found line 1: expected an AEM version out of 1.0, 2.0",
-        ),
+        ("CCSDS_AEM_VERS = 9\n", "a.csv: expected a CCSDS AEM, found line 1: expected an AEM version out of 1.0, 2.0"),
         ("", "a.csv, line 1: expected image_ticks,q_w"),
         ("ticks,q\n", "a.csv, line 1: expected image_ticks,q_w"),
         (f"{HEADER}\n5,1,0,0,0\n6,1,0,0\n", "a.csv, line 3: expected on-board ticks and a unit quaternion"),

@@ -20,12 +20,7 @@ from ground_service.evaluation.model import PassFigures
 from ground_service.evaluation.recall import Viewing
 from ground_service.evaluation.smoother import ONBOARD, FilterStates, StartState
 from ground_service.missions.model import Requirements
-from ground_service.telemetry.samples import (
-    DetectionSamples,
-    NavigationSamples,
-    OutcomeSamples,
-    no_detections,
-)
+from ground_service.telemetry.samples import DetectionSamples, NavigationSamples, OutcomeSamples, no_detections
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, make_catalogue
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
@@ -83,13 +78,10 @@ def reference(stop_s: float = 600.0) -> Ephemeris:
 def catalogue() -> CraterCatalogue:
     """Craters 10 k, 10 k + 1 and 10 k + 2 below, north and south of frame k."""
     return make_catalogue(
-        np.radians(np.tile([0.0, 0.1, -0.1], FRAMES)),
-        np.radians(np.repeat(LONGITUDE_DEG, 3)),
-        np.tile([6e3, 12e3, 20e3], FRAMES),
-        source="made",
-        ids=(10 * np.arange(FRAMES)[:, None] + np.arange(3)).ravel(),
-        rim_height_m=np.zeros(3 * FRAMES),
-    )
+        np.radians(np.tile([0.0, 0.1, -0.1], FRAMES)), np.radians(np.repeat(LONGITUDE_DEG, 3)),
+        np.tile([6e3, 12e3, 20e3], FRAMES), source="made",
+        ids=(10 * np.arange(FRAMES)[:, None] + np.arange(3)).ravel(), rim_height_m=np.zeros(3 * FRAMES),
+    )  # fmt: skip
 
 
 UP_M = 3 * [ALTITUDE_M] + np.array([0.0, 1.0, 1.0]) * MOON_M * (1.0 - math.cos(math.radians(0.1)))
@@ -113,17 +105,12 @@ def detections() -> DetectionSamples:
         rows.append(seen)
     flat = [one for row in rows for one in row]
     return DetectionSamples(
-        frame_number=100 + np.arange(FRAMES),
-        utc_ns=TIMES,
-        usable=np.arange(FRAMES) != DARK,
+        frame_number=100 + np.arange(FRAMES), utc_ns=TIMES, usable=np.arange(FRAMES) != DARK,
         quality=tuple("dark" if frame == DARK else "ok" for frame in range(FRAMES)),
-        offsets=np.cumsum([0, *map(len, rows)]),
-        u_px=np.array([one[0] for one in flat]),
-        v_px=np.array([one[1] for one in flat]),
-        diameter_px=np.array([one[2] for one in flat]),
-        score=np.full(len(flat), 0.75),
-        size_class=np.array([one[3] for one in flat]),
-    )
+        offsets=np.cumsum([0, *map(len, rows)]), u_px=np.array([one[0] for one in flat]),
+        v_px=np.array([one[1] for one in flat]), diameter_px=np.array([one[2] for one in flat]),
+        score=np.full(len(flat), 0.75), size_class=np.array([one[3] for one in flat]),
+    )  # fmt: skip
 
 
 EAST_M = 200.0 * (np.arange(FRAMES) % 6)
@@ -132,17 +119,11 @@ EAST_M = 200.0 * (np.arange(FRAMES) % 6)
 
 def paper(**changed: Any) -> NavigationSamples:
     values: dict[str, Any] = {
-        "estimator": "paper",
-        "frame_number": 100 + np.arange(FRAMES),
-        "utc_ns": TIMES,
-        "latitude_deg": np.zeros(FRAMES),
-        "longitude_deg": LONGITUDE_DEG + np.degrees(EAST_M / RADIUS_M) - 360.0,
-        "altitude_m": np.full(FRAMES, ALTITUDE_M),
-        "sigma_rtn_m": np.full((FRAMES, 3), np.nan),
-        "nis": np.full(FRAMES, np.nan),
-        "matched": np.arange(FRAMES),
-        "outcome": ("matched",) * FRAMES,
-    }
+        "estimator": "paper", "frame_number": 100 + np.arange(FRAMES), "utc_ns": TIMES,
+        "latitude_deg": np.zeros(FRAMES), "longitude_deg": LONGITUDE_DEG + np.degrees(EAST_M / RADIUS_M) - 360.0,
+        "altitude_m": np.full(FRAMES, ALTITUDE_M), "sigma_rtn_m": np.full((FRAMES, 3), np.nan),
+        "nis": np.full(FRAMES, np.nan), "matched": np.arange(FRAMES), "outcome": ("matched",) * FRAMES,
+    }  # fmt: skip
     return NavigationSamples(**{**values, **changed})
 
 
@@ -150,14 +131,10 @@ def anchored(**changed: Any) -> NavigationSamples:
     """30 m too high, with a fix at the frames 1 and 4."""
     fixed = np.isin(np.arange(FRAMES), (1, 4))
     values: dict[str, Any] = {
-        "estimator": "anchored",
-        "longitude_deg": LONGITUDE_DEG,
-        "altitude_m": np.full(FRAMES, ALTITUDE_M + 30.0),
-        "sigma_rtn_m": np.tile([10.0, 20.0, 30.0], (FRAMES, 1)),
-        "nis": np.where(fixed, 7.0, np.nan),
-        "matched": np.where(fixed, 4, 0),
-        "outcome": tuple("fixed" if one else "predicted" for one in fixed),
-    }
+        "estimator": "anchored", "longitude_deg": LONGITUDE_DEG, "altitude_m": np.full(FRAMES, ALTITUDE_M + 30.0),
+        "sigma_rtn_m": np.tile([10.0, 20.0, 30.0], (FRAMES, 1)), "nis": np.where(fixed, 7.0, np.nan),
+        "matched": np.where(fixed, 4, 0), "outcome": tuple("fixed" if one else "predicted" for one in fixed),
+    }  # fmt: skip
     return paper(**{**values, **changed})
 
 
@@ -167,14 +144,9 @@ def outcomes() -> OutcomeSamples:
     triggers = ["none"] * FRAMES
     triggers[0], triggers[6] = "initialization", "safety_timeout"
     return OutcomeSamples(
-        "paper",
-        100 + kept,
-        TIMES[kept],
-        ("matched",) * len(kept),
-        tuple(triggers[k] for k in kept),
-        50 + kept,
+        "paper", 100 + kept, TIMES[kept], ("matched",) * len(kept), tuple(triggers[k] for k in kept), 50 + kept,
         np.where(kept < 6, 1, 2),
-    )
+    )  # fmt: skip
 
 
 def filter_states() -> FilterStates:
@@ -195,26 +167,14 @@ START = StartState(EPOCH, circle(0.0)[0] + np.array([100.0, 0.0, 0.0]), circle(0
 
 def inputs(**changed: Any) -> PassInputs:
     values: dict[str, Any] = {
-        "pass_id": "7",
-        "title": "a made pass",
-        "start_utc_ns": EPOCH,
-        "stop_utc_ns": EPOCH + 200 * SECOND,
-        "packets": PACKETS,
-        "viewing": Viewing(CAMERA),
-        "orientation": Still(),
-        "onboard_orientation": Still(),
-        "reference": reference(),
-        "catalogue": catalogue(),
-        "detections": detections(),
-        "navigation": (paper(), anchored()),
-        "outcomes": (outcomes(),),
-        "gravity": builtin_gravity(),
+        "pass_id": "7", "title": "a made pass", "start_utc_ns": EPOCH, "stop_utc_ns": EPOCH + 200 * SECOND,
+        "packets": PACKETS, "viewing": Viewing(CAMERA), "orientation": Still(), "onboard_orientation": Still(),
+        "reference": reference(), "catalogue": catalogue(), "detections": detections(),
+        "navigation": (paper(), anchored()), "outcomes": (outcomes(),), "gravity": builtin_gravity(),
         "reference_sigma_rtn_m": REFERENCE_SIGMA_M,
-        "limits": Requirements(estimator="paper", median_error_m=1_000.0),
-        "frames_expected": 14,
-        "cadence_s": CADENCE_S,
-        "images": IMAGES,
-    }
+        "limits": Requirements(estimator="paper", median_error_m=1_000.0), "frames_expected": 14,
+        "cadence_s": CADENCE_S, "images": IMAGES,
+    }  # fmt: skip
     return PassInputs(**{**values, **changed})
 
 
@@ -383,10 +343,7 @@ def test_the_start_state_is_propagated_with_every_field_and_from_the_reference()
     field = builtin_gravity().name
     assert [(one.name, one.description) for one in baselines] == [
         ("propagate-only", f"start state of the filter propagated with {field} to degree 12, Earth and Sun"),
-        (
-            "propagate-only, other",
-            "start state of the filter propagated with other to degree 12, Earth and Sun",
-        ),
+        ("propagate-only, other", "start state of the filter propagated with other to degree 12, Earth and Sun"),
         (
             "propagate-only, perfect start",
             f"state of the reference propagated with {field} to degree 12, Earth and Sun",
@@ -437,9 +394,7 @@ def test_a_start_within_the_pass_is_propagated_from_there() -> None:
 
 def test_why_there_is_no_baseline(report: PassReport, monkeypatch: pytest.MonkeyPatch) -> None:
     assert report.remarks == ("no propagate-only baseline: the pass names no start state",)
-    refused = evaluate_pass(
-        inputs(start_state=START, gravity=None, refused={"gravity": "field Y is not here"})
-    )
+    refused = evaluate_pass(inputs(start_state=START, gravity=None, refused={"gravity": "field Y is not here"}))
     assert refused.remarks == ("no propagate-only baseline: field Y is not here",)
 
     def fail(*_: object, **__: object) -> np.ndarray:
@@ -489,10 +444,7 @@ def test_without_a_reference_the_report_says_what_was_flown_and_why_no_more() ->
 
 @pytest.mark.parametrize(
     ("refused", "reason"),
-    [
-        ({}, "no lunar orientation is given"),
-        ({"orientation": "kernel Z is not here"}, "kernel Z is not here"),
-    ],
+    [({}, "no lunar orientation is given"), ({"orientation": "kernel Z is not here"}, "kernel Z is not here")],
 )
 def test_without_an_orientation_nothing_is_compared(refused: dict[str, str], reason: str) -> None:
     report = evaluate_pass(inputs(orientation=None, refused=refused))
@@ -510,9 +462,7 @@ def test_a_pass_over_ground_without_a_catalogue_has_no_recall_and_no_precision_a
     report = evaluate_pass(inputs(catalogue=elsewhere))
     assert report.detector is not None and report.detector.micro is not None
     assert np.isnan([report.detector.micro.recall, report.detector.micro.precision]).all()
-    assert (
-        report.not_available["recall"] == "the crater catalogue has no complete crater of 5 to 30 km in view"
-    )
+    assert report.not_available["recall"] == "the crater catalogue has no complete crater of 5 to 30 km in view"
     assert "recall" not in evaluate_pass(inputs()).not_available
 
 
@@ -534,9 +484,7 @@ def test_what_did_not_come_down_is_named() -> None:
         "frame_number", "utc_ns", "latitude_deg", "longitude_deg", "altitude_m", "sigma_rtn_m", "nis", "matched",
         "outcome",
     )})  # fmt: skip
-    assert [one.name for one in evaluate_pass(inputs(navigation=(silent, anchored()))).navigation] == [
-        "anchored"
-    ]
+    assert [one.name for one in evaluate_pass(inputs(navigation=(silent, anchored()))).navigation] == ["anchored"]
     assert evaluate_pass(inputs(reference=None, navigation=(silent,))).navigation == ()
 
 
@@ -615,9 +563,9 @@ def test_the_pointing_is_told_from_what_is_known_of_it() -> None:
     assert "into the camera in its telemetered attitude;" in scored(every)[1]
     assert len(every.remarks) == 1
     # The first five frames were told a quarter of a turn off: of the four that see anything, only the centre is found.
-    turned = Rotation.from_matrix(
-        np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) @ nadir
-    ).as_quat()[:, [3, 0, 1, 2]]
+    turned = Rotation.from_matrix(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) @ nadir).as_quat()[
+        :, [3, 0, 1, 2]
+    ]
     some = evaluate_pass(inputs(viewing=Viewing(CAMERA, attitude_utc_ns=TIMES[:5], q_wxyz=turned[:5])))
     assert [one.detected_true for one in some.detector.per_class] == [10, 6, 5]
     assert "into the camera in its telemetered attitude, if available;" in scored(some)[1]
@@ -648,8 +596,7 @@ def test_fixes_are_repeated_from_single_frames_and_told_right_from_wrong() -> No
     np.testing.assert_allclose(found.error_rtn_m[:3, 1], -0.6 * pixel_m, rtol=0.05)
     np.testing.assert_allclose(found.error_rtn_m[:3, 2], 0.8 * pixel_m, rtol=0.05)
     assert "snapshot" not in [
-        one.name
-        for one in evaluate_pass(inputs(identifications=identified(), navigation=(paper(),))).navigation
+        one.name for one in evaluate_pass(inputs(identifications=identified(), navigation=(paper(),))).navigation
     ]
     bare = evaluate_pass(inputs(identifications=identified(), catalogue=None))
     assert series(bare, "anchored").wrong_fixes is None
@@ -663,9 +610,7 @@ def test_the_map_of_the_payload_is_compared_with_the_catalogue(report: PassRepor
     )  # fmt: skip
     some = identified()
     own = IdentificationSamples(
-        np.append(some.utc_ns, TIMES[5]),
-        np.append(some.detection, 0),
-        np.append(some.crater_id, 3_000_000_000),
+        np.append(some.utc_ns, TIMES[5]), np.append(some.detection, 0), np.append(some.crater_id, 3_000_000_000)
     )
     found = evaluate_pass(inputs(landmarks=landmark, identifications=own)).payload_map
     assert found is not None
@@ -703,11 +648,8 @@ def test_the_headline_is_that_of_the_declared_estimator(report: PassReport) -> N
     p95 = float(np.percentile(size, 95.0))
     first, second, third, fourth, fifth = report.headline
     assert shown(first) == (
-        "Median position error",
-        pytest.approx(500.0, abs=0.01),
-        "m",
-        f"paper; 95 % below {p95:.0f} m",
-    )
+        "Median position error", pytest.approx(500.0, abs=0.01), "m", f"paper; 95 % below {p95:.0f} m",
+    )  # fmt: skip
     assert shown(second) == ("Propagation alone, same start", None, "m", "no start state")
     drift = pytest.approx(100.0 * 200.0 / STEP_M, rel=1e-6)
     assert shown(third) == ("Drift", drift, "% of path", "paper, horizontal")
@@ -727,9 +669,7 @@ def test_no_other_estimator_stands_in_for_the_declared_one(estimator: str | None
     assert (report.headline[3].value, report.headline[3].note) == (None, "not evaluated")
 
 
-@pytest.mark.parametrize(
-    ("error_m", "text"), [(9_940.0, "9940 m"), (9_960.0, "10.0 km"), (52_340.0, "52.3 km")]
-)
+@pytest.mark.parametrize(("error_m", "text"), [(9_940.0, "9940 m"), (9_960.0, "10.0 km"), (52_340.0, "52.3 km")])
 def test_lengths_from_ten_kilometres_on_are_in_kilometres(error_m: float, text: str) -> None:
     high = paper(altitude_m=np.full(FRAMES, ALTITUDE_M + error_m), longitude_deg=LONGITUDE_DEG)
     report = evaluate_pass(inputs(navigation=(high,)))
@@ -794,14 +734,7 @@ def test_the_summary_holds_the_figures_of_the_report(report: PassReport) -> None
         "evidence_level": "", "data": [], "experiment": "", "experiment_level": "",
     }  # fmt: skip
     assert {name: summary[name] for name in named} == named
-    assert set(summary) == {
-        *named,
-        "detector",
-        "navigation",
-        "requirements",
-        "error_budget",
-        "not_available",
-    }
+    assert set(summary) == {*named, "detector", "navigation", "requirements", "error_budget", "not_available"}
     assert summary["navigation"]["paper"] == {
         "median_3d_m": pytest.approx(500.0, abs=0.01),
         "p68_3d_m": paper_of.statistics.p68_3d_m,
@@ -839,12 +772,7 @@ def test_the_summary_holds_the_figures_of_the_report(report: PassReport) -> None
 def test_the_summary_of_a_pass_without_figures_holds_none() -> None:
     report = evaluate_pass(inputs(detections=no_detections(), navigation=(), reference=None, catalogue=None))
     bare = summary_of(replace(report, accounting=None, packets=None))
-    assert (bare["frames"], bare["packets"], bare["packets_lost"], bare["packets_expected"]) == (
-        None,
-        0,
-        0,
-        0,
-    )
+    assert (bare["frames"], bare["packets"], bare["packets_lost"], bare["packets_expected"]) == (None, 0, 0, 0)
     assert bare["detector"] == {"precision": None, "recall": None, "loc_px": None, "per_class": []}
     assert (bare["navigation"], bare["baselines"], bare["error_budget"]) == ({}, {}, {})
 
@@ -857,19 +785,11 @@ def test_baselines_have_their_own_place_in_the_summary() -> None:
 
 def test_outcomes_are_joined_by_frame_number_in_any_order() -> None:
     found = OutcomeSamples(
-        "paper",
-        np.array([104, 101, 109]),
-        TIMES[:3],
-        ("matched",) * 3,
-        ("time_gap", "none", "manual_step"),
-        np.array([4, 1, 9]),
-        np.array([1, 1, 1]),
-    )
+        "paper", np.array([104, 101, 109]), TIMES[:3], ("matched",) * 3, ("time_gap", "none", "manual_step"),
+        np.array([4, 1, 9]), np.array([1, 1, 1]),
+    )  # fmt: skip
     triggers, candidates, reads = _joined(paper(), found)
-    assert {100 + k: one for k, one in enumerate(triggers) if one != "none"} == {
-        104: "time_gap",
-        109: "manual_step",
-    }
+    assert {100 + k: one for k, one in enumerate(triggers) if one != "none"} == {104: "time_gap", 109: "manual_step"}
     assert candidates is not None and candidates.tolist() == [0, 1, 0, 0, 4, 0, 0, 0, 0, 9, 0, 0]
     assert reads.tolist() == [1, 1, 1]
     none = replace(found, frame_number=np.zeros(0, dtype=np.int64))

@@ -56,9 +56,7 @@ def series_at(latitude_deg: list[float], longitude_deg: list[float]) -> tuple[Na
     series = NavigationSeries(
         "anchored", "estimate", times, nothing, nothing, nothing, np.full((len(times), 3), np.nan)
     )
-    track = SimpleNamespace(
-        utc_ns=times, latitude_deg=np.array(latitude_deg), longitude_deg=np.array(longitude_deg)
-    )
+    track = SimpleNamespace(utc_ns=times, latitude_deg=np.array(latitude_deg), longitude_deg=np.array(longitude_deg))
     return series, track
 
 
@@ -88,13 +86,10 @@ def event(seconds: int, name: str, detail: str = "") -> PassEvent:
 def test_times_with_a_degraded_attitude_are_remarks() -> None:
     noise = "noise 0.2 deg per axis, declared 0.01 deg"
     events = (
-        event(5, "attitude_restored"),
-        event(300, "attitude_degraded", noise),
-        event(30, "attitude_degraded", noise),
-        event(40, "boot"),
-        event(90, "attitude_restored"),
+        event(5, "attitude_restored"), event(300, "attitude_degraded", noise),
+        event(30, "attitude_degraded", noise), event(40, "boot"), event(90, "attitude_restored"),
         event(95, "attitude_restored"),
-    )
+    )  # fmt: skip
     text = f"on ({noise}): the payload used the estimated noise"
     assert event_remarks(events) == [
         f"attitude judged noisier than declared from 2029-08-07T00:00:30.000Z {text}, until 2029-08-07T00:01:30.000Z",
@@ -125,14 +120,9 @@ def test_the_worst_frames_are_chosen_from_all_frames_and_not_from_those_with_an_
     found[10, 0] = -1
     m = FRAMES * CRATERS
     expected = ExpectedCraters(
-        offsets=np.arange(FRAMES + 1) * CRATERS,
-        index=np.arange(m),
-        u_px=np.zeros(m),
-        v_px=np.zeros(m),
-        diameter_px=np.ones(m),
-        size_class=np.zeros(m, dtype=np.int64),
-        complete=np.ones(m, dtype=np.bool_),
-    )
+        offsets=np.arange(FRAMES + 1) * CRATERS, index=np.arange(m), u_px=np.zeros(m), v_px=np.zeros(m),
+        diameter_px=np.ones(m), size_class=np.zeros(m, dtype=np.int64), complete=np.ones(m, dtype=np.bool_),
+    )  # fmt: skip
     usable = np.ones(FRAMES, dtype=np.bool_)
     usable[30] = False
 
@@ -141,8 +131,7 @@ def test_the_worst_frames_are_chosen_from_all_frames_and_not_from_those_with_an_
             return FRAMES
 
     inputs = SimpleNamespace(
-        detections=Detections(frame_number=np.arange(FRAMES), usable=usable),
-        images={0: None, 10: None, 39: None},
+        detections=Detections(frame_number=np.arange(FRAMES), usable=usable), images={0: None, 10: None, 39: None}
     )
     matches = Matches(np.zeros(0, dtype=np.int64), found.ravel())
     spread, worst = _choose_frames(cast("Any", inputs), expected, matches)
@@ -394,9 +383,7 @@ def test_a_tilted_distorted_camera_sees_craters_on_high_ground_where_they_are() 
 
 def test_a_camera_that_leans_far_sees_craters_beyond_a_nadir_footprint() -> None:
     """2.5 degrees north of the track is 76 km, past the corner of a nadir image from 30 km (73 km)."""
-    far = make_catalogue(
-        np.radians([3.0]), np.radians([0.0]), np.array([9e3]), source="made", rim_height_m=np.zeros(1)
-    )
+    far = make_catalogue(np.radians([3.0]), np.radians([0.0]), np.array([9e3]), source="made", rim_height_m=np.zeros(1))
     narrow = BrownCamera(512, 512, math.radians(60.0))
     assert len(expected_craters(far, narrow, POSITION).index) == 0
     leaning = Viewing(narrow, math.radians(65.0)).pointed(POSITION)
@@ -417,21 +404,16 @@ def test_a_telemetered_attitude_wins_over_the_declared_pointing() -> None:
 
 def test_a_frame_without_reference_expects_nothing() -> None:
     lost = np.full((1, 3), np.nan)
-    assert (
-        len(expected_craters(catalogue(), CAMERA, lost, Viewing(CAMERA, TILT_RAD).pointed(lost)).index) == 0
-    )
+    assert len(expected_craters(catalogue(), CAMERA, lost, Viewing(CAMERA, TILT_RAD).pointed(lost)).index) == 0
 
 
 @pytest.mark.parametrize("telemetered", [True, False])
 def test_a_snapshot_of_a_tilted_distorted_camera_finds_its_place(telemetered: bool) -> None:
     craters = catalogue()
     pairs = Pairs(
-        np.zeros(4, dtype=np.int64),
-        np.zeros(4, dtype=np.int64),
-        np.array([pixel(*place, RIM_HEIGHT_M) for place in PLACES_DEG]),
-        np.full(4, 40.0),
-        craters.position_mcmf_m,
-    )
+        np.zeros(4, dtype=np.int64), np.zeros(4, dtype=np.int64),
+        np.array([pixel(*place, RIM_HEIGHT_M) for place in PLACES_DEG]), np.full(4, 40.0), craters.position_mcmf_m,
+    )  # fmt: skip
     viewing = Viewing(CAMERA, TILT_RAD)
     attitude = viewing.pointed(POSITION) if telemetered else None
     start = POSITION + np.array([[800.0, -500.0, 300.0]])

@@ -38,17 +38,10 @@ def detections(
 ) -> DetectionSamples:
     n = len(u)
     return DetectionSamples(
-        frame_number=np.array([7]),
-        utc_ns=np.array([0]),
-        usable=np.array([usable]),
-        quality=("ok" if usable else "dark",),
-        offsets=np.array([0, n]),
-        u_px=np.array(u),
-        v_px=np.array(v),
-        diameter_px=np.array(d),
-        score=np.linspace(0.9, 0.5, n),
-        size_class=np.array(classes),
-    )
+        frame_number=np.array([7]), utc_ns=np.array([0]), usable=np.array([usable]),
+        quality=("ok" if usable else "dark",), offsets=np.array([0, n]), u_px=np.array(u), v_px=np.array(v),
+        diameter_px=np.array(d), score=np.linspace(0.9, 0.5, n), size_class=np.array(classes),
+    )  # fmt: skip
 
 
 def scored(found: Any, expected: Any) -> Any:
@@ -83,10 +76,7 @@ def test_a_crater_of_unknown_height_is_neither_missed_nor_a_false_alarm() -> Non
 def test_a_perfect_detector_scores_one() -> None:
     expected = expected_craters(field(), CAMERA, POSITION)
     found = detections(
-        (expected.u_px + 0.3).tolist(),
-        (expected.v_px - 0.4).tolist(),
-        expected.diameter_px.tolist(),
-        [0, 1, 2, 3],
+        (expected.u_px + 0.3).tolist(), (expected.v_px - 0.4).tolist(), expected.diameter_px.tolist(), [0, 1, 2, 3]
     )
     score = scored(found, expected)
     assert score.micro is not None
@@ -114,10 +104,7 @@ def test_the_limits_of_a_match(offset_px: float, width: float, hit: bool) -> Non
     """The 20 km crater is some 98 px wide: half a radius is 24 px, so the paper's 10 px decide."""
     expected = expected_craters(field(), CAMERA, POSITION)
     found = detections(
-        [float(expected.u_px[2]) - offset_px],
-        [float(expected.v_px[2])],
-        [float(expected.diameter_px[2]) * width],
-        [2],
+        [float(expected.u_px[2]) - offset_px], [float(expected.v_px[2])], [float(expected.diameter_px[2]) * width], [2]
     )
     assert bool(match_detections(found, expected).crater_of_detection[0] >= 0) is hit
 
@@ -125,10 +112,7 @@ def test_the_limits_of_a_match(offset_px: float, width: float, hit: bool) -> Non
 def test_small_craters_count_neither_for_nor_against() -> None:
     expected = expected_craters(field(), CAMERA, POSITION)
     found = detections(
-        [float(expected.u_px[3]), 3.0],
-        [float(expected.v_px[3]), 3.0],
-        [float(expected.diameter_px[3]), 15.0],
-        [3, 3],
+        [float(expected.u_px[3]), 3.0], [float(expected.v_px[3]), 3.0], [float(expected.diameter_px[3]), 15.0], [3, 3]
     )
     score = scored(found, expected)
     assert score.micro is not None
@@ -165,26 +149,16 @@ def three_frames() -> tuple[DetectionSamples, ExpectedCraters, Matches]:
     """
     u = np.array([50.0, 150.0, 250.0, 350.0, 50.0, 150.0, 250.0])
     expected = ExpectedCraters(
-        offsets=np.array([0, 4, 6, 7]),
-        index=np.arange(7),
-        u_px=u,
-        v_px=np.full(7, 100.0),
-        diameter_px=np.full(7, 40.0),
-        size_class=np.array([0, 1, 2, 0, 0, 1, 2]),
+        offsets=np.array([0, 4, 6, 7]), index=np.arange(7), u_px=u, v_px=np.full(7, 100.0),
+        diameter_px=np.full(7, 40.0), size_class=np.array([0, 1, 2, 0, 0, 1, 2]),
         complete=np.array([True, True, True, False, True, True, True]),
-    )
+    )  # fmt: skip
     found = DetectionSamples(
-        frame_number=np.arange(3),
-        utc_ns=np.arange(3),
-        usable=np.ones(3, dtype=np.bool_),
-        quality=("ok",) * 3,
-        offsets=np.array([0, 3, 5, 7]),
-        u_px=np.array([151.0, 250.0, 450.0, 50.0, 150.0, 250.0, 450.0]),
-        v_px=np.array([100.0, 102.0, 100.0, 103.0, 100.0, 104.0, 100.0]),
-        diameter_px=np.full(7, 40.0),
-        score=np.array([0.9, 0.8, 0.35, 0.7, 0.6, 0.95, 0.31]),
-        size_class=np.array([1, 2, 1, 0, 1, 2, 3]),
-    )
+        frame_number=np.arange(3), utc_ns=np.arange(3), usable=np.ones(3, dtype=np.bool_), quality=("ok",) * 3,
+        offsets=np.array([0, 3, 5, 7]), u_px=np.array([151.0, 250.0, 450.0, 50.0, 150.0, 250.0, 450.0]),
+        v_px=np.array([100.0, 102.0, 100.0, 103.0, 100.0, 104.0, 100.0]), diameter_px=np.full(7, 40.0),
+        score=np.array([0.9, 0.8, 0.35, 0.7, 0.6, 0.95, 0.31]), size_class=np.array([1, 2, 1, 0, 1, 2, 3]),
+    )  # fmt: skip
     return found, expected, match_detections(found, expected)
 
 
@@ -193,53 +167,32 @@ def test_scores_are_given_by_class_and_by_bins_of_altitude_and_of_the_sun() -> N
     assert matches.crater_of_detection.tolist() == [1, 2, -1, 4, 5, 6, -1]
     assert matches.detection_of_crater.tolist() == [-1, 0, 1, -1, 3, 4, 5]
     score = score_detections(
-        found,
-        expected,
-        matches,
-        np.array([25e3, 25.5e3, 31e3]),
-        np.array([4.0, 7.0, 8.0]),
+        found, expected, matches, np.array([25e3, 25.5e3, 31e3]), np.array([4.0, 7.0, 8.0]),
         np.array([10.0, 20.0, 30.0]),
-    )
+    )  # fmt: skip
     assert score.micro is not None and score.residuals is not None
     # Errors of 1, 2, 3, 0 and 4 px; the crater of the incomplete region is not expected.
     assert (score.micro.expected, score.micro.detected_true, score.micro.false_alarms) == (6, 5, 1)
     assert score.micro.localisation_px == pytest.approx(2.0)
     assert (score.micro.size_class, score.micro.label) == (-1, "5–30 km")
     assert [
-        (one.size_class, one.label, one.expected, one.detected_true, one.false_alarms)
-        for one in score.per_class
-    ] == [
-        (0, "5–10 km", 2, 1, 0),
-        (1, "10–15 km", 2, 2, 1),
-        (2, "15–30 km", 2, 2, 0),
-    ]
+        (one.size_class, one.label, one.expected, one.detected_true, one.false_alarms) for one in score.per_class
+    ] == [(0, "5–10 km", 2, 1, 0), (1, "10–15 km", 2, 2, 1), (2, "15–30 km", 2, 2, 0)]
     assert [
         (one.low, one.high, one.expected, one.precision, one.recall, one.localisation_px)
         for one in score.by_altitude_km
-    ] == [
-        (20.0, 30.0, 5, pytest.approx(0.8), pytest.approx(0.8), pytest.approx(1.5)),
-        (30.0, 40.0, 1, 1.0, 1.0, 4.0),
-    ]
-    assert [
-        (one.low, one.high, one.expected, one.precision, one.recall) for one in score.by_sun_elevation_deg
-    ] == [
+    ] == [(20.0, 30.0, 5, pytest.approx(0.8), pytest.approx(0.8), pytest.approx(1.5)), (30.0, 40.0, 1, 1.0, 1.0, 4.0)]
+    assert [(one.low, one.high, one.expected, one.precision, one.recall) for one in score.by_sun_elevation_deg] == [
         (0.0, 5.0, 3, pytest.approx(2 / 3), pytest.approx(2 / 3)),
         (5.0, 10.0, 3, 1.0, 1.0),
     ]
     residuals = score.residuals
-    assert (
-        residuals.u_px.tolist() == [150.0, 250.0, 50.0, 150.0, 250.0]
-        and residuals.v_px.tolist() == [100.0] * 5
-    )
+    assert residuals.u_px.tolist() == [150.0, 250.0, 50.0, 150.0, 250.0] and residuals.v_px.tolist() == [100.0] * 5
     assert residuals.du_px.tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
     assert residuals.dv_px.tolist() == [0.0, 2.0, 3.0, 0.0, 4.0]
     assert residuals.sun_azimuth_deg is not None and residuals.sun_azimuth_deg.tolist() == [
-        10.0,
-        10.0,
-        20.0,
-        20.0,
-        30.0,
-    ]
+        10.0, 10.0, 20.0, 20.0, 30.0,
+    ]  # fmt: skip
     assert residuals.diameter_px is not None and residuals.diameter_px.tolist() == [40.0] * 5
     assert "into a nadir camera; a detection is true within 0.5 radii and 10 px of the centre" in score.method
 
@@ -257,12 +210,8 @@ def test_curves_and_calibration_follow_the_scores() -> None:
     np.testing.assert_allclose(score.curves[1].precision, [2 / 3, 1.0, 1.0])
     np.testing.assert_allclose(score.curves[1].recall, [1.0, 1.0, 0.5])
     assert [(one.mean_score, one.fraction_true, one.count) for one in score.calibration] == [
-        (0.35, 0.0, 1),
-        (0.6, 1.0, 1),
-        (0.7, 1.0, 1),
-        (0.8, 1.0, 1),
-        (pytest.approx(0.925), 1.0, 2),
-    ]
+        (0.35, 0.0, 1), (0.6, 1.0, 1), (0.7, 1.0, 1), (0.8, 1.0, 1), (pytest.approx(0.925), 1.0, 2),
+    ]  # fmt: skip
     assert score.by_sun_elevation_deg == () and score.residuals is not None
     assert score.residuals.sun_azimuth_deg is None
 
@@ -280,15 +229,10 @@ def test_the_closest_pair_in_radii_is_matched_first() -> None:
     """A detection 4 px from a crater of 40 px (0.2 radii) and 3 px from one of 20 px (0.3) belongs to the former."""
     _, expected, _ = three_frames()
     two = replace(
-        expected,
-        offsets=np.array([0, 2]),
-        u_px=np.array([50.0, 57.0]),
-        v_px=np.zeros(2),
-        diameter_px=np.array([40.0, 20.0]),
-        size_class=np.zeros(2, dtype=np.int64),
-        index=np.arange(2),
+        expected, offsets=np.array([0, 2]), u_px=np.array([50.0, 57.0]), v_px=np.zeros(2),
+        diameter_px=np.array([40.0, 20.0]), size_class=np.zeros(2, dtype=np.int64), index=np.arange(2),
         complete=np.ones(2, dtype=np.bool_),
-    )
+    )  # fmt: skip
     found = detections([54.0], [0.0], [28.0], [0])
     assert match_detections(found, two).detection_of_crater.tolist() == [0, -1]
     # With a second detection on the latter both have their own.

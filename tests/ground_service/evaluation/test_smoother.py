@@ -95,9 +95,7 @@ def batch(session: Session) -> Arrays:
     return state, np.linalg.inv(normal)
 
 
-def test_without_process_noise_the_first_smoothed_state_is_that_of_one_least_squares_over_everything() -> (
-    None
-):
+def test_without_process_noise_the_first_smoothed_state_is_that_of_one_least_squares_over_everything() -> None:
     session = Session(1)
     smoothed = smooth(session.filtered, QUIET)
     expected, covariance = batch(session)
@@ -202,10 +200,7 @@ def straight(seconds: list[float], seed: int = 9) -> FilterStates:
 
 
 def rauch_tung_striebel(
-    filtered: FilterStates,
-    legs: list[list[float]],
-    kicks: list[list[float]] | None = None,
-    sigma_m_s: float = 0.0,
+    filtered: FilterStates, legs: list[list[float]], kicks: list[list[float]] | None = None, sigma_m_s: float = 0.0
 ) -> Arrays:
     """Return smoothed states and covariances by equations 3.28 to 3.30, with plain inverses.
 
@@ -303,10 +298,7 @@ def test_long_steps_are_cut_into_equal_ones_of_a_minute_at_most() -> None:
     first, last, after = _legs(EPOCH, EPOCH + 100 * second, start_s, (burn,))
     assert (first, last[1:]) == ((start_s, 45.0, None), (45.0, burn)) and after[1:] == (10.0, None)
     # Microseconds are what a float64 of seconds past J2000 tells.
-    assert (last[0] - start_s, after[0] - start_s) == (
-        pytest.approx(45.0, abs=1e-5),
-        pytest.approx(90.0, abs=1e-5),
-    )
+    assert (last[0] - start_s, after[0] - start_s) == (pytest.approx(45.0, abs=1e-5), pytest.approx(90.0, abs=1e-5))
 
 
 def test_the_smoother_has_the_noise_of_the_field_on_each_side_of_the_moon() -> None:
@@ -322,8 +314,7 @@ def test_the_smoother_has_the_noise_of_the_field_on_each_side_of_the_moon() -> N
     np.testing.assert_allclose(far, model.field_noise.far_psd_m2_s3, rtol=1e-3)
     # The noise of a step is that of the place at its beginning.
     carried = [
-        _carried(state[None], np.array([EPOCH]), np.array([EPOCH + 60 * 10**9]), model)[2][0]
-        for state in states
+        _carried(state[None], np.array([EPOCH]), np.array([EPOCH + 60 * 10**9]), model)[2][0] for state in states
     ]
     ratio = np.trace(carried[1][3:6, 3:6]) / np.trace(carried[0][3:6, 3:6])
     assert ratio == pytest.approx(far.sum() / near.sum(), rel=0.02)
@@ -341,9 +332,7 @@ def test_the_shift_of_the_map_is_renewed_over_the_ground() -> None:
     added = noise[0] - plain[0]
     axes = rtn_from_inertial(behind, carried[0, 3:6])
     share = 1.0 - np.exp(-2.0 * angle / np.radians(30.0))
-    np.testing.assert_allclose(
-        axes @ added[:3, :3] @ axes.T, share * np.diag([100.0, 1600.0, 1600.0]), atol=1e-6
-    )
+    np.testing.assert_allclose(axes @ added[:3, :3] @ axes.T, share * np.diag([100.0, 1600.0, 1600.0]), atol=1e-6)
     np.testing.assert_allclose(added[3:], 0.0, atol=1e-12)
     errors = CommonErrors()
     east_m, north_m, up_m = errors.catalogue_offset_m

@@ -30,21 +30,12 @@ from reports.values import (
 N = 10
 
 
-def series(
-    name: str, kind: str = "estimate", median: float = 50.0, p95: float = 90.0, **more
-) -> NavigationSeries:
+def series(name: str, kind: str = "estimate", median: float = 50.0, p95: float = 90.0, **more) -> NavigationSeries:
     nothing = np.zeros(N)
     return NavigationSeries(
-        name,
-        kind,
-        np.arange(N, dtype=np.int64),
-        nothing,
-        nothing,
-        nothing,
-        np.zeros((N, 3)),
-        statistics=NavigationStatistics(median_3d_m=median, p95_3d_m=p95),
-        **more,
-    )
+        name, kind, np.arange(N, dtype=np.int64), nothing, nothing, nothing, np.zeros((N, 3)),
+        statistics=NavigationStatistics(median_3d_m=median, p95_3d_m=p95), **more,
+    )  # fmt: skip
 
 
 def found(*navigation: NavigationSeries, **more) -> Evaluated:
@@ -93,9 +84,7 @@ def test_nees_is_judged_by_both_bounds_for_its_independent_draws(
     """Too bold is a failure, too cautious a remark."""
     times = np.arange(N, dtype=np.int64) * gap_s * 10**9
     flown = replace(series("anchored", nees=np.full(N, 3.0 * factor)), utc_ns=times)
-    judged = row(
-        "consistency.nees", Requirements(estimator="anchored", consistency_inside_percent=95.0), found(flown)
-    )
+    judged = row("consistency.nees", Requirements(estimator="anchored", consistency_inside_percent=95.0), found(flown))
     assert (judged.value, judged.status) == (pytest.approx(factor), status)
     assert judged.note.endswith(f"; {bounds} with 95 % for {draws} independent draws{wrong}")
     cautious = ["mean NEES per degree of freedom 0.31: sigmas 1.8 times too large"]
@@ -172,18 +161,14 @@ def test_a_baseline_has_to_be_beaten_and_not_only_matched(baseline: float, statu
 
 def test_every_baseline_is_shown_and_one_that_is_missing_is_unknown() -> None:
     limits = Requirements(estimator="anchored", better_than=("snapshot",))
-    evaluated = found(
-        series("anchored"), series("Kepler", "baseline", 1.0), series("smoothed", "smoothed", 1.0)
-    )
+    evaluated = found(series("anchored"), series("Kepler", "baseline", 1.0), series("smoothed", "smoothed", 1.0))
     assert row("better_than.snapshot", limits, evaluated).status == "unknown"
     for name in ("Kepler", "smoothed"):
         shown = row(f"better_than.{name}", limits, evaluated)
         assert (shown.status, shown.value, shown.limit) == ("not judged", 50.0, 1.0)
     rival = limits.model_copy(update={"better_than": ("Kepler",)})
     assert row("better_than.Kepler", rival, evaluated).status == "not judged"  # from the best known orbit
-    assert (
-        row("better_than.Kepler", rival, replace(evaluated, experiment=StartOrbit(1e3))).status == "not met"
-    )
+    assert row("better_than.Kepler", rival, replace(evaluated, experiment=StartOrbit(1e3))).status == "not met"
 
 
 def test_an_experiment_is_judged_apart_and_its_accuracy_from_convergence_on() -> None:
@@ -196,11 +181,7 @@ def test_an_experiment_is_judged_apart_and_its_accuracy_from_convergence_on() ->
         sigma_rtn_m=np.column_stack([np.where(np.arange(N) < 3, 100.0, 20.0)] * 3),
     )
     limits = Requirements(
-        estimator="anchored",
-        median_error_m=60.0,
-        p95_error_m=100.0,
-        better_than=("Kepler",),
-        convergence_s=80.0,
+        estimator="anchored", median_error_m=60.0, p95_error_m=100.0, better_than=("Kepler",), convergence_s=80.0
     )
     evaluated = replace(found(flown, series("Kepler", "baseline", 10.0)), experiment=StartOrbit(1e3, 24.0))
     table = {one.key: one for one in requirements(limits, evaluated)}
@@ -229,24 +210,16 @@ def test_an_experiment_is_judged_apart_and_its_accuracy_from_convergence_on() ->
 def test_packets_whose_loss_at_the_edges_is_not_known_are_never_complete() -> None:
     limits = Requirements(packets_percent=99.0)
     assert row("completeness.packets", limits, found(packets=PacketAccounting(100))).status == "unknown"
-    assert (
-        row("completeness.packets", limits, found(packets=PacketAccounting(50, lost=50))).status == "not met"
-    )
+    assert row("completeness.packets", limits, found(packets=PacketAccounting(50, lost=50))).status == "not met"
     assert row("completeness.packets", limits, found(packets=PacketAccounting(0))).value is None
 
 
 def test_two_frames_are_judged_and_one_is_not() -> None:
     two = replace(series("anchored", median=0.0), utc_ns=np.zeros(2, dtype=np.int64))
-    assert (
-        row("accuracy.median", Requirements(estimator="anchored", median_error_m=10.0), found(two)).status
-        == "met"
-    )
+    assert row("accuracy.median", Requirements(estimator="anchored", median_error_m=10.0), found(two)).status == "met"
     one = replace(series("anchored", median=0.0), utc_ns=np.zeros(1, dtype=np.int64))
     judged = row("accuracy.median", Requirements(estimator="anchored", median_error_m=10.0), found(one))
-    assert (judged.status, judged.note) == (
-        "unknown",
-        "only one frame was navigated, too few for a judgement",
-    )
+    assert (judged.status, judged.note) == ("unknown", "only one frame was navigated, too few for a judgement")
 
 
 def test_resets_of_other_estimators_are_shown_without_judgement() -> None:
@@ -289,9 +262,7 @@ def test_the_error_budget_takes_the_reference_off_in_squares() -> None:
     error = np.array([[3.0, 4.0, 12.0], [-3.0, 4.0, -12.0], [np.nan, 0.0, 0.0]])
     budget = error_budget(error, (3.0, 4.0, 0.0))
     assert budget is not None
-    assert (budget.observed_rms_m, budget.reference_rms_m, budget.estimate_rms_m) == pytest.approx(
-        (13.0, 5.0, 12.0)
-    )
+    assert (budget.observed_rms_m, budget.reference_rms_m, budget.estimate_rms_m) == pytest.approx((13.0, 5.0, 12.0))
     below = error_budget(error, (30.0, 0.0, 0.0))
     assert below is not None and np.isnan(below.estimate_rms_m)
     assert error_budget(error, None) is None and error_budget(error[2:], (1.0, 1.0, 1.0)) is None
@@ -300,26 +271,11 @@ def test_the_error_budget_takes_the_reference_off_in_squares() -> None:
 
 
 EVERY_LIMIT = Requirements(
-    estimator="anchored",
-    median_error_m=60.0,
-    p95_error_m=80.0,
-    better_than=("snapshot",),
-    consistency_inside_percent=90.0,
-    packets_percent=75.0,
-    frames_percent=90.0,
-    images_percent=25.0,
-    recall=0.25,
-    precision=0.8,
-    anchor_reads=3.0,
-    resets=1.0,
-    cpu_percent=50.0,
-    memory_mib=4.5,
-    storage_percent=20.0,
-    temperature_max_c=45.0,
-    temperature_min_c=5.0,
-    offset_px=0.3,
-    clock_step_s=0.1,
-)
+    estimator="anchored", median_error_m=60.0, p95_error_m=80.0, better_than=("snapshot",),
+    consistency_inside_percent=90.0, packets_percent=75.0, frames_percent=90.0, images_percent=25.0, recall=0.25,
+    precision=0.8, anchor_reads=3.0, resets=1.0, cpu_percent=50.0, memory_mib=4.5, storage_percent=20.0,
+    temperature_max_c=45.0, temperature_min_c=5.0, offset_px=0.3, clock_step_s=0.1,
+)  # fmt: skip
 
 
 def test_the_table_of_a_pass_in_full() -> None:

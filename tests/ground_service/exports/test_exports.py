@@ -113,9 +113,7 @@ def test_states_of_the_payload_have_the_errors_of_the_report_in_each_format(
         errors = errors_rtn_m(rich_pass, utc_ns, position)
         np.testing.assert_allclose(errors, np.tile(FILTER_ERROR_RTN_M, (FRAMES, 1)), atol=0.01, err_msg=kind)
     rows = csv.DictReader(io.StringIO(unzipped(export(rich_ground, "csv"))["residuals.csv"].decode()))
-    reported = [
-        [float(one[f"error_{axis}_m"]) for axis in "rtn"] for one in rows if one["solution"] == "anchored"
-    ]
+    reported = [[float(one[f"error_{axis}_m"]) for axis in "rtn"] for one in rows if one["solution"] == "anchored"]
     np.testing.assert_allclose(reported, np.tile(FILTER_ERROR_RTN_M, (FRAMES, 1)), atol=0.01)
 
 
@@ -204,9 +202,7 @@ def test_geojson_and_geopackage_have_the_same_features_on_the_moon(
     assert counts["footprints"] == FRAMES
     assert counts["tracks"] == 4
     with sqlite3.connect(tmp_path / "pass.gpkg") as database:
-        columns = {
-            row[1]: row[2] for name in layers for row in database.execute(f"PRAGMA table_info({name})")
-        }
+        columns = {row[1]: row[2] for name in layers for row in database.execute(f"PRAGMA table_info({name})")}
         times = database.execute("SELECT start, stop FROM tracks").fetchall()
     expected = {"utc": "DATETIME", "start": "DATETIME", "stop": "DATETIME", "complete": "BOOLEAN"}
     assert {name: columns[name] for name in expected} == expected
@@ -215,9 +211,7 @@ def test_geojson_and_geopackage_have_the_same_features_on_the_moon(
     assert "1737400" in read["crs"]
 
 
-def test_located_detections_lie_on_their_craters(
-    rich_ground: Ground, rich_pass: RichPass, tmp_path: Path
-) -> None:
+def test_located_detections_lie_on_their_craters(rich_ground: Ground, rich_pass: RichPass, tmp_path: Path) -> None:
     path = tmp_path / "pass.gpkg"
     path.write_bytes(export(rich_ground, "gpkg"))
     catalogue = load_catalogue(rich_pass.folder / "catalogue.csv")
@@ -235,9 +229,7 @@ def test_located_detections_lie_on_their_craters(
     assert np.median(np.linalg.norm(found - true, axis=1)) < 1000.0
 
 
-def test_footprints_hold_the_sub_satellite_point_and_detections(
-    rich_ground: Ground, rich_pass: RichPass
-) -> None:
+def test_footprints_hold_the_sub_satellite_point_and_detections(rich_ground: Ground, rich_pass: RichPass) -> None:
     document = json.loads(export(rich_ground, "geojson"))
     from lunar.frames import spherical_from_mcmf
 
@@ -250,9 +242,7 @@ def test_footprints_hold_the_sub_satellite_point_and_detections(
     for k in range(FRAMES):
         east = np.degrees((longitude[k] + np.pi) % (2 * np.pi) - np.pi)
         low, high = rings[k].min(axis=0), rings[k].max(axis=0)
-        assert (low < [east, np.degrees(latitude[k])]).all() and (
-            [east, np.degrees(latitude[k])] < high
-        ).all()
+        assert (low < [east, np.degrees(latitude[k])]).all() and ([east, np.degrees(latitude[k])] < high).all()
         # The true arc to the middle of an edge is 53.4 km at 30 km altitude.
         ring = mcmf_from_spherical(np.radians(rings[k][:, 1]), np.radians(rings[k][:, 0]), 0.0) / 1_737_400.0
         below = rich_pass.position_mcmf_m[k] / np.linalg.norm(rich_pass.position_mcmf_m[k])
@@ -264,9 +254,7 @@ def test_footprints_hold_the_sub_satellite_point_and_detections(
 def test_maps_of_an_estimator_move_with_its_error(rich_ground: Ground) -> None:
     def points(states: str) -> np.ndarray:
         features = json.loads(export(rich_ground, "geojson", states))["features"]
-        places = [
-            one["geometry"]["coordinates"] for one in features if one["properties"]["layer"] == "detections"
-        ]
+        places = [one["geometry"]["coordinates"] for one in features if one["properties"]["layer"] == "detections"]
         return np.array(places)
 
     shift = np.radians(np.linalg.norm(points("spherical") - points("reference"), axis=1)) * 1_737_400.0
@@ -275,9 +263,7 @@ def test_maps_of_an_estimator_move_with_its_error(rich_ground: Ground) -> None:
     assert np.median(shift) == pytest.approx(horizontal, rel=0.25)
 
 
-def test_czml_is_read_by_czml3_with_the_positions_of_the_oem(
-    rich_ground: Ground, rich_pass: RichPass
-) -> None:
+def test_czml_is_read_by_czml3_with_the_positions_of_the_oem(rich_ground: Ground, rich_pass: RichPass) -> None:
     from czml3 import Packet
 
     packets = json.loads(export(rich_ground, "czml"))
@@ -317,9 +303,7 @@ def test_csv_tables_have_every_sample_with_units(rich_ground: Ground, rich_pass:
     assert next(one for one in columns if one["name"] == "altitude_m")["linna:unit"] == "m"
     assert [one["name"] for one in columns] == list(states[0])
     spherical = [
-        one
-        for one in csv.DictReader(io.StringIO(files["residuals.csv"].decode()))
-        if one["solution"] == "spherical"
+        one for one in csv.DictReader(io.StringIO(files["residuals.csv"].decode())) if one["solution"] == "spherical"
     ]
     found = np.array([[float(one[f"error_{axis}_m"]) for axis in "rtn"] for one in spherical])
     np.testing.assert_allclose(found, SPHERICAL_ERROR_RTN_M + np.zeros((FRAMES, 1)), atol=0.5)
@@ -337,13 +321,9 @@ def test_netcdf_has_the_tables_as_groups(rich_ground: Ground, rich_pass: RichPas
     rows = unzipped(export(rich_ground, "csv"))
     with xarray.open_datatree(path, engine="h5netcdf") as tree:
         assert tree.attrs["title"] == "synthetic pass"
-        assert re.fullmatch(
-            r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ LINNA: pass 1 exported as netCDF", tree.attrs["history"]
-        )
+        assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ LINNA: pass 1 exported as netCDF", tree.attrs["history"])
         frames = tree["frames"].to_dataset()
-        np.testing.assert_array_equal(
-            frames["utc"].values.astype("datetime64[ns]").astype(np.int64), rich_pass.utc_ns
-        )
+        np.testing.assert_array_equal(frames["utc"].values.astype("datetime64[ns]").astype(np.int64), rich_pass.utc_ns)
         assert tree["detections"]["u_px"].attrs["units"] == "px"
         for name in ("states", "residuals", "detections", "events", "housekeeping", "reference", "attitude"):
             table = pandas.read_csv(io.BytesIO(rows[f"{name}.csv"]))
@@ -357,12 +337,7 @@ def test_netcdf_has_the_tables_as_groups(rich_ground: Ground, rich_pass: RichPas
 
 def test_parquet_has_a_file_for_each_packet_type_with_units(rich_ground: Ground, rich_pass: RichPass) -> None:
     files = unzipped(export(rich_ground, "parquet"))
-    assert {
-        "detections.parquet",
-        "housekeeping.parquet",
-        "filter_state.parquet",
-        "event_info.parquet",
-    } <= set(files)
+    assert {"detections.parquet", "housekeeping.parquet", "filter_state.parquet", "event_info.parquet"} <= set(files)
     table = parquet.read_table(io.BytesIO(files["housekeeping.parquet"]))
     assert table.num_rows == FRAMES
     assert str(table.schema.field("utc").type) == "timestamp[ns, tz=UTC]"
@@ -377,9 +352,7 @@ def test_parquet_has_a_file_for_each_packet_type_with_units(rich_ground: Ground,
 
 def test_tum_trajectories_differ_by_the_error(rich_ground: Ground) -> None:
     files = unzipped(export(rich_ground, "tum"))
-    solution, reference = (
-        np.loadtxt(io.BytesIO(files[name])) for name in ("spherical.tum", "spherical-reference.tum")
-    )
+    solution, reference = (np.loadtxt(io.BytesIO(files[name])) for name in ("spherical.tum", "spherical-reference.tum"))
     assert len(solution) == FRAMES
     distance = np.linalg.norm(solution[:, 1:4] - reference[:, 1:4], axis=1)
     np.testing.assert_allclose(distance, np.linalg.norm(SPHERICAL_ERROR_RTN_M), atol=1.0)
@@ -436,18 +409,12 @@ def test_every_format_is_listed_and_gives_the_same_octets_twice(rich_ground: Gro
 @pytest.mark.parametrize(
     ("kind", "states", "message"),
     [
-        (
-            "oem",
-            "paper",
-            "states: expected reference or anchored .downlinked with velocities., found 'paper'",
-        ),
+        ("oem", "paper", "states: expected reference or anchored .downlinked with velocities., found 'paper'"),
         ("oem", "truth", "states: expected reference or paper or spherical or anchored, found 'truth'"),
         ("geojson", "truth", "states: expected reference or paper or spherical or anchored, found 'truth'"),
     ],
 )
-def test_states_that_do_not_exist_are_one_line(
-    rich_ground: Ground, kind: str, states: str, message: str
-) -> None:
+def test_states_that_do_not_exist_are_one_line(rich_ground: Ground, kind: str, states: str, message: str) -> None:
     with pytest.raises(EvaluationError, match=message):
         export(rich_ground, kind, states)
 
@@ -456,11 +423,7 @@ def test_a_pass_without_content_of_a_format_is_one_line(rich_ground: Ground) -> 
     from ground_service.passes.service import define_pass
 
     empty = define_pass(
-        rich_ground,
-        name="empty",
-        start_utc_ns=10**18,
-        stop_utc_ns=10**18 + 60 * 10**9,
-        spacecraft_id=SPACECRAFT,
+        rich_ground, name="empty", start_utc_ns=10**18, stop_utc_ns=10**18 + 60 * 10**9, spacecraft_id=SPACECRAFT
     )
     for kind, message in (
         ("aem", "expected attitudes of its frames, found none"),
@@ -480,9 +443,7 @@ def test_a_missing_library_is_one_line_with_its_extra(
     rich_ground: Ground, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     usual, chosen = importlib.util.find_spec, FORMATS[kind]
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name == chosen.library else usual(name)
-    )
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == chosen.library else usual(name))
     expected = rf"export as {kind}: expected the library {chosen.library}, found none; install linna\[{chosen.extra}\]"
     with pytest.raises(MissingLibrary, match=expected):
         export(rich_ground, kind)
@@ -536,9 +497,7 @@ def test_faults_of_the_command_are_one_line(
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("")
     places = {name: str(tmp_path / name) for name in ("folder", "file", "new")}
-    status, text, errors = linna(
-        capsys, "export", *(one.format(**places) for one in arguments), "--home", home
-    )
+    status, text, errors = linna(capsys, "export", *(one.format(**places) for one in arguments), "--home", home)
     assert (status, text) == (2, "")
     assert message in errors.splitlines()[-1]
     assert not (tmp_path / "new").exists()
@@ -593,12 +552,9 @@ def test_a_ring_across_the_meridian_becomes_two() -> None:
 
 
 @given(
-    east=st.floats(-180.0, 180.0),
-    north=st.floats(-60.0, 60.0),
-    size=st.floats(0.5, 20.0),
-    points=st.integers(3, 40),
-    backwards=st.booleans(),
-)
+    east=st.floats(-180.0, 180.0), north=st.floats(-60.0, 60.0), size=st.floats(0.5, 20.0),
+    points=st.integers(3, 40), backwards=st.booleans(),
+)  # fmt: skip
 def test_cut_rings_keep_the_area_and_turn_counterclockwise(
     east: float, north: float, size: float, points: int, backwards: bool
 ) -> None:

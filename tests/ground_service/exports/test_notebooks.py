@@ -22,10 +22,7 @@ from ground_service.passes.archive_import import zip_folder
 from ground_service.settings import Settings
 from linna.errors import UsageError
 from linna.passes import Archive
-from tests.ground_service.conftest import (
-    SPHERICAL_ERROR_RTN_M,
-    free_port,
-)
+from tests.ground_service.conftest import SPHERICAL_ERROR_RTN_M, free_port
 from tests.ground_service.exports.conftest import FRAMES, RichPass
 from tmtc.errors import MissingLibrary
 
@@ -46,9 +43,7 @@ def check(archive: Archive) -> None:
     assert sorted(one.images) == [0, 4, 8]
     assert one.images[4][0, 0] == 40
     summary = archive.summary()
-    assert summary.loc[one.id, "spherical median_3d_m"] == pytest.approx(
-        spherical["error_3d_m"].median(), rel=1e-3
-    )
+    assert summary.loc[one.id, "spherical median_3d_m"] == pytest.approx(spherical["error_3d_m"].median(), rel=1e-3)
 
 
 def test_a_home_folder_is_opened(rich_ground: Ground) -> None:
@@ -129,10 +124,7 @@ def test_a_source_of_no_kind_is_one_line(tmp_path: Path, name: str) -> None:
     assert list((tmp_path / "empty").iterdir()) == []
 
 
-def test_without_pandas_one_line_names_the_extra(
-    rich_ground: Ground,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_pandas_one_line_names_the_extra(rich_ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
     usual = builtins.__import__
 
     def without(name: str, *rest: object) -> object:
@@ -155,11 +147,7 @@ def test_a_notebook_is_stored_without_outputs_and_small(path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs(
-    path: Path,
-    rich_ground: Ground,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_notebook_runs(path: Path, rich_ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
     import nbformat  # two seconds, which the other tests need not spend
     from nbclient import NotebookClient
 

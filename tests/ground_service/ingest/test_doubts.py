@@ -11,12 +11,7 @@ import pytest
 from ground_service.access.model import AuditFilter
 from ground_service.access.store import list_audit
 from ground_service.clock import TelemetryTime, set_mission_clock
-from ground_service.contacts.commanding.service import (
-    enter_command,
-    get_command,
-    release_command,
-    take_uplink,
-)
+from ground_service.contacts.commanding.service import enter_command, get_command, release_command, take_uplink
 from ground_service.contacts.links import store as links
 from ground_service.errors import Conflict, StateConflict
 from ground_service.ground import Ground, open_ground

@@ -60,10 +60,7 @@ def test_a_bomb_is_stopped_before_it_fills_the_disk(ground: Ground, tmp_path: Pa
 def test_too_many_files_files_twice_and_no_zip_at_all_are_refused(
     ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with (
-        pytest.warns(UserWarning, match="Duplicate name"),
-        zipfile.ZipFile(tmp_path / "twice.zip", "w") as archive,
-    ):
+    with pytest.warns(UserWarning, match="Duplicate name"), zipfile.ZipFile(tmp_path / "twice.zip", "w") as archive:
         archive.writestr("a", "1")
         archive.writestr("a", "2")
     with pytest.raises(InvalidInput, match="expected each file once"):
@@ -90,9 +87,7 @@ def directory_of(entries: int) -> bytes:
 
 
 @pytest.mark.parametrize("claimed", [None, 1])
-def test_a_great_directory_is_refused_before_it_is_read(
-    ground: Ground, tmp_path: Path, claimed: int | None
-) -> None:
+def test_a_great_directory_is_refused_before_it_is_read(ground: Ground, tmp_path: Path, claimed: int | None) -> None:
     """The number of entries is counted in the directory, not taken from the end record."""
     entries = 1_200_000 if claimed is None else 100_000
     directory = directory_of(entries)

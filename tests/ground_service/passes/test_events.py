@@ -69,11 +69,7 @@ def passed(either: Ground, tmp_path: Path) -> Ground:
     ingest_file(either, file)
     for name, start in (("first", 0), ("second", 5 * HOUR_S)):
         service.define_pass(
-            either,
-            name=name,
-            start_utc_ns=utc_ns(start),
-            stop_utc_ns=utc_ns(start + HOUR_S),
-            spacecraft_id=76,
+            either, name=name, start_utc_ns=utc_ns(start), stop_utc_ns=utc_ns(start + HOUR_S), spacecraft_id=76
         )
     return either
 
@@ -135,10 +131,7 @@ def test_a_pass_without_a_catalogue_has_no_craters(passed: Ground) -> None:
 def receive(ground: Ground, tmp_path: Path, second: int, **values: float) -> None:
     zeros: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
     packet = DICTIONARY.pack(
-        "housekeeping",
-        zeros | values | {"structure_id": 1},
-        ticks=TICKS + second * 65_536,
-        sequence_count=second,
+        "housekeeping", zeros | values | {"structure_id": 1}, ticks=TICKS + second * 65_536, sequence_count=second
     )
     file = tmp_path / f"{second}.cadu"
     file.write_bytes(encode_cadus([packet], spacecraft_id=76))
@@ -196,10 +189,7 @@ def test_a_parameter_of_a_further_structure_has_a_series_a_live_value_an_alarm_a
     values = [10.0, HOT_C, 20.0]
     packets = [
         DICTIONARY.pack(
-            "performance",
-            zeros | {"camera_temperature_c": value},
-            ticks=TICKS + (second << 16),
-            sequence_count=second,
+            "performance", zeros | {"camera_temperature_c": value}, ticks=TICKS + (second << 16), sequence_count=second
         )
         for second, value in enumerate(values)
     ]
@@ -208,21 +198,15 @@ def test_a_parameter_of_a_further_structure_has_a_series_a_live_value_an_alarm_a
         start, stop = (format_utc(int(utc_ns_from_ticks(TICKS + (s << 16)))) for s in (-60, 60))
         pass_id = client.define_pass("pass", start, stop, 76).id
         listed = {one.name: one for one in client.list_parameters(pass_id).parameters}
-        assert (listed["camera_temperature_c"].packet, listed["camera_temperature_c"].unit) == (
-            "performance",
-            "degC",
-        )
+        assert (listed["camera_temperature_c"].packet, listed["camera_temperature_c"].unit) == ("performance", "degC")
         series = client.get_parameter(pass_id, "camera_temperature_c")
         assert [bucket.mean for bucket in series.buckets] == values
         live = {one.name: one for one in client.list_live_parameters(76)}["camera_temperature_c"]
         assert (live.value, live.limit_state) == (20.0, "within")
         [alarm] = client.list_alarms()
         assert (alarm.name, alarm.severity, alarm.value, alarm.active) == (
-            "camera_temperature_c",
-            "alarm",
-            HOT_C,
-            False,
-        )
+            "camera_temperature_c", "alarm", HOT_C, False,
+        )  # fmt: skip
         monkeypatch.setattr(inputs, "DRAWN", ("camera_temperature_c",))
         [drawn] = inputs.load_pass_inputs(ground, pass_id).housekeeping
         assert (drawn.name, drawn.unit, drawn.values.tolist()) == ("camera_temperature_c", "°C", values)
@@ -305,19 +289,11 @@ def add_report(ground: Ground, pass_id: int, level: str, created_utc_ns: int) ->
         store.add_report(
             connection,
             StoredReport(
-                id=f"{pass_id:016x}{created_utc_ns:016x}",
-                pass_id=pass_id,
-                html_sha256=stored.sha256,
-                json_sha256=stored.sha256,
-                pdf_sha256=None,
-                summary={"verdict_level": level},
-                mission_id=None,
-                event_number=None,
-                previous_id=None,
-                changes=None,
-                created_utc_ns=created_utc_ns,
+                id=f"{pass_id:016x}{created_utc_ns:016x}", pass_id=pass_id, html_sha256=stored.sha256,
+                json_sha256=stored.sha256, pdf_sha256=None, summary={"verdict_level": level}, mission_id=None,
+                event_number=None, previous_id=None, changes=None, created_utc_ns=created_utc_ns,
             ),
-        )
+        )  # fmt: skip
 
 
 def listed(ground: Ground, **terms: Any) -> tuple[list[int], int]:
@@ -329,13 +305,7 @@ def listed(ground: Ground, **terms: Any) -> tuple[list[int], int]:
 def test_passes_are_listed_by_the_verdict_of_their_newest_report(either: Ground) -> None:
     for hour in range(3):
         start = (1_900_000_000 + 3600 * hour) * NS
-        define_pass(
-            either,
-            name=f"pass {hour}",
-            start_utc_ns=start,
-            stop_utc_ns=start + 60 * NS,
-            spacecraft_id=76,
-        )
+        define_pass(either, name=f"pass {hour}", start_utc_ns=start, stop_utc_ns=start + 60 * NS, spacecraft_id=76)
     add_report(either, 1, "met", 2 * NS)
     add_report(either, 1, "not met", 1 * NS)  # older
     add_report(either, 2, "met", 1 * NS)
@@ -348,18 +318,11 @@ def test_passes_are_listed_by_the_verdict_of_their_newest_report(either: Ground)
     assert listed(either) == ([1, 2, 3], 3)
 
 
-def test_the_interval_of_a_pass_takes_time_in_proportion_to_its_starts(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_the_interval_of_a_pass_takes_time_in_proportion_to_its_starts(ground: Ground, tmp_path: Path) -> None:
     file = tmp_path / "starts.packets"
-    file.write_bytes(
-        b"".join(event_packet(TICKS + 65_536 * k, k, "observation_started") for k in range(4_000))
-    )
+    file.write_bytes(b"".join(event_packet(TICKS + 65_536 * k, k, "observation_started") for k in range(4_000)))
     ingest_file(ground, file, spacecraft_id=76)
-    span = {
-        "start_utc_ns": utc_ns_from_ticks(TICKS),
-        "stop_utc_ns": utc_ns_from_ticks(TICKS + 65_536 * 4_000),
-    }
+    span = {"start_utc_ns": utc_ns_from_ticks(TICKS), "stop_utc_ns": utc_ns_from_ticks(TICKS + 65_536 * 4_000)}
     key = define_pass(ground, name="p", spacecraft_id=76, **span)
     record, begun = ground.read(get_pass, key), time.process_time()
     ground.read(pass_span, record)

@@ -36,14 +36,7 @@ from ground_service.telemetry.packets import batch_of_cut
 from ground_service.telemetry.rollups import BASE_TICKS, HOUSEKEEPING_VALUES, STATE_VALUES
 from ground_service.telemetry.writing import store_samples
 from lunar.timescales import parse_utc, ticks_from_utc_ns
-from tests.ground_service.conftest import (
-    NS,
-    SPACECRAFT,
-    SyntheticPass,
-    define_pass_of,
-    encode_downlink,
-    enter_files,
-)
+from tests.ground_service.conftest import NS, SPACECRAFT, SyntheticPass, define_pass_of, encode_downlink, enter_files
 from tests.lazy import Lazy
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
@@ -69,13 +62,9 @@ def states(seed: int = 1) -> dict[str, Any]:
     columns["matched"] = rng.integers(0, 20, COUNT)
     columns["nis"][::7] = np.nan
     columns.update(
-        packet=np.arange(COUNT),
-        ticks=FIRST + seconds * SECOND + 11,
-        packet_ticks=FIRST + seconds * SECOND,
-        frame_number=np.arange(COUNT),
-        estimator=np.arange(COUNT) % 2,
-        outcome=np.zeros(COUNT, dtype=np.int64),
-    )
+        packet=np.arange(COUNT), ticks=FIRST + seconds * SECOND + 11, packet_ticks=FIRST + seconds * SECOND,
+        frame_number=np.arange(COUNT), estimator=np.arange(COUNT) % 2, outcome=np.zeros(COUNT, dtype=np.int64),
+    )  # fmt: skip
     return columns
 
 
@@ -86,11 +75,7 @@ def stored(ground: Ground, columns: dict[str, Any], batches: list[np.ndarray]) -
             chosen = {name: column[batch] for name, column in columns.items() if name != "packet"}
             chosen["packet"] = np.arange(len(batch))
             store_samples(
-                connection,
-                vehicle,
-                DICTIONARY.version,
-                {"navigation_states": chosen},
-                columns["packet"][batch] + 1,
+                connection, vehicle, DICTIONARY.version, {"navigation_states": chosen}, columns["packet"][batch] + 1
             )
     return vehicle
 
@@ -214,13 +199,7 @@ def test_few_texts_of_the_query_for_buckets_find_any_number_of_them(ground: Grou
         )
         buckets = np.unique(list(rows.scalars()))
         texts.clear()
-        key = {
-            "vehicle_id": vehicle,
-            "dictionary_version": DICTIONARY.version,
-            "kind": 2,
-            "part": 0,
-            "level": 0,
-        }
+        key = {"vehicle_id": vehicle, "dictionary_version": DICTIONARY.version, "kind": 2, "part": 0, "level": 0}
         for count in range(1, 25):
             wanted = [(key, (buckets[start : start + 4], *[np.zeros(0)] * 4)) for start in range(0, count, 4)]
             whole = {(0, 0): sorted({b for _, (some, *_) in wanted for b in some.tolist()})}
@@ -265,12 +244,9 @@ def anchored_packets(made: Any, version: int) -> list[bytes]:
         frame = {"frame_number": k, "image_ticks": ticks}
         triangle = np.tril_indices(9) if version == 2 else np.triu_indices(9)
         values = {
-            **frame,
-            "position_icrf_m": position,
-            "velocity_icrf_m_s": state[3:],
-            "acceleration_rtn_m_s2": np.zeros(3),
-            "covariance": covariance[triangle],
-        }
+            **frame, "position_icrf_m": position, "velocity_icrf_m_s": state[3:],
+            "acceleration_rtn_m_s2": np.zeros(3), "covariance": covariance[triangle],
+        }  # fmt: skip
         name = "filter_state" if version == 2 else "filter_estimate"
         if version != 2:
             values["innovation_degrees"] = 24
@@ -280,9 +256,7 @@ def anchored_packets(made: Any, version: int) -> list[bytes]:
             "longitude_deg": np.degrees(longitude) % 360.0, "altitude_m": altitude,
             "velocity_icrf_m_s": state[3:], "sigma_rtn_m": SIGMA_M, "nis": 12.0, "matched": 12,
         }  # fmt: skip
-        packets.append(
-            DICTIONARY.pack("navigation_state", state_values, ticks=ticks + 6, sequence_count=1_001 + 2 * k)
-        )
+        packets.append(DICTIONARY.pack("navigation_state", state_values, ticks=ticks + 6, sequence_count=1_001 + 2 * k))
     return packets
 
 
@@ -346,9 +320,7 @@ def test_what_version_2_decoded_is_decoded_again_to_the_same_states(ground: Grou
     assert versions == {2, DICTIONARY.version}
 
 
-def test_the_report_weighs_errors_with_the_whole_covariance(
-    flown: tuple[Path, Any, int], ground: Ground
-) -> None:
+def test_the_report_weighs_errors_with_the_whole_covariance(flown: tuple[Path, Any, int], ground: Ground) -> None:
     _, made, version = flown
     folder = archive_with(made, anchored_packets(made, version))
     report = evaluate_pass(load_pass_inputs(ground, import_archive(ground, folder)))
@@ -364,9 +336,7 @@ def test_sigmas_alone_give_a_sum_of_another_name(ground: Ground, make_pass: Any)
     made = make_pass(frames=8, seed=3)
     octets = b"".join(anchored_packets(made, 3))
     states = [
-        packet
-        for packet in cut_packets(octets).packets(octets)
-        if DICTIONARY.unpack(packet)[0] == "navigation_state"
+        packet for packet in cut_packets(octets).packets(octets) if DICTIONARY.unpack(packet)[0] == "navigation_state"
     ]
     folder = archive_with(made, states)
     report = evaluate_pass(load_pass_inputs(ground, import_archive(ground, folder)))
@@ -444,9 +414,7 @@ def test_frames_of_an_archive_are_listed_and_read(ground: Ground, synthetic_pass
         store.add_frames(connection, pass_id, {3: stored.sha256})
         record = store.get_pass(connection, pass_id)
     (vehicle,) = {one.instance for one in list_spacecraft(ground)}
-    (found,) = archive_import.list_images(
-        ground, SPACECRAFT, vehicle, record.start_utc_ns, record.stop_utc_ns
-    )
+    (found,) = archive_import.list_images(ground, SPACECRAFT, vehicle, record.start_utc_ns, record.stop_utc_ns)
     assert (found.frame_number, found.source, found.pass_id) == (3, "archive", pass_id)
     assert record.start_utc_ns < found.time.utc_ns < record.stop_utc_ns
     assert found.address == f"/api/v1/passes/{pass_id}/images/3"
@@ -456,10 +424,7 @@ def test_frames_of_an_archive_are_listed_and_read(ground: Ground, synthetic_pass
     own = [one for one in items if one.frame_number == 3]
     drawn = archive_import.archived_image(ground, pass_id, 3, detections=True)
     picture = cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR)
-    assert own and set(map(tuple, picture.reshape(-1, 3).tolist())) == {
-        (77, 77, 77),
-        archive_import.ORANGE_BGR,
-    }
+    assert own and set(map(tuple, picture.reshape(-1, 3).tolist())) == {(77, 77, 77), archive_import.ORANGE_BGR}
     for one in own:
         rim = (round(one.v_px), round(one.u_px) + max(round(one.diameter_px / 2), 1))
         if max(rim) < 1024:
@@ -479,9 +444,7 @@ def detection(frame_number: int, ticks: int, count: int = 1) -> bytes:
     return DICTIONARY.pack("detections", frame, ticks=ticks + 100, sequence_count=frame_number)
 
 
-def test_detections_are_drawn_on_an_enlarged_thumbnail_of_a_known_camera(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_detections_are_drawn_on_an_enlarged_thumbnail_of_a_known_camera(ground: Ground, tmp_path: Path) -> None:
     made, octets = thumbnail(1, TICKS)  # 12 by 8: one pixel for 8 by 8 of the camera
     later = TICKS + 600 * SECOND
     others = large_data(thumbnail(2, TICKS + 15 * SECOND)[1], 2, later + 200)

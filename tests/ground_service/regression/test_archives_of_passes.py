@@ -42,14 +42,7 @@ from ground_service.regression.pass_archives import LIVE, NO_INPUTS, archive_of_
 from ground_service.regression.service import find_replay, run_regression
 from linna.commands import regress
 from lunar.datafolder import find_data
-from tests.ground_service.conftest import (
-    SPACECRAFT,
-    START,
-    FlyablePass,
-    SyntheticPass,
-    encode_downlink,
-    enter_files,
-)
+from tests.ground_service.conftest import SPACECRAFT, START, FlyablePass, SyntheticPass, encode_downlink, enter_files
 
 REPLAY = KeptReplay(
     outcome="ok", detail="", downlink_sha256=None, performance_sha256=None, wall_s=1.0, cpu_s=1.0, peak_rss_mib=1.0,
@@ -105,9 +98,7 @@ def test_an_imported_pass_is_kept_without_a_request(either: Ground, flown: Flyab
     assert compared(either, given)["archives"] == [digest]
 
 
-def test_an_archive_without_inputs_of_the_payload_is_telemetry_only(
-    ground: Ground, archive: SyntheticPass
-) -> None:
+def test_an_archive_without_inputs_of_the_payload_is_telemetry_only(ground: Ground, archive: SyntheticPass) -> None:
     pass_id = import_archive(ground, archive.folder)
     [kept] = kept_archives(ground)
     assert (kept.pass_id, kept.state, kept.reason) == (pass_id, "telemetry only", NO_INPUTS)
@@ -139,9 +130,7 @@ def test_a_live_pass_keeps_its_received_data_and_is_replaced_by_late_data(
         file.write_bytes(encode_downlink(packets))
         ingest_file(either, file, spacecraft_id=SPACECRAFT)
         if number == 0:
-            pass_id = define_pass(
-                either, name="live", start_utc_ns=START, stop_utc_ns=STOP, spacecraft_id=SPACECRAFT
-            )
+            pass_id = define_pass(either, name="live", start_utc_ns=START, stop_utc_ns=STOP, spacecraft_id=SPACECRAFT)
             first = archive_of_pass(either, pass_id)
             assert archive_of_pass(either, pass_id).digest == first.digest
     assert (first.pass_id, first.state, first.reason) == (pass_id, "telemetry only", LIVE)
@@ -190,9 +179,7 @@ def test_frames_that_cannot_be_rendered_leave_telemetry_only_with_the_reason(
     assert outcome.verdict == "inconclusive"
     assert outcome.gates == ()
     verdict = verdict_document(outcome)
-    assert verdict.headline.startswith(
-        "inconclusive: synthetic pass 5: good is a program, which needs frames"
-    )
+    assert verdict.headline.startswith("inconclusive: synthetic pass 5: good is a program, which needs frames")
     assert "0 of 0 gates passed" in regression_text(verdict)
     junit = regression_junit(verdict, 0)
     assert 'failures="1" errors="0" skipped="1"' in junit
@@ -294,9 +281,7 @@ def test_an_archive_that_cannot_be_rendered_is_settled_once(
     assert rendering.settle_archive(ground, first.digest) == first
 
 
-def test_an_unchanged_archive_keeps_its_replays(
-    ground: Ground, unrendered: Path, make_build: Callable
-) -> None:
+def test_an_unchanged_archive_keeps_its_replays(ground: Ground, unrendered: Path, make_build: Callable) -> None:
     digest = keep_archive(ground, unrendered).digest
     rendering.settle_archive(ground, digest)
     build = good(ground, make_build, {})
@@ -308,11 +293,7 @@ def test_an_unchanged_archive_keeps_its_replays(
 
 
 def test_a_replay_of_an_archive_that_is_completed_meanwhile_is_done_again(
-    either: Ground,
-    unrendered: Path,
-    flown: FlyablePass,
-    make_build: Callable,
-    monkeypatch: pytest.MonkeyPatch,
+    either: Ground, unrendered: Path, flown: FlyablePass, make_build: Callable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     digest = keep_archive(either, unrendered).digest
     assert rendering.settle_archive(either, digest).state == "telemetry only"
@@ -357,9 +338,7 @@ def test_detections_besides_all_frames_are_refused_and_not_given_to_a_build(
     assert not (tmp_path / "partial/frames").exists()
 
 
-def test_a_placebo_sees_images_with_noise_of_its_seed_and_their_hashes(
-    flown: FlyablePass, tmp_path: Path
-) -> None:
+def test_a_placebo_sees_images_with_noise_of_its_seed_and_their_hashes(flown: FlyablePass, tmp_path: Path) -> None:
     images, hashes = [], []
     for k, seed in enumerate((5, 5, 6)):
         view = tmp_path / str(k)
@@ -403,10 +382,7 @@ def test_data_products_that_are_mounted_later_are_noticed(tmp_path: Path) -> Non
 
 
 def test_files_are_removed_after_the_commit_and_only_if_all_kept_archives_are_known(
-    either: Ground,
-    flown: FlyablePass,
-    unrendered: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    either: Ground, flown: FlyablePass, unrendered: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = MagicMock()
     monkeypatch.setattr("ground_service.regression.archives._log", log)
@@ -456,9 +432,7 @@ def test_an_archive_is_rendered_again_on_request(
     assert [one.state for one in kept_archives(ground)] == ["complete"]
 
 
-def test_an_archive_of_an_older_version_asks_for_another_import(
-    tmp_path: Path, archive: SyntheticPass
-) -> None:
+def test_an_archive_of_an_older_version_asks_for_another_import(tmp_path: Path, archive: SyntheticPass) -> None:
     with open_ground(tmp_path / "home") as ground:
         pass_id = import_archive(ground, archive.folder)
         ground.files.path(read_manifest(archive.folder)[1]).unlink()

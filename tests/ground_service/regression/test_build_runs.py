@@ -37,9 +37,7 @@ def archive(make_flyable: Callable) -> Path:
 @pytest.fixture
 def fly(make_build: Callable, archive: Path, tmp_path: Path) -> Callable[..., BuildRun]:
     def run(program: str, limits: str = LIMITS) -> BuildRun:
-        build = load_build(
-            make_build("bad", program="import os, pathlib, sys, time\n" + program, extra=limits)
-        )
+        build = load_build(make_build("bad", program="import os, pathlib, sys, time\n" + program, extra=limits))
         return run_build(build, archive, tmp_path / "out")
 
     return run
@@ -61,17 +59,13 @@ def test_builds_do_not_run_without_bubblewrap(fly, monkeypatch: pytest.MonkeyPat
     host.protection.cache_clear()
     run = fly("pathlib.Path(sys.argv[2], 'downlink.packets').write_bytes(b'abc')")
     assert (run.outcome, run.downlink) == ("refused", None)
-    assert run.detail.startswith(
-        "expected the program bwrap (Debian package bubblewrap), found none; remedy: "
-    )
+    assert run.detail.startswith("expected the program bwrap (Debian package bubblewrap), found none; remedy: ")
 
 
 def test_a_refusal_has_a_reason_if_python_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     host.protection.cache_clear()
     monkeypatch.setattr(host, "execute", lambda run: {"exit_status": 1})
-    with pytest.raises(
-        host.SandboxRefused, match="Python does not run in the sandbox: no text, exit status 1"
-    ):
+    with pytest.raises(host.SandboxRefused, match="Python does not run in the sandbox: no text, exit status 1"):
         host.protection()
 
 
@@ -114,15 +108,11 @@ def test_a_program_that_uses_too_much_processor_time_is_stopped(fly) -> None:
 
 
 def test_a_program_that_fills_the_disk_with_small_files_is_stopped(fly) -> None:
-    run = fly(
-        "for i in range(8): pathlib.Path(sys.argv[2], f'{i}.bin').write_bytes(bytes(2 << 20))\ntime.sleep(2)"
-    )
+    run = fly("for i in range(8): pathlib.Path(sys.argv[2], f'{i}.bin').write_bytes(bytes(2 << 20))\ntime.sleep(2)")
     assert run.outcome == "disk"
 
 
-def test_a_program_that_is_not_there_is_a_crash_and_no_error_of_the_ground(
-    archive: Path, tmp_path: Path
-) -> None:
+def test_a_program_that_is_not_there_is_a_crash_and_no_error_of_the_ground(archive: Path, tmp_path: Path) -> None:
     file = tmp_path / "build.toml"
     file.write_text('name = "gone"\ncommand = ["/nonexistent/program", "{archive}", "{out}"]\n')
     run = run_build(load_build(file), archive, tmp_path / "out")
@@ -161,9 +151,7 @@ def test_a_program_gets_no_socket_but_pairs_of_its_own(fly) -> None:
     assert run.downlink is not None and run.downlink.read_text() == "[1, 1, 1, 1, 1, 'x', 1]"
 
 
-def test_a_program_sees_what_the_payload_was_given_and_no_truth_or_secret(
-    fly, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_program_sees_what_the_payload_was_given_and_no_truth_or_secret(fly, monkeypatch: pytest.MonkeyPatch) -> None:
     for secret in ("LINNA_DATABASE_URL", "HTTPS_PROXY", "LINNA_DATA"):
         monkeypatch.setenv(secret, "postgresql://secret")
     run = fly(
@@ -223,10 +211,7 @@ def test_a_run_goes_into_a_new_folder_only(fly, tmp_path: Path) -> None:
         ),
         ('name = "x"\n[limits]\nwall_s = -1', "limits.wall_s: expected greater than 0, found -1"),
         ('name = "x"\n[limits]\nwall_s = 7_201', "limits.wall_s: expected less than or equal to 7200"),
-        (
-            'name = "x"\n[limits]\nmemory_mib = 9_000_000_000_000',
-            "limits.memory_mib: expected less than or equal",
-        ),
+        ('name = "x"\n[limits]\nmemory_mib = 9_000_000_000_000', "limits.memory_mib: expected less than or equal"),
         (f'name = "x"\n[provenance]\ncommit = 0x{"f" * 5000}', "provenance.commit"),
         ('name = "x"\nschema_version = 9', "schema_version: expected 1, found 9"),
         ("name = ", "expected a build file (TOML)"),
@@ -305,8 +290,7 @@ def write(tmp_path: Path) -> Callable[[str], str]:
     [
         (
             "flight.anchored.gravity_degre = 60",
-            "p.toml, flight.anchored.gravity_degre: expected gravity_degree (nearest known key), "
-            "found an unknown key",
+            "p.toml, flight.anchored.gravity_degre: expected gravity_degree (nearest known key), found an unknown key",
         ),
         (
             "detector.score_threshold = 7.0",
@@ -369,9 +353,7 @@ def test_a_build_that_cannot_be_checked_is_not_registered(
     assert home.read(list_builds, Paging()).items == []
 
 
-def test_the_command_checks_a_build_file(
-    write: Callable[[str], str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_checks_a_build_file(write: Callable[[str], str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["replay", "--check-build", write("detector.max_detection = 3")]) == 2
     assert "expected max_detections (nearest known key), found an unknown key" in capsys.readouterr().out
     file = write("detector.max_detections = 3")
@@ -392,37 +374,19 @@ POLICY = {"version": "1", "sha256": "00", "confidence": 0.95, "power": 0.8}  # o
 
 def gate(name: str, outcome: str, **values: Any) -> JudgedGate:
     known = {
-        "pass_id": None,
-        "passed": outcome == "pass",
-        "baseline": 0.9,
-        "candidate": 0.7,
-        "margin": None,
-        "limit": 0.05,
-        "unit": "",
-        "change_bounds": (None, None),
-        "p_value": None,
-        "level": None,
-        "resolution": None,
-        "frames": 10,
-        "frames_needed": None,
-        "reason": None,
-    }
+        "pass_id": None, "passed": outcome == "pass", "baseline": 0.9, "candidate": 0.7, "margin": None,
+        "limit": 0.05, "unit": "", "change_bounds": (None, None), "p_value": None, "level": None,
+        "resolution": None, "frames": 10, "frames_needed": None, "reason": None,
+    }  # fmt: skip
     return JudgedGate(name=name, outcome=outcome, **known | values)
 
 
 def regression(verdict: str, gates: list[JudgedGate], **values: Any) -> Regression:
     result = Verdict(
-        verdict=verdict,
-        baseline={"name": "old", **BUILD},
-        candidate={"name": "new", **BUILD},
-        policy=POLICY,
-        headline=f"{verdict}: no loss",
-        frames=10,
-        frames_needed=None,
-        gates=gates,
-        passes=values.get("passes", []),
+        verdict=verdict, baseline={"name": "old", **BUILD}, candidate={"name": "new", **BUILD}, policy=POLICY,
+        headline=f"{verdict}: no loss", frames=10, frames_needed=None, gates=gates, passes=values.get("passes", []),
         remarks=["builds were isolated"],
-    )
+    )  # fmt: skip
     return Regression(id="1", verdict=verdict, created=UtcTime(0), result=result)
 
 

@@ -138,9 +138,7 @@ def largest_count(trials: int, rate: float) -> int:
 
 @pytest.mark.parametrize("passes", [1, 5])
 def test_equal_builds_fail_once_in_a_hundred_at_most_and_pass_on_five_windows(passes: int) -> None:
-    outcomes = [
-        verdict_of(judge(suite(0, passes, 100 * k), suite(1, passes, 100 * k), POLICY)) for k in range(100)
-    ]
+    outcomes = [verdict_of(judge(suite(0, passes, 100 * k), suite(1, passes, 100 * k), POLICY)) for k in range(100)]
     assert outcomes.count("fail") <= largest_count(100, 0.01)
     assert outcomes.count("pass") >= 95
 
@@ -148,15 +146,12 @@ def test_equal_builds_fail_once_in_a_hundred_at_most_and_pass_on_five_windows(pa
 @pytest.mark.parametrize(
     ("passes", "faults", "names"),
     [
-        (1, {"recall": 0.5}, {"detector.recall"}),
-        (5, {"recall": 0.65, "false_cells": 11}, {"detector.recall"}),
-        (5, {"false_cells": 24}, {"detector.precision"}),
-        (1, {"off_px": 0.5}, {"detector.localisation"}),
-        (5, {"fixes": 0.8}, {"navigation.anchored.fixes"}),
-        (5, {"error": 2.0}, {"navigation.anchored.p50"}),
+        (1, {"recall": 0.5}, {"detector.recall"}), (5, {"recall": 0.65, "false_cells": 11}, {"detector.recall"}),
+        (5, {"false_cells": 24}, {"detector.precision"}), (1, {"off_px": 0.5}, {"detector.localisation"}),
+        (5, {"fixes": 0.8}, {"navigation.anchored.fixes"}), (5, {"error": 2.0}, {"navigation.anchored.p50"}),
         (20, {"error": 1.25}, {"navigation.anchored.p50"}),
     ],
-)
+)  # fmt: skip
 def test_a_degraded_build_fails_by_the_metric_that_is_worse(
     passes: int, faults: dict[str, Any], names: set[str]
 ) -> None:
@@ -318,22 +313,14 @@ EXACT: list[tuple[str, Callable[[PassFrames], PassFrames], str]] = [
         lambda f: replace(f, estimators={}),
         "no state of the estimator anchored in 49 of 49 frames on which the baseline has one",
     ),
-    (
-        "navigation.wrong_fixes",
-        lambda f: wrong(f, 3),
-        "3 fixes are wrong, against 0 of the baseline",
-    ),
+    ("navigation.wrong_fixes", lambda f: wrong(f, 3), "3 fixes are wrong, against 0 of the baseline"),
     ("memory", lambda f: replace(f, memory_mib=320.0), "peak memory rises from 250 to 320 MiB"),
     (
         "latency.total",
         lambda f: replace(f, latency_ms={"a": 48.0 + f.packets}),
         "processor time of a frame rises from 40 to 56 ms",
     ),
-    (
-        "latency.start",
-        lambda f: replace(f, cpu_s=f.cpu_s + 2.0),
-        "processor time of the start rises from 3 to 5 s",
-    ),
+    ("latency.start", lambda f: replace(f, cpu_s=f.cpu_s + 2.0), "processor time of the start rises from 3 to 5 s"),
 ]
 TIMES = {"latency_ms": {"a": np.full(FRAMES, 40.0)}, "cpu_s": 3.0 + 0.04 * (FRAMES - 2)}
 
@@ -426,9 +413,7 @@ def test_a_position_without_a_reference_is_a_value() -> None:
 
 def test_wrong_fixes_are_not_judged_without_a_reference() -> None:
     before = suite(1, passes=1)
-    unknown = _estimator(
-        np.ones(FRAMES, np.bool_), np.full((FRAMES, 3), np.nan), np.ones((FRAMES, 3)), {0: "fixed"}
-    )
+    unknown = _estimator(np.ones(FRAMES, np.bool_), np.full((FRAMES, 3), np.nan), np.ones((FRAMES, 3)), {0: "fixed"})
     after = {"pass 0": replace(before["pass 0"], estimators={"anchored": unknown})}
     assert by_name(judge(before, after, POLICY))["navigation.wrong_fixes"].outcome == "not judged"
 
@@ -440,14 +425,8 @@ def test_exact_gates_tolerate_what_the_policy_says() -> None:
     five = suite(0, 5)
     assert failed(judge(five, {**five, "pass 0": wrong(five["pass 0"], 2)}, POLICY)) == set()
     # With a wrong reference the fixes of both builds are wrong: 9 of them vary by 2.33 times their root, which is 7.
-    for count, others, names in (
-        (16, 0, []),
-        (19, 0, ["navigation.wrong_fixes"]),
-        (16, 1, ["navigation.wrong_fixes"]),
-    ):
-        after = {name: wrong(one, others) for name, one in five.items()} | {
-            "pass 0": wrong(five["pass 0"], count)
-        }
+    for count, others, names in ((16, 0, []), (19, 0, ["navigation.wrong_fixes"]), (16, 1, ["navigation.wrong_fixes"])):
+        after = {name: wrong(one, others) for name, one in five.items()} | {"pass 0": wrong(five["pass 0"], count)}
         assert failed(judge({**five, "pass 0": wrong(five["pass 0"], 9)}, after, POLICY)) == set(names)
     more = {"pass 0": replace(before["pass 0"], memory_mib=312.0)}
     assert failed(judge(before, more, POLICY)) == set()
@@ -463,9 +442,7 @@ def test_passes_without_images_judge_fixes_and_telemetry_only() -> None:
 
 
 def test_a_metric_that_neither_build_has_is_not_judged() -> None:
-    before, after = (
-        {name: replace(one, estimators={}) for name, one in suite(noise, 1).items()} for noise in (0, 1)
-    )
+    before, after = ({name: replace(one, estimators={}) for name, one in suite(noise, 1).items()} for noise in (0, 1))
     gates = judge(before, after, POLICY)
     assert by_name(gates)["navigation.anchored.fixes"].reason == "neither build has this metric"
     assert verdict_of(gates) == "pass"
@@ -474,8 +451,7 @@ def test_a_metric_that_neither_build_has_is_not_judged() -> None:
 def test_other_metrics_inform_and_never_decide() -> None:
     before = suite(0, 12)
     after = {
-        name: replace(one, octets=one.octets * (1.5 + 0.01 * k))
-        for k, (name, one) in enumerate(suite(1, 12).items())
+        name: replace(one, octets=one.octets * (1.5 + 0.01 * k)) for k, (name, one) in enumerate(suite(1, 12).items())
     }
     gates = judge(before, after, POLICY)
     volume = by_name(gates)["telemetry.octets_per_frame"]
@@ -487,9 +463,7 @@ def test_other_metrics_inform_and_never_decide() -> None:
 
 def test_levels_are_shared_by_weight_and_between_all_passes_and_parts() -> None:
     gates = by_name(judge(suite(0, 2), suite(1, 2), POLICY))
-    levels = {
-        name: gate.level for name, gate in gates.items() if gate.level < 0.005 and gate.outcome == "pass"
-    }
+    levels = {name: gate.level for name, gate in gates.items() if gate.level < 0.005 and gate.outcome == "pass"}
     assert levels == pytest.approx(
         {
             "detector.recall": 0.0015,
@@ -507,14 +481,11 @@ def gate(outcome: str, name: str = "x") -> Gate:
 @pytest.mark.parametrize(
     ("gates", "verdict"),
     [
-        ([], "inconclusive"),
-        ([gate("pass")], "pass"),
-        ([gate("pass", name="memory")], "inconclusive"),
-        ([gate("pass"), gate("inconclusive")], "inconclusive"),
-        ([gate("inconclusive"), gate("fail")], "fail"),
+        ([], "inconclusive"), ([gate("pass")], "pass"), ([gate("pass", name="memory")], "inconclusive"),
+        ([gate("pass"), gate("inconclusive")], "inconclusive"), ([gate("inconclusive"), gate("fail")], "fail"),
         ([gate("pass"), gate("not judged"), gate("informs")], "pass"),
     ],
-)
+)  # fmt: skip
 def test_the_verdict_is_that_of_the_worst_deciding_gate(gates: list[Gate], verdict: str) -> None:
     assert verdict_of(gates) == verdict
 
@@ -602,11 +573,7 @@ def sums(unit: list[int], numerator: list[float], denominator: list[float], stra
 
 def test_rows_are_summed_by_unit_and_units_of_either_build_are_aligned() -> None:
     before, after = sums([7, 3, 7], [1, 1, 0], [1, 1, 1]), sums([3, 9], [1, 0], [1, 1])
-    assert (before.unit.tolist(), before.numerator.tolist(), before.denominator.tolist()) == (
-        [3, 7],
-        [1, 1],
-        [1, 2],
-    )
+    assert (before.unit.tolist(), before.numerator.tolist(), before.denominator.tolist()) == ([3, 7], [1, 1], [1, 2])
     first, second = aligned(before, after)
     assert first.unit.tolist() == second.unit.tolist() == [3, 7, 9]
     assert (first.denominator.tolist(), second.denominator.tolist()) == ([1, 2, 0], [1, 0, 1])
@@ -639,8 +606,7 @@ def test_a_one_sided_test_is_wrong_as_often_as_it_says(correlated: bool) -> None
     for _ in range(400):
         draws = rng.random((2, 120))[:, track] if correlated else rng.random((2, len(track)))
         before, after = (
-            unit_sums(track, np.zeros_like(track), (row < 0.7).astype(float), np.ones(len(track)))
-            for row in draws
+            unit_sums(track, np.zeros_like(track), (row < 0.7).astype(float), np.ones(len(track))) for row in draws
         )
         change = ratio_change(before, after)
         wrong += student_upper_tail(-change.estimate / change.error, change.units - 1) < 0.05

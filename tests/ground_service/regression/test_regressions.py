@@ -101,21 +101,12 @@ def judge(home: Ground, passes: list[Any], packets: Packets, make_build: Callabl
     """Hold a build that sends these packets against the build that flew."""
 
     def run(
-        given: Packets | None = None,
-        archives: list[Path] | None = None,
-        repeated: bool = False,
-        **options: Any,
+        given: Packets | None = None, archives: list[Path] | None = None, repeated: bool = False, **options: Any
     ) -> RegressionOutcome:
         baseline = register_build(home, load_build(make_build("good", packets)))
         candidate = register_build(home, load_build(make_build("candidate", given or packets, **options)))
         return run_regression(
-            home,
-            archives or [one.folder for one in passes],
-            candidate,
-            baseline,
-            policy,
-            workers=2,
-            repeated=repeated,
+            home, archives or [one.folder for one in passes], candidate, baseline, policy, workers=2, repeated=repeated
         )
 
     return run
@@ -151,9 +142,7 @@ def test_a_bias_of_seven_tenths_of_a_pixel_fails_as_a_centre_error(judge, packet
     assert told.endswith("navigation holds: share of fixes 1 to 1, median position error 30 to 30 m")
 
 
-def test_processor_times_are_compared_only_of_replays_at_the_same_time(
-    judge, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge, monkeypatch: pytest.MonkeyPatch) -> None:
     judge()  # the baseline is replayed before
     outcome = judge(network_ms=20.0)
     (latency,) = [gate for gate in outcome.gates if gate.name == "latency.total"]
@@ -168,11 +157,7 @@ def test_processor_times_are_compared_only_of_replays_at_the_same_time(
     # Short replays of a loaded machine may miss each other.
     monkeypatch.setattr(KeptReplay, "overlaps", lambda _one, _other: True)
     again = judge(network_ms=20.0, repeated=True)
-    assert (
-        {gate.name for gate in again.gates if gate.name.startswith("latency.")}
-        >= failed(again)
-        >= {"latency.total"}
-    )
+    assert {gate.name for gate in again.gates if gate.name.startswith("latency.")} >= failed(again) >= {"latency.total"}
 
 
 @pytest.mark.parametrize(
@@ -189,9 +174,7 @@ def test_packets_with_times_that_contradict_their_images_fail_in_one_sentence(
     assert failed(outcome) - {"telemetry.frames_without_value"} == {"telemetry.times"}
     times = next(gate for gate in outcome.gates if gate.name == "telemetry.times")
     moved = sum(
-        a != b
-        for name, some in altered(packets, fault).items()
-        for a, b in zip(some, packets[name], strict=True)
+        a != b for name, some in altered(packets, fault).items() for a, b in zip(some, packets[name], strict=True)
     )
     assert times.baseline == 0 < moved <= times.candidate
     assert told in verdict_document(outcome).headline
@@ -321,33 +304,23 @@ def test_something_that_is_no_archive_is_told(judge, passes, tmp_path: Path) -> 
     assert [item.state for item in outcome.passes] == ["unusable", "unusable", "judged"]
 
 
-def test_a_replay_is_done_once_and_one_that_failed_again(
-    home, judge, passes, make_build, packets, policy
-) -> None:
+def test_a_replay_is_done_once_and_one_that_failed_again(home, judge, passes, make_build, packets, policy) -> None:
     outcome = judge()
     digest = keep_archive(home, passes[0].folder).digest
     before = find_replay(home, digest, outcome.candidate)
     flown: list[int] = []
     run_regression(
-        home,
-        [passes[0].folder],
-        outcome.candidate,
-        outcome.baseline,
-        policy,
+        home, [passes[0].folder], outcome.candidate, outcome.baseline, policy,
         progress=lambda items, total: (flown.append(total), iter(items))[1],
-    )
+    )  # fmt: skip
     assert flown == []
     assert find_replay(home, digest, outcome.candidate) == before
     broken = register_build(home, load_build(make_build("broken", program="raise SystemExit(3)")))
     for _ in range(2):
         run_regression(
-            home,
-            [passes[0].folder],
-            broken,
-            outcome.baseline,
-            policy,
+            home, [passes[0].folder], broken, outcome.baseline, policy,
             progress=lambda items, total: (flown.append(total), iter(items))[1],
-        )
+        )  # fmt: skip
     assert flown == [1, 1]
 
 
@@ -379,9 +352,7 @@ def test_a_crash_is_one_failure_in_junit(judge, passes) -> None:
     suite = ET.fromstring(regression_junit(verdict, 0))
     assert [suite.attrib[name] for name in ("tests", "failures", "errors", "skipped")] == ["1", "1", "0", "0"]
     case = suite.find("testcase[@name='synthetic pass 41']/failure")
-    assert case is not None and case.attrib["message"].endswith(
-        "candidate crashed: exit status 1: no network"
-    )
+    assert case is not None and case.attrib["message"].endswith("candidate crashed: exit status 1: no network")
     assert verdict.headline == ("fail: candidate crashed: exit status 1: no network, on synthetic pass 41")
 
 
@@ -393,11 +364,7 @@ def test_the_last_lines_of_a_program_that_crashed_are_in_every_output(home, judg
     lines = one["candidate"]["printed"].splitlines()
     assert (len(lines), lines[-1], one["baseline"]["printed"]) == (40, "RuntimeError: no network", None)
     suite = ET.fromstring(regression_junit(verdict, 0))
-    for text in (
-        regression_text(verdict),
-        suite.findtext("system-err"),
-        regression_html(home, outcome, "0" * 32),
-    ):
+    for text in (regression_text(verdict), suite.findtext("system-err"), regression_html(home, outcome, "0" * 32)):
         assert text is not None and "Traceback (most recent call last)" in text and "line 49" in text
 
 
@@ -441,9 +408,7 @@ def test_a_zip_of_an_archive_is_the_archive(passes, tmp_path: Path, ground: Grou
     assert (out.folder / "downlink.cadu").read_bytes() == (passes[0].folder / "downlink.cadu").read_bytes()
 
 
-def test_archives_that_are_pinned_stay_and_shared_files_stay_with_them(
-    passes, ground: Ground, tmp_path: Path
-) -> None:
+def test_archives_that_are_pinned_stay_and_shared_files_stay_with_them(passes, ground: Ground, tmp_path: Path) -> None:
     first, second = (keep_archive(ground, one.folder) for one in passes)
     pin_archive(ground, second.digest, True)
     assert let_go(ground, unused_for_ns=10**18) == []
@@ -464,9 +429,7 @@ def test_archives_go_by_age_and_by_size_with_a_record(passes, ground: Ground) ->
     assert let_go(ground, unused_for_ns=None, limit_octets=octets[first.digest]) == [second.digest]
     keep_archive(ground, passes[1].folder)
     # The one that was used before the other goes first, and only as many as need to go.
-    assert let_go(ground, unused_for_ns=None, limit_octets=octets[second.digest], actor="ann") == [
-        first.digest
-    ]
+    assert let_go(ground, unused_for_ns=None, limit_octets=octets[second.digest], actor="ann") == [first.digest]
     pin_archive(ground, second.digest, True)
     assert let_go(ground, unused_for_ns=None, limit_octets=0) == []
     pin_archive(ground, second.digest, False)
@@ -491,10 +454,7 @@ def test_the_archive_of_a_rare_condition_outlasts_one_that_was_used_later(passes
             change_if(connection, ARCHIVES, kept[0], {}, used_utc_ns=0)  # the longest unused
     place = {kept[0]: "sparse", "x": "cratered", "y": "cratered", "z": "cratered"}
     octets = kept_archives(ground)[0].octets
-    assert let_go(ground, unused_for_ns=None, limit_octets=2 * octets, condition=place.__getitem__) == [
-        "x",
-        "y",
-    ]
+    assert let_go(ground, unused_for_ns=None, limit_octets=2 * octets, condition=place.__getitem__) == ["x", "y"]
     assert condition_of_archive(ground, kept[0]) == "cratered, above 25 km"
 
 
@@ -503,12 +463,9 @@ def test_the_settings_say_how_long_archives_are_kept(tmp_path: Path, monkeypatch
     monkeypatch.setenv("LINNA_ARCHIVE_LIMIT_MIB", "2000")
     kept = Settings(home=tmp_path).kept
     assert kept == {
-        "retention_days": 90,
-        "archive_days": 400,
-        "archive_limit_mib": 2000,
-        "audit_heads": None,
+        "retention_days": 90, "archive_days": 400, "archive_limit_mib": 2000, "audit_heads": None,
         "placebo_passes": 3,
-    }
+    }  # fmt: skip
     with pytest.MonkeyPatch.context() as patched:
         called = MagicMock(return_value=[])
         patched.setattr("ground_service.worker.upkeep.let_go", called)
@@ -517,9 +474,7 @@ def test_the_settings_say_how_long_archives_are_kept(tmp_path: Path, monkeypatch
     assert kept_for.items() <= called.call_args.kwargs.items()
 
 
-def test_a_registered_build_is_found_by_the_beginning_of_its_identity(
-    ground: Ground, make_build, packets
-) -> None:
+def test_a_registered_build_is_found_by_the_beginning_of_its_identity(ground: Ground, make_build, packets) -> None:
     build: Build = register_build(ground, load_build(make_build("kept", packets)))
     assert registered_build(ground, build.digest[:12]).digest == build.digest
     (build.folder / "fly.py").write_text("changed behind its back")
@@ -533,10 +488,7 @@ def test_a_registered_build_is_found_by_the_beginning_of_its_identity(
         ("", "schema_version: expected 3, found None"),
         ("schema_version = 2", "schema_version: expected 3, found 2"),
         ("versoin = 'x'", "versoin: expected 'version', found unknown key 'versoin'"),
-        (
-            "alpha = 0.01",
-            "alpha: expected schema_version, version, inconclusive, fail, gate",
-        ),
+        ("alpha = 0.01", "alpha: expected schema_version, version, inconclusive, fail, gate"),
         (
             "[[gate]]\nmetric = 'x'\nmargn = 1.0\nreason = 'y'",
             "gate.1.margn: expected 'margin', found unknown key 'margn'",
@@ -547,10 +499,7 @@ def test_a_registered_build_is_found_by_the_beginning_of_its_identity(
             "[[gate]]\nmetric = 'x'\nmargin = 'much'\nreason = 'y'",
             "gate.1.margin: expected a valid number, found 'much'",
         ),
-        (
-            "[[gate]]\nmetric = 'x'\nmargin = 0.1\nreason = 'y'",
-            "gate.1.weight: expected a weight above 0, found 0",
-        ),
+        ("[[gate]]\nmetric = 'x'\nmargin = 0.1\nreason = 'y'", "gate.1.weight: expected a weight above 0, found 0"),
         (
             "[[gate]]\nmetric = 'memory'\nweight = 0.1\nmargin = 0.1\nreason = 'y'",
             "gate.1.weight: expected no weight: the metric is exact, found 0.1",
@@ -608,12 +557,9 @@ def test_a_build_that_differs_on_few_frames_is_inconclusive_with_the_frames_need
     )
     changed = judge(with_detections(packets, changed_here_and_there))
     outcome = run_regression(
-        home,
-        [one.digest for one in changed.passes],
-        changed.candidate,
-        changed.baseline,
+        home, [one.digest for one in changed.passes], changed.candidate, changed.baseline,
         dataclasses.replace(policy, policy=dataclasses.replace(policy.policy, rules=strict)),
-    )
+    )  # fmt: skip
     assert (outcome.verdict, verdict_document(outcome).exit_status) == ("inconclusive", 3)
     recall = next(gate for gate in outcome.gates if gate.name == "detector.recall" and not gate.pass_id)
     assert (recall.outcome, recall.frames) == ("inconclusive", 60)
@@ -627,9 +573,7 @@ def test_a_build_that_differs_on_few_frames_is_inconclusive_with_the_frames_need
     assert (figures["verdict"], figures["frames"]) == ("inconclusive", 60)
     assert figures["frames_needed"] == outcome.frames_needed
     for policy, kind in (("failure", "failure"), ("skip", "skipped")):
-        chosen = verdict.model_copy(
-            update={"policy": verdict.policy.model_copy(update={"inconclusive": policy})}
-        )
+        chosen = verdict.model_copy(update={"policy": verdict.policy.model_copy(update={"inconclusive": policy})})
         case = ET.fromstring(regression_junit(chosen, 0)).find(f"testcase[@name='detector.recall']/{kind}")
         assert case is not None and "frames decide it, 60 compared" in case.attrib["message"]
 
@@ -645,15 +589,10 @@ def test_a_regression_without_a_gate_is_never_a_pass(judge, home, policy, passes
 
 JUNIT = {
     "testsuite": {"name", "timestamp", "hostname", "tests", "failures", "errors", "skipped", "time"},
-    "properties": set(),
-    "property": {"name", "value"},
-    "testcase": {"name", "classname", "time"},
-    "failure": {"message", "type"},
-    "error": {"message", "type"},
-    "skipped": {"message"},
-    "system-out": set(),
+    "properties": set(), "property": {"name", "value"}, "testcase": {"name", "classname", "time"},
+    "failure": {"message", "type"}, "error": {"message", "type"}, "skipped": {"message"}, "system-out": set(),
     "system-err": set(),
-}
+}  # fmt: skip
 """Attributes that both the schema of the Jenkins xUnit plugin (junit-10.xsd) and that of Apache Ant permit and need."""
 
 
@@ -669,15 +608,8 @@ def test_the_junit_document_holds_what_both_schemas_permit(judge, passes, packet
         for element in suite.iter():
             assert set(element.attrib) == JUNIT[element.tag], element.tag
         # The stricter schema demands this order, and one result for each case.
-        assert [child.tag for child in suite if child.tag != "testcase"] == [
-            "properties",
-            "system-out",
-            "system-err",
-        ]
-        assert suite[0].tag == "properties" and [one.tag for one in suite[-2:]] == [
-            "system-out",
-            "system-err",
-        ]
+        assert [child.tag for child in suite if child.tag != "testcase"] == ["properties", "system-out", "system-err"]
+        assert suite[0].tag == "properties" and [one.tag for one in suite[-2:]] == ["system-out", "system-err"]
         assert all(len(case) <= 1 for case in suite.findall("testcase"))
         names = [case.attrib["name"] for case in suite.findall("testcase")]
         assert all(name == " ".join(name.split()) for name in names)

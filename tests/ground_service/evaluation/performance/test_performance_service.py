@@ -54,25 +54,14 @@ def add_pass(ground: Ground, number: int, *, instance: str = FLOWN, **changes: A
     """Add a pass with a report, one a day."""
     start = FIRST + number * DAY_NS
     pass_id = define_pass(
-        ground,
-        name=f"pass {number}",
-        start_utc_ns=start,
-        stop_utc_ns=start + 10**12,
-        spacecraft_id=SPACECRAFT,
+        ground, name=f"pass {number}", start_utc_ns=start, stop_utc_ns=start + 10**12, spacecraft_id=SPACECRAFT,
         instance=instance,
-    )
+    )  # fmt: skip
     blob = ground.files.put_octets(b"x")
     values: dict[str, Any] = {
-        "recall": 0.70 + 0.01 * (number % 3),
-        "drift": 0.10,
-        "error": 80.0,
-        "altitude": 25.0,
-        "status": "met",
-        "build": "a",
-        "key": "accuracy.median",
-        "limit": 100.0,
-        **changes,
-    }
+        "recall": 0.70 + 0.01 * (number % 3), "drift": 0.10, "error": 80.0, "altitude": 25.0, "status": "met",
+        "build": "a", "key": "accuracy.median", "limit": 100.0, **changes,
+    }  # fmt: skip
     errors = dict.fromkeys(("p68_3d_m", "p95_3d_m", "p99_3d_m", "max_3d_m", "end_of_pass_m"))
     summary = {
         "pass_id": pass_id,
@@ -106,18 +95,10 @@ def add_pass(ground: Ground, number: int, *, instance: str = FLOWN, **changes: A
     with ground.database.writing() as connection:
         register_file(connection, blob, "report", "x", 1)
         report = StoredReport(
-            id=f"{pass_id:032x}",
-            pass_id=pass_id,
-            html_sha256=blob.sha256,
-            json_sha256=blob.sha256,
-            pdf_sha256=None,
-            summary=summary,
-            mission_id=None,
-            event_number=None,
-            previous_id=None,
-            changes=None,
+            id=f"{pass_id:032x}", pass_id=pass_id, html_sha256=blob.sha256, json_sha256=blob.sha256,
+            pdf_sha256=None, summary=summary, mission_id=None, event_number=None, previous_id=None, changes=None,
             created_utc_ns=start,
-        )
+        )  # fmt: skip
         add_report(connection, report)
     return pass_id
 
@@ -186,10 +167,7 @@ def test_the_same_month_is_stored_once_and_late_data_give_a_new_report(either: G
     add_pass(either, 5, status="not met")
     second = make_monthly_report(either, SPACECRAFT, "2029-08")
     assert second.id != first.id and second.verdict == "requirements not met in every pass: 1 of 1 judged"
-    assert {one.id for one in either.read(list_monthly_reports, MonthlyReportFilter()).items} == {
-        first.id,
-        second.id,
-    }
+    assert {one.id for one in either.read(list_monthly_reports, MonthlyReportFilter()).items} == {first.id, second.id}
     with pytest.raises(InvalidInput, match="2029-09: expected passes with a report, found none"):
         make_monthly_report(either, SPACECRAFT, "2029-09")
 
@@ -214,10 +192,7 @@ def test_a_requirement_that_is_unknown_on_some_passes_is_not_good(ground: Ground
         add_pass(ground, number, status="met" if number == 3 else "unknown")
     value = monthly_value(performance(ground, SPACECRAFT, window_days=31.0), "2029-08")
     assert value.verdict_level == "unknown"
-    assert (
-        value.verdict
-        == "requirements judged: 1 of 1, none missed; median 3-D error not judged on 3 of 4 passes"
-    )
+    assert value.verdict == "requirements judged: 1 of 1, none missed; median 3-D error not judged on 3 of 4 passes"
 
 
 def test_a_requirement_without_a_limit_may_be_unknown(ground: Ground) -> None:
@@ -326,23 +301,11 @@ def test_the_first_processed_window_of_a_month_reports_the_last_one(ground: Grou
     with ground.database.writing() as connection:
         row = connection.execute(repository.PASSES.select()).mappings().one()
         values = {
-            "vehicle_id": row["vehicle_id"],
-            "pass_id": row["id"],
-            "name": "w",
-            "start_utc_ns": FIRST,
-            "stop_utc_ns": FIRST + 10**12,
-            "cadence_s": 15.0,
-            "state": "processed",
-            "version": 1,
-            "decision": "approved",
-            "data_octets": 1,
-            "predicted": {},
-            "closed": 0,
-            "created_by": "a",
-            "edited_by": "a",
-            "created_utc_ns": 1,
-            "changed_utc_ns": 1,
-        }
+            "vehicle_id": row["vehicle_id"], "pass_id": row["id"], "name": "w", "start_utc_ns": FIRST,
+            "stop_utc_ns": FIRST + 10**12, "cadence_s": 15.0, "state": "processed", "version": 1,
+            "decision": "approved", "data_octets": 1, "predicted": {}, "closed": 0, "created_by": "a",
+            "edited_by": "a", "created_utc_ns": 1, "changed_utc_ns": 1,
+        }  # fmt: skip
         window = repository.add(connection, repository.WINDOWS, **values)
         publish(connection, WindowChanged(id=int(window), state="processed"))
     [made] = ground.read(list_monthly_reports, MonthlyReportFilter()).items
@@ -374,21 +337,7 @@ def test_operations_and_commands_give_the_same_report(
     assert [one["metric"] for one in document["changes"]] == ["recall"]
     home = ("--home", str(ground.home))
     spacecraft = ("--spacecraft-id", str(SPACECRAFT))
-    assert (
-        run(
-            [
-                "performance",
-                "report",
-                *spacecraft,
-                "--month",
-                "2029-08",
-                "--out",
-                str(tmp_path / "cli"),
-                *home,
-            ]
-        )
-        == 0
-    )
+    assert run(["performance", "report", *spacecraft, "--month", "2029-08", "--out", str(tmp_path / "cli"), *home]) == 0
     assert (tmp_path / "cli/report.html").read_text() == page
     capsys.readouterr()
     assert run(["performance", "show", *spacecraft, *home]) == 0
@@ -396,9 +345,7 @@ def test_operations_and_commands_give_the_same_report(
     assert "change of recall at pass 8" in told and "14 passes with a report" in told
     assert run(["performance", "list", *home, "--json"]) == 0
     assert [one["id"] for one in json.loads(capsys.readouterr().out)["reports"]] == [made.id]
-    assert (
-        run(["performance", "report", *spacecraft, "--month", "2029-10", "--out", str(tmp_path), *home]) == 2
-    )
+    assert run(["performance", "report", *spacecraft, "--month", "2029-10", "--out", str(tmp_path), *home]) == 2
     assert "expected passes with a report, found none" in capsys.readouterr().err
 
 
@@ -417,7 +364,5 @@ def test_operations_and_commands_give_the_same_report(
         ("accuracy.median", [0.1] * 12, ""),
     ],
 )
-def test_a_filter_is_judged_over_passes_by_both_bounds(
-    key: str, values: list[float | None], remark: str
-) -> None:
+def test_a_filter_is_judged_over_passes_by_both_bounds(key: str, values: list[float | None], remark: str) -> None:
     assert _consistency_remark(key, values) == remark

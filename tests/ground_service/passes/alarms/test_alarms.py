@@ -44,9 +44,7 @@ def housekeeping(second: int, temperature_c: float) -> bytes:
     """A housekeeping packet with one value outside its limits, if that of the temperature is."""
     values: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
     values |= {"structure_id": 1, "bus_voltage_v": 12.0, "temperature_c": temperature_c}
-    return DICTIONARY.pack(
-        "housekeeping", values, ticks=START + second * SECOND, sequence_count=second % 16_384
-    )
+    return DICTIONARY.pack("housekeeping", values, ticks=START + second * SECOND, sequence_count=second % 16_384)
 
 
 def event(second: int, name: str = "event_high", event_id: int = 20) -> bytes:
@@ -72,9 +70,7 @@ def facts(alarm: Alarm) -> tuple[object, ...]:
     )  # fmt: skip
 
 
-def test_an_event_stays_raised_through_later_passes_until_it_is_acknowledged(
-    either: Ground, tmp_path: Path
-) -> None:
+def test_an_event_stays_raised_through_later_passes_until_it_is_acknowledged(either: Ground, tmp_path: Path) -> None:
     receive(either, tmp_path / "in", [event(k) for k in range(82)])
     receive(either, tmp_path / "in", [housekeeping(k, 20.0) for k in range(200, 240)])
     (alarm,) = alarms(either)
@@ -87,9 +83,7 @@ def test_an_event_stays_raised_through_later_passes_until_it_is_acknowledged(
     assert either.read(list_audit, AuditFilter()).items[0].action == "acknowledge alarm"
 
 
-def test_a_limit_is_broken_once_and_cleared_after_acknowledgement_and_return(
-    either: Ground, tmp_path: Path
-) -> None:
+def test_a_limit_is_broken_once_and_cleared_after_acknowledgement_and_return(either: Ground, tmp_path: Path) -> None:
     receive(either, tmp_path / "in", [housekeeping(k, 70.0 + k) for k in range(5)])
     (alarm,) = alarms(either, "raised")
     assert (alarm.name, alarm.severity, alarm.count, alarm.value) == ("temperature_c", "warning", 5, 74.0)
@@ -176,9 +170,7 @@ def test_a_shelved_alarm_returns_at_its_time(either: Ground, tmp_path: Path) -> 
         shelve_alarm(either, alarm.id, now + hour, "", actor="eva")
 
 
-def test_an_alarm_is_shelved_in_mission_time_and_its_records_are_in_time_of_day(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_an_alarm_is_shelved_in_mission_time_and_its_records_are_in_time_of_day(ground: Ground, tmp_path: Path) -> None:
     receive(ground, tmp_path / "in", [event(0)])
     moment = utc_now_ns() + 1000 * 86_400 * 10**9
     set_mission_clock(lambda: moment)
@@ -207,9 +199,7 @@ def test_the_end_and_the_return_of_a_condition_are_published(ground: Ground, tmp
 
 def test_events_of_low_severity_and_refused_fixes_raise_no_alarm(ground: Ground, tmp_path: Path) -> None:
     receive(ground, tmp_path / "in", [event(k, "event_medium", 36) for k in range(4)])
-    receive(
-        ground, tmp_path / "in", [event(0, "event_info", 2), event(1, "event_low", 36), housekeeping(2, 20.0)]
-    )
+    receive(ground, tmp_path / "in", [event(0, "event_info", 2), event(1, "event_low", 36), housekeeping(2, 20.0)])
     assert alarms(ground) == []
 
 
@@ -219,9 +209,7 @@ def condition(ticks: int, severity: int, value: float) -> core.Condition:
 
 @given(
     st.lists(
-        st.builds(condition, st.integers(0, 5), st.sampled_from([1, 2]), st.floats(-90, 90)),
-        min_size=3,
-        max_size=6,
+        st.builds(condition, st.integers(0, 5), st.sampled_from([1, 2]), st.floats(-90, 90)), min_size=3, max_size=6
     ),
     st.randoms(),
 )
