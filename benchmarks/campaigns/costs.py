@@ -399,9 +399,9 @@ def main(words: Sequence[str] | None = None) -> int:
         figures = f"{one.memory_mib:7.0f} MiB {one.kept_mib:6.0f} kept {one.processor_s:6.1f} s {one.wall_s:5.0f} wall"
         found = f"{figures}  {one.fault} {one.detail}"
         print(f"{one.operation:28} {one.what:26} {one.status} {found}", flush=True)
-    if given.write:
-        head = PAGE.read_text().split("| operation |")[0]
-        PAGE.write_text(head + table(costs) + "\n")
+        if given.write:
+            head = PAGE.read_text().split("| operation |")[0]
+            PAGE.write_text(head + table(costs) + "\n")
     return int(any(one.fault for one in costs))
 
 
