@@ -40,13 +40,14 @@ test: $(VENV)/.dev
 # that have not passed; `make campaigns-left` lists them, and `make clean-campaigns` forgets what has passed.
 campaigns: $(VENV)/.dev
 	$(SUITE) -m campaign --resume
+	$(BIN)/python -m benchmarks.campaigns.compatibility --write
 	$(MAKE) test-cost
 
 campaigns-left: $(VENV)/.dev
 	$(BIN)/python -m pytest -m campaign --resume --collect-only -q
 
 clean-campaigns:
-	rm -f build/campaigns.txt
+	rm -rf build/campaigns.txt build/compatibility/results
 
 # Processor time of the newest complete `make test` by folder, compared with tests/cost.csv.
 test-cost: $(VENV)/.dev
@@ -89,7 +90,7 @@ pictures: $(VENV)/.dev
 
 # Table of the pages by width, colours, font and data, written by the test of all pages.
 page-table: $(VENV)/.dev
-	LINNA_PAGE_TABLE=docs/reference/pages.md $(BIN)/python -m pytest -q -m campaign tests/ground_service/web/test_matrix.py
+	LINNA_PAGE_TABLE=docs/results/pages.md $(BIN)/python -m pytest -q -m campaign tests/ground_service/web/test_matrix.py
 
 # Bill of materials of what is shipped (CycloneDX): hashes, licences, dependencies, telemetry displays. STATUS names a
 # copy of /var/lib/dpkg/status of the image, for its Debian packages.

@@ -241,11 +241,11 @@ def _picture(page: Any, file: Path, source: str, part: str = "body") -> bytes:
 
     page.wait_for_timeout(FILLED_MS)
     octets: bytes = page.screenshot() if part == "body" else page.locator(part).screenshot()
-    told = PngInfo()
-    told.add_text("Source", source)
+    metadata = PngInfo()
+    metadata.add_text("Source", source)
     picture = Image.open(io.BytesIO(octets)).convert("RGB")
     picture = picture.crop((0, 0, picture.width, min(picture.height, 800)))
-    picture.quantize(256, Image.Quantize.MAXCOVERAGE).save(file, optimize=True, pnginfo=told)
+    picture.quantize(256, Image.Quantize.MAXCOVERAGE).save(file, optimize=True, pnginfo=metadata)
     return octets
 
 

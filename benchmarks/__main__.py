@@ -1,12 +1,14 @@
 """`python -m benchmarks [NAME …] [--json]`: benchmarks, each compared with its named alternatives in the same run.
 
 Exit status 1: a benchmark did not finish, or a row contradicts the expectation. What takes longer than minutes (gate
-error rates, campaigns) has a command of its own and is not in this list.
+error rates, campaigns) has a command of its own and is not in this list. `python -m benchmarks rooms` prints the size
+and the import graph of each package.
 """
 
 import argparse
 import sys
 
+from benchmarks import rooms
 from benchmarks._rows import measure, report
 
 NAMES = (
@@ -17,6 +19,8 @@ NAMES = (
 
 def main(words: list[str]) -> int:
     """Run the benchmarks that are named, all when none is."""
+    if words[:1] == ["rooms"]:
+        return rooms.main(words[1:])
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks", description=(__doc__ or "").split("\n\n")[0]
     )

@@ -25,7 +25,7 @@ READS = (
     "/passes/1/states?max_points=500", "/passes/1/telemetry/power_w?max_points=500", "/jobs", "/ingests", "/windows",
     "/telecommands", "/ephemerides", "/spacecraft/76/trends", "/spacecraft/76/correlations",
 )  # fmt: skip
-"""What operators' screens ask for, in turn."""
+"""Requests of the pages of operators, in turn."""
 
 
 def answers_under_load(

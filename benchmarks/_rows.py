@@ -46,7 +46,7 @@ class Row:
 
     @property
     def ratio(self) -> float | None:
-        """How many times better than the peer; None without one."""
+        """Return the factor by which the figure is better than the peer; None without one."""
         if self.theirs is None or not self.ours or not self.theirs:
             return None
         more = "/s" in self.unit or self.unit in MORE_IS_BETTER

@@ -321,7 +321,7 @@ STREAMS: dict[str, Callable[[], Stream]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FoundPackets:
     """Packets found in a stream by one program, false ones, and octets accounted for."""
 
     packets: int
@@ -329,7 +329,7 @@ class Found:
     octets: int
 
 
-def checked(stream: Stream) -> Found:
+def checked(stream: Stream) -> FoundPackets:
     """Return what `linna tm check` finds in each spacecraft's frames of all files together."""
     octets = b"".join(stream.files)
     found = false = accounted = 0
@@ -337,15 +337,15 @@ def checked(stream: Stream) -> Found:
         try:
             decoded = decode(octets, spacecraft_id=spacecraft, form=PacketForm(stream.error_control))
         except TmtcError:
-            return Found(0, 0, 0)
+            return FoundPackets(0, 0, 0)
         mine = set(decoded.cut.packets(decoded.buffer))
         found += len(mine & packets)
         false += len(mine - packets)
         accounted = sum(decoded.octets.values())
-    return Found(found, false, accounted)
+    return FoundPackets(found, false, accounted)
 
 
-def ingested(stream: Stream) -> Found:
+def ingested(stream: Stream) -> FoundPackets:
     """Return what `linna ingest` stores of the files in an empty archive."""
     from sqlalchemy import select
 
@@ -379,7 +379,7 @@ def ingested(stream: Stream) -> Found:
                 found += len(mine & packets)
                 false += len(mine - packets)
         ground.close()
-    return Found(found, false, accounted)
+    return FoundPackets(found, false, accounted)
 
 
 def compare(names: Sequence[str]) -> Iterator[dict[str, Any]]:
@@ -404,7 +404,7 @@ def compare(names: Sequence[str]) -> Iterator[dict[str, Any]]:
 
 
 def rows() -> Iterator[Row]:
-    """Yield the packets that `tm check` and `ingest` find beside those that can be found."""
+    """Yield the packets that `tm check` and `ingest` find, compared with those that can be found."""
     for one in compare(list(STREAMS)):
         found = f"check {one['check']}, ingest {one['ingest']}, false {one['false']}"
         wrong = "" if one["right"] else found

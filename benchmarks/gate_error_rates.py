@@ -338,7 +338,7 @@ def states_of_the_frame_before(frames: PassFrames, rng: np.random.Generator) -> 
 
 
 def shifted_registration(frames: PassFrames, rng: np.random.Generator) -> PassFrames:
-    """Anchor to a table that lies 200 m beside the catalogue of the ground."""
+    """Anchor to a table that lies 200 m from the catalogue of the ground."""
     return of_anchored(frames, error_m=np.hypot(frames.estimators["anchored"].error_m, 200.0))
 
 
@@ -446,11 +446,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for case in CASES:
         for size in case.sizes:
             verdicts, gates, of = measured(windows, case, size, given.resamplings)
-            told = [
+            shares = [
                 "{} {:.3f} ({:.3f} to {:.3f})".format(name, *share(verdicts[name], given.resamplings))
                 for name in ("fail", "pass", "inconclusive")
             ]
-            print(f"{case.what}, {size} of {of} windows: {', '.join(told)}", flush=True)
+            print(f"{case.what}, {size} of {of} windows: {', '.join(shares)}", flush=True)
             print("   ", {name: dict(n) for name, n in gates.items() if set(n) - {"pass", "informs"}})
 
 

@@ -27,12 +27,12 @@ from benchmarks._servers import PostgresServer
 from ground_service.errors import GroundError
 from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
-from ground_service.ingest.store import store_samples
 from ground_service.passes.service import define_pass, state_series
-from ground_service.store import telemetry
 from ground_service.store.database import prepare_database
-from ground_service.store.rollups import STATE_VALUES
 from ground_service.store.vehicles import vehicle_id
+from ground_service.telemetry import store as telemetry
+from ground_service.telemetry.rollups import STATE_VALUES
+from ground_service.telemetry.writing import store_samples
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus

@@ -73,7 +73,7 @@ def textbook(c, s, gm, radius, positions, out):
 
 
 def rows() -> Iterator[Row]:
-    """Yield acceleration and propagation beside their rivals: processor time, best of some rounds."""
+    """Yield acceleration and propagation compared with their peers: processor time, best of some rounds."""
     named = os.environ.get("LINNA_DATA")
     data = find_data(Path(named) if named else None)
     field, orientation = default_gravity(data), default_orientation(data)

@@ -25,8 +25,8 @@ import numpy as np
 from benchmarks._rows import Row, needs
 from ground_service.ground import open_ground
 from ground_service.passes.service import define_pass
-from ground_service.store.rollups import HOUSEKEEPING_VALUES, add_to_rollups
 from ground_service.store.vehicles import vehicle_id
+from ground_service.telemetry.rollups import HOUSEKEEPING_VALUES, add_to_rollups
 from ground_service.web.pages import PAGES
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from studies.harness.parts import Part, answers_http, free_port

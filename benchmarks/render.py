@@ -50,7 +50,7 @@ FULLY_LIT = 0.95
 
 @dataclasses.dataclass(frozen=True)
 class Region:
-    """Where random poses are drawn: latitudes and longitudes in degrees; the place of the timed frames."""
+    """Region of random poses: latitudes and longitudes in degrees; the place of the timed frames."""
 
     latitude_deg: tuple[float, float]
     longitude_deg: tuple[float, float]
@@ -228,7 +228,7 @@ def _cpu_ms(work: Callable[[], Any]) -> float:
 
 
 def rows() -> Iterator[Row]:
-    """Yield the fast renderer beside the ray march on the procedural Moon; pictures that disagree are an error."""
+    """Yield the fast renderer compared with the ray march on the procedural Moon; different pictures are an error."""
     terrain = open_terrain("procedural", find_data(None), 3)
     found: Any = agreement(terrain, PROCEDURAL, poses=6, every=16)["fast_vs_raymarch"]
     wrong = "" if found["correlation"] > 0.99 and found["median_range_error_m"] < 5.0 else f"{found}"

@@ -114,7 +114,7 @@ def bench(packets: int = PACKETS) -> dict[str, Any]:
 
 
 def rows() -> Iterator[Row]:
-    """Yield rates of decoding beside the quickest rivals; different values are an error."""
+    """Yield rates of decoding compared with the fastest peers; different values are an error."""
     figures = bench()
     wrong = "" if figures["values_equal"] else "values of the decoders differ"
     for kind in ("fixed_62_octets", "variable_mean_267_octets"):
@@ -216,7 +216,7 @@ def _struct_loop_variable(octets: bytes) -> list[Any]:
 
 
 def _compare(fixed: bytes, variable: bytes, ours_fixed: Any, ours_variable: Any, packets: int) -> bool:
-    """Whether all decoders read the same values."""
+    """Return whether all decoders read the same values."""
     columns = ours_fixed["fixed"].columns
     theirs = _ccsdspy_fixed(fixed)
     same = all(np.array_equal(columns[f.name], theirs[f.name]) for f in FIXED.fields)

@@ -14,13 +14,10 @@ import socket
 import sys
 from collections.abc import AsyncIterator
 from contextlib import ExitStack, asynccontextmanager
-from dataclasses import dataclass
-from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from anyio import to_thread
-from fastapi import APIRouter, FastAPI
+from fastapi import FastAPI
 from starlette.routing import Route
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
@@ -30,7 +27,7 @@ from ground_service.contacts.links.supervisor import LinkSupervisor
 from ground_service.errors import ServerError
 from ground_service.ground import ground_from_settings
 from ground_service.http import problems
-from ground_service.http.common import API_PREFIX
+from ground_service.http.common import API_PREFIX, OPERATIONS
 from ground_service.http.limits import LOOPBACK, BodyLimit, HeadersAndTags, LastRequests, SameOrigin
 from ground_service.http.model import Problem
 from ground_service.http.requests import PlainText
@@ -56,47 +53,6 @@ if TYPE_CHECKING:
 
     import uvicorn
     from starlette.datastructures import State
-
-
-@dataclass(frozen=True, slots=True)
-class Router:
-    """Router `name` in the module `module`; most of its operations are under the path `segment` of the API."""
-
-    module: str
-    name: str
-    segment: str
-
-    def imported(self) -> ModuleType:
-        """Return the module."""
-        return import_module(self.module)
-
-    def load(self) -> APIRouter:
-        """Return the router."""
-        router: APIRouter = getattr(self.imported(), self.name)
-        return router
-
-
-OPERATIONS = (
-    Router("ground_service.passes.routes", "passes", "passes"),
-    Router("ground_service.ingest.routes", "ingests", "telemetry"),
-    Router("ground_service.evaluation.routes", "evaluation", "reports"),
-    Router("ground_service.evaluation.performance.routes", "reports", "monthly-reports"),
-    Router("ground_service.evaluation.landmarks.routes", "landmarks", "landmarks"),
-    Router("ground_service.exports.routes", "exports", "exports"),
-    Router("ground_service.missions.ephemerides.routes", "ephemerides", "ephemerides"),
-    Router("ground_service.jobs.routes", "jobs", "jobs"),
-    Router("ground_service.missions.routes", "missions", "missions"),
-    Router("ground_service.missions.timekeeping.routes", "timekeeping", "spacecraft"),
-    Router("ground_service.planning.routes", "planning", "windows"),
-    Router("ground_service.contacts.links.routes", "links", "links"),
-    Router("ground_service.planning.routes", "requests", "requests"),
-    Router("ground_service.contacts.commanding.routes", "telecommands", "telecommands"),
-    Router("ground_service.passes.alarms.routes", "alarms", "alarms"),
-    Router("ground_service.regression.routes", "regressions", "regressions"),
-    Router("ground_service.access.routes", "access", "users"),
-    Router("ground_service.worker.metrics", "status", "status"),
-)
-"""Operations of the HTTP API."""
 
 
 _PAGE = re.compile(r"PageOf_(\w+?)_(?=\")")

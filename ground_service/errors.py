@@ -144,7 +144,7 @@ class Stopping(GroundError):
 
 
 PASSING = (DatabaseUnavailable, DatabaseBusy, StorageFull, StorageReadOnly, ObjectsUnavailable, Stopping)
-"""What is no fault of the work that meets it: the same work, later, may well succeed."""
+"""Errors that are no fault of the work itself: the same work may succeed later."""
 
 
 class AuditBroken(StoreError):
@@ -183,7 +183,7 @@ class StateConflict(Conflict):
 
 
 class InvalidInput(GroundError):
-    """What was given cannot be accepted."""
+    """Input that is not acceptable."""
 
     def __init__(self, what: str, where: str, expected: str, found: str) -> None:
         place = f"{what}, {where}" if where else what

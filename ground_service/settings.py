@@ -22,7 +22,7 @@ SECRETS = ("oidc_client_secret", "objects_access_key", "objects_secret_key")
 
 
 def default_home() -> Path:
-    """Where the archive lives when ``LINNA_HOME`` is not set: the user's own data folder."""
+    """Return the folder of the archive if ``LINNA_HOME`` is not set: the user's own data folder."""
     base = os.environ.get("XDG_DATA_HOME")
     return (Path(base) if base else Path.home() / ".local" / "share") / "linna"
 
@@ -173,7 +173,7 @@ class Settings(BaseSettings):
     archive_days: int = Field(
         default=0,
         ge=0,
-        description="Days after their last use for which regression archives are kept; 0: for good",
+        description="Days after their last use for which regression archives are kept; 0: without limit",
     )
     archive_limit_mib: int = Field(
         default=0,

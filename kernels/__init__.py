@@ -1,6 +1,8 @@
 """Compiled functions, and files kept in their folder; the import of this package alone does not import numba."""
 
+import functools
 import hashlib
+import logging
 import os
 import time
 import uuid
@@ -21,8 +23,8 @@ def cache_folder() -> Path:
 
 
 def _folder_of(kind: str) -> Path:
-    """Return the folder of a kind; builds under test read that of compiled code, and no ground may lie in it."""
-    return Path(f"{cache_folder()}-ground") if kind in ("tile", "rims") else cache_folder()
+    """Return the folder of a kind; builds under test read that of compiled code: no ground and no figure lie in it."""
+    return Path(f"{cache_folder()}-ground") if kind in ("tile", "rims", "figure") else cache_folder()
 
 
 def kept(name: str) -> bytes | None:
@@ -45,15 +47,25 @@ def keep(name: str, octets: bytes, most: int = 0) -> None:
     """
     kind = name.partition("-")[0]
     folder = _folder_of(kind)
-    with suppress(OSError):
+    part = folder / uuid.uuid4().hex
+    try:
         folder.mkdir(parents=True, exist_ok=True)
         folder.chmod(0o755 if os.getuid() == 0 else 0o700)  # builds under test of root are other users
-        part = folder / uuid.uuid4().hex
         part.write_bytes(hashlib.sha256(octets).digest() + octets)
         part.replace(folder / name)
-        with os.scandir(folder) as files:
-            written = sorted((file.stat().st_mtime, file.name) for file in files)
+    except OSError as error:
+        _log_once(f"nothing is kept in {folder}: {error.strerror}")
+        with suppress(OSError):
+            part.unlink()  # of a full disk
+        return
+    with suppress(OSError), os.scandir(folder) as files:
+        written = sorted((file.stat().st_mtime, file.name) for file in files)
         same = [other for _, other in written if other.partition("-")[0] == kind]
         old = [other for second, other in written if second < time.time() - KEPT_S]
         for other in {*old, *same[:-most]}:
             (folder / other).unlink()
+
+
+@functools.cache
+def _log_once(message: str) -> None:
+    logging.getLogger(__name__).warning(message)

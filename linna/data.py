@@ -1,4 +1,4 @@
-"""Where the real data products are: $LINNA_DATA, else the user's data directory, else nowhere; and where Blender is."""
+"""Location of the real data products: $LINNA_DATA, else the user's data directory; location of Blender."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def user_data_directory() -> Path:
 
 
 def data_directory() -> Path:
-    """Where the data products lie or are to be fetched to: $LINNA_DATA, else the user's data directory."""
+    """Return the folder of the data products: $LINNA_DATA, else the user's data directory."""
     named = os.environ.get("LINNA_DATA")
     return Path(named) if named else user_data_directory()
 
@@ -34,12 +34,18 @@ def data_folder() -> DataFolder:
     return find_data(default if default.is_dir() else None)
 
 
-def load_orbit(path: Path) -> Ephemeris:
-    """Return the ephemeris in a file for figures of its states, which must move as gravity moves them."""
-    from lunar.comparison import check_gravity
-    from lunar.messages.ephemeris_files import load_ephemeris
+def load_orbit(path: Path, spice_id: int | None = None, step_s: float | None = None) -> Ephemeris:
+    """Return the ephemeris in a file, whose states must move as gravity moves them.
 
-    ephemeris = load_ephemeris(path)
+    Of an SPK, body `spice_id` is taken, with a state every `step_s` seconds.
+    """
+    from lunar.comparison import check_gravity
+    from lunar.messages import ephemeris_files
+    from lunar.messages.spice import READ_STEP_S, load_spk
+
+    if not ephemeris_files.is_spk(path):
+        return ephemeris_files.load_orbit(path)
+    ephemeris = load_spk(path, spice_id, step_s or READ_STEP_S)
     check_gravity(ephemeris)
     return ephemeris
 

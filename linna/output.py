@@ -1,4 +1,4 @@
-"""What commands print: one JSON object or plain text on stdout, progress on stderr."""
+"""Output of commands: one JSON object or plain text on stdout, progress on stderr."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ def number(
 ) -> Callable[[str], Any]:
     """Return the type of an option: a finite number within limits."""
     limits = {"from": least, "above": above, "up to": most, "below": below}
-    told = " and ".join(f"{word} {limit:g}" for word, limit in limits.items() if math.isfinite(limit))
+    stated = " and ".join(f"{word} {limit:g}" for word, limit in limits.items() if math.isfinite(limit))
 
     def parse(text: str) -> Any:
         try:
@@ -129,7 +129,7 @@ def number(
         except ValueError:
             value = math.nan
         if not (least <= value <= most and above < value < below):
-            raise argparse.ArgumentTypeError(f"expected a number {told}, found {text!r}")
+            raise argparse.ArgumentTypeError(f"expected a number {stated}, found {text!r}")
         return value
 
     return parse

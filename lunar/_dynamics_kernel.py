@@ -22,7 +22,7 @@ TABLE_START_S, TABLE_STEP_S, GM_EARTH, GM_SUN, PRESSURE, MOON_RADIUS, EARTH_RADI
 """Places in ``force``; PRESSURE is the radiation acceleration times the squared distance from the Sun, 0 for none."""
 
 REACHED, STEP_LIMIT, EVENT, GROUND, TOO_SMALL = range(5)
-"""Why an integration ended."""
+"""Reasons for the end of an integration."""
 
 NO_EVENT, PERISELENE, APOSELENE = range(3)
 
@@ -32,7 +32,7 @@ SHORTEST_STEP_S = 1e-6
 
 
 class Forces(NamedTuple):
-    """What acts: packed gravity field, scalars (see the module), table over the span, length of the field's scratch."""
+    """Acting forces: packed gravity field, scalars (see the module), table over the span, scratch length."""
 
     gravity: FloatArray
     scalars: FloatArray

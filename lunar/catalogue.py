@@ -24,7 +24,14 @@ from lunar.compressed import EXPANDED_LIMIT_OCTETS, open_expanded
 from lunar.constants import MOON_RADIUS_M
 from lunar.errors import DataFileError, LunarError
 from lunar.frames import mcmf_from_spherical
-from lunar.plausible import CRATER_COVER, CRATER_DEPTH_RATIO, CRATER_DIAMETER_M, CRATER_MEDIAN_M, HEIGHT_M
+from lunar.plausible import (
+    CRATER_COVER,
+    CRATER_DEPTH,
+    CRATER_DEPTH_RATIO,
+    CRATER_DIAMETER_M,
+    CRATER_MEDIAN_M,
+    HEIGHT_M,
+)
 
 TWO_PI = 2.0 * math.pi
 
@@ -356,6 +363,27 @@ def _joined(blocks: list[CraterCatalogue]) -> CraterCatalogue:
     return CraterCatalogue(**columns, source=prefix + ", ".join(sorted(sources)))
 
 
+def catalogue_words(catalogue: CraterCatalogue) -> str:
+    """Return number, places, diameters and depths of the craters of a list, as printed with figures of it."""
+    if not len(catalogue):
+        return "0 craters"
+    east = np.degrees(catalogue.longitude_rad)
+    ranges = [
+        (np.degrees(catalogue.latitude_rad), "deg north"),
+        (east, "deg east"),
+        (catalogue.diameter_m / 1e3, "km across"),
+        (catalogue.depth_m, "m deep"),
+        (catalogue.rim_height_m, "m rim height"),
+    ]
+    words = [
+        f"{np.nanmin(values):.4g} to {np.nanmax(values):.4g} {unit}"
+        for values, unit in ranges
+        if np.isfinite(values).any()
+    ]
+    kept = np.count_nonzero(catalogue.complete)
+    return f"{len(catalogue)} craters ({kept} of a complete list): {', '.join(words)}"
+
+
 def save_catalogue(catalogue: CraterCatalogue, path: Path | str) -> None:
     """Write a CSV in the LINNA format: id, latitude_deg, longitude_deg, diameter_m, rim_height_m, depth_m, complete."""
     Path(path).write_text(format_catalogue(catalogue), encoding="ascii", newline="\n")
@@ -604,10 +632,15 @@ def _check_ranges(path: Path, catalogue: CraterCatalogue) -> None:
             f"a rim height of {HEIGHT_M} above the map sphere",
             catalogue.rim_height_m,
         ),
+        (
+            CRATER_DEPTH.holds(catalogue.depth_m / catalogue.diameter_m) | np.isnan(catalogue.depth_m),
+            f"a depth over diameter of {CRATER_DEPTH}",
+            catalogue.depth_m / catalogue.diameter_m,
+        ),
     )
-    for good, expected, values in checks:
-        if not np.all(good):
-            row = int(np.flatnonzero(~good)[0])
+    for valid, expected, values in checks:
+        if not np.all(valid):
+            row = int(np.flatnonzero(~valid)[0])
             raise DataFileError(path, f"line {row + 2}", expected, f"{values[row]:.10g}")
 
 

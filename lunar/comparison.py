@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lunar.arrays import FloatArray, IntArray
-from lunar.constants import GM_EARTH_M3_S2, GM_MOON_M3_S2
+from lunar.constants import GM_EARTH_M3_S2, GM_MOON_M3_S2, NS
 from lunar.ephemeris import Ephemeris, EphemerisSegment
-from lunar.errors import EphemerisCoverageError, UnmovedByGravity
-from lunar.frames import rtn_from_inertial
+from lunar.errors import EphemerisCoverageError, EphemerisError, UnmovedByGravity
+from lunar.frames import matrix_from_quaternion, rtn_from_inertial
+from lunar.plausible import OFF_NADIR_DEG, VIEWS_OF_MOON
 from lunar.third_bodies import earth_position_icrf_m
-from lunar.timescales import NS, format_utc, tdb_s_from_tai_ns
+from lunar.timescales import format_tai, format_utc, tdb_s_from_tai_ns
 
 GRAVITY_TOLERANCE = 2.5e-3
 """Largest median deviation of states from the motion about a point mass, as a part of the fall: see `check_gravity`."""
@@ -22,6 +23,11 @@ GRAVITY_TOLERANCE = 2.5e-3
 _ARC_RAD, _LONGEST_S, _FALL_M = 0.3, 21_600.0, 1000.0
 _PAIRS, _STEPS = 200, 8
 _NEAREST_EARTH_M, _MOST_TIDE = 3.56e8, 0.5
+_SINGLE, _SINGLE_M, _FEWEST = 0.02, 100.0, 6
+"""Part of the fall, and distance for rounded values, beyond which a state is off its neighbours; fewest states."""
+
+_BURN_M_S = 100.0
+"""More than an orbit correction changes the velocity."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,8 +96,11 @@ def check_gravity(ephemeris: Ephemeris) -> None:
     ------
     UnmovedByGravity
         Where the median of an arc is above `GRAVITY_TOLERANCE`, with the numbers.
+    EphemerisError
+        Where a state alone is off the motion of its neighbours.
     """
     for arc in ephemeris.arcs():
+        _check_single(arc)
         measured = _deviations(arc)
         if not len(measured):
             continue
@@ -100,6 +109,75 @@ def check_gravity(ephemeris: Ephemeris) -> None:
         tide = 3.0 * GM_EARTH_M3_S2 / GM_MOON_M3_S2 * (radius / _NEAREST_EARTH_M) ** 3
         if weighted > GRAVITY_TOLERANCE + min(tide, _MOST_TIDE):
             raise UnmovedByGravity(arc.object_name, radius, expected, found, off)
+
+
+def check_pointing(ephemeris: Ephemeris, utc_ns: IntArray, q_wxyz: FloatArray) -> None:
+    """Refuse attitudes (n, 4), ICRF to camera at epochs (n,), whose boresights mostly miss the Moon.
+
+    Raises
+    ------
+    EphemerisError
+        Where a quaternion of another direction or order, or of other axes, is likely.
+    """
+    known = ephemeris.covers(utc_ns)
+    if not known.any():
+        spans = (
+            f"{format_utc(int(a))}..{format_utc(int(b))}"
+            for a, b in ((ephemeris.start_utc_ns, ephemeris.stop_utc_ns), (utc_ns[0], utc_ns[-1]))
+        )
+        raise EphemerisError("attitudes: expected times within {}, found {}".format(*spans))
+    position = ephemeris.at(utc_ns[known])[0]
+    radius = np.linalg.norm(position, axis=1)
+    boresight = matrix_from_quaternion(q_wxyz[known])[:, 2]
+    angle = np.arccos(np.clip(-np.einsum("ni,ni->n", boresight, position) / radius, -1.0, 1.0))
+    seen, middle = float(np.mean(angle <= math.radians(OFF_NADIR_DEG))), math.degrees(float(np.median(angle)))
+    if seen < VIEWS_OF_MOON:
+        raise EphemerisError(
+            f"attitudes: expected the camera within {OFF_NADIR_DEG:g} deg of nadir in {VIEWS_OF_MOON:.0%} of them or "
+            f"more, found {seen:.0%}, {middle:.0f} deg in the median: quaternions in another order or direction, other "
+            "axes, or other times?"
+        )
+
+
+def _check_single(arc: EphemerisSegment) -> None:
+    """Refuse a state between two that agree without it; a burn parts the states before it from those after it."""
+    rows = np.arange(len(arc.utc_ns))
+    if len(rows) < _FEWEST:
+        return
+    off, fall, span = _apart(arc, rows)
+    limit = max(_SINGLE, 20.0 * float(np.median(off / fall)))
+    for k in np.flatnonzero(off > limit * fall + _SINGLE_M)[:_PAIRS].tolist():
+        near = rows[max(k - 3, 0) : k + 6]
+        for one in (k, k + 1, k + 2):
+            others, least, _ = _apart(arc, near[near != one])
+            # At the ends a burn looks alike, so only what no burn does is refused there.
+            is_inner = 0 < one < len(rows) - 1 or off[k] > _BURN_M_S * span[k]
+            if is_inner and np.all(others <= limit * least + _SINGLE_M):
+                raise EphemerisError(
+                    f"ephemeris state {one + 1} of {arc.object_name}, {format_tai(int(arc.tai_ns[one]))}: expected a "
+                    f"state between its neighbours, found {np.round(arc.position_m[one] / 1e3, 3).tolist()} km and "
+                    f"{np.round(arc.velocity_m_s[one] / 1e3, 6).tolist()} km/s"
+                )
+
+
+def _apart(arc: EphemerisSegment, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return how far inner states (n - 2) lie off the curve of degree 5 through their neighbours, fall, and span in s.
+
+    The fall is that of a body between the two, in m.
+    """
+    first, middle, last = rows[:-2], rows[1:-1], rows[2:]
+    position, velocity = arc.position_m, arc.velocity_m_s
+    pull = -GM_MOON_M3_S2 * position / np.linalg.norm(position, axis=1, keepdims=True) ** 3
+    span = ((arc.tai_ns[last] - arc.tai_ns[first]) / NS)[:, None]
+    share = ((arc.tai_ns[middle] - arc.tai_ns[first]) / NS)[:, None] / span
+    between: FloatArray = np.zeros_like(position[middle])
+    for side, t, sign in ((first, share, 1.0), (last, 1.0 - share, -1.0)):
+        between += position[side] * (1.0 - t**3 * (10.0 - 15.0 * t + 6.0 * t**2))
+        between += velocity[side] * (sign * span * (t - t**3 * (6.0 - 8.0 * t + 3.0 * t**2)))
+        between += pull[side] * (0.5 * span**2 * t**2 * (1.0 - t) ** 3)
+    off = np.linalg.norm(position[middle] - between, axis=1)
+    fall = np.median(np.linalg.norm(pull, axis=1)) * span[:, 0] ** 2 / 8.0
+    return off, fall, span[:, 0]
 
 
 def _deviations(arc: EphemerisSegment) -> FloatArray:

@@ -30,4 +30,5 @@ SOLAR_PRESSURE_1AU_N_M2 = 1361.0 / SPEED_OF_LIGHT_M_S
 """Radiation pressure of sunlight at 1 au (nominal irradiance 1361 W/m2, IAU 2015 resolution B3)."""
 
 SECONDS_PER_DAY = 86_400.0
-NANOSECONDS_PER_SECOND = 1_000_000_000
+NS = 1_000_000_000
+"""Nanoseconds in a second."""

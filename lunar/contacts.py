@@ -1,4 +1,4 @@
-"""When an orbit is in shadow, over the night side, hidden from the Earth, and in contact with ground stations."""
+"""Spans of shadow, night side, occultation and contacts of an orbit."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from lunar.arrays import BoolArray, IntArray
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
-from lunar.timescales import NS, tdb_s_from_utc_ns
+from lunar.timescales import tdb_s_from_utc_ns
 from lunar.visibility import (
     GroundStation,
     find_windows,

@@ -27,9 +27,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
+from lunar.constants import NS
 from lunar.errors import DataFileError, EphemerisCoverageError, EphemerisError
 from lunar.frames import ICRF
-from lunar.timescales import NS, format_tai, tai_ns_from_utc_ns, utc_ns_from_tai_ns
+from lunar.timescales import format_tai, tai_ns_from_utc_ns, utc_ns_from_tai_ns
 
 GAP_FACTOR = 10
 """A step longer than this many median steps of its segment is a gap, in which nothing is interpolated."""
@@ -155,7 +156,7 @@ class Ephemeris:
     Raises
     ------
     EphemerisError
-        Where there is no segment, or the useable intervals of two overlap.
+        Where there is no segment, the useable intervals of two overlap, or they are those of two objects.
     """
 
     segments: tuple[EphemerisSegment, ...]
@@ -165,6 +166,10 @@ class Ephemeris:
     def __post_init__(self) -> None:
         if not self.segments:
             raise EphemerisError("an ephemeris: expected at least one segment, found none")
+        names = dict.fromkeys(one.object_name.casefold() for one in self.segments)
+        if len(names) > 1:
+            found = ", ".join(dict.fromkeys(one.object_name for one in self.segments))
+            raise EphemerisError(f"an ephemeris: expected segments of one object, found {found}")
         for earlier, later in pairwise(self.segments):
             start, stop = later.span_tai_ns[0], earlier.span_tai_ns[1]
             if start < stop:
@@ -172,6 +177,12 @@ class Ephemeris:
                     f"an ephemeris: expected the next segment at or after {format_tai(stop)}, "
                     f"found it at {format_tai(start)}"
                 )
+
+    @property
+    def words(self) -> str:
+        """Return the object and the time scales of the file, as printed with figures of it."""
+        systems = dict.fromkeys(one.time_system for one in self.segments)
+        return f"{self.segments[0].object_name}, epochs in {' and '.join(systems)}"
 
     @property
     def start_utc_ns(self) -> int:

@@ -36,6 +36,7 @@ from numpy.typing import ArrayLike
 from lunar.arrays import FloatArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.errors import DataFileError, EphemerisCoverageError
+from lunar.plausible import ORIENTATION_RAD
 
 ARCSECOND_RAD = np.pi / 648_000.0
 DAY_S = 86_400.0
@@ -237,7 +238,15 @@ def load_orientation(bpc_path: Path | str, tf_path: Path | str | None = None) ->
     coefficients = records[:, 2:].reshape(len(records), 3, -1)
     me_from_pa = PA_FROM_ME_DE421.T if tf_path is None else _me_from_pa_of_kernel(Path(tf_path), frame)
     name = "DE421" if frame == 31006 else f"binary PCK frame {frame}"
-    return De421Orientation(start, record_s, np.ascontiguousarray(coefficients), me_from_pa, name)
+    orientation = De421Orientation(start, record_s, np.ascontiguousarray(coefficients), me_from_pa, name)
+    epochs = np.linspace(start, orientation.stop_tdb_s, 5)
+    turned = orientation.mcmf_from_icrf(epochs) @ np.swapaxes(IauOrientation().mcmf_from_icrf(epochs), -1, -2)
+    off_rad = float(np.linalg.norm(rotation_vector_from_matrix(turned), axis=-1).max())
+    if not off_rad <= ORIENTATION_RAD:
+        where = path if tf_path is None else f"{path} with {tf_path}"
+        expected = f"mean-Earth axes within {ORIENTATION_RAD:g} rad of the IAU series"
+        raise DataFileError(where, "", expected, f"{off_rad:.3g} rad: other units, axes or body?")
+    return orientation
 
 
 def icrf_from_j2000() -> FloatArray:

@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike
 from lunar.arrays import FloatArray
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.errors import DataFileError, OrbitError
+from lunar.plausible import GRAVITY_ALIKE, GRAVITY_ALIKE_DEGREE, GRAVITY_TERM
 
 GM_TOLERANCE, RADIUS_TOLERANCE, C20_TOLERANCE = 1e-3, 1e-2, 0.05
 """Relative deviations from the Moon of a field: its GM, the radius that it refers to, and its flattening."""
@@ -53,6 +54,14 @@ class GravityField:
     @property
     def degree(self) -> int:
         return len(self.c_bar) - 1
+
+    @property
+    def words(self) -> str:
+        """Return name, degree, GM and radius, as printed with figures of the field."""
+        return (
+            f"{self.name} to degree {self.degree}, GM {self.gm_m3_s2 / 1e9:.10g} km3/s2, radius "
+            f"{self.radius_m / 1e3:.10g} km"
+        )
 
     def truncated(self, degree: int) -> GravityField:
         """Return the field without its terms above ``degree``."""
@@ -344,5 +353,26 @@ def _assembled(
     if wanted >= 2 and abs(c_bar[2, 0] / C20_MOON - 1.0) > C20_TOLERANCE:
         expected = f"the normalised flattening term {C20_MOON:g} of the Moon"
         raise DataFileError(file, "degree 2, order 0", expected, f"{float(c_bar[2, 0]):g}")
+    _require_moon(file, radius, c_bar, s_bar)
     c_bar.flags.writeable = s_bar.flags.writeable = False
     return GravityField(name, gm, radius, c_bar, s_bar)
+
+
+def _require_moon(file: Path, radius: float, c_bar: FloatArray, s_bar: FloatArray) -> None:
+    """Refuse terms of a low degree unlike those of the Moon, and a term greater than any of its degree."""
+    known = builtin_gravity()
+    for n in range(2, min(len(c_bar) - 1, GRAVITY_ALIKE_DEGREE) + 1):
+        there = np.concatenate([known.c_bar[n, : n + 1], known.s_bar[n, : n + 1]])
+        here = np.concatenate([c_bar[n, : n + 1], s_bar[n, : n + 1]]) * (radius / known.radius_m) ** n
+        off = float(np.linalg.norm(here - there) / np.linalg.norm(there))
+        if off > GRAVITY_ALIKE:
+            expected = f"terms within {GRAVITY_ALIKE:.0%} of those of the Moon in its principal axes"
+            found = f"{off:.0%}: another scale, sign, order, meridian or normalisation?"
+            raise DataFileError(file, f"degree {n}", expected, found)
+    degree = np.arange(len(c_bar), dtype=np.float64)[:, None]
+    size = np.maximum(np.abs(c_bar), np.abs(s_bar)) * degree**2
+    size[:2] = 0.0
+    if size.max() > GRAVITY_TERM:
+        n, m = np.unravel_index(int(np.argmax(size)), size.shape)
+        found = f"{float(max(abs(c_bar[n, m]), abs(s_bar[n, m]))):.3g}"
+        raise DataFileError(file, f"degree {n}, order {m}", f"at most {GRAVITY_TERM / n**2:.3g}", found)

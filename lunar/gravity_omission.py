@@ -1,4 +1,4 @@
-"""What a lunar gravity field leaves out along a low orbit, or has wrong, as white noise that a filter can carry.
+"""Omission and commission errors of a lunar gravity field along a low orbit, as white noise for a filter.
 
 A filter that gets a fix every few seconds smooths over minutes, a coast lasts an hour: what disturbs both is the slow
 part of the acceleration that is missing. A field cut at a degree misses waves of higher degrees, which pass in a minute

@@ -1,4 +1,4 @@
-"""Where an orbiter was over the Moon."""
+"""Ground track of an orbiter over the Moon."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lunar.arrays import FloatArray, IntArray
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation
-from lunar.timescales import NS, tdb_s_from_utc_ns
+from lunar.timescales import tdb_s_from_utc_ns
 from lunar.visibility import subsatellite
 
 

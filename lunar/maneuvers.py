@@ -33,7 +33,7 @@ from lunar.timescales import utc_ns_from_tdb_s
 
 @dataclass(frozen=True, slots=True)
 class ManeuverRule:
-    """When to burn, and the orbit to come back to."""
+    """Rule for burns, and the orbit to which they return."""
 
     periselene_altitude_m: float = 15_000.0
     semi_major_axis_m: float = 1_768_180.0

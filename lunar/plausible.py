@@ -46,6 +46,14 @@ RELIEF_M = 3.0
 """Least standard deviation of heights over ground of 20 km: the flattest of all 136,000 cells of that size of GLD100
 has 4.6 m, the median 300 m."""
 
+RASTER_PIXEL_M = Limit(0.2, 500_000.0, "m")
+"""Size of the pixels of a map: images from orbit have 0.25 m and more, ten pixels about the Moon 1,100 km."""
+
+SLOPE_DEG, STEEP_SHARE, SLOPE_BASE_M = 45.0, 0.01, 50.0
+"""Slope that at most this share of the ground exceeds over a pixel of this size or more: of 608 windows of 121 km on
+GLD100 at 237 m none has 38 degrees on more than 0.06 %; the angle of repose is 32 to 37 degrees (Kreslavsky & Head
+2016, Icarus 273).  Heights that are twice too great have it on about 1 % of cratered ground."""
+
 MAP_SHIFT_M = 5_000.0
 """More than any offset between published height models of the Moon."""
 
@@ -59,6 +67,9 @@ CRATER_MEDIAN_M = Limit(100.0, 300_000.0, "m")
 CRATER_DEPTH_RATIO = Limit(0.003, 0.3, "")
 """Medians of depth over diameter: fresh simple craters have 0.20 (Pike 1977), those of 2 km or more in LU1319381 0.076,
 with 0.02 and 0.21 as first and last percentile."""
+
+CRATER_DEPTH = Limit(0.0, 0.5, "")
+"""Depth over diameter of any crater: the deepest of 222,447 in LU1319381 has 0.32."""
 
 LISTED_DEPTH_RATIO = Limit(0.45, 1.5, "")
 """Medians of depths measured on a height raster over those in a list: on GLD100 at 128 pixels per degree, which smooths
@@ -74,6 +85,16 @@ ORBIT_RADIUS_M = Limit(MOON_RADIUS_M, 66_000_000.0, "m")
 ORBIT_SPEED_M_S = Limit(0.0, 3_500.0, "m/s")
 """Arrivals from the Earth pass low over the Moon with 2.3 to 2.6 km/s; escape at the ground is at 2.376 km/s."""
 
+ORIENTATION_RAD = 2e-4
+"""Greatest difference of an orientation of the Moon from the IAU series: DE421 has 9e-5 at most from 1900 to 2050."""
+
+GRAVITY_ALIKE, GRAVITY_ALIKE_DEGREE = 0.3, 6
+"""Greatest relative difference of the terms of each degree up to this one from GRAIL's: LP165P differs by 0.7 %."""
+
+GRAVITY_TERM = 25.0 * 2.5e-4
+"""Greatest normalised coefficient, times the square of its degree: Kaula's rule has 2.5e-4, GRGM660PRIM 5 times that,
+the noise of LP165P 11 times."""
+
 UTC_NS = Limit(63_072_000_000_000_000, 4_102_444_800_000_000_000, "ns")
 """From 1972-01-01, when UTC got whole leap seconds, to 2100-01-01."""
 
@@ -82,6 +103,16 @@ CAMERA_FIELD_DEG = Limit(1.0, 170.0, "deg")
 
 CAMERA_PIXELS = Limit(16, 8192, "pixels")
 """Width and height of an image: from one cell of the detector to the largest sensors of small spacecraft."""
+
+OFF_NADIR_DEG, VIEWS_OF_MOON = 60.0, 0.9
+"""Angle from nadir within which a camera looks in this share of the frames of a pass: from 30 km the horizon is 79
+degrees from nadir.  Quaternions of another order or direction turn it through all directions."""
+
+EXPOSURE_S = Limit(0.0, 60.0, "s")
+"""Exposure of an image of the sunlit ground, which moves by 1.6 km in a second, or of the night side."""
+
+REFERENCE_SIGMA_M = Limit(0.0, 100_000.0, "m")
+"""Error of an orbit determination that is used as a reference."""
 
 CLOCK_ERROR_S = 3600.0
 """Largest error of a clock in use: time zones, leap seconds and unset offsets of stations stay below, a wrong date does

@@ -53,7 +53,7 @@ class SolarPressure:
 
 @dataclass(frozen=True, eq=False)
 class ForceModel:
-    """What acts on the orbiter.  ``degree`` None takes the whole field.
+    """Forces on the orbiter.  ``degree`` None takes the whole field.
 
     Tables of the Moon's orientation and of Earth and Sun are kept inside as they are asked for, per half day.
     """

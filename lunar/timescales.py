@@ -24,9 +24,9 @@ from typing import Any, overload
 import numpy as np
 
 from lunar.arrays import FloatArray, IntArray
+from lunar.constants import NS
 from lunar.errors import LeapSecondError, TimeFormatError
 from lunar.utc import LEAP_DATES as LEAP_DATES
-from lunar.utc import NS as NS
 from lunar.utc import format_utc as format_utc
 from lunar.utc import parse_utc as parse_utc
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import re
 from datetime import UTC, datetime, timedelta
 
+from lunar.constants import NS
 from lunar.errors import LeapSecondError, TimeFormatError
-
-NS = 1_000_000_000
 
 _ISO = re.compile(
     r"(\d{4})-(?:(\d{2})-(\d{2})|(\d{3}))(?:[T ](\d{2}):(\d{2})(?::(\d{2})(?:\.(\d*))?)?)?(?:Z|\+00:00)?\Z",

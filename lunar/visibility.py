@@ -1,4 +1,4 @@
-"""What sees what: sub-satellite point, Sun and shadow, the Earth and its stations behind the limb.
+"""Visibility: sub-satellite point, Sun and shadow, the Earth and its stations behind the limb.
 
 Bodies are spheres: the Moon of `MOON_RADIUS_M`, the Sun and the Earth of their mean radii.  Positions are
 Moon-centred in ICRF axes unless a name says otherwise; directions to the Sun are geometric (its light is 500
@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
-from lunar.constants import EARTH_RADIUS_M, MOON_RADIUS_M, SPEED_OF_LIGHT_M_S, SUN_RADIUS_M
+from lunar.constants import EARTH_RADIUS_M, MOON_RADIUS_M, NS, SPEED_OF_LIGHT_M_S, SUN_RADIUS_M
 from lunar.ephemeris import Ephemeris
 from lunar.errors import LunarError
 from lunar.frames import Orientation, enu_from_mcmf, mcmf_from_spherical, spherical_from_mcmf
-from lunar.timescales import NS, TT_MINUS_TAI_NS, tai_ns_from_utc_ns, tdb_s_from_utc_ns
+from lunar.timescales import TT_MINUS_TAI_NS, tai_ns_from_utc_ns, tdb_s_from_utc_ns
 
 
 @dataclass(frozen=True, slots=True)

@@ -82,7 +82,7 @@ class Product:
         return sum(sizes) if all(sizes) else 0
 
     def claims(self, path: str) -> bool:
-        """Whether a path of the data folder belongs to the product."""
+        """Return whether a path of the data folder belongs to the product."""
         return any(path == file.path for file in self.files) or any(
             fnmatch.fnmatch(path, pattern) for pattern in self.patterns
         )
@@ -275,5 +275,4 @@ PRODUCTS: tuple[Product, ...] = (
 
 
 def find_product(name: str) -> Product | None:
-    """The product of a name."""
     return next((product for product in PRODUCTS if product.name == name), None)

@@ -1,4 +1,4 @@
-"""What can go wrong in the payload emulator.
+"""Errors of the payload emulator.
 
 PayloadError
 ├── ScenarioError      a scenario file, or what it asks for, is not usable

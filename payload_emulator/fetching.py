@@ -110,7 +110,7 @@ def verify(root: Path, products: Sequence[Product] = PRODUCTS) -> list[Checked]:
 
 
 def survey(root: Path, products: Sequence[Product] = PRODUCTS) -> list[dict[str, Any]]:
-    """What is known of each product and how much of it lies in the data folder."""
+    """Return each product with its state and its size in the data folder."""
     there = {
         str(path.relative_to(root)) for folder in _folders(products) for path in (root / folder).glob("**/*")
     }
@@ -176,7 +176,7 @@ def _check(root: Path, path: str, file: ProductFile | None, recorded: str) -> Ch
 
 
 def _status_of(file: ProductFile, path: Path, recorded: dict[str, str]) -> str:
-    """Whether a file on disk is as it should be, without more reading than its size where that tells."""
+    """Return whether a file on disk is as it should be, without more reading than its size where that tells."""
     if file.octets and not file.member and path.stat().st_size != file.octets:
         return "damaged"
     if file.origin != "published" and file.path not in recorded:

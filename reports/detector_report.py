@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
-from reports.document import Block, Column, Document, Facts, Heading, Picture, Table
+from reports.document import Block, Column, Document, Heading, Picture, Properties, Table
 from reports.figures import training
 from reports.figures.detector import OCTANTS, octant_bias
 from reports.sections.detection import detector_blocks, gallery_picture
@@ -23,7 +24,6 @@ from reports.values import BiasBin, DetectorReport, NamedScore, ResidualSeries, 
 
 
 def detector_document(report: DetectorReport) -> Document:
-    """The document of a detector."""
     blocks: list[Block] = [*judgement(report), Heading("Scores")]
     found = detector_blocks(report.score) if report.score is not None else []
     blocks += found or [absent(report, "score", "Scores", "the detector was not evaluated")]
@@ -64,12 +64,12 @@ def detector_document(report: DetectorReport) -> Document:
                 "Quantities over the training run.",
                 "Training curves: " + ", ".join(c.name for c in curves),
                 0.78 + rows * 1.25 + (rows - 1) * 0.75,
-                lambda c: training.draw_training(c, curves),
+                partial(training.draw_training, curves=curves),
             ),
         ]
     blocks.append(Heading("Cost on board"))
     if report.cost:
-        blocks.append(Facts(tuple(report.cost.items())))
+        blocks.append(Properties(tuple(report.cost.items())))
     else:
         blocks.append(absent(report, "cost", "Latency and memory", "they were not measured"))
     blocks.append(Heading("Detections over the images"))
@@ -116,7 +116,7 @@ def _named(key: str, scores: Sequence[NamedScore], caption: str) -> list[Block]:
         ),
     )
     picture = Picture(
-        key, caption, caption, 0.85 + 0.3 * len(scores), lambda c: training.draw_named_scores(c, scores)
+        key, caption, caption, 0.85 + 0.3 * len(scores), partial(training.draw_named_scores, scores=scores)
     )
     return [picture, table]
 

@@ -99,7 +99,7 @@ class Table:
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
+class Properties:
     """Names and their values."""
 
     pairs: tuple[tuple[str, str], ...]
@@ -141,7 +141,7 @@ class Listing:
     text: str
 
 
-Block = Heading | Paragraph | Verdict | Headline | Table | Facts | Bullets | Picture | Absent | Listing
+Block = Heading | Paragraph | Verdict | Headline | Table | Properties | Bullets | Picture | Absent | Listing
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,14 +1,21 @@
-"""Figures of a document: drawn once for its renderings, and as files."""
+"""Figures of a document: drawn once for its renderings, kept for later documents, and as files."""
 
 from __future__ import annotations
 
 import csv
+import dataclasses
+import functools
+import hashlib
 import io
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kernels import keep, kept
 from reports.document import Picture
 from reports.figures.canvas import Canvas
 from reports.figures.svg import draw_svg
@@ -19,6 +26,9 @@ if TYPE_CHECKING:
 
 PNG_DPI = 200
 
+KEPT_FIGURES = 1024
+"""Figures that are kept on disk: those of forty reports."""
+
 
 class Drawings(dict[str, str]):
     """SVG of the figures of one document by key, each drawn once for all its renderings."""
@@ -26,8 +36,62 @@ class Drawings(dict[str, str]):
     def svg(self, one: Picture) -> str:
         """Return the SVG of a picture; the keys of the pictures of a document are unique."""
         if one.key not in self:
-            self[one.key] = draw_svg(one.key, one.width_in, one.height_in, one.draw, one.alt)
+            self[one.key] = self._drawn(one)
         return self[one.key]
+
+    def _drawn(self, one: Picture) -> str:
+        return draw_svg(one.key, one.width_in, one.height_in, one.draw, one.alt)
+
+
+class KeptDrawings(Drawings):
+    """Drawings that are kept on disk by the hash of what they show, and drawn again if that or the code changed."""
+
+    def _drawn(self, one: Picture) -> str:
+        name = f"figure-{drawing_hash(one)}"
+        octets = kept(name)
+        if octets is None:
+            octets = super()._drawn(one).encode()
+            keep(name, octets, KEPT_FIGURES)
+        return octets.decode()
+
+
+def drawing_hash(one: Picture) -> str:
+    """Return the hash of all that the SVG of a picture depends on: size, text, function, values and code."""
+    key = hashlib.sha256(_code_hash())
+    for octets in _octets((one.key, one.width_in, one.height_in, one.alt, one.draw)):
+        key.update(octets)
+    return key.hexdigest()
+
+
+def _octets(value: Any) -> Iterator[bytes]:
+    """Yield octets that are equal for equal values only."""
+    if isinstance(value, np.ndarray) and not value.dtype.hasobject:
+        yield f"{value.dtype.str}{value.shape}".encode()
+        yield value.tobytes()
+    elif isinstance(value, list | tuple | np.ndarray):
+        yield f"{len(value)} of ".encode()
+        for part in value:
+            yield from _octets(part)
+    elif isinstance(value, Mapping):
+        yield from _octets(tuple(value.items()))
+    elif isinstance(value, partial):
+        yield from _octets((value.func, value.args, value.keywords))
+    elif dataclasses.is_dataclass(value):
+        yield from _octets([getattr(value, field.name) for field in dataclasses.fields(value)])
+    elif callable(value):
+        yield f"{value.__module__}.{value.__qualname__} ".encode()
+        yield from _octets([cell.cell_contents for cell in getattr(value, "__closure__", None) or ()])
+    else:
+        yield f"{value!r} ".encode()
+
+
+@functools.cache
+def _code_hash() -> bytes:
+    """Return the hash of the code of figures and of the versions of the libraries that draw."""
+    key = hashlib.sha256(" ".join(version(name) for name in ("matplotlib", "numpy", "pillow")).encode())
+    for file in sorted(Path(__file__).parent.rglob("*.py")):
+        key.update(file.read_bytes())
+    return key.digest()
 
 
 def picture_files(picture: Picture) -> tuple[bytes, str]:

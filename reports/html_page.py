@@ -15,12 +15,12 @@ from reports.document import (
     Cell,
     Column,
     Document,
-    Facts,
     Heading,
     Headline,
     Listing,
     Paragraph,
     Picture,
+    Properties,
     Table,
     Verdict,
     cells,
@@ -92,7 +92,7 @@ def _plain(block: Block) -> str:
             return f'\n<div class="verdict {role}"><p class="word">{word}</p><p class="says">{escape(text)}</p></div>'
         case Headline():
             return _headline(block)
-        case Facts(pairs, mono):
+        case Properties(pairs, mono):
             body = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in pairs)
             return f'\n<dl class="pairs{" mono" if mono else ""}">{body}</dl>'
         case Bullets(items):

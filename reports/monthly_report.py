@@ -4,7 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from reports.document import VERDICT_ROLES, Block, Cell, Column, Document, Heading, Paragraph, Picture, Table
+from reports.document import (
+    VERDICT_ROLES,
+    Block,
+    Bullets,
+    Cell,
+    Column,
+    Document,
+    Heading,
+    Paragraph,
+    Picture,
+    Table,
+)
 from reports.figures import monthly
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
 from reports.text import count_text, number_text, percent_text, significant_text, utc_text
@@ -16,10 +27,10 @@ METRICS = {
     "median_error_m": ("median error", "m", 1.0, 0),
 }
 """Name, unit, scale and decimals of the metrics."""
+_DRAWN = METRICS | {"map_offset_m": ("offset of the list", "m", 1.0, 0)}
 
 
 def monthly_document(report: MonthlyReportValue) -> Document:
-    """Return the document of a monthly report."""
     blocks: list[Block] = [*judgement(report), Heading("Passes over time")]
     if report.passes:
         blocks.append(_trend(report))
@@ -42,15 +53,17 @@ def _trend(report: MonthlyReportValue) -> Picture:
     }
     words = "; ".join(
         f"{label}: {number_text(scale * medians[name], decimals)} {unit}"
-        for name, (label, unit, scale, decimals) in METRICS.items()
+        for name, (label, unit, scale, decimals) in _DRAWN.items()
+        if name in medians
     )
     return Picture(
         "monthly-trend",
-        "Recall, drift and median error of each pass; vertical lines are changes of level. "
+        "Recall, drift, median error and offset of the crater list as learned on board, of each pass; vertical lines "
+        "are changes of level. "
         f"Median of the passes: {words}.",
         f"Recall, drift and median error over time. Median of the passes: {words}.",
         4.2,
-        lambda canvas: monthly.draw_trend(canvas, report, METRICS),
+        lambda canvas: monthly.draw_trend(canvas, report, _DRAWN),
     )
 
 
@@ -120,7 +133,9 @@ def _requirements(report: MonthlyReportValue) -> list[Block]:
         Column("share met"),
         Column("95 % interval"),
     )
-    return [Table(f"Requirements over the last {report.window_days:g} days of passes.", columns, tuple(rows))]
+    table = Table(f"Requirements over the last {report.window_days:g} days of passes.", columns, tuple(rows))
+    remarks = tuple(f"{one.name}, {one.remark}" for one in report.requirements if one.remark)
+    return [table, Bullets(remarks)] if remarks else [table]
 
 
 def _groups(report: MonthlyReportValue) -> list[Block]:

@@ -39,7 +39,7 @@ from reports.figures.theme import LIGHT, color
 from reports.text import NOT_A_VALUE, headline_text
 
 _PAGE_IN = (8.27 - 2 * 0.66, 11.69 - 0.62 - 0.78)
-_BESIDE_IN = 1.2
+_TEXT_IN = 1.2
 """Height kept free for the heading and the caption of a figure."""
 _LEAST_SHRINKING = 0.7
 """A figure shrinks by no more than this to leave room for others: its text must remain legible."""
@@ -187,9 +187,9 @@ def _picture(block: Picture, number: int, drawings: Drawings, root: Path) -> dic
     (root / name).write_text(svg.replace("<svg", _SVG, 1), encoding="utf-8")
     width_in, height_in = _PAGE_IN
     # One scale for all figures, unless a page is too small.
-    scale = min(width_in / max(block.width_in, WIDTH_IN), (height_in - _BESIDE_IN) / block.height_in)
+    scale = min(width_in / max(block.width_in, WIDTH_IN), (height_in - _TEXT_IN) / block.height_in)
     # A page that a figure of up to half a page does not fit is itself half full.
-    half = (height_in / 2.0 - _BESIDE_IN) / block.height_in
+    half = (height_in / 2.0 - _TEXT_IN) / block.height_in
     if half >= _LEAST_SHRINKING * scale:
         scale = min(scale, half)
     return {

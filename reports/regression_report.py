@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 from reports.document import Block, Cell, Column, Document, Heading, Picture, Table
 from reports.figures.regression import draw_changed_craters
 from reports.sections.detection import gallery_picture
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
 from reports.text import count_text, loss_text, number_text, significant_text
-from reports.values import RegressionGate, RegressionReport
+from reports.values import Gate, RegressionReport
 
 _ORDER = ("fail", "inconclusive", "not judged", "pass")
 _SWATCHES = {"pass": "green", "inconclusive": "orange", "fail": "vermillion", "not judged": ""}
 
 
 def regression_document(report: RegressionReport) -> Document:
-    """The document of a regression."""
     counts = {outcome: sum(g.outcome == outcome for g in report.gates) for outcome in _ORDER}
     blocks: list[Block] = [*judgement(report), Heading("Craters that changed"), *_changed(report)]
     blocks += [Heading("Passes"), _passes(report), Heading("Gates")]
@@ -66,7 +66,7 @@ def _gates(report: RegressionReport) -> Table:
     )
 
 
-def _outcome_text(gate: RegressionGate) -> str:
+def _outcome_text(gate: Gate) -> str:
     """Return the outcome of a gate with its reason and evidence."""
     parts = [{"pass": "passed", "fail": "failed"}.get(gate.outcome, gate.outcome), gate.reason, gate.evidence]
     if gate.outcome == "inconclusive" and gate.frames_needed is not None:
@@ -82,16 +82,16 @@ def _changed(report: RegressionReport) -> list[Block]:
     craters = report.craters
     if craters is not None and len(craters.change):
         lost, gained = int((craters.change < 0).sum()), int((craters.change > 0).sum())
-        told = f"{lost} of {len(craters.change)} tracks of craters lost, {gained} gained"
+        counts = f"{lost} of {len(craters.change)} tracks of craters lost, {gained} gained"
         blocks.append(
             Picture(
                 "craters",
-                f"{told}. Vermillion: the candidate detects the crater in fewer frames; blue: in more; gray: in as "
+                f"{counts}. Vermillion: the candidate detects the crater in fewer frames; blue: in more; gray: in as "
                 f"many. Crosses: {len(craters.false_latitude_deg)} places where the candidate alone has a detection "
                 "without a crater.",
-                told,
+                counts,
                 3.6,
-                lambda c: draw_changed_craters(c, craters),
+                partial(draw_changed_craters, craters=craters),
             )
         )
     if not report.changed_tracks:

@@ -11,12 +11,13 @@ from reports.values import DetectorReport, MonthlyReportValue, PassReport, Regre
 
 if TYPE_CHECKING:
     from reports.document import Document
+    from reports.drawings import Drawings
 
 __all__ = ["render_html", "render_pages", "to_json"]
 
 
-def render_html(report: Any) -> str:
-    """One self-contained HTML page; the same value gives the same text.
+def render_html(report: Any, drawings: Drawings | None = None) -> str:
+    """Return one self-contained HTML page; the same value gives the same text.
 
     Raises
     ------
@@ -27,11 +28,11 @@ def render_html(report: Any) -> str:
     """
     from reports.html_page import html_page
 
-    return html_page(_document(report))
+    return html_page(_document(report), drawings)
 
 
-def render_pages(report: Any) -> tuple[str, bytes]:
-    """Return a report as HTML page and as A4 PDF; each figure is drawn once.
+def render_pages(report: Any, drawings: Drawings | None = None) -> tuple[str, bytes]:
+    """Return a report as HTML page and as A4 PDF; each figure is drawn once, unless ``drawings`` has it.
 
     Raises
     ------
@@ -44,8 +45,8 @@ def render_pages(report: Any) -> tuple[str, bytes]:
     from reports.html_page import html_page
     from reports.pdf_pages import pdf_pages
 
-    document, drawings = _document(report), Drawings()
-    return html_page(document, drawings), pdf_pages(document, drawings)
+    document, drawn = _document(report), Drawings() if drawings is None else drawings
+    return html_page(document, drawn), pdf_pages(document, drawn)
 
 
 def _document(report: Any) -> Document:

@@ -182,6 +182,15 @@ def per_degree(values: FloatArray, dof: FloatArray | IntArray) -> tuple[int, flo
     return len(value), float(value.sum() / freedom.sum()), float(within.mean())
 
 
+def sigma_remark(mean: float, low: float, high: float) -> str:
+    """Return by which factor sigmas are wrong: a mean NEES or NIS per degree outside its bounds; else nothing."""
+    if mean > high:
+        return f"sigmas {math.sqrt(mean):.1f} times too small"
+    if 0.0 < mean < low:
+        return f"sigmas {1.0 / math.sqrt(mean):.1f} times too large"
+    return ""
+
+
 def running_mean(values: FloatArray, window: int) -> FloatArray:
     """Mean of the finite values in a centred window, NaN where there is none, (n,)."""
     finite = np.isfinite(values)

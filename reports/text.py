@@ -21,7 +21,6 @@ def utc_fields(utc_ns: int) -> tuple[int, int, int, int, int, int]:
 
 
 def month_name(month: int) -> str:
-    """Name of a month, 1 to 12."""
     return _MONTHS[month - 1]
 
 
@@ -97,7 +96,7 @@ def significant_text(value: float | int | str | None, digits: int = 3) -> str:
 
 
 def headline_text(value: float | int | str | None) -> str:
-    """A number of the first page to three digits; one too small to be told from nothing is said to be so."""
+    """A number of the first page to three digits; one that rounds to zero is stated as below the last digit."""
     if isinstance(value, float) and 0.0 < abs(value) < 1e-3:
         return "< 0.001" if value > 0.0 else "> −0.001"
     return significant_text(value)

@@ -1,4 +1,4 @@
-"""What a report is made of: frozen values of plain arrays, numbers and text.
+"""Values of a report: frozen values of plain arrays, numbers and text.
 
 Conventions: times are ``utc_ns`` (int64, POSIX nanoseconds), angles are degrees, lengths metres, image
 coordinates pixels with pixel centres at integers, speeds metres per second. Vectors in R/T/N are radial,
@@ -11,6 +11,7 @@ A report reads no clock: the same value gives the same octets.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
@@ -84,7 +85,7 @@ class ErrorBudget:
 
 @dataclass(frozen=True, slots=True)
 class FrameAccounting:
-    """Where the frames of a pass went; None where a count is not known."""
+    """Accounting of the frames of a pass; None if a count is unknown."""
 
     expected: int | None = None
     acquired: int | None = None
@@ -559,7 +560,7 @@ class ScoreGroup:
 
 @dataclass(frozen=True, slots=True)
 class SigmaBin:
-    """How centre errors compare with the sigma predicted for them: rms of error over sigma, shares inside."""
+    """Centre errors compared with their predicted sigma: rms of error over sigma, shares inside."""
 
     label: str
     pairs: int
@@ -614,40 +615,58 @@ class DetectorReport(ReportCommon):
 
 
 @dataclass(frozen=True, slots=True)
-class RegressionGate:
-    """One requirement on a candidate build.
+class Gate:
+    """Decision of one gate, or the change of a metric that informs.
 
     Attributes
     ----------
-    limit
-        The baseline degraded by the margin, in the same unit.
     outcome
-        "pass", "fail", "inconclusive" or "not judged".
+        "pass", "fail", "inconclusive", "not judged" or "informs".
+    pass_id
+        Pass or kind of terrain; empty for all passes.
+    baseline, candidate
+        Values of the metric; NaN where unknown.
+    margin, limit
+        Tolerated loss, and the baseline with this loss.
+    change_low, change_high
+        One-sided 95 % bounds of the loss: a difference, or a share of the baseline. Positive is worse.
+    p_value, level
+        Of the test against no loss, and the level of the fail claim; NaN for exact gates.
     resolution
-        Loss that the frames find with a power of 0.8: in the unit, or as a share of the baseline.
+        Loss that these frames find with a power of 0.8; infinite if none.
     frames, frames_needed
-        Number of compared frames, and number needed to decide the gate; None if unknown.
+        Number of compared frames, and number that decides an inconclusive gate; None if unknown.
     evidence
         Number and name of the units.
     reason
-        The fact in words; may be empty.
+        The fact in words, where the figures alone do not state it.
     relative
-        Whether the resolution is a share of the baseline.
+        Whether margin, change and resolution are shares of the baseline.
     """
 
     name: str
+    outcome: str
     baseline: float
     candidate: float
+    margin: float
     limit: float
-    outcome: str
     unit: str = ""
     pass_id: str = ""
-    resolution: float = float("nan")
+    change_low: float = float("nan")
+    change_high: float = float("nan")
+    p_value: float = float("nan")
+    level: float = float("nan")
+    resolution: float = 0.0
     frames: int = 0
     frames_needed: int | None = None
     evidence: str = ""
     reason: str = ""
     relative: bool = False
+
+    @property
+    def passed(self) -> bool:
+        """Return whether the gate passed."""
+        return self.outcome == "pass"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -686,7 +705,7 @@ class RegressionReport(ReportCommon):
     regression_id: str
     candidate: str = ""
     baseline: str = ""
-    gates: tuple[RegressionGate, ...] = ()
+    gates: tuple[Gate, ...] = ()
     passes: tuple[RegressionPass, ...] = ()
     craters: ChangedCraters | None = None
     changed_tracks: tuple[ChangedTrack, ...] = ()
@@ -710,6 +729,7 @@ class MonthPass:
     packets: int
     packets_lost: int
     verdict_level: str
+    map_offset_m: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -741,7 +761,10 @@ class LevelChange:
 
 @dataclass(frozen=True, slots=True)
 class RequirementOverTime:
-    """Requirement over the passes of a rolling window; the share of met ones is NaN where none was judged."""
+    """Requirement over the passes of a rolling window; the share of met ones is NaN where none was judged.
+
+    ``remark`` says that the mean of a NEES or NIS over the passes is outside its bounds.
+    """
 
     name: str
     unit: str
@@ -753,6 +776,7 @@ class RequirementOverTime:
     share_met: float
     low: float
     high: float
+    remark: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ import numpy as np
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue
-from lunar.constants import MOON_RADIUS_M
+from lunar.constants import MOON_RADIUS_M, NS
 from lunar.frames import Orientation, matrix_from_quaternion, rtn_from_inertial
 from lunar.gravity import GravityField
 from lunar.propagation import ForceModel, propagate
@@ -49,8 +49,7 @@ from tmtc.dictionary.tables import (
     unpack_orientation_table,
 )
 
-_NS = 1_000_000_000
-_ORIENTATION_STEP_NS = 7_200 * _NS
+_ORIENTATION_STEP_NS = 7_200 * NS
 _PUSH_S = 60.0
 _ORIENTATION_MARGIN_NS = 5 * _ORIENTATION_STEP_NS
 
@@ -190,7 +189,7 @@ class NavigationRun:
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """Whether errors and claims of some runs agree; imaging frames after the settling time.
+    """Consistency of errors and claims of some runs; imaging frames after the settling time.
 
     Attributes
     ----------
@@ -241,7 +240,7 @@ def fly(case: NavigationCase, seed: int) -> NavigationRun:
     bias_rad = case.attitude_bias_rad * rng.standard_normal(3)
     lasting = rng.standard_normal((len(true_map), 2))
     detector, slow = case.detector, np.random.default_rng((seed, 3))
-    elapsed_s = np.diff(case.frame_utc_ns) / _NS
+    elapsed_s = np.diff(case.frame_utc_ns) / NS
     tilts_rad = _wandering(bias_rad, case.attitude_bias_rad, case.attitude_correlation_s, elapsed_s, slow)
     first_px, sigma_px = np.array(detector.bias_px) - given_px, detector.bias_sigma_px
     shifts_px = given_px + _wandering(first_px, sigma_px, detector.bias_correlation_s, elapsed_s, slow)
@@ -304,7 +303,7 @@ def anees_bounds(runs: int) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether the claims of a filter hold over independent runs, and where they do not."""
+    """Verdict on the claims of a filter over independent runs."""
 
     consistent: bool
     anees_bounds: tuple[float, float]
@@ -332,7 +331,7 @@ def verdict(result: Consistency, runs: int) -> Verdict:
         ),
         (worst <= slack, f"share inside 1.96 sigma {worst:.3f} from 0.95, over {slack:.3f}"),
     )
-    reasons = tuple(text for good, text in checks if not good)
+    reasons = tuple(text for holds, text in checks if not holds)
     return Verdict(not reasons, (low, high), reasons)
 
 

@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from lunar.catalogue import CraterCatalogue, make_catalogue
-from lunar.constants import MOON_RADIUS_M
+from lunar.constants import MOON_RADIUS_M, NS
 from lunar.datafolder import DataFolder
 from lunar.elements import Elements, icrf_state_from_elements
 from lunar.frames import IauOrientation
@@ -19,6 +19,7 @@ from lunar.gravity import GravityField, builtin_gravity, load_gravity
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.flight.navigation.filter.dynamics import process_noise
+from payload_emulator.flight.navigation.filter.map_offset import OffsetRule
 from payload_emulator.sim.detector import SimulatedDetector
 from studies.montecarlo import CatalogueErrors, NavigationCase
 
@@ -30,7 +31,6 @@ KAULA = 2.5e-4
 _TRUTH_DEGREE, _FILTER_DEGREE = 150, 100
 # Craters of 5 to 30 km per square metre, and the slope of their cumulative size distribution (the paper's counts).
 _DENSITY_M2, _SIZE_SLOPE = 2.09e-9, -1.77
-_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +119,7 @@ def standard_case(data: DataFolder, track: Track, hours: float, catalogued: floa
         float(tdb_s_from_utc_ns(epoch_utc_ns)),
         gravity.gm_m3_s2,
     )
-    parameters = AnchoredParameters(gravity_degree=_FILTER_DEGREE)
+    parameters = AnchoredParameters(gravity_degree=_FILTER_DEGREE, offset=OffsetRule())
     errors, shipped = parameters.errors, process_noise(_FILTER_DEGREE, other.name)
     frames = round(hours * 240.0)
     # Two arcs of 37 minutes in each period of 111, with gaps of 18 over the poles.
@@ -129,7 +129,7 @@ def standard_case(data: DataFolder, track: Track, hours: float, catalogued: floa
         epoch_utc_ns=epoch_utc_ns,
         position_icrf_m=position,
         velocity_icrf_m_s=velocity,
-        frame_utc_ns=epoch_utc_ns + np.arange(frames) * 15 * _NS,
+        frame_utc_ns=epoch_utc_ns + np.arange(frames) * 15 * NS,
         imaging=elapsed_s % 3_336.0 < 2_226.0,
         gravity=gravity,
         gravity_degree=min(_TRUTH_DEGREE, gravity.degree),

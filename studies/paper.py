@@ -26,7 +26,7 @@ from reports.text import count_text, length_text
 from reports.values import ClassScore, HeadlineFigure
 from studies import paper_steps
 from studies.paper_sessions import flights, fly
-from studies.paper_steps import Workshop
+from studies.paper_steps import StepFolder
 
 CLASS_ONLY = "class-only network"
 SHIPPED_NETWORK = "shipped network"
@@ -38,7 +38,7 @@ _METHODS = {
 _LABELS = ("5–10 km", "10–15 km", "15–30 km")
 
 
-def make_paper(shop: Workshop, *, quick: bool) -> PaperReport:
+def make_paper(steps: StepFolder, *, quick: bool) -> PaperReport:
     """Run every step that is not done yet and return the document's content.
 
     Parameters
@@ -47,18 +47,18 @@ def make_paper(shop: Workshop, *, quick: bool) -> PaperReport:
         States in the document that sizes were reduced.
     """
     missing: dict[str, str] = {}
-    orbit, curves = paper_steps.orbit(shop), paper_steps.field_of_view(shop)
-    diameters, counts, source = paper_steps.classes(shop)
-    region, samples = paper_steps.region(shop), paper_steps.sample_dataset(shop)
-    dataset = paper_steps.method_dataset(shop)
-    network = paper_steps.class_only_network(shop, dataset)
+    orbit, curves = paper_steps.orbit(steps), paper_steps.field_of_view(steps)
+    diameters, counts, source = paper_steps.classes(steps)
+    region, samples = paper_steps.region(steps), paper_steps.sample_dataset(steps)
+    dataset = paper_steps.method_dataset(steps)
+    network = paper_steps.class_only_network(steps, dataset)
     if network is None:
         missing["sessions"] = (
             "the paper's own network is trained with torch, which is not installed (make install-dev), and no "
             "--model was given"
         )
-    detectors = _detectors(shop, network, dataset)
-    sessions = tuple(fly(shop, flight) for flight in flights(shop, network))
+    detectors = _detectors(steps, network, dataset)
+    sessions = tuple(fly(steps, flight) for flight in flights(steps, network))
     classes = CatalogueClasses(diameters, counts, source)
     altitude = orbit["altitude_km"]
     month = PaperOrbit(
@@ -72,30 +72,31 @@ def make_paper(shop: Workshop, *, quick: bool) -> PaperReport:
         orbit=month,
         catalogue=classes,
         fov=_fov(curves),
-        region=_region(shop, region),
+        region=_region(steps, region),
         samples=PaperPicture(
-            paper_steps.load_png(shop.out / "samples.png"),
+            paper_steps.load_png(steps.out / "samples.png"),
             "Form of the paper's Fig. 5: samples of the data set with labels (cyan: class 0, lime: class 1, yellow: "
             "class 2).",
-            "3s (real terrain)" if shop.real else "2 (procedural Moon)",
+            "3s (real terrain)" if steps.real else "2 (procedural Moon)",
         ),
         dataset=DatasetCounts(
-            samples["frames"], _three(samples["instances"]), "GLD100" if shop.real else "procedural Moon"
+            samples["frames"], _three(samples["instances"]), "GLD100" if steps.real else "procedural Moon"
         ),
         detectors=detectors,
         sessions=sessions,
-        differences=differences(month, classes, _fov(curves), samples["frames"], detectors, sessions, shop),
+        differences=differences(month, classes, _fov(curves), samples["frames"], detectors, sessions, steps),
         verdict=_verdict(sessions),
         evidence_level=sessions[0].level,
         headline=_headline(month, () if quick else detectors, sessions),
-        provenance=_provenance(shop, network),
-        data_sources=tuple(shop.data.names()) or ("procedural Moon, low-degree gravity and IAU orientation",),
-        remarks=_remarks(quick, shop),
+        provenance=_provenance(steps, network),
+        data_sources=tuple(steps.data.names())
+        or ("procedural Moon, low-degree gravity and IAU orientation",),
+        remarks=_remarks(quick, steps),
         not_available=missing,
     )
 
 
-def _detectors(shop: Workshop, network: Path | None, dataset: Path) -> tuple[DetectorResult, ...]:
+def _detectors(steps: StepFolder, network: Path | None, dataset: Path) -> tuple[DetectorResult, ...]:
     from payload_emulator.flight.models import load_shipped_model
 
     networks = [(SHIPPED_NETWORK, "shipped", "measures sizes as well", load_shipped_model(), False)]
@@ -104,7 +105,7 @@ def _detectors(shop: Workshop, network: Path | None, dataset: Path) -> tuple[Det
         networks.insert(0, (CLASS_ONLY, "class-only", words, network.read_bytes(), True))
     found = []
     for name, key, description, octets, paper_classes in networks:
-        figures = paper_steps.evaluation(shop, key, octets, dataset, paper_classes)
+        figures = paper_steps.evaluation(steps, key, octets, dataset, paper_classes)
         found.append(
             DetectorResult(
                 name,
@@ -113,7 +114,7 @@ def _detectors(shop: Workshop, network: Path | None, dataset: Path) -> tuple[Det
                 figures["level"],
                 tuple(_score(k, _LABELS[k], row) for k, row in enumerate(figures["per_class"])),
                 _score(-1, "5–30 km", figures["micro"]),
-                paper_steps.load_gallery(shop.out / f"gallery-{key}.npz"),
+                paper_steps.load_gallery(steps.out / f"gallery-{key}.npz"),
             )
         )
     return tuple(found)
@@ -138,20 +139,20 @@ def _fov(curves: dict[str, Any]) -> FovCurves:
     )
 
 
-def _region(shop: Workshop, region: dict[str, Any]) -> PaperPicture:
+def _region(steps: StepFolder, region: dict[str, Any]) -> PaperPicture:
     latitude, longitude = paper_steps.VAVILOV_DEG
     place = f"{abs(latitude):g}° S, {longitude:g}° E"
-    if shop.real:
+    if steps.real:
         caption = (
             f"Form of the paper's Fig. 3: crater Vavilov ({place}) rendered from 110 km, Sun in the west "
             f"{paper_steps.VAVILOV_SUN_DEG:g}° high, over {region['terrain']}."
         )
-        return PaperPicture(paper_steps.load_png(shop.out / "region.png"), caption, "3s (real terrain)")
+        return PaperPicture(paper_steps.load_png(steps.out / "region.png"), caption, "3s (real terrain)")
     caption = (
         f"Form of the paper's Fig. 3: the procedural Moon at the place of the crater Vavilov ({place}), which is not "
         "on it, rendered from 110 km."
     )
-    return PaperPicture(paper_steps.load_png(shop.out / "region.png"), caption, "2 (procedural Moon)")
+    return PaperPicture(paper_steps.load_png(steps.out / "region.png"), caption, "2 (procedural Moon)")
 
 
 def _three(values: Sequence[int]) -> tuple[int, int, int]:
@@ -166,31 +167,31 @@ def differences(
     samples: int,
     detectors: Sequence[DetectorResult],
     sessions: Sequence[PaperSession],
-    shop: Workshop,
+    steps: StepFolder,
 ) -> tuple[Difference, ...]:
     """Return every difference between the paper and this run, each with one sentence."""
-    rows = [*_orbit_differences(orbit, classes, fov, sessions[0], shop), *_image_differences(samples, shop)]
+    rows = [*_orbit_differences(orbit, classes, fov, sessions[0], steps), *_image_differences(samples, steps)]
     if any(d.name == CLASS_ONLY for d in detectors):
         rows.append(
             Difference(
                 "Class-only head",
                 "15 h of training on an RTX 4060",
-                f"{shop.effort.training_steps} steps on a CPU",
+                f"{steps.effort.training_steps} steps on a CPU",
                 "Both networks give class heatmaps and offsets; this one starts from the shipped weights and sees "
-                f"{shop.effort.method_frames} images, so precision and recall are those of a short training.",
+                f"{steps.effort.method_frames} images, so precision and recall are those of a short training.",
             )
         )
     return (*rows, *_METHOD_DIFFERENCES)
 
 
 def _orbit_differences(
-    orbit: PaperOrbit, classes: CatalogueClasses, fov: FovCurves, first: PaperSession, shop: Workshop
+    orbit: PaperOrbit, classes: CatalogueClasses, fov: FovCurves, first: PaperSession, steps: StepFolder
 ) -> list[Difference]:
     return [
         Difference(
             "Images of the session",
             f"{count_text(published.SESSION_FRAMES)} in about 24 h",
-            f"{count_text(first.frames)} in {shop.effort.hours:g} h",
+            f"{count_text(first.frames)} in {steps.effort.hours:g} h",
             f"24 h at 15 s within 60° of latitude, the limit of Section V-B.4, give at most "
             f"{count_text(orbit.frames_of_a_day)} images; 5,196 need either images up to 81° of latitude or 32.5 h.",
         ),
@@ -217,12 +218,12 @@ def _orbit_differences(
     ]
 
 
-def _image_differences(samples: int, shop: Workshop) -> list[Difference]:
+def _image_differences(samples: int, steps: StepFolder) -> list[Difference]:
     return [
         Difference(
             "Pictures",
             "Blender Cycles on SLDEM2015 at 256 px/deg",
-            f"own renderer on {'GLD100' if shop.real else 'a procedural Moon'}",
+            f"own renderer on {'GLD100' if steps.real else 'a procedural Moon'}",
             "The fast renderer agrees with Cycles in shadows and radiance (documentation, renderers) and makes "
             "24 h of images in minutes.",
         ),
@@ -299,18 +300,18 @@ def _headline(
     return tuple(figures)
 
 
-def _provenance(shop: Workshop, network: Path | None) -> dict[str, str]:
+def _provenance(steps: StepFolder, network: Path | None) -> dict[str, str]:
     rows = {
         "Command": "linna paper",
-        "Session": f"paper-day, {shop.effort.hours:g} h, seed 2029",
-        "Training": f"{shop.effort.method_frames} images, {shop.effort.training_steps} steps",
+        "Session": f"paper-day, {steps.effort.hours:g} h, seed 2029",
+        "Training": f"{steps.effort.method_frames} images, {steps.effort.training_steps} steps",
     }
     if network is not None:
         rows["Class-only network SHA-256"] = hashlib.sha256(network.read_bytes()).hexdigest()
     return rows
 
 
-def _remarks(quick: bool, shop: Workshop) -> tuple[str, ...]:
+def _remarks(quick: bool, steps: StepFolder) -> tuple[str, ...]:
     rows = [
         "Figs. 1 and 2 of the paper are block diagrams of the payload; the documentation of this system has its own.",
         "The paper's Figs. 7, 8 and 10 are drawings without a table of values; only their form can be compared.",
@@ -318,7 +319,7 @@ def _remarks(quick: bool, shop: Workshop) -> tuple[str, ...]:
         "over the procedural Moon (level 2).",
     ]
     if quick:
-        effort = shop.effort
+        effort = steps.effort
         rows.insert(
             0,
             f"Quick run: {effort.hours:g} h instead of 24 h, {effort.sample_frames} and {effort.method_frames} images "

@@ -25,7 +25,7 @@ from reports.values import (
     TimeSpan,
     TrackSeries,
 )
-from studies.paper_steps import Workshop, load_png
+from studies.paper_steps import StepFolder, load_png
 
 ACTOR = "linna paper"
 ODOMETRY = ("paper", "spherical")
@@ -44,10 +44,10 @@ class Flight:
     own_method: bool
 
 
-def flights(shop: Workshop, network: Path | None) -> tuple[Flight, ...]:
+def flights(steps: StepFolder, network: Path | None) -> tuple[Flight, ...]:
     """The sessions: the paper's method, this system's estimators, and real terrain never used in training."""
     day = load_scenario("paper-day")
-    day = replace(day, window=replace(day.window, duration_s=shop.effort.hours * 3600.0))
+    day = replace(day, window=replace(day.window, duration_s=steps.effort.hours * 3600.0))
     ours = replace(day, navigation=replace(day.navigation, estimators=("paper", "spherical", "anchored")))
     found = []
     if network is not None:
@@ -57,7 +57,7 @@ def flights(shop: Workshop, network: Path | None) -> tuple[Flight, ...]:
             Flight(
                 "own",
                 "State estimation by the paper's method (Figs. 7 to 10)",
-                f"{shop.effort.hours:g} hours from the paper's epoch, an image each 15 s within 60° of latitude, Sun "
+                f"{steps.effort.hours:g} hours from the paper's epoch, an image each 15 s within 60° of latitude, Sun "
                 "5–15° high. The network is class-only, as in the paper: it gives positions and classes, no sizes. "
                 "“paper” is the odometry of Section VI on a flat Moon, “spherical” the same odometry with exact "
                 "back-projection to the sphere. Both read the ground-truth ephemeris at resets and for the scale.",
@@ -69,25 +69,25 @@ def flights(shop: Workshop, network: Path | None) -> tuple[Flight, ...]:
         Flight(
             "ours",
             "The same with the estimators of this system",
-            f"The same {shop.effort.hours:g} hours with the shipped network, which also measures sizes. “anchored” is "
+            f"The same {steps.effort.hours:g} hours with the shipped network, which also measures sizes. “anchored” is "
             "the on-board filter that identifies craters of an uploaded catalogue. It starts 5 km and 5 m/s off and "
             "never reads the truth. “smoothed” is the same filter improved on the ground with later data.",
             ours,
             False,
         )
     )
-    if shop.real:
+    if steps.real:
         unseen = load_scenario("unseen-strip")
         unseen = replace(
             unseen,
-            window=replace(unseen.window, passes=shop.effort.unseen_passes),
+            window=replace(unseen.window, passes=steps.effort.unseen_passes),
             navigation=replace(unseen.navigation, estimators=("paper", "spherical", "anchored")),
         )
         found.append(
             Flight(
                 "unseen",
                 "The same over real terrain never used in training",
-                f"{shop.effort.unseen_passes} passes over 285–300° E of GLD100 with the shipped network, which was "
+                f"{steps.effort.unseen_passes} passes over 285–300° E of GLD100 with the shipped network, which was "
                 "trained on other ground.",
                 unseen,
                 False,
@@ -96,34 +96,34 @@ def flights(shop: Workshop, network: Path | None) -> tuple[Flight, ...]:
     return tuple(found)
 
 
-def fly(shop: Workshop, flight: Flight) -> PaperSession:
+def fly(steps: StepFolder, flight: Flight) -> PaperSession:
     """Fly, ingest and evaluate a session, or read the results of an earlier run of the same."""
     network = Path(flight.scenario.detector.network)
     made_from = {
         "scenario": format_scenario(flight.scenario),
         "network": hashlib.sha256(network.read_bytes()).hexdigest() if network.is_file() else network.name,
     }
-    archive, report = shop.out / "flights" / flight.key, shop.out / f"session-{flight.key}.json"
+    archive, report = steps.out / "flights" / flight.key, steps.out / f"session-{flight.key}.json"
     if not (archive / "manifest.json").is_file():
-        (shop.out / "steps" / f"flight {flight.key}.json").unlink(missing_ok=True)
+        (steps.out / "steps" / f"flight {flight.key}.json").unlink(missing_ok=True)
 
     def make_flight() -> dict[str, Any]:
         archive.parent.mkdir(parents=True, exist_ok=True)
-        summary = emulate(flight.scenario, shop.data, archive, frames_kept=8, progress=shop.progress)
+        summary = emulate(flight.scenario, steps.data, archive, frames_kept=8, progress=steps.progress)
         return {"frames": summary["frames"], "wall_s": summary["wall_s"]}
 
     def make_report() -> dict[str, Any]:
-        home = shop.out / "ground" / flight.key
+        home = steps.out / "ground" / flight.key
         shutil.rmtree(home, ignore_errors=True)  # of an interrupted run, or of another version
-        with local_client(open_ground(home, shop.data), ACTOR) as service:
+        with local_client(open_ground(home, steps.data), ACTOR) as service:
             pass_id = service.import_archive(archive)
             service.get_report(service.make_report(pass_id), report, format="json")
         return {"pass_id": pass_id}
 
-    flown = shop.step(f"flight {flight.key}", made_from, make_flight)
+    flown = steps.step(f"flight {flight.key}", made_from, make_flight)
     if not report.is_file():
-        (shop.out / "steps" / f"report {flight.key}.json").unlink(missing_ok=True)
-    shop.step(f"report {flight.key}", made_from, make_report)
+        (steps.out / "steps" / f"report {flight.key}.json").unlink(missing_ok=True)
+    steps.step(f"report {flight.key}", made_from, make_report)
     return session_of(flight, int(flown["frames"]), archive, json.loads(report.read_text(encoding="utf-8")))
 
 

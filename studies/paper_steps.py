@@ -83,8 +83,8 @@ QUICK = Effort(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Workshop:
-    """Where the steps work and with what.
+class StepFolder:
+    """Working folder and inputs of the steps.
 
     `model` is a class-only network made elsewhere; None: it is trained, if torch is installed.
     """
@@ -122,17 +122,17 @@ class Workshop:
         return self.data.catalogue_composite or self.data.catalogue_lu or self.data.catalogue_robbins
 
 
-def orbit(shop: Workshop) -> dict[str, Any]:
+def orbit(steps: StepFolder) -> dict[str, Any]:
     """Altitudes over the month, and the images that a day can give."""
 
     def make() -> dict[str, Any]:
         scenario = load_scenario("selenita")
-        model = force_model(scenario, shop.data)
-        flown = propagate_scenario(scenario, model, shop.effort.days * 86_400.0)
+        model = force_model(scenario, steps.data)
+        flown = propagate_scenario(scenario, model, steps.effort.days * 86_400.0)
         _, states = sample(flown, 30.0)
         altitude_km = (np.linalg.norm(states[:, :3], axis=1) - MOON_RADIUS_M) / 1e3
         ephemeris, _ = sample(flown, 15.0)
-        orientation = default_orientation(shop.data)
+        orientation = default_orientation(steps.data)
         first_day = even_epochs(ephemeris, 15.0)[: 24 * 240]
         latitude = np.degrees(ground_track(ephemeris, orientation, first_day).latitude_rad)
         return {
@@ -144,38 +144,40 @@ def orbit(shop: Workshop) -> dict[str, Any]:
                 "min": float(altitude_km.min()),
                 "max": float(altitude_km.max()),
             },
-            "days": shop.effort.days,
+            "days": steps.effort.days,
             "maneuvers": len(flown.maneuvers),
             "frames_of_a_day": int(np.count_nonzero(np.abs(latitude) <= 60.0)),
             "gravity": f"{model.gravity.name} to degree {model.degree}",
         }
 
-    return dict(shop.step("orbit", {"days": shop.effort.days}, make))
+    return dict(steps.step("orbit", {"days": steps.effort.days}, make))
 
 
-def open_catalogue(shop: Workshop) -> CraterCatalogue:
+def open_catalogue(steps: StepFolder) -> CraterCatalogue:
     """The most complete real catalogue, or a synthetic one of the paper's density."""
-    return paper_density_catalogue(1) if shop.catalogue_path is None else load_catalogue(shop.catalogue_path)
+    return (
+        paper_density_catalogue(1) if steps.catalogue_path is None else load_catalogue(steps.catalogue_path)
+    )
 
 
-def paper_density(shop: Workshop) -> CraterCatalogue:
+def paper_density(steps: StepFolder) -> CraterCatalogue:
     """A catalogue with the paper's class counts: the real one with random craters in its empty tiles, or synthetic."""
-    path = shop.data.catalogue_lu
+    path = steps.data.catalogue_lu
     return paper_density_catalogue(1) if path is None else completed_to_paper(load_catalogue(path), 1)
 
 
-def field_of_view(shop: Workshop) -> dict[str, Any]:
+def field_of_view(steps: StepFolder) -> dict[str, Any]:
     """The paper's study of the field of view over the month's orbit."""
 
     def make() -> dict[str, Any]:
         scenario = load_scenario("selenita")
-        flown = propagate_scenario(scenario, force_model(scenario, shop.data), shop.effort.days * 86_400.0)
-        ephemeris, _ = sample(flown, shop.effort.fov_step_s)
+        flown = propagate_scenario(scenario, force_model(scenario, steps.data), steps.effort.days * 86_400.0)
+        ephemeris, _ = sample(flown, steps.effort.fov_step_s)
         track = ground_track(
-            ephemeris, default_orientation(shop.data), even_epochs(ephemeris, shop.effort.fov_step_s)
+            ephemeris, default_orientation(steps.data), even_epochs(ephemeris, steps.effort.fov_step_s)
         )
         position = mcmf_from_spherical(track.latitude_rad, track.longitude_rad, track.altitude_m)
-        study = study_field_of_view(position, paper_density(shop))
+        study = study_field_of_view(position, paper_density(steps))
         return {
             "fov_deg": study.fov_deg.tolist(),
             "probability": {str(n): values.tolist() for n, values in study.probability_at_least.items()},
@@ -185,24 +187,29 @@ def field_of_view(shop: Workshop) -> dict[str, Any]:
         }
 
     return dict(
-        shop.step(
+        steps.step(
             "fov",
-            {"days": shop.effort.days, "step_s": shop.effort.fov_step_s, "density": "paper", "places": "all"},
+            {
+                "days": steps.effort.days,
+                "step_s": steps.effort.fov_step_s,
+                "density": "paper",
+                "places": "all",
+            },
             make,
         )
     )
 
 
-def classes(shop: Workshop) -> tuple[FloatArray, tuple[int, int, int], str]:
+def classes(steps: StepFolder) -> tuple[FloatArray, tuple[int, int, int], str]:
     """Diameters of 5 to 30 km, kilometres, the counts of the classes, and the source."""
-    catalogue = open_catalogue(shop)
+    catalogue = open_catalogue(steps)
     first, second, third = (int(n) for n in class_counts(catalogue))
     return catalogue.diameter_m / 1e3, (first, second, third), catalogue.source
 
 
-def region(shop: Workshop) -> dict[str, Any]:
+def region(steps: StepFolder) -> dict[str, Any]:
     """A picture of the place of the paper's Fig. 3, `region.png`."""
-    path = shop.out / "region.png"
+    path = steps.out / "region.png"
 
     def make() -> dict[str, Any]:
         from payload_emulator.sim.render.photometry import Photometry
@@ -210,9 +217,9 @@ def region(shop: Workshop) -> dict[str, Any]:
         from payload_emulator.sim.terrain.opening import open_terrain
 
         terrain = (
-            open_terrain("raster", shop.data, 1, sharpen=False)
-            if shop.real
-            else open_terrain("procedural", shop.data, 1)
+            open_terrain("raster", steps.data, 1, sharpen=False)
+            if steps.real
+            else open_terrain("procedural", steps.data, 1)
         )
         latitude, longitude = (math.radians(v) for v in VAVILOV_DEG)
         position = mcmf_from_spherical(latitude, longitude, VAVILOV_ALTITUDE_M)
@@ -230,59 +237,59 @@ def region(shop: Workshop) -> dict[str, Any]:
         return {"terrain": terrain.name, "data": list(terrain.data_names)}
 
     if not path.is_file():
-        (shop.out / "steps" / "region.json").unlink(missing_ok=True)
-    return dict(shop.step("region", {"place": VAVILOV_DEG, "altitude_m": VAVILOV_ALTITUDE_M}, make))
+        (steps.out / "steps" / "region.json").unlink(missing_ok=True)
+    return dict(steps.step("region", {"place": VAVILOV_DEG, "altitude_m": VAVILOV_ALTITUDE_M}, make))
 
 
-def sample_dataset(shop: Workshop) -> dict[str, Any]:
+def sample_dataset(steps: StepFolder) -> dict[str, Any]:
     """The paper's data set in small, with a sheet of its frames, `samples.png`."""
     recipe = load_recipe(SHIPPED / "paper-dataset.toml")
-    if shop.real:
+    if steps.real:
         recipe = replace(recipe, sources=tuple(replace(source, terrain="real") for source in recipe.sources))
-    folder = shop.out / f"samples-{recipe.digest[:8]}-{shop.effort.sample_frames}"
+    folder = steps.out / f"samples-{recipe.digest[:8]}-{steps.effort.sample_frames}"
 
     def make() -> dict[str, Any]:
         from payload_emulator.training.data.integrity import summarise
         from payload_emulator.training.evaluate.sheets import draw_sheet
 
-        _build(shop, recipe, folder, shop.effort.sample_frames)
+        _build(steps, recipe, folder, steps.effort.sample_frames)
         sheet = draw_sheet(Dataset(folder), "", SAMPLE_COLUMNS, SAMPLE_ROWS, 320)
-        save_png(shop.out / "samples.png", sheet)
+        save_png(steps.out / "samples.png", sheet)
         figures = summarise(folder)
         return {name: figures[name] for name in ("frames", "instances", "labels_sha256", "data")}
 
-    made_from = {"recipe": recipe.digest, "frames": shop.effort.sample_frames}
-    return dict(shop.step("samples", made_from, make))
+    made_from = {"recipe": recipe.digest, "frames": steps.effort.sample_frames}
+    return dict(steps.step("samples", made_from, make))
 
 
-def method_dataset(shop: Workshop) -> Path:
+def method_dataset(steps: StepFolder) -> Path:
     """Data set of the paper's own detector; without real terrain, its procedural sources alone."""
     recipe = load_recipe(SHIPPED / "paper-method-dataset.toml")
-    if not shop.real:
+    if not steps.real:
         kept = [source for source in recipe.sources if source.terrain == "procedural"]
         total = sum(source.share for source in kept)
         recipe = replace(
             recipe, sources=tuple(replace(source, share=source.share / total) for source in kept)
         )
-    folder = shop.out / f"method-{recipe.digest[:8]}-{shop.effort.method_frames}"
+    folder = steps.out / f"method-{recipe.digest[:8]}-{steps.effort.method_frames}"
 
     def make() -> dict[str, Any]:
-        _build(shop, recipe, folder, shop.effort.method_frames)
+        _build(steps, recipe, folder, steps.effort.method_frames)
         return {"labels_sha256": Dataset(folder).digest}
 
-    shop.step("method data set", {"recipe": recipe.digest, "frames": shop.effort.method_frames}, make)
+    steps.step("method data set", {"recipe": recipe.digest, "frames": steps.effort.method_frames}, make)
     return folder
 
 
-def class_only_network(shop: Workshop, dataset: Path) -> Path | None:
+def class_only_network(steps: StepFolder, dataset: Path) -> Path | None:
     """The paper's own detector: class heatmaps and offsets; None where it cannot be trained here."""
     import importlib.util
 
-    if shop.model is not None:
-        return shop.model
+    if steps.model is not None:
+        return steps.model
     if importlib.util.find_spec("torch") is None:
         return None
-    path = shop.out / "class-only.onnx"
+    path = steps.out / "class-only.onnx"
 
     def make() -> dict[str, Any]:
         from payload_emulator.flight.models import DEFAULT_NETWORK, load_shipped_model
@@ -291,32 +298,32 @@ def class_only_network(shop: Workshop, dataset: Path) -> Path | None:
         from payload_emulator.training.model.export import export
         from payload_emulator.training.model.train import train
 
-        run = shop.out / f"run-{dataset.name}-{shop.effort.training_steps}"
-        start = shop.out / "start.onnx"
+        run = steps.out / f"run-{dataset.name}-{steps.effort.training_steps}"
+        start = steps.out / "start.onnx"
         start.write_bytes(load_shipped_model(DEFAULT_NETWORK))
         parameters = TrainParameters(
             minutes=0.0,
-            steps=shop.effort.training_steps,
+            steps=steps.effort.training_steps,
             learning_rate=1e-3,
             replicas=1,
             seed=5,
             preparation=Preparation.normalise_first,
         )
         sets = [Dataset(dataset)]
-        train(sets, run, parameters, start_from=start, report=shop.log)
+        train(sets, run, parameters, start_from=start, report=steps.log)
         best = run / "best.pt"
         export(best if best.is_file() else run / "checkpoint.pt", path, sets, classes_only=True)
-        return {"steps": shop.effort.training_steps}
+        return {"steps": steps.effort.training_steps}
 
-    made_from = {"labels": Dataset(dataset).digest, "steps": shop.effort.training_steps}
+    made_from = {"labels": Dataset(dataset).digest, "steps": steps.effort.training_steps}
     if not path.is_file():
-        (shop.out / "steps" / "class-only network.json").unlink(missing_ok=True)
-    shop.step("class-only network", made_from, make)
+        (steps.out / "steps" / "class-only network.json").unlink(missing_ok=True)
+    steps.step("class-only network", made_from, make)
     return path
 
 
 def evaluation(
-    shop: Workshop, name: str, octets: bytes, dataset: Path, paper_classes: bool
+    steps: StepFolder, name: str, octets: bytes, dataset: Path, paper_classes: bool
 ) -> dict[str, Any]:
     """Scores of a network on the test frames of the highest evidence level available.
 
@@ -324,8 +331,8 @@ def evaluation(
     """
     import hashlib
 
-    path = shop.out / f"gallery-{name}.npz"
-    source = "real-strip" if shop.real else "procedural-world"
+    path = steps.out / f"gallery-{name}.npz"
+    source = "real-strip" if steps.real else "procedural-world"
 
     def make() -> dict[str, Any]:
         from payload_emulator.training.evaluate.evaluate import open_for_evaluation, run, summary
@@ -338,7 +345,7 @@ def evaluation(
             "test",
             source,
             None,
-            lambda f: shop.progress(f, len(f)),
+            lambda f: steps.progress(f, len(f)),
             paper_classes=paper_classes,
         )
         figures = summary(detector, sets, scored, "test", source)
@@ -348,21 +355,21 @@ def evaluation(
         return {key: figures[key] for key in kept}
 
     if not path.is_file():
-        (shop.out / "steps" / f"evaluation of {name}.json").unlink(missing_ok=True)
+        (steps.out / "steps" / f"evaluation of {name}.json").unlink(missing_ok=True)
     made_from = {
         "model": hashlib.sha256(octets).hexdigest(),
         "labels": Dataset(dataset).digest,
         "source": source,
     }
-    return dict(shop.step(f"evaluation of {name}", made_from, make))
+    return dict(steps.step(f"evaluation of {name}", made_from, make))
 
 
-def _build(shop: Workshop, recipe: Recipe, folder: Path, frames: int) -> None:
+def _build(steps: StepFolder, recipe: Recipe, folder: Path, frames: int) -> None:
     from payload_emulator.training.data.build import build
 
-    for done, total in build(recipe, folder, frames, shop.data, 1):
+    for done, total in build(recipe, folder, frames, steps.data, 1):
         if done % 20 == 0 or done == total:
-            shop.log(f"{folder.name}: {done}/{total} frames")
+            steps.log(f"{folder.name}: {done}/{total} frames")
 
 
 def save_png(path: Path, picture: Any) -> None:

@@ -8,6 +8,7 @@ of the windows of all seeds together. The first frames of a session, which start
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +30,7 @@ from payload_emulator.session.spacecraft.loop import new_spacecraft
 from payload_emulator.session.spacecraft.schedule import fly_scenario, timeline
 from payload_emulator.session.world.world import World, build_world, registered_share
 from payload_emulator.sim.terrain.curation import Region
+from reports.statistics import sigma_remark
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
@@ -38,6 +40,9 @@ SETTLED_FRAMES = 20
 TRACK_FRAMES = (5, 2)
 """A crater is counted on its track with so many frames that have it in the image, and as found with so many that
 detect it."""
+
+COAST_FRAMES = (1, 60, 120)
+"""Numbers of frames before a coast from which coasts are counted together."""
 
 RECALL_GROUPS = {
     "5_30_km": "5 to 30 km",
@@ -49,7 +54,11 @@ RECALL_GROUPS = {
 
 
 class SurveyWindow(BaseModel):
-    """One window; errors of the position in metres, and the share of frames within 2 sigma along each axis."""
+    """One window; errors of the position in metres, and the share of frames within 2 sigma along each axis.
+
+    The coast ends at the first frame of the window: its error, the same over its standard deviation along each axis,
+    and the frames of the session before it.
+    """
 
     seed: int
     longitude_deg: float
@@ -63,6 +72,8 @@ class SurveyWindow(BaseModel):
     nees: float
     nis: float | None
     coast_end_m: float | None
+    coast_sigmas: tuple[float, float, float] | None = None
+    coast_frames: int = 0
     position_m: tuple[float, ...]
 
 
@@ -123,10 +134,10 @@ def _flown(world: World, data: DataFolder, progress: Progress) -> SurveySession:
     spacecraft = new_spacecraft(world, loaded)
     attitudes = np.full((world.frame_utc_ns.size, 3, 3), np.nan)
     packets: list[bytes] = []
-    for turn in progress(fly_scenario(world, spacecraft), len(timeline(world))):
-        packets += turn.packets
-        if turn.exposure is not None:
-            attitudes[turn.moment.frame] = turn.exposure.camera_from_mcmf
+    for result in progress(fly_scenario(world, spacecraft), len(timeline(world))):
+        packets += result.packets
+        if result.exposure is not None:
+            attitudes[result.step.frame] = result.exposure.camera_from_mcmf
     judged = judge_session(world, loaded, catalogue, attitudes, b"".join(packets))
     if judged is None:
         raise ScenarioError(
@@ -183,7 +194,8 @@ def _windows(world: World, judged: JudgedSession) -> tuple[SurveyWindow, ...]:
             continue
         chosen = judged.imaging & (number >= start) & (number <= last)
         rtn, sigma = errors.state_error_rtn[mine, :3], errors.sigma_rtn_m[mine]
-        coast = errors.coast_end_m[errors.frame == first]
+        here = errors.frame == first
+        coast, sigmas = errors.coast_end_m[here], errors.coast_sigmas[here]
         rows.append(
             SurveyWindow(
                 seed=world.scenario.seed,
@@ -198,6 +210,8 @@ def _windows(world: World, judged: JudgedSession) -> tuple[SurveyWindow, ...]:
                 nees=errors.nees[mine].mean(),
                 nis=judged.nis_per_degree(chosen),
                 coast_end_m=coast[0] if np.isfinite(coast).all() and coast.size else None,
+                coast_sigmas=tuple(sigmas[0]) if np.isfinite(sigmas).all() and coast.size else None,
+                coast_frames=int(judged.imaging[:first].sum()),
                 position_m=tuple(errors.position_m[mine]),
             )
         )
@@ -246,9 +260,11 @@ def summary(sessions: Sequence[SurveySession]) -> dict[str, Any]:
         "median_95_m": np.percentile(medians, (2.5, 97.5)).tolist(),
         "p95_m": float(np.percentile(position, 95.0)),
         "max_m": float(position.max()),
+        "coasts": _coasts(windows),
         "coast_end_p95_m": float(np.percentile(coasts, 95.0)) if coasts else None,
         "nees_mean": float(nees.mean()),
         "bounds": [float(low), float(high)],
+        "nees_remark": sigma_remark(float(nees.mean()) / 6.0, float(low) / 6.0, float(high) / 6.0),
         "nees_trend": float(np.polyfit(order, nees, 1)[0]) if np.ptp(order) > 0 else None,
         "nees_above_12_6_share": float((nees > 12.6).mean()),
         "bias_rtn_m": bias.tolist(),
@@ -263,6 +279,21 @@ def summary(sessions: Sequence[SurveySession]) -> dict[str, Any]:
         "level": sessions[0].level,
         "data": list(sessions[0].data),
     }
+
+
+def _coasts(windows: Sequence[SurveyWindow]) -> list[dict[str, Any]]:
+    """Return the coasts by the frames before them: number, largest error, share of the axes within 2 sigma."""
+    rows = []
+    for least, most in zip(COAST_FRAMES, (*COAST_FRAMES[1:], math.inf), strict=True):
+        mine = [one for one in windows if one.coast_sigmas is not None and least <= one.coast_frames < most]
+        if mine:
+            inside = np.abs([one.coast_sigmas for one in mine]) <= 2.0
+            largest_m = max(one.coast_end_m or 0.0 for one in mine)
+            share = float(np.mean(inside))
+            rows.append(
+                {"frames_from": least, "coasts": len(mine), "max_m": largest_m, "inside_2_sigma": share}
+            )
+    return rows
 
 
 def format_survey(figures: dict[str, Any]) -> str:
@@ -295,7 +326,16 @@ def format_survey(figures: dict[str, Any]) -> str:
             + ("" if coast is None else f"; end of coast 95 % {coast:.0f} m"),
             f"mean NEES(6) {figures['nees_mean']:.2f}, bounds {least:.2f} to {most:.2f} for {len(figures['windows'])} "
             f"windows; within 2 sigma {', '.join(f'{axis.upper()} {share:.2f}' for axis, share in inside.items())}; "
-            f"NIS {nis}",
+            f"NIS {nis}" + (f"; {wrong}" if (wrong := figures["nees_remark"]) else ""),
+            "coasts, by the frames before them: "
+            + (
+                "; ".join(
+                    f"from {row['frames_from']} on {row['coasts']}, largest {row['max_m']:.0f} m, "
+                    f"within 2 sigma {row['inside_2_sigma']:.2f}"
+                    for row in figures["coasts"]
+                )
+                or "none"
+            ),
             f"fixed {100 * figures['fixed_share']:.1f} %; wrong pairs {100 * figures['wrong_pairs_share']:.2f} %, "
             f"wrong fixes {figures['wrong_fixes']}; crater list {stated}",
             f"{100 * figures['catalogued_share']:.0f} % of the detections are catalogued craters; detected of the "

@@ -10,8 +10,22 @@ import pytest
 from _pytest.assertion import rewrite
 from hypothesis import settings
 
+from ground_service import clock
 from tests.cost import Cost
 
+
+def _keep_temporary_files_in_memory() -> None:
+    """Use a folder in memory, if there is one with room: a disk takes milliseconds for each commit of a database."""
+    place = Path("/dev/shm")
+    if not os.access(place, os.W_OK):
+        return
+    found = os.statvfs(place)
+    if found.f_bavail * found.f_frsize >= 4 << 30 and not found.f_flag & os.ST_NOEXEC:
+        os.environ.setdefault("TMPDIR", str(place))
+
+
+_keep_temporary_files_in_memory()
+os.environ.setdefault("MALLOC_ARENA_MAX", "2")  # memory that threads of ended tests have used is used again
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
 os.environ.setdefault("NUMBA_SLP_VECTORIZE", "1")
@@ -25,7 +39,17 @@ settings.load_profile("linna")
 
 
 # Libraries that no test needs before it runs: they cost each process seconds and hundreds of megabytes.
-HEAVY = ("torch", "astropy", "scipy.stats", "matplotlib", "onnxscript", "playwright")
+HEAVY = (
+    "torch",
+    "astropy",
+    "scipy.stats",
+    "matplotlib",
+    "onnxscript",
+    "playwright",
+    "pandas",
+    "pyarrow",
+    "rasterio",
+)
 IMPORTED = pytest.StashKey[list[str]]()
 
 
@@ -87,9 +111,8 @@ def _campaigns() -> set[str]:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark campaigns; run slow files first, browser tests last, the largest file first; real data only with LINNA_DATA.
+    """Mark campaigns; run browser tests and slow files first, the largest first; real data only with LINNA_DATA.
 
-    A driven browser keeps an event loop in the thread of the tests, in which `asyncio.run` is then refused.
     With several processes this needs `--no-loadscope-reorder`.
     """
     moved = _campaigns()
@@ -103,13 +126,21 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     driven = {item.path for item in items if "browser" in getattr(item, "fixturenames", ())}
     sizes = Counter(item.path for item in items if item.path in driven)
     slow = Counter(item.path for item in items if "slow" in item.keywords)
-    items.sort(key=lambda item: (item.path in driven, -slow[item.path], -sizes[item.path]))
+    items.sort(key=lambda item: (-sizes[item.path], -slow[item.path]))
     if os.environ.get("LINNA_DATA"):
         return
     skip = pytest.mark.skip(reason="LINNA_DATA is not set: no real data on this machine")
     for item in items:
         if "real_data" in item.keywords:
             item.add_marker(skip)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call():
+    """Forget the mission clock of a command that a test has run in this process: its home may be removed."""
+    stated = clock._mission.stated
+    yield
+    clock.follow_missions(stated)
 
 
 @pytest.fixture(scope="session")

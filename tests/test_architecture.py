@@ -28,7 +28,7 @@ def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
         capture_output=True,
         text=True,
         check=False,
-        env={"PYTHONPATH": str(folder), "PATH": "/usr/bin:/bin"},
+        env={"PYTHONPATH": str(folder), "PATH": "/usr/bin:/bin", "COLUMNS": "300"},
     )
 
 
@@ -49,27 +49,28 @@ def test_every_import_contract_is_kept() -> None:
     assert result.returncode == 0, result.stdout
 
 
-@pytest.mark.parametrize(
-    ("module", "planted"),
-    [
-        ("payload_emulator/flight/navigation/odometry/odometry.py", "import payload_emulator.sim"),
-        ("payload_emulator/flight/navigation/odometry/odometry.py", "import torch"),
-        ("payload_emulator/flight/payload.py", "import payload_emulator.training"),
-        ("payload_emulator/session/archive/emulator.py", "import ground_service"),
-        ("ground_service/__init__.py", "import payload_emulator"),
-        ("lunar/camera.py", "import tmtc"),
-        ("ground_service/evaluation/core.py", "import sqlalchemy"),
-        ("ground_service/ingest/service.py", "import ground_service.evaluation.service"),
-        ("payload_emulator/sim/render/renderer.py", "import payload_emulator.session.world.world"),
-        ("tmtc/dictionary/tables.py", "import lunar.constants"),
-    ],
-)
-def test_a_planted_import_across_a_wall_is_refused(copy_of_the_tree: Path, module: str, planted: str) -> None:
-    file = copy_of_the_tree / module
-    file.write_text(file.read_text() + f"\n{planted}\n")
+WALLS = [
+    ("payload_emulator.flight.navigation.odometry.odometry", "payload_emulator.sim"),
+    ("payload_emulator.flight.navigation.odometry.odometry", "torch"),
+    ("payload_emulator.flight.payload", "payload_emulator.training"),
+    ("payload_emulator.session.archive.emulator", "ground_service"),
+    ("ground_service.errors", "payload_emulator"),
+    ("lunar.camera", "tmtc"),
+    ("ground_service.evaluation.core", "sqlalchemy"),
+    ("ground_service.ingest.service", "ground_service.evaluation.service"),
+    ("payload_emulator.sim.render.renderer", "payload_emulator.session.world.world"),
+    ("tmtc.dictionary.tables", "lunar.constants"),
+]
+
+
+def test_planted_imports_across_walls_are_refused(copy_of_the_tree: Path) -> None:
+    for module, imported in WALLS:
+        with (copy_of_the_tree / f"{module.replace('.', '/')}.py").open("a") as file:
+            file.write(f"\nimport {imported}\n")
     result = lint_imports(copy_of_the_tree)
-    assert result.returncode == 1, result.stdout
-    assert "BROKEN" in result.stdout
+    assert result.returncode == 1 and "BROKEN" in result.stdout
+    told = " ".join(result.stdout.split())
+    assert [wall for wall in WALLS if f"{wall[0]} -> {wall[1]} (" not in told] == []
 
 
 def modules_of(root: Path) -> dict[str, Path]:
@@ -156,9 +157,9 @@ def test_no_import_cycles_also_in_functions_and_for_type_checking() -> None:
     ("module", "planted", "cycle"),
     [
         (
-            "ground_service/ingest/packets.py",
+            "ground_service/ingest/frames.py",
             "def late():\n    from ground_service.ingest import service",
-            "ground_service.ingest.packets",
+            "ground_service.ingest.frames",
         ),
         (
             "ground_service/store/files.py",
@@ -199,7 +200,11 @@ def modules_with_sql(root: Path) -> list[str]:
     found = []
     for name, file in modules_of(root).items():
         parts = name.split(".")
-        if parts[0] != "ground_service" or parts[1:2] == ["store"] or re.fullmatch(r"(.*_)?store", parts[-1]):
+        if (
+            parts[0] != "ground_service"
+            or parts[1:2] in (["store"], ["telemetry"])
+            or re.fullmatch(r"(.*_)?store", parts[-1])
+        ):
             continue
         if name in SMALL:
             continue
@@ -300,3 +305,23 @@ def test_a_planted_function_of_one_line_more_is_found(tmp_path: Path) -> None:
     assert long_functions(tmp_path) == []
     file.write_text("async def longer():\n" + "    pass\n" * LONGEST_FUNCTION)
     assert long_functions(tmp_path) == ["lunar.planted.longer: 81 lines"]
+
+
+DECODED = re.compile(
+    r'(?<=""")(?:What|Where|Who|How|When|Why|Whether|Which)\b'  # the start of a docstring
+    r"|(?<!kidnap )\b(?:told|heard(?!: UtcTime)|anew|at hand|beside|for good|lets? go of|came? to (?:an|no) end)\b"
+    r"|\b(?:class|def) \w*(?<![a-z])(?:told|heard|beside|anew)(?![a-z])\w*"
+    r"|\bclass (?:Moment|Turn|Given|Begun|Asked|Hand|Found|Shelving|Workshop|Patience|Craft|Facts|Eye|Told)\b"
+)
+
+
+def test_names_messages_and_docstrings_use_the_terms_of_the_field() -> None:
+    found = {
+        str(file.relative_to(ROOT)): words
+        for package in (*PACKAGES, "benchmarks")
+        for file in (ROOT / package).rglob("*.py")
+        if (words := DECODED.findall(file.read_text(encoding="utf-8")))
+    }
+    assert found == {}
+    planted = 'class Moment:\n    """Where it is beside."""\n    def _told(): raise Lost("came to no end")\n'
+    assert DECODED.findall(planted) == ["class Moment", "Where", "beside", "def _told", "came to no end"]

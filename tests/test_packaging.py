@@ -121,7 +121,7 @@ def installed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     (wheel,) = built.glob("*.whl")
     home = tmp_path_factory.mktemp("installed") / "venv"
     venv.create(home, with_pip=not has_base_pip())
-    done = pip_of(home / "bin", "install", "--no-deps", "--no-index", str(wheel))
+    done = pip_of(home / "bin", "install", "--no-deps", "--no-index", "--no-compile", str(wheel))
     assert done.returncode == 0, done.stdout + done.stderr
     packages = Path(sysconfig.get_path("purelib", vars={"base": str(home), "platbase": str(home)}))
     (packages / "shared.pth").write_text(sysconfig.get_path("purelib") + "\n")
@@ -148,23 +148,6 @@ def in_folder(folder: Path, *command: str | Path) -> str:
     )  # fmt: skip
     assert done.returncode == 0, f"{command}\n{done.stderr[-2000:]}"
     return done.stdout
-
-
-@pytest.mark.slow
-def test_pip_installs_the_wheel_with_its_console_script(installed: Path, tmp_path: Path) -> None:
-    where = Path(
-        in_folder(tmp_path, installed / "python", "-c", "import linna; print(linna.__file__)").strip()
-    )
-    assert installed.parent in where.parents and ROOT not in where.parents
-    assert "../../../bin/linna" in pip_of(installed, "show", "--files", "linna").stdout
-    linna = installed / "linna"
-    assert "usage: linna demo" in in_folder(tmp_path, linna, "demo", "--help")
-    in_folder(
-        tmp_path, linna, "orbit", "propagate", "selenita", "--days", "0.1", "--step", "60", "--out", "day.oem"
-    )
-    assert (tmp_path / "day.oem").is_file()
-    in_folder(tmp_path, linna, "mission", "write", "selenita", "--out", "mission.toml")
-    in_folder(tmp_path, linna, "detector", "info")
 
 
 SHORT = """

@@ -71,12 +71,10 @@ def test_a_healthy_pass_is_met(healthy: PassReport) -> None:
 @pytest.mark.parametrize(
     ("fault", "requirement"),
     [
-        ("camera bias of 0.5 px", "pointing.offset"),
-        ("undeclared attitude bias of 0.2 deg", "pointing.offset"),
-        ("recall of four fifths", "detector.recall"),
-        ("clock step of 1 s", "time.step"),
+        ("camera bias of 0.5 px", "pointing.offset"), ("undeclared attitude bias of 0.2 deg", "pointing.offset"),
+        ("recall of four fifths", "detector.recall"), ("clock step of 1 s", "time.step"),
     ],
-)
+)  # fmt: skip
 def test_a_planted_fault_is_flagged_in_the_first_pass_by_its_requirement(
     fault: str, requirement: str, healthy: PassReport, fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,11 +13,8 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 WHEEL = "linna-0.1.0-py3-none-any.whl"
 FILES = {
-    WHEEL: b"wheel",
-    "linna-0.1.0.tar.gz": b"sdist",
-    "linna.cdx.json": b"{}",
-    "licences.txt": b"numpy\tBSD",
-}
+    WHEEL: b"wheel", "linna-0.1.0.tar.gz": b"sdist", "linna.cdx.json": b"{}", "licences.txt": b"numpy\tBSD",
+}  # fmt: skip
 
 
 def release(*words: object) -> int:

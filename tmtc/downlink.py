@@ -198,7 +198,7 @@ class FrameTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DownlinkDecode:
-    """What came out of a downlink, and the accounting of every octet.
+    """Decoded downlink with the accounting of every octet.
 
     `buffer` holds the packet octets that `cut` points into. `unknown` counts packets with a right checksum that the
     dictionary does not know or that are not as long as it says. `octets` says where the octets of the input went;
@@ -259,12 +259,12 @@ class DownlinkDecode:
 
     @property
     def uplink(self) -> tuple[UplinkSeen, ...]:
-        """What the frames of the spacecraft tell of its telecommand channels."""
+        """Return the telecommand channels as the frames of the spacecraft report them."""
         return () if self.frames is None else uplink_seen(self.frames.clcw)
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is damaged, missing, unknown or left over."""
+        """Return whether nothing is damaged, missing, unknown or left over."""
         return not (
             self.sequence.gaps
             or self.sequence.conflicts
@@ -320,7 +320,7 @@ def decode(
     form: PacketForm = CHECKED,
     plan: LinkPlan | None = None,
 ) -> DownlinkDecode:
-    """Everything that a downlink file holds: a stream of CADUs or of bare packets, told apart by their
+    """Everything that a downlink file holds: a stream of CADUs or of bare packets, distinguished by their
     content.
 
     Parameters
@@ -859,7 +859,7 @@ def _account(
 
 
 def _boots(buffer: OctetArray, cut: PacketCut, ticks: IntArray, dictionary: Dictionary) -> IntArray | None:
-    """Which boot made each packet, by the boot counts that housekeeping reports; None where it reports one
+    """Return the boot of each packet by the boot counts in housekeeping; None where it reports one
     at most.
 
     Boots are taken to begin at their boot event, or else at their first housekeeping packet.

@@ -1,4 +1,4 @@
-"""What can be wrong with octets, or with values that shall become octets.
+"""Errors of octets, and of values that are packed into octets.
 
 TmtcError
 ├── TruncatedPacket       fewer octets than the header or the definition asks for
@@ -8,7 +8,7 @@ TmtcError
 ├── ValueRefused          a value that its field cannot hold or its range forbids
 ├── FrameError            a transfer frame that cannot be built or read
 ├── TableError            an uploaded table (anchor ephemeris, catalogue, gravity) is damaged or of another kind
-├── LinkFormatError       a stream whose framing cannot be told, or settings that contradict each other
+├── LinkFormatError       a stream whose framing cannot be determined, or settings that contradict each other
 ├── DefinitionError       an imported packet definition that is damaged, contradicts itself or is not supported
 └── MissingLibrary        a file format whose optional library is not installed
 """
@@ -65,7 +65,7 @@ class TableError(TmtcError):
 
 
 class LinkFormatError(TmtcError):
-    """A stream whose framing cannot be told, or link settings that contradict each other."""
+    """A stream whose framing cannot be determined, or link settings that contradict each other."""
 
 
 class UnknownCoding(LinkFormatError):

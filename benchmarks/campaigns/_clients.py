@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from benchmarks.campaigns._ledger import Entered, HandOut, Ledger, Told, mark_of
+from benchmarks.campaigns._ledger import Decision, Entered, HandOut, Ledger, mark_of
 
-PATIENCE_S = 900.0
+TIMEOUT_S = 900.0
 LOOK_AFTER_S = 1.0
 """Time after which the database has completed the statements of a killed process."""
 
@@ -70,7 +70,7 @@ class Session:
         Raises
         ------
         SystemExit
-            If there is no such response within `PATIENCE_S`.
+            If there is no such response within `TIMEOUT_S`.
         """
         headers = {"Authorization": f"Bearer {self.token}"}
         if body is not None:
@@ -79,7 +79,7 @@ class Session:
             )
         if key:
             headers["Idempotency-Key"] = key
-        until = time.monotonic() + PATIENCE_S
+        until = time.monotonic() + TIMEOUT_S
         for api in itertools.cycle(random.sample(self.apis, len(self.apis))):
             request = urllib.request.Request(f"{api}/api/v1{path}", data=body, method=method, headers=headers)
             try:
@@ -91,7 +91,7 @@ class Session:
             except (OSError, ValueError, http.client.HTTPException):  # the response was incomplete
                 pass
             if time.monotonic() > until:
-                raise SystemExit(f"{method} {path}: no answer within {PATIENCE_S:.0f} s")
+                raise SystemExit(f"{method} {path}: no answer within {TIMEOUT_S:.0f} s")
             time.sleep(0.3)
         raise AssertionError
 
@@ -186,11 +186,11 @@ class Client(threading.Thread):
         verb, body = ("release", b"") if state == "released" else ("reject", b'{"reason": "campaign"}')
         answer = self._session.ask("POST", f"/telecommands/{command}/{verb}", body)
         if answer.status == 200:
-            self._ledger.told.append(Told(command, state, self.name))
+            self._ledger.decisions.append(Decision(command, state, self.name))
         elif answer.status != 409:
             raise SystemExit(f"POST /telecommands/{command}/{verb}: {answer.status} {answer.body[:300]!r}")
         elif found := answer.json().get("state"):
-            self._ledger.told.append(Told(command, found))
+            self._ledger.decisions.append(Decision(command, found))
 
     def _fetch(self) -> None:
         """Fetch the telecommands to be sent, sometimes twice under one key."""

@@ -111,7 +111,7 @@ class Keeper:
             if done[one.part, one.phase]:
                 done[one.part, one.phase] -= 1
                 self._left.remove(one)
-        self._orders: queue.Queue[tuple[PlannedKill, str]] = queue.Queue()
+        self._due: queue.Queue[tuple[PlannedKill, str]] = queue.Queue()
         self._stopping, self._back = threading.Event(), threading.Event()
         self._spacecraft_is_down = False
         self._fault: Exception | None = None
@@ -140,11 +140,11 @@ class Keeper:
         due = [one for one in self._left if one.phase == phase and one.utc_ns <= utc_ns]
         for one in due:
             self._left.remove(one)
-            self._orders.put((one, format_utc(utc_ns)))
+            self._due.put((one, format_utc(utc_ns)))
 
     def wait(self) -> bool:
         """Wait until the ordered kills are carried out; return False at once if the spacecraft is killed."""
-        while self._orders.unfinished_tasks:
+        while self._due.unfinished_tasks:
             self.check()
             if self._spacecraft_is_down:
                 return False
@@ -175,15 +175,15 @@ class Keeper:
 
     def _run(self) -> None:
         try:
-            while not (self._stopping.is_set() and self._orders.empty()):
+            while not (self._stopping.is_set() and self._due.empty()):
                 try:
-                    planned, utc = self._orders.get(timeout=LOOK_S)
+                    planned, utc = self._due.get(timeout=LOOK_S)
                 except queue.Empty:
                     self._revive()
                     continue
                 time.sleep(planned.delay_s)
                 self._kill(planned, utc)
-                self._orders.task_done()
+                self._due.task_done()
         except Exception as error:  # outermost loop of the thread; `check` raises it in the run
             self._fault = error
 

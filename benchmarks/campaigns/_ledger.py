@@ -41,7 +41,7 @@ class Entered:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class Decision:
     """Acknowledged state; `decided_by` is set if it is the decision of that client."""
 
     command: int
@@ -72,7 +72,7 @@ class Ledger:
     """Acknowledgements of all clients of a run; filled by several threads."""
 
     entered: list[Entered] = field(default_factory=list)
-    told: list[Told] = field(default_factory=list)
+    decisions: list[Decision] = field(default_factory=list)
     hand_outs: list[HandOut] = field(default_factory=list)
     unanswered_hand_outs: int = 0
     changed_answers: int = 0
@@ -120,11 +120,11 @@ def judge(ledger: Ledger, rows: Sequence[Mapping[str, Any]], lines: Iterable[Aud
     for one in ledger.entered:
         row = by_id.get(one.command)
         faults["commands_lost"] += row is None or mark_of(row) != one.mark
-    for told in ledger.told:
-        row = by_id.get(told.command)
-        kept = row is not None and row["state"] in AFTER[told.state]
-        if row is not None and told.decided_by is not None:
-            kept = kept and row["decided_by"] == told.decided_by
+    for decision in ledger.decisions:
+        row = by_id.get(decision.command)
+        kept = row is not None and row["state"] in AFTER[decision.state]
+        if row is not None and decision.decided_by is not None:
+            kept = kept and row["decided_by"] == decision.decided_by
         faults["states_lost"] += not kept
     counts = Counter(
         (row["vehicle_id"], row["sequence_count"]) for row in rows if row["sequence_count"] is not None
@@ -165,9 +165,9 @@ def _wrong_lines(ledger: Ledger, by_id: Mapping[int, Mapping[str, Any]], lines: 
             expected["send", command] = None
     for one in ledger.entered:
         expected["enter", one.command] = one.actor
-    for told in ledger.told:
-        if told.decided_by is not None:
-            expected[DECISIONS[told.state], told.command] = told.decided_by
+    for decision in ledger.decisions:
+        if decision.decided_by is not None:
+            expected[DECISIONS[decision.state], decision.command] = decision.decided_by
     for hand_out in ledger.hand_outs:
         expected.update({("send", command): hand_out.actor for command in hand_out.commands})
     wrong = sum(abs(found[key] - 1) for key in expected) + sum(

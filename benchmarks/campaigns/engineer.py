@@ -68,14 +68,14 @@ def main(words: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="engineer-") as name:
         shell = Shell(Path(name))
         for line in commands_of("tutorials/own-build.md", shell.folder):
-            status, told = shell.run(line.replace("--frames 40", f"--frames {given.frames}"))
-            diary.expect("B", f"as printed: {line[:60]}", status in (0, 1), f"{status}: {told}")
-        first = next((one for one in told.splitlines() if re.match("(fail|pass|inconclusive):", one)), "")
+            status, printed = shell.run(line.replace("--frames 40", f"--frames {given.frames}"))
+            diary.expect("B", f"as printed: {line[:60]}", status in (0, 1), f"{status}: {printed}")
+        first = next((one for one in printed.splitlines() if re.match("(fail|pass|inconclusive):", one)), "")
         diary.expect(
             "A",
             "the worse detector fails, and the line says what fell",
             first.startswith("fail: recall falls"),
-            told,
+            printed,
         )
         diary.expect("B", "the report exists", (shell.folder / "gate.html").exists())
         programs(diary, shell)
@@ -87,31 +87,31 @@ def programs(diary: Diary, shell: Shell) -> None:
     """Judge the program of the template, one that takes more processor time, and one that crashes."""
     run = "linna regress run --archive passes --baseline current --home gate-ground --build"
     template(shell.folder / "same")
-    status, told = shell.run(f"{run} same/build.toml")
+    status, printed = shell.run(f"{run} same/build.toml")
     diary.expect(
         "A",
         "the template is identical in every octet",
-        status == 0 and "identical in every octet" in told,
-        told,
+        status == 0 and "identical in every octet" in printed,
+        printed,
     )
     template(shell.folder / "slow", BUSY.format(seconds=30), program="slow")
-    status, told = shell.run(f"{run} slow/build.toml --repeat-baseline --junit slow.xml")
-    is_named = "processor time" in told or "latency" in told
+    status, printed = shell.run(f"{run} slow/build.toml --repeat-baseline --junit slow.xml")
+    is_named = "processor time" in printed or "latency" in printed
     diary.expect(
         "A",
         "a program with more processor time does not pass in silence",
         status != 0 and is_named,
-        f"{status}: {told}",
+        f"{status}: {printed}",
     )
     template(
         shell.folder / "crash", "def stop():\n    raise ValueError('wrong turn')\nstop()\n", program="crash"
     )
-    status, told = shell.run(f"{run} crash/build.toml --junit crash.xml")
+    status, printed = shell.run(f"{run} crash/build.toml --junit crash.xml")
     diary.expect(
         "B",
         "the traceback of a crash is in the text",
-        status != 0 and "wrong turn" in told,
-        f"{status}: {told}",
+        status != 0 and "wrong turn" in printed,
+        f"{status}: {printed}",
     )
     junit = shell.folder / "crash.xml"
     text = junit.read_text() if junit.exists() else "no file"
@@ -132,16 +132,21 @@ def mistakes(diary: Diary, shell: Shell) -> None:
             f"linna replay --check-build {folder.name}/build.toml",
             f"{run} {folder.name}/build.toml",
         ):
-            status, told = shell.run(command)
-            held = status == 2 and "Traceback" not in told and "expected" in told
-            diary.expect("B", f"{what} is refused by {command.split()[1]}", held, f"{status}: {told}")
+            status, printed = shell.run(command)
+            held = status == 2 and "Traceback" not in printed and "expected" in printed
+            diary.expect("B", f"{what} is refused by {command.split()[1]}", held, f"{status}: {printed}")
     (shell.folder / "parameters.toml").write_text("detector.score_treshold = 0.8\n")
-    status, told = shell.run("linna replay --check-build build.toml")
+    status, printed = shell.run("linna replay --check-build build.toml")
     diary.expect(
-        "B", "a misspelled parameter is named", status == 2 and "score_threshold" in told, f"{status}: {told}"
+        "B",
+        "a misspelled parameter is named",
+        status == 2 and "score_threshold" in printed,
+        f"{status}: {printed}",
     )
-    status, told = shell.run(f"{run} build.toml --archive nowhere")
-    diary.expect("B", "a missing archive is one line", status == 2 and "nowhere" in told, f"{status}: {told}")
+    status, printed = shell.run(f"{run} build.toml --archive nowhere")
+    diary.expect(
+        "B", "a missing archive is one line", status == 2 and "nowhere" in printed, f"{status}: {printed}"
+    )
 
 
 if __name__ == "__main__":

@@ -351,14 +351,14 @@ def _judged(profile: str, kind: str, run: Mapping[str, Any], place: Path) -> lis
     found: list[Finding] = []
     delivered = {path.name: path for path in place.iterdir()}
     if kind == "explore":
-        told = (
+        report = (
             json.loads(delivered["downlink.packets"].read_text()) if "downlink.packets" in delivered else None
         )
-        if told is None:
+        if report is None:
             return [
                 Finding(profile, kind, "the build", True, f"did not report: {run['outcome']} {run['detail']}")
             ]
-        found += [Finding(profile, kind, name, bool(won), str(seen)) for name, (won, seen) in told.items()]
+        found += [Finding(profile, kind, name, bool(won), str(seen)) for name, (won, seen) in report.items()]
     elif run["outcome"] not in EXPECTED[kind]:
         found.append(Finding(profile, kind, "outcome", True, f"{run['outcome']}: {run['detail']}"))
     for name, path in delivered.items():

@@ -7,7 +7,7 @@ downlink, cut at random octets, in random order, over and over, and meanwhile en
 release, reject and fetch telecommands. One part after another is killed (SIGKILL) and started again.
 
 In the end every job has to be done, the archive equal to that of the same downlink ingested once, undisturbed, into
-SQLite, and what the clients were told has to hold: every acknowledged telecommand is there once, in the acknowledged
+SQLite, and answers to the clients have to hold: every acknowledged telecommand is there once, in the acknowledged
 state, none shares a sequence count or was handed out twice, every change has one audit entry, the hash chain is whole,
 and `linna verify` finds no damage. Exit status 1 where that does not hold. `--laptop`: one API alone, with its jobs, on
 SQLite.
@@ -35,7 +35,7 @@ from typing import Any
 
 from sqlalchemy import select
 
-from benchmarks.campaigns._clients import PATIENCE_S, Client, Piece, Session, broken_of, cut_pieces
+from benchmarks.campaigns._clients import TIMEOUT_S, Client, Piece, Session, broken_of, cut_pieces
 from benchmarks.campaigns._deployment import Deployment, Laptop
 from benchmarks.campaigns._ledger import FAULTS, AuditLine, Ledger, judge
 from benchmarks.ground import START, STEP_NS, mixed_downlink
@@ -275,11 +275,11 @@ def ask_for_reports(session: Session, packets: int, reports: int, ledger: Ledger
 
 
 def ends_of(session: Session, jobs: Sequence[str]) -> tuple[Counter[str], int]:
-    """How the jobs ended, and how often they were begun."""
+    """Count the final states of the jobs and their starts."""
     states: Counter[str] = Counter()
     attempts = 0
     for job in jobs:
-        until = time.monotonic() + PATIENCE_S
+        until = time.monotonic() + TIMEOUT_S
         while True:
             row = session.get(f"/jobs/{job}")
             if row["state"] in ENDS or time.monotonic() > until:
@@ -306,7 +306,7 @@ def totals(runs: Sequence[Mapping[str, Any]]) -> Figures:
 
 
 def holds(figures: Mapping[str, Any]) -> bool:
-    """Whether nothing was lost or doubled and every job and ingest came to a good end."""
+    """Return whether nothing was lost or doubled and every job and ingest ended well."""
     return (
         figures["archives_identical"] == figures["runs"]
         and figures["lost"] == figures["doubled"] == 0

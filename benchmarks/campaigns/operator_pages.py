@@ -108,9 +108,9 @@ def operate(diary: Diary, page: Any) -> None:
     now = parse_utc(page.request.get("/api/v1/status").json()["mission_time"])
     page.get_by_text("Enter a window").click()
     enter(page, now - 7200 * 10**9)
-    told = page.locator("body").inner_text()
+    shown = page.locator("body").inner_text()
     diary.expect(
-        "A", "a window in the past is refused in words", "after the mission time" in told, told[-500:]
+        "A", "a window in the past is refused in words", "after the mission time" in shown, shown[-500:]
     )
     enter(page, now + 7200 * 10**9)
     windows = page.request.get("/api/v1/windows").json()["items"]

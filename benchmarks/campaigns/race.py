@@ -14,7 +14,7 @@ regress   four regressions with one idempotency key
 
 The campaign counts what must never happen: a telecommand released or handed out twice, two telecommands with one
 sequence count, a release and a rejection that both succeed, telecommands of a withdrawn window that are handed out,
-two jobs of one key, a request that lost without being told the winning state, any server error. Exit status 1 if there
+two jobs of one key, a lost request whose answer lacks the winning state, any server error. Exit status 1 if there
 was any. `--seconds` begins no race after that time.
 """
 
@@ -48,6 +48,7 @@ from ground_service.planning.service import WindowEntry, add_window, change_wind
 from ground_service.regression.builds import load_build, register_build
 from ground_service.store import repository
 from ground_service.store.database import prepare_database
+from lunar.constants import NS
 
 SHARES = {"release": 60, "uplink": 15, "approve": 10, "window": 9, "ingest": 3, "regress": 3}
 """Share of each kind of race in percent."""
@@ -55,7 +56,6 @@ SHARES = {"release": 60, "uplink": 15, "approve": 10, "window": 9, "ingest": 3, 
 FIRST_SPACECRAFT, SPACECRAFT = 100, 8
 CRITICAL = ("perform_function", {"function_id": "reboot", "argument_1": 0.0, "argument_2": 0.0})
 ROUTINE: tuple[str, dict[str, Any]] = ("test_connection", {})
-NS = 1_000_000_000
 WINDOWS_FROM_NS = 1_900_000_000 * NS
 FAULTS = (
     "double_releases",
@@ -95,7 +95,7 @@ class Answer:
 
     @property
     def won(self) -> bool:
-        """Whether the request took effect."""
+        """Return whether the request took effect."""
         return 200 <= self.status < 300
 
     def json(self) -> Any:
@@ -185,11 +185,11 @@ class Tally:
             self.won[kind] += one.won
             self.handed_out.update(one.telecommands)
             if not one.won:
-                told = f"{one.label} {one.status} {one.body[:200]!r}"
+                message = f"{one.label} {one.status} {one.body[:200]!r}"
                 if one.status not in expected:
-                    self.fault("server_errors", kind, told)
+                    self.fault("server_errors", kind, message)
                 elif kind not in ("ingest", "regress") and not (one.json() or {}).get("state"):
-                    self.fault("unnamed_losers", kind, told)
+                    self.fault("unnamed_losers", kind, message)
 
 
 class Campaign:
@@ -330,11 +330,11 @@ class Campaign:
             ).all()
         live = Counter(row[0] for row in rows if row[1] != "rejected")
         waiting = [row for row in rows if row[1] in ("released", "carried")]
-        told = f"window {window} {state}: {[tuple(row) for row in rows]}"
-        self.tally.fault("two_winners", "window", told, live["enable_schedule"] > 1)
-        self.tally.fault("withdrawn_but_live", "window", told, state != "approved" and bool(waiting))
+        message = f"window {window} {state}: {[tuple(row) for row in rows]}"
+        self.tally.fault("two_winners", "window", message, live["enable_schedule"] > 1)
+        self.tally.fault("withdrawn_but_live", "window", message, state != "approved" and bool(waiting))
         sent = any(row[1] == "sent" for row in rows)
-        self.tally.fault("withdrawn_but_live", "window", told, state == "draft" and sent)
+        self.tally.fault("withdrawn_but_live", "window", message, state == "draft" and sent)
 
     def _ingest(self, number: int) -> None:
         body = f"race {number}".encode() * 8

@@ -45,7 +45,7 @@ def added_once(
 def once(
     ground: Ground, *, actor: str, operation: str, key: str | None, request: dict[str, Any], work: Work
 ) -> dict[str, Any]:
-    """What `work` gives, or what it gave when this actor asked for the same under the same key.
+    """Return the result of `work`, or its earlier result for this actor and key.
 
     Work that ends with an error leaves the key free: it may be asked for again. Without a key the work is simply done.
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from ground_service.http.model import Entity, Given, GivenTime, Paging, UtcTime
+from ground_service.http.model import Entity, Paging, RequestModel, RequestTime, UtcTime
 
 DAYS_LIMIT = 36_500.0
 
@@ -45,7 +45,7 @@ class User(Entity):
 
 
 class ProviderIdentity(Entity):
-    """Who signed in with an OpenID provider."""
+    """Identity of a user who signed in with an OpenID provider."""
 
     issuer: str
     subject: str = Field(max_length=255)
@@ -153,7 +153,7 @@ class Session(Entity):
     )
 
 
-class NewSession(Given):
+class NewSession(RequestModel):
     """Token to start a browser session with."""
 
     token: str = Field(min_length=1, max_length=200)
@@ -166,7 +166,7 @@ class UserWithToken(Entity):
     token: str
 
 
-class NewUser(Given):
+class NewUser(RequestModel):
     """User to add."""
 
     name: str = Field(pattern=USER_NAME, examples=["ann"])
@@ -175,7 +175,7 @@ class NewUser(Given):
     days_valid: Days
 
 
-class UserChange(Given):
+class UserChange(RequestModel):
     """Change of the state, role or missions of a user."""
 
     state: Literal["active", "disabled"] | None = None
@@ -183,7 +183,7 @@ class UserChange(Given):
     missions: MissionNames | None = Field(default=None, description="Empty: all missions")
 
 
-class NewToken(Given):
+class NewToken(RequestModel):
     """Token to create."""
 
     days_valid: Days
@@ -217,5 +217,5 @@ class AuditFilter(Paging):
     actor: Words | None = None
     action: Words | None = Field(default=None, description="Part of the action")
     target: Words | None = None
-    since: GivenTime | None = None
-    until: GivenTime | None = Field(default=None, description="UTC, RFC 3339; exclusive")
+    since: RequestTime | None = None
+    until: RequestTime | None = Field(default=None, description="UTC, RFC 3339; exclusive")

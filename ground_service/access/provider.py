@@ -60,7 +60,7 @@ LOGOUT_EVENT = "http://schemas.openid.net/event/backchannel-logout"
 
 
 @dataclass(frozen=True, slots=True)
-class Begun:
+class PendingSignIn:
     """A sign-in that has begun, as the cookie of the browser remembers it."""
 
     state: str
@@ -69,7 +69,7 @@ class Begun:
     next_page: str
 
     @classmethod
-    def new(cls, next_page: str) -> Begun:
+    def new(cls, next_page: str) -> PendingSignIn:
         """Return a new sign-in; `next_page` is the page to open after it."""
         state, nonce, verifier = (secrets.token_urlsafe(SECRET_OCTETS) for _ in range(3))
         return cls(state, nonce, verifier, own_page(next_page))
@@ -79,7 +79,7 @@ class Begun:
         return ".".join((self.state, self.nonce, self.verifier, quote(self.next_page, safe="")))
 
     @classmethod
-    def of_cookie(cls, cookie: str | None, state: str) -> Begun:
+    def of_cookie(cls, cookie: str | None, state: str) -> PendingSignIn:
         """Return the sign-in that a provider answers.
 
         Raises
@@ -112,7 +112,7 @@ class Provider:
     _read_s: float = 0.0
     _reading: asyncio.Lock = field(default_factory=asyncio.Lock)
 
-    async def begin(self, begun: Begun, redirect_uri: str) -> str:
+    async def begin(self, begun: PendingSignIn, redirect_uri: str) -> str:
         """Return the address of the provider to send the browser to."""
         client = await self._configured()
         found = await client.create_authorization_url(
@@ -121,7 +121,7 @@ class Provider:
         return str(found["url"])
 
     async def complete(
-        self, begun: Begun, code: str, redirect_uri: str, issuer: str | None = None
+        self, begun: PendingSignIn, code: str, redirect_uri: str, issuer: str | None = None
     ) -> ProviderIdentity:
         """Exchange a code for an ID token and return who signed in.
 

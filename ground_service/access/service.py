@@ -72,11 +72,11 @@ class Caller:
     spacecraft: frozenset[int] | None = None
 
     def may(self, role: str) -> bool:
-        """Whether the caller has this role or a higher one."""
+        """Return whether the caller has this role or a higher one."""
         return ROLES.index(self.role) >= ROLES.index(role)
 
     def may_use(self, *spacecraft_id: int | None) -> bool:
-        """Whether the caller may read and command all of these spacecraft; None is one that is not known."""
+        """Return whether the caller may read and command all of these spacecraft; None is one that is not known."""
         return self.spacecraft is None or self.spacecraft.issuperset(spacecraft_id)
 
     def own(self, items: Iterable[Owned]) -> list[Owned]:
@@ -187,7 +187,6 @@ def list_users(ground: Ground) -> list[User]:
 
 
 def get_user(ground: Ground, name: str) -> User:
-    """Return one user."""
     with ground.database.reading() as connection:
         return User.of(dict(store.get_user(connection, name)))
 

@@ -71,7 +71,6 @@ def find_provider_user(connection: Connection, issuer: str, subject: str) -> Use
 
 
 def get_user(connection: Connection, name: str) -> UserRecord:
-    """Return a user."""
     user = find_user(connection, name)
     if user is None:
         raise NotFound("user", repr(name)[1:-1][:80])
@@ -105,7 +104,6 @@ def change_user(connection: Connection, user: UserRecord, column: str, expected:
 
 
 def limit_user(connection: Connection, user: UserRecord, missions: Sequence[str]) -> None:
-    """Limit a user to missions; none: to all."""
     repository.change(connection, USERS, user.id, missions=_names(missions))
 
 

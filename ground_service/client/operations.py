@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ground_service.passes.alarms import model as alarms
     from ground_service.planning import model as planning
     from ground_service.regression import model as regression
-    from ground_service.worker import condition as condition
+    from ground_service.worker import condition
 else:
     import_lazily(
         globals(),

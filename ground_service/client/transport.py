@@ -15,10 +15,10 @@ from starlette.routing import Match
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from ground_service.access.service import Caller
-from ground_service.app import OPERATIONS
 from ground_service.client.connection import API_PREFIX
 from ground_service.ground import Ground
 from ground_service.http import problems
+from ground_service.http.common import OPERATIONS
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
 from ground_service.jobs.service import Dispatcher

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris
 from lunar.frames import (
     Orientation,
@@ -364,11 +364,11 @@ def format_tum(utc_ns: IntArray, position_m: FloatArray, reference_m: FloatArray
     reference_m
         Positions of the reference at the same times, which give the orientation; n is at least 2.
     """
-    seconds = (utc_ns - utc_ns[0]) / NANOSECONDS_PER_SECOND
+    seconds = (utc_ns - utc_ns[0]) / NS
     velocity = np.gradient(reference_m, seconds, axis=0)
     turns = quaternion_from_matrix(np.swapaxes(rtn_from_inertial(reference_m, velocity), 1, 2))
     lines = [
-        f"{int(t) // NANOSECONDS_PER_SECOND}.{int(t) % NANOSECONDS_PER_SECOND:09d} "
+        f"{int(t) // NS}.{int(t) % NS:09d} "
         + " ".join(f"{value:.6f}" for value in position)
         + " "
         + " ".join(f"{value:.12f}" for value in turn)

@@ -52,6 +52,7 @@ from ground_service.evaluation.smoother import (
     SMOOTHED,
     CommandedBurn,
     FilterStates,
+    MapOffset,
     StartState,
     propagated_positions,
     smoothed_series,
@@ -59,16 +60,17 @@ from ground_service.evaluation.smoother import (
 )
 from ground_service.evaluation.verdict import (
     Evaluated,
-    Limits,
     StartOrbit,
+    consistency_remarks,
     requirements,
     verdict_of,
     without_mission,
 )
-from ground_service.passes.samples import DetectionSamples, NavigationSamples, OutcomeSamples
+from ground_service.missions.model import Requirements
+from ground_service.telemetry.samples import DetectionSamples, NavigationSamples, OutcomeSamples
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
-from lunar.constants import MOON_RADIUS_M, NANOSECONDS_PER_SECOND
+from lunar.constants import MOON_RADIUS_M, NS
 from lunar.ephemeris import Ephemeris
 from lunar.errors import LunarError
 from lunar.frames import Orientation
@@ -133,6 +135,8 @@ class PassInputs:
         Reasons for models that are None, by name.
     reference_sigma_rtn_m
         Declared 1-sigma error of the reference in radial, transverse and normal.
+    map_offset
+        Offset of the crater list that the payload uses; None where neither it nor the mission description states one.
     limits
         Limits of the verdict.
     experiment
@@ -170,7 +174,8 @@ class PassInputs:
     onboard_gravity: GravityField | None = None
     refused: Mapping[str, str] = field(default_factory=dict)
     reference_sigma_rtn_m: tuple[float, float, float] | None = None
-    limits: Limits = field(default_factory=Limits)
+    map_offset: MapOffset | None = None
+    limits: Requirements = field(default_factory=Requirements)
     experiment: StartOrbit | None = None
     clock_step_s: float | None = None
     no_mission: str = ""
@@ -217,7 +222,7 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
     detector, gallery, worst, craters = _detector(inputs, missing, remarks)
     if not inputs.images:
         missing["gallery"] = missing["worst_frames"] = "no images came down with this pass"
-    remarks += attitude_remarks(inputs.events)
+    remarks += event_remarks(inputs.events)
     accounting = _frame_accounting(inputs)
     evaluated = Evaluated(
         navigation,
@@ -231,6 +236,7 @@ def evaluate_pass(inputs: PassInputs) -> PassReport:
         inputs.clock_step_s,
     )
     table = requirements(inputs.limits, evaluated)
+    remarks += consistency_remarks(table)
     if inputs.no_mission:
         table = without_mission(table, inputs.no_mission)
     verdict, level = verdict_of(table)
@@ -277,9 +283,11 @@ def _reference_px(inputs: PassInputs, reference: TrackSeries | None) -> float:
     )
 
 
-def attitude_remarks(events: Sequence[PassEvent]) -> list[str]:
-    """Return a remark for each time in which the payload judged its attitude noisier than declared."""
-    found: list[str] = []
+def event_remarks(events: Sequence[PassEvent]) -> list[str]:
+    """Return remarks on the newest offset of the list, and on times of an attitude noisier than declared."""
+    sizes = [one for one in events if one.name == "map_offset"]
+    newest = sorted(sizes, key=lambda event: event.utc_ns)[-1:]
+    found = [f"offset of the crater list used on board, 1 sigma: {one.detail}" for one in newest]
     lasting = False
     for one in sorted(events, key=lambda event: event.utc_ns):
         if one.name == "attitude_degraded":
@@ -501,8 +509,8 @@ def _consistency(
         return None, degrees
     covariance = np.where(same[:, None, None], filtered.position_covariance_rtn_m2[at], np.nan)
     if degrees is not None and filtered.innovation_degrees is not None:
-        told = filtered.innovation_degrees[at]
-        degrees = np.where(known & same & (told >= 0), told, degrees).astype(np.int64)
+        reported = filtered.innovation_degrees[at]
+        degrees = np.where(known & same & (reported >= 0), reported, degrees).astype(np.int64)
     return nees(error_rtn_m, covariance + reference_covariance), degrees
 
 
@@ -530,7 +538,7 @@ def _smoothed(
     rows = np.minimum(np.searchsorted(track.utc_ns, filtered.utc_ns), len(track.utc_ns) - 1)
     kept = track.covered[rows] & (track.utc_ns[rows] == filtered.utc_ns)
     filtered, rows = filtered.select(kept).in_icrf(inputs.orientation, onboard), rows[kept]
-    model = smoother_model(gravity, inputs.orientation, inputs.burns)
+    model = smoother_model(gravity, inputs.orientation, inputs.burns, inputs.map_offset)
     series = smoothed_series(
         filtered,
         track.at_rows(rows),
@@ -569,7 +577,7 @@ def _time_since_fix_s(samples: NavigationSamples) -> FloatArray | None:
     if not fixed.any():
         return None
     last = np.maximum.accumulate(np.where(fixed, np.arange(len(fixed)), -1))
-    since = (samples.utc_ns - samples.utc_ns[np.maximum(last, 0)]) / NANOSECONDS_PER_SECOND
+    since = (samples.utc_ns - samples.utc_ns[np.maximum(last, 0)]) / NS
     return np.where(last >= 0, since, np.nan)
 
 
@@ -826,7 +834,7 @@ def _gaps(inputs: PassInputs) -> tuple[TimeSpan, ...]:
     times = inputs.detections.utc_ns
     if inputs.cadence_s is None or len(times) < 2:
         return ()
-    limit = 1.5 * inputs.cadence_s * NANOSECONDS_PER_SECOND
+    limit = 1.5 * inputs.cadence_s * NS
     return tuple(
         TimeSpan(int(times[i]), int(times[i + 1]), "no frames")
         for i in np.flatnonzero(np.diff(times) > limit)

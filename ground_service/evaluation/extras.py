@@ -17,7 +17,7 @@ from ground_service.evaluation.alignment import (
 )
 from ground_service.evaluation.fixes import Pairs, snapshot_positions, wrong_fixes
 from ground_service.evaluation.recall import Viewing
-from ground_service.passes.samples import NavigationSamples
+from ground_service.telemetry.samples import NavigationSamples
 from lunar.arrays import FloatArray
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.third_bodies import sun_position_icrf_m

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ground_service.evaluation.recall import CENTRE_TOLERANCE_PX, CENTRE_TOLERANCE_RADII
-from ground_service.passes.samples import DetectionSamples
+from ground_service.telemetry.samples import DetectionSamples
 from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue
@@ -236,7 +236,7 @@ class MappedCraters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapComparison:
-    """What the catalogue says of a map.
+    """Comparison of a map with the catalogue.
 
     Attributes
     ----------

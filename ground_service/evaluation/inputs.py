@@ -1,4 +1,4 @@
-"""Stored data of a pass, prepared and read into the plain arrays that the evaluation takes."""
+"""Stored data of a pass, prepared and read into the plain arrays of the evaluation."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ from ground_service.evaluation.smoother import (
     SIZE,
     CommandedBurn,
     FilterStates,
+    MapOffset,
     StartState,
 )
-from ground_service.evaluation.verdict import Limits, StartOrbit
+from ground_service.evaluation.verdict import StartOrbit
 from ground_service.ground import Ground
 from ground_service.missions.catalogues import catalogue_of, read_catalogue
 from ground_service.missions.ephemerides.model import Ephemeris as EphemerisEntry
@@ -47,20 +48,20 @@ from ground_service.passes import sample_store
 from ground_service.passes import store as passes
 from ground_service.passes.model import PassRecord
 from ground_service.passes.packet_accounting import packet_accounting
-from ground_service.passes.sample_store import code_labels, detection_samples, event_list
-from ground_service.passes.samples import (
+from ground_service.passes.sample_store import code_labels, detection_samples, event_list, learned_offset_m
+from ground_service.passes.span import PassSpan, pass_span
+from ground_service.store.files import FileArchive, register_file
+from ground_service.store.vehicles import Vehicle, get_vehicle
+from ground_service.telemetry.samples import (
     NavigationSamples,
     OutcomeSamples,
 )
-from ground_service.passes.span import PassSpan, pass_span
-from ground_service.store.files import FileArchive, register_file
-from ground_service.store.telemetry import unpack_filter_states, unpack_identifications
-from ground_service.store.vehicles import Vehicle, get_vehicle
+from ground_service.telemetry.store import unpack_filter_states, unpack_identifications
 from ground_service.toml import read_table
 from lunar.boxes import share_outside
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, format_catalogue
-from lunar.constants import MOON_RADIUS_M, NANOSECONDS_PER_SECOND
+from lunar.constants import MOON_RADIUS_M, NS
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation
@@ -157,7 +158,8 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             onboard_gravity=declared.onboard_gravity,
             refused=_refused(declared, mission.camera),
             reference_sigma_rtn_m=mission.reference.sigma_rtn_m,
-            limits=Limits(**mission.requirements.model_dump()),
+            map_offset=_map_offset(mission.catalogue, learned_offset_m(connection, span)),
+            limits=mission.requirements,
             experiment=_experiment(mission, manifest),
             clock_step_s=_clock_step_s(connection, record, span),
             no_mission="" if record.mission_id is not None else _no_mission(vehicle.ccsds_id),
@@ -244,7 +246,7 @@ def filter_states(connection: Connection, span: PassSpan) -> FilterStates | None
 
 
 def identification_samples(connection: Connection, span: PassSpan) -> IdentificationSamples | None:
-    """Which crater each used detection was taken for, in time order; None where nothing came down about it."""
+    """Return the identified crater of each used detection, in time order; None without telemetry about it."""
     rows = sample_store.samples(connection, span, "identifications", ("ticks", "items"))
     if not rows["ticks"]:
         return None
@@ -266,7 +268,7 @@ def landmark_reports(connection: Connection, span: PassSpan) -> MappedCraters:
 
 
 def outcome_samples(connection: Connection, span: PassSpan) -> tuple[OutcomeSamples, ...]:
-    """What every estimator made of every frame, in time order."""
+    """Return the outcome of every estimator by frame, in time order."""
     names = (
         "ticks", "estimator", "frame_number", "outcome", "reset_trigger", "candidate_pairs", "anchor_reads",
     )  # fmt: skip
@@ -525,6 +527,16 @@ def _provenance(
     return {name: value for name, value in entries.items() if value}
 
 
+def _map_offset(stated: Catalogue, learned_m: float | None) -> MapOffset | None:
+    """Return the offset of the crater list as stated, with the size that the payload learned by the end of the pass."""
+    if stated.offset_sigma_m is None or stated.offset_correlation_deg is None:
+        return None
+    east_m, north_m, up_m = stated.offset_sigma_m
+    if learned_m is not None:
+        east_m = north_m = learned_m
+    return MapOffset((east_m, north_m, up_m), stated.offset_correlation_deg)
+
+
 def _registration_text(catalogue: Catalogue) -> str:
     """Return where the crater list is registered to the terrain, and its shift; empty if it is not stated."""
     if catalogue.registered_share is None:
@@ -637,7 +649,7 @@ def _store_catalogue(ground: Ground, mission: Mission, reference: Ephemeris, rec
         raise InvalidInput(mission.name, "frames.orientation", "an available lunar orientation", "none")
     half_diagonal = math.sqrt(2.0) * math.tan(camera_of(mission.camera).fov_rad / 2.0)
     reach = half_diagonal + math.tan(math.radians(abs(mission.camera.tilt_deg or 0.0)))
-    step_ns = round(TRACK_STEP_S * NANOSECONDS_PER_SECOND)
+    step_ns = round(TRACK_STEP_S * NS)
     utc_ns = np.arange(record.start_utc_ns, record.stop_utc_ns + step_ns, step_ns, dtype=np.int64)
     track = reference_states(reference, orientation, utc_ns)
     octets = format_catalogue(along_track(catalogue, track, reach)).encode("ascii")

@@ -8,6 +8,7 @@ from typing import Any
 from pydantic import ConfigDict, Field
 
 from ground_service.http.model import Entity, UtcTime
+from reports.values import Requirement
 
 
 class ReportErrors(Entity):
@@ -20,20 +21,6 @@ class ReportErrors(Entity):
     max_m: list[float]
     mean_m: list[float]
     after_gap: list[bool] = Field(description="A gap precedes the interval: draw no line across it")
-
-
-class ReportRequirement(Entity):
-    """Row of the verdict table: the value must be at most, or at least, the limit."""
-
-    key: str = Field(examples=["accuracy.median"])
-    name: str = Field(examples=["median 3-D error"])
-    unit: str = Field(examples=["m"])
-    value: float | None = Field(description="null: unknown")
-    limit: float | None = Field(description="null: not stated in the mission description")
-    at_most: bool
-    status: str = Field(description="met, not met, unknown or not judged", examples=["met"])
-    note: str
-    question: str = Field(default="operations", description="operations or experiment")
 
 
 class ChangedFigure(Entity):
@@ -161,6 +148,9 @@ class PassConditions(Entity):
     sun_elevation_deg: float | None = Field(description="Median at the sub-satellite point")
     build: str = Field(description="Hashes of model and parameters in the last housekeeping packet")
     estimator: str | None = Field(description="Estimator that the mission description judges")
+    map_offset_m: float | None = Field(
+        default=None, description="Offset of the crater list that the payload uses, 1 sigma east and north"
+    )
 
 
 class PassFigures(Entity):
@@ -205,6 +195,6 @@ class ReportOverview(Entity):
     evidence_level: str
     created_utc: str
     headline: list[dict[str, Any]]
-    requirements: list[ReportRequirement]
+    requirements: list[Requirement]
     not_available: dict[str, str]
     navigation: list[ReportErrors]

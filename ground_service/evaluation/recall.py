@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ground_service.passes.samples import DetectionSamples
+from ground_service.telemetry.samples import DetectionSamples
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, above_horizon, ground_arc_m, horizon_arc_m, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue, size_class
@@ -63,7 +63,7 @@ class ExpectedCraters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """Who matched whom: for each detection its row of `ExpectedCraters`, for each of those its detection; -1: none."""
+    """Matches: for each detection its row of `ExpectedCraters`, for each of those its detection; -1: none."""
 
     crater_of_detection: IntArray
     detection_of_crater: IntArray

@@ -56,6 +56,7 @@ def conditions_of(inputs: PassInputs) -> dict[str, Any]:
         "sun_elevation_deg": _median(sun_angles(track).elevation_deg) if inputs.sun_known else None,
         "build": inputs.build,
         "estimator": inputs.limits.estimator,
+        "map_offset_m": None if inputs.map_offset is None else inputs.map_offset.sigma_enu_m[0],
     }
 
 
@@ -202,12 +203,13 @@ def reevaluate(ground: Ground, pass_id: int, *, report_id: str, event: int) -> M
 
 def _documents(report: PassReport, *, pdf: bool) -> dict[str, bytes]:
     """Return the octets of a report by kind."""
+    from reports.drawings import KeptDrawings
     from reports.render import render_html, render_pages, to_json
 
     data = to_json(report).encode()
     if not pdf:
-        return {"html": render_html(report).encode(), "json": data}
-    page, printed = render_pages(report)
+        return {"html": render_html(report, KeptDrawings()).encode(), "json": data}
+    page, printed = render_pages(report, KeptDrawings())
     return {"html": page.encode(), "json": data, "pdf": printed}
 
 

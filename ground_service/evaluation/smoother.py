@@ -8,6 +8,7 @@ state), white acceleration for the gravity that the field omits, and commanded b
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,7 @@ from ground_service.evaluation.alignment import (
     places_of_positions,
 )
 from lunar.arrays import FloatArray, IntArray
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from lunar.frames import ICRF, Orientation, icrf_from_onboard, rtn_from_inertial
 from lunar.gravity import GravityField
 from lunar.gravity_omission import FieldNoise, densities_at, field_noise
@@ -111,6 +112,14 @@ class CommandedBurn:
     utc_ns: int
     delta_v_m_s: FloatArray
     sigma_m_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class MapOffset:
+    """Offset that all craters of the list have in common, 1 sigma east, north, up, and the arc of its memory (1/e)."""
+
+    sigma_enu_m: tuple[float, float, float]
+    correlation_deg: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,8 +244,8 @@ def _legs(
     at = from_utc_ns
     between = [burn for burn in burns if from_utc_ns < burn.utc_ns <= to_utc_ns]
     for stop, burn in [*((burn.utc_ns, burn) for burn in between), (to_utc_ns, None)]:
-        count = max(1, int(np.ceil((stop - at) / (_LONGEST_STEP_S * NANOSECONDS_PER_SECOND))))
-        step_s = (stop - at) / NANOSECONDS_PER_SECOND / count
+        count = max(1, int(np.ceil((stop - at) / (_LONGEST_STEP_S * NS))))
+        step_s = (stop - at) / NS / count
         if step_s > 0.0 or burn is not None:
             if at != from_utc_ns:
                 start_s = float(tdb_s_from_utc_ns(at))
@@ -343,24 +352,29 @@ def propagated_positions(
 
 SMOOTHED = "smoothed"
 SMOOTHER_DEGREE = 100
-MAP_SIGMA_RTN_M, MAP_CORRELATION_RAD = (10.0, 40.0, 40.0), float(np.radians(30.0))
-"""Remainder of the registration of the catalogue, as in the filter (`CommonErrors`)."""
+UNSTATED_OFFSET = MapOffset((40.0, 40.0, 10.0), 30.0)
+"""Offset of the payloads that were flown before the mission description stated one."""
 
 
 def smoother_model(
-    gravity: GravityField, orientation: Orientation, burns: tuple[CommandedBurn, ...]
+    gravity: GravityField,
+    orientation: Orientation,
+    burns: tuple[CommandedBurn, ...],
+    offset: MapOffset | None = None,
 ) -> SmootherModel:
     """Return the smoother's model of the motion, with gravity to `SMOOTHER_DEGREE` or the degree of the field.
 
-    The process noise is that of the filter: of the field, by its name, and of the map.
+    The process noise is that of the filter: of the field, by its name, and of the map; None: `UNSTATED_OFFSET`.
     """
+    offset = UNSTATED_OFFSET if offset is None else offset
+    east_m, north_m, up_m = offset.sigma_enu_m
     degree = min(SMOOTHER_DEGREE, gravity.degree)
     return SmootherModel(
         ForceModel(gravity, orientation, degree),
         burns=burns,
         field_noise=field_noise(gravity.name, degree),
-        map_sigma_rtn_m=MAP_SIGMA_RTN_M,
-        map_correlation_rad=MAP_CORRELATION_RAD,
+        map_sigma_rtn_m=(up_m, north_m, east_m),
+        map_correlation_rad=math.radians(offset.correlation_deg),
     )
 
 

@@ -16,7 +16,6 @@ _MISSIONS = repository.MISSIONS
 
 
 def get_report(connection: Connection, report_id: str) -> StoredReport:
-    """Return a report."""
     return StoredReport.of(repository.get(connection, _REPORTS, report_id, "report"))
 
 

@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ground_service.evaluation.alignment import bounds_per_degree, independent_samples
+from ground_service.missions.model import Requirements
 from lunar.arrays import FloatArray
-from lunar.constants import NANOSECONDS_PER_SECOND
-from reports.statistics import per_degree
+from lunar.constants import NS
+from reports.statistics import per_degree, sigma_remark
 from reports.text import count_text, significant_text
 from reports.values import (
     DetectorScore,
@@ -37,33 +38,6 @@ NO_MISSION = "mission"
 """Key of the row that says that a pass has no mission description."""
 LARGEST_SENTENCE = 5
 """Largest number of failed requirements named in the sentence; the table has all."""
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Limits of a mission description, None where not stated; see `ground_service.missions.model.Requirements`."""
-
-    estimator: str | None = None
-    median_error_m: float | None = None
-    p95_error_m: float | None = None
-    better_than: tuple[str, ...] | None = None
-    consistency_inside_percent: float | None = None
-    packets_percent: float | None = None
-    frames_percent: float | None = None
-    images_percent: float | None = None
-    recall: float | None = None
-    precision: float | None = None
-    anchor_reads: float | None = None
-    resets: float | None = None
-    cpu_percent: float | None = None
-    memory_mib: float | None = None
-    storage_percent: float | None = None
-    temperature_max_c: float | None = None
-    temperature_min_c: float | None = None
-    convergence_s: float | None = None
-    drift_percent: float | None = None
-    offset_px: float | None = None
-    clock_step_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +78,7 @@ class Evaluated:
     clock_step_s: float | None = None
 
 
-def requirements(limits: Limits, found: Evaluated) -> tuple[Requirement, ...]:
+def requirements(limits: Requirements, found: Evaluated) -> tuple[Requirement, ...]:
     """Return the verdict table of a pass."""
     return (
         *_accuracy(limits, found),
@@ -196,7 +170,7 @@ def _row(
     return Requirement(key, name, unit, value, limit, at_most, status, note, question)
 
 
-def _declared(limits: Limits, found: Evaluated) -> NavigationSeries | None:
+def _declared(limits: Requirements, found: Evaluated) -> NavigationSeries | None:
     return next(
         (one for one in found.navigation if one.kind == "estimate" and one.name == limits.estimator), None
     )
@@ -218,7 +192,7 @@ def _median(series: NavigationSeries | None) -> float | None:
     return None if series is None or len(series.utc_ns) < 2 else series.statistics.median_3d_m
 
 
-def _accuracy(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+def _accuracy(limits: Requirements, found: Evaluated) -> Iterable[Requirement]:
     series = _declared(limits, found)
     if limits.estimator is None:
         note = "the mission description declares no estimator"
@@ -251,7 +225,7 @@ def _accuracy(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
     )
 
 
-def _comparisons(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+def _comparisons(limits: Requirements, found: Evaluated) -> Iterable[Requirement]:
     """Yield the comparisons of the declared estimator with every computed or required baseline."""
     wanted = limits.better_than or ()
     others = {one.name: one for one in found.navigation if one.kind in ("baseline", "smoothed")}
@@ -277,7 +251,7 @@ def _comparisons(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
         )
 
 
-def _experiment(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+def _experiment(limits: Requirements, found: Evaluated) -> Iterable[Requirement]:
     """Yield convergence and drift of a pass that starts from an orbit of a stated error."""
     if found.experiment is None:
         return
@@ -321,13 +295,13 @@ def _convergence_s(series: NavigationSeries, limit_m: float) -> float | None:
         return None
     lasting = np.asarray(np.lib.stride_tricks.sliding_window_view(good, LASTING).all(axis=1))
     first = int(np.argmax(lasting))
-    return float(series.utc_ns[first] - series.utc_ns[0]) / NANOSECONDS_PER_SECOND if lasting[first] else None
+    return float(series.utc_ns[first] - series.utc_ns[0]) / NS if lasting[first] else None
 
 
-def _consistency(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
-    """Yield the mean NEES and NIS against the upper bound for the number of independent draws in the pass.
+def _consistency(limits: Requirements, found: Evaluated) -> Iterable[Requirement]:
+    """Yield the mean NEES and NIS against the bounds for the number of independent draws in the pass.
 
-    A pass alone shows a filter that is too confident. A mean below the lower bound is a matter of many passes.
+    Above the upper bound the requirement is not met; below the lower one it is met, with a remark.
     """
     series = _declared(limits, found)
     nees = nis = None
@@ -349,6 +323,8 @@ def _consistency(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
                 degrees = float(values[1][values[1] > 0].mean())
                 low, bound = bounds_per_degree(degrees, values[2], share / 100.0)
                 note += f"; {low:.2f} to {bound:.2f} with {share:g} % for {values[2]:.3g} independent draws"
+                wrong = sigma_remark(mean, low, bound)
+                note += f"; {wrong}" if wrong else ""
         yield _row(
             f"consistency.{key}",
             f"mean {key.upper()} per degree of freedom",
@@ -361,7 +337,13 @@ def _consistency(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
         )
 
 
-def _completeness(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+def consistency_remarks(table: Sequence[Requirement]) -> list[str]:
+    """Return a remark for each mean NEES or NIS that shows a filter that is too cautious."""
+    wrong = ((one, one.note.rpartition("; ")[2]) for one in table if one.key.startswith("consistency."))
+    return [f"{one.name} {one.value:.2f}: {text}" for one, text in wrong if text.endswith("too large")]
+
+
+def _completeness(limits: Requirements, found: Evaluated) -> Iterable[Requirement]:
     packets, frames = found.packets, found.frames
     share = edges = None
     note = ""
@@ -411,7 +393,7 @@ def _completeness(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
         )
 
 
-def _detector(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+def _detector(limits: Requirements, found: Evaluated) -> Iterable[Requirement]:
     micro = None if found.detector is None else found.detector.micro
     note = "" if micro is None else f"{count_text(micro.expected)} craters of {micro.label} expected"
     recall, precision = (None, None) if micro is None else (micro.recall, micro.precision)
@@ -421,7 +403,7 @@ def _detector(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
     )
 
 
-def _pointing(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+def _pointing(limits: Requirements, found: Evaluated) -> Iterable[Requirement]:
     """Yield the offset of the images from the catalogue: an error of the camera or of the attitude."""
     residuals = None if found.detector is None else found.detector.residuals
     offset, note = None, ""
@@ -443,7 +425,7 @@ def _pointing(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
     )
 
 
-def _clock(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+def _clock(limits: Requirements, found: Evaluated) -> Iterable[Requirement]:
     yield _row(
         "time.step",
         "step of the on-board clock",
@@ -455,7 +437,7 @@ def _clock(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
     )
 
 
-def _independence(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+def _independence(limits: Requirements, found: Evaluated) -> Iterable[Requirement]:
     series = _declared(limits, found)
     reads = None if series is None else series.anchor_reads_after_start
     resets = _resets(series)
@@ -481,7 +463,7 @@ def _resets(series: NavigationSeries | None) -> float | None:
     return float(sum(trigger != "none" for trigger in series.reset_trigger[1:]))
 
 
-def _resources(limits: Limits, found: Evaluated) -> Iterable[Requirement]:
+def _resources(limits: Requirements, found: Evaluated) -> Iterable[Requirement]:
     values = {one.name: one.values[np.isfinite(one.values)] for one in found.housekeeping}
 
     def greatest(name: str, scale: float = 1.0) -> float | None:

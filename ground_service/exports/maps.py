@@ -30,14 +30,14 @@ from ground_service.exports.messages import Poses, poses_of
 from ground_service.exports.tables import identified_craters
 from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera, ground_point_sphere
-from lunar.constants import MOON_RADIUS_M
+from lunar.constants import MOON_RADIUS_M, NS
 from lunar.frames import (
     continuous_quaternions,
     mcmf_from_spherical,
     quaternion_from_matrix,
     spherical_from_mcmf,
 )
-from lunar.timescales import NS, format_utc
+from lunar.timescales import format_utc
 from tmtc.errors import MissingLibrary
 
 CRS = "IAU_2015:30100"

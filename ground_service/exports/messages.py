@@ -89,7 +89,6 @@ def poses_of(inputs: PassInputs, states: str = REFERENCE) -> Poses:
 
 
 def states_names(inputs: PassInputs) -> list[str]:
-    """Return the names of the states of a pass."""
     names = [one.estimator for one in inputs.navigation if len(one.utc_ns)]
     return [*([REFERENCE] if inputs.reference is not None else []), *names]
 
@@ -137,7 +136,7 @@ GAP_STEPS = 1.5
 
 
 @dataclass(frozen=True, slots=True)
-class Craft:
+class SpacecraftNames:
     """Name and CCSDS number of a spacecraft, and the correlations of its clock."""
 
     name: str
@@ -151,7 +150,7 @@ def craft_name(inputs: PassInputs, number: int) -> str:
     return reference.segments[0].object_name if reference is not None else f"SPACECRAFT_{number}"
 
 
-def ephemeris_of(inputs: PassInputs, states: str, craft: Craft) -> Ephemeris:
+def ephemeris_of(inputs: PassInputs, states: str, spacecraft: SpacecraftNames) -> Ephemeris:
     """Return the states of a pass as an ephemeris: the reference in its interval, or the states of the filter.
 
     Raises
@@ -183,7 +182,7 @@ def ephemeris_of(inputs: PassInputs, states: str, craft: Craft) -> Ephemeris:
         found.utc_ns,
         found.state[:, :3],
         found.state[:, 3:6],
-        craft.name,
+        spacecraft.name,
         frame=found.frame,
         interpolation="HERMITE",
         degree=3,
@@ -196,15 +195,15 @@ def ephemeris_of(inputs: PassInputs, states: str, craft: Craft) -> Ephemeris:
     )
 
 
-def orbit_octets(inputs: PassInputs, craft: Craft, kind: str, states: str) -> bytes:
+def orbit_octets(inputs: PassInputs, spacecraft: SpacecraftNames, kind: str, states: str) -> bytes:
     """Return the orbit of a pass as `oem`, `oem-xml` or `spk`."""
-    ephemeris = ephemeris_of(inputs, states, craft)
+    ephemeris = ephemeris_of(inputs, states, spacecraft)
     if kind == "spk":
-        return spk_kernel(ephemeris, spacecraft_id(craft.number)).octets
+        return spk_kernel(ephemeris, spacecraft_id(spacecraft.number)).octets
     return (format_oem_xml(ephemeris) if kind == "oem-xml" else format_oem(ephemeris)).encode()
 
 
-def attitude_octets(inputs: PassInputs, craft: Craft, kind: str, version: str) -> bytes:
+def attitude_octets(inputs: PassInputs, spacecraft: SpacecraftNames, kind: str, version: str) -> bytes:
     """Return the attitude of the camera in the frames of a pass as `ck`, or `aem` of a version.
 
     Raises
@@ -216,10 +215,12 @@ def attitude_octets(inputs: PassInputs, craft: Craft, kind: str, version: str) -
     if not len(utc_ns):
         raise EvaluationError(f"pass {inputs.pass_id}: expected attitudes of its frames, found none")
     if kind == "ck":
-        ticks = np.array([ticks_of_utc_ns(int(one), craft.correlations) for one in utc_ns], dtype=np.int64)
+        ticks = np.array(
+            [ticks_of_utc_ns(int(one), spacecraft.correlations) for one in utc_ns], dtype=np.int64
+        )
         step = float(np.median(np.diff(ticks))) if len(ticks) > 1 else float(TICKS_PER_SECOND)
-        return ck_octets(ticks, q_wxyz, spacecraft_id(craft.number), gap_ticks=int(GAP_STEPS * step))
-    segment = AttitudeSegment(utc_ns, q_wxyz, object_name=craft.name, object_id=craft.name)
+        return ck_octets(ticks, q_wxyz, spacecraft_id(spacecraft.number), gap_ticks=int(GAP_STEPS * step))
+    segment = AttitudeSegment(utc_ns, q_wxyz, object_name=spacecraft.name, object_id=spacecraft.name)
     return format_aem((segment,), version).encode()
 
 
@@ -237,15 +238,17 @@ def clock_lines(correlations: Sequence[TimeCorrelation], ticks: IntArray) -> lis
     return lines
 
 
-def text_kernel(inputs: PassInputs, craft: Craft, kind: str) -> str:
+def text_kernel(inputs: PassInputs, spacecraft: SpacecraftNames, kind: str) -> str:
     """Return the text kernel `sclk`, `fk` or `ik` of a pass."""
-    number = spacecraft_id(craft.number)
+    number = spacecraft_id(spacecraft.number)
     if kind == "fk":
-        return format_fk(number, craft.name)
+        return format_fk(number, spacecraft.name)
     if kind == "ik":
-        return format_ik(inputs.viewing.camera, number, craft.name)
-    ticks = [ticks_of_utc_ns(one, craft.correlations) for one in (inputs.start_utc_ns, inputs.stop_utc_ns)]
-    return format_sclk(clock_lines(craft.correlations, np.array(ticks, dtype=np.int64)), number)
+        return format_ik(inputs.viewing.camera, number, spacecraft.name)
+    ticks = [
+        ticks_of_utc_ns(one, spacecraft.correlations) for one in (inputs.start_utc_ns, inputs.stop_utc_ns)
+    ]
+    return format_sclk(clock_lines(spacecraft.correlations, np.array(ticks, dtype=np.int64)), number)
 
 
 def leap_seconds() -> str:

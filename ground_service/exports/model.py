@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, WithJsonSchema
 
-from ground_service.http.model import Entity, Given
+from ground_service.http.model import Entity, RequestModel
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Format:
 
     @property
     def several_files(self) -> bool:
-        """Whether an export has several files."""
+        """Return whether an export has several files."""
         return self.ending == "zip"
 
 
@@ -89,7 +89,7 @@ def _known(name: str) -> str:
 FormatName = Annotated[str, AfterValidator(_known), WithJsonSchema({"type": "string", "enum": list(FORMATS)})]
 
 
-class ExportRequest(Given):
+class ExportRequest(RequestModel):
     """A pass, and the format of its export."""
 
     pass_id: int = Field(ge=1, le=2**31 - 1, examples=[1])

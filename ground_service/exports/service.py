@@ -115,12 +115,12 @@ def _octets(ground: Ground, request: ExportRequest) -> bytes:
     with ground.database.reading() as connection:
         correlations = load_correlations(connection, store.get_pass(connection, request.pass_id).vehicle_id)
     number = detail.spacecraft_id
-    craft = messages.Craft(messages.craft_name(inputs, number), number, correlations)
+    spacecraft = messages.SpacecraftNames(messages.craft_name(inputs, number), number, correlations)
     if kind in ORBITS:
-        return messages.orbit_octets(inputs, craft, kind, request.states)
+        return messages.orbit_octets(inputs, spacecraft, kind, request.states)
     if kind in ATTITUDES:
-        return messages.attitude_octets(inputs, craft, kind, request.version)
-    return messages.text_kernel(inputs, craft, kind).encode()
+        return messages.attitude_octets(inputs, spacecraft, kind, request.version)
+    return messages.text_kernel(inputs, spacecraft, kind).encode()
 
 
 def _files(ground: Ground, request: ExportRequest, chosen: Format) -> Iterator[tuple[str, bytes]]:

@@ -1,1 +1,1 @@
-"""What every endpoint shares: limits, origins, uploads, problem details, schemas, time formats."""
+"""Common parts of all endpoints: limits, origins, uploads, problem details, schemas, time formats."""

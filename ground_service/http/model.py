@@ -43,7 +43,7 @@ class Entity(BaseModel):
         return cls.model_validate(values)
 
 
-class Given(BaseModel):
+class RequestModel(BaseModel):
     """Base class of requests; values are not converted between types, such as true to 1."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -193,7 +193,7 @@ def _read(value: Any) -> UtcTime:
     raise ValueError(f"expected a time such as {EXAMPLE_TIME}, found {type(value).__name__}")
 
 
-GivenTime = Annotated[
+RequestTime = Annotated[
     UtcTime, BeforeValidator(_given), Field(examples=[EXAMPLE_TIME], description="UTC, RFC 3339")
 ]
 """A time in a request: text only, within the range of the on-board clock."""

@@ -65,7 +65,7 @@ class UnsupportedEncoding(GroundError):
 
 
 class PreconditionFailed(GroundError):
-    """What is stored is no longer what the caller saw."""
+    """Stored object that differs from the one that the caller read."""
 
 
 STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
@@ -93,7 +93,7 @@ STATUSES: tuple[tuple[type[Exception], int, str], ...] = (
     (GroundError, 400, "bad request"),
 )
 
-TOLD: tuple[tuple[type[Exception], str], ...] = (
+PUBLIC_TEXTS: tuple[tuple[type[Exception], str], ...] = (
     (StorageFull, "no space left; the data were not stored"),
     (StorageReadOnly, "the archive or the database cannot be written"),
     (FileDamaged, "the content of a stored file has changed"),
@@ -173,22 +173,22 @@ def install(app: FastAPI) -> None:
         if isinstance(error, Busy):
             return busy(str(error), request)
         is_local = getattr(request.app.state, "local_caller", None) is not None
-        told = str(error) if is_local else public_text(error)  # the log contains the complete text
+        message = str(error) if is_local else public_text(error)  # the log contains the complete text
         if isinstance(error, PlanConflicts):
             found = [
                 {"where": f"window {one.window_id}" if one.window_id else one.kind, "detail": one.detail}
                 for one in error.conflicts
             ]
-            return problem(409, "conflict", told, request, errors=found)
+            return problem(409, "conflict", message, request, errors=found)
         if isinstance(error, StateConflict):
-            return problem(409, "conflict", told, request, state=error.found)
+            return problem(409, "conflict", message, request, state=error.found)
         status, title = next((s, t) for kind, s, t in STATUSES if isinstance(error, kind))
         if status < 500 or is_local or status == HTTPStatus.NOT_IMPLEMENTED:  # names a library, no path
-            return problem(status, title, told, request)
+            return problem(status, title, message, request)
         # The message may contain paths or addresses: it is logged with the id of the request.
         request_id = getattr(request.state, "request_id", None)
         log.error("%s %s: %s", request.method, request.url.path, error, extra={"request_id": request_id})
-        detail = next(text for kind, text in TOLD if isinstance(error, kind))
+        detail = next(text for kind, text in PUBLIC_TEXTS if isinstance(error, kind))
         return problem(status, title, detail, request, request_id=request_id)
 
     async def http(request: Request, error: Exception) -> JSONResponse:
@@ -217,8 +217,8 @@ def install(app: FastAPI) -> None:
         return problem(422, "invalid request", detail, request, errors=found)
 
     async def unexpected(request: Request, error: Exception) -> JSONResponse:
-        told = {"request_id": getattr(request.state, "request_id", None)}
-        log.exception("%s %s", request.method, request.url.path, exc_info=error, extra=told)
+        fields = {"request_id": getattr(request.state, "request_id", None)}
+        log.exception("%s %s", request.method, request.url.path, exc_info=error, extra=fields)
         return problem(500, "internal error", "internal error; see the log of the service", request)
 
     for kind in (GroundError, TmtcError, LunarError, ReportError):

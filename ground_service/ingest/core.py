@@ -15,6 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from ground_service.telemetry.packets import NO_TIME
 from lunar.arrays import IntArray, OctetArray
 from lunar.plausible import AGREEING_PACKETS, CLOCK_ERROR_S, SILENCE_S, UNSET_CLOCK_S
 from tmtc.link.clcw import UplinkSeen
@@ -45,13 +46,13 @@ class Gap:
 
     @property
     def missing(self) -> int:
-        """How many packets are missing."""
+        """Return the number of missing packets."""
         return self.last_count - self.first_count + 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SequenceAccount:
-    """What the counts of one vehicle and APID say.
+    """Sequence accounting of one vehicle and APID.
 
     `order` sorts the packets given into on-board order; `run` and `count` (n,) are in that order: the number of the
     run since a restart, and the unwrapped count within it. `conflicts` are packets whose unwrapped count another
@@ -380,10 +381,6 @@ CDS_EPOCH_DAYS = 4383
 """Days from 1958-01-01 to 1970-01-01."""
 
 
-NO_TIME = -1
-"""Reception time of a CADU whose record states none."""
-
-
 @dataclass(frozen=True, slots=True)
 class RecordFormat:
     """Octets of a station's record around each CADU; `time_code` None: the header has no reception time."""
@@ -421,7 +418,7 @@ NO_RECORD = RecordFormat()
 
 
 @dataclass(slots=True)
-class Found:
+class LinkContent:
     """Counts of what a piece of a recording has completed: frames, packets, link quality, octets.
 
     Attributes

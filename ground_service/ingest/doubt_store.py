@@ -15,16 +15,16 @@ from ground_service.http.model import PageOf
 from ground_service.ingest import store
 from ground_service.ingest.core import (
     LONGEST_STEP,
-    NO_TIME,
     UNSET_TICKS,
     fits_between,
     implausible_times,
 )
 from ground_service.ingest.model import ImplausibleFilter, ImplausiblePacket
-from ground_service.ingest.packets import PacketBatch, batch_of_cut
-from ground_service.store import repository, telemetry
+from ground_service.store import repository
 from ground_service.store.event_kinds import TelemetryWithdrawn, TimesDoubted, publish
 from ground_service.store.vehicles import get_vehicle, lock_vehicle
+from ground_service.telemetry import store as telemetry
+from ground_service.telemetry.packets import NO_TIME, PacketBatch, batch_of_cut
 from lunar.arrays import IntArray
 from lunar.plausible import AGREEING_PACKETS
 from lunar.timescales import ticks_from_utc_ns, utc_ns_from_ticks
@@ -176,7 +176,7 @@ def review_times(ground: Ground, vehicle: int) -> None:
 
 
 def _contradicted(connection: Connection, vehicle: int) -> tuple[list[int], str] | None:
-    """Return packets of the archive whose time is implausible beside the others, and the reason."""
+    """Return packets of the archive whose time is implausible compared with the others, and the reason."""
     newest = telemetry.newest_ticks(connection, vehicle)
     if newest is None:
         return None

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.ingest.core import COUNTS, UNKNOWN, Channel, Found, Fragment, RecordFormat, is_idle
-from ground_service.ingest.packets import PacketBatch, batch_of_cut
+from ground_service.ingest.core import COUNTS, UNKNOWN, Channel, Fragment, LinkContent, RecordFormat, is_idle
+from ground_service.telemetry.packets import PacketBatch, batch_of_cut
 from lunar.arrays import BoolArray, IntArray, OctetArray
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Dictionary
@@ -92,7 +92,7 @@ class FrameBlock:
 
     @property
     def good(self) -> BoolArray:
-        """Which frames (n,) can be used."""
+        """Return which frames (n,) can be used."""
         good: BoolArray = self.found.valid & (self.found.header.version == 0)
         return good
 
@@ -132,7 +132,7 @@ class FrameReader:
         self,
         section: Section,
         settings: LinkSettings,
-        found: Found,
+        found: LinkContent,
         *,
         spacecraft_id: int | None = None,
         dictionary: Dictionary = DICTIONARY,
@@ -496,7 +496,7 @@ class PacketReader:
     def __init__(
         self,
         section: Section,
-        found: Found,
+        found: LinkContent,
         form: PacketForm = CHECKED,
         *,
         spacecraft_id: int | None = None,
@@ -549,7 +549,7 @@ class PacketReader:
 
     @property
     def _is_start(self) -> bool:
-        """Whether a packet begins where the section begins."""
+        """Return whether a packet begins where the section begins."""
         return self.section.position + self.section.start == 0
 
     def _batch(self, octets: OctetArray, cut: PacketCut, at: int) -> PacketBatch:

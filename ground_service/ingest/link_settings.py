@@ -15,11 +15,11 @@ from weakref import WeakKeyDictionary
 from sqlalchemy import Connection, Engine
 
 from ground_service.ingest.core import NO_RECORD, RecordFormat
-from ground_service.ingest.parameters import definitions_of_spacecraft
 from ground_service.ingest.recording_store import Piece, Surroundings, surroundings
 from ground_service.missions.definitions import PacketDefinitions
 from ground_service.missions.model import Link, StationLink
 from ground_service.missions.store import links_in_force
+from ground_service.telemetry.decoding import definitions_of_spacecraft
 from tmtc.link.settings import LinkSettings
 from tmtc.packets.stream import CHECKED, PacketForm
 
@@ -70,7 +70,7 @@ class ExpectedLink:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Known:
-    """What is known before a piece is read; `definitions` is None for a piece of any spacecraft."""
+    """Knowledge before a piece is read; `definitions` is None for a piece of any spacecraft."""
 
     expected: ExpectedLink
     definitions: PacketDefinitions | None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import ConfigDict, Field
 
-from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber, UtcTime
+from ground_service.http.model import Entity, InstanceName, Paging, RequestModel, SpacecraftNumber, UtcTime
 from ground_service.toml import LINE_PATTERN_JSON
 
 
@@ -34,7 +34,7 @@ class ReceivedSection(Entity):
 
 
 class ReceivedLink(Entity):
-    """Link quality of one piece, see `ingest.quality.Found`; null: unknown."""
+    """Link quality of one piece, see `ingest.quality.LinkContent`; null: unknown."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)  # accountings of earlier versions have more fields
 
@@ -125,8 +125,8 @@ class IngestResult(Entity):
     uplink: tuple[ReceivedControlWords, ...] = ()
 
 
-class Withdrawal(Given):
-    """Why an ingest is withdrawn."""
+class Withdrawal(RequestModel):
+    """Reason for the withdrawal of an ingest."""
 
     reason: str = Field(min_length=1, max_length=500, pattern=LINE_PATTERN_JSON, examples=["another flight"])
 

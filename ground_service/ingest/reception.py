@@ -20,23 +20,23 @@ from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
 from ground_service.ingest import frames, store
 from ground_service.ingest import recording_store as recordings
-from ground_service.ingest.core import Found, Fragment, complete, join
+from ground_service.ingest.core import Fragment, LinkContent, complete, join
 from ground_service.ingest.doubt_store import count_implausible, plausible_part
 from ground_service.ingest.frames import CADU_MAX_OCTETS, FrameReader, PacketReader, Section
 from ground_service.ingest.link_settings import known_before, packet_form
 from ground_service.ingest.model import IngestResult, ReceivedControlWords, ReceivedLink, ReceivedSection
-from ground_service.ingest.packets import PacketBatch, batch_of_cut, time_receptions
-from ground_service.ingest.parameters import (
-    catch_up,
-    decode_declared,
-    definitions_of_spacecraft,
-    note_dictionary,
-)
 from ground_service.ingest.recording_store import Part, Piece
 from ground_service.ingest.store import Stored
 from ground_service.missions.definitions import PacketDefinitions
 from ground_service.store.files import FileArchive, mapped_octets, read_blocks, recorded_name
 from ground_service.store.vehicles import vehicle_id
+from ground_service.telemetry.decoding import (
+    catch_up,
+    decode_declared,
+    definitions_of_spacecraft,
+    note_dictionary,
+)
+from ground_service.telemetry.packets import PacketBatch, batch_of_cut, time_receptions
 from lunar.arrays import OctetArray
 from tmtc.arrays import as_octets
 from tmtc.dictionary.payload import DICTIONARY
@@ -101,7 +101,6 @@ class Run:
         return self.read(0, self.octets)
 
     def read(self, start: int, stop: int) -> OctetArray:
-        """Return the octets [start, stop)."""
         return as_octets(b"".join(self._blocks(start, stop)))
 
     def windows(self, start: int, stop: int) -> Iterator[tuple[OctetArray, bool]]:
@@ -176,7 +175,7 @@ class Reading:
         self.forms: dict[int, PacketForm] = {}
         if piece.spacecraft_id is not None:
             self.forms[piece.spacecraft_id] = self.expected.form
-        self.found = Found()
+        self.found = LinkContent()
         self.unknown = 0
         self.ticks: list[int] = []
         self.sections: list[Section] = []
@@ -315,7 +314,6 @@ class Reading:
         return reader
 
     def _form_of(self, spacecraft: int) -> PacketForm:
-        """Return the form of the packets of a spacecraft."""
         if spacecraft not in self.forms:
             with self.ground.database.reading() as connection:
                 found = packet_form(connection, spacecraft, self.piece.scope, self.piece.station)
@@ -525,7 +523,7 @@ class Reading:
         framed = [(one, one.settings) for one in self.sections if one.settings is not None]
         if not framed:
             return None
-        names = {one.name for one in fields(Found)} & set(ReceivedLink.model_fields)
+        names = {one.name for one in fields(LinkContent)} & set(ReceivedLink.model_fields)
         return ReceivedLink(
             station=self.piece.station,
             bit_error_rate=self.found.bit_error_rate,

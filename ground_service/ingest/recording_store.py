@@ -56,7 +56,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Neighbours:
-    """What earlier pieces of a recording have around a piece: octets before and behind it, in order, without a gap.
+    """Octets of earlier pieces directly before and behind a piece of a recording.
 
     `new`: ranges [start, stop) of the piece, as positions in the recording, that no earlier piece has; all of it if the
     piece itself was entered before. Pieces with other statements of their sender and those that failed do not count.
@@ -89,7 +89,6 @@ def add_piece(connection: Connection, piece: Piece) -> None:
 
 
 def get_piece(connection: Connection, ingest_id: int) -> Piece:
-    """Return the piece of an ingest."""
     (piece,) = _pieces(connection, PIECES.c.ingest_id == ingest_id)
     return piece
 
@@ -290,7 +289,7 @@ def surroundings(connection: Connection, piece: Piece) -> Surroundings:
 
 
 def _surroundings_query() -> Any:
-    """Return the query of `surroundings`: aggregates of one row each, beside the vehicle if it exists."""
+    """Return the query of `surroundings`: aggregates of one row each, with the vehicle if it exists."""
     scope: Any = bindparam("scope")
     missions = select(func.count().label("missions"), func.max(MISSIONS.c.id).label("last_mission"))
     vehicles = VEHICLES.alias()

@@ -19,15 +19,16 @@ from ground_service.errors import PASSING, Conflict, GroundError, InvalidInput, 
 from ground_service.ground import Ground
 from ground_service.ingest import doubt_store, store
 from ground_service.ingest.model import IngestResult
-from ground_service.ingest.parameters import decode_declared, definitions_in_force, redecode
 from ground_service.ingest.reception import Progress, Reading
 from ground_service.ingest.recording_store import Piece, add_piece, get_piece
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import OTHER_REQUEST, add_job, find_job
 from ground_service.missions.store import stations_in_force
-from ground_service.store import parameters, telemetry
 from ground_service.store.files import StoredFile, register_file
 from ground_service.store.vehicles import FLOWN, all_vehicles, hold, lock_vehicle
+from ground_service.telemetry import store as telemetry
+from ground_service.telemetry import values as parameters
+from ground_service.telemetry.decoding import decode_declared, definitions_in_force, redecode
 from ground_service.toml import REASON_LIMIT, require_line
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import TmtcError

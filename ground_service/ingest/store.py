@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -17,12 +17,12 @@ from ground_service.ingest.model import Ingest, IngestResult
 from ground_service.missions.timekeeping.model import RECEPTIONS_LIMIT
 from ground_service.store import repository
 from ground_service.store.event_kinds import ReceptionsEntered, TelemetryReceived, publish
-from ground_service.store.models import NO_TICKS, PACKETS, SAMPLE_TABLES, VEHICLES
-from ground_service.store.parameters import forget_others
+from ground_service.store.models import NO_TICKS, PACKETS, VEHICLES
 from ground_service.store.repository import insert_columns
-from ground_service.store.rollups import add_to_rollups, forget_rollups, rebuild_rollups
 from ground_service.store.states import change_if
-from ground_service.store.telemetry import pack_detections, pack_filter_states, pack_identifications
+from ground_service.telemetry.rollups import rebuild_rollups
+from ground_service.telemetry.values import forget_others
+from ground_service.telemetry.writing import TABLES, store_samples
 from lunar.arrays import IntArray
 
 RANGE_GAP_TICKS = 600 << 16
@@ -33,7 +33,6 @@ FEW_PACKETS = 64
 FORGOTTEN_PACKETS = 1000
 """Packets that one statement removes."""
 
-_TABLES: dict[str, Any] = {table.name: table for table in SAMPLE_TABLES}
 _PACKETS: Any = PACKETS
 _INGESTS = repository.INGESTS
 _FILES = repository.FILES
@@ -48,10 +47,6 @@ _PLACE = (
 
 log = logging.getLogger(__name__)
 
-_PACKED: dict[str, Callable[..., list[bytes]]] = {
-    "detections": pack_detections,
-    "identifications": pack_identifications,
-}
 
 _IN_RANGE = select(_PACKETS.c.digest).where(
     _PACKETS.c.vehicle_id == bindparam("vehicle_id"),
@@ -61,7 +56,7 @@ _IN_RANGE = select(_PACKETS.c.digest).where(
 
 
 class Batch(Protocol):
-    """What is stored: see `ground_service.ingest.packets.PacketBatch`."""
+    """Batch to store: see `ground_service.telemetry.packets.PacketBatch`."""
 
     @property
     def apid(self) -> IntArray: ...
@@ -98,7 +93,7 @@ RETURNING id, digest
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """What storing a batch changed."""
+    """Changes by the storage of a batch."""
 
     new: int
     repeated: int
@@ -185,48 +180,6 @@ def note_receptions(
         changed += connection.execute(statement.returning(_RECEPTIONS.c.ticks)).first() is not None
     if changed:
         publish(connection, ReceptionsEntered(vehicle_id=vehicle_id, reports=changed))
-
-
-def store_samples(
-    connection: Connection,
-    vehicle_id: int,
-    dictionary_version: int,
-    rows: Mapping[str, Mapping[str, Any]],
-    packet_ids: IntArray,
-) -> int:
-    """Insert decoded rows whose packet has an id in `packet_ids` (n,), 0 meaning: leave its rows out."""
-    stored = 0
-    counted: list[tuple[str, dict[str, Any]]] = []
-    for kind, columns in rows.items():
-        owner = packet_ids[columns["packet"]]
-        keep = np.flatnonzero(owner > 0)
-        if len(keep) == 0:
-            continue
-        keep = keep[np.lexsort((owner[keep], columns["ticks"][keep]))]
-        chosen = {
-            name: column[keep]
-            for name, column in columns.items()
-            if name not in ("packet", "items", "offsets", "state", "covariance")
-        }
-        if kind in _PACKED:
-            packed = _PACKED[kind](columns["items"], columns["offsets"])
-            chosen["items"] = [packed[i] for i in keep.tolist()]
-        if kind == "filter_states":
-            chosen["values"] = pack_filter_states(columns["state"][keep], columns["covariance"][keep])
-        stored += insert_columns(
-            connection,
-            _TABLES[kind],
-            {
-                "vehicle_id": np.full(len(keep), vehicle_id),
-                "dictionary_version": np.full(len(keep), dictionary_version),
-                "packet_id": owner[keep],
-                **chosen,
-            },
-        )
-        counted.append((kind, chosen))
-    for kind, chosen in counted:
-        add_to_rollups(connection, vehicle_id, dictionary_version, kind, chosen)
-    return stored
 
 
 def _new_packets(connection: Connection, vehicle_id: int, batch: Batch) -> IntArray:
@@ -423,17 +376,6 @@ def _may_have_packets(vehicle: int, start_ticks: int, stop_ticks: int) -> tuple[
     )
 
 
-def forget_samples(connection: Connection, vehicle: int, dictionary_version: int) -> None:
-    """Remove what a dictionary version has decoded from the packets of a vehicle."""
-    for table in _TABLES.values():
-        connection.execute(
-            delete(table).where(
-                table.c.vehicle_id == vehicle, table.c.dictionary_version == dictionary_version
-            )
-        )
-    forget_rollups(connection, vehicle, dictionary_version)
-
-
 def forget_packets(connection: Connection, vehicle: int, ids: Sequence[int]) -> tuple[int, int]:
     """Remove packets of a vehicle and what was decoded from them; return the extent of their times.
 
@@ -442,7 +384,7 @@ def forget_packets(connection: Connection, vehicle: int, ids: Sequence[int]) -> 
     extent: list[int] = []
     for first in range(0, len(ids), FORGOTTEN_PACKETS):
         chosen = ids[first : first + FORGOTTEN_PACKETS]
-        for kind, table in _TABLES.items():
+        for kind, table in TABLES.items():
             mine = (table.c.vehicle_id == vehicle, table.c.packet_id.in_(chosen))
             gone = connection.execute(
                 delete(table).where(*mine).returning(table.c.dictionary_version, table.c.ticks)
@@ -478,7 +420,7 @@ def ingests_of_vehicles(connection: Connection, vehicles: Sequence[int], but: in
 
 
 def forget_rest(connection: Connection, vehicle: int, ingest_id: int) -> None:
-    """Remove what an ingest has left besides packets of a vehicle: fragments, doubts, its place, and its marks.
+    """Remove what an ingest has left except packets of a vehicle: fragments, doubts, its place, and its marks.
 
     Telecommands that were sent after it are verified from where those before it were.
     """
@@ -498,19 +440,6 @@ def newest_ingest(connection: Connection, vehicle: int) -> int:
     """Return the id of the newest ingest with packets of a vehicle."""
     query = select(func.max(_INGESTS.c.id)).where(_INGESTS.c.vehicle_id == vehicle)
     return int(connection.execute(query).scalar_one())
-
-
-def packets_between(
-    connection: Connection, vehicle: int, after: int, until: int, limit: int
-) -> tuple[IntArray, list[bytes]]:
-    """Return ids (n,) and octets of the packets with ids above `after`, up to `until`, in the order of their ids."""
-    rows = connection.execute(
-        select(_PACKETS.c.id, _PACKETS.c.octets)
-        .where(_PACKETS.c.vehicle_id == vehicle, _PACKETS.c.id > after, _PACKETS.c.id <= until)
-        .order_by(_PACKETS.c.id)
-        .limit(limit)
-    ).all()
-    return np.array([row[0] for row in rows], dtype=np.int64), [bytes(row[1]) for row in rows]
 
 
 def _ingest(row: Mapping[str, Any]) -> Ingest:

@@ -66,7 +66,6 @@ def find_job(connection: Connection, job_id: str) -> Job | None:
 
 
 def get_job(connection: Connection, job_id: str) -> Job:
-    """Return a job."""
     return Job.of(repository.get(connection, JOBS, job_id, "job"))
 
 

@@ -21,6 +21,14 @@ from ground_service.missions.section import Array, Section
 from ground_service.toml import faults, read_table
 from lunar.boxes import Box, Region
 from lunar.errors import TimeFormatError
+from lunar.plausible import (
+    CAMERA_FIELD_DEG,
+    CAMERA_PIXELS,
+    EXPOSURE_S,
+    MAP_SHIFT_M,
+    REFERENCE_SIGMA_M,
+    Limit,
+)
 from lunar.timescales import parse_utc
 from tmtc.dictionary.effects import EFFECTS, FUNCTION, Effect
 from tmtc.dictionary.payload import DICTIONARY
@@ -35,6 +43,14 @@ NOT_STATED = "not stated"
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
+
+
+def _within(limit: Limit) -> Any:
+    return Field(ge=limit.low, le=limit.high)
+
+
+MapShift = Annotated[float, Field(ge=-MAP_SHIFT_M, le=MAP_SHIFT_M)]
+ReferenceSigma = Annotated[float, _within(REFERENCE_SIGMA_M)]
 Percent = Annotated[float, Field(ge=0.0, le=100.0)]
 Estimator = Literal["paper", "spherical", "anchored"]
 
@@ -50,7 +66,7 @@ CommandSubject = Annotated[str, AfterValidator(_known_subject)]
 
 
 class Spacecraft(Section):
-    """Spacecraft identification; `object_names` are those in ephemerides (OBJECT_NAME), besides `name`."""
+    """Spacecraft identification; `object_names` are those in ephemerides (OBJECT_NAME), in addition to `name`."""
 
     id: Annotated[int, Field(ge=0, le=1023)] | None = None
     name: str | None = None
@@ -169,6 +185,14 @@ def _utc(text: str) -> str:
     return text
 
 
+def _epoch(text: str) -> str:
+    try:
+        parse_utc(text.removesuffix(EPOCH_TAI))
+    except TimeFormatError as error:
+        raise ValueError(f"an epoch such as 1958-01-01T00:00:00 TAI: {error}") from None
+    return text
+
+
 class MissionClock(Section):
     """Clock of the mission time, at which plans, contacts and ages of values are counted.
 
@@ -195,8 +219,8 @@ class MissionClock(Section):
 class Time(Section):
     """On-board time and its correlation with UTC."""
 
-    epoch: str | None = None
-    ticks_per_second: int | None = None
+    epoch: Annotated[str, AfterValidator(_epoch)] | None = None
+    ticks_per_second: Annotated[int, Field(ge=1)] | None = None
     clock: str | None = None
     correlation: Literal["automatic", "manual", "ideal"] | None = None
     mission_clock: MissionClock | None = None
@@ -224,18 +248,18 @@ class Camera(Section):
     coefficients of the lens.
     """
 
-    width_px: Annotated[int, Field(ge=1)] | None = None
-    height_px: Annotated[int, Field(ge=1)] | None = None
-    fov_deg: Annotated[float, Field(gt=0.0, lt=180.0)] | None = None
+    width_px: Annotated[int, _within(CAMERA_PIXELS)] | None = None
+    height_px: Annotated[int, _within(CAMERA_PIXELS)] | None = None
+    fov_deg: Annotated[float, _within(CAMERA_FIELD_DEG)] | None = None
     k1: float | None = None
     k2: float | None = None
     k3: float | None = None
     p1: float | None = None
     p2: float | None = None
     pointing: Literal["nadir", "attitude"] | None = None
-    tilt_deg: float | None = None
-    yaw_deg: float | None = None
-    exposure_s: NotNegative | None = None
+    tilt_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
+    yaw_deg: Annotated[float, Field(ge=-360.0, le=360.0)] | None = None
+    exposure_s: Annotated[float, _within(EXPOSURE_S)] | None = None
     frame_interval_s: Positive | None = None
 
 
@@ -246,15 +270,19 @@ class Catalogue(Section):
     registration is the mean shift from the listed craters to the terrain near the frames, with its standard deviation
     per axis and the number of rims that it was fitted to; it is contained in the positions of an archive's catalogue.
     `registered_share` is the share of frames over ground where there is one: 0 if the catalogue is not registered.
+    `offset_sigma_m` (east, north, up) is the 1-sigma offset that all craters have in common, as the payload assumes it
+    at its start, `offset_correlation_deg` the arc over which it is similar (1/e).
     """
 
     source: str | None = None
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
-    registration_north_m: float | None = None
-    registration_east_m: float | None = None
+    registration_north_m: MapShift | None = None
+    registration_east_m: MapShift | None = None
     registration_sigma_m: NotNegative | None = None
     registration_rims: Annotated[int, Field(ge=0)] | None = None
     registered_share: Share | None = None
+    offset_sigma_m: Annotated[tuple[NotNegative, NotNegative, NotNegative], Array] | None = None
+    offset_correlation_deg: Positive | None = None
 
 
 class Detector(Section):
@@ -270,7 +298,7 @@ class Reference(Section):
     """Source of the reference ephemeris, and its 1-sigma error in radial, transverse and normal."""
 
     source: str | None = None
-    sigma_rtn_m: Annotated[tuple[NotNegative, NotNegative, NotNegative], Array] | None = None
+    sigma_rtn_m: Annotated[tuple[ReferenceSigma, ReferenceSigma, ReferenceSigma], Array] | None = None
     correlation_time_s: Positive | None = None
 
 
@@ -287,7 +315,14 @@ LEVEL_WORDS: dict[Level, str] = {
 }
 
 
-BoxLimits = Annotated[tuple[float, float, float, float], Array]
+def _box(limits: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    west, east, south, north = limits
+    if not (-360.0 <= west < east <= west + 360.0 <= 1080.0 and -90.0 <= south < north <= 90.0):
+        raise ValueError("west, east, south and north in degrees")
+    return limits
+
+
+BoxLimits = Annotated[tuple[float, float, float, float], Array, AfterValidator(_box)]
 
 
 class TrainedGround(Section):
@@ -606,10 +641,7 @@ class PacketTime(Section):
             )
         if self.epoch.endswith(EPOCH_TAI) and (self.code == "cds" or self.clock == "unix"):
             raise ValueError("an epoch in UTC for a CDS code or a Unix clock, found one in TAI")
-        try:
-            parse_utc(self.epoch.removesuffix(EPOCH_TAI))
-        except TimeFormatError as error:
-            raise ValueError(f"an epoch such as 1958-01-01T00:00:00 TAI: {error}") from None
+        _epoch(self.epoch)
         return self
 
 
@@ -672,7 +704,7 @@ class Mission(Section):
     links: Annotated[tuple[StationConnection, ...], Array] | None = None
     packets: Annotated[tuple[PacketSource, ...], Array] | None = None
     procedures: dict[str, Annotated[str, Field(min_length=1, max_length=4000)]] = Field(default_factory=dict)
-    """What an operator does about an alarm, by the name of its event or parameter."""
+    """Procedures of the operator for alarms, by the name of event or parameter."""
 
     @model_validator(mode="after")
     def _links_once(self) -> Mission:
@@ -721,6 +753,16 @@ class Mission(Section):
         return hashlib.sha256(text.encode()).hexdigest()
 
     @property
+    def words(self) -> str:
+        """Return the stated numbers and times as read, by section, for `linna mission check`."""
+        stated = self.model_dump(mode="json", exclude_none=True, exclude={"procedures", "notify", "world"})
+        return "\n".join(
+            f"{name}: {', '.join(_listed(section))}"
+            for name, section in stated.items()
+            if isinstance(section, (dict, list)) and section
+        )
+
+    @property
     def unknown(self) -> tuple[str, ...]:
         """Keys that are not stated, as ``section.key``, in the order of the document."""
         return tuple(_not_stated(self))
@@ -739,7 +781,7 @@ class MissionRevision(Entity):
 
 
 class MissionCheck(Entity):
-    """What a text would be as a mission description; it was not added."""
+    """Result of checking a text as a mission description; it was not added."""
 
     faults: tuple[str, ...] = Field(description="One line for each fault; empty if it can be added")
     unknown: tuple[str, ...] = Field(description="Keys that it does not state")
@@ -789,6 +831,18 @@ def read_document(text: str, source: str, *, stored: bool = False) -> Mission | 
         return [error]
     except ValidationError as error:
         return faults(Mission, error, source)
+
+
+def _listed(value: Any, path: str = "") -> Iterator[str]:
+    """Yield the numbers, flags and short texts in a section, with their keys."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _listed(item, f"{path}.{key}" if path else key)
+    elif isinstance(value, list) and any(isinstance(item, dict) for item in value):
+        for number, item in enumerate(value):
+            yield from _listed(item, f"{path}.{number}" if path else str(number))
+    else:
+        yield f"{path} {json.dumps(value)[:80]}"
 
 
 def _not_stated(section: BaseModel, path: str = "") -> Iterator[str]:

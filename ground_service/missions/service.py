@@ -107,7 +107,7 @@ def _text_of(octets: bytes, source: str) -> str:
 
 
 def _read(text: str, source: str) -> tuple[Mission | None, list[InvalidInput]]:
-    """Return what a text describes, None if that cannot be told, and all faults."""
+    """Return what a text describes, None if that is unknown, and all faults."""
     read = read_document(text, source)
     return (read, definition_faults(read, source)) if isinstance(read, Mission) else (None, read)
 

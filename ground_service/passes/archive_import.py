@@ -11,10 +11,10 @@ import struct
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,12 @@ from ground_service.errors import InvalidInput, NotFound, storage_error
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_stored
 from ground_service.missions import store as missions
-from ground_service.missions.ephemerides.service import attitude_file, insert_ephemeris, load_attitudes
+from ground_service.missions.ephemerides.service import (
+    attitude_file,
+    check_attitudes,
+    insert_ephemeris,
+    load_attitudes,
+)
 from ground_service.missions.frames import mission_of_manifest
 from ground_service.missions.model import Mission
 from ground_service.missions.service import enter, read_mission
@@ -40,8 +45,9 @@ from ground_service.store.vehicles import ARCHIVE_ACTOR, SPACECRAFT_ID_MAX, find
 from ground_service.toml import read_json, require_line
 from lunar.arrays import FloatArray
 from lunar.catalogue import load_catalogue
+from lunar.ephemeris import Ephemeris
 from lunar.errors import LunarError
-from lunar.messages.ephemeris_files import load_ephemeris
+from lunar.messages.ephemeris_files import load_orbit
 from lunar.timescales import TICKS_PER_SECOND, parse_utc
 from tmtc.dictionary.payload import APID_LARGE_DATA, DICTIONARY
 from tmtc.errors import ValueRefused
@@ -53,6 +59,7 @@ SCHEMA_VERSION = 1
 RECEPTIONS_FILE = "receptions.csv"
 MISSION_FILE = "mission.toml"
 MANIFEST_FILE = "manifest.json"
+Content = TypeVar("Content")
 
 FRAMES_KEPT = 200
 """Images kept with a pass, spread evenly: galleries need a few, and a day of them would fill the archive."""
@@ -91,22 +98,32 @@ def import_archive(ground: Ground, folder: Path) -> int:
     names = checked_files(folder, manifest)
     start_utc_ns, stop_utc_ns = _interval(folder, manifest)
     mission, text = _mission(folder, manifest)
-    for name, load in (("reference.oem", load_ephemeris), ("catalogue.csv", load_catalogue)):
-        if name in names:
-            try:
-                load(folder / name)
-            except LunarError as error:
-                raise InvalidInput(str(folder / name), "", "a readable file", str(error)) from None
+    reference = _readable(load_orbit, folder / "reference.oem", names)
+    _readable(load_catalogue, folder / "catalogue.csv", names)
     receptions = read_receptions(folder / RECEPTIONS_FILE) if RECEPTIONS_FILE in names else None
     attitudes = attitude_file(names, str(folder))
     if attitudes is not None:
-        load_attitudes(folder / attitudes, str(folder / attitudes))
+        table = load_attitudes(folder / attitudes, str(folder / attitudes))
+        if reference is not None:
+            try:
+                check_attitudes(table, reference, start_utc_ns, stop_utc_ns)
+            except LunarError as error:
+                raise InvalidInput(str(folder / attitudes), "", "attitudes of the pass", str(error)) from None
     stored = {name: ground.files.put_file(folder / name) for name in names if not name.startswith("frames/")}
     # The regression archive of the pass is made of the stored files, which the manifest names.
     stored[MANIFEST_FILE] = ground.files.put_file(folder / MANIFEST_FILE)
     images = {number: ground.files.put_file(folder / name) for number, name in _chosen_frames(names)}
     pass_id = _register(
-        ground, folder, manifest, digest, start_utc_ns, stop_utc_ns, stored, images, (mission, text)
+        ground,
+        folder,
+        manifest,
+        digest,
+        start_utc_ns,
+        stop_utc_ns,
+        stored,
+        images,
+        (mission, text),
+        reference,
     )
     if receptions is not None:
         enter_receptions(
@@ -129,6 +146,14 @@ def import_archive(ground: Ground, folder: Path) -> int:
         vehicle = store.get_pass(connection, pass_id).vehicle_id
         publish_once(connection, ArchiveImported(pass_id=pass_id, vehicle_id=vehicle))
     return pass_id
+
+
+def _readable(load: Callable[[Path], Content], path: Path, names: Collection[str]) -> Content | None:
+    """Return the content of a file of an archive, None if the archive has no such file."""
+    try:
+        return load(path) if path.name in names else None
+    except LunarError as error:
+        raise InvalidInput(str(path), "", "a readable file", str(error)) from None
 
 
 def read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
@@ -270,9 +295,9 @@ def _register(
     stored: Mapping[str, StoredFile],
     images: Mapping[int, StoredFile],
     mission: tuple[Mission, str | None],
+    reference: Ephemeris | None,
 ) -> int:
     now = utc_now_ns()
-    reference = load_ephemeris(folder / "reference.oem") if "reference.oem" in stored else None
     attitudes = attitude_file(stored, str(folder))
     with ground.database.writing() as connection:
         hold(connection, f"archive {digest}")
@@ -460,7 +485,7 @@ def _checked_name(entry: zipfile.ZipInfo, seen: set[str], name: str) -> str:
 
 
 def _root(folder: Path) -> Path:
-    """Where the manifest lies: in the folder, or in the only one within it."""
+    """Return the folder of the manifest: the folder itself, or the only one within it."""
     inside = list(folder.iterdir())
     if len(inside) == 1 and inside[0].is_dir() and not (folder / "manifest.json").exists():
         return inside[0]

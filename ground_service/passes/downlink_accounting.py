@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.ingest.packets import packet_ticks
+from ground_service.telemetry.packets import packet_ticks
 from lunar.arrays import BoolArray, IntArray
 from tmtc.arrays import Octets
 from tmtc.downlink import FRAME_FOREIGN, FRAME_GOOD, DownlinkDecode, decode

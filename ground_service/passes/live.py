@@ -22,9 +22,9 @@ from ground_service.passes.model import (
     SpacecraftInstance,
 )
 from ground_service.passes.parameters import DeclaredParameter, declared_reading
-from ground_service.store import parameters as declared_values
-from ground_service.store import telemetry
 from ground_service.store.vehicles import FLOWN, Vehicle, find_vehicle, get_vehicle, used_vehicles
+from ground_service.telemetry import store as telemetry
+from ground_service.telemetry import values as declared_values
 from tmtc.dictionary.fields import Field
 from tmtc.dictionary.payload import DICTIONARY, STRUCTURES
 from tmtc.dictionary.schema import DecodedPacket, limit_states
@@ -44,7 +44,6 @@ LIMIT_STATES: tuple[LimitState, ...] = ("within", "warning", "alarm")
 
 
 def list_spacecraft(ground: Ground) -> list[SpacecraftInstance]:
-    """Return all spacecraft in all instances."""
     with ground.database.reading() as connection:
         found = [
             SpacecraftInstance(

@@ -10,10 +10,10 @@ from pydantic import BeforeValidator, Field
 
 from ground_service.http.model import (
     Entity,
-    Given,
-    GivenTime,
     InstanceName,
     Paging,
+    RequestModel,
+    RequestTime,
     SpacecraftNumber,
     UtcTime,
 )
@@ -71,12 +71,12 @@ class PassDetail(PassSummary):
     reports: list[str] = Field(description="Ids of the newest reports")
 
 
-class PassDefinition(Given):
+class PassDefinition(RequestModel):
     """An interval of a spacecraft's time to be kept as a pass."""
 
     name: str = Field(min_length=1, max_length=200, pattern=LINE_PATTERN_JSON, examples=["evening pass"])
-    start: GivenTime
-    stop: GivenTime
+    start: RequestTime
+    stop: RequestTime
     spacecraft_id: SpacecraftNumber
     instance: InstanceName = "flight"
 
@@ -342,5 +342,5 @@ class EventFilter(Paging):
     name: str | None = Field(
         default=None, min_length=1, max_length=100, description="Part of the name of the event"
     )
-    start: GivenTime | None = None
-    stop: GivenTime | None = None
+    start: RequestTime | None = None
+    stop: RequestTime | None = None

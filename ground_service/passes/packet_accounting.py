@@ -23,9 +23,9 @@ from ground_service.passes import sample_store
 from ground_service.passes.downlink_accounting import RawAccount, RawFile, account_raw, read_raw
 from ground_service.passes.model import PassRecord
 from ground_service.passes.span import STARTED, STOPPED, PassSpan
-from ground_service.store import telemetry
 from ground_service.store.files import FileArchive
 from ground_service.store.vehicles import get_vehicle
+from ground_service.telemetry import store as telemetry
 from reports.values import ApidAccounting, CompletenessSeries, PacketAccounting, ReceptionQuality
 from tmtc.dictionary.payload import APID_DETECTIONS, DICTIONARY
 from tmtc.link.link_plan import LinkSection

@@ -20,9 +20,9 @@ from ground_service.passes import sample_store, store
 from ground_service.passes.model import ExportFormat, PacketInfo, ParameterInfo, PassParameters
 from ground_service.passes.series import PARAMETERS, STATE_VALUES, SampleSource, kind_samples
 from ground_service.passes.span import PassSpan, pass_span
-from ground_service.store import parameters as declared_values
-from ground_service.store import rollups
 from ground_service.store.vehicles import find_vehicle
+from ground_service.telemetry import rollups
+from ground_service.telemetry import values as declared_values
 from lunar.timescales import format_utc, ticks_from_utc_ns
 from tmtc.dictionary.fields import Field
 from tmtc.dictionary.payload import DICTIONARY, STRUCTURES
@@ -113,7 +113,6 @@ def packet_samples(packet: PacketDefinition, field: str, version: int) -> Sample
 
 
 def pass_parameters(ground: Ground, pass_id: int) -> PassParameters:
-    """Return the parameters of a pass."""
     with ground.database.reading() as connection:
         record = store.get_pass(connection, pass_id)
         span = pass_span(connection, record)

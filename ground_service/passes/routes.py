@@ -23,7 +23,7 @@ from ground_service.http.common import (
     linked,
     upload_body,
 )
-from ground_service.http.model import GivenTime, PageOf, ns_of
+from ground_service.http.model import PageOf, RequestTime, ns_of
 from ground_service.http.requests import operations, problems
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import DispatcherOf, get_job
@@ -208,8 +208,8 @@ def get_trend(
     spacecraft_id: SpacecraftId,
     parameter: Parameter,
     instance: Instance = FLOWN,
-    start: GivenTime | None = None,
-    stop: GivenTime | None = None,
+    start: RequestTime | None = None,
+    stop: RequestTime | None = None,
     max_points: MaxPoints = 1000,
 ) -> Response:
     """Return the series of a housekeeping parameter of a spacecraft over an interval; by default over all."""
@@ -249,8 +249,8 @@ def list_images(
     ground: GroundOf,
     _: Viewer,
     spacecraft_id: SpacecraftId,
-    start: GivenTime,
-    stop: GivenTime,
+    start: RequestTime,
+    stop: RequestTime,
     instance: Instance = FLOWN,
 ) -> PageOf[Image]:
     """List the images of an interval: downlinked thumbnails, and frames of pass archives; at most 2000."""

@@ -12,11 +12,12 @@ from sqlalchemy import Connection, func, select
 
 from ground_service.http.model import Paging
 from ground_service.missions.timekeeping.core import utc_ns_of_ticks
-from ground_service.passes.samples import DetectionSamples, no_detections
 from ground_service.passes.span import PassSpan
-from ground_service.store import repository, telemetry
+from ground_service.store import repository
 from ground_service.store.models import TELECOMMANDS
-from ground_service.store.telemetry import DETECTION_ITEM, unpack_detections
+from ground_service.telemetry import store as telemetry
+from ground_service.telemetry.samples import DetectionSamples, no_detections
+from ground_service.telemetry.store import DETECTION_ITEM, unpack_detections
 from lunar.arrays import IntArray
 from lunar.timescales import format_utc
 from reports.values import PassEvent
@@ -132,6 +133,14 @@ def event_list(connection: Connection, span: PassSpan) -> tuple[PassEvent, ...]:
     rows = samples(connection, span, "events", _EVENT_COLUMNS)
     events = _pass_events(list(zip(*rows.values(), strict=True)), span)
     return tuple(sorted(events, key=lambda event: (event.utc_ns, event.name, event.detail)))
+
+
+def learned_offset_m(connection: Connection, span: PassSpan) -> float | None:
+    """Return the newest size of the offset of the crater list that the payload reported; None without one."""
+    labels = DICTIONARY.labels("event_info", "event_id")
+    rows = samples(connection, span, "events", ("ticks", "event_id", "value_1"))
+    found = (row for row in zip(*rows.values(), strict=True) if labels.get(row[1]) == "map_offset")
+    return max(((ticks, size_m) for ticks, _, size_m in found if size_m is not None), default=(0, None))[1]
 
 
 def event_page(

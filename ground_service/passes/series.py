@@ -26,11 +26,12 @@ from ground_service.passes.core import (
 )
 from ground_service.passes.span import LAST_TICKS, PassSpan
 from ground_service.passes.store import decoding_state
-from ground_service.store import rollups, telemetry
 from ground_service.store.event_kinds import CorrelationChanged, TelemetryReceived
 from ground_service.store.events import LoggedEvent, newest_event, read_events
-from ground_service.store.rollups import HOUSEKEEPING_VALUES as PARAMETERS
-from ground_service.store.rollups import STATE_VALUES
+from ground_service.telemetry import rollups
+from ground_service.telemetry import store as telemetry
+from ground_service.telemetry.rollups import HOUSEKEEPING_VALUES as PARAMETERS
+from ground_service.telemetry.rollups import STATE_VALUES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

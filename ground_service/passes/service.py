@@ -13,7 +13,6 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf, Paging, UtcTime, ns_of
-from ground_service.ingest.parameters import readable_version
 from ground_service.ingest.store import results_state
 from ground_service.missions import store as missions
 from ground_service.missions.catalogues import read_catalogue
@@ -49,9 +48,10 @@ from ground_service.passes.span import (
     pass_span,
     vehicle_span,
 )
-from ground_service.store import rollups
 from ground_service.store.files import StoredFile, register_file
 from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
+from ground_service.telemetry import rollups
+from ground_service.telemetry.decoding import readable_version
 from ground_service.toml import require_line
 from lunar.timescales import format_utc
 from reports.values import PacketAccounting

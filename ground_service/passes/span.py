@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from sqlalchemy import Connection
 
-from ground_service.ingest.parameters import readable_version
 from ground_service.missions.timekeeping.core import TimeCorrelation, ticks_of_utc_ns, utc_ns_of_ticks
 from ground_service.missions.timekeeping.store import load_correlations
 from ground_service.passes import store
 from ground_service.passes.model import PassRecord
-from ground_service.store import telemetry
+from ground_service.telemetry import store as telemetry
+from ground_service.telemetry.decoding import readable_version
 from lunar.arrays import IntArray
 from tmtc.dictionary.codes import EVENTS
 

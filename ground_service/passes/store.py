@@ -17,7 +17,6 @@ _REPORTS_LISTED = 20
 
 
 def get_pass(connection: Connection, pass_id: int) -> PassRecord:
-    """Return a pass."""
     return PassRecord.of(repository.get(connection, _PASSES, pass_id, "pass"))
 
 

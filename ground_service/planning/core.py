@@ -21,7 +21,7 @@ from ground_service.planning.filling import Option
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation, spherical_from_mcmf
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
@@ -33,7 +33,6 @@ Range = tuple[float, float]
 TerrainAt = Callable[[FloatArray, FloatArray], BoolArray]
 """Latitudes and longitudes (n,) in rad to whether the ground there is mare (n,)."""
 
-NS = NANOSECONDS_PER_SECOND
 CONTACT_HORIZON_S = 86_400.0
 """Data that are not down a day after their window are taken to stay on board."""
 
@@ -43,14 +42,14 @@ OPEN_END = 1e6
 
 TOO_SHORT = "too short"
 BATTERY, STORAGE, CONTACT = "battery too low", "storage too small", "no contact to downlink its data"
-"""Why a span is no candidate."""
+"""Reasons why a span is no candidate."""
 
 _DEGREE = 180.0 / math.pi
 
 
 @dataclass(frozen=True, slots=True)
 class Constraints:
-    """What a window has to fulfil all along; None where anything will do. Angles in rad, lengths in m."""
+    """Conditions that a window fulfils throughout; None: no condition. Angles in rad, lengths in m."""
 
     altitude_m: Range | None = None
     sun_elevation_rad: Range | None = None
@@ -85,7 +84,7 @@ class Excess:
 
 @dataclass(frozen=True, slots=True)
 class Resources:
-    """What the spacecraft and the ground have to offer; the defaults are those of a 6U CubeSat."""
+    """Resources of spacecraft and ground; the defaults are those of a 6U CubeSat."""
 
     storage_octets: int = 64 << 20
     downlink_bit_s: float = 16_000.0
@@ -263,7 +262,7 @@ class Planner:
         until_utc_ns: int,
         commitments: Sequence[Option] = (),
     ) -> Candidate:
-        """What a given window would be like: the battery is full at `since`, contacts are counted up to `until`."""
+        """Predict the resources of a given window: battery full at `since`, contacts up to `until`."""
         horizon = min(until_utc_ns, stop_utc_ns + round(CONTACT_HORIZON_S) * NS)
         contacts = predict_contacts(self.ephemeris, self.resources.stations, start_utc_ns, horizon)
         battery = self._battery(since_utc_ns, stop_utc_ns, 30.0)
@@ -409,6 +408,12 @@ def in_regions(
 def frames_between(start_utc_ns: int, stop_utc_ns: int, cadence_s: float) -> int:
     """Return the number of frames of an observation: one at its start, then one per cadence, none at its stop."""
     return max(-((start_utc_ns - stop_utc_ns) // round(cadence_s * NS)), 1)
+
+
+COAST_M_S = 1.65e6
+"""Along-track error, 1 sigma, after a coast of one revolution, times the duration of the window before it, if nothing
+was known before: what the filter states on tuning ground at 20 to 40 km (docs/results/navigation.md), .9 to 1.0 times
+this for windows up to 15 minutes and .7 for 35 minutes."""
 
 
 def data_octets(frames: int, detections_per_frame: float, estimators: int) -> int:

@@ -28,7 +28,7 @@ from lunar.datafolder import DataFolder
 from lunar.errors import LunarError
 
 MISSION, CATALOGUE, REFERENCE, REQUEST = "mission.toml", "craters.csv", "reference.oem", "request.json"
-"""Files beside a mission description that the ground posts; a description can do without the catalogue."""
+"""Files in the folder of a mission description that the ground posts; a description can do without the catalogue."""
 
 ASSUMED = {"name": "dry run", "windows": 10, "period_days": 1.0, "horizon_days": 1.0}
 """Request of a dry run in a service without one of the spacecraft."""
@@ -56,29 +56,30 @@ def rehearsed(ground: Ground, octets: bytes) -> DryRun:
 
     Without a request it is one of ten windows in a day. Windows in the plan of the service do not count.
     """
-    craft, now = read_mission(octets)[0].spacecraft, mission_now_ns()
+    spacecraft, now = read_mission(octets)[0].spacecraft, mission_now_ns()
     with ground.database.reading() as connection:
-        held = covering_ephemerides(connection, now, 1 << 62, craft.id)
+        held = covering_ephemerides(connection, now, 1 << 62, spacecraft.id)
         listed = store.list_requests(connection, Paging(limit=1000)).items
-    mine = [one.sha256 for one in held if craft.is_object(one.object_name)]
+    mine = [one.sha256 for one in held if spacecraft.is_object(one.object_name)]
     if not mine:
         return DryRun(faults=(NO_EPHEMERIS,))
     asked = [
-        one.terms.model_dump(mode="json", exclude_none=True) | {"name": one.name, "spacecraft_id": craft.id}
+        one.terms.model_dump(mode="json", exclude_none=True)
+        | {"name": one.name, "spacecraft_id": spacecraft.id}
         for one in listed
-        if one.spacecraft_id == craft.id and one.state == "active"
+        if one.spacecraft_id == spacecraft.id and one.state == "active"
     ]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / MISSION).write_bytes(octets)
-        (folder / REQUEST).write_text(json.dumps(asked or [ASSUMED | {"spacecraft_id": craft.id}]))
+        (folder / REQUEST).write_text(json.dumps(asked or [ASSUMED | {"spacecraft_id": spacecraft.id}]))
         shutil.copyfile(ground.files.path(mine[0]), folder / REFERENCE)
         flown = fly(folder / MISSION, ground.data, now, MOST_S)
     return replace(flown, faults=tuple(one.replace(f"{folder}/", "") for one in flown.faults))
 
 
 def fly(mission: Path, data: DataFolder, now_utc_ns: int = 0, most_s: float = TIMEOUT_MAX) -> DryRun:
-    """Plan the standing requests beside a mission description and release their telecommands; nothing is sent.
+    """Plan the standing requests next to a mission description and release their telecommands; nothing is sent.
 
     The time is that at which the reference ephemeris begins, or `now_utc_ns` if that is later. A person approves
     windows that are not approved automatically, another one releases them.
@@ -106,7 +107,9 @@ def _posted(ground: Ground, mission: Path) -> tuple[list[int], int]:
     folder = mission.parent
     for name in (REFERENCE, REQUEST):
         if not (folder / name).is_file():
-            raise InvalidInput(str(folder / name), "", "a file beside the mission description", "none")
+            raise InvalidInput(
+                str(folder / name), "", "a file in the folder of the mission description", "none"
+            )
     if (folder / CATALOGUE).is_file():
         add_catalogue(ground, ground.files.put_file(folder / CATALOGUE), CATALOGUE, actor=OPERATOR)
     add_mission(ground, read_mission_file(mission), source=str(mission), actor=OPERATOR)
@@ -132,8 +135,8 @@ def _faults(ground: Ground, mission: Path, requests: list[int], now: int) -> Ite
         windows = store.list_windows(connection, WindowFilter()).items
     if not windows:
         reasons = Counter(one.reason for plan in plans for one in plan.candidates if one.reason is not None)
-        told = [one.reason for one in plans if one.reason is not None]
-        found = next(iter(told or dict(reasons.most_common(1))), "none")
+        stated = [one.reason for one in plans if one.reason is not None]
+        found = next(iter(stated or dict(reasons.most_common(1))), "none")
         yield str(InvalidInput(str(mission.parent / REQUEST), "", "windows that can be planned", found))
     for one in windows:
         ground.check_stopping()

@@ -10,20 +10,21 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from ground_service.http.model import (
     Entity,
-    Given,
-    GivenTime,
     InstanceName,
     Paging,
+    RequestModel,
+    RequestTime,
     SpacecraftNumber,
     UtcTime,
 )
 from ground_service.planning import core
 from ground_service.planning.core import Constraints
 from ground_service.toml import LINE_PATTERN_JSON
+from lunar.constants import NS
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1, max_length=200, pattern=LINE_PATTERN_JSON)]
-Time = Annotated[GivenTime, AfterValidator(lambda time: UtcTime(time.utc_ns // 1000 * 1000))]
+Time = Annotated[RequestTime, AfterValidator(lambda time: UtcTime(time.utc_ns // 1000 * 1000))]
 """Time of a plan, in whole microseconds, so that an exported plan states it exactly."""
 
 WindowState = Literal[
@@ -54,7 +55,7 @@ class WindowEntry:
     ephemeris_id: int | None = None
 
 
-class Limits(Given):
+class Limits(RequestModel):
     """A minimum and a maximum."""
 
     min: Finite = Field(examples=[30.0])
@@ -71,7 +72,7 @@ class Limits(Given):
         return self.min * factor, self.max * factor
 
 
-class WindowSearch(Given):
+class WindowSearch(RequestModel):
     """Constraints that a window must fulfil throughout; a constraint that is not stated does not apply."""
 
     start: Time | None = Field(default=None, description="Default: where the ephemeris begins")
@@ -92,6 +93,13 @@ class WindowSearch(Given):
     sunlit: bool = Field(default=False, description="The spacecraft has to be in full sunlight")
     minimum_duration_s: Finite = Field(default=300.0, ge=0.0, le=86_400.0)
     maximum_duration_s: Finite = Field(default=2400.0, ge=30.0, le=86_400.0)
+    first_coast_m: Finite | None = Field(
+        default=None,
+        ge=500.0,
+        le=1e6,
+        description="Along-track error, 1 sigma, that a coast of one revolution after a first window may end with: the "
+        "window has to be as long as this requires",
+    )
     minimum_battery: Finite | None = Field(default=None, ge=0.0, le=1.0, description="Share of its capacity")
     needs_contact: bool = Field(default=False, description="Its data must be downlinked within the span")
 
@@ -101,6 +109,7 @@ class WindowSearch(Given):
         def angles(limits: Limits | None) -> tuple[float, float] | None:
             return None if limits is None else limits.scaled(math.pi / 180.0)
 
+        needed_s = 0.0 if self.first_coast_m is None else core.COAST_M_S / self.first_coast_m
         return Constraints(
             altitude_m=None if self.altitude_km is None else self.altitude_km.scaled(1e3),
             sun_elevation_rad=angles(self.sun_elevation_deg),
@@ -109,7 +118,7 @@ class WindowSearch(Given):
             crater_diameter_m=self.crater_diameter_km.scaled(1e3),
             mare=None if self.terrain is None else self.terrain == "mare",
             sunlit=self.sunlit,
-            minimum_duration_s=self.minimum_duration_s,
+            minimum_duration_s=max(self.minimum_duration_s, needed_s),
             maximum_duration_s=self.maximum_duration_s,
             minimum_battery=self.minimum_battery,
             needs_contact=self.needs_contact,
@@ -143,6 +152,10 @@ class WindowPrediction(Entity):
     sunlit_share: float | None = None
     craters_per_frame: Span | None = None
     mare_share: float | None = None
+    first_coast_m: float | None = Field(
+        default=None,
+        description="Along-track error, 1 sigma, after a coast of one revolution, if this is the first window",
+    )
     data_octets: int | None = None
     energy_wh: float | None = None
     battery_minimum: float | None = Field(
@@ -166,8 +179,10 @@ class Candidate(WindowPrediction):
     def from_core(cls, found: core.Candidate) -> Candidate:
         """Return the entity of a candidate of the planner."""
         craters = found.craters_per_frame
+        duration_s = (found.stop_utc_ns - found.start_utc_ns) / NS
         return cls.of(
             asdict(found),
+            first_coast_m=core.COAST_M_S / duration_s,
             altitude_km=Span(min=found.altitude_m[0] / 1e3, max=found.altitude_m[1] / 1e3),
             sun_elevation_deg=Span.degrees(found.sun_elevation_rad),
             latitude_deg=Span.degrees(found.latitude_rad),
@@ -206,7 +221,7 @@ class SearchResult(Entity):
 
 
 class WindowConflict(Entity):
-    """What stands in the way of a planned window."""
+    """Conflict of a planned window."""
 
     window_id: int
     reasons: list[str]
@@ -250,7 +265,7 @@ class CraterDensity(Entity):
     rows: list[list[float]]
 
 
-class WindowIn(Given):
+class WindowIn(RequestModel):
     """A window to be planned."""
 
     name: Name = Field(default="observation", examples=["evening pass"])
@@ -268,7 +283,7 @@ class WindowIn(Given):
         return WindowEntry(start_utc_ns=self.start.utc_ns, stop_utc_ns=self.stop.utc_ns, **stated)
 
 
-class WindowChange(Given):
+class WindowChange(RequestModel):
     """Changes of a draft, or a decision on a window; fields that are not stated do not change."""
 
     name: Name | None = None
@@ -350,7 +365,7 @@ class StartedOrbit(Entity):
 
 
 class WindowUploads(Entity):
-    """What the telecommands of a window load on board, as the manifest of a pass states it."""
+    """Tables that the telecommands of a window load on board, as in the manifest of a pass."""
 
     start_state: UploadedState | None = None
     burns: list[UploadedBurn] | None = None
@@ -390,7 +405,7 @@ class WindowFilter(Paging):
 RequestState = Literal["active", "paused"]
 
 
-class Region(Given):
+class Region(RequestModel):
     """Sub-satellite points between two latitudes and two longitudes; from `min` to the east to `max`."""
 
     latitude_deg: Limits = Limits(min=-90.0, max=90.0)
@@ -398,8 +413,8 @@ class Region(Given):
     east_deg: Annotated[Finite, Field(ge=-180.0, le=360.0)] = 180.0
 
 
-class RequestTerms(Given):
-    """What is requested; a constraint that is not stated does not apply."""
+class RequestTerms(RequestModel):
+    """Terms of a request; a constraint that is not stated does not apply."""
 
     windows: int = Field(ge=1, le=1000, description="Windows in each period", examples=[10])
     period_days: Finite = Field(default=7.0, ge=0.1, le=366.0)
@@ -453,7 +468,7 @@ class StandingRequestIn(RequestTerms):
         return RequestTerms(**{name: getattr(self, name) for name in RequestTerms.model_fields})
 
 
-class StandingRequestChange(Given):
+class StandingRequestChange(RequestModel):
     """Changes of a standing request; what is not stated does not change."""
 
     state: RequestState | None = None

@@ -12,7 +12,7 @@ import numpy as np
 from ground_service.errors import Conflict
 from ground_service.evaluation.smoother import StartState
 from ground_service.missions.model import Uploads
-from lunar.constants import NANOSECONDS_PER_SECOND as NS
+from lunar.constants import NS as NS
 from lunar.ephemeris import Ephemeris
 from lunar.errors import EphemerisCoverageError
 from lunar.frames import IauOrientation, Orientation
@@ -58,7 +58,7 @@ def prepare_window(
     transaction: int,
     start: StartState | None = None,
 ) -> tuple[list[Activity], StartState | None]:
-    """Return the activities around a window besides its observation, and the uploaded start state.
+    """Return the activities around a window other than its observation, and the uploaded start state.
 
     `start` is the start state of a window of the experiment; None: that of the reference.
 

@@ -19,10 +19,10 @@ from ground_service.passes.span import STARTED, STOPPED, PassSpan, observation_e
 from ground_service.passes.store import received_frames
 from ground_service.planning import store
 from ground_service.planning.model import WindowRecord
-from ground_service.planning.window_states import WindowFacts, state_of
-from ground_service.store import telemetry
+from ground_service.planning.window_states import WindowEvidence, state_of
 from ground_service.store.event_kinds import WindowChanged, publish
 from ground_service.store.vehicles import lock_spacecraft
+from ground_service.telemetry import store as telemetry
 
 REASON_LENGTH = 500
 DELETE = "delete_activity"
@@ -74,10 +74,10 @@ def note_reason(ground: Ground, window_id: int, reason: str) -> None:
 
 def _advance(connection: Connection, window: WindowRecord) -> str | None:
     """Return the new state of a window; None if it has not changed, or the window was decided meanwhile."""
-    facts = _facts(connection, window)
-    state, reason = state_of(facts)
+    evidence = _evidence(connection, window)
+    state, reason = state_of(evidence)
     values: dict[str, Any] = {}
-    if facts.frames > 0 and window.pass_id is None and state != "failed":
+    if evidence.frames > 0 and window.pass_id is None and state != "failed":
         mission_id = window.mission_id or missions.in_force(connection, window.vehicle_id)
         pass_id = store.add_pass(connection, window, mission_id, utc_now_ns())
         values |= {"pass_id": pass_id, "mission_id": mission_id}
@@ -94,23 +94,23 @@ def span_of(connection: Connection, window: WindowRecord) -> PassSpan:
     return observed_span(connection, window.vehicle_id, window.start.utc_ns, window.stop.utc_ns, window.id)
 
 
-def _facts(connection: Connection, window: WindowRecord) -> WindowFacts:
+def _evidence(connection: Connection, window: WindowRecord) -> WindowEvidence:
     vehicle, predecessor = window.vehicle_id, window.predecessor_id
     span = span_of(connection, window)
     start, stop = span.start_ticks, span.stop_ticks
     events = {event for _, event, _ in observation_events(connection, span)}
     frames = received_frames(connection, vehicle, span.dictionary_version, start, stop)
-    heard_after = store.has_reports_between(connection, vehicle, stop, stop + HEARD_TICKS)
+    received_after = store.has_reports_between(connection, vehicle, stop, stop + HEARD_TICKS)
     awaited = (
         frames == 0
-        and heard_after
+        and received_after
         and not store.has_reports_between(connection, vehicle, stop + AWAITED_TICKS, stop + HEARD_TICKS)
         and _is_interrupted(connection, vehicle, start, stop)
     )
     views = views_of_window(connection, window.id, utc_now_ns())
     commands = [one for one in views if (one.record.name == DELETE) == (window.decision == "cancelling")]
     failed = (f"{view.record.name} {view.remark}" for view in commands if view.state == "failed")
-    return WindowFacts(
+    return WindowEvidence(
         decision=window.decision,
         replaced=store.is_replaced(connection, window),
         predecessor_failed=predecessor is not None
@@ -121,7 +121,7 @@ def _facts(connection: Connection, window: WindowRecord) -> WindowFacts:
         frames=frames,
         started=STARTED in events,
         stopped=STOPPED in events,
-        heard_after=heard_after,
+        received_after=received_after,
         ended=mission_now_ns() >= window.stop.utc_ns,
         awaited=awaited,
         lost=_lost(connection, vehicle, start, stop) if frames else None,

@@ -18,7 +18,7 @@ from ground_service.http.common import (
     OnceKey,
     PassId,
 )
-from ground_service.http.model import GivenTime, PageOf
+from ground_service.http.model import PageOf, RequestTime
 from ground_service.http.problems import PreconditionFailed
 from ground_service.http.requests import operations, problems
 from ground_service.missions import service as missions
@@ -148,8 +148,10 @@ def get_forecast(
     ground: GroundOf,
     _: Viewer,
     spacecraft_id: Annotated[int, Query(ge=0, le=1023, examples=[76])],
-    start: Annotated[GivenTime, Query(examples=["2029-08-07T00:00:00Z"])],
-    stop: Annotated[GivenTime, Query(examples=["2029-08-08T00:00:00Z"], description="At most 8 days later")],
+    start: Annotated[RequestTime, Query(examples=["2029-08-07T00:00:00Z"])],
+    stop: Annotated[
+        RequestTime, Query(examples=["2029-08-08T00:00:00Z"], description="At most 8 days later")
+    ],
     instance: Instance = "flight",
     ephemeris_id: Annotated[int | None, Query(ge=1, le=2**31 - 1)] = None,
 ) -> PlanForecast:

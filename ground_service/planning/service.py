@@ -64,13 +64,11 @@ from ground_service.store.event_kinds import WindowChanged, publish
 from ground_service.store.vehicles import lock_spacecraft, vehicle_id
 from ground_service.toml import REASON_LIMIT, require_line
 from lunar.catalogue import CraterCatalogue
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris as States
 from lunar.errors import EphemerisCoverageError
 from tmtc.dictionary.arguments import argument_text
-
-NS = NANOSECONDS_PER_SECOND
 
 SEARCH_LIMIT_S = 31 * 86_400
 STEPS_LIMIT = 100_000
@@ -689,7 +687,7 @@ def _prediction(
     mission: Mission,
     commitments: Sequence[Option],
 ) -> Candidate | None:
-    """What the window would be like, where a reference ephemeris covers it."""
+    """Predict the window if a reference ephemeris covers it."""
     candidates = (
         [service.get_ephemeris(connection, entry.ephemeris_id)]
         if entry.ephemeris_id is not None
@@ -831,7 +829,7 @@ def _check_entry(entry: WindowEntry) -> None:
 
 @functools.lru_cache(maxsize=2)
 def _mare(data: DataFolder) -> Any:
-    """Whether the ground is mare: darker than the value that best parts the albedo map in two (Otsu 1979)."""
+    """Return whether the ground is mare: darker than the value that best parts the albedo map in two (Otsu 1979)."""
     if data.albedo is None:
         return None
     from PIL import Image

@@ -235,7 +235,7 @@ def _decided(ground: Ground, window: WindowRecord, decision: str, reason: str | 
 
 @dataclass(frozen=True, slots=True)
 class _Situation:
-    """What a plan depends on."""
+    """Inputs of a plan."""
 
     request: RequestRecord
     mission: Mission

@@ -13,7 +13,6 @@ from sqlalchemy.sql import Select
 from ground_service.contacts.commanding.store import ids_of_windows
 from ground_service.errors import NotFound
 from ground_service.http.model import PageOf, Paging, UtcTime
-from ground_service.ingest.parameters import readable_version
 from ground_service.passes import store as passes
 from ground_service.planning.filling import Option
 from ground_service.planning.model import (
@@ -32,6 +31,7 @@ from ground_service.store import repository
 from ground_service.store.repository import page, within
 from ground_service.store.states import change_if
 from ground_service.store.vehicles import get_vehicle
+from ground_service.telemetry.decoding import readable_version
 
 WINDOWS, VEHICLES = repository.WINDOWS, repository.VEHICLES
 
@@ -105,12 +105,10 @@ def note_uploads(connection: Connection, window_id: int, uploads: WindowUploads)
 
 
 def delete_window(connection: Connection, window_id: int) -> None:
-    """Delete a window."""
     connection.execute(WINDOWS.delete().where(WINDOWS.c.id == window_id))
 
 
 def get_window(connection: Connection, window_id: int) -> Window:
-    """Return a window."""
     return _one(connection, window_id, Window)
 
 
@@ -223,7 +221,6 @@ def add_pass(connection: Connection, window: WindowRecord, mission_id: int | Non
 
 
 def has_report(connection: Connection, pass_id: int) -> bool:
-    """Return whether a pass has a report."""
     return repository.find(connection, repository.REPORTS, pass_id=pass_id) is not None
 
 
@@ -309,7 +306,6 @@ def add_request(
 
 
 def get_request(connection: Connection, request_id: int) -> StandingRequest:
-    """Return a request."""
     return _request(connection, repository.get(connection, _REQUESTS, request_id, "request"))
 
 

@@ -1,9 +1,9 @@
-"""Where a planned window has come, from what people decided and what telemetry says; and what stands in its way.
+"""State of a planned window, from decisions and telemetry, and its conflicts.
 
 draft → approved → uplinked → executing → executed → downlinked → processed, or failed; a window whose telecommands were
 sent is cancelled by others that delete them on board: it is cancelling until their verification, then failed
 
-The state is a function of facts, not of the order in which they became known: late telemetry mends a state that was
+The state is a function of evidence, not of the order in which they became known: late telemetry mends a state that was
 concluded without it.
 """
 
@@ -27,8 +27,8 @@ REPLACED = "it failed, and another window has its time"
 
 
 @dataclass(frozen=True, slots=True)
-class WindowFacts:
-    """What is known about a window.
+class WindowEvidence:
+    """Known evidence about a window.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class WindowFacts:
         Frames of it that came down.
     started, stopped
         Whether an event report or a verification report shows the start, and the end, of the observation.
-    heard_after
+    received_after
         Whether telemetry from after its end has come down.
     ended
         Whether it has ended by the mission clock: telemetry does not fail a window before that.
@@ -71,7 +71,7 @@ class WindowFacts:
     frames: int = 0
     started: bool = False
     stopped: bool = False
-    heard_after: bool = False
+    received_after: bool = False
     ended: bool = True
     awaited: bool = False
     lost: int | None = None
@@ -79,52 +79,54 @@ class WindowFacts:
     closed: bool = False
 
 
-def state_of(facts: WindowFacts) -> tuple[str, str | None]:
+def state_of(evidence: WindowEvidence) -> tuple[str, str | None]:
     """The state of a window, and the reason where it failed."""
-    if facts.decision == "cancelling":
-        return _cancelled(facts)
-    if facts.decision != "approved":
-        return facts.decision, None
-    if facts.replaced:
+    if evidence.decision == "cancelling":
+        return _cancelled(evidence)
+    if evidence.decision != "approved":
+        return evidence.decision, None
+    if evidence.replaced:
         return "failed", REPLACED
-    return _flown(facts) or _awaiting(facts)
+    return _flown(evidence) or _awaiting(evidence)
 
 
-def _cancelled(facts: WindowFacts) -> tuple[str, str | None]:
+def _cancelled(evidence: WindowEvidence) -> tuple[str, str | None]:
     """Return state and reason of a window that is cancelled: what flies all the same becomes a pass."""
-    flown = _flown(facts)
+    flown = _flown(evidence)
     if flown is not None:
         return flown[0], FLOWN
-    if set(facts.deletion_states) == {"completed"}:
+    if set(evidence.deletion_states) == {"completed"}:
         return "failed", CANCELLED
-    if facts.heard_after and facts.ended and not facts.awaited:
+    if evidence.received_after and evidence.ended and not evidence.awaited:
         return "failed", "it was cancelled, telemetry from after its end shows no observation"
-    refused = facts.deletion_states.count("failed")
+    refused = evidence.deletion_states.count("failed")
     return (
         "cancelling",
-        f"{refused} of its activities could not be deleted: {facts.failure}" if refused else None,
+        f"{refused} of its activities could not be deleted: {evidence.failure}" if refused else None,
     )
 
 
-def _flown(facts: WindowFacts) -> tuple[str, str | None] | None:
+def _flown(evidence: WindowEvidence) -> tuple[str, str | None] | None:
     """Return the state of a window whose observation has begun; None if it has not."""
-    begun = facts.started or facts.frames > 0
-    over = begun and (facts.stopped or facts.heard_after)
-    if over and facts.heard_after and (facts.lost == 0 or facts.closed):
-        return ("processed" if facts.reported else "downlinked"), None
+    begun = evidence.started or evidence.frames > 0
+    over = begun and (evidence.stopped or evidence.received_after)
+    if over and evidence.received_after and (evidence.lost == 0 or evidence.closed):
+        return ("processed" if evidence.reported else "downlinked"), None
     if over:
         return "executed", None
     return ("executing", None) if begun else None
 
 
-def _awaiting(facts: WindowFacts) -> tuple[str, str | None]:
+def _awaiting(evidence: WindowEvidence) -> tuple[str, str | None]:
     """Return the state of an approved window whose observation has not begun."""
-    if "failed" in facts.command_states:
-        return "failed", f"a telecommand of it failed: {facts.failure or 'no reason is known'}"
-    if facts.predecessor_failed:
+    if "failed" in evidence.command_states:
+        return "failed", f"a telecommand of it failed: {evidence.failure or 'no reason is known'}"
+    if evidence.predecessor_failed:
         return "failed", "its predecessor failed"
-    sent = bool(facts.command_states) and not {"queued", "released", "carried"} & set(facts.command_states)
-    if sent and facts.heard_after and facts.ended and not facts.awaited:
+    sent = bool(evidence.command_states) and not {"queued", "released", "carried"} & set(
+        evidence.command_states
+    )
+    if sent and evidence.received_after and evidence.ended and not evidence.awaited:
         return "failed", "telemetry from after its end shows no observation"
     return ("uplinked" if sent else "approved"), None
 

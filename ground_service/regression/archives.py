@@ -1,4 +1,4 @@
-"""Pass archives to fly again: folders and zips of them, checked, kept by content, pinned and let go.
+"""Pass archives to fly again: folders and zips of them, checked, kept by content, pinned and removed.
 
 Whatever an archive says, nothing outside the folder it is unpacked into is written, nothing unreasonably large is
 unpacked, and no file is used whose hash is not the one in the manifest.
@@ -102,7 +102,7 @@ class PassArchive:
 
     @property
     def has_inputs(self) -> bool:
-        """Whether the archive contains the inputs of the payload."""
+        """Return whether the archive contains the inputs of the payload."""
         return INPUTS in self.manifest["files"]
 
 
@@ -133,7 +133,7 @@ def check_archive(folder: Path) -> PassArchive:
     Raises
     ------
     InvalidInput
-        The archive is damaged, lacks an input of the payload, or has detections besides all its frames.
+        The archive is damaged, lacks an input of the payload, or has detections in addition to all its frames.
     """
     manifest, digest = read_manifest(folder)
     names = set(checked_files(folder, manifest))
@@ -321,7 +321,6 @@ def kept_archives(ground: Ground) -> list[KeptArchive]:
 
 
 def kept_archive(ground: Ground, digest: str) -> KeptArchive:
-    """Return a kept archive."""
     with ground.database.reading() as connection:
         return _shown(store.get_archive(connection, digest))
 
@@ -485,7 +484,7 @@ def _shown(record: ArchiveRecord) -> KeptArchive:
 
 
 def frame_inputs(folder: Path, *, steps: bool = False) -> list[dict[str, Any]]:
-    """What the payload was given with each frame, a row per frame; steps without one only with `steps`."""
+    """Return the inputs of the payload, a row per frame; steps without one only with `steps`."""
     path = folder / INPUTS
     rows = []
     try:

@@ -76,11 +76,11 @@ class BuildRun:
         figures = {
             key: value for key, value in asdict(self).items() if key not in ("downlink", "performance")
         }
-        told = f"{self.build} {OUTCOMES[self.outcome]}" + (f": {self.detail}" if self.detail else "")
+        message = f"{self.build} {OUTCOMES[self.outcome]}" + (f": {self.detail}" if self.detail else "")
         return {
             **figures,
             "downlink": str(self.downlink) if self.downlink else None,
-            "text": f"{told} ({self.cpu_s:.1f} s of CPU, {self.peak_rss_mib:.0f} MiB)",
+            "text": f"{message} ({self.cpu_s:.1f} s of CPU, {self.peak_rss_mib:.0f} MiB)",
         }
 
 

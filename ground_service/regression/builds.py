@@ -171,7 +171,7 @@ class Build:
 
     @property
     def folder_needed(self) -> bool:
-        """Whether the build has its own files; the flight code of this installation has none."""
+        """Return whether the build has its own files; the flight code of this installation has none."""
         return str(self.file) != CURRENT
 
     def stage(self, folder: Path) -> None:
@@ -377,21 +377,21 @@ def check_parameters(build: Build, *, runner: Path | None = None, private: Seque
             report = run_confined(request, work, work / "out", printed, runner=runner, private=private)
         except SandboxRefused as error:
             raise BuildNotChecked(build.title, str(error)) from None
-        told = tail(printed, CHECK_LIMIT_OCTETS).strip()
+        message = tail(printed, CHECK_LIMIT_OCTETS).strip()
     if report["exit_status"] == 0 and not report["cause"]:
         return
-    fault = _fault_of(told) if report["exit_status"] == CHECK_FAILED else None
+    fault = _fault_of(message) if report["exit_status"] == CHECK_FAILED else None
     if fault is None:
-        last = told.splitlines()[-1][:200] if told else "nothing printed"
+        last = message.splitlines()[-1][:200] if message else "nothing printed"
         status = report["cause"] or f"status {report['exit_status']}"
         raise BuildNotChecked(build.title, f"the check of the parameters ended with {status}: {last}")
     raise fault
 
 
-def _fault_of(told: str) -> InvalidInput | None:
+def _fault_of(message: str) -> InvalidInput | None:
     """Return the fault that the check printed as JSON; None if it printed none."""
     try:
-        fault = json.loads(told[told.index('{"fault"') :])["fault"]
+        fault = json.loads(message[message.index('{"fault"') :])["fault"]
         return InvalidInput(*(str(fault[name]) for name in ("file", "key", "expected", "found")))
     except (ValueError, KeyError, TypeError):
         return None

@@ -6,7 +6,7 @@ import json
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,6 @@ from ground_service.regression.gates.core import (
     INFORMS,
     NOT_JUDGED,
     PASS,
-    Gate,
 )
 from ground_service.regression.gates.metrics import LATENCY, RUN, START, first_difference, metrics_of
 from ground_service.regression.gates.samples import cell_places_deg
@@ -47,8 +46,8 @@ from reports.values import (
     ChangedCraters,
     ChangedTrack,
     GalleryFrame,
+    Gate,
     HeadlineFigure,
-    RegressionGate,
     RegressionPass,
     RegressionReport,
 )
@@ -83,9 +82,9 @@ def _reason(outcome: RegressionOutcome) -> str:
     if exact := [gate for gate in failed if gate.name in EXACT_METRICS]:
         return "; ".join(gate.reason for gate in exact)
     if failed:
-        whole = [gate for gate in failed if not gate.pass_name] or failed[:1]
+        whole = [gate for gate in failed if not gate.pass_id] or failed[:1]
         failed.sort(key=lambda gate: -gate.change_low)
-        places = list(dict.fromkeys(gate.pass_name for gate in failed if gate.pass_name))
+        places = list(dict.fromkeys(gate.pass_id for gate in failed if gate.pass_id))
         where = f", most on {', '.join(places[:3])}" if places else ""
         return f"{_changes(whole)}{where}, on {outcome.frames_judged} frames; {_navigation(outcome.gates)}"
     if outcome.verdict == INCONCLUSIVE:
@@ -98,8 +97,8 @@ def _reason(outcome: RegressionOutcome) -> str:
             return "no gate was judged"
         needed = outcome.frames_needed
         more = f"; about {needed:,} frames decide, {outcome.frames_judged:,} were compared" if needed else ""
-        told = "; ".join(f"{_name(gate)} {_figures(gate)}, {gate.reason}" for gate in open_gates[:2])
-        return told + more
+        message = "; ".join(f"{_name(gate)} {_figures(gate)}, {gate.reason}" for gate in open_gates[:2])
+        return message + more
     if any(gate.reason.startswith(IDENTICAL) for gate in gates):
         return f"{IDENTICAL} on {outcome.frames_judged} frames"
     better = [gate for gate in gates if gate.outcome == PASS and gate.change_high < 0.0]
@@ -187,14 +186,14 @@ def regression_text(verdict: Verdict) -> str:
     lines += [f"{one.name}: {one.state}: {one.detail}" for one in verdict.passes if one.state != JUDGED]
     order = (FAIL, INCONCLUSIVE, NOT_JUDGED, PASS)
     deciding = [gate for gate in verdict.gates if gate.outcome in order]
-    whole = {gate.name for gate in deciding if gate.outcome == FAIL and not gate.pass_name}
+    whole = {gate.name for gate in deciding if gate.outcome == FAIL and not gate.pass_id}
     for gate in sorted(deciding, key=lambda gate: order.index(gate.outcome)):
-        if not gate.passed and not (gate.pass_name and gate.name in whole):
+        if not gate.passed and not (gate.pass_id and gate.name in whole):
             # The headline names the passes on which a metric fails that fails over all of them.
             lines.append(f"{gate.outcome}: {gate.text}")
-    told = ("worse", "better")
+    words = ("worse", "better")
     informing = [gate for gate in verdict.gates if gate.outcome == INFORMS]
-    lines += [f"informs: {gate.text}" for gate in informing if (gate.reason or "").startswith(told)]
+    lines += [f"informs: {gate.text}" for gate in informing if (gate.reason or "").startswith(words)]
     if len(lines) > SCREEN_LINES:
         lines[SCREEN_LINES:] = [f"and {len(lines) - SCREEN_LINES} further facts in the JSON document"]
     counts = {name: sum(gate.outcome == name for gate in deciding) for name in order}
@@ -242,7 +241,7 @@ def regression_junit(verdict: Verdict, finished_utc_ns: int) -> str:
             continue
         kind = {PASS: "", FAIL: "failure", INCONCLUSIVE: open_kind, NOT_JUDGED: "skipped"}[gate.outcome]
         text = f"{gate.outcome}: {gate.text}"
-        cases.append((" on ".join(filter(None, (gate.name, gate.pass_name))), "gates", kind, text, 0.0))
+        cases.append((" on ".join(filter(None, (gate.name, gate.pass_id))), "gates", kind, text, 0.0))
     if not verdict.gates and all(one.state != "candidate failed" for one in verdict.passes):
         cases.append(("gates", "gates", open_kind, "inconclusive: no gate was judged", 0.0))
     kinds = [kind for _, _, kind, _, _ in cases]
@@ -307,7 +306,7 @@ def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str)
         regression_id=identity,
         candidate=candidate,
         baseline=baseline,
-        gates=tuple(_report_gate(gate) for gate in outcome.gates if gate.outcome != INFORMS),
+        gates=tuple(gate for gate in outcome.gates if gate.outcome != INFORMS),
         passes=tuple(_regression_pass(one) for one in judged),
         craters=changed_craters(judged),
         changed_tracks=tuple(changed_tracks(ground, judged)),
@@ -458,7 +457,7 @@ def _gate(gate: Gate) -> dict[str, Any]:
     row = asdict(gate)
     bounds = [row.pop("change_low"), row.pop("change_high")]
     texts = {
-        "pass": row.pop("pass_name") or None,
+        "pass": row.pop("pass_id") or None,
         "reason": gate.reason or None,
     }
     return {**row, **texts, "passed": gate.passed, "change_bounds": bounds}
@@ -483,11 +482,6 @@ def _pass(one: PassVerdict) -> dict[str, Any]:
     return found
 
 
-def _report_gate(gate: Gate) -> RegressionGate:
-    names = [field.name for field in fields(RegressionGate) if field.name != "pass_id"]
-    return RegressionGate(pass_id=gate.pass_name, **{name: getattr(gate, name) for name in names})
-
-
 def _regression_pass(one: PassVerdict) -> RegressionPass:
     assert one.baseline_read and one.candidate_read
     sides = (one.baseline_read.frames, one.candidate_read.frames)
@@ -507,5 +501,5 @@ def _headline(outcome: RegressionOutcome) -> tuple[HeadlineFigure, ...]:
             f"baseline {gate.baseline:.3g} {gate.unit}",
         )
         for gate in outcome.gates
-        if gate.name in NAMES and not gate.pass_name
+        if gate.name in NAMES and not gate.pass_id
     )

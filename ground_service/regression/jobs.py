@@ -56,9 +56,9 @@ def run_placebo(
         if one.state == JUDGED and one.context and one.baseline_read and one.candidate_read:
             frames = (one.baseline_read.frames, one.candidate_read.frames)
             noise += pass_noise(*frames, policy.policy, condition_of(one.context))
-    told = f"placebo: the baseline against itself with other noise in the images, seed {seed}"
+    remark = f"placebo: the baseline against itself with other noise in the images, seed {seed}"
     return replace(
-        outcome, baseline=build, candidate=build, noise=tuple(noise), remarks=(*outcome.remarks, told)
+        outcome, baseline=build, candidate=build, noise=tuple(noise), remarks=(*outcome.remarks, remark)
     )
 
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, model_validator
 
-from ground_service.http.model import Entity, Given, UtcTime
+from ground_service.http.model import Entity, RequestModel, UtcTime
 from reports.text import loss_text
 
 UNUSABLE_STATES = ("unusable", "baseline failed")
@@ -19,7 +19,7 @@ COMPLETE, TO_RENDER, TELEMETRY_ONLY = "complete", "to render", "telemetry only"
 """States of a kept archive: all frames are stored; missing frames are rendered at the first use; no frames."""
 
 
-BESIDE = 0.5
+LEAST_OVERLAP = 0.5
 """Share of the elapsed time of two replays during which both ran, from which their processor times are compared."""
 
 REASONS_LIMIT = 5
@@ -81,15 +81,15 @@ class KeptReplay(Entity):
     machine: str
     created_utc_ns: int = 0
 
-    def beside(self, other: KeptReplay) -> bool:
+    def overlaps(self, other: KeptReplay) -> bool:
         """Return whether both ran on one machine at the same time, for most of the time of the longer one."""
         if self.machine != other.machine:
             return False
         (first, short), (last, long) = sorted((one.created_utc_ns / 1e9, one.wall_s) for one in (self, other))
-        return first - max(first - short, last - long) > BESIDE * max(short, long)
+        return first - max(first - short, last - long) > LEAST_OVERLAP * max(short, long)
 
 
-class ArchiveChange(Given):
+class ArchiveChange(RequestModel):
     """Change of a kept archive."""
 
     pinned: bool = Field(description="Exempt the archive from removal")
@@ -101,7 +101,7 @@ class Pruned(Entity):
     removed: list[str] = Field(description="Identities")
 
 
-class Comparison(Given):
+class Comparison(RequestModel):
     """Builds to compare, and the archives to replay."""
 
     candidate: str = Field(
@@ -210,7 +210,7 @@ class JudgedGate(Entity):
     model_config = ConfigDict(validate_by_name=True, serialize_by_alias=True)
 
     name: str = Field(examples=["detector.recall"])
-    pass_name: str | None = Field(alias="pass", description="null: the whole suite")
+    pass_id: str | None = Field(alias="pass", description="null: the whole suite")
     outcome: str = Field(
         description="pass, fail, inconclusive, not judged, or informs: a metric that never decides",
         examples=["pass"],
@@ -246,7 +246,7 @@ class JudgedGate(Entity):
     @property
     def text(self) -> str:
         """The gate as one line: the change, its bounds and its evidence, or the reason of its outcome."""
-        place = "" if self.pass_name is None else f" on {self.pass_name}"
+        place = "" if self.pass_id is None else f" on {self.pass_id}"
         if self.baseline is None or self.candidate is None or self.outcome == "not judged":
             return f"{self.name}{place}: {self.reason or self.outcome}"
         unit = f" {self.unit}" if self.unit else ""

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from ground_service.regression.builds import Build
-from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, NOT_JUDGED, Gate, verdict_of
+from ground_service.regression.gates.core import FAIL, INCONCLUSIVE, NOT_JUDGED, verdict_of
 from ground_service.regression.gates.metrics import outcome_shares
 from ground_service.regression.gates.policy import PolicyFile
 from ground_service.regression.gates.samples import PassFrames
 from ground_service.regression.model import KeptReplay, Noise
 from ground_service.regression.replay_samples import PassContext, ReadDownlink
+from reports.values import Gate
 
 JUDGED, TELEMETRY_JUDGED = "judged", "telemetry judged"
 JUDGED_STATES = (JUDGED, TELEMETRY_JUDGED)

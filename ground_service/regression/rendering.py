@@ -131,7 +131,7 @@ def _settled(ground: Ground, archive: PassArchive, out: Path, renders: bool) -> 
     try:
         return with_detections(archive)
     except InvalidInput as error:
-        return replace(archive, reason=f"{reason}{NO_DETECTIONS}{_told(str(error))}")
+        return replace(archive, reason=f"{reason}{NO_DETECTIONS}{_shortened(str(error))}")
 
 
 def _render(ground: Ground, archive: PassArchive, out: Path) -> str:
@@ -167,7 +167,7 @@ def _render(ground: Ground, archive: PassArchive, out: Path) -> str:
         raise RenderingFailed(
             archive.name, refusal or report["cause"] or f"exit status {report['exit_status']}"
         )
-    return f"the frames cannot be rendered: {_told(_ARCHIVE.sub('archive', refusal))}"
+    return f"the frames cannot be rendered: {_shortened(_ARCHIVE.sub('archive', refusal))}"
 
 
 def _refusal(status: int, printed: str) -> str:
@@ -176,12 +176,12 @@ def _refusal(status: int, printed: str) -> str:
     begin = "linna: error: "
     if status != 2 or not lines or not lines[-1].startswith(begin):
         return ""
-    told = lines[-1].removeprefix(begin)
+    message = lines[-1].removeprefix(begin)
     of_system = tuple(os.strerror(code) for code in errno.errorcode)
-    return "" if told.startswith(of_system) or "[Errno " in told else told
+    return "" if message.startswith(of_system) or "[Errno " in message else message
 
 
-def _told(text: str) -> str:
+def _shortened(text: str) -> str:
     """Return a message as one line of limited length."""
     line = "".join(sign if sign.isprintable() else " " for sign in text)
     return " ".join(line.split())[:REASON_LIMIT]

@@ -26,10 +26,10 @@ from ground_service.missions.ephemerides.service import (
 from ground_service.missions.frames import camera_of
 from ground_service.missions.model import Camera, Evidence, Mission
 from ground_service.passes.archive_import import archived_mission
-from ground_service.passes.samples import DetectionSamples, NavigationSamples, no_detections
 from ground_service.regression.archives import PassArchive, frame_inputs
 from ground_service.regression.builds import flat
 from ground_service.regression.gates.samples import KINDS, CraterRows, PassFrames, TimeTags, pass_frames
+from ground_service.telemetry.samples import DetectionSamples, NavigationSamples, no_detections
 from ground_service.toml import read_table
 from lunar.arrays import IntArray
 from lunar.camera import PinholeCamera
@@ -37,7 +37,7 @@ from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation
-from lunar.messages.ephemeris_files import load_ephemeris
+from lunar.messages.ephemeris_files import load_orbit
 from lunar.timescales import TICKS_PER_SECOND, utc_ns_from_ticks
 from tmtc.dictionary.definitions import parse_dictionary
 from tmtc.dictionary.schema import Dictionary, Table
@@ -52,7 +52,7 @@ LOW_KM, LOW_SUN_DEG = 25.0, 20.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassContext:
-    """What the ground knows of an archived pass, whichever build flies it: read once, used for every build.
+    """Data of an archived pass that are independent of the build: read once, used for every build.
 
     `mission` is the revision of the mission description of the archive, `step_ticks` the on-board time of every step of
     the payload, those without an image included.
@@ -98,7 +98,7 @@ def pass_context(archive: PassArchive, data: DataFolder) -> PassContext:
     text = (folder / "payload/dictionary.json").read_text(encoding="utf-8")
     utc_ns = _frame_times(folder, [row["frame"] for row in rows], ticks)
     camera = camera_of(mission.camera)
-    orientation, reference = orientation_of(mission, data), load_ephemeris(folder / "reference.oem")
+    orientation, reference = orientation_of(mission, data), load_orbit(folder / "reference.oem")
     return PassContext(
         name=archive.name,
         manifest=archive.manifest,
@@ -154,7 +154,7 @@ def read_downlink(
     memory_mib: float = math.nan,
     cpu_s: float = math.nan,
 ) -> ReadDownlink:
-    """What came down, by frame of the archive.
+    """Return the received telemetry by frame of the archive.
 
     Raises
     ------

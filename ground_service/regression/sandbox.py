@@ -497,7 +497,7 @@ def check_private(folders: Sequence[Path], shown: Sequence[Path] = ()) -> None:
 
 def package_root() -> Path:
     """Return the folder of the packages of this checkout or installation."""
-    return Path(__file__).resolve().parents[3]
+    return Path(__file__).resolve().parents[2]
 
 
 def tail(path: Path, octets: int = 2000) -> str:

@@ -221,7 +221,7 @@ def _replayed(ground: Ground, digest: str, build: Build) -> tuple[KeptReplay, st
 
 
 def find_replay(ground: Ground, digest: str, build: Build) -> KeptReplay | None:
-    """What was kept of a replay; None where it was not done, or something of it is lost."""
+    """Return the stored replay; None if it was not done, or a part of it is lost."""
     replay = ground.read(store.find_replay, digest, build.digest)
     if replay is None:
         return None
@@ -231,7 +231,7 @@ def find_replay(ground: Ground, digest: str, build: Build) -> KeptReplay | None:
 
 
 def is_done(replay: KeptReplay | None) -> bool:
-    """Whether a replay need not be done again: what failed once may have failed for want of time or space."""
+    """Return whether a replay need not be done again: what failed once may have failed for want of time or space."""
     return replay is not None and replay.outcome == OK
 
 
@@ -258,7 +258,7 @@ def judge_regression(
     for name, one in zip(names, judged, strict=True):
         assert one.baseline_read and one.candidate_read and one.baseline and one.candidate
         old, new = one.baseline_read.frames, one.candidate_read.frames
-        if not one.baseline.beside(one.candidate):
+        if not one.baseline.overlaps(one.candidate):
             apart += baseline != candidate
             old, new = (replace(frames, latency_ms={}, cpu_s=math.nan) for frames in (old, new))
         before[name], after[name] = old, new
@@ -377,10 +377,10 @@ def _pass_verdict(ground: Ground, archive: PassArchive, candidate: Build, baseli
         return PassVerdict(archive.name, archive.digest, "unusable", "it was not flown", old, new)
     for replay, build, state in ((new, candidate, "candidate failed"), (old, baseline, "baseline failed")):
         if replay.outcome != OK:
-            told = f"{build.name} {OUTCOMES[replay.outcome]}" + (
+            message = f"{build.name} {OUTCOMES[replay.outcome]}" + (
                 f": {replay.detail}" if replay.detail else ""
             )
-            return PassVerdict(archive.name, archive.digest, state, told, old, new)
+            return PassVerdict(archive.name, archive.digest, state, message, old, new)
     try:
         context = _context(ground, archive.digest)
         read = [_read(ground, context, replay) for replay in (old, new)]
@@ -403,7 +403,7 @@ def _read(ground: Ground, context: PassContext, replay: KeptReplay) -> ReadDownl
 
 
 def _other_camera(build: Build, archive: PassArchive) -> str:
-    """Why a build made for one camera cannot fly this archive; empty where it can."""
+    """Return why a build made for one camera cannot fly this archive; empty where it can."""
     given: Mapping[str, Any] = archive.manifest.get("camera") or {}
     for key, value in build.camera:
         if key in given and abs(float(given[key]) - value) > 1e-6:
@@ -420,7 +420,7 @@ def _unique_names(passes: Sequence[PassVerdict]) -> list[str]:
 
 
 def _machine() -> str:
-    """What a latency was measured on."""
+    """Return the machine on which a latency was measured."""
     return f"{platform.node()}, {platform.machine()}"
 
 

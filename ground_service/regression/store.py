@@ -258,7 +258,6 @@ def add_regression(
 
 
 def get_regression(connection: Connection, regression_id: str) -> Regression:
-    """Return a regression."""
     return Regression.of(repository.get(connection, REGRESSIONS, regression_id, "regression"))
 
 

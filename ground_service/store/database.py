@@ -160,7 +160,7 @@ class Database:
 
     @contextmanager
     def alone(self, name: str) -> Iterator[bool]:
-        """Whether no other process holds the lock of this name now; it is held until the end, or the process's.
+        """Return whether no other process holds the lock of this name now; it is held until the end, or the process's.
 
         A SQLite database serves the jobs of one process only, which then is alone anyway.
         """

@@ -53,7 +53,7 @@ CACHED_S = 3600.0
 
 @dataclass(frozen=True, slots=True)
 class StoredFile:
-    """Where a file of the archive lies and what it holds."""
+    """Location and content of a file of the archive."""
 
     sha256: str
     octets: int
@@ -244,7 +244,7 @@ class FileArchive:
 
 
 _trimmed: dict[Path, float] = {}
-"""When this process trimmed each cache, by the monotonic clock."""
+"""Monotonic time at which this process last trimmed each cache."""
 
 
 _durable: set[Path] = set()

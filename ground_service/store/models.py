@@ -265,7 +265,7 @@ FRAME_OUTCOMES = image_samples(
     *optionals(Float, "shift_east_m", "shift_north_m"),
     column("anchor_reads", BigInteger),
 )
-"""What one estimator made of one image."""
+"""Outcome of one estimator for one image."""
 
 EVENTS = samples(
     "events",
@@ -308,7 +308,7 @@ IDENTIFICATIONS = image_samples(
     column("count", SmallInteger),
     column("items", LargeBinary),
 )
-"""Which catalogued crater each used detection of an image was taken for.
+"""Catalogued crater with which each used detection of an image was identified.
 
 `items` packs pairs of detection (uint16) and crater (uint32), little-endian.
 """
@@ -410,7 +410,7 @@ RECEPTIONS = table(
     key("station", String(64)),
     column("earth_utc_ns", BigInteger),
 )
-"""When a station on the Earth received a time report, whether or not the report itself has come in yet.
+"""Reception times of time reports at stations, whether or not the report itself has been received.
 
 The report is the packet of time reports with these `ticks` in its header and this count. `station` is empty where
 only the Earth is known; of several times at one station the first counts, as later ones are played back.
@@ -643,7 +643,7 @@ ANSWERS = table(
     optional("answer", JSON),
     column("created_utc_ns", BigInteger),
 )
-"""What was answered under an idempotency key; NULL while the work is being done."""
+"""Answers by idempotency key; NULL while the work is in progress."""
 
 TELECOMMANDS = table(
     "telecommands",

@@ -43,7 +43,6 @@ class ObjectStore:
     _clients: dict[int, Any] = field(default_factory=dict, repr=False, compare=False)
 
     def under(self, folder: str) -> ObjectStore:
-        """Return the objects of a folder of this store."""
         return replace(self, prefix=f"{self.prefix}{folder}/")
 
     def key(self, sha256: str) -> str:

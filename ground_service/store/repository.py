@@ -7,10 +7,8 @@ turns into the entities of its capability.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
 from sqlalchemy import (
     BigInteger,
     ColumnElement,
@@ -32,10 +30,13 @@ from sqlalchemy.sql import Select
 from ground_service.errors import NotFound
 from ground_service.store import models
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 Row = dict[str, Any]
 
 
-class Asked(Protocol):
+class ListQuery(Protocol):
     """The page of a list and the filters that are asked for."""
 
     @property
@@ -131,7 +132,7 @@ def find(connection: Connection, table: Table, **equal: Any) -> Row | None:
 
 
 def page(
-    connection: Connection, query: Select[Any], asked: Asked, *order: Any, others: Sequence[str] = ()
+    connection: Connection, query: Select[Any], asked: ListQuery, *order: Any, others: Sequence[str] = ()
 ) -> tuple[list[Row], int]:
     """Return a page of the rows of a query in an order, and the number of all rows.
 
@@ -152,7 +153,7 @@ def page(
     return [dict(row) for row in rows], int(total)
 
 
-def newest(connection: Connection, table: Table, asked: Asked, **equal: Any) -> tuple[list[Row], int]:
+def newest(connection: Connection, table: Table, asked: ListQuery, **equal: Any) -> tuple[list[Row], int]:
     """Return a page of the rows of a table with these values, newest first, and the number of all rows."""
     key = next(iter(table.primary_key.columns))
     order = [table.c.created_utc_ns, key] if "created_utc_ns" in table.c else [key]
@@ -207,7 +208,7 @@ def within(table: Table, where: tuple[int, int, int, int]) -> ColumnElement[bool
 
 FEW_ROWS = 64
 
-Column = Sequence[Any] | NDArray[Any]
+Column: TypeAlias = "Sequence[Any] | NDArray[Any]"
 
 _COPY_TYPES = (
     (SmallInteger, "int2"),
@@ -267,9 +268,9 @@ def _on_conflict(table: Table, columns: Mapping[str, Column]) -> str:
 
 def plain_column(column: Column) -> list[Any]:
     """A column as Python values, NaN as None (SQL has no other word for "not known")."""
-    if not isinstance(column, np.ndarray):
+    if isinstance(column, Sequence):
         return list(column)
     values: list[Any] = column.tolist()
-    if column.dtype.kind == "f" and np.isnan(column).any():
+    if column.dtype.kind == "f" and (column != column).any():
         return [None if value != value else value for value in values]
     return values

@@ -57,7 +57,6 @@ def find_vehicle(connection: Connection, ccsds_id: int, instance: str) -> Vehicl
 
 
 def all_vehicles(connection: Connection) -> list[Vehicle]:
-    """Return all vehicles."""
     return [Vehicle(**row) for row in connection.execute(select(repository.VEHICLES)).mappings()]
 
 

@@ -29,7 +29,6 @@ SENDER = uuid.uuid4().hex.encode()
 
 
 def is_redis(broker_url: str | None) -> bool:
-    """Return whether a broker is Redis."""
     return broker_url is not None and broker_url.startswith(("redis://", "rediss://"))
 
 

@@ -144,7 +144,7 @@ for _page in PAGES:
 
 @pages.get("/static/{path:path}")
 def static_file(path: str, v: str = "") -> Response:
-    """A file of the pages; kept by the browser for good where its version is asked for."""
+    """A file of the pages; cached by the browser without limit where its version is asked for."""
     body = files_of(_STATIC).get(path)
     if body is None:
         raise NotFound("file", path[:80])
@@ -294,7 +294,7 @@ def _environment() -> Environment:
 
 @cache
 def _dictionary() -> dict[str, Any]:
-    """What pages need to know of the dictionary: telecommands to enter, parameters to look at."""
+    """Return the parts of the dictionary for pages: telecommands to enter, parameters to look at."""
     second = Approval().needs_second_person
     return {
         "version": DICTIONARY.version,
@@ -426,7 +426,7 @@ def policy(page: bytes) -> str:
 
 
 FOLDER = Path(__file__).parents[2] / "deploy" / "openmct" / "node_modules" / "openmct"
-"""Where `make openmct` installs the npm package `openmct`."""
+"""Folder in which `make openmct` installs the npm package `openmct`."""
 
 DISPLAY_POLICY = (
     "default-src 'none'; script-src 'self' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
@@ -464,7 +464,7 @@ def displays_page(request: Request) -> Response:
 
 @displays.get("/mct/{version}/{path:path}")
 def displays_file(request: Request, version: str, path: str) -> Response:
-    """A file of Open MCT; addresses contain the version, so browsers keep files for good."""
+    """A file of Open MCT; addresses contain the version, so browsers cache files without limit."""
     found = installation(request.app.state.openmct)
     body = None if found is None or found.version != version else found.plain.get(path)
     if found is None or body is None:

@@ -16,7 +16,7 @@ from fastapi.responses import RedirectResponse
 from ground_service.access import service as users
 from ground_service.access.provider import (
     SIGN_IN_S,
-    Begun,
+    PendingSignIn,
     Provider,
     end_provider_sessions,
     own_page,
@@ -38,7 +38,7 @@ Words = Annotated[str, Query(max_length=4096)]
 @sign_in.get("/sign-in/provider")
 async def begin_sign_in(request: Request, next: Words = "/") -> Response:
     """Send the browser to the provider."""
-    begun = Begun.new(next)
+    begun = PendingSignIn.new(next)
     try:
         place = await _provider(request).begin(begun, _own(request, CALLBACK))
     except ProviderUnavailable as error:
@@ -63,7 +63,7 @@ async def complete_sign_in(
     """Start the session of somebody whom the provider has sent back."""
     provider = _provider(request)
     try:
-        begun = Begun.of_cookie(request.cookies.get(_cookie(request)), state)
+        begun = PendingSignIn.of_cookie(request.cookies.get(_cookie(request)), state)
         if error or not code:
             raise SignInRefused("answer of the provider", "a code", repr(error)[:80] if error else "none")
         who = await provider.complete(begun, code, _own(request, CALLBACK), iss)

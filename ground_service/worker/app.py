@@ -113,7 +113,7 @@ def _job_of(message: bytes) -> str | None:
 
 
 def worker_answers(settings: Settings, timeout_s: float = 4.0) -> bool:
-    """Whether the worker of this machine answers over the broker.
+    """Return whether the worker of this machine answers over the broker.
 
     Raises
     ------

@@ -124,13 +124,13 @@ GROUPS = ("files", "broker", "provider", "data", "settings")
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """What a process works with: version of the program, digests of `GROUPS`, and its clock minus the database's."""
+    """Shared settings of a process: version of the program, digests of `GROUPS`, and its clock minus the database's."""
 
     version: str
     digests: tuple[str, ...]
     clock_ms: int = 0
     runner: str = "-"
-    """Whether a worker sees a runner of payload builds: yes or no; - without an exchange folder."""
+    """State of the runner of payload builds as a worker sees it: yes or no; - without an exchange folder."""
 
     def text(self) -> str:
         """Return the statement as one line."""
@@ -354,12 +354,12 @@ class Condition:
     correlation_ages_s: dict[tuple[int, str], float]
     scheduler: str | None
     broker: bool | None = None
-    """Whether the broker answers; None: jobs run in the service."""
+    """True if the broker answers; None: jobs run in the service."""
     processes: dict[str, int] = field(default_factory=dict)
     """Running processes by kind; empty with SQLite."""
     disagreements: tuple[str, ...] = ()
     runner: bool | None = None
-    """Whether a worker sees a runner; None: no worker has an exchange folder."""
+    """True if a worker sees a runner; None: no worker has an exchange folder."""
     backup_missing: bool = False
     """A folder of backups is set, and no complete backup is in it."""
     uncorrelated: tuple[int, ...] = ()

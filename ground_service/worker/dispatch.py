@@ -1,4 +1,4 @@
-"""Who does a job: this process when there is no broker, the workers when there is one."""
+"""Dispatch of jobs: to this process without a broker, otherwise to the workers."""
 
 from __future__ import annotations
 

@@ -23,8 +23,6 @@ from sqlalchemy import Table as Table
 
 from ground_service.errors import GroundError
 from ground_service.ground import Ground
-from ground_service.ingest.packets import DIGEST_OCTETS
-from ground_service.ingest.parameters import decode_declared
 from ground_service.ingest.service import run_ingest
 from ground_service.missions.timekeeping.core import utc_ns_of_ticks
 from ground_service.missions.timekeeping.recorrelation import AUTOMATIC, recorrelate
@@ -32,9 +30,11 @@ from ground_service.missions.timekeeping.store import correlations_in_force, loa
 from ground_service.store import audit, events, models
 from ground_service.store.database import prepare_database
 from ground_service.store.files import FileArchive
-from ground_service.store.rollups import PARAMETERS_CODE
 from ground_service.store.rows import insert_rows, row_blocks
 from ground_service.store.vehicles import FLOWN, all_vehicles
+from ground_service.telemetry.decoding import decode_declared
+from ground_service.telemetry.packets import DIGEST_OCTETS
+from ground_service.telemetry.rollups import PARAMETERS_CODE
 from ground_service.worker.follow_up import CONSUMER
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import TmtcError

@@ -22,7 +22,6 @@ from ground_service.errors import (
 )
 from ground_service.evaluation.service import make_report, reevaluate
 from ground_service.ground import Ground
-from ground_service.ingest.parameters import catch_up, redecode_job_id, vehicles_behind
 from ground_service.ingest.service import apply_definition, derive_without, run_ingest
 from ground_service.jobs import service
 from ground_service.jobs.model import Job
@@ -32,6 +31,7 @@ from ground_service.passes.archive_import import import_zip
 from ground_service.planning.standing import plan_tick
 from ground_service.regression.jobs import analysis_job, regression_job, rendering_job, replay_job
 from ground_service.store.event_kinds import JobChanged, publish
+from ground_service.telemetry.decoding import catch_up, redecode_job_id, vehicles_behind
 from ground_service.worker.actions import run_steps, send_messages
 from ground_service.worker.upkeep import nightly
 from kernels.memory import give_back
@@ -154,7 +154,7 @@ def _attempt(ground: Ground, job_id: str) -> Job:
             return service.get_job(connection, job_id)
         publish(connection, JobChanged(id=job_id, kind=job.kind, state="running"))
     if attempt > ATTEMPTS_LIMIT:
-        error = f"given up after {ATTEMPTS_LIMIT} attempts that did not come to an end"
+        error = f"given up after {ATTEMPTS_LIMIT} attempts that did not finish"
         return _finish(ground, job_id, attempt, error=error)
     log.info("job %s (%s) begins", job_id, job.kind, extra={"job": job_id, "kind": job.kind})
     try:
@@ -197,7 +197,7 @@ def _progress_of(ground: Ground, job_id: str) -> Callable[[float], None]:
 
 @contextmanager
 def _alone_here(job_id: str) -> Iterator[bool]:
-    """Whether no other thread of this process does the job."""
+    """Return whether no other thread of this process does the job."""
     with _doing_lock:
         alone = job_id not in _doing
         _doing.add(job_id)
@@ -234,6 +234,6 @@ def _finish(
         job = service.get_job(connection, job_id)
         publish(connection, JobChanged(id=job_id, kind=job.kind, state=job.state, result=job.result))
     took_s = 0.0 if job.started is None else (finished - job.started.utc_ns) / 1e9
-    told = {"job": job_id, "kind": job.kind, "state": job.state, "seconds": round(took_s, 3)}
-    log.info("job %s (%s) is %s after %.1f s", job_id, job.kind, job.state, took_s, extra=told)
+    fields = {"job": job_id, "kind": job.kind, "state": job.state, "seconds": round(took_s, 3)}
+    log.info("job %s (%s) is %s after %.1f s", job_id, job.kind, job.state, took_s, extra=fields)
     return job

@@ -171,7 +171,7 @@ class Watch:
         self._metrics.requests.labels(scope["method"], route, status).inc()
         self._metrics.seconds.labels(scope["method"], route).observe(took_s)
         if scope["path"] not in _UNLOGGED:
-            told = {
+            fields = {
                 "request_id": request_id,
                 "method": scope["method"],
                 "path": scope["path"],
@@ -181,7 +181,7 @@ class Watch:
                 "caller": scope["state"].get("caller"),
                 "address": (scope.get("client") or (None,))[0],
             }
-            log.info("%s %s %d", scope["method"], scope["path"], status, extra=told)
+            log.info("%s %s %d", scope["method"], scope["path"], status, extra=fields)
         return {
             "name": f"{scope['method']} {route}",
             "http.request.method": scope["method"],

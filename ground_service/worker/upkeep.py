@@ -1,6 +1,6 @@
 """Nightly job: removal of what is no longer needed, trends with limit checks, reports of the last complete month.
 
-The raw telemetry, what is decoded from it, reports and the audit log are kept for good. What is watched and forgotten
+Raw and decoded telemetry, reports and the audit log are kept without limit. Data of the operation
 (the feed, finished jobs, answers to idempotency keys, what broken uploads left) goes after `retention_days`, tokens of
 expired browser sessions at once. Regression archives go by their age since the last use and by their total size, if the
 settings say so; the audit log has a record of each.
@@ -54,7 +54,7 @@ def plan_job_id(utc_ns: int) -> str:
 
 
 def nightly(ground: Ground, arguments: Mapping[str, Any], _job_id: str = "") -> dict[str, Any]:
-    """What was taken away, and trends and due reports of every spacecraft.
+    """Remove expired rows; compute trends and due reports of every spacecraft.
 
     The removal is first, so that a failure of the rest does not make the archive grow. Without a nightly job of the day
     before, nothing is removed: a clock that has jumped ahead would make everything old.

@@ -1,4 +1,4 @@
-"""`linna catalogue register`: by how much the rims on a terrain lie beside the craters of a list, by place."""
+"""`linna catalogue register`: the shift from the craters of a list to the rims on a terrain, by place."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
         figures,
         text="\n".join(
             [
-                "rims on the terrain beside the list; south and west edge of tiles of 15 degrees:",
+                "rims on the terrain compared with the list; south and west edge of tiles of 15 degrees:",
                 *lines,
                 f"{out}: {registration.row.size} nodes, {registration.rims.sum()} rims",
             ]

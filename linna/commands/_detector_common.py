@@ -1,4 +1,4 @@
-"""What the verbs of `linna detector` share: the model option and torch."""
+"""Common parts of the verbs of `linna detector`: the model option and torch."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from linna.parser import option
 
 
 def add_model(parser: argparse.ArgumentParser) -> None:
-    """Add --model."""
     from payload_emulator.flight.models import NETWORKS
 
     option(

@@ -73,6 +73,8 @@ def run_compare(arguments: argparse.Namespace) -> int:
         "samples": difference.samples,
         "start": format_utc(int(difference.utc_ns[0])),
         "stop": format_utc(int(difference.utc_ns[-1])),
+        "a": first.words,
+        "b": second.words,
     }
     rows = [
         f"{name:<4} radial {radial:.6g} m, transverse {transverse:.6g} m, normal {normal:.6g} m"
@@ -82,6 +84,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
         )
     ]
     text = (
+        f"A: {figures['a']}; B: {figures['b']}\n"
         f"{difference.samples} epochs from {figures['start']} to {figures['stop']}\n"
         f"distance: max {difference.max_m:.6g} m, rms {difference.rms_m:.6g} m\n" + "\n".join(rows)
     )
@@ -128,6 +131,7 @@ def run_interpolate(arguments: argparse.Namespace) -> int:
         arguments,
         {
             "states": states,
+            "file": ephemeris.words,
             "frame": "ICRF, Moon-centred",
             "orientation": orientation.name,
             "data": [f"lunar orientation {orientation.name}"],
@@ -137,14 +141,13 @@ def run_interpolate(arguments: argparse.Namespace) -> int:
 
 
 def run_convert(arguments: argparse.Namespace) -> int:
-    from linna.data import data_folder
+    from linna.data import data_folder, load_orbit
     from linna.errors import UsageError
     from lunar.datafolder import default_orientation
     from lunar.ephemeris import resampled
-    from lunar.messages.ephemeris_files import is_spk, load_ephemeris
     from lunar.messages.oem import format_oem
     from lunar.messages.oem_xml import format_oem_xml
-    from lunar.messages.spice import READ_STEP_S, load_spk, spk_kernel
+    from lunar.messages.spice import spk_kernel
     from lunar.messages.stk import format_stk
     from lunar.messages.tabular import format_csv, format_tum
 
@@ -159,10 +162,8 @@ def run_convert(arguments: argparse.Namespace) -> int:
     out: Path = arguments.out
     if out.suffix.lower() not in writers:
         raise UsageError(f"--out: expected a name ending in {', '.join(writers)}, found {out.name!r}")
-    if is_spk(arguments.ephemeris):
-        ephemeris = load_spk(arguments.ephemeris, arguments.spice_id, arguments.step or READ_STEP_S)
-    else:
-        ephemeris = load_ephemeris(arguments.ephemeris)
+    ephemeris = load_orbit(arguments.ephemeris, arguments.spice_id, arguments.step)
+    words = ephemeris.words
     if arguments.step or out.suffix.lower() in (".e", ".csv", ".tum"):
         ephemeris = resampled(ephemeris, arguments.step)
     written = writers[out.suffix.lower()](ephemeris)
@@ -170,6 +171,7 @@ def run_convert(arguments: argparse.Namespace) -> int:
         "out": str(out),
         "states": sum(len(segment.utc_ns) for segment in ephemeris.segments),
         "segments": len(ephemeris.segments),
+        "file": words,
         "frame": "ICRF, Moon-centred",
     }
     text = f"{figures['states']} states in {figures['segments']} segments, {figures['frame']}"
@@ -180,7 +182,7 @@ def run_convert(arguments: argparse.Namespace) -> int:
             text = text.replace("states", "records of polynomials") + f", within {written.error_m:.1e} m"
         written = written.octets
     save(out, written if isinstance(written, bytes) else written.encode())
-    return emit(arguments, figures, text=f"{text} -> {out}")
+    return emit(arguments, figures, text=f"{words}: {text} -> {out}")
 
 
 def _spice_id(arguments: argparse.Namespace) -> int:

@@ -36,7 +36,7 @@ def as_json(entity: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """What a person sees of an argument: help, name of its value, and another name of the option."""
+    """Presentation of an argument: help, name of its value, and another name of the option."""
 
     help: str = ""
     metavar: str | tuple[str, str] | None = None
@@ -141,7 +141,7 @@ class Command:
         return work
 
 
-Commands = Mapping[str, "Command | Group | Hand"]
+Commands = Mapping[str, "Command | Group | CustomCommand"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +157,7 @@ class Group:
 
 
 @dataclass(frozen=True, slots=True)
-class Hand:
+class CustomCommand:
     """A command whose options are added by a function, which sets a handler as well."""
 
     help: str
@@ -180,8 +180,8 @@ def _add(
     if get_origin(kind) in (Union, types.UnionType):
         kind, inner = (inner[0], list(get_args(inner[0]))) if len(inner) == 1 else (inner[0], [])
     origin = get_origin(kind)
-    told = option.help or HELP.get(name, "")
-    words: dict[str, Any] = {"help": told}
+    text = option.help or HELP.get(name, "")
+    words: dict[str, Any] = {"help": text}
     if kind is bool:
         words["action"] = "store_true"
     else:
@@ -201,7 +201,7 @@ def _add(
             words["default"] = default
             if default not in (None, "", ()):
                 shown = f"{default:g}" if isinstance(default, float) else default
-                words["help"] = f"{told} (default: {shown})".strip()
+                words["help"] = f"{text} (default: {shown})".strip()
     if positional:
         metavar = option.metavar or ("ID" if name.endswith("_id") else name.upper())
         words |= {"metavar": metavar} if words.get("metavar") is None or option.metavar is None else {}

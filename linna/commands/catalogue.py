@@ -69,7 +69,7 @@ def _configure_curate(curate: argparse.ArgumentParser) -> None:
 
 
 def run_stats(arguments: argparse.Namespace) -> int:
-    from lunar.catalogue import PAPER_CLASS_COUNTS, class_counts
+    from lunar.catalogue import PAPER_CLASS_COUNTS, catalogue_words, class_counts
 
     catalogue = open_catalogue(arguments.catalogue, arguments.seed)
     counts = [int(count) for count in class_counts(catalogue)]
@@ -82,7 +82,7 @@ def run_stats(arguments: argparse.Namespace) -> int:
         "source": catalogue.source,
         "data": [f"crater catalogue {catalogue.source}"],
     }
-    lines = [f"{catalogue.source}: {len(catalogue)} craters"]
+    lines = [f"{catalogue.source}: {catalogue_words(catalogue)}"]
     names = ("5-10 km", "10-15 km", "15-30 km")
     lines += [
         f"class {k} ({name}): {count} (paper {paper})"
@@ -96,7 +96,7 @@ def run_curate(arguments: argparse.Namespace) -> int:
 
     from linna.data import data_folder
     from linna.errors import UsageError
-    from lunar.catalogue import format_catalogue, load_catalogue
+    from lunar.catalogue import catalogue_words, format_catalogue, load_catalogue
     from payload_emulator.sim.terrain.curation import CurationRules, RasterHeights, curate
     from tmtc.dictionary.tables import pack_catalogue_table, table_hash
 
@@ -142,6 +142,7 @@ def run_curate(arguments: argparse.Namespace) -> int:
         f"rims lie {curation.offset_m[0]:.0f} m east, {curation.offset_m[1]:.0f} m north of the list on average "
         f"(+- {curation.offset_sigma_m:.0f} m, by place from {curation.registration.rims.sum()} rims); "
         f"{heights.pixels_per_degree:g} px/deg, rim heights raised by {curation.height_correction_m:.0f} m",
+        f"{listed.source}: {catalogue_words(listed)}",
         *(heights.readings if arguments.terrain else ()),
         f"{arguments.out}: {len(written)} octets, table {table_hash(octets):08x}",
     ]

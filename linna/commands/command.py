@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linna.commands._ground import add_operator_options, ground_client
-from linna.commands._table import Command, Commands, Hand, Option, add_commands
+from linna.commands._table import Command, Commands, CustomCommand, Option, add_commands
 from linna.errors import UsageError
 from linna.output import emit, finish
 from linna.parser import option
@@ -165,7 +165,7 @@ COMMANDS: Commands = {
         "handovers",
         "no notes, no holds",
     ),
-    "uplink": Hand(
+    "uplink": CustomCommand(
         "take the released telecommands and write them to a file; they count as sent from then on",
         _configure_uplink,
     ),

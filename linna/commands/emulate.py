@@ -185,13 +185,16 @@ def _check(arguments: argparse.Namespace, scenario: Scenario, external: External
         "unknown": list(mission.unknown),
         "ends": world.ends,
         "data": list(world.data_names),
+        "stated": scenario.words,
+        "registration": "" if world.terrain.registration is None else world.terrain.registration.words,
     }
     return emit(
         arguments,
         figures,
         text=f"{scenario.name}: {len(times)} frames, {figures['start_utc']} to {figures['stop_utc']}, estimators "
         f"{', '.join(scenario.navigation.estimators)}\n{f'{world.ends}{chr(10)}' if world.ends else ''}"
-        f"data: {'; '.join(world.data_names)}",
+        f"data: {'; '.join(world.data_names)}\nstated: {scenario.words}"
+        + (f"\nregistration: {figures['registration']}" if figures["registration"] else ""),
     )
 
 
@@ -202,7 +205,8 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
     from linna.data import data_folder
     from lunar.timescales import format_utc
     from payload_emulator.session.archive.mission import OPERATIONS, default_ports, live_mission_text
-    from payload_emulator.session.live.session import LiveSession, station_names
+    from payload_emulator.session.live.contacts import station_names
+    from payload_emulator.session.live.session import LiveSession
     from payload_emulator.session.spacecraft.loading import launch, load_scenario_payload
     from payload_emulator.session.world.world import build_world
 

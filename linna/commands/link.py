@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linna.commands._ground import add_service_options, event_of_signals, open_ground_only, settings_of
-from linna.commands._table import Command, Commands, Hand, Option, add_commands
+from linna.commands._table import Command, Commands, CustomCommand, Option, add_commands
 from linna.output import emit, finish, log
 from linna.parser import option
 
@@ -192,7 +192,7 @@ def _contacts(found: Contacts) -> str:
 
 
 COMMANDS: Commands = {
-    "check": Hand("propose the link settings of a recording from the whole file", _configure_check),
+    "check": CustomCommand("propose the link settings of a recording from the whole file", _configure_check),
     "list": Command(
         "list_links",
         "list the links of the mission descriptions with their state",
@@ -216,7 +216,7 @@ COMMANDS: Commands = {
             "link": Option("contacts of this link only", "LINK"),
         },
     ),
-    "run": Hand("operate links in a process of their own", _configure_run),
+    "run": CustomCommand("operate links in a process of their own", _configure_run),
 }
 
 

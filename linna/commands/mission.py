@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from linna.commands._table import Command, Commands, Hand, add_commands, as_json
+from linna.commands._table import Command, Commands, CustomCommand, add_commands, as_json
 from linna.output import emit, finish, log, watched_rims
 from linna.parser import ABOVE_ZERO, LinnaParser, number, option
 
@@ -21,7 +21,7 @@ def _configure_write(writing: LinnaParser) -> None:
         writing,
         "--flight",
         bool,
-        "of a spacecraft that the ground commands, with craters.csv, reference.oem and request.json beside it",
+        "of a spacecraft that the ground commands, with craters.csv, reference.oem and request.json in the same folder",
     )
     option(writing, "--windows N", int, "windows a day of the request", 2)
     option(writing, "--window-min M", float, "duration of its windows", 12.0)
@@ -34,7 +34,7 @@ def _configure_check(checking: LinnaParser) -> None:
         checking,
         "--flight",
         bool,
-        "dry run: plan request.json over reference.oem beside the file, and release the telecommands",
+        "dry run: plan request.json over reference.oem in the folder of the file, and release the telecommands",
     )
     finish(checking, check)
 
@@ -130,6 +130,7 @@ def _figures(mission: Any) -> dict[str, Any]:
     return {
         "mission": mission.name,
         "revision": mission.revision,
+        "stated": mission.words,
         "unknown": list(mission.unknown),
         "remarks": definition_remarks(mission),
     }
@@ -137,7 +138,10 @@ def _figures(mission: Any) -> dict[str, Any]:
 
 def _described(figures: Mapping[str, Any]) -> str:
     unknown = figures["unknown"]
-    lines = [f"mission {figures['mission']}, revision {figures['revision'][:16]}"]
+    lines = [
+        f"mission {figures['mission']}, revision {figures['revision'][:16]}",
+        *figures["stated"].splitlines(),
+    ]
     if unknown:
         lines.append(f"not stated ({len(unknown)}): {', '.join(unknown)}")
     return "\n".join([*lines, *figures.get("remarks", ())])
@@ -207,8 +211,8 @@ def went_well(figures: Mapping[str, Any]) -> bool:
 
 
 COMMANDS: Commands = {
-    "write": Hand("write the mission description of a scenario", _configure_write),
-    "check": Hand("check a mission description; print one line for each fault", _configure_check),
+    "write": CustomCommand("write the mission description of a scenario", _configure_write),
+    "check": CustomCommand("check a mission description; print one line for each fault", _configure_check),
     "add": Command(
         "add_mission", "add a mission description as a revision", lambda made: _described(as_json(made))
     ),
@@ -227,7 +231,7 @@ COMMANDS: Commands = {
         lambda found: f"{_described(as_json(found))}\n\n{found.text.rstrip()}",
         options={"revision": "the hash or its first eight digits"},
     ),
-    "run": Hand("run payload, stations, ground service and automation for days", _configure_run),
+    "run": CustomCommand("run payload, stations, ground service and automation for days", _configure_run),
 }
 
 

@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     duration = "6 minutes" if arguments.quick else "an hour"
     log(f"this takes about {duration} on two idle cores; the same command continues it")
     started = time.monotonic()
-    report = make_paper(_workshop(arguments, data_folder()), quick=arguments.quick)
+    report = make_paper(_step_folder(arguments, data_folder()), quick=arguments.quick)
     html, pdf = render_pages(report)
     out = arguments.out
     (out / "paper.html").write_text(html, encoding="utf-8")
@@ -92,16 +92,16 @@ def save_tables(out: Path, report: PaperReport) -> None:
             (folder / f"{picture.key}.csv").write_text(text, encoding="utf-8")
 
 
-def _workshop(arguments: argparse.Namespace, data: Any) -> Any:
+def _step_folder(arguments: argparse.Namespace, data: Any) -> Any:
     from dataclasses import replace
 
-    from studies.paper_steps import QUICK, Effort, Workshop
+    from studies.paper_steps import QUICK, Effort, StepFolder
 
     effort = QUICK if arguments.quick else Effort()
     if arguments.hours is not None:
         effort = replace(effort, hours=arguments.hours)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    return Workshop(
+    return StepFolder(
         arguments.out, data, effort, arguments.model, log,
         lambda items, total: progress(items, total, "frames", "frame"),
     )  # fmt: skip

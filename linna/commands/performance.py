@@ -40,8 +40,11 @@ def performance_lines(found: Performance) -> str:
         lines.append("  no change of level")
     for rule in found.requirements:
         judged = rule.met + rule.not_met
-        told = f"met on {rule.met} of {judged} judged passes" if judged else "not judged"
-        lines.append(f"  {rule.name}, last {found.window_days:g} days: {told}, unknown on {rule.unknown}")
+        status = f"met on {rule.met} of {judged} judged passes" if judged else "not judged"
+        remark = f"; {rule.remark}" if rule.remark else ""
+        lines.append(
+            f"  {rule.name}, last {found.window_days:g} days: {status}, unknown on {rule.unknown}{remark}"
+        )
     return "\n".join(lines)
 
 

@@ -190,12 +190,12 @@ def _placebo(arguments: argparse.Namespace) -> int:
             log(f"placebo {len(verdicts)} of {arguments.runs}: {verdicts[-1]}")
         noise = service.list_calibrations()
     counts = {name: verdicts.count(name) for name in ("fail", "pass", "inconclusive")}
-    told = ", ".join(f"{count} {name}" for name, count in counts.items())
+    totals = ", ".join(f"{count} {name}" for name, count in counts.items())
     figures = {"placebos": counts, "calibrations": [one.model_dump() for one in noise]}
     return emit(
         arguments,
         figures,
-        text="\n".join([told, *(one.text for one in noise if not (one.condition and one.calibrated))]),
+        text="\n".join([totals, *(one.text for one in noise if not (one.condition and one.calibrated))]),
     )
 
 

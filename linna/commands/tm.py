@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from tmtc.xtce.decode import XtceDecode
     from tmtc.xtce.definition import Definition
 
-_PAUSE_S = 0.005
+_PAUSE_S = 0.03
 """Time between two frames of a file, so that a receiver loses none."""
 
 
@@ -142,15 +142,19 @@ def run_check(arguments: argparse.Namespace) -> int:
 def _read_foreign(arguments: argparse.Namespace) -> tuple[DownlinkDecode, XtceDecode, Definition]:
     """The downlink, its packets through the definition, and the definition."""
     from tmtc.dictionary.schema import Dictionary
-    from tmtc.xtce.decode import DECODED, Decoder
+    from tmtc.xtce.decode import DECODED, JOINED, Decoder
     from tmtc.xtce.importing import parse_xtce
 
     documents = {str(path): path.read_bytes() for path in arguments.xtce}
     definition = parse_xtce(documents, arguments.leading_size)
     decoder = Decoder(definition, arguments.container)
     decoded = _read(arguments, Dictionary(version=0, telemetry=()))
-    found = decoder.decode(decoded.buffer, decoded.cut, decoded.headers, whole_stream=True)
-    unknown = int((decoded.cut.crc_ok & (found.verdict != DECODED)).sum())
+    checksum = 0 if arguments.no_error_control else 2
+    found = decoder.decode(
+        decoded.buffer, decoded.cut, decoded.headers, whole_stream=True, checksum_octets=checksum
+    )
+    known = (found.verdict == DECODED) | (found.verdict == JOINED)
+    unknown = int((decoded.cut.crc_ok & ~known).sum())
     return replace(decoded, unknown=unknown), found, definition
 
 
@@ -345,6 +349,9 @@ def _describe_definition(found: XtceDecode, definition: Definition) -> str:
     unknown = ", ".join(f"{name} {count}" for name, count in found.values_unknown().items())
     if unknown:
         lines.append(f"  values not known (outside their calibrator, or no text): {unknown}")
+    behind = ", ".join(f"{name} {low} to {high}" for name, (low, high) in found.bits_not_read().items())
+    if behind:
+        lines.append(f"  bits behind the last entry, not read: {behind}")
     return "\n".join([*lines, *(f"  {remark}" for remark in definition.remarks)])
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 from linna.commands._ground import add_service_options, local_actor, open_service
-from linna.commands._table import Command, Commands, Hand, Option, add_commands
+from linna.commands._table import Command, Commands, CustomCommand, Option, add_commands
 from linna.output import emit, finish, log
 from linna.parser import option
 
@@ -124,7 +124,9 @@ COMMANDS: Commands = {
         lambda made: made["token"],
         options=DAYS | {"keep": "keep earlier tokens valid"},
     ),
-    "ensure": Hand("create the user if needed, with the token of an environment variable", _configure_ensure),
+    "ensure": CustomCommand(
+        "create the user if needed, with a token from the environment", _configure_ensure
+    ),
     "disable": Command(
         "change_user",
         "disable a user and all tokens of the user",

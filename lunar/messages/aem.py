@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lunar.arrays import FloatArray, IntArray
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.errors import EphemerisError, UnknownTimeSystemError
 from lunar.frames import continuous_quaternions
 from lunar.messages.kvn import Lines, comment_lines, epoch_texts, is_number, numbered_lines
@@ -28,6 +28,9 @@ UNIT_TOLERANCE = 1e-3
 
 CAMERA_FRAME = "INSTRUMENT_1"
 """Name of the camera axes in messages; SANA registers INSTRUMENT_n for instruments."""
+
+CAMERA_NAMES = ("INSTRUMENT", "CAMERA")
+"""Beginnings of the names of the camera axes in an AEM."""
 
 _MANDATORY = (
     "OBJECT_NAME",
@@ -146,12 +149,14 @@ def _read_segment(reader: Lines) -> AttitudeSegment:
     line = reader.take()
     if line != "META_START":
         raise reader.error("META_START", repr(line[:60]))
-    comments, meta, _ = reader.metadata(_META_KEYS, _MANDATORY)
+    comments, meta, where = reader.metadata(_META_KEYS, _MANDATORY)
     system = meta["TIME_SYSTEM"].upper()
     if system not in TIME_SYSTEMS:
         raise UnknownTimeSystemError(meta["TIME_SYSTEM"], TIME_SYSTEMS, reader.source)
     first, inverse = _notation(reader, meta)
     utc_ns, numbers = _read_quaternions(reader, system)
+    useable = _useable(reader, meta, where, system, utc_ns)
+    utc_ns, numbers = utc_ns[useable], numbers[useable]
     q_wxyz = numbers if first else numbers[:, [3, 0, 1, 2]]
     if not inverse:
         q_wxyz = q_wxyz * [1.0, -1.0, -1.0, -1.0]
@@ -166,6 +171,28 @@ def _read_segment(reader: Lines) -> AttitudeSegment:
         system,
         tuple(comments),
     )
+
+
+def _useable(
+    reader: Lines, meta: dict[str, str], where: dict[str, int], system: str, utc_ns: IntArray
+) -> BoolArray:
+    """Return which attitudes (n,) are in the useable interval; they span START_TIME to STOP_TIME, to 1 ms."""
+    start, stop, first, last = (
+        reader.epoch(meta[key], system, where[key]) if key in meta else None
+        for key in ("START_TIME", "STOP_TIME", "USEABLE_START_TIME", "USEABLE_STOP_TIME")
+    )
+    for key, stated, found in (("START_TIME", start, utc_ns[0]), ("STOP_TIME", stop, utc_ns[-1])):
+        if stated is not None and abs(stated - int(found)) > 10**6:
+            expected = f"an attitude at {key} = {format_utc(stated)}"
+            raise reader.error(expected, f"{format_utc(int(found))}; the segment is cut short?", where[key])
+    held = np.ones(len(utc_ns), dtype=np.bool_)
+    if first is not None:
+        held &= utc_ns >= first
+    if last is not None:
+        held &= utc_ns <= last
+    if not held.any():
+        raise reader.error("attitudes in the useable interval", "none")
+    return held
 
 
 def _notation(reader: Lines, meta: dict[str, str]) -> tuple[bool, bool]:

@@ -9,6 +9,7 @@ import io
 import itertools
 from pathlib import Path
 
+from lunar.comparison import check_gravity
 from lunar.compressed import read_expanded
 from lunar.ephemeris import Ephemeris
 from lunar.errors import DataFileError
@@ -60,6 +61,13 @@ def load_ephemeris(path: Path | str) -> Ephemeris:
     except UnicodeDecodeError:
         raise DataFileError(path, "", EXPECTED, "octets that are no text") from None
     raise DataFileError(path, "first line", _FIRST, "nothing")
+
+
+def load_orbit(path: Path | str) -> Ephemeris:
+    """Return the ephemeris in a file, whose states must move as gravity moves them; raises as `check_gravity` too."""
+    ephemeris = load_ephemeris(path)
+    check_gravity(ephemeris)
+    return ephemeris
 
 
 def is_spk(path: Path | str) -> bool:

@@ -13,9 +13,10 @@ from datetime import datetime
 
 import numpy as np
 
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError, UnknownFrameError
-from lunar.timescales import NS, format_tai, to_tai_ns, utc_ns_from_tai_ns
+from lunar.timescales import format_tai, to_tai_ns, utc_ns_from_tai_ns
 
 UNITS_M = {"KM-S": (1e3, 1e3), "M-S": (1.0, 1.0), "KM-D": (1e3, 1e3 / 86_400.0)}
 """Metres and metres per second in units of the table, by its name for them."""

@@ -7,15 +7,9 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lunar.constants import NS
 from lunar.errors import DataFileError, LeapSecondError, TimeFormatError
-from lunar.timescales import (
-    NS,
-    from_tai_ns,
-    in_leap_second,
-    parse_tai,
-    tai_ns_from_utc_ns,
-    utc_ns_from_tai_ns,
-)
+from lunar.timescales import from_tai_ns, in_leap_second, parse_tai, tai_ns_from_utc_ns, utc_ns_from_tai_ns
 
 _HEADER_KEYS = ("CLASSIFICATION", "CREATION_DATE", "ORIGINATOR", "MESSAGE_ID")
 
@@ -147,7 +141,6 @@ def is_number(token: str) -> bool:
 
 
 def comment_lines(comments: Iterable[str]) -> list[str]:
-    """Return the COMMENT lines of comments."""
     return [f"COMMENT {line}".rstrip() for comment in comments for line in (comment.splitlines() or [""])]
 
 

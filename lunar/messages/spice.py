@@ -26,7 +26,7 @@ from numpy.polynomial import chebyshev
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
-from lunar.constants import MOON_RADIUS_M, SECONDS_PER_DAY
+from lunar.constants import MOON_RADIUS_M, NS, SECONDS_PER_DAY
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError, EphemerisError, MissingLibrary, UnknownFrameError
 from lunar.frames import (
@@ -46,7 +46,6 @@ from lunar.frames import (
 from lunar.third_bodies import moon_barycentric_icrf_m
 from lunar.timescales import (
     J2000_TT_AS_UTC_COUNT_NS,
-    NS,
     TICKS_PER_SECOND,
     TT_MINUS_TAI_NS,
     tai_ns_from_utc_ns,

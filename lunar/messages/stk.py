@@ -17,6 +17,7 @@ from itertools import pairwise
 import numpy as np
 
 from lunar.arrays import FloatArray, IntArray
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris, EphemerisSegment, parse_numbers, resampled
 from lunar.errors import (
     DataFileError,
@@ -26,7 +27,7 @@ from lunar.errors import (
     UnknownTimeSystemError,
 )
 from lunar.frames import ICRF_NAMES, J2000_NAMES, icrf_from_j2000
-from lunar.timescales import NS, format_tai, parse_tai, utc_ns_from_tai_ns
+from lunar.timescales import format_tai, parse_tai, utc_ns_from_tai_ns
 
 _STATE_WIDTH = {"EPHEMERISTIMEPOSVEL": 7, "EPHEMERISTIMEPOSVELACC": 10}
 _UNITS_M = {"METERS": 1.0, "KILOMETERS": 1000.0, "METER": 1.0, "KILOMETER": 1000.0}

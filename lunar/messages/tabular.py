@@ -11,9 +11,10 @@ from __future__ import annotations
 import numpy as np
 
 from lunar.arrays import FloatArray, IntArray
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris, resampled
 from lunar.frames import Orientation, continuous_quaternions, quaternion_from_matrix, rtn_from_inertial
-from lunar.timescales import NS, format_tai, tdb_s_from_tai_ns, utc_ns_from_tai_ns
+from lunar.timescales import format_tai, tdb_s_from_tai_ns, utc_ns_from_tai_ns
 from lunar.visibility import subsatellite
 
 CSV_COLUMNS = (

@@ -1,4 +1,4 @@
-"""What would fly: image preparation, detector, odometry, anchored navigation, telemetry.
+"""Flight software: image preparation, detector, odometry, anchored navigation, telemetry.
 
 Nothing here sees truth, torch, the wall clock or the network. The one door is `payload.Payload.step`.
 """

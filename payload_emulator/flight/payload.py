@@ -202,7 +202,7 @@ class Payload:
 
     @property
     def has_cadence(self) -> bool:
-        """Whether the observation was commanded with an interval of frames; else every image is looked at."""
+        """Return whether the observation was commanded with an interval of frames; else every image is looked at."""
         return self._machine.observation.cadence_ticks > 0
 
     def will_look(self, ticks: int, telecommand_octets: bytes) -> bool:
@@ -215,14 +215,14 @@ class Payload:
             return ticks >= window.next_ticks
         schedule = machine.schedule
         due = [one.packet for one in schedule.activities if schedule.enabled and one.release_ticks <= ticks]
-        orders = [*parse_commands(telecommand_octets), *parse_commands(b"".join(due))]
+        telecommands = [*parse_commands(telecommand_octets), *parse_commands(b"".join(due))]
         return any(
             not isinstance(order, Refusal)
             and (
                 name_of(order) == "start_observation"
                 or (name_of(order) == "set_mode" and order.values["argument_1"] == PayloadMode.observing)
             )
-            for order in orders
+            for order in telecommands
         )
 
     def summary(self) -> dict[str, Any]:
@@ -485,7 +485,7 @@ class Payload:
     # Downlink
 
     def _downlink(self) -> list[bytes]:
-        """What TM/TC takes of the store; a time report at the commanded interval of frames."""
+        """Return the packets that are sent from the store; a time report at the commanded interval of frames."""
         machine = self._machine
         takes = machine.board.downlink_octets()
         sends_all = machine.mode in (PayloadMode.observing, PayloadMode.downlinking)

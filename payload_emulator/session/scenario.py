@@ -18,7 +18,9 @@ from lunar.errors import LunarError
 from lunar.plausible import (
     CAMERA_FIELD_DEG,
     CAMERA_PIXELS,
+    CRATER_DIAMETER_M,
     MAP_SHIFT_M,
+    OFF_NADIR_DEG,
     ORBIT_RADIUS_M,
     ORBIT_SPEED_M_S,
     UTC_NS,
@@ -41,7 +43,7 @@ SHIPPED = Path(__file__).resolve().parents[2] / "scenarios"
 
 @dataclass(frozen=True, slots=True)
 class OrbitSection:
-    """Where the spacecraft is at the epoch: osculating Keplerian elements, a Cartesian state, or an OEM file.
+    """Orbit at the epoch: osculating Keplerian elements, a Cartesian state, or an OEM file.
 
     `position_km` and `velocity_km_s` (three numbers each, axes of `frame`) replace the elements. An OEM file gives the
     whole trajectory.
@@ -80,7 +82,7 @@ class DynamicsSection:
 class ManeuverSection:
     """The paper's orbit maintenance (section V-B.1).
 
-    The payload is told of planned burns; what is carried out differs from the plan by a share of it (1 sigma per axis).
+    The payload knows the planned burns; what is carried out differs from the plan by a share of it (1 sigma per axis).
     """
 
     enabled: bool = True
@@ -92,7 +94,7 @@ class ManeuverSection:
 
 @dataclass(frozen=True, slots=True)
 class WindowSection:
-    """When the payload observes.
+    """Observation windows of the payload.
 
     `search`: "terrain" takes the first window of the wanted direction that lies entirely over the available terrain,
     no earlier than `start` (the orbit's epoch when empty), between the two longitudes (east-positive; the second may
@@ -233,10 +235,10 @@ class AttitudeSection:
 
 @dataclass(frozen=True, slots=True)
 class DisturbancesSection:
-    """What happens on the way; times in seconds after the first frame, nothing happens where a size is zero.
+    """Disturbances of the flight; times in seconds after the first frame, none where a size is zero.
 
-    - kidnap: the spacecraft is found elsewhere, turned about the Moon's centre by a distance on the ground; `told`: the
-      payload is told by telecommand that its estimate is worth no more than that distance;
+    - kidnap: the spacecraft is found elsewhere, turned about the Moon's centre by a distance on the ground;
+      `kidnap_told`: the payload is informed by telecommand that its estimate is worth no more than that distance;
     - outage: the camera gives no image;
     - burn: along the velocity; `declared`: the payload has it in its burn table. `maneuvers` gives its execution error.
     """
@@ -262,7 +264,7 @@ class ClockSection:
 
 @dataclass(frozen=True, slots=True)
 class FaultsSection:
-    """What breaks: a line each, `KIND at SECONDS [for SECONDS] [size NUMBER]`; the kinds are in `sim.faults`."""
+    """Faults: a line each, `KIND at SECONDS [for SECONDS] [size NUMBER]`; the kinds are in `sim.faults`."""
 
     events: tuple[str, ...] = ()
 
@@ -354,12 +356,24 @@ class Scenario:
 
     @property
     def has_flat_ground(self) -> bool:
-        """Whether the ground is the sphere: no image is rendered, and no estimator needs heights."""
+        """Return whether the ground is the sphere: no image is rendered, and no estimator needs heights."""
         return self.camera.images == "reduced" and "anchored" not in self.navigation.estimators
 
     @property
     def epoch_utc_ns(self) -> int:
         return parse_utc(self.orbit.epoch)
+
+    @property
+    def words(self) -> str:
+        """Return the values that differ from the defaults, as printed with figures of the scenario."""
+        default, listed = Scenario(""), []
+        for item in dataclasses.fields(self):
+            section, plain = getattr(self, item.name), getattr(default, item.name)
+            if dataclasses.is_dataclass(section):
+                names = (key.name for key in dataclasses.fields(section))
+                changed = [name for name in names if getattr(section, name) != getattr(plain, name)]
+                listed += [f"{item.name}.{name} {toml_text(getattr(section, name))}" for name in changed]
+        return ", ".join(listed)
 
     def with_choices(
         self,
@@ -368,7 +382,7 @@ class Scenario:
         seed: int | None = None,
         anchoring_catalogue: Path | None = None,
     ) -> Scenario:
-        """The same scenario with other estimators, seed or table of craters; None keeps what it has."""
+        """Return the same scenario with other estimators, seed or table of craters; None keeps what it has."""
         navigation = self.navigation
         if modes is not None:
             navigation = dataclasses.replace(navigation, estimators=tuple(dict.fromkeys(modes)))
@@ -388,7 +402,7 @@ def shipped_file(path: Path) -> Path:
 
 
 def load_scenario(path: Path | str) -> Scenario:
-    """The scenario in a TOML file; a bare name means one of those shipped (`scenarios/NAME.toml`).
+    """Load the scenario of a TOML file; a bare name means one of those shipped (`scenarios/NAME.toml`).
 
     Raises
     ------
@@ -412,7 +426,7 @@ def load_scenario(path: Path | str) -> Scenario:
 
 
 def parse_scenario(text: str, source: str = "scenario") -> Scenario:
-    """The scenario written in `text`; `source` names it in error messages.
+    """Parse the scenario in `text`; `source` names it in error messages.
 
     Archives state every key, so keys without effect are allowed.
     """
@@ -437,7 +451,7 @@ def parse_scenario(text: str, source: str = "scenario") -> Scenario:
 
 
 def format_scenario(scenario: Scenario) -> str:
-    """TOML text that parses to an equal scenario (every key written out)."""
+    """Return TOML text that parses to an equal scenario (every key written out)."""
     lines: list[str] = []
     sections: list[str] = []
     for item in dataclasses.fields(scenario):
@@ -559,8 +573,13 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "camera.width_px": (CAMERA_PIXELS.low, CAMERA_PIXELS.high),
     "camera.height_px": (CAMERA_PIXELS.low, CAMERA_PIXELS.high),
     "camera.fov_deg": (CAMERA_FIELD_DEG.low, CAMERA_FIELD_DEG.high),
-    "camera.tilt_deg": (-60.0, 60.0),
+    "camera.tilt_deg": (-OFF_NADIR_DEG, OFF_NADIR_DEG),
     "camera.frame_interval_s": (_POSITIVE, _ANY),
+    "clock.drift_ppm": (-1e5, 1e5),
+    "navigation.initial_position_error_m": (0.0, MOON_RADIUS_M),
+    "navigation.initial_velocity_error_m_s": (0.0, ORBIT_SPEED_M_S.high),
+    "navigation.catalogue_min_diameter_km": (CRATER_DIAMETER_M.low / 1e3, CRATER_DIAMETER_M.high / 1e3),
+    "navigation.catalogue_max_diameter_km": (CRATER_DIAMETER_M.low / 1e3, CRATER_DIAMETER_M.high / 1e3),
     "window.passes": (1, _ANY),
     "window.arc_interval": (1, _ANY),
     "detector.max_detections": (1, 255),
@@ -771,6 +790,11 @@ def _check_light(scenario: Scenario, require: Require) -> None:
 
 
 def _check_navigation(scenario: Scenario, require: Require) -> None:
+    require(
+        scenario.navigation.catalogue_min_diameter_km < scenario.navigation.catalogue_max_diameter_km,
+        "navigation.catalogue_min_diameter_km",
+        "less than navigation.catalogue_max_diameter_km",
+    )
     for name in scenario.navigation.estimators:
         require(name in ESTIMATORS, "navigation.estimators", f"of {', '.join(ESTIMATORS)}", name)
     require(len(scenario.navigation.estimators) > 0, "navigation.estimators", "at least one estimator", ())

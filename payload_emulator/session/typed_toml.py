@@ -215,7 +215,6 @@ def _fault(kind: type, error: ValidationError, path: str) -> TableFault:
 
 
 def toml_text(value: object) -> str:
-    """Return a value in TOML."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):

@@ -35,7 +35,7 @@ class Photo:
 
 @dataclass(frozen=True, slots=True)
 class Canvas:
-    """What a drawing function draws on: a (sub)figure of ``width_in`` by ``height_in`` design inches.
+    """Canvas of a drawing function: a (sub)figure of ``width_in`` by ``height_in`` design inches.
 
     Where ``photos`` is a list, images are collected there in the order of drawing and only a place is kept in the
     drawing.
@@ -237,7 +237,7 @@ def end_labels(
     line_width: float,
     axes_width_in: float,
 ) -> None:
-    """Names of lines, each after a short sample of it, beside their right ends, moved apart where they would touch.
+    """Names of lines, each after a short sample of it, at their right ends, moved apart where they would touch.
 
     Parameters
     ----------

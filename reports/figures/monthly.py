@@ -15,11 +15,12 @@ _LEFT, _RIGHT, _BOTTOM, _TOP, _GAP = 0.85, 0.2, 0.50, 0.25, 0.22
 
 
 def series(report: MonthlyReportValue) -> dict[str, FloatArray]:
-    """Return the values (n,) of each metric over the passes."""
-    return {
+    """Return the values (n,) of each metric over the passes; the offset of the list only where one is known."""
+    found = {
         name: np.array([getattr(one, name) for one in report.passes], dtype=np.float64)
-        for name in ("recall", "drift_percent", "median_error_m")
+        for name in ("recall", "drift_percent", "median_error_m", "map_offset_m")
     }
+    return {name: one for name, one in found.items() if name != "map_offset_m" or np.isfinite(one).any()}
 
 
 def draw_trend(
@@ -29,12 +30,13 @@ def draw_trend(
     starts = np.array([one.start_utc_ns for one in report.passes], dtype=np.int64)
     room = max(int(starts.max() - starts.min()) // 40, 1_800_000_000_000)
     time = TimeScale(int(starts.min()) - room, int(starts.max()) + room)
-    height = (canvas.height_in - _BOTTOM - _TOP - 2.0 * _GAP) / 3.0
-    for row, (name, values) in enumerate(series(report).items()):
+    panels = series(report)
+    height = (canvas.height_in - _BOTTOM - _TOP - (len(panels) - 1) * _GAP) / len(panels)
+    for row, (name, values) in enumerate(panels.items()):
         label, unit, scale, _ = metrics[name]
         bottom = canvas.height_in - _TOP - (row + 1) * height - row * _GAP
         axes = canvas.axes(_LEFT, bottom, canvas.width_in - _LEFT - _RIGHT, height)
-        time_axis(axes, time, labelled=row == 2)
+        time_axis(axes, time, labelled=row == len(panels) - 1)
         axes.set_ylabel(f"{label}\n{unit}")
         known = np.isfinite(values)
         axes.plot(time.x(starts[known]), scale * values[known], "o", color=color("blue"), markersize=3.5)

@@ -44,7 +44,7 @@ def resets_of(series: Sequence[NavigationSeries], time: TimeScale) -> list[tuple
 
 
 def mark_resets(axes: Axes, time: TimeScale, resets: Sequence[tuple[int, str]], named: bool) -> None:
-    """Dashed gray lines at resets; their triggers beside them where there is room, ticks at the top otherwise."""
+    """Dashed gray lines at resets; their triggers next to them where there is room, ticks at the top otherwise."""
     few = len(resets) <= _MOST_NAMED_RESETS
     for utc_ns, trigger in resets:
         x = float(time.x(utc_ns))

@@ -22,7 +22,7 @@ _BINS = 96
 
 
 def outcome_counts(one: NavigationSeries) -> dict[str, int]:
-    """How often each outcome occurred, in the order of the dictionary; samples without an outcome do not count."""
+    """Count each outcome, in the order of the dictionary; samples without an outcome do not count."""
     named = [o for o in one.outcome if o]
     order = [*OUTCOMES, *sorted({o for o in named if o not in OUTCOMES})]
     return {o: n for o in order if (n := named.count(o))}

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
-from reports.document import Block, Column, Facts, Heading, Paragraph, Picture, Table
+from reports.document import Block, Column, Heading, Paragraph, Picture, Properties, Table
 from reports.figures import accounting
 from reports.sections.common import PassView, arc_words
 from reports.text import (
@@ -85,7 +86,7 @@ def frames_and_packets(view: PassView) -> list[Block]:
     packets = report.packets
     if packets is None:
         return [*blocks, view.absent("packets", "Packet accounting")]
-    blocks += [Heading("Downlink", 3), _downlink_facts(packets)]
+    blocks += [Heading("Downlink", 3), _downlink_properties(packets)]
     if packets.completeness is not None and len(packets.completeness.expected):
         blocks.append(_completeness(view, packets.completeness))
     if packets.by_apid:
@@ -112,7 +113,7 @@ def _frame_blocks(view: PassView) -> list[Block]:
             f"({percent_text(last[1], steps[0][1])}) are {last[0]}.{bad}",
             "Bars: " + ", ".join(f"{name} {n}" for name, n in steps),
             0.28 + 0.27 * len(steps),
-            lambda c: accounting.draw_frame_steps(c, steps),
+            partial(accounting.draw_frame_steps, steps=steps),
         )
     ]
     if count.quality:
@@ -121,8 +122,8 @@ def _frame_blocks(view: PassView) -> list[Block]:
     return blocks
 
 
-def _downlink_facts(packets: PacketAccounting) -> Facts:
-    return Facts(
+def _downlink_properties(packets: PacketAccounting) -> Properties:
+    return Properties(
         (
             (
                 "Packets received",
@@ -163,7 +164,13 @@ def _completeness(view: PassView, completeness: CompletenessSeries) -> Picture:
         f"vermillion.{arc_words(view.time, report.imaging_arcs)}",
         f"Completeness over time. {said}",
         1.85,
-        lambda c: accounting.draw_completeness(c, completeness, view.time, report.imaging_arcs, report.gaps),
+        partial(
+            accounting.draw_completeness,
+            series=completeness,
+            time=view.time,
+            arcs=report.imaging_arcs,
+            gaps=report.gaps,
+        ),
     )
 
 

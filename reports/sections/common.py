@@ -82,7 +82,7 @@ def slug(name: str) -> str:
 
 
 def arc_words(time: TimeScale, arcs: tuple[TimeSpan, ...]) -> str:
-    """What a caption says of the tint of imaging arcs."""
+    """Return the words of a caption about the tint of imaging arcs."""
     if arcs_differ(time, arcs):
         return " Tinted ground marks imaging arcs."
     return " The whole span is one imaging arc." if len(arcs) == 1 else ""

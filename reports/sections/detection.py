@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -78,7 +79,7 @@ def detector_blocks(score: DetectorScore) -> list[Block]:
                 f"Precision, recall and localisation by class; better than the paper in all three: {beats} of "
                 f"{len(scores)} classes.",
                 1.15 + 0.34 * len(scores),
-                lambda c: detector.draw_class_scores(c, scores),
+                partial(detector.draw_class_scores, scores=scores),
             )
         )
     blocks += _bins(score)
@@ -89,7 +90,7 @@ def detector_blocks(score: DetectorScore) -> list[Block]:
                 _curves_caption(bool(score.curves), bool(score.calibration)),
                 "Precision-recall curves and calibration.",
                 2.95,
-                lambda c: detector.draw_curves(c, score.curves, score.calibration),
+                partial(detector.draw_curves, curves=score.curves, calibration=score.calibration),
             )
         )
     if score.residuals is not None and np.isfinite(score.residuals.du_px).any():
@@ -130,7 +131,7 @@ def _bins(score: DetectorScore) -> list[Block]:
                 "expected in each bin (gray, separate scale).",
                 f"Precision and recall in bins of {' and '.join(by[label] for label, _ in parts)}.",
                 2.3,
-                lambda c: detector.draw_bins(c, parts),
+                partial(detector.draw_bins, parts=parts),
             )
         )
     return blocks
@@ -153,7 +154,7 @@ def _residuals(residuals: ResidualSeries) -> Picture:
         "common to a frame moves the whole fix and does not show in the innovations.",
         f"Mean residual over all {significant_text(whole, 2)} px.",
         3.5,
-        lambda c: detector.draw_residuals(c, residuals),
+        partial(detector.draw_residuals, residuals=residuals),
     )
 
 
@@ -193,7 +194,7 @@ def gallery_picture(key: str, frames: tuple[GalleryFrame, ...], columns: int, le
         "their own size; dotted: not detected. Cyan: 5–10 km, yellow: 10–15 km, pink: 15–30 km, white: others.",
         f"{len(frames)} image frames with detections and catalogue craters.",
         gallery.gallery_height_in(len(frames), columns, WIDTH_IN),
-        lambda c: gallery.draw_gallery(c, frames, columns),
+        partial(gallery.draw_gallery, frames=frames, columns=columns),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 from reports.document import Block, Cell, Column, Heading, Picture, Table
 from reports.figures import outcomes
@@ -35,7 +36,7 @@ def matching(view: PassView) -> list[Block]:
             f"frequent: {'; '.join(largest)}. Colours as in the table below.",
             "Rings of outcome shares. " + "; ".join(largest),
             min(2.15, (WIDTH_IN - 0.2) / max(len(shown), 1)) + 0.48,
-            lambda c: outcomes.draw_outcome_shares(c, shown),
+            partial(outcomes.draw_outcome_shares, series=shown),
         )
     )
     blocks.append(outcome_table(series))
@@ -47,7 +48,9 @@ def matching(view: PassView) -> list[Block]:
             "detector gave the matcher too little to work with.",
             "Outcome of each frame over time, one row for each estimator.",
             0.58 + 0.52 * len(series),
-            lambda c: outcomes.draw_outcome_course(c, series, view.time, view.report.imaging_arcs),
+            partial(
+                outcomes.draw_outcome_course, series=series, time=view.time, arcs=view.report.imaging_arcs
+            ),
         )
     )
     return blocks

@@ -33,7 +33,7 @@ def errors(view: PassView) -> list[Block]:
             "its median.",
             "Cumulative distribution of the 3-D error of every solution.",
             2.7,
-            lambda c: navigation.draw_distribution(c, view.with_error, view.styles, arcs),
+            partial(navigation.draw_distribution, series=view.with_error, styles=view.styles, arcs=arcs),
         )
     )
     blocks.append(_arc_table(view))
@@ -200,7 +200,7 @@ def drift(view: PassView) -> list[Block]:
                 f"{caption[0].upper()}{caption[1:]}.",
                 "Drift of the odometry.",
                 2.6,
-                lambda c: navigation.draw_drift(c, shown, view.styles),
+                partial(navigation.draw_drift, series=shown, styles=view.styles),
             )
         )
     if swept:
@@ -358,6 +358,6 @@ def dependence(view: PassView) -> list[Block]:
             "samples are left out.",
             "Median and 95th percentile of the error in bins of each quantity.",
             0.86 + rows * 1.75 + (rows - 1) * 0.66,
-            lambda c: consistency.draw_dependence(c, series, track, view.styles),
+            partial(consistency.draw_dependence, series=series, track=track, styles=view.styles),
         ),
     ]

@@ -1,4 +1,4 @@
-"""What every report begins and ends with: verdict, figures, provenance, data, configuration."""
+"""Opening and closing sections of every report: verdict, figures, provenance, data, configuration."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from reports.document import (
     Absent,
     Block,
     Bullets,
-    Facts,
     Heading,
     Headline,
     Paragraph,
+    Properties,
     Verdict,
     evidence_number,
     evidence_text,
@@ -72,7 +72,7 @@ def provenance_and_data(report: ReportCommon) -> list[Block]:
         )
     if report.provenance:
         blocks.append(
-            Facts(tuple((k, hash_text(v) if is_hash(v) else v) for k, v in report.provenance.items()))
+            Properties(tuple((k, hash_text(v) if is_hash(v) else v) for k, v in report.provenance.items()))
         )
     else:
         blocks.append(absent(report, "provenance", "Build, hashes, seed", "none was archived"))
@@ -89,5 +89,5 @@ def settings(configuration: Mapping[str, Mapping[str, Any]]) -> list[Block]:
     blocks: list[Block] = []
     for group, values in configuration.items():
         blocks.append(Heading(str(group), 3))
-        blocks.append(Facts(tuple((str(k), setting_text(v)) for k, v in values.items()), mono=True))
+        blocks.append(Properties(tuple((str(k), setting_text(v)) for k, v in values.items()), mono=True))
     return blocks

@@ -1,8 +1,9 @@
-"""What the payload mapped itself."""
+"""Section on the craters that the payload mapped."""
 
 from __future__ import annotations
 
 import math
+from functools import partial
 
 from reports.document import Block, Column, Heading, Picture, Table
 from reports.figures import payload_map as figure
@@ -53,7 +54,7 @@ def payload_map(view: PassView) -> list[Block]:
                 "the last bar holds all beyond.",
                 f"Scatter of {mapped.catalogued} offsets between the payload's map and the catalogue.",
                 3.6,
-                lambda c: figure.draw_payload_map(c, mapped),
+                partial(figure.draw_payload_map, mapped=mapped),
             )
         )
     return blocks

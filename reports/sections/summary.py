@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 from reports.document import Block, Cell, Column, Heading, Picture, Table, Verdict
 from reports.figures import navigation
@@ -138,7 +139,7 @@ def error_picture(view: PassView, key: str, height_in: float, time: TimeScale) -
         f"{smallest}{arc_words(time, arcs)}{marks}",
         f"Error over time. {smallest}",
         height_in,
-        lambda c: navigation.draw_error_over_time(c, series, view.styles, time, arcs),
+        partial(navigation.draw_error_over_time, series=series, styles=view.styles, time=time, arcs=arcs),
     )
 
 

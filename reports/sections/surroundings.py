@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from reports.document import Block, Column, Heading, Picture, Table
@@ -36,7 +38,13 @@ def ground_track(view: PassView) -> list[Block]:
             f"{'; blue: the arc of the next figure' if several else ''}.",
             "Map of the Moon with the ground track.",
             4.6 if several else 3.2,
-            lambda c: track_map.draw_globe(c, track, arcs, report.terrain, chosen if several else None),
+            partial(
+                track_map.draw_globe,
+                track=track,
+                arcs=arcs,
+                terrain=report.terrain,
+                span=chosen if several else None,
+            ),
         )
     )
     crater_text = ""
@@ -57,7 +65,15 @@ def ground_track(view: PassView) -> list[Block]:
             f"{crater_text}",
             "Strips along one imaging arc with craters and estimated tracks.",
             4.9,
-            lambda c: track_map.draw_strips(c, track, flown, view.styles, craters, report.terrain, chosen),
+            partial(
+                track_map.draw_strips,
+                track=track,
+                series=flown,
+                styles=view.styles,
+                craters=craters,
+                terrain=report.terrain,
+                span=chosen,
+            ),
         )
     )
     return blocks
@@ -83,7 +99,12 @@ def housekeeping_and_events(view: PassView) -> list[Block]:
                 "Engineering parameters over the pass, each on its own scale.",
                 "Housekeeping parameters: " + ", ".join(p.name for p in parameters),
                 housekeeping.housekeeping_height_in(len(parameters)),
-                lambda c: housekeeping.draw_housekeeping(c, parameters, view.time, report.imaging_arcs),
+                partial(
+                    housekeeping.draw_housekeeping,
+                    parameters=parameters,
+                    time=view.time,
+                    arcs=report.imaging_arcs,
+                ),
             )
         )
     else:

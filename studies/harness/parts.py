@@ -108,7 +108,7 @@ class Part:
 
     @property
     def has_ended(self) -> bool:
-        """Whether it was started and has ended by itself."""
+        """Return whether it was started and has ended by itself."""
         return not self._ended and self._process is not None and self._process.poll() is not None
 
     def revive(self) -> None:
@@ -123,7 +123,7 @@ class Part:
         return self._process.pid
 
     def end(self, number: signal.Signals | None = None) -> None:
-        """End it for good, with a signal first if one is given: it is not started again."""
+        """End it permanently, with a signal first if one is given: it is not started again."""
         self._ended = True
         if self._process is None:
             return

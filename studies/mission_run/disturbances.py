@@ -1,7 +1,7 @@
 """Disturbances of a mission run: what a file of them changes at the spacecraft, the stations and flight dynamics.
 
 All of them are faults that spacecraft, link and reference can have anyway; a file states when in hours after the start
-of the run. The ground service is not told: neither its mission description nor its requests change.
+of the run. The ground service is not informed: neither its mission description nor its requests change.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from lunar.constants import NANOSECONDS_PER_SECOND as NS
+from lunar.constants import NS as NS
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import SHIPPED, Scenario, format_scenario, parse_scenario

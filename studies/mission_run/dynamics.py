@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from lunar.catalogue import save_catalogue
-from lunar.constants import NANOSECONDS_PER_SECOND as NS
+from lunar.constants import NS as NS
 from lunar.datafolder import DataFolder
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc
 from payload_emulator.session.archive.mission import OPERATIONS, default_ports, live_mission_text
-from payload_emulator.session.live.session import pruned, station_names
+from payload_emulator.session.live.contacts import station_names
+from payload_emulator.session.live.session import pruned
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.session.world.regions import observed_boxes, observed_craters
 from payload_emulator.session.world.rims import Watched
@@ -121,7 +122,7 @@ def write_flight(
     ports: dict[str, tuple[int, int]] | None = None,
     watched: Watched = iter,
 ) -> str:
-    """Write what the ground posts to fly a scenario, beside its mission description; return the description.
+    """Write what the ground posts to fly a scenario, next to its mission description; return the description.
 
     The files are `craters.csv`, `reference.oem` and `request.json`. `ports` are those of the stations for telemetry
     and telecommands (default: as `linna emulate --live` opens them). `watched` shows the progress of the longest step.

@@ -1,4 +1,4 @@
-"""Closing figures of a mission run: what the ground service says of its month, beside what the spacecraft counted."""
+"""Closing figures of a mission run: what the ground service says of its month, and what the spacecraft counted."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ import numpy as np
 
 from ground_service.evaluation.performance.model import PassPerformance
 from ground_service.planning.model import RequestPlan
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from studies.mission_run.ground import MissionGround
 
 UNKNOWN = "not known"
 """Reason of a missing window that no plan states."""
 
-DAY_NS = 86_400 * NANOSECONDS_PER_SECOND
+DAY_NS = 86_400 * NS
 FLOWN = ("executing", "executed", "downlinked", "processed")
 
 
 @dataclass(slots=True)
 class Progress:
-    """What the runner has seen; kept in the folder of the run and in its checkpoints.
+    """Progress of a run; kept in the folder of the run and in its checkpoints.
 
     Attributes
     ----------

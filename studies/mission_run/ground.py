@@ -27,8 +27,8 @@ from ground_service.ingest.live import spooled_octets
 from ground_service.jobs.service import unfinished_jobs as unfinished
 from ground_service.planning.model import Window
 from ground_service.store.events import position_of, read_events
-from ground_service.store.telemetry import packet_headers
 from ground_service.store.vehicles import all_vehicles
+from ground_service.telemetry.store import packet_headers
 from ground_service.worker.follow_up import CONSUMER, KINDS
 from lunar.datafolder import DataFolder
 

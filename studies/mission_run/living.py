@@ -14,7 +14,7 @@ from ground_service.clock import ClockFile
 from ground_service.errors import GroundError
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import ScenarioError
-from payload_emulator.session.live.session import station_names
+from payload_emulator.session.live.contacts import station_names
 from payload_emulator.session.scenario import Scenario, format_scenario
 from payload_emulator.session.world.rims import Watched
 from payload_emulator.session.world.world import open_world
@@ -59,8 +59,8 @@ def living_demo(
         A part does not start, or ends by itself.
     """
     mission, flown, clock = folder / "mission.toml", folder / "scenario.toml", folder / "clock"
-    ports, told = folder / "ports.json", format_scenario(scenario)
-    goes_on = ports.is_file() and flown.read_text(encoding="utf-8") == told
+    ports, stated = folder / "ports.json", format_scenario(scenario)
+    goes_on = ports.is_file() and flown.read_text(encoding="utf-8") == stated
     if not goes_on and folder.exists() and any(folder.iterdir()):
         raise ScenarioError(
             f"{folder}: expected a new folder, or that of a living demo of this scenario, found one with other files"
@@ -74,7 +74,7 @@ def living_demo(
         stations = {name: (free_port(), free_port()) for name in station_names(scenario, has_operator=False)}
         text = write_flight(scenario, data, mission, WINDOWS_A_DAY, WINDOW_S, stations, watched)
         mission.write_text(text, encoding="utf-8")
-        flown.write_text(told, encoding="utf-8")
+        flown.write_text(stated, encoding="utf-8")
     address = f"http://127.0.0.1:{port}"
     with ExitStack() as running:
         parts = _parts(folder, rate, port, stations)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ground_service.clock import ClockFile, set_mission_clock
-from lunar.constants import NANOSECONDS_PER_SECOND as NS
+from lunar.constants import NS as NS
 from lunar.datafolder import DataFolder
 from lunar.timescales import format_utc, parse_utc
 from payload_emulator.errors import LinkError, ScenarioError
@@ -44,14 +44,14 @@ CHECKPOINT_S = 60.0
 COUNTED = (
     "frames", "images_lost", "packets", "packets_lost_on_link", "telecommands", "telecommand_octets_lost", "resets",
 )  # fmt: skip
-"""What the spacecraft counts itself."""
+"""Counters of the spacecraft."""
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class RunTerms:
-    """What is run.
+    """Terms of a run.
 
     Attributes
     ----------
@@ -157,7 +157,7 @@ class MissionRun:
 
     spacecraft_class = SpacecraftProcess
     keeps_archive = True
-    """Whether checkpoints contain the archive of the ground service."""
+    """True if checkpoints contain the archive of the ground service."""
 
     def __init__(
         self,

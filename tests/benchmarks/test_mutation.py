@@ -181,13 +181,11 @@ def test_a_missing_program_is_named() -> None:
 @pytest.mark.parametrize(
     ("rows", "fault", "status"),
     [
-        ([Row("job", 1.0, "s")], "", 0),
-        ([], "not measured: Chromium is not installed", 0),
-        ([Row("job", 1.0, "s", wrong="values differ")], "", 1),
-        ([], "exit status 1", 1),
+        ([Row("job", 1.0, "s")], "", 0), ([], "not measured: Chromium is not installed", 0),
+        ([Row("job", 1.0, "s", wrong="values differ")], "", 1), ([], "exit status 1", 1),
         ([Row("job", 1.0, "s")], "did not finish in 300 s", 1),
     ],
-)
+)  # fmt: skip
 def test_the_status_tells_contradictions_from_missing_programs(
     rows: list[Row],
     fault: str,

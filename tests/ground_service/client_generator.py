@@ -17,9 +17,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from fastapi.routing import APIRoute
 from pydantic import BaseModel
 
-from ground_service.app import OPERATIONS
 from ground_service.client.connection import API_PREFIX
-from ground_service.http.common import IDEMPOTENCY_HEADER, IF_MATCH_HEADER
+from ground_service.http.common import IDEMPOTENCY_HEADER, IF_MATCH_HEADER, OPERATIONS
 from ground_service.http.model import PageOf, Paging, UtcTime
 from ground_service.http.requests import header_names
 
@@ -211,8 +210,8 @@ def generate() -> str:
         sections.append(f"    # {router.tags[0]}\n\n" + "\n\n".join(methods))
     modules = sorted(spelling.modules.items())
     imports = [
-        f"    from {name.rpartition('.')[0]} import {name.rpartition('.')[2]} as {alias}"
-        for alias, name in modules
+        f"    from {package} import {last}{'' if last == alias else f' as {alias}'}"
+        for alias, (package, _, last) in ((alias, name.rpartition(".")) for alias, name in modules)
     ]
     names = textwrap.wrap(" ".join(name.removeprefix("ground_service.") for _, name in modules), 90)
     text = HEADER + "\n".join(

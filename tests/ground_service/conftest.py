@@ -4,6 +4,7 @@ The orbit is an exact circle, the craters are placed by chance, the detections a
 noise and known faults, and the navigation states carry errors put in on purpose, so every figure is known beforehand.
 """
 
+import functools
 import hashlib
 import itertools
 import json
@@ -21,10 +22,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from httpx._transports import default as httpx_transports
 from sqlalchemy import create_engine, text
 
 from ground_service.access.service import add_user
-from ground_service.app import create_app
+from ground_service.app import DescribedApi, create_app
 from ground_service.clock import set_mission_clock, utc_now_ns
 from ground_service.ground import Ground, open_ground
 from ground_service.missions.ephemerides.service import add_ephemeris
@@ -62,6 +64,29 @@ def name_of_the_test_client() -> Iterator[None]:
     """Allow the host name that the test client of the web framework gives itself."""
     with pytest.MonkeyPatch.context() as environment:
         environment.setenv("LINNA_ALLOWED_HOSTS", "testserver")
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_tls_context() -> Iterator[None]:
+    """Read the trusted certificates once: each HTTP client would read them."""
+    with pytest.MonkeyPatch.context() as patch:
+        made = functools.cache(httpx_transports.create_ssl_context)
+        patch.setattr(httpx_transports, "create_ssl_context", made)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_description() -> Iterator[None]:
+    """Make the OpenAPI document, which is the same for every application, once: it takes two seconds."""
+    describe, made = DescribedApi.openapi, list[dict[str, Any]]()
+
+    def openapi(app: DescribedApi) -> dict[str, Any]:
+        made[:] = made or [describe(app)]
+        return made[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(DescribedApi, "openapi", openapi)
         yield
 
 

@@ -36,12 +36,10 @@ class ObjectServer:
     def settings(self) -> dict[str, Any]:
         """Return the settings of a service that uses this store."""
         return {
-            "objects": f"s3://{self.bucket}/operations",
-            "objects_endpoint": f"http://127.0.0.1:{self.port}",
-            "objects_region": "us-east-1",
-            "objects_access_key": SecretStr("key"),
+            "objects": f"s3://{self.bucket}/operations", "objects_endpoint": f"http://127.0.0.1:{self.port}",
+            "objects_region": "us-east-1", "objects_access_key": SecretStr("key"),
             "objects_secret_key": SecretStr("secret"),
-        }
+        }  # fmt: skip
 
     def environment(self) -> dict[str, str]:
         """Return the same as variables of the environment."""

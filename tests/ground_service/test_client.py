@@ -201,27 +201,16 @@ def test_a_service_that_cannot_be_reached_is_not_asked_again(clock: Clock) -> No
 @pytest.mark.parametrize(
     ("status", "kind"),
     [
-        (401, NotAuthenticated),
-        (403, NotPermitted),
-        (404, NotFound),
-        (409, Conflict),
-        (412, Conflict),
-        (422, InvalidRequest),
-        (507, Unavailable),
-        (500, ServiceProblem),
-        (302, ServiceProblem),
+        (401, NotAuthenticated), (403, NotPermitted), (404, NotFound), (409, Conflict), (412, Conflict),
+        (422, InvalidRequest), (507, Unavailable), (500, ServiceProblem), (302, ServiceProblem),
     ],
-)
+)  # fmt: skip
 def test_a_refusal_is_an_exception_of_its_kind_with_the_problem_details(
     status: int, kind: type[ServiceProblem]
 ) -> None:
     problem = {
-        "type": "about:blank",
-        "title": "t",
-        "status": status,
-        "detail": "window 3: no",
-        "state": "draft",
-    }
+        "type": "about:blank", "title": "t", "status": status, "detail": "window 3: no", "state": "draft",
+    }  # fmt: skip
     with pytest.raises(ServiceProblem) as caught:
         client_of(lambda _: httpx.Response(status, json={**problem, "new_field": 1})).get_window(3)
     assert type(caught.value) is kind
@@ -274,13 +263,10 @@ def test_a_list_is_fetched_page_by_page_until_its_end(total: int, pages: int) ->
 @pytest.mark.parametrize(
     ("limit", "expected", "requests"),
     [
-        (1, 1, [(1, 0)]),
-        (0, 1, [(1, 0)]),
-        (50, 50, [(50, 0)]),
-        (1200, 1200, [(1000, 0), (200, 1000)]),
+        (1, 1, [(1, 0)]), (0, 1, [(1, 0)]), (50, 50, [(50, 0)]), (1200, 1200, [(1000, 0), (200, 1000)]),
         (5000, 2500, [(1000, 0), (1000, 1000), (1000, 2000)]),
     ],
-)
+)  # fmt: skip
 def test_a_page_has_as_many_items_as_asked_for(
     limit: int, expected: int, requests: list[tuple[int, int]]
 ) -> None:
@@ -437,8 +423,6 @@ def test_the_example_of_the_documentation_runs(
     monkeypatch.chdir(tmp_path)
     exec(compile(example, "docs/client.md", "exec"), {})
     assert capsys.readouterr().out.splitlines() == [
-        "5 packets",
-        "evening pass 2029-08-07T06:00:00.000000Z 0 packets lost",
-        "['boot', 'boot', 'boot', 'boot', 'boot']",
-        "404 pass 99: not found",
-    ]
+        "5 packets", "evening pass 2029-08-07T06:00:00.000000Z 0 packets lost",
+        "['boot', 'boot', 'boot', 'boot', 'boot']", "404 pass 99: not found",
+    ]  # fmt: skip

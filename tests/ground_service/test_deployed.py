@@ -53,11 +53,9 @@ class Deployed:
         """Return a client of the proxy or of one API process."""
         token = (self.secrets / "admin_token").read_text()
         return httpx.Client(
-            base_url=self.addresses[name],
-            headers={"Authorization": f"Bearer {token}"},
-            verify=ssl.create_default_context(cafile=str(self.secrets / "tls/certificate")),
-            timeout=30.0,
-        )
+            base_url=self.addresses[name], headers={"Authorization": f"Bearer {token}"},
+            verify=ssl.create_default_context(cafile=str(self.secrets / "tls/certificate")), timeout=30.0,
+        )  # fmt: skip
 
 
 @contextmanager
@@ -100,11 +98,9 @@ def deployed(folder: Path, overlay: dict[str, str], *, is_shared: bool) -> Itera
         words = ["--port", str(broker), "--bind", "127.0.0.1", "--dir", str(folder)]
         parts = {"db": database.part}
         parts["broker"] = Part(
-            ["sh", str(ROOT / "deploy/redis.sh"), *words],
-            folder / "broker.log",
-            lambda: listens(broker),
+            ["sh", str(ROOT / "deploy/redis.sh"), *words], folder / "broker.log", lambda: listens(broker),
             env={**run, "LINNA_REDIS_USERS": f"{folder}/users"},
-        )
+        )  # fmt: skip
         ports = {name: free_port() for name in (*APIS, "proxy")}
         for name in (*APIS, "worker", "scheduler", "runner"):
             command, log = [local(word) for word in SERVICES[name]["command"]], folder / f"{name}.log"
@@ -130,11 +126,9 @@ def deployed(folder: Path, overlay: dict[str, str], *, is_shared: bool) -> Itera
                 part.start()
         addresses = {name: f"http://127.0.0.1:{ports[name]}" for name in APIS}
         yield Deployed(
-            parts,
-            {**addresses, "proxy": f"https://localhost:{ports['proxy']}"},
-            secrets,
+            parts, {**addresses, "proxy": f"https://localhost:{ports['proxy']}"}, secrets,
             local("postgresql+psycopg://linna@db:5432/linna"),
-        )
+        )  # fmt: skip
 
 
 def carried(downlink: bytes, service: Deployed, overlay: Overlay) -> str:

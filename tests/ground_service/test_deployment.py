@@ -24,13 +24,9 @@ COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
 SECRETS = (
-    "database_superuser_password",
-    "database_owner_password",
-    "database_password",
-    "database_backup_password",
-    "broker_password",
-    "admin_token",
-)
+    "database_superuser_password", "database_owner_password", "database_password", "database_backup_password",
+    "broker_password", "admin_token",
+)  # fmt: skip
 OPTIONAL = ("objects_access_key", "objects_secret_key", "oidc_client_secret")
 """Secrets of optional parts: empty files until a setting names them."""
 
@@ -121,13 +117,10 @@ def test_every_process_has_the_same_settings() -> None:
     without_broker = {"LINNA_BROKER_URL", "LINNA_BROKER_PASSWORD_FILE"}
     migration = {f"LINNA_{name}" for name in ("MIGRATION_DATABASE_URL", "MIGRATION_DATABASE_PASSWORD_FILE")}
     assert own == {
-        "api": common | {"LINNA_BACKUPS"},
-        "api2": common | {"LINNA_BACKUPS"},
-        "worker": common,
-        "scheduler": common,
-        "migrate": without_broker | migration | {"LINNA_BACKUP_ROLE"},
+        "api": common | {"LINNA_BACKUPS"}, "api2": common | {"LINNA_BACKUPS"}, "worker": common,
+        "scheduler": common, "migrate": without_broker | migration | {"LINNA_BACKUP_ROLE"},
         "backup": without_broker | {"LINNA_DATABASE_URL", "LINNA_DATABASE_PASSWORD_FILE"},
-    }
+    }  # fmt: skip
     files = {json.dumps(SERVICES[name]["env_file"]) for name in PROCESSES}
     assert len(files) == 1 and "settings.env" in files.pop()
     assert {name for name in SERVICES if "env_file" in SERVICES[name]} == set(PROCESSES)
@@ -164,14 +157,12 @@ def test_secrets_are_files_of_those_who_need_them_and_in_no_command_or_environme
         for name in COMPOSE["secrets"]
     }
     assert holders == {
-        "database_superuser_password": {"db"},
-        "database_owner_password": {"db", "migrate"},
+        "database_superuser_password": {"db"}, "database_owner_password": {"db", "migrate"},
         "database_password": {"db", "migrate", "api", "api2", "worker", "scheduler"},
         "database_backup_password": {"db", "backup"},
-        "broker_password": {"broker", "api", "api2", "worker", "scheduler"},
-        "admin_token": {"migrate"},
+        "broker_password": {"broker", "api", "api2", "worker", "scheduler"}, "admin_token": {"migrate"},
         **{key: set(PROCESSES) for key in OPTIONAL},
-    }
+    }  # fmt: skip
     for service in SERVICES.values():
         for name, value in service.get("environment", {}).items():
             # A password or token is named by a file, and no URL holds one.
@@ -199,11 +190,9 @@ def test_the_runner_has_no_secret_no_network_and_no_archive() -> None:
     assert set(runner["environment"]) == {"LINNA_LOG_FORMAT", "LINNA_DATA"}
     assert "user" not in runner and "cap_add" not in runner and runner["cap_drop"] == ["ALL"]
     assert runner["security_opt"] == [
-        "no-new-privileges:true",
-        "seccomp=deploy/runner-seccomp.json",
-        "apparmor=unconfined",
+        "no-new-privileges:true", "seccomp=deploy/runner-seccomp.json", "apparmor=unconfined",
         "systempaths=unconfined",
-    ]
+    ]  # fmt: skip
     assert "install -y --no-install-recommends bubblewrap" in DOCKERFILE.rpartition("\nFROM ")[2]
     assert all("size=" in place for place in runner["tmpfs"])
     assert runner["memswap_limit"] == runner["mem_limit"]
@@ -245,10 +234,8 @@ def test_an_error_of_openssl_is_reported(tmp_path: Path) -> None:
     done = subprocess.run(
         ["sh", str(ROOT / "deploy/secrets.sh")],
         env={"PATH": f"{programs}:{os.environ['PATH']}", "LINNA_SECRETS_DIR": str(tmp_path / "secrets")},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
     assert done.returncode == 1 and "secrets are in" not in done.stdout
     assert "no certificate was made for localhost:\na reason" in done.stderr
 
@@ -277,20 +264,13 @@ def start_script(
         (folder / "secrets" / secret).write_text(value)
     written = folder / "written"
     environment = {
-        "PATH": f"{programs}:{os.environ['PATH']}",
-        "LINNA_SECRETS": str(folder / "secrets"),
-        "LINNA_REDIS_USERS": str(written),
-        "POSTGRES_USER": "postgres",
-        "POSTGRES_DB": "linna",
-    }
+        "PATH": f"{programs}:{os.environ['PATH']}", "LINNA_SECRETS": str(folder / "secrets"),
+        "LINNA_REDIS_USERS": str(written), "POSTGRES_USER": "postgres", "POSTGRES_DB": "linna",
+    }  # fmt: skip
     done = subprocess.run(
-        ["sh", str(ROOT / "deploy" / name)],
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+        ["sh", str(ROOT / "deploy" / name)], env=environment, stdin=subprocess.DEVNULL, capture_output=True,
+        text=True, check=False,
+    )  # fmt: skip
     return done, written
 
 
@@ -333,19 +313,15 @@ def test_the_broker_grants_what_a_worker_needs_and_no_administration(tmp_path: P
     }
     words = ["--port", str(port), "--bind", "127.0.0.1", "--dir", str(tmp_path)]
     broker = Part(
-        ["sh", str(ROOT / "deploy/redis.sh"), *words],
-        tmp_path / "redis.log",
-        lambda: listens(port),
+        ["sh", str(ROOT / "deploy/redis.sh"), *words], tmp_path / "redis.log", lambda: listens(port),
         env=environment,
-    )
+    )  # fmt: skip
     url = f"redis://linna:secret@127.0.0.1:{port}/0"
     log = tmp_path / "worker.log"
     worker = Part(
-        [sys.executable, "-m", "linna", "worker"],
-        log,
-        lambda: log.exists() and " ready." in log.read_text(),
+        [sys.executable, "-m", "linna", "worker"], log, lambda: log.exists() and " ready." in log.read_text(),
         env={**os.environ, "LINNA_HOME": str(tmp_path / "home"), "LINNA_BROKER_URL": url},
-    )
+    )  # fmt: skip
     try:
         broker.start()
         worker.start()
@@ -369,11 +345,9 @@ def test_a_certificate_without_its_key_is_refused_and_kept(name: str, tmp_path: 
     (tls / name).write_text("of a certification authority")
     done = subprocess.run(
         ["sh", str(ROOT / "deploy/secrets.sh")],
-        env={"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(tmp_path)},
-        capture_output=True,
-        text=True,
+        env={"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(tmp_path)}, capture_output=True, text=True,
         check=False,
-    )
+    )  # fmt: skip
     (other,) = set(CERTIFICATE) - {name}
     assert done.returncode == 2
     assert done.stderr == f"secrets: expected {tls}/{other} for {tls}/{name}, found none\n"
@@ -388,10 +362,8 @@ def test_nothing_stays_of_a_base_backup_that_fails(tmp_path: Path) -> None:
     (programs / "pg_basebackup").chmod(0o755)
     done = subprocess.run(
         ["sh", str(ROOT / "deploy/base-backup.sh")],
-        env={"PATH": f"{programs}:{os.environ['PATH']}", "LINNA_WAL": str(wal)},
-        capture_output=True,
-        check=False,
-    )
+        env={"PATH": f"{programs}:{os.environ['PATH']}", "LINNA_WAL": str(wal)}, capture_output=True, check=False,
+    )  # fmt: skip
     assert done.returncode == 1 and list((wal / "base").iterdir()) == []
 
 

@@ -72,15 +72,11 @@ def test_toml_in_its_limits_is_parsed_whatever_its_strings_contain() -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "[" * 50_000,
-        '{"stages": {"a": [' + "9" * 5_000 + "]}}",
-        '{"stages": {"a": [1' + "0" * 400 + "]}}",
-        '{"stages": {"a": [NaN]}}',
-        '{"stages": {"a": [-5]}}',
-        '{"stages": {"a": [1.0]}}' + " " * (8 << 20),
+        "[" * 50_000, '{"stages": {"a": [' + "9" * 5_000 + "]}}", '{"stages": {"a": [1' + "0" * 400 + "]}}",
+        '{"stages": {"a": [NaN]}}', '{"stages": {"a": [-5]}}', '{"stages": {"a": [1.0]}}' + " " * (8 << 20),
     ],
     ids=["deep", "digits", "overflow", "not a number", "negative", "long"],
-)
+)  # fmt: skip
 def test_costs_that_a_build_states_without_end_are_not_read(text: str, tmp_path: Path) -> None:
     (tmp_path / "performance.json").write_text('{"stages": {"a": [1.0]}}')
     assert read_performance(tmp_path / "performance.json") == {"stages": {"a": [1.0]}}

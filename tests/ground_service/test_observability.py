@@ -85,12 +85,8 @@ def samples(tmp_path_factory: pytest.TempPathFactory, synthetic_pass: Any) -> di
 def add_correlation(ground: Ground, vehicle: int, created_utc_ns: int) -> None:
     with ground.database.writing() as connection:
         line = {
-            "start_ticks": 0,
-            "stop_ticks": 1,
-            "reference_ticks": 0,
-            "reference_utc_ns": 0,
-            "drift_ppb": 0.0,
-        }
+            "start_ticks": 0, "stop_ticks": 1, "reference_ticks": 0, "reference_utc_ns": 0, "drift_ppb": 0.0,
+        }  # fmt: skip
         given = {"vehicle_id": vehicle, "method": "test", "points": 2, "created_utc_ns": created_utc_ns}
         repository.add(connection, repository.CORRELATIONS, **line, **given)
 
@@ -288,20 +284,14 @@ def test_alerts_fire_and_only_when_they_should(tmp_path: Path) -> None:
     )
     assert checked.returncode == 0, checked.stderr
     values = {
-        'up{job="linna"}': "1x200",
-        "linna_scheduler": "1x200",
-        "linna_backup_age_seconds": "3600x200",
+        'up{job="linna"}': "1x200", "linna_scheduler": "1x200", "linna_backup_age_seconds": "3600x200",
         "linna_backup_configured": "1x200",
         'probe_ssl_earliest_cert_expiry{job="linna-proxy"}': f"{15 * 86_400}x200",
-        "linna_queue_age_seconds": "30x200",
-        'linna_processes{kind="worker"}': "2x200",
-        'linna_broker_up{kind="redis"}': "1x200",
-        'linna_runner_up{kind="exchange"}': "1x200",
-        "linna_disagreements": "0x200",
-        "linna_disk_free_bytes": "50x200",
-        "linna_disk_size_bytes": "100x200",
+        "linna_queue_age_seconds": "30x200", 'linna_processes{kind="worker"}': "2x200",
+        'linna_broker_up{kind="redis"}': "1x200", 'linna_runner_up{kind="exchange"}': "1x200",
+        "linna_disagreements": "0x200", "linna_disk_free_bytes": "50x200", "linna_disk_size_bytes": "100x200",
         'linna_jobs{state="failed",kind="report"}': "2x200",
-    }
+    }  # fmt: skip
     healthy = [{"series": series, "values": value} for series, value in values.items()]
     names = [rule["alert"] for rule in alerts()]
     tests: list[dict[str, Any]] = [

@@ -89,18 +89,13 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
     with open_ground(folder / "home") as ground:
         token = add_user(ground, "ann", "operator")
     settings = {
-        **os.environ,
-        "LINNA_HOME": str(folder / "home"),
-        "LINNA_TRUSTED_PROXIES": "127.0.0.1/32",
+        **os.environ, "LINNA_HOME": str(folder / "home"), "LINNA_TRUSTED_PROXIES": "127.0.0.1/32",
         "LINNA_LOG_FORMAT": "json",
-    }
+    }  # fmt: skip
     with (folder / "service.log").open("wb") as out:
         service = subprocess.Popen(
-            [sys.executable, "-m", "linna", "serve", "--port", str(upstream)],
-            env=settings,
-            stdout=out,
-            stderr=out,
-        )
+            [sys.executable, "-m", "linna", "serve", "--port", str(upstream)], env=settings, stdout=out, stderr=out,
+        )  # fmt: skip
     made = Proxied(f"localhost:{port}", folder, secrets / "tls/certificate", token)
 
     def answers() -> bool:

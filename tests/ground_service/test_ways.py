@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -27,9 +26,12 @@ from payload_emulator.session.live.station_ports import RECORD_HEADER
 from payload_emulator.session.scenario import Scenario, parse_scenario
 from payload_emulator.session.spacecraft.loading import launch, load_scenario_payload
 from payload_emulator.session.world.world import build_world, clock_ticks, open_world
+from tests.lazy import Lazy
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode, encode_cadus
 from tmtc.link.settings import LinkSettings
+
+cv2 = Lazy("cv2")
 
 NO_DATA = DataFolder(None)
 NS = 1_000_000_000
@@ -71,7 +73,9 @@ def packets_of(cadus: bytes) -> list[bytes]:
     return list(found.cut.packets(found.buffer))
 
 
-def flown(session: LiveSession, orders: Callable[[LiveSession], bytes] = lambda session: b"") -> list[bytes]:
+def flown(
+    session: LiveSession, telecommands: Callable[[LiveSession], bytes] = lambda session: b""
+) -> list[bytes]:
     """Fly a session that is paused until it has its telecommands, and return what a station receives."""
     thread = threading.Thread(target=session.run, daemon=True)
     thread.start()
@@ -84,10 +88,10 @@ def flown(session: LiveSession, orders: Callable[[LiveSession], bytes] = lambda 
             socket.create_connection(("127.0.0.1", session.ports["telecommand earth"]), timeout=900.0) as up,
             socket.create_connection(("127.0.0.1", session.ports["console"]), timeout=900.0) as console,
         ):
-            octets = orders(session)
+            octets = telecommands(session)
             up.sendall(octets)
             lines = console.makefile("r")
-            while sum(len(one) for _, one in session._uplinked) < len(octets):
+            while sum(len(one) for _, one in session.contacts._uplink) < len(octets):
                 console.sendall(b"state\n")
                 assert json.loads(lines.readline())["kind"] == "state"
             console.sendall(b"run\n")
@@ -176,7 +180,7 @@ def commanded(scenario: Scenario, start_utc_ns: int, frames: int) -> tuple[LiveS
     stop = start_utc_ns + (frames * 15 + 60) * NS
     session = LiveSession(*launch(scenario, NO_DATA), stop_utc_ns=stop, paused=True)
 
-    def orders(session: LiveSession) -> bytes:
+    def telecommands(session: LiveSession) -> bytes:
         values = {"function_id": "start_observation", "argument_1": frames * 15.0 - 7.5, "argument_2": 15.0}
         start = DICTIONARY.pack_command("perform_function", values, sequence_count=0, source=1)
         items = {"octet": np.frombuffer(start, dtype=np.uint8)}
@@ -184,7 +188,7 @@ def commanded(scenario: Scenario, start_utc_ns: int, frames: int) -> tuple[LiveS
         later = {"release_ticks": ticks, "items": items}
         return DICTIONARY.pack_command("insert_activity", later, sequence_count=1, source=1)
 
-    return session, flown(session, orders)
+    return session, flown(session, telecommands)
 
 
 def test_a_window_commanded_by_the_ground_gives_the_images_and_detections_of_the_archive(

@@ -82,12 +82,9 @@ def write(folder: Path, old: str = "", new: str = "") -> Path:
 
 def start(folder: Path, cache: Path, **variables: str) -> subprocess.Popen[str]:
     environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)]),
-        "PYTHONDONTWRITEBYTECODE": "1",
-        "NUMBA_CACHE_DIR": str(cache),
-        **variables,
-    }
+        **os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)]), "PYTHONDONTWRITEBYTECODE": "1",
+        "NUMBA_CACHE_DIR": str(cache), **variables,
+    }  # fmt: skip
     return subprocess.Popen([sys.executable, "-c", CALL], stdout=subprocess.PIPE, text=True, env=environment)
 
 
@@ -178,15 +175,13 @@ def dependencies(module: Any) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("old", "new", "changed"),
     [
-        ("STEP = 1", "STEP = 2", {"outer"}),
-        ("by=1", "by=2", {"outer"}),
-        ('"nsz", "contract"', '"nsz", "arcp"', {"outer"}),
-        ("@njit\n", "@njit(error_model='numpy')\n", {"outer"}),
+        ("STEP = 1", "STEP = 2", {"outer"}), ("by=1", "by=2", {"outer"}),
+        ('"nsz", "contract"', '"nsz", "arcp"', {"outer"}), ("@njit\n", "@njit(error_model='numpy')\n", {"outer"}),
         ("np.arange(2000)", "np.arange(2000) + (np.arange(2000) == 1000)", {"of_array"}),
         ('"nsz", "contract"', '"contract", "nsz"', set()),
         ("return arguments[0]", "return builder.neg(arguments[0])", set()),
     ],
-)
+)  # fmt: skip
 def test_a_kernel_depends_on_all_that_it_names_and_on_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, changed: set[str]
 ) -> None:

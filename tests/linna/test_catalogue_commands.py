@@ -29,17 +29,11 @@ METRES_PER_DEG = math.radians(1.0) * 1_737_400.0
 def landmarks_packet(latitude: list[float], identity: int = 3_000_000_000) -> bytes:
     one = np.ones(len(latitude))
     items = {
-        "landmark_id": identity + np.arange(len(latitude)),
-        "latitude_deg": np.array(latitude),
-        "longitude_deg": 300.0 * one,
-        "height_m": 50.0 * one,
-        "diameter_m": 6_000.0 * one,
-        "sigma_east_m": 100.0 * one,
-        "sigma_north_m": 100.0 * one,
-        "sigma_up_m": 100.0 * one,
-        "sightings": 3 * one.astype(int),
-        "passes": one.astype(int),
-    }
+        "landmark_id": identity + np.arange(len(latitude)), "latitude_deg": np.array(latitude),
+        "longitude_deg": 300.0 * one, "height_m": 50.0 * one, "diameter_m": 6_000.0 * one,
+        "sigma_east_m": 100.0 * one, "sigma_north_m": 100.0 * one, "sigma_up_m": 100.0 * one,
+        "sightings": 3 * one.astype(int), "passes": one.astype(int),
+    }  # fmt: skip
     values = {"frame_number": 1, "image_ticks": 5, "items": items}
     return DICTIONARY.pack("landmarks", values, ticks=0, sequence_count=0)
 

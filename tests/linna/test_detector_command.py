@@ -43,12 +43,10 @@ def test_info_tells_the_hash_and_the_thresholds(capsys):
 @pytest.mark.parametrize(
     ("name", "image"),
     [
-        ("a.png", speckled()),
-        ("b.tiff", speckled(dtype=np.uint16)),
-        ("c.png", speckled((300, 700, 3))),
+        ("a.png", speckled()), ("b.tiff", speckled(dtype=np.uint16)), ("c.png", speckled((300, 700, 3))),
         ("d.png", speckled((64, 48))),
     ],
-)
+)  # fmt: skip
 def test_detect_takes_any_size_and_depth(write_image, capsys, name, image):
     path = write_image(name, image)
     assert run(["detector", "detect", str(path), "--altitude-km", "30", "--threshold", "0.05", "--json"]) == 0

@@ -8,10 +8,10 @@ import pytest
 
 from linna import cli
 from lunar.catalogue import PAPER_CLASS_COUNTS
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris
 from lunar.messages.oem import save_oem
 from lunar.messages.stk import format_stk
-from lunar.timescales import NS
 from tests.lunar.orbits import polar_orbit
 
 

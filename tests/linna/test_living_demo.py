@@ -68,12 +68,9 @@ def test_a_living_demo_plans_and_commands_until_it_is_ended(tmp_path: Path) -> N
     environment = bare_environment()
     environment.pop("LINNA_DATA", None)
     demo = Part(
-        [sys.executable, "-m", "linna", *map(str, words)],
-        log,
-        lambda: "shows the shift at 240 times real time" in log.read_text(),
-        attempts=1,
-        env=environment,
-    )
+        [sys.executable, "-m", "linna", *map(str, words)], log,
+        lambda: "shows the shift at 240 times real time" in log.read_text(), attempts=1, env=environment,
+    )  # fmt: skip
     with demo, Client(f"http://127.0.0.1:{port}") as client:
         wait_for(
             lambda: (

@@ -11,7 +11,7 @@ import pytest
 from linna import cli
 from lunar.datafolder import find_data
 from studies import paper_steps
-from studies.paper_steps import Effort, Workshop
+from studies.paper_steps import Effort, StepFolder
 
 SMALL = Effort(
     hours=0.1,
@@ -95,11 +95,13 @@ def test_a_step_is_done_again_when_what_it_is_made_from_changes(tmp_path: Path) 
         calls.append(len(calls))
         return len(calls)
 
-    shop = Workshop(tmp_path, find_data(None), SMALL, None, lambda _: None, lambda items, total: iter(items))
+    steps = StepFolder(
+        tmp_path, find_data(None), SMALL, None, lambda _: None, lambda items, total: iter(items)
+    )
     assert [
-        shop.step("one", {"a": 1}, make),
-        shop.step("one", {"a": 1}, make),
-        shop.step("one", {"a": 2}, make),
+        steps.step("one", {"a": 1}, make),
+        steps.step("one", {"a": 1}, make),
+        steps.step("one", {"a": 2}, make),
     ] == [1, 1, 2]
 
 

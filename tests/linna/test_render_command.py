@@ -2,10 +2,12 @@
 
 import json
 
-import cv2
 import pytest
 
 from linna import cli
+from tests.lazy import Lazy
+
+cv2 = Lazy("cv2")
 
 SMALL = """
 name = "small"

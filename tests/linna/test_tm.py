@@ -323,15 +323,15 @@ def timed(tmp_path):
 
 def test_parts_of_segmented_packets_and_packets_without_their_header_are_counted_apart(timed, capsys):
     packets = [bus_packet(k, bytes(6)) for k in range(5)]
-    packets += [bus_packet(5, bytes(6), flags=1), bus_packet(6, bytes(6), secondary=False, flags=2)]
-    packets += [bus_packet(7, b"BOOTED", secondary=False)]
+    packets += [bus_packet(5, bytes(5), flags=1), bus_packet(6, b"\x07", secondary=False, flags=2)]
+    packets += [bus_packet(7, b"BOOTED", secondary=False), bus_packet(9, bytes(6), secondary=False, flags=2)]
     assert run(timed("check", packets, "--json")) == 0
     verdicts = figures(capsys)["verdicts"]
     assert {name: count for name, count in verdicts.items() if count} == {
-        "decoded": 5, "segments_not_joined": 2, "no_secondary_header": 1,
+        "decoded": 6, "segments_not_joined": 1, "no_secondary_header": 1, "segments_joined": 1,
     }  # fmt: skip
     assert run(timed("decode", packets)) == 0
-    assert [record["value"] for record in json.loads(capsys.readouterr().out)] == [0] * 5
+    assert [record["value"] for record in json.loads(capsys.readouterr().out)] == [0] * 5 + [7]
     bare = [bus_packet(k, bytes(6), secondary=False) for k in range(3)]  # no packet of the APID has a header
     assert run(timed("check", bare, "--json")) == 0
     assert figures(capsys)["verdicts"]["decoded"] == 3

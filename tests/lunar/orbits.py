@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from lunar.constants import NS
 from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation
-from lunar.timescales import NS, parse_utc
+from lunar.timescales import parse_utc
 
 START = parse_utc("2029-08-07T00:00:00")
 RADIUS_M = 1_768_180.0

@@ -2,7 +2,6 @@
 
 import math
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,6 +19,9 @@ from lunar.camera import (
 )
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import enu_from_mcmf, mcmf_from_spherical
+from tests.lazy import Lazy
+
+cv2 = Lazy("cv2")
 
 CAMERA = PinholeCamera()
 latitudes = st.floats(-1.57, 1.57)

@@ -26,12 +26,9 @@ from lunar.errors import DataFileError, LunarError
 def random_catalogue(n, seed=0):
     rng = np.random.default_rng(seed)
     return make_catalogue(
-        np.arcsin(rng.uniform(-1, 1, n)),
-        rng.uniform(-np.pi, np.pi, n),
-        rng.uniform(3e3, 30e3, n),
-        source="random",
+        np.arcsin(rng.uniform(-1, 1, n)), rng.uniform(-np.pi, np.pi, n), rng.uniform(3e3, 30e3, n), source="random",
         rim_height_m=np.where(rng.random(n) < 0.5, np.nan, rng.uniform(-3e3, 3e3, n)),
-    )
+    )  # fmt: skip
 
 
 CATALOGUE = random_catalogue(5000)
@@ -250,14 +247,10 @@ def test_a_column_in_another_unit_is_refused(tmp_path, column, factor):
     rng = np.random.default_rng(3)
     diameter_m = 3_000.0 * (1.0 - rng.random(60)) ** -0.5
     table = {
-        "id": np.arange(60),
-        "latitude_deg": rng.uniform(20.0, 24.0, 60),
-        "longitude_deg": rng.uniform(30.0, 34.0, 60),
-        "diameter_m": diameter_m,
-        "rim_height_m": rng.normal(-1_000.0, 800.0, 60),
-        "depth_m": 0.15 * diameter_m,
-        "complete": np.ones(60),
-    }
+        "id": np.arange(60), "latitude_deg": rng.uniform(20.0, 24.0, 60),
+        "longitude_deg": rng.uniform(30.0, 34.0, 60), "diameter_m": diameter_m,
+        "rim_height_m": rng.normal(-1_000.0, 800.0, 60), "depth_m": 0.15 * diameter_m, "complete": np.ones(60),
+    }  # fmt: skip
     path = tmp_path / "own.csv"
 
     def written(values):

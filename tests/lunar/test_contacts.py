@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from lunar.constants import MOON_RADIUS_M, SPEED_OF_LIGHT_M_S
+from lunar.constants import MOON_RADIUS_M, NS, SPEED_OF_LIGHT_M_S
 from lunar.contacts import visibility_spans
 from lunar.ephemeris import ephemeris_from_states
 from lunar.errors import LunarError
 from lunar.frames import IauOrientation
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
-from lunar.timescales import NS, parse_utc, tdb_s_from_utc_ns
+from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from lunar.visibility import GroundStation
 
 START = parse_utc("2029-08-15T00:00:00")

@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 from scipy.interpolate import KroghInterpolator
 
 from lunar.comparison import check_gravity
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states, resampled
 from lunar.errors import DataFileError, EphemerisCoverageError, EphemerisError, UnmovedByGravity
 from lunar.frames import IauOrientation
 from lunar.messages.ephemeris_files import load_ephemeris
-from lunar.timescales import NS, parse_utc, tdb_s_from_tai_ns
+from lunar.timescales import parse_utc, tdb_s_from_tai_ns
 from tests.lunar.orbits import START, circle, polar_orbit, times
 
 

@@ -89,11 +89,9 @@ def test_positions_over_regions_that_the_catalogue_leaves_out_do_not_count():
 
 def test_over_the_meridian_and_the_pole_craters_are_found():
     catalogue = make_catalogue(
-        np.radians([0.0, 0.0, 89.9, 89.9, 0.2]),
-        np.radians([359.9, 0.1, 10.0, 190.0, 0.0]),
-        [6e3] * 5,
+        np.radians([0.0, 0.0, 89.9, 89.9, 0.2]), np.radians([359.9, 0.1, 10.0, 190.0, 0.0]), [6e3] * 5,
         source="five",
-    )
+    )  # fmt: skip
     positions = mcmf_from_spherical(np.radians([0.0, 90.0]), np.radians([0.0, 0.0]), 30e3)
     study = study_field_of_view(positions, catalogue)
     assert np.count_nonzero(np.isfinite(np.tan(np.radians(study.required_fov_deg / 2)))[0]) >= 3

@@ -13,7 +13,7 @@ import spiceypy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lunar.constants import MOON_RADIUS_M
+from lunar.constants import MOON_RADIUS_M, NS
 from lunar.datafolder import DataFolder, default_orientation, find_data
 from lunar.errors import DataFileError, EphemerisCoverageError
 from lunar.frames import (
@@ -31,7 +31,6 @@ from lunar.frames import (
     spherical_from_mcmf,
 )
 from lunar.ground_track import even_epochs, ground_track
-from lunar.timescales import NS
 from tests.lunar.orbits import polar_orbit
 
 SPICE = json.loads(

@@ -12,7 +12,7 @@ import pytest
 
 from lunar import _dynamics_kernel
 from lunar.comparison import compare
-from lunar.constants import GM_EARTH_M3_S2, GM_SUN_M3_S2, MOON_RADIUS_M, SPEED_OF_LIGHT_M_S
+from lunar.constants import GM_EARTH_M3_S2, GM_SUN_M3_S2, MOON_RADIUS_M, NS, SPEED_OF_LIGHT_M_S
 from lunar.elements import Elements, elements_from_state, state_from_elements
 from lunar.ephemeris import ephemeris_from_states
 from lunar.errors import EphemerisCoverageError, ImpactError
@@ -27,7 +27,7 @@ from lunar.propagation import (
     propagate_with_stm,
 )
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
-from lunar.timescales import NS, parse_utc, tdb_s_from_utc_ns
+from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from tests.lunar.orbits import POLAR, RADIUS_M, RATE_RAD_S, START, circle, times
 
 EPOCH_S = float(tdb_s_from_utc_ns(parse_utc("2029-08-07T00:00:00Z")))

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lunar.constants import NS
 from lunar.errors import LeapSecondError, TimeFormatError
 from lunar.timescales import (
     LEAP_DATES,
-    NS,
     TIME_SYSTEMS,
     format_tai,
     format_utc,

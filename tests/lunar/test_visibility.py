@@ -11,6 +11,7 @@ from lunar.constants import (
     ASTRONOMICAL_UNIT_M,
     EARTH_RADIUS_M,
     MOON_RADIUS_M,
+    NS,
     SPEED_OF_LIGHT_M_S,
     SUN_RADIUS_M,
 )
@@ -18,7 +19,7 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.errors import EphemerisCoverageError, LunarError
 from lunar.frames import IauOrientation, mcmf_from_spherical
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
-from lunar.timescales import NS, parse_utc, tdb_s_from_utc_ns
+from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from lunar.visibility import (
     GroundStation,
     find_windows,

@@ -28,18 +28,11 @@ def navigation_case() -> Callable[..., NavigationCase]:
 
     def make(frames: int = 120, **changes: Any) -> NavigationCase:
         values: dict[str, Any] = {
-            "epoch_utc_ns": EPOCH,
-            "position_icrf_m": position,
-            "velocity_icrf_m_s": velocity,
-            "frame_utc_ns": EPOCH + np.arange(frames) * 15 * 10**9,
-            "imaging": np.ones(frames, dtype=bool),
-            "gravity": gravity,
-            "gravity_degree": TRUTH_DEGREE,
-            "orientation": IauOrientation(),
-            "filter_gravity": gravity.truncated(50),
-            "filter_orientation": IauOrientation(),
-            "craters": craters,
-        }
+            "epoch_utc_ns": EPOCH, "position_icrf_m": position, "velocity_icrf_m_s": velocity,
+            "frame_utc_ns": EPOCH + np.arange(frames) * 15 * 10**9, "imaging": np.ones(frames, dtype=bool),
+            "gravity": gravity, "gravity_degree": TRUTH_DEGREE, "orientation": IauOrientation(),
+            "filter_gravity": gravity.truncated(50), "filter_orientation": IauOrientation(), "craters": craters,
+        }  # fmt: skip
         return NavigationCase(**{**values, **changes})
 
     return make

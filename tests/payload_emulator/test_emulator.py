@@ -170,13 +170,9 @@ filter_degree = 8
 
 def test_a_named_anchoring_table_is_uploaded_as_it_is(tmp_path: Path) -> None:
     table = CatalogueTable(
-        np.arange(3),
-        np.radians([10.0, 20.0, 30.0]),
-        np.radians([40.0, 50.0, 60.0]),
-        np.full(3, 8e3),
-        np.zeros(3),
+        np.arange(3), np.radians([10.0, 20.0, 30.0]), np.radians([40.0, 50.0, 60.0]), np.full(3, 8e3), np.zeros(3),
         np.full((3, 3), 50.0),
-    )
+    )  # fmt: skip
     named = tmp_path / "three.table"
     named.write_bytes(pack_catalogue_table(table))
     scenario = parse_scenario(SHORT).with_choices(anchoring_catalogue=named)

@@ -5,7 +5,6 @@ import re
 import shutil
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -21,6 +20,9 @@ from payload_emulator.session.archive.replay import FlightBuild, replay_archive
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.world.external import load_external
 from payload_emulator.session.world.world import build_world
+from tests.lazy import Lazy
+
+cv2 = Lazy("cv2")
 
 TEXT = """
 name = "given"

@@ -72,16 +72,10 @@ LINKS = {
     "copies": LinkSection(repeat_share=0.5),
     "disorder": LinkSection(reorder_share=0.5),
     "everything": LinkSection(
-        frame_loss=0.02,
-        bit_error_rate=1e-5,
-        burst_start=0.02,
-        burst_end=0.3,
-        burst_frame_loss=0.3,
-        burst_bit_error_rate=5e-3,
-        repeat_share=0.3,
-        reorder_share=0.3,
+        frame_loss=0.02, bit_error_rate=1e-5, burst_start=0.02, burst_end=0.3, burst_frame_loss=0.3,
+        burst_bit_error_rate=5e-3, repeat_share=0.3, reorder_share=0.3,
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", sorted(LINKS))

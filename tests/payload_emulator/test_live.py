@@ -29,10 +29,10 @@ from payload_emulator.session.live.station_ports import (
     Server,
     TelecommandBuffer,
 )
-from payload_emulator.session.live.viewing import turn_message
+from payload_emulator.session.live.viewing import step_message
 from payload_emulator.session.scenario import FaultsSection, parse_scenario
 from payload_emulator.session.spacecraft.loading import LoadedPayload, load_scenario_payload
-from payload_emulator.session.spacecraft.loop import Moment, Turn, new_spacecraft
+from payload_emulator.session.spacecraft.loop import StepInput, StepResult, new_spacecraft
 from payload_emulator.session.spacecraft.schedule import Operator, fly_scenario
 from payload_emulator.session.world.camera import Exposure, expose
 from payload_emulator.session.world.world import World, build_world
@@ -62,7 +62,9 @@ class Watcher:
 
     def __init__(self, live: LiveSession) -> None:
         self.telemetry = socket.create_connection(("127.0.0.1", live.ports["telemetry earth"]), timeout=900.0)
-        self.orders = socket.create_connection(("127.0.0.1", live.ports["telecommand earth"]), timeout=900.0)
+        self.telecommands = socket.create_connection(
+            ("127.0.0.1", live.ports["telecommand earth"]), timeout=900.0
+        )
         self.console = socket.create_connection(("127.0.0.1", live.ports["console"]), timeout=900.0)
         self.lines = self.console.makefile("r")
         self.say("watch")
@@ -89,7 +91,7 @@ class Watcher:
 
     def close(self) -> None:
         self.lines.close()
-        for connection in (self.telemetry, self.orders, self.console):
+        for connection in (self.telemetry, self.telecommands, self.console):
             connection.close()
 
 
@@ -119,11 +121,11 @@ def ping(count: int) -> bytes:
     return DICTIONARY.pack_command("test_connection", {}, sequence_count=count)
 
 
-def seen_from(world: World, utc_ns: int, packets: list[bytes]) -> Turn:
+def seen_from(world: World, utc_ns: int, packets: list[bytes]) -> StepResult:
     """A step with a nadir image that is not rendered."""
     position = world.truth.positions_mcmf(utc_ns)[0]
     exposure = Exposure(utc_ns, np.zeros((0, 0), np.uint8), np.zeros(9), 0, world.camera_from_mcmf(position))
-    return Turn(Moment(utc_ns, 0, 1.0, True, 0), exposure, packets, b"")
+    return StepResult(StepInput(utc_ns, 0, 1.0, True, 0), exposure, packets, b"")
 
 
 def test_rings_of_the_catalogue_lie_on_the_rims_of_the_rendered_ground() -> None:
@@ -158,7 +160,7 @@ def test_detections_that_the_payload_identified_have_their_craters(
         for name, values in (("identifications", pairs), ("detections", detections))
     ]
     turn = seen_from(world, int(world.frame_utc_ns[0]), packets)
-    message = turn_message(new_spacecraft(world, loaded), turn)
+    message = step_message(new_spacecraft(world, loaded), turn)
     assert [one.get("crater_id") for one in message["detections"]] == [None, 4711, None]
     assert message["terrain"] == {"name": world.terrain.name, "real": False}
 
@@ -179,9 +181,9 @@ def test_a_session_of_watching_stepping_and_commanding(running: tuple[LiveSessio
     assert second["estimates"]["spherical"]["reset_trigger"] == "manual_step"
     # Telecommands, as CLTU and bare, in pieces.
     cltu = UplinkEncoder(0x4C).encode([ping(7)])
-    watcher.orders.sendall(cltu[:11])
-    watcher.orders.sendall(cltu[11:] + ping(8)[:5])
-    watcher.orders.sendall(ping(8)[5:] + ping(8))
+    watcher.telecommands.sendall(cltu[:11])
+    watcher.telecommands.sendall(cltu[11:] + ping(8)[:5])
+    watcher.telecommands.sendall(ping(8)[5:] + ping(8))
     watcher.say("sideways")
     watcher.until(lambda message: message["kind"] == "error")
     watcher.say("run")
@@ -228,7 +230,7 @@ def test_the_operator_answers_to_telemetry_of_two_light_times_ago(flown: tuple[W
         operator = Operator(flown[0])
         # What the payload is in before moment k it was in telemetry of moment k - 1.
         seen = [
-            operator._mode_seen(Moment(EPOCH + k * step_s * second, -1, 1.0, True, 0, 1.28), mode)
+            operator._mode_seen(StepInput(EPOCH + k * step_s * second, -1, 1.0, True, 0, 1.28), mode)
             for k, mode in enumerate(modes)
         ]
         assert seen[behind:] == modes[: len(modes) - behind]
@@ -289,7 +291,7 @@ def test_hundreds_of_short_half_open_and_reset_connections_do_not_stop_the_paylo
         connection.close()
     # Parts of packets and words that were broken off do not run into those of others.
     wanted = int.from_bytes(ping(1005)[:4], "big")
-    watcher.orders.sendall(ping(1005))
+    watcher.telecommands.sendall(ping(1005))
     watcher.say("rate 0")
     watcher.say("run")
     watcher.until(
@@ -388,19 +390,21 @@ def test_no_more_connections_are_held_than_the_limit() -> None:
 def test_telecommands_come_out_of_any_noise_whole_or_not_at_all() -> None:
     rng = np.random.default_rng(6)
     for trial in range(200):
-        orders = [ping(k) for k in range(4)]
-        noise = [bytes(rng.integers(0x30, 0x80, int(rng.integers(0, 9))).astype(np.uint8)) for _ in orders]
+        telecommands = [ping(k) for k in range(4)]
+        noise = [
+            bytes(rng.integers(0x30, 0x80, int(rng.integers(0, 9))).astype(np.uint8)) for _ in telecommands
+        ]
         encoder = UplinkEncoder(0x4C)
         parts = [
-            quiet + (encoder.encode([order]) if (trial >> k) & 1 else order)
-            for k, (quiet, order) in enumerate(zip(noise, orders, strict=True))
+            quiet + (encoder.encode([telecommand]) if (trial >> k) & 1 else telecommand)
+            for k, (quiet, telecommand) in enumerate(zip(noise, telecommands, strict=True))
         ]
         stream, buffer, found = b"".join(parts), TelecommandBuffer(Receiver(0x4C)), []
         while stream:
             cut = int(rng.integers(1, 40))
             found += buffer.take(stream[:cut])
             stream = stream[cut:]
-        assert found == orders
+        assert found == telecommands
         assert buffer.dropped >= sum(map(len, noise))
 
 
@@ -417,7 +421,9 @@ def test_a_processor_that_hangs_is_reset_and_the_payload_goes_on(flown: tuple[Wo
     flights = []
     for _ in range(2):
         spacecraft = new_spacecraft(replace(world, scenario=scenario), loaded)
-        packets = [packet for turn in fly_scenario(spacecraft.world, spacecraft) for packet in turn.packets]
+        packets = [
+            packet for result in fly_scenario(spacecraft.world, spacecraft) for packet in result.packets
+        ]
         flights.append(packets)
         assert len(spacecraft.resets) == 1 and spacecraft.payload.mode is PayloadMode.standby
     unpacked = list(map(DICTIONARY.unpack, flights[0]))

@@ -22,6 +22,7 @@ from payload_emulator.session.archive.mission import (
     unseen_share,
 )
 from payload_emulator.session.scenario import DetectorSection, parse_scenario
+from payload_emulator.session.spacecraft.loading import launch_payload
 from payload_emulator.session.world.world import build_world
 from payload_emulator.sim.terrain.registration import Rims, fit_registration
 from payload_emulator.sim.terrain.tiles import Terrain
@@ -88,6 +89,15 @@ def test_the_registration_of_the_terrain_is_stated(world) -> None:
     shifted.registration = fit_registration(Rims(places[0], places[1] + np.pi, same, same, 60.0 * same))
     stated = parse_mission(mission_text(replace(world, terrain=shifted), DataFolder())).catalogue
     assert stated.registered_share == 0.0 and stated.registration_sigma_m is None
+
+
+def test_the_offset_of_the_list_that_the_payload_starts_with_is_stated(world) -> None:
+    stated = parse_mission(mission_text(world, DataFolder())).catalogue
+    loaded = launch_payload(world.scenario, world.camera, DataFolder()).parameters.flight.anchored
+    assert loaded.offset is not None
+    up_m = loaded.errors.catalogue_offset_m[2]
+    assert stated.offset_sigma_m == (loaded.offset.prior_m, loaded.offset.prior_m, up_m)
+    assert np.radians(stated.offset_correlation_deg) == pytest.approx(loaded.offset.correlation_rad)
 
 
 def test_limits_of_the_scenario_are_stated_and_negative_ones_are_not(world) -> None:

@@ -81,12 +81,9 @@ def test_each_way_of_not_knowing_its_errors_is_named(fault: dict[str, Any], word
 
 def test_errors_of_a_run_differ_for_each_seed(navigation_case: Any) -> None:
     case = navigation_case(
-        30,
-        start_position_m=100.0,
-        start_velocity_m_s=0.1,
-        detector=SimulatedDetector(scale_sigma=0.02),
+        30, start_position_m=100.0, start_velocity_m_s=0.1, detector=SimulatedDetector(scale_sigma=0.02),
         parameters=PARAMETERS,
-    )
+    )  # fmt: skip
     # Two per cent of 23 km of altitude are 460 m: the radial errors of runs scatter by that, and not without it.
     radial = [fly(case, seed).error_rtn_m[-1, 0] for seed in range(6)]
     exact = [fly(replace(case, detector=SimulatedDetector()), seed).error_rtn_m[-1, 0] for seed in range(3)]
@@ -146,12 +143,9 @@ def test_after_hours_without_a_camera_the_first_frames_bring_the_orbit_back(navi
 
 def test_a_wrong_catalogue_is_refused_and_the_orbit_coasted(navigation_case: Any) -> None:
     case = navigation_case(
-        40,
-        start_position_m=100.0,
-        start_velocity_m_s=0.1,
-        catalogue_errors=CatalogueErrors(centre_of_diameter=0.03, wrong_share=1.0),
-        parameters=PARAMETERS,
-    )
+        40, start_position_m=100.0, start_velocity_m_s=0.1,
+        catalogue_errors=CatalogueErrors(centre_of_diameter=0.03, wrong_share=1.0), parameters=PARAMETERS,
+    )  # fmt: skip
     run = fly(case, 6)
     # A lone chance neighbour inside its gate may be taken for a crater now and then: it moves nothing by much.
     assert np.count_nonzero(run.fixed) <= 4
@@ -248,11 +242,9 @@ def test_a_scenario_distorts_the_map_that_is_uploaded_by_the_stated_amount(
     if named:
         (tmp_path / "table.bin").write_bytes(plain)
     navigation = replace(
-        scenario.navigation,
-        anchoring_catalogue=str(tmp_path / "table.bin") if named else "",
-        catalogue_distortion_m=80.0,
-        catalogue_distortion_deg=1.0,
-    )
+        scenario.navigation, anchoring_catalogue=str(tmp_path / "table.bin") if named else "",
+        catalogue_distortion_m=80.0, catalogue_distortion_deg=1.0,
+    )  # fmt: skip
     one, other = (
         unpack_catalogue_table(octets)
         for octets in (plain, loading._catalogue_octets(replace(scenario, navigation=navigation), craters))

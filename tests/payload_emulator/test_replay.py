@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 
 from ground_service.ground import open_ground
@@ -36,10 +35,13 @@ from payload_emulator.session.spacecraft.parameter_file import (
     parse_parameters,
 )
 from payload_emulator.session.world import world
+from tests.lazy import Lazy
 from tests.scenarios import short_scenario
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode
 from tmtc.packets.stream import cut_packets
+
+onnx = Lazy("onnx")
 
 FRAMES = 5
 SCENARIO = short_scenario(75.0, "") + "[disturbances]\noutage_at_s = 25.0\noutage_duration_s = 15.0\n"

@@ -208,15 +208,9 @@ def test_a_scenario_of_an_older_archive_reads_as_before() -> None:
 def measured(source: str) -> CraterCatalogue:
     count = 5
     return CraterCatalogue(
-        np.arange(count),
-        np.linspace(-0.1, 0.1, count),
-        np.linspace(0.2, 0.3, count),
-        np.full(count, 5_000.0),
-        np.linspace(-2_000.0, 2_000.0, count),
-        np.full(count, 400.0),
-        source,
-        np.ones(count, dtype=bool),
-    )
+        np.arange(count), np.linspace(-0.1, 0.1, count), np.linspace(0.2, 0.3, count), np.full(count, 5_000.0),
+        np.linspace(-2_000.0, 2_000.0, count), np.full(count, 400.0), source, np.ones(count, dtype=bool),
+    )  # fmt: skip
 
 
 def on_board(source: str, fraction: float = 0.0) -> CatalogueTable:

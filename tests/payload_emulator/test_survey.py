@@ -88,12 +88,22 @@ def test_windows_of_all_seeds_are_counted_together_each_by_its_frames() -> None:
     assert figures["nees_mean"] == pytest.approx((6.0 + 8.0 + 12.8) / 3.0)
     # Chi-square with 18 degrees of freedom (Abramowitz and Stegun, table 26.8): 8.23075 and 31.5264.
     assert figures["bounds"] == pytest.approx([8.23075 / 3.0, 31.5264 / 3.0], abs=1e-4)
+    # Sigmas are too large by the root of the mean per degree, too small likewise; within the bounds nothing is said.
+    assert (figures["nees_remark"], "sigmas" in format_survey(figures)) == ("", False)
+    for nees, told in ((1.5, "sigmas 2.0 times too large"), (24.0, "sigmas 2.0 times too small")):
+        assert f"NIS 1.00; {told}\n" in format_survey(summary([session(*[window(nees=nees)] * 3)]))
     assert figures["nees_above_12_6_share"] == pytest.approx(1.0 / 3.0)
     assert figures["nees_trend"] == pytest.approx(8.0 - (6.0 + 12.8) / 2.0)
     assert figures["bias_rtn_m"] == pytest.approx([(8 * 1 + 12 * 5) / 20, 2.0, (8 * 3 - 12) / 20])
     assert figures["inside_2_sigma"] == pytest.approx({"r": 0.76, "t": 0.5, "n": 0.6})
     assert figures["nis"] == pytest.approx((3 + 3 + 2 * 12) / 18)
     assert figures["coast_end_p95_m"] == 100.0
+    # Coasts after few frames are counted apart; an axis at 2 sigma is within, and a coast is three axes.
+    after = [((2.0, 0.1, -2.1), 37, 900.0), ((0.5, 0.5, -0.5), 59, 300.0), ((9.0, 9.0, 9.0), 60, 50.0)]
+    coasts = [window(coast_sigmas=sigmas, coast_frames=n, coast_end_m=end_m) for sigmas, n, end_m in after]
+    few, many = summary([session(window(), *coasts)])["coasts"]
+    assert few == {"frames_from": 1, "coasts": 2, "max_m": 900.0, "inside_2_sigma": pytest.approx(5 / 6)}
+    assert many == {"frames_from": 60, "coasts": 1, "max_m": 50.0, "inside_2_sigma": 0.0}
     assert figures["fixed_share"] == 18 / 20
     assert (figures["catalogued_share"], figures["recall_5_30_km"]) == (0.25, 0.75)
     assert (figures["track_recall_5_30_km"], figures["recall_5_30_km_depth_06_10"]) == (0.8, 0.4)

@@ -45,16 +45,10 @@ def test_values_keep_their_types_and_only_whole_numbers_become_floats() -> None:
     found = read_table(
         Outer,
         {
-            "name": "a",
-            "share": 1,
-            "mode": "fast",
-            "colours": ["blue", "red"],
-            "inner": {"limits": [0, 3.5]},
-            "rest": {"length_m": 4},
-            "items": [{"length_m": 1.0}, {}],
-            "free": {"any": 1},
+            "name": "a", "share": 1, "mode": "fast", "colours": ["blue", "red"], "inner": {"limits": [0, 3.5]},
+            "rest": {"length_m": 4}, "items": [{"length_m": 1.0}, {}], "free": {"any": 1},
         },
-    )
+    )  # fmt: skip
     assert found == Outer(
         "a", 1, 1.0, False, "fast", (Colour.blue, Colour.red), Inner(2.0, (0.0, 3.5)), Inner(4.0),
         (Inner(1.0), Inner()), {"any": 1},

@@ -45,12 +45,8 @@ class Tab:
     def size(self, width: int, height: int) -> None:
         """Set the size of the window."""
         self.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=1,
-            mobile=False,
-        )
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False,
+        )  # fmt: skip
 
     def theme(self, scheme: str, media: str = "screen") -> None:
         """Prefer light or dark, on a screen or on paper."""
@@ -86,20 +82,14 @@ def tab(profile: Path) -> Iterator[Tab]:
     assert CHROMIUM is not None
     process = subprocess.Popen(
         [
-            CHROMIUM,
-            "--headless",
-            "--no-sandbox",
-            "--disable-gpu",
-            "--disable-dev-shm-usage",
-            "--disable-background-networking",
-            "--remote-debugging-port=0",
-            f"--user-data-dir={profile}",
+            CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
+            "--disable-background-networking", "--remote-debugging-port=0", f"--user-data-dir={profile}",
             "about:blank",
         ],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
-    )
+    )  # fmt: skip
     assert process.stderr is not None
     try:
         line = next(line for line in process.stderr if "DevTools listening on" in line)

@@ -1,6 +1,7 @@
 """Regression and detector reports: the same promises as the report of a pass."""
 
 import json
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -41,6 +42,8 @@ def test_the_page_is_whole_self_contained_and_repeatable(kind: str, text: str) -
     assert len(page.ids) == len(set(page.ids)) and page.references <= set(page.ids)
     assert all(a.startswith("data:") for a in page.addresses) and "script" not in page.tags
     assert render_html(_report(kind)) == text
+    heads = [part.split("</thead>")[0] for part in text.split("<thead>")[1:]]
+    assert heads and not [head for head in heads if re.search(r"<th[^>]*></th>", head)]
 
 
 def test_the_verdict_and_the_figures_come_first(kind: str, text: str) -> None:

@@ -29,17 +29,10 @@ def series(name: str, radial_m: float, outcome: str) -> NavigationSeries:
     error = np.zeros((4, 3))
     error[:, 0] = radial_m
     return NavigationSeries(
-        name,
-        "estimate",
-        UTC_NS,
-        TRACK.latitude_deg,
-        TRACK.longitude_deg,
-        TRACK.altitude_m + radial_m,
-        error,
+        name, "estimate", UTC_NS, TRACK.latitude_deg, TRACK.longitude_deg, TRACK.altitude_m + radial_m, error,
         outcome=("anchored", outcome, outcome, "predicted"),
-        reset_trigger=("initialization", "none", "none", "none"),
-        anchor_reads=5,
-    )
+        reset_trigger=("initialization", "none", "none", "none"), anchor_reads=5,
+    )  # fmt: skip
 
 
 def report(**changes: Any) -> PaperReport:

@@ -1,15 +1,21 @@
 """The PDF of a report: A4, reproducible, complete, and free of markup."""
 
 import io
+import logging
 import subprocess
 import sys
+from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from pypdf import PdfReader
 
-from reports.document import Column, Document, Facts, Heading, Listing, Paragraph, Picture, Table
+from reports import drawings
+from reports.document import Column, Document, Heading, Listing, Paragraph, Picture, Properties, Table
+from reports.drawings import KeptDrawings, drawing_hash
+from reports.pass_report import pass_document
 from reports.pdf_pages import _typeset, pdf_pages
 from reports.render import render_html, render_pages
 from reports.values import PassReport
@@ -109,7 +115,7 @@ def test_a_wide_table_is_set_in_smaller_type() -> None:
 
 
 def test_a_long_word_is_broken_inside_the_width() -> None:
-    pages = pages_of(pdf_pages(document(Paragraph("x" * 400), Facts((("path", "/" + "long" * 80),)))))
+    pages = pages_of(pdf_pages(document(Paragraph("x" * 400), Properties((("path", "/" + "long" * 80),)))))
     lines = [line for line in pages[0].splitlines() if "xxxx" in line or "longlong" in line]
     assert len(lines) > 6
     assert sum(line.count("x") for line in lines) == 400
@@ -155,3 +161,47 @@ def test_a_fault_of_typesetting_is_one_line(tmp_path: Path) -> None:
     ) as raised:
         _typeset(tmp_path)
     assert "\n" not in str(raised.value)
+
+
+def test_a_kept_figure_is_shown_again_unless_it_is_damaged_or_of_another_version(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+    picture, drawn = Picture("one", "one", "one", 1.0, partial(len)), 0
+
+    def draw(*_: object) -> str:
+        nonlocal drawn
+        drawn += 1
+        return "<svg/>"
+
+    monkeypatch.setattr(drawings, "draw_svg", draw)
+    assert [KeptDrawings().svg(picture) for _ in range(2)] == ["<svg/>"] * 2
+    assert drawn == 1
+    (file,) = (tmp_path / "kept-ground").iterdir()  # where no build under test reads
+    file.write_bytes(file.read_bytes()[:-1])
+    assert KeptDrawings().svg(picture) == "<svg/>"
+    assert drawn == 2
+    monkeypatch.setattr(drawings, "_code_hash", lambda: b"another version")
+    KeptDrawings().svg(picture)
+    assert drawn == 3
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(file / "folder"))  # under a file: nothing can be kept
+    with caplog.at_level(logging.WARNING):
+        assert [KeptDrawings().svg(picture) for _ in range(2)] == ["<svg/>"] * 2
+    assert drawn == 5
+    assert [record.getMessage() for record in caplog.records] == [
+        f"nothing is kept in {file}/folder-ground: Not a directory"
+    ]
+
+
+def test_late_telemetry_changes_only_the_figures_that_show_it(small: PassReport) -> None:
+    def hashes(report: PassReport) -> dict[str, str]:
+        return {
+            one.key: drawing_hash(one) for one in pass_document(report).blocks if isinstance(one, Picture)
+        }
+
+    before = hashes(example.pass_report(hours=0.2, gallery=1, worst=0))
+    assert before == hashes(small)  # equal values, other objects
+    assert len(set(before.values())) == len(before) > 15
+    late = replace(small.housekeeping[0], values=small.housekeeping[0].values + 1.0)
+    after = hashes(replace(small, housekeeping=(late, *small.housekeeping[1:])))
+    assert [key for key in before if after[key] != before[key]] == ["housekeeping"]

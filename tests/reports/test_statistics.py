@@ -63,15 +63,9 @@ def test_statistics_given_are_kept_and_the_others_found() -> None:
     error = np.zeros((5, 3))
     error[:, 1] = [1.0, 2.0, 3.0, 4.0, np.nan]
     one = NavigationSeries(
-        "x",
-        "estimate",
-        np.arange(5),
-        np.zeros(5),
-        np.zeros(5),
-        np.zeros(5),
-        error,
+        "x", "estimate", np.arange(5), np.zeros(5), np.zeros(5), np.zeros(5), error,
         statistics=NavigationStatistics(median_3d_m=99.0),
-    )
+    )  # fmt: skip
     found = completed(one)
     assert (found.median_3d_m, found.max_3d_m, found.end_of_pass_m) == (99.0, 4.0, 4.0)
     assert np.isnan(found.drift_percent)

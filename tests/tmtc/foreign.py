@@ -216,9 +216,7 @@ BUS = document(
     _PARAMETERS,
     HEADER_CONTAINER
     + container(
-        "TIMED",
-        ["DAY", "MILLISECOND", "MICROSECOND"],
-        "CCSDSPacket",
+        "TIMED", ["DAY", "MILLISECOND", "MICROSECOND"], "CCSDSPacket",
         both(comparison("VERSION", 0), comparison("SEC_HDR_FLG", 1), comparison("PKT_APID", APID_DUMP, "!=")),
         abstract=True,
     )
@@ -227,12 +225,9 @@ BUS = document(
     + container("UrgentEvent", ["VALUE"], "Event", comparison("REASON", 200, ">="))
     + container("Dump", ["COARSE", "FINE", "DUMP", "VALUE"], "CCSDSPacket", comparison("PKT_APID", APID_DUMP))
     + container(
-        "Bare",
-        ["VALUE"],
-        "CCSDSPacket",
-        _either(("PKT_APID", "==", APID_BARE), ("PKT_APID", "==", APID_BARE + 1)),
+        "Bare", ["VALUE"], "CCSDSPacket", _either(("PKT_APID", "==", APID_BARE), ("PKT_APID", "==", APID_BARE + 1)),
     ),
-)
+)  # fmt: skip
 
 
 @dataclass
@@ -260,12 +255,9 @@ class Bits:
 def space_packet(apid: int, data: bytes, count: int, secondary: bool = True) -> bytes:
     """A packet with the header that `spacepackets` makes."""
     header = SpacePacketHeader(
-        packet_type=PacketType.TM,
-        apid=apid,
-        seq_count=count & 0x3FFF,
-        data_len=len(data) - 1,
+        packet_type=PacketType.TM, apid=apid, seq_count=count & 0x3FFF, data_len=len(data) - 1,
         sec_header_flag=secondary,
-    )
+    )  # fmt: skip
     return bytes(header.pack()) + data
 
 

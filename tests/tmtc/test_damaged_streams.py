@@ -177,13 +177,11 @@ def test_foreign_packets_are_not_ordered_by_a_time_they_do_not_carry():
     # the 14th octet is that of a CUC time of the dictionary, the six octets behind it count down
     foreign = [
         pack_packet(
-            0x123,
-            bytes(7) + b"\x2e" + (10**6 - k).to_bytes(6, "big") + bytes(8),
-            sequence_count=k,
+            0x123, bytes(7) + b"\x2e" + (10**6 - k).to_bytes(6, "big") + bytes(8), sequence_count=k,
             secondary_header=True,
         )
         for k in range(50)
-    ]
+    ]  # fmt: skip
     decoded = decode(b"".join(append_crc(packet) for packet in _with_room(foreign)))
     assert decoded.packets == 50
     assert (decoded.sequence.gaps, decoded.sequence.missing) == (0, 0)

@@ -145,13 +145,11 @@ def test_ccsdspy_reads_the_repeated_items_to_the_same_raw_values():
 
 def detections(count: int, rng: np.random.Generator) -> dict:
     items = {
-        "u_px": rng.uniform(0, 1023, count),
-        "v_px": rng.uniform(0, 1023, count),
-        "diameter_px": rng.uniform(0, 1023, count),
-        "score": rng.uniform(0, 1, count),
+        "u_px": rng.uniform(0, 1023, count), "v_px": rng.uniform(0, 1023, count),
+        "diameter_px": rng.uniform(0, 1023, count), "score": rng.uniform(0, 1, count),
         "size_class": rng.integers(-1, 4, count),
         "sigma_px": np.where(rng.uniform(size=count) < 0.2, np.nan, rng.uniform(0, 3.9, count)),
-    }
+    }  # fmt: skip
     return {"frame_number": 9, "image_ticks": 1 << 40, "image_quality": "ok", "items": items}
 
 
@@ -322,15 +320,10 @@ def test_packets_of_another_dictionary_are_unknown_and_left_out_of_the_tables():
         (
             PacketDefinition("strange", 0x123, 200, 1, "Not ours", (Field("x", "u8", "x"),)),
             PacketDefinition(
-                "longer",
-                0x0A5,
-                9,
-                2,
-                "Our time report, longer",
-                (Field("x", "u64", "x"), Field("y", "u32", "y")),
+                "longer", 0x0A5, 9, 2, "Our time report, longer", (Field("x", "u64", "x"), Field("y", "u32", "y")),
             ),
         ),
-    )
+    )  # fmt: skip
     strange = other.pack("strange", {"x": 1}, ticks=0, sequence_count=0)
     longer = other.pack("longer", {"x": 1, "y": 2}, ticks=0, sequence_count=0)
     with pytest.raises(UnknownPacket, match="no packet of APID 0x123, service 200, subtype 1"):
@@ -373,14 +366,10 @@ def test_integer_columns_do_not_wrap_in_arithmetic():
 @pytest.mark.parametrize("value", [0, 2**63 - 1, 2**63, 2**64 - 1])
 def test_unsigned_integers_of_64_bits_stay_what_was_sent(value):
     definition = PacketDefinition(
-        "wide",
-        1,
-        3,
-        25,
-        "",
+        "wide", 1, 3, 25, "",
         (Field("number", "u64", ""), Field("vector", "u64", "", size=2), Field("count", "u8", "")),
         Group("count", (Field("item", "u64", ""),)),
-    )
+    )  # fmt: skip
     dictionary = Dictionary(1, (definition,))
     values = {"number": value, "vector": [1, value], "items": [{"item": value}, {"item": 7}]}
     octets = dictionary.pack("wide", values, ticks=0, sequence_count=0)
@@ -394,15 +383,8 @@ def test_limits_tell_warning_from_alarm():
     temperature = DICTIONARY.packet("housekeeping").field("temperature_c")
     values = [-41.0, -30.0, -20.0, 20.0, 60.0, 61.0, 86.0, math.nan]
     assert limit_states(temperature, values).tolist() == [
-        ALARM,
-        WARNING,
-        0,
-        0,
-        0,
-        WARNING,
-        ALARM,
-        WITHIN_LIMITS,
-    ]
+        ALARM, WARNING, 0, 0, 0, WARNING, ALARM, WITHIN_LIMITS,
+    ]  # fmt: skip
     assert limit_states(DICTIONARY.packet("housekeeping").field("mode"), [3]).tolist() == [WITHIN_LIMITS]
 
 
@@ -462,12 +444,10 @@ def test_a_parameter_and_the_table_that_holds_it_have_the_same_effect() -> None:
 @pytest.mark.parametrize(
     ("name", "code", "expected"),
     [
-        ("set_mode", 1, Effect.CHANGES_STATE),
-        ("start_observation", 2, Effect.ROUTINE),
-        ("reboot", 7, Effect.DESTROYS_DATA),
-        ("synchronise_clock", 9, Effect.CHANGES_STATE),
+        ("set_mode", 1, Effect.CHANGES_STATE), ("start_observation", 2, Effect.ROUTINE),
+        ("reboot", 7, Effect.DESTROYS_DATA), ("synchronise_clock", 9, Effect.CHANGES_STATE),
     ],
-)
+)  # fmt: skip
 def test_a_function_has_its_effect_by_name_and_by_code(name: str, code: int, expected: Effect) -> None:
     assert effect(FUNCTION, **function(name)) is effect(FUNCTION, **function(code)) is expected
 
@@ -634,13 +614,9 @@ def packet(name: str, row: int, ticks: int) -> bytes:
         triangle = [covariance[i, j] for i in range(9) for j in range(i, 9)]
         extra = {"covariance": triangle, "innovation_degrees": 22}
     values = {
-        "frame_number": 5 + row,
-        "image_ticks": ticks,
-        "position_icrf_m": STATES[row, :3],
-        "velocity_icrf_m_s": STATES[row, 3:6],
-        "acceleration_rtn_m_s2": STATES[row, 6:],
-        **extra,
-    }
+        "frame_number": 5 + row, "image_ticks": ticks, "position_icrf_m": STATES[row, :3],
+        "velocity_icrf_m_s": STATES[row, 3:6], "acceleration_rtn_m_s2": STATES[row, 6:], **extra,
+    }  # fmt: skip
     return DICTIONARY.pack(name, values, ticks=ticks + 9, sequence_count=row)
 
 
@@ -718,14 +694,10 @@ def test_a_thumbnail_reads_back(shape: tuple[int, int]) -> None:
 @pytest.mark.parametrize(
     "octets",
     [
-        b"",
-        bytes(15),
-        HEADER.pack(1, 2, 3, 4) + b"no zlib",
-        HEADER.pack(1, 2, 3, 4) + zlib.compress(bytes(11)),
-        HEADER.pack(1, 2, 3, 4) + zlib.compress(bytes(13)),
-        HEADER.pack(1, 2, 3, 4) + zlib.compress(bytes(12))[:-5],
+        b"", bytes(15), HEADER.pack(1, 2, 3, 4) + b"no zlib", HEADER.pack(1, 2, 3, 4) + zlib.compress(bytes(11)),
+        HEADER.pack(1, 2, 3, 4) + zlib.compress(bytes(13)), HEADER.pack(1, 2, 3, 4) + zlib.compress(bytes(12))[:-5],
     ],
-)
+)  # fmt: skip
 def test_what_is_no_thumbnail_is_refused(octets: bytes) -> None:
     with pytest.raises(ValueRefused, match="thumbnail"):
         unpack_thumbnail(octets)

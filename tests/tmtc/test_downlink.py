@@ -39,13 +39,9 @@ def make_packets(count: int, seed: int = 0, boot: int = 1, start_s: int = 0) -> 
         ticks = start_s + k << 16
         n = int(rng.integers(0, 30))
         items = {
-            "u_px": rng.uniform(0, 511, n),
-            "v_px": rng.uniform(0, 511, n),
-            "diameter_px": rng.uniform(5, 80, n),
-            "score": rng.uniform(0, 1, n),
-            "size_class": rng.integers(-1, 4, n),
-            "sigma_px": np.full(n, np.nan),
-        }
+            "u_px": rng.uniform(0, 511, n), "v_px": rng.uniform(0, 511, n), "diameter_px": rng.uniform(5, 80, n),
+            "score": rng.uniform(0, 1, n), "size_class": rng.integers(-1, 4, n), "sigma_px": np.full(n, np.nan),
+        }  # fmt: skip
         values = {"frame_number": k, "image_ticks": ticks, "image_quality": 0, "items": items}
         packets.append(
             DICTIONARY.pack("detections", values, ticks=ticks, sequence_count=sequencer.next(0xA1))
@@ -77,13 +73,9 @@ def assert_all_octets_are_accounted_for(octets, decoded) -> None:
 @pytest.mark.parametrize("frame_length", [223, 892, 1000, 1115])
 def test_what_is_sent_comes_back_and_the_settings_are_found_out(randomiser, coding, checksum, frame_length):
     octets = encode_cadus(
-        sent(),
-        spacecraft_id=76,
-        frame_length=frame_length,
-        coding=coding,
-        randomiser=randomiser,
+        sent(), spacecraft_id=76, frame_length=frame_length, coding=coding, randomiser=randomiser,
         checksum=checksum,
-    )
+    )  # fmt: skip
     decoded = decode(octets)
     assert list(decoded.cut.packets(decoded.buffer)) == sent()
     assert decoded.spacecraft_id == 76 and decoded.complete
@@ -98,12 +90,9 @@ def test_what_is_sent_comes_back_and_the_settings_are_found_out(randomiser, codi
 def test_every_reed_solomon_setting_is_found_out(errors, dual_basis, interleave):
     frame_length = (255 - 2 * errors - 3) * interleave
     wanted = LinkSettings(
-        frame_length=frame_length,
-        rs_errors=errors,
-        interleave=interleave,
-        dual_basis=dual_basis,
+        frame_length=frame_length, rs_errors=errors, interleave=interleave, dual_basis=dual_basis,
         randomiser="long",
-    )
+    )  # fmt: skip
     octets = DownlinkEncoder(5, wanted).encode(sent())
     decoded = decode(octets)
     assert decoded.settings == wanted

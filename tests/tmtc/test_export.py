@@ -15,13 +15,9 @@ from tmtc.packets.stream import cut_packets
 
 def tables():
     items = {
-        "u_px": [1.5, 2.0],
-        "v_px": [3.0, 4.0],
-        "diameter_px": [10.0, 20.0],
-        "score": [1.0, 0.0],
-        "size_class": [0, -1],
-        "sigma_px": [0.5, np.nan],
-    }
+        "u_px": [1.5, 2.0], "v_px": [3.0, 4.0], "diameter_px": [10.0, 20.0], "score": [1.0, 0.0],
+        "size_class": [0, -1], "sigma_px": [0.5, np.nan],
+    }  # fmt: skip
     detections = {"frame_number": 1, "image_ticks": 7, "image_quality": "dark"}
     event = {"event_id": "boot", "frame_number": 0, "value_1": 0.25, "value_2": np.nan}
     state = {
@@ -54,15 +50,10 @@ def test_records_stand_in_the_order_of_the_stream_with_names_for_codes():
     assert records[1]["image_quality"] == "dark" and records[1]["onboard_tai"].endswith("00:00:01.500000")
     assert records[1]["items"] == [
         {
-            "u_px": 1.5,
-            "v_px": 3.0,
-            "diameter_px": 10.0,
-            "score": 1.0,
-            "size_class": "5-10 km",
-            "sigma_px": 0.5,
+            "u_px": 1.5, "v_px": 3.0, "diameter_px": 10.0, "score": 1.0, "size_class": "5-10 km", "sigma_px": 0.5,
         },
         {"u_px": 2.0, "v_px": 4.0, "diameter_px": 20.0, "score": 0.0, "size_class": "none", "sigma_px": None},
-    ]
+    ]  # fmt: skip
     assert records[2]["items"] == []
     assert records[3]["sigma_rtn_m"] == [4.0, 5.0, None]
 

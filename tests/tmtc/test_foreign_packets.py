@@ -94,13 +94,8 @@ def test_ccsdspy_reads_the_same_columns():
     ]  # fmt: skip
     theirs = ccsdspy.FixedLength(fields).load(io.BytesIO(octets))
     own = {
-        "DAY": "U16",
-        "MS": "U32",
-        "US": "U16",
-        "ID": "U8",
-        "TIME": "U64",
-        **{f"P{k}": "F" for k in range(6)},
-    }
+        "DAY": "U16", "MS": "U32", "US": "U16", "ID": "U8", "TIME": "U64", **{f"P{k}": "F" for k in range(6)},
+    }  # fmt: skip
     own |= {"AGAIN": "U64", **{f"Q{k}": "F" for k in range(4)}, "REST": "U64"}
     text = document(
         HEADER_TYPES + integer("U64", 64) + floating("F", 32),

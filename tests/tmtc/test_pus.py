@@ -30,13 +30,9 @@ from tmtc.packets.space_packets import (
 
 def test_a_telemetry_packet_is_what_spacepackets_reads():
     octets = DICTIONARY.pack(
-        "time_report",
-        {"reported_ticks": 0x0123456789AB, "rate_exponent": 4},
-        ticks=0x0A0B0C0D0E0F,
-        sequence_count=77,
-        message_counter=513,
-        destination=9,
-    )
+        "time_report", {"reported_ticks": 0x0123456789AB, "rate_exponent": 4}, ticks=0x0A0B0C0D0E0F,
+        sequence_count=77, message_counter=513, destination=9,
+    )  # fmt: skip
     theirs = PusTm.unpack(octets, timestamp_len=7)
     assert (theirs.apid, theirs.service, theirs.message_subtype, theirs.seq_count) == (0x0A5, 9, 2, 77)
     assert theirs.pus_tm_sec_header.message_counter == 513
@@ -47,24 +43,17 @@ def test_a_telemetry_packet_is_what_spacepackets_reads():
 
 def test_a_telecommand_of_spacepackets_is_read_and_equal_to_ours():
     theirs = PusTc(
-        service=17,
-        message_subtype=1,
-        apid=0x0A0,
-        seq_count=5,
-        source_id=3,
+        service=17, message_subtype=1, apid=0x0A0, seq_count=5, source_id=3,
         ack_flags=ACK_ACCEPTANCE | ACK_COMPLETION,
-    ).pack()
+    ).pack()  # fmt: skip
     ours = DICTIONARY.pack_command(
         "test_connection", {}, sequence_count=5, acknowledgements=ACK_ACCEPTANCE | ACK_COMPLETION, source=3
     )
     assert ours == bytes(theirs)
     read = DICTIONARY.unpack_command(bytes(theirs))
     assert (read.name, read.sequence_count, read.acknowledgements, read.source) == (
-        "test_connection",
-        5,
-        9,
-        3,
-    )
+        "test_connection", 5, 9, 3,
+    )  # fmt: skip
 
 
 def test_headers_come_back():

@@ -161,12 +161,9 @@ def test_no_blocks_are_no_frames():
 
 @settings(max_examples=25, deadline=None)
 @given(
-    st.sampled_from([8, 16]),
-    st.sampled_from([1, 2, 3, 4, 5, 8]),
-    st.integers(0, 200),
-    st.booleans(),
+    st.sampled_from([8, 16]), st.sampled_from([1, 2, 3, 4, 5, 8]), st.integers(0, 200), st.booleans(),
     st.integers(0, 99),
-)
+)  # fmt: skip
 def test_every_setting_encodes_to_clean_codewords_that_a_flipped_bit_spoils(errors, depth, fill, dual, seed):
     code = ReedSolomon(errors, depth, fill, dual)
     frames = frames_for(code, 2, seed)

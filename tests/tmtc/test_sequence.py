@@ -170,11 +170,9 @@ def test_counts_of_other_content_that_come_again_are_a_restart(counts, restarts,
 
 @settings(max_examples=80, deadline=None)
 @given(
-    st.integers(0, 16383),
-    st.lists(st.integers(1, 400), min_size=1, max_size=60),
-    st.lists(st.integers(0, 59), max_size=20),
-    st.randoms(use_true_random=False),
-)
+    st.integers(0, 16383), st.lists(st.integers(1, 400), min_size=1, max_size=60),
+    st.lists(st.integers(0, 59), max_size=20), st.randoms(use_true_random=False),
+)  # fmt: skip
 def test_any_losses_copies_and_orders_are_accounted_for(start, steps, copies, random):
     sent = start + np.cumsum(np.array(steps)) - steps[0]
     rows = list(range(sent.size)) + [c % sent.size for c in copies]

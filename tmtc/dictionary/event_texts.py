@@ -140,6 +140,11 @@ EVENT_TEXTS: Mapping[str, EventText] = {
         ("declared noise per axis, deg", _number("deg")),
     ),
     "attitude_restored": _of("declared noise {0} per axis", ("declared noise per axis, deg", _number("deg"))),
+    "map_offset": _of(
+        "{0} east and north, from {1} fixes",
+        ("1 sigma of the offset of the list, m", _number("m")),
+        ("fixes that it was learned from; 0: the prior", _number()),
+    ),
     "anchor_read": _of("trigger: {0}, {1} estimator", ("trigger", _TRIGGER), ("estimator", _ESTIMATOR)),
     "clock_jump": _of("{0}", ("jump, s", _number("s"))),
     "clock_synchronised": _of("{0}", ("on-board time", _time)),

@@ -31,12 +31,12 @@ class Field:
 
     @property
     def is_float(self) -> bool:
-        """Whether it is stored as an IEEE 754 number."""
+        """Return whether it is stored as an IEEE 754 number."""
         return self.type[0] == "f"
 
     @property
     def is_calibrated(self) -> bool:
-        """Whether the engineering value differs from the raw one."""
+        """Return whether the engineering value differs from the raw one."""
         return self.scale != 1.0 or self.offset != 0.0 or self.missing is not None
 
     @property

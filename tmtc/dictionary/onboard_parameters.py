@@ -20,7 +20,7 @@ class Parameter:
     whole: bool = False
 
     def accepts(self, value: float) -> bool:
-        """Whether the value lies within the limits (NaN does not) and is whole where it must be."""
+        """Return whether the value lies within the limits (NaN does not) and is whole where it must be."""
         return self.minimum <= value <= self.maximum and not (self.whole and value != math.floor(value))
 
 

@@ -482,7 +482,7 @@ class _Compiled:
         return values, raw
 
     def lengths_hold(self, octets: OctetArray, offsets: IntArray, lengths: IntArray) -> BoolArray:
-        """Whether each packet is as long as its definition and count say."""
+        """Return whether each packet is as long as its definition and count say."""
         definition = self.definition
         if definition.group is None:
             return np.asarray(lengths == definition.base_length)

@@ -1,4 +1,4 @@
-"""What a downlink tells of the uplink: the command link control words (CLCW) of its frames, summed up.
+"""State of the uplink in the downlink: the command link control words (CLCW) of its frames, summed up.
 
 References
 ----------
@@ -52,7 +52,7 @@ class UplinkSeen:
 
 
 def uplink_seen(words: npt.NDArray[np.uint32]) -> tuple[UplinkSeen, ...]:
-    """What the operational control fields of frames (n,) in order tell, by telecommand channel; 0 where there is none.
+    """Return the state of each telecommand channel from the control fields of frames (n,); 0 where there is none.
 
     Fields that are no CLCW (of another control word type or version) are passed over.
     """

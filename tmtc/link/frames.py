@@ -73,7 +73,7 @@ def frame_headers(frames: OctetArray) -> TmFrameHeaders:
 
 
 def frame_checksums_hold(frames: OctetArray) -> BoolArray:
-    """Whether the last two octets of each frame (n, length) are the checksum of those before."""
+    """Return whether the last two octets of each frame (n, length) are the checksum of those before."""
     if frames.shape[1] <= CRC_LENGTH:
         return np.zeros(frames.shape[0], dtype=np.bool_)
     from tmtc.packets import _cutting

@@ -99,7 +99,7 @@ class LinkProposal:
 
     @property
     def has_regular_markers(self) -> bool:
-        """Whether the stream has more, or more regular, markers than random data."""
+        """Return whether the stream has more, or more regular, markers than random data."""
         return self.markers >= 3 or max(self.distances.values(), default=0) >= 2
 
 

@@ -63,7 +63,7 @@ class LinkPlan:
 
     @property
     def ambiguous(self) -> bool:
-        """Whether other settings have equal support."""
+        """Return whether other settings have equal support."""
         return self.proposal is not None and self.proposal.ambiguous
 
 

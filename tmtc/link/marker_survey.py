@@ -40,7 +40,7 @@ class MarkerSurvey:
 
     @property
     def is_regular(self) -> bool:
-        """Whether the stream has more, or more regular, markers than random data."""
+        """Return whether the stream has more, or more regular, markers than random data."""
         return self.markers >= 3 or max(self.distances.values(), default=0) >= 2
 
 

@@ -136,7 +136,7 @@ def decode(blocks: OctetArray, code: ReedSolomon) -> RsDecode:
 
 
 def clean(blocks: OctetArray, code: ReedSolomon) -> BoolArray:
-    """Whether each codeword of codeblocks (n, block_length) is free of errors, shape (n, interleave)."""
+    """Return whether each codeword of codeblocks (n, block_length) is free of errors, shape (n, interleave)."""
     words = blocks.reshape(blocks.shape[0], CODEWORD - code.virtual_fill, code.interleave)
     sent = words[:, code.symbols :].transpose(0, 2, 1)
     result: npt.NDArray[np.bool_] = (_parity(words, code) == sent).all(axis=2)

@@ -105,7 +105,7 @@ class LinkSettings:
 
     @property
     def proves_frames(self) -> bool:
-        """Whether damaged frames can be detected, by code or checksum."""
+        """Return whether damaged frames can be detected, by code or checksum."""
         return self.coding != "none" or self.checksum
 
     def describe(self) -> dict[str, object]:

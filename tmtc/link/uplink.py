@@ -168,7 +168,7 @@ class Farm:
     farm_b_counter: int = 0
 
     def accept(self, frame: TcFrame) -> bool:
-        """Whether the frame's data are to be used; control commands are executed here and give False."""
+        """Return whether the frame's data are to be used; control commands are executed here and give False."""
         if frame.control:
             sets_count = frame.data[:2] == CONTROL_SET_COUNT and len(frame.data) == 3
             # any other control command makes the frame invalid; it is not counted (232.1-B, event E9)
@@ -198,7 +198,7 @@ class Farm:
 
     @property
     def clcw(self) -> Clcw:
-        """What the downlink tells about the uplink."""
+        """Return the command link control word."""
         return Clcw(
             virtual_channel=self.virtual_channel,
             report_value=self.expected,
@@ -210,7 +210,7 @@ class Farm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UplinkDecode:
-    """What came out of an uplink stream; frames that could not be used are told one by one in `faults`."""
+    """Decoded uplink stream; `faults` lists each frame that could not be used."""
 
     packets: tuple[bytes, ...]
     frames: int

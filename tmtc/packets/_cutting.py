@@ -119,7 +119,7 @@ def is_idle(buffer: RecordArray, p: int) -> bool:
 
 @njit(nogil=True)
 def is_pus(buffer: RecordArray, p: int, length: int, packet_type: int) -> bool:
-    """Whether a PUS-C secondary header stands where it should."""
+    """Return whether a PUS-C secondary header stands where it should."""
     if not buffer[p] & 0x08:
         return False
     if packet_type == 0:
@@ -147,7 +147,7 @@ def _prefix_holds(
     tables: RecordArray,
     powers: RecordArray,
 ) -> bool:
-    """Whether the packet at `p` ends with its checksum; `prefix` is filled over [known[0], known[1]]."""
+    """Return whether the packet at `p` ends with its checksum; `prefix` is filled over [known[0], known[1]]."""
     e = p + length
     if p < known[0] or p > known[1]:
         # what was filled does not reach here: start afresh
@@ -169,7 +169,7 @@ def _stands(
     buffer: RecordArray, p: int, stop: int, packet_type: int,
     prefix: RecordArray, known: RecordArray, tables: RecordArray, powers: RecordArray,
 ) -> bool:  # fmt: skip
-    """Whether a whole packet with a right checksum, or the header of an idle packet, stands at `p`."""
+    """Return whether a whole packet with a right checksum, or the header of an idle packet, stands at `p`."""
     length = length_at(buffer, p, stop, packet_type)
     if length == 0:
         return False
@@ -275,7 +275,7 @@ def proves(
     buffer: RecordArray, q: int, stop: int, packet_type: int, prefix: int, last: RecordArray,
     is_begin: bool, first: bool = False,
 ) -> bool:  # fmt: skip
-    """Whether packets without error control begin at `q`.
+    """Return whether packets without error control begin at `q`.
 
     Headers must follow each other until one continues the sequence counts of its APID: those before the damage, or
     those of another packet of this chain. At the beginning of a segment it is also enough that they lead to its end, or

@@ -32,7 +32,7 @@ _REPEATED = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ApidAccount:
-    """What came of one APID during one boot.
+    """Packet counts of one APID during one boot.
 
     `missing_ranges` (m, 2) are ranges [first, last] of extended counts that never came; `received` counts
     different packets, not copies; `restarts` tells how often the counter restarted.

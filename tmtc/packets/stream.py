@@ -38,7 +38,7 @@ LOOK_AHEAD = 3 * PACKET_MAX_LENGTH + PRIMARY_HEADER_LENGTH
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PacketCut:
-    """Where packets stand in a buffer, or in the segments of it that were cut.
+    """Positions of packets in a buffer, or in the segments cut from it.
 
     `offsets`, `lengths` (n,) and `crc_ok` (n,) hold the packets in the buffer's order, the damaged ones
     included; `idle` (m, 2) and `skipped` (k, 2) are ranges [start, stop) of idle packets and of octets that
@@ -92,7 +92,7 @@ class PrimaryHeaders:
 
 @dataclass(frozen=True, slots=True)
 class PacketForm:
-    """How packets stand in a stream.
+    """Form of the packets in a stream.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class PacketForm:
 
     @property
     def by_headers(self) -> bool:
-        """Whether packets are found by their headers, which needs the octets behind them."""
+        """Return whether packets are found by their headers, which needs the octets behind them."""
         return not self.error_control or self.prefix_octets > 0
 
     @property
@@ -153,7 +153,7 @@ def cut_packets(
     form: PacketForm = CHECKED,
     begins: bool = True,
 ) -> PacketCut:
-    """Where packets stand in `buffer`.
+    """Return the positions of packets in `buffer`.
 
     Parameters
     ----------
@@ -352,7 +352,7 @@ class _Cutter(_Rows):
         return int(self.kernels.unchecked_length(*key, self.unchecked) or self.kernels.length_at(*key))
 
     def is_packet_at(self, p: int, stop: int) -> bool:
-        """Whether a whole packet, with a right checksum if it has one, or the header of an idle one stands at `p`."""
+        """Return whether a whole packet (with a right checksum if it has one) or an idle header stands at `p`."""
         if self.kernels.unchecked_length(self.octets, p, stop, self.packet_type, self.unchecked):
             return True
         length = self.length_at(p, stop)

@@ -13,7 +13,7 @@ CCSDS 660.1-G-2; MIL-STD-1750A section 4.1 for its floating point formats.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import eq, ge, gt, le, lt, methodcaller, ne
 from typing import Any
 
@@ -23,7 +23,14 @@ import numpy.typing as npt
 from tmtc.arrays import BoolArray, IntArray, OctetArray, Octets, RecordArray, as_octets
 from tmtc.dictionary.schema import gather
 from tmtc.errors import DefinitionError
-from tmtc.packets.space_packets import FLAGS_WHOLE
+from tmtc.packets.space_packets import (
+    FLAGS_CONTINUATION,
+    FLAGS_FIRST,
+    FLAGS_LAST,
+    FLAGS_WHOLE,
+    PRIMARY_HEADER_LENGTH,
+    SEQUENCE_COUNT_LIMIT,
+)
 from tmtc.packets.stream import PacketCut, PrimaryHeaders
 from tmtc.xtce.columns import (
     ArrayColumn,
@@ -62,14 +69,15 @@ from tmtc.xtce.definition import (
     tree,
 )
 
-DECODED, NO_CONTAINER, AMBIGUOUS, TOO_SHORT, MALFORMED, DAMAGED, SEGMENT, NO_HEADER = range(8)
+DECODED, NO_CONTAINER, AMBIGUOUS, TOO_SHORT, MALFORMED, DAMAGED, SEGMENT, NO_HEADER, JOINED = range(9)
 VERDICTS = (
     "decoded", "no_container", "ambiguous", "too_short", "malformed", "damaged", "segments_not_joined",
-    "no_secondary_header",
+    "no_secondary_header", "segments_joined",
 )  # fmt: skip
 """Outcomes of decoding a packet: decoded; no or several containers match; shorter than its container; a size that is
-not possible, so that the places of the values behind it are unknown; a wrong checksum; a part of a segmented packet;
-without the secondary header that other packets of its APID have."""
+not possible, so that the places of the values behind it are unknown; a wrong checksum; a part of a segmented packet
+that is not complete; without the secondary header that other packets of its APID have; a part that was decoded with the
+first one of its packet, which has the outcome."""
 
 _CHUNK = 1 << 17
 """Packets decoded together: bounds the memory for what is between."""
@@ -99,9 +107,8 @@ class XtceTable:
     def __len__(self) -> int:
         return len(self.packet_index)
 
-    def kept(self, keep: BoolArray) -> XtceTable:
+    def take(self, index: IntArray) -> XtceTable:
         """Return the selected packets."""
-        index = np.flatnonzero(keep)
         columns = {name: column.take(index) for name, column in self.columns.items()}
         return XtceTable(self.name, self.packet_index[index], columns, self.unread_bits[index])
 
@@ -127,9 +134,14 @@ class XtceDecode:
         """Values of decoded packets that are not known, by parameter."""
         return {name: len(packets) for name, packets in self.unknown.items() if len(packets)}
 
+    def bits_not_read(self) -> dict[str, tuple[int, int]]:
+        """Return least and most bits behind the last entry of packets, by container; without those that have none."""
+        spans = {name: one.unread_bits for name, one in self.tables.items() if len(one)}
+        return {name: (int(bits.min()), int(bits.max())) for name, bits in spans.items() if bits.max() > 0}
+
 
 def choose_roots(definition: Definition, names: Sequence[str] = ()) -> tuple[Container, ...]:
-    """The containers that packets begin with: those named, or all without a base if they can be told apart.
+    """The containers that packets begin with: those named, or all without a base if they can be distinguished.
 
     Raises
     ------
@@ -153,6 +165,16 @@ def choose_roots(definition: Definition, names: Sequence[str] = ()) -> tuple[Con
     return roots
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Source:
+    """Octets with packets in them; `offsets` and `lengths` are by packet of the cut and hold for `packets`."""
+
+    octets: OctetArray
+    offsets: IntArray
+    lengths: IntArray
+    packets: IntArray
+
+
 class Decoder:
     """A definition with its containers compiled to steps; stateless between calls."""
 
@@ -173,6 +195,7 @@ class Decoder:
         headers: PrimaryHeaders | None = None,
         *,
         whole_stream: bool = False,
+        checksum_octets: int = 0,
     ) -> XtceDecode:
         """Tables of all packets, and a verdict for each.
 
@@ -182,20 +205,29 @@ class Decoder:
             Primary headers: parts of segmented packets are not decoded, unless the definition asks for the sequence
             flags.
         whole_stream
-            With `headers`: of an APID whose packets have a secondary header, packets without one are not decoded,
-            unless the definition asks for the flag.
+            With `headers`: the parts of a segmented packet are joined. Of an APID whose packets have a secondary
+            header, packets without one are not decoded, unless the definition asks for the flag.
+        checksum_octets
+            Octets of the checksum at the end of a packet, which each part of a segmented packet has.
         """
         verdict = np.where(cut.crc_ok, DECODED, DAMAGED).astype(np.int8)
+        octets = as_octets(buffer)
+        sources = [_Source(octets, cut.offsets, cut.lengths, np.empty(0, dtype=np.int64))]
         if headers is not None and not self._reads_segments:
             verdict[cut.crc_ok & (headers.sequence_flags != FLAGS_WHOLE)] = SEGMENT
+            if whole_stream and (verdict == SEGMENT).any():
+                sources.append(_join_segments(octets, cut, headers, verdict, checksum_octets))
         if headers is not None and whole_stream and not self._reads_header_flag:
             whole = verdict == DECODED
             usual = np.unique(headers.apid[whole & headers.secondary_header])
             verdict[whole & ~headers.secondary_header & np.isin(headers.apid, usual)] = NO_HEADER
-        packets = np.flatnonzero(verdict == DECODED)
+        sources[0] = replace(sources[0], packets=np.flatnonzero(verdict == DECODED))
+        for joined in sources[1:]:
+            verdict[joined.packets] = DECODED
         if len(self.roots) == 1:
-            return self._decode(self.roots[0], buffer, cut, verdict, packets)
-        octets, whole = as_octets(buffer), packets[cut.lengths[packets] >= 2]
+            return self._decode(self.roots[0], sources, verdict)
+        packets = np.concatenate([source.packets for source in sources])
+        whole = packets[cut.lengths[packets] >= 2]
         apid = np.full(len(cut), -1, dtype=np.int64)
         apid[whole] = (octets[cut.offsets[whole]].astype(np.int64) & 7) << 8 | octets[cut.offsets[whole] + 1]
         named = [packet_apids(root) for root in self.roots]
@@ -204,31 +236,27 @@ class Decoder:
             foreign = frozenset().union(*(one for one, _ in named)) - apids
             possible = ~np.isin(apid, list(foreign)) if accepts_others else np.isin(apid, list(apids))
             mine = np.where((verdict == DECODED) & ~possible, NO_CONTAINER, verdict).astype(np.int8)
-            found.append(self._decode(root, buffer, cut, mine, packets[possible[packets]]))
+            its = [replace(one, packets=one.packets[possible[one.packets]]) for one in sources]
+            found.append(self._decode(root, its, mine))
         return _merged(found, self._conditional)
 
     def _decode(
-        self,
-        root: Container,
-        buffer: Octets,
-        cut: PacketCut,
-        verdict: npt.NDArray[np.int8],
-        packets: IntArray,
+        self, root: Container, sources: Sequence[_Source], verdict: npt.NDArray[np.int8]
     ) -> XtceDecode:
         """Decode packets that begin with a container; their verdicts are set."""
-        octets = as_octets(buffer)
-        begins, ends = cut.offsets * 8, (cut.offsets + cut.lengths) * 8
         pieces: dict[str, list[XtceTable]] = {}
         unknown: dict[str, list[IntArray]] = {}
-        for first in range(0, len(packets), _CHUNK):
-            chunk = packets[first : first + _CHUNK]
-            base = int(cut.offsets[chunk].min())
-            end = int((cut.offsets[chunk] + cut.lengths[chunk]).max())
-            data = b"".join((octets[base:end].data, bytes(_SHORT_TEXT)))
-            padded = np.frombuffer(data, dtype=np.uint8)
-            run = _Run(octets, begins, ends, verdict, data, padded, base, unknown)
-            for table in self._tables(root, run, _Rows(chunk, cut.offsets[chunk] * 8)):
-                pieces.setdefault(table.name, []).append(table)
+        for source in sources:
+            octets, packets = source.octets, source.packets
+            begins, ends = source.offsets * 8, (source.offsets + source.lengths) * 8
+            for first in range(0, len(packets), _CHUNK):
+                chunk = packets[first : first + _CHUNK]
+                base, end = int(begins[chunk].min()) // 8, int(ends[chunk].max()) // 8
+                data = b"".join((octets[base:end].data, bytes(_SHORT_TEXT)))
+                padded = np.frombuffer(data, dtype=np.uint8)
+                run = _Run(octets, begins, ends, verdict, data, padded, base, unknown)
+                for table in self._tables(root, run, _Rows(chunk, begins[chunk])):
+                    pieces.setdefault(table.name, []).append(table)
         tables = {name: _joined(found) for name, found in sorted(pieces.items())}
         noted = {name: np.concatenate(parts) for name, parts in sorted(unknown.items())}
         return XtceDecode(
@@ -266,6 +294,44 @@ class Decoder:
         return self._steps[container.path]
 
 
+def _join_segments(
+    octets: OctetArray,
+    cut: PacketCut,
+    headers: PrimaryHeaders,
+    verdict: npt.NDArray[np.int8],
+    checksum_octets: int,
+) -> _Source:
+    """Join the parts of segmented packets whose counts follow one another; `packets` are the first parts.
+
+    The verdict of the other parts becomes `JOINED`. A later part with a secondary header, whose length is not known,
+    is not joined.
+    """
+    parts = np.flatnonzero(verdict == SEGMENT)
+    parts = parts[np.argsort(headers.apid[parts], kind="stable")]
+    apid, count, flags = headers.apid[parts], headers.sequence_count[parts], headers.sequence_flags[parts]
+    follows = (apid[1:] == apid[:-1]) & (count[1:] == (count[:-1] + 1) % SEQUENCE_COUNT_LIMIT)
+    follows &= np.isin(flags[:-1], (FLAGS_FIRST, FLAGS_CONTINUATION)) & ~headers.secondary_header[parts[1:]]
+    follows &= np.isin(flags[1:], (FLAGS_LAST, FLAGS_CONTINUATION))
+    starts = np.flatnonzero(np.append(True, ~follows))
+    stops = np.append(starts[1:], len(parts))
+    is_whole = (flags[starts] == FLAGS_FIRST) & (flags[stops - 1] == FLAGS_LAST)
+    offsets, lengths = cut.offsets.copy(), cut.lengths.copy()
+    pieces: list[OctetArray] = []
+    size = 0
+    for start, stop in zip(starts[is_whole].tolist(), stops[is_whole].tolist(), strict=True):
+        first, begin = parts[start], size
+        for part in parts[start:stop].tolist():
+            skipped = 0 if part == first else PRIMARY_HEADER_LENGTH
+            left = 0 if part == parts[stop - 1] else checksum_octets
+            at = cut.offsets[part]
+            pieces.append(octets[at + skipped : max(at + cut.lengths[part] - left, at + skipped)])
+            size += len(pieces[-1])
+        verdict[parts[start + 1 : stop]] = JOINED
+        offsets[first], lengths[first] = begin, size - begin
+    joined = np.concatenate(pieces) if pieces else np.empty(0, dtype=np.uint8)
+    return _Source(joined, offsets, lengths, np.sort(parts[starts[is_whole]]))
+
+
 def _asks_for(root: Container, bit: int, bits: int) -> bool:
     """Return whether conditions of containers and entries ask for the value in a place of the header."""
     field = header_field(root, bit, bits)
@@ -294,7 +360,7 @@ def _merged(found: Sequence[XtceDecode], conditional: Sequence[set[str]]) -> Xtc
     unknown: dict[str, list[IntArray]] = {}
     for k, one in enumerate(found):
         for name, table in one.tables.items():
-            kept = table.kept(chosen[k, table.packet_index])
+            kept = table.take(np.flatnonzero(chosen[k, table.packet_index]))
             if len(kept):
                 tables[name] = kept
         for name, packets in one.unknown.items():
@@ -320,7 +386,7 @@ class _Seek:
     """Go to `offset` bits behind a mark (None: behind here)."""
 
     mark: str | None
-    offset: int
+    offset: int | Size
 
 
 @dataclass(frozen=True, slots=True)
@@ -365,20 +431,22 @@ def _compile(entries: Sequence[Entry], mark: str) -> list[_Step]:
         kind = item.type if isinstance(item, Parameter) and isinstance(item.type, ScalarType) else None
         bits = None if kind is None else kind.bits
         encoding = None if kind is None else kind.encoding
-        plain = not entry.from_start and entry.condition is None and cursor + entry.offset >= 0
-        if plain and bits is not None and isinstance(encoding, (IntegerEncoding, FloatEncoding)):
+        offset = entry.offset
+        plain = not entry.from_start and entry.condition is None
+        is_number = bits is not None and isinstance(encoding, (IntegerEncoding, FloatEncoding))
+        if plain and isinstance(offset, int) and is_number:
             assert kind is not None
             if fields and encoding.calibration.contexts:  # they may ask for fields of the same stretch
                 close()
-            if cursor + entry.offset >= 0:
-                fields.append((item.name, kind, cursor + entry.offset))
-                cursor += entry.offset + bits
+            if cursor + offset >= 0:
+                fields.append((item.name, kind, cursor + offset))
+                cursor += offset + bits
                 extent = max(extent, cursor)
                 continue
         close()
         own: list[_Step] = []
-        if entry.from_start or entry.offset:
-            own.append(_Seek(mark if entry.from_start else None, entry.offset))
+        if entry.from_start or offset:
+            own.append(_Seek(mark if entry.from_start else None, offset))
         if isinstance(item, Parameter):
             own.append(_Read(item))
         else:
@@ -509,7 +577,12 @@ def _advance(run: _Run, steps: Sequence[_Step], rows: _Rows) -> _Rows:
             rows = _moved(rows, rows.at + step.advance)
         elif isinstance(step, _Seek):
             mark = None if step.mark is None else rows.column(step.mark)
-            at = (mark.raw if isinstance(mark, ValueColumn) else rows.at) + step.offset
+            at = mark.raw if isinstance(mark, ValueColumn) else rows.at
+            if isinstance(step.offset, int):
+                at = at + step.offset
+            else:
+                steps_on, sized = _sizes(run, step.offset, rows, None)
+                rows, at = run.keep(rows, sized, MALFORMED), (at + steps_on)[sized]
             begin = run.begins[rows.packet]
             good = (at >= begin) & (at <= run.end(rows))
             moved = _moved(rows, at)
@@ -527,15 +600,17 @@ def _advance(run: _Run, steps: Sequence[_Step], rows: _Rows) -> _Rows:
 
 
 def _joined(tables: list[XtceTable]) -> XtceTable:
-    """The tables of the chunks as one."""
+    """The tables of the chunks as one, in the order of the packets."""
     if len(tables) == 1:
         return tables[0]
-    return XtceTable(
+    index = np.concatenate([table.packet_index for table in tables])
+    whole = XtceTable(
         tables[0].name,
-        np.concatenate([table.packet_index for table in tables]),
+        index,
         {name: concatenated([table.columns[name] for table in tables]) for name in tables[0].columns},
         np.concatenate([table.unread_bits for table in tables]),
     )
+    return whole if (np.diff(index) > 0).all() else whole.take(np.argsort(index, kind="stable"))
 
 
 def _moved(rows: _Rows, at: IntArray) -> _Rows:
@@ -679,15 +754,16 @@ def _read_array(run: _Run, data_type: ArrayType, rows: _Rows, name: str) -> _Fou
     bits = 1
     if fixed is not None:
         bits = fixed[-1][1] + (fixed[-1][0].bits or 0)
+    gap = data_type.gap_bits
     # an element takes a bit at least, so that a count alone cannot ask for memory
-    room = good & (counts <= (run.end(rows) - rows.at) // bits)
+    room = good & (counts <= (run.end(rows) - rows.at + gap) // (bits + gap))
     run.verdict[rows.packet[good & ~room]] = TOO_SHORT
     mine = rows.narrowed(room)
     counts = counts[room]
     if fixed is not None:
-        column, at, whole = _read_fixed_elements(run, data_type.element, fixed, mine, counts, bits, name)
+        column, at, whole = _read_fixed_elements(run, data_type, fixed, mine, counts, bits + gap, name)
     else:
-        column, at, whole = _read_open_elements(run, data_type.element, mine, counts, name)
+        column, at, whole = _read_open_elements(run, data_type, mine, counts, name)
     if whole is not None:
         kept = room.copy()
         kept[np.flatnonzero(room)] = whole
@@ -697,18 +773,19 @@ def _read_array(run: _Run, data_type: ArrayType, rows: _Rows, name: str) -> _Fou
 
 def _read_fixed_elements(
     run: _Run,
-    element: DataType,
+    data_type: ArrayType,
     fields: list[tuple[ScalarType, int]],
     rows: _Rows,
     counts: IntArray,
     bits: int,
     name: str,
 ) -> _Found:
+    """Elements of fixed width, `bits` from the start of one to that of the next."""
     owner = np.repeat(np.arange(len(rows), dtype=np.int64), counts)
     place = np.arange(len(owner), dtype=np.int64) - np.repeat(np.cumsum(counts) - counts, counts)
     elements = _Rows(rows.packet[owner], rows.at[owner] + place * bits, rows, owner)
-    column, _, good = _read_records(run, element, fields, elements, name)
-    at = rows.at + counts * bits
+    column, _, good = _read_records(run, data_type.element, fields, elements, name)
+    at = rows.at + counts * bits - data_type.gap_bits * (counts > 0)
     if good is None:
         return ArrayColumn(counts, column), at, None
     kept = np.ones(len(rows), dtype=np.bool_)
@@ -718,8 +795,9 @@ def _read_fixed_elements(
     return ArrayColumn(counts[index], column.take(stays)), at[index], kept
 
 
-def _read_open_elements(run: _Run, element: DataType, rows: _Rows, counts: IntArray, name: str) -> _Found:
+def _read_open_elements(run: _Run, data_type: ArrayType, rows: _Rows, counts: IntArray, name: str) -> _Found:
     """Elements whose width depends on the packet: the k-th of all packets together."""
+    element = data_type.element
     at = rows.at.copy()
     kept = np.ones(len(rows), dtype=np.bool_)
     pieces: list[Column] = []
@@ -729,7 +807,8 @@ def _read_open_elements(run: _Run, element: DataType, rows: _Rows, counts: IntAr
         active = np.flatnonzero(kept & (counts > k))
         if not len(active):
             break
-        elements = _Rows(rows.packet[active], at[active], rows, active)
+        start = at[active] + (data_type.gap_bits if k else 0)
+        elements = _Rows(rows.packet[active], start, rows, active)
         column, behind, good = _read(run, element, elements, name)
         if good is not None:
             kept[active[~good]] = False
@@ -929,7 +1008,7 @@ def _text(octets: bytes, encoding: StringEncoding) -> str:
 
 
 def _terminated(octets: bytes, terminator: bytes) -> int:
-    """Where the terminator stands, at a whole character; -1 without one."""
+    """Return the position of the terminator, at a whole character; -1 without one."""
     place = octets.find(terminator)
     while place > 0 and place % len(terminator):
         place = octets.find(terminator, place + 1)
@@ -1149,7 +1228,7 @@ def _applied(calibrator: Calibrator, raw: RecordArray) -> tuple[RecordArray, Boo
         total = np.zeros(len(x))
         with np.errstate(all="ignore"):
             for coefficient, exponent in calibrator.terms:
-                total = total + coefficient * (x if exponent == 1 else x**exponent)
+                total += coefficient * (x**exponent if exponent > 1 else x if exponent else 1.0)
         return total, None
     return _splined(calibrator, x)
 
@@ -1157,13 +1236,12 @@ def _applied(calibrator: Calibrator, raw: RecordArray) -> tuple[RecordArray, Boo
 def _splined(spline: Spline, x: RecordArray) -> tuple[RecordArray, BoolArray | None]:
     raws = np.array([point[0] for point in spline.points])
     calibrated = np.array([point[1] for point in spline.points])
-    place = np.clip(np.searchsorted(raws, x, side="right") - 1, 0, len(raws) - 1)
     if spline.order == 0:
-        values = calibrated[place]
+        values = calibrated[np.searchsorted(raws[1:], x, side="right")]
     else:
-        left = np.minimum(place, len(raws) - 2)
-        slope = (calibrated[left + 1] - calibrated[left]) / (raws[left + 1] - raws[left])
-        values = slope * (x - raws[left]) + calibrated[left]
+        left = np.searchsorted(raws[1:-1], x, side="right")
+        slopes = np.diff(calibrated) / np.diff(raws)
+        values = slopes[left] * (x - raws[left]) + calibrated[left]
     inside = (x >= raws[0]) & (x <= raws[-1])
     if spline.extrapolate:
         inside = ~np.isnan(x)
@@ -1204,7 +1282,7 @@ def _known(values: RecordArray) -> BoolArray:
 
 
 def _holds(condition: Condition, rows: _Rows) -> BoolArray:
-    """Where a condition holds (n,); a comparison with a parameter that a packet does not have does not."""
+    """Return where a condition holds (n,); a comparison with a parameter that a packet does not have does not."""
     if isinstance(condition, (AllOf, AnyOf)):
         parts = [_holds(one, rows) for one in condition.conditions]
         joined: BoolArray = np.all(parts, axis=0) if isinstance(condition, AllOf) else np.any(parts, axis=0)

@@ -37,7 +37,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class CodeIn:
-    """Whether the code of an enumerated parameter lies in one of the ranges [first, last]; `negated`: in none."""
+    """Condition that an enumerated code lies in one of the ranges [first, last]; `negated`: in none."""
 
     left: Reference
     ranges: tuple[tuple[int, int], ...]
@@ -175,12 +175,13 @@ class ScalarType:
 
 @dataclass(frozen=True, slots=True)
 class ArrayType:
-    """Elements of one type with indices `first` to `last`, both included."""
+    """Elements of one type with indices `first` to `last`, both included, `gap_bits` between two of them."""
 
     name: str
     element: DataType
     first: Size
     last: Size
+    gap_bits: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,11 +209,12 @@ class Parameter:
 class Entry:
     """A parameter, or the entries of another container, in a container.
 
-    It begins `offset` bits after the entry before it (`from_start` False) or after the beginning of the container.
+    It begins `offset` bits, or as many as the packet states, after the entry before it (`from_start` False) or after
+    the beginning of the container.
     """
 
     item: Parameter | Container
-    offset: int = 0
+    offset: int | Size = 0
     from_start: bool = False
     condition: Condition | None = None
 
@@ -237,7 +239,7 @@ class Container:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Definition:
-    """What a set of XTCE documents defines; `roots` are the containers without a base, by name.
+    """Definitions of a set of XTCE documents; `roots` are the containers without a base, by name.
 
     `alarms_not_read` counts the alarms of its types that change no limit here. `size_tags` says what the sizes before
     texts count (``octets``, ``bits``, or both); it is empty without any. `extrapolates`: splines that do not state it
@@ -300,7 +302,7 @@ def _place_entries(
     """Add values of fixed place by (bit, width); return the place behind them, None if it is not fixed."""
     at: int | None = start
     for entry in entries:
-        if at is None or entry.condition is not None:
+        if at is None or entry.condition is not None or isinstance(entry.offset, Size):
             return None
         at = (start if entry.from_start else at) + entry.offset
         if isinstance(entry.item, Parameter):

@@ -368,8 +368,9 @@ class _Importer:
         """Return an entry that is repeated, as an array; the repetitions of a container are aggregates."""
         node.only(("Count", "Offset"))
         offset = node.child("Offset")
-        gap = Size(fixed=0) if offset is None else self.size(offset, system, least=0)
-        _expect(node, gap.fixed == 0, "repetitions without an Offset", "one")
+        gap = 0 if offset is None else self.size(offset, system, least=0).fixed
+        if offset is not None and gap is None:
+            raise offset.error("a FixedValue between repetitions", offset.children[0].tag)
         count = self.size(node.required("Count"), system, least=0)
         if isinstance(item, Container):
             plain = [
@@ -385,7 +386,7 @@ class _Importer:
             last = replace(count, lookup=tuple((condition, value - 1) for condition, value in count.lookup))
         else:
             last = replace(count, intercept=count.intercept - 1)
-        return replace(item, type=ArrayType(item.type.name, item.type, Size(fixed=0), last))
+        return replace(item, type=ArrayType(item.type.name, item.type, Size(fixed=0), last, gap or 0))
 
     # references
 
@@ -428,7 +429,7 @@ class _Importer:
         return start, getattr(start, kind)[name]
 
     def reference(self, node: Node, system: _System) -> tuple[Reference, ScalarType]:
-        """What a `parameterRef` names, and its type."""
+        """Return the parameter that a `parameterRef` names, and its type."""
         instance = node.attributes.get("instance", "0")
         _expect(node, instance == "0", "instance 0, the one of this packet", instance)
         text = node.attribute("parameterRef")
@@ -530,7 +531,6 @@ class _Importer:
         return made, self.values[id(found)]
 
     def aggregate(self, system: _System, node: Node) -> tuple[DataType, int]:
-        """An aggregate type."""
         node.only((*_DESCRIPTION, "MemberList"), _NAMED)
         listed = node.required("MemberList")
         listed.only(("Member",))
@@ -558,10 +558,8 @@ class _Importer:
             _expect(node, chain[-1][1].tag == node.tag, f"a base type that is a {node.tag}", chain[-1][1].tag)
         is_time = "Time" in node.tag
         for _, one in chain:
-            children = (
-                (*_DESCRIPTION, "Encoding", "ReferenceTime", *_ENCODINGS) if is_time else _TYPE_CHILDREN
-            )
-            one.only(children, _TYPE_ATTRIBUTES)
+            extra = ("Encoding", "ReferenceTime") if is_time else ()
+            one.only((*_TYPE_CHILDREN, *extra), _TYPE_ATTRIBUTES)
         encoding, place, home = None, node, system
         scale: tuple[float, float] | None = None
         for home, one in chain:
@@ -614,7 +612,7 @@ class _Importer:
             _expect(node, scale is None, "a number where scale and offset are given", "octets")
             return self.binary(node, system)
         node.only(
-            ("DefaultCalibrator", "ContextCalibratorList"),
+            ("ErrorDetectCorrect", "DefaultCalibrator", "ContextCalibratorList"),
             ("bitOrder", "byteOrder", "encoding", "sizeInBits", "changeThreshold"),
         )
         calibration = self.calibration(node, system)
@@ -646,7 +644,7 @@ class _Importer:
     def binary(self, node: Node, system: _System) -> BinaryEncoding:
         """Return the encoding of octets; of the algorithms, only a size in octets before them is supported."""
         children = ("SizeInBits", "FromBinaryTransformAlgorithm", "ToBinaryTransformAlgorithm")
-        node.only(children, ("bitOrder", "byteOrder"))
+        node.only((*children, "ErrorDetectCorrect"), ("bitOrder", "byteOrder"))
         _expect(node, not _is_little(node, 8), "octets in their order", "leastSignificantByteFirst")
         algorithm = node.child(children[1])
         if algorithm is None:
@@ -664,7 +662,7 @@ class _Importer:
 
     def string(self, node: Node, system: _System) -> StringEncoding:
         """A text: its buffer, and what says where the text ends in it."""
-        node.only(("SizeInBits", "Variable"), ("bitOrder", "byteOrder", "encoding"))
+        node.only(("SizeInBits", "Variable", "ErrorDetectCorrect"), ("bitOrder", "byteOrder", "encoding"))
         name = node.attributes.get("encoding", "UTF-8")
         _expect(node, name in _CHARSETS, f"encoding {', '.join(_CHARSETS)}", name)
         charset = _CHARSETS[name]
@@ -694,7 +692,7 @@ class _Importer:
             dynamic = holder.child("DynamicValue")
             name_of = dynamic.required("ParameterInstanceRef") if dynamic is not None else None
             if name_of is None or name_of.attributes.get("parameterRef") != _NO_PARAMETER:
-                size = self.size(holder, system, least=0, others=("TerminationChar", "LeadingSize"))
+                size = self.size(holder, system, 0, ("TerminationChar", "LeadingSize"), ("maxSizeInBits",))
         terminator, tag_bits, unit = b"", 0, 1
         if end is not None:
             try:
@@ -716,10 +714,17 @@ class _Importer:
         _expect(holder, size is not None or end is not None or tag is not None, "a size of the text", "none")
         return StringEncoding(charset, size, terminator, tag_bits, most, unit)
 
-    def size(self, node: Node, system: _System, least: int | None, others: tuple[str, ...] = ()) -> Size:
+    def size(
+        self,
+        node: Node,
+        system: _System,
+        least: int | None,
+        others: tuple[str, ...] = (),
+        attributes: tuple[str, ...] = (),
+    ) -> Size:
         """A fixed or dynamic number; a fixed one is not below `least`."""
         kinds = ("FixedValue", "DynamicValue", "DiscreteLookupList")
-        node.only((*kinds, *others), ("maxSizeInBits",) if others else ())
+        node.only((*kinds, *others), attributes)
         listed = [child for child in node.children if child.tag in kinds]
         _expect(node, len(listed) == 1, f"one of {', '.join(kinds)}", f"{len(listed)}")
         value = listed[0]
@@ -847,14 +852,15 @@ class _Importer:
             (*attributes, "shortDescription", "lastEntryForThisArrayInstance"),
         )
         location, condition = node.child("LocationInContainerInBits"), node.child("IncludeCondition")
-        offset, from_start = 0, False
+        offset: int | Size = 0
+        from_start = False
         if location is not None:
-            location.only(("FixedValue",), ("referenceLocation",))
             where = location.attributes.get("referenceLocation", "previousEntry")
             places = ("previousEntry", "containerStart")
             _expect(location, where in places, f"referenceLocation {' or '.join(places)}", where)
             from_start = where == "containerStart"
-            offset = _fixed(location.required("FixedValue"), 0 if from_start else None)
+            place = self.size(location, system, 0 if from_start else None, attributes=("referenceLocation",))
+            offset = place if place.fixed is None else place.fixed
         return Entry(
             item, offset, from_start, None if condition is None else self.condition(condition, system)
         )
@@ -884,6 +890,7 @@ def _check_order(root: Container, document: str) -> None:
 def _check_entries(entries: tuple[Entry, ...], names: dict[str, bool], place: str) -> None:
     """Add the parameters of entries to `names`, with whether they have one value; refuse references to others."""
     for entry in entries:
+        _check_known(references(entry.offset), names, place)
         if entry.condition is not None:
             _check_known(references(entry.condition), names, place)
             twice = sorted(_names_of(entry.item) & names.keys())
@@ -967,6 +974,8 @@ def _calibrator(node: Node, extrapolate: bool) -> Calibrator:
             _expect(term, 0 <= exponent <= MAX_EXPONENT, f"an exponent of 0 to {MAX_EXPONENT}", f"{exponent}")
             terms.append((_number(term, "coefficient", None), exponent))
         _expect(inner, bool(terms), "a Term", "none")
+        exponents = [exponent for _, exponent in terms]
+        _expect(inner, len(set(exponents)) == len(exponents), "each exponent once", str(exponents))
         return Polynomial(tuple(terms))
     inner.only(("SplinePoint", "AncillaryDataSet"), (*_NAMED, "order", "extrapolate"))
     points = sorted(
@@ -974,6 +983,9 @@ def _calibrator(node: Node, extrapolate: bool) -> Calibrator:
     )
     order = _integer(inner, "order", 1)
     _expect(inner, order in (0, 1), "order 0 or 1", f"{order}")
+    for point in inner.all("SplinePoint"):
+        own = _integer(point, "order", order)
+        _expect(point, own == order, f"order {order}, that of the calibrator", f"{own}")
     _expect(inner, len(points) >= 2, "two points or more", f"{len(points)}")
     rising = all(a[0] < b[0] for a, b in itertools.pairwise(points))
     _expect(inner, rising, "one calibrated value for each raw value", "two")
@@ -1114,5 +1126,6 @@ def _number(node: Node, name: str, default: float | None) -> float:
 def _boolean(node: Node, name: str, default: bool) -> bool:
     text = node.attributes.get(name, "true" if default else "false")
     known = {"true": True, "1": True, "false": False, "0": False}
-    _expect(node, text.lower() in known, f"true or false as {name}", repr(text))
-    return known[text.lower()]
+    plain = text.strip().lower()
+    _expect(node, plain in known, f"true or false as {name}", repr(text))
+    return known[plain]

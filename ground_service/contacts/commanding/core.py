@@ -64,7 +64,7 @@ class SentCommand:
 
 @dataclass(frozen=True, slots=True)
 class CommandFate:
-    """How far a command is known to have come: sent, accepted, started, completed or failed, and its reports."""
+    """Latest known stage of a command: sent, accepted, started, completed or failed, and its reports."""
 
     state: str
     timed_out: bool
@@ -72,7 +72,7 @@ class CommandFate:
 
 
 def fate_of(command: SentCommand, reports: Sequence[VerificationReport], now_utc_ns: int) -> CommandFate:
-    """What the reports say about a command; `timed_out` when its end is overdue at `now_utc_ns`."""
+    """Return the fate of a command by its reports; `timed_out` when its end is overdue at `now_utc_ns`."""
     mine = tuple(
         sorted(
             (

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from ground_service.contacts.commanding.core import DUPLICATE, OUT_OF_SEQUENCE, STAGES, CommandFate
-from ground_service.http.model import Entity, Given, InstanceName, Paging, SpacecraftNumber, UtcTime
+from ground_service.http.model import Entity, InstanceName, Paging, RequestModel, SpacecraftNumber, UtcTime
 from ground_service.ingest.model import ControlWords
 from ground_service.toml import LINE_PATTERN_JSON
 from lunar.timescales import format_utc, utc_ns_from_ticks
@@ -19,7 +19,7 @@ _FAILURES = dict(FAILURES)
 REMEDY = "; the payload expects other sequence counts: send perform_function resynchronise_commands first"
 
 
-class CommandEntry(Given):
+class CommandEntry(RequestModel):
     """A telecommand to be queued."""
 
     name: str = Field(max_length=64, examples=["perform_function"])
@@ -32,8 +32,8 @@ class CommandEntry(Given):
     timeout_s: int = Field(default=600, ge=1, le=86_400 * 30)
 
 
-class Rejection(Given):
-    """Why a telecommand is not to be sent."""
+class Rejection(RequestModel):
+    """Reason for the rejection of a telecommand."""
 
     reason: str = Field(min_length=1, max_length=500, pattern=LINE_PATTERN_JSON, examples=["wrong cadence"])
 
@@ -141,7 +141,7 @@ class CommandView:
 
     @property
     def remark(self) -> str:
-        """Why the telecommand failed, was rejected or timed out."""
+        """Reason why the telecommand failed, was rejected or timed out."""
         if self.fate is None:
             return self.record.reason or ""
         stages = [STAGES.get(report.subtype, str(report.subtype)) for report in self.fate.reports]
@@ -184,7 +184,7 @@ class CommandView:
 
 
 class Handover(Entity):
-    """What a shift hands over to the next one about a spacecraft: a note, and the hold of its telecommands."""
+    """Handover of a spacecraft to the next shift: a note, and the hold of its telecommands."""
 
     spacecraft_id: int = Field(examples=[76])
     instance: str = Field(examples=["flight"])
@@ -198,7 +198,7 @@ class Handover(Entity):
     hold_reason: str = ""
 
 
-class HandoverNote(Given):
+class HandoverNote(RequestModel):
     """Note for the next shift; replaces the one before, which the audit log keeps."""
 
     note: str = Field(max_length=2000, examples=["Camera warm since orbit 12, see alarm 3."])

@@ -33,11 +33,12 @@ from ground_service.contacts.commanding.model import (
 from ground_service.http.model import PageOf
 from ground_service.ingest.core import LONGEST_SILENCE, LONGEST_STEP
 from ground_service.ingest.doubt_store import latest_ticks
-from ground_service.ingest.parameters import readable_version
-from ground_service.store import repository, telemetry
+from ground_service.store import repository
 from ground_service.store.states import TELECOMMAND, change_if, move, move_all
 from ground_service.store.vehicles import get_vehicle
-from lunar.constants import NANOSECONDS_PER_SECOND
+from ground_service.telemetry import store as telemetry
+from ground_service.telemetry.decoding import readable_version
+from lunar.constants import NS
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.packets.stream import cut_packets
 
@@ -243,7 +244,7 @@ def views_of_unnoted_timeouts(
     connection: Connection, since_utc_ns: int, until_utc_ns: int, now_utc_ns: int
 ) -> list[CommandView]:
     """Return the sent telecommands whose timeout ends in an interval and is not recorded."""
-    due = TELECOMMANDS.c.sent_utc_ns + cast(TELECOMMANDS.c.timeout_s, BigInteger) * NANOSECONDS_PER_SECOND
+    due = TELECOMMANDS.c.sent_utc_ns + cast(TELECOMMANDS.c.timeout_s, BigInteger) * NS
     query = select(TELECOMMANDS).where(
         TELECOMMANDS.c.state == "sent",
         TELECOMMANDS.c.timeout_noted_utc_ns.is_(None),
@@ -424,9 +425,9 @@ def _fates(
             VERIFICATIONS.c.request_id.in_(requests),
         )
     )
-    told: dict[int, list[VerificationReport]] = {}
+    by_request: dict[int, list[VerificationReport]] = {}
     for row in reports:
-        told.setdefault(row.request_id, []).append(VerificationReport(*row))
+        by_request.setdefault(row.request_id, []).append(VerificationReport(*row))
     copies = connection.execute(
         select(
             TELECOMMANDS.c.request_id,
@@ -445,7 +446,7 @@ def _fates(
         boot = next((row[3] for row in copies if row[1] == key), None)
         fates[key] = fate_of(
             replace(one, repeated_after_ticks=min(later, default=None), boot=boot),
-            told.get(one.request_id, ()),
+            by_request.get(one.request_id, ()),
             now_utc_ns,
         )
     return fates
@@ -467,5 +468,5 @@ def _sent(record: CommandRecord) -> SentCommand | None:
         sent_utc_ns=record.sent_utc_ns,
         sent_after_ticks=record.sent_after_ticks,
         repeated_after_ticks=None,
-        timeout_ns=record.timeout_s * NANOSECONDS_PER_SECOND,
+        timeout_ns=record.timeout_s * NS,
     )

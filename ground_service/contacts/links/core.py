@@ -6,11 +6,10 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris
 from lunar.visibility import GroundStation, find_windows, link
 
-NS = NANOSECONDS_PER_SECOND
 STEP_S = 120.0
 """A contact behind the limb lasts an hour and more; shorter ones than this may be missed."""
 

@@ -12,7 +12,7 @@ from ground_service.contacts.links import service
 from ground_service.contacts.links.core import NS
 from ground_service.contacts.links.model import Contacts, LinkStatus
 from ground_service.http.common import GroundOf
-from ground_service.http.model import GivenTime, PageOf
+from ground_service.http.model import PageOf, RequestTime
 from ground_service.http.requests import operations, problems
 
 links = operations("links")
@@ -44,8 +44,8 @@ def send_link(ground: GroundOf, caller: Operator, name: LinkName) -> LinkStatus:
 def list_contacts(
     ground: GroundOf,
     caller: Viewer,
-    since: Annotated[GivenTime | None, Query(description="Default: a day before mission time")] = None,
-    until: Annotated[GivenTime | None, Query(description="Default: two days after `since`")] = None,
+    since: Annotated[RequestTime | None, Query(description="Default: a day before mission time")] = None,
+    until: Annotated[RequestTime | None, Query(description="Default: two days after `since`")] = None,
     link: Annotated[str | None, Query(max_length=64, description="Contacts of this link only")] = None,
 ) -> Contacts:
     """List contacts that took place, were missed or are predicted from the geometry of the stations."""

@@ -68,7 +68,7 @@ class Connector:
 
     @property
     def connected(self) -> bool:
-        """Whether the connection is open."""
+        """Return whether the connection is open."""
         return self._socket is not None
 
     def connect(self) -> bool:
@@ -248,7 +248,7 @@ class LinkRunner:
 
     @property
     def waits_for_others(self) -> bool:
-        """Whether telecommands wait for earlier ones of another link."""
+        """Return whether telecommands wait for earlier ones of another link."""
         return self._waits_s is not None
 
     @property
@@ -258,7 +258,7 @@ class LinkRunner:
 
     @property
     def alive(self) -> bool:
-        """Whether the link is operated: started, not stopped, and owned."""
+        """Return whether the link is operated: started, not stopped, and owned."""
         return bool(self._threads) and all(one.is_alive() for one in self._threads)
 
     def start(self) -> None:
@@ -329,9 +329,9 @@ class LinkRunner:
         self._contact = self._ground.read(store.open_contact, self._name)
         if self._contact is not None:
             # When octets in the spool were received is not known: now at the latest.
-            heard = None if left else service.last_heard_ns(self._ground, self._name)
+            received_ns = None if left else service.last_reception_ns(self._ground, self._name)
             self._progress.heard_utc_ns = (
-                max(self._contact.start_utc_ns, heard or 0) if heard else mission_now_ns()
+                max(self._contact.start_utc_ns, received_ns or 0) if received_ns else mission_now_ns()
             )
         self._opened = True
         self._work.set()
@@ -399,10 +399,10 @@ class LinkRunner:
     def _hear(self) -> None:
         """Note a reception now; after a silence it starts a new contact."""
         now = mission_now_ns()
-        heard = self._progress.heard_utc_ns
-        if self._contact is not None and heard is not None and self._was_silent_since(heard):
+        received_ns = self._progress.heard_utc_ns
+        if self._contact is not None and received_ns is not None and self._was_silent_since(received_ns):
             self._cut()
-            self._finish_contact(heard, wait=True)
+            self._finish_contact(received_ns, wait=True)
         if self._contact is None:
             if self._progress.ends_whole:  # else the next octets may belong to the frame that was cut
                 self._spool.begin()
@@ -412,10 +412,10 @@ class LinkRunner:
         self._progress.empty_utc_ns = None
 
     def _follow_contact(self) -> None:
-        now, heard = mission_now_ns(), self._progress.heard_utc_ns
-        if self._contact is not None and heard is not None and self._was_silent_since(heard):
+        now, received_ns = mission_now_ns(), self._progress.heard_utc_ns
+        if self._contact is not None and received_ns is not None and self._was_silent_since(received_ns):
             self._cut()
-            self._finish_contact(heard, wait=False)
+            self._finish_contact(received_ns, wait=False)
         if time.monotonic() - self._missed_s >= MISSED_S and self._contact is None:
             self._missed_s = time.monotonic()
             fault = self._down.fault if self._down is not None else None
@@ -436,9 +436,9 @@ class LinkRunner:
     def _silence_s(self) -> float:
         return self.declared.link.silence_s
 
-    def _was_silent_since(self, heard: int) -> bool:
+    def _was_silent_since(self, received_ns: int) -> bool:
         empty = self._progress.empty_utc_ns
-        return empty is not None and core.is_silent(heard, empty, self._silence_s)
+        return empty is not None and core.is_silent(received_ns, empty, self._silence_s)
 
     def _send(self) -> None:
         if self._up is None:
@@ -614,7 +614,7 @@ class LinkRunner:
 
     def _report(self, path: Path, result: dict[str, Any] | GroundError) -> None:
         octets = path.stat().st_size if path.is_file() else 0
-        heard = self._progress.cut_utc_ns.pop(path.name, None)
+        received_ns = self._progress.cut_utc_ns.pop(path.name, None)
         made = result["result"] if isinstance(result, dict) else None
         if isinstance(result, GroundError):
             log.warning("link %s: %s: %s", self._name, path.name, result)
@@ -624,8 +624,8 @@ class LinkRunner:
             self._name,
             None if contact is None else contact.id,
             octets,
-            heard,
-            _clock_offset_ns(made, heard),
+            received_ns,
+            _clock_offset_ns(made, received_ns),
         )
         self._remark = "" if made is None else made.remark
         self._progress.frame_octets = _frame_octets(made)

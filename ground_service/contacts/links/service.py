@@ -2,7 +2,7 @@
 
 A transmission is taken in one transaction with the state "sent" of its telecommands, and marked when its octets are on
 the wire. A process that ends between the two leaves a pending transmission, which the next owner of the link sends.
-Telecommands of which nothing was heard by the next contact are transmitted again: the payload refuses the second copy
+Telecommands without a report by the next contact are transmitted again: the payload refuses the second copy
 of a command that it has accepted. A transmission that its station refuses, because another one has the contact now, is
 given to the link of that station.
 """
@@ -64,7 +64,7 @@ class DeclaredLink:
 
 @dataclass(frozen=True, slots=True)
 class SendDue:
-    """Whether a transmission was requested, the number of the request, and whether transmissions are pending."""
+    """Requested transmission, the number of the request, and whether transmissions are pending."""
 
     requested: bool
     request: int
@@ -223,7 +223,7 @@ def owners(ground: Ground) -> dict[str, str | None]:
     }
 
 
-def last_heard_ns(ground: Ground, name: str) -> int | None:
+def last_reception_ns(ground: Ground, name: str) -> int | None:
     """Return the mission time of the newest ingested reception of a link; None if nothing was received."""
     found = ground.read(store.find_link, name)
     return None if found is None else found.heard_utc_ns
@@ -238,8 +238,8 @@ def silent_contacts(ground: Ground) -> list[str]:
             row, contact = store.find_link(connection, name), store.open_contact(connection, name)
             if row is None or contact is None:
                 continue
-            heard = max(contact.start_utc_ns, row.heard_utc_ns or 0)
-            if core.is_silent(heard, now, declared.link.silence_s):
+            received_ns = max(contact.start_utc_ns, row.heard_utc_ns or 0)
+            if core.is_silent(received_ns, now, declared.link.silence_s):
                 found.append(name)
     return found
 
@@ -312,7 +312,7 @@ def note_reception(
         store.add_octets(connection, name, octets)
         if contact_id is not None:
             store.count_in_contact(connection, contact_id, octets=octets)
-        store.note_heard(connection, name, heard_utc_ns, offset_ns)
+        store.note_reception(connection, name, heard_utc_ns, offset_ns)
 
 
 def note_missed(ground: Ground, declared: DeclaredLink, owner: str, now_utc_ns: int, why: str) -> int:
@@ -431,13 +431,13 @@ def repeat_unconfirmed(ground: Ground, declared: DeclaredLink, contact: ContactR
     if declared.link.uplink is None:
         return 0
     with ground.database.reading() as connection:
-        heard = store.last_contact_stop(connection, contact.vehicle_id, contact.id)
-        if heard is None:
+        received_ns = store.last_contact_stop(connection, contact.vehicle_id, contact.id)
+        if received_ns is None:
             return 0
         earlier = store.transmitted_before(
             connection,
             contact.vehicle_id,
-            min(heard, contact.start_utc_ns),
+            min(received_ns, contact.start_utc_ns),
             contact.start_utc_ns - REPEAT_WITHIN_NS,
             REPEAT_ATTEMPTS,
         )

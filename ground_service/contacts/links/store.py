@@ -144,7 +144,9 @@ def add_octets(connection: Connection, name: str, octets: int) -> None:
     connection.execute(statement)
 
 
-def note_heard(connection: Connection, name: str, heard_utc_ns: int | None, offset_ns: int | None) -> None:
+def note_reception(
+    connection: Connection, name: str, heard_utc_ns: int | None, offset_ns: int | None
+) -> None:
     """Record when something was received over a link, and the offset of the station's clock; None changes nothing."""
     given = {"heard_utc_ns": heard_utc_ns, "clock_offset_ns": offset_ns}
     values = {key: value for key, value in given.items() if value is not None}

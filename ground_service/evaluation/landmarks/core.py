@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ground_service.evaluation.recall import ExpectedCraters, Matches
-from ground_service.passes.samples import DetectionSamples
+from ground_service.telemetry.samples import DetectionSamples
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, above_horizon, intersect_sphere
 from lunar.catalogue import NAVIGATION_MINIMUM_M, CraterCatalogue
@@ -166,7 +166,6 @@ def same_place(one: Place, other: Place) -> bool:
 
 
 def is_listed(place: Place, catalogue: CraterCatalogue) -> bool:
-    """Return whether a place is a crater of a catalogue."""
     near = catalogue.near(place.latitude_rad, place.longitude_rad, REACH * place.diameter_m)
     columns = (catalogue.latitude_rad[near], catalogue.longitude_rad[near], catalogue.diameter_m[near])
     return any(

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from ground_service.http.model import Entity, Given, Paging, SpacecraftNumber, UtcTime
+from ground_service.http.model import Entity, Paging, RequestModel, SpacecraftNumber, UtcTime
 from ground_service.toml import LINE_PATTERN_JSON
 
 LandmarkState = Literal["seen", "proposed", "accepted", "rejected"]
@@ -79,8 +79,8 @@ class LandmarkDetail(Landmark):
     evidence: list[PassSightings]
 
 
-class LandmarkDecision(Given):
-    """Why a landmark is accepted or rejected."""
+class LandmarkDecision(RequestModel):
+    """Reason for accepting or rejecting a landmark."""
 
     reason: str = Field(
         default="", max_length=500, pattern=LINE_PATTERN_JSON, examples=["crater in all images"]
@@ -88,7 +88,7 @@ class LandmarkDecision(Given):
 
 
 class LandmarkUpdate(Entity):
-    """What a pass has contributed to the landmarks."""
+    """Contribution of a pass to the landmarks."""
 
     pass_id: int
     detections: int

@@ -47,13 +47,13 @@ from ground_service.missions.service import mission_of_pass
 from ground_service.passes import store as passes
 from ground_service.passes.archive_import import list_images
 from ground_service.passes.sample_store import sample_arrays
-from ground_service.passes.samples import DetectionSamples
 from ground_service.passes.span import pass_span
 from ground_service.store import repository
 from ground_service.store.event_kinds import LandmarkChanged, publish
 from ground_service.store.files import files_beginning
 from ground_service.store.states import LANDMARK, change_if, move
 from ground_service.store.vehicles import get_vehicle, lock_spacecraft
+from ground_service.telemetry.samples import DetectionSamples
 from lunar.arrays import FloatArray
 from lunar.catalogue import CraterCatalogue, make_catalogue
 from tmtc.dictionary.payload import DICTIONARY
@@ -99,7 +99,6 @@ def add_landmark(
     now_utc_ns: int,
     **figures: Any,
 ) -> int:
-    """Add a landmark; return its id."""
     values = {"created_utc_ns": now_utc_ns, "changed_utc_ns": now_utc_ns, **figures}
     key = repository.add(
         connection, _LANDMARKS, spacecraft_id=spacecraft_id, state=state, evidence=_rows(evidence), **values

@@ -10,7 +10,7 @@ from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.evaluation.performance import service
 from ground_service.evaluation.performance.model import MonthlyReport, Performance
 from ground_service.http.common import GroundOf, Key
-from ground_service.http.model import GivenTime, InstanceName, ns_of
+from ground_service.http.model import InstanceName, RequestTime, ns_of
 from ground_service.http.requests import operations
 from ground_service.store.vehicles import FLOWN
 
@@ -31,8 +31,8 @@ def get_performance(
         InstanceName | None,
         Query(description="Default: the flown one if it has passes, otherwise all imported passes"),
     ] = None,
-    start: GivenTime | None = None,
-    stop: GivenTime | None = None,
+    start: RequestTime | None = None,
+    stop: RequestTime | None = None,
     window_days: Annotated[
         float, Query(gt=0.0, le=3660.0, description="Length of the rolling window of the requirements")
     ] = service.WINDOW_DAYS,

@@ -15,9 +15,11 @@ from sqlalchemy import Connection, func, select
 
 from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.errors import DatabaseBusy, InvalidInput, NotFound, Stopping, fault_of
+from ground_service.evaluation.alignment import bounds_per_degree
 from ground_service.evaluation.model import PassFigures, StoredReport
 from ground_service.evaluation.performance.core import (
     ALTITUDE_EDGES_KM,
+    CONFIDENCE,
     FALSE_ALARM_RATE,
     METRICS,
     SUN_EDGES_DEG,
@@ -40,6 +42,7 @@ from ground_service.evaluation.performance.model import (
 )
 from ground_service.evaluation.service import PREFERRED_ESTIMATORS
 from ground_service.evaluation.store import newest_reports
+from ground_service.evaluation.verdict import NEES_DEGREES
 from ground_service.ground import Ground
 from ground_service.http.model import Entity, PageOf, UtcTime
 from ground_service.passes.model import PassRecord
@@ -47,6 +50,7 @@ from ground_service.store import repository
 from ground_service.store.files import register_file
 from ground_service.store.vehicles import FLOWN, get_vehicle
 from lunar.timescales import format_utc, parse_utc
+from reports.statistics import sigma_remark
 from reports.values import (
     HeadlineFigure,
     LevelChange,
@@ -118,7 +122,6 @@ def add_monthly_report(connection: Connection, report: StoredMonthlyReport) -> b
 
 
 def get_monthly_report(connection: Connection, report_id: str) -> StoredMonthlyReport:
-    """Return a monthly report."""
     return StoredMonthlyReport.of(repository.get(connection, _MONTHLY, report_id, "monthly report"))
 
 
@@ -288,6 +291,7 @@ def _pass_performance(record: PassRecord, report: StoredReport, figures: PassFig
         median_error_m=None if errors is None else errors.median_3d_m,
         altitude_km=None if conditions is None else conditions.altitude_km,
         sun_elevation_deg=None if conditions is None else conditions.sun_elevation_deg,
+        map_offset_m=None if conditions is None else conditions.map_offset_m,
         terrain=figures.evidence_level,
         build="" if conditions is None else conditions.build,
         frames=figures.frames,
@@ -387,9 +391,28 @@ def _requirements(found: Sequence[Reported], window_ns: int) -> list[RollingRequ
                 low=_known(share.low),
                 high=_known(share.high),
                 lowest_share=min(shares, default=None),
+                remark=_consistency_remark(
+                    key, [row[key].value for row in rows[-sum(last.values()) :] if key in row]
+                ),
             )
         )
     return requirements
+
+
+def _consistency_remark(key: str, values: Sequence[float | None]) -> str:
+    """Return whether the mean NEES or NIS per degree of some passes, each at least one draw, is outside its bounds.
+
+    The bounds of the NEES are those of chi-square, of the NIS those of Student's t: a pass has many draws of it.
+    """
+    known = [value for value in values if value is not None]
+    if not key.startswith("consistency.") or len(known) < 2:
+        return ""
+    level = mean_level(known)
+    low, high = 1.0 - level.high + level.mean, 1.0 + level.mean - level.low
+    if key == "consistency.nees":
+        low, high = bounds_per_degree(NEES_DEGREES, len(known), CONFIDENCE)
+    wrong = sigma_remark(level.mean, low, high)
+    return f"mean {level.mean:.2f} of {len(known)} passes: {wrong}" if wrong else ""
 
 
 def make_monthly_report(

@@ -24,12 +24,14 @@ from ground_service.store.event_kinds import EphemerisAdded, publish
 from ground_service.store.files import StoredFile, register_file
 from ground_service.store.vehicles import hold
 from lunar import ephemeris
-from lunar.comparison import check_gravity
+from lunar.comparison import check_pointing
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris as States
-from lunar.errors import LunarError, UnmovedByGravity
+from lunar.errors import EphemerisError, LunarError, UnmovedByGravity
 from lunar.frames import ICRF_NAMES
-from lunar.messages.aem import parse_aem
-from lunar.messages.ephemeris_files import load_ephemeris
+from lunar.messages.aem import CAMERA_NAMES, parse_aem
+from lunar.messages.ephemeris_files import load_ephemeris, load_orbit
+from lunar.timescales import TICKS_PER_SECOND
 
 EPHEMERIDES = repository.EPHEMERIDES
 
@@ -67,7 +69,6 @@ def find_ephemeris(connection: Connection, *, sha256: str, precedence: int, name
 
 
 def get_ephemeris(connection: Connection, ephemeris_id: int) -> Ephemeris:
-    """Return an ephemeris."""
     return _ephemeris(repository.get(connection, EPHEMERIDES, ephemeris_id, "ephemeris"))
 
 
@@ -128,8 +129,7 @@ def add_ephemeris(
         If it is that of an object of another mission than those of the caller.
     """
     try:
-        ephemeris = load_ephemeris(stored.path)
-        check_gravity(ephemeris)
+        ephemeris = load_orbit(stored.path)
     except UnmovedByGravity as error:
         raise InvalidInput("ephemeris", error.where, error.expected, error.found) from None
     except LunarError as error:
@@ -201,10 +201,10 @@ def _loaded(path: str) -> States:
 
 
 ATTITUDE_FILES = ("attitude.csv", "attitude.aem")
-CAMERA_NAMES = ("INSTRUMENT", "CAMERA")
-"""Beginnings of the names of the camera axes in an AEM."""
-
 HEADER = "image_ticks,q_w,q_x,q_y,q_z"
+_MANY = 8
+"""Attitudes from which their span is compared with that of the pass."""
+
 UNIT_TOLERANCE = 1e-3
 """Accepted deviation of a quaternion from unit length: attitude control reports have few digits."""
 
@@ -273,9 +273,33 @@ def load_attitudes(path: Path, source: str = "attitude.csv") -> AttitudeTable:
             raise InvalidInput(
                 source, f"line {number}", "on-board ticks and a unit quaternion", repr(line[:80])
             )
+        if time in ticks[-1:]:
+            raise InvalidInput(source, f"line {number}", "one attitude of an image", f"{time} again")
         ticks.append(time)
         quaternions.append(quaternion)
     return AttitudeTable(np.array(ticks, dtype=np.int64), np.array(quaternions).reshape(-1, 4))
+
+
+def check_attitudes(table: AttitudeTable, reference: States, start_utc_ns: int, stop_utc_ns: int) -> None:
+    """Refuse attitudes of other times than those of a pass, or of a camera that looks away from the Moon.
+
+    Raises
+    ------
+    EphemerisError
+        The attitudes are not those of the pass.
+    """
+    if not len(table.q_wxyz):
+        return
+    # The clock on board may not be set, but it counts seconds.
+    since_s = (table.image_ticks - table.image_ticks.min(initial=1 << 48)) / TICKS_PER_SECOND
+    utc_ns = start_utc_ns + np.rint(NS * since_s).astype(np.int64) if table.utc_ns is None else table.utc_ns
+    spanned_s, most_s = float(np.ptp(utc_ns)) / NS, (stop_utc_ns - start_utc_ns) / NS
+    if len(utc_ns) >= _MANY and not most_s / _MANY <= spanned_s <= 2.0 * most_s:
+        raise EphemerisError(
+            f"attitudes: expected times that span {most_s / _MANY:.0f} to {2.0 * most_s:.0f} s, found "
+            f"{spanned_s:.6g} s: another unit (ticks are 2^-16 s)?"
+        )
+    check_pointing(reference, np.sort(utc_ns), table.q_wxyz[np.argsort(utc_ns)])
 
 
 def _of_message(text: str, source: str) -> AttitudeTable:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ground_service.errors import EvaluationError
 from lunar.arrays import BoolArray, IntArray
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from lunar.plausible import STATION_DIFFERENCE_NS, WHOLE_SECONDS
 from lunar.timescales import (
     ONBOARD_EPOCH_TAI_NS,
@@ -69,7 +69,7 @@ class TimeCorrelation:
         """UTC (n,) of on-board ticks (n,)."""
         since = np.asarray(ticks, dtype=np.int64) - self.reference_ticks
         whole, part = np.divmod(since, TICKS_PER_SECOND)  # the product overflows after two years
-        nominal = whole * NANOSECONDS_PER_SECOND + part * _NS_NUMERATOR // _NS_DENOMINATOR
+        nominal = whole * NS + part * _NS_NUMERATOR // _NS_DENOMINATOR
         drift = np.rint(nominal * (self.drift_ppb * 1e-9)).astype(np.int64)
         tai = int(tai_ns_from_utc_ns(self.reference_utc_ns)) + nominal + drift
         return np.asarray(utc_ns_from_tai_ns(tai), dtype=np.int64)
@@ -99,7 +99,7 @@ def largest_step_s(runs: Sequence[TimeCorrelation], after_utc_ns: int, until_utc
         utc_ns, shown_ns = int(run.utc_ns(begin)[0]), int(last.utc_ns(begin)[0])
         if after_utc_ns < utc_ns <= until_utc_ns:
             largest_ns = max(largest_ns, abs(utc_ns - shown_ns))
-    return largest_ns / NANOSECONDS_PER_SECOND
+    return largest_ns / NS
 
 
 def ticks_of_utc_ns(utc_ns: int, correlations: Sequence[TimeCorrelation]) -> int:
@@ -227,7 +227,7 @@ def doubted_stations(
     """
     sent = np.asarray(tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - light_time_ns
     whole, part = np.divmod(np.asarray(ticks, dtype=np.int64), TICKS_PER_SECOND)
-    nominal = whole * NANOSECONDS_PER_SECOND + part * _NS_NUMERATOR // _NS_DENOMINATOR
+    nominal = whole * NS + part * _NS_NUMERATOR // _NS_DENOMINATOR
     off = (nominal + ONBOARD_EPOCH_TAI_NS - sent).astype(np.float64)
     kept = np.ones(len(ticks), dtype=np.bool_)
     names = np.array(station)

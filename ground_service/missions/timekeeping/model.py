@@ -4,37 +4,37 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from ground_service.http.model import Entity, Given, GivenTime, UtcTime
+from ground_service.http.model import Entity, RequestModel, RequestTime, UtcTime
 
 RECEPTIONS_LIMIT = 100_000
 """Largest number of reception times of time reports of a vehicle."""
 
 
-class TimePointIn(Given):
+class TimePointIn(RequestModel):
     """A time report as it was received."""
 
     ticks: int = Field(ge=0, lt=2**48, description="On-board time, 2^-16 s")
-    received: GivenTime = Field(description="Earth reception time")
+    received: RequestTime = Field(description="Earth reception time")
     light_time_s: float = Field(ge=0.0, le=10.0, allow_inf_nan=False, examples=[1.28])
     boot_count: int = Field(default=0, ge=0, le=65_535)
 
 
-class TimePoints(Given):
+class TimePoints(RequestModel):
     """Time reports of one spacecraft."""
 
     points: list[TimePointIn] = Field(min_length=1, max_length=10_000)
 
 
-class ReceptionIn(Given):
+class ReceptionIn(RequestModel):
     """Earth reception time of a time report; its packet may arrive before or after this."""
 
     packet_ticks: int = Field(ge=0, lt=2**48, description="On-board time in the packet's header, 2^-16 s")
     sequence_count: int = Field(ge=0, lt=2**14, description="Count in the packet's header")
-    received: GivenTime
+    received: RequestTime
     station: str = Field(default="", max_length=64, description="Empty: light time to the Earth's centre")
 
 
-class Receptions(Given):
+class Receptions(RequestModel):
     """Receptions of time reports of one spacecraft."""
 
     receptions: list[ReceptionIn] = Field(min_length=1, max_length=10_000)

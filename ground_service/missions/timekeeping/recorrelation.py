@@ -72,7 +72,7 @@ _LINE = (
 
 @dataclass(frozen=True, slots=True)
 class ReceivedReport:
-    """When a time report came to the Earth: the on-board time and the count in its header say which it is."""
+    """Reception of a time report on the Earth; on-board time and count of its header identify it."""
 
     ticks: int
     sequence_count: int

@@ -8,10 +8,10 @@ from pydantic import Field
 
 from ground_service.http.model import (
     Entity,
-    Given,
-    GivenTime,
     InstanceName,
     Paging,
+    RequestModel,
+    RequestTime,
     SpacecraftNumber,
     UtcTime,
 )
@@ -63,16 +63,16 @@ class AlarmDetail(Alarm):
     history: list[AlarmChange]
 
 
-class Acknowledgement(Given):
+class Acknowledgement(RequestModel):
     """Acknowledgement of an alarm."""
 
     comment: str = Field(default="", max_length=500)
 
 
-class Shelving(Given):
+class ShelveRequest(RequestModel):
     """Suppression of an alarm until a mission time; one in the past ends it."""
 
-    until: GivenTime
+    until: RequestTime
     comment: str = Field(default="", max_length=500)
 
 

@@ -6,7 +6,7 @@ from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.http.common import GroundOf, RowId
 from ground_service.http.requests import operations
 from ground_service.passes.alarms import service
-from ground_service.passes.alarms.model import Acknowledgement, AlarmDetail, Shelving
+from ground_service.passes.alarms.model import Acknowledgement, AlarmDetail, ShelveRequest
 
 alarms = operations("alarms")
 
@@ -29,6 +29,6 @@ def acknowledge_alarm(
 
 
 @alarms.post("/alarms/{alarm_id}/shelve")
-def shelve_alarm(ground: GroundOf, caller: Operator, alarm_id: RowId, given: Shelving) -> AlarmDetail:
+def shelve_alarm(ground: GroundOf, caller: Operator, alarm_id: RowId, given: ShelveRequest) -> AlarmDetail:
     """Suppress an alarm until a mission time; one in the past ends this."""
     return service.shelve_alarm(ground, alarm_id, given.until.utc_ns, given.comment, actor=caller.name)

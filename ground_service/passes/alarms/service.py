@@ -32,11 +32,13 @@ from ground_service.passes.alarms.model import (
     AlarmDetail,
     AlarmFilter,
 )
-from ground_service.store import models, parameters, states, telemetry
+from ground_service.store import models, states
 from ground_service.store.event_kinds import AlarmChanged, publish
 from ground_service.store.repository import VEHICLES, Row, add_new, page
 from ground_service.store.states import StateMachine
 from ground_service.store.vehicles import FLOWN, lock_vehicle, vehicle_id
+from ground_service.telemetry import store as telemetry
+from ground_service.telemetry import values as parameters
 from lunar.timescales import format_utc
 from tmtc.dictionary.payload import STRUCTURES
 
@@ -193,7 +195,6 @@ def note_change(
 
 
 def get(connection: Connection, alarm_id: int) -> AlarmRow:
-    """Return an alarm."""
     row = connection.execute(_select().where(_ALARMS.c.id == alarm_id)).mappings().first()
     if row is None:
         raise NotFound("alarm", alarm_id)

@@ -18,7 +18,6 @@ from ground_service.regression.gates.core import (
     FAIL,
     NOT_JUDGED,
     PASS_SPREAD,
-    Gate,
     GatePolicy,
     verdict_of,
 )
@@ -32,6 +31,7 @@ from ground_service.regression.gates.statistics import (
     student_upper_tail,
 )
 from ground_service.regression.model import Calibration, Noise
+from reports.values import Gate
 
 PLACEBO_LEVEL = 0.05
 DOUBT = 1e-3

@@ -58,6 +58,7 @@ from ground_service.regression.gates.statistics import (
     student_upper_tail,
 )
 from reports.text import counted, loss_text
+from reports.values import Gate
 
 PASS, FAIL, INCONCLUSIVE = "pass", "fail", "inconclusive"
 NOT_JUDGED, INFORMS = "not judged", "informs"
@@ -153,61 +154,6 @@ class GatePolicy:
     inconclusive: str = "failure"
 
 
-@dataclass(frozen=True, slots=True)
-class Gate:
-    """Decision of one gate, or the change of a metric that informs.
-
-    Attributes
-    ----------
-    outcome
-        "pass", "fail", "inconclusive", "not judged" or "informs".
-    pass_name
-        Pass or kind of terrain; empty for all passes.
-    baseline, candidate
-        Values of the metric; NaN where unknown.
-    margin, limit
-        Tolerated loss, and the baseline with this loss.
-    change_low, change_high
-        One-sided 95 % bounds of the loss: a difference, or a share of the baseline. Positive is worse.
-    p_value, level
-        Of the test against no loss, and the level of the fail claim; NaN for exact gates.
-    resolution
-        Loss that these frames find with a power of 0.8; infinite if none.
-    frames, frames_needed
-        Number of compared frames, and number that decides an inconclusive gate; None if unknown.
-    evidence
-        Number and name of the units.
-    reason
-        The fact in words, where the figures alone do not state it.
-    relative
-        Whether margin, change and resolution are shares of the baseline.
-    """
-
-    name: str
-    outcome: str
-    baseline: float
-    candidate: float
-    margin: float
-    limit: float
-    unit: str = ""
-    pass_name: str = ""
-    change_low: float = math.nan
-    change_high: float = math.nan
-    p_value: float = math.nan
-    level: float = math.nan
-    resolution: float = 0.0
-    frames: int = 0
-    frames_needed: int | None = None
-    evidence: str = ""
-    reason: str = ""
-    relative: bool = False
-
-    @property
-    def passed(self) -> bool:
-        """Whether the gate passed."""
-        return self.outcome == PASS
-
-
 def judge(
     before: Mapping[str, PassFrames],
     after: Mapping[str, PassFrames],
@@ -278,12 +224,12 @@ def _exact_gate(
     worst = max(found, key=lambda name: found[name].candidate - found[name].baseline, default="")
     unit = "packets" if rule.metric in (UNDECODABLE, TIMES) else "frames"
     more = sum(one.candidate > one.baseline for one in found.values()) - 1
-    told = f"{worst}: {found[worst].text}" + (f" (and on {more} more)" if more else "") if failed else ""
+    reason = f"{worst}: {found[worst].text}" + (f" (and on {more} more)" if more else "") if failed else ""
     if not found:
-        told = "it is unknown without a reference"
+        reason = "it is unknown without a reference"
     limit = then + tolerated
     outcome = FAIL if failed else PASS if found else NOT_JUDGED
-    return Gate(rule.metric, outcome, then, now, tolerated, limit, unit, frames=frames, reason=told)
+    return Gate(rule.metric, outcome, then, now, tolerated, limit, unit, frames=frames, reason=reason)
 
 
 def _cost_gate(
@@ -298,9 +244,9 @@ def _cost_gate(
     old, new = (np.array([metric.value(side[name]) for name in pictured]) for side in (before, after))
     known = np.isfinite(old + new)
     if not known.any():
-        told = "it was not measured for both builds"
+        reason = "it was not measured for both builds"
         return Gate(
-            metric.name, NOT_JUDGED, math.nan, math.nan, rule.margin, math.nan, metric.unit, reason=told
+            metric.name, NOT_JUDGED, math.nan, math.nan, rule.margin, math.nan, metric.unit, reason=reason
         )
     if metric.name == MEMORY:
         margin, then, now = rule.margin, old[known].max(), new[known].max()
@@ -310,9 +256,9 @@ def _cost_gate(
         now = then * float(np.median(new[known] / old[known]))
     # A program that starts or runs in a tenth of a second has no time to speak of.
     limit = max(then * (1.0 + margin), then + START_FLOOR_S * (metric.name in (START, RUN)))
-    told = f"{COSTS[metric.name]} rises from {then:.4g} to {now:.4g} {metric.unit}" if now > limit else ""
-    outcome = FAIL if told else PASS
-    return Gate(metric.name, outcome, then, now, margin, limit, metric.unit, frames=frames, reason=told)
+    reason = f"{COSTS[metric.name]} rises from {then:.4g} to {now:.4g} {metric.unit}" if now > limit else ""
+    outcome = FAIL if reason else PASS
+    return Gate(metric.name, outcome, then, now, margin, limit, metric.unit, frames=frames, reason=reason)
 
 
 def _sums(
@@ -441,20 +387,20 @@ def _decided(
     if loss - reach * error > claim:
         return replace(gate, outcome=FAIL)
     if by_pass and change.units < FEWEST_PASSES:
-        told = f"{_size(change, metric)}; fewer than {FEWEST_PASSES} passes inform only"
-        return replace(gate, outcome=NOT_JUDGED, reason=told)
+        reason = f"{_size(change, metric)}; fewer than {FEWEST_PASSES} passes inform only"
+        return replace(gate, outcome=NOT_JUDGED, reason=reason)
     if few:
         needed = math.ceil(frames * FEWEST_TRACKS / max(change.units, 1))
-        told = f"{change.units} of {FEWEST_TRACKS} {metric.evidence}"
-        return replace(gate, reason=told, frames_needed=needed)
+        reason = f"{change.units} of {FEWEST_TRACKS} {metric.evidence}"
+        return replace(gate, reason=reason, frames_needed=needed)
     if high < margin:
         return replace(gate, outcome=PASS)
     # The nearer claim: a pass if the loss is nearer to none than to the margin, else a failure.
     needed_to_pass = frames_needed(frames, error, margin - max(loss, 0.0), ahead + power)
     needed_to_fail = frames_needed(frames, error, loss - materiality, reach + power)
     known = [one for one in (needed_to_pass, needed_to_fail) if one is not None]
-    told = f"a loss of {loss_text(_stated(metric, max(high, 0.0)), metric.relative)} cannot be excluded"
-    return replace(gate, reason=told, frames_needed=min(known, default=None))
+    reason = f"a loss of {loss_text(_stated(metric, max(high, 0.0)), metric.relative)} cannot be excluded"
+    return replace(gate, reason=reason, frames_needed=min(known, default=None))
 
 
 def _informing(
@@ -480,15 +426,15 @@ def _informing(
     levels = holm_levels(p_values, INFORM_LEVEL)
     gates = []
     for (metric, change, frames), p, level in zip(rows, p_values, levels, strict=True):
-        told = ""
+        reason = ""
         if p <= level:
             better = metric.higher_is_better == (change.estimate > 0.0)
-            told = f"{'better' if better else 'worse'} ({_size(change, metric)}, {counted(change.units, 'passes')})"
+            reason = f"{'better' if better else 'worse'} ({_size(change, metric)}, {counted(change.units, 'passes')})"
         gates.append(
             Gate(
                 metric.name, INFORMS, change.baseline, change.candidate, math.nan, math.nan, metric.unit,
                 p_value=p, level=level, resolution=math.inf, frames=frames,
-                evidence=counted(change.units, "passes"), reason=told,
+                evidence=counted(change.units, "passes"), reason=reason,
             )
         )  # fmt: skip
     return gates
@@ -545,6 +491,6 @@ def detectable(policy: GatePolicy, frames: int, passes: int) -> list[dict[str, A
 
 def power_text(found: Sequence[dict[str, Any]]) -> str:
     """Return the frames and minutes of all passes together and the losses that they detect, as one line."""
-    told = ", ".join(f"{one['metric']} {one['change']:.2g}" for one in found)
+    losses = ", ".join(f"{one['metric']} {one['change']:.2g}" for one in found)
     cost = "{frames} frames, {minutes} minutes of a core for the candidate".format(**found[0])
-    return f"all passes together ({cost}) find with a power of {POWER:g} a loss of: {told}"
+    return f"all passes together ({cost}) find with a power of {POWER:g} a loss of: {losses}"

@@ -1,4 +1,4 @@
-"""What one build did with one archived pass, frame by frame: the numbers that gates are made of."""
+"""Results of one build on one archived pass, frame by frame: the inputs of the gates."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ground_service.evaluation.recall import (
     expected_craters,
     match_detections,
 )
-from ground_service.passes.samples import DetectionSamples, NavigationSamples
+from ground_service.telemetry.samples import DetectionSamples, NavigationSamples
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue, size_class
@@ -75,7 +75,7 @@ class CraterRows:
 
     @property
     def hit(self) -> BoolArray:
-        """Whether the build detected it (m,)."""
+        """Return whether the build detected it (m,)."""
         return np.isfinite(self.du_px)
 
 
@@ -323,7 +323,6 @@ def cell_places_deg(cell: IntArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _sums(owner: IntArray, values: FloatArray, frames: int) -> FloatArray:
-    """Sum of the values of each frame (frames,)."""
     return np.asarray(np.bincount(owner, weights=values, minlength=frames)[:frames], dtype=np.float64)
 
 

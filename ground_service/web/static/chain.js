@@ -121,9 +121,9 @@ export async function uplink(window) {
   const contact = contactOf(window, ahead.contacts);
   const link = uplinkOf(window, links.items, contact);
   const waiting = released.items.filter((one) => one.spacecraft_id === window.spacecraft_id && one.instance === window.instance && one.carrier_id === null);
-  const told = waiting.map((one) => `${one.id}  ${named(one)}${one.window_id ? `, window ${one.window_id}` : ""}`).reverse();
-  if (!window.telecommands.length) return release(window, link, contact?.state === "open" && contact.link === link?.name, told);
+  const listed = waiting.map((one) => `${one.id}  ${named(one)}${one.window_id ? `, window ${one.window_id}` : ""}`).reverse();
+  if (!window.telecommands.length) return release(window, link, contact?.state === "open" && contact.link === link?.name, listed);
   if (!link) throw new Error("No link can send: linna command uplink writes the octets to a file.");
-  if (!told.length) throw new Error("No telecommand is released: those in the queue wait for a second person, see Commands.");
-  if (await confirmed(`Send ${told.length} telecommands over ${link.name} now?`, told, "Send")) await order(link);
+  if (!listed.length) throw new Error("No telecommand is released: those in the queue wait for a second person, see Commands.");
+  if (await confirmed(`Send ${listed.length} telecommands over ${link.name} now?`, listed, "Send")) await order(link);
 }

@@ -157,7 +157,7 @@ export function confirmed(title, lines, ...deeds) {
 
 export const trouble = (error) => notice(error.message, "bad");
 
-// A listener whose failure is told, and which keeps its button from being pressed twice. A disabled button loses the focus.
+// A listener whose failure is shown, and which keeps its button from being pressed twice. A disabled button loses the focus.
 export function acting(task) {
   return async (event) => {
     event?.preventDefault?.();

@@ -105,6 +105,7 @@ async function showPerformance() {
       "not_met",
       "unknown",
       ["Share met, 95 % interval", (row) => (row.share_met == null ? "not judged" : `${figure(row.share_met)} (${interval(row)})`)],
+      ["Remark", "remark"],
     ],
     found.requirements,
     "No report has requirements.",

@@ -16,9 +16,9 @@ const OUTCOMES = ["fail", "inconclusive", "not judged", "pass", "informs"];
 
 // What would decide an open gate.
 function remarkOf(gate) {
-  const told = [gate.reason, gate.evidence].filter(Boolean).join(", ");
-  if (gate.outcome !== "inconclusive" || gate.frames_needed == null) return told;
-  return `${told}: about ${figure(gate.frames_needed)} frames decide, ${figure(gate.frames)} compared`;
+  const reasons = [gate.reason, gate.evidence].filter(Boolean).join(", ");
+  if (gate.outcome !== "inconclusive" || gate.frames_needed == null) return reasons;
+  return `${reasons}: about ${figure(gate.frames_needed)} frames decide, ${figure(gate.frames)} compared`;
 }
 
 function gateRows(regression) {

@@ -24,11 +24,11 @@ function showToken(made) {
   );
 }
 
-// A change of a user or token: it is told, and the lists are read again even if it was refused.
-const changing = (task, told) => async () => {
+// A change of a user or token: it is shown, and the lists are read again even if it was refused.
+const changing = (task, message) => async () => {
   try {
     await task();
-    notice(told());
+    notice(message());
   } finally {
     await load();
   }

@@ -45,7 +45,8 @@ from payload_emulator.flight.navigation.filter.attitude_monitor import (
     monitored,
 )
 from payload_emulator.flight.navigation.filter.dynamics import OrbitModel, process_noise
-from payload_emulator.flight.navigation.filter.filter import FilterState
+from payload_emulator.flight.navigation.filter.filter import FilterState, KalmanFilter
+from payload_emulator.flight.navigation.filter.map_offset import OffsetSize, first_size, learned
 from payload_emulator.flight.navigation.landmark_map import (
     FIRST_LANDMARK_ID,
     Landmark,
@@ -82,7 +83,7 @@ _NO_CRATERS = np.empty(0, dtype=np.int64)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnchoredSetup:
-    """What the estimator works with from one start to the next.
+    """Parts of the estimator that stay from one start to the next.
 
     Attributes
     ----------
@@ -98,6 +99,8 @@ class AnchoredSetup:
         Planned burns.
     initial
         Estimate that starts the filter.
+    method
+        Filter that predicts and corrects.
     """
 
     parameters: AnchoredParameters
@@ -107,6 +110,7 @@ class AnchoredSetup:
     markov_sigma_m_s2: tuple[float, float, float]
     burns: BurnTable
     initial: FilterState
+    method: KalmanFilter
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,6 +140,8 @@ class AnchoredState:
         without craters; none while the attitude is degraded.
     places
         Search index of `landmarks`; None before the first search.
+    offset
+        Size of the catalogue's common offset as learned; None where it is not.
     """
 
     estimate: FilterState
@@ -148,6 +154,7 @@ class AnchoredState:
     attitude: AttitudeMonitor = field(default_factory=AttitudeMonitor)
     trusted: tuple[FilterState, ...] = ()
     places: PlaceIndex | None = None
+    offset: OffsetSize | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,6 +198,8 @@ class AnchoredReport:
         Landmarks that were made or improved.
     attitude_declared_rad, attitude_noise_rad
         Standard deviation of the attitude per axis as declared, and as estimated if it is noisier, else 0.
+    offset
+        Size of the catalogue's common offset; None where it is not learned.
     """
 
     outcome: Outcome
@@ -209,6 +218,7 @@ class AnchoredReport:
     new_landmarks: tuple[Landmark, ...] = ()
     attitude_declared_rad: float = 0.0
     attitude_noise_rad: float = 0.0
+    offset: OffsetSize | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -248,8 +258,18 @@ def start(
     camera: PinholeCamera,
     parameters: AnchoredParameters,
     burns: BurnTable | None = None,
+    method: KalmanFilter = kalman,
+    offset: OffsetSize | None = None,
 ) -> tuple[AnchoredSetup, AnchoredState]:
-    """Return set-up and first state from uploaded tables, the calibrated camera and the parameters."""
+    """Return set-up and first state from uploaded tables, the calibrated camera and the parameters.
+
+    `offset` is what was learned of the same catalogue before; None starts from the prior.
+    """
+    if parameters.offset is None:
+        offset = None
+    elif offset is None:
+        offset = first_size(parameters.offset)
+    parameters = _with_errors(parameters, parameters.errors.attitude_noise_rad, offset)
     degree = min(parameters.gravity_degree, gravity.c_bar.shape[0] - 1)
     noise = process_noise(degree, gravity.name) if parameters.noise is None else parameters.noise
     model = OrbitModel(gravity, orientation, degree, noise)
@@ -261,6 +281,7 @@ def start(
         initial_state.sigma_velocity_m_s,
         noise.markov_sigma_m_s2,
         parameters.errors,
+        offset is not None,
     )
     setup = AnchoredSetup(
         parameters,
@@ -270,8 +291,10 @@ def start(
         noise.markov_sigma_m_s2,
         no_burns() if burns is None else burns,
         estimate,
+        method,
     )
-    return setup, AnchoredState(estimate, landmark_map(catalogue), MapState(), initial_state.ticks)
+    landmarks = landmark_map(catalogue)
+    return setup, AnchoredState(estimate, landmarks, MapState(), initial_state.ticks, offset=offset)
 
 
 def step(
@@ -284,13 +307,17 @@ def step(
     """
     found, camera_from_icrf = observation.found, observation.camera_from_icrf
     declared_rad = setup.parameters.errors.attitude_noise_rad
-    setup = _with_attitude_sigma(setup, state.attitude.sigma_rad(declared_rad))
-    parameters = setup.parameters
+    parameters = _with_errors(setup.parameters, state.attitude.sigma_rad(declared_rad), state.offset)
+    setup = replace(setup, parameters=parameters)
     mcmf_from_icrf = setup.model.mcmf_from_icrf(observation.ticks)
-    prior = predicted(state.estimate, observation.ticks, setup.model, setup.burns, parameters.errors)
+    prior = predicted(
+        state.estimate, observation.ticks, setup.model, setup.burns, parameters.errors, setup.method
+    )
     if prior is not None and not is_usable(prior, parameters.limits):
         state = replace(state, estimate=setup.initial, fixed_ticks=None, trusted=())
-        prior = predicted(setup.initial, observation.ticks, setup.model, setup.burns, parameters.errors)
+        prior = predicted(
+            setup.initial, observation.ticks, setup.model, setup.burns, parameters.errors, setup.method
+        )
     if prior is None or mcmf_from_icrf is None or not is_usable(prior, parameters.limits):
         return state, _report(state, setup, Outcome.refused, None, _Decisions())
     state, decided = _entered(state, prior, observation, setup)
@@ -314,8 +341,7 @@ def step(
         state, fix = recovered(state, pose, found, setup)
     if fix is not None:
         state = replace(state, estimate=fix.update.state, fixed_ticks=observation.ticks)
-        if fix.reacquired:
-            state = replace(state, trusted=())
+        state = replace(state, trusted=()) if fix.reacquired else _with_learned_offset(state, fix, parameters)
     state = with_judged_attitude(state, judged, None if evidence is None else search.prior, setup)
     decided = replace(decided, candidates=search.candidates, expected=search.expected, fix=fix)
     if parameters.map_landmarks:
@@ -338,9 +364,25 @@ def is_lost(state: AnchoredState, parameters: AnchoredParameters) -> bool:
     return not state.estimate.finite or state.estimate.position_sigma_m > parameters.divergence_limit_m
 
 
-def _with_attitude_sigma(setup: AnchoredSetup, sigma_rad: float) -> AnchoredSetup:
-    errors = replace(setup.parameters.errors, attitude_noise_rad=sigma_rad)
-    return replace(setup, parameters=replace(setup.parameters, errors=errors))
+def _with_errors(
+    parameters: AnchoredParameters, attitude_rad: float, offset: OffsetSize | None
+) -> AnchoredParameters:
+    """Return the parameters with the noise of the attitude and the offset of the catalogue that are in use."""
+    errors = replace(parameters.errors, attitude_noise_rad=attitude_rad)
+    if offset is not None and parameters.offset is not None:
+        size_m = (offset.sigma_m, offset.sigma_m, errors.catalogue_offset_m[2])
+        memory_rad = parameters.offset.correlation_rad
+        errors = replace(errors, catalogue_offset_m=size_m, catalogue_correlation_rad=memory_rad)
+    return replace(parameters, errors=errors)
+
+
+def _with_learned_offset(state: AnchoredState, fix: Fix, parameters: AnchoredParameters) -> AnchoredState:
+    """Return the state after the size of the catalogue's offset was learned from a fix."""
+    if state.offset is None or parameters.offset is None or state.estimate.slope is None:
+        return state
+    offset = learned(state.offset, fix.update.score, parameters.offset)
+    estimate = state.estimate.with_offset(state.offset.sigma_m, offset.sigma_m)
+    return replace(state, estimate=estimate, offset=offset)
 
 
 def _entered(
@@ -377,7 +419,9 @@ def search_around(state: AnchoredState, pose: Pose, found: Detections, setup: An
     sigma_m = prior.position_sigma_m
     if sigma_m > tracking_limit_m(prior, parameters):
         expected = len(in_view(landmarks, pose, camera, 0.0))
-        fix = recovery.search_by_votes(prior, pose, found, landmarks, camera, parameters, sigma_m)
+        fix = recovery.search_by_votes(
+            prior, pose, found, landmarks, camera, parameters, sigma_m, method=setup.method
+        )
         # A search that found no safe place is a fix refused, and counts the detections it was tried with.
         tried = len(found) if len(found) >= SEARCHABLE_DETECTIONS else 0
         return Search(prior, fix, tried if fix is None else fix.identification.candidates, expected)
@@ -392,7 +436,7 @@ def search_around(state: AnchoredState, pose: Pose, found: Detections, setup: An
     if identification.believed:
         fix = correct(
             prior, pose, found, identification, sighting, landmarks, camera, parameters,
-            altitude_above_sphere_m(prior), reacquired=False,
+            altitude_above_sphere_m(prior), reacquired=False, method=setup.method,
         )  # fmt: skip
     return Search(prior, fix, identification.candidates, expected)
 
@@ -418,7 +462,8 @@ def rotation_evidence(
             prior, parameters
         ):
             return None
-        fix = search_around(state, pose, found, _with_attitude_sigma(setup, trial_rad)).fix
+        tried = _with_errors(parameters, trial_rad, state.offset)
+        fix = search_around(state, pose, found, replace(setup, parameters=tried)).fix
     if fix is None or len(fix.index) < parameters.monitor.least_craters:
         return None
     return replace(fix.update.rotation, trial=disagrees)
@@ -446,7 +491,9 @@ def with_judged_attitude(
         return replace(state, attitude=judged, trusted=() if judged.degraded else trusted)
     estimate = state.estimate
     if trusted:
-        carried = predicted(trusted[0], estimate.ticks, setup.model, setup.burns, parameters.errors)
+        carried = predicted(
+            trusted[0], estimate.ticks, setup.model, setup.burns, parameters.errors, setup.method
+        )
         if carried is not None and is_usable(carried, parameters.limits):
             estimate = carried
     if len(trusted) <= len(before.window) and len(trusted) < parameters.monitor.window_frames:
@@ -468,12 +515,22 @@ def recovered(
     unseen_s = math.inf
     if state.fixed_ticks is not None:
         unseen_s = (prior.ticks - state.fixed_ticks) / TICKS_PER_SECOND
-    fix = recovery.search_widely(prior, pose, found, state.landmarks, camera, parameters, unseen_s)
+    fix = recovery.search_widely(
+        prior, pose, found, state.landmarks, camera, parameters, unseen_s, setup.method
+    )
     if fix is None and recovery.is_lost_search_due(state.disagreements, parameters):
         places = place_index(state.landmarks) if state.places is None else state.places
         state = replace(state, places=places)
         fix = recovery.search_everywhere(
-            prior, pose, found, state.landmarks, camera, parameters, setup.markov_sigma_m_s2, places
+            prior,
+            pose,
+            found,
+            state.landmarks,
+            camera,
+            parameters,
+            setup.markov_sigma_m_s2,
+            places,
+            setup.method,
         )
     return state, fix
 
@@ -562,4 +619,5 @@ def _report(
         decided.new_landmarks,
         decided.attitude_declared_rad,
         state.attitude.noise_rad,
+        state.offset,
     )

@@ -8,6 +8,7 @@ from lunar.constants import MOON_RADIUS_M
 from payload_emulator.flight.navigation.filter.attitude_monitor import MonitorParameters
 from payload_emulator.flight.navigation.filter.dynamics import ProcessNoise
 from payload_emulator.flight.navigation.filter.filter import CommonErrors
+from payload_emulator.flight.navigation.filter.map_offset import OffsetRule
 from payload_emulator.flight.navigation.landmark_map import MappingParameters
 from payload_emulator.flight.navigation.search.acquisition import AcquisitionParameters
 from payload_emulator.flight.navigation.search.identification import IdentificationParameters
@@ -115,6 +116,8 @@ class AnchoredParameters:
         Parameters of the monitor of the attitude.
     limits
         Plausibility limits, gap limits and gates.
+    offset
+        How the size of the catalogue's common offset is learned; None keeps that of `errors`.
     crater_limit
         Largest number of craters used in one frame, the most certain first. More craters add little, because the errors
         of attitude and catalogue are common to all.
@@ -140,3 +143,5 @@ class AnchoredParameters:
     crater_limit: int = 32
     monitor: MonitorParameters = field(default_factory=MonitorParameters)
     limits: AnchoredLimits = field(default_factory=AnchoredLimits)
+    # Without it the text, and so the hash in telemetry, is that of builds that learned nothing.
+    offset: OffsetRule | None = field(default=None, repr=False)

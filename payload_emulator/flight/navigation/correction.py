@@ -12,7 +12,7 @@ from lunar.constants import MOON_RADIUS_M
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredLimits, AnchoredParameters
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.dynamics import OrbitModel
-from payload_emulator.flight.navigation.filter.filter import CommonErrors, FilterState, Update
+from payload_emulator.flight.navigation.filter.filter import CommonErrors, FilterState, KalmanFilter, Update
 from payload_emulator.flight.navigation.search.identification import GATE, Identification, identify
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, Sighting, ground_scale
 from payload_emulator.flight.vision.detections import Detections
@@ -110,6 +110,7 @@ def correct(
     altitude_m: float,
     *,
     reacquired: bool,
+    method: KalmanFilter = kalman,
 ) -> Fix | None:
     """Return the fix of identified craters; None where it contradicts the prediction as a whole.
 
@@ -131,7 +132,7 @@ def correct(
         persistence = detection_persistence(found, parameters)[identification.detection]
         lasting = variance * persistence
         sigma_m = crater_sigma_m(landmarks.sigma_m[index], lasting, altitude_m, camera, parameters)
-        update = kalman.update(
+        update = method.update(
             prior.with_craters(index, sigma_m),
             pose.camera_from_icrf,
             pose.mcmf_from_icrf,
@@ -226,7 +227,12 @@ def frame_limit(degrees: int, sigmas: float) -> float:
 
 
 def predicted(
-    estimate: FilterState, ticks: int, model: OrbitModel, burns: BurnTable, errors: CommonErrors
+    estimate: FilterState,
+    ticks: int,
+    model: OrbitModel,
+    burns: BurnTable,
+    errors: CommonErrors,
+    method: KalmanFilter = kalman,
 ) -> FilterState | None:
     """Return the estimate at another on-board time; None outside the orientation table.
 
@@ -235,11 +241,11 @@ def predicted(
     sense = 1.0 if ticks >= estimate.ticks else -1.0
     low, high = np.searchsorted(burns.ticks, sorted((estimate.ticks, ticks)), side="right")
     for k in range(low, high)[:: int(sense)]:
-        reached = kalman.predict(estimate, int(burns.ticks[k]), model, errors)
+        reached = method.predict(estimate, int(burns.ticks[k]), model, errors)
         if reached is None:
             return None
         estimate = kalman.burn(reached, sense * burns.delta_v_icrf_m_s[k], float(burns.sigma_m_s[k]))
-    return kalman.predict(estimate, ticks, model, errors)
+    return method.predict(estimate, ticks, model, errors)
 
 
 def is_usable(estimate: FilterState, limits: AnchoredLimits) -> bool:

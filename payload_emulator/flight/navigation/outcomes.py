@@ -29,7 +29,7 @@ class Outcome(IntEnum):
 
 
 class ResetTrigger(IntEnum):
-    """Why an odometry estimate was put back onto the anchor ephemeris (section VII-B of the paper)."""
+    """Reasons for a reset of an odometry estimate to the anchor ephemeris (section VII-B of the paper)."""
 
     none = 0
     initialization = 1

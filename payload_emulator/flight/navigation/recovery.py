@@ -17,7 +17,7 @@ from payload_emulator.flight.navigation.correction import (
     detection_variance_px2,
 )
 from payload_emulator.flight.navigation.filter import filter as kalman
-from payload_emulator.flight.navigation.filter.filter import FilterState
+from payload_emulator.flight.navigation.filter.filter import FilterState, KalmanFilter
 from payload_emulator.flight.navigation.search.acquisition import acquire
 from payload_emulator.flight.navigation.search.identification import Identification
 from payload_emulator.flight.navigation.search.lost_in_space import LostParameters, PlaceIndex, find_place
@@ -73,6 +73,7 @@ def search_by_votes(
     parameters: AnchoredParameters,
     radius_m: float,
     unseen_s: float | None = None,
+    method: KalmanFilter = kalman,
 ) -> Fix | None:
     """Return a fix from a search by votes around the prediction; None where none is safe.
 
@@ -105,7 +106,8 @@ def search_by_votes(
     identification = Identification(pairs.detection, everything, pairs.candidates, pairs.needed)
     altitude_m = altitude_above_sphere_m(prior)
     return correct(
-        prior, pose, found, identification, sighting, landmarks, camera, parameters, altitude_m, reacquired=True
+        prior, pose, found, identification, sighting, landmarks, camera, parameters, altitude_m, reacquired=True,
+        method=method,
     )  # fmt: skip
 
 
@@ -117,6 +119,7 @@ def search_widely(
     camera: PinholeCamera,
     parameters: AnchoredParameters,
     unseen_s: float = math.inf,
+    method: KalmanFilter = kalman,
 ) -> Fix | None:
     """Return a fix from a search far beyond the claimed uncertainty of the estimate; None where none is safe.
 
@@ -129,7 +132,7 @@ def search_widely(
         Time since the last fix; inf without one.
     """
     radius_m = parameters.search_radius_m / parameters.limits.search_radius_sigmas
-    return search_by_votes(prior, pose, found, landmarks, camera, parameters, radius_m, unseen_s)
+    return search_by_votes(prior, pose, found, landmarks, camera, parameters, radius_m, unseen_s, method)
 
 
 def _velocity_error_m_s(moved_m: float, unseen_s: float, radius_m: float) -> float:
@@ -151,6 +154,7 @@ def search_everywhere(
     parameters: AnchoredParameters,
     markov_sigma_m_s2: tuple[float, float, float],
     places: PlaceIndex,
+    method: KalmanFilter = kalman,
 ) -> Fix | None:
     """Return a fix from a search over the whole map, for a nadir camera; None where no place is safe.
 
@@ -177,6 +181,7 @@ def search_everywhere(
         ORBITAL_RATE_RAD_S * float(np.linalg.norm(new - old)) + limits.found_velocity_m_s,
         markov_sigma_m_s2,
         parameters.errors,
+        prior.slope is not None,
     )
     there = replace(pose, position_icrf_m=new)
     sighting = look(landmarks, place.index, there, camera)
@@ -184,7 +189,8 @@ def search_everywhere(
     identification = Identification(place.detection, everything, len(found), len(place))
     altitude_m = altitude_above_sphere_m(prior)
     return correct(
-        fresh, there, found, identification, sighting, landmarks, camera, parameters, altitude_m, reacquired=True
+        fresh, there, found, identification, sighting, landmarks, camera, parameters, altitude_m, reacquired=True,
+        method=method,
     )  # fmt: skip
 
 

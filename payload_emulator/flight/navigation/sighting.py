@@ -86,7 +86,7 @@ def landmark_map(table: CatalogueTable) -> LandmarkMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """Where the camera is and how it points, with what is common to the frame.
+    """Position and attitude of the camera, with the values that are common to the frame.
 
     Attributes
     ----------

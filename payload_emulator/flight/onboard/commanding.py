@@ -64,7 +64,7 @@ def parse_commands(octets: bytes) -> Iterator[Command | Refusal]:
 
 @dataclass(slots=True)
 class CommandHistory:
-    """Which commands came before: a repeated packet is a duplicate, an older count of its source is out of sequence.
+    """Record of earlier commands: a repeated packet is a duplicate, an older count of its source is out of sequence.
 
     Counts may jump forward (commands lost on the way), by less than half of their range. A packet is known by its
     request id and CRC-32.

@@ -18,7 +18,7 @@ _HYSTERESIS = 0.02
 
 
 class Reaction(IntEnum):
-    """What a monitor asks for."""
+    """Reaction that a monitor requests."""
 
     none = 0
     cycle_camera = 1
@@ -87,7 +87,7 @@ class Monitors:
 
     @property
     def in_streak(self) -> bool:
-        """Whether bad images have lasted so long that they are not reported one by one."""
+        """Return whether bad images have lasted so long that they are not reported one by one."""
         return self._bad_images >= int(self.parameters["streak_frames"])
 
     def detector(self, failed: bool) -> Reaction:

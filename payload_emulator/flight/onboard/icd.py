@@ -55,6 +55,8 @@ observation ends |
 | filter diverges | filter_divergence, filter_reset | the search for craters is widened until it is found again |
 | attitude noisier than declared | attitude_degraded, attitude_restored | the estimated noise is used in place of \
 the declared one until it is restored |
+| the crater list has an offset of another size than believed | map_offset | the size, learned from the fixes, is \
+used from then on; it is kept until another catalogue is loaded or the estimators are reset |
 | processor hangs | watchdog_reset | reset by the watchdog; the observation is resumed; `watchdog_limit` within an \
 hour: safe |
 | bits of model, parameters or tables change | model_hash_mismatch, parameters_hash_mismatch, \

@@ -1,4 +1,4 @@
-"""What flight software is loaded with at boot: parameters of its build, and tables."""
+"""Loads of the flight software at boot: parameters of its build, and tables."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ UNPACKERS: dict[str, Callable[[bytes], object]] = {
 
 @dataclass(frozen=True, slots=True)
 class FlightParameters:
-    """What a build of the payload is tuned to; what may change in flight is in `parameters`.
+    """Constants of a build of the payload; those that may change in flight are in `parameters`.
 
     Attributes
     ----------
@@ -82,7 +82,8 @@ class FlightParameters:
     def sha256(self) -> str:
         """SHA-256 of the parameters as text, hexadecimal."""
         reports = "image_reports" if self.image_reports else ""
-        return hashlib.sha256((repr(self) + reports).encode()).hexdigest()
+        learned = "" if self.anchored.offset is None else repr(self.anchored.offset)
+        return hashlib.sha256((repr(self) + reports + learned).encode()).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)

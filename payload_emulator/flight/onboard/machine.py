@@ -88,7 +88,7 @@ _LOADS = {
 
 @dataclass(slots=True)
 class Observation:
-    """The observation window in progress; `stop_ticks` 0: until told, `cadence_ticks` 0: every frame that comes."""
+    """The observation window in progress; `stop_ticks` 0: until commanded, `cadence_ticks` 0: every frame."""
 
     stop_ticks: int = 0
     cadence_ticks: int = 0

@@ -47,10 +47,10 @@ ALLOWED: dict[str, frozenset[PayloadMode]] = {
 
 
 def may_change(present: PayloadMode, wanted: PayloadMode) -> bool:
-    """Whether an order may lead from one mode to the other."""
+    """Return whether an order may lead from one mode to the other."""
     return wanted in TRANSITIONS[present]
 
 
 def allows(mode: PayloadMode, name: str) -> bool:
-    """Whether a telecommand or function may be carried out in a mode."""
+    """Return whether a telecommand or function may be carried out in a mode."""
     return mode in ALLOWED.get(name, ALL_MODES)

@@ -12,17 +12,11 @@ from numpy.typing import NDArray
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import size_class
 from lunar.frames import matrix_from_quaternion
-from payload_emulator.flight.navigation import anchored
-from payload_emulator.flight.navigation.anchored import (
-    AnchoredReport,
-    AnchoredSetup,
-    AnchoredState,
-    Observation,
-)
+from payload_emulator.flight.navigation.anchored import AnchoredReport, AnchoredState
+from payload_emulator.flight.navigation.estimator import ESTIMATORS, Frame
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.landmark_map import map_rows
 from payload_emulator.flight.navigation.odometry import odometry
-from payload_emulator.flight.navigation.odometry.odometry import OdometryState
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.onboard.housekeeping import StageTimer
 from payload_emulator.flight.onboard.loads import TABLE_NUMBERS, FlightParameters, FlightTables
@@ -31,7 +25,6 @@ from payload_emulator.flight.telemetry.packets import Telemetry
 from payload_emulator.flight.vision.detections import Detections, Detector, no_detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from tmtc.dictionary.tables import (
-    AnchorTable,
     table_hash,
     unpack_anchor_table,
     unpack_burn_table,
@@ -45,12 +38,18 @@ from tmtc.errors import TableError
 Table = TypeVar("Table")
 
 _NAN = float("nan")
-_UNKNOWN_VECTOR = (_NAN, _NAN, _NAN)
 _PIXEL_LIMIT = 65_535 / 64.0
 # No camera has a detection out there: what the network gives beyond, or as no number, is passed over.
 _FARTHEST_PX = 1e5
 _MILLISECOND_NS = 1e6
 _LANDMARKS_A_PACKET = 40
+_UNPACK: dict[str, Callable[[bytes], Any]] = {
+    "catalogue": unpack_catalogue_table,
+    "gravity": unpack_gravity_table,
+    "orientation": unpack_orientation_table,
+    "initial_state": unpack_initial_state,
+    "burns": unpack_burn_table,
+}
 _ORBIT_TRIANGLE = np.triu_indices(kalman.ORBIT.stop)
 
 
@@ -89,34 +88,35 @@ class Observer:
         self._timer = timer
         self._outcomes: dict[Mode, Counter[Outcome]] = {mode: Counter() for mode in parameters.modes}
         self._triggers: dict[Mode, Counter[ResetTrigger]] = {mode: Counter() for mode in parameters.modes}
-        self._odometry: dict[Mode, OdometryState | None] = {}
-        self._anchor: AnchorTable | None = None
-        self._setup: AnchoredSetup | None = None
-        self._anchored: AnchoredState | None = None
+        self._states: dict[Mode, Any] = {}
+        self._loaded: dict[str, Any] = {}
         self._in_trouble: set[str] = set()
+        self._map_offset: tuple[float, float] | None = None
         self._tables = FlightTables()
 
     @property
     def anchor_reads(self) -> int:
         """Reads of the anchor ephemeris since boot, all estimators."""
-        return sum(state.altitude_reads + state.resets for state in self._odometry.values() if state)
+        return sum(sum(ESTIMATORS[mode].summary(state)) for mode, state in self._states.items())
 
     def load_tables(self, tables: FlightTables) -> None:
         """Start again with these tables; a damaged one is reported and not used."""
         self._tables = tables
-        self._odometry.clear()
-        self._anchor = self._load("anchor_ephemeris", unpack_anchor_table)
-        self._start_navigator()
+        self._loaded["anchor_ephemeris"] = self._load("anchor_ephemeris", unpack_anchor_table)
+        for mode in self._parameters.modes:
+            self._start(mode)
 
     def reset(self) -> None:
-        """Forget all estimates; each estimator starts from its tables."""
-        self._odometry.clear()
-        self._start_navigator()
+        """Forget all estimates and what was learned of the tables; each estimator starts from its tables."""
+        self._states.clear()
+        for mode in self._parameters.modes:
+            self._start(mode)
 
     def widen(self, position_m: float, velocity_m_s: float) -> None:
         """Trust the orbit no more than this."""
-        if self._anchored is not None:
-            self._anchored = anchored.widened(self._anchored, position_m, velocity_m_s)
+        for mode, state in self._states.items():
+            if state is not None:
+                self._states[mode] = ESTIMATORS[mode].widen(state, position_m, velocity_m_s)
 
     def frame(
         self,
@@ -148,14 +148,12 @@ class Observer:
                 telemetry.event("low", f"image_{quality.name.lower()}")
         self._timer.enter(Stage.navigation)
         altitude_m = _NAN
+        reason = "detector failed" if self.detector_failed else quality.name.lower()
+        given = Frame(telemetry.ticks, found, reason == "ok", camera_from_icrf, self.manual_step)
+        if not given.usable and Mode.anchored in self._parameters.modes:
+            self._no_image[reason] += 1
         for mode in self._parameters.modes:
-            if mode is Mode.anchored:
-                reason = "detector failed" if self.detector_failed else quality.name.lower()
-                if reason != "ok":
-                    self._no_image[reason] += 1
-                below_m = self._anchored_frame(found if reason == "ok" else None, camera_from_icrf)
-            else:
-                below_m = self._odometry_frame(mode, found)
+            below_m = self._estimate(mode, given)
             altitude_m = below_m if np.isfinite(below_m) else altitude_m
         self._timer.enter(Stage.telemetry)
         self._altitude_m = altitude_m if np.isfinite(altitude_m) else self._altitude_m
@@ -186,11 +184,10 @@ class Observer:
         }
 
     def _summary_of(self, mode: Mode) -> dict[str, Any]:
-        names = [outcome for outcome in Outcome if (outcome >= Outcome.fixed) is (mode is Mode.anchored)]
-        state = self._odometry.get(mode)
-        altitude_reads, resets = (0, 0) if state is None else (state.altitude_reads, state.resets)
+        estimator = ESTIMATORS[mode]
+        altitude_reads, resets = estimator.summary(self._states.get(mode))
         return {
-            "outcomes": {outcome.name: self._outcomes[mode][outcome] for outcome in names},
+            "outcomes": {outcome.name: self._outcomes[mode][outcome] for outcome in estimator.outcomes},
             "reset_triggers": {trigger.name: n for trigger, n in sorted(self._triggers[mode].items())},
             "resets": resets,
             "altitude_reads": altitude_reads,
@@ -229,77 +226,80 @@ class Observer:
             self.detector_failed, found = True, no_detections()
         return quality, found
 
-    def _start_navigator(self) -> None:
-        self._setup = self._anchored = None
-        if Mode.anchored not in self._parameters.modes:
-            return
-        catalogue = self._load("catalogue", unpack_catalogue_table)
-        gravity = self._load("gravity", unpack_gravity_table)
-        orientation = self._load("orientation", unpack_orientation_table)
-        state = self._load("initial_state", unpack_initial_state)
-        burns = self._load("burns", unpack_burn_table)
-        if catalogue and gravity and orientation and state:
-            self._setup, self._anchored = anchored.start(
-                catalogue,
-                gravity,
-                orientation,
-                state,
-                self._parameters.camera,
-                self._parameters.anchored,
-                burns,
-            )
+    def _start(self, mode: Mode) -> None:
+        """Start an estimator from its tables; what it learned of the same tables is kept."""
+        estimator = ESTIMATORS[mode]
+        for name in estimator.tables:
+            self._loaded[name] = self._load(name, _UNPACK[name])
+        self._states[mode] = estimator.start(self._loaded, self._parameters, self._states.get(mode))
 
-    def _anchored_frame(self, found: Detections | None, camera_from_icrf: FloatArray | None) -> float:
-        """Run the anchored estimator on one frame, report it, and return its altitude."""
-        mode, detections = Mode.anchored, 0 if found is None else len(found)
-        report = None
-        if self._setup is not None and self._anchored is not None:
-            observation = Observation(self._telemetry.ticks, found, camera_from_icrf)
-            try:
-                self._anchored, report = anchored.step(self._anchored, observation, self._setup)
-            except np.linalg.LinAlgError:
-                self._telemetry.event("high", "estimator_error", float(mode))
-                # A covariance that cannot be inverted is of no use: start again from the tables.
-                self._start_navigator()
-        outcome = Outcome.refused if report is None else report.outcome
-        self._outcomes[mode][outcome] += 1
-        self._send_outcome(
-            mode,
-            outcome,
-            ResetTrigger.none,
-            detections,
-            (0, 0) if report is None else (report.candidates, report.matched),
-            (_NAN, _NAN),
-            0,
+    def _estimate(self, mode: Mode, given: Frame) -> float:
+        """Run an estimator on one frame, report it, and return the altitude that scales the frame."""
+        estimator = ESTIMATORS[mode]
+        try:
+            self._states[mode], report = estimator.step(self._states.get(mode), given, self._parameters)
+        except np.linalg.LinAlgError:
+            self._telemetry.event("high", "estimator_error", float(mode))
+            # A covariance that cannot be inverted is of no use: start again from the tables.
+            self._start(mode)
+            _, report = estimator.step(None, given, self._parameters)
+        self._outcomes[mode][report.outcome] += 1
+        if report.trigger is not ResetTrigger.none:
+            self._triggers[mode][report.trigger] += 1
+            self._telemetry.event("info", "anchor_read", float(report.trigger), float(mode))
+        frame = {"frame_number": self._telemetry.frame_number, "image_ticks": self._telemetry.ticks}
+        self._telemetry.send(
+            "frame_outcome",
+            {
+                **frame,
+                "estimator": int(mode),
+                "outcome": int(report.outcome),
+                "reset_trigger": int(report.trigger),
+                "detections": report.detections,
+                "candidate_pairs": report.pairs[0],
+                "pairs": report.pairs[1],
+                "shift_east_m": report.shift_m[0],
+                "shift_north_m": report.shift_m[1],
+                "anchor_reads": report.anchor_reads,
+            },
         )
-        if report is None or self._anchored is None or not np.isfinite(report.latitude_rad):
-            return _NAN
-        if report.reacquired:
-            self.reacquisitions += 1
-            self._telemetry.event("medium", "filter_reset", float(report.matched), max(report.sigma_rtn_m))
-        self._trouble(
-            "fix_refused", outcome is Outcome.refused, float(report.candidates), float(report.expected)
-        )
-        self._trouble("filter_divergence", report.lost, max(report.sigma_rtn_m), 0.0)
-        self._report_attitude(report)
+        if report.place is None:
+            return report.below_m
+        if report.filter is not None:
+            self._report_troubles(report.filter[1])
+        latitude_rad, longitude_rad, altitude_m = report.place
         self._telemetry.send(
             "navigation_state",
             {
-                "frame_number": self._telemetry.frame_number,
-                "image_ticks": self._telemetry.ticks,
+                **frame,
                 "estimator": int(mode),
-                "outcome": int(outcome),
-                "latitude_deg": float(np.degrees(report.latitude_rad)),
-                "longitude_deg": float(np.degrees(report.longitude_rad)) % 360.0,
-                "altitude_m": report.altitude_m,
+                "outcome": int(report.outcome),
+                "latitude_deg": float(np.degrees(latitude_rad)),
+                "longitude_deg": float(np.degrees(longitude_rad)) % 360.0,
+                "altitude_m": altitude_m,
                 "velocity_icrf_m_s": report.velocity_icrf_m_s,
                 "sigma_rtn_m": report.sigma_rtn_m,
                 "nis": report.nis,
-                "matched": report.matched,
+                "matched": report.pairs[1],
             },
         )
-        self._send_filter(self._anchored, report, found)
-        return report.altitude_m
+        if report.filter is not None:
+            self._send_filter(*report.filter, given.found if given.usable else None)
+        return report.below_m
+
+    def _report_troubles(self, report: AnchoredReport) -> None:
+        """Send the events of a filter: a reset, and the beginning of a lasting trouble."""
+        refused, sigma_m = report.outcome is Outcome.refused, max(report.sigma_rtn_m)
+        if report.reacquired:
+            self.reacquisitions += 1
+            self._telemetry.event("medium", "filter_reset", float(report.matched), sigma_m)
+        self._trouble("fix_refused", refused, float(report.candidates), float(report.expected))
+        self._trouble("filter_divergence", report.lost, sigma_m, 0.0)
+        self._report_attitude(report)
+        offset = None if report.offset is None else (report.offset.sigma_m, float(report.offset.fixes))
+        if offset is not None and offset != self._map_offset:
+            self._telemetry.event("info", "map_offset", *offset)
+            self._map_offset = offset
 
     def _send_filter(self, state: AnchoredState, report: AnchoredReport, found: Detections | None) -> None:
         """Send what the ground needs to judge and to smooth the filter: its orbit in full, the pairs of its fix."""
@@ -358,83 +358,6 @@ class Observer:
             self._telemetry.event("medium", "attitude_degraded", float(noise_deg), float(declared_deg))
         else:
             self._telemetry.event("info", "attitude_restored", float(declared_deg))
-
-    def _odometry_frame(self, mode: Mode, found: Detections) -> float:
-        """Run one odometry on one frame, report it, and return the altitude it scaled the frame with."""
-        if self._anchor is None:
-            self._outcomes[mode][Outcome.missed] += 1
-            self._send_outcome(mode, Outcome.missed, ResetTrigger.none, len(found), (0, 0), (_NAN, _NAN), 0)
-            return _NAN
-        state, report = odometry.step(
-            self._odometry.get(mode),
-            self._telemetry.ticks,
-            found,
-            self._anchor,
-            self._parameters.camera,
-            mode,
-            self._parameters.odometry,
-            manual_step=self.manual_step,
-        )
-        self._odometry[mode] = state
-        self._outcomes[mode][report.outcome] += 1
-        if report.reset_trigger is not ResetTrigger.none:
-            self._triggers[mode][report.reset_trigger] += 1
-            self._telemetry.event("info", "anchor_read", float(report.reset_trigger), float(mode))
-        self._send_outcome(
-            mode,
-            report.outcome,
-            report.reset_trigger,
-            len(found),
-            (report.candidate_pairs, report.pairs),
-            (report.shift_east_m, report.shift_north_m),
-            0 if state is None else state.altitude_reads,
-        )
-        if state is None:
-            return _NAN
-        self._telemetry.send(
-            "navigation_state",
-            {
-                "frame_number": self._telemetry.frame_number,
-                "image_ticks": self._telemetry.ticks,
-                "estimator": int(mode),
-                "outcome": int(report.outcome),
-                "latitude_deg": float(np.degrees(state.latitude_rad)),
-                "longitude_deg": float(np.degrees(state.longitude_rad)) % 360.0,
-                "altitude_m": state.altitude_m,
-                "velocity_icrf_m_s": _UNKNOWN_VECTOR,
-                "sigma_rtn_m": _UNKNOWN_VECTOR,
-                "nis": _NAN,
-                "matched": report.pairs,
-            },
-        )
-        return state.features.altitude_m
-
-    def _send_outcome(
-        self,
-        mode: Mode,
-        outcome: Outcome,
-        trigger: ResetTrigger,
-        detections: int,
-        pairs: tuple[int, int],
-        shift_m: tuple[float, float],
-        reads: int,
-    ) -> None:
-        self._telemetry.send(
-            "frame_outcome",
-            {
-                "frame_number": self._telemetry.frame_number,
-                "image_ticks": self._telemetry.ticks,
-                "estimator": int(mode),
-                "outcome": int(outcome),
-                "reset_trigger": int(trigger),
-                "detections": detections,
-                "candidate_pairs": pairs[0],
-                "pairs": pairs[1],
-                "shift_east_m": shift_m[0],
-                "shift_north_m": shift_m[1],
-                "anchor_reads": reads,
-            },
-        )
 
     def _report_detections(self, found: Detections, altitude_m: float) -> None:
         kept = found.select(_reported(found))

@@ -1,4 +1,4 @@
-"""What survives a reset: one text of settings in two copies, the newer of which that is whole counts.
+"""Settings that survive a reset: one text of settings in two copies, the newer of which that is whole counts.
 
 Each half of the memory holds a block: magic `LNST`, generation (u32), length (u32), CRC-32 of generation, length and
 content (u32), content (JSON, UTF-8); big-endian. Both are written at every change, one after the other: a reset in the
@@ -24,7 +24,7 @@ _HEADER = struct.Struct(">4sIII")
 
 
 class Recovery(IntEnum):
-    """What was found in the settings memory at boot."""
+    """State of the settings memory at boot."""
 
     blank = 0
     whole = 1

@@ -1,4 +1,4 @@
-"""What each telecommand does. A function returns the code of the reason why nothing was done; 0 or None: it was."""
+"""Effects of the telecommands. A function returns the code of the reason why nothing was done; 0 or None: it was."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _FUNCTIONS = DICTIONARY.labels("perform_function", "function_id")
 
 
 def name_of(command: Command) -> str:
-    """What a command is called in the table of modes: its function where it performs one."""
+    """Return the name of a command in the table of modes: its function if it performs one."""
     if command.name == "perform_function":
         return _FUNCTIONS.get(int(command.values["function_id"]), "")
     return command.name
 
 
 def check(machine: Machine, command: Command) -> int:
-    """Whether a command could be carried out at all: it exists, and its values lie within their ranges."""
+    """Return whether a command could be carried out at all: it exists, and its values lie within their ranges."""
     values, name = command.values, name_of(command)
     if name not in _FUNCTION_HANDLERS and name not in _HANDLERS:
         return failure("unknown_function")

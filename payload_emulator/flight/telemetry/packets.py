@@ -1,4 +1,4 @@
-"""What the payload says: packets of the dictionary with their counts, into the store; events as they are wanted."""
+"""Telemetry of the payload: packets of the dictionary with their counts, into the store; events as they are wanted."""
 
 from __future__ import annotations
 

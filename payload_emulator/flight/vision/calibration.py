@@ -56,7 +56,7 @@ class SigmaModel:
 def sigma_features(
     found: Detections, sun_in_camera: FloatArray | None, width_px: int, height_px: int, *, whole: bool = True
 ) -> FloatArray:
-    """What sigma depends on, (n, 6); `whole` False: the place in the image is not that of the camera's frames."""
+    """Return the features of sigma, (n, 6); `whole` False: the image is not a whole frame of the camera."""
     count = len(found)
     depth = np.full(count, TYPICAL_DEPTH_RATIO) if found.depth_ratio is None else found.depth_ratio
     sine = TYPICAL_SUN_SINE

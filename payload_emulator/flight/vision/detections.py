@@ -1,4 +1,4 @@
-"""What a detector hands to navigation: crater positions and sizes in one image, in pixels.
+"""Output of a detector for navigation: crater positions and sizes in one image, in pixels.
 
 Pixel centres lie at integer coordinates, u to the right, v down.
 """

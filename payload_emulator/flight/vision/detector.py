@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 INPUT_SIZE_PX = 512
 STRIDE_PX = 4
 STRIDES_PX = (4, 2)
-UNTOLD_SIGMA_PX = 2.0
+UNSTATED_SIGMA_PX = 2.0
 """Error of a centre whose network does not tell it: half a cell of stride 4."""
 
 SAME_PLACE_CELLS = 1.5
@@ -71,7 +71,7 @@ GEOMETRY_NAME = "geometry"
 
 @dataclass(frozen=True, slots=True)
 class DetectorParameters:
-    """What may be changed on board without a new network.
+    """Parameters of the detector that may change on board without a new network.
 
     score_threshold : None takes the threshold that the network's own metadata carry (fixed on its validation set).
     max_detections : the detections packet counts in one octet; 120 exceeds the craters of any frame seen.
@@ -269,7 +269,7 @@ def decode(
         score,
         np.exp(mean(geometry[3][near_row, near_column].astype(np.float64)))
         if sized
-        else np.full(row.size, UNTOLD_SIGMA_PX),
+        else np.full(row.size, UNSTATED_SIGMA_PX),
         np.clip(0.1 * mean(geometry[4][near_row, near_column].astype(np.float64)), 0.0, 0.25)
         if geometry.shape[0] > 4
         else None,

@@ -60,7 +60,7 @@ class SunEstimate:
 
     @property
     def determined(self) -> bool:
-        """Whether the picture decides between the two opposite directions."""
+        """Return whether the picture decides between the two opposite directions."""
         return self.confidence >= LEAST_CONFIDENCE
 
 

@@ -30,11 +30,11 @@ from payload_emulator.flight.vision.picture_search import find_sun
 from payload_emulator.flight.vision.preprocess import prepare_image
 from payload_emulator.session.archive.mission import MISSION_FILE, mission_text, save_attitudes
 from payload_emulator.session.archive.recording import (
-    StepInput,
+    RecordedStep,
+    recorded_step,
     save_frame_times,
     save_image,
     save_record,
-    step_input,
 )
 from payload_emulator.session.archive.scoring import judge_session, score_navigation
 from payload_emulator.session.scenario import Scenario, format_scenario
@@ -46,7 +46,7 @@ from payload_emulator.session.spacecraft.loading import (
 from payload_emulator.session.spacecraft.loop import (
     PLAYBACK_CHANNEL,
     Spacecraft,
-    Turn,
+    StepResult,
     new_spacecraft,
 )
 from payload_emulator.session.spacecraft.schedule import fly_scenario, timeline
@@ -182,18 +182,18 @@ class Sender:
     def __post_init__(self) -> None:
         self.transmitter = Transmitter(self.world.scenario.spacecraft_id, self.settings)
 
-    def take(self, turn: Turn) -> None:
-        """Take the packets of a turn, and send what is complete."""
-        self._utc_ns, self._light_s = turn.moment.utc_ns, turn.moment.light_s
+    def take(self, result: StepResult) -> None:
+        """Take the packets of a step, and send the dumps that are complete."""
+        self._utc_ns, self._light_s = result.step.utc_ns, result.step.light_s
         stations = bool(self.world.scenario.link.stations)
-        now = clock_ticks(self.world, turn.moment.utc_ns)
-        for packet in turn.packets:
+        now = clock_ticks(self.world, result.step.utc_ns)
+        for packet in result.packets:
             late = stations and now - int.from_bytes(packet[14:20], "big") > _LATE_TICKS
-            self._waiting.setdefault(PLAYBACK_CHANNEL if late else 0, []).append((packet, turn.clcw))
+            self._waiting.setdefault(PLAYBACK_CHANNEL if late else 0, []).append((packet, result.clcw))
             if not late and int.from_bytes(packet[:2], "big") & 0x7FF == APID_TIME_REPORT:
-                self.time_reports.append((packet, turn.moment.utc_ns))
+                self.time_reports.append((packet, result.step.utc_ns))
         waiting = sum(len(packet) for packets in self._waiting.values() for packet, _ in packets)
-        if stations and (not turn.moment.heard or waiting > _DUMP_OCTETS):
+        if stations and (not result.step.in_contact or waiting > _DUMP_OCTETS):
             self.flush()
 
     def flush(self) -> None:
@@ -224,21 +224,21 @@ def _emulate_into(
     )
     spacecraft = new_spacecraft(world, loaded)
     sender = Sender(world, LinkSettings(coding=scenario.link.coding))
-    inputs: list[StepInput] = []
+    inputs: list[RecordedStep] = []
     attitudes = np.full((total, 3, 3), np.nan)
     flown = fly_scenario(world, spacecraft)
-    for turn in progress(flown, len(timeline(world))) if progress else flown:
-        sender.take(turn)
-        given, number = spacecraft.given, turn.moment.frame
-        if turn.exposure is not None:
-            if turn.exposure.fault:
-                raise TerrainError(turn.exposure.fault)
-            attitudes[number] = turn.exposure.camera_from_mcmf
-        if given is None:
+    for result in progress(flown, len(timeline(world))) if progress else flown:
+        sender.take(result)
+        payload_input, number = spacecraft.payload_input, result.step.frame
+        if result.exposure is not None:
+            if result.exposure.fault:
+                raise TerrainError(result.exposure.fault)
+            attitudes[number] = result.exposure.camera_from_mcmf
+        if payload_input is None:
             continue
-        inputs.append(step_input(number, given))
+        inputs.append(recorded_step(number, payload_input))
         if number in kept:
-            save_image(folder, number, given.image)
+            save_image(folder, number, payload_input.image)
     sender.flush()
     reception = transmit(sender.transmitter.dumps, sender.transmitter.settings, scenario.link, scenario.seed)
     save_record(folder, inputs, loaded.parameters, loaded.tables)
@@ -307,7 +307,7 @@ def _summary(
 
 
 def _manifest(world: World, loaded: LoadedPayload, folder: Path) -> dict[str, Any]:
-    """What the ground needs to know of a pass, with the hash of every file of the archive but itself."""
+    """Return the facts of a pass that the ground needs, with the hash of every other file of the archive."""
     scenario, camera = world.scenario, world.scenario.camera
     return {
         "schema_version": 1,

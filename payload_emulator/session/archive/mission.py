@@ -18,13 +18,15 @@ import numpy as np
 from lunar.arrays import IntArray
 from lunar.boxes import Region, share_outside
 from lunar.constants import MOON_RADIUS_M
-from lunar.constants import NANOSECONDS_PER_SECOND as NS
+from lunar.constants import NS as NS
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation, spherical_from_mcmf
 from lunar.timescales import format_utc
 from payload_emulator.flight.models import NETWORKS
+from payload_emulator.flight.navigation.filter.filter import CommonErrors
+from payload_emulator.flight.navigation.filter.map_offset import OffsetRule
 from payload_emulator.flight.vision.detector import OnnxDetector
-from payload_emulator.session.archive.recording import StepInput
+from payload_emulator.session.archive.recording import RecordedStep
 from payload_emulator.session.live.station_ports import RECORD_HEADER
 from payload_emulator.session.scenario import (
     SHIPPED,
@@ -86,7 +88,7 @@ ORBIT_AGE_H = 24.0
 
 _TRACK_STEP_S = 60.0
 _ALTITUDE_MARGIN = 1.3
-"""Altitudes of the mission beside those of the flight so far."""
+"""Altitudes of the mission in addition to those of the flight so far."""
 
 CLOCK_EPOCH = "2000-01-01T00:00:00 TAI"
 
@@ -119,6 +121,7 @@ def mission_text(world: World, data: DataFolder, orbit_age_h: float | None = Non
     """
     scenario, camera = world.scenario, world.scenario.camera
     link = LinkSettings(coding=scenario.link.coding)
+    errors, rule = CommonErrors(), OffsetRule()
     flown_field = filter_field(scenario.navigation.filter_gravity, scenario.navigation.filter_degree, data)
     sections: dict[str, dict[str, Value]] = {
         "spacecraft": {"id": scenario.spacecraft_id, "name": scenario.spacecraft},
@@ -157,6 +160,8 @@ def mission_text(world: World, data: DataFolder, orbit_age_h: float | None = Non
         "catalogue": {
             "source": world.terrain.catalogue.source,
             **_registration(world),
+            "offset_sigma_m": [rule.prior_m, rule.prior_m, errors.catalogue_offset_m[2]],
+            "offset_correlation_deg": round(math.degrees(rule.correlation_rad), 6),
         },
         "detector": _detector(scenario),
         "reference": {
@@ -208,7 +213,7 @@ def _track_utc_ns(world: World) -> IntArray:
 
 
 def _registration(world: World) -> dict[str, float | int]:
-    """Where the catalogue is registered to the terrain, and its shift near the frames."""
+    """Return the terrain that the catalogue is registered to, and its shift near the frames."""
     registration = world.terrain.registration
     share = registered_share(world.terrain, world.truth, world.frame_utc_ns)
     if registration is None or not share:
@@ -295,7 +300,7 @@ def _section(title: str, values: Mapping[str, Value]) -> list[str]:
 
 
 def _station(name: str, link: LinkSection) -> dict[str, Value]:
-    """Place, rates and outages of a station of the scenario, and its records."""
+    """Return place, rates and outages of a station of the scenario, and its records."""
     records: dict[str, Value] = {
         "header_octets": RECORD_HEADER.size,
         "time_code": "unix_ns",
@@ -318,14 +323,14 @@ def _station(name: str, link: LinkSection) -> dict[str, Value]:
 
 
 def _uploaded_tables(scenario: Scenario) -> list[str]:
-    """Tables that the estimators of a scenario need for each window."""
+    """Return the tables that the estimators of a scenario need for each window."""
     estimators = scenario.navigation.estimators
     anchored = ["orientation"] if "anchored" in estimators else []
     odometry = ["anchor_ephemeris"] if set(estimators) - {"anchored"} else []
     return [*anchored, *odometry, *(["initial_state"] if anchored else [])]
 
 
-def save_attitudes(folder: Path, inputs: Iterable[StepInput]) -> None:
+def save_attitudes(folder: Path, inputs: Iterable[RecordedStep]) -> None:
     """Write the attitude of every frame, as attitude control gave it, into an archive."""
     rows = []
     for item in inputs:

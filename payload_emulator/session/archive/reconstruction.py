@@ -29,7 +29,7 @@ from payload_emulator.flight.telemetry.products import image_report
 from payload_emulator.session.archive.emulator import Progress, file_entries
 from payload_emulator.session.archive.mission import save_attitudes
 from payload_emulator.session.archive.recording import (
-    StepInput,
+    RecordedStep,
     pixel_hash,
     save_frame_times,
     save_image,
@@ -70,7 +70,7 @@ _UNKNOWN_SENSORS = np.full(4, np.nan)
 
 @dataclass(frozen=True, slots=True)
 class ImageReport:
-    """What telemetry states of one image."""
+    """Statement of telemetry about one image."""
 
     ticks: int
     values: Mapping[str, int]
@@ -105,7 +105,7 @@ def reconstruct(
     _check_loads(archive, telemetry.get("housekeeping"), loaded, telecommands)
     world = flown_until(world, first_utc_ns(world, reports[-1].ticks))
     shutil.copytree(archive, out)
-    steps: dict[int, StepInput] = {}
+    steps: dict[int, RecordedStep] = {}
     times = []
     for number, (report, exposure) in enumerate(
         progress(_exposures(world, reports), len(reports)) if progress else _exposures(world, reports)
@@ -145,7 +145,7 @@ def flown_until(world: World, utc_ns: int) -> World:
     return world
 
 
-def with_telecommands(steps: Mapping[int, StepInput], telecommands: bytes) -> list[StepInput]:
+def with_telecommands(steps: Mapping[int, RecordedStep], telecommands: bytes) -> list[RecordedStep]:
     """Return the steps of a pass: a boot that receives the telecommands, and one at each time of release or image."""
     releases = [
         int(command.values["release_ticks"])
@@ -175,12 +175,12 @@ def _exposures(world: World, reports: Sequence[ImageReport]) -> Iterator[tuple[I
         yield report, exposure
 
 
-def _step(ticks: int) -> StepInput:
+def _step(ticks: int) -> RecordedStep:
     """Return a step without an image."""
-    return StepInput(-1, ticks, _NO_ATTITUDE, b"", (0, 0), "", None, _UNKNOWN_SENSORS, 0, UNLIMITED)
+    return RecordedStep(-1, ticks, _NO_ATTITUDE, b"", (0, 0), "", None, _UNKNOWN_SENSORS, 0, UNLIMITED)
 
 
-def _frame_step(number: int, ticks: int, exposure: Exposure) -> StepInput:
+def _frame_step(number: int, ticks: int, exposure: Exposure) -> RecordedStep:
     return replace(
         _step(ticks),
         number=number,

@@ -1,7 +1,7 @@
-"""What a payload was given during a pass, kept so that another build can be given the same.
+"""Recorded inputs of a payload during a pass, from which another build flies the same pass.
 
 In a pass archive this is the folder `payload/`: `inputs.jsonl` (one line per step: on-board time, message of the ADCS,
-telecommands, hash of the image, what the board said), `parameters.toml`, `tables/*.bin` as uploaded, and
+telecommands, hash of the image, readings of the board), `parameters.toml`, `tables/*.bin` as uploaded, and
 `dictionary.json` (the packet definitions the downlink was made with); images lie in `frames/`. Nothing of the truth is
 here.
 """
@@ -32,7 +32,7 @@ from tmtc.dictionary.definitions import format_dictionary
 from tmtc.dictionary.payload import DICTIONARY
 
 if TYPE_CHECKING:
-    from payload_emulator.session.spacecraft.loop import Given
+    from payload_emulator.session.spacecraft.loop import PayloadInput
 
 FOLDER = "payload"
 INPUTS = f"{FOLDER}/inputs.jsonl"
@@ -45,8 +45,8 @@ Image = NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StepInput:
-    """What one call of `Payload.step` was given, the image by its hash.
+class RecordedStep:
+    """Inputs of one call of `Payload.step`, the image by its hash.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class StepInput:
     boot
         Cause of the start of the processor before this step, None without one.
     sensors, uptime_ticks, downlink_octets
-        What the board said: readings (4,), time since power-on, room on the link.
+        Values of the board: readings (4,), time since power-on, room on the link.
     image_shape, image_sha256
         Shape of the pixels and SHA-256 of their octets, row by row; an empty shape and hash for a camera that gave
         none.
@@ -83,35 +83,35 @@ class PassRecord:
         Parameters and tables of the record that the present flight code no longer has.
     """
 
-    inputs: tuple[StepInput, ...]
+    inputs: tuple[RecordedStep, ...]
     parameters: BuildParameters
     tables: FlightTables
     dropped: tuple[str, ...] = ()
 
 
-def step_input(number: int, given: Given) -> StepInput:
-    """The record of one step."""
-    return StepInput(
+def recorded_step(number: int, payload_input: PayloadInput) -> RecordedStep:
+    """Return the record of one step."""
+    return RecordedStep(
         number,
-        given.clock_ticks,
-        np.asarray(given.attitude, np.float64),
-        given.telecommands,
-        given.image.shape,
-        pixel_hash(given.image) if number >= 0 else "",
-        given.boot,
-        np.asarray(given.sensors, np.float64),
-        given.uptime_ticks,
-        given.downlink_octets,
+        payload_input.clock_ticks,
+        np.asarray(payload_input.attitude, np.float64),
+        payload_input.telecommands,
+        payload_input.image.shape,
+        pixel_hash(payload_input.image) if number >= 0 else "",
+        payload_input.boot,
+        np.asarray(payload_input.sensors, np.float64),
+        payload_input.uptime_ticks,
+        payload_input.downlink_octets,
     )
 
 
 def pixel_hash(image: NDArray[Any]) -> str:
-    """SHA-256 of the pixels, row by row; empty for an image without any."""
+    """Return the SHA-256 of the pixels, row by row; empty for an image without any."""
     return hashlib.sha256(np.ascontiguousarray(image).data).hexdigest() if image.size else ""
 
 
 def save_record(
-    folder: Path, inputs: Iterable[StepInput], parameters: BuildParameters, tables: FlightTables
+    folder: Path, inputs: Iterable[RecordedStep], parameters: BuildParameters, tables: FlightTables
 ) -> None:
     """Write the record of a pass into its archive `folder`."""
     (folder / TABLES).mkdir(parents=True, exist_ok=True)
@@ -131,7 +131,7 @@ def save_frame_times(folder: Path, utc_ns: IntArray) -> None:
 
 
 def load_record(folder: Path) -> PassRecord:
-    """The record in a pass archive.
+    """Load the record of a pass archive.
 
     Raises
     ------
@@ -165,12 +165,12 @@ def load_record(folder: Path) -> PassRecord:
 
 
 def frame_path(number: int) -> str:
-    """Name of the image of a frame in an archive."""
+    """Return the name of the image of a frame in an archive."""
     return f"frames/{number:06d}.png"
 
 
-def missing_frames(folder: Path, inputs: Sequence[StepInput]) -> list[int]:
-    """Frames that had an image which is not in the archive."""
+def missing_frames(folder: Path, inputs: Sequence[RecordedStep]) -> list[int]:
+    """Return the frames that had an image which is not in the archive."""
     return [
         item.number
         for item in inputs
@@ -192,8 +192,8 @@ def save_image(folder: Path, number: int, image: Image) -> None:
     path.write_bytes(encoded.tobytes())
 
 
-def load_image(folder: Path, item: StepInput) -> Image:
-    """The image of a frame as the payload was given it, checked against its hash; no pixels where it had none.
+def load_image(folder: Path, item: RecordedStep) -> Image:
+    """Load the image of a frame as the payload received it, checked against its hash; no pixels if it had none.
 
     Raises
     ------
@@ -217,7 +217,7 @@ def load_image(folder: Path, item: StepInput) -> Image:
     return image
 
 
-def check_image(item: StepInput, image: Image, source: str) -> None:
+def check_image(item: RecordedStep, image: Image, source: str) -> None:
     """Refuse an image that is not the one that the payload was given."""
     if image.shape != item.image_shape:
         raise RecordError(
@@ -236,7 +236,7 @@ def _size(shape: tuple[int, ...]) -> str:
     return " x ".join(map(str, shape)) + " pixels"
 
 
-def _line(item: StepInput) -> str:
+def _line(item: RecordedStep) -> str:
     row = {
         "frame": item.number,
         "ticks": item.clock_ticks,
@@ -261,7 +261,7 @@ def _array(values: list[float | None]) -> FloatArray:
     return np.array([math.nan if value is None else float(value) for value in values], dtype=np.float64)
 
 
-def _parse(line: str, path: Path, index: int) -> StepInput:
+def _parse(line: str, path: Path, index: int) -> RecordedStep:
     try:
         row = json.loads(line)
         if "instruments" in row:
@@ -270,7 +270,7 @@ def _parse(line: str, path: Path, index: int) -> StepInput:
                 f"{', '.join(row['instruments'])}: other instruments were withdrawn; the version that recorded "
                 "this pass can replay it"
             )
-        return StepInput(
+        return RecordedStep(
             int(row["frame"]),
             int(row["ticks"]),
             _array(row["attitude"]),

@@ -34,7 +34,7 @@ from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.archive.recording import (
     INPUTS,
     PassRecord,
-    StepInput,
+    RecordedStep,
     check_image,
     load_image,
     load_record,
@@ -75,7 +75,7 @@ class FlightBuild:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay:
-    """What a replay gave: packets, counts of the payload, and CPU milliseconds of stages by frame."""
+    """Result of a replay: packets, counts of the payload, and CPU milliseconds of stages by frame."""
 
     packets: list[bytes]
     summary: dict[str, Any]
@@ -83,7 +83,7 @@ class Replay:
 
 
 def load_flight_build(path: Path) -> FlightBuild:
-    """A build from its TOML file: `name`, `version`, `model` and `parameters` (files in the same folder).
+    """Load a build from its TOML file: `name`, `version`, `model` and `parameters` (files in the same folder).
 
     Raises
     ------
@@ -238,7 +238,7 @@ def replay(
     payload = started()
     packets: list[bytes] = []
     rows: list[tuple[float, float, float]] = []
-    pairs: Iterable[tuple[StepInput, Image]] = zip(record.inputs, images, strict=True)
+    pairs: Iterable[tuple[RecordedStep, Image]] = zip(record.inputs, images, strict=True)
     for item, image in progress(pairs, len(record.inputs)) if progress else pairs:
         if board.enter_step(item) and item is not record.inputs[0]:
             payload = started()
@@ -267,12 +267,12 @@ def _with_network(build: FlightBuild, manifest: dict[str, Any]) -> FlightBuild:
 
 
 def stored_images(archive: Path, record: PassRecord) -> Iterator[Image]:
-    """The images of a pass from its archive, the next one read while this one is worked on."""
+    """Yield the images of a pass from its archive; the next one is read while one is processed."""
     return _ahead(lambda item: load_image(archive, item), record.inputs)
 
 
 def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iterator[Image]:
-    """The images of a pass, those that its archive lacks rendered from scenario and seed and found to be the same."""
+    """Yield the images of a pass; those that its archive lacks are rendered from scenario and seed, and verified."""
     from payload_emulator.session.scenario import parse_scenario
     from payload_emulator.session.world.camera import expose
 
@@ -285,7 +285,7 @@ def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iter
     world.terrain.release_thread()
     absent = set(missing_frames(archive, record.inputs))
 
-    def image_of(item: StepInput) -> Image:
+    def image_of(item: RecordedStep) -> Image:
         if item.number not in absent or not item.image_sha256:
             return load_image(archive, item)
         if item.number >= world.frame_utc_ns.size:
@@ -379,7 +379,7 @@ class RecordedBoard(BareBoard):
     downlink: int = UNLIMITED
     asked_to_reset: bool = False
 
-    def enter_step(self, item: StepInput) -> bool:
+    def enter_step(self, item: RecordedStep) -> bool:
         """Take the place of the board in a step; whether the processor restarts before it."""
         self.uptime, self.downlink = item.uptime_ticks, item.downlink_octets
         if np.isfinite(item.sensors).all():
@@ -443,7 +443,7 @@ class _TimedDetector:
         return found
 
 
-def _ahead(load: Callable[[StepInput], Image], inputs: tuple[StepInput, ...]) -> Iterator[Image]:
+def _ahead(load: Callable[[RecordedStep], Image], inputs: tuple[RecordedStep, ...]) -> Iterator[Image]:
     with ThreadPoolExecutor(max_workers=1) as reader:
         pending = [reader.submit(load, item) for item in inputs[:2]]
         for number in range(len(inputs)):

@@ -15,9 +15,10 @@ import numpy as np
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import project_mcmf
 from lunar.catalogue import CraterCatalogue
+from lunar.constants import NS
 from lunar.frames import icrf_from_onboard, rtn_from_inertial, spherical_from_mcmf
 from lunar.timescales import format_utc, tdb_s_from_utc_ns
-from payload_emulator.flight.navigation.filter.dynamics import OrbitModel, flown, process_noise
+from payload_emulator.flight.navigation.filter.dynamics import OrbitModel, coasted, flown, process_noise
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome
 from payload_emulator.session.spacecraft.loading import LoadedPayload
 from payload_emulator.session.world.world import World, clock_ticks
@@ -35,9 +36,8 @@ from tmtc.dictionary.tables import (
 )
 from tmtc.packets.stream import cut_packets
 
-_NS = 1_000_000_000
 # Frames further apart than this belong to different arcs: the shortest gap, over a pole, takes 18 minutes.
-_ARC_GAP_NS = 600 * _NS
+_ARC_GAP_NS = 600 * NS
 # A session of several arcs is judged from the third on, a single one after this many frames.
 _SETTLED_ARC, _SETTLED_FRAMES = 2, 20
 # A pair is right if the crater truly lies within this of the detection: six pixels, or a quarter of its diameter.
@@ -63,8 +63,9 @@ class FlownErrors:
         Normalised estimation error squared, 6 degrees of freedom.
     only_error_m
         Length of the position error of propagation alone.
-    coast_end_m
-        Length of the error right before the first image after a gap; NaN elsewhere.
+    coast_end_m, coast_sigmas
+        Length of the error right before the first image after a gap, and the error along each axis over the standard
+        deviation that the filter states by then, shape (n, 3); NaN elsewhere.
     """
 
     frame: IntArray
@@ -73,6 +74,7 @@ class FlownErrors:
     nees: FloatArray
     only_error_m: FloatArray
     coast_end_m: FloatArray
+    coast_sigmas: FloatArray
 
     @property
     def position_m(self) -> FloatArray:
@@ -81,7 +83,7 @@ class FlownErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedSession:
-    """What the anchored estimator did in a session, judged by the truth; a row per frame of the session.
+    """Performance of the anchored estimator in a session, judged by the truth; a row per frame of the session.
 
     Attributes
     ----------
@@ -118,7 +120,7 @@ class JudgedSession:
 
     @property
     def wrong_fixes(self) -> int:
-        """Fixes most of whose pairs are wrong."""
+        """Fixes with mostly wrong pairs."""
         return int(np.sum(self.fixed & (self.pairs[:, 1] > self.pairs[:, 0])))
 
     def nis_per_degree(self, chosen: BoolArray) -> float | None:
@@ -230,7 +232,7 @@ def _errors(
     burns = unpack_burn_table(loaded.tables.burns) if loaded.tables.burns else no_burns()
     gravity = unpack_gravity_table(loaded.tables.gravity)
     degree = gravity.c_bar.shape[0] - 1
-    model = OrbitModel(gravity, orientation, degree, process_noise(degree))
+    model = OrbitModel(gravity, orientation, degree, process_noise(degree, gravity.name))
     utc_ns = world.frame_utc_ns[frame]
     position, velocity = world.truth.states(utc_ns)
     truth = np.concatenate([position, velocity], axis=1)
@@ -244,21 +246,22 @@ def _errors(
     sigma = np.sqrt(np.einsum("nij,njk,nik->ni", axes, covariance[:, :3, :3], axes))
     only = _propagated(loaded, model, burns, ticks)
     only_error = np.linalg.norm(rtn_errors(only, truth, to_truth, rtn)[:, :3], axis=1)
-    coast_end = np.full(frame.size, np.nan)
+    coast_end, coast_sigmas = np.full(frame.size, np.nan), np.full((frame.size, 3), np.nan)
     for first, _ in _arcs(world.frame_utc_ns, imaging)[1:]:
         at = int(np.searchsorted(frame, first))
         if 0 < at < frame.size and frame[at] == first:
-            prior = flown(model, own[at - 1], int(ticks[at - 1]), int(ticks[at]), burns)
+            span = int(ticks[at - 1]), int(ticks[at])
+            prior = coasted(model, own[at - 1], covariance[at - 1], *span, burns)
             if prior is not None:
                 here = slice(at, at + 1)
-                coast_end[at] = np.linalg.norm(
-                    rtn_errors(prior[None, :6], truth[here], to_truth[here], rtn[here])[0, :3]
-                )
-    return FlownErrors(frame, error, sigma, nees, only_error, coast_end)
+                off = rtn_errors(prior[0][None, :6], truth[here], to_truth[here], rtn[here])[0, :3]
+                stated = np.diag(axes[at] @ prior[1][:3, :3] @ axes[at].T)
+                coast_end[at], coast_sigmas[at] = np.linalg.norm(off), off / np.sqrt(stated)
+    return FlownErrors(frame, error, sigma, nees, only_error, coast_end, coast_sigmas)
 
 
 def turns(rotation: FloatArray, orientation: OrientationTable, ticks: IntArray) -> FloatArray:
-    """Rotations (n, 3, 3) from the payload's inertial axes to the true ones, by way of the Moon both look at."""
+    """Return the rotations (n, 3, 3) from the payload's inertial axes to the true ones, by way of the Moon."""
     own = [orientation.at(int(tick)) for tick in ticks]
     known = np.array([np.full((3, 3), np.nan) if matrix is None else matrix for matrix in own])
     return icrf_from_onboard(rotation, known)
@@ -274,7 +277,7 @@ def turned(states: FloatArray, turn: FloatArray) -> FloatArray:
 
 
 def rtn_errors(states: FloatArray, truth: FloatArray, turn: FloatArray, rtn: FloatArray) -> FloatArray:
-    """Errors (n, 6) of the payload's states along the axes of the true orbit."""
+    """Return the errors (n, 6) of the payload's states along the axes of the true orbit."""
     return turned(turned(states, turn) - truth, rtn)
 
 
@@ -288,7 +291,7 @@ def normalised_squares(error: FloatArray, block: FloatArray) -> FloatArray:
 
 
 def _propagated(loaded: LoadedPayload, model: OrbitModel, burns: BurnTable, ticks: IntArray) -> FloatArray:
-    """States (n, 6) of the start state flown on without any image, NaN where the orbit model ends."""
+    """Return the states (n, 6) of the start state propagated without any image, NaN where the orbit model ends."""
     start = unpack_initial_state(loaded.tables.initial_state)
     state: FloatArray | None = np.concatenate([start.position_icrf_m, start.velocity_icrf_m_s, np.zeros(3)])
     at, states = start.ticks, np.full((ticks.size, 6), np.nan)
@@ -419,7 +422,7 @@ def frames_to_recover(error_m: FloatArray) -> int | None:
 
 
 def _recovery(world: World, errors: FlownErrors, imaging: BoolArray) -> dict[str, Any] | None:
-    """How many frames with an image it took to be back after a kidnap or an outage; None without either."""
+    """Return the number of frames with an image until recovery from a kidnap or an outage; None without either."""
     section = world.scenario.disturbances
     if section.kidnap_distance_km > 0.0:
         event = "kidnap told" if section.kidnap_told else "silent kidnap"
@@ -429,7 +432,7 @@ def _recovery(world: World, errors: FlownErrors, imaging: BoolArray) -> dict[str
     else:
         return None
     utc_ns = world.frame_utc_ns
-    since = (utc_ns[errors.frame] >= utc_ns[0] + round(after_s * _NS)) & imaging[errors.frame]
+    since = (utc_ns[errors.frame] >= utc_ns[0] + round(after_s * NS)) & imaging[errors.frame]
     frames = frames_to_recover(errors.position_m[since])
     return {"after": event, "frames_with_image": int(np.sum(since)), "frames_until_below_500_m": frames}
 

@@ -28,7 +28,7 @@ class SuitePass:
 def suite_scenarios(
     given: Sequence[str] = (), *, frames: int | None = None, seeds: int = 1
 ) -> list[Scenario]:
-    """The scenarios of a suite: those shipped, or those given, each with a number of seeds.
+    """Load the scenarios of a suite: those shipped, or those given, each with a number of seeds.
 
     Parameters
     ----------

@@ -6,7 +6,8 @@ list that begins with its kind; a value that occurs again is `["ref", n]`, the n
 the last item of the document has their lengths, and equal ones are written once. Arrays keep their views: flight
 software holds views of the memory of its board, and a later fault of the memory has to reach it.
 
-Nothing in the file is executed: it names classes of this program, whose attributes are set without a call.
+Nothing in the file is executed: it names classes of this program, whose attributes are set without a call. A class or
+attribute that gets another name needs an entry in `RENAMED`, a new field a default; other changes a new `VERSION`.
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ import importlib
 import json
 import os
 import re
+import struct
 from collections import Counter, OrderedDict, deque
 from collections.abc import Mapping
+from dataclasses import MISSING, Field, dataclass
 from enum import Enum
 from io import BytesIO
 from pathlib import Path
@@ -40,6 +43,14 @@ _SEQUENCES: dict[str, type] = {
 _PLAIN_NEW: object = object.__new__
 _MAPPINGS = (dict, Counter, OrderedDict)
 _UNSET = object()
+_CLOCK = struct.Struct("<q")
+_LOOP = "payload_emulator.session.spacecraft.loop"
+RENAMED = {
+    f"{_LOOP}:Given": f"{_LOOP}:PayloadInput",
+    f"{_LOOP}:Spacecraft.given": "payload_input",
+    "payload_emulator.session.live.session:Account": "payload_emulator.session.live.contacts:Account",
+}
+"""Present names of classes, and of attributes of classes, that states of this version may have by a former name."""
 
 
 def pack_state(scenario: str, values: Mapping[str, Any], known: Mapping[str, object]) -> bytes:
@@ -126,6 +137,26 @@ def load_state(path: Path, scenario: str, known: Mapping[str, object]) -> dict[s
         return unpack_state(octets, scenario, known)
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from None
+
+
+@dataclass(slots=True)
+class ClockFile:
+    """File of the mission time, which other processes map into memory; without a path, none."""
+
+    path: Path | None
+    _map: Any = None
+
+    def write(self, utc_ns: int) -> None:
+        """Write the time."""
+        if self.path is None:
+            return
+        if self._map is None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            # Other processes have mapped the file of an earlier session: it must not become shorter.
+            with self.path.open("r+b" if self.path.exists() else "w+b") as file:
+                file.write(_CLOCK.pack(utc_ns))
+            self._map = np.memmap(self.path, dtype="<i8", mode="r+", shape=(1,))
+        self._map[0] = utc_ns
 
 
 class _Writer:
@@ -270,7 +301,14 @@ class _Reader:
         made = _class(name, object)
         one = self._made[at] = object.__new__(made)
         for attribute, node in attributes:
-            object.__setattr__(one, attribute, self.value(node))
+            object.__setattr__(one, RENAMED.get(f"{name}.{attribute}", attribute), self.value(node))
+        known: dict[str, Field[Any]] = getattr(made, "__dataclass_fields__", {})
+        if len(attributes) < len(known):
+            for key, field in known.items():  # fields that were added since the state was written
+                factory = field.default_factory
+                value = field.default if factory is MISSING else factory()
+                if value is not MISSING and not hasattr(one, key):
+                    object.__setattr__(one, key, value)
         return one
 
 
@@ -285,6 +323,7 @@ def _name(kind: type) -> str:
 
 def _class(name: str, base: type) -> Any:
     """Return a class that a module of this program defines."""
+    name = RENAMED.get(name, name)
     module_name, _, place = name.partition(":")
     if module_name.partition(".")[0] not in _PACKAGES:
         raise ValueError(f"expected a class of this program, found {name}")

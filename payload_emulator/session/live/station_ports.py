@@ -1,7 +1,7 @@
 """Ports of one emulated ground station: received telemetry out as records, telecommands in.
 
 A record is the time of reception (unsigned 64-bit nanoseconds since 1970-01-01 UTC, most significant octet first) and
-a CADU. The station keeps records that a client has not acknowledged, if it is told to: a client acknowledges with the
+a CADU. The station keeps records that a client has not acknowledged, if `keeps` is set: a client acknowledges with the
 number of octets of its connection that are durable there (unsigned 64 bits, most significant octet first), and a new
 connection begins with the first record that is not acknowledged completely.
 
@@ -388,7 +388,7 @@ class TelecommandBuffer:
     _octets: bytes = b""
 
     def take(self, octets: bytes) -> list[bytes]:
-        """The packets that these octets complete."""
+        """Return the packets that these octets complete."""
         self._octets += octets
         packets: list[bytes] = []
         while self._octets:

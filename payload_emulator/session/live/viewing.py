@@ -11,7 +11,7 @@ import numpy as np
 from lunar.arrays import FloatArray, IntArray
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.timescales import format_utc
-from payload_emulator.session.spacecraft.loop import Spacecraft, Turn
+from payload_emulator.session.spacecraft.loop import Spacecraft, StepResult
 from payload_emulator.session.world.camera import Exposure, craters_in_view
 from payload_emulator.session.world.world import World
 from payload_emulator.sim.render.labels import label_frame
@@ -24,32 +24,32 @@ _SHOWN_CRATERS = 200
 _SMALLEST_SHOWN_PX = 6.0
 
 
-def turn_message(
-    spacecraft: Spacecraft, turn: Turn, craters: list[dict[str, float]] | None = None
+def step_message(
+    spacecraft: Spacecraft, result: StepResult, craters: list[dict[str, float]] | None = None
 ) -> dict[str, Any]:
-    """A step for a viewer: image, detections, catalogue, outcome and estimate of each estimator, and truth.
+    """Return a step for a viewer: image, detections, catalogue, outcome and estimate of each estimator, and truth.
 
     `craters` are those of the catalogue in the image; None: on the sphere, as the detections of reduced images are.
 
     A detection that the payload identified has the `crater_id` that it reported.
     """
-    world, exposure = spacecraft.world, turn.exposure
+    world, exposure = spacecraft.world, result.exposure
     message: dict[str, Any] = {
         "kind": "turn" if exposure is None else "frame",
-        "utc": format_utc(turn.moment.utc_ns),
+        "utc": format_utc(result.step.utc_ns),
         "mode": spacecraft.payload.mode.name,
-        "packets": len(turn.packets),
+        "packets": len(result.packets),
         "waiting": spacecraft.payload.waiting,
         "resets": len(spacecraft.resets),
         "events": [],
         "verifications": [],
     }
-    estimates = _add_packets(message, turn.packets)
+    estimates = _add_packets(message, result.packets)
     if exposure is not None:
         position = world.truth.positions_mcmf(exposure.utc_ns)[0]
         latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))
         message |= {
-            "frame": spacecraft.payload.frames - 1 if turn.moment.frame < 0 else turn.moment.frame,
+            "frame": spacecraft.payload.frames - 1 if result.step.frame < 0 else result.step.frame,
             "reference": {
                 "latitude_deg": np.degrees(latitude),
                 "longitude_deg": np.degrees(longitude) % 360.0,
@@ -149,7 +149,7 @@ def _largest(world: World, index: IntArray, columns: dict[str, FloatArray]) -> l
 
 
 def _jpeg(image: Any) -> str:
-    """A picture for the eye in base64, at a third of a PNG's time and half its size; "" without one."""
+    """Return a JPEG image in base64, at a third of a PNG's time and half its size; "" without pixels."""
     if not image.size:
         return ""
     import cv2

@@ -1,4 +1,4 @@
-"""What is uploaded to the payload before a window: model, parameters, tables.
+"""Uploads to the payload before a window: model, parameters, tables.
 
 It is made by the ground from the ground's own knowledge (reference ephemeris, catalogue, gravity field). Nothing of the
 simulated truth passes through here except what a scenario declares to be known.
@@ -27,6 +27,7 @@ from payload_emulator.errors import ModelError
 from payload_emulator.flight.models import NETWORKS, load_shipped_model
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.flight.navigation.filter.filter import CommonErrors
+from payload_emulator.flight.navigation.filter.map_offset import OffsetRule
 from payload_emulator.flight.navigation.odometry.odometry import OdometryParameters
 from payload_emulator.flight.navigation.outcomes import Mode
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload, PayloadMode
@@ -202,7 +203,9 @@ def _build(scenario: Scenario, camera: PinholeCamera, data: DataFolder, is_launc
             camera=camera,
             modes=tuple(Mode[name] for name in navigation.estimators),
             odometry=OdometryParameters(safety_timeout_s=navigation.safety_timeout_s or None),
-            anchored=AnchoredParameters(gravity_degree=field.degree, errors=_attitude_errors(scenario)),
+            anchored=AnchoredParameters(
+                gravity_degree=field.degree, errors=_attitude_errors(scenario), offset=OffsetRule()
+            ),
             image_reports=is_launched,
             time_reports=is_launched,
             scrub_interval_s=_SCRUB_S if is_launched else FlightParameters().scrub_interval_s,
@@ -216,7 +219,7 @@ def _build(scenario: Scenario, camera: PinholeCamera, data: DataFolder, is_launc
 def _loaded(
     build: _Build, tables: FlightTables, start_state: dict[str, Any], orientation: Orientation
 ) -> LoadedPayload:
-    """The payload of a build with tables, described for the archive."""
+    """Return the payload of a build with tables, described for the archive."""
     parameters, detector, field = build.parameters.flight, build.detector, build.field
     payload = Payload(
         detector, parameters, tables, model_hash=detector.model_hash, model_octets=len(build.model)
@@ -252,7 +255,7 @@ def _gravity_octets(field: GravityField) -> bytes:
 
 
 def _attitude_errors(scenario: Scenario) -> CommonErrors:
-    """How well the ADCS knows the attitude, by its data sheet: as flown, no better than flight believes as shipped."""
+    """Return the attitude errors of the ADCS by its data sheet: as flown, at least those of the shipped parameters."""
     errors, attitude = CommonErrors(), scenario.attitude
     noise_deg = attitude.declared_noise_deg
     if noise_deg < 0.0:
@@ -268,7 +271,7 @@ def _attitude_errors(scenario: Scenario) -> CommonErrors:
 
 
 def _catalogue_octets(scenario: Scenario, catalogue: CraterCatalogue) -> bytes:
-    """The anchoring catalogue as uploaded: the table the scenario names, else one of the terrain's craters."""
+    """Return the anchoring catalogue as uploaded: the table the scenario names, else one of the terrain's craters."""
     navigation = scenario.navigation
     octets = _named_catalogue(scenario) or pack_catalogue_table(onboard_catalogue(scenario, catalogue))
     table = unpack_catalogue_table(octets)
@@ -305,7 +308,7 @@ def check_payload_files(scenario: Scenario) -> None:
 
 
 def onboard_catalogue(scenario: Scenario, catalogue: CraterCatalogue) -> CatalogueTable:
-    """The anchoring catalogue: craters deep enough to be seen, with their errors' sizes and (seeded) their errors."""
+    """Return the anchoring catalogue: craters deep enough to be seen, with sizes of errors and (seeded) errors."""
     with np.errstate(invalid="ignore"):
         depth_ratio = catalogue.depth_m / catalogue.diameter_m
     known = np.isfinite(catalogue.rim_height_m) & ~(depth_ratio < _VISIBLE_DEPTH_RATIO)
@@ -337,7 +340,7 @@ def onboard_catalogue(scenario: Scenario, catalogue: CraterCatalogue) -> Catalog
 def _initial_state(
     scenario: Scenario, utc_ns: int, position_icrf_m: FloatArray, velocity_icrf_m_s: FloatArray
 ) -> InitialState:
-    """The state that starts the filter: the reference, displaced by a (seeded) error of the declared size."""
+    """Return the state that starts the filter: the reference, displaced by a (seeded) error of the declared size."""
     navigation = scenario.navigation
     directions = np.random.default_rng((scenario.seed, 2**35)).standard_normal((2, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -353,7 +356,7 @@ def _initial_state(
 
 
 def _burn_table(burns: Sequence[TrueBurn]) -> bytes:
-    """The burns as planned; no octets where there is none."""
+    """Pack the planned burns; no octets without any."""
     if not burns:
         return b""
     return pack_burn_table(
@@ -377,7 +380,7 @@ def filter_field(name: str, degree: int, data: DataFolder) -> GravityField:
 
 
 def _orientation_table(orientation: Orientation, start_utc_ns: int, stop_utc_ns: int) -> bytes:
-    """The rotation of the Moon as uploaded, an hour between samples, with a margin for interpolation."""
+    """Pack the rotation of the Moon as uploaded, an hour between samples, with a margin for interpolation."""
     times = np.arange(
         np.int64(start_utc_ns - _ORIENTATION_MARGIN_NS),
         np.int64(stop_utc_ns + _ORIENTATION_MARGIN_NS),
@@ -390,7 +393,7 @@ def _orientation_table(orientation: Orientation, start_utc_ns: int, stop_utc_ns:
 
 
 def _anchor_table(reference: Ephemeris, orientation: Orientation) -> bytes:
-    """The anchor ephemeris as uploaded: places in MCMF against on-board time."""
+    """Pack the anchor ephemeris as uploaded: positions in MCMF against on-board time."""
     times = np.arange(reference.start_utc_ns, reference.stop_utc_ns + 1, _ANCHOR_STEP_NS, dtype=np.int64)
     position, _ = reference.at(times)
     rotation = orientation.mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(times), dtype=np.float64))
@@ -429,7 +432,7 @@ def network_octets(name: str) -> bytes:
 
 
 def load_scenario_payload(world: World, data: DataFolder) -> tuple[LoadedPayload, Ephemeris, CraterCatalogue]:
-    """The payload loaded for a world, with the reference and the catalogue that the ground made its tables of."""
+    """Load the payload for a world; return it with the reference and the catalogue of the tables of the ground."""
     scenario = world.scenario
     truth_ephemeris = sample_truth(world.truth, world.frame_utc_ns, scenario.spacecraft.upper())
     reference = with_reference_error(truth_ephemeris, scenario.reference, scenario.seed)

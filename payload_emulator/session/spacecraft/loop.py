@@ -1,6 +1,6 @@
 """The spacecraft: the payload on its simulated board, its camera and receiver, and the loop that flies it.
 
-Every way to fly is `fly` over a schedule of moments: a scenario with its operator, a process commanded by the ground.
+Every way to fly is `fly` over a schedule of steps: a scenario with its operator, a process commanded by the ground.
 Time, power, faults and resets are around `Payload.step`.
 """
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray, OctetArray
+from lunar.constants import NS
 from payload_emulator.flight.onboard.loads import MODEL_NUMBER, TABLE_NUMBERS
 from payload_emulator.flight.onboard.machine import PARAMETERS_NUMBER
 from payload_emulator.flight.payload import Payload
@@ -32,7 +33,6 @@ from tmtc.packets.cuc import TICKS_PER_SECOND
 PLAYBACK_CHANNEL = 1
 """Virtual channel of packets that are sent long after they were made."""
 
-_NS = 1_000_000_000
 _NO_ATTITUDE = np.full(7, np.nan)
 _NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
 _PLATFORM = PlatformModel()
@@ -45,47 +45,47 @@ _REGIONS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
-    """One step of the spacecraft.
+class StepInput:
+    """Input of one step of the spacecraft.
 
     Attributes
     ----------
     frame
         Number of the frame of the scenario; -1 where it has none.
-    heard
-        Whether a station listens.
+    in_contact
+        Whether a station receives.
     light_s
         Light time to there.
     image_utc_ns, next_image_utc_ns
         Time of the image that the camera takes in this step, None without one, and of the one that probably follows.
-    orders
+    telecommands
         Telecommand packets that reach the payload.
     """
 
     utc_ns: int
     frame: int
     sunlit: float
-    heard: bool
+    in_contact: bool
     downlink_octets: int
     light_s: float = LIGHT_S
     image_utc_ns: int | None = None
     next_image_utc_ns: int | None = None
-    orders: bytes = b""
+    telecommands: bytes = b""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Turn:
+class StepResult:
     """Outcome of one step; `clcw` is the state of the telecommand receiver after it, as frames carry it."""
 
-    moment: Moment
+    step: StepInput
     exposure: Exposure | None
     packets: list[bytes]
     clcw: bytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Given:
-    """What the payload was given in a step: at its door, and by its board.
+class PayloadInput:
+    """Inputs of the payload in a step, and values of its board.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ class BreakableDetector:
 
 
 def new_board(seed: int, store_octets: int = STORE_OCTETS) -> SimulatedBoard:
-    """A board as it comes from the factory: all memory zero."""
+    """Return a new board, all memory zero."""
     return SimulatedBoard(
         _PLATFORM, seed, np.zeros(store_octets, dtype=np.uint8), np.zeros(SETTINGS_OCTETS, dtype=np.uint8)
     )
@@ -151,7 +151,7 @@ class Spacecraft:
         Belongs to the platform: a restart of the payload leaves it as it is.
     resets
         Starts of the processor after the first, by cause.
-    given
+    payload_input
         Inputs of the payload in the last step; None while the processor was down.
     truth_reads
         Number of reads of the simulated truth during payload steps; the payload must not have access to it.
@@ -166,7 +166,7 @@ class Spacecraft:
     detector: Detector | None = None
     resets: list[int] = field(default_factory=list)
     payload: Payload = field(init=False)
-    given: Given | None = None
+    payload_input: PayloadInput | None = None
     truth_reads: ReadCount = field(default_factory=ReadCount)
     _booted: int | None = None
     _breakable: BreakableDetector = field(init=False)
@@ -185,30 +185,30 @@ class Spacecraft:
 
     @property
     def world(self) -> World:
-        """The world as far as it is flown."""
+        """World with the flight so far."""
         return self.camera.world
 
     @world.setter
     def world(self, world: World) -> None:
         self.camera.world = world
 
-    def turn(self, moment: Moment) -> Turn:
-        """Let the spacecraft do what is due at a moment."""
+    def fly_step(self, step: StepInput) -> StepResult:
+        """Take the image that is due, and let the payload make one step."""
         exposure = None
-        if moment.image_utc_ns is not None:
-            exposure = self.camera.take(moment.image_utc_ns, moment.next_image_utc_ns)
+        if step.image_utc_ns is not None:
+            exposure = self.camera.take(step.image_utc_ns, step.next_image_utc_ns)
             if isinstance(self.detector, CatalogueDetector):
                 self.detector.show(self.world, exposure)
         packets = self.step(
-            moment.utc_ns,
+            step.utc_ns,
             None if exposure is None else exposure.image,
             _NO_ATTITUDE if exposure is None else exposure.attitude,
-            clock_ticks(self.world, moment.utc_ns),
-            moment.orders,
-            sunlit=moment.sunlit,
-            downlink_octets=moment.downlink_octets,
+            clock_ticks(self.world, step.utc_ns),
+            step.telecommands,
+            sunlit=step.sunlit,
+            downlink_octets=step.downlink_octets,
         )
-        return Turn(moment, exposure, packets, self.receiver.clcw)
+        return StepResult(step, exposure, packets, self.receiver.clcw)
 
     def step(
         self,
@@ -221,12 +221,12 @@ class Spacecraft:
         sunlit: float = 1.0,
         downlink_octets: int = UNLIMITED,
     ) -> list[bytes]:
-        """What goes down after a step; None for an image: nobody looks now. Faults change what comes in."""
+        """Return the packets for downlink after a step; `image` is None without one. Faults change the inputs."""
         board = self.board
         if self._last_utc_ns is not None:
-            board.advance((utc_ns - self._last_utc_ns) / _NS, sunlit)
+            board.advance((utc_ns - self._last_utc_ns) / NS, sunlit)
         self._last_utc_ns = utc_ns
-        self.given = None
+        self.payload_input = None
         board.downlink = downlink_octets
         picture, message = self._break(utc_ns, image, attitude)
         if self._down_until_ns is not None:
@@ -242,9 +242,9 @@ class Spacecraft:
             with counted_reads(self.truth_reads):
                 packets = self.payload.step(picture, message, ticks, telecommands)
         except ProcessorHang:
-            self._down_until_ns = utc_ns + round(board.model.watchdog_s * _NS)
+            self._down_until_ns = utc_ns + round(board.model.watchdog_s * NS)
             packets = []
-        self.given = Given(
+        self.payload_input = PayloadInput(
             _NO_IMAGE if picture is None else picture,
             message,
             ticks,
@@ -264,12 +264,12 @@ class Spacecraft:
 
     @property
     def frames(self) -> int:
-        """Frames that the payload has looked at: one made for a command that it refused is none."""
+        """Frames that the payload has processed; an image for a refused command does not count."""
         return self._frames_before + self.payload.frames
 
     @property
     def clock_error_ticks(self) -> int:
-        """How far clock jumps have set the on-board clock ahead of the clock of the scenario."""
+        """Sum of the clock jumps: on-board clock minus clock of the scenario."""
         return self._clock_error_ticks
 
     def _boot(self) -> Payload:
@@ -285,8 +285,8 @@ class Spacecraft:
     def _break(
         self, utc_ns: int, image: NDArray[Any] | None, attitude: FloatArray
     ) -> tuple[NDArray[Any] | None, FloatArray]:
-        """Let the faults of this moment act; what is left of the image and of the message of the ADCS."""
-        second = (utc_ns - self.first_utc_ns) / _NS
+        """Apply the present faults; return the remaining image and message of the ADCS."""
+        second = (utc_ns - self.first_utc_ns) / NS
         present = {fault.kind: fault for fault in self.faults if fault.present(second)}
         for fault in self.faults:
             if fault.at_s <= second and fault not in self._begun:
@@ -309,7 +309,7 @@ class Spacecraft:
         return image, attitude
 
     def _strike(self, fault: Fault) -> None:
-        """What happens once, when a fault begins."""
+        """Apply the change that a fault makes once, when it begins."""
         board, bits = self.board, int(fault.size)
         if fault.kind in _REGIONS:
             region = _REGIONS[fault.kind]
@@ -342,10 +342,10 @@ class Spacecraft:
             memory[at] ^= 1 << int(self._rng.integers(0, 8))
 
 
-def fly(spacecraft: Spacecraft, schedule: Iterable[Moment]) -> Iterator[Turn]:
-    """Fly the moments of a schedule, which may look at the spacecraft before each."""
-    for moment in schedule:
-        yield spacecraft.turn(moment)
+def fly(spacecraft: Spacecraft, schedule: Iterable[StepInput]) -> Iterator[StepResult]:
+    """Fly the steps of a schedule, which may depend on the spacecraft after the step before."""
+    for step in schedule:
+        yield spacecraft.fly_step(step)
 
 
 def new_spacecraft(world: World, loaded: LoadedPayload, first_utc_ns: int | None = None) -> Spacecraft:

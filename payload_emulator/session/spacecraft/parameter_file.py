@@ -55,7 +55,7 @@ class BuildParameters:
 
 
 def format_parameters(parameters: BuildParameters) -> str:
-    """TOML text with every parameter; `parse_parameters` reads equal values back."""
+    """Return TOML text with every parameter; `parse_parameters` reads equal values back."""
     return "\n".join(_section(parameters, "")).strip() + "\n"
 
 

@@ -1,4 +1,4 @@
-"""The schedule of a scenario: its frames, turns without frames, contacts, and the telecommands of its operator."""
+"""The schedule of a scenario: its frames, steps without frames, contacts, and the telecommands of its operator."""
 
 from __future__ import annotations
 
@@ -8,32 +8,32 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from lunar.constants import NS
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns
 from lunar.visibility import sunlit_fraction
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.ports import UNLIMITED
-from payload_emulator.session.spacecraft.loop import Moment, Spacecraft, Turn, fly
+from payload_emulator.session.spacecraft.loop import Spacecraft, StepInput, StepResult, fly
 from payload_emulator.session.world.world import World, clock_ticks, sample_truth
 from payload_emulator.sim.board.link import contacts
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.packets.cuc import TICKS_PER_SECOND
 
-_NS = 1_000_000_000
 # Source of the planned telecommands; a person who commands by hand has another one, with separate counts.
 _PLANNING_SOURCE = 1
 _TIME_RATE_EXPONENT = 1  # a clock known to be off is watched: a time report every second frame of telemetry
-_BEFORE_ARC_NS = 60 * _NS
-_IDLE_STEP_NS = 60 * _NS
+_BEFORE_ARC_NS = 60 * NS
+_IDLE_STEP_NS = 60 * NS
 _STANDBY_BEFORE_TICKS = 20 * TICKS_PER_SECOND
-_PATIENCE_NS = 600 * _NS
-_AHEAD_NS = 12 * 3_600 * _NS
+_IDLE_LIMIT_NS = 600 * NS
+_AHEAD_NS = 12 * 3_600 * NS
 
 
-def timeline(world: World) -> list[Moment]:
-    """The moments of a scenario: frames, a minute before and the end of each arc, each minute where stations listen."""
+def timeline(world: World) -> list[StepInput]:
+    """Return the steps of a scenario: frames, a minute before and the end of each arc, each minute with stations."""
     frames, section = world.frame_utc_ns, world.scenario.link
-    interval_ns = round(world.scenario.camera.frame_interval_s * _NS)
+    interval_ns = round(world.scenario.camera.frame_interval_s * NS)
     between = []
     for first, last in arcs(world):
         between += [int(frames[first]) - _BEFORE_ARC_NS, int(frames[last]) + interval_ns]
@@ -46,16 +46,16 @@ def timeline(world: World) -> list[Moment]:
     number[np.searchsorted(utc_ns, frames)] = np.arange(frames.size)
     position, _ = world.truth.states(utc_ns)
     sunlit = sunlit_fraction(position, sun_position_icrf_m(np.asarray(tdb_s_from_utc_ns(utc_ns))))
-    heard, light_s = contacts(sample_truth(world.truth, utc_ns), utc_ns, section)
-    seconds = np.diff(utc_ns, prepend=utc_ns[:1]) / _NS
+    in_contact, light_s = contacts(sample_truth(world.truth, utc_ns), utc_ns, section)
+    seconds = np.diff(utc_ns, prepend=utc_ns[:1]) / NS
     allowed = np.floor(section.rate_bps / 8.0 * seconds).astype(np.int64)
     return [
-        Moment(
+        StepInput(
             int(utc_ns[k]),
             int(number[k]),
             float(sunlit[k]),
-            bool(heard[k]),
-            (int(allowed[k]) if section.stations else UNLIMITED) if heard[k] else 0,
+            bool(in_contact[k]),
+            (int(allowed[k]) if section.stations else UNLIMITED) if in_contact[k] else 0,
             float(light_s[k]),
             int(utc_ns[k]) if number[k] >= 0 else None,
             int(frames[number[k] + 1]) if 0 <= number[k] < frames.size - 1 else None,
@@ -66,7 +66,7 @@ def timeline(world: World) -> list[Moment]:
 
 def arcs(world: World) -> list[tuple[int, int]]:
     """First and last frame of every stretch of frames without a gap."""
-    interval_ns = round(world.scenario.camera.frame_interval_s * _NS)
+    interval_ns = round(world.scenario.camera.frame_interval_s * NS)
     breaks = np.flatnonzero(np.diff(world.frame_utc_ns) > 1.5 * interval_ns)
     first = np.concatenate([[0], breaks + 1])
     last = np.concatenate([breaks, [world.frame_utc_ns.size - 1]])
@@ -75,9 +75,9 @@ def arcs(world: World) -> list[tuple[int, int]]:
 
 @dataclass(slots=True, eq=False)
 class Operator:
-    """What the ground sends: the observation windows for the schedule, modes around contacts, requests for playback.
+    """Telecommands of the ground: observation windows for the schedule, modes around contacts, requests for playback.
 
-    What arrives at a moment was sent a light time before, by somebody who had seen telemetry of two light times before.
+    A telecommand that arrives was sent a light time before, by an operator who had telemetry of two light times before.
     """
 
     world: World
@@ -92,7 +92,7 @@ class Operator:
     _last_utc_ns: int = 0
 
     def command(self, name: str, **values: object) -> bytes:
-        """The next telecommand packet."""
+        """Return the next telecommand packet."""
         packet = DICTIONARY.pack_command(
             name, values, sequence_count=self.sequence_count, source=_PLANNING_SOURCE
         )
@@ -100,48 +100,48 @@ class Operator:
         return packet
 
     def function(self, name: str, first: float = 0.0, second: float = 0.0) -> bytes:
-        """A telecommand that performs a function."""
+        """Return a telecommand that performs a function."""
         return self.command("perform_function", function_id=name, argument_1=first, argument_2=second)
 
-    def orders(self, moment: Moment, mode: PayloadMode) -> bytes:
-        """What arrives at a moment; `mode` is the payload's since the moment before."""
-        mode = self._mode_seen(moment, mode)
+    def telecommands(self, step: StepInput, mode: PayloadMode) -> bytes:
+        """Return the telecommands that arrive in a step; `mode` is the payload's since the step before."""
+        mode = self._mode_seen(step, mode)
         first = not self._started
         self._started = True
-        if not (moment.heard or first):
-            self._end_contact(moment)
+        if not (step.in_contact or first):
+            self._end_contact(step)
             return b""
-        orders = [*self._windows(moment), *self._resumed(moment, mode)]
+        telecommands = [*self._windows(step), *self._resumed(step, mode)]
         clock = self.world.scenario.clock
         if first and (clock.offset_s or clock.drift_ppm):
-            orders.append(self.command("set_time_report_rate", rate_exponent=_TIME_RATE_EXPONENT))
+            telecommands.append(self.command("set_time_report_rate", rate_exponent=_TIME_RATE_EXPONENT))
         if self.world.scenario.link.stations:
-            orders += self._contact(moment, mode)
-        if moment.frame >= 0:
-            orders.append(self._told(moment.frame))
-        return b"".join(orders)
+            telecommands += self._contact(step, mode)
+        if step.frame >= 0:
+            telecommands.append(self._after_kidnap(step.frame))
+        return b"".join(telecommands)
 
-    def _mode_seen(self, moment: Moment, mode: PayloadMode) -> PayloadMode:
-        """The mode in the newest telemetry that what arrives now can be an answer to."""
+    def _mode_seen(self, step: StepInput, mode: PayloadMode) -> PayloadMode:
+        """Return the mode in the newest telemetry that a telecommand arriving now can answer."""
         self._modes.append((self._last_utc_ns, mode))
-        self._last_utc_ns = moment.utc_ns
-        seen_until = moment.utc_ns - round(2.0 * moment.light_s * _NS)
+        self._last_utc_ns = step.utc_ns
+        seen_until = step.utc_ns - round(2.0 * step.light_s * NS)
         while len(self._modes) > 1 and self._modes[1][0] <= seen_until:
             self._modes.popleft()
         return self._modes[0][1]
 
-    def _windows(self, moment: Moment) -> Iterator[bytes]:
+    def _windows(self, step: StepInput) -> Iterator[bytes]:
         world, every = self.world, arcs(self.world)
         interval_s = world.scenario.camera.frame_interval_s
         while self._uploaded < len(every):
             first, last = every[self._uploaded]
             start_utc_ns = int(world.frame_utc_ns[first])
-            if start_utc_ns > moment.utc_ns + _AHEAD_NS:
+            if start_utc_ns > step.utc_ns + _AHEAD_NS:
                 return
             self._uploaded += 1
-            duration_s = (int(world.frame_utc_ns[last]) - start_utc_ns) / _NS + 0.5 * interval_s
-            if start_utc_ns <= moment.utc_ns:
-                late_s = (moment.utc_ns - start_utc_ns) / _NS
+            duration_s = (int(world.frame_utc_ns[last]) - start_utc_ns) / NS + 0.5 * interval_s
+            if start_utc_ns <= step.utc_ns:
+                late_s = (step.utc_ns - start_utc_ns) / NS
                 if late_s < duration_s:
                     yield self.function("start_observation", duration_s - late_s)
                 continue
@@ -150,51 +150,51 @@ class Operator:
                 yield self._at(ticks - _STANDBY_BEFORE_TICKS, self.function("set_mode", PayloadMode.standby))
             yield self._at(ticks, self.function("start_observation", duration_s))
 
-    def _resumed(self, moment: Moment, mode: PayloadMode) -> Iterator[bytes]:
-        """A payload found waiting in a window, as after a camera that it gave up, is told to observe again."""
-        if moment.frame < 0 or mode is not PayloadMode.standby:
+    def _resumed(self, step: StepInput, mode: PayloadMode) -> Iterator[bytes]:
+        """Yield a telecommand to observe again if the payload waits in a window, as after a failure of its camera."""
+        if step.frame < 0 or mode is not PayloadMode.standby:
             self._idle_since_ns = None
             return
         if self._idle_since_ns is None:
-            self._idle_since_ns = moment.utc_ns
-        if moment.utc_ns - self._idle_since_ns < _PATIENCE_NS:
+            self._idle_since_ns = step.utc_ns
+        if step.utc_ns - self._idle_since_ns < _IDLE_LIMIT_NS:
             return
         self._idle_since_ns = None
-        last = next(stop for start, stop in arcs(self.world) if start <= moment.frame <= stop)
-        left_s = (int(self.world.frame_utc_ns[last]) - moment.utc_ns) / _NS
+        last = next(stop for start, stop in arcs(self.world) if start <= step.frame <= stop)
+        left_s = (int(self.world.frame_utc_ns[last]) - step.utc_ns) / NS
         yield self.function("start_observation", left_s + 0.5 * self.world.scenario.camera.frame_interval_s)
 
     def _at(self, ticks: int, packet: bytes) -> bytes:
         octets = np.frombuffer(packet, dtype=np.uint8)
         return self.command("insert_activity", release_ticks=ticks, items={"octet": octets})
 
-    def _contact(self, moment: Moment, mode: PayloadMode) -> Iterator[bytes]:
-        """Downlinking while a station listens and nothing is observed; at the beginning, a playback."""
+    def _contact(self, step: StepInput, mode: PayloadMode) -> Iterator[bytes]:
+        """Yield the telecommand for downlink in a contact without observation, and for a playback at its beginning."""
         if not self._in_contact:
-            self._in_contact, self._contact_start = True, clock_ticks(self.world, moment.utc_ns)
+            self._in_contact, self._contact_start = True, clock_ticks(self.world, step.utc_ns)
             if self.world.scenario.link.playback and self._last_contact and mode is not PayloadMode.observing:
                 start, stop = self._last_contact
                 yield self.command("replay_store", start_ticks=start, stop_ticks=start + (stop - start) // 2)
-        if mode is PayloadMode.standby and not self._arc_is_near(moment):
+        if mode is PayloadMode.standby and not self._arc_is_near(step):
             yield self.function("set_mode", PayloadMode.downlinking)
 
-    def _end_contact(self, moment: Moment) -> None:
+    def _end_contact(self, step: StepInput) -> None:
         if self._in_contact:
-            self._last_contact = (self._contact_start, clock_ticks(self.world, moment.utc_ns))
+            self._last_contact = (self._contact_start, clock_ticks(self.world, step.utc_ns))
         self._in_contact = False
 
-    def _arc_is_near(self, moment: Moment) -> bool:
-        after = np.searchsorted(self.world.frame_utc_ns, moment.utc_ns)
+    def _arc_is_near(self, step: StepInput) -> bool:
+        after = np.searchsorted(self.world.frame_utc_ns, step.utc_ns)
         if after == self.world.frame_utc_ns.size:
             return False
-        return int(self.world.frame_utc_ns[after]) - moment.utc_ns < 2 * _BEFORE_ARC_NS
+        return int(self.world.frame_utc_ns[after]) - step.utc_ns < 2 * _BEFORE_ARC_NS
 
-    def _told(self, number: int) -> bytes:
-        """Telecommands that reach the payload with a frame: after a told kidnap, to trust its estimate less."""
+    def _after_kidnap(self, number: int) -> bytes:
+        """Return the telecommand that widens the estimate at the first frame after an announced kidnap, else none."""
         section, frames = self.world.scenario.disturbances, self.world.frame_utc_ns
         if not (section.kidnap_told and section.kidnap_distance_km > 0.0):
             return b""
-        moved_utc_ns = int(frames[0]) + round(section.kidnap_at_s * _NS)
+        moved_utc_ns = int(frames[0]) + round(section.kidnap_at_s * NS)
         if int(frames[number]) < moved_utc_ns or (number and int(frames[number - 1]) >= moved_utc_ns):
             return b""
         distance_m = 1e3 * section.kidnap_distance_km
@@ -206,18 +206,18 @@ class Operator:
         )
 
 
-def fly_scenario(world: World, spacecraft: Spacecraft) -> Iterator[Turn]:
+def fly_scenario(world: World, spacecraft: Spacecraft) -> Iterator[StepResult]:
     """Fly the windows of a scenario with its operator."""
     try:
-        yield from fly(spacecraft, _moments(world, spacecraft))
+        yield from fly(spacecraft, _steps_due(world, spacecraft))
     finally:
         spacecraft.camera.close()
 
 
-def _moments(world: World, spacecraft: Spacecraft) -> Iterator[Moment]:
-    """Yield the moments of a scenario with what its operator sends; each follows from the turn before."""
+def _steps_due(world: World, spacecraft: Spacecraft) -> Iterator[StepInput]:
+    """Yield the steps of a scenario with the telecommands of its operator, which depend on the step before."""
     operator, receiver = Operator(world), spacecraft.receiver
-    for moment in timeline(world):
-        receiver.carrier = receiver.bit_lock = moment.heard
-        orders = operator.orders(moment, spacecraft.payload.mode)
-        yield replace(moment, orders=receiver.take(orders))
+    for step in timeline(world):
+        receiver.carrier = receiver.bit_lock = step.in_contact
+        telecommands = operator.telecommands(step, spacecraft.payload.mode)
+        yield replace(step, telecommands=receiver.take(telecommands))

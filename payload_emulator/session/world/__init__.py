@@ -1,1 +1,1 @@
-"""What is simulated: orbit, terrain regions, light, camera frames, external images, recipes of data sets."""
+"""The simulated world: orbit, terrain regions, light, camera frames, external images, recipes of data sets."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray, IntArray
 from lunar.camera import project_mcmf
-from lunar.constants import MOON_RADIUS_M
+from lunar.constants import MOON_RADIUS_M, NS
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import format_utc, tdb_s_from_utc_ns
@@ -28,7 +28,6 @@ from payload_emulator.sim.render.renderer import highest_latitude_rad, render
 from payload_emulator.sim.render.sensor import Picture, take_picture
 from payload_emulator.sim.terrain.tiles import POLE_LIMIT_RAD
 
-_NS = 1_000_000_000
 _MS = 1_000_000
 # What stands for an image where none is rendered, and for one that the camera does not give.
 _REDUCED_PX = 8
@@ -61,7 +60,7 @@ class Exposure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scene:
-    """What lies before the camera at one frame, and the draws that are still to come.
+    """Scene before the camera at one frame, and its generator of random draws.
 
     Attributes
     ----------
@@ -87,12 +86,12 @@ class Camera:
 
     Attributes
     ----------
-    beside
+    overlay
         Called in the thread of the terrain with world, time and true attitude of each frame; `shown` is its result.
     """
 
     world: World
-    beside: Callable[[World, int, FloatArray], Any] | None = None
+    overlay: Callable[[World, int, FloatArray], Any] | None = None
     shown: Any = None
     _renderer: ThreadPoolExecutor = field(init=False)
     _sensor: ThreadPoolExecutor = field(init=False)
@@ -113,8 +112,8 @@ class Camera:
         except TerrainError as error:
             exposure = replace(expose(self.world, utc_ns, NO_PICTURE), fault=str(error))
         self.shown = None
-        if self.beside is not None:
-            shown = self._renderer.submit(self.beside, self.world, utc_ns, exposure.camera_from_mcmf)
+        if self.overlay is not None:
+            shown = self._renderer.submit(self.overlay, self.world, utc_ns, exposure.camera_from_mcmf)
             self.shown = shown.result()
         self._ahead = None
         if next_utc_ns is not None:
@@ -226,9 +225,9 @@ def _exposed(world: World, scene: _Scene) -> Exposure:
 def _seen(
     world: World, utc_ns: int, position_mcmf_m: FloatArray, camera_from_mcmf: FloatArray, sun_mcmf: FloatArray
 ) -> tuple[NDArray[np.float32] | None, Picture | None]:
-    """The light on the sensor, none of it in deep night; in an outage no light but a picture without pixels."""
+    """Return the light on the sensor, none of it in deep night; in an outage no light but a picture without pixels."""
     section, camera = world.scenario.disturbances, world.true_camera
-    elapsed_s = (utc_ns - int(world.frame_utc_ns[0])) / _NS
+    elapsed_s = (utc_ns - int(world.frame_utc_ns[0])) / NS
     if section.outage_at_s <= elapsed_s < section.outage_at_s + section.outage_duration_s:
         return None, NO_PICTURE
     if world.external is not None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lunar.arrays import FloatArray, IntArray
 from lunar.errors import LunarError
 from lunar.frames import matrix_from_quaternion
-from lunar.messages.aem import AttitudeSegment, parse_aem
+from lunar.messages.aem import CAMERA_NAMES, AttitudeSegment, parse_aem
 from lunar.timescales import format_utc, parse_utc
 from payload_emulator.errors import DatasetError, ScenarioError
 from payload_emulator.session.scenario import Scenario
@@ -36,7 +36,7 @@ _HOT = 4.0
 
 
 def read_picture(path: Path) -> tuple[NDArray[np.generic], str]:
-    """Pixels of an image file (PNG, JPEG, TIFF, NPY), and what was wrong with some of them; colours in RGB order.
+    """Read the pixels of an image file (PNG, JPEG, TIFF, NPY) and the faults of some; colours in RGB order.
 
     Pixels are 8 or 16 bits or float in 0..1, turned as EXIF states. Those without data (not finite, far below zero)
     become black. A 16-bit file whose greatest value would fit into 12 or 14 bits is taken for one of so many. Float
@@ -135,9 +135,17 @@ class ExternalFrames:
     attitude_utc_ns: IntArray
     q_wxyz: FloatArray
     evidence: World = ""
+    attitude_scales: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        """Return times of the frames and time scales of the attitudes, as printed with figures of them."""
+        first, last = (format_utc(int(one)) for one in self.utc_ns[[0, -1]])
+        scales = " and ".join(self.attitude_scales) or "none stated"
+        return f"{self.files[0].name} {first} to {self.files[-1].name} {last}, epochs of attitudes: {scales}"
 
     def image(self, utc_ns: int) -> Picture:
-        """Pixels of the frame of a time, 8 or 16 bits.
+        """Return the pixels of the frame of a time, 8 or 16 bits.
 
         Raises
         ------
@@ -177,7 +185,7 @@ class ExternalFrames:
 
 
 def load_external(folder: Path, scenario: Scenario, evidence: World = "") -> ExternalFrames:
-    """The frames of a folder for the camera of a scenario.
+    """Load the frames of a folder for the camera of a scenario.
 
     Raises
     ------
@@ -185,7 +193,7 @@ def load_external(folder: Path, scenario: Scenario, evidence: World = "") -> Ext
         A file is missing or broken, or attitudes do not reach over all frames; the message names the place.
     """
     utc_ns, files = _table(folder)
-    attitude_utc_ns, q_wxyz = _attitudes(folder)
+    attitude_utc_ns, q_wxyz, scales = _attitudes(folder)
     if attitude_utc_ns.size and (utc_ns[0] < attitude_utc_ns[0] or utc_ns[-1] > attitude_utc_ns[-1]):
         raise ScenarioError(
             f"{folder}: expected attitudes from {format_utc(int(utc_ns[0]))} to {format_utc(int(utc_ns[-1]))}, "
@@ -199,11 +207,12 @@ def load_external(folder: Path, scenario: Scenario, evidence: World = "") -> Ext
         attitude_utc_ns,
         q_wxyz,
         evidence,
+        scales,
     )
 
 
 def external_scenario(scenario: Scenario, frames: ExternalFrames) -> Scenario:
-    """The scenario with the orbit and times of external frames, the real Sun, and without pointing errors."""
+    """Return the scenario with the orbit and times of external frames, the real Sun, and without pointing errors."""
     duration_s = float(frames.utc_ns[-1] - frames.utc_ns[0]) / 1e9
     return replace(
         scenario,
@@ -254,9 +263,9 @@ def _table(folder: Path) -> tuple[IntArray, tuple[Path, ...]]:
     return np.array(times, dtype=np.int64), tuple(files)
 
 
-def _attitudes(folder: Path) -> tuple[IntArray, FloatArray]:
+def _attitudes(folder: Path) -> tuple[IntArray, FloatArray, tuple[str, ...]]:
     if not any(folder.glob("*.aem")):
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 4))
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 4)), ()
     path = _only(folder, "*.aem", "attitude file")
     try:
         segments: tuple[AttitudeSegment, ...] = parse_aem(path.read_text(encoding="utf-8"), str(path))
@@ -265,7 +274,16 @@ def _attitudes(folder: Path) -> tuple[IntArray, FloatArray]:
     for one in segments:
         if one.frame_a not in _INERTIAL:
             raise ScenarioError(f"{path}: expected REF_FRAME_A {' or '.join(_INERTIAL)}, found {one.frame_a}")
-    return np.concatenate([one.utc_ns for one in segments]), np.concatenate([one.q_wxyz for one in segments])
+        if not one.frame_b.upper().startswith(CAMERA_NAMES):
+            raise ScenarioError(
+                f"{path}: expected REF_FRAME_B INSTRUMENT_1 (the camera), found {one.frame_b}"
+            )
+    scales = tuple(dict.fromkeys(one.time_system for one in segments))
+    return (
+        np.concatenate([one.utc_ns for one in segments]),
+        np.concatenate([one.q_wxyz for one in segments]),
+        scales,
+    )
 
 
 def _only(folder: Path, pattern: str, what: str) -> Path:

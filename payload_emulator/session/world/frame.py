@@ -17,7 +17,7 @@ from lunar.camera import ground_point_sphere
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
 from lunar.lens import BrownCamera
-from lunar.messages.oem import load_oem
+from lunar.messages.ephemeris_files import load_orbit
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import Scenario
@@ -76,7 +76,7 @@ def render_frame(
     renderer_name: str = "fast",
     blender_python: str = sys.executable,
 ) -> Frame:
-    """The picture that the scenario's camera takes at an epoch, whatever the scenario's windows are.
+    """Return the image that the scenario's camera takes at an epoch, whatever the scenario's windows are.
 
     The light of the paper is drawn from the scenario's seed and the epoch, the sensor's noise likewise.
 
@@ -91,7 +91,7 @@ def render_frame(
 
 
 def find_renderer(name: str, blender_python: str = sys.executable) -> Callable[..., Rendering]:
-    """The renderer of a name, called as `renderer.render`; `blender_python` is the interpreter that has Blender."""
+    """Return the function that renders, by its name; `blender_python` is the interpreter that has Blender."""
     if name == "cycles":
         from payload_emulator.sim.render import cycles
 
@@ -103,7 +103,7 @@ def find_renderer(name: str, blender_python: str = sys.executable) -> Callable[.
 
 
 def world_at(scenario: Scenario, data: DataFolder, epochs_utc_ns: Sequence[int]) -> World:
-    """The scenario's world, flown as far as the last of the epochs.
+    """Return the scenario's world, flown as far as the last of the epochs.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def _require_covered(scenario: Scenario, first_utc_ns: int, last_utc_ns: int) ->
                 f"found {format_utc(first_utc_ns)}"
             )
         return
-    ephemeris = load_oem(Path(scenario.orbit.oem))
+    ephemeris = load_orbit(Path(scenario.orbit.oem))
     for utc_ns in (first_utc_ns, last_utc_ns):
         if not ephemeris.start_utc_ns <= utc_ns < ephemeris.stop_utc_ns:
             raise ScenarioError(
@@ -144,14 +144,14 @@ def _require_covered(scenario: Scenario, first_utc_ns: int, last_utc_ns: int) ->
 
 
 def window_epochs(scenario: Scenario, data: DataFolder, count: int) -> tuple[World, list[int]]:
-    """The scenario's world and ``count`` of its frames' epochs, evenly spread over its observation windows."""
+    """Return the scenario's world and ``count`` of its frames' epochs, evenly spread over its observation windows."""
     world = build_world(scenario, data)
     chosen = np.linspace(0, world.frame_utc_ns.size - 1, count + 2)[1:-1].round().astype(np.int64)
     return world, [int(utc_ns) for utc_ns in world.frame_utc_ns[np.unique(chosen)]]
 
 
 def view_at(world: World, utc_ns: int) -> View:
-    """Where the spacecraft is at an epoch, how its camera points, where the Sun stands."""
+    """Return position, pointing and direction of the Sun at an epoch."""
     position = world.truth.positions_mcmf(utc_ns)[0]
     rng = np.random.default_rng((world.scenario.seed, utc_ns))
     sun = true_sun_direction(world, position, utc_ns, rng)
@@ -164,7 +164,7 @@ def take_frame(
     renderer_name: str = "fast",
     blender_python: str = sys.executable,
 ) -> Frame:
-    """The frame of a view: rendered, exposed, labelled."""
+    """Take the frame of a view: rendered, exposed, labelled."""
     pose = (world.terrain, world.true_camera, view.position_mcmf_m, view.camera_from_mcmf, view.sun_mcmf)
     law, filmic_png = Photometry(world.scenario.light.photometry), b""
     if renderer_name == "cycles":
@@ -189,7 +189,7 @@ def take_frame(
 
 
 def metadata_of(world: World, view: View) -> dict[str, Any]:
-    """How a view is taken, angles in degrees; the same keys as in the metadata of data sets."""
+    """Return the metadata of a view, angles in degrees; the same keys as in the metadata of data sets."""
     camera, section, scenario = world.true_camera, world.scenario.camera, world.scenario
     position, rotation, sun = view.position_mcmf_m, view.camera_from_mcmf, view.sun_mcmf
     latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lunar.arrays import FloatArray, IntArray
+from lunar.constants import NS
 from lunar.datafolder import DataFolder, default_gravity, default_orientation
 from lunar.elements import Elements, icrf_state_from_elements, state_from_elements
 from lunar.ephemeris import Ephemeris, EphemerisSegment
@@ -20,7 +21,6 @@ from lunar.timescales import tai_ns_from_utc_ns, tdb_minus_tt_s, tdb_s_from_utc_
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import Scenario
 
-_NS = 1_000_000_000
 _BEFORE_IMPACT_S = 1.0
 
 
@@ -35,14 +35,14 @@ class ScenarioOrbit:
 
 
 def open_gravity(name: str, data: DataFolder) -> GravityField:
-    """The field a scenario names: "auto" (the best available), "builtin", or a coefficient file."""
+    """Open the field a scenario names: "auto" (the best available), "builtin", or a coefficient file."""
     if name == "auto":
         return default_gravity(data)
     return builtin_gravity() if name == "builtin" else load_gravity(Path(name))
 
 
 def open_orientation(name: str, data: DataFolder) -> Orientation:
-    """The lunar orientation a scenario names: "auto", "iau" or "de421"."""
+    """Open the lunar orientation a scenario names: "auto", "iau" or "de421"."""
     if name == "iau":
         return IauOrientation()
     if name == "de421" and data.orientation_bpc is None:
@@ -54,7 +54,7 @@ def open_orientation(name: str, data: DataFolder) -> Orientation:
 
 
 def force_model(scenario: Scenario, data: DataFolder) -> ForceModel:
-    """The forces of a scenario; its degree is cut to what the available field holds."""
+    """Return the forces of a scenario; its degree is cut to what the available field holds."""
     dynamics = scenario.dynamics
     gravity = open_gravity(dynamics.gravity, data)
     orientation = open_orientation(dynamics.orientation, data)
@@ -92,7 +92,7 @@ def initial_state_icrf(scenario: Scenario, gm_m3_s2: float) -> FloatArray:
 
 
 def propagate_scenario(scenario: Scenario, model: ForceModel, duration_s: float) -> ScenarioOrbit:
-    """The orbit from the scenario's epoch on, with the burns of its rule where that is enabled.
+    """Propagate the orbit from the scenario's epoch on, with the burns of its rule where that is enabled.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def propagate_to_impact(
     try:
         return propagate_scenario(scenario, model, duration_s), None
     except ImpactError as impact:
-        lived_s = (impact.utc_ns - scenario.epoch_utc_ns) / _NS - _BEFORE_IMPACT_S
+        lived_s = (impact.utc_ns - scenario.epoch_utc_ns) / NS - _BEFORE_IMPACT_S
         if lived_s <= 0.0:
             raise
         return propagate_scenario(scenario, model, lived_s), impact
@@ -159,10 +159,10 @@ def propagate_from(
 def sample(
     orbit: ScenarioOrbit, step_s: float, object_name: str = "SELENITA"
 ) -> tuple[Ephemeris, FloatArray]:
-    """The ephemeris on a regular grid, a segment between burns with a state at each end; the grid's states (n, 6)."""
+    """Return the ephemeris on a regular grid, a segment with states at its ends between burns; its states (n, 6)."""
     last_s = float(orbit.trajectory.elapsed_s[-1])
     steps = int(np.floor(last_s / step_s + 1e-9))
-    grid = orbit.epoch_utc_ns + np.rint(np.arange(steps + 1) * (step_s * _NS)).astype(np.int64)
+    grid = orbit.epoch_utc_ns + np.rint(np.arange(steps + 1) * (step_s * NS)).astype(np.int64)
     elapsed = np.minimum(_elapsed_s(grid, orbit.epoch_utc_ns), last_s)
     edges = [int(grid[0]), *(burn.utc_ns for burn in orbit.maneuvers), int(grid[-1])]
     segments = []
@@ -185,7 +185,7 @@ def sample(
 
 
 def _elapsed_s(utc_ns: IntArray, epoch_utc_ns: int) -> FloatArray:
-    """TDB seconds since an epoch; differences of integers first, so that nothing is lost to the size of TDB."""
-    tai_s = (tai_ns_from_utc_ns(utc_ns) - tai_ns_from_utc_ns(epoch_utc_ns)) / _NS
+    """Return TDB seconds since an epoch; differences of integers first, so that nothing is lost to the size of TDB."""
+    tai_s = (tai_ns_from_utc_ns(utc_ns) - tai_ns_from_utc_ns(epoch_utc_ns)) / NS
     start_s = tdb_s_from_utc_ns(epoch_utc_ns)
     return np.asarray(tai_s + tdb_minus_tt_s(start_s + tai_s) - tdb_minus_tt_s(start_s), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""What a data set is made of: sources of terrain by split, where frames may look, under which light and from where.
+"""Recipe of a data set: sources of terrain by split, regions of its frames, light and positions.
 
 A recipe is a TOML file with a `[dataset]` table and one `[[dataset.source]]` table per source. Angles are degrees and
 lengths kilometres in the file. Splits are separated by footprint: every pixel of a frame looks into one of its source's
@@ -109,7 +109,7 @@ class Recipe:
 
 
 def _source_dict(source: dict[str, Any]) -> dict[str, Any]:
-    """A source's values; of an ephemeris only the name, as its folder says nothing about the frames."""
+    """Return a source's values; of an ephemeris only the name, as its folder says nothing about the frames."""
     source = _without_defaults(
         source,
         {"sharpen": True, "footprint": "inside", "label_minimum_px": 5.0, "views": 1, "view_step_km": 24.5},

@@ -13,7 +13,8 @@ import numpy as np
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue
-from lunar.constants import MOON_RADIUS_M
+from lunar.comparison import check_pointing
+from lunar.constants import MOON_RADIUS_M, NS
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import ImpactError
@@ -21,7 +22,7 @@ from lunar.frames import Orientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.gravity import GravityField
 from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from lunar.maneuvers import Maneuver
-from lunar.messages.oem import load_oem
+from lunar.messages.ephemeris_files import load_orbit
 from lunar.plausible import HEIGHT_M
 from lunar.propagation import ForceModel
 from lunar.timescales import (
@@ -55,10 +56,9 @@ from tmtc.packets.cuc import TICKS_PER_SECOND
 CHUNK_S = 86_400.0
 """Time that the orbit is propagated at once; another division gives other last digits."""
 
-_NS = 1_000_000_000
 _TICKS_NS = 200_000
-_EPHEMERIS_STEP_NS = 10 * _NS
-_EPHEMERIS_MARGIN_NS = 120 * _NS
+_EPHEMERIS_STEP_NS = 10 * NS
+_EPHEMERIS_MARGIN_NS = 120 * NS
 _BEFORE_JUMP_NS = 10_000
 _EDGE_NS = 1_000
 _SEARCH_CHUNK_DAYS = 15.0
@@ -125,7 +125,7 @@ _parsed_utc = functools.lru_cache(maxsize=16)(parse_utc)
 
 
 def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames | None = None) -> World:
-    """The world of a scenario, flown as far as its observation windows reach.
+    """Build the world of a scenario, flown as far as its observation windows reach.
 
     With external frames, their ephemeris is the flight and their times are the frames.
 
@@ -139,7 +139,7 @@ def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames |
     if external is not None:
         return _external_world(external_scenario(scenario, external), external, terrain, model)
     truth, burns, windows, ends = _fly_to_windows(scenario, model, terrain)
-    interval_ns = round(scenario.camera.frame_interval_s * _NS)
+    interval_ns = round(scenario.camera.frame_interval_s * NS)
     band_rad = _band_rad(scenario)
     frames = [frame_times(truth, start, stop, interval_ns, band_rad) for start, stop in windows]
     frame_utc_ns = np.concatenate(frames) if frames else np.zeros(0, dtype=np.int64)
@@ -162,17 +162,20 @@ def _external_world(
     scenario: Scenario, external: ExternalFrames, terrain: Terrain, model: ForceModel
 ) -> World:
     """Return the world of external frames."""
-    truth = _truth_of_ephemeris(load_oem(external.ephemeris), model.orientation)
+    ephemeris = load_orbit(external.ephemeris)
+    truth = _truth_of_ephemeris(ephemeris, model.orientation)
     first, last = int(external.utc_ns[0]), int(external.utc_ns[-1])
     if first < truth.start_utc_ns or last > truth.stop_utc_ns:
         raise ScenarioError(
             f"{external.ephemeris}: expected states from {format_utc(first)} to {format_utc(last)}, found "
             f"{format_utc(truth.start_utc_ns)} to {format_utc(truth.stop_utc_ns)}"
         )
+    if external.attitude_utc_ns.size:
+        check_pointing(ephemeris, external.attitude_utc_ns, external.q_wxyz)
     _register(terrain, truth, external.utc_ns)
     require_above_ground(truth, external.utc_ns, terrain.height_m, HEIGHT_M.high)
     names = (
-        f"external images {external.files[0].parent.name}",
+        f"external images {external.files[0].parent.name} ({external.words}), orbit of {ephemeris.words}",
         *_names(terrain, model, truth, external.utc_ns),
     )
     return World(scenario, truth, terrain, model, (), external.utc_ns, names, external)
@@ -281,7 +284,7 @@ def extended_flight(world: World, duration_s: float) -> tuple[Truth, tuple[TrueB
     longer = Truth(
         spliced(truth.state_icrf, float(tdb_s_from_utc_ns(joint_utc_ns)), orbit.trajectory.state),
         truth.start_utc_ns,
-        joint_utc_ns + round(duration_s * _NS),
+        joint_utc_ns + round(duration_s * NS),
         truth.orientation,
         (*truth.breaks_utc_ns, *(burn.utc_ns for burn in burns)),
     )
@@ -291,10 +294,10 @@ def extended_flight(world: World, duration_s: float) -> tuple[Truth, tuple[TrueB
 def _disturbed(
     scenario: Scenario, truth: Truth, burns: tuple[TrueBurn, ...], first_utc_ns: int, model: ForceModel
 ) -> tuple[Truth, tuple[TrueBurn, ...]]:
-    """The flight with the disturbances of the scenario, and all its burns."""
+    """Return the flight with the disturbances of the scenario, and all its burns."""
     section = scenario.disturbances
     if section.burn_delta_v_m_s != 0.0:
-        utc_ns = first_utc_ns + round(section.burn_at_s * _NS)
+        utc_ns = first_utc_ns + round(section.burn_at_s * NS)
         velocity = truth.states(utc_ns)[1][0]
         done = section.burn_delta_v_m_s * velocity / np.linalg.norm(velocity)
         burn = executed(utc_ns, done, scenario.maneuvers.execution_error_fraction, (scenario.seed, 2**36))
@@ -304,7 +307,7 @@ def _disturbed(
         heading = np.random.default_rng((scenario.seed, 2**37)).uniform(0.0, 2.0 * np.pi)
         truth = changed(
             truth,
-            first_utc_ns + round(section.kidnap_at_s * _NS),
+            first_utc_ns + round(section.kidnap_at_s * NS),
             lambda state: turned_state(state, 1e3 * section.kidnap_distance_km, heading),
             model,
         )
@@ -312,9 +315,9 @@ def _disturbed(
 
 
 def clock_ticks(world: World, utc_ns: int) -> int:
-    """The on-board clock's reading: ideal ticks, an offset, and a drift since the reference of the clock."""
+    """Return the on-board clock's reading: ideal ticks, an offset, and a drift since the reference of the clock."""
     clock = world.scenario.clock
-    elapsed_s = (utc_ns - world.clock_utc_ns) / _NS
+    elapsed_s = (utc_ns - world.clock_utc_ns) / NS
     error_s = clock.offset_s + clock.drift_ppm * 1e-6 * elapsed_s
     return int(ticks_from_utc_ns(utc_ns)) + round(error_s * TICKS_PER_SECOND)
 
@@ -323,7 +326,7 @@ def first_utc_ns(world: World, ticks: int) -> int:
     """Return the first time at which the clock of a scenario reads `ticks`."""
     utc_ns = world.clock_utc_ns
     for _ in range(4):
-        utc_ns += round((ticks - clock_ticks(world, utc_ns)) * _NS / TICKS_PER_SECOND)
+        utc_ns += round((ticks - clock_ticks(world, utc_ns)) * NS / TICKS_PER_SECOND)
     # The reading rises by one tick in 15 us; from a time within some ticks of it, the first is found by bisection.
     low, high = utc_ns - _TICKS_NS, utc_ns + _TICKS_NS
     while high - low > 1:
@@ -348,18 +351,18 @@ def _fly_to_windows(
     window = scenario.window
     not_before = parse_utc(window.start) if window.start else scenario.epoch_utc_ns
     if scenario.orbit.oem:
-        truth = _truth_of_ephemeris(load_oem(Path(scenario.orbit.oem)), model.orientation)
+        truth = _truth_of_ephemeris(load_orbit(Path(scenario.orbit.oem)), model.orientation)
         return truth, (), _windows(scenario, truth, terrain, max(not_before, truth.start_utc_ns)), ""
     reach_days = min(_SEARCH_CHUNK_DAYS, window.search_days)
     if window.search == "none":
         reach_days = (
-            (not_before - scenario.epoch_utc_ns) / _NS / 86_400.0 + window.duration_s / 86_400.0 + 0.01
+            (not_before - scenario.epoch_utc_ns) / NS / 86_400.0 + window.duration_s / 86_400.0 + 0.01
         )
     while True:
         truth, burns, impact = _propagate(scenario, model, reach_days)
         ends = "" if impact is None else str(impact)
         if window.search == "none":
-            if impact is not None and truth.stop_utc_ns < not_before + round(window.duration_s * _NS):
+            if impact is not None and truth.stop_utc_ns < not_before + round(window.duration_s * NS):
                 raise impact
             return truth, burns, _windows(scenario, truth, terrain, not_before), ends
         crossings = _crossings(scenario, truth, terrain, not_before)
@@ -376,7 +379,7 @@ def _fly_to_windows(
 
 
 def _no_band(crossings: list[Crossing], window: WindowSection) -> str:
-    """Which latitudes lack terrain on the crossing that lacks the least of it."""
+    """Return the latitudes that lack terrain on the crossing that lacks the least."""
     band = f"latitudes {_degrees(window.latitude_band_deg)}"
     near = [one for one in crossings if one.in_reach and one.missing_rad.size]
     if not near:
@@ -404,7 +407,7 @@ def _windows(
 ) -> list[tuple[int, int]]:
     window = scenario.window
     if window.search == "none":
-        stop_utc_ns = not_before_utc_ns + round(window.duration_s * _NS)
+        stop_utc_ns = not_before_utc_ns + round(window.duration_s * NS)
         return [(not_before_utc_ns, min(stop_utc_ns, truth.stop_utc_ns))]
     crossings = _crossings(scenario, truth, terrain, not_before_utc_ns)
     return [(one.start_utc_ns, one.stop_utc_ns) for one in crossings if one.observable][: window.passes]
@@ -433,9 +436,9 @@ def _propagate(
 ) -> tuple[Truth, tuple[TrueBurn, ...], ImpactError | None]:
     """Return the flight over some days, or up to the impact that ends it before."""
     orbit, impact = propagate_to_impact(scenario, model, days * 86_400.0)
-    stop_utc_ns = scenario.epoch_utc_ns + round(days * 86_400.0 * _NS)
+    stop_utc_ns = scenario.epoch_utc_ns + round(days * 86_400.0 * NS)
     if impact is not None:
-        stop_utc_ns = scenario.epoch_utc_ns + math.floor(orbit.trajectory.elapsed_s[-1] * _NS)
+        stop_utc_ns = scenario.epoch_utc_ns + math.floor(orbit.trajectory.elapsed_s[-1] * NS)
     burns = _executed(scenario, orbit.maneuvers)
     truth = Truth(
         orbit.trajectory.state,
@@ -466,7 +469,7 @@ def _truth_of_ephemeris(ephemeris: Ephemeris, orientation: Orientation) -> Truth
 
 
 def sample_truth(truth: Truth, frame_utc_ns: IntArray, object_name: str = "SELENITA") -> Ephemeris:
-    """The true trajectory over the frames and a margin: a state each ten seconds, a segment between jumps."""
+    """Sample the true trajectory over the frames and a margin: a state each ten seconds, a segment between jumps."""
     start = max(int(frame_utc_ns[0]) - _EPHEMERIS_MARGIN_NS, truth.start_utc_ns)
     stop = min(int(frame_utc_ns[-1]) + _EPHEMERIS_MARGIN_NS, truth.stop_utc_ns)
     grid = np.append(np.arange(start, stop, _EPHEMERIS_STEP_NS, dtype=np.int64), stop)
@@ -478,7 +481,7 @@ def sample_truth(truth: Truth, frame_utc_ns: IntArray, object_name: str = "SELEN
         asked = times.copy()
         asked[-1] -= _BEFORE_JUMP_NS if last != stop else 0
         position, velocity = truth.states(asked)
-        position += velocity * ((times - asked) / _NS)[:, None]
+        position += velocity * ((times - asked) / NS)[:, None]
         segments.append(
             EphemerisSegment(
                 times,
@@ -515,7 +518,7 @@ def with_reference_error(ephemeris: Ephemeris, section: ReferenceSection, seed: 
     rate = float(np.linalg.norm(np.cross(first.position_m[0], first.velocity_m_s[0]))) / radius**2
 
     def displaced(segment: EphemerisSegment) -> EphemerisSegment:
-        u = rate * (segment.utc_ns - ephemeris.start_utc_ns) / _NS
+        u = rate * (segment.utc_ns - ephemeris.start_utc_ns) / NS
         cosine, sine = np.cos(u), np.sin(u)
         x, y = a * cosine + b * sine, c - 2.0 * a * sine + 2.0 * b * cosine
         z = d * cosine + e * sine
@@ -537,7 +540,7 @@ def with_reference_error(ephemeris: Ephemeris, section: ReferenceSection, seed: 
 
 
 def catalogue_near_track(world: World) -> CraterCatalogue:
-    """The craters of 3 to 30 km that any frame could see, with the heights of their rims."""
+    """Return the craters of 3 to 30 km that any frame could see, with the heights of their rims."""
     positions = world.truth.positions_mcmf(world.frame_utc_ns)
     latitude, longitude, altitude = spherical_from_mcmf(positions)
     half_diagonal = np.sqrt(2.0) * np.tan(np.radians(world.scenario.camera.fov_deg) / 2.0)

@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris
 from lunar.errors import LunarError
 from lunar.timescales import parse_utc
@@ -19,11 +20,10 @@ from lunar.visibility import GroundStation, find_windows, link
 from payload_emulator.errors import ScenarioError
 from payload_emulator.sim.board.link import STATIONS, station
 
-_NS = 1_000_000_000
 _LIGHT_NS = 1_500_000_000
 _STEP_S = 60.0
 _TOLERANCE_S = 0.5
-_LIGHT_STEP_NS = 60 * _NS
+_LIGHT_STEP_NS = 60 * NS
 
 
 class Geometry(Protocol):
@@ -100,7 +100,7 @@ def parse_clock_error(text: str) -> tuple[str, int]:
     """
     name, _, seconds = text.partition(" ")
     try:
-        error_ns = round(float(seconds) * _NS)
+        error_ns = round(float(seconds) * NS)
     except (ValueError, OverflowError):
         error_ns = None
     if error_ns is None or name not in STATIONS:
@@ -154,5 +154,5 @@ def _with_light(ephemeris: Ephemeris, first: int, last: int, place: GroundStatio
     light_s = link(ephemeris, times + _LIGHT_NS, place).light_time_s
     # Of the reception that answers an emission at these instants.
     for _ in range(2):
-        light_s = link(ephemeris, times + np.rint(light_s * _NS).astype(np.int64), place).light_time_s
+        light_s = link(ephemeris, times + np.rint(light_s * NS).astype(np.int64), place).light_time_s
     return StationContact(place.name, first, last, times, np.asarray(light_s))

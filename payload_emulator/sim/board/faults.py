@@ -13,7 +13,7 @@ from payload_emulator.errors import ScenarioError
 
 @dataclass(frozen=True, slots=True)
 class FaultKind:
-    """What a kind of fault does; `size` is its default and what it counts."""
+    """Effect of a kind of fault; `size` is its default and its unit."""
 
     name: str
     meaning: str
@@ -61,7 +61,7 @@ class Fault:
     size: float
 
     def present(self, second: float) -> bool:
-        """Whether it is present at a second after the first frame."""
+        """Return whether it is present at a second after the first frame."""
         return self.at_s <= second < self.at_s + self.duration_s
 
 

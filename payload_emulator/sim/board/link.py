@@ -44,7 +44,7 @@ STATIONS = {
 
 @dataclass(frozen=True, slots=True)
 class LinkSection:
-    """What the link does to the downlink, frame by frame, and when there is one.
+    """Errors of the link, frame by frame, and its contacts.
 
     Losses and bit errors have two states: a burst begins and ends with the given probabilities per frame. What is sent
     at once (a dump) comes again with probability `repeat_share`, and behind the next one with `reorder_share`.
@@ -183,7 +183,7 @@ class Transmitter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reception:
-    """What arrived.
+    """Received octets with their accounting.
 
     Attributes
     ----------
@@ -292,23 +292,23 @@ def station(name: str, minimum_elevation_deg: float = 10.0) -> GroundStation:
 
 
 def contacts(ephemeris: Ephemeris, utc_ns: IntArray, section: LinkSection) -> tuple[BoolArray, FloatArray]:
-    """Whether any station hears the spacecraft at emission epochs (n,), and the light time to there in s.
+    """Return whether any station receives the spacecraft at emission epochs (n,), and the light time to there in s.
 
-    Without stations it is always heard, by the Earth's centre. Contacts begin and end on a grid of a minute.
+    Without stations it is always received, by the Earth's centre. Contacts begin and end on a grid of a minute.
     """
     if utc_ns.size == 0:
         return np.ones(0, dtype=np.bool_), np.full(0, LIGHT_S)
     if not section.stations:
         return np.ones(utc_ns.size, dtype=np.bool_), light_to_earth_s(ephemeris.at(utc_ns)[0], utc_ns)
     grid = np.arange(utc_ns.min(), utc_ns.max() + 1, _CONTACT_STEP_NS, dtype=np.int64)
-    heard, light_s = np.zeros(grid.size, dtype=np.bool_), np.full(grid.size, LIGHT_S)
+    in_contact, light_s = np.zeros(grid.size, dtype=np.bool_), np.full(grid.size, LIGHT_S)
     for name in section.stations:
         # Reception comes later than emission by the light time, within a third of a second of this.
         geometry = link(ephemeris, grid + _LIGHT_NS, station(name, section.minimum_elevation_deg))
-        heard |= geometry.visible
+        in_contact |= geometry.visible
         light_s = np.where(geometry.visible, geometry.light_time_s, light_s)
     at = (utc_ns - grid[0]) // _CONTACT_STEP_NS
-    return heard[at], light_s[at]
+    return in_contact[at], light_s[at]
 
 
 def light_to_earth_s(position_icrf_m: FloatArray, utc_ns: IntArray) -> FloatArray:
@@ -320,7 +320,7 @@ def light_to_earth_s(position_icrf_m: FloatArray, utc_ns: IntArray) -> FloatArra
 def _bursts(
     frames: int, section: LinkSection, bursting: bool, rng: np.random.Generator
 ) -> tuple[BoolArray, bool]:
-    """Whether each frame falls into a burst, and whether one goes on behind the last."""
+    """Return whether each frame falls into a burst, and whether one goes on behind the last."""
     states = np.zeros(frames, dtype=np.bool_)
     for k, draw in enumerate(rng.random(frames).tolist()):
         bursting = draw >= section.burst_end if bursting else draw < section.burst_start

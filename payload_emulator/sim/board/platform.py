@@ -146,7 +146,7 @@ class SimulatedBoard:
 
     @property
     def camera_on(self) -> bool:
-        """Whether the camera is powered."""
+        """Return whether the camera is powered."""
         return bool(self._loads & _CAMERA)
 
     def reset(self, cause: int) -> None:

@@ -1,4 +1,4 @@
-"""What happens to the true flight on the way: it is found elsewhere, it burns, its camera falls silent."""
+"""Disturbances of the true flight: displacement, burns, outage of the camera."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lunar.arrays import FloatArray
+from lunar.constants import NS
 from lunar.frames import matrix_from_quaternion, rtn_from_inertial
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns
 from payload_emulator.sim.orbit.truth import Truth
 
-_NS = 1_000_000_000
 # The flown orbit is known this long beyond what anyone asks for.
 _MARGIN_S = 1.0
 
@@ -51,7 +51,7 @@ def changed(
     """The flight whose state (6,), ICRF, is changed at an instant and flown on from there without further burns."""
     at_s = float(tdb_s_from_utc_ns(utc_ns))
     state = change(truth.state_icrf(np.array([at_s]))[0])
-    left_s = (truth.stop_utc_ns - utc_ns) / _NS + _MARGIN_S
+    left_s = (truth.stop_utc_ns - utc_ns) / NS + _MARGIN_S
     after = propagate(at_s, state[:3], state[3:], left_s, model).state
     before = truth.state_icrf
 

@@ -153,7 +153,7 @@ class Crossing:
 
     @property
     def observable(self) -> bool:
-        """Whether the whole swath lies on terrain and between the wanted longitudes."""
+        """Return whether the whole swath lies on terrain and between the wanted longitudes."""
         return self.in_reach and not self.missing_rad.size
 
 
@@ -215,7 +215,7 @@ def perturbed(camera_from_source: FloatArray, error_rad: FloatArray) -> FloatArr
 
 
 def attitude_message(camera_from_icrf: FloatArray, sun_direction_camera: FloatArray) -> FloatArray:
-    """What the ADCS tells: q_wxyz of camera_from_icrf, then the unit Sun vector in the camera, shape (7,)."""
+    """Return the message of the ADCS: q_wxyz of camera_from_icrf, then the unit Sun vector in the camera, (7,)."""
     return np.concatenate([quaternion_from_matrix(camera_from_icrf), sun_direction_camera])
 
 

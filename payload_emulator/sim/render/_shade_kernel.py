@@ -19,7 +19,7 @@ from kernels.compiled import FAST, njit
 from lunar.arrays import Float32Array, Int32Array
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.sim.render._grid_kernel import INLINED, LINE, NODE_STEP, Grid, Nodes, Tiles
-from payload_emulator.sim.render._trace_kernel import Eye
+from payload_emulator.sim.render._trace_kernel import Viewpoint
 
 # Columns of the work buffer of a row of pixels: depth along the boresight (then range), place in the tangent frame,
 # fractions of the grid's and of the nodes' row and column, height of the ground, its rise out of shadow, phase.
@@ -90,7 +90,7 @@ class Steps(NamedTuple):
 
 @njit(
     ahead=(
-        "f4[:, ::1], Grid(f8, f8, f8), Eye(f8, f8[:, ::1], f8, f8, f8), Light(f8, f8, f4[:, ::1], b1), "
+        "f4[:, ::1], Grid(f8, f8, f8), Viewpoint(f8, f8[:, ::1], f8, f8, f8), Light(f8, f8, f4[:, ::1], b1), "
         "Nodes(*4 * [f4[:, ::1]]), Tiles(f4[:, :, ::1], i4[:, ::1], i8), Surface(f4[:, :, ::1], i8, f8, f8), "
         "none, none, *3 * [f4[:, ::1]]"
     ),
@@ -99,7 +99,7 @@ class Steps(NamedTuple):
 def shade_pixels(
     depth: Float32Array,
     grid: Grid,
-    eye: Eye,
+    viewpoint: Viewpoint,
     light: Light,
     nodes: Nodes,
     tiles: Tiles,
@@ -140,12 +140,12 @@ def shade_pixels(
     last_phase = np.float32(law.shape[1] - 2)
     mean = np.float32(mean_albedo)
     spread = np.float32(contrast)
-    high = np.float32(eye.altitude_m)
-    change = _ray_change(eye)
+    high = np.float32(viewpoint.altitude_m)
+    change = _ray_change(viewpoint)
     work = np.empty(_WORK, np.float32)
     places = np.empty(_PLACES, np.int32)
     for v in range(radiance.shape[0]):
-        first = _first_ray(eye, v)
+        first = _first_ray(viewpoint, v)
         _locate_row(work, places, range_m, v, change, first, high, steps, shift_u, shift_v)
         _look_up_row(
             work, places, range_m.shape[1], rises, steps, node_rows, node_columns, row_slopes, column_slopes,
@@ -171,8 +171,8 @@ def _steps_of(grid: Grid, columns: int, node_rows: int, node_columns: int) -> St
 
 
 @njit(**INLINED)
-def _ray_change(eye: Eye) -> RayChange:
-    turn, focal = eye.tangent_from_camera, eye.focal_px
+def _ray_change(viewpoint: Viewpoint) -> RayChange:
+    turn, focal = viewpoint.tangent_from_camera, viewpoint.focal_px
     return RayChange(
         np.float32(turn[0, 0] / focal),
         np.float32(turn[1, 0] / focal),
@@ -185,11 +185,11 @@ def _ray_change(eye: Eye) -> RayChange:
 
 
 @njit(**INLINED)
-def _first_ray(eye: Eye, v: int) -> FirstRay:
+def _first_ray(viewpoint: Viewpoint, v: int) -> FirstRay:
     """Return the ray of the first pixel of row ``v`` of the image."""
-    turn, focal = eye.tangent_from_camera, eye.focal_px
-    b = (v - eye.centre_v_px) / focal
-    a = -eye.centre_u_px / focal
+    turn, focal = viewpoint.tangent_from_camera, viewpoint.focal_px
+    b = (v - viewpoint.centre_v_px) / focal
+    a = -viewpoint.centre_u_px / focal
     return FirstRay(
         np.float32(turn[0, 0] * a + turn[0, 1] * b + turn[0, 2]),
         np.float32(turn[1, 0] * a + turn[1, 1] * b + turn[1, 2]),

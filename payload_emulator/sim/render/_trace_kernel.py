@@ -34,7 +34,7 @@ _TINY = np.float32(1.0e-9)
 _SLOWEST_FALL = np.float32(1.0e-3)
 
 
-class Eye(NamedTuple):
+class Viewpoint(NamedTuple):
     """Camera above the tangent point: altitude, rotation (3, 3), focal length and centre of the image in pixels."""
 
     altitude_m: float
@@ -182,9 +182,12 @@ def find_hit(
     return -1.0
 
 
-@njit(ahead="f4[:, ::1], f4[:, ::1], Grid(f8, f8, f8), Eye(f8, f8[:, ::1], f8, f8, f8), f4[:, ::1]", **FAST)
+@njit(
+    ahead="f4[:, ::1], f4[:, ::1], Grid(f8, f8, f8), Viewpoint(f8, f8[:, ::1], f8, f8, f8), f4[:, ::1]",
+    **FAST,
+)
 def trace_pixels(
-    heights: Float32Array, peaks: Float32Array, grid: Grid, eye: Eye, depth_along: Float32Array
+    heights: Float32Array, peaks: Float32Array, grid: Grid, viewpoint: Viewpoint, depth_along: Float32Array
 ) -> None:
     """Fill ``depth_along`` (H, W) with the distance of the first hit along the boresight; -1 where there is none.
 
@@ -199,14 +202,14 @@ def trace_pixels(
     start = Start(
         np.float32(-grid.x0_m * inverse),
         np.float32(-grid.y0_m * inverse),
-        np.float32(eye.altitude_m),
+        np.float32(viewpoint.altitude_m),
         np.float32(rows - 2.01),
         np.float32(columns - 2.01),
     )
     top = float(peaks.max()) + 1.0
     low = float(heights.min()) - 1.0
     close = np.float32(CLOSE_TEXELS * grid.texel_m)
-    nadir_u, nadir_v = _nadir_pixel(eye, high, wide)
+    nadir_u, nadir_v = _nadir_pixel(viewpoint, high, wide)
     inner = np.empty(high + wide, np.float32)
     inner_z = np.empty(high + wide, np.float32)
     work = np.empty(_WORK, np.float32)
@@ -233,24 +236,28 @@ def trace_pixels(
             count = min(sector.cross0 + half, sector.cross_size - 1) + 1 - begin
             first = n == 0 or (not upright and n == 1)
             _take_neighbours(work, inner, inner_z, sector, half, begin, count, first, np.float32(top))
-            line = _line_of(eye, upright, main, begin, inverse)
+            line = _line_of(viewpoint, upright, main, begin, inverse)
             _newton_steps(work, places, heights, start, line, count)
             _settle(
-                depth_along, inner, inner_z, work, heights, peaks, start, line, eye.altitude_m, upright, main,
+                depth_along, inner, inner_z, work, heights, peaks, start, line, viewpoint.altitude_m, upright, main,
                 begin, count, close, top, low,
             )  # fmt: skip
 
 
 @njit(**INLINED)
-def _nadir_pixel(eye: Eye, high: int, wide: int) -> tuple[int, int]:
+def _nadir_pixel(viewpoint: Viewpoint, high: int, wide: int) -> tuple[int, int]:
     """Return the pixel (u, v) below the camera, within the image; its middle where the camera looks elsewhere."""
-    rotation = eye.tangent_from_camera
+    rotation = viewpoint.tangent_from_camera
     down = -rotation[2, 2]
     nadir_u = wide // 2
     nadir_v = high // 2
     if down > 0.05:
-        nadir_u = min(max(int(eye.centre_u_px - eye.focal_px * rotation[2, 0] / down), 0), wide - 1)
-        nadir_v = min(max(int(eye.centre_v_px - eye.focal_px * rotation[2, 1] / down), 0), high - 1)
+        nadir_u = min(
+            max(int(viewpoint.centre_u_px - viewpoint.focal_px * rotation[2, 0] / down), 0), wide - 1
+        )
+        nadir_v = min(
+            max(int(viewpoint.centre_v_px - viewpoint.focal_px * rotation[2, 1] / down), 0), high - 1
+        )
     return nadir_u, nadir_v
 
 
@@ -289,15 +296,15 @@ def _take_neighbours(
 
 
 @njit(**INLINED)
-def _line_of(eye: Eye, upright: bool, main: int, begin: int, inverse: float) -> Line:
+def _line_of(viewpoint: Viewpoint, upright: bool, main: int, begin: int, inverse: float) -> Line:
     """Return the rays of a line of pixels, which runs along u in upright sectors and along v in the others."""
-    rotation, focal = eye.tangent_from_camera, eye.focal_px
+    rotation, focal = viewpoint.tangent_from_camera, viewpoint.focal_px
     run = 0 if upright else 1
     ax = rotation[0, run] / focal
     ay = rotation[1, run] / focal
     az = rotation[2, run] / focal
-    start = eye.centre_u_px if upright else eye.centre_v_px
-    b = (main - (eye.centre_v_px if upright else eye.centre_u_px)) / focal
+    start = viewpoint.centre_u_px if upright else viewpoint.centre_v_px
+    b = (main - (viewpoint.centre_v_px if upright else viewpoint.centre_u_px)) / focal
     bx = rotation[0, 1 - run] * b + rotation[0, 2] - ax * start
     by = rotation[1, 1 - run] * b + rotation[1, 2] - ay * start
     bz = rotation[2, 1 - run] * b + rotation[2, 2] - az * start
@@ -425,7 +432,7 @@ def trace_shifted(
     heights: Float32Array,
     peaks: Float32Array,
     grid: Grid,
-    eye: Eye,
+    viewpoint: Viewpoint,
     shift_u: Float32Array,
     shift_v: Float32Array,
     depth_along: Float32Array,
@@ -439,15 +446,17 @@ def trace_shifted(
     j0 = -grid.y0_m * inverse
     top = float(peaks.max()) + 1.0
     low = float(heights.min()) - 1.0
-    rotation = eye.tangent_from_camera
+    rotation = viewpoint.tangent_from_camera
     for v in range(depth_along.shape[0]):
         for u in range(depth_along.shape[1]):
-            right = (u + shift_u[v, u] - eye.centre_u_px) / eye.focal_px
-            below = (v + shift_v[v, u] - eye.centre_v_px) / eye.focal_px
+            right = (u + shift_u[v, u] - viewpoint.centre_u_px) / viewpoint.focal_px
+            below = (v + shift_v[v, u] - viewpoint.centre_v_px) / viewpoint.focal_px
             di = (rotation[0, 0] * right + rotation[0, 1] * below + rotation[0, 2]) * inverse
             dj = (rotation[1, 0] * right + rotation[1, 1] * below + rotation[1, 2]) * inverse
             dz = rotation[2, 0] * right + rotation[2, 1] * below + rotation[2, 2]
-            depth_along[v, u] = _search(heights, peaks, i0, j0, eye.altitude_m, di, dj, dz, 0.0, top, low)
+            depth_along[v, u] = _search(
+                heights, peaks, i0, j0, viewpoint.altitude_m, di, dj, dz, 0.0, top, low
+            )
 
 
 @njit(**FAST)

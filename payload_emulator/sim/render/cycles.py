@@ -45,7 +45,7 @@ Not larger: ground of cosine 0.01, which the Sun still sees whole, edges every b
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CyclesPicture:
-    """What Cycles made of a scene.
+    """Image of a scene by Cycles.
 
     Attributes
     ----------
@@ -135,8 +135,10 @@ def rendering_of_passes(planes: dict[str, Image], scene: CyclesScene) -> Renderi
     cosine = sum(np.float32(s) * plane for s, plane in zip(sun, normal, strict=True))
     direct = _plane(planes, "Diffuse Direct.R", "DiffDir.R")
     lit = np.where(ground & (cosine > GRAZING), np.clip(direct / np.maximum(cosine, GRAZING), 0.0, 1.0), 0.0)
-    eye = scene.camera_to_world[:3, 3]
-    offset = [_plane(planes, f"Position.{axis}") - np.float32(e) for axis, e in zip("XYZ", eye, strict=True)]
+    viewpoint = scene.camera_to_world[:3, 3]
+    offset = [
+        _plane(planes, f"Position.{axis}") - np.float32(e) for axis, e in zip("XYZ", viewpoint, strict=True)
+    ]
     range_m = 1e3 * np.sqrt(sum(plane.astype(np.float64) ** 2 for plane in offset))
     return Rendering(
         np.where(ground, _plane(planes, "Combined.R"), np.float32(0.0)).astype(np.float32),

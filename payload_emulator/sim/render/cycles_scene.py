@@ -52,7 +52,7 @@ MATT_SPECULAR_IOR = 1.05
 
 @dataclass(frozen=True, slots=True)
 class CyclesSettings:
-    """How Cycles samples and what the regolith is to it.
+    """Sampling and surface of Cycles.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class CyclesSettings:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CyclesScene:
-    """Everything that Blender is told; lengths in km, east-north-up axes.
+    """Complete input of Blender; lengths in km, east-north-up axes.
 
     Attributes
     ----------
@@ -265,7 +265,7 @@ def _law_over_lambert(
     sun: FloatArray,
     photometry: Photometry,
 ) -> Image:
-    """What the law makes of each texel over a matt Lambert surface; slopes over two texels, as elsewhere."""
+    """Return the ratio of the law to a matt Lambert surface by texel; slopes over two texels."""
     south, north, west, east = bounds
     rows, columns = heights.shape
     latitude = south + (np.arange(rows) + 0.5) / rows * (north - south)

@@ -1,4 +1,4 @@
-"""Where the Sun stands: drawn per frame as the paper does, or from the ephemeris."""
+"""Direction of the Sun: drawn per frame as in the paper, or from the ephemeris."""
 
 from __future__ import annotations
 

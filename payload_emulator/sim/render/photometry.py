@@ -1,4 +1,4 @@
-"""How the regolith scatters: Lambert, Lunar-Lambert and Hapke, as tables over the phase angle.
+"""Photometry of the regolith: Lambert, Lunar-Lambert and Hapke, as tables over the phase angle.
 
 A fourth law, ``matt``, is Lambert without any fall of brightness with phase: what the paper's Principled BSDF comes to.
 

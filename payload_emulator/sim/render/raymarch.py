@@ -87,7 +87,7 @@ def cast(
     camera_from_mcmf: npt.ArrayLike,
     uv_px: npt.ArrayLike,
 ) -> FloatArray:
-    """Where the rays of picture points (n, 2), inside the picture or not far outside, meet the ground: (n, 3) in MCMF,
+    """Return where the rays of picture points (n, 2), inside or not far outside, meet the ground: (n, 3) in MCMF,
     NaN for the sky.  The same march, over the same level of detail, as that of `render`.
     """
     position = np.asarray(position_mcmf_m, dtype=np.float64)

@@ -162,7 +162,7 @@ def _render_grid(
 ) -> Rendering:
     from payload_emulator.sim.render._grid_kernel import Grid, Nodes, Tiles, block_peaks, sweep_shadows
     from payload_emulator.sim.render._shade_kernel import Light, Surface, shade_pixels
-    from payload_emulator.sim.render._trace_kernel import Eye, trace_pixels, trace_shifted
+    from payload_emulator.sim.render._trace_kernel import Viewpoint, trace_pixels, trace_shifted
 
     sunward = _sunward_grid(grid, view)
     # One patch for both grids: a second call could evict tiles of the first.
@@ -191,7 +191,7 @@ def _render_grid(
         np.empty(shape, np.float32),
     )
     place = Grid(grid.x0_m, grid.y0_m, grid.texel_m)
-    eye = Eye(
+    viewpoint = Viewpoint(
         view.altitude_m,
         np.ascontiguousarray(view.tangent_from_camera),
         camera.focal_px,
@@ -200,13 +200,13 @@ def _render_grid(
     )
     shift_u, shift_v = pixel_shifts(camera) if isinstance(camera, BrownCamera) else (None, None)
     if shift_u is None or shift_v is None:
-        trace_pixels(heights, block_peaks(heights), place, eye, range_m)
+        trace_pixels(heights, block_peaks(heights), place, viewpoint, range_m)
     else:
-        trace_shifted(heights, block_peaks(heights), place, eye, shift_u, shift_v, range_m)
+        trace_shifted(heights, block_peaks(heights), place, viewpoint, shift_u, shift_v, range_m)
     shade_pixels(
         lit,
         place,
-        eye,
+        viewpoint,
         Light(
             math.sin(view.sun_elevation_rad),
             math.cos(view.sun_elevation_rad),
@@ -336,7 +336,7 @@ def _reach(rays: FloatArray, altitude_m: float, height_m: npt.ArrayLike) -> Floa
 
 
 def _border_hits(rays: FloatArray, view: View, patch: TerrainPatch) -> list[FloatArray]:
-    """Where the rays meet the ground, (n, 2) per round of a fixed-point search, the settled rounds only."""
+    """Return where the rays meet the ground, (n, 2) per round of a fixed-point search, the settled rounds only."""
     from payload_emulator.sim.terrain import kernels
 
     height = np.zeros(rays.shape[0])

@@ -30,7 +30,7 @@ from tmtc.dictionary.tables import CatalogueTable
 Mask = BoolArray
 
 REASONS = ("size", "no_terrain", "shallow", "no_rim", "moved", "confusable")
-"""Why a crater is dropped, in the order in which it is tested."""
+"""Reasons for dropping a crater, in the order of the tests."""
 
 # Rims measured on coarse rasters lie low: 44 m (5 to 30 km) and 30 m (3 to 30 km) at 16 px/deg compared with 64 px/deg,
 # 106 m at 4 px/deg (measured on GLD100); taken as linear in the logarithm of the resolution, zero from 64 px/deg on.
@@ -78,7 +78,7 @@ class Region:
 
 @dataclass(frozen=True, slots=True)
 class CurationRules:
-    """What is kept.
+    """Conditions for a crater to be kept.
 
     Attributes
     ----------
@@ -246,7 +246,7 @@ def curate(
 
 
 def measured_rims(catalogue: CraterCatalogue, heights: Heights, region: Region) -> Rims:
-    """Return the clear rims of a region beside the listed craters, of the sizes whose centres are known best."""
+    """Return the clear rims of a region with their listed craters, of the sizes whose centres are known best."""
     chosen = region.holds(catalogue.latitude_rad, catalogue.longitude_rad)
     chosen &= (catalogue.diameter_m >= REGISTERED_M[0]) & (catalogue.diameter_m <= REGISTERED_M[1])
     craters = catalogue.select(chosen)
@@ -458,7 +458,7 @@ class RasterHeights:
 
     @property
     def readings(self) -> list[str]:
-        """How the values of the files that were read are taken."""
+        """Return the interpretation of the values of each file that was read."""
         return self._layer.readings
 
     def window(self, south: float, north: float, west: float, east: float) -> tuple[FloatArray, float, float]:

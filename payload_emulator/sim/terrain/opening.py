@@ -157,7 +157,7 @@ def _found(name: str, data: DataFolder, what: str) -> Path:
 
 
 def _names(data: DataFolder) -> tuple[str, ...]:
-    """Which products of the folder a raster terrain is made of."""
+    """Return which products of the folder a raster terrain is made of."""
     heights = "height model SLDEM2015" if data.dem_sldem else data.own_heights or "height model LROC"
     coarse = "height model LROC WAC GLD100, 16" if data.dem_global else "-"
     catalogue = "crater catalogue LU" if data.catalogue_lu else "crater catalogue"

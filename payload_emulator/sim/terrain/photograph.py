@@ -45,7 +45,7 @@ class PhotographTerrain(RasterTerrain):
         super().__init__(paths, catalogue, sharpen=False, **options)
 
     def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> BoolArray:
-        """Whether a height raster and a photograph span each place."""
+        """Return whether a height raster and a photograph span each place."""
         latitude, longitude = np.broadcast_arrays(
             np.asarray(latitude_rad, dtype=np.float64), np.asarray(longitude_rad, dtype=np.float64)
         )

@@ -122,7 +122,7 @@ class ProceduralTerrain(Terrain):
                 self._bands.append((float(reach[chosen].max()), chosen, catalogue.select(chosen)))
 
     def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> BoolArray:
-        """Whether the source itself holds each place: everywhere but within six degrees of the poles."""
+        """Return whether the source itself holds each place: everywhere but within six degrees of the poles."""
         latitude, _ = np.broadcast_arrays(
             np.asarray(latitude_rad, dtype=np.float64), np.asarray(longitude_rad)
         )
@@ -171,7 +171,7 @@ class ProceduralTerrain(Terrain):
         return mottled_albedo(1.12 - 0.5 * plain, latitude_rad, longitude_rad, self._salts[40:46])
 
     def _plain(self, latitude: FloatArray, longitude: FloatArray) -> FloatArray:
-        """How much of a plain (0..1) a grid of places is, (rows, columns), cubic in a half-degree map."""
+        """Return the plain fraction (0..1) of a grid of places, (rows, columns), cubic in a half-degree map."""
         rows = (90.0 - np.degrees(latitude)) * 2.0
         columns = np.degrees(longitude) * 2.0
         left = math.floor(columns[0]) - 2
@@ -241,7 +241,7 @@ def mottled_albedo(
 
 
 def _plains_map(salts: list[int]) -> npt.NDArray[np.float32]:
-    """How much of a plain each half-degree node is, 0..1, (361, 720); node rows start at the north pole."""
+    """Return the plain fraction of each half-degree node, 0..1, (361, 720); node rows start at the north pole."""
     latitude = np.radians(90.0 - np.arange(361) * 0.5)
     longitude = np.radians(np.arange(720) * 0.5)
     field = np.zeros((361, 720), np.float32)

@@ -111,7 +111,7 @@ class RasterTerrain(Terrain):
         super().__init__(name, data_names or (name,), catalogue, pixels_per_degree, cache_tiles)
 
     def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> BoolArray:
-        """Whether a height raster (not a coarse one) spans each place."""
+        """Return whether a height raster (not a coarse one) spans each place."""
         latitude, longitude = np.broadcast_arrays(
             np.asarray(latitude_rad, dtype=np.float64), np.asarray(longitude_rad, dtype=np.float64)
         )

@@ -21,7 +21,16 @@ import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.constants import MOON_RADIUS_M
-from lunar.plausible import HEIGHT_M, RADIUS_M, RELIEF_M, SPHERE_TOLERANCE
+from lunar.plausible import (
+    HEIGHT_M,
+    RADIUS_M,
+    RASTER_PIXEL_M,
+    RELIEF_M,
+    SLOPE_BASE_M,
+    SLOPE_DEG,
+    SPHERE_TOLERANCE,
+    STEEP_SHARE,
+)
 from payload_emulator.errors import TerrainError, install_hint
 from payload_emulator.sim.terrain.tiles import Heights
 
@@ -55,6 +64,9 @@ _SPIKES = 0.01
 """Share of implausible heights of a chunk, above which the unit and not a few pixels are wrong."""
 
 _RELIEF_SPAN_M = 20e3
+_NARROW = 0.05
+"""Cosine of the latitude beyond which columns are too narrow for slopes to the east."""
+
 _LIKENESS = 0.9
 """Correlation with the coarse relief from which scale and zero are compared."""
 _SCALES = (0.7, 1.4)
@@ -63,7 +75,7 @@ _ZERO_M = 300.0
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """How the values of a file are read: ``raw * scale_m + offset_m``.
+    """Conversion of the values of a file: ``raw * scale_m + offset_m``.
 
     `unit` is what the file states, in lower case; `is_radius`: whether its zero is the Moon's centre, as it states.
     """
@@ -184,7 +196,7 @@ class RasterLayer:
 
     @property
     def readings(self) -> list[str]:
-        """What each file that was read states of its values, and how they are taken."""
+        """Return the stated and the used interpretation of the values of each file."""
         return [f"{self.files[k].path.name}: {one.words}" for k, one in sorted(self._readings.items())]
 
     def read(self, first_row: int, first_column: int, rows: int, columns: int) -> Heights:
@@ -211,7 +223,7 @@ class RasterLayer:
         return out
 
     def holds(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> BoolArray:
-        """Whether a file spans each place."""
+        """Return whether a file spans each place."""
         row = (90.0 - np.degrees(latitude_rad)) * self.pixels_per_degree
         column = np.degrees(longitude_rad) * self.pixels_per_degree
         held = np.zeros(row.shape, dtype=bool)
@@ -281,8 +293,17 @@ class RasterLayer:
         if reading is None and np.isfinite(values).any():
             pixel_m = math.radians(MOON_RADIUS_M / self.pixels_per_degree)
             _require_relief(file, chosen, values, pixel_m)
+            latitude_deg = 90.0 - (file.row + corner[0] + 0.5 * len(values)) / self.pixels_per_degree
+            _require_slopes(file, chosen, values, pixel_m, math.cos(math.radians(latitude_deg)))
             like = self._compared(file, values, corner)
-            self._readings[number] = replace(chosen, words=f"{chosen.words}{like}")
+            ppd = self.pixels_per_degree
+            north, west = 90.0 - file.row / ppd, file.column / ppd
+            found = (
+                f"; {north - file.rows / ppd:.4g} to {north:.4g} deg north, {west:.4g} to "
+                f"{west + file.columns / ppd:.4g} deg east, heights of {np.nanmin(values):.4g} to "
+                f"{np.nanmax(values):.4g} m"
+            )
+            self._readings[number] = replace(chosen, words=f"{chosen.words}{found}{like}")
         return values
 
     def _compared(self, file: RasterFile, values: Heights, corner: tuple[int, int]) -> str:
@@ -422,6 +443,24 @@ def _require_relief(file: RasterFile, reading: Reading, values: Heights, pixel_m
     )
 
 
+def _require_slopes(
+    file: RasterFile, reading: Reading, values: Heights, pixel_m: float, narrow: float
+) -> None:
+    """Refuse heights without a unit that are steeper than ground of the Moon is; columns are ``narrow`` pixels wide."""
+    if reading.unit or pixel_m < SLOPE_BASE_M or min(values.shape) < 2 or narrow < _NARROW:
+        return
+    south, east = np.gradient(values.astype(np.float64), pixel_m)
+    steep = np.hypot(south, east / narrow)
+    good = np.isfinite(steep)
+    share = float(np.mean(steep[good] > math.tan(math.radians(SLOPE_DEG)))) if good.any() else 0.0
+    if share > STEEP_SHARE:
+        raise TerrainError(
+            f"{file.path}: expected at most {STEEP_SHARE:.1%} of the pixels steeper than {SLOPE_DEG:g} deg, found "
+            f"{share:.1%} (heights of {np.nanmin(values):.4g} to {np.nanmax(values):.4g} m, no unit stated): half "
+            f"metres, feet or another scale? {_STATE_IT}"
+        )
+
+
 def _has_mask(source: Any) -> bool:
     """Return whether a file has a mask or an alpha band that marks pixels without data."""
     return "per_dataset" in {flag.name for flag in source.mask_flag_enums[0]}
@@ -546,10 +585,18 @@ def _placed(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tupl
     if across and not transform.b and not transform.d:
         wide, high = transform.a / across, -transform.e / down
         if wide > 0.0 and abs(wide - high) <= 1e-6 * wide:
+            _require_pixel(file, math.radians(MOON_RADIUS_M * wide))
             ppd = round(1.0 / wide, 6)
             west_deg = (middle_deg + west / across) % 360.0
             return ppd, replace(file, row=(90.0 - north / down) * ppd, column=west_deg * ppd)
     return _warped(file, crs, transform, radius_m)
+
+
+def _require_pixel(file: RasterFile, pixel_m: float) -> None:
+    if not RASTER_PIXEL_M.holds(pixel_m):
+        raise TerrainError(
+            f"{file.path}: expected pixels of {RASTER_PIXEL_M}, found {pixel_m:.3g} m: coordinates in another unit?"
+        )
 
 
 def _unit_m(values: dict[str, Any]) -> float:
@@ -565,6 +612,7 @@ def _warped(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tupl
     rows, columns = file.shape
     pixel = math.sqrt(abs(transform.determinant))
     pixel_deg = pixel if crs.is_geographic else pixel * _unit_m(crs.to_dict()) / math.radians(radius_m)
+    _require_pixel(file, math.radians(MOON_RADIUS_M * pixel_deg))
     ppd = round(1.0 / pixel_deg, 6)
     y, x = np.meshgrid(np.linspace(0, rows, 65), np.linspace(0, columns, 65), indexing="ij")
     east, north = _transformed(crs, sphere, *_applied(transform, x.ravel(), y.ravel()))

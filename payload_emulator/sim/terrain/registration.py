@@ -1,4 +1,4 @@
-"""Registration of a crater catalogue to a terrain: by how much the rims on the terrain lie beside the listed craters.
+"""Registration of a crater catalogue to a terrain: the shift from the listed craters to the rims on the terrain.
 
 Catalogues and height models are tied to the Moon by different images and orbits. Their difference is tens of metres and
 changes slowly from place to place, so no constant shift is correct. It is fitted from rims measured on the terrain:
@@ -23,6 +23,7 @@ import numpy as np
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M
+from lunar.plausible import MAP_SHIFT_M
 from payload_emulator.errors import TerrainError
 
 VERSION = 1
@@ -52,7 +53,7 @@ _LARGEST_SHIFT = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rims:
-    """Rims on a terrain beside the craters of a list, arrays of length n.
+    """Rims on a terrain compared with the craters of a list, arrays of length n.
 
     Attributes
     ----------
@@ -101,6 +102,13 @@ class Registration:
     catalogue: str = ""
     terrain: Mapping[str, str] = field(default_factory=dict)
     made_utc: str = ""
+
+    @property
+    def words(self) -> str:
+        """Return nodes, rims and mean shift, as printed with figures."""
+        spans = (("east", self.east_m), ("north", self.north_m), ("1 sigma", self.sigma_m))
+        listed = (f"{part.min():.2f} to {part.max():.2f} m {name}" for name, part in spans if part.size)
+        return ", ".join([f"{self.row.size} nodes of {int(self.rims.sum())} rims", *listed])
 
     def at(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return shifts east and north (k, 2) and their sigma (k,); zero and NaN where nothing is known.
@@ -363,8 +371,20 @@ def parse_registration(text: str, source: str) -> Registration:
         raise TerrainError(
             f"{source}: expected nodes of {len(_COLUMNS)} numbers and two hashes, found {error}"
         ) from None
-    if not np.all(np.isfinite(rows)) or np.any(rows[:, 4] <= 0.0):
-        raise TerrainError(f"{source}: expected finite shifts and positive sigma_m, found others")
+    if not np.all(np.isfinite(rows)) or np.any(rows[:, 4] <= 0.0) or np.any(rows[:, 5] < 0.0):
+        raise TerrainError(
+            f"{source}: expected finite shifts, positive sigma_m and counts of rims, found others"
+        )
+    places, shifts = rows[:, :2] / LATTICE_DEG, np.abs(rows[:, 2:4])
+    is_lattice = np.all(np.abs(places - np.rint(places)) < 1e-6) and np.all(np.abs(rows[:, 0]) <= 90.0)
+    if not is_lattice or len(np.unique(rows[:, :2], axis=0)) < len(rows):
+        raise TerrainError(
+            f"{source}: expected each node of the lattice of {LATTICE_DEG:g} deg once, found others"
+        )
+    if shifts.size and shifts.max() > MAP_SHIFT_M:
+        raise TerrainError(
+            f"{source}: expected shifts of at most {MAP_SHIFT_M:g} m, found {shifts.max():.6g} m"
+        )
     row, column = np.rint(rows[:, :2].T / LATTICE_DEG).astype(np.int64)
     return Registration(
         row,

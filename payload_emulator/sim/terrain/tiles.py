@@ -110,11 +110,11 @@ class Terrain(ABC):
     """
 
     is_real: bool = False
-    """Whether the heights are those of the Moon."""
+    """True if the heights are those of the Moon."""
     registration: Registration | None = None
-    """How the catalogue was registered to the heights; None where that does not apply or is not known."""
+    """Registration of the catalogue to the heights; None if not applicable or unknown."""
     sources: str = ""
-    """What the terrain was made of, so that equal texts and catalogues mean equal ground; empty if not known."""
+    """Sources of the terrain: equal texts and catalogues mean equal ground; empty if unknown."""
 
     _small: SmallCraters | None = None
     """Craters below the catalogue's limit, where the source draws any."""
@@ -171,7 +171,7 @@ class Terrain(ABC):
 
     @abstractmethod
     def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> BoolArray:
-        """Whether the source itself holds each place."""
+        """Return whether the source itself holds each place."""
 
     def small_craters(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> CraterShapes:
         """Seeded craters below the catalogue's limit that can touch a window of these latitudes and longitudes."""
@@ -302,7 +302,7 @@ class Terrain(ABC):
         self._rims_m = np.concatenate([self._rims_m, values_m])
 
     def rim_tilts_m(self, indices: IntArray) -> FloatArray:
-        """How much higher than its mean the rim's best plane is in the north and in the east, (n, 2); 0 if unknown."""
+        """Return the rise of the rim's best plane over its mean in the north and in the east, (n, 2); 0 if unknown."""
         self._measure(indices[self._row[indices] < 0])
         return self.measurements_m(indices)[:, 2:]
 
@@ -345,7 +345,7 @@ class Terrain(ABC):
         self.listed = self.catalogue = self.catalogue.select(slice(0))
 
     def release_thread(self) -> None:
-        """Let go of the thread that asked for ground so far: the next one that asks is kept to."""
+        """Release the thread that has requested ground so far; the next one that requests some owns it."""
         self._owner = None
 
     def _made(self, key: tuple[int, int, int]) -> int:

@@ -261,7 +261,7 @@ def _follow_parent() -> None:
 
 
 def _wanted(recipe: Recipe, frames: int) -> list[tuple[Source, int]]:
-    """How many frames each source gives."""
+    """Return the number of frames of each source."""
     total = sum(source.share for source in recipe.sources)
     if frames < len(recipe.sources) or total <= 0.0:
         raise DatasetError(

@@ -184,7 +184,7 @@ class Dataset:
         ]
 
     def is_scored(self, frame: Frame, latitude_deg: FloatArray, longitude_deg: FloatArray) -> BoolArray:
-        """Whether places count in the scores of a frame: all, but where its source keeps only the middle in a box."""
+        """Return whether places count in the scores of a frame: all, or only the middle in a box."""
         boxes = self._scored_boxes.get(frame.source)
         if boxes is None:
             return np.ones(np.shape(latitude_deg), dtype=bool)
@@ -303,7 +303,6 @@ def write_shard(folder: Path, name: str, labels: ShardLabels) -> str:
 
 
 def load_shard(path: Path) -> ShardLabels:
-    """Labels of one shard."""
     try:
         # Opened here: numpy leaves a damaged file open.
         with path.open("rb") as stream, np.load(stream) as stored:
@@ -418,7 +417,7 @@ def write_whole(path: Path, octets: bytes) -> str:
 
 
 def in_picture(craters: dict[str, NDArray[Any]], width_px: int, height_px: int) -> BoolArray:
-    """Which craters have their centre in the picture."""
+    """Return which craters have their centre in the picture."""
     inside: BoolArray = (
         (craters["u_px"] >= -0.5)
         & (craters["u_px"] <= width_px - 0.5)

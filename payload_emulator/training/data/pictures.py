@@ -1,9 +1,9 @@
 """Labelled image sets in COCO form, from any source.
 
-A set is a folder with one or more COCO files (`*.json`, at any depth). Image files lie beside their COCO file or in its
-folder `images`. Craters are the annotations whose category says crater in its name or supercategory, or all where the
-file has no categories. A crater is a box or one or more polygons; of a polygon, centre and diameter are those of its
-area. Equal labels count once.
+A set is a folder with one or more COCO files (`*.json`, at any depth). Image files lie in the folder of their COCO file
+or in its folder `images`. Craters are the annotations whose category says crater in its name or supercategory, or all
+if the file has no categories. A crater is a box or one or more polygons; of a polygon, centre and diameter are those
+of its area. Equal labels count once.
 Further keys are read where present: `centre` and `diameter` of an annotation (as `linna dataset build` writes them),
 `sun_azimuth_deg`, `pixel_m` and `altitude_km` of an image. Pixel centres are integers, so the centre of a box that
 starts at x and is w wide is x + w / 2 - 0.5.
@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,6 +73,31 @@ def load_pictures(folder: Path, category: str = "") -> list[LabelledPicture]:
             f"{'none' if folder.is_dir() else 'no such folder'}"
         )
     return [picture for path, document in documents for picture in _pictures(path, document, category)]
+
+
+def set_words(pictures: Sequence[LabelledPicture]) -> list[str]:
+    """Return what is taken from a set, as printed with figures of it."""
+    box = np.concatenate([picture.box_px for picture in pictures] or [np.zeros((0, 4))])
+    crowds = sum(np.count_nonzero(picture.crowd) for picture in pictures)
+    others = Counter(name for picture in pictures for name in picture.left_out)
+    repeated = sum(picture.repeated for picture in pictures)
+    words = []
+    if len(box):
+        low, high = box[:, :2].min(axis=0), (box[:, :2] + box[:, 2:]).max(axis=0)
+        wide, tall = max(one.width_px for one in pictures), max(one.height_px for one in pictures)
+        span = f"{low[0]:g}, {low[1]:g} to {high[0]:g}, {high[1]:g} px of {wide} x {tall}"
+        words.append(f"boxes from {span}, {crowds} for many craters")
+    if others:
+        listed = ", ".join(f"{count} {name}" for name, count in others.items())
+        words.append(f"labels of other categories, not counted: {listed}")
+    if repeated:
+        words.append(f"labels equal to another, counted once: {repeated}")
+    stated = {"Sun at deg": "sun_azimuth_deg", "m of a pixel": "pixel_m", "altitude in km": "altitude_km"}
+    for what, name in stated.items():
+        values = np.array([getattr(picture, name) for picture in pictures])
+        if np.isfinite(values).any():
+            words.append(f"{what}: {np.nanmin(values):g} to {np.nanmax(values):g}")
+    return words
 
 
 def _coco(path: Path) -> dict[str, Any] | None:
@@ -165,11 +191,12 @@ def _require_boxes_in_pixels(path: Path, pictures: Sequence[LabelledPicture]) ->
     )
     if not len(box):
         return
-    if ends.max() <= 2.0 < sizes.min():
-        raise DatasetError(
-            f"{path}, annotations: expected boxes and polygons in pixels, found none over {ends.max():.3g}: "
-            "coordinates from 0 to 1?"
-        )
+    for most, fewest, words in ((2.0, 1, "coordinates from 0 to 1"), (100.0, 20, "per cent")):
+        if ends.max() <= most < sizes.min() / 2.0 and len(box) >= fewest:
+            raise DatasetError(
+                f"{path}, annotations: expected boxes and polygons in pixels, found none over {ends.max():.3g}: "
+                f"{words}?"
+            )
     corners = (box[:, 2:] > box[:, :2]).all() and len(box) > 2
     beyond = np.count_nonzero((ends > sizes + 1.0).any(axis=1))
     outside = np.flatnonzero((box[:, :2] + 0.5 * box[:, 2:] > sizes + 1.0).any(axis=1))
@@ -237,6 +264,8 @@ def _label(item: Mapping[str, Any], place: str) -> _Label:
     polygons = item.get("segmentation")
     if isinstance(polygons, list) and polygons:
         box, u, v, diameter = _of_polygons(polygons, place)
+        if math.isclose(math.pi / 4.0 * diameter**2, box[2] * box[3], rel_tol=1e-9):
+            diameter = math.sqrt(box[2] * box[3])  # the polygon is its box, about the crater
     elif item.get("bbox"):
         box = _box(item["bbox"], place)
         u, v = box[0] + 0.5 * box[2] - 0.5, box[1] + 0.5 * box[3] - 0.5

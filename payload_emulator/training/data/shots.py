@@ -1,4 +1,4 @@
-"""Where the frames of a data set are taken from, in which light and by which camera: seeded draws.
+"""Places, light and cameras of the frames of a data set: seeded draws.
 
 Everything is drawn from the generator passed in, in a fixed order, so that a shard's frames follow from its number.
 """
@@ -28,7 +28,7 @@ _SHARD_REACH_DEG = 2.5  # frames of a shard look at neighbouring ground, so that
 
 @dataclass(slots=True)
 class Place:
-    """Where a shard draws its frames: the box of its source; after the first frame, the part about that frame."""
+    """Region of the frames of a shard: the box of its source; after the first frame, the part about that frame."""
 
     box: Box
     near: Box | None = None
@@ -36,7 +36,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """Where a camera is, rad and m, and over what: mean height of the ground in view above the map sphere."""
+    """Position of a camera (rad, m), and the mean height of the ground in view above the map sphere."""
 
     latitude_rad: float
     longitude_rad: float
@@ -195,7 +195,7 @@ def _about(box: Box, latitude_deg: float, longitude_deg: float) -> Box:
 
 
 def allowed(source: Source, box: Box, latitude_deg: FloatArray, longitude_deg: FloatArray) -> bool:
-    """Whether a footprint's edge lies in the box and clear of every box to avoid, buffer included."""
+    """Return whether a footprint's edge lies in the box and clear of every box to avoid, buffer included."""
     if not inside_box(box, latitude_deg, longitude_deg, 0.0).all():
         return False
     return not any(

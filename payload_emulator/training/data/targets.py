@@ -1,4 +1,4 @@
-"""What the network should say about one image: heatmap, geometry and where no loss is taken.
+"""Training targets of one image: heatmap, geometry and where no loss is taken.
 
 Three tiers of craters: LABEL pulls the heatmap up with a weight that grows with depth/diameter; IGNORE (catalogued, but
 too shallow, too small, cut, or in shadow) takes the loss away around its centre; what no catalogue lists is background.

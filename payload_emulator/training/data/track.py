@@ -11,6 +11,7 @@ import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, ground_point_sphere, nadir_camera_from_mcmf
+from lunar.constants import NS
 from lunar.datafolder import DataFolder, default_orientation
 from lunar.frames import spherical_from_mcmf
 from lunar.timescales import tdb_s_from_utc_ns
@@ -18,7 +19,6 @@ from payload_emulator.errors import DatasetError
 from payload_emulator.session.world.recipe import EVERYWHERE, PAPER_SHARES, PAPER_SPLIT, Source
 from payload_emulator.training.data.shots import allowed, edge_pixels
 
-_NS = 1_000_000_000
 _BATCH = 4096  # places looked at together: their footprints take a few MB
 _DAY_S = 86_400.0
 _STRIP_RAD = np.radians(10.0)  # a few footprints wide: the tiles of one crossing fit the terrain's cache
@@ -103,7 +103,7 @@ def split_track(split: str, count: int, seed: int) -> tuple[str, ...]:
 
 
 def _can_look(source: Source, camera: PinholeCamera, terrain: Any, position: FloatArray) -> BoolArray:
-    """Whether the nadir footprint from each place (n, 3) is on the terrain and where the source may look."""
+    """Return whether the nadir footprint from each place (n, 3) is on the terrain and where the source may look."""
     rotation = nadir_camera_from_mcmf(position)
     ground = ground_point_sphere(camera, rotation[:, None], position[:, None], edge_pixels(camera))
     latitude, longitude, _ = spherical_from_mcmf(ground)
@@ -120,9 +120,9 @@ def _can_look(source: Source, camera: PinholeCamera, terrain: Any, position: Flo
 def _places(source: Source, data: DataFolder) -> tuple[IntArray, FloatArray]:
     """Epochs (n,) every `step_s` and places (n, 3) in MCMF m of an ephemeris file or a scenario's orbit."""
     if source.ephemeris.endswith((".oem", ".e")):
-        from lunar.messages.ephemeris_files import load_ephemeris
+        from lunar.messages.ephemeris_files import load_orbit
 
-        ephemeris, orientation = load_ephemeris(Path(source.ephemeris)), default_orientation(data)
+        ephemeris, orientation = load_orbit(Path(source.ephemeris)), default_orientation(data)
     else:
         from payload_emulator.session.scenario import load_scenario
         from payload_emulator.session.world.orbit import force_model, propagate_scenario, sample
@@ -131,7 +131,7 @@ def _places(source: Source, data: DataFolder) -> tuple[IntArray, FloatArray]:
         model = force_model(scenario, data)
         orbit = propagate_scenario(scenario, model, source.days * _DAY_S)
         ephemeris, orientation = sample(orbit, source.step_s)[0], model.orientation
-    step_ns = round(source.step_s * _NS)
+    step_ns = round(source.step_s * NS)
     utc_ns: list[IntArray] = []
     position_icrf_m: list[FloatArray] = []
     for segment in ephemeris.segments:

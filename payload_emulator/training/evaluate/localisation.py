@@ -1,7 +1,7 @@
 """Position errors of detections: signed errors by Sun.
 
-Errors are detection minus crater in pixels, u right and v down. Beside the image's axes they are given toward the Sun
-in the image and across it (to the right of who looks toward the Sun): shadows would draw a detector along the first.
+Errors are detection minus crater in pixels, u right and v down. They are given along the image's axes, and toward the
+Sun in the image and across it (to the right of who looks toward it): shadows would draw a detector along the first.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ FEWEST_PAIRS = 20
 
 
 def right(tallied: Tally, threshold: float) -> BoolArray:
-    """Which detections are right at a threshold."""
+    """Return which detections are right at a threshold."""
     chosen: BoolArray = (tallied.score >= threshold) & (tallied.outcome == 1)
     return chosen
 

@@ -199,7 +199,7 @@ def _recall_by(
 
 
 def _state(tallied: Tally, threshold: float) -> dict[str, Any]:
-    """How well the network tells fresh from degraded, over matched craters; rows are truth, columns said."""
+    """Return how well the network separates fresh from degraded, over matched craters; rows are truth, columns said."""
     known = (tallied.outcome == 1) & (tallied.score >= threshold) & np.isfinite(tallied.detection_depth_ratio)
     said, true = tallied.detection_depth_ratio[known], tallied.matched_depth_ratio[known]
     edges = (DEGRADED_DEPTH_RATIO, FRESH_DEPTH_RATIO)
@@ -216,7 +216,7 @@ def _state(tallied: Tally, threshold: float) -> dict[str, Any]:
 
 
 def _calibration(tallied: Tally, threshold: float, chosen: BoolArray | None = None) -> dict[str, float]:
-    """How the errors compare with the predicted sigma: 1 and 0.683 would be perfect for a Gaussian."""
+    """Compare the errors with the predicted sigma: 1 and 0.683 would be perfect for a Gaussian."""
     hit = right(tallied, threshold)
     if chosen is not None:
         hit &= chosen

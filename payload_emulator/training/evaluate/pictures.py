@@ -28,7 +28,7 @@ from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.flight.vision.picture_search import PictureSearch, search_picture, sun_at_azimuth
 from payload_emulator.session.world.external import read_picture
-from payload_emulator.training.data.pictures import LabelledPicture, load_pictures
+from payload_emulator.training.data.pictures import LabelledPicture, load_pictures, set_words
 from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate.localisation import bias_by_octant, bias_overall
 from payload_emulator.training.evaluate.scoring import (
@@ -48,14 +48,14 @@ SUN_RIGHT_DEG = 67.5
 
 
 class Criterion(enum.StrEnum):
-    """When a detection takes a label."""
+    """Criterion for matching a detection to a label."""
 
     strict = "strict"
     centre = "centre"
 
 
 class SunKnowledge(enum.StrEnum):
-    """What a search is told of the Sun."""
+    """Prior knowledge of the Sun for a search."""
 
     given = "given"
     found = "found"
@@ -132,6 +132,7 @@ def evaluate_pictures(
         "craters": craters,
         "other_labels": dict(Counter(name for picture in pictures for name in picture.left_out)),
         "repeated_labels": sum(picture.repeated for picture in pictures),
+        "labels": set_words(pictures),
         "remarks": remarks,
         "threshold": threshold,
         "two_scales": options.two_scales,
@@ -202,13 +203,7 @@ def format_picture_figures(figures: dict[str, Any]) -> str:
 
 def _left_out(figures: dict[str, Any]) -> list[str]:
     """Return lines about labels and pixels that do not count."""
-    others = ", ".join(f"{count} {name}" for name, count in figures["other_labels"].items())
-    repeated = figures["repeated_labels"]
-    return [
-        *([f"labels of other categories, not counted: {others}"] if others else []),
-        *([f"labels equal to another, counted once: {repeated}"] if repeated else []),
-        *figures["remarks"],
-    ]
+    return [*figures["labels"], *figures["remarks"]]
 
 
 def _between(values: FloatArray, limits: tuple[float, float]) -> BoolArray:
@@ -254,7 +249,7 @@ def _overlap(picture: LabelledPicture, u_px: float, v_px: float, diameter_px: fl
 
 
 def _in_crowd(picture: LabelledPicture, found: Detections) -> BoolArray:
-    """Whether each detection's centre lies in a region that stands for many craters."""
+    """Return whether each detection's centre lies in a region that stands for many craters."""
     inside = np.zeros(len(found), bool)
     for x, y, width, height in picture.box_px[picture.crowd]:
         inside |= (np.abs(found.u_px + 0.5 - x - 0.5 * width) <= 0.5 * width) & (
@@ -344,7 +339,7 @@ def _scales_m(pictures: Sequence[LabelledPicture], options: PictureSetOptions) -
 def _sun_figures(
     pictures: Sequence[LabelledPicture], searches: Sequence[PictureSearch], azimuths: FloatArray
 ) -> dict[str, Any]:
-    """What was found of the Sun in each image, and how far from what was given."""
+    """Return the found Sun azimuth of each image and its error."""
     rows: list[dict[str, Any]] = []
     errors = []
     for picture, search, azimuth in zip(pictures, searches, azimuths, strict=True):

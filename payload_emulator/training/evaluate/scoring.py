@@ -1,4 +1,4 @@
-"""How well detections agree with a catalogue: one-to-one matching, strict and ignore-aware figures.
+"""Agreement of detections with a catalogue: one-to-one matching, strict and ignore-aware figures.
 
 Strict counts every catalogued crater whose centre lies in the frame. Ignore-aware leaves out what hardly anyone could
 see: the truth is craters of depth/diameter of at least 0.03 whose centre lies half a radius inside the frame, and a
@@ -323,7 +323,7 @@ def match_any(
     truth_diameter: FloatArray,
     rule: MatchRule,
 ) -> BoolArray:
-    """Whether each detection lies on any of the craters by the rule; several may share one."""
+    """Return whether each detection lies on any of the craters by the rule; several may share one."""
     if truth_u.size == 0 or detection_u.size == 0:
         return np.zeros(detection_u.size, bool)
     limit = rule.limits_px(truth_diameter)

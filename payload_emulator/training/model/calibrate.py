@@ -1,4 +1,4 @@
-"""What is fixed on the validation split before a network flies: thresholds, corrections, parallax of the walls."""
+"""Values fixed on the validation split before a network is used: thresholds, corrections, parallax of the walls."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _LEAST_PAIRS = 50
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What is fixed on the validation split.
+    """Values fixed on the validation split.
 
     geometry_shift : added to the network's geometry: cells, cells, ln, ln.
     parallax_per_px : share of a crater's depth by which its apparent middle lies below the rim, over the focal length
@@ -153,7 +153,7 @@ def without_parallax(found: FrameDetections, share_per_px: float, truth: FrameTr
 def geometry_shift(
     tallied: Tally, threshold: float, cell_px: int = STRIDE_PX
 ) -> tuple[float, float, float, float]:
-    """What to add to the network's geometry so that errors in the Sun-up image are centred and sigma is one sigma."""
+    """Return the shift of the network's geometry that centres errors in the Sun-up image and makes sigma one sigma."""
     right = (tallied.outcome == 1) & (tallied.score >= threshold)
     if np.count_nonzero(right) < _LEAST_PAIRS:
         return (0.0, 0.0, 0.0, 0.0)

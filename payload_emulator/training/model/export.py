@@ -218,7 +218,7 @@ def keep_blocked(model: Any) -> Any:
 
 
 def _spatial_mean(node: Any, shape: dict[str, list[int]]) -> bool:
-    """Whether a mean is taken over height and width and leaves them as 1."""
+    """Return whether a mean is taken over height and width and leaves them as 1."""
     before, after = shape.get(node.input[0], []), shape.get(node.output[0], [])
     return len(before) == len(after) == 4 and before[:2] == after[:2] and after[2:] == [1, 1]
 

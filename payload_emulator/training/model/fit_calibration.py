@@ -399,7 +399,7 @@ def _log_linear(
 
 
 def format_calibration_figures(document: dict[str, Any]) -> str:
-    """What was fitted, in lines."""
+    """Format the fitted values as lines."""
     sun, sigma = document["sun"], document["sigma"]
     pulls = ", ".join(
         f"{name} {value:+.3f} ± {error:.3f}"

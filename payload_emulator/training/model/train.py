@@ -201,7 +201,7 @@ def _optimise(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _RunFiles:
-    """What a run saves: network, running average of its weights and optimiser, in the files of its folder."""
+    """Saved files of a run: network, running average of its weights and optimiser, in the files of its folder."""
 
     run: Path
     network: Any

@@ -63,12 +63,9 @@ ROWS: list[dict[str, Any]] = [
 for row in ROWS:
     row.update(vehicle_id=1, requested_by="ann", arguments={"argument_1": 10.0 + row["id"]})
 LINES = [
-    *(AuditLine("enter", number, "ann") for number in (1, 2, 3, 4)),
-    AuditLine("release", 1, "ann"),
-    AuditLine("send", 1, "bob"),
-    AuditLine("reject", 2, "bob"),
-    AuditLine("release", 3, "bob"),
-]
+    *(AuditLine("enter", number, "ann") for number in (1, 2, 3, 4)), AuditLine("release", 1, "ann"),
+    AuditLine("send", 1, "bob"), AuditLine("reject", 2, "bob"), AuditLine("release", 3, "bob"),
+]  # fmt: skip
 
 
 def what_clients_were_told() -> Ledger:
@@ -90,19 +87,14 @@ def changed(number: int, **values: Any) -> list[dict[str, Any]]:
 @pytest.mark.parametrize(
     ("fault", "rows"),
     [
-        ("commands_lost", ROWS[1:]),
-        ("commands_lost", changed(2, arguments={"argument_1": 99.0})),
-        ("commands_doubled", [*ROWS, {**ROWS[3], "id": 5}]),
-        ("states_lost", changed(3, state="queued")),
-        ("states_lost", changed(2, decided_by="ann")),
-        ("states_lost", ROWS[:3]),
-        ("shared_counts", changed(3, sequence_count=0)),
-        ("hand_outs_wrong", changed(1, state="released")),
-        ("hand_outs_wrong", changed(1, octets=b"another")),
-        ("hand_outs_wrong", changed(3, state="sent")),
+        ("commands_lost", ROWS[1:]), ("commands_lost", changed(2, arguments={"argument_1": 99.0})),
+        ("commands_doubled", [*ROWS, {**ROWS[3], "id": 5}]), ("states_lost", changed(3, state="queued")),
+        ("states_lost", changed(2, decided_by="ann")), ("states_lost", ROWS[:3]),
+        ("shared_counts", changed(3, sequence_count=0)), ("hand_outs_wrong", changed(1, state="released")),
+        ("hand_outs_wrong", changed(1, octets=b"another")), ("hand_outs_wrong", changed(3, state="sent")),
         ("audit_wrong", changed(4, state="rejected", decided_by="bob")),
     ],
-)
+)  # fmt: skip
 def test_each_difference_of_a_row_is_a_fault(fault: str, rows: list[dict[str, Any]]) -> None:
     assert judge(what_clients_were_told(), rows, LINES)[fault] > 0
 

@@ -25,13 +25,9 @@ HOUR_NS = 3_600_000_000_000
 SCENARIO = commanded_scenario("half-a-day")
 
 KILLED = (
-    ("started", "database", 0.0),
-    ("started", "spacecraft", 0.1),
-    ("ended", "link", 0.3),
-    ("ended", "worker", 0.0),
-    ("settled", "broker", 0.2),
-    ("settled", "api", 0.0),
-)
+    ("started", "database", 0.0), ("started", "spacecraft", 0.1), ("ended", "link", 0.3), ("ended", "worker", 0.0),
+    ("settled", "broker", 0.2), ("settled", "api", 0.0),
+)  # fmt: skip
 
 
 def hold_telecommands_until_the_spacecraft_was_killed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,11 +23,8 @@ class OpenIdProvider:
 
     def __init__(self) -> None:
         self.claims: dict[str, Any] = {
-            "sub": "u-1",
-            "preferred_username": "ann",
-            "roles": ["linna-operators"],
-            "sid": "s-1",
-        }
+            "sub": "u-1", "preferred_username": "ann", "roles": ["linna-operators"], "sid": "s-1",
+        }  # fmt: skip
         self.change: Callable[[dict[str, Any]], dict[str, Any]] = lambda claims: claims
         self.algorithm = "RS256"
         self.key = KEY
@@ -101,15 +98,12 @@ class OpenIdProvider:
                     self._send(
                         200,
                         {
-                            "issuer": issuer,
-                            "authorization_endpoint": f"{issuer}/authorise",
-                            "token_endpoint": f"{issuer}/token",
-                            "jwks_uri": f"{issuer}/keys",
+                            "issuer": issuer, "authorization_endpoint": f"{issuer}/authorise",
+                            "token_endpoint": f"{issuer}/token", "jwks_uri": f"{issuer}/keys",
                             "end_session_endpoint": f"{issuer}/end",
-                            "authorization_response_iss_parameter_supported": True,
-                            **provider.metadata,
+                            "authorization_response_iss_parameter_supported": True, **provider.metadata,
                         },
-                    )
+                    )  # fmt: skip
                 elif self.path.endswith("/keys"):
                     keys = [one.as_dict(private=False) for one in provider.published]
                     self._send(200, {"keys": keys})

@@ -162,12 +162,9 @@ def test_an_operation_reaches_only_spacecraft_of_the_callers_missions(route: API
             assert "expected a spacecraft of the missions ours, found" in answer.json()["detail"]
     state = SimpleNamespace(ground=fleet.client.app.state.ground)
     asked: Any = SimpleNamespace(
-        scope={"route": route},
-        path_params=values,
-        query_params=query,
-        _json=body,
+        scope={"route": route}, path_params=values, query_params=query, _json=body,
         app=SimpleNamespace(state=state),
-    )
+    )  # fmt: skip
     for caller in (Caller("eve", "viewer"), fleet.theirs):
         if scope.decision == "service" and caller.missions is not None:
             with pytest.raises(Forbidden, match="found an operation of the whole service"):
@@ -280,13 +277,11 @@ def test_a_socket_sends_only_events_of_the_callers_spacecraft(fleet: Fleet) -> N
 @pytest.mark.parametrize(
     "event",
     [
-        WindowChanged(id=1, state="approved"),
-        CommandStateChanged(id=1, state="sent"),
-        LinkChanged(link="theirs", state="connected"),
-        RequestChanged(id=1, state="active"),
+        WindowChanged(id=1, state="approved"), CommandStateChanged(id=1, state="sent"),
+        LinkChanged(link="theirs", state="connected"), RequestChanged(id=1, state="active"),
         PlanChanged(request_id=1, windows_added=(1,)),
     ],
-)
+)  # fmt: skip
 def test_an_event_of_a_row_is_of_the_spacecraft_of_the_row(event: Event, fleet: Fleet) -> None:
     logged = LoggedEvent(1, 0, event.event_kind, event.model_dump(mode="json"))
     assert event_owner(fleet.client.app.state.ground, logged) == THEIRS

@@ -37,13 +37,9 @@ def provider() -> Iterator[OpenIdProvider]:
 
 def settings(home: Path, provider: OpenIdProvider, **given: object) -> Settings:
     return Settings(
-        home=home,
-        oidc_issuer=provider.issuer,
-        oidc_client_id=CLIENT,
-        oidc_client_secret=SECRET,
-        oidc_roles=ROLES,
+        home=home, oidc_issuer=provider.issuer, oidc_client_id=CLIENT, oidc_client_secret=SECRET, oidc_roles=ROLES,
         **given,
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -86,11 +82,8 @@ def test_a_user_of_the_provider_is_added_with_the_role_and_gets_a_session(client
     assert "max-age=0" in cookies["linna_sign_in"]
     found = session_of(client)
     assert (found["name"], found["role"], found["browser"], found["provider"]) == (
-        "ann",
-        "operator",
-        True,
-        True,
-    )
+        "ann", "operator", True, True,
+    )  # fmt: skip
     left_s = (datetime.fromisoformat(found["expires"]) - datetime.now(UTC)).total_seconds()
     assert 0 < left_s <= 3600.0  # then the provider states the role again
     assert "max-age=3600" in cookies[SESSION_COOKIE]
@@ -388,13 +381,8 @@ def test_sign_out_ends_the_session_here_and_leads_to_the_provider(client, provid
 
 def logout_token(provider: OpenIdProvider, **change: object) -> str:
     claims = {
-        **provider.common(),
-        "jti": "j-1",
-        "sub": "u-1",
-        "sid": "s-1",
-        "events": {oidc.LOGOUT_EVENT: {}},
-        **change,
-    }
+        **provider.common(), "jti": "j-1", "sub": "u-1", "sid": "s-1", "events": {oidc.LOGOUT_EVENT: {}}, **change,
+    }  # fmt: skip
     return provider.signed({name: value for name, value in claims.items() if value is not None})
 
 

@@ -170,15 +170,12 @@ def test_an_administrator_manages_users(guarded: Guarded) -> None:
 @pytest.mark.parametrize(
     "body",
     [
-        {"name": "a\nb", "role": "viewer"},
-        {"name": "ann", "role": "root"},
-        {"name": "ann", "role": "viewer", "days_valid": True},
-        {"name": "ann", "role": "viewer", "days_valid": -1},
-        {"name": "ann", "role": "viewer", "days_valid": "3"},
-        {"name": 5, "role": "viewer"},
+        {"name": "a\nb", "role": "viewer"}, {"name": "ann", "role": "root"},
+        {"name": "ann", "role": "viewer", "days_valid": True}, {"name": "ann", "role": "viewer", "days_valid": -1},
+        {"name": "ann", "role": "viewer", "days_valid": "3"}, {"name": 5, "role": "viewer"},
         {"name": "ann", "role": "viewer", "admin": True},
     ],
-)
+)  # fmt: skip
 def test_a_user_that_cannot_be_added_is_refused(guarded: Guarded, body: dict[str, object]) -> None:
     client, heads = guarded
     assert client.post(f"{V1}/users", json=body, headers=heads["admin"]).status_code == 422

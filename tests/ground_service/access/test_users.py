@@ -50,11 +50,9 @@ def test_a_disabled_user_is_refused_at_once_in_every_process(either: Ground, tmp
         change_user(other, "bob", state="active")
         assert authenticate(either, token).role == "operator"
     assert [one[:3] for one in details(either)] == [
-        ("local", "add user", "ann"),
-        ("ann", "add user", "bob"),
-        ("ann", "disable user", "bob"),
+        ("local", "add user", "ann"), ("ann", "add user", "bob"), ("ann", "disable user", "bob"),
         ("local", "enable user", "bob"),
-    ]
+    ]  # fmt: skip
 
 
 def test_a_revoked_token_is_refused_and_others_stay(either: Ground) -> None:
@@ -183,16 +181,14 @@ def test_every_change_is_in_the_audit_log_with_what_it_changed(ground: Ground) -
     ensure_user(ground, "cleo", "operator", SECRET, actor="deployment")
     assert details(ground) == [
         ("eve", "add user", "ann", {"role": "admin", "token_id": 1}),
-        ("ann", "add user", "bob", {"role": "viewer", "token_id": 2}),
-        ("ann", "add token", "bob", {"token_id": 3}),
+        ("ann", "add user", "bob", {"role": "viewer", "token_id": 2}), ("ann", "add token", "bob", {"token_id": 3}),
         ("ann", "renew token", "bob", {"token_id": 4, "revoked": 2}),
         ("ann", "change role", "bob", {"from": "viewer", "to": "operator"}),
         ("ann", "disable user", "bob", {"sessions": 0}),
         ("ann", "change role", "bob", {"from": "operator", "to": "viewer"}),
-        ("ann", "enable user", "bob", {"sessions": 0}),
-        ("ann", "revoke token", "bob", {"token_id": 4}),
+        ("ann", "enable user", "bob", {"sessions": 0}), ("ann", "revoke token", "bob", {"token_id": 4}),
         ("deployment", "ensure user", "cleo", {"role": "operator", "token_id": 5}),
-    ]
+    ]  # fmt: skip
 
 
 def test_who_is_not_named_is_local(ground: Ground) -> None:
@@ -369,11 +365,8 @@ def test_users_are_listed_by_name_and_tokens_newest_first(ground: Ground) -> Non
     assert ground.read(has_users)
     assert [one.name for one in list_users(ground)] == ["ann", "bob", "cleo"]
     assert [(one.id, one.user) for one in list_tokens(ground)] == [
-        (4, "ann"),
-        (3, "bob"),
-        (2, "ann"),
-        (1, "cleo"),
-    ]
+        (4, "ann"), (3, "bob"), (2, "ann"), (1, "cleo"),
+    ]  # fmt: skip
     assert [one.id for one in list_tokens(ground, "ann")] == [4, 2]
     with pytest.raises(NotFound):
         list_tokens(ground, "eve")

@@ -109,11 +109,9 @@ def test_an_error_of_place_splits_along_the_orbit() -> None:
     latitude, longitude = track.latitude_deg[0], track.longitude_deg[0]
     step = 1e-3
     error = error_of_places_rtn_m(
-        track,
-        np.array([latitude, latitude + step, latitude]),
-        np.array([longitude, longitude, longitude + step]),
+        track, np.array([latitude, latitude + step, latitude]), np.array([longitude, longitude, longitude + step]),
         np.array([50_070.0, 50_000.0, 50_000.0]),
-    )
+    )  # fmt: skip
     along = RADIUS_M * math.radians(step)
     expected = [[70.0, 0.0, 0.0], [0.0, along, 0.0], [0.0, 0.0, -along * math.cos(math.radians(latitude))]]
     # The chord of 31 m sinks below the sphere by 0.3 mm.

@@ -107,19 +107,11 @@ def test_a_whole_pass(make_pass: Maker, ground: Ground) -> None:
     assert table["detector.precision"].value == pytest.approx(hits / (hits + FRAMES))
     assert table["resources.temperature_max"].value == pytest.approx(20.0 + 0.1 * (FRAMES - 1))
     assert statuses(report) == {
-        "accuracy.median": "not met",
-        "accuracy.p95": "met",
-        "better_than.propagate-only": "not met",
-        "completeness.packets": "met",
-        "completeness.frames": "met",
-        "completeness.images": "met",
-        "detector.recall": "met",
-        "detector.precision": "met",
-        "anchor_reads": "met",
-        "resets": "met",
-        "resources.cpu": "unknown",
-        "resources.temperature_max": "not met",
-    }
+        "accuracy.median": "not met", "accuracy.p95": "met", "better_than.propagate-only": "not met",
+        "completeness.packets": "met", "completeness.frames": "met", "completeness.images": "met",
+        "detector.recall": "met", "detector.precision": "met", "anchor_reads": "met", "resets": "met",
+        "resources.cpu": "unknown", "resources.temperature_max": "not met",
+    }  # fmt: skip
     assert report.verdict_level == "not met"
     assert report.verdict.startswith("2 of 11 requirements not met: median 3-D error 130 m (at most 129);")
     assert report.verdict.endswith("1 unknown: CPU load. 8 of 11 requirements met.")
@@ -166,11 +158,9 @@ def test_the_share_over_unseen_terrain_is_that_of_the_frames_of_the_pass(
 def test_half_a_downlink(make_pass: Maker, ground: Ground) -> None:
     """Six of twelve frames were received: no count has a gap, but half of the image packets are missing."""
     made = make_pass(
-        frames=FRAMES,
-        seed=42,
-        encode=lambda packets: encode_downlink(packets[: 6 * PACKETS_PER_FRAME]),
+        frames=FRAMES, seed=42, encode=lambda packets: encode_downlink(packets[: 6 * PACKETS_PER_FRAME]),
         mission=MISSION,
-    )
+    )  # fmt: skip
     report = evaluated(ground, made.folder)
     assert report.packets is not None and report.accounting is not None
     assert (report.packets.packets, report.packets.lost, report.packets.lost_at_edges) == (36, 0, 30)

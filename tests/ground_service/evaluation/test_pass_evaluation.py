@@ -19,8 +19,13 @@ from ground_service.evaluation.fixes import IdentificationSamples, MappedCraters
 from ground_service.evaluation.model import PassFigures
 from ground_service.evaluation.recall import Viewing
 from ground_service.evaluation.smoother import ONBOARD, FilterStates, StartState
-from ground_service.evaluation.verdict import Limits
-from ground_service.passes.samples import DetectionSamples, NavigationSamples, OutcomeSamples, no_detections
+from ground_service.missions.model import Requirements
+from ground_service.telemetry.samples import (
+    DetectionSamples,
+    NavigationSamples,
+    OutcomeSamples,
+    no_detections,
+)
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, make_catalogue
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
@@ -205,7 +210,7 @@ def inputs(**changed: Any) -> PassInputs:
         "outcomes": (outcomes(),),
         "gravity": builtin_gravity(),
         "reference_sigma_rtn_m": REFERENCE_SIGMA_M,
-        "limits": Limits(estimator="paper", median_error_m=1_000.0),
+        "limits": Requirements(estimator="paper", median_error_m=1_000.0),
         "frames_expected": 14,
         "cadence_s": CADENCE_S,
         "images": IMAGES,
@@ -715,7 +720,7 @@ def test_the_headline_is_that_of_the_declared_estimator(report: PassReport) -> N
     ("estimator", "reason"), [(None, "no estimator is declared"), ("spherical", "spherical is not known")]
 )
 def test_no_other_estimator_stands_in_for_the_declared_one(estimator: str | None, reason: str) -> None:
-    report = evaluate_pass(inputs(limits=Limits(estimator=estimator), detections=no_detections()))
+    report = evaluate_pass(inputs(limits=Requirements(estimator=estimator), detections=no_detections()))
     assert [(one.value, one.note) for one in report.headline[::2]] == [
         (None, reason), (None, reason), (100, "of 2\u202f000 expected"),
     ]  # fmt: skip
@@ -741,7 +746,7 @@ def test_one_sample_is_no_headline() -> None:
 
 def test_the_verdict_is_that_of_the_limits(report: PassReport) -> None:
     assert (report.verdict, report.verdict_level) == ("1 of 1 requirement met.", "met")
-    failed = evaluate_pass(inputs(limits=Limits(estimator="paper", median_error_m=499.0)))
+    failed = evaluate_pass(inputs(limits=Requirements(estimator="paper", median_error_m=499.0)))
     assert failed.verdict_level == "not met"
     assert {one.key for one in report.requirements if one.status == "met"} == {"accuracy.median"}
 

@@ -30,7 +30,7 @@ from ground_service.evaluation.alignment import (
     nees,
     squared_normalised_errors,
 )
-from ground_service.evaluation.core import WORST_FRAMES, _choose_frames, attitude_remarks
+from ground_service.evaluation.core import WORST_FRAMES, _choose_frames, event_remarks
 from ground_service.evaluation.extras import dark_limit, surface_map, with_terrain
 from ground_service.evaluation.fixes import Pairs, snapshot_positions, wrong_fixes
 from ground_service.evaluation.recall import ExpectedCraters, Matches, Viewing, expected_craters
@@ -96,11 +96,22 @@ def test_times_with_a_degraded_attitude_are_remarks() -> None:
         event(95, "attitude_restored"),
     )
     text = f"on ({noise}): the payload used the estimated noise"
-    assert attitude_remarks(events) == [
+    assert event_remarks(events) == [
         f"attitude judged noisier than declared from 2029-08-07T00:00:30.000Z {text}, until 2029-08-07T00:01:30.000Z",
         f"attitude judged noisier than declared from 2029-08-07T00:05:00.000Z {text}",
     ]
-    assert attitude_remarks(()) == []
+    assert event_remarks(()) == []
+
+
+def test_the_newest_offset_of_the_list_on_board_is_a_remark() -> None:
+    events = (
+        event(90, "map_offset", "frame 80: 31.2 m east and north, from 80 fixes"),
+        event(5, "map_offset", "frame 0: 60 m east and north, from 0 fixes"),
+        event(99, "boot"),
+    )
+    assert event_remarks(events) == [
+        "offset of the crater list used on board, 1 sigma: frame 80: 31.2 m east and north, from 80 fixes"
+    ]
 
 
 FRAMES, CRATERS = 40, 5

@@ -13,7 +13,7 @@ from ground_service.evaluation.recall import (
     match_detections,
     score_detections,
 )
-from ground_service.passes.samples import DetectionSamples
+from ground_service.telemetry.samples import DetectionSamples
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, make_catalogue
 from lunar.frames import mcmf_from_spherical

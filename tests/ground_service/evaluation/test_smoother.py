@@ -10,6 +10,7 @@ from ground_service.evaluation.smoother import (
     ONBOARD,
     CommandedBurn,
     FilterStates,
+    MapOffset,
     SmootherModel,
     _carried,
     _legs,
@@ -346,6 +347,9 @@ def test_the_shift_of_the_map_is_renewed_over_the_ground() -> None:
     np.testing.assert_allclose(added[3:], 0.0, atol=1e-12)
     errors = CommonErrors()
     east_m, north_m, up_m = errors.catalogue_offset_m
+    stated = smoother_model(builtin_gravity(), IauOrientation(), (), MapOffset((20.0, 25.0, 5.0), 80.0))
+    assert stated.map_sigma_rtn_m == (5.0, 25.0, 20.0)
+    assert stated.map_correlation_rad == pytest.approx(np.radians(80.0))
     assert model.map_sigma_rtn_m == (up_m, north_m, east_m)
     assert model.map_correlation_rad == errors.catalogue_correlation_rad
 

@@ -84,15 +84,13 @@ def rich_pass(make_pass: Callable[..., SyntheticPass]) -> RichPass:
         sent.send(
             "filter_state",
             {
-                "frame_number": k,
-                "image_ticks": tick,
+                "frame_number": k, "image_ticks": tick,
                 "position_icrf_m": onboard_from_icrf[k] @ (position[k] + error[k]),
-                "velocity_icrf_m_s": onboard_from_icrf[k] @ velocity[k],
-                "acceleration_rtn_m_s2": np.zeros(3),
+                "velocity_icrf_m_s": onboard_from_icrf[k] @ velocity[k], "acceleration_rtn_m_s2": np.zeros(3),
                 "covariance": COVARIANCE[np.tril_indices(9)],
             },
             tick + 700,
-        )
+        )  # fmt: skip
     (folder / "downlink.cadu").write_bytes(encode_downlink([*made.packets, *sent.packets]))
     manifest = json.loads((folder / "manifest.json").read_text())
     manifest["gravity"]["filter_orientation"] = TurnedOrientation().name

@@ -15,10 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet
-import pyogrio
 import pytest
-import spiceypy
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -52,6 +49,10 @@ from tests.ground_service.exports.conftest import COVARIANCE, FRAMES, RichPass
 from tests.lazy import Lazy
 from tests.serving import TestClient
 from tmtc.errors import MissingLibrary
+
+parquet = Lazy("pyarrow.parquet")
+pyogrio = Lazy("pyogrio")
+spiceypy = Lazy("spiceypy")
 
 CRAFT = spacecraft_id(SPACECRAFT)
 
@@ -362,7 +363,7 @@ def test_parquet_has_a_file_for_each_packet_type_with_units(rich_ground: Ground,
         "filter_state.parquet",
         "event_info.parquet",
     } <= set(files)
-    table = pyarrow.parquet.read_table(io.BytesIO(files["housekeeping.parquet"]))
+    table = parquet.read_table(io.BytesIO(files["housekeeping.parquet"]))
     assert table.num_rows == FRAMES
     assert str(table.schema.field("utc").type) == "timestamp[ns, tz=UTC]"
     stated = table.schema.field("temperature_c").metadata

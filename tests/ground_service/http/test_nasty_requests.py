@@ -16,20 +16,9 @@ from tests.serving import TestClient
 
 NS = 1_000_000_000
 TEXTS = (
-    "",
-    "x",
-    "1",
-    "-1",
-    "0",
-    "1e308",
-    "nan",
-    "true",
-    "a" * 5000,
-    "ä\u202e☾",
-    "%00",
-    "' OR 1=1 --",
+    "", "x", "1", "-1", "0", "1e308", "nan", "true", "a" * 5000, "ä\u202e☾", "%00", "' OR 1=1 --",
     "../../etc/passwd",
-)
+)  # fmt: skip
 NUMBERS = ("1", "0", "-1", str(2**31), str(2**63), str(2**70), "1.5", "x", "")
 BODIES: tuple[Any, ...] = (
     None, [], {}, "text", 5, {"a": 1}, [[[[]]]], {"start": 5}, {"points": []}, {"points": [{"ticks": 2**70}]},
@@ -44,14 +33,9 @@ BODIES: tuple[Any, ...] = (
     {"state": "approved", "reason": "\x00"}, {"reason": "x"}, {"predecessor_id": 1},
 )  # fmt: skip
 OCTETS = (
-    b"",
-    b"\x00" * 100,
-    b"PK\x03\x04",
-    b"CCSDS_OEM_VERS = 2.0\n",
-    b"\x1a\xcf\xfc\x1d" * 50,
-    b"[" * 100_000,
+    b"", b"\x00" * 100, b"PK\x03\x04", b"CCSDS_OEM_VERS = 2.0\n", b"\x1a\xcf\xfc\x1d" * 50, b"[" * 100_000,
     b'{"a":' * 20_000,
-)
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -126,12 +110,7 @@ def test_no_request_makes_the_server_fail(client: TestClient, every: int) -> Non
                 for octets in some(OCTETS):
                     kind = next(iter(content))
                     checked(
-                        client,
-                        method.upper(),
-                        plain,
-                        operation,
-                        content=octets,
-                        headers={"content-type": kind},
-                    )
+                        client, method.upper(), plain, operation, content=octets, headers={"content-type": kind},
+                    )  # fmt: skip
                     asked += 1
     assert asked > 4000 / every

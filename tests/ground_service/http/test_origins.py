@@ -63,20 +63,14 @@ def test_a_supervisor_may_ask_for_health_by_any_name(client: TestClient) -> None
 @pytest.mark.parametrize(
     "browser",
     [
-        {"Origin": "https://attacker.example"},
-        {"Origin": "null"},
-        {"Origin": "http://127.0.0.1:3000"},
-        {"Origin": "http://127.0.0.1"},
-        {"Origin": "http://localhost:8042"},
-        {"Origin": "file://"},
-        {"Sec-Fetch-Site": "cross-site"},
-        {"Sec-Fetch-Site": "same-site"},
-        {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Origin": BASE},
-        {"Cookie": "session=1"},
+        {"Origin": "https://attacker.example"}, {"Origin": "null"}, {"Origin": "http://127.0.0.1:3000"},
+        {"Origin": "http://127.0.0.1"}, {"Origin": "http://localhost:8042"}, {"Origin": "file://"},
+        {"Sec-Fetch-Site": "cross-site"}, {"Sec-Fetch-Site": "same-site"},
+        {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Origin": BASE}, {"Cookie": "session=1"},
         {**OWN, "Content-Type": "text/plain"},
         {**OWN, "Content-Type": "application/x-www-form-urlencoded; charset=utf-8"},
     ],
-)
+)  # fmt: skip
 def test_a_page_of_another_origin_changes_nothing(client: TestClient, browser: dict[str, str]) -> None:
     queued = client.post(f"{V1}/telecommands", json=PING).json()["id"]
     for method, path, body in (

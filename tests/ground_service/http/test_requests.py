@@ -65,12 +65,10 @@ def test_control_characters_in_a_path_are_refused(client: TestClient) -> None:
 @pytest.mark.parametrize(
     ("query", "words"),
     [
-        ("limti=5", "expected 'limit', found 'limti'"),
-        ("kinds=report", "expected 'kind', found 'kinds'"),
-        ("x=1", "expected one of kind, limit, offset, found 'x'"),
-        ("limit=5&__=", "found '__'"),
+        ("limti=5", "expected 'limit', found 'limti'"), ("kinds=report", "expected 'kind', found 'kinds'"),
+        ("x=1", "expected one of kind, limit, offset, found 'x'"), ("limit=5&__=", "found '__'"),
     ],
-)
+)  # fmt: skip
 def test_an_unknown_query_key_is_refused_with_the_nearest_known(
     client: TestClient, query: str, words: str
 ) -> None:
@@ -111,13 +109,11 @@ def test_known_query_keys_are_taken(client: TestClient) -> None:
     [
         (b'{"name": "x", "cadence_s": NaN}', "found NaN"),
         (b'{"name": "x", "cadence_s": -Infinity}', "found -Infinity"),
-        (b'{"name": "x", "cadence_s": 1e400}', "found 1e400"),
-        (b'{"name": "a\\u0000b"}', "without NUL"),
-        (b'{"a\\u0000b": 1}', "without NUL"),
-        (b'{"name": ["\\ud800"]}', "lone surrogates"),
+        (b'{"name": "x", "cadence_s": 1e400}', "found 1e400"), (b'{"name": "a\\u0000b"}', "without NUL"),
+        (b'{"a\\u0000b": 1}', "without NUL"), (b'{"name": ["\\ud800"]}', "lone surrogates"),
         (b'{"name": "x", "name": "y"}', "found a duplicate"),
     ],
-)
+)  # fmt: skip
 def test_json_with_no_or_two_meanings_is_refused(client: TestClient, body: bytes, words: str) -> None:
     for path in ("/windows", "/telecommands", "/passes", "/requests"):
         assert words in detail(client.post(f"{V1}{path}", content=body, headers=JSON), 422)

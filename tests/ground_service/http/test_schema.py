@@ -28,12 +28,9 @@ from tests.serving import TestClient
 
 V1 = "/api/v1"
 CHECKS = [
-    not_a_server_error,
-    status_code_conformance,
-    content_type_conformance,
-    response_headers_conformance,
+    not_a_server_error, status_code_conformance, content_type_conformance, response_headers_conformance,
     response_schema_conformance,
-]
+]  # fmt: skip
 EXAMPLES = int(os.environ.get("SCHEMA_EXAMPLES", "1"))
 """Number of requests of each kind to each operation; SCHEMA_EXAMPLES=50, for instance, sends more."""
 
@@ -88,13 +85,9 @@ def test_every_operation_answers_as_its_schema_says(client: TestClient, mode: Ge
         operation = found.ok()
 
         @settings(
-            max_examples=EXAMPLES,
-            deadline=None,
-            database=None,
-            derandomize=True,
-            phases=[Phase.generate],
+            max_examples=EXAMPLES, deadline=None, database=None, derandomize=True, phases=[Phase.generate],
             suppress_health_check=list(HealthCheck),
-        )
+        )  # fmt: skip
         @given(case=operation.as_strategy(generation_mode=mode))
         def ask(case: Any) -> None:
             asked.add((case.method, case.operation.path))

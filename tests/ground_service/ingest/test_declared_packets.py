@@ -18,7 +18,6 @@ from ground_service.app import create_app
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
-from ground_service.ingest import parameters as decoding
 from ground_service.ingest.service import Place, decode_all_again, ingest_file, undecoded_vehicles
 from ground_service.missions import definitions
 from ground_service.missions import store as missions
@@ -33,7 +32,8 @@ from ground_service.passes.parameters import export_packets, pass_parameters
 from ground_service.passes.service import completeness, define_pass, get_pass, parameter_series, trend_series
 from ground_service.settings import Settings
 from ground_service.store import repository
-from ground_service.store.parameters import readable_decoding
+from ground_service.telemetry import decoding
+from ground_service.telemetry.values import readable_decoding
 from ground_service.toml import read_table
 from ground_service.worker import follow_up
 from ground_service.worker.integrity import verify

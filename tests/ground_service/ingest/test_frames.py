@@ -22,10 +22,10 @@ from benchmarks.campaigns.cuts import KINDS, ORDERS, Archive, Piece, archive, ca
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.core import NO_RECORD, Found
 from ground_service.ingest.frames import FrameReader, PacketReader, Section
-from ground_service.ingest.parameters import redecode
 from ground_service.ingest.reception import Reading, Run
 from ground_service.ingest.service import Place, ingest_file
 from ground_service.store import repository
+from ground_service.telemetry.decoding import redecode
 from tests.ground_service.archive_hash import hash_of
 from tmtc.arrays import as_octets
 from tmtc.dictionary.payload import DICTIONARY

@@ -21,9 +21,6 @@ from ground_service.app import create_app
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
-from ground_service.ingest import parameters
-from ground_service.ingest.packets import batch_of_cut
-from ground_service.ingest.parameters import catch_up, redecode, vehicles_behind
 from ground_service.ingest.service import Place, ingest_file
 from ground_service.ingest.store import store_batch
 from ground_service.passes.service import list_events, parameter_series, state_series
@@ -32,6 +29,9 @@ from ground_service.store import database as stores
 from ground_service.store import repository
 from ground_service.store.database import open_database
 from ground_service.store.vehicles import vehicle_id
+from ground_service.telemetry import decoding as parameters
+from ground_service.telemetry.decoding import catch_up, redecode, vehicles_behind
+from ground_service.telemetry.packets import batch_of_cut
 from tests.ground_service.archive_hash import archive_hash, hash_of
 from tests.ground_service.conftest import define_pass_of
 from tests.serving import TestClient

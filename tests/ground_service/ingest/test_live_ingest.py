@@ -17,11 +17,11 @@ from ground_service.ingest import store
 from ground_service.ingest.core import NO_TIME, Found, RecordFormat
 from ground_service.ingest.frames import FrameReader, Section
 from ground_service.ingest.live import Spool, WatchedFolder
-from ground_service.ingest.packets import CLOCKS_AGREE_NS, PacketBatch, batch_of_cut, time_receptions
 from ground_service.ingest.service import Place, ingest_file
 from ground_service.store.event_kinds import read_events
 from ground_service.store.repository import RECEPTIONS
 from ground_service.store.vehicles import vehicle_id
+from ground_service.telemetry.packets import CLOCKS_AGREE_NS, PacketBatch, batch_of_cut, time_receptions
 from lunar.arrays import IntArray
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service.archive_hash import hash_of

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from ground_service.ground import Ground
 from ground_service.ingest.core import COUNT_MODULUS, account_sequence
-from ground_service.ingest.packets import batch_of_cut
 from ground_service.ingest.service import ingest_file
 from ground_service.ingest.store import recordings_of_vehicle
 from ground_service.store import repository
+from ground_service.telemetry.packets import batch_of_cut
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.packets.cuc import NO_TICKS, TICKS_PER_SECOND
 from tmtc.packets.stream import cut_packets

@@ -112,17 +112,13 @@ def test_a_formatted_mission_parses_to_itself() -> None:
 @pytest.mark.parametrize(
     ("values", "level"),
     [
-        ({}, None),
-        ({"world": "unit-geometry"}, "1"),
-        ({"world": "procedural"}, "2"),
-        ({"world": "real-terrain"}, None),
-        ({"world": "real-terrain", "unseen_share": 0.0}, "3s"),
+        ({}, None), ({"world": "unit-geometry"}, "1"), ({"world": "procedural"}, "2"),
+        ({"world": "real-terrain"}, None), ({"world": "real-terrain", "unseen_share": 0.0}, "3s"),
         ({"world": "real-terrain", "unseen_share": 0.999}, "3s"),
-        ({"world": "real-terrain", "unseen_share": 1.0}, "3"),
-        ({"world": "other-renderer"}, "4"),
+        ({"world": "real-terrain", "unseen_share": 1.0}, "3"), ({"world": "other-renderer"}, "4"),
         ({"world": "photographs"}, "5"),
     ],
-)
+)  # fmt: skip
 def test_the_evidence_level_follows_from_the_world_that_was_flown(values: dict, level: str | None) -> None:
     assert Evidence(**values).level == level
 

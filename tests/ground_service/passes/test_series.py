@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from sqlalchemy import event, select
@@ -17,10 +16,8 @@ from ground_service.evaluation.core import evaluate_pass
 from ground_service.evaluation.inputs import filter_states, load_pass_inputs
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
-from ground_service.ingest.packets import batch_of_cut
-from ground_service.ingest.parameters import catch_up
 from ground_service.ingest.service import ingest_file
-from ground_service.ingest.store import store_batch, store_samples
+from ground_service.ingest.store import store_batch
 from ground_service.missions.service import add_mission
 from ground_service.passes import archive_import, series, store
 from ground_service.passes.archive_import import import_archive
@@ -29,11 +26,15 @@ from ground_service.passes.parameters import series_source, spacecraft_parameter
 from ground_service.passes.service import detections, trend_series
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.passes.store import get_pass
-from ground_service.store import repository, rollups
+from ground_service.store import repository
 from ground_service.store.files import register_file
 from ground_service.store.models import ROLLUPS
-from ground_service.store.rollups import BASE_TICKS, HOUSEKEEPING_VALUES, STATE_VALUES
 from ground_service.store.vehicles import vehicle_id
+from ground_service.telemetry import rollups
+from ground_service.telemetry.decoding import catch_up
+from ground_service.telemetry.packets import batch_of_cut
+from ground_service.telemetry.rollups import BASE_TICKS, HOUSEKEEPING_VALUES, STATE_VALUES
+from ground_service.telemetry.writing import store_samples
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service.conftest import (
     NS,
@@ -43,11 +44,14 @@ from tests.ground_service.conftest import (
     encode_downlink,
     enter_files,
 )
+from tests.lazy import Lazy
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.packets.large_data import split
 from tmtc.packets.stream import cut_packets
 from tmtc.packets.thumbnails import Thumbnail, pack_thumbnail
+
+cv2 = Lazy("cv2")
 
 SECOND = 1 << 16
 FIRST = 900_000_000 * SECOND

@@ -17,15 +17,9 @@ STEP_S = 600.0
 def grid(hours: int = 24, **changes: object) -> ResourceGrid:
     n = round(hours * 3600 / STEP_S)
     plain = ResourceGrid(
-        start_utc_ns=0,
-        step_s=STEP_S,
-        gain_wh=np.full(n, 1.0),
-        downlink_octets=np.full(n, 1000.0),
-        battery_wh=50.0,
-        floor_wh=15.0,
-        observing_w=20.0,
-        storage_octets=10_000.0,
-    )
+        start_utc_ns=0, step_s=STEP_S, gain_wh=np.full(n, 1.0), downlink_octets=np.full(n, 1000.0), battery_wh=50.0,
+        floor_wh=15.0, observing_w=20.0, storage_octets=10_000.0,
+    )  # fmt: skip
     return replace(plain, **changes)
 
 

@@ -41,15 +41,10 @@ downlink_kbit_s = 8.0
 
 def test_curves_fill_and_empty_battery_and_storage() -> None:
     grid = ResourceGrid(
-        start_utc_ns=0,
-        step_s=3600.0,
-        gain_wh=np.array([1.0, -2.0, -2.0, 5.0]),
-        downlink_octets=np.array([0.0, 30.0, 30.0, 100.0]),
-        battery_wh=10.0,
-        floor_wh=0.0,
-        observing_w=3.0,
+        start_utc_ns=0, step_s=3600.0, gain_wh=np.array([1.0, -2.0, -2.0, 5.0]),
+        downlink_octets=np.array([0.0, 30.0, 30.0, 100.0]), battery_wh=10.0, floor_wh=0.0, observing_w=3.0,
         storage_octets=1000.0,
-    )
+    )  # fmt: skip
     found = curves(grid, [Option(3600 * NS, 2 * 3600 * NS, 50)])  # in the second hour
     assert found.battery_wh.tolist() == [10.0, 5.0, 3.0, 8.0]  # full; -2 - 3; -2; +5
     assert found.stored_octets.tolist() == [0.0, 50.0, 20.0, 0.0]
@@ -143,15 +138,9 @@ def test_craters_are_counted_by_area_and_searched_for(planned: Ground, tmp_path:
     degrees = np.array([[1.0, 1.0, 6.0], [5.0, 9.0, 8.0], [85.0, -5.0, 7.0], [5.0, 5.0, 60.0]])
     ids, radians = np.arange(4), np.radians(degrees[:, :2])
     catalogue = CraterCatalogue(
-        ids=ids,
-        latitude_rad=radians[:, 0],
-        longitude_rad=radians[:, 1],
-        diameter_m=1e3 * degrees[:, 2],
-        rim_height_m=np.zeros(4),
-        depth_m=np.full(4, np.nan),
-        complete=np.ones(4, dtype=np.bool_),
-        source="four",
-    )
+        ids=ids, latitude_rad=radians[:, 0], longitude_rad=radians[:, 1], diameter_m=1e3 * degrees[:, 2],
+        rim_height_m=np.zeros(4), depth_m=np.full(4, np.nan), complete=np.ones(4, dtype=np.bool_), source="four",
+    )  # fmt: skip
     save_catalogue(catalogue, tmp_path / "four.csv")
     stored = planned.files.put_file(tmp_path / "four.csv")
     add_catalogue(planned, stored, "four.csv")

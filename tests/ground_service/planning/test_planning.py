@@ -36,7 +36,7 @@ from ground_service.planning.service import WindowEntry, add_window
 from ground_service.planning.store import get_record
 from ground_service.planning.window_states import (
     PlannedSpan,
-    WindowFacts,
+    WindowEvidence,
     span_conflicts,
     state_of,
 )
@@ -255,37 +255,44 @@ SENT = ("completed", "accepted")
 
 
 @pytest.mark.parametrize(
-    ("facts", "expected"),
+    ("evidence", "expected"),
     [
-        (WindowFacts("draft", started=True), "draft"),
-        (WindowFacts("failed", frames=5), "failed"),
-        (WindowFacts("approved"), "approved"),
-        (WindowFacts("approved", command_states=("released", "carried")), "approved"),
-        (WindowFacts("approved", command_states=SENT), "uplinked"),
-        (WindowFacts("approved", command_states=("sent", "failed")), "failed"),
-        (WindowFacts("approved", predecessor_failed=True, command_states=SENT), "failed"),
-        (WindowFacts("approved", replaced=True, command_states=SENT, frames=2), "failed"),
-        (WindowFacts("approved", command_states=SENT, heard_after=True), "failed"),
-        (WindowFacts("approved", command_states=SENT, started=True), "executing"),
-        (WindowFacts("approved", command_states=SENT, frames=2), "executing"),
-        (WindowFacts("approved", command_states=SENT, started=True, stopped=True, lost=2), "executed"),
-        (WindowFacts("approved", command_states=SENT, frames=9, heard_after=True, lost=1), "executed"),
-        (WindowFacts("approved", command_states=SENT, frames=9, heard_after=True, lost=0), "downlinked"),
+        (WindowEvidence("draft", started=True), "draft"),
+        (WindowEvidence("failed", frames=5), "failed"),
+        (WindowEvidence("approved"), "approved"),
+        (WindowEvidence("approved", command_states=("released", "carried")), "approved"),
+        (WindowEvidence("approved", command_states=SENT), "uplinked"),
+        (WindowEvidence("approved", command_states=("sent", "failed")), "failed"),
+        (WindowEvidence("approved", predecessor_failed=True, command_states=SENT), "failed"),
+        (WindowEvidence("approved", replaced=True, command_states=SENT, frames=2), "failed"),
+        (WindowEvidence("approved", command_states=SENT, received_after=True), "failed"),
+        (WindowEvidence("approved", command_states=SENT, started=True), "executing"),
+        (WindowEvidence("approved", command_states=SENT, frames=2), "executing"),
+        (WindowEvidence("approved", command_states=SENT, started=True, stopped=True, lost=2), "executed"),
+        (WindowEvidence("approved", command_states=SENT, frames=9, received_after=True, lost=1), "executed"),
         (
-            WindowFacts("approved", command_states=SENT, frames=9, heard_after=True, lost=0, reported=True),
+            WindowEvidence("approved", command_states=SENT, frames=9, received_after=True, lost=0),
+            "downlinked",
+        ),
+        (
+            WindowEvidence(
+                "approved", command_states=SENT, frames=9, received_after=True, lost=0, reported=True
+            ),
             "processed",
         ),
     ],
 )
-def test_the_state_follows_from_the_facts(facts: WindowFacts, expected: str) -> None:
-    state, reason = state_of(facts)
+def test_the_state_follows_from_the_facts(evidence: WindowEvidence, expected: str) -> None:
+    state, reason = state_of(evidence)
     assert state == expected
-    assert (reason is not None) == (state == "failed" and facts.decision == "approved")
+    assert (reason is not None) == (state == "failed" and evidence.decision == "approved")
 
 
 def test_a_window_that_failed_names_the_telecommand_and_its_failure() -> None:
-    facts = WindowFacts("approved", command_states=("failed",), failure="insert_activity not accepted: busy")
-    assert state_of(facts)[1] == "a telecommand of it failed: insert_activity not accepted: busy"
+    evidence = WindowEvidence(
+        "approved", command_states=("failed",), failure="insert_activity not accepted: busy"
+    )
+    assert state_of(evidence)[1] == "a telecommand of it failed: insert_activity not accepted: busy"
 
 
 OUTSIDE = parse_utc("2031-01-01T00:00:00Z")

@@ -52,11 +52,9 @@ def approved(client: TestClient, start_s: float, stop_s: float, **fields: Any) -
 
 def test_windows_are_searched_over_the_uploaded_ephemeris(client: TestClient) -> None:
     body = {
-        "altitude_km": {"min": 29, "max": 31},
-        "maximum_duration_s": 600,
-        "spacecraft_id": 76,
+        "altitude_km": {"min": 29, "max": 31}, "maximum_duration_s": 600, "spacecraft_id": 76,
         "minimum_battery": 0.1,
-    }
+    }  # fmt: skip
     found = client.post(f"{V1}/windows/search", json=body)
     assert found.status_code == 200, found.text
     document = found.json()
@@ -242,14 +240,10 @@ def test_a_window_without_images_fails_when_no_packet_of_its_time_may_come(
 @pytest.mark.parametrize(
     "fields",
     [
-        {"name": "two\nlines"},
-        {"name": "\x1b[2J"},
-        {"name": "nul\x00"},
-        {"cadence_s": True},
-        {"spacecraft_id": True},
-        {"spacecraft_id": 1024},
+        {"name": "two\nlines"}, {"name": "\x1b[2J"}, {"name": "nul\x00"}, {"cadence_s": True},
+        {"spacecraft_id": True}, {"spacecraft_id": 1024},
     ],
-)
+)  # fmt: skip
 def test_a_window_with_a_value_of_another_kind_is_refused(client: TestClient, fields: dict[str, Any]) -> None:
     entry = {"name": "n", "start": at(0), "stop": at(300), "spacecraft_id": 76, **fields}
     assert client.post(f"{V1}/windows", json=entry).status_code == 422

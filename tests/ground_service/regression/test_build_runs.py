@@ -392,7 +392,7 @@ POLICY = {"version": "1", "sha256": "00", "confidence": 0.95, "power": 0.8}  # o
 
 def gate(name: str, outcome: str, **values: Any) -> JudgedGate:
     known = {
-        "pass_name": None,
+        "pass_id": None,
         "passed": outcome == "pass",
         "baseline": 0.9,
         "candidate": 0.7,
@@ -441,7 +441,7 @@ def test_a_gate_that_was_waived_in_an_earlier_verdict_does_not_count() -> None:
 
 def test_reasons_are_failed_gates_then_open_ones_then_passes_without_a_comparison() -> None:
     open_gate = gate("drift", "inconclusive", reason="too few frames")
-    failed = gate("recall", "fail", pass_name="pass 1", unit="m")
+    failed = gate("recall", "fail", pass_id="pass 1", unit="m")
     lost = {"name": "pass 2", "archive": "x", "state": "candidate failed", "detail": "exit status 4"}
     found = regression("fail", [open_gate, failed], passes=[lost])
     assert found.summary().reasons == [

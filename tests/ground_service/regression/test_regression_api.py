@@ -9,8 +9,6 @@ from typing import Any
 
 import pytest
 
-from ground_service.client.local import local_client
-from ground_service.ground import open_ground
 from ground_service.regression.archives import pack_archive
 from linna.cli import run
 from tests.serving import TestClient, wait_for
@@ -83,12 +81,10 @@ def test_a_build_is_registered_held_against_another_and_judged(
 @pytest.mark.parametrize(
     "body",
     [
-        {"candidate": "../../etc/passwd"},
-        {"candidate": "0" * 64},
-        {"candidate": "current", "archives": ["0" * 64]},
-        {},
+        {"candidate": "../../etc/passwd"}, {"candidate": "0" * 64},
+        {"candidate": "current", "archives": ["0" * 64]}, {},
     ],
-)
+)  # fmt: skip
 def test_a_regression_of_nothing_known_is_refused(client: TestClient, body: dict[str, Any]) -> None:
     assert client.post(f"{V1}/regressions", json=body).status_code == 422
 
@@ -109,51 +105,6 @@ def test_only_an_administrator_registers_a_program(
         for role, one in heads.items()
     }
     assert found == {"viewer": 403, "operator": 403, "admin": 201}
-
-
-def test_commands_compare_and_analyse_builds_over_archives(
-    make_flyable: Callable, make_build: Callable, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    flown = make_flyable(frames=12, seed=53)
-    packets = {"synthetic pass 53": flown.packets}
-    good = make_build("good", packets)
-    broken = make_build("broken", packets, program="raise SystemExit(4)")
-
-    def regress(*words: object, status: int = 0) -> Any:
-        place = ["--archive", flown.folder, "--home", tmp_path / "home", "--workers", 1, "--json"]
-        assert run(["regress", *map(str, (*words, *place))]) == status
-        return json.loads(capsys.readouterr().out)
-
-    passed = regress("run", "--build", good, "--baseline", good)
-    assert (passed["verdict"], passed["frames"], [one["state"] for one in passed["passes"]]) == (
-        "pass", 12, ["judged"],
-    )  # fmt: skip
-    junit, page = tmp_path / "junit.xml", tmp_path / "page.html"
-    documents = ("--junit", junit, "--report", page)
-    failed = regress("run", "--build", broken, "--baseline", good, *documents, status=1)
-    assert failed["passes"][0]["state"] == "candidate failed"
-    assert '<property name="verdict" value="fail" />' in junit.read_text()
-    assert "Regression report" in page.read_text()
-    figures = regress("baseline", "--build", good)
-    assert figures["suite"] == figures["passes"][0]["figures"] != {}
-    assert figures["not_flown"] == []
-    assert regress("baseline", "--build", broken, status=2)["not_flown"][0]["name"] == "synthetic pass 53"
-    listed = ["--archive", passed["passes"][0]["archive"][:16], "--home", str(tmp_path / "home")]
-    assert run(["regress", "run", "--build", str(good), "--baseline", str(good), *listed]) == 0
-    typo = tmp_path / "unused"
-    words = ["regress", "run", "--build", good, "--baseline", good, "--home", tmp_path / "home"]
-    assert run([*map(str, words), "--archive", str(flown.folder), str(typo)]) == 2
-    assert (
-        f"linna: error: --archive {typo}: expected a pass archive, or the identity or the pass of one that is kept, "
-        "found nothing there"
-    ) in capsys.readouterr().err
-    with open_ground(tmp_path / "home") as ground:
-        jobs = list(local_client(ground, "ann").list_jobs())
-    assert {one.state for one in jobs} == {"done"}
-    assert {one.kind for one in jobs} == {
-        "regression",
-        "analysis",
-    }  # replays run within the job of the verdict
 
 
 def test_the_suite_states_what_its_passes_can_detect_before_anything_is_run(capsys) -> None:

@@ -17,7 +17,6 @@ from ground_service.regression.gates.core import (
     FEWEST_PASSES,
     FEWEST_TRACKS,
     PASS_SPREAD,
-    Gate,
     detectable,
     judge,
     power_text,
@@ -53,6 +52,7 @@ from lunar.catalogue import make_catalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical
 from reports.text import loss_text
+from reports.values import Gate
 from tests.lazy import Lazy
 
 stats = Lazy("scipy.stats")
@@ -120,7 +120,7 @@ def suite(noise: int, passes: int = 5, first_scene: int = 0, **faults: Any) -> d
 
 
 def by_name(gates: list[Gate]) -> dict[str, Gate]:
-    return {gate.name: gate for gate in gates if not gate.pass_name}
+    return {gate.name: gate for gate in gates if not gate.pass_id}
 
 
 def failed(gates: list[Gate]) -> set[str]:
@@ -172,13 +172,13 @@ def test_a_better_build_passes_on_one_window_and_the_bounds_say_that_it_is_bette
 
 def test_a_loss_in_one_kind_of_terrain_fails_there() -> None:
     gates = judge(suite(0), suite(1, recall=0.72, other_kind_recall=0.58), POLICY)
-    assert "sparse terrain" in {gate.pass_name for gate in gates if gate.outcome == "fail"}
-    assert "cratered terrain" not in {gate.pass_name for gate in gates}
+    assert "sparse terrain" in {gate.pass_id for gate in gates if gate.outcome == "fail"}
+    assert "cratered terrain" not in {gate.pass_id for gate in gates}
 
 
 def test_a_build_that_fails_on_one_pass_alone_fails_there() -> None:
     after = {**suite(1), "pass 3": simulated(3, 1, recall=0.5)}
-    places = {gate.pass_name for gate in judge(suite(0), after, POLICY) if gate.outcome == "fail"}
+    places = {gate.pass_id for gate in judge(suite(0), after, POLICY) if gate.outcome == "fail"}
     assert "pass 3" in places and not places & {"pass 0", "pass 1", "pass 2", "pass 4"}
 
 

@@ -163,10 +163,10 @@ def test_processor_times_are_compared_only_of_replays_at_the_same_time(
     assert told in outcome.remarks
     one = KeptReplay(outcome="ok", detail="", machine="a", wall_s=8.0)
     changed = ({"created_utc_ns": at} for at in (3 * 10**9, 5 * 10**9))
-    beside = [one.beside(one.model_copy(update=values)) for values in (*changed, {"machine": "b"})]
-    assert beside == [True, False, False]
+    overlaps = [one.overlaps(one.model_copy(update=values)) for values in (*changed, {"machine": "b"})]
+    assert overlaps == [True, False, False]
     # Short replays of a loaded machine may miss each other.
-    monkeypatch.setattr(KeptReplay, "beside", lambda _one, _other: True)
+    monkeypatch.setattr(KeptReplay, "overlaps", lambda _one, _other: True)
     again = judge(network_ms=20.0, repeated=True)
     assert (
         {gate.name for gate in again.gates if gate.name.startswith("latency.")}
@@ -615,7 +615,7 @@ def test_a_build_that_differs_on_few_frames_is_inconclusive_with_the_frames_need
         dataclasses.replace(policy, policy=dataclasses.replace(policy.policy, rules=strict)),
     )
     assert (outcome.verdict, verdict_document(outcome).exit_status) == ("inconclusive", 3)
-    recall = next(gate for gate in outcome.gates if gate.name == "detector.recall" and not gate.pass_name)
+    recall = next(gate for gate in outcome.gates if gate.name == "detector.recall" and not gate.pass_id)
     assert (recall.outcome, recall.frames) == ("inconclusive", 60)
     assert recall.change_high > recall.margin == 0.045 > recall.change_low
     assert outcome.frames_judged == 60

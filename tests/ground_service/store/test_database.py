@@ -255,13 +255,10 @@ def test_a_database_of_another_encoding_is_refused_in_one_line(
 @pytest.mark.parametrize(
     "values",
     [
-        {"result": {"value": float("nan")}},
-        {"result": {"value": [1.0, float("inf")]}},
-        {"attempts": 10**20},
-        {"created_utc_ns": -(2**70)},
-        {"error": "half of a pair \ud800"},
+        {"result": {"value": float("nan")}}, {"result": {"value": [1.0, float("inf")]}}, {"attempts": 10**20},
+        {"created_utc_ns": -(2**70)}, {"error": "half of a pair \ud800"},
     ],
-)
+)  # fmt: skip
 def test_a_value_that_no_database_can_hold_is_refused(either: Ground, values: dict[str, Any]) -> None:
     row = {
         "id": "j", "kind": "report", "state": "queued", "arguments": {}, "progress": 0.0, "attempts": 0,

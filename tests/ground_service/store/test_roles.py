@@ -78,29 +78,17 @@ def assert_refused(url: str, statement: str) -> None:
 @pytest.mark.parametrize(
     "statement",
     [
-        "UPDATE audit SET actor = 'nobody'",
-        "DELETE FROM audit",
-        "TRUNCATE audit",
-        "ALTER TABLE audit DISABLE TRIGGER ALL",
-        "DROP TRIGGER audit_no_update ON audit",
-        "ALTER TABLE users ADD COLUMN hidden text",
-        "DROP TABLE packets",
-        "TRUNCATE packets",
-        "CREATE TABLE mine (a int)",
-        "CREATE FUNCTION mine() RETURNS int LANGUAGE sql AS 'SELECT 1'",
+        "UPDATE audit SET actor = 'nobody'", "DELETE FROM audit", "TRUNCATE audit",
+        "ALTER TABLE audit DISABLE TRIGGER ALL", "DROP TRIGGER audit_no_update ON audit",
+        "ALTER TABLE users ADD COLUMN hidden text", "DROP TABLE packets", "TRUNCATE packets",
+        "CREATE TABLE mine (a int)", "CREATE FUNCTION mine() RETURNS int LANGUAGE sql AS 'SELECT 1'",
         "CREATE TRIGGER mine AFTER INSERT ON users EXECUTE FUNCTION linna_refuse_audit_change()",
-        "UPDATE alembic_version SET version_num = '9'",
-        "CREATE ROLE mine SUPERUSER",
-        "ALTER ROLE linna_service SUPERUSER",
-        "SET ROLE linna_owner",
-        "SET session_replication_role = replica",
-        "COPY (SELECT 1) TO PROGRAM 'true'",
-        "COPY users FROM '/etc/passwd'",
-        "SELECT pg_read_file('/etc/passwd')",
-        "ALTER SYSTEM SET archive_command = 'true'",
-        "CREATE EXTENSION file_fdw",
+        "UPDATE alembic_version SET version_num = '9'", "CREATE ROLE mine SUPERUSER",
+        "ALTER ROLE linna_service SUPERUSER", "SET ROLE linna_owner", "SET session_replication_role = replica",
+        "COPY (SELECT 1) TO PROGRAM 'true'", "COPY users FROM '/etc/passwd'", "SELECT pg_read_file('/etc/passwd')",
+        "ALTER SYSTEM SET archive_command = 'true'", "CREATE EXTENSION file_fdw",
     ],
-)
+)  # fmt: skip
 def test_the_role_of_the_service_is_refused(roles: Roles, statement: str) -> None:
     assert_refused(roles.service, statement)
 
@@ -109,16 +97,11 @@ def test_the_role_of_the_service_is_refused(roles: Roles, statement: str) -> Non
     "statement",
     [
         "INSERT INTO users (name, role, state, created_utc_ns) VALUES ('a', 'admin', 'active', 0)",
-        "UPDATE users SET role = 'admin'",
-        "DELETE FROM jobs",
-        "TRUNCATE packets",
-        "DROP TABLE packets",
-        "CREATE TABLE mine (a int)",
-        "SELECT nextval('users_id_seq')",
-        "SET ROLE linna_service",
+        "UPDATE users SET role = 'admin'", "DELETE FROM jobs", "TRUNCATE packets", "DROP TABLE packets",
+        "CREATE TABLE mine (a int)", "SELECT nextval('users_id_seq')", "SET ROLE linna_service",
         "COPY (SELECT 1) TO PROGRAM 'true'",
     ],
-)
+)  # fmt: skip
 def test_the_role_of_the_backup_cannot_write(roles: Roles, statement: str) -> None:
     assert_refused(roles.backup, statement)
 

@@ -20,18 +20,10 @@ def add_command(ground: Ground, state: str = "queued") -> int:
         vehicle = vehicle_id(connection, 76, "flight")
         return int(
             repository.add(
-                connection,
-                repository.TELECOMMANDS,
-                vehicle_id=vehicle,
-                name="test_connection",
-                arguments={},
-                state=state,
-                critical=0,
-                timeout_s=1,
-                requested_by="ann",
-                created_utc_ns=1,
+                connection, repository.TELECOMMANDS, vehicle_id=vehicle, name="test_connection", arguments={},
+                state=state, critical=0, timeout_s=1, requested_by="ann", created_utc_ns=1,
             )
-        )
+        )  # fmt: skip
 
 
 def state_of(ground: Ground, key: int) -> str:
@@ -61,16 +53,9 @@ def test_a_row_that_does_not_exist_is_not_found(either: Ground) -> None:
 
 def test_a_transition_can_ask_for_more_than_the_state(either: Ground) -> None:
     either.write(
-        repository.add,
-        repository.JOBS,
-        id="j",
-        kind="report",
-        state="running",
-        arguments={},
-        progress=0.0,
-        attempts=2,
-        created_utc_ns=1,
-    )
+        repository.add, repository.JOBS, id="j", kind="report", state="running", arguments={}, progress=0.0,
+        attempts=2, created_utc_ns=1,
+    )  # fmt: skip
     with pytest.raises(StateConflict), either.database.writing() as connection:
         move(connection, JOB, "j", "done", where={"attempts": 1})
     either.write(move, JOB, "j", "done", where={"attempts": 2})

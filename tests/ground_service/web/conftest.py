@@ -17,7 +17,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -31,12 +30,14 @@ from lunar.timescales import parse_utc
 from tests.lazy import Lazy, expect
 from tests.serving import wait_for
 
+cv2 = Lazy("cv2")
+
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, BrowserContext, Page
 
 CHROMIUM = "/usr/bin/chromium"
 OPENMCT = Path(__file__).parents[3] / "deploy" / "openmct"
-PATIENCE_S = 900.0
+TIMEOUT_S = 900.0
 NS = 1_000_000_000
 # Counts the requests of a page's scripts until their answers are read, and notes what was refused.
 COUNT_REQUESTS = """
@@ -121,7 +122,7 @@ class Console:
     def close(self) -> None:
         for one in (self._listener, *self._clients):
             end_socket(one)
-        self._thread.join(PATIENCE_S)
+        self._thread.join(TIMEOUT_S)
 
 
 def live_frame(number: int) -> dict[str, object]:
@@ -205,7 +206,7 @@ class Service:
 
     def __exit__(self, *_: object) -> None:
         self._process.terminate()
-        self._process.wait(PATIENCE_S)
+        self._process.wait(TIMEOUT_S)
         self._log.close()
 
 
@@ -265,11 +266,14 @@ class Pictures:
         picture.quantize(256).save(self.folder / f"{name}.png", optimize=True)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """The system's Chromium, without a screen; a state that is reached ends the wait for it."""
+    """The system's Chromium, without a screen; a state that is reached ends the wait for it.
+
+    While it is driven, `asyncio.run` is refused in the thread of the tests, so it ends with its file.
+    """
     sync_api = Lazy("playwright.sync_api")
-    sync_api.expect.set_options(timeout=PATIENCE_S * 1e3)
+    sync_api.expect.set_options(timeout=TIMEOUT_S * 1e3)
     with sync_api.sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         yield chromium
@@ -278,7 +282,7 @@ def browser() -> Iterator[Browser]:
 
 def patient(context: BrowserContext) -> BrowserContext:
     """Let the pages of a context wait long."""
-    context.set_default_timeout(PATIENCE_S * 1e3)
+    context.set_default_timeout(TIMEOUT_S * 1e3)
     return context
 
 

@@ -39,11 +39,9 @@ def ask(port: int, path: str, body: bytes | None = None) -> tuple[int, bytes, An
 def housekeeping(second: int, **values: float) -> bytes:
     fields = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
     packet = DICTIONARY.pack(
-        "housekeeping",
-        fields | values | {"structure_id": 1},
-        ticks=(900_000_000 + second) * 65_536,
+        "housekeeping", fields | values | {"structure_id": 1}, ticks=(900_000_000 + second) * 65_536,
         sequence_count=second,
-    )
+    )  # fmt: skip
     return encode_cadus([packet], spacecraft_id=76)
 
 
@@ -70,11 +68,8 @@ def other(tmp_path: Path, server_url: str, monkeypatch: pytest.MonkeyPatch) -> I
     monkeypatch.setattr(wakeups, "RETRY_S", 0.1)
     with ManyApis(tmp_path, server_url, count=1) as processes:
         settings = Settings(
-            home=processes.home,
-            database_url=server_url,
-            broker_url=processes.broker_url,
-            links=False,
-        )
+            home=processes.home, database_url=server_url, broker_url=processes.broker_url, links=False,
+        )  # fmt: skip
         with TestClient(create_app(settings)) as client:
             yield processes, client
 

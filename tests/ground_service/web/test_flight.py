@@ -30,7 +30,7 @@ from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.spacecraft.loading import load_scenario_payload
 from payload_emulator.session.world.world import build_world
 from tests.ground_service.conftest import circular_states
-from tests.ground_service.web.conftest import PATIENCE_S, Pictures, press, strict_page
+from tests.ground_service.web.conftest import TIMEOUT_S, Pictures, press, strict_page
 from tests.lazy import expect
 from tests.scenarios import SELENITA
 from tests.serving import wait_for
@@ -147,14 +147,14 @@ def flown(
                 lambda: sum(len(one) for _, one in payload._uplinked) == octets,
                 "no telecommands have arrived",
             )
-            clients = payload.stations["earth"].telemetry.clients
+            clients = payload.contacts.stations["earth"].telemetry.clients
             wait_for(lambda: bool(clients), "the link is not connected")
             found = Flown(service.url, layout, live)
             follow(found)
             yield found
     finally:
         payload.stopping.set()
-        thread.join(PATIENCE_S)
+        thread.join(TIMEOUT_S)
     assert not thread.is_alive()
 
 

@@ -45,11 +45,8 @@ FONTS = {"DejaVu": "DejaVu Sans", "Arial": "Liberation Sans"}
 
 EVERY_LOOK: Looks = tuple(itertools.product(("light", "dark"), FONTS, (1280, 768, 390)))
 FEW_LOOKS: Looks = (
-    ("light", "Arial", 1280),
-    ("dark", "Arial", 768),
-    ("light", "DejaVu", 390),
-    ("dark", "Arial", 390),
-)
+    ("light", "Arial", 1280), ("dark", "Arial", 768), ("light", "DejaVu", 390), ("dark", "Arial", 390),
+)  # fmt: skip
 """Each scheme, font and width at least once; the last width is that of the keyboard."""
 
 LOOKS = pytest.mark.parametrize(
@@ -184,12 +181,10 @@ def work(api: Client, spacecraft: Spacecraft, packets: list[bytes]) -> int:
     ).id
     window = api.add_window(
         {
-            "name": "morning",
-            "start": format_utc(START - 300 * NS),
-            "stop": format_utc(START + 300 * NS),
+            "name": "morning", "start": format_utc(START - 300 * NS), "stop": format_utc(START + 300 * NS),
             "spacecraft_id": SPACECRAFT,
         }
-    ).id
+    ).id  # fmt: skip
     api.change_window(window, {"state": "approved"})
     api.uplink_window(window)
     api.send_link("madrid")

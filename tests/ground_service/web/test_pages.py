@@ -2,7 +2,6 @@
 
 import re
 
-import cv2
 import numpy as np
 import pytest
 
@@ -10,6 +9,9 @@ from ground_service.errors import InvalidInput
 from ground_service.evaluation.extras import WIDTH_PX
 from ground_service.web.pages import PAGES, POLICY, basemap_jpeg
 from tests.ground_service.web.test_displays import ask
+from tests.lazy import Lazy
+
+cv2 = Lazy("cv2")
 
 PATHS = [page.path.replace("{pass_id}", "1").replace("{revision}", "0" * 16) for page in PAGES]
 

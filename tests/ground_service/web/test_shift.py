@@ -27,7 +27,7 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import save_oem
 from lunar.timescales import ticks_from_utc_ns
 from tests.ground_service.conftest import circular_states
-from tests.ground_service.web.conftest import PATIENCE_S, end_socket, press, shows, strict_page
+from tests.ground_service.web.conftest import TIMEOUT_S, end_socket, press, shows, strict_page
 from tests.lazy import expect
 from tests.scenarios import SELENITA
 from tests.serving import wait_for
@@ -174,7 +174,7 @@ class Spacecraft:
         for one in (self.down, self.up, *self._listeners, *self._connections):
             end_socket(one)
         for task in self._tasks:
-            task.join(PATIENCE_S)
+            task.join(TIMEOUT_S)
 
 
 @dataclass

@@ -133,11 +133,9 @@ def signed_in_elsewhere(tmp_path_factory, serve, console, provider):
     home.mkdir()
     (home.parent / "secret").write_text(SECRET)
     settings = {
-        "LINNA_OIDC_ISSUER": provider.issuer,
-        "LINNA_OIDC_CLIENT_ID": CLIENT,
-        "LINNA_OIDC_CLIENT_SECRET_FILE": str(home.parent / "secret"),
-        "LINNA_OIDC_ROLES": "admin=linna-admins",
-    }
+        "LINNA_OIDC_ISSUER": provider.issuer, "LINNA_OIDC_CLIENT_ID": CLIENT,
+        "LINNA_OIDC_CLIENT_SECRET_FILE": str(home.parent / "secret"), "LINNA_OIDC_ROLES": "admin=linna-admins",
+    }  # fmt: skip
     with serve(home, console.port, settings=settings) as running:
         yield running.url.replace("127.0.0.1", "localhost")
 

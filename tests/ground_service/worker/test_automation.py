@@ -136,15 +136,9 @@ def done_steps(ground: Ground) -> list[str]:
 
 def end_contact(ground: Ground, vehicle: int, utc_ns: int) -> None:
     ended = ContactEnded(
-        contact_id=1,
-        link="x",
-        station="madrid",
-        vehicle_id=vehicle,
-        start_utc_ns=utc_ns - 60 * NS,
-        stop_utc_ns=utc_ns,
-        octets=1,
-        telecommands=0,
-    )
+        contact_id=1, link="x", station="madrid", vehicle_id=vehicle, start_utc_ns=utc_ns - 60 * NS,
+        stop_utc_ns=utc_ns, octets=1, telecommands=0,
+    )  # fmt: skip
     ground.write(publish, ended)
 
 

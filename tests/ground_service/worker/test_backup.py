@@ -4,7 +4,7 @@ import hashlib
 import json
 import re
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from ground_service.store.database import open_database, upgrade_database
 from ground_service.store.models import METADATA
 from ground_service.store.rows import table_digests
 from ground_service.worker.backup import backup, restore
-from ground_service.worker.integrity import verify
 from linna import cli
 
 NS = 1_000_000_000
@@ -170,13 +169,11 @@ def test_a_backup_of_version_1_0_is_restored(tmp_path: Path) -> None:
     database.engine.dispose()
     assert head is not None
     manifest = {
-        "schema_version": 2,
-        "rows": {name: one.rows for name, one in tables.items()},
-        "tables": {name: one.sha256 for name, one in tables.items()},
-        "files": 0,
+        "schema_version": 2, "rows": {name: one.rows for name, one in tables.items()},
+        "tables": {name: one.sha256 for name, one in tables.items()}, "files": 0,
         "files_sha256": hashlib.sha256(b"").hexdigest(),
         "audit_head": {"number": head.number, "sha256": head.sha256},
-    }
+    }  # fmt: skip
     assert "row_digests" not in tables
     (saved / "backup.json").write_text(json.dumps(manifest))
     (saved / "linna.db").chmod(0o400)
@@ -185,21 +182,3 @@ def test_a_backup_of_version_1_0_is_restored(tmp_path: Path) -> None:
         restore(saved, other)
         assert [one.name for one in list_users(other)] == ["ann"]
     assert (saved / "linna.db").read_bytes() == before
-
-
-def test_a_backup_moves_from_sqlite_to_postgresql_and_back(
-    filled: tuple[Ground, str], saved: Path, tmp_path: Path, migrated_postgres: Callable[[], str]
-) -> None:
-    url = migrated_postgres()
-    with open_ground(tmp_path / "pg", database_url=url) as other:
-        restore(saved, other)
-        assert everything(other) == everything(filled[0])
-        first = json.loads((saved / "backup.json").read_text())
-        second = backup(other, tmp_path / "again", now_utc_ns=START)
-        assert (second["tables"], second["audit_head"]) == (first["tables"], first["audit_head"])
-        with open_ground(tmp_path / "back") as back:
-            restore(tmp_path / "again", back)
-            assert everything(back) == everything(filled[0])
-            assert verify(back, rebuild=True).damaged == []
-        add_window(other, WindowEntry("new", START, START + NS, 1.0, 76), actor="bob")
-        assert verify(other, rebuild=True).damaged == []

@@ -92,12 +92,9 @@ def test_a_worker_makes_the_report(
     hopeless = dispatcher.submit("report", {"pass_id": 4711})
     assert not worker_answers(settings, timeout_s=1.0)
     environment = {
-        **os.environ,
-        "LINNA_HOME": str(ground.home),
-        "LINNA_DATABASE_URL": upgraded,
-        "LINNA_BROKER_URL": redis_url,
+        **os.environ, "LINNA_HOME": str(ground.home), "LINNA_DATABASE_URL": upgraded, "LINNA_BROKER_URL": redis_url,
         "LINNA_DATA": "",
-    }
+    }  # fmt: skip
     environment.pop("LINNA_DATA")
     environment["LINNA_LOG_FORMAT"] = "json"
     with (tmp_path / "worker.log").open("wb") as log:

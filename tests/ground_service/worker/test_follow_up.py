@@ -113,13 +113,9 @@ def test_equal_work_of_several_events_is_done_once_and_in_order(ground: Ground, 
             say(ground, TelemetryReceived(vehicle_id=vehicle, packets=1))
         assert recorded.done == []
     assert recorded.done == [
-        ("recorrelate", 5),
-        ("recorrelate", 7),
-        ("alarms", 5),
-        ("alarms", 7),
-        ("advance windows", 5),
+        ("recorrelate", 5), ("recorrelate", 7), ("alarms", 5), ("alarms", 7), ("advance windows", 5),
         ("advance windows", 7),
-    ]
+    ]  # fmt: skip
     assert position(ground) == 3
 
 
@@ -234,12 +230,9 @@ def halves(
 def reported_pass(ground: Ground, early: Path) -> int:
     ingest_file(ground, early, spacecraft_id=SPACECRAFT)
     pass_id = define_pass(
-        ground,
-        name="late data",
-        start_utc_ns=parse_utc("2029-08-07T05:50:00Z"),
-        stop_utc_ns=parse_utc("2029-08-07T06:30:00Z"),
-        spacecraft_id=SPACECRAFT,
-    )
+        ground, name="late data", start_utc_ns=parse_utc("2029-08-07T05:50:00Z"),
+        stop_utc_ns=parse_utc("2029-08-07T06:30:00Z"), spacecraft_id=SPACECRAFT,
+    )  # fmt: skip
     make_report(ground, pass_id)
     return pass_id
 

@@ -289,16 +289,9 @@ def test_the_body_of_an_answer_is_not_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "host",
     [
-        "127.0.0.1",
-        "localhost",
-        "::1",
-        "::ffff:10.0.0.1",
-        "10.1.2.3",
-        "169.254.169.254",
-        "0.0.0.0",
-        "224.0.0.1",
+        "127.0.0.1", "localhost", "::1", "::ffff:10.0.0.1", "10.1.2.3", "169.254.169.254", "0.0.0.0", "224.0.0.1",
     ],
-)
+)  # fmt: skip
 def test_an_address_that_is_not_public_is_refused(host: str) -> None:
     with pytest.raises(NotDelivered, match="expected a public address or one of LINNA_NOTIFY_NETWORKS"):
         permitted_address(host, 80, ())
@@ -391,13 +384,9 @@ def test_every_receiver_is_notified_also_if_another_one_fails(
     document = json.loads(body)
     assert document.pop("created").startswith("20")
     assert document == {
-        "event": number,
-        "trigger": "gate done",
-        "text": f"regression {'1' * 32}: fail",
-        "spacecraft_id": 76,
-        "pass_id": None,
-        "window_id": None,
-    }
+        "event": number, "trigger": "gate done", "text": f"regression {'1' * 32}: fail", "spacecraft_id": 76,
+        "pass_id": None, "window_id": None,
+    }  # fmt: skip
     assert len(mailbox.received) == 1
     send_messages(local, number)
     assert webhook.received[1][0]["Idempotency-Key"] == headers["Idempotency-Key"]

@@ -62,10 +62,8 @@ def worker(home: Path, environment: dict[str, str]) -> Iterator[None]:
     with (home.parent / f"{home.name}.log").open("ab") as log:
         process = subprocess.Popen(
             [sys.executable, "-m", "linna", "worker", "--concurrency", "1"],
-            env={**os.environ, **environment, "LINNA_HOME": str(home), "LINNA_DATA": ""},
-            stdout=log,
-            stderr=log,
-        )
+            env={**os.environ, **environment, "LINNA_HOME": str(home), "LINNA_DATA": ""}, stdout=log, stderr=log,
+        )  # fmt: skip
         try:
             yield
         finally:

@@ -63,17 +63,8 @@ class Server:
         log = str(self.folder / "log")
         # Output to the log, so that no pipe stays open.
         command = [
-            *self.user,
-            str(self.bin / "pg_ctl"),
-            "-D",
-            str(self.data),
-            "-w",
-            "-t",
-            "120",
-            "-l",
-            log,
-            "start",
-        ]
+            *self.user, str(self.bin / "pg_ctl"), "-D", str(self.data), "-w", "-t", "120", "-l", log, "start",
+        ]  # fmt: skip
         environment = {"PATH": SYSTEM, "LINNA_WAL": str(self.wal)}
         started = subprocess.run(
             command, cwd=self.folder, env=environment, stdout=subprocess.DEVNULL, check=False
@@ -106,17 +97,8 @@ def server() -> Iterator[Server]:
     try:
         made.run("mkdir", str(made.wal))
         made.run(
-            str(made.bin / "initdb"),
-            "-D",
-            str(made.data),
-            "-U",
-            "linna",
-            "-A",
-            "trust",
-            "-E",
-            "UTF8",
-            "--no-sync",
-        )
+            str(made.bin / "initdb"), "-D", str(made.data), "-U", "linna", "-A", "trust", "-E", "UTF8", "--no-sync",
+        )  # fmt: skip
         made.start()
         made.run(str(made.bin / "createdb"), "-h", "127.0.0.1", "-p", str(made.port), "-U", "linna", "linna")
         yield made

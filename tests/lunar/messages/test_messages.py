@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from lxml import etree
 
 from lunar.compressed import read_expanded
+from lunar.constants import NS
 from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError, EphemerisError, TimeFormatError, UnknownFrameError
 from lunar.frames import continuous_quaternions, matrix_from_quaternion
@@ -19,7 +20,7 @@ from lunar.messages.aem import AttitudeSegment, format_aem, parse_aem
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.messages.oem import format_oem
 from lunar.messages.oem_xml import format_oem_xml, parse_oem_xml
-from lunar.timescales import NS, from_tai_ns, parse_tai, parse_utc
+from lunar.timescales import from_tai_ns, parse_tai, parse_utc
 
 START = parse_utc("2029-08-07T00:00:00")
 

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
+from lunar.constants import NS
 from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError, UnknownFrameError, UnknownTimeSystemError
 from lunar.frames import icrf_from_j2000
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.messages.oem import format_oem, load_oem, parse_oem, save_oem
 from lunar.messages.oem_xml import format_oem_xml, parse_oem_xml
-from lunar.timescales import NS, TIME_SYSTEMS, format_utc, parse_tai, parse_utc, utc_ns_from_tai_ns
+from lunar.timescales import TIME_SYSTEMS, format_utc, parse_tai, parse_utc, utc_ns_from_tai_ns
 from tests.lunar.orbits import circle
 
 # The independent package keeps time with ERFA, which warns of UTC more than five years after its own release.

@@ -12,6 +12,7 @@ import pytest
 import spiceypy
 
 from lunar.camera import PinholeCamera
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError, EphemerisError, MissingLibrary, UnknownFrameError
 from lunar.frames import matrix_from_quaternion
@@ -29,14 +30,7 @@ from lunar.messages.spice import (
     spk_kernel,
     tai_ns_from_et,
 )
-from lunar.timescales import (
-    NS,
-    TICKS_PER_SECOND,
-    parse_tai,
-    parse_utc,
-    tai_ns_from_utc_ns,
-    ticks_from_utc_ns,
-)
+from lunar.timescales import TICKS_PER_SECOND, parse_tai, parse_utc, tai_ns_from_utc_ns, ticks_from_utc_ns
 from tests.lunar.spice_pool import kernels
 
 START = parse_utc("2029-08-07T00:00:00")

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from lunar.comparison import compare
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states
 from lunar.errors import DataFileError, EphemerisError, UnknownFrameError, UnknownTimeSystemError
 from lunar.frames import icrf_from_j2000
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.messages.stk import format_stk, parse_stk
-from lunar.timescales import NS, format_utc
+from lunar.timescales import format_utc
 from tests.lunar.orbits import START, circle, times
 
 EXAMPLE = """\

@@ -6,10 +6,11 @@ import io
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lunar.constants import NS
 from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation, rtn_from_inertial
 from lunar.messages.tabular import format_csv, format_tum
-from lunar.timescales import NS, parse_utc
+from lunar.timescales import parse_utc
 
 START = parse_utc("2029-08-07T00:00:00")
 ANGLE = np.arange(20)[:, None] * 0.3

@@ -105,12 +105,9 @@ def make_crater_field(seed: int) -> CraterField:
 def detections(u_px: FloatArray, v_px: FloatArray, diameter_px: FloatArray) -> Detections:
     u = np.atleast_1d(np.asarray(u_px, dtype=np.float64))
     return Detections(
-        u,
-        np.atleast_1d(np.asarray(v_px, dtype=np.float64)),
-        np.atleast_1d(np.asarray(diameter_px, dtype=np.float64)),
-        np.ones_like(u),
-        np.full_like(u, np.nan),
-    )
+        u, np.atleast_1d(np.asarray(v_px, dtype=np.float64)),
+        np.atleast_1d(np.asarray(diameter_px, dtype=np.float64)), np.ones_like(u), np.full_like(u, np.nan),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -152,14 +149,9 @@ class Rig:
         if cause is not None:
             self.board.reset(cause)
         self.payload = Payload(
-            self,
-            FlightParameters(),
-            self.tables,
-            model_octets=self.model,
-            board=self.board,
-            mode=mode,
+            self, FlightParameters(), self.tables, model_octets=self.model, board=self.board, mode=mode,
             make_detector=self._make_detector,
-        )
+        )  # fmt: skip
 
     def _make_detector(self, octets: bytes) -> Rig:
         assert octets == self.model

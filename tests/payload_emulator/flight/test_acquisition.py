@@ -31,14 +31,10 @@ def crater_map(seed: int = 3, reach_rad: float = 0.08, mean_in_image: float = 22
     place = rng.uniform(-reach_rad, reach_rad, (2, count))
     return landmark_map(
         CatalogueTable(
-            np.arange(count),
-            place[0],
-            place[1],
-            5e3 * rng.uniform(0.07, 1.0, count) ** (-1.0 / 1.77),
-            rng.uniform(-1e3, 1e3, count),
-            np.full((count, 3), 50.0),
+            np.arange(count), place[0], place[1], 5e3 * rng.uniform(0.07, 1.0, count) ** (-1.0 / 1.77),
+            rng.uniform(-1e3, 1e3, count), np.full((count, 3), 50.0),
         )
-    )
+    )  # fmt: skip
 
 
 def pose_at(east_m: float, north_m: float, altitude_m: float = ALTITUDE_M) -> Pose:
@@ -166,14 +162,11 @@ def test_two_places_that_explain_as_much_are_no_place() -> None:
         count = 9 * len(longitudes)
         return landmark_map(
             CatalogueTable(
-                np.arange(count),
-                np.tile(place[0], len(longitudes)),
-                np.concatenate([place[1] + shift for shift in longitudes]),
-                np.tile(diameter, len(longitudes)),
-                np.zeros(count),
-                np.full((count, 3), 50.0),
+                np.arange(count), np.tile(place[0], len(longitudes)),
+                np.concatenate([place[1] + shift for shift in longitudes]), np.tile(diameter, len(longitudes)),
+                np.zeros(count), np.full((count, 3), 50.0),
             )
-        )
+        )  # fmt: skip
 
     single, double = table([-apart / 2.0]), table([-apart / 2.0, apart / 2.0])
     true = pose_at(-10_000.0, 0.0)

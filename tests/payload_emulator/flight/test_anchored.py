@@ -37,12 +37,9 @@ class Flight:
         self.ticks = [int(ticks_from_utc_ns(int(utc_ns))) for utc_ns in case.frame_utc_ns]
         tdb_s = np.asarray(tdb_s_from_utc_ns(case.frame_utc_ns), dtype=np.float64)
         orbit = propagate(
-            float(tdb_s[0]),
-            case.position_icrf_m,
-            case.velocity_icrf_m_s,
-            float(tdb_s[-1] - tdb_s[0]) + 1.0,
+            float(tdb_s[0]), case.position_icrf_m, case.velocity_icrf_m_s, float(tdb_s[-1] - tdb_s[0]) + 1.0,
             ForceModel(case.gravity, case.orientation),
-        )
+        )  # fmt: skip
         self.states, self.rotations = orbit.state(tdb_s), case.orientation.mcmf_from_icrf(tdb_s)
         true_map = landmark_map(catalogue_table(case.craters))
         self.frames: list[tuple[ImageQuality, Detections]] = []
@@ -69,14 +66,11 @@ class Flight:
             orientation=pack_orientation_table(np.asarray(ticks_from_utc_ns(hours)), rotations, pa_from_mcmf),
             initial_state=pack_initial_state(
                 InitialState(
-                    self.ticks[0],
-                    self.states[0, :3] + np.array([600.0, -500.0, 400.0]),
-                    self.states[0, 3:] + np.array([0.5, 0.4, -0.3]),
-                    600.0,
-                    0.6,
+                    self.ticks[0], self.states[0, :3] + np.array([600.0, -500.0, 400.0]),
+                    self.states[0, 3:] + np.array([0.5, 0.4, -0.3]), 600.0, 0.6,
                 )
             ),
-        )
+        )  # fmt: skip
 
     def payload(self, **changes: bytes) -> Payload:
         return Payload(

@@ -408,7 +408,7 @@ def test_a_place_found_without_a_prior_turns_the_orbit_with_it(
     np.testing.assert_allclose(sigma_px, 1.0)
     assert places is index
     ((fresh, moved, detected, identification, sighting, *rest, altitude_m, more),) = updated
-    assert more == {"reacquired": True} and detected is found
+    assert more == {"reacquired": True, "method": kalman} and detected is found
     assert rest == [landmarks, setup.camera, setup.parameters]
     # Detections are scaled to the ground by the altitude that was predicted.
     assert altitude_m == pytest.approx(np.linalg.norm(prior.mean[:3]) - 1_737_400.0)
@@ -462,7 +462,7 @@ def test_a_widened_search_adds_the_distance_of_the_place_to_the_uncertainty(
     added[:3, :3], added[3:6, 3:6] = np.eye(3) * moved_m**2, np.eye(3) * velocity_m_s**2
     np.testing.assert_allclose(given[0].covariance - prior.covariance, added, rtol=1e-9, atol=1e-6)
     np.testing.assert_array_equal(given[0].mean, prior.mean)
-    assert named == {"reacquired": True}
+    assert named == {"reacquired": True, "method": kalman}
     # A search within what the estimate claims adds nothing, and covers 28 km (1 sigma) at most.
     recovery.search_by_votes(prior, pose, *chosen, 90_000.0)
     assert acquired[1][4] == 28_000.0
@@ -539,7 +539,7 @@ def test_the_time_since_the_last_fix_goes_into_the_widened_search(
     fly(orbit, navigator, 1, 3)
     assert navigator.state.fixed_ticks == orbit.ticks[2]
     navigator.step(int(orbit.ticks[4]), empty, orbit.attitude(4))
-    assert [given[-1] for given in widened] == [np.inf, 30.0]
+    assert [given[-2] for given in widened] == [np.inf, 30.0]
 
 
 def test_a_reset_of_the_filter_drops_the_predictions_of_the_window(
@@ -613,7 +613,7 @@ def test_disagreeing_frames_widen_the_search_and_then_give_the_prior_up(
     ]  # fmt: skip
     # The search index is made once.
     assert navigator.state.places is not None
-    assert {id(given[-1]) for given in anywhere} == {id(navigator.state.places)}
+    assert {id(given[-2]) for given in anywhere} == {id(navigator.state.places)}
     candidates = 0
     report = navigator.step(int(orbit.ticks[13]), orbit.detections(13), orbit.attitude(13))
     assert report.outcome is Outcome.coasted

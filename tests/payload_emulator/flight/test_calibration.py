@@ -23,11 +23,9 @@ from tests.payload_emulator.bowls import bowl_image
 
 SUN = np.array([0.1, -0.95, -0.17])
 SIGMA = SigmaModel(
-    fresh=(np.log(0.5), 0.0, 0.0, 0.0, 0.0, 0.0),
-    total=(np.log(1.0), 1.0, 0.0, 0.0, 0.0, 0.0),
-    low=(1.0, -1.0, -5.0, 0.0, 0.0, 0.0),
-    high=(1.0, 1.0, 5.0, 3.0, 10.0, 3.0),
-)
+    fresh=(np.log(0.5), 0.0, 0.0, 0.0, 0.0, 0.0), total=(np.log(1.0), 1.0, 0.0, 0.0, 0.0, 0.0),
+    low=(1.0, -1.0, -5.0, 0.0, 0.0, 0.0), high=(1.0, 1.0, 5.0, 3.0, 10.0, 3.0),
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

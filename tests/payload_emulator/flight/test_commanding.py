@@ -102,14 +102,10 @@ def noted(*packets: bytes) -> CommandHistory:
 @pytest.mark.parametrize(
     ("count", "code"),
     [
-        (100, OUT_OF_SEQUENCE),
-        (99, OUT_OF_SEQUENCE),
-        (101, 0),
-        (8_291, 0),
-        (8_292, OUT_OF_SEQUENCE),
+        (100, OUT_OF_SEQUENCE), (99, OUT_OF_SEQUENCE), (101, 0), (8_291, 0), (8_292, OUT_OF_SEQUENCE),
         (16_383, OUT_OF_SEQUENCE),
     ],
-)
+)  # fmt: skip
 def test_counts_go_forward_by_less_than_half_of_their_range(count: int, code: int) -> None:
     """After 100 come 101 to 8291; 8192 further on may as well be behind. The packets differ by their flags."""
     assert noted(packet(100)).judge(packet(count, acknowledge=1)) == code

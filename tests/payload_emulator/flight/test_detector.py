@@ -4,7 +4,6 @@ import hashlib
 import json
 
 import numpy as np
-import onnx
 import pytest
 
 from payload_emulator.errors import ModelError
@@ -20,8 +19,11 @@ from payload_emulator.flight.vision.detector import (
     remove_parallax,
 )
 from payload_emulator.flight.vision.preprocess import ImageQuality
+from tests.lazy import Lazy
 from tests.payload_emulator.bowls import BOWL_CENTRES as CENTRES
 from tests.payload_emulator.bowls import bowl_image
+
+onnx = Lazy("onnx")
 
 
 @pytest.fixture(scope="module")

@@ -146,12 +146,8 @@ def test_noise_over_the_far_side_grows_with_the_cosine_of_the_inclination(inclin
 
 def test_the_noise_that_the_filter_adds_is_that_of_its_inclination() -> None:
     noise = ProcessNoise(
-        (1e-12,) * 3,
-        (1e-12,) * 3,
-        900.0,
-        far_side_psd_m2_s3=(1e-12,) * 3,
-        far_side_oblique_psd_m2_s3=(2e-6,) * 3,
-    )
+        (1e-12,) * 3, (1e-12,) * 3, 900.0, far_side_psd_m2_s3=(1e-12,) * 3, far_side_oblique_psd_m2_s3=(2e-6,) * 3,
+    )  # fmt: skip
     added = []
     for inclination_deg in (90.0, 60.0):
         inclination = np.radians(inclination_deg)

@@ -237,13 +237,10 @@ def test_a_clock_that_jumps_ahead_does_not_release_what_it_has_passed(rig: Any) 
 @pytest.mark.parametrize(
     ("heat_c", "drop_v", "event", "safe"),
     [
-        (52.0, 0.0, "temperature_high", False),
-        (90.0, 0.0, "temperature_high", True),
-        (-50.0, 0.0, "temperature_low", False),
-        (0.0, 2.3, "power_low", False),
-        (0.0, 3.5, "power_low", True),
+        (52.0, 0.0, "temperature_high", False), (90.0, 0.0, "temperature_high", True),
+        (-50.0, 0.0, "temperature_low", False), (0.0, 2.3, "power_low", False), (0.0, 3.5, "power_low", True),
     ],
-)
+)  # fmt: skip
 def test_power_and_heat_out_of_limits_are_told_once_and_end_in_safe_beyond(
     observing: Any, heat_c: float, drop_v: float, event: str, safe: bool
 ) -> None:

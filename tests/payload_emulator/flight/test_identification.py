@@ -69,14 +69,9 @@ def common_shift(count: int, sigma_px: float) -> np.ndarray:
 def run(detected: Detections, craters: Sighting, sigma_px: float) -> list[tuple[int, int]]:
     count = len(craters)
     result = identify(
-        detected,
-        craters,
-        common_shift(count, sigma_px),
-        np.zeros((count, 2, 2)) + 0.25 * np.eye(2),
-        np.ones(len(detected)),
-        512.0 * 512.0,
-        IdentificationParameters(),
-    )
+        detected, craters, common_shift(count, sigma_px), np.zeros((count, 2, 2)) + 0.25 * np.eye(2),
+        np.ones(len(detected)), 512.0 * 512.0, IdentificationParameters(),
+    )  # fmt: skip
     pairs = list(zip(result.detection.tolist(), result.sighted.tolist(), strict=True))
     return sorted(pairs) if result.believed else []
 
@@ -201,14 +196,10 @@ def test_craters_of_different_class_never_pair() -> None:
 @pytest.mark.parametrize(
     "shift, inside",
     [
-        ((0.0, 17_501.0), True),
-        ((0.0, 17_499.0), False),
-        ((0.0, 32_499.0), True),
-        ((0.0, 32_501.0), False),
-        ((1_249.0, 25_000.0), True),
-        ((-1_251.0, 25_000.0), False),
+        ((0.0, 17_501.0), True), ((0.0, 17_499.0), False), ((0.0, 32_499.0), True), ((0.0, 32_501.0), False),
+        ((1_249.0, 25_000.0), True), ((-1_251.0, 25_000.0), False),
     ],
-)
+)  # fmt: skip
 def test_the_paper_bounds_at_30_s_are_halved_at_15_s(shift: tuple[float, float], inside: bool) -> None:
     earlier = features([[0.0, 0.0], [9e3, 1e3]], [0, 1])
     assert match_frames(earlier, moved(earlier, *shift), 15.0, 1).candidate_pairs == (2 if inside else 0)
@@ -306,13 +297,9 @@ def test_what_is_in_view_is_all_that_projects_into_the_image_and_is_above_the_li
     rng = np.random.default_rng(1)
     count = 4_000
     table = CatalogueTable(
-        np.arange(count),
-        rng.uniform(-0.2, 0.2, count),
-        rng.uniform(-0.2, 0.2, count),
-        np.full(count, 5e3),
-        rng.uniform(-4e3, 4e3, count),
-        np.full((count, 3), 90.0),
-    )
+        np.arange(count), rng.uniform(-0.2, 0.2, count), rng.uniform(-0.2, 0.2, count), np.full(count, 5e3),
+        rng.uniform(-4e3, 4e3, count), np.full((count, 3), 90.0),
+    )  # fmt: skip
     landmarks = landmark_map(table)
     for margin_px in (0.0, 60.0):
         found = in_view(landmarks, pose(np.zeros(11)), CAMERA, margin_px).index

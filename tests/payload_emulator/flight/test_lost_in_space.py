@@ -108,11 +108,9 @@ def test_false_detections_mirrored_and_turned_images_find_no_place(index: PlaceI
     _, found = frame(index.landmarks, 2.0, 3.0, 35e3, seed=6, false=6)
     scattered = rng.uniform(0.0, 511.0, (2, len(found)))
     hostile = [
-        changed(found, scattered[0], scattered[1]),
-        changed(found, 511.0 - found.u_px, found.v_px),
-        changed(found, 511.0 - found.v_px, found.u_px),
-        changed(found, 511.0 - found.u_px, 511.0 - found.v_px),
-    ]
+        changed(found, scattered[0], scattered[1]), changed(found, 511.0 - found.u_px, found.v_px),
+        changed(found, 511.0 - found.v_px, found.u_px), changed(found, 511.0 - found.u_px, 511.0 - found.v_px),
+    ]  # fmt: skip
     assert find_place(found, found.sigma_px, index, CAMERA, RULES) is not None
     for detections in hostile:
         assert find_place(detections, found.sigma_px, index, CAMERA, RULES) is None
@@ -149,13 +147,9 @@ def test_fewer_inliers_suffice_on_a_smaller_map() -> None:
     whole = craters()
     near = np.flatnonzero(np.abs(whole.latitude_rad) < math.radians(4.0))
     part = LandmarkMap(
-        whole.ids[near],
-        whole.latitude_rad[near],
-        whole.position_mcmf_m[near],
-        whole.enu_from_mcmf[near],
-        whole.diameter_m[near],
-        whole.sigma_m[near],
-    )
+        whole.ids[near], whole.latitude_rad[near], whole.position_mcmf_m[near], whole.enu_from_mcmf[near],
+        whole.diameter_m[near], whole.sigma_m[near],
+    )  # fmt: skip
     _, found = frame(whole, 0.5, 0.0, 30e3, seed=4)
     best = [candidate_places(found, found.sigma_px, place_index(m), CAMERA, RULES)[0] for m in (whole, part)]
     assert len(best[0]) == len(best[1])

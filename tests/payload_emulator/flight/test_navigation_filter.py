@@ -5,6 +5,7 @@ The reference holds all states in one vector, differentiates its own measurement
 Gauss-Newton on the least-squares problem and inverts the normal matrix: none of it shares code or form with the filter.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.dynamics import OrbitModel, Prediction, ProcessNoise, flown
 from payload_emulator.flight.navigation.filter.filter import CommonErrors, FilterState
+from payload_emulator.flight.navigation.filter.map_offset import OffsetRule, first_size, learned
 from payload_emulator.flight.navigation.sighting import LandmarkMap, landmark_map, look
 from tests.payload_emulator.flight.test_dynamics import start_state
 from tmtc.dictionary.tables import (
@@ -487,3 +489,106 @@ def test_a_burn_is_flown_at_its_time_and_not_before(model: OrbitModel) -> None:
     before = flown(model, state, START, START + 599 * SECOND, TABLE)
     coasted = flown(model, state, START, START + 599 * SECOND, no_burns())
     np.testing.assert_array_equal(before, coasted)
+
+
+class Turning(Drift):
+    """Dynamics that turn position and velocity by 0.23 degrees a call, so that the offset is renewed a little."""
+
+    def propagate(self, state: np.ndarray, from_ticks: int, to_ticks: int) -> Prediction:
+        transition = np.eye(9)
+        if to_ticks > from_ticks:
+            transition[:3, :3] = transition[3:6, 3:6] = Rotation.from_rotvec([0.0, 0.0, 4e-3]).as_matrix()
+        return Prediction(transition @ state, transition, np.zeros((9, 9)))
+
+
+def log_likelihood(prior: FilterState, landmarks: LandmarkMap, index: np.ndarray, nis: float) -> float:
+    """Logarithm of the density of innovations of variance 0.7 px^2 and a NIS, without its constant."""
+    state = prior.with_craters(kalman.TURN, np.full((1, 3), ERRORS.attitude_noise_rad))
+    pose = kalman.pose_of(state, CAMERA_FROM_ICRF, MCMF_FROM_ICRF)
+    design = kalman.design_matrix(look(landmarks, index, pose, CAMERA, state.shifts(index)), state)
+    design = design.reshape(-1, state.mean.size)
+    spread = design @ state.covariance @ design.T + 0.7 * np.eye(len(design))
+    return -0.5 * (nis + float(np.linalg.slogdet(spread)[1]))
+
+
+def test_the_slope_is_the_derivative_of_state_and_likelihood_by_the_size_of_the_offset() -> None:
+    """Four sightings of the same craters from a moving camera: differences over 2 % of the variance."""
+    landmarks, index = craters(), np.array([5, 0, 3, 2, 6])
+    model, variance = Turning(), np.full(5, 0.7)
+    turn = model.propagate(np.zeros(9), 0, 1).transition[:3, :3]
+
+    def flown(size_m: float) -> tuple[FilterState, float, float, float]:
+        errors = replace(ERRORS, catalogue_offset_m=(size_m, size_m, 10.0))
+        state = kalman.initial_filter_state(
+            0, POSITION_ICRF, np.zeros(3), 40.0, 1e-3, (1e-6,) * 3, errors, learns_offset=True
+        )
+        logarithm = score = information = 0.0
+        rng, place = np.random.default_rng(3), POSITION_ICRF
+        for k in range(4):
+            moved = kalman.predict(state, 5 * k * SECOND, model, errors)
+            assert moved is not None
+            place = turn @ place if k else place
+            prior = moved.with_craters(index, np.full((5, 3), 50.0)).only_craters(index)
+            true = np.concatenate([place, np.zeros(11), [30.0, -20.0, 0.0], np.zeros(16)])
+            uv = projected(true, landmarks, index, np.zeros(3)) + 0.8 * rng.standard_normal((5, 2))
+            found = kalman.update(
+                prior, CAMERA_FROM_ICRF, MCMF_FROM_ICRF, landmarks, index, uv, variance, CAMERA, errors, 1
+            )
+            assert found is not None
+            logarithm += log_likelihood(prior, landmarks, index, found.nis)
+            state, score = found.state, score + found.score[0]
+            information += found.score[1]
+        return state, logarithm, score, information
+
+    (low, below, *_), (middle, _, score, information), (high, above, *_) = (
+        flown(30.0 * np.exp(0.5 * x)) for x in (-0.01, 0.0, 0.01)
+    )
+    assert middle.slope is not None
+    sigma = np.sqrt(np.diag(middle.covariance))
+    np.testing.assert_allclose(middle.slope.mean / sigma, (high.mean - low.mean) / 0.02 / sigma, atol=1e-3)
+    both = sigma[:, None] * sigma
+    changed = (high.covariance - low.covariance) / 0.02 / both
+    np.testing.assert_allclose(middle.slope.covariance / both, changed, atol=1e-3)
+    assert np.abs(changed).max() > 0.1
+    assert score == pytest.approx((above - below) / 0.02, rel=0.02) and abs(score) > 0.05
+    assert 0.0 < information < 0.05
+
+
+def test_an_offset_of_another_size_scales_its_part_of_state_and_slope() -> None:
+    start = kalman.initial_filter_state(
+        0, POSITION_ICRF, np.zeros(3), 40.0, 1.0, (1e-6,) * 3, ERRORS, learns_offset=True
+    )
+    covariance = start.covariance.copy()
+    covariance[0, 14] = covariance[14, 0] = 100.0
+    mean = start.mean.copy()
+    mean[14:17] = [4.0, 6.0, 8.0]
+    grown = replace(start, mean=mean, covariance=covariance).with_offset(20.0, 30.0)
+    assert grown.mean[14:17].tolist() == pytest.approx([6.0, 9.0, 8.0])
+    assert grown.covariance[14, 14] == pytest.approx(2.25 * covariance[14, 14])
+    assert grown.covariance[16, 16] == covariance[16, 16] and grown.covariance[0, 0] == covariance[0, 0]
+    assert grown.covariance[0, 14] == grown.covariance[14, 0] == pytest.approx(150.0)
+    assert grown.slope is not None and start.slope is not None
+    assert grown.slope.covariance[15, 15] == pytest.approx(2.25 * start.slope.covariance[15, 15])
+
+
+def test_the_size_of_the_offset_is_learned_in_bounded_steps_and_not_from_a_few_fixes() -> None:
+    rule = OffsetRule(fixes=3)
+    size = first_size(rule)
+    assert (size.sigma_m, size.fixes) == (60.0, 0)
+    for score in ((-0.2, 0.1), (math.nan, 0.1), (-0.2, 0.1)):
+        size = learned(size, score, rule)
+    # A score that is no number is no evidence: two fixes are too few.
+    assert (size.sigma_m, size.pending, size.fixes) == (60.0, 2, 0)
+    size = learned(size, (-0.1, 0.115), rule)
+    # x moves by the scores over the information 0.97 * 1 + 0.315 = 1.285: exp(-0.5 / 2.57) of the size.
+    assert size.information == pytest.approx(1.285)
+    assert (size.sigma_m, size.pending, size.fixes) == (pytest.approx(60.0 * math.exp(-0.5 / 2.57)), 0, 3)
+
+    def after(score: float, steps: int) -> float:
+        size = first_size(rule)
+        for _ in range(3 * steps):
+            size = learned(size, (score, 0.1), rule)
+        return size.sigma_m
+
+    assert after(-9.0, 1) == pytest.approx(30.0) and after(-9.0, 9) == 15.0
+    assert after(9.0, 1) == 100.0

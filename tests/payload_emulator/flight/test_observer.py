@@ -8,6 +8,7 @@ import pytest
 
 from payload_emulator.flight.navigation import anchored
 from payload_emulator.flight.navigation.anchored import AnchoredReport, Observation
+from payload_emulator.flight.navigation.filter.map_offset import OffsetSize
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.onboard.loads import FlightParameters, FlightTables
 from payload_emulator.flight.onboard.observer import Observer
@@ -74,7 +75,7 @@ class Navigator:
         self.given: list[tuple[int, Detections | None, Any]] = []
         self.outcome, self.lost, self.fix, self.new_landmarks = Outcome.coasted, False, None, ()
         self.breaks = self.reacquired = False
-        self.attitude_noise_rad = 0.0
+        self.attitude_noise_rad, self.offset = 0.0, None
         root = RNG.standard_normal((18, 18))
         self.start = SimpleNamespace(estimate=None, landmarks=None)
         self.state = SimpleNamespace(
@@ -90,7 +91,7 @@ class Navigator:
             raise np.linalg.LinAlgError
         return self.state, AnchoredReport(
             self.outcome, 0.1, -0.2, 30e3, (1.0, 2.0, 3.0), (4.0, 6.0, 5.0), 7.0, 3, 9, 11, self.reacquired,
-            self.lost, self.fix, self.new_landmarks, np.radians(0.01), self.attitude_noise_rad,
+            self.lost, self.fix, self.new_landmarks, np.radians(0.01), self.attitude_noise_rad, self.offset,
         )  # fmt: skip
 
     def widen(self, state: Any, position_m: float, velocity_m_s: float) -> Any:
@@ -113,7 +114,7 @@ def detections(count: int) -> Detections:
 def rig(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     eye, telemetry, clock, navigator = Eye(), Recorder(), Clock(), Navigator()
     observer = Observer(eye, FlightParameters(modes=(Mode.anchored,)), telemetry, clock)
-    observer._setup, observer._anchored = "the tables", navigator.start
+    observer._states[Mode.anchored] = ("the tables", navigator.start)
     monkeypatch.setattr(anchored, "step", navigator.step)
     monkeypatch.setattr(anchored, "widened", navigator.widen)
     return SimpleNamespace(eye=eye, telemetry=telemetry, clock=clock, navigator=navigator, observer=observer)
@@ -267,6 +268,14 @@ def test_an_attitude_noisier_than_declared_is_reported_at_its_beginning_and_end(
     np.testing.assert_allclose([event[2:] for event in found], [(0.2, 0.01), (0.01, 0.0), (1.0, 0.01)])
 
 
+def test_the_size_of_the_map_offset_is_sent_when_it_changes(rig: SimpleNamespace) -> None:
+    for sigma_m, fixes, pending in ((60.0, 0, 0), (60.0, 0, 7), (31.0, 40, 0), (31.0, 40, 9), (31.0, 80, 0)):
+        rig.navigator.offset = OffsetSize(sigma_m, 0.5, fixes, pending=pending)
+        look(rig)
+    sent = [event[2:] for event in rig.telemetry.events if event[:2] == ("info", "map_offset")]
+    assert sent == [(60.0, 0.0), (31.0, 40.0), (31.0, 80.0)]
+
+
 def test_a_reset_of_the_filter_is_told_and_counted(rig: SimpleNamespace) -> None:
     rig.navigator.reacquired = True
     look(rig)
@@ -315,7 +324,7 @@ def test_a_frame_of_odometry_is_reported_in_full(
     """Longitude -0.3 rad is 342.8 degrees east; velocities, sigmas and NIS do not exist for odometry."""
     observer = Observer(rig.eye, FlightParameters(modes=(Mode.spherical,)), rig.telemetry, rig.clock)
     anchor: Any = object()
-    observer._anchor = anchor
+    observer._states[Mode.spherical] = (anchor, None)
     observer.manual_step = True
     state = SimpleNamespace(
         latitude_rad=0.2, longitude_rad=-0.3, altitude_m=31e3, altitude_reads=7, resets=2,
@@ -379,7 +388,7 @@ def test_odometry_without_a_position_reports_its_outcome_alone(
         "shift_north_m": nothing, "anchor_reads": 0,
     }  # fmt: skip
     assert rig.telemetry.named("frame_outcome") == [expected]
-    observer._anchor = object()
+    observer._states[Mode.paper] = (object(), None)
     report = SimpleNamespace(
         outcome=Outcome.rejected, reset_trigger=ResetTrigger.none, candidate_pairs=3, pairs=0, shift_east_m=np.nan,
         shift_north_m=np.nan,
@@ -479,7 +488,7 @@ def test_detections_are_reported_within_the_range_of_their_fields_and_with_their
 
 
 def test_without_an_altitude_no_detection_has_a_class(rig: SimpleNamespace) -> None:
-    rig.observer._setup = rig.observer._anchored = None
+    rig.observer._states.clear()
     look(rig)
     (sent,) = rig.telemetry.named("detections")
     assert set(sent["items"]["size_class"].tolist()) == {-1}
@@ -492,16 +501,15 @@ def test_a_damaged_table_is_told_by_its_number_and_its_hash(rig: SimpleNamespace
     assert rig.telemetry.events == [
         ("high", "table_refused", float(number), float(table_hash(octets))) for number in (1, 2, 10)
     ]
-    assert observer._setup is None and observer._anchored is None
+    assert observer._states == {Mode.anchored: None}
 
 
 def test_a_widened_orbit_and_a_reset_reach_the_navigator(rig: SimpleNamespace) -> None:
     calls = rig.navigator.widened
     rig.observer.widen(500.0, 0.5)
     assert calls == [(500.0, 0.5)]
-    rig.observer._odometry[Mode.paper] = "remembered"
     rig.observer.reset()
     # There are no tables to start a new one from.
-    assert rig.observer._setup is None and rig.observer._anchored is None and rig.observer._odometry == {}
+    assert rig.observer._states == {Mode.anchored: None}
     rig.observer.widen(500.0, 0.5)
     assert len(calls) == 1

@@ -42,14 +42,9 @@ def fly(
     for second in seconds:
         position = moon.orbit([second])[0]
         state, report = odometry.step(
-            state,
-            moon.ticks_at(second),
-            field.perfect_detections(position),
-            anchor,
-            CAMERA,
-            mode,
+            state, moon.ticks_at(second), field.perfect_detections(position), anchor, CAMERA, mode,
             parameters or OdometryParameters(),
-        )
+        )  # fmt: skip
         reports.append(report)
         unit = position / np.linalg.norm(position)
         if previous is not None:
@@ -170,15 +165,9 @@ class Stream:
         if kind == "none":
             seen = seen.select(np.zeros(len(seen), dtype=bool))
         self.state, report = odometry.step(
-            self.state,
-            self.moon.ticks_at(self.second),
-            seen,
-            self.anchor,
-            CAMERA,
-            Mode.paper,
-            self.parameters,
+            self.state, self.moon.ticks_at(self.second), seen, self.anchor, CAMERA, Mode.paper, self.parameters,
             manual_step=manual_step,
-        )
+        )  # fmt: skip
         return report
 
 
@@ -287,11 +276,9 @@ def test_detections_with_nan_or_beyond_the_horizon_match_nothing() -> None:
         features = odometry.frame_features(seen, 30_000.0, CAMERA, mode)
         assert features.ground.size_class.tolist() == [-1, -1, -1]
     high = odometry.frame_features(
-        odometry.Detections(*(np.array([value]) for value in (0.0, 0.0, 9.0, 1.0, 1.0))),
-        400_000.0,
-        CAMERA,
+        odometry.Detections(*(np.array([value]) for value in (0.0, 0.0, 9.0, 1.0, 1.0))), 400_000.0, CAMERA,
         Mode.spherical,
-    )
+    )  # fmt: skip
     assert high.ground.size_class.tolist() == [-1]
 
 
@@ -302,12 +289,8 @@ def test_on_the_sphere_a_detection_lies_at_its_arc_from_the_place_below() -> Non
     tangent = MOON_RADIUS_M * math.sin(arc_rad) / down_m
     u, v = camera.centre_px
     seen = Detections(
-        np.array([u + camera.focal_px * tangent, u]),
-        np.array([v, v]),
-        np.full(2, 20.0),
-        np.ones(2),
-        np.ones(2),
-    )
+        np.array([u + camera.focal_px * tangent, u]), np.array([v, v]), np.full(2, 20.0), np.ones(2), np.ones(2),
+    )  # fmt: skip
     ground = frame_features(seen, altitude_m, camera, Mode.spherical).ground
     assert ground.east_m == pytest.approx([MOON_RADIUS_M * arc_rad, 0.0], abs=1e-6)
     assert ground.north_m == pytest.approx([0.0, 0.0], abs=1e-6)

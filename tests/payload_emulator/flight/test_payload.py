@@ -172,12 +172,9 @@ def test_without_a_usable_anchor_table_frames_are_missed_and_detections_still_co
 def test_nothing_a_camera_or_adcs_can_send_stops_the_payload(moon: Any) -> None:
     nan = np.full(7, np.nan)
     wild = Detections(
-        np.array([-3.0, 5e3, np.nan, np.inf]),
-        np.array([4.0, -9.0, 1.0, 2.0]),
-        np.array([1e9, -5.0, 30.0, 1.0]),
-        np.array([2.0, -1.0, np.nan, 0.5]),
-        np.array([np.nan, 1e9, 0.1, 0.1]),
-    )
+        np.array([-3.0, 5e3, np.nan, np.inf]), np.array([4.0, -9.0, 1.0, 2.0]), np.array([1e9, -5.0, 30.0, 1.0]),
+        np.array([2.0, -1.0, np.nan, 0.5]), np.array([np.nan, 1e9, 0.1, 0.1]),
+    )  # fmt: skip
     flown = payload(moon, [wild, wild, (ImageQuality.INVALID, no_detections()), wild])
     packets = []
     for k, attitude in enumerate([nan, np.empty(0), ATTITUDE, ATTITUDE]):

@@ -132,12 +132,9 @@ def random_detections(count, seed, side):
     diameter = np.exp(rng.normal(3.0, 0.8, count))
     diameter[:: max(1, count // 7)] = np.nan
     return Detections(
-        rng.uniform(0, side, count),
-        rng.uniform(0, side, count),
-        diameter,
-        np.sort(rng.uniform(0, 1, count))[::-1],
+        rng.uniform(0, side, count), rng.uniform(0, side, count), diameter, np.sort(rng.uniform(0, 1, count))[::-1],
         np.ones(count),
-    )
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("seed", range(5))

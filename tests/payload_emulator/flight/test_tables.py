@@ -20,13 +20,9 @@ def small_anchor(moon: Any) -> bytes:
 def catalogue_table(count: int = 50) -> tables.CatalogueTable:
     rng = np.random.default_rng(2)
     return tables.CatalogueTable(
-        np.arange(count) + 7,
-        rng.uniform(-1.0, 1.0, count),
-        rng.uniform(0.0, 2.0 * np.pi, count),
-        rng.uniform(3e3, 30e3, count),
-        rng.uniform(-8e3, 8e3, count),
-        rng.uniform(20.0, 900.0, (count, 3)),
-    )
+        np.arange(count) + 7, rng.uniform(-1.0, 1.0, count), rng.uniform(0.0, 2.0 * np.pi, count),
+        rng.uniform(3e3, 30e3, count), rng.uniform(-8e3, 8e3, count), rng.uniform(20.0, 900.0, (count, 3)),
+    )  # fmt: skip
 
 
 def test_an_anchor_table_of_60_s_steps_interpolates_to_a_millimetre(moon: Any) -> None:
@@ -90,13 +86,9 @@ def test_a_catalogue_table_comes_back_within_its_quantisation(moon: Any) -> None
 def test_longitudes_on_either_side_of_the_meridian_survive_packing() -> None:
     table = catalogue_table(3)
     near = tables.CatalogueTable(
-        table.ids,
-        table.latitude_rad,
-        np.array([-1e-12, 2 * np.pi - 1e-12, -3.0]),
-        table.diameter_m,
-        table.rim_height_m,
-        table.sigma_m,
-    )
+        table.ids, table.latitude_rad, np.array([-1e-12, 2 * np.pi - 1e-12, -3.0]), table.diameter_m,
+        table.rim_height_m, table.sigma_m,
+    )  # fmt: skip
     back = tables.unpack_catalogue_table(tables.pack_catalogue_table(near))
     expected = near.longitude_rad[np.argsort(near.latitude_rad)]
     np.testing.assert_allclose(np.exp(1j * back.longitude_rad), np.exp(1j * expected), atol=2e-9)

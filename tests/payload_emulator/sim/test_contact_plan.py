@@ -114,12 +114,10 @@ def test_outages_cut_contacts(ephemeris: Ephemeris) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "madrid",
-        "paris 2029-08-07T00:00:00Z 2029-08-08T00:00:00Z",
-        "madrid tomorrow 2029-08-08T00:00:00Z",
+        "madrid", "paris 2029-08-07T00:00:00Z 2029-08-08T00:00:00Z", "madrid tomorrow 2029-08-08T00:00:00Z",
         "madrid 2029-08-08T00:00:00Z 2029-08-07T00:00:00Z",
     ],
-)
+)  # fmt: skip
 def test_an_outage_in_another_form_is_refused(text: str) -> None:
     with pytest.raises(ScenarioError, match=r"link\.outages: expected"):
         parse_outage(text)

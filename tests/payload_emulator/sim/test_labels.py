@@ -24,12 +24,9 @@ CAMERA = PinholeCamera()
 
 def crater_at(latitude_deg, longitude_deg, diameter_m, rim_height_m):
     return make_catalogue(
-        np.radians([latitude_deg]),
-        np.radians([longitude_deg]),
-        [diameter_m],
-        source="t",
+        np.radians([latitude_deg]), np.radians([longitude_deg]), [diameter_m], source="t",
         rim_height_m=[rim_height_m],
-    )
+    )  # fmt: skip
 
 
 def test_a_crater_below_the_camera_is_in_the_middle_and_as_wide_as_the_lens_makes_it():
@@ -98,12 +95,9 @@ def project_rim_middle(catalogue, position, rotation):
         np.sin(azimuth) * np.sin(arc) * math.cos(latitude), np.cos(arc) - math.sin(latitude) * sine
     )
     spread = make_catalogue(
-        np.arcsin(sine),
-        longitude + east,
-        np.full(n.size, 3000.0),
-        source="t",
+        np.arcsin(sine), longitude + east, np.full(n.size, 3000.0), source="t",
         rim_height_m=np.full(n.size, catalogue.rim_height_m[0]),
-    )
+    )  # fmt: skip
     labels = project_craters(spread, CAMERA, position, rotation)
     weight = 1.0 / area_of_pixels(labels)
     return np.average(labels.u_px, weights=weight), np.average(labels.v_px, weights=weight)
@@ -195,15 +189,13 @@ def test_planes_come_back_by_name(tmp_path, options):
 @pytest.mark.parametrize(
     ("octets", "message"),
     [
-        (exr_octets(PLANES)[:-5], "expected 3 lines"),
-        (exr_octets(PLANES, kind=1), "32-bit floats"),
+        (exr_octets(PLANES)[:-5], "expected 3 lines"), (exr_octets(PLANES, kind=1), "32-bit floats"),
         (exr_octets(PLANES, compression=3), "uncompressed EXR, found method 3"),
         (exr_octets(PLANES, version=2 | 0x1000), "single-part EXR"),
-        (b"\x89PNG\r\n\x1a\n" + bytes(40), "single-part EXR"),
-        (exr_octets(PLANES)[:30], "damaged"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(40), "single-part EXR"), (exr_octets(PLANES)[:30], "damaged"),
         (b"", "damaged"),
     ],
-)
+)  # fmt: skip
 def test_anything_else_is_refused_with_what_is_wrong(tmp_path, octets, message):
     file = tmp_path / "b.exr"
     file.write_bytes(octets)

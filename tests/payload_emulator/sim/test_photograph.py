@@ -88,12 +88,9 @@ def test_ground_outside_the_photograph_is_black_and_not_covered(tmp_path):
 def test_the_registration_of_the_heights_moves_the_photograph_too(tmp_path):
     terrain_of(tmp_path)
     moved = PhotographTerrain(
-        [tmp_path / "h.tif"],
-        [tmp_path / "p.tif"],
-        NONE,
-        registration_north_m=3_000.0,
+        [tmp_path / "h.tif"], [tmp_path / "p.tif"], NONE, registration_north_m=3_000.0,
         registration_east_m=-2_000.0,
-    )
+    )  # fmt: skip
     place = np.array([[math.radians(LATITUDE)]]), np.array([[math.radians(LONGITUDE)]])
     north_deg = math.degrees(3_000.0 / MOON_RADIUS_M)
     east_deg = math.degrees(-2_000.0 / MOON_RADIUS_M) / math.cos(math.radians(LATITUDE))

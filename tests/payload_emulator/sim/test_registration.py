@@ -49,12 +49,9 @@ def rims(
     latitude, longitude = rng.uniform(-0.5, 0.5, (2, count)) * size_deg
     east, north = noise_m * rng.standard_normal((2, count))
     return Rims(
-        np.radians(10.0 + latitude),
-        np.radians(300.0 + longitude),
-        shift_m[0] + east,
-        shift_m[1] + north,
+        np.radians(10.0 + latitude), np.radians(300.0 + longitude), shift_m[0] + east, shift_m[1] + north,
         np.full(count, noise_m),
-    )
+    )  # fmt: skip
 
 
 def middle(registration: Registration) -> tuple[np.ndarray, float]:
@@ -131,11 +128,9 @@ def test_tiles_are_summed_up() -> None:
 
 def test_a_product_is_read_as_it_was_written() -> None:
     made = replace(
-        fit_registration(rims(100, (-30.0, 70.0), 60.0)),
-        catalogue="ab",
-        terrain={"a.tif": "cd"},
+        fit_registration(rims(100, (-30.0, 70.0), 60.0)), catalogue="ab", terrain={"a.tif": "cd"},
         made_utc="2026-11-23T00:00:00Z",
-    )
+    )  # fmt: skip
     read = parse_registration(format_registration(made), "x")
     for name in ("row", "column", "rims"):
         assert np.array_equal(getattr(read, name), getattr(made, name))

@@ -2,7 +2,6 @@
 
 import math
 
-import cv2
 import numpy as np
 import pytest
 
@@ -18,6 +17,9 @@ from payload_emulator.sim.render.light import sun_angles, sun_direction_mcmf
 from payload_emulator.sim.render.photometry import LAWS, TABLE_SIZE, Photometry
 from payload_emulator.sim.render.renderer import pixel_shifts
 from payload_emulator.sim.render.sensor import COLOUR, SensorModel, auto_exposure, random_sensor, take_picture
+from tests.lazy import Lazy
+
+cv2 = Lazy("cv2")
 
 ERRORS = ("psf_sigma_px", "vignetting", "gain_mismatch", "stray", "hot_pixels", "dark_e", "offset")
 PLAIN = dict.fromkeys(ERRORS, 0.0)

@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 import pytest
-import rasterio
-from rasterio.warp import transform as reproject
 
 from lunar.catalogue import make_catalogue
 from lunar.constants import MOON_RADIUS_M
@@ -15,6 +13,9 @@ from payload_emulator.sim.terrain.albedo import open_albedo
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.raster import RasterTerrain
 from payload_emulator.sim.terrain.rasters import open_layers
+from tests.lazy import Lazy
+
+rasterio, warp = Lazy("rasterio"), Lazy("rasterio.warp")
 
 NONE = make_catalogue([], [], [], source="none")
 AS_IT_IS = {"sharpen": False, "registration_north_m": 0.0, "smoothing_pixels": 0.0}
@@ -361,11 +362,11 @@ def test_a_layer_says_how_the_values_of_its_files_are_taken(tmp_path):
 )
 def test_any_projection_that_gdal_knows_is_read_at_its_places(tmp_path, crs):
     step, size = (1.0 if "km" in crs else 1_000.0), 900
-    (x,), (y,) = reproject(MOON, crs, [17.0], [77.5])
+    (x,), (y,) = warp.transform(MOON, crs, [17.0], [77.5])
     transform = rasterio.Affine(step, 0, x - 0.5 * size * step, 0, -step, y + 0.5 * size * step)
     column, row = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
     across, down = transform.c + step * column, transform.f - step * row
-    east, north = map(np.array, reproject(crs, MOON, across.ravel(), down.ravel()))
+    east, north = map(np.array, warp.transform(crs, MOON, across.ravel(), down.ravel()))
     values = ground(north, east).reshape(size, size).astype("float32")
     terrain = RasterTerrain([write_tiff(tmp_path / "a.tif", transform, values, crs)], NONE, **AS_IT_IS)
     # Two resamplings of pixels of 1 km.

@@ -15,17 +15,8 @@ from payload_emulator.sim.terrain.procedural import ProceduralTerrain
 
 PIXEL_M = math.radians(MOON_RADIUS_M) / 256.0
 BANDS_KM = (
-    (14, 20),
-    (10, 14),
-    (7, 10),
-    (5, 7),
-    (3.5, 5),
-    (2.5, 3.5),
-    (1.8, 2.5),
-    (1.3, 1.8),
-    (0.9, 1.3),
-    (0.65, 0.9),
-)
+    (14, 20), (10, 14), (7, 10), (5, 7), (3.5, 5), (2.5, 3.5), (1.8, 2.5), (1.3, 1.8), (0.9, 1.3), (0.65, 0.9),
+)  # fmt: skip
 """Wavelengths on both sides of the join at 1.8 km; down to 3.5 km the raster itself can be believed."""
 
 BELIEVED = slice(0, 5)

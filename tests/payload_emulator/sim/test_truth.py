@@ -39,14 +39,9 @@ def everywhere(latitude, longitude=None):
 
 def crossings(truth, covers, in_reach=everywhere, direction="ascending", band_rad=BAND_RAD):
     return find_crossings(
-        truth,
-        covers,
-        in_reach,
-        not_before_utc_ns=START_NS,
-        latitude_band_rad=band_rad,
-        direction=direction,
+        truth, covers, in_reach, not_before_utc_ns=START_NS, latitude_band_rad=band_rad, direction=direction,
         half_fov_rad=np.radians(60.0),
-    )
+    )  # fmt: skip
 
 
 class StillMoon:
@@ -269,13 +264,11 @@ def test_every_kind_of_fault_is_read(kind: str) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("camera_dark", "expected KIND at SECONDS"),
-        ("camera_dark at soon for 3", "expected KIND at SECONDS"),
-        ("camera_dark at 5", "expected how long it lasts"),
-        ("meteor at 5", "expected one of camera_dark"),
+        ("camera_dark", "expected KIND at SECONDS"), ("camera_dark at soon for 3", "expected KIND at SECONDS"),
+        ("camera_dark at 5", "expected how long it lasts"), ("meteor at 5", "expected one of camera_dark"),
         ("", "expected KIND at SECONDS"),
     ],
-)
+)  # fmt: skip
 def test_other_lines_are_refused_with_a_reason(text: str, message: str) -> None:
     with pytest.raises(ScenarioError, match=message):
         parse_fault(text)

@@ -52,30 +52,18 @@ def write_blob_dataset(
             rows.append(number)
             craters.append(
                 {
-                    "id": np.arange(u.size) + 1000 * number,
-                    "u_px": u,
-                    "v_px": v,
-                    "diameter_px": d,
-                    "diameter_m": d * 30_000.0 / focal,
-                    "depth_ratio": np.full(u.size, 0.15),
-                    "lit": np.ones(u.size),
-                    "hidden": np.zeros(u.size, np.uint8),
-                    "latitude_deg": np.zeros(u.size),
+                    "id": np.arange(u.size) + 1000 * number, "u_px": u, "v_px": v, "diameter_px": d,
+                    "diameter_m": d * 30_000.0 / focal, "depth_ratio": np.full(u.size, 0.15),
+                    "lit": np.ones(u.size), "hidden": np.zeros(u.size, np.uint8), "latitude_deg": np.zeros(u.size),
                     "longitude_deg": np.zeros(u.size),
                 }
-            )
+            )  # fmt: skip
             first.append(first[-1] + u.size)
             number += 1
         values = {
-            "number": rows,
-            "latitude_deg": 0.0,
-            "longitude_deg": 0.0,
-            "altitude_m": 30_000.0,
-            "ground_m": 0.0,
-            "sun_elevation_deg": 10.0,
-            "sun_azimuth_deg": 0.0,
-            "block": rows,
-        }
+            "number": rows, "latitude_deg": 0.0, "longitude_deg": 0.0, "altitude_m": 30_000.0, "ground_m": 0.0,
+            "sun_elevation_deg": 10.0, "sun_azimuth_deg": 0.0, "block": rows,
+        }  # fmt: skip
         labels = store.ShardLabels(
             source=split,
             split=split,

@@ -91,17 +91,8 @@ def test_a_build_killed_at_work_goes_on_to_the_same_bytes(built, tmp_path):
     assert load_recipe(recipe).digest == RECIPE.digest
     target = tmp_path / "set"
     command = [
-        sys.executable,
-        "-m",
-        "linna",
-        "dataset",
-        "build",
-        str(recipe),
-        "--out",
-        str(target),
-        "--frames",
-        "3",
-    ]
+        sys.executable, "-m", "linna", "dataset", "build", str(recipe), "--out", str(target), "--frames", "3",
+    ]  # fmt: skip
     environment = {key: value for key, value in os.environ.items() if key != "LINNA_DATA"}
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": ROOT, "env": environment}
     with subprocess.Popen(command, **quiet) as first:

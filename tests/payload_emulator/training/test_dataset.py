@@ -213,13 +213,11 @@ def test_an_ellipse_in_the_image_keeps_its_box_and_area():
 @pytest.mark.parametrize(
     ("centre", "box", "share"),
     [
-        ((0.0, 40.0), (0.0, 30.0, 10.0, 50.0), 0.5),
-        ((200.0, 40.0), (190.0, 30.0, 200.0, 50.0), 0.5),
-        ((100.0, 0.0), (90.0, 0.0, 110.0, 10.0), 0.5),
-        ((100.0, 80.0), (90.0, 70.0, 110.0, 80.0), 0.5),
+        ((0.0, 40.0), (0.0, 30.0, 10.0, 50.0), 0.5), ((200.0, 40.0), (190.0, 30.0, 200.0, 50.0), 0.5),
+        ((100.0, 0.0), (90.0, 0.0, 110.0, 10.0), 0.5), ((100.0, 80.0), (90.0, 70.0, 110.0, 80.0), 0.5),
         ((200.0, 80.0), (190.0, 70.0, 200.0, 80.0), 0.25),
     ],
-)
+)  # fmt: skip
 def test_a_crater_on_the_border_is_clipped_to_the_image(centre, box, share):
     rim = clipped(ellipse_polygon(*centre, 10.0, 10.0, 0.0), 200, 80)
     np.testing.assert_allclose([*rim.min(axis=0), *rim.max(axis=0)], box, atol=1e-9)
@@ -257,32 +255,21 @@ def test_the_ground_diameter_undoes_the_projection(blob_dataset):
 
 def craters(**changes):
     base = {
-        "id": 7,
-        "u_px": 100.0,
-        "v_px": 100.0,
-        "diameter_px": 30.0,
-        "diameter_m": 6000.0,
-        "depth_ratio": 0.12,
-        "lit": 0.9,
-        "hidden": 0,
-    } | changes
+        "id": 7, "u_px": 100.0, "v_px": 100.0, "diameter_px": 30.0, "diameter_m": 6000.0, "depth_ratio": 0.12,
+        "lit": 0.9, "hidden": 0,
+    } | changes  # fmt: skip
     return {key: np.array([value]) for key, value in base.items()}
 
 
 @pytest.mark.parametrize(
     ("change", "tier"),
     [
-        ({}, Tier.LABEL),
-        ({"depth_ratio": 0.01}, Tier.IGNORE),
-        ({"depth_ratio": np.nan}, Tier.IGNORE),
-        ({"diameter_px": 6.0}, Tier.IGNORE),
-        ({"diameter_m": 2200.0}, Tier.IGNORE),
-        ({"diameter_m": 1200.0, "id": -4}, Tier.LABEL),
-        ({"lit": 0.0}, Tier.IGNORE),
-        ({"hidden": 1}, Tier.IGNORE),
+        ({}, Tier.LABEL), ({"depth_ratio": 0.01}, Tier.IGNORE), ({"depth_ratio": np.nan}, Tier.IGNORE),
+        ({"diameter_px": 6.0}, Tier.IGNORE), ({"diameter_m": 2200.0}, Tier.IGNORE),
+        ({"diameter_m": 1200.0, "id": -4}, Tier.LABEL), ({"lit": 0.0}, Tier.IGNORE), ({"hidden": 1}, Tier.IGNORE),
         ({"u_px": -5.0}, Tier.IGNORE),
     ],
-)
+)  # fmt: skip
 def test_what_can_be_seen_is_a_label_and_the_rest_is_ignored(change, tier):
     tiers, weights = store.choose_tiers(craters(**change), 512, 512, complete=False)
     assert tiers[0] == tier
@@ -340,16 +327,9 @@ def spot_image(u, v):
 def test_a_spot_lands_where_the_label_says(sun, seed):
     u, v = np.array([250.0, 330.0]), np.array([200.0, 280.0])
     crop = make_crop(
-        spot_image(u, v),
-        np.array(sun),
-        u,
-        v,
-        np.full(2, 20.0),
-        np.array([True, True]),
-        384,
-        QUIET,
+        spot_image(u, v), np.array(sun), u, v, np.full(2, 20.0), np.array([True, True]), 384, QUIET,
         np.random.default_rng(seed),
-    )
+    )  # fmt: skip
     for x, y in zip(crop.u_px, crop.v_px, strict=True):
         if not (12 < x < 371 and 12 < y < 371):
             continue
@@ -367,31 +347,18 @@ def test_the_sun_is_at_the_top_of_every_crop():
     bright_right = np.rot90((255 * (1 - row / 511)).astype(np.uint8), 3).copy()
     assert bright_right[:, -1].mean() > bright_right[:, 0].mean()
     crop = make_crop(
-        bright_right,
-        np.array([1.0, 0.0, 0.0]),
-        np.zeros(0),
-        np.zeros(0),
-        np.zeros(0),
-        np.zeros(0, bool),
-        384,
-        QUIET,
-        np.random.default_rng(3),
-    )
+        bright_right, np.array([1.0, 0.0, 0.0]), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, bool), 384,
+        QUIET, np.random.default_rng(3),
+    )  # fmt: skip
     assert crop.image[:40].mean() > crop.image[-40:].mean() + 0.5
 
 
 def test_one_seed_gives_one_crop():
     image = spot_image([100, 300], [100, 300])
     arguments = (
-        image,
-        np.array([0.0, -1.0, 0.0]),
-        np.array([100.0]),
-        np.array([100.0]),
-        np.array([20.0]),
-        np.array([True]),
-        256,
-        AugmentParameters(),
-    )
+        image, np.array([0.0, -1.0, 0.0]), np.array([100.0]), np.array([100.0]), np.array([20.0]), np.array([True]),
+        256, AugmentParameters(),
+    )  # fmt: skip
     first = make_crop(*arguments, np.random.default_rng(9))
     second = make_crop(*arguments, np.random.default_rng(9))
     assert np.array_equal(first.image, second.image)
@@ -401,14 +368,9 @@ def test_one_seed_gives_one_crop():
 def perfect_maps(u, v, diameter):
     n = len(u)
     t = make_targets(
-        512,
-        512,
-        np.array(u, float),
-        np.array(v, float),
-        np.array(diameter, float),
-        np.full(n, Tier.LABEL, np.int8),
-        np.ones(n),
-    )
+        512, 512, np.array(u, float), np.array(v, float), np.array(diameter, float),
+        np.full(n, Tier.LABEL, np.int8), np.ones(n),
+    )  # fmt: skip
     geometry = np.concatenate([t.geometry, np.zeros((1, 128, 128), np.float32)])
     return t, geometry
 
@@ -429,14 +391,9 @@ def test_decoding_the_targets_returns_the_craters():
 
 def test_an_ignored_crater_takes_the_loss_away_around_it_and_adds_no_heat():
     t = make_targets(
-        512,
-        512,
-        np.array([200.0]),
-        np.array([100.0]),
-        np.array([60.0]),
-        np.array([Tier.IGNORE], np.int8),
+        512, 512, np.array([200.0]), np.array([100.0]), np.array([60.0]), np.array([Tier.IGNORE], np.int8),
         np.ones(1),
-    )
+    )  # fmt: skip
     assert t.heat.max() == 0.0 and t.weight.max() == 0.0 and t.regressed.max() == 0.0
     assert t.negative[0, 25, 50] == 0.0
     assert t.negative[0, 25, 80] == 1.0
@@ -444,28 +401,17 @@ def test_an_ignored_crater_takes_the_loss_away_around_it_and_adds_no_heat():
 
 def test_a_label_beside_an_ignored_crater_keeps_its_own_weight():
     t = make_targets(
-        512,
-        512,
-        np.array([200.0, 206.0]),
-        np.array([100.0, 100.0]),
-        np.array([60.0, 40.0]),
-        np.array([Tier.IGNORE, Tier.LABEL], np.int8),
-        np.array([1.0, 0.7]),
-    )
+        512, 512, np.array([200.0, 206.0]), np.array([100.0, 100.0]), np.array([60.0, 40.0]),
+        np.array([Tier.IGNORE, Tier.LABEL], np.int8), np.array([1.0, 0.7]),
+    )  # fmt: skip
     assert t.weight.max() == pytest.approx(0.7)
 
 
 def test_class_heatmaps_follow_the_common_one():
     t = make_targets(
-        512,
-        512,
-        np.array([100.0, 300.0]),
-        np.array([100.0, 300.0]),
-        np.array([40.0, 60.0]),
-        np.full(2, Tier.LABEL, np.int8),
-        np.ones(2),
-        np.array([0, 3], np.int8),
-    )
+        512, 512, np.array([100.0, 300.0]), np.array([100.0, 300.0]), np.array([40.0, 60.0]),
+        np.full(2, Tier.LABEL, np.int8), np.ones(2), np.array([0, 3], np.int8),
+    )  # fmt: skip
     assert t.heat.shape[0] == 4
     assert t.heat[1].max() == 1.0 and t.heat[2].max() == 0.0 and t.heat[3].max() == 0.0
     assert (t.heat[0] == 1.0).sum() == 2

@@ -270,13 +270,9 @@ def frames(count=12, share=SHARE, depth_said=True, noise=0.0, seed=0):
         inward = 1.0 / (1.0 + share * ratio * diameter)
         found = FrameDetections(
             255.5 + (u - 255.5) * inward + rng.normal(0, noise + 1e-12, n),
-            255.5 + (v - 255.5) * inward + rng.normal(0, noise + 1e-12, n),
-            diameter,
-            np.full(n, 7e3),
-            np.full(n, 0.9),
-            np.ones(n),
-            ratio if depth_said else None,
-        )
+            255.5 + (v - 255.5) * inward + rng.normal(0, noise + 1e-12, n), diameter, np.full(n, 7e3),
+            np.full(n, 0.9), np.ones(n), ratio if depth_said else None,
+        )  # fmt: skip
         pairs.append((truth, found))
     return pairs
 
@@ -322,14 +318,9 @@ def test_the_papers_threshold_is_chosen_over_its_classes_together():
         one, one, np.array([30.0]), np.array([7e3]), np.array([0.1]), np.array([1]), 512, 512, 0.0, 0
     )
     found = FrameDetections(
-        np.array([100.0, 300.0]),
-        np.array([100.0, 300.0]),
-        np.full(2, 30.0),
-        np.array([7e3, 12e3]),
-        np.array([0.7, 0.5]),
-        np.ones(2),
-        size_class=np.array([0, 1], np.int8),
-    )
+        np.array([100.0, 300.0]), np.array([100.0, 300.0]), np.full(2, 30.0), np.array([7e3, 12e3]),
+        np.array([0.7, 0.5]), np.ones(2), size_class=np.array([0, 1], np.int8),
+    )  # fmt: skip
     assert 0.5 < paper_threshold([truth], [found]) <= 0.7
 
 
@@ -345,14 +336,10 @@ def scene(u, v, *, shift=(0.0, 0.0), scale=0.0, sigma=1.0, said=0.15, depth=0.15
     )
     keep = np.ones(n, bool) if found is None else np.array(found)
     detections = FrameDetections(
-        (u + shift[0] + scale * (u - 255.5))[keep],
-        (v + shift[1] + scale * (v - 255.5))[keep],
-        np.full(keep.sum(), 30.0),
-        np.full(keep.sum(), 7_000.0),
-        np.full(keep.sum(), 0.8),
-        np.full(keep.sum(), sigma),
-        np.full(keep.sum(), said),
-    )
+        (u + shift[0] + scale * (u - 255.5))[keep], (v + shift[1] + scale * (v - 255.5))[keep],
+        np.full(keep.sum(), 30.0), np.full(keep.sum(), 7_000.0), np.full(keep.sum(), 0.8),
+        np.full(keep.sum(), sigma), np.full(keep.sum(), said),
+    )  # fmt: skip
     return truth, detections
 
 
@@ -431,11 +418,7 @@ def test_average_precision_of_a_ranking_done_by_hand():
     # Ranked right, wrong, right over 2 craters: areas 0.5 * 1 + 0.5 * 2/3.
     truth, _ = scene([100, 200], [100, 200])
     found = FrameDetections(
-        np.array([100.0, 400.0, 200.0]),
-        np.array([100.0, 400.0, 200.0]),
-        np.full(3, 30.0),
-        np.full(3, 7_000.0),
-        np.array([0.9, 0.8, 0.7]),
-        np.ones(3),
-    )
+        np.array([100.0, 400.0, 200.0]), np.array([100.0, 400.0, 200.0]), np.full(3, 30.0), np.full(3, 7_000.0),
+        np.array([0.9, 0.8, 0.7]), np.ones(3),
+    )  # fmt: skip
     assert average_precision(tally([truth], [found])) == pytest.approx(0.5 + 0.5 * 2 / 3)

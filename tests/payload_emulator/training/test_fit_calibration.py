@@ -37,18 +37,9 @@ def scored_frames(count=150, seed=1):
         n = int(right.sum())
         truths.append(
             FrameTruth(
-                u[right],
-                v[right],
-                diameter[right],
-                size_m[:n],
-                np.full(n, 0.1),
-                np.arange(n),
-                512,
-                512,
-                0.0,
-                0,
+                u[right], v[right], diameter[right], size_m[:n], np.full(n, 0.1), np.arange(n), 512, 512, 0.0, 0,
             )
-        )
+        )  # fmt: skip
     return truths, found
 
 

@@ -106,14 +106,9 @@ def test_an_unknown_colour_is_refused(tmp_path) -> None:
 def classes_only(coloured: Dataset, tmp_path_factory) -> bytes:
     run = tmp_path_factory.mktemp("classes")
     parameters = TrainParameters(
-        minutes=0.0,
-        steps=1,
-        batch=2,
-        crop_px=96,
-        replicas=1,
-        detail_blocks=0,
+        minutes=0.0, steps=1, batch=2, crop_px=96, replicas=1, detail_blocks=0,
         preparation=Preparation.normalise_first,
-    )
+    )  # fmt: skip
     train([coloured, one_frame(run.with_name("validation"), "val")], run, parameters)
     export(run / "checkpoint.pt", run / "m.onnx", [coloured], classes_only=True)
     return (run / "m.onnx").read_bytes()

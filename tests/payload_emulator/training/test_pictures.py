@@ -205,16 +205,11 @@ def test_a_set_with_another_order_scale_or_identity_is_refused(tmp_path, change,
 @pytest.mark.parametrize(
     ("orientation", "seen"),
     [
-        (1, [[0, 1, 2], [3, 4, 5]]),
-        (2, [[2, 1, 0], [5, 4, 3]]),
-        (3, [[5, 4, 3], [2, 1, 0]]),
-        (4, [[3, 4, 5], [0, 1, 2]]),
-        (5, [[0, 3], [1, 4], [2, 5]]),
-        (6, [[3, 0], [4, 1], [5, 2]]),
-        (7, [[5, 2], [4, 1], [3, 0]]),
-        (8, [[2, 5], [1, 4], [0, 3]]),
+        (1, [[0, 1, 2], [3, 4, 5]]), (2, [[2, 1, 0], [5, 4, 3]]), (3, [[5, 4, 3], [2, 1, 0]]),
+        (4, [[3, 4, 5], [0, 1, 2]]), (5, [[0, 3], [1, 4], [2, 5]]), (6, [[3, 0], [4, 1], [5, 2]]),
+        (7, [[5, 2], [4, 1], [3, 0]]), (8, [[2, 5], [1, 4], [0, 3]]),
     ],
-)
+)  # fmt: skip
 def test_a_picture_is_turned_as_its_exif_data_state(tmp_path, orientation, seen):
     from PIL import Image
 
@@ -295,15 +290,9 @@ def test_arrays_that_are_no_images_are_refused(tmp_path, values):
 def picture(boxes, crowd=()):
     box = np.array(boxes, float).reshape(-1, 4)
     return LabelledPicture(
-        None,
-        200,
-        100,
-        box[:, 0] + 0.5 * box[:, 2] - 0.5,
-        box[:, 1] + 0.5 * box[:, 3] - 0.5,
-        np.sqrt(box[:, 2] * box[:, 3]),
-        box,
-        np.isin(np.arange(len(box)), crowd),
-    )
+        None, 200, 100, box[:, 0] + 0.5 * box[:, 2] - 0.5, box[:, 1] + 0.5 * box[:, 3] - 0.5,
+        np.sqrt(box[:, 2] * box[:, 3]), box, np.isin(np.arange(len(box)), crowd),
+    )  # fmt: skip
 
 
 def detections(rows):

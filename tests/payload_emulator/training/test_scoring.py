@@ -20,30 +20,19 @@ from payload_emulator.training.evaluate.scoring import (
 def truth(u, v, diameter_px=30.0, diameter_m=7_000.0, depth_ratio=0.15, block=0):
     n = len(u)
     return FrameTruth(
-        np.array(u, float),
-        np.array(v, float),
-        np.full(n, diameter_px),
-        np.broadcast_to(diameter_m, n).astype(float),
-        np.broadcast_to(depth_ratio, n).astype(float),
-        np.arange(n),
-        512,
-        512,
-        0.0,
-        block,
-    )
+        np.array(u, float), np.array(v, float), np.full(n, diameter_px),
+        np.broadcast_to(diameter_m, n).astype(float), np.broadcast_to(depth_ratio, n).astype(float), np.arange(n),
+        512, 512, 0.0, block,
+    )  # fmt: skip
 
 
 def found(u, v, score, diameter_m=7_000.0):
     n = len(u)
     order = np.argsort(-np.array(score, float), kind="stable")
     return FrameDetections(
-        np.array(u, float)[order],
-        np.array(v, float)[order],
-        np.full(n, 30.0),
-        np.broadcast_to(diameter_m, n).astype(float)[order],
-        np.array(score, float)[order],
-        np.ones(n),
-    )
+        np.array(u, float)[order], np.array(v, float)[order], np.full(n, 30.0),
+        np.broadcast_to(diameter_m, n).astype(float)[order], np.array(score, float)[order], np.ones(n),
+    )  # fmt: skip
 
 
 def test_two_detections_of_one_crater_are_one_right_and_one_false():

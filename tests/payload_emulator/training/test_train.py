@@ -32,25 +32,15 @@ from tests.lazy import Lazy
 torch = Lazy("torch")
 
 SHORT = TrainParameters(
-    minutes=0.0,
-    steps=8,
-    batch=4,
-    crop_px=128,
-    warm_up_steps=4,
-    validation_frames=2,
-    replicas=2,
-    detail_blocks=0,
-)
+    minutes=0.0, steps=8, batch=4, crop_px=128, warm_up_steps=4, validation_frames=2, replicas=2, detail_blocks=0,
+)  # fmt: skip
 
 
 def test_a_run_leaves_checkpoints_curves_and_provenance(blob_dataset, tmp_path):
     assert train([blob_dataset], tmp_path, SHORT)["steps"] == 8
     assert {path.name for path in tmp_path.iterdir()} >= {
-        "checkpoint.pt",
-        "best.pt",
-        "curves.csv",
-        "run.json",
-    }
+        "checkpoint.pt", "best.pt", "curves.csv", "run.json",
+    }  # fmt: skip
     document = json.loads((tmp_path / "run.json").read_text())
     assert document["datasets"][0]["labels_sha256"]
     assert document["parameters"]["seed"] == 1
@@ -207,11 +197,9 @@ def test_a_run_killed_and_resumed_reaches_the_figures_of_one_left_alone(blob_dat
         "t.train([Dataset(Path(sys.argv[1]))], Path(sys.argv[2]), p)\n"
     )
     process = subprocess.Popen(
-        [sys.executable, "-c", code, str(blob_dataset.folder), str(tmp_path / "killed")],
-        stdout=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": os.getcwd()},
-        text=True,
-    )
+        [sys.executable, "-c", code, str(blob_dataset.folder), str(tmp_path / "killed")], stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.getcwd()}, text=True,
+    )  # fmt: skip
     assert process.stdout is not None
     while (line := process.stdout.readline()).strip() != "checkpoint.pt":
         assert line, "the run ended before it wrote a checkpoint"

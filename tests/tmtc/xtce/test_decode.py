@@ -29,7 +29,7 @@ from tests.tmtc.foreign import (
 from tests.tmtc.xtce.test_export import random_packet
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import DefinitionError
-from tmtc.packets.stream import PacketCut
+from tmtc.packets.stream import PacketCut, primary_headers
 from tmtc.xtce.columns import ArrayColumn, OptionalColumn, ValueColumn
 from tmtc.xtce.decode import VERDICTS, Decoder, XtceDecode
 from tmtc.xtce.export import format_xtce
@@ -559,6 +559,37 @@ def test_entries_under_a_condition_are_there_or_not():
     assert verdicts(text, [b"\x01\x00\x05", *packets]) == ["too_short", *["decoded"] * 4]
 
 
+def test_an_entry_may_stand_at_a_place_that_the_packet_states():
+    def at(place: str, reference: str) -> str:
+        return (
+            f'<ParameterRefEntry parameterRef="{place}"><LocationInContainerInBits referenceLocation="{reference}">'
+            '<DynamicValue><ParameterInstanceRef parameterRef="n"/><LinearAdjustment slope="8"/></DynamicValue>'
+            "</LocationInContainerInBits></ParameterRefEntry>"
+        )
+
+    body = container("P", ["n", at("a", "containerStart"), at("b", "previousEntry")])
+    text = document(integer("N", 8), dict.fromkeys("nab", "N"), body)
+    packets = [bytes((1, 2, 3, 4)), bytes((2, 9, 4, 5, 6, 7)), bytes((1, 2, 3)), bytes((9, 0, 0))]
+    assert verdicts(text, packets) == ["decoded", "decoded", "too_short", "too_short"]
+    assert values(text, packets) == {"n": [1, 2], "a": [2, 4], "b": [4, 7]}
+
+
+@pytest.mark.parametrize(("width", "kind"), [(8, "fixed"), (8, "text")])
+def test_repetitions_stand_apart_by_their_offset(width, kind):
+    repeat = (
+        '<ParameterRefEntry parameterRef="a"><RepeatEntry><Count><DynamicValue><ParameterInstanceRef parameterRef="n"/>'
+        "</DynamicValue></Count><Offset><FixedValue>8</FixedValue></Offset></RepeatEntry></ParameterRefEntry>"
+    )
+    one = integer("A", width) if kind == "fixed" else text_type(foreign.fixed_size(width), name="A")
+    text = document(integer("N", 8) + one, {"n": "N", "a": "A", "z": "N"}, container("P", ["n", repeat, "z"]))
+    packets = [b"\x03A.B.CZ", b"\x01AZ", b"\x00Z", b"\x02A.B", b"\x02A."]
+    assert verdicts(text, packets) == ["decoded"] * 3 + ["too_short"] * 2
+    right = [["A", "B", "C"], ["A"], []]
+    plain = [[ord(c) for c in row] for row in right] if kind == "fixed" else right
+    found = values(text, packets[:3])
+    assert found["a"] == plain and found["z"] == [ord("Z")] * 3
+
+
 def test_a_container_in_a_container_begins_where_it_stands():
     location = (
         '<ParameterRefEntry parameterRef="y"><LocationInContainerInBits referenceLocation="containerStart">'
@@ -745,3 +776,63 @@ def test_columns_of_numbers_are_arrays():
     assert column.values.dtype == np.float64 and column.raw.dtype == np.int64
     assert np.array_equal(column.values, column.raw * 0.25 - 1.5)
     assert list(HEADER) == list(HEADER_PARAMETERS)
+
+
+def parts(apid: int, first_count: int, *pieces: bytes, flags: tuple[int, ...] = ()) -> list[bytes]:
+    """Parts of a segmented packet: the first alone has a secondary header."""
+    chosen = flags or (1, *[0] * (len(pieces) - 2), 2)
+    return [
+        struct.pack(
+            ">HHH", apid | (0x0800 if k == 0 else 0), flag << 14 | (first_count + k) % 16384, len(piece) - 1
+        )
+        + piece
+        for k, (piece, flag) in enumerate(zip(pieces, chosen, strict=True))
+    ]
+
+
+def stream_of(packets: list[bytes], checksum_octets: int = 0) -> tuple[list[tuple[int, int, int]], list[str]]:
+    """(index, a, b) of decoded packets of a stream, and the verdict of each packet."""
+    body = container("P", ["a", "b"], "CCSDSPacket", comparison("VERSION", 0))
+    text = document(HEADER_TYPES, {**HEADER_PARAMETERS, "a": "U16", "b": "U32"}, HEADER_CONTAINER + body)
+    octets, cut = whole(packets)
+    found = Decoder(parse_xtce(text)).decode(
+        octets, cut, primary_headers(octets, cut), whole_stream=True, checksum_octets=checksum_octets
+    )
+    table = found.tables.get("P")
+    rows = [] if table is None else zip(
+        table.packet_index.tolist(), table.columns["a"].to_list(), table.columns["b"].to_list(), strict=True
+    )  # fmt: skip
+    return list(rows), [VERDICTS[v] for v in found.verdict.tolist()]
+
+
+def test_parts_of_segmented_packets_are_joined_also_between_others_and_over_the_end_of_the_counts():
+    one = parts(5, 16383, b"\x00", b"\x01\x00\x00", b"\x00\x02")
+    two = parts(6, 3, b"\x00\x03\x00\x00\x00", b"\x04")
+    whole_one = space_packet(7, b"\x00\x05\x00\x00\x00\x06", 0)
+    found, verdict = stream_of([one[0], whole_one, two[0], one[1], two[1], one[2]])
+    assert found == [(0, 1, 2), (1, 5, 6), (2, 3, 4)]
+    assert verdict == [
+        "decoded",
+        "decoded",
+        "decoded",
+        "segments_joined",
+        "segments_joined",
+        "segments_joined",
+    ]
+
+
+def test_each_part_has_its_checksum():
+    found, _ = stream_of(parts(5, 0, b"\x00\x01CC", b"\x00\x00CC", b"\x00\x02CC"), checksum_octets=2)
+    assert found == [(0, 1, 2)]
+
+
+def test_parts_that_make_no_packet_are_counted_and_not_decoded():
+    def all_of_them_alone(packets: list[bytes]) -> bool:
+        return stream_of(packets) == ([], ["segments_not_joined"] * len(packets))
+
+    three = parts(5, 0, b"\x00\x01", b"\x00\x00", b"\x00\x02")
+    assert all_of_them_alone(three[:2]) and all_of_them_alone(three[1:]) and all_of_them_alone(three[::2])
+    assert all_of_them_alone(three[::-1])
+    headed = bytes((three[2][0] | 8,)) + three[2][1:]  # the length of its secondary header is not known
+    assert all_of_them_alone([*three[:2], headed])
+    assert stream_of([*three[:2], *parts(5, 2, b"\x00\x07\x00", b"\x00\x00\x08")])[0] == [(2, 7, 8)]

@@ -129,12 +129,9 @@ def random_packet(definition: PacketDefinition, count: int, rng: np.random.Gener
     if group:
         values[group.name] = [{f.name: random_value(f, rng) for f in group.fields} for _ in range(count)]
     return DICTIONARY.pack(
-        definition.name,
-        values,
-        ticks=int(rng.integers(0, 2**48)),
-        sequence_count=int(rng.integers(0, 16384)),
+        definition.name, values, ticks=int(rng.integers(0, 2**48)), sequence_count=int(rng.integers(0, 16384)),
         message_counter=int(rng.integers(0, 65536)),
-    )
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("definition", DICTIONARY.telemetry, ids=lambda d: d.name)

@@ -270,8 +270,9 @@ def test_types_beyond_the_subset_or_their_bounds_are_refused_by_name(types, word
         ('<ParameterSegmentRefEntry parameterRef="a" sizeInBits="4"/>', "ParameterSegmentRefEntry"),
         (
             '<ParameterRefEntry parameterRef="a"><RepeatEntry><Count><FixedValue>2</FixedValue></Count>'
-            "<Offset><FixedValue>8</FixedValue></Offset></RepeatEntry></ParameterRefEntry>",
-            "repetitions without an Offset",
+            '<Offset><DynamicValue><ParameterInstanceRef parameterRef="a"/></DynamicValue></Offset></RepeatEntry>'
+            "</ParameterRefEntry>",
+            "Offset: expected a FixedValue between repetitions, found DynamicValue",
         ),
         (
             '<ParameterRefEntry parameterRef="a"><LocationInContainerInBits referenceLocation="containerEnd">'
@@ -281,7 +282,12 @@ def test_types_beyond_the_subset_or_their_bounds_are_refused_by_name(types, word
         (
             '<ParameterRefEntry parameterRef="a"><LocationInContainerInBits><DynamicValue/></LocationInContainerInBits>'
             "</ParameterRefEntry>",
-            "DynamicValue, which is not",
+            "expected an element ParameterInstanceRef, found none",
+        ),
+        (
+            '<IndirectParameterRefEntry><ParameterInstance parameterRef="a"/></IndirectParameterRefEntry>',
+            "expected an entry that is supported (ParameterRefEntry, ArrayParameterRefEntry, ContainerRefEntry), "
+            "found IndirectParameterRefEntry",
         ),
         (ARRAY_ENTRY("a"), "an array"),
     ],
@@ -552,3 +558,27 @@ def test_descriptions_alarms_algorithms_and_commands_change_nothing():
     assert parameter.type.encoding.calibration.default == Polynomial(((1.0, 0), (2.0, 1)))
     column = Decoder(definition).decode(*whole([b"\x05"])).tables["P"].columns["a"]
     assert column.to_list() == [11.0] and np.array_equal(column.to_list(raw=True), [5])
+
+
+def test_what_the_schema_allows_and_no_value_depends_on_is_no_reason_to_refuse():
+    time = (
+        '<RelativeTimeParameterType name="t"><Encoding units="s"><IntegerDataEncoding sizeInBits="8">'
+        '<ErrorDetectCorrect><Parity type="Even" bitsFromReference="0" reference="start"/></ErrorDetectCorrect>'
+        "</IntegerDataEncoding></Encoding><DefaultAlarm><StaticAlarmRanges/></DefaultAlarm>"
+        "</RelativeTimeParameterType>"
+    )
+    octets = (
+        '<BinaryParameterType name="o"><BinaryDataEncoding><ErrorDetectCorrect/><SizeInBits><FixedValue>8</FixedValue>'
+        "</SizeInBits></BinaryDataEncoding></BinaryParameterType>"
+    )
+    body = container("P", ["a", "b"]).replace('abstract="false"', 'abstract=" false "')
+    definition = parse_xtce(document(time + octets, {"a": "t", "b": "o"}, body))
+    columns = Decoder(definition).decode(*whole([b"\x05\x06"])).tables["P"].columns
+    assert columns["a"].to_list() == [5] and columns["b"].to_list() == [b"\x06"]
+
+
+def test_points_of_a_spline_of_another_order_are_refused():
+    points = '<SplinePoint raw="0" calibrated="1"/><SplinePoint order="1" raw="9" calibrated="2"/>'
+    spline = f'<DefaultCalibrator><SplineCalibrator order="0">{points}</SplineCalibrator></DefaultCalibrator>'
+    words = refused(document(calibrated("u8", 8, "unsigned", spline), {"a": "u8"}, container("P", ["a"])))
+    assert "SplinePoint: expected order 0, that of the calibrator, found 1" in words

@@ -1,4 +1,4 @@
-// The dictionary as an object tree: spacecraft -> packet -> parameter, and the objects of a spacecraft beside them.
+// The dictionary as an object tree: spacecraft -> packet -> parameter, and the further objects of a spacecraft.
 import { get } from "../api.js";
 import { parameterName, unitText } from "../units.js";
 import { newest } from "./feed.js";

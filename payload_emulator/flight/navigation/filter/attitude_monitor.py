@@ -88,7 +88,7 @@ class MonitorParameters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RotationEvidence:
-    """What the innovations of a frame say about a rotation of the camera.
+    """Evidence of a rotation of the camera in the innovations of a frame.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class AttitudeMonitor:
 
     @property
     def degraded(self) -> bool:
-        """Whether the attitude is noisier than declared."""
+        """Return whether the attitude is noisier than declared."""
         return self.noise_rad > 0.0
 
     def sigma_rad(self, declared_rad: float) -> float:

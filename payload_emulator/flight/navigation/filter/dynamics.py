@@ -182,16 +182,31 @@ def flown(
     model: OrbitModel, state: FloatArray, from_ticks: int, to_ticks: int, burns: BurnTable
 ) -> FloatArray | None:
     """Return the state (9,) carried forwards over the planned burns on the way; None outside the orientation table."""
+    reached = coasted(model, state, np.zeros((9, 9)), from_ticks, to_ticks, burns)
+    return None if reached is None else reached[0]
+
+
+def coasted(
+    model: OrbitModel,
+    state: FloatArray,
+    covariance: FloatArray,
+    from_ticks: int,
+    to_ticks: int,
+    burns: BurnTable,
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return state (9,) and covariance (9, 9) as `flown` does, with the noise of the motion and of the burns."""
     low, high = np.searchsorted(burns.ticks, [from_ticks, to_ticks], side="right")
     stops = [*burns.ticks[low:high].tolist(), to_ticks]
     for number, stop in enumerate(stops):
         reached = model.propagate(state, from_ticks, stop)
         if reached is None:
             return None
+        covariance = reached.transition @ covariance @ reached.transition.T + reached.noise
         state, from_ticks = reached.state.copy(), stop
         if number < len(stops) - 1:
             state[3:6] += burns.delta_v_icrf_m_s[low + number]
-    return state
+            covariance[3:6, 3:6] += np.eye(3) * burns.sigma_m_s[low + number] ** 2
+    return state, covariance
 
 
 _THIRD_BODY_GMS = np.array([GM_EARTH_M3_S2, GM_SUN_M3_S2])

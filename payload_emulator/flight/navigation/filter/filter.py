@@ -11,7 +11,8 @@ it as noise about the measured attitude.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -26,6 +27,8 @@ SIZE = 18
 POSITION, VELOCITY, ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
 ATTITUDE, PIXEL, OFFSET, SCALE = slice(9, 12), slice(12, 14), slice(14, 17), 17
 ORBIT = slice(0, 9)
+LEARNED = slice(14, 16)
+"""The offset of the catalogue east and north, whose size is learned in flight."""
 TURN: IntArray = np.array([-2], dtype=np.int64)
 """Stands among the craters of a state for the rotation that the attitude of the frame is off by."""
 
@@ -70,6 +73,14 @@ class CommonErrors:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Slope:
+    """Derivatives of mean (n,) and covariance (n, n) by the logarithm of the variance of the catalogue offset."""
+
+    mean: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class FilterState:
     """Estimate (18 + 3 m,) and covariance at an on-board time, with the m craters among the states.
 
@@ -77,12 +88,15 @@ class FilterState:
     ----------
     craters
         Indices into the map, shape (m,).
+    slope
+        Derivatives by the size of the catalogue offset; None where that is not learned.
     """
 
     ticks: int
     mean: FloatArray
     covariance: FloatArray
     craters: IntArray
+    slope: Slope | None = None
 
     @property
     def position_sigma_m(self) -> float:
@@ -118,8 +132,10 @@ class FilterState:
         covariance[:size, :size] = self.covariance
         rest = np.arange(size, size + 3 * count)
         covariance[rest, rest] = sigma_m[new].reshape(-1) ** 2
-        mean = np.concatenate([self.mean, np.zeros(3 * count)])
-        return FilterState(self.ticks, mean, covariance, np.concatenate([self.craters, index[new]]))
+        mean, slope = np.concatenate([self.mean, np.zeros(3 * count)]), self.slope
+        if slope is not None:
+            slope = Slope(np.pad(slope.mean, (0, 3 * count)), np.pad(slope.covariance, (0, 3 * count)))
+        return FilterState(self.ticks, mean, covariance, np.concatenate([self.craters, index[new]]), slope)
 
     def only_craters(self, keep: IntArray) -> FilterState:
         """Return the state without the craters that are not among the given ones."""
@@ -128,9 +144,20 @@ class FilterState:
             return self
         slots = SIZE + 3 * np.flatnonzero(kept)
         places = np.concatenate([np.arange(SIZE), (slots[:, None] + np.arange(3)).reshape(-1)])
-        return FilterState(
-            self.ticks, self.mean[places], self.covariance[np.ix_(places, places)], self.craters[kept]
-        )
+        both, slope = np.ix_(places, places), self.slope
+        if slope is not None:
+            slope = Slope(slope.mean[places], slope.covariance[both])
+        return FilterState(self.ticks, self.mean[places], self.covariance[both], self.craters[kept], slope)
+
+    def with_offset(self, old_m: float, new_m: float) -> FilterState:
+        """Return the state with the offset of the catalogue, east and north, scaled from one size to another."""
+        if old_m == new_m:
+            return self
+        scale = np.ones(self.mean.size)
+        scale[LEARNED] = new_m / old_m
+        both = scale[:, None] * scale
+        slope = None if self.slope is None else Slope(self.slope.mean * scale, self.slope.covariance * both)
+        return replace(self, mean=self.mean * scale, covariance=self.covariance * both, slope=slope)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,6 +180,9 @@ class Update:
     contradiction
         Squared normalised innovation of each sighting after the update with all the others, shape (n,): chi-square of
         two degrees of freedom.
+    score
+        Derivative of the log-likelihood of the innovations by the logarithm of the variance of the catalogue offset,
+        and its expected square; 0, 0 where that is not learned.
     """
 
     state: FilterState
@@ -163,6 +193,28 @@ class Update:
     attitude_sigma_rad: float
     rotation: RotationEvidence
     contradiction: FloatArray
+    score: tuple[float, float] = (0.0, 0.0)
+
+
+class KalmanFilter(Protocol):
+    """Prediction and correction of a filter state, as in this module; a replacement is a module with the same two."""
+
+    def predict(
+        self, state: FilterState, ticks: int, model: OrbitModel, errors: CommonErrors
+    ) -> FilterState | None: ...
+
+    def update(
+        self,
+        prior: FilterState,
+        camera_from_icrf: FloatArray,
+        mcmf_from_icrf: FloatArray,
+        landmarks: LandmarkMap,
+        index: IntArray,
+        uv_px: FloatArray,
+        variance_px2: FloatArray,
+        camera: PinholeCamera,
+        errors: CommonErrors,
+    ) -> Update | None: ...
 
 
 def initial_filter_state(
@@ -173,6 +225,7 @@ def initial_filter_state(
     sigma_velocity_m_s: float,
     markov_sigma_m_s2: tuple[float, float, float],
     errors: CommonErrors,
+    learns_offset: bool = False,
 ) -> FilterState:
     """Return the state that starts the filter: common errors as calibrated, with their full uncertainty."""
     mean = np.zeros(SIZE)
@@ -188,7 +241,12 @@ def initial_filter_state(
             np.array([errors.scale_sigma]),
         ]
     )
-    return FilterState(ticks, mean, np.diag(sigma**2), np.empty(0, dtype=np.int64))
+    state = FilterState(ticks, mean, np.diag(sigma**2), np.empty(0, dtype=np.int64))
+    if not learns_offset:
+        return state
+    by_size = np.zeros((SIZE, SIZE))
+    by_size[LEARNED, LEARNED] = state.covariance[LEARNED, LEARNED]
+    return replace(state, slope=Slope(np.zeros(SIZE), by_size))
 
 
 def predict(state: FilterState, ticks: int, model: OrbitModel, errors: CommonErrors) -> FilterState | None:
@@ -196,11 +254,23 @@ def predict(state: FilterState, ticks: int, model: OrbitModel, errors: CommonErr
     transition, mean, noise = transition_to(state, ticks, model, errors)
     if transition is None:
         return None
-    covariance = state.covariance.copy()
+    slope = state.slope
+    if slope is not None:
+        renewed = np.zeros_like(noise)
+        renewed[LEARNED, LEARNED] = noise[LEARNED, LEARNED]
+        moved = slope.mean.copy()
+        moved[:SIZE] = transition @ moved[:SIZE]
+        slope = Slope(moved, _carried(slope.covariance, transition, renewed))
+    return FilterState(ticks, mean, _carried(state.covariance, transition, noise), state.craters, slope)
+
+
+def _carried(covariance: FloatArray, transition: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return a covariance (n, n) after the transition (18, 18) of its first states with their noise, symmetric."""
+    covariance = covariance.copy()
     covariance[:SIZE] = transition @ covariance[:SIZE]
     covariance[:, :SIZE] = covariance[:, :SIZE] @ transition.T
     covariance[:SIZE, :SIZE] += noise
-    return FilterState(ticks, mean, 0.5 * (covariance + covariance.T), state.craters)
+    return np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)
 
 
 def burn(state: FilterState, delta_v_icrf_m_s: FloatArray, sigma_m_s: float) -> FilterState:
@@ -208,7 +278,7 @@ def burn(state: FilterState, delta_v_icrf_m_s: FloatArray, sigma_m_s: float) -> 
     mean, covariance = state.mean.copy(), state.covariance.copy()
     mean[VELOCITY] += delta_v_icrf_m_s
     covariance[VELOCITY, VELOCITY] += np.eye(3) * sigma_m_s**2
-    return FilterState(state.ticks, mean, covariance, state.craters)
+    return replace(state, mean=mean, covariance=covariance)
 
 
 def widened(state: FilterState, sigma_position_m: float, sigma_velocity_m_s: float) -> FilterState:
@@ -216,7 +286,7 @@ def widened(state: FilterState, sigma_position_m: float, sigma_velocity_m_s: flo
     covariance = state.covariance.copy()
     covariance[POSITION, POSITION] += np.eye(3) * sigma_position_m**2
     covariance[VELOCITY, VELOCITY] += np.eye(3) * sigma_velocity_m_s**2
-    return FilterState(state.ticks, state.mean, covariance, state.craters)
+    return replace(state, covariance=covariance)
 
 
 def transition_to(
@@ -305,7 +375,7 @@ def update(
     noise: FloatArray = np.diag(np.repeat(variance_px2, 2))
     mean = prior.mean
     for step in range(iterations):
-        current = FilterState(prior.ticks, mean, prior.covariance, prior.craters)
+        current = replace(prior, mean=mean)
         sighting = look(
             landmarks,
             index,
@@ -334,8 +404,9 @@ def update(
         moved = float(np.linalg.norm(mean[POSITION] - previous[POSITION]))
         if moved < _LINEAR_M and turned < _LINEAR_RAD:
             break
+    slope, score = _sloped(prior.slope, design, gain, spread, innovation)
     covariance = corrected_covariance(prior.covariance, design, gain, noise)
-    state = FilterState(prior.ticks, mean, covariance, prior.craters)
+    state = FilterState(prior.ticks, mean, covariance, prior.craters, slope)
     pose = pose_of(state, camera_from_icrf, mcmf_from_icrf)
     after = look(landmarks, index, pose, camera, state.shifts(index))
     attitude = np.r_[ATTITUDE, turn : turn + 3]
@@ -352,7 +423,32 @@ def update(
         float(np.sqrt(np.max(np.linalg.eigvalsh(left)))),
         rotation,
         _contradiction(spread, innovation),
+        score,
     )
+
+
+def _sloped(
+    slope: Slope | None, design: FloatArray, gain: FloatArray, spread: FloatArray, innovation: FloatArray
+) -> tuple[Slope | None, tuple[float, float]]:
+    """Return the derivatives after a measurement, and those of its log-likelihood: score and expected information.
+
+    References
+    ----------
+    Gupta, Mehra (1974), Computational aspects of maximum likelihood estimation, IEEE Trans. Automatic Control 19.
+    """
+    if slope is None:
+        return None, (0.0, 0.0)
+    crossed = slope.covariance @ design.T
+    both = np.column_stack([design @ crossed, -design @ slope.mean, innovation])
+    solved = np.linalg.solve(spread, both)
+    relative, moved, pull = solved[:, :-2], solved[:, -2], solved[:, -1]
+    changed = both[:, :-2]
+    score = 0.5 * float(pull @ changed @ pull - np.trace(relative)) - float(both[:, -2] @ pull)
+    information = 0.5 * float(np.sum(relative * relative.T)) + float(both[:, -2] @ moved)
+    mean = slope.mean + gain @ both[:, -2] + (crossed - gain @ changed) @ pull
+    across = gain @ crossed.T
+    covariance = slope.covariance - across - across.T + gain @ changed @ gain.T
+    return Slope(mean, 0.5 * (covariance + covariance.T)), (score, information)
 
 
 def _contradiction(spread: FloatArray, innovation: FloatArray) -> FloatArray:

@@ -78,7 +78,7 @@ class OdometryParameters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameFeatures:
-    """What the next frame needs of this one: pixels, ground places and the altitude they were scaled with."""
+    """Features of a frame for the next one: pixels, ground places and the altitude they were scaled with."""
 
     u_px: FloatArray
     v_px: FloatArray
@@ -98,7 +98,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OdometryState:
-    """Where the odometry believes to be, and all it remembers.
+    """Estimated position of the odometry, and its memory.
 
     Attributes
     ----------

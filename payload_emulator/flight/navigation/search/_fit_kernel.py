@@ -37,7 +37,7 @@ class Image(NamedTuple):
     half_px: FloatArray
 
 
-class Found(NamedTuple):
+class DetectedCraters(NamedTuple):
     """Detections: centres (k, 2), logarithms of diameters, variances of the centres per axis and scores, each (k,)."""
 
     uv_px: FloatArray
@@ -93,7 +93,7 @@ def fit_place(
     start: FloatArray,
     camera_from_enu: FloatArray,
     image: Image,
-    found: Found,
+    found: DetectedCraters,
     craters: Craters,
     attitude_sigma: float,
     gates: Gates,
@@ -153,7 +153,7 @@ def fit_place(
 
 @njit
 def log_evidence(
-    nearest: IntArray, seen: Seen, found: Found, image: Image, log_diameter_sigma: float
+    nearest: IntArray, seen: Seen, found: DetectedCraters, image: Image, log_diameter_sigma: float
 ) -> float:
     """Return how much likelier the detections are with the camera at a place than scattered, as a logarithm.
 
@@ -289,7 +289,7 @@ def _project(
 
 
 @njit
-def _choose(nearest: IntArray, seen: Seen, found: Found, gates: Gates, tolerance2: float) -> int:
+def _choose(nearest: IntArray, seen: Seen, found: DetectedCraters, gates: Gates, tolerance2: float) -> int:
     """Fill the crater of each detection with mutual nearest ones and return their number."""
     count, members = nearest.size, seen.log_diameter.size
     distance = np.full(count, np.inf)
@@ -323,7 +323,7 @@ def _normal_equations(
     theta: FloatArray,
     rotation: FloatArray,
     seen: Seen,
-    found: Found,
+    found: DetectedCraters,
     nearest: IntArray,
     attitude_sigma: float,
     focal_px: float,

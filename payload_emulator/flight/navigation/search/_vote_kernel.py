@@ -105,7 +105,7 @@ def vote(
 
     A crater seen under a known angle from a known altitude puts the camera on one place of the sphere. Each pair of
     a detection and a crater whose size fits adds the detection's weight to the four overlapping blocks about that
-    place, once per detection and tile: beside the edge of a tile one detection may count twice. The weight is the
+    place, once per detection and tile: near the edge of a tile one detection may count twice. The weight is the
     logarithm of how much rarer a chance vote is than a true one.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Where the camera is when the prediction is off by kilometres to tens of kilometres: votes over position and height.
+"""Search for the camera if the prediction is wrong by up to tens of kilometres: votes over position and height.
 
 Attitude is known to the ADCS's accuracy. A detection and a crater, taken as a pair, put the camera on the line of
 sight through the crater; at an assumed altitude that is one point. True pairs agree on the point, chance pairs
@@ -325,7 +325,7 @@ def _needed(
 ) -> int:
     """Return how many explained detections a fix of this search needs.
 
-    A fit has three free numbers, so besides the pair that fixes the place the second only fixes the altitude: the
+    A fit has three free numbers, so beyond the pair that fixes the place the second only fixes the altitude: the
     number of independent places is that of the cells of the search at the final tolerance, times altitude steps.
     """
     sighting = in_view(landmarks, best.pose, camera, 0.0)

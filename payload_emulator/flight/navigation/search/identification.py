@@ -1,4 +1,4 @@
-"""Which detection is which crater of the catalogue, around a predicted pose.
+"""Identification of detections with craters of the catalogue, around a predicted pose.
 
 The prediction errs by much the same amount for every crater of a frame, so craters are not gated one by one: each
 possible pair of a detection and a crater is taken as a hypothesis, the prediction is corrected by it, and the

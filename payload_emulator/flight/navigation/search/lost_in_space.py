@@ -1,4 +1,4 @@
-"""Where the camera is when nothing is known of its place.
+"""Search for the pose of the camera without any prior position.
 
 The camera looks down with a known heading, both only as well as the ADCS holds them; altitude is known to lie in an
 interval, and the place anywhere over the map. Every pair of a detection and a crater puts the camera on one place for
@@ -401,14 +401,20 @@ def _fitted(
     parameters: LostParameters,
 ) -> list[Place]:
     """Return places (MCMF), shape (n, 3), fitted to the detections they explain; those without three are left out."""
-    from payload_emulator.flight.navigation.search._fit_kernel import Craters, Found, Gates, Image, fit_place
+    from payload_emulator.flight.navigation.search._fit_kernel import (
+        Craters,
+        DetectedCraters,
+        Gates,
+        Image,
+        fit_place,
+    )
 
     landmarks = index.landmarks
     half_px = 0.5 * np.array([camera.width_px, camera.height_px], dtype=np.float64)
     image = Image(camera.focal_px, np.array(camera.centre_px), half_px)
     uv = np.stack([chosen.u_px, chosen.v_px], axis=1)
     score = np.nan_to_num(chosen.score, nan=_UNKNOWN_SCORE)
-    found = Found(uv, np.log(chosen.diameter_px), sigma_px**2, np.clip(score, _LEAST_SCORE, 1.0))
+    found = DetectedCraters(uv, np.log(chosen.diameter_px), sigma_px**2, np.clip(score, _LEAST_SCORE, 1.0))
     craters = Craters(
         landmarks.latitude_rad,
         landmarks.position_mcmf_m,

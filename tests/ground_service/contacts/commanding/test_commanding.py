@@ -376,13 +376,9 @@ def test_each_step_keeps_what_was_done_when_by_whom_and_tells_those_who_watch(
     release_command(ground, command, actor="bob")
     octets = DICTIONARY.pack_command("perform_function", START, sequence_count=0)
     expected |= {
-        "state": "released",
-        "decided_by": "bob",
-        "decided_utc_ns": NOW + 1,
-        "sequence_count": 0,
-        "octets": octets,
+        "state": "released", "decided_by": "bob", "decided_utc_ns": NOW + 1, "sequence_count": 0, "octets": octets,
         "request_id": int.from_bytes(octets[:4], "big"),
-    }
+    }  # fmt: skip
     row = get_command(ground, command).record
     assert {name: getattr(row, name) for name in expected} == expected
     clock(NOW + 2)
@@ -404,11 +400,8 @@ def test_a_rejection_keeps_its_reason(ground: Ground, clock: Callable[[int], Non
     reject_command(ground, command, actor="bob", reason="wrong cadence")
     row = get_command(ground, command).record
     assert (row.state, row.decided_by, row.decided_utc_ns, row.reason) == (
-        "rejected",
-        "bob",
-        NOW + 5,
-        "wrong cadence",
-    )
+        "rejected", "bob", NOW + 5, "wrong cadence",
+    )  # fmt: skip
     assert notes(ground, command)[1] == ("bob", "reject telecommand", {"reason": "wrong cadence"})
     assert told(ground)[-1] == {"id": command, "state": "rejected"}
 
@@ -477,11 +470,9 @@ def test_a_command_is_judged_by_reports_newer_than_those_known_when_it_was_sent(
     first = sent(ground)
     request = get_command(ground, first).record.request_id
     downlink(
-        ground,
-        tmp_path,
-        ("verification_accepted", 900, {"request_id": request}),
+        ground, tmp_path, ("verification_accepted", 900, {"request_id": request}),
         ("verification_completed", 1200, {"request_id": request}),
-    )
+    )  # fmt: skip
     assert get_command(ground, sent(ground)).record.sent_after_ticks == 1200
     other = enter_command(ground, "test_connection", {}, spacecraft_id=77, actor="ann")
     release_command(ground, other, actor="ann")
@@ -601,15 +592,9 @@ def test_a_telecommand_released_at_once_needs_an_approval_by_two_persons(
 
     def add(name: str, arguments: dict[str, Any]) -> int:
         return ground.write(
-            commanding.add_released,
-            vehicle,
-            name,
-            arguments,
-            actor="ann",
-            timeout_s=50,
-            window_id=3,
+            commanding.add_released, vehicle, name, arguments, actor="ann", timeout_s=50, window_id=3,
             approval=approval,
-        )
+        )  # fmt: skip
 
     def schedule() -> int:
         with ground.database.writing() as connection:
@@ -777,11 +762,7 @@ def test_reports_of_other_requests_do_not_count() -> None:
 
 def test_reports_are_in_order_of_time_stage_and_step() -> None:
     ordered = [
-        report(1, 110),
-        report(3, 110),
-        report(5, 120),
-        report(5, 120, step=1),
-        report(5, 120, step=2),
+        report(1, 110), report(3, 110), report(5, 120), report(5, 120, step=1), report(5, 120, step=2),
         report(7, 130),
-    ]
+    ]  # fmt: skip
     assert fate_of(COMMAND, ordered[::-1], 0).reports == tuple(ordered)

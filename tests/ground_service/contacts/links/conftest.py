@@ -13,7 +13,7 @@ from ground_service.contacts.links.runner import LinkRunner
 from ground_service.ground import Ground
 from ground_service.missions.service import add_mission
 
-PATIENCE_S = 900.0
+TIMEOUT_S = 900.0
 
 
 @dataclass
@@ -29,7 +29,7 @@ class Station:
     def __post_init__(self) -> None:
         threading.Thread(target=self._take_uplinks, daemon=True).start()
 
-    def accept(self, seconds: float = PATIENCE_S) -> socket.socket:
+    def accept(self, seconds: float = TIMEOUT_S) -> socket.socket:
         """Return the next telemetry connection of the service."""
         self.down.settimeout(seconds)
         connection, _ = self.down.accept()

@@ -715,13 +715,10 @@ def test_telecommands_do_not_wait_for_ever_for_those_of_another_link(
 @pytest.mark.parametrize(
     "change",
     [
-        ('format = "packets"', ""),
-        ('send = "manual"', ""),
-        ('instance = "twin"', ""),
-        ("", "released"),
+        ('format = "packets"', ""), ('send = "manual"', ""), ('instance = "twin"', ""), ("", "released"),
         ("", "ended"),
     ],
-)
+)  # fmt: skip
 def test_a_refused_transmission_is_given_to_no_link_that_cannot_send_it(
     either: Ground, station: Station, change: tuple[str, str]
 ) -> None:

@@ -40,22 +40,15 @@ def test_a_single_pass_has_no_interval_and_none_no_mean() -> None:
 @pytest.mark.parametrize(
     ("value", "name"),
     [
-        (19.999, "below 20 km"),
-        (20.0, "20 to 30 km"),
-        (39.0, "30 to 40 km"),
-        (40.0, "40 km and above"),
+        (19.999, "below 20 km"), (20.0, "20 to 30 km"), (39.0, "30 to 40 km"), (40.0, "40 km and above"),
         (NAN, "unknown"),
     ],
-)
+)  # fmt: skip
 def test_a_value_belongs_to_one_interval(value: float, name: str) -> None:
     assert interval_name(value, ALTITUDE_EDGES_KM, "km") == name
     assert interval_names(ALTITUDE_EDGES_KM, "km") == [
-        "below 20 km",
-        "20 to 30 km",
-        "30 to 40 km",
-        "40 km and above",
-        "unknown",
-    ]
+        "below 20 km", "20 to 30 km", "30 to 40 km", "40 km and above", "unknown",
+    ]  # fmt: skip
 
 
 def test_a_step_is_found_at_its_place_with_the_medians_of_both_sides() -> None:
@@ -112,11 +105,8 @@ def test_a_share_has_the_interval_of_wilson() -> None:
 def test_a_rolling_window_excludes_passes_of_its_length_ago() -> None:
     counts = rolling_counts([0, 10, 20, 21], ["met", "not met", "met", "unknown"], 20)
     assert counts == [
-        {"met": 1},
-        {"met": 1, "not met": 1},
-        {"met": 1, "not met": 1},
-        {"met": 1, "not met": 1, "unknown": 1},
-    ]
+        {"met": 1}, {"met": 1, "not met": 1}, {"met": 1, "not met": 1}, {"met": 1, "not met": 1, "unknown": 1},
+    ]  # fmt: skip
 
 
 def test_permutations_in_blocks_give_the_same_changes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from ground_service.evaluation.model import StoredReport
 from ground_service.evaluation.performance import service
 from ground_service.evaluation.performance.model import MonthlyReportFilter
 from ground_service.evaluation.performance.service import (
+    _consistency_remark,
     last_month,
     list_monthly_reports,
     make_due_report,
@@ -399,3 +400,24 @@ def test_operations_and_commands_give_the_same_report(
         run(["performance", "report", *spacecraft, "--month", "2029-10", "--out", str(tmp_path), *home]) == 2
     )
     assert "expected passes with a report, found none" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("key", "values", "remark"),
+    [
+        # Twelve passes, 36 degrees of freedom: 21.34 / 36 and 54.44 / 36 (tables of chi-square).
+        ("consistency.nees", [0.3] * 11 + [0.42], "mean 0.31 of 12 passes: sigmas 1.8 times too large"),
+        ("consistency.nees", [0.6] * 12, ""),
+        ("consistency.nees", [1.5] * 12, ""),
+        ("consistency.nees", [1.6] * 12, "mean 1.60 of 12 passes: sigmas 1.3 times too small"),
+        ("consistency.nees", [9.0], ""),
+        # Student's t: 0.7 +- 4.303 * 0.1 / sqrt(3) = 0.45 to 0.95, and 0.8 the same excludes nothing.
+        ("consistency.nis", [0.6, None, 0.7, 0.8], "mean 0.70 of 3 passes: sigmas 1.2 times too large"),
+        ("consistency.nis", [0.7, 0.8, 0.9], ""),
+        ("accuracy.median", [0.1] * 12, ""),
+    ],
+)
+def test_a_filter_is_judged_over_passes_by_both_bounds(
+    key: str, values: list[float | None], remark: str
+) -> None:
+    assert _consistency_remark(key, values) == remark

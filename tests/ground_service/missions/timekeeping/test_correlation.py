@@ -109,12 +109,10 @@ def reports_of_stations(
 @pytest.mark.parametrize(
     ("difference", "cause"),
     [
-        (37.0, ": TAI instead of UTC?"),
-        (-18.0, ": GPS time instead of UTC?"),
-        (1.0, ": a leap second?"),
+        (37.0, ": TAI instead of UTC?"), (-18.0, ": GPS time instead of UTC?"), (1.0, ": a leap second?"),
         (5.5, ""),
     ],
-)
+)  # fmt: skip
 @pytest.mark.parametrize("pattern", ["abababababababab", "bbbbaaaabbbbaaaa", "abcabcabcabcabca"])
 def test_a_station_whose_clock_is_wrong_is_named_and_left_out(
     pattern: str, difference: float, cause: str

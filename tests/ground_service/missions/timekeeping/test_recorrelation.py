@@ -128,12 +128,9 @@ def test_every_boot_gets_its_line_and_every_derived_time_names_it(
         assert row.drift_ppb == pytest.approx(-3000.0, abs=20.0)  # a tick (15 us) over 14 minutes is 18 ppb
         assert row.residual_rms_ns < 15_259
     key = define_pass(
-        ground,
-        name="p",
-        start_utc_ns=START - 60 * NS,
-        stop_utc_ns=START + REPORTS * 60 * NS,
+        ground, name="p", start_utc_ns=START - 60 * NS, stop_utc_ns=START + REPORTS * 60 * NS,
         spacecraft_id=SPACECRAFT,
-    )
+    )  # fmt: skip
     found = list_events(ground, key, Paging(limit=1000)).items
     np.testing.assert_allclose([event.time.utc_ns for event in found], spacecraft.sent, atol=20_000)
     assert [event.correlation_id for event in found] == [rows[0].id] * 15 + [rows[1].id] * 15

@@ -68,15 +68,8 @@ def alarms(ground: Ground, *states: str) -> list[Alarm]:
 
 def facts(alarm: Alarm) -> tuple[object, ...]:
     return (
-        alarm.name,
-        alarm.severity,
-        alarm.count,
-        alarm.active,
-        alarm.state,
-        alarm.value,
-        alarm.first,
-        alarm.last,
-    )
+        alarm.name, alarm.severity, alarm.count, alarm.active, alarm.state, alarm.value, alarm.first, alarm.last,
+    )  # fmt: skip
 
 
 def test_an_event_stays_raised_through_later_passes_until_it_is_acknowledged(

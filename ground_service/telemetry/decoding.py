@@ -14,13 +14,9 @@ import numpy as np
 from sqlalchemy import Connection
 
 from ground_service.ground import Ground
-from ground_service.ingest import store
-from ground_service.ingest.packets import batch_of_cut
 from ground_service.missions import store as missions
 from ground_service.missions.definitions import PacketDefinitions, packet_definitions
 from ground_service.missions.model import EPOCH_TAI, PacketTime
-from ground_service.store import parameters
-from ground_service.store.parameters import Decoding, StoredPackets, last_packet
 from ground_service.store.vehicles import (
     Vehicle,
     all_vehicles,
@@ -29,9 +25,13 @@ from ground_service.store.vehicles import (
     get_vehicle,
     lock_vehicle,
 )
+from ground_service.telemetry import values as parameters
+from ground_service.telemetry import writing
+from ground_service.telemetry.packets import batch_of_cut
+from ground_service.telemetry.values import Decoding, StoredPackets, last_packet
 from lunar.arrays import FloatArray, IntArray
+from lunar.constants import NS
 from lunar.timescales import (
-    NS,
     ONBOARD_EPOCH_TAI_NS,
     TICKS_PER_SECOND,
     parse_utc,
@@ -241,7 +241,7 @@ def _behind(vehicle: Vehicle) -> bool:
 
 def _begin(connection: Connection, vehicle: int, version: int) -> None:
     """Take away what this version gave, and note what is to be decoded: the packets that are there now."""
-    store.forget_samples(connection, vehicle, version)
+    writing.forget_samples(connection, vehicle, version)
     last = last_packet(connection, vehicle)
     change_vehicle(connection, vehicle, redecoding_version=version, redecoded_to=0, redecode_until=last)
 
@@ -262,7 +262,7 @@ def _go_on(ground: Ground, vehicle: int, dictionary: Dictionary) -> int:
 
 def _block(connection: Connection, vehicle: Vehicle, dictionary: Dictionary) -> int | None:
     """Decode the next packets; None when there are none left, which ends the re-decoding."""
-    ids, packets = store.packets_between(
+    ids, packets = writing.packets_between(
         connection, vehicle.id, vehicle.redecoded_to or 0, vehicle.redecode_until or 0, BLOCK_PACKETS
     )
     if not packets:
@@ -273,7 +273,7 @@ def _block(connection: Connection, vehicle: Vehicle, dictionary: Dictionary) -> 
         return None
     cut = whole_packets(np.array([len(octets) for octets in packets], dtype=np.int64))
     batch = batch_of_cut(b"".join(packets), cut, dictionary)
-    rows = store.store_samples(connection, vehicle.id, dictionary.version, batch.rows, ids)
+    rows = writing.store_samples(connection, vehicle.id, dictionary.version, batch.rows, ids)
     change_vehicle(connection, vehicle.id, redecoded_to=int(ids[-1]))
     return rows
 

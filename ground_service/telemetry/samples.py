@@ -1,4 +1,4 @@
-"""What the evaluation works on: decoded samples of one pass as plain arrays, on correlated UTC."""
+"""Decoded samples of one pass as plain arrays, on correlated UTC: the input of the evaluation."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class NavigationSamples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutcomeSamples:
-    """What one estimator made of each frame, in time order, arrays (n,); `anchor_reads` is cumulative."""
+    """Outcomes of one estimator by frame, in time order, arrays (n,); `anchor_reads` is cumulative."""
 
     estimator: str
     frame_number: IntArray

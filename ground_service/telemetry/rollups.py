@@ -17,8 +17,8 @@ from sqlalchemy import ColumnElement, Connection, LargeBinary, and_, bindparam, 
 
 from ground_service.store.models import HOUSEKEEPING, NAVIGATION_STATES, ROLLUPS
 from ground_service.store.repository import FEW_ROWS, insert_columns
-from ground_service.store.telemetry import sample_arrays
 from ground_service.store.vehicles import hold
+from ground_service.telemetry.store import sample_arrays
 from lunar.arrays import FloatArray, IntArray
 
 HOUSEKEEPING_VALUES = tuple(one.name for one in HOUSEKEEPING.c if not one.primary_key)
@@ -188,7 +188,7 @@ def rolled_extent(
     start_ticks: int,
     stop_ticks: int,
 ) -> tuple[int, int, int]:
-    """How many samples there are in the longest buckets that touch a span, and their first and last time."""
+    """Return the number of samples in the longest buckets that touch a span, and their first and last time."""
     width = width_ticks(LEVELS - 1)
     row = connection.execute(
         select(

@@ -1,4 +1,4 @@
-"""SQL of packets that mission descriptions define: definitions, progress of decoding, and values."""
+"""Values of parameters of declared packets: stored, read, and forgotten with their definition."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, LargeBinary, delete, func, select, update
 
-from ground_service.store import repository, rollups
+from ground_service.store import repository
 from ground_service.store.repository import insert_columns
+from ground_service.telemetry import rollups
 from lunar.arrays import FloatArray, IntArray
 from tmtc.packets.cuc import NO_TICKS
 

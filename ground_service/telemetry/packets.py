@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ground_service.ingest.core import NO_TIME
 from lunar.arrays import IntArray
-from lunar.constants import NANOSECONDS_PER_SECOND
+from lunar.constants import NS
 from lunar.timescales import utc_ns_from_ticks
 from tmtc.arrays import Octets, as_octets
 from tmtc.dictionary.estimates import ESTIMATE_PACKETS, filter_estimates
@@ -25,11 +24,14 @@ Columns = dict[str, Any]
 
 DIGEST_OCTETS = 16
 
-CLOCKS_AGREE_NS = 60 * NANOSECONDS_PER_SECOND
+CLOCKS_AGREE_NS = 60 * NS
 """Largest difference of the on-board clock from the reception time of its report, light time included.
 
 Two independent clocks that agree are believed. A larger difference is a wrong clock of the station, or a report that
 was played back from the store."""
+
+NO_TIME = -1
+"""Reception time of a CADU whose record states none."""
 
 _TIMED_HEADER = np.dtype(
     [("primary", "V6"), ("pus", "u1"), ("kind", "V6"), ("p_field", "u1"), ("coarse", ">u4"), ("fine", ">u2")]

@@ -1,0 +1,1 @@
+"""Telemetry archive: packets, samples, roll-ups and values of declared packets."""
