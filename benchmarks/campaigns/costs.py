@@ -104,88 +104,67 @@ def catalogue(rows: int) -> Iterator[bytes]:
         yield f"{k + 1},{place},{1000 + k % 3_000},0\n".encode()
 
 
-def zipped(**files: bytes) -> bytes:
-    """Return a zip file."""
+def zipped(name: str, octets: bytes, **others: bytes) -> bytes:
+    """Return a zip file of a file, and of others."""
     made = io.BytesIO()
     with zipfile.ZipFile(made, "w") as archive:
-        for name, octets in files.items():
-            archive.writestr(name.replace("_", "."), octets)
+        for one, content in {name: octets, **others}.items():
+            archive.writestr(one, content)
     return made.getvalue()
 
 
-def noise(mib: int) -> Iterator[bytes]:
-    """Yield a body of a size."""
-    yield from [os.urandom(1 << 20)] * mib
-
-
-def cases() -> dict[str, list[tuple[str, str, Any]]]:
-    """Return what is largest, path, and body (made when it is sent) of requests by operation."""
+def cases() -> list[tuple[str, str, str, Any]]:
+    """Return operation, what is largest, path, and body (made when it is sent) of requests."""
     region = {"latitude_deg": {"min": -60.0, "max": 60.0}, "west_deg": 300.0, "east_deg": 40.0}
     terms = {"windows": 100, "period_days": 1.0, "regions": [region] * 50}
     times = [{"ticks": (1 << 40) + 65_536 * 60 * k, "received": at(k / 1440)} for k in range(9_000)]
     points = [one | {"light_time_s": 1.3, "boot_count": 0} for one in times]
     link = '[[links]]\nname = "l{}"\nkind = "file"\ndownlink = "/nowhere"\n'
     described = (MISSION + "".join(map(link.format, range(14_000)))).encode()
-    search = {"spacecraft_id": 76, "start": at(0), "stop": at(31), "step_s": 30.0}
-    manifest = {
-        "schema_version": 1,
-        "pass_name": "p",
+    span = {"spacecraft_id": 76, "start": at(0), "stop": at(31)}
+    files = {f"images/{k}.png": {"sha256": f"{k:064x}", "bytes": 1} for k in range(15_000)}
+    manifest = {"schema_version": 1, "pass_name": "p", "spacecraft_id": 76, "cadence_s": 15.0, "files": files}
+    compared = {"candidate": "current", "archives": [f"{k:064x}" for k in range(14_000)]}
+    command = {
+        "name": "test_connection",
         "spacecraft_id": 76,
-        "start_utc": at(0),
-        "stop_utc": at(0.1),
+        "arguments": dict.fromkeys(map(str, range(60_000))),
     }
-    manifest |= {"cadence_s": 15.0, "frames_expected": 0}
-    manifest["files"] = {f"images/{k}.png": {"sha256": f"{k:064x}", "bytes": 1} for k in range(15_000)}
-    compared = {
-        "candidate": "current",
-        "baseline": "current",
-        "archives": [f"{k:064x}" for k in range(14_000)],
-    }
+    build = {"model": bytes(256 << 20)}
+    listed = json.dumps(manifest).encode()
     formats = "oem oem-xml aem spk ck spice sclk fk ik geojson gpkg czml parquet netcdf csv tum images"
     kinds = [f"{kind}?format={one}" for kind in ("housekeeping", "detections") for one in ("json", "csv")]
-    command = {"name": "test_connection", "spacecraft_id": 76}
-    build = {"build_toml": b'schema_version = 1\nname = "b"\n'}
-    return {
-        "upload_archive": [("256 MiB", "archives", lambda: noise(256))],
-        "upload_telemetry": [("1 GiB", "telemetry?spacecraft_id=76", lambda: noise(1024))],
-        "add_ephemeris": [
-            ("800,000 states", "ephemerides", lambda: circle(800_000, 2.0)),
-            ("96 MiB in one line", "ephemerides", lambda: b"X" * (96 << 20)),
-        ],
-        "add_catalogue": [(f"{ROWS_LIMIT:,} rows", "catalogues", lambda: b"".join(catalogue(ROWS_LIMIT)))],
-        "add_mission": [("1 MiB, 14,000 links", "missions", lambda: described)],
-        "check_mission": [
-            ("1 MiB, 14,000 links", "missions/check", lambda: described),
-            ("a plan", "missions/check?plan=true", MISSION.encode),
-        ],
-        "define_pass": [("", "passes", definition(PACKETS) | {"name": "again"})],
-        "export_pass": [(one, "exports", {"pass_id": 1, "format": one}) for one in formats.split()],
-        "search_windows": [
-            ("31 days", "windows/search", search),
-            ("with contacts", "windows/search", search | {"needs_contact": True, "minimum_battery": 0.3}),
-            ("with craters", "windows/search", search | {"craters_per_frame": 5.0}),
-        ],
-        "add_window": [("10 h at 10 Hz", "windows", search | {"stop": at(0.4), "cadence_s": 0.1})],
-        "change_window": [("a draft", "windows/1", {"state": "approved"})],
-        "add_request": [("50 regions", "requests", {"name": "r", "spacecraft_id": 76, **terms})],
-        "change_request": [("50 regions", "requests/1", {"terms": terms})],
-        "add_correlations": [("9,000 points", "spacecraft/76/correlations", {"points": points})],
-        "add_receptions": [("9,000 times", "spacecraft/76/receptions", {"receptions": times})],
-        "get_forecast": [("8 days", f"plan/forecast?spacecraft_id=76&start={at(0)}&stop={at(8)}", None)],
-        "list_contacts": [("31 days", f"contacts?since={at(0)}&until={at(31)}", None)],
-        "enter_telecommand": [
-            ("60,000 arguments", "telecommands", command | {"arguments": {f"k{k}": k for k in range(60_000)}})
-        ],
-        "add_build": [("256 MiB", "builds", lambda: zipped(**build, model_onnx=os.urandom(256 << 20)))],
-        "keep_archive": [
-            ("15,000 files", "regression-archives", lambda: zipped(manifest_json=json.dumps(manifest).encode()))
-        ],
-        "start_regression": [("14,000 archives", "regressions", compared)],
-        "start_analysis": [("14,000 archives", "analyses", compared)],
-        "get_packets": [(f"10,000 {one}", f"passes/1/packets/{one}", None) for one in kinds],
-        "list_newest_reports": [("100", "reports?" + "&".join(f"pass_id={k}" for k in range(1, 101)), None)],
-        "withdraw_ingest": [("all packets", "ingests/1/withdraw", {"reason": "measured"})],
-    }  # fmt: skip
+    return [
+        ("upload_archive", "256 MiB", "archives", lambda: iter([os.urandom(1 << 20)] * 256)),
+        ("upload_telemetry", "1 GiB", "telemetry?spacecraft_id=76", lambda: iter([os.urandom(1 << 20)] * 1024)),
+        ("add_ephemeris", "800,000 states", "ephemerides", lambda: circle(800_000, 2.0)),
+        ("add_ephemeris", "96 MiB in one line", "ephemerides", lambda: b"X" * (96 << 20)),
+        ("add_catalogue", f"{ROWS_LIMIT:,} rows", "catalogues", lambda: b"".join(catalogue(ROWS_LIMIT))),
+        ("add_mission", "1 MiB, 14,000 links", "missions", lambda: described),
+        ("check_mission", "1 MiB, 14,000 links", "missions/check", lambda: described),
+        ("check_mission", "a plan", "missions/check?plan=true", MISSION.encode),
+        ("define_pass", "", "passes", definition(PACKETS) | {"name": "again"}),
+        *(("export_pass", one, "exports", {"pass_id": 1, "format": one}) for one in formats.split()),
+        ("search_windows", "31 days", "windows/search", span),
+        ("search_windows", "with contacts", "windows/search", span | {"needs_contact": True, "minimum_battery": 0.3}),
+        ("search_windows", "with craters", "windows/search", span | {"craters_per_frame": 5.0}),
+        ("add_window", "10 h at 10 Hz", "windows", span | {"stop": at(0.4), "cadence_s": 0.1}),
+        ("change_window", "a draft", "windows/1", {"state": "approved"}),
+        ("add_request", "50 regions", "requests", {"name": "r", "spacecraft_id": 76, **terms}),
+        ("change_request", "50 regions", "requests/1", {"terms": terms}),
+        ("add_correlations", "9,000 points", "spacecraft/76/correlations", {"points": points}),
+        ("add_receptions", "9,000 times", "spacecraft/76/receptions", {"receptions": times}),
+        ("get_forecast", "8 days", f"plan/forecast?spacecraft_id=76&start={at(0)}&stop={at(8)}", None),
+        ("list_contacts", "31 days", f"contacts?since={at(0)}&until={at(31)}", None),
+        ("enter_telecommand", "60,000 arguments", "telecommands", command),
+        ("add_build", "256 MiB", "builds", lambda: zipped("build.toml", b"schema_version = 1", **build)),
+        ("keep_archive", "15,000 files", "regression-archives", lambda: zipped("manifest.json", listed)),
+        ("start_regression", "14,000 archives", "regressions", compared),
+        ("start_analysis", "14,000 archives", "analyses", compared),
+        *(("get_packets", f"10,000 {one}", f"passes/1/packets/{one}", None) for one in kinds),
+        ("list_newest_reports", "100 passes", "reports?" + "&".join(f"pass_id={k}" for k in range(1, 101)), None),
+        ("withdraw_ingest", "all packets", "ingests/1/withdraw", {"reason": "measured"}),
+    ]  # fmt: skip
 
 
 VALUES: dict[str, Any] = {
@@ -262,19 +241,18 @@ def measured(only: Sequence[str]) -> Iterator[Cost]:
                     downlink.write_bytes(mixed_downlink(PACKETS))
                     ingest_file(ground, downlink, spacecraft_id=76)
                     values = {**VALUES, "report_id": make_report(ground, 1).report_id}
-                special, part = cases(), service.parts["api 1"]
-                paths = client.get("openapi.json").json()["paths"]
+                part, paths = service.parts["api 1"], client.get("openapi.json").json()["paths"]
                 found = [(one, m, path[8:]) for path, methods in paths.items() for m, one in methods.items()]
                 found.sort(key=lambda one: (one[0]["operationId"] == "withdraw_ingest", one[1] == "delete"))
                 for described, method, path in found:
                     operation = described["operationId"]
-                    for case in special.get(operation) or [derived(path, described, values)]:
-                        if only and operation not in only:
-                            continue
-                        cost = measure(client, part, operation, method, case)
-                        if cost.fault and cost.status == 200:  # the first answer may compile kernels
+                    mine = [one[1:] for one in cases() if one[0] == operation]
+                    for case in mine or [derived(path, described, values)]:
+                        if not only or operation in only:
                             cost = measure(client, part, operation, method, case)
-                        yield cost
+                            if cost.fault and cost.status == 200:  # the first answer may compile kernels
+                                cost = measure(client, part, operation, method, case)
+                            yield cost
 
 
 def main(words: Sequence[str] | None = None) -> int:
