@@ -130,7 +130,6 @@ def cases() -> list[tuple[str, str, str, Any]]:
         "spacecraft_id": 76,
         "arguments": dict.fromkeys(map(str, range(60_000))),
     }
-    build = {"model": bytes(256 << 20)}
     listed = json.dumps(manifest).encode()
     formats = "oem oem-xml aem spk ck spice sclk fk ik geojson gpkg czml parquet netcdf csv tum images"
     kinds = [f"{kind}?format={one}" for kind in ("housekeeping", "detections") for one in ("json", "csv")]
@@ -157,7 +156,7 @@ def cases() -> list[tuple[str, str, str, Any]]:
         ("get_forecast", "8 days", f"plan/forecast?spacecraft_id=76&start={at(0)}&stop={at(8)}", None),
         ("list_contacts", "31 days", f"contacts?since={at(0)}&until={at(31)}", None),
         ("enter_telecommand", "60,000 arguments", "telecommands", command),
-        ("add_build", "256 MiB", "builds", lambda: zipped("build.toml", b"schema_version = 1", **build)),
+        ("add_build", "256 MiB", "builds", lambda: zipped("build.toml", b"", model=bytes(256 << 20))),
         ("keep_archive", "15,000 files", "regression-archives", lambda: zipped("manifest.json", listed)),
         ("start_regression", "14,000 archives", "regressions", compared),
         ("start_analysis", "14,000 archives", "analyses", compared),
