@@ -373,6 +373,6 @@ def _require_moon(file: Path, radius: float, c_bar: FloatArray, s_bar: FloatArra
     size = np.maximum(np.abs(c_bar), np.abs(s_bar)) * degree**2
     size[:2] = 0.0
     if size.max() > GRAVITY_TERM:
-        n, m = np.unravel_index(int(np.argmax(size)), size.shape)
+        n, m = map(int, np.unravel_index(int(np.argmax(size)), size.shape))
         found = f"{float(max(abs(c_bar[n, m]), abs(s_bar[n, m]))):.3g}"
         raise DataFileError(file, f"degree {n}, order {m}", f"at most {GRAVITY_TERM / n**2:.3g}", found)

@@ -287,7 +287,7 @@ def _coasts(windows: Sequence[SurveyWindow]) -> list[dict[str, Any]]:
     for least, most in zip(COAST_FRAMES, (*COAST_FRAMES[1:], math.inf), strict=True):
         mine = [one for one in windows if one.coast_sigmas is not None and least <= one.coast_frames < most]
         if mine:
-            inside = np.abs([one.coast_sigmas for one in mine]) <= 2.0
+            inside = np.abs([one.coast_sigmas or () for one in mine]) <= 2.0
             largest_m = max(one.coast_end_m or 0.0 for one in mine)
             share = float(np.mean(inside))
             rows.append(

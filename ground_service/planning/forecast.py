@@ -14,12 +14,12 @@ from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.model import Mission
 from ground_service.planning import service, store
 from ground_service.planning.core import Planner
-from ground_service.planning.filling import NS, Option, ResourceGrid, curves, violation
+from ground_service.planning.filling import Option, ResourceGrid, curves, violation
 from ground_service.planning.model import CraterDensity, PlanForecast, Span, Window, WindowConflict
 from ground_service.planning.window_states import COMMITTED
 from lunar.arrays import FloatArray
 from lunar.catalogue import CraterCatalogue
-from lunar.constants import MOON_RADIUS_M
+from lunar.constants import MOON_RADIUS_M, NS
 from lunar.timescales import format_utc
 
 LIMIT_S = 8 * 86_400

@@ -29,7 +29,7 @@ from ground_service.missions.model import Mission
 from ground_service.planning import service as planning
 from ground_service.planning import store
 from ground_service.planning.core import Constraints, Planner, data_octets, frames_between
-from ground_service.planning.filling import NS, Option, ResourceGrid, choose
+from ground_service.planning.filling import Option, ResourceGrid, choose
 from ground_service.planning.model import (
     PlannedCandidate,
     RequestPlan,
@@ -46,6 +46,7 @@ from ground_service.planning.store import RequestRecord
 from ground_service.planning.window_states import COMMITTED
 from ground_service.store.event_kinds import PlanChanged, RequestChanged, publish
 from ground_service.store.vehicles import get_vehicle, lock_spacecraft, vehicle_id
+from lunar.constants import NS
 from lunar.errors import EphemerisCoverageError, LunarError
 
 log = logging.getLogger(__name__)

@@ -433,9 +433,13 @@ def _compile(entries: Sequence[Entry], mark: str) -> list[_Step]:
         encoding = None if kind is None else kind.encoding
         offset = entry.offset
         plain = not entry.from_start and entry.condition is None
-        is_number = bits is not None and isinstance(encoding, (IntegerEncoding, FloatEncoding))
-        if plain and isinstance(offset, int) and is_number:
-            assert kind is not None
+        if (
+            plain
+            and isinstance(offset, int)
+            and kind is not None
+            and bits is not None
+            and isinstance(encoding, (IntegerEncoding, FloatEncoding))
+        ):
             if fields and encoding.calibration.contexts:  # they may ask for fields of the same stretch
                 close()
             if cursor + offset >= 0:

@@ -427,7 +427,7 @@ def _fates(
     )
     by_request: dict[int, list[VerificationReport]] = {}
     for row in reports:
-        by_request.setdefault(row.request_id, []).append(VerificationReport(*row))
+        by_request.setdefault(row.request_id, []).append(VerificationReport(*tuple(row)))
     copies = connection.execute(
         select(
             TELECOMMANDS.c.request_id,

@@ -9,11 +9,11 @@ from fastapi import Path, Query
 from ground_service.access.security import Operator, Viewer
 from ground_service.clock import mission_now_ns
 from ground_service.contacts.links import service
-from ground_service.contacts.links.core import NS
 from ground_service.contacts.links.model import Contacts, LinkStatus
 from ground_service.http.common import GroundOf
 from ground_service.http.model import PageOf, RequestTime
 from ground_service.http.requests import operations, problems
+from lunar.constants import NS
 
 links = operations("links")
 

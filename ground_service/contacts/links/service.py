@@ -19,7 +19,7 @@ from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.contacts.commanding import service as commanding
 from ground_service.contacts.commanding.store import count_released
 from ground_service.contacts.links import core, store
-from ground_service.contacts.links.core import NS, PredictedContact
+from ground_service.contacts.links.core import PredictedContact
 from ground_service.contacts.links.model import Contacts, LinkContact, LinkState, LinkStatus
 from ground_service.contacts.links.store import ContactRow, LinkRow, TransmissionRow
 from ground_service.errors import Conflict, InvalidInput, NotFound
@@ -33,6 +33,7 @@ from ground_service.missions.model import StationConnection
 from ground_service.missions.places import outages_of, station_of
 from ground_service.store.event_kinds import ContactEnded, ContactMissed, ContactStarted, LinkChanged, publish
 from ground_service.store.vehicles import get_vehicle, vehicle_id
+from lunar.constants import NS
 from lunar.errors import LunarError
 
 ACTOR = "link"

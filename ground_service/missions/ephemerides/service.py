@@ -261,7 +261,8 @@ def load_attitudes(path: Path, source: str = "attitude.csv") -> AttitudeTable:
         return _of_message("\n".join(lines), source)
     if not lines or lines[0] != HEADER:
         raise InvalidInput(source, "line 1", HEADER, repr(lines[0][:80]) if lines else "nothing")
-    ticks, quaternions = [], []
+    ticks: list[int] = []
+    quaternions: list[list[float]] = []
     for number, line in enumerate(lines[1:], 2):
         fields = line.split(",")
         try:
