@@ -68,8 +68,9 @@ CRATER_DEPTH_RATIO = Limit(0.003, 0.3, "")
 """Medians of depth over diameter: fresh simple craters have 0.20 (Pike 1977), those of 2 km or more in LU1319381 0.076,
 with 0.02 and 0.21 as first and last percentile."""
 
-CRATER_DEPTH = Limit(0.0, 0.5, "")
-"""Depth over diameter of any crater: the deepest of 222,447 in LU1319381 has 0.32."""
+CRATER_DEPTH = Limit(-0.1, 0.5, "")
+"""Depth over diameter of any crater: the deepest of 222,447 in LU1319381 has 0.32. Measured on a height raster, a worn
+crater on a hill has a floor above its rim."""
 
 LISTED_DEPTH_RATIO = Limit(0.45, 1.5, "")
 """Medians of depths measured on a height raster over those in a list: on GLD100 at 128 pixels per degree, which smooths
