@@ -2,7 +2,7 @@
 
 `python -m benchmarks.campaigns.costs [--only NAME ...] [--write]`: an API process on PostgreSQL without workers, so
 that jobs are added and not run, answers each operation of the API. An operation without a case is called with the
-largest value of each of its parameters. Memory is anonymous memory of the process. The exit status is 1 if an answer
+largest value of each of its parameters. Memory is that of the process. The exit status is 1 if an answer
 is above `MEMORY_MIB` or `PROCESSOR_S`, or is an internal error.
 `--write` stores the table in `docs/results/requests.md`.
 """
@@ -16,7 +16,6 @@ import os
 import re
 import sys
 import tempfile
-import threading
 import time
 import urllib.parse
 import zipfile
@@ -28,7 +27,7 @@ from typing import Any
 import httpx
 import numpy as np
 
-from benchmarks._ground_service import processor_s
+from benchmarks._ground_service import processor_s, resident_mib
 from benchmarks._servers import PostgresServer
 from benchmarks.campaigns._deployment import ManyApis
 from benchmarks.ground import START, definition, mixed_downlink
@@ -188,36 +187,19 @@ def derived(path: str, operation: Mapping[str, Any], values: Mapping[str, Any]) 
     return "largest page" if "limit" in query else "", f"{filled}?{urllib.parse.urlencode(query)}", body
 
 
-def anonymous_mib(part: Part) -> float:
-    """Return the anonymous memory of a process."""
-    lines = Path(f"/proc/{part.pid}/status").read_text().splitlines()
-    return int(next(one for one in lines if one.startswith("RssAnon")).split()[1]) / 1024
-
-
 def measure(client: httpx.Client, part: Part, name: str, method: str, case: tuple[str, str, Any]) -> Cost:
     """Send a request and return what it costs."""
     what, path, body = case
     given = {"json": body} if isinstance(body, Mapping) else {"content": body() if callable(body) else body}
-    resting, before = anonymous_mib(part), processor_s(part)
-    samples, done = [resting], threading.Event()
-
-    def watch() -> None:
-        while not done.wait(0.01):
-            samples.append(anonymous_mib(part))
-
-    watcher = threading.Thread(target=watch)
-    watcher.start()
-    try:
-        answer = client.request(method, path, **given)
-    finally:
-        done.set()
-        watcher.join()
-    spent, until = processor_s(part) - before, time.monotonic() + 30.0
-    while anonymous_mib(part) > resting + 32 and time.monotonic() < until:
+    Path(f"/proc/{part.pid}/clear_refs").write_text("5")  # the peak begins at the present memory
+    resting, before = resident_mib(part, "VmRSS"), processor_s(part)
+    answer = client.request(method, path, **given)
+    spent, peak = processor_s(part) - before, resident_mib(part, "VmHWM") - resting
+    until = time.monotonic() + 30.0
+    while resident_mib(part, "VmRSS") > resting + 32 and time.monotonic() < until:
         time.sleep(0.1)
     detail = answer.text[:200] if answer.status_code >= 400 else ""
-    kept = anonymous_mib(part) - resting
-    return Cost(name, what, answer.status_code, max(samples) - resting, kept, spent, detail)
+    return Cost(name, what, answer.status_code, peak, resident_mib(part, "VmRSS") - resting, spent, detail)
 
 
 def measured(only: Sequence[str]) -> Iterator[Cost]:
