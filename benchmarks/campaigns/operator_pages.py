@@ -50,17 +50,21 @@ def main(demo: str = "", pictures: str = "") -> int:
     return diary.close()
 
 
-def opened(page: Any, path: str) -> str:
-    """Open a page; return its text when it is filled."""
+def opened(page: Any, path: str, *named: str) -> str:
+    """Open a page; return its text when it has these words, or after a minute."""
     page.goto(path)
-    page.wait_for_timeout(QUIET_MS)
-    return str(page.locator("body").inner_text())
+    for _ in range(20):
+        page.wait_for_timeout(QUIET_MS)
+        text = str(page.locator("body").inner_text())
+        if all(one.lower() in text.lower() for one in named):
+            break
+    return text
 
 
 def look(diary: Diary, page: Any, width: int, pictures: str) -> None:
     """Look at the pages, which fit the screen, say where they are and link to help."""
     for name, (path, *named) in LOOKED_AT.items():
-        text = opened(page, path)
+        text = opened(page, path, *named)
         missing = [one for one in named if one.lower() not in text.lower()]
         diary.expect("B", f"{name} at {width} px says {', '.join(named)}", not missing, text)
         over = page.evaluate("document.scrollingElement.scrollWidth - innerWidth")
