@@ -69,8 +69,8 @@ CRATER_DEPTH_RATIO = Limit(0.003, 0.3, "")
 with 0.02 and 0.21 as first and last percentile."""
 
 CRATER_DEPTH = Limit(-0.1, 0.5, "")
-"""Depth over diameter of any crater: the deepest of 222,447 in LU1319381 has 0.32. Measured on a height raster, a worn
-crater on a hill has a floor above its rim."""
+"""Depth over diameter of any crater: the deepest of 222,447 in LU1319381 has 0.32. On a height raster, a
+crater under the ejecta or in the wall of another one has less than zero: -0.04 on the procedural Moon."""
 
 LISTED_DEPTH_RATIO = Limit(0.45, 1.5, "")
 """Medians of depths measured on a height raster over those in a list: on GLD100 at 128 pixels per degree, which smooths

@@ -21,7 +21,7 @@ from ground_service.ground import Ground
 from ground_service.ingest import frames, store
 from ground_service.ingest import recording_store as recordings
 from ground_service.ingest.core import Fragment, LinkContent, complete, join
-from ground_service.ingest.doubt_store import count_implausible, plausible_part
+from ground_service.ingest.doubt_store import count_implausible, plausible_part, withdraw_doubted
 from ground_service.ingest.frames import CADU_MAX_OCTETS, FrameReader, PacketReader, Section
 from ground_service.ingest.link_settings import known_before, packet_form
 from ground_service.ingest.model import IngestResult, ReceivedControlWords, ReceivedLink, ReceivedSection
@@ -468,7 +468,7 @@ class Reading:
             if spacecraft == mine and is_current and not self._definitions(spacecraft).declared:
                 continue
             catch_up(self.ground, vehicle)
-            decode_declared(self.ground, vehicle)
+            decode_declared(self.ground, vehicle, withdraw_doubted)
 
     def _result(self, totals: tuple[int, int, int]) -> IngestResult:
         """Return the result with the totals of `recording_store.count_stored`."""

@@ -270,7 +270,7 @@ def apply_definition(ground: Ground, vehicle: int) -> int:
 
     Packets without a checksum that no earlier description declared are not stored yet: the raw files are read again.
     """
-    stored = decode_declared(ground, vehicle)
+    stored = decode_declared(ground, vehicle, doubt_store.withdraw_doubted)
     with ground.database.reading() as connection:
         to_read = parameters.ingests_to_read(connection, vehicle)
     for ingest_id in to_read:
@@ -279,7 +279,7 @@ def apply_definition(ground: Ground, vehicle: int) -> int:
             run_ingest(ground, ingest_id)
     with ground.database.writing() as connection:
         parameters.note_read(connection, vehicle)
-    return stored + decode_declared(ground, vehicle)
+    return stored + decode_declared(ground, vehicle, doubt_store.withdraw_doubted)
 
 
 def decode_all_again(ground: Ground) -> int:

@@ -8,6 +8,7 @@ of the definition before it are read. Packets of APIDs without a definition stay
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -44,7 +45,7 @@ from tmtc.dictionary.schema import Dictionary
 from tmtc.packets.cuc import NO_TICKS, TICKS_LIMIT
 from tmtc.packets.packet_times import TimeCode, elapsed
 from tmtc.packets.stream import PacketCut, primary_headers, whole_packets
-from tmtc.xtce.decode import VERDICTS
+from tmtc.xtce.decode import DECODED, VERDICTS
 from tmtc.xtce.series import series_matrix
 
 BLOCK_PACKETS = 20_000
@@ -54,8 +55,15 @@ Samples = dict[int, tuple[IntArray, IntArray, FloatArray]]
 """Times (n,), packet ids (n,) and values (n, v) by container number."""
 
 
-def decode_declared(ground: Ground, vehicle: int) -> int:
-    """Decode the packets of a vehicle that the definition in force has not decoded; return the number of samples."""
+Judge = Callable[[Connection, int, IntArray, IntArray, int | None], IntArray]
+"""Keeps some packets apart, by their ids (n,), times (n,) and the newest declared time, and returns their ids."""
+
+
+def decode_declared(ground: Ground, vehicle: int, judge: Judge | None = None) -> int:
+    """Decode the packets of a vehicle that the definition in force has not decoded; return the number of samples.
+
+    `judge` keeps packets with an implausible time apart; None: all are believed.
+    """
     stored = 0
     while True:
         ground.check_stopping()
@@ -64,7 +72,7 @@ def decode_declared(ground: Ground, vehicle: int) -> int:
             if not definitions.declared and parameters.readable_decoding(connection, vehicle) is None:
                 return stored
         with ground.database.writing() as connection:
-            found = _next_block(connection, vehicle)
+            found = _next_block(connection, vehicle, judge)
         if found is None:
             return stored
         stored += found
@@ -86,7 +94,7 @@ def definitions_of_spacecraft(
     return packet_definitions(missions.get_mission(connection, mission_id)), mission_id
 
 
-def _next_block(connection: Connection, vehicle: int) -> int | None:
+def _next_block(connection: Connection, vehicle: int, judge: Judge | None = None) -> int | None:
     """Decode the next packets; None if none are left."""
     lock_vehicle(connection, vehicle)
     definitions, mission_id = definitions_in_force(connection, vehicle)
@@ -109,6 +117,15 @@ def _next_block(connection: Connection, vehicle: int) -> int | None:
         parameters.forget_others(connection, vehicle, definition)
         return None
     samples, counts = decoded_values(definitions, packets)
+    if judge is not None and samples:
+        ids, ticks = (np.concatenate([one[k] for one in samples.values()]) for k in (1, 0))
+        newest = parameters.newest_declared_ticks(connection, vehicle, definition, samples)
+        apart = judge(connection, vehicle, ids, ticks, newest)
+        for number, columns in samples.items() if apart.size else ():
+            kept = ~np.isin(columns[1], apart)
+            samples[number] = (columns[0][kept], columns[1][kept], columns[2][kept])
+        for apid in (packets.apids[packets.ids.index(one)] for one in apart.tolist()):
+            counts[apid][VERDICTS[DECODED]] -= 1
     stored = parameters.store_values(connection, vehicle, definition, samples)
     parameters.change(connection, vehicle, _with_counts(progress, packets.ids[-1], counts))
     return stored

@@ -245,6 +245,18 @@ def newest_values(
     return None if row is None else (int(row[0]), np.frombuffer(bytes(row[1]), VALUE))
 
 
+def newest_declared_ticks(
+    connection: Connection, vehicle: int, definition: int | None = None, containers: Collection[int] = ()
+) -> int | None:
+    """Return the greatest time of the samples of a vehicle, or of some containers; None without any."""
+    query = select(func.max(_SAMPLES.c.ticks)).where(_SAMPLES.c.vehicle_id == vehicle, _SAMPLES.c.ticks >= 0)
+    if definition is None:
+        return connection.execute(query).scalar()
+    query = query.where(_SAMPLES.c.definition_id == definition)
+    times = (connection.execute(query.where(_SAMPLES.c.container == one)).scalar() for one in containers)
+    return max((time for time in times if time is not None), default=None)
+
+
 def count_values(
     connection: Connection, vehicle: int, definition: int, container: int, start_ticks: int, stop_ticks: int
 ) -> int:

@@ -33,9 +33,7 @@ class Console:
     Attributes
     ----------
     answers
-        Functions that return the messages for words that ask the session.
-    stopping
-        Set by `quit`.
+        Functions of the session that return the answer to a word.
     ends_session
         Whether the session ends when the last connection ends.
     rate
@@ -44,8 +42,6 @@ class Console:
         Whether time stands still at the beginning or end of a contact until `run`.
     steps
         Steps by hand that are due.
-    until_ns
-        Time of the next pause; None: none.
     """
 
     answers: Mapping[str, Callable[[], dict[str, Any]]]

@@ -78,17 +78,11 @@ class Contacts:
     ----------
     names
         Stations that have ports.
-    planned_until_ns
-        End of the plan.
     keeps
         Whether stations keep records until they are acknowledged, and confirm transmissions.
     journal_file
         File of confirmed transmissions. A start from a state repeats those after it at their times, so that the session
         goes on as if the process had not ended.
-    stations
-        Ports of the stations, by name.
-    contact
-        Present contact; None between contacts.
     waiting
         Packets that waited for downlink when the contact began.
     """
@@ -150,7 +144,7 @@ class Contacts:
     def advance(self, spacecraft: Spacecraft, utc_ns: int) -> float:
         """Begin the contact that is due; return the seconds of contact since the step before."""
         if self.contact is None and self._planned and self._planned[0].start_utc_ns <= utc_ns:
-            self._begin(self._planned.popleft(), spacecraft, utc_ns)
+            self.begin(spacecraft, utc_ns, self._planned.popleft())
             return _FIRST_DOWNLINK_S
         if self.contact is None:
             return 0.0
@@ -158,14 +152,11 @@ class Contacts:
         self._last_step_ns = utc_ns
         return seconds
 
-    def begin_unlimited(self, spacecraft: Spacecraft, utc_ns: int) -> None:
-        """Begin a contact that has no end, with the station that always sees the spacecraft."""
+    def begin(self, spacecraft: Spacecraft, utc_ns: int, contact: StationContact | None = None) -> None:
+        """Begin a contact; None: one without an end, with the station that always sees the spacecraft."""
         empty = np.zeros(0)
-        contact = StationContact(ALWAYS_IN_CONTACT, utc_ns, UNLIMITED, empty.astype(np.int64), empty)
-        self._begin(contact, spacecraft, utc_ns)
-
-    def _begin(self, contact: StationContact, spacecraft: Spacecraft, utc_ns: int) -> None:
-        self.contact = contact
+        endless = StationContact(ALWAYS_IN_CONTACT, utc_ns, UNLIMITED, empty.astype(np.int64), empty)
+        self.contact = contact or endless
         self.waiting = spacecraft.payload.waiting
         self.account.contacts += 1
         self._last_step_ns = utc_ns

@@ -146,7 +146,7 @@ class LiveSession:
             if not self._is_continued:
                 self.utc_ns = self._slots[0].utc_ns
         if not self.contacts.is_limited and not self._is_continued:
-            self.contacts.begin_unlimited(self.spacecraft, self.utc_ns)
+            self.contacts.begin(self.spacecraft, self.utc_ns)
         self._clock = ClockFile(clock_file)
         self._clock.write(self.utc_ns)
         self._open_ports()
@@ -218,7 +218,7 @@ class LiveSession:
         if not slot.in_contact:
             contacts.end()
         elif contacts.contact is None:
-            contacts.begin_unlimited(spacecraft, self.utc_ns)
+            contacts.begin(spacecraft, self.utc_ns)
         receiver = spacecraft.receiver
         receiver.carrier = receiver.bit_lock = slot.in_contact
         telecommands = receiver.take(self._operator.telecommands(slot, spacecraft.payload.mode))
@@ -378,21 +378,18 @@ class LiveSession:
 
     def _finish_step(self, result: StepResult) -> None:
         """Count a step, send its packets to the station of the contact, and show it on consoles that watch."""
-        self._count(result)
-        self.contacts.send(result)
-        camera, watched = self.spacecraft.camera, self.console.is_watched
-        if watched:
-            self.console.show(step_message(self.spacecraft, result, camera.shown))
-        rendered = self.world.scenario.camera.images != "reduced"
-        camera.overlay = rims_in_view if watched and rendered else None
-
-    def _count(self, result: StepResult) -> None:
         account = self.account
         if result.exposure is not None and result.exposure.fault:
             account.images_lost += 1
             text = f"no image: {result.exposure.fault}"
             self.console.send({"kind": "fault", "utc": format_utc(self.utc_ns), "text": text})
         account.frames, account.resets = self.spacecraft.frames, len(self.spacecraft.resets)
+        self.contacts.send(result)
+        camera, watched = self.spacecraft.camera, self.console.is_watched
+        if watched:
+            self.console.show(step_message(self.spacecraft, result, camera.shown))
+        rendered = self.world.scenario.camera.images != "reduced"
+        camera.overlay = rims_in_view if watched and rendered else None
 
     # Ports
 

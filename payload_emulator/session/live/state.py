@@ -6,8 +6,8 @@ list that begins with its kind; a value that occurs again is `["ref", n]`, the n
 the last item of the document has their lengths, and equal ones are written once. Arrays keep their views: flight
 software holds views of the memory of its board, and a later fault of the memory has to reach it.
 
-Nothing in the file is executed: it names classes of this program, whose attributes are set without a call. A class or
-attribute that gets another name needs an entry in `RENAMED`, a new field a default; other changes a new `VERSION`.
+Nothing in the file is executed: it names classes of this program, whose attributes are set without a call.
+A class or attribute of the state that changes needs a new `VERSION`.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ import re
 import struct
 from collections import Counter, OrderedDict, deque
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, dataclass
+from dataclasses import dataclass
 from enum import Enum
 from io import BytesIO
 from pathlib import Path
-from types import MethodType
+from types import MethodType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,7 @@ import numpy as np
 from lunar.propagation import Trajectory
 from payload_emulator.errors import RecordError
 
-VERSION = 7
+VERSION = 8
 _HEADER = re.compile(rb"LINNA spacecraft state, version (\d{1,9}), SHA-256 ([0-9a-f]{64})\n")
 _EXPECTED = "the state of a spacecraft process (linna emulate --live --state)"
 _PACKAGES = ("payload_emulator", "lunar", "tmtc")
@@ -44,13 +44,6 @@ _PLAIN_NEW: object = object.__new__
 _MAPPINGS = (dict, Counter, OrderedDict)
 _UNSET = object()
 _CLOCK = struct.Struct("<q")
-_LOOP = "payload_emulator.session.spacecraft.loop"
-RENAMED = {
-    f"{_LOOP}:Given": f"{_LOOP}:PayloadInput",
-    f"{_LOOP}:Spacecraft.given": "payload_input",
-    "payload_emulator.session.live.session:Account": "payload_emulator.session.live.contacts:Account",
-}
-"""Present names of classes, and of attributes of classes, that states of this version may have by a former name."""
 
 
 def pack_state(scenario: str, values: Mapping[str, Any], known: Mapping[str, object]) -> bytes:
@@ -198,6 +191,8 @@ class _Writer:
             return ["trajectory", self.node(value.__self__)]
         if kind is np.random.Generator and isinstance(value.bit_generator, np.random.PCG64):
             return ["PCG64", self.node(dict(value.bit_generator.state))]
+        if kind is ModuleType and value.__name__.partition(".")[0] in _PACKAGES:
+            return ["module", value.__name__]
         if kind.__module__.partition(".")[0] in _PACKAGES and kind.__new__ is _PLAIN_NEW:
             self._classes[kind] = _name(kind), _slots(kind)
             return self._object(value)
@@ -279,6 +274,8 @@ class _Reader:
             if not isinstance(trajectory, Trajectory):
                 raise ValueError("expected a trajectory")
             return trajectory.state
+        if kind == "module":
+            return _module(rest[0])
         if kind == "PCG64":
             generator = np.random.Generator(np.random.PCG64(0))
             generator.bit_generator.state = self.value(rest[0])
@@ -301,14 +298,7 @@ class _Reader:
         made = _class(name, object)
         one = self._made[at] = object.__new__(made)
         for attribute, node in attributes:
-            object.__setattr__(one, RENAMED.get(f"{name}.{attribute}", attribute), self.value(node))
-        known: dict[str, Field[Any]] = getattr(made, "__dataclass_fields__", {})
-        if len(attributes) < len(known):
-            for key, field in known.items():  # fields that were added since the state was written
-                factory = field.default_factory
-                value = field.default if factory is MISSING else factory()
-                if value is not MISSING and not hasattr(one, key):
-                    object.__setattr__(one, key, value)
+            object.__setattr__(one, attribute, self.value(node))
         return one
 
 
@@ -323,14 +313,18 @@ def _name(kind: type) -> str:
 
 def _class(name: str, base: type) -> Any:
     """Return a class that a module of this program defines."""
-    name = RENAMED.get(name, name)
     module_name, _, place = name.partition(":")
-    if module_name.partition(".")[0] not in _PACKAGES:
-        raise ValueError(f"expected a class of this program, found {name}")
-    found = getattr(importlib.import_module(module_name), place)
+    found = getattr(_module(module_name), place)
     if not isinstance(found, type) or not issubclass(found, base) or _name(found) != name:
         raise ValueError(f"expected a class of {module_name}, found {place}")
     return found
+
+
+def _module(name: str) -> ModuleType:
+    """Import a module of this program."""
+    if name.partition(".")[0] not in _PACKAGES:
+        raise ValueError(f"expected a module of this program, found {name}")
+    return importlib.import_module(name)
 
 
 def _numeric(name: str) -> np.dtype[Any]:

@@ -18,6 +18,8 @@ from ground_service.app import create_app
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
+from ground_service.ingest.doubt_store import list_implausible
+from ground_service.ingest.model import ImplausibleFilter
 from ground_service.ingest.service import Place, decode_all_again, ingest_file, undecoded_vehicles
 from ground_service.missions import definitions
 from ground_service.missions import store as missions
@@ -26,6 +28,8 @@ from ground_service.missions.model import XTCE_COMPRESSED, Mission, PacketTime, 
 from ground_service.missions.service import add_mission, check_mission_file
 from ground_service.missions.store import packets_in_force
 from ground_service.passes import series
+from ground_service.passes.alarms.model import AlarmFilter
+from ground_service.passes.alarms.service import list_alarms
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.live import live_parameters
 from ground_service.passes.parameters import export_packets, pass_parameters
@@ -33,11 +37,11 @@ from ground_service.passes.service import completeness, define_pass, get_pass, p
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.telemetry import decoding
-from ground_service.telemetry.values import readable_decoding
+from ground_service.telemetry.values import newest_declared_ticks, readable_decoding
 from ground_service.toml import read_table
 from ground_service.worker import follow_up
 from ground_service.worker.integrity import verify
-from lunar.timescales import parse_utc, utc_ns_from_ticks
+from lunar.timescales import parse_utc, ticks_from_utc_ns, utc_ns_from_ticks
 from tests.serving import TestClient
 from tests.tmtc import foreign
 from tmtc.dictionary.payload import DICTIONARY
@@ -643,3 +647,31 @@ def test_a_long_document_is_embedded_compressed(ground: Ground, tmp_path: Path) 
     assert add_mission(ground, read_mission_file(path)).id == entered.id
     ingest_file(ground, downlink(tmp_path, bus_packets(5)))
     assert parameter_series(ground, define(ground), "VOLTAGE", 100).samples == 5
+
+
+def test_a_declared_packet_from_the_future_is_kept_apart_until_others_agree(
+    ground: Ground, tmp_path: Path
+) -> None:
+    enter(ground, tmp_path / "m")
+    rng = np.random.default_rng(7)
+    ingest_file(ground, downlink(tmp_path, bus_packets(40)))
+    pass_id = define(ground)
+    before = parameter_series(ground, pass_id, "VOLTAGE")
+    late = [at(foreign.housekeeping(rng, 40 + k), 3 * 86_400.0 + k) for k in range(12)]
+    for number, packets in enumerate(([at(foreign.housekeeping(rng, 99), 70 * 365 * 86_400.0)], late[:1])):
+        ingest_file(ground, downlink(tmp_path, packets, f"{number}.cadu"))
+    [one, other] = ground.read(list_implausible, ImplausibleFilter(limit=9)).items
+    assert (one.apid, other.apid) == (100, 100) and "after all other telemetry" in one.reason
+    assert parameter_series(ground, pass_id, "VOLTAGE") == before
+    assert alarm_names(ground) == {"implausible_time"}
+    ingest_file(ground, downlink(tmp_path, late[1:], "3.cadu"))
+    assert len(ground.read(list_implausible, ImplausibleFilter(limit=9)).items) == 1
+    assert newest_declared_ticks_of(ground) < int(ticks_from_utc_ns(START + 4 * 86_400 * NS))
+
+
+def alarm_names(ground: Ground) -> set[str]:
+    return {one.name for one in ground.read(list_alarms, AlarmFilter(limit=99, state=["raised"])).items}
+
+
+def newest_declared_ticks_of(ground: Ground) -> int:
+    return ground.read(newest_declared_ticks, 1) or 0

@@ -19,7 +19,7 @@ from ground_service.contacts.commanding.service import (
 )
 from ground_service.contacts.links import store as links
 from ground_service.errors import Conflict, StateConflict
-from ground_service.ground import Ground
+from ground_service.ground import Ground, open_ground
 from ground_service.ingest.core import fits_between, implausible_times
 from ground_service.ingest.doubt_store import list_implausible
 from ground_service.ingest.model import ImplausibleFilter
@@ -285,3 +285,42 @@ def test_a_lease_that_ended_in_a_standstill_is_renewed_with_its_state(either: Gr
         assert found is not None and (found.state, found.lease_utc_ns) == ("contact", 55)
         assert links.acquire(connection, "l", 76, "flight", wall_utc_ns=70, **given | {"owner": "b"})
         assert not links.acquire(connection, "l", 76, "flight", wall_utc_ns=10, **given)
+
+
+@pytest.mark.parametrize("ahead", [26 * HOUR, YEARS, 100 * (1 << 16) - TICKS])
+def test_a_detection_of_an_image_at_another_time_is_kept_apart(
+    ground: Ground, tmp_path: Path, ahead: int
+) -> None:
+    def detections(image_ticks: int, count: int) -> bytes:
+        none = {
+            name: np.zeros(0) for name in ("u_px", "v_px", "diameter_px", "score", "size_class", "sigma_px")
+        }
+        values = {"frame_number": count, "image_ticks": image_ticks, "image_quality": 0, "items": none}
+        return DICTIONARY.pack("detections", values, ticks=TICKS + (11 << 16), sequence_count=count)
+
+    assert receive(ground, tmp_path, contact() + detections(TICKS, 0)) == 0
+    before = hash_of(ground)
+    assert receive(ground, tmp_path, detections(TICKS + ahead, 1)) == 1
+    assert hash_of(ground) == before and alarms(ground) == {"implausible_time": 1}
+    assert reasons(ground)[0].startswith("the time of its image is ")
+    receive(ground, tmp_path, report(TICKS + 12 * (60 << 16), 12))
+    assert len(reasons(ground)) == 1
+
+
+def test_a_day_with_disturbances_ends_with_the_archive_of_the_day_without(tmp_path: Path) -> None:
+    contacts = [contact(TICKS + 2 * HOUR * k, 12 * k) for k in range(12)]
+    with open_ground(tmp_path / "calm") as calm, open_ground(tmp_path / "disturbed") as disturbed:
+        for octets in contacts:
+            receive(calm, tmp_path, octets)
+        late = contacts.copy()
+        late[3], late[4], late[7], late[9] = late[4], late[3], late[9], late[7]
+        for k, octets in enumerate(late):
+            receive(disturbed, tmp_path, octets)
+            wrong = (TICKS + 26 * HOUR * (k + 2), YEARS + TICKS, (100 + k) << 16)[k % 3]
+            if k:
+                receive(disturbed, tmp_path, report(wrong, 4000 + k, temperature_c=99.0))
+            receive(disturbed, tmp_path, late[k // 2])
+        assert hash_of(disturbed) == hash_of(calm)
+        assert disturbed.read(newest_ticks, 1) == calm.read(newest_ticks, 1)
+        assert alarms(disturbed) == {"implausible_time": alarms(disturbed).get("implausible_time")}
+        assert len(reasons(disturbed)) == 11
