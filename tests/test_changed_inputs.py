@@ -38,12 +38,7 @@ from lunar.comparison import check_pointing
 from lunar.constants import NS
 from lunar.ephemeris import Ephemeris, clipped, ephemeris_from_states
 from lunar.errors import LunarError
-from lunar.frames import (
-    icrf_from_j2000,
-    load_orientation,
-    matrix_from_quaternion,
-    quaternion_from_matrix,
-)
+from lunar.frames import icrf_from_j2000, load_orientation, matrix_from_quaternion, quaternion_from_matrix
 from lunar.gravity import acceleration, builtin_gravity, load_gravity
 from lunar.messages.aem import AttitudeSegment, format_aem
 from lunar.messages.oem import format_oem
@@ -109,11 +104,7 @@ def orbit(change: str = "x") -> Ephemeris:
 def turning(t: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return states in axes that turn with the Moon."""
     angle, zero = 2.6617e-6 * (t + 3e5), np.zeros_like(t)
-    rows = [
-        [np.cos(angle), np.sin(angle), zero],
-        [-np.sin(angle), np.cos(angle), zero],
-        [zero, zero, zero + 1.0],
-    ]
+    rows = [[np.cos(angle), np.sin(angle), zero], [-np.sin(angle), np.cos(angle), zero], [zero, zero, zero + 1.0]]
     turned = np.einsum("ijn,nkj->nki", rows, x.reshape(-1, 2, 3)).reshape(-1, 6)
     turned[:, 3:5] += 2.6617e-6 * np.column_stack([turned[:, 1], -turned[:, 0]])
     return turned
@@ -141,9 +132,7 @@ def horizons(ephemeris: Ephemeris) -> str:
         strict=True,
     ):
         date = str(np.datetime64(count, "ns")).replace("-08-", "-Aug-").replace("T", " ")
-        rows.append(
-            f"{count / 864e11 + 2440587.5:.9f}, A.D. {date}, " + ", ".join(f"{v:.12e}" for v in state) + ","
-        )
+        rows.append(f"{count / 864e11 + 2440587.5:.9f}, A.D. {date}, " + ", ".join(f"{v:.12e}" for v in state) + ",")
     head = """Target body name: SELENITA (-85)                  {source: test}
 Center body name: Moon (301)                      {source: DE441}
 Output units    : KM-S
@@ -195,9 +184,7 @@ def pointing(path: Path) -> tuple[Any, str]:
     ephemeris = load_orbit(frames.ephemeris)
     check_pointing(ephemeris, frames.attitude_utc_ns, frames.q_wxyz)
     found = [(frames.camera_from_icrf(t), float(np.mean(frames.image(t)))) for t in frames.utc_ns.tolist()]
-    return np.concatenate(
-        [np.append(m, shade) for m, shade in found] + [(frames.utc_ns - START) / NS]
-    ), frames.words
+    return np.concatenate([np.append(m, shade) for m, shade in found] + [(frames.utc_ns - START) / NS]), frames.words
 
 
 def attitude_table() -> str:
@@ -232,10 +219,7 @@ HEADS = {
         f"POTFIELD 12 12  0 {GM:.14e} {RADIUS:.14e} 1.00000000000000e+00\n",
         "RECOEF  {:3d}{:3d}   {:21.14e}{:21.14e}\n",
     ),
-    "gravity pyshtools": (
-        f"{RADIUS:.6e}, {GM:.12e}, 2.66e-06, 12\n0, 0, 1.0, 0.0\n",
-        "{}, {}, {:.15e}, {:.15e}\n",
-    ),
+    "gravity pyshtools": (f"{RADIUS:.6e}, {GM:.12e}, 2.66e-06, 12\n0, 0, 1.0, 0.0\n", "{}, {}, {:.15e}, {:.15e}\n"),
 }
 
 
@@ -286,9 +270,7 @@ def list_text(name: str, column: str = "id", change: str = "v") -> str:
         columns["diameter_m"] = columns["diameter_m"] / 1e3
     kept = [k for k, head in enumerate(heads) if head]
     rows = zip(*(columns[NAMES[k]].tolist() for k in kept), strict=True)
-    return "\n".join(
-        [",".join(heads[k] for k in kept), *(",".join(f"{v:.9g}" for v in row) for row in rows), ""]
-    )
+    return "\n".join([",".join(heads[k] for k in kept), *(",".join(f"{v:.9g}" for v in row) for row in rows), ""])
 
 
 def catalogue_figures(path: Path) -> tuple[Any, str]:
@@ -367,17 +349,8 @@ def turned(path: Path) -> tuple[Any, str]:
 def labels() -> str:
     rng = np.random.default_rng(5)
     boxes = np.column_stack([rng.uniform(10, 400, (30, 2)), *[rng.uniform(9, 60, 30)] * 2]).tolist()
-    image = {
-        "id": 7,
-        "file_name": "a.png",
-        "width": 512,
-        "height": 480,
-        "sun_azimuth_deg": 30.0,
-        "pixel_m": 90.0,
-    }
-    listed = [
-        {"id": k, "image_id": 7, "category_id": 2 - (k % 3 > 0), "bbox": box} for k, box in enumerate(boxes)
-    ]
+    image = {"id": 7, "file_name": "a.png", "width": 512, "height": 480, "sun_azimuth_deg": 30.0, "pixel_m": 90.0}
+    listed = [{"id": k, "image_id": 7, "category_id": 2 - (k % 3 > 0), "bbox": box} for k, box in enumerate(boxes)]
     kinds = [{"id": 1, "name": "crater"}, {"id": 2, "name": "boulder"}]
     return json.dumps({"images": [image], "annotations": listed, "categories": kinds})
 
@@ -426,9 +399,7 @@ def seen(path: Path) -> tuple[Any, str]:
 
 
 def bus(folder: Path) -> Path:
-    types = x_tce.HEADER_TYPES + x_tce.calibrated(
-        "VOLT", 12, "unsigned", x_tce.default(x_tce.polynomial(-1.5, 0.25))
-    )
+    types = x_tce.HEADER_TYPES + x_tce.calibrated("VOLT", 12, "unsigned", x_tce.default(x_tce.polynomial(-1.5, 0.25)))
     types += (
         x_tce.integer("I20", 20, "twosComplement")
         + x_tce.floating("F32", 32)
@@ -442,9 +413,7 @@ def bus(folder: Path) -> Path:
     packet = x_tce.container("HK", list(names), "CCSDSPacket", x_tce.comparison("PKT_APID", 100))
     octets = b""
     for k in range(20):
-        body = ((100 + 7 * k) << 20 | (-5 * k & 0xFFFFF)).to_bytes(4, "big") + struct.pack(
-            ">fB", 1.5 * k, 1 + k % 2
-        )
+        body = ((100 + 7 * k) << 20 | (-5 * k & 0xFFFFF)).to_bytes(4, "big") + struct.pack(">fB", 1.5 * k, 1 + k % 2)
         octets += struct.pack(">HHH", 100, 0xC000 | k, len(body) - 1) + body
     (folder / "bus.bin").write_bytes(octets)
     document = x_tce.document(types, x_tce.HEADER_PARAMETERS | names, x_tce.HEADER_CONTAINER + packet)
@@ -574,9 +543,7 @@ def change(reader: str, kind: str, place: str, new: str, path: Path) -> None:
         path.write_text(list_text(reader, place, new))
     elif kind == "column":
         path.write_text(
-            re.sub(
-                r"^\d+", lambda found: str(value(new, v=int(found[0]))), path.read_text(), flags=re.MULTILINE
-            )
+            re.sub(r"^\d+", lambda found: str(value(new, v=int(found[0]))), path.read_text(), flags=re.MULTILINE)
         )
     elif kind == "form":
         (polar if reader == "polar rasters" else write_form)(path, **value(f"dict({new})"))

@@ -33,18 +33,13 @@ def test_a_benchmark_states_its_ratio_to_the_build_before(
 ) -> None:
     def run(names: Sequence[str], root: Path = _rows.ROOT) -> Iterator[tuple[str, list[_rows.Row], str]]:
         now = root == _rows.ROOT
-        rows = [
-            _rows.Row("rate", 30.0 if now else 20.0, "packets/s"),
-            _rows.Row("time", 2.0 if now else 3.0, "ms"),
-        ]
+        rows = [_rows.Row("rate", 30.0 if now else 20.0, "packets/s"), _rows.Row("time", 2.0 if now else 3.0, "ms")]
         yield names[0], [*rows, _rows.Row("new", 1.0, "ms")] if now else rows, ""
 
     monkeypatch.setattr(_rows, "run", run)
     assert _rows.report(["tmtc"], as_json=False, before=tmp_path) == 0
     rate, time, new = capsys.readouterr().out.splitlines()[2:5]
-    assert rate.endswith("ratio to the build before: 1.50") and time.endswith(
-        "ratio to the build before: 1.50"
-    )
+    assert rate.endswith("ratio to the build before: 1.50") and time.endswith("ratio to the build before: 1.50")
     assert new.endswith("no peer")
     assert main(["tmtc", "--before", "no-such-commit"]) == 2
     assert capsys.readouterr().err == "benchmarks: expected a commit of this project, found no-such-commit\n"

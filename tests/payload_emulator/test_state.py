@@ -18,19 +18,8 @@ from payload_emulator.errors import RecordError
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.session.live.session import LiveSession
-from payload_emulator.session.live.state import (
-    VERSION,
-    load_state,
-    pack_state,
-    save_state,
-    unpack_state,
-)
-from payload_emulator.session.live.station_ports import (
-    JournalEntry,
-    StationPorts,
-    add_to_journal,
-    load_journal,
-)
+from payload_emulator.session.live.state import VERSION, load_state, pack_state, save_state, unpack_state
+from payload_emulator.session.live.station_ports import JournalEntry, StationPorts, add_to_journal, load_journal
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.spacecraft.loading import launch
 from payload_emulator.sim.board.faults import parse_fault

@@ -95,9 +95,7 @@ def test_the_same_report_again_is_kept_once(either: Ground, tmp_path: Path) -> N
     assert len(reasons(either)) == 1 and alarms(either) == {"implausible_time": 1}
 
 
-def test_the_archive_does_not_depend_on_whether_the_wrong_report_came_first(
-    either: Ground, tmp_path: Path
-) -> None:
+def test_the_archive_does_not_depend_on_whether_the_wrong_report_came_first(either: Ground, tmp_path: Path) -> None:
     receive(either, tmp_path, report(TICKS + DAY, 12, temperature_c=99.0))
     receive(either, tmp_path, report(5 << 16, 13, temperature_c=-99.0))
     assert "temperature_c" in alarms(either)
@@ -108,9 +106,7 @@ def test_the_archive_does_not_depend_on_whether_the_wrong_report_came_first(
     assert verify(either, rebuild=True).verdict == "intact"
 
 
-def test_the_next_contact_is_believed_and_puts_back_what_was_kept_apart(
-    either: Ground, tmp_path: Path
-) -> None:
+def test_the_next_contact_is_believed_and_puts_back_what_was_kept_apart(either: Ground, tmp_path: Path) -> None:
     receive(either, tmp_path, contact())
     assert receive(either, tmp_path, contact(TICKS + DAY, 1440, number=2)) == 2
     assert receive(either, tmp_path, contact(TICKS + DAY + (120 << 16), 1442)) == 0
@@ -125,17 +121,13 @@ def test_a_wrong_report_does_not_become_right_when_its_time_comes(ground: Ground
     assert len(reasons(ground)) == 1
 
 
-def test_a_clock_of_the_mission_believes_a_single_report_after_a_silence(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_a_clock_of_the_mission_believes_a_single_report_after_a_silence(ground: Ground, tmp_path: Path) -> None:
     receive(ground, tmp_path, contact())
     set_mission_clock(lambda: NOW + 86_400 * 10**9)
     assert receive(ground, tmp_path, report(TICKS + DAY, 12)) == 0
 
 
-def test_a_clock_that_was_not_set_and_a_stamp_from_the_past_are_kept_apart(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_a_clock_that_was_not_set_and_a_stamp_from_the_past_are_kept_apart(ground: Ground, tmp_path: Path) -> None:
     receive(ground, tmp_path, contact(TICKS - DAY))
     receive(ground, tmp_path, contact(TICKS, 1440))
     assert receive(ground, tmp_path, report(100 << 16, 1452)) == 1
@@ -186,9 +178,7 @@ def test_a_withdrawn_ingest_leaves_no_trace_but_its_record(either: Ground, tmp_p
     assert entry.detail["reason"] == "another flight"
 
 
-def test_telecommands_are_verified_again_after_a_foreign_flight_is_withdrawn(
-    either: Ground, tmp_path: Path
-) -> None:
+def test_telecommands_are_verified_again_after_a_foreign_flight_is_withdrawn(either: Ground, tmp_path: Path) -> None:
     def verification(ticks: int, request: int) -> bytes:
         values = {"request_id": request}
         return DICTIONARY.pack("verification_completed", values, ticks=ticks, sequence_count=0)
@@ -215,19 +205,13 @@ def test_reports_from_before_the_release_do_not_verify_a_telecommand(either: Gro
     take_uplink(either, spacecraft_id=76, actor="ann")
     request = get_command(either, key).record.request_id or 0
     late = {"request_id": request}
-    receive(
-        either,
-        tmp_path,
-        DICTIONARY.pack("verification_completed", late, ticks=TICKS - 2 * HOUR, sequence_count=1),
-    )
+    receive(either, tmp_path, DICTIONARY.pack("verification_completed", late, ticks=TICKS - 2 * HOUR, sequence_count=1))
     assert get_command(either, key).state == "sent"
 
 
 def test_reports_of_an_earlier_boot_do_not_verify_a_telecommand(either: Ground, tmp_path: Path) -> None:
     def completed(ticks: int) -> bytes:
-        return DICTIONARY.pack(
-            "verification_completed", {"request_id": request}, ticks=ticks, sequence_count=1
-        )
+        return DICTIONARY.pack("verification_completed", {"request_id": request}, ticks=ticks, sequence_count=1)
 
     request = 5
     receive(either, tmp_path, contact(boot=3) + completed(TICKS + HOUR // 2))
@@ -238,9 +222,7 @@ def test_reports_of_an_earlier_boot_do_not_verify_a_telecommand(either: Ground, 
     later = TICKS + HOUR
     receive(either, tmp_path, report(later, 900, boot=1) + completed(later + 9))  # of another flight
     assert get_command(either, key).state == "sent"
-    receive(
-        either, tmp_path, report(later + HOUR, 13, boot=4) + completed(later + HOUR + 9)
-    )  # after a reboot
+    receive(either, tmp_path, report(later + HOUR, 13, boot=4) + completed(later + HOUR + 9))  # after a reboot
     assert get_command(either, key).state == "completed"
 
 
@@ -254,11 +236,7 @@ def test_commanding_starts_from_the_count_that_the_payload_reports(either: Groun
     assert record.sequence_count == 42
     take_uplink(either, spacecraft_id=76, actor="ann")
     refused = {"request_id": record.request_id, "failure_code": "out_of_sequence"}
-    receive(
-        either,
-        tmp_path,
-        DICTIONARY.pack("verification_not_accepted", refused, ticks=TICKS + 9, sequence_count=0),
-    )
+    receive(either, tmp_path, DICTIONARY.pack("verification_not_accepted", refused, ticks=TICKS + 9, sequence_count=0))
     assert "send perform_function resynchronise_commands first" in get_command(either, key).remark
 
 
@@ -283,13 +261,9 @@ def test_a_lease_that_ended_in_a_standstill_is_renewed_with_its_state(either: Gr
 
 
 @pytest.mark.parametrize("ahead", [26 * HOUR, YEARS, 100 * (1 << 16) - TICKS])
-def test_a_detection_of_an_image_at_another_time_is_kept_apart(
-    ground: Ground, tmp_path: Path, ahead: int
-) -> None:
+def test_a_detection_of_an_image_at_another_time_is_kept_apart(ground: Ground, tmp_path: Path, ahead: int) -> None:
     def detections(image_ticks: int, count: int) -> bytes:
-        none = {
-            name: np.zeros(0) for name in ("u_px", "v_px", "diameter_px", "score", "size_class", "sigma_px")
-        }
+        none = {name: np.zeros(0) for name in ("u_px", "v_px", "diameter_px", "score", "size_class", "sigma_px")}
         values = {"frame_number": count, "image_ticks": image_ticks, "image_quality": 0, "items": none}
         return DICTIONARY.pack("detections", values, ticks=TICKS + (11 << 16), sequence_count=count)
 
