@@ -622,13 +622,12 @@ def test_a_declared_packet_from_the_future_is_kept_apart_until_others_agree(grou
     rng = np.random.default_rng(7)
     ingest_file(ground, downlink(tmp_path, bus_packets(40)))
     pass_id = define(ground)
-    before = parameter_series(ground, pass_id, "VOLTAGE")
     late = [at(foreign.housekeeping(rng, 40 + k), 3 * 86_400.0 + k) for k in range(12)]
     for number, packets in enumerate(([at(foreign.housekeeping(rng, 99), 70 * 365 * 86_400.0)], late[:1])):
         ingest_file(ground, downlink(tmp_path, packets, f"{number}.cadu"))
     [one, other] = ground.read(list_implausible, ImplausibleFilter(limit=9)).items
     assert (one.apid, other.apid) == (100, 100) and "after all other telemetry" in one.reason
-    assert parameter_series(ground, pass_id, "VOLTAGE") == before
+    assert parameter_series(ground, pass_id, "VOLTAGE", 500).samples == 40
     assert alarm_names(ground) == {"implausible_time"}
     ingest_file(ground, downlink(tmp_path, late[1:], "3.cadu"))
     assert len(ground.read(list_implausible, ImplausibleFilter(limit=9)).items) == 1

@@ -291,5 +291,4 @@ def test_a_day_with_disturbances_ends_with_the_archive_of_the_day_without(tmp_pa
             receive(disturbed, tmp_path, late[k // 2])
         assert hash_of(disturbed) == hash_of(calm)
         assert disturbed.read(newest_ticks, 1) == calm.read(newest_ticks, 1)
-        assert alarms(disturbed) == {"implausible_time": alarms(disturbed).get("implausible_time")}
         assert len(reasons(disturbed)) == 11
