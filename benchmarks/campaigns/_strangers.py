@@ -32,8 +32,8 @@ class Diary:
     def expect(self, kind: str, step: str, held: bool, found: object = "") -> bool:
         """Record a step, and a wrong turn if what the documents state did not happen."""
         self.steps += 1
-        told = "ok" if held else f"WRONG TURN {kind}, found {str(found)[-600:]}"
-        print(f"[{time.monotonic() - self.started:5.0f} s] {step}: {told}", file=sys.stderr, flush=True)
+        text = "ok" if held else f"WRONG TURN {kind}, found {str(found)[-600:]}"
+        print(f"[{time.monotonic() - self.started:5.0f} s] {step}: {text}", file=sys.stderr, flush=True)
         if not held:
             self.turns.append(f"{kind}: {step}; found {str(found)[-300:]}")
         return held

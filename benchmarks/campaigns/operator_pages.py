@@ -95,7 +95,7 @@ def operate(diary: Diary, page: Any) -> None:
         return
     path = f"/api/v1/windows/{windows[0]['id']}"
     opened(page, f"/planner?window={windows[0]['id']}")
-    for button, told, deed, states in (
+    for button, shown, deed, states in (
         ("Approve", "an image every", "Approve", ("approved",)),
         ("Uplink", "start observation", "Release", ("approved", "uplinked")),
         ("Take back", "telecommands", "Take back", ("failed", "cancelling")),
@@ -104,7 +104,7 @@ def operate(diary: Diary, page: Any) -> None:
         page.wait_for_timeout(QUIET_MS)
         dialog = page.get_by_role("dialog")
         asked = dialog.inner_text() if dialog.count() else "no question"
-        if not diary.expect("A", f"{button} asks first", told in asked, asked):
+        if not diary.expect("A", f"{button} asks first", shown in asked, asked):
             return
         dialog.get_by_role("button", name=deed, exact=True).click()
         page.wait_for_timeout(QUIET_MS)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 class Cells:
-    """What a program reads in our files (`samples`), and which values it writes to files of its own (`out`)."""
+    """Values that a program reads in our files (`samples`) and writes to files of its own (`out`)."""
 
     def __init__(self, samples, out):
         self.samples, self.out, self.entries = Path(samples), Path(out), []
