@@ -22,10 +22,7 @@ from ground_service.passes.archive_import import zip_folder
 from ground_service.settings import Settings
 from linna.errors import UsageError
 from linna.passes import Archive
-from tests.ground_service.conftest import (
-    SPHERICAL_ERROR_RTN_M,
-    free_port,
-)
+from tests.ground_service.conftest import SPHERICAL_ERROR_RTN_M, free_port
 from tests.ground_service.exports.conftest import FRAMES, RichPass
 from tmtc.errors import MissingLibrary
 
@@ -130,8 +127,7 @@ def test_a_source_of_no_kind_is_one_line(tmp_path: Path, name: str) -> None:
 
 
 def test_without_pandas_one_line_names_the_extra(
-    rich_ground: Ground,
-    monkeypatch: pytest.MonkeyPatch,
+    rich_ground: Ground, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usual = builtins.__import__
 
@@ -155,11 +151,7 @@ def test_a_notebook_is_stored_without_outputs_and_small(path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs(
-    path: Path,
-    rich_ground: Ground,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_notebook_runs(path: Path, rich_ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
     import nbformat  # two seconds, which the other tests need not spend
     from nbclient import NotebookClient
 

@@ -2,12 +2,13 @@
 
 import json
 import shutil
-import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pytest import approx, raises
 
 from ground_service.errors import EvaluationError, InvalidInput, NotFound, StateConflict
 from ground_service.evaluation.landmarks.core import (
@@ -86,21 +87,26 @@ def both_passes(ground: Ground, folder: Path) -> list[int]:
     return ids
 
 
+def landmarks(ground: Ground, **terms: str) -> list[Landmark]:
+    page = ground.read(list_landmarks, LandmarkFilter(limit=1000, **terms))
+    assert page.total == len(page.items)
+    return page.items
+
+
 def test_withheld_craters_become_proposals_at_their_places(either: Ground, thinned) -> None:
     folder, _, withheld = thinned
     first, second = both_passes(either, folder)
     update = update_landmarks(either, first)
     assert update.unmatched > update.places > 30 and update.controls > 30
     assert update.proposed == 0 and update.added == update.places  # one pass is not enough
-    assert {one.state for one in either.read(list_landmarks, LandmarkFilter(limit=1000)).items} == {"seen"}
+    assert {one.state for one in landmarks(either)} == {"seen"}
     # the detections of these passes are all half a pixel right and 1.25 pixels up of the craters
     assert update.offset_east_m is not None and update.offset_north_m is not None
     assert 60.0 < update.offset_east_m < 140.0 and 170.0 < update.offset_north_m < 340.0
     update = update_landmarks(either, second)
     assert update.added == 0 and update.proposed > 30
-    page = either.read(list_landmarks, LandmarkFilter(state="proposed", limit=1000))
-    proposed, total = page.items, page.total
-    assert total == len(proposed) == update.proposed
+    proposed = landmarks(either, state="proposed")
+    assert len(proposed) == update.proposed
     errors = np.array([distances_m(withheld, one).min() for one in proposed])
     sigma = np.array([np.hypot(one.sigma_east_m, one.sigma_north_m) for one in proposed])
     assert np.median(errors) < 60.0
@@ -108,7 +114,7 @@ def test_withheld_craters_become_proposals_at_their_places(either: Ground, thinn
     assert 0.77 < np.mean((errors / sigma) ** 2) < 2.3
     for one in proposed:
         nearest = int(np.argmin(distances_m(withheld, one)))
-        assert one.diameter_m == pytest.approx(withheld.diameter_m[nearest], rel=0.05)
+        assert one.diameter_m == approx(withheld.diameter_m[nearest], rel=0.05)
         assert one.passes == 2 and one.sightings >= 4 and one.looks >= one.sightings
         assert min(one.sigma_east_m, one.sigma_north_m, one.sigma_up_m) >= 20.0
 
@@ -140,7 +146,7 @@ def test_craters_of_the_full_list_are_not_proposed_where_the_catalogue_of_the_pa
         add_catalogue(ground, held, "list.csv")
         (tmp_path / "pass/mission.toml").write_text(MISSION + stated.format(held=held.sha256))
         updates = [update_landmarks(ground, one) for one in both_passes(ground, tmp_path / "pass")]
-        proposed = ground.read(list_landmarks, LandmarkFilter(state="proposed", limit=1000)).items
+        proposed = landmarks(ground, state="proposed")
     assert [one.listed > 15 for one in updates] == [listed, listed]
     found = {int(distances_m(withheld, one).argmin()) % 2 for one in proposed}
     assert len(proposed) > 15 and found == ({0} if listed else {0, 1})
@@ -155,30 +161,19 @@ def test_a_place_is_in_view_of_every_frame_that_saw_it(
     nowhere = "ground_service.evaluation.landmarks.core.in_view"
     monkeypatch.setattr(nowhere, lambda _, frames: np.zeros(len(frames.position_mcmf_m), dtype=np.bool_))
     update_landmarks(ground, first)
-    found = ground.read(list_landmarks, LandmarkFilter(limit=1000)).items
+    found = landmarks(ground)
     assert found and all(one.looks == one.sightings > 0 for one in found)
 
 
 def test_the_same_pass_from_two_processes_adds_each_landmark_once(either: Ground, thinned) -> None:
     folder, _, _ = thinned
     first, _ = both_passes(either, folder)
-    faults: list[Exception] = []
 
-    def search() -> None:
-        try:
-            update_landmarks(either, first)
-        except Exception as error:  # shown by the assertion below
-            faults.append(error)
-
-    threads = [threading.Thread(target=search) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert faults == []
-    page = either.read(list_landmarks, LandmarkFilter(limit=1000))
-    found, total = page.items, page.total
-    assert total == update_landmarks(either, first).places
+    with ThreadPoolExecutor(3) as pool:
+        for one in [pool.submit(update_landmarks, either, first) for _ in range(3)]:
+            one.result()
+    found = landmarks(either)
+    assert len(found) == update_landmarks(either, first).places
     assert {one.passes for one in found} == {1}
 
 
@@ -186,19 +181,23 @@ def test_only_proposed_landmarks_are_decided_and_decisions_remain(ground: Ground
     folder, _, _ = thinned
     first, second = both_passes(ground, folder)
     update_landmarks(ground, first)
-    seen = ground.read(list_landmarks, LandmarkFilter()).items[0]
-    with pytest.raises(StateConflict, match="proposed or rejected"):
-        decide_landmark(ground, seen.id, accept=True, reason="", actor="ann")
+    seen = landmarks(ground)[0].id
+
+    def decide(actor: str, accept: bool = True, key: int = seen) -> Landmark:
+        return decide_landmark(ground, key, accept=accept, reason="a rim in all frames", actor=actor)
+
+    with raises(StateConflict, match="proposed or rejected"):
+        decide("ann")
     update_landmarks(ground, second)
-    decided = decide_landmark(ground, seen.id, accept=True, reason="a rim in all frames", actor="ann")
+    decided = decide("ann")
     assert (decided.state, decided.decided_by, decided.reason) == ("accepted", "ann", "a rim in all frames")
-    with pytest.raises(StateConflict):
-        decide_landmark(ground, seen.id, accept=True, reason="", actor="bob")
+    with raises(StateConflict):
+        decide("bob")
     update_landmarks(ground, second)
-    assert get_landmark(ground, seen.id).state == "accepted"
-    assert decide_landmark(ground, seen.id, accept=False, reason="", actor="bob").decided_by == "bob"
-    with pytest.raises(NotFound):
-        decide_landmark(ground, 99_999, accept=True, reason="", actor="ann")
+    assert get_landmark(ground, seen).state == "accepted"
+    assert decide("bob", accept=False).decided_by == "bob"
+    with raises(NotFound):
+        decide("ann", key=99_999)
 
 
 def test_a_place_that_later_frames_do_not_see_again_is_not_proposed(
@@ -209,10 +208,10 @@ def test_a_place_that_later_frames_do_not_see_again_is_not_proposed(
     rewrite(folder, "first pass")
     first = import_archive(ground, folder)
     update_landmarks(ground, first)
-    before = {one.id: one.looks for one in ground.read(list_landmarks, LandmarkFilter(limit=1000)).items}
+    before = {one.id: one.looks for one in landmarks(ground)}
     complete = make_pass(frames=FRAMES, seed=4)
     update_landmarks(ground, import_archive(ground, complete.folder))
-    after = ground.read(list_landmarks, LandmarkFilter(limit=1000)).items
+    after = landmarks(ground)
     assert {one.state for one in after} == {"seen"} and {one.passes for one in after} == {1}
     assert all(one.looks > before[one.id] for one in after)
     blind = get_landmark(ground, after[0].id).evidence[1]
@@ -223,7 +222,7 @@ def test_a_pass_without_a_catalogue_is_refused_with_the_reason(ground: Ground, m
     folder = make_pass(frames=4).folder
     (folder / "catalogue.csv").unlink()
     rewrite(folder, "bare")
-    with pytest.raises(EvaluationError, match="expected a crater catalogue, found none"):
+    with raises(EvaluationError, match="expected a crater catalogue, found none"):
         update_landmarks(ground, import_archive(ground, folder))
 
 
@@ -235,18 +234,16 @@ def _place(east_m: float = 0.0, sigma_m: float = 50.0, diameter_m: float = 8000.
 def test_passes_that_agree_reduce_the_variance_but_not_what_is_common_to_them() -> None:
     """The error of the catalogue, and the 30 % of the variance that the detector repeats on every pass."""
     common = 20.0
-    sigma = float(np.hypot(100.0, common))
-    assert combined([_place(sigma_m=sigma)]).sigma_m[0] == pytest.approx(sigma)
-    four = combined([_place(sigma_m=sigma)] * 4)
-    assert four.sigma_m[0] == pytest.approx(np.sqrt(100.0**2 * (0.3 + 0.7 / 4.0) + common**2))
-    many = combined([_place(sigma_m=sigma)] * 10_000)
-    assert many.sigma_m[0] == pytest.approx(np.sqrt(0.3 * 100.0**2 + common**2), rel=0.01)
+    place = _place(sigma_m=float(np.hypot(100.0, common)))
+    for count in (1, 4, 10_000):
+        left = np.sqrt(100.0**2 * (0.3 + 0.7 / count) + common**2)
+        assert combined([place] * count).sigma_m[0] == approx(left)
 
 
 def test_passes_that_disagree_enlarge_the_uncertainty() -> None:
     apart = combined([_place(-300.0), _place(300.0)])
-    assert apart.longitude_rad == pytest.approx(0.0, abs=1e-12)
-    assert apart.sigma_m[0] == pytest.approx(np.hypot(300.0, 20.0), rel=0.01)
+    assert apart.longitude_rad == approx(0.0, abs=1e-12)
+    assert apart.sigma_m[0] == approx(np.hypot(300.0, 20.0), rel=0.01)
     assert apart.sigma_m[1] < 50.0
 
 
@@ -335,28 +332,24 @@ def test_the_anchoring_table_gets_accepted_landmarks_once_with_their_uncertainty
     assert table.ids.tolist() == [7, FIRST_ID + 1, FIRST_ID + 2]
     back = unpack_catalogue_table(pack_catalogue_table(table))
     assert back.sigma_m[1].tolist() == [80.5, 90.0, 300.0]  # rounded upwards
-    assert back.rim_height_m[1] == pytest.approx(-1200.5, abs=0.5)
+    assert back.rim_height_m[1] == approx(-1200.5, abs=0.5)
     assert len(extended_table(table, found)) == 3
-    with pytest.raises(InvalidInput, match="expected accepted landmarks, found none among 1"):
+    with raises(InvalidInput, match="expected accepted landmarks, found none among 1"):
         extended_table(_table(), [_landmark(3, "rejected")])
 
 
 def test_the_catalogue_gets_accepted_landmarks(tmp_path: Path) -> None:
-    base = load_catalogue(_catalogue_file(tmp_path))
+    path = tmp_path / "old.csv"
+    path.write_text(
+        "id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete\n5,1,2,6000,10,300,1\n"
+    )
+    base = load_catalogue(path)
     extended = extended_catalogue(base, [_landmark(1), _landmark(2, "seen")])
     save_catalogue(extended, tmp_path / "new.csv")
     again = load_catalogue(tmp_path / "new.csv")
     assert again.ids.tolist() == [5, FIRST_ID + 1]
-    assert np.degrees(again.latitude_rad[1]) == pytest.approx(11.0)
+    assert np.degrees(again.latitude_rad[1]) == approx(11.0)
     assert np.isnan(again.depth_m[1]) and again.complete.all()
-
-
-def _catalogue_file(folder: Path) -> Path:
-    path = folder / "old.csv"
-    path.write_text(
-        "id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete\n5,1,2,6000,10,300,1\n"
-    )
-    return path
 
 
 def test_labels_are_what_training_reads(tmp_path: Path) -> None:
@@ -370,12 +363,10 @@ def test_labels_are_what_training_reads(tmp_path: Path) -> None:
 def test_an_upload_puts_the_table_together_again_on_board() -> None:
     assert [name for name, _ in upload_entries(pack_catalogue_table(_table()), 3)] == ["uplink_last"]
     octets = bytes(range(256)) * 150
-    receiver, whole = LargeDataReceiver(), None
-    names = []
-    for count, (name, values) in enumerate(upload_entries(octets, 3)):
-        packed = DICTIONARY.pack_command(name, values, sequence_count=count)
-        command = DICTIONARY.unpack_command(packed)
+    receiver, names = LargeDataReceiver(), []
+    for count, entry in enumerate(upload_entries(octets, 3)):
+        command = DICTIONARY.unpack_command(DICTIONARY.pack_command(*entry, sequence_count=count))
         names.append(command.name)
         whole = receiver.accept(command.name, command.values)
     assert names == ["uplink_first", "uplink_middle", "uplink_last"]
-    assert whole is not None and whole.octets == octets and whole.transaction == 3
+    assert whole.octets == octets and whole.transaction == 3

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from pytest import approx
 
 from ground_service.evaluation.performance import core
 from ground_service.evaluation.performance.core import (
@@ -26,8 +27,8 @@ def test_a_mean_has_the_interval_of_students_t() -> None:
     level = mean_level([1.0, 2.0, NAN, 3.0])
     # t with 2 degrees of freedom at 0.975 is 4.302653 (table); standard error 1 / sqrt(3).
     assert (level.passes, level.mean) == (3, 2.0)
-    assert level.high - 2.0 == pytest.approx(4.302653 / math.sqrt(3.0), abs=1e-6)
-    assert 2.0 - level.low == pytest.approx(level.high - 2.0)
+    assert level.high - 2.0 == approx(4.302653 / math.sqrt(3.0), abs=1e-6)
+    assert 2.0 - level.low == approx(level.high - 2.0)
 
 
 def test_a_single_pass_has_no_interval_and_none_no_mean() -> None:
@@ -97,8 +98,8 @@ def test_a_share_has_the_interval_of_wilson() -> None:
     # Agresti and Coull, The American Statistician 52 (1998): 10 of 10 gives 0.722 to 1.
     share = wilson(10, 10)
     assert share.share == 1.0
-    assert share.low == pytest.approx(0.7225, abs=1e-4)
-    assert share.high == pytest.approx(1.0)
+    assert share.low == approx(0.7225, abs=1e-4)
+    assert share.high == approx(1.0)
     assert math.isnan(wilson(0, 0).share)
 
 
