@@ -119,7 +119,7 @@ package: docs
 	$(BIN)/python -m build --outdir dist
 
 bench: $(VENV)/.bench
-	$(BIN)/python -m benchmarks
+	$(BIN)/python -m benchmarks $(if $(BEFORE),--before $(BEFORE))
 
 mutation: $(VENV)/.mutation
 	$(BIN)/python -m benchmarks.mutation --sample $(SAMPLE) --seed $(SEED) $(if $(GROUP),--group $(GROUP))

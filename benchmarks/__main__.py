@@ -1,4 +1,4 @@
-"""`python -m benchmarks [NAME …] [--json]`: benchmarks, each compared with its named alternatives in the same run.
+"""`python -m benchmarks [NAME …] [--json] [--before COMMIT]`: benchmarks, each compared with its peers.
 
 Exit status 1: a benchmark did not finish, or a row contradicts the expectation. What takes longer than minutes (gate
 error rates, campaigns) has a command of its own and is not in this list. `python -m benchmarks rooms` prints the size
@@ -9,7 +9,7 @@ import argparse
 import sys
 
 from benchmarks import rooms
-from benchmarks._rows import measure, report
+from benchmarks._rows import NotMeasured, checkout, measure, report
 
 NAMES = (
     "tmtc", "downlink", "ground", "orbit", "render", "pages",
@@ -26,6 +26,7 @@ def main(words: list[str]) -> int:
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(NAMES))
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--before", metavar="COMMIT", help="add the ratio to this commit, run in turn")
     parser.add_argument("--rows-of", choices=NAMES, help=argparse.SUPPRESS)
     given = parser.parse_args(words)
     if given.rows_of:
@@ -34,7 +35,14 @@ def main(words: list[str]) -> int:
     if unknown := [name for name in given.names if name not in NAMES]:
         print(f"benchmarks: expected {', '.join(NAMES)}; found {', '.join(unknown)}", file=sys.stderr)
         return 2
-    return report(given.names or NAMES, as_json=given.json)
+    if not given.before:
+        return report(given.names or NAMES, as_json=given.json)
+    try:
+        with checkout(given.before) as before:
+            return report(given.names or NAMES, as_json=given.json, before=before)
+    except NotMeasured as error:
+        print(f"benchmarks: {error}", file=sys.stderr)
+        return 2
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """The running service under load: answers at a steady rate of requests, and memory while a long downlink streams in."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import os

@@ -1,16 +1,18 @@
 """Rows of a benchmark: a figure, its peer of the same run, and whether it contradicts the expectation."""
 
-from __future__ import annotations
-
 import importlib
+import io
 import json
 import shutil
 import subprocess
 import sys
+import tarfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 ROOT = Path(__file__).resolve().parent.parent
 LIMIT_S = 300.0
@@ -67,13 +69,33 @@ def needs(program: str, *names: str) -> str:
     return found
 
 
-def line(row: Row) -> str:
-    """Return a row as a line of the table."""
+@contextmanager
+def checkout(commit: str) -> Iterator[Path]:
+    """Yield a folder with the files of a commit of this project.
+
+    Raises
+    ------
+    NotMeasured
+        There is no such commit.
+    """
+    command = ["git", "-C", str(ROOT), "archive", commit]
+    packed = subprocess.run(command, capture_output=True, check=False)
+    if packed.returncode:
+        raise NotMeasured(f"expected a commit of this project, found {commit}")
+    with TemporaryDirectory(prefix="linna-before-") as folder:
+        with tarfile.open(fileobj=io.BytesIO(packed.stdout)) as files:
+            files.extractall(folder, filter="data")
+        yield Path(folder)
+
+
+def line(row: Row, before: float | None = None) -> str:
+    """Return a row as a line of the table, with how many times better it is than its figure before."""
+    earlier = replace(row, theirs=before).ratio
     peer = "no peer" if row.theirs is None else f"{row.peer}: {row.theirs:,.4g}"
     ratio = "" if row.ratio is None else f"{row.ratio:8.2f} x"
-    return f"{row.what:<58}{row.ours:>12,.4g} {row.unit:<14}{ratio:>10}  {peer}" + (
-        f"  DIFFERENT: {row.wrong}" if row.wrong else ""
-    )
+    since = "" if earlier is None else f"  ratio to the build before: {earlier:.2f}"
+    different = f"  DIFFERENT: {row.wrong}" if row.wrong else ""
+    return f"{row.what:<58}{row.ours:>12,.4g} {row.unit:<14}{ratio:>10}  {peer}{since}{different}"
 
 
 def measure(name: str) -> None:
@@ -85,8 +107,8 @@ def measure(name: str) -> None:
         print(json.dumps({"missing": str(missing)}), flush=True)
 
 
-def run(names: Sequence[str]) -> Iterator[tuple[str, list[Row], str]]:
-    """Run benchmarks one after the other, each in a process of its own.
+def run(names: Sequence[str], root: Path = ROOT) -> Iterator[tuple[str, list[Row], str]]:
+    """Run the benchmarks of a checkout one after the other, each in a process of its own.
 
     Yields
     ------
@@ -101,7 +123,7 @@ def run(names: Sequence[str]) -> Iterator[tuple[str, list[Row], str]]:
         command = [sys.executable, "-m", "benchmarks", "--rows-of", name]
         try:
             ended = subprocess.run(
-                command, cwd=ROOT, stdout=subprocess.PIPE, text=True, timeout=LIMIT_S, check=False
+                command, cwd=root, stdout=subprocess.PIPE, text=True, timeout=LIMIT_S, check=False
             )
         except subprocess.TimeoutExpired:
             yield name, [], f"did not finish in {LIMIT_S:.0f} s"
@@ -116,16 +138,20 @@ def run(names: Sequence[str]) -> Iterator[tuple[str, list[Row], str]]:
         yield name, rows, fault
 
 
-def report(names: Sequence[str], *, as_json: bool) -> int:
-    """Print the table of benchmarks; return 1 if one failed or a row contradicts the expectation."""
+def report(names: Sequence[str], *, as_json: bool, before: Path | None = None) -> int:
+    """Print the table of benchmarks; return 1 if one failed or a row contradicts the expectation.
+
+    Each benchmark is run in the checkout ``before`` in turn with this one.
+    """
     begun, failed, table = time.monotonic(), False, []
     for name, rows, fault in run(names):
         failed |= any(row.wrong for row in rows) or (bool(fault) and not fault.startswith("not measured"))
-        table.append(
-            {"benchmark": name, "rows": [{**asdict(row), "ratio": row.ratio} for row in rows], "fault": fault}
-        )
+        earlier = {one.what: one.ours for _, old, _ in run([name], before) for one in old} if before else {}
+        values = [{**asdict(row), "ratio": row.ratio, "before": earlier.get(row.what)} for row in rows]
+        table.append({"benchmark": name, "rows": values, "fault": fault})
         if not as_json:
-            print("\n".join([f"\n== {name}", *map(line, rows), *([fault] if fault else [])]), flush=True)
+            lines = [line(row, earlier.get(row.what)) for row in rows]
+            print("\n".join([f"\n== {name}", *lines, *([fault] if fault else [])]), flush=True)
     if as_json:
         print(json.dumps(table))
     else:

@@ -9,8 +9,6 @@ are compared with this number, and their octet accounting with the size of the s
 `--noise N`: N files of random octets instead; none may give a good frame or a packet.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import json

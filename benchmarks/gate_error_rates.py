@@ -6,8 +6,6 @@ faults are planted into what these builds sent. Each resampling draws windows wi
 the noise of baseline and candidate. Windows with fewer than 90 crater tracks are left out.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import pickle

@@ -6,8 +6,6 @@ server) and by the clock. `states`: down-sampled reads over one parameter, compa
 reads at a steady rate. `stream`: memory of the service while a long downlink comes in.
 """
 
-from __future__ import annotations
-
 import argparse
 import gc
 import json

@@ -8,8 +8,6 @@ Two kinds of mutant are left out because no test should detect them: the element
 choose anyway, and the wording of a message (a text with blanks).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

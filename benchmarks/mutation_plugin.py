@@ -5,8 +5,6 @@ it; here its calls are credited to every test that uses it, and its time to the 
 order of their time, so that a mutant dies early.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 from collections.abc import Generator

@@ -4,8 +4,6 @@ Rivals in the same run: the textbook recursion in numba, brahe (Rust) and heyoka
 coefficients and places, and SciPy's DOP853 over the same right-hand side.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import tempfile

@@ -6,8 +6,6 @@ for and its main thread is idle; the middle of the three is printed, with the pr
 took, which a busy machine does not stretch.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import shutil

@@ -8,8 +8,6 @@ file, the orientation of the Moon from SPICE (kernels in `LINNA_DATA`). Printed 
 the statistics of five reports, drawn by the seed: median, 95th percentile, maximum and end of pass.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import random

@@ -7,8 +7,6 @@ confidence, the stated share of the passes of a healthy payload lies within the 
 normal distribution). A limit of a mission description that is the bound, rounded outwards, is met by so many passes.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Sequence

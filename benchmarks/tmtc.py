@@ -5,8 +5,6 @@ a busy one changes it little. Slow rivals decode fewer packets of the same kind.
 with ours.
 """
 
-from __future__ import annotations
-
 import binascii
 import io
 import json

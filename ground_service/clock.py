@@ -5,8 +5,6 @@ depends on the time at the spacecraft: contacts, plans and windows. A mission de
 otherwise it is the wall clock.
 """
 
-from __future__ import annotations
-
 import mmap
 import struct
 import threading

@@ -8,8 +8,6 @@ A file of the cache is named after the hash of all that its machine code depends
 of the program share one folder. This is the only place that uses private parts of numba.
 """
 
-from __future__ import annotations
-
 import functools
 import gc
 import hashlib
@@ -105,9 +103,7 @@ event.register("numba:compile", _Collection())
 
 
 @contextmanager
-def compiling_ahead(
-    groups: Sequence[Sequence[str]], log: Callable[[str], None]
-) -> Iterator[Callable[[], None]]:
+def compiling_ahead(groups: Sequence[Sequence[str]], log: Callable[[str], None]) -> Iterator[Callable[[], None]]:
     """Compile the kernels of groups of modules that have no file, each group in a process of its own.
 
     Yields a function that waits for them and logs how many are done.  A kernel that fails there is compiled on its
@@ -166,10 +162,7 @@ def declared(group: Sequence[str]) -> Iterator[tuple[Any, tuple[Any, ...]]]:
         importlib.import_module(module)
         for kernel, text in _ahead.get(module, {}).values():
             values = eval(f"[{text}]", {**vars(types), **kernel.py_func.__globals__})
-            yield (
-                kernel,
-                tuple(BaseTuple.from_types(v, type(v)) if isinstance(v, tuple) else v for v in values),
-            )
+            yield (kernel, tuple(BaseTuple.from_types(v, type(v)) if isinstance(v, tuple) else v for v in values))
 
 
 class _KernelCache:

@@ -4,8 +4,6 @@ The allocator of glibc keeps a heap for each of many threads, and free memory be
 changing work without a leak. With another C library nothing is changed.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import threading

@@ -1,7 +1,5 @@
 """One example for each command, and the page of the documentation that explains an error."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -6,8 +6,6 @@ normalised, principal axes of DE430, without permanent tide.  Columns: n, m, C, 
 errors of these terms are about 1e-11).
 """
 
-from __future__ import annotations
-
 NAME = "GRGM1200L (12x12, built in)"
 GM_M3_S2 = 4.9028001218467998e12
 RADIUS_M = 1_738_000.0

@@ -1,7 +1,5 @@
 """Compiled search for the first craters that enter a widening field of view."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -9,8 +9,6 @@ its form (s sine, c cosine, 1 constant, T centuries since J2000), the multiplier
 of the mean longitudes of Venus, Earth, Mars and Jupiter, the amplitude.
 """
 
-from __future__ import annotations
-
 TERMS = """
 L 1 0 0 0 0 0 0 0 0 0 1698.1
 L T 0 0 0 0 0 0 0 0 0 5668.4

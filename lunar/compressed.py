@@ -1,7 +1,5 @@
 """Files that may be compressed: gzip, or a zip archive with one file, expanded to a bounded size."""
 
-from __future__ import annotations
-
 import gzip
 import zipfile
 import zlib

@@ -1,7 +1,5 @@
 """Physical constants in SI units, each with its source."""
 
-from __future__ import annotations
-
 MOON_RADIUS_M = 1_737_400.0
 """Radius of the reference sphere of lunar maps, height models and altitudes (IAU WGCCRE 2009 and 2015)."""
 

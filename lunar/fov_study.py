@@ -14,8 +14,6 @@ The paper, section V-B.3: fields of view from 10 to 160 degrees; the smallest wi
 craters.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ thirty waves a revolution, not from the root mean square and a correlation time,
 The densities below were measured on GRAIL's field with the method that the tests repeat (`measured_omission`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 Readers of files compare what they find with these limits; no other module repeats one of them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,8 +66,9 @@ CRATER_DEPTH_RATIO = Limit(0.003, 0.3, "")
 """Medians of depth over diameter: fresh simple craters have 0.20 (Pike 1977), those of 2 km or more in LU1319381 0.076,
 with 0.02 and 0.21 as first and last percentile."""
 
-CRATER_DEPTH = Limit(0.0, 0.5, "")
-"""Depth over diameter of any crater: the deepest of 222,447 in LU1319381 has 0.32."""
+CRATER_DEPTH = Limit(-0.1, 0.5, "")
+"""Depth over diameter of any crater: the deepest of 222,447 in LU1319381 has 0.32. On a height raster, a
+crater under the ejecta or in the wall of another one has less than zero: -0.04 on the procedural Moon."""
 
 LISTED_DEPTH_RATIO = Limit(0.45, 1.5, "")
 """Medians of depths measured on a height raster over those in a list: on GLD100 at 128 pixels per degree, which smooths

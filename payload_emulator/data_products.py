@@ -4,8 +4,6 @@ What is not known is left empty and said to be unknown; nothing here is guessed.
 gathered in November 2026 without opening the archives: each says where it comes from.
 """
 
-from __future__ import annotations
-
 import fnmatch
 from dataclasses import dataclass
 from typing import Literal

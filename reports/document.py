@@ -1,7 +1,5 @@
 """A report as a sequence of blocks, before it is HTML or PDF."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ ReportError
 └── UnknownReportKind    a value that no renderer is written for
 """
 
-from __future__ import annotations
-
 
 class ReportError(Exception):
     """Base of all errors raised by the reports."""

@@ -1,7 +1,5 @@
 """A report value as JSON: every field under its own name, the same bytes every time."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

@@ -1,20 +1,10 @@
 """Values of the document that repeats the figures and tables of the LINNA paper; conventions as in `reports.values`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 from reports.arrays import FloatArray
-from reports.values import (
-    ByteArray,
-    ClassScore,
-    GalleryFrame,
-    NavigationSeries,
-    ReportCommon,
-    TimeSpan,
-    TrackSeries,
-)
+from reports.values import ByteArray, ClassScore, GalleryFrame, NavigationSeries, ReportCommon, TimeSpan, TrackSeries
 
 
 @dataclass(frozen=True, slots=True)

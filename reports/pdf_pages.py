@@ -5,8 +5,6 @@ drawings of the HTML page in the light colours. Fonts are those that matplotlib 
 used, so the same document gives the same octets.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
@@ -149,9 +147,7 @@ def _plain(block: Block) -> dict[str, Any]:
         case Headline():
             return _headline(block)
         case Listing(title):
-            return _plain(
-                Paragraph(f"{title}: in full in the HTML and JSON forms of this report.", small=True)
-            )
+            return _plain(Paragraph(f"{title}: in full in the HTML and JSON forms of this report.", small=True))
         case _:
             return {"kind": type(block).__name__.lower(), **asdict(block)}
 

@@ -1,7 +1,5 @@
 """Small statistics of error series: lengths, quantiles, shares, bins, chi-squared bounds. NaN samples never count."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -99,12 +97,12 @@ def north_east_error_m(series: NavigationSeries, track: TrackSeries) -> tuple[Fl
     return north, east
 
 
-def containment(error: FloatArray, sigma: FloatArray, factor: float = 3.0) -> float:
-    """Share of finite samples within ``factor`` sigma, NaN where there is none."""
+def containment(error: FloatArray, sigma: FloatArray) -> float:
+    """Share of finite samples within 3 sigma, NaN where there is none."""
     usable = np.isfinite(error) & np.isfinite(sigma)
     if not usable.any():
         return math.nan
-    return float(np.mean(np.abs(error[usable]) <= factor * sigma[usable]))
+    return float(np.mean(np.abs(error[usable]) <= 3.0 * sigma[usable]))
 
 
 def cumulative(values: FloatArray, points: int = 300) -> tuple[FloatArray, FloatArray]:

@@ -1,7 +1,5 @@
 """The style of every report page: one sheet for screen (light and dark) and for A4 paper."""
 
-from __future__ import annotations
-
 from reports.figures.theme import DARK, LIGHT
 
 _PAGE = """

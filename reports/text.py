@@ -1,7 +1,5 @@
 """Numbers, times and counts as the reports print them."""
 
-from __future__ import annotations
-
 import math
 from datetime import UTC, datetime, timedelta
 

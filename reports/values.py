@@ -9,8 +9,6 @@ field is ``None`` or empty its section says that it is not available, with the r
 A report reads no clock: the same value gives the same octets.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field

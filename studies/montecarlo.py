@@ -5,8 +5,6 @@ with errors), and how the instruments err. One seed draws one run. Statistics co
 covariances that the filter claims: a filter whose noise is mistuned looks fine in its errors and fails here.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterable, Sequence

@@ -3,8 +3,6 @@
 The process noise of the filter is tuned on the track `tuning` only. The other tracks are held out.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 

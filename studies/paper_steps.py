@@ -4,8 +4,6 @@ A step is finished when `steps/NAME.json` states what it was made from and that 
 training) also continue from where they stopped.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping

@@ -5,8 +5,6 @@ filter). Windows are judged by their mean errors: errors within a window are alm
 of the windows of all seeds together. The first frames of a session, which starts with a large error, do not count.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Sequence

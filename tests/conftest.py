@@ -39,17 +39,7 @@ settings.load_profile("linna")
 
 
 # Libraries that no test needs before it runs: they cost each process seconds and hundreds of megabytes.
-HEAVY = (
-    "torch",
-    "astropy",
-    "scipy.stats",
-    "matplotlib",
-    "onnxscript",
-    "playwright",
-    "pandas",
-    "pyarrow",
-    "rasterio",
-)
+HEAVY = ("torch", "astropy", "scipy.stats", "matplotlib", "onnxscript", "playwright", "pandas", "pyarrow", "rasterio")
 IMPORTED = pytest.StashKey[list[str]]()
 
 
@@ -58,9 +48,7 @@ PASSED = Path(__file__).parents[1] / "build" / "campaigns.txt"
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the option that resumes the campaigns."""
-    parser.addoption(
-        "--resume", action="store_true", help="leave out campaigns that have passed, and note new ones"
-    )
+    parser.addoption("--resume", action="store_true", help="leave out campaigns that have passed, and note new ones")
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:

@@ -20,8 +20,7 @@ PACKAGES = (
 )  # fmt: skip
 _STRING = "|".join(rf"{q}(?:[^\\]|\\.)*?{q}" for q in ('"""', "'''", '"', "'"))
 TOKEN = re.compile(
-    rf"#[^\n]*|(?:\b[rRbBfFuU]{{1,2}})?(?:{_STRING})|{tokenize.Number}|{tokenize.Name}|{tokenize.Special}",
-    re.DOTALL,
+    rf"#[^\n]*|(?:\b[rRbBfFuU]{{1,2}})?(?:{_STRING})|{tokenize.Number}|{tokenize.Name}|{tokenize.Special}", re.DOTALL
 )
 """A comment or a code token, as `tokenize` cuts them; layout is passed over."""
 Sizes = dict[str, tuple[int, int]]
@@ -59,9 +58,7 @@ def sizes_of(root: Path) -> Sizes:
 
 def load_table(text: str) -> Sizes:
     """Return the limits by package from a table with the columns package, lines and tokens."""
-    return {
-        row["package"]: (int(row["lines"]), int(row["tokens"])) for row in csv.DictReader(io.StringIO(text))
-    }
+    return {row["package"]: (int(row["lines"]), int(row["tokens"])) for row in csv.DictReader(io.StringIO(text))}
 
 
 def above(sizes: Sizes, limits: Sizes) -> list[str]:
@@ -105,9 +102,7 @@ def main(arguments: list[str]) -> int:
     limits = load_table(TABLE.read_text(encoding="utf-8")) if TABLE.exists() else {}
     for package, (lines, tokens) in sizes.items():
         limit = limits.get(package, (0, 0))
-        print(
-            f"{package:18} {lines:7} lines ({lines - limit[0]:+}) {tokens:8} tokens ({tokens - limit[1]:+})"
-        )
+        print(f"{package:18} {lines:7} lines ({lines - limit[0]:+}) {tokens:8} tokens ({tokens - limit[1]:+})")
     if "--write" in arguments:
         rows = "".join(f"{package},{lines},{tokens}\n" for package, (lines, tokens) in sizes.items())
         TABLE.write_text("package,lines,tokens\n" + rows, encoding="utf-8")

@@ -23,22 +23,16 @@ def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
         "--no-cache",
     ]
     return subprocess.run(
-        command,
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
+        command, cwd=folder, capture_output=True, text=True, check=False,
         env={"PYTHONPATH": str(folder), "PATH": "/usr/bin:/bin", "COLUMNS": "300"},
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture()
 def copy_of_the_tree(tmp_path: Path) -> Path:
     for package in PACKAGES:
         shutil.copytree(
-            ROOT / package,
-            tmp_path / package,
-            ignore=shutil.ignore_patterns("__pycache__", "*.onnx", "static"),
+            ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__", "*.onnx", "static")
         )
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     return tmp_path
@@ -179,15 +173,10 @@ def test_a_planted_cycle_is_found(copy_of_the_tree: Path, module: str, planted: 
 SMALL = {
     f"ground_service.{name}"
     for name in (
-        "evaluation.landmarks.service",
-        "evaluation.performance.service",
-        "jobs.service",
-        "missions.ephemerides.service",
-        "passes.alarms.service",
-        "worker.condition",
-        "worker.integrity",
+        "evaluation.landmarks.service", "evaluation.performance.service", "jobs.service",
+        "missions.ephemerides.service", "passes.alarms.service", "worker.condition", "worker.integrity",
     )
-}
+}  # fmt: skip
 """Modules of small capabilities, which hold their SQL."""
 
 
@@ -247,9 +236,7 @@ def compiled_functions() -> list[tuple[Path, ast.FunctionDef]]:
             if "njit" not in text:
                 continue
             for node in ast.walk(ast.parse(text)):
-                if isinstance(node, ast.FunctionDef) and any(
-                    "njit" in ast.unparse(one) for one in node.decorator_list
-                ):
+                if isinstance(node, ast.FunctionDef) and any("njit" in ast.unparse(one) for one in node.decorator_list):
                     found.append((file, node))
     return found
 

@@ -45,16 +45,8 @@ def demo(scenario_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple
 def test_the_demo_prints_one_json_object_with_the_agreed_keys(demo) -> None:
     figures, _ = demo
     assert set(figures) >= {
-        "report",
-        "pass_id",
-        "frames",
-        "packets",
-        "packets_lost",
-        "detector",
-        "navigation",
-        "wall_s",
-        "data",
-    }
+        "report", "pass_id", "frames", "packets", "packets_lost", "detector", "navigation", "wall_s", "data",
+    }  # fmt: skip
     assert figures["frames"] == FRAMES
     assert figures["packets_lost"] == 0
     assert set(figures["detector"]) >= {"precision", "recall", "loc_px"}
@@ -67,14 +59,10 @@ def test_the_anchored_estimator_never_reads_the_anchor_ephemeris(demo) -> None:
     _, out = demo
     summary = json.loads((out / "pass" / "summary.json").read_text())
     assert summary["truth_reads_after_start"] == 0
-    assert (
-        summary["estimators"]["paper"]["anchor_reads_after_start"] >= FRAMES - 1
-    )  # the altitude, each frame
+    assert summary["estimators"]["paper"]["anchor_reads_after_start"] >= FRAMES - 1  # the altitude, each frame
 
 
-def test_the_emulators_score_and_the_grounds_report_agree_on_the_filter_and_the_smoother_is_shown(
-    demo,
-) -> None:
+def test_the_emulators_score_and_the_grounds_report_agree_on_the_filter_and_the_smoother_is_shown(demo) -> None:
     figures, out = demo
     score = json.loads((out / "pass" / "summary.json").read_text())["navigation"]["imaging_from_start"]
     flown = figures["navigation"]["anchored"]
@@ -87,13 +75,7 @@ def test_the_emulators_score_and_the_grounds_report_agree_on_the_filter_and_the_
 def test_the_manifest_hashes_what_lies_in_the_archive(demo) -> None:
     _, out = demo
     manifest = json.loads((out / "pass" / "manifest.json").read_text())
-    assert set(manifest["files"]) >= {
-        "downlink.cadu",
-        "reference.oem",
-        "truth.oem",
-        "catalogue.csv",
-        "summary.json",
-    }
+    assert set(manifest["files"]) >= {"downlink.cadu", "reference.oem", "truth.oem", "catalogue.csv", "summary.json"}
     for name, entry in manifest["files"].items():
         octets = (out / "pass" / name).read_bytes()
         assert (len(octets), hashlib.sha256(octets).hexdigest()) == (entry["bytes"], entry["sha256"])

@@ -15,10 +15,7 @@ def test_the_collection_imports_no_heavy_library(imported_while_collecting: list
     assert imported_while_collecting == []
 
 
-@pytest.mark.parametrize(
-    ("turns", "named"),
-    [(119.0, []), (121.0, ["a: 121 turns, limit 120"])],
-)
+@pytest.mark.parametrize(("turns", "named"), [(119.0, []), (121.0, ["a: 121 turns, limit 120"])])
 def test_a_folder_that_costs_a_fifth_more_than_the_table_is_named(turns: float, named: list[str]) -> None:
     assert cost.grown({"a": 100.0, "gone": 50.0}, {"a": turns}) == named
 
@@ -37,8 +34,7 @@ def test_what_was_measured_is_written_and_read_as_turns_by_folder(
     measured.files = Counter({"tests/b/test_x.py": 0.7, "tests/b/test_y.py": 0.5, "tests/a/test_z.py": 5.0})
     report: Any = SimpleNamespace(section=lines.append, write_line=lines.append)
     config: Any = SimpleNamespace(
-        args_source=pytest.Config.ArgsSource.TESTPATHS,
-        getoption={"keyword": "", "markexpr": "not campaign"}.get,
+        args_source=pytest.Config.ArgsSource.TESTPATHS, getoption={"keyword": "", "markexpr": "not campaign"}.get
     )
     measured.pytest_terminal_summary(report, config)
     assert cost.read(written) == {"tests/a": 10.0, "tests/b": 2.0}

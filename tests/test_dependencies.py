@@ -45,9 +45,7 @@ def version_of(pin: Requirement) -> str:
     return str(pin.specifier).removeprefix("==")
 
 
-def applies(
-    requirement: Requirement, python: str | None = None, extras: frozenset[str] = frozenset()
-) -> bool:
+def applies(requirement: Requirement, python: str | None = None, extras: frozenset[str] = frozenset()) -> bool:
     """Return whether a requirement holds for a version of Python (without one: for this)."""
     here = dict(default_environment())
     if python is not None:
@@ -95,8 +93,7 @@ def needed(python: str, files: tuple[str, ...]) -> dict[str, list[Requirement]]:
 
 @pytest.mark.parametrize("python", ["3.11.0", "3.11.2", "3.11.3", "3.12.0"])
 @pytest.mark.parametrize(
-    "files",
-    [("runtime",), ("runtime", "terrain"), ("runtime", "postgres", "parquet", "traces", "oidc", "objects")],
+    "files", [("runtime",), ("runtime", "terrain"), ("runtime", "postgres", "parquet", "traces", "oidc", "objects")]
 )
 def test_what_packages_require_is_pinned_for_every_python(files: tuple[str, ...], python: str) -> None:
     """An installation with hashes fails for a package without a pin, also one that only some versions need."""
@@ -146,9 +143,7 @@ HASHED = ("runtime", "postgres", "parquet", "traces", "oidc", "objects", "terrai
 def test_the_requirements_with_hashes_are_the_same_versions(name: str) -> None:
     text = (ROOT / "requirements" / "hashed" / f"{name}.txt").read_text().replace("\\\n", " ")
     entries = {name_of(line): line for line in text.splitlines() if line and not line.startswith("#")}
-    assert {key: Requirement(line.partition("--hash")[0].strip()) for key, line in entries.items()} == pins(
-        name
-    )
+    assert {key: Requirement(line.partition("--hash")[0].strip()) for key, line in entries.items()} == pins(name)
     for line in entries.values():
         assert re.fullmatch("(--hash=sha256:[0-9a-f]{64} *)+", line[line.index("--hash") :])
 
@@ -218,9 +213,7 @@ def osv() -> Iterator[str]:
         thread.join()
 
 
-def test_the_audit_finds_a_known_vulnerability(
-    osv: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_audit_finds_a_known_vulnerability(osv: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "a.txt"
     file.write_text("# packages\nbad==1.1\ngood==1.0 \\\n    --hash=sha256:00\n")
     assert materials.main(["audit", str(file), "--url", osv]) == 0

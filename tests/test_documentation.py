@@ -66,9 +66,7 @@ def test_the_service_shows_the_site_under_its_policy(site: Path, monkeypatch: py
     policy = answer.headers["Content-Security-Policy"]
     assert answer.media_type == "text/html; charset=utf-8" and "default-src 'none'" in policy
     inline = re.findall(rb"<script>(.*?)</script>", bytes(answer.body), re.DOTALL)
-    assert (
-        inline and policy.count("'sha256-") == len(set(inline)) and "script-src 'self' 'unsafe" not in policy
-    )
+    assert inline and policy.count("'sha256-") == len(set(inline)) and "script-src 'self' 'unsafe" not in policy
     for path in ("../pages.py", "no.html", "/etc/passwd"):
         with pytest.raises(pages.NotFound):
             pages.documentation_file(path)
@@ -87,21 +85,14 @@ def test_every_page_links_to_help_and_help_needs_no_build(monkeypatch: pytest.Mo
 
 def test_links_and_anchors_of_help_lead_to_what_is_there() -> None:
     found = {
-        one.relative_to(DOCS).as_posix(): pages.page_of(one.relative_to(DOCS).as_posix())
-        for one in DOCS.rglob("*.md")
+        one.relative_to(DOCS).as_posix(): pages.page_of(one.relative_to(DOCS).as_posix()) for one in DOCS.rglob("*.md")
     }
     for source, page in found.items():
         for target, anchor in re.findall(r'<a href="([^":#]*)(?:#([^"]*))?"', page):
             if target.startswith("/"):
                 continue
-            name = (
-                os.path.normpath(Path(source).parent / target).replace(".html", ".md") if target else source
-            )
-            assert (DOCS / name).exists() and (not anchor or f'id="{anchor}"' in found[name]), (
-                source,
-                target,
-                anchor,
-            )
+            name = os.path.normpath(Path(source).parent / target).replace(".html", ".md") if target else source
+            assert (DOCS / name).exists() and (not anchor or f'id="{anchor}"' in found[name]), (source, target, anchor)
 
 
 def test_spelling() -> None:
@@ -114,18 +105,14 @@ def test_spelling() -> None:
 
 def test_the_readme_has_the_tour_of_the_first_tutorial() -> None:
     (tour,) = [
-        m["text"]
-        for m in MARK.finditer((DOCS / "tutorials" / "first-pass.md").read_text())
-        if m["kind"] == "tour"
+        m["text"] for m in MARK.finditer((DOCS / "tutorials" / "first-pass.md").read_text()) if m["kind"] == "tour"
     ]
     assert tour in README
 
 
 def environment(home: Path) -> dict[str, str]:
     kept = {
-        name: value
-        for name, value in os.environ.items()
-        if name not in ("LINNA_DATA", "LINNA_HOME", "LINNA_SERVER")
+        name: value for name, value in os.environ.items() if name not in ("LINNA_DATA", "LINNA_HOME", "LINNA_SERVER")
     }
     return kept | {
         "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
@@ -147,9 +134,7 @@ def command_lines(text: str) -> list[list[str]]:
 
 @pytest.mark.parametrize("name", TUTORIALS)
 def test_the_commands_of_a_tutorial_are_accepted_by_the_parser(name: str) -> None:
-    marks = [
-        m for m in MARK.finditer((DOCS / "tutorials" / name).read_text()) if m["kind"] in ("run", "tour")
-    ]
+    marks = [m for m in MARK.finditer((DOCS / "tutorials" / name).read_text()) if m["kind"] in ("run", "tour")]
     commands = [words for mark in marks for words in command_lines(mark["text"])]
     assert commands
     for words in commands:
@@ -200,9 +185,7 @@ def test_the_workflow_of_the_ci_page_runs_with_short_passes(tmp_path: Path) -> N
     text = "\n".join(["set -e", *script]).replace("--out passes", "--frames 6 --out passes")
     with (tmp_path / "log").open("w") as log:
         known = environment(tmp_path / "data")
-        done = subprocess.run(
-            ["bash", "-c", text], cwd=tmp_path, env=known, stdout=log, stderr=log, check=False
-        )
+        done = subprocess.run(["bash", "-c", text], cwd=tmp_path, env=known, stdout=log, stderr=log, check=False)
     told = (tmp_path / "log").read_text()
     assert done.returncode == 0, told[-3000:]
     assert "pass: identical in every octet on 12 frames" in told
@@ -212,9 +195,7 @@ def test_the_workflow_of_the_ci_page_runs_with_short_passes(tmp_path: Path) -> N
 def _check_first_spacecraft(folder: Path) -> None:
     """Check report, archive, webhook and alarms of the spacecraft that was flown with the page alone."""
     names = ("summary", "archives", "alarms", "notification")
-    summary, archives, alarms, notified = (
-        json.loads((folder / f"{name}.json").read_text()) for name in names
-    )
+    summary, archives, alarms, notified = (json.loads((folder / f"{name}.json").read_text()) for name in names)
     assert (notified["trigger"], notified["pass_id"]) == ("report done", 1)
     assert summary["frames"] > 0 == summary["packets_lost"] == alarms["total"]
     assert {*summary["navigation"]} == {"spherical", "anchored"}
@@ -224,16 +205,14 @@ def _check_first_spacecraft(folder: Path) -> None:
 
 def test_the_table_of_changes_names_files_that_exist() -> None:
     table = (DOCS / "contributing.md").read_text().split("## Where do I change")[1].split("\n## ")[0]
-    named = re.findall(
-        r"`([\w./]+)`", " ".join(row.split("|")[2] for row in re.findall(r"^\| .*\|$", table, re.M))
-    )
+    named = re.findall(r"`([\w./]+)`", " ".join(row.split("|")[2] for row in re.findall(r"^\| .*\|$", table, re.M)))
     found = {name for name in named if (ROOT / name).exists() or [*ROOT.glob(f"ground_service/**/{name}")]}
     assert len(named) > 20 and {*named} - found == {"Command", "PAGES", "add_list"}
 
 
-@pytest.mark.parametrize("page", ["walks", "security"])
+@pytest.mark.parametrize("page", ["explanation/walks", "results/attempts"])
 def test_the_walks_and_attempts_name_functions_that_exist(page: str) -> None:
-    steps = re.findall(r"`([\w/]+\.py): (\w+)`", (DOCS / "explanation" / f"{page}.md").read_text())
+    steps = re.findall(r"`([\w/]+\.py): (\w+)`", (DOCS / f"{page}.md").read_text())
     gone = [
         (file, name)
         for file, name in steps
@@ -258,9 +237,7 @@ def test_the_animation_of_the_readme_shows_the_figures_of_the_text() -> None:
         shown = picture.info["comment"].decode()
     told = (DOCS / "tutorials" / "first-pass.md").read_text().split("```text\n")[1].split("```")[0].strip()
     assert shown == told
-    median, p95, level = re.findall(r"^anchored +(\d+) +(\d+) .*level (\d)", shown, re.MULTILINE | re.DOTALL)[
-        0
-    ]
+    median, p95, level = re.findall(r"^anchored +(\d+) +(\d+) .*level (\d)", shown, re.MULTILINE | re.DOTALL)[0]
     navigation = (DOCS / "navigation.md").read_text()
     assert f"| `linna demo` with `LINNA_DATA`, one window | {level} | {median} m | {p95} m |" in navigation
     for name in ("pass", "report", *docs_site.TOUR_PAGES, *docs_site.SHIFT_PAGES):

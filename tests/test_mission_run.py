@@ -53,9 +53,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Figures]:
 
 
 @pytest.mark.slow
-def test_six_hours_are_planned_flown_received_and_reported_without_a_person(
-    whole: tuple[Path, Figures],
-) -> None:
+def test_six_hours_are_planned_flown_received_and_reported_without_a_person(whole: tuple[Path, Figures]) -> None:
     folder, figures = whole
     said: list[str] = []
     windows = figures["windows"]
@@ -95,9 +93,7 @@ def assert_same_figures(one: dict[str, Any], other: dict[str, Any]) -> None:
 
 @pytest.mark.campaign
 def test_three_spacecraft_of_two_missions_have_the_figures_that_each_has_alone(tmp_path: Path) -> None:
-    other = commanded_scenario("other", "[clock]\noffset_s = -2.0\n").replace(
-        "[orbit]", "[orbit]\nraan_deg = 40.0"
-    )
+    other = commanded_scenario("other", "[clock]\noffset_s = -2.0\n").replace("[orbit]", "[orbit]\nraan_deg = 40.0")
     other = f'spacecraft = "Other"\nspacecraft_id = 78{other}'
     scenarios = [parse_scenario(text) for text in (SCENARIO, SECOND, other)]
     terms, folder = TERMS, tmp_path / "fleet"
@@ -132,9 +128,7 @@ def test_a_fleet_has_a_new_folder_and_different_spacecraft(tmp_path: Path) -> No
             run_fleet(fleet, DataFolder(None), tmp_path / "new", TERMS, lambda line: None)
 
 
-def test_the_spacecraft_whose_time_is_the_earliest_flies_and_its_time_is_that_of_the_service(
-    tmp_path: Path,
-) -> None:
+def test_the_spacecraft_whose_time_is_the_earliest_flies_and_its_time_is_that_of_the_service(tmp_path: Path) -> None:
     seen: list[tuple[str, int]] = []
     runs: list[Any] = [SimpleNamespace(clock_file=tmp_path / name) for name in ("a", "b")]
 
@@ -145,9 +139,7 @@ def test_the_spacecraft_whose_time_is_the_earliest_flies_and_its_time_is_that_of
             yield time
 
     try:
-        _take_turns(
-            runs, [flight(run, times) for run, times in zip(runs, ([5, 20, 30], [10, 15]), strict=True)]
-        )
+        _take_turns(runs, [flight(run, times) for run, times in zip(runs, ([5, 20, 30], [10, 15]), strict=True)])
     finally:
         set_mission_clock()
     assert seen == [("a", 5), ("b", 10), ("a", 20), ("b", 15), ("a", 30)]
@@ -177,11 +169,7 @@ def test_disturbances_change_the_spacecraft_and_not_what_the_ground_is_told(tmp_
     found = load_disturbances(path).apply(scenario)
     assert found.link.frame_loss == 0.25 and found.link.clock_errors == ("madrid 3600",)
     begin = [" ".join(one.split()[:2]).partition(".")[0] for one in found.link.missed]
-    assert begin == [
-        "madrid 2029-08-07T06:00:00",
-        "madrid 2029-08-07T20:00:00",
-        "canberra 2029-08-07T20:00:00",
-    ]
+    assert begin == ["madrid 2029-08-07T06:00:00", "madrid 2029-08-07T20:00:00", "canberra 2029-08-07T20:00:00"]
     assert found.link.outages == scenario.link.outages
     assert found.faults.events == ("clock_jump at 1800.0 size 1.0", "camera_dark at 600 for 60")
     assert found.attitude.knowledge_bias_deg == 0.2 and found.sensor.hot_pixels == 0.001
@@ -264,9 +252,7 @@ def test_a_wait_for_stored_telemetry_ends_with_an_error_or_with_all(
     assert set(spacecraft.orders) == {"state"}
 
 
-@pytest.mark.parametrize(
-    "text", ["", "[]", "{}", '{"posts": [], "unknown": 1}', '{"posts": [1]}', '{"posts": null}']
-)
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"posts": [], "unknown": 1}', '{"posts": [1]}', '{"posts": null}'])
 def test_the_folder_of_another_version_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     (tmp_path / "progress.json").write_text(text)
     with pytest.raises(ScenarioError, match=r"progress.json: expected .* start the run in a new folder$"):
@@ -293,10 +279,7 @@ def test_each_missing_window_has_the_reason_of_the_plan_of_its_day() -> None:
     note_plan(progress, plan, start)
     note_plan(progress, plan.model_copy(update={"candidates": [], "reason": night}), start)
     found = missing_windows([at[0].utc_ns, at[2].utc_ns, at[2].utc_ns], start, 2, 6, progress)
-    assert [(one["day"], one["missing"], one["reason"]) for one in found] == [
-        (0, 1, night),
-        (2, 2, "not known"),
-    ]
+    assert [(one["day"], one["missing"], one["reason"]) for one in found] == [(0, 1, night), (2, 2, "not known")]
     assert progress.not_entered["1"] == contact
 
 
@@ -401,11 +384,7 @@ def test_windows_are_requested_where_rasters_and_catalogue_describe_the_ground()
     assert inside_box(widened, *places).tolist() == [True, True, False]
 
 
-@pytest.mark.parametrize(
-    "words", [["--speed", "0"], ["--speed", "quick"], ["--window-min", "0.1"], ["--kill", "1"]]
-)
-def test_options_that_do_not_fit_are_refused_in_one_line(
-    words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("words", [["--speed", "0"], ["--speed", "quick"], ["--window-min", "0.1"], ["--kill", "1"]])
+def test_options_that_do_not_fit_are_refused_in_one_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["mission", "run", "selenita", "--days", "1", *words]) == 2
     assert capsys.readouterr().err.count("\n") == 1

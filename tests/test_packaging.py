@@ -44,12 +44,9 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("package")
     source = folder / "source"
     listed = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
+        ["git", "ls-files", "--cached", "--others", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True,
         check=True,
-    ).stdout.splitlines()
+    ).stdout.splitlines()  # fmt: skip
     for name in listed:
         if not name.startswith("tests/") and (ROOT / name).is_file():
             (source / name).parent.mkdir(parents=True, exist_ok=True)
@@ -58,13 +55,8 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     page = source / site / "tutorials" / "first-pass.html"
     page.parent.mkdir(parents=True)
     page.write_text("First pass")
-    code = (
-        "import setuptools.build_meta as b, sys; "
-        f"b.build_wheel({str(folder)!r}); b.build_sdist({str(folder)!r})"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=source, capture_output=True, text=True, check=False
-    )
+    code = f"import setuptools.build_meta as b, sys; b.build_wheel({str(folder)!r}); b.build_sdist({str(folder)!r})"
+    done = subprocess.run([sys.executable, "-c", code], cwd=source, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     return folder
 
@@ -168,9 +160,7 @@ filter_degree = 8
 @pytest.mark.slow
 def test_the_commands_of_the_tour_run_with_the_installed_wheel(installed: Path, tmp_path: Path) -> None:
     """The tour of the README on a short pass; the service answers on a free port."""
-    tour = re.findall(
-        r"^linna (?:demo|serve|plan|report) .*$", (ROOT / "README.md").read_text(), re.MULTILINE
-    )
+    tour = re.findall(r"^linna (?:demo|serve|plan|report) .*$", (ROOT / "README.md").read_text(), re.MULTILINE)
     (tmp_path / "short.toml").write_text(SHORT)
 
     def command(line: str, *more: str) -> list[str | Path]:
@@ -197,9 +187,7 @@ def test_the_commands_of_the_tour_run_with_the_installed_wheel(installed: Path, 
 
 def answers(port: int) -> bool:
     try:
-        with urllib.request.urlopen(
-            f"http://127.0.0.1:{port}/help/tutorials/first-pass.html", timeout=10
-        ) as answer:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/help/tutorials/first-pass.html", timeout=10) as answer:
             return answer.status == 200 and b"First pass" in answer.read()
     except OSError:
         return False
@@ -217,9 +205,7 @@ def test_the_project_has_its_legal_and_citation_files() -> None:
 
 
 @pytest.mark.campaign
-def test_the_bill_of_materials_has_hashes_licences_and_the_graph_of_everything_shipped(
-    tmp_path: Path,
-) -> None:
+def test_the_bill_of_materials_has_hashes_licences_and_the_graph_of_everything_shipped(tmp_path: Path) -> None:
     import json
 
     from cyclonedx.schema import SchemaVersion

@@ -80,9 +80,7 @@ def test_a_planted_fault_is_flagged_in_the_first_pass_by_its_requirement(
 ) -> None:
     scenario = SCENARIO
     if fault.startswith("camera"):
-        monkeypatch.setattr(
-            camera, "_REDUCED_DETECTOR", replace(camera._REDUCED_DETECTOR, bias_px=(0.5, 0.0))
-        )
+        monkeypatch.setattr(camera, "_REDUCED_DETECTOR", replace(camera._REDUCED_DETECTOR, bias_px=(0.5, 0.0)))
     elif fault.startswith("undeclared"):
         attitude = replace(scenario.attitude, knowledge_bias_deg=0.2, declared_bias_deg=0.0)
         scenario = replace(scenario, attitude=attitude)

@@ -69,9 +69,7 @@ def test_an_imported_pass_without_its_world_is_replayed_from_received_detections
     (judged,) = found["passes"]
     assert judged["state"] == "telemetry judged" and "declares no scenario to render" in judged["detail"]
     gates = {gate["name"]: gate for gate in found["gates"]}
-    assert (
-        gates["navigation.anchored.fixes"]["frames"] == gates["telemetry.frames_without_value"]["frames"] == 5
-    )
+    assert gates["navigation.anchored.fixes"]["frames"] == gates["telemetry.frames_without_value"]["frames"] == 5
     assert gates["detector.recall"]["reason"] == "no pass was replayed from images"
     assert cli.run(["regress", "archive", "list", *home]) == 0
     (archive,) = json.loads(capsys.readouterr().out)["archives"]

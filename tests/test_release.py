@@ -137,9 +137,7 @@ def test_a_source_distribution_has_the_same_octets_whenever_and_wherever_it_is_p
         shutil.make_archive(str(folder / "sdist"), "gztar", folder, "linna-0.1.0")
         path = folder / "sdist.tar.gz"
         command = ["sh", str(ROOT / "deploy/reproducible.sh"), str(path)]
-        subprocess.run(
-            command, check=True, env={"PATH": os.environ["PATH"], "SOURCE_DATE_EPOCH": "1700000000"}
-        )
+        subprocess.run(command, check=True, env={"PATH": os.environ["PATH"], "SOURCE_DATE_EPOCH": "1700000000"})
         made.append(path.read_bytes())
     assert made[0] == made[1]
     with tarfile.open(tmp_path / "0/sdist.tar.gz") as archive:

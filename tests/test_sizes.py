@@ -26,11 +26,7 @@ def test_a_change_of_the_table_that_raises_an_entry_lowers_another_by_more() -> 
     revisions = subprocess.run(log, capture_output=True, text=True, check=False).stdout.split()
     tables = [sizes.load_table(sizes.TABLE.read_text(encoding="utf-8"))]
     tables += [table for table in map(sizes.committed_table, revisions) if table is not None]
-    assert [sizes.unpaid(before, after) for after, before in itertools.pairwise(tables)] in (
-        [],
-        [[]],
-        [[], []],
-    )
+    assert [sizes.unpaid(before, after) for after, before in itertools.pairwise(tables)] in ([], [[]], [[], []])
 
 
 def test_tokens_do_not_count_comments_docstrings_and_line_breaks() -> None:

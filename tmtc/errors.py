@@ -13,8 +13,6 @@ TmtcError
 └── MissingLibrary        a file format whose optional library is not installed
 """
 
-from __future__ import annotations
-
 
 class TmtcError(Exception):
     """Base of every error raised by this package; `str(error)` is one line."""

@@ -1,7 +1,5 @@
 """Decoded packets as JSON, CSV or Parquet: one record for each packet, in the order of the stream."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """Clients that upload pieces and add, decide and fetch telecommands while parts of the service are killed."""
 
-from __future__ import annotations
-
 import http.client
 import itertools
 import json

@@ -4,8 +4,6 @@ The run starts a database server and a broker of its own, unless it is given som
 and a process for the links. Mission time comes from the file of the spacecraft, so that all processes have the same.
 """
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import sys

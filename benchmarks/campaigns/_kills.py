@@ -1,7 +1,5 @@
 """Kills of parts of a deployment at seeded points, and the supervision that starts ended parts again."""
 
-from __future__ import annotations
-
 import json
 import queue
 import threading

@@ -1,7 +1,5 @@
 """Acknowledgements of telecommands received by clients, and their comparison with the final archive."""
 
-from __future__ import annotations
-
 import threading
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,72 +1,66 @@
 """Record of an hour of a new user: what the documents state and what happened."""
 
-from __future__ import annotations
-
 import json
+import os
 import re
 import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+from studies.harness.parts import bare_environment
+
+ROOT = Path(__file__).resolve().parents[2]
 MARK = re.compile(
-    r"^ *<!-- (?P<kind>file|run|tour|output)(?:: (?P<name>[\w.-]+))?(?:, status (?P<status>[\d,]+))?[^\n]*-->\n"
+    r"^ *<!-- (?P<kind>file|run|tour)(?:: (?P<name>[\w.-]+))?(?:, status (?P<status>[\d,]+))?[^\n]*-->\n"
     r" *```\w+\n(?P<text>.*?)^ *```$",
     re.MULTILINE | re.DOTALL,
 )
-"""A file or commands of a page that are to be used as printed."""
-
-Kind = Literal["A", "B", "C"]
+"""A file or commands of a page that are used as printed."""
 
 
 @dataclass(slots=True)
 class Diary:
-    """Steps of an hour, and the wrong turns: A harms operations, B misleads, C costs minutes."""
+    """Steps of an hour, and the wrong turns by kind: A harms operations, B misleads, C costs minutes."""
 
     name: str
     started: float = field(default_factory=time.monotonic)
-    turns: list[tuple[Kind, str]] = field(default_factory=list)
+    turns: list[str] = field(default_factory=list)
     steps: int = 0
 
-    def expect(self, kind: Kind, step: str, held: bool, found: object = "") -> bool:
+    def expect(self, kind: str, step: str, held: bool, found: object = "") -> bool:
         """Record a step, and a wrong turn if what the documents state did not happen."""
         self.steps += 1
-        word = "ok" if held else f"wrong turn ({kind})"
-        print(
-            f"[{self.name} {time.monotonic() - self.started:5.0f} s] {word}: {step}",
-            file=sys.stderr,
-            flush=True,
-        )
+        text = "ok" if held else f"WRONG TURN {kind}, found {str(found)[-600:]}"
+        print(f"[{time.monotonic() - self.started:5.0f} s] {step}: {text}", file=sys.stderr, flush=True)
         if not held:
-            print(f"    found: {str(found)[:600]}", file=sys.stderr, flush=True)
-            self.turns.append((kind, f"{step}; found {str(found)[:300]}"))
+            self.turns.append(f"{kind}: {step}; found {str(found)[-300:]}")
         return held
 
     def close(self) -> int:
         """Print the result; 1 if there was a wrong turn of the classes A or B."""
+        seconds = round(time.monotonic() - self.started)
         print(
             json.dumps(
-                {
-                    "hour": self.name,
-                    "seconds": round(time.monotonic() - self.started),
-                    "steps": self.steps,
-                    "wrong_turns": {
-                        kind: [text for one, text in self.turns if one == kind] for kind in "ABC"
-                    },
-                }
+                {"hour": self.name, "seconds": seconds, "steps": self.steps, "wrong_turns": self.turns}
             )
         )
-        return int(any(kind in "AB" for kind, _ in self.turns))
+        return int(any(one[0] in "AB" for one in self.turns))
 
 
 def commands_of(page: str, folder: Path) -> Iterator[str]:
     """Write the files that a page prints into a folder; yield its commands."""
-    for mark in MARK.finditer((DOCS / page).read_text()):
+    for mark in MARK.finditer((ROOT / "docs" / page).read_text()):
         if mark["kind"] == "file":
             (folder / mark["name"]).write_text(mark["text"])
-        elif mark["kind"] in ("run", "tour"):
-            allowed = f' || [[ ",{mark["status"]}," == *",$?,"* ]]' if mark["status"] else ""
-            yield from (line.strip() + allowed for line in mark["text"].splitlines())
+            continue
+        allowed = f' || [[ ",{mark["status"]}," == *",$?,"* ]]' if mark["status"] else ""
+        yield from (line.strip() + allowed for line in mark["text"].splitlines())
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """Return the environment of a new user without data, with `linna` in the path."""
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    made = bare_environment(PATH=path, PYTHONPATH=str(ROOT), XDG_DATA_HOME=str(folder / "data"))
+    return {name: value for name, value in made.items() if name != "LINNA_DATA"}

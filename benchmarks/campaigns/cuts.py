@@ -9,8 +9,6 @@ ingests must equal those of the whole recordings. With PostgreSQL, several proce
 same time. `--packets-only` compares packets and values only. The exit status is 1 if an archive differs.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import json

@@ -17,8 +17,6 @@ added to a file when it is over, and a campaign goes on where that file ends; `-
 and ends the kills of the one under way.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

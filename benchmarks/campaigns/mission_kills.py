@@ -7,8 +7,6 @@ random points of the seed and started again; a run that was stopped continues wi
 those of `linna mission run`, and `kills`. The exit status is 1 if a window was not processed or a packet was lost.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -18,8 +18,6 @@ two jobs of one key, a lost request whose answer lacks the winning state, any se
 was any. `--seconds` begins no race after that time.
 """
 
-from __future__ import annotations
-
 import argparse
 import http.client
 import json

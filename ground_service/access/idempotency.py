@@ -4,8 +4,6 @@ A key is stored before the work starts. If a crash leaves it without a response,
 done: the key is then refused, and the caller must check the state.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable
@@ -23,12 +21,7 @@ Added = TypeVar("Added", bound=BaseModel)
 
 
 def added_once(
-    ground: Ground,
-    kind: type[Added],
-    actor: str,
-    key: str | None,
-    given: BaseModel,
-    work: Callable[[], Added],
+    ground: Ground, kind: type[Added], actor: str, key: str | None, given: BaseModel, work: Callable[[], Added]
 ) -> Added:
     """Return the entity that `work` adds as `once` does; its kind is the operation."""
     answer = once(

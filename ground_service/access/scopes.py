@@ -4,8 +4,6 @@ Most decisions follow from the parameters: the spacecraft, or the row of a table
 the decisions that do not. An operation without a decision is refused to a limited caller.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -79,11 +77,7 @@ def scope_of(route: APIRoute) -> Scope | None:
         if route.name in names:
             return Scope(decision)
     dependant = route.dependant
-    body = {
-        name
-        for one in dependant.body_params
-        for name in getattr(one.field_info.annotation, "model_fields", ())
-    }
+    body = {name for one in dependant.body_params for name in getattr(one.field_info.annotation, "model_fields", ())}
     places: tuple[tuple[Literal["path", "query", "body"], Collection[str]], ...] = (
         ("path", [one.name for one in dependant.path_params]),
         ("query", query_keys(dependant).known),

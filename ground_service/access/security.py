@@ -1,7 +1,5 @@
 """Authentication of requests, and roles that operations require."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import inspect
@@ -27,9 +25,7 @@ SESSION_COOKIE = "linna_session"
 _bearer = HTTPBearer(auto_error=False, description="Token issued by 'linna user add'")
 
 
-def caller_of(
-    request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
-) -> Caller:
+def caller_of(request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]) -> Caller:
     """Return the owner of the token or session cookie of a request; the local user of a service without users."""
     local: Caller | None = getattr(request.app.state, "local_caller", None)
     if local is not None:
@@ -64,9 +60,7 @@ Operator = Annotated[Caller, Depends(requires("operator"))]
 Admin = Annotated[Caller, Depends(requires("admin"))]
 
 
-def add_list(
-    router: APIRouter, path: str, work: Callable[[Connection, Any], PageOf[Any]], role: Any = Viewer
-) -> None:
+def add_list(router: APIRouter, path: str, work: Callable[[Connection, Any], PageOf[Any]]) -> None:
     """Add the operation of a list: the name, docstring, filter and entity of the function that reads it.
 
     A client in process calls the function without HTTP.
@@ -80,7 +74,7 @@ def add_list(
             return linked(request, work(connection, asked))
 
     keyword = inspect.Parameter.KEYWORD_ONLY
-    kinds = {"ground": GroundOf, "caller": role, "request": Request, "asked": Annotated[asked, Query()]}
+    kinds = {"ground": GroundOf, "caller": Viewer, "request": Request, "asked": Annotated[asked, Query()]}
     parameters = [inspect.Parameter(name, keyword, annotation=kind) for name, kind in kinds.items()]
     endpoint.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     functools.update_wrapper(endpoint, work, ("__name__", "__doc__"), ())

@@ -1,7 +1,5 @@
 """SQL of reports."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from sqlalchemy import Connection, func, select

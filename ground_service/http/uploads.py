@@ -5,8 +5,6 @@ or not at all therefore uses an upload slot and an open file, but no thread. Oth
 threads.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor

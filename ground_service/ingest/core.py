@@ -168,8 +168,7 @@ def implausible_times(
         agreed = known & (np.abs(ticks - received) <= LONGEST_STEP)
         if agreed.any():  # otherwise the clock of the station is wrong
             doubts = {
-                int(k): f"{_span(int(ticks[k] - received[k]))} after its reception"
-                for k in np.flatnonzero(ahead)
+                int(k): f"{span_words(int(ticks[k] - received[k]))} after its reception" for k in np.flatnonzero(ahead)
             }
     reached = newest
     for stretch in np.split(order, np.flatnonzero(np.diff(times) > LONGEST_STEP) + 1):
@@ -177,12 +176,12 @@ def implausible_times(
         reason = None
         if reached is not None and first - reached > LONGEST_STEP and not agreed[stretch].any():
             if latest is not None:
-                reason = f"{_span(last - latest)} after the mission time" if last > latest else None
+                reason = f"{span_words(last - latest)} after the mission time" if last > latest else None
             elif len(stretch) < AGREEING_PACKETS:
                 few = f"{len(stretch)} of {AGREEING_PACKETS} packets agree"
-                reason = f"{_span(first - reached)} after all other telemetry, {few}"
+                reason = f"{span_words(first - reached)} after all other telemetry, {few}"
             elif first - reached > LONGEST_SILENCE:
-                reason = f"{_span(first - reached)} after all other telemetry"
+                reason = f"{span_words(first - reached)} after all other telemetry"
         if reason is None:
             is_firm = newest is not None or len(stretch) >= AGREEING_PACKETS
             reached = max(reached or last, last) if is_firm else reached
@@ -200,7 +199,8 @@ def fits_between(count: int, before: int | None, after: int | None) -> bool:
     return (count - before) % COUNT_MODULUS <= (after - before) % COUNT_MODULUS
 
 
-def _span(ticks: int) -> str:
+def span_words(ticks: int) -> str:
+    """Return a span of on-board time in days or hours."""
     seconds = ticks / TICKS_PER_SECOND
     return f"{seconds / 86_400:.1f} d" if seconds >= 86_400 else f"{seconds / 3600:.1f} h"
 
@@ -343,21 +343,14 @@ def join(
     def among(
         known: dict[tuple[Channel, int], list[Fragment]], one: Fragment, counts: Mapping[int, int]
     ) -> list[Fragment]:
-        there = {
-            other: octets for count, octets in counts.items() for other in known.get((one.channel, count), ())
-        }
+        there = {other: octets for count, octets in counts.items() for other in known.get((one.channel, count), ())}
         return [other for other, octets in there.items() if other not in used and fits(other, octets)]
 
     packets = []
     for one in fragments:
         if not one.begins or one in used:
             continue
-        found = complete(
-            one,
-            partial(among, lasts),
-            partial(among, firsts),
-            form_of(one.channel[0]),
-        )
+        found = complete(one, partial(among, lasts), partial(among, firsts), form_of(one.channel[0]))
         if found is not None:
             used.update(found[0])
             packets.append((one.channel[0], found[1]))

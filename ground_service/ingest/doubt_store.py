@@ -4,7 +4,7 @@ A batch is judged before it is stored. What follows can change the judgement: pa
 supports their time, and taken out of the archive when telemetry that came later shows that it was wrong.
 """
 
-from __future__ import annotations
+from dataclasses import replace
 
 import numpy as np
 from sqlalchemy import Connection, delete, func, insert, select
@@ -13,18 +13,14 @@ from ground_service.clock import independent_now_ns
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf
 from ground_service.ingest import store
-from ground_service.ingest.core import (
-    LONGEST_STEP,
-    UNSET_TICKS,
-    fits_between,
-    implausible_times,
-)
+from ground_service.ingest.core import LONGEST_STEP, UNSET_TICKS, fits_between, implausible_times, span_words
 from ground_service.ingest.model import ImplausibleFilter, ImplausiblePacket
 from ground_service.store import repository
 from ground_service.store.event_kinds import TelemetryWithdrawn, TimesDoubted, publish
 from ground_service.store.vehicles import get_vehicle, lock_vehicle
 from ground_service.telemetry import store as telemetry
 from ground_service.telemetry.packets import NO_TIME, PacketBatch, batch_of_cut
+from ground_service.telemetry.values import newest_declared_ticks
 from lunar.arrays import IntArray
 from lunar.plausible import AGREEING_PACKETS
 from lunar.timescales import ticks_from_utc_ns, utc_ns_from_ticks
@@ -47,7 +43,7 @@ def plausible_part(
     if is_doubted:
         digests = connection.execute(select(_DOUBTED.c.digest).where(_DOUBTED.c.vehicle_id == vehicle))
         known = {bytes(digest) for digest in digests.scalars()}
-    doubts = {} if judged else _doubts(connection, vehicle, batch, newest)
+    doubts = {} if judged else _doubts(connection, vehicle, batch, newest) | _image_doubts(batch)
     new = {k: reason for k, reason in doubts.items() if batch.digest[k] not in known}
     if not new and not known:
         return batch
@@ -85,6 +81,49 @@ def _doubts(connection: Connection, vehicle: int, batch: PacketBatch, newest: in
             if not _fits(connection, vehicle, int(batch.apid[k]), int(batch.ticks[k]), batch.count_of(k)):
                 doubts.setdefault(k, "its sequence count belongs to another time")
     return doubts
+
+
+def _image_doubts(batch: PacketBatch) -> dict[int, str]:
+    """Return the packets of a batch whose image was taken long after them, or before the clock was set."""
+    doubts: dict[int, str] = {}
+    for columns in batch.rows.values():
+        if "packet_ticks" not in columns:
+            continue
+        image, packet = columns["ticks"], columns["packet_ticks"]
+        late = image > packet + LONGEST_STEP
+        unset = (image > 0) & (image < UNSET_TICKS) & (packet > 2 * UNSET_TICKS)
+        for k in np.flatnonzero((late | unset) & (packet != NO_TICKS)).tolist():
+            words = f"{span_words(int(image[k] - packet[k]))} after it" if late[k] else "from a clock that was not set"
+            doubts[int(columns["packet"][k])] = f"the time of its image is {words}"
+    return doubts
+
+
+def withdraw_doubted(
+    connection: Connection, vehicle: int, ids: IntArray, ticks: IntArray, newest_declared: int | None
+) -> IntArray:
+    """Keep stored packets (n,) apart whose declared time is implausible; return their ids.
+
+    `newest_declared` is the greatest declared time in the archive; the caller holds the lock of the vehicle.
+    """
+    known = [one for one in (telemetry.newest_ticks(connection, vehicle), newest_declared) if one is not None]
+    newest = max(known, default=None)
+    timed = ticks[ticks != NO_TICKS]
+    if not timed.size or (newest is not None and timed.max() <= newest + LONGEST_STEP and timed.min() > UNSET_TICKS):
+        return np.zeros(0, dtype=np.int64)
+    if newest is not None and not _is_firm(connection, vehicle):
+        newest = None
+    doubts = implausible_times(ticks, None, newest, latest_ticks(newest))
+    found = {int(ids[k]): (int(ticks[k]), reason) for k, reason in doubts.items()}
+    if found:
+        rows = select(_PACKETS.c.octets).where(_PACKETS.c.id.in_(found)).order_by(_PACKETS.c.id)
+        batch = _batch([bytes(octets) for octets in connection.execute(rows).scalars()], None)
+        withdraw_packets(connection, vehicle, list(found))
+        shown = [found[key] for key in sorted(found)]
+        times = np.array([time for time, _ in shown], dtype=np.int64)
+        reasons = {k: reason for k, (_, reason) in enumerate(shown)}
+        ingest_id = store.newest_ingest(connection, vehicle)
+        _keep_apart(connection, vehicle, ingest_id, replace(batch, ticks=times), reasons)
+    return np.array(sorted(found), dtype=np.int64)
 
 
 def latest_ticks(newest: int | None) -> int | None:
@@ -152,17 +191,14 @@ def list_implausible(connection: Connection, asked: ImplausibleFilter) -> PageOf
     query = select(*columns, _VEHICLES.c.ccsds_id.label("spacecraft_id"), _VEHICLES.c.instance)
     query = query.join(_VEHICLES, _VEHICLES.c.id == _DOUBTED.c.vehicle_id)
     rows, total = repository.page(connection, query, asked, _DOUBTED.c.id.desc())
-    return asked.page(
-        (ImplausiblePacket.of(row, time=utc_ns_from_ticks(row["ticks"])) for row in rows), total
-    )
+    return asked.page((ImplausiblePacket.of(row, time=utc_ns_from_ticks(row["ticks"])) for row in rows), total)
 
 
 def needs_review(connection: Connection, vehicle: int, first_ticks: int | None) -> bool:
     """Return whether new telemetry, from this time on, can change a judgement."""
-    if first_ticks is None:
-        return False
     newest, is_doubted = telemetry.newest_and_doubted(connection, vehicle)
-    return is_doubted or (newest is not None and first_ticks < newest - LONGEST_STEP)
+    is_old = newest is not None and first_ticks is not None and first_ticks < newest - LONGEST_STEP
+    return is_doubted or is_old
 
 
 def review_times(ground: Ground, vehicle: int) -> None:
@@ -209,15 +245,15 @@ def withdraw_packets(connection: Connection, vehicle: int, ids: list[int]) -> No
 
 
 def _put_back(connection: Connection, vehicle: int) -> None:
-    rows = connection.execute(
-        select(_DOUBTED).where(_DOUBTED.c.vehicle_id == vehicle).order_by(_DOUBTED.c.ticks)
-    )
+    rows = connection.execute(select(_DOUBTED).where(_DOUBTED.c.vehicle_id == vehicle).order_by(_DOUBTED.c.ticks))
     found = rows.mappings().all()
     if not found:
         return
-    newest = telemetry.newest_ticks(connection, vehicle)
+    known = (telemetry.newest_ticks(connection, vehicle), newest_declared_ticks(connection, vehicle))
+    newest = max((one for one in known if one is not None), default=None)
     ticks = np.array([row["ticks"] for row in found], dtype=np.int64)
     doubts = implausible_times(ticks, None, newest, latest_ticks(newest))
+    doubts |= _image_doubts(_batch([bytes(row["octets"]) for row in found], None))
     supported = [
         row
         for k, row in enumerate(found)

@@ -5,8 +5,6 @@ They are never inferred from the octets. Descriptions are only ever added: they 
 one query shows that something was added.
 """
 
-from __future__ import annotations
-
 import threading
 from dataclasses import dataclass, replace
 from typing import Any
@@ -152,8 +150,5 @@ def _station(link: Link, station: str) -> StationLink | None:
 
 def _record(station: StationLink) -> RecordFormat:
     return RecordFormat(
-        station.header_octets or 0,
-        station.trailer_octets or 0,
-        station.time_code,
-        station.time_offset or 0,
+        station.header_octets or 0, station.trailer_octets or 0, station.time_code, station.time_offset or 0
     )

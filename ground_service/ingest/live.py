@@ -5,8 +5,6 @@ segment with its position; a segment is removed when it is in the archive. Since
 nothing, whatever a crash leaves in the spool is simply ingested by the next run: exactly once, nothing lost.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Entities of jobs."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pydantic import Field

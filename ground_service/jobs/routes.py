@@ -1,7 +1,5 @@
 """HTTP operations on jobs."""
 
-from __future__ import annotations
-
 from fastapi import Response
 
 from ground_service.access.security import Operator, Viewer, add_list

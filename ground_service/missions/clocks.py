@@ -1,7 +1,5 @@
 """Mission time of a service as the mission descriptions in force state it."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Iterator

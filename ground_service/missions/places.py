@@ -1,7 +1,5 @@
 """Places and outages of the ground stations of a mission description."""
 
-from __future__ import annotations
-
 import math
 
 from ground_service.missions.model import Link, StationLink

@@ -4,8 +4,6 @@ The state is worked out afresh from the archive each time (`planning.window_stat
 order. A window that has telemetry is given a pass, which its report is then made of.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from sqlalchemy import Connection
@@ -113,8 +111,7 @@ def _evidence(connection: Connection, window: WindowRecord) -> WindowEvidence:
     return WindowEvidence(
         decision=window.decision,
         replaced=store.is_replaced(connection, window),
-        predecessor_failed=predecessor is not None
-        and store.get_window(connection, predecessor).state == "failed",
+        predecessor_failed=predecessor is not None and store.get_window(connection, predecessor).state == "failed",
         command_states=tuple(view.state for view in commands),
         deletion_states=tuple(view.state for view in commands if view.record.name == DELETE),
         failure=next(failed, ""),

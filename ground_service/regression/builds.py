@@ -5,8 +5,6 @@ on the installed flight code. Its identity is the hash of everything that decide
 network, parameters and the flight code itself. The limits of a program belong to it, those of the flight code do not.
 """
 
-from __future__ import annotations
-
 import datetime
 import hashlib
 import importlib.util
@@ -179,10 +177,7 @@ class Build:
         folder.mkdir(parents=True)
         if not self.folder_needed:
             return
-        for name, source in (
-            (BUILD_FILE, self.file),
-            *((name, self.folder / name) for name, _ in self.files),
-        ):
+        for name, source in ((BUILD_FILE, self.file), *((name, self.folder / name) for name, _ in self.files)):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(source, folder / name)
 
@@ -416,10 +411,7 @@ def registered_build(ground: Ground, digest: str) -> Build:
     build = load_build(folder)
     if build.digest != whole:
         raise InvalidInput(
-            f"build {whole[:12]}",
-            "",
-            "the files and flight code it was registered with",
-            f"{build.digest[:12]}",
+            f"build {whole[:12]}", "", "the files and flight code it was registered with", f"{build.digest[:12]}"
         )
     return build
 

@@ -1,7 +1,5 @@
 """Regression archives of passes: the archive that a pass was imported from, or the received data of a live pass."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil
@@ -163,10 +161,7 @@ def _received(ground: Ground, connection: Connection, record: PassRecord, folder
         "start_state": record.manifest.get("start_state"),
         "data_sources": list(record.manifest.get("data_sources", ())),
         "files": {
-            path.name: {
-                "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
-                "bytes": path.stat().st_size,
-            }
+            path.name: {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size}
             for path in sorted(folder.iterdir())
         },
     }

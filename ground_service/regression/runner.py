@@ -9,8 +9,6 @@ The service does not trust the results: it accepts only requested names, regular
 limits, opened without following symbolic links, and it validates every field of the report.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import json
@@ -130,12 +128,7 @@ def _run_in_sandbox(
     variables = {**ENVIRONMENT, "NUMBA_CACHE_DIR": "/kernels"}
     if request.reads_data and data is not None:
         folders["data"], variables["LINNA_DATA"] = data, "/data"
-    places = {
-        "{python}": sys.executable,
-        "{archive}": "/archive",
-        "{out}": host.OUT,
-        "{folder}": "/build",
-    }
+    places = {"{python}": sys.executable, "{archive}": "/archive", "{out}": host.OUT, "{folder}": "/build"}
     run = Run(
         tuple(_placed(word, places) for word in request.words),
         variables,
@@ -145,19 +138,13 @@ def _run_in_sandbox(
         printed.absolute(),
         (
             *host.program_view(),
-            *(
-                host.Part("bind", str(path.absolute()), f"/{name}")
-                for name, path in folders.items()
-                if path.is_dir()
-            ),
+            *(host.Part("bind", str(path.absolute()), f"/{name}") for name, path in folders.items() if path.is_dir()),
         ),
     )
     return host.execute(run)
 
 
-def _run_by_runner(
-    exchange: Path, request: RunRequest, staged: Path, written: Path, printed: Path
-) -> dict[str, Any]:
+def _run_by_runner(exchange: Path, request: RunRequest, staged: Path, written: Path, printed: Path) -> dict[str, Any]:
     identity = uuid.uuid4().hex
     try:
         for name in ("jobs", "running", "results"):
@@ -202,11 +189,7 @@ ENVIRONMENT = {
 
 
 def serve_exchange(
-    exchange: Path,
-    *,
-    jobs: int | None = None,
-    stopping: threading.Event | None = None,
-    data: Path | None = None,
+    exchange: Path, *, jobs: int | None = None, stopping: threading.Event | None = None, data: Path | None = None
 ) -> int:
     """Run the jobs of an exchange folder one by one, until `jobs` of them are done or `stopping` is set.
 
@@ -377,13 +360,7 @@ def _taken(result: Path, request: RunRequest, written: Path, printed: Path) -> d
 
 
 def _octets(folder: int, name: str, limit: int) -> bytes | None:
-    """Return the content of a regular file with a single link and a permitted size; None if there is no file.
-
-    Raises
-    ------
-    SandboxRefused
-        The name is not such a file.
-    """
+    """Return the content of a regular file with a single link and a permitted size; None if there is no file."""
     try:
         descriptor = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=folder)
     except FileNotFoundError:

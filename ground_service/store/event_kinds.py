@@ -4,8 +4,6 @@ A capability publishes an event in the transaction of its change and does not kn
 decides that; pages and WebSockets show the same log.
 """
 
-from __future__ import annotations
-
 from typing import Any, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict

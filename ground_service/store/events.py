@@ -5,8 +5,6 @@ the change that it reports was committed. On PostgreSQL a lock orders the number
 Numbers have no gaps.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager

@@ -3,8 +3,6 @@
 A table with leases has the columns `name` (key), `owner` and `lease_utc_ns`, the end of the lease.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from sqlalchemy import Connection, Table, delete, or_, select, text, update
@@ -22,14 +20,7 @@ _CLOCKS_NS = 60_000_000_000
 
 
 def renew_or_take(
-    connection: Connection,
-    table: Table,
-    name: str,
-    owner: str,
-    *,
-    now_utc_ns: int,
-    until_utc_ns: int,
-    **taken: Any,
+    connection: Connection, table: Table, name: str, owner: str, *, now_utc_ns: int, until_utc_ns: int, **taken: Any
 ) -> bool:
     """Renew the lease of `owner`, or take one that is free or has ended; return whether `owner` has it now.
 
@@ -45,9 +36,7 @@ def renew_or_take(
     renewal = update(table).where(rows.name == name, rows.owner == owner).values(lease_utc_ns=until_utc_ns)
     ahead = rows.lease_utc_ns > until_utc_ns + _CLOCKS_NS
     free = or_(rows.owner.is_(None), rows.lease_utc_ns < now_utc_ns, ahead)
-    taking = (
-        update(table).where(rows.name == name, free).values(owner=owner, lease_utc_ns=until_utc_ns, **taken)
-    )
+    taking = update(table).where(rows.name == name, free).values(owner=owner, lease_utc_ns=until_utc_ns, **taken)
     return connection.execute(renewal).rowcount == 1 or connection.execute(taking).rowcount == 1
 
 

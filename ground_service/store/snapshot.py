@@ -4,8 +4,6 @@
 migration executes such a file, so that it does not depend on tables of later versions.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import sys

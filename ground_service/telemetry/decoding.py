@@ -5,9 +5,8 @@ where it was. A new definition decodes all packets from the first one on. Until 
 of the definition before it are read. Packets of APIDs without a definition stay stored as they are.
 """
 
-from __future__ import annotations
-
 import hashlib
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -31,20 +30,14 @@ from ground_service.telemetry.packets import batch_of_cut
 from ground_service.telemetry.values import Decoding, StoredPackets, last_packet
 from lunar.arrays import FloatArray, IntArray
 from lunar.constants import NS
-from lunar.timescales import (
-    ONBOARD_EPOCH_TAI_NS,
-    TICKS_PER_SECOND,
-    parse_utc,
-    tai_ns_from_utc_ns,
-    ticks_from_utc_ns,
-)
+from lunar.timescales import ONBOARD_EPOCH_TAI_NS, TICKS_PER_SECOND, parse_utc, tai_ns_from_utc_ns, ticks_from_utc_ns
 from tmtc.arrays import Octets
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Dictionary
 from tmtc.packets.cuc import NO_TICKS, TICKS_LIMIT
 from tmtc.packets.packet_times import TimeCode, elapsed
 from tmtc.packets.stream import PacketCut, primary_headers, whole_packets
-from tmtc.xtce.decode import VERDICTS
+from tmtc.xtce.decode import DECODED, VERDICTS
 from tmtc.xtce.series import series_matrix
 
 BLOCK_PACKETS = 20_000
@@ -54,8 +47,15 @@ Samples = dict[int, tuple[IntArray, IntArray, FloatArray]]
 """Times (n,), packet ids (n,) and values (n, v) by container number."""
 
 
-def decode_declared(ground: Ground, vehicle: int) -> int:
-    """Decode the packets of a vehicle that the definition in force has not decoded; return the number of samples."""
+Judge = Callable[[Connection, int, IntArray, IntArray, int | None], IntArray]
+"""Keeps some packets apart, by their ids (n,), times (n,) and the newest declared time, and returns their ids."""
+
+
+def decode_declared(ground: Ground, vehicle: int, judge: Judge | None = None) -> int:
+    """Decode the packets of a vehicle that the definition in force has not decoded; return the number of samples.
+
+    `judge` keeps packets with an implausible time apart; None: all are believed.
+    """
     stored = 0
     while True:
         ground.check_stopping()
@@ -64,7 +64,7 @@ def decode_declared(ground: Ground, vehicle: int) -> int:
             if not definitions.declared and parameters.readable_decoding(connection, vehicle) is None:
                 return stored
         with ground.database.writing() as connection:
-            found = _next_block(connection, vehicle)
+            found = _next_block(connection, vehicle, judge)
         if found is None:
             return stored
         stored += found
@@ -76,9 +76,7 @@ def definitions_in_force(connection: Connection, vehicle: int) -> tuple[PacketDe
     return definitions_of_spacecraft(connection, found.ccsds_id, found.instance)
 
 
-def definitions_of_spacecraft(
-    connection: Connection, spacecraft: int, instance: str
-) -> tuple[PacketDefinitions, int]:
+def definitions_of_spacecraft(connection: Connection, spacecraft: int, instance: str) -> tuple[PacketDefinitions, int]:
     """As `definitions_in_force`, by spacecraft id and instance."""
     mission_id = missions.packets_in_force(connection, spacecraft, instance)
     if mission_id is None:
@@ -86,7 +84,7 @@ def definitions_of_spacecraft(
     return packet_definitions(missions.get_mission(connection, mission_id)), mission_id
 
 
-def _next_block(connection: Connection, vehicle: int) -> int | None:
+def _next_block(connection: Connection, vehicle: int, judge: Judge | None = None) -> int | None:
     """Decode the next packets; None if none are left."""
     lock_vehicle(connection, vehicle)
     definitions, mission_id = definitions_in_force(connection, vehicle)
@@ -99,9 +97,7 @@ def _next_block(connection: Connection, vehicle: int) -> int | None:
         earlier = _readable_definitions(connection, vehicle)
         new = definitions.form.unchecked - earlier.form.unchecked
         progress = parameters.begin(connection, vehicle, definition, read_again=bool(new))
-    packets = parameters.packets_after(
-        connection, vehicle, progress.decoded_to, definitions.apids, BLOCK_PACKETS
-    )
+    packets = parameters.packets_after(connection, vehicle, progress.decoded_to, definitions.apids, BLOCK_PACKETS)
     if not packets.ids:
         end = replace(progress, decoded_to=parameters.last_packet(connection, vehicle), complete=True)
         if end != progress:
@@ -109,6 +105,15 @@ def _next_block(connection: Connection, vehicle: int) -> int | None:
         parameters.forget_others(connection, vehicle, definition)
         return None
     samples, counts = decoded_values(definitions, packets)
+    if judge is not None and samples:
+        ids, ticks = (np.concatenate([one[k] for one in samples.values()]) for k in (1, 0))
+        newest = parameters.newest_declared_ticks(connection, vehicle, definition, samples)
+        apart = judge(connection, vehicle, ids, ticks, newest)
+        for number, columns in samples.items() if apart.size else ():
+            kept = ~np.isin(columns[1], apart)
+            samples[number] = (columns[0][kept], columns[1][kept], columns[2][kept])
+        for apid in (packets.apids[packets.ids.index(one)] for one in apart.tolist()):
+            counts[apid][VERDICTS[DECODED]] -= 1
     stored = parameters.store_values(connection, vehicle, definition, samples)
     parameters.change(connection, vehicle, _with_counts(progress, packets.ids[-1], counts))
     return stored
@@ -132,9 +137,7 @@ def _with_counts(progress: Decoding, decoded_to: int, counts: dict[int, dict[str
     return replace(progress, decoded_to=decoded_to, counts=merged)
 
 
-def decoded_values(
-    definitions: PacketDefinitions, packets: StoredPackets
-) -> tuple[Samples, dict[int, dict[str, int]]]:
+def decoded_values(definitions: PacketDefinitions, packets: StoredPackets) -> tuple[Samples, dict[int, dict[str, int]]]:
     """Return the values of packets, and the number of packets by APID and outcome of decoding."""
     apids = np.array(packets.apids, dtype=np.int64)
     ids = np.array(packets.ids, dtype=np.int64)

@@ -4,8 +4,6 @@ A job does what follows one event, derived from the state of the database. A job
 process left, does all of it again under the same identities, so that it has one result.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -214,8 +212,7 @@ def _monthly_report_of(vehicle: int) -> Step:
 
 def _landmarks_of(pass_id: int) -> Step:
     return Step(
-        f"landmarks of pass {pass_id}",
-        lambda ground: update_landmarks(ground, pass_id).model_dump(mode="json"),
+        f"landmarks of pass {pass_id}", lambda ground: update_landmarks(ground, pass_id).model_dump(mode="json")
     )
 
 

@@ -4,8 +4,6 @@ Tasks are acknowledged when they are done and given to another worker when their
 twice without harm, that loses and doubles nothing.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging.config
@@ -187,13 +185,7 @@ def run_worker(settings: Settings, concurrency: int = 1) -> None:
     def configure(**_: Any) -> None:
         logging.config.dictConfig(logging_config(settings.log_format))
 
-    words = [
-        "worker",
-        "--loglevel=INFO",
-        f"--concurrency={concurrency}",
-        "--without-gossip",
-        "--without-mingle",
-    ]
+    words = ["worker", "--loglevel=INFO", f"--concurrency={concurrency}", "--without-gossip", "--without-mingle"]
     with present(ground, settings, "worker"):
         ground.close()  # its processes are forked without connections
         make_app(settings).worker_main(words)

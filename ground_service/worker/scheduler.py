@@ -5,8 +5,6 @@ after `LEASE_NS`. All work may be done twice without harm: a process that was st
 next one, can briefly act at the same time.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

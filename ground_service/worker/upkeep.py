@@ -6,8 +6,6 @@ expired browser sessions at once. Regression archives go by their age since the 
 settings say so; the audit log has a record of each.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import re

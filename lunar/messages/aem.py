@@ -9,8 +9,6 @@ References
 CCSDS 504.0-B-1 (2008) and 504.0-B-2 (2024), Attitude Data Messages, section 4 and annex on quaternions.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -173,9 +171,7 @@ def _read_segment(reader: Lines) -> AttitudeSegment:
     )
 
 
-def _useable(
-    reader: Lines, meta: dict[str, str], where: dict[str, int], system: str, utc_ns: IntArray
-) -> BoolArray:
+def _useable(reader: Lines, meta: dict[str, str], where: dict[str, int], system: str, utc_ns: IntArray) -> BoolArray:
     """Return which attitudes (n,) are in the useable interval; they span START_TIME to STOP_TIME, to 1 ms."""
     start, stop, first, last = (
         reader.epoch(meta[key], system, where[key]) if key in meta else None

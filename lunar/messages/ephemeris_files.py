@@ -3,8 +3,6 @@
 SPICE kernels are binary and read by `lunar.messages.spice`, outside of the server.
 """
 
-from __future__ import annotations
-
 import io
 import itertools
 from pathlib import Path

@@ -6,8 +6,6 @@ Horizons manual, vector tables: output types 2 and 3 with CSV_FORMAT = YES; the 
 the table lies between `$$SOE` and `$$EOE`.  Times are TDB.
 """
 
-from __future__ import annotations
-
 import re
 from datetime import datetime
 

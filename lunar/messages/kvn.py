@@ -1,7 +1,5 @@
 """Keyword notation (KVN) of CCSDS navigation messages: lines, keywords, comments and epochs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 
 import numpy as np

@@ -9,8 +9,6 @@ References
 CCSDS 505.0-B-2 (2021), XML Specification for Navigation Data Messages, sections on the OEM and AEM.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from xml.parsers import expat
 from xml.sax.saxutils import escape

@@ -4,8 +4,6 @@ Frames, attitude, time and telecommands come through `Payload.step`; everything 
 arrays, counts and octets cross these interfaces, so that no simulated truth can.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Protocol

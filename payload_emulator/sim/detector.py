@@ -4,8 +4,6 @@ All simulations without images use it: reduced flights of the session, the Monte
 identification.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

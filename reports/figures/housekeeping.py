@@ -1,7 +1,5 @@
 """Housekeeping parameters over time, one small panel each."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Map of the craters that a candidate build lost and gained."""
 
-from __future__ import annotations
-
 from reports.figures.canvas import Canvas
 from reports.figures.theme import color
 from reports.values import ChangedCraters

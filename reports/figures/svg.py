@@ -1,7 +1,5 @@
 """A drawing as a piece of SVG for a page: colours become roles of the page's theme, ids are unique, bytes repeat."""
 
-from __future__ import annotations
-
 import base64
 import io
 import re
@@ -37,9 +35,7 @@ def draw_svg(key: str, width_in: float, height_in: float, draw: Callable[[Canvas
         photos: list[Photo] = []
         draw(Canvas(figure, width_in, height_in, photos=photos))
         buffer = io.StringIO()
-        figure.savefig(
-            buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None}
-        )
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     return _for_page(buffer.getvalue(), key, label, photos)
 
 

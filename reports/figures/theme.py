@@ -6,8 +6,6 @@ those of Okabe and Ito (2008), which stay apart under the common colour-vision d
 well.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Common parts of the sections of a pass report: values, time axis, colours and reasons for missing items."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

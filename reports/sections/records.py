@@ -1,7 +1,5 @@
 """Reads of the anchor ephemeris, and configuration."""
 
-from __future__ import annotations
-
 from reports.document import Block, Cell, Column, Heading, Listing, Paragraph, Table
 from reports.figures.theme import TRIGGERS
 from reports.sections.common import PassView, role_of, setting_text

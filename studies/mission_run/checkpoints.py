@@ -1,7 +1,5 @@
 """Checkpoints of a mission run: spacecraft, archive and progress of one moment at which the ground is idle."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from contextlib import closing

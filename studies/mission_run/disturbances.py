@@ -4,8 +4,6 @@ All of them are faults that spacecraft, link and reference can have anyway; a fi
 of the run. The ground service is not informed: neither its mission description nor its requests change.
 """
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,12 +22,15 @@ class LinkDisturbances:
     """Losses, and contacts that do not happen: `STATION FROM TO` in hours, or every station with `all`.
 
     A stated probability replaces that of the scenario: of the loss of a frame, and of the begin and the end of a burst.
+    So do the shares of frames that a station sends twice or out of order.
     `clocks` are errors of station clocks: `STATION SECONDS`, positive where the clock is fast.
     """
 
     frame_loss: float = 0.0
     burst_start: float = 0.0
     burst_end: float = 0.2
+    repeat_share: float = 0.0
+    reorder_share: float = 0.0
     missed_contacts: tuple[str, ...] = ()
     clocks: tuple[str, ...] = ()
 
@@ -95,6 +96,8 @@ class Disturbances:
                 frame_loss=link.frame_loss or scenario.link.frame_loss,
                 burst_start=link.burst_start or scenario.link.burst_start,
                 burst_end=link.burst_end if link.burst_start else scenario.link.burst_end,
+                repeat_share=link.repeat_share or scenario.link.repeat_share,
+                reorder_share=link.reorder_share or scenario.link.reorder_share,
                 missed=(*scenario.link.missed, *missed),
                 clock_errors=(*scenario.link.clock_errors, *link.clocks),
             ),

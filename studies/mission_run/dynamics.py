@@ -3,8 +3,6 @@
 Each day's orbit determination has errors of its own; the burns that it knows of are those that were planned.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Closing figures of a mission run: what the ground service says of its month, and what the spacecraft counted."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence

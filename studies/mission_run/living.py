@@ -1,7 +1,5 @@
 """`linna demo --live`: a spacecraft that flies and the service that operates it, until both are stopped."""
 
-from __future__ import annotations
-
 import json
 import sys
 import threading

@@ -1,7 +1,5 @@
 """The spacecraft of a mission run: `linna emulate --live --no-operator` as a process, and its console."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

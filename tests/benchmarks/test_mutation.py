@@ -90,10 +90,7 @@ def test_what_a_shared_fixture_calls_is_credited_to_every_test_that_uses_it(stat
 
 def test_the_time_of_a_test_holds_that_of_its_fixtures(state: Any) -> None:
     for when, total in (("call", 1.0), ("setup", 3.5)):
-        mutation_plugin.pytest_runtest_makereport(
-            SimpleNamespace(nodeid="a"),
-            SimpleNamespace(when=when, duration=2.5),
-        )
+        mutation_plugin.pytest_runtest_makereport(SimpleNamespace(nodeid="a"), SimpleNamespace(when=when, duration=2.5))
         assert state.duration_by_test == {"a": total}
 
 
@@ -116,9 +113,7 @@ def rendering(dark_columns, radiance=0.02, size=16):
     lit = np.ones((size, size), np.float32)
     lit[:, :dark_columns] = 0.0
     bright = np.linspace(0.5, 1.5, size, dtype=np.float32)[:, None] * np.float32(radiance)
-    return Rendering(
-        np.where(lit > 0, bright, 0.0).astype(np.float32), lit, np.full((size, size), 2e4, np.float32)
-    )
+    return Rendering(np.where(lit > 0, bright, 0.0).astype(np.float32), lit, np.full((size, size), 2e4, np.float32))
 
 
 def test_the_iou_of_shadows_is_counted_over_all_views():
@@ -187,11 +182,7 @@ def test_a_missing_program_is_named() -> None:
     ],
 )  # fmt: skip
 def test_the_status_tells_contradictions_from_missing_programs(
-    rows: list[Row],
-    fault: str,
-    status: int,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    rows: list[Row], fault: str, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(_rows, "run", lambda names: iter([(names[0], rows, fault)]))
     assert report(["tmtc"], as_json=True) == status
@@ -206,9 +197,7 @@ def test_an_unknown_name_is_refused_in_one_line(capsys: pytest.CaptureFixture[st
     assert capsys.readouterr().err.startswith("benchmarks: expected tmtc, ")
 
 
-def test_every_benchmark_of_the_list_yields_rows_in_a_process_of_its_own(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_every_benchmark_of_the_list_yields_rows_in_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     import importlib
 
     assert all(callable(importlib.import_module(f"benchmarks.{name}").rows) for name in NAMES)

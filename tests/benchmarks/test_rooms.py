@@ -1,20 +1,21 @@
-"""Rooms, floors and arrows of packages."""
+"""Rooms, floors and arrows of packages; the table of the benchmarks."""
 
+from collections.abc import Iterator, Sequence
 from graphlib import CycleError
+from pathlib import Path
 
 import pytest
 
+from benchmarks import _rows
+from benchmarks.__main__ import main
 from benchmarks.rooms import Rooms, measure
 
 MODULES = {
     "house": "",
     "house.attic": "import json\nfrom house.hall import (\n    door,\n)\n\n\ndef f():\n    from house import cellar\n",
-    "house.hall": "",
-    "house.hall.door": "from house.hall.key import KEY\nfrom house.cellar import STAIRS\n",
-    "house.hall.key": "KEY = 1\n",
-    "house.cellar": "STAIRS = 1\n",
-    "houses": "import house\n",
-}
+    "house.hall": "", "house.hall.door": "from house.hall.key import KEY\nfrom house.cellar import STAIRS\n",
+    "house.hall.key": "KEY = 1\n", "house.cellar": "STAIRS = 1\n", "houses": "import house\n",
+}  # fmt: skip
 
 
 def test_rooms_floors_and_arrows_are_those_of_the_imports() -> None:
@@ -25,3 +26,20 @@ def test_rooms_floors_and_arrows_are_those_of_the_imports() -> None:
 def test_a_circle_of_imports_between_rooms_is_refused() -> None:
     with pytest.raises(CycleError, match="cycle"):
         measure("house", MODULES | {"house.cellar": "from house import attic\n"})
+
+
+def test_a_benchmark_states_its_ratio_to_the_build_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(names: Sequence[str], root: Path = _rows.ROOT) -> Iterator[tuple[str, list[_rows.Row], str]]:
+        now = root == _rows.ROOT
+        rows = [_rows.Row("rate", 30.0 if now else 20.0, "packets/s"), _rows.Row("time", 2.0 if now else 3.0, "ms")]
+        yield names[0], [*rows, _rows.Row("new", 1.0, "ms")] if now else rows, ""
+
+    monkeypatch.setattr(_rows, "run", run)
+    assert _rows.report(["tmtc"], as_json=False, before=tmp_path) == 0
+    rate, time, new = capsys.readouterr().out.splitlines()[2:5]
+    assert rate.endswith("ratio to the build before: 1.50") and time.endswith("ratio to the build before: 1.50")
+    assert new.endswith("no peer")
+    assert main(["tmtc", "--before", "no-such-commit"]) == 2
+    assert capsys.readouterr().err == "benchmarks: expected a commit of this project, found no-such-commit\n"

@@ -174,25 +174,16 @@ def save_circle(path: Path, start_utc_ns: int = START, hours: float = 4.0) -> Pa
     return path
 
 
-def _catalogue(
-    latitude_rad: np.ndarray, longitude_rad: np.ndarray, rng: np.random.Generator
-) -> CraterCatalogue:
+def _catalogue(latitude_rad: np.ndarray, longitude_rad: np.ndarray, rng: np.random.Generator) -> CraterCatalogue:
     """Craters on a jittered grid of half a degree around the track, so that no two are near one another."""
-    cells = np.unique(
-        np.round(np.degrees(np.column_stack([latitude_rad, longitude_rad])) / 0.5).astype(int), axis=0
-    )
+    cells = np.unique(np.round(np.degrees(np.column_stack([latitude_rad, longitude_rad])) / 0.5).astype(int), axis=0)
     grid = np.unique(
-        (cells[:, None, :] + np.array([[i, j] for i in range(-3, 4) for j in range(-3, 4)])).reshape(-1, 2),
-        axis=0,
+        (cells[:, None, :] + np.array([[i, j] for i in range(-3, 4) for j in range(-3, 4)])).reshape(-1, 2), axis=0
     )
     places = np.radians(grid * 0.5 + rng.uniform(-0.08, 0.08, grid.shape))
     diameter = rng.choice([6e3, 8e3, 11e3, 14e3, 4e3], len(grid))
     return make_catalogue(
-        places[:, 0],
-        places[:, 1],
-        diameter,
-        source="synthetic",
-        rim_height_m=rng.uniform(-500.0, 500.0, len(grid)),
+        places[:, 0], places[:, 1], diameter, source="synthetic", rim_height_m=rng.uniform(-500.0, 500.0, len(grid))
     )
 
 
@@ -245,9 +236,7 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
             items = {
                 "u_px": np.append(uv[seen, 0] + PIXEL_OFFSET[0], 3.0),
                 "v_px": np.append(uv[seen, 1] + PIXEL_OFFSET[1], 3.0),
-                "diameter_px": np.append(
-                    camera.focal_px * catalogue.diameter_m[seen] / in_camera[seen, 2], 200.0
-                ),
+                "diameter_px": np.append(camera.focal_px * catalogue.diameter_m[seen] / in_camera[seen, 2], 200.0),
                 "score": np.append(np.full(len(seen), 0.9), 0.4),
                 "size_class": np.append(classes[seen], 2),
                 "sigma_px": np.full(len(seen) + 1, 1.0),
@@ -255,10 +244,7 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
             frame = {"frame_number": k, "image_ticks": ticks}
             sent.send("detections", {**frame, "image_quality": 0, "items": items}, ticks + 100)
             since = k - (RESET_FRAME if k >= RESET_FRAME else 0)
-            flown = [
-                (0, np.array([0.0, PAPER_DRIFT_PER_FRAME_M * since, 0.0])),
-                (1, SPHERICAL_ERROR_RTN_M),
-            ]
+            flown = [(0, np.array([0.0, PAPER_DRIFT_PER_FRAME_M * since, 0.0])), (1, SPHERICAL_ERROR_RTN_M)]
             if filter_nis is not None:
                 flown.append((2, FILTER_ERROR_RTN_M))
             for estimator, error in flown:

@@ -13,9 +13,7 @@ def described_schema(database: Database) -> dict[str, Any]:
         inspector = inspect(connection)
         tables = {
             name: {
-                "columns": [
-                    {**column, "type": repr(column["type"])} for column in inspector.get_columns(name)
-                ],
+                "columns": [{**column, "type": repr(column["type"])} for column in inspector.get_columns(name)],
                 "key": inspector.get_pk_constraint(name),
                 "foreign": sorted(inspector.get_foreign_keys(name), key=str),
                 "unique": sorted(inspector.get_unique_constraints(name), key=str),

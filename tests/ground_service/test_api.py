@@ -92,9 +92,7 @@ def test_the_telecommand_receiver_is_shown_as_the_newest_telemetry_tells_it(
     receive(None)  # as recorded before frames had the field
     assert shown() == []
     locked = receive(Clcw(0, 4, lockout=True, farm_b_counter=1))
-    assert [(one["ingest_id"], one["lockout"], one["frames_lockout"] > 0) for one in shown()] == [
-        (locked, True, True)
-    ]
+    assert [(one["ingest_id"], one["lockout"], one["frames_lockout"] > 0) for one in shown()] == [(locked, True, True)]
     ready = receive(Clcw(0, 4, farm_b_counter=2))
     receive(None)
     (channel,) = shown()
@@ -220,9 +218,7 @@ def test_an_ephemeris_is_uploaded_once(client: TestClient, synthetic_pass: Any) 
     first = client.post(f"{V1}/ephemerides", content=octets, params={"name": "reference"})
     assert first.status_code == 201, first.text
     assert first.json()["frame"] == "ICRF"
-    assert (
-        client.post(f"{V1}/ephemerides", content=octets, params={"name": "reference"}).json() == first.json()
-    )
+    assert client.post(f"{V1}/ephemerides", content=octets, params={"name": "reference"}).json() == first.json()
     refused = client.post(f"{V1}/ephemerides", content=b"not an ephemeris")
     assert is_problem(refused, 422)
     assert "/files/" not in refused.text
@@ -286,9 +282,7 @@ def test_every_operation_asks_for_its_role(guarded: Guarded) -> None:
                 assert status not in (401, 403), (path, role)
 
 
-def test_what_happens_is_sent_live_and_can_be_caught_up_with(
-    client: TestClient, make_pass: Callable[..., Any]
-) -> None:
+def test_what_happens_is_sent_live_and_can_be_caught_up_with(client: TestClient, make_pass: Callable[..., Any]) -> None:
     def payload_of(message: dict[str, Any]) -> tuple[int, str]:
         return message["payload"]["id"], message["payload"]["state"]
 
@@ -380,9 +374,7 @@ def test_json_that_no_reader_takes_is_refused_in_one_line(client: TestClient) ->
         assert "expected JSON of ordinary depth" in answer.json()["detail"]
 
 
-def test_a_telecommand_that_is_sent_again_under_its_key_is_queued_once(
-    guarded: Guarded,
-) -> None:
+def test_a_telecommand_that_is_sent_again_under_its_key_is_queued_once(guarded: Guarded) -> None:
     client, heads = guarded
     operator = heads["operator"] | {"Idempotency-Key": "k1"}
     ping = {"name": "test_connection", "arguments": {}, "spacecraft_id": 76}

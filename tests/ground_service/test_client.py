@@ -77,9 +77,7 @@ class Service:
                 else:
                     service.bodies.append(self.rfile.read(octets))
                 status, headers = service.answers[min(len(service.bodies), len(service.answers)) - 1]
-                self._answer(
-                    status, headers, json.dumps(EPHEMERIS if status < 300 else {"detail": "busy now"})
-                )
+                self._answer(status, headers, json.dumps(EPHEMERIS if status < 300 else {"detail": "busy now"}))
 
             def do_GET(self) -> None:
                 self.send_response(200)
@@ -132,18 +130,14 @@ def client_of(answer: Callable[[httpx.Request], httpx.Response]) -> Client:
     return Client("http://ground", "secret", transport=httpx.MockTransport(answer))
 
 
-def test_an_upload_that_finds_the_service_busy_is_sent_again_whole(
-    service: Service, clock: Clock, body: Path
-) -> None:
+def test_an_upload_that_finds_the_service_busy_is_sent_again_whole(service: Service, clock: Clock, body: Path) -> None:
     service.answers = [(503, {"Retry-After": "1"}), (503, {"Retry-After": "3"}), (201, {})]
     assert Client(service.url).add_ephemeris(body).model_dump(mode="json") == EPHEMERIS
     assert clock.slept == [1.0, 3.0]
     assert service.bodies == [body.read_bytes()] * 3
 
 
-def test_a_service_that_stays_busy_is_given_up_in_its_own_words(
-    service: Service, clock: Clock, body: Path
-) -> None:
+def test_a_service_that_stays_busy_is_given_up_in_its_own_words(service: Service, clock: Clock, body: Path) -> None:
     service.answers = [(503, {"Retry-After": "600"})]
     with pytest.raises(ServiceProblem, match="busy now") as caught:
         Client(service.url).add_ephemeris(body)
@@ -267,9 +261,7 @@ def test_a_list_is_fetched_page_by_page_until_its_end(total: int, pages: int) ->
         (5000, 2500, [(1000, 0), (1000, 1000), (1000, 2000)]),
     ],
 )  # fmt: skip
-def test_a_page_has_as_many_items_as_asked_for(
-    limit: int, expected: int, requests: list[tuple[int, int]]
-) -> None:
+def test_a_page_has_as_many_items_as_asked_for(limit: int, expected: int, requests: list[tuple[int, int]]) -> None:
     asked: list[tuple[int, int]] = []
     page = client_of(passes_of(2500, asked)).list_passes().page(limit)
     assert (len(page.items), page.total, asked) == (expected, 2500, requests)
@@ -312,9 +304,7 @@ def test_a_download_that_breaks_leaves_no_file(tmp_path: Path, clock: Clock) -> 
             raise httpx.ReadError("connection reset")
 
     with pytest.raises(Unreachable):
-        client_of(lambda _: httpx.Response(200, stream=Broken())).get_report(
-            "0" * 32, tmp_path / "report.html"
-        )
+        client_of(lambda _: httpx.Response(200, stream=Broken())).get_report("0" * 32, tmp_path / "report.html")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -338,9 +328,7 @@ def operations_of(tmp_path: Path) -> list[Any]:
     ]
 
 
-def test_every_operation_of_the_api_has_a_method_of_its_name_with_its_path_keys_and_result(
-    tmp_path: Path,
-) -> None:
+def test_every_operation_of_the_api_has_a_method_of_its_name_with_its_path_keys_and_result(tmp_path: Path) -> None:
     sent: list[httpx.Request] = []
 
     def answer(request: httpx.Request) -> httpx.Response:

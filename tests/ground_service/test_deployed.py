@@ -108,9 +108,7 @@ def deployed(folder: Path, overlay: dict[str, str], *, is_shared: bool) -> Itera
                 command[command.index("--host") + 1] = "127.0.0.1"
                 command[command.index("--port") + 1] = str(ports[name])
             ready: Callable[[], bool] = {
-                **{
-                    api: lambda api=api: answers_http(f"http://127.0.0.1:{ports[api]}/readyz") for api in APIS
-                },
+                **{api: lambda api=api: answers_http(f"http://127.0.0.1:{ports[api]}/readyz") for api in APIS},
                 "runner": lambda: alive(folder / "exchange"),
             }.get(name, lambda log=log: log.exists() and log.stat().st_size > 0)
             parts[name] = Part([sys.executable, "-m", "linna", *command], log, ready, env=environment(name))
@@ -180,9 +178,7 @@ def carried(downlink: bytes, service: Deployed, overlay: Overlay) -> str:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("kind", ["base", "objects", "provider"])
-def test_no_acknowledged_piece_is_lost_with_any_server_lost(
-    kind: str, synthetic_pass: Any, tmp_path: Path
-) -> None:
+def test_no_acknowledged_piece_is_lost_with_any_server_lost(kind: str, synthetic_pass: Any, tmp_path: Path) -> None:
     downlink = synthetic_pass.folder / "downlink.cadu"
     with open_ground(tmp_path / "reference") as ground:
         ingest_file(ground, downlink)

@@ -153,8 +153,7 @@ def test_secrets_are_files_of_those_who_need_them_and_in_no_command_or_environme
     text = (ROOT / "docker-compose.yml").read_text()
     assert not re.search(r"\$\{?LINNA_[A-Z_]*(PASSWORD|TOKEN)", text)
     holders = {
-        name: {user for user in SERVICES if name in SERVICES[user].get("secrets", [])}
-        for name in COMPOSE["secrets"]
+        name: {user for user in SERVICES if name in SERVICES[user].get("secrets", [])} for name in COMPOSE["secrets"]
     }
     assert holders == {
         "database_superuser_password": {"db"}, "database_owner_password": {"db", "migrate"},
@@ -200,20 +199,13 @@ def test_the_runner_has_no_secret_no_network_and_no_archive() -> None:
     assert int(exchange, 8) & 0o007 == 0
     assert "exchange:/exchange" in SERVICES["worker"]["volumes"]
     assert environment_of("worker")["LINNA_RUNNER_EXCHANGE"] == "/exchange"
-    assert {name for name in SERVICES if "exchange:/exchange" in SERVICES[name]["volumes"]} == {
-        "worker",
-        "runner",
-    }
+    assert {name for name in SERVICES if "exchange:/exchange" in SERVICES[name]["volumes"]} == {"worker", "runner"}
 
 
 def test_the_secrets_that_are_missing_are_made_and_those_that_are_there_are_kept(tmp_path: Path) -> None:
     folder = tmp_path / "secrets"
     script = ["sh", str(ROOT / "deploy/secrets.sh")]
-    environment = {
-        "PATH": os.environ["PATH"],
-        "LINNA_SECRETS_DIR": str(folder),
-        "LINNA_ADMIN_TOKEN": "given" * 5,
-    }
+    environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(folder), "LINNA_ADMIN_TOKEN": "given" * 5}
     subprocess.run(script, check=True, env=environment, capture_output=True)
     made = {path.name: path.read_text() for path in folder.rglob("*") if path.is_file()}
     assert set(made) == {*SECRETS, *OPTIONAL, *CERTIFICATE}
@@ -242,17 +234,12 @@ def test_an_error_of_openssl_is_reported(tmp_path: Path) -> None:
 
 HOLDERS = {
     "redis.sh": ("redis-server", ("broker_password",)),
-    "postgres-roles.sh": (
-        "psql",
-        ("database_password", "database_owner_password", "database_backup_password"),
-    ),
+    "postgres-roles.sh": ("psql", ("database_password", "database_owner_password", "database_backup_password")),
 }
 """Scripts that read passwords, with the program that they start and the names of the passwords."""
 
 
-def start_script(
-    name: str, secrets: dict[str, str], folder: Path
-) -> tuple[subprocess.CompletedProcess[str], Path]:
+def start_script(name: str, secrets: dict[str, str], folder: Path) -> tuple[subprocess.CompletedProcess[str], Path]:
     """Run a script with these secrets and a program that only prints its arguments and its input."""
     program, _ = HOLDERS[name]
     programs = folder / "programs"
@@ -293,10 +280,7 @@ def test_passwords_may_have_any_character(tmp_path: Path) -> None:
     (tmp_path / "redis").mkdir()
     done, written = start_script("redis.sh", {"broker_password": odd}, tmp_path / "redis")
     assert done.returncode == 0, done.stderr
-    assert (
-        f" #{hashlib.sha256(odd.encode()).hexdigest()} " in written.read_text()
-        and odd not in written.read_text()
-    )
+    assert f" #{hashlib.sha256(odd.encode()).hexdigest()} " in written.read_text() and odd not in written.read_text()
 
 
 def test_the_broker_grants_what_a_worker_needs_and_no_administration(tmp_path: Path) -> None:
@@ -306,11 +290,7 @@ def test_the_broker_grants_what_a_worker_needs_and_no_administration(tmp_path: P
             pytest.skip(f"{program} is not installed")
     (tmp_path / "broker_password").write_text("secret")
     port = free_port()
-    environment = {
-        **os.environ,
-        "LINNA_SECRETS": str(tmp_path),
-        "LINNA_REDIS_USERS": str(tmp_path / "users.acl"),
-    }
+    environment = {**os.environ, "LINNA_SECRETS": str(tmp_path), "LINNA_REDIS_USERS": str(tmp_path / "users.acl")}
     words = ["--port", str(port), "--bind", "127.0.0.1", "--dir", str(tmp_path)]
     broker = Part(
         ["sh", str(ROOT / "deploy/redis.sh"), *words], tmp_path / "redis.log", lambda: listens(port),
@@ -371,9 +351,7 @@ def test_an_api_process_drains_before_it_ends_and_the_proxy_has_another_one() ->
     proxy = (ROOT / "deploy/nginx.conf").read_text()
     upstream = re.findall(r"^ +server (\w+):8042 ", proxy, re.MULTILINE)
     assert upstream == ["api", "api2"] and set(upstream) <= set(SERVICES["proxy"]["depends_on"])
-    (idle_s,) = (
-        int(one) for one in re.findall(r"keepalive 32;.*?keepalive_timeout (\d+)s;", proxy, re.DOTALL)
-    )
+    (idle_s,) = (int(one) for one in re.findall(r"keepalive 32;.*?keepalive_timeout (\d+)s;", proxy, re.DOTALL))
     for name in upstream:
         drain_s = int(environment_of(name)["LINNA_DRAIN_S"])
         # Then 20 s for requests in progress.

@@ -55,9 +55,7 @@ def test_toml_without_end_is_refused_in_one_line(text: str, told: str, tmp_path:
         ("# " + "x" * (4 << 20), "at most 4 MiB"),
     ],
 )
-def test_toml_that_would_cost_much_is_not_parsed(
-    text: str, told: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_toml_that_would_cost_much_is_not_parsed(text: str, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr("tomllib.loads")
     with pytest.raises(InvalidInput, match=told):
         read_table(text, "body", "TOML")

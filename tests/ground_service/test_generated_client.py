@@ -58,9 +58,7 @@ def operation(name: str) -> ModuleType:
 
 def test_every_operation_has_a_function(service: TestClient, generated: Path) -> None:
     paths = service.get("/api/v1/openapi.json").json()["paths"]
-    wanted = {
-        f"{one['tags'][0]}.{one['operationId']}" for methods in paths.values() for one in methods.values()
-    }
+    wanted = {f"{one['tags'][0]}.{one['operationId']}" for methods in paths.values() for one in methods.values()}
     found = {f"{file.parent.name}.{file.stem}" for file in (generated / "api").glob("*/*.py")}
     assert wanted <= found
     for file in generated.rglob("*.py"):

@@ -68,17 +68,12 @@ def samples(tmp_path_factory: pytest.TempPathFactory, synthetic_pass: Any) -> di
     def distributed(*given: Any) -> condition.Condition:
         return replace(read_condition(*given), broker=True, runner=True, processes={"worker": 2})
 
-    with (
-        pytest.MonkeyPatch.context() as patched,
-        TestClient(create_app(settings, inline_jobs=True)) as client,
-    ):
+    with pytest.MonkeyPatch.context() as patched, TestClient(create_app(settings, inline_jobs=True)) as client:
         patched.setattr("ground_service.worker.metrics.read_condition", distributed)
         client.get("/api/v1/passes")
         text = client.get("/metrics").text
     return {
-        sample.name: set(sample.labels)
-        for family in text_string_to_metric_families(text)
-        for sample in family.samples
+        sample.name: set(sample.labels) for family in text_string_to_metric_families(text) for sample in family.samples
     }
 
 
@@ -118,10 +113,7 @@ def test_every_alert_has_a_severity_a_summary_and_an_action() -> None:
 
 
 def test_the_limits_of_the_status_are_those_of_the_alerts() -> None:
-    limits = {
-        rule["alert"]: [float(word) for word in re.findall(r"[<>] ([0-9.]+)", rule["expr"])]
-        for rule in alerts()
-    }
+    limits = {rule["alert"]: [float(word) for word in re.findall(r"[<>] ([0-9.]+)", rule["expr"])] for rule in alerts()}
     assert limits["LinnaQueueOld"] == [condition.QUEUE_AGE_LIMIT_S]
     assert limits["LinnaIngestLag"] == [condition.INGEST_LAG_LIMIT_S]
     assert limits["LinnaDiskFull"] == [condition.DISK_FREE_LIMIT]
@@ -140,10 +132,7 @@ GOOD = condition.Condition(WorkCounts({}, {}, 0, None, None), 0.0, 0.0, 50, 100,
         ({"broker": False}, "The broker does not answer."),
         ({"processes": {"api": 2, "worker": 0}}, "No worker does jobs."),
         ({"runner": False}, "No runner of payload builds responds."),
-        (
-            {"disagreements": ("api b: other files than api a",)},
-            "Processes disagree: api b: other files than api a.",
-        ),
+        ({"disagreements": ("api b: other files than api a",)}, "Processes disagree: api b: other files than api a."),
         ({"queue_age_s": 901.0}, "A job has waited for 901 s."),
         ({"ingest_lag_s": 601.0}, "An ingest has been unfinished for 601 s."),
         ({"disk_free": 9}, "9% of the disk of the archive are free."),
@@ -169,11 +158,7 @@ GET = 'linna_http_request_seconds_bucket{method="GET"'
 
 FIRING: dict[str, tuple[dict[str, str], str, str]] = {
     "LinnaDown": ({'up{job="linna"}': "1x5 0x20 1x200"}, "20m", "40m"),
-    "LinnaApiLost": (
-        {'up{job="linna"}': "1x200", 'up{job="linna",instance="b"}': "1x5 0x20 1x200"},
-        "20m",
-        "40m",
-    ),
+    "LinnaApiLost": ({'up{job="linna"}': "1x200", 'up{job="linna",instance="b"}': "1x5 0x20 1x200"}, "20m", "40m"),
     "LinnaNoWorker": ({'linna_processes{kind="worker"}': "2x5 0x20 2x200"}, "12m", "40m"),
     "LinnaProcessLost": ({'linna_processes{kind="worker"}': "2x5 1x40 2x200"}, "30m", "60m"),
     "LinnaNoRunner": ({'linna_runner_up{kind="exchange"}': "1x5 0x20 1x200"}, "20m", "40m"),
@@ -202,11 +187,7 @@ FIRING: dict[str, tuple[dict[str, str], str, str]] = {
     ),
     "LinnaDiskFull": ({"linna_disk_free_bytes": "50x5 9x20 50x200"}, "20m", "40m"),
     "LinnaBackupOld": ({"linna_backup_age_seconds": "90000+60x200 60x200"}, "180m", "240m"),
-    "LinnaTimeCorrelationOld": (
-        {f"{CORRELATION}": "172000+60x120 0x200"},
-        "120m",
-        "160m",
-    ),
+    "LinnaTimeCorrelationOld": ({f"{CORRELATION}": "172000+60x120 0x200"}, "120m", "160m"),
     "LinnaCertificateExpires": (
         {'probe_ssl_earliest_cert_expiry{job="linna-proxy"}': f"{13 * 86_400}x120 {90 * 86_400}x200"},
         "120m",
@@ -226,9 +207,7 @@ def test_the_configuration_of_prometheus_is_valid_and_has_the_jobs_of_the_alerts
     if program is None:
         pytest.skip("promtool is not installed")
     place = RULES.with_name("prometheus.yml")
-    checked = subprocess.run(
-        [program, "check", "config", str(place)], capture_output=True, text=True, check=False
-    )
+    checked = subprocess.run([program, "check", "config", str(place)], capture_output=True, text=True, check=False)
     assert checked.returncode == 0, checked.stdout + checked.stderr
     jobs = {one["job_name"] for one in yaml.safe_load(place.read_text())["scrape_configs"]}
     assert set(re.findall(r'job="([^"]+)"', RULES.read_text())) == jobs
@@ -279,9 +258,7 @@ def test_alerts_fire_and_only_when_they_should(tmp_path: Path) -> None:
     program = shutil.which("promtool")
     if program is None:
         pytest.skip("promtool is not installed")
-    checked = subprocess.run(
-        [program, "check", "rules", str(RULES)], capture_output=True, text=True, check=False
-    )
+    checked = subprocess.run([program, "check", "rules", str(RULES)], capture_output=True, text=True, check=False)
     assert checked.returncode == 0, checked.stderr
     values = {
         'up{job="linna"}': "1x200", "linna_scheduler": "1x200", "linna_backup_age_seconds": "3600x200",
@@ -411,9 +388,7 @@ def test_spans_of_a_request_its_job_and_its_report_are_one_tree(tmp_path: Path, 
     assert (job.attributes["linna.state"], report.attributes["linna.pass"]) == ("done", pass_id)
 
 
-def test_traces_without_the_library_are_refused_with_a_remedy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_traces_without_the_library_are_refused_with_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "opentelemetry.sdk.trace", None)
     with pytest.raises(SettingsError, match="LINNA_TRACES: expected the extra 'traces'"):
         create_app(Settings(home=tmp_path, traces="http://127.0.0.1:4318/v1/traces"))

@@ -127,18 +127,13 @@ def test_an_impossible_time_is_answered_with_the_expected_form(client: TestClien
     given = {"name": "p", "start": "tomorrow", "stop": "2029-08-07T06:37:00Z", "spacecraft_id": 76}
     answer = client.post("/api/v1/passes", json=given)
     assert answer.status_code == 422
-    assert answer.json()["detail"] == (
-        "body.start: expected a time such as 2029-08-07T06:00:00Z, found 'tomorrow'"
-    )
+    assert answer.json()["detail"] == ("body.start: expected a time such as 2029-08-07T06:00:00Z, found 'tomorrow'")
 
 
 @pytest.mark.parametrize(
     ("change", "detail"),
     [
-        (
-            {"spacecraft_id": 1024},
-            "body.spacecraft_id: expected less than or equal to 1023, found '1024'",
-        ),
+        ({"spacecraft_id": 1024}, "body.spacecraft_id: expected less than or equal to 1023, found '1024'"),
         ({"spacecraft": 76}, "body.spacecraft: expected spacecraft_id, found an unknown field"),
         ({"name": None}, "body.name: expected a valid string"),
         ({"start": 5}, "body.start: expected a time such as 2029-08-07T06:00:00Z, found '5'"),
@@ -148,19 +143,11 @@ def test_an_impossible_time_is_answered_with_the_expected_form(client: TestClien
 def test_a_fault_is_answered_with_what_was_expected_and_found(
     client: TestClient, change: dict[str, Any], detail: str
 ) -> None:
-    given = {
-        "name": "p",
-        "start": "2029-08-07T06:00:00Z",
-        "stop": "2029-08-07T06:37:00Z",
-        "spacecraft_id": 76,
-    }
+    given = {"name": "p", "start": "2029-08-07T06:00:00Z", "stop": "2029-08-07T06:37:00Z", "spacecraft_id": 76}
     answer = client.post("/api/v1/passes", json=given | change)
     assert (answer.status_code, answer.json()["detail"]) == (422, detail)
     del given["name"]
-    assert (
-        client.post("/api/v1/passes", json=given).json()["detail"]
-        == "body.name: expected a value, found none"
-    )
+    assert client.post("/api/v1/passes", json=given).json()["detail"] == "body.name: expected a value, found none"
 
 
 def test_pages_of_a_list_link_to_each_other(client: TestClient) -> None:
@@ -191,7 +178,7 @@ def test_links_keep_the_filter_of_a_list(client: TestClient) -> None:
 REFUSALS = re.findall(
     r"^\| (?P<mistake>[^|]+) \| `(?P<request>[A-Z]+ [^` ]+)`(?: `(?P<body>[^`]*)`)?(?: with `(?P<header>[^`]+)`)? "
     r"\| (?P<status>\d{3}) \| (?P<line>.+) \|$",
-    (Path(__file__).parents[2] / "docs" / "http.md").read_text(),
+    (Path(__file__).parents[2] / "docs" / "results" / "http-mistakes.md").read_text(),
     re.MULTILINE,
 )
 
@@ -209,9 +196,7 @@ def shift(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TestClient
         }
         add_mission(ground, b'name = "m"\n[spacecraft]\nid = 76\nname = "SelenITA"\n')
         add_reference(ground, save_circle(home / "a.oem"))
-        planning.add_window(
-            ground, WindowEntry("w", START + HOUR, START + HOUR + HOUR // 6, 15.0, 76), actor="ann"
-        )
+        planning.add_window(ground, WindowEntry("w", START + HOUR, START + HOUR + HOUR // 6, 15.0, 76), actor="ann")
         planning.change_window(ground, 1, actor="ann", changes={}, decision="approved")
         reboot = {"function_id": "reboot"}
         for name, arguments in (("test_connection", {}), ("perform_function", reboot)):

@@ -159,9 +159,7 @@ def test_the_address_of_the_client_cannot_be_forged(proxied: Proxied) -> None:
 
 def test_the_cookie_of_a_session_is_for_tls_only(proxied: Proxied) -> None:
     with proxied.client() as client:
-        answer = client.post(
-            "/api/v1/session", json={"token": proxied.token}, headers={"Origin": proxied.url}
-        )
+        answer = client.post("/api/v1/session", json={"token": proxied.token}, headers={"Origin": proxied.url})
         assert answer.status_code == 200, answer.text
         assert "secure" in answer.headers["set-cookie"].lower().split("; ")
         assert client.get("/api/v1/session").json()["name"] == "ann"
@@ -175,9 +173,7 @@ def test_a_websocket_goes_through(proxied: Proxied) -> None:
         assert opened.response is not None and opened.response.status_code == 101
 
 
-def test_a_flood_is_limited_before_the_service_but_not_others_of_its_address(
-    proxied: Proxied, tmp_path: Path
-) -> None:
+def test_a_flood_is_limited_before_the_service_but_not_others_of_its_address(proxied: Proxied, tmp_path: Path) -> None:
     """With smaller figures than the shipped ones: 1 + 5 requests pass, the others are refused by the proxy."""
     port = free_port()
     text = (proxied.folder / "nginx.conf").read_text()

@@ -32,9 +32,7 @@ def test_a_port_in_use_is_one_clear_line(tmp_path: Path) -> None:
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        with pytest.raises(
-            ServerError, match=f"port {port}: is in use by another program; choose another with --port"
-        ):
+        with pytest.raises(ServerError, match=f"port {port}: is in use by another program; choose another with --port"):
             serve(Settings(home=tmp_path, port=port))
 
 

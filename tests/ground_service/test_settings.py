@@ -10,15 +10,7 @@ from ground_service.settings import SECRETS, URLS, load_settings, normalised_url
 
 @pytest.fixture(autouse=True)
 def bare(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    for name in (
-        "HOME",
-        "DATABASE_URL",
-        "BROKER_URL",
-        "HOST",
-        "PORT",
-        "DATABASE_URL_FILE",
-        "BROKER_URL_FILE",
-    ):
+    for name in ("HOME", "DATABASE_URL", "BROKER_URL", "HOST", "PORT", "DATABASE_URL_FILE", "BROKER_URL_FILE"):
         monkeypatch.delenv(f"LINNA_{name}", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
 
@@ -37,9 +29,7 @@ def test_what_is_given_goes_before_the_environment(monkeypatch: pytest.MonkeyPat
     assert load_settings(port=9001).port == 9001
 
 
-def test_secrets_can_come_from_files_and_are_not_printed(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_secrets_can_come_from_files_and_are_not_printed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "url").write_text("postgres://linna:geheim@db/linna\n")
     monkeypatch.setenv("LINNA_DATABASE_URL_FILE", str(tmp_path / "url"))
     settings = load_settings()
@@ -66,17 +56,11 @@ def test_a_password_can_come_from_a_file_of_its_own(monkeypatch: pytest.MonkeyPa
     [
         ("LINNA_PORT", "seventy", "LINNA_PORT: expected input should be a valid integer"),
         ("LINNA_PORT", "70000", "LINNA_PORT: expected input should be less than or equal to 65535"),
-        (
-            "LINNA_TRUSTED_PROXIES",
-            "proxy",
-            "^LINNA_TRUSTED_PROXIES: expected IP addresses or networks, found 'proxy'$",
-        ),
+        ("LINNA_TRUSTED_PROXIES", "proxy", "^LINNA_TRUSTED_PROXIES: expected IP addresses or networks, found 'proxy'$"),
         ("LINNA_DATABASE_URL_FILE", "/does/not/exist", "LINNA_DATABASE_URL_FILE: expected a readable file"),
     ],
 )
-def test_a_wrong_setting_is_named(
-    monkeypatch: pytest.MonkeyPatch, name: str, value: str, message: str
-) -> None:
+def test_a_wrong_setting_is_named(monkeypatch: pytest.MonkeyPatch, name: str, value: str, message: str) -> None:
     monkeypatch.setenv(name, value)
     with pytest.raises(SettingsError, match=message):
         load_settings()
@@ -105,9 +89,7 @@ def test_an_unusable_secret_is_refused_in_one_line_and_never_replaced_by_a_defau
     assert str(tmp_path / "secret") in str(error.value) and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    "url", ["nonsense", "amqp://linna:geheim@broker/0", "redis://", "//linna:geheim@broker"]
-)
+@pytest.mark.parametrize("url", ["nonsense", "amqp://linna:geheim@broker/0", "redis://", "//linna:geheim@broker"])
 def test_a_broker_other_than_redis_is_refused_without_showing_its_password(
     monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:

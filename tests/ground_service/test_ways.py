@@ -73,18 +73,14 @@ def packets_of(cadus: bytes) -> list[bytes]:
     return list(found.cut.packets(found.buffer))
 
 
-def flown(
-    session: LiveSession, telecommands: Callable[[LiveSession], bytes] = lambda session: b""
-) -> list[bytes]:
+def flown(session: LiveSession, telecommands: Callable[[LiveSession], bytes] = lambda session: b"") -> list[bytes]:
     """Fly a session that is paused until it has its telecommands, and return what a station receives."""
     thread = threading.Thread(target=session.run, daemon=True)
     thread.start()
     records = b""
     try:
         with (
-            socket.create_connection(
-                ("127.0.0.1", session.ports["telemetry earth"]), timeout=60.0
-            ) as telemetry,
+            socket.create_connection(("127.0.0.1", session.ports["telemetry earth"]), timeout=60.0) as telemetry,
             socket.create_connection(("127.0.0.1", session.ports["telecommand earth"]), timeout=900.0) as up,
             socket.create_connection(("127.0.0.1", session.ports["console"]), timeout=900.0) as console,
         ):
@@ -113,9 +109,7 @@ def of_kind(name: str, packets: list[bytes]) -> dict[int, dict[str, Any]]:
     for packet in packets:
         kind, values = DICTIONARY.unpack(packet)
         if kind == name:
-            found[int(values["image_ticks"])] = json.loads(
-                json.dumps(values, default=lambda value: value.tolist())
-            )
+            found[int(values["image_ticks"])] = json.loads(json.dumps(values, default=lambda value: value.tolist()))
     return found
 
 
@@ -191,16 +185,13 @@ def commanded(scenario: Scenario, start_utc_ns: int, frames: int) -> tuple[LiveS
     return session, flown(session, telecommands)
 
 
-def test_a_window_commanded_by_the_ground_gives_the_images_and_detections_of_the_archive(
-    archive: Path,
-) -> None:
+def test_a_window_commanded_by_the_ground_gives_the_images_and_detections_of_the_archive(archive: Path) -> None:
     scenario = parse_scenario(SCENARIO)
     first = int(build_world(scenario, NO_DATA).frame_utc_ns[0])
     session, packets = commanded(scenario, first, FRAMES)
     assert session.account.frames == FRAMES
     pictures = [
-        cv2.imread(str(archive / frame_path(number)), cv2.IMREAD_UNCHANGED)[..., ::-1]
-        for number in range(FRAMES)
+        cv2.imread(str(archive / frame_path(number)), cv2.IMREAD_UNCHANGED)[..., ::-1] for number in range(FRAMES)
     ]
     reported = of_kind("image_report", packets)
     assert [one["image_crc"] for one in reported.values()] == [

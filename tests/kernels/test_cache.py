@@ -123,9 +123,7 @@ def test_processes_that_compile_at_once_leave_whole_files(tmp_path: Path) -> Non
     assert run(folder, cache) == "20 1"
 
 
-def test_the_folder_is_private_and_files_of_others_are_ignored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_folder_is_private_and_files_of_others_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     keep("a-1", b"code")
     uid = os.getuid()
@@ -196,10 +194,7 @@ def test_the_order_of_the_fields_of_a_tuple_counts(tmp_path: Path, monkeypatch: 
     from numba.core.registry import cpu_target
 
     names = []
-    for folder, old, new in (
-        ("one", "", ""),
-        ("two", "first: float\n    second", "second: float\n    first"),
-    ):
+    for folder, old, new in (("one", "", ""), ("two", "first: float\n    second", "second: float\n    first")):
         module = imported(write(tmp_path / folder, old, new), monkeypatch)
         signature = (typeof((module.callee.Pair(1.0, 2.0),)),)
         names.append(module.of_pair._cache._name(signature, cpu_target.target_context.codegen()))
@@ -236,9 +231,7 @@ def test_declared_versions_are_compiled_at_the_same_time_and_once(
     assert module.outer(1) == 20
     assert module.of_pair(module.Pair(2.0, 3.0)) == 2.0
     assert [len(kernel.stats.cache_hits) for kernel in (module.outer, module.of_pair)] == [1, 1]
-    monkeypatch.setenv(
-        "NUMBA_CACHE_DIR", str(folder / "caller.py")
-    )  # not a folder: no process could keep a file
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder / "caller.py"))  # not a folder: no process could keep a file
     with compiling_ahead([["caller"]], said.append) as wait:
         wait()
     assert len(said) == 2

@@ -32,9 +32,7 @@ def library(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
     return found
 
 
-def test_memory_is_given_back_once_in_an_interval(
-    library: MagicMock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_memory_is_given_back_once_in_an_interval(library: MagicMock, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr(memory.time, "monotonic", lambda: now[0])
     done = []

@@ -38,13 +38,9 @@ def landmarks_packet(latitude: list[float], identity: int = 3_000_000_000) -> by
     return DICTIONARY.pack("landmarks", values, ticks=0, sequence_count=0)
 
 
-def test_a_downlinked_map_is_compared_with_a_catalogue(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_downlinked_map_is_compared_with_a_catalogue(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, downlink = tmp_path / "list.csv", tmp_path / "map.bin"
-    listed = make_catalogue(
-        np.radians([10.0]), np.radians([300.0]), [6_000.0], source="one", rim_height_m=[50.0]
-    )
+    listed = make_catalogue(np.radians([10.0]), np.radians([300.0]), [6_000.0], source="one", rim_height_m=[50.0])
     save_catalogue(listed, path)
     # 0.01 degrees are 303 m on the ground; the other landmark is far from any crater.
     downlink.write_bytes(landmarks_packet([10.01, 20.0]))
@@ -65,9 +61,7 @@ def test_a_downlink_without_a_map_has_none(tmp_path: Path, capsys: pytest.Captur
 
 
 def test_a_list_is_registered_to_terrain(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    latitude, longitude = (
-        part.ravel() for part in np.meshgrid(np.arange(1.5, 9, 1.5), np.arange(301.5, 309, 1.5))
-    )
+    latitude, longitude = (part.ravel() for part in np.meshgrid(np.arange(1.5, 9, 1.5), np.arange(301.5, 309, 1.5)))
 
     def bowls(lat: np.ndarray, lon: np.ndarray) -> np.ndarray:
         height = np.zeros(np.broadcast_shapes(lat.shape, lon.shape))
@@ -75,9 +69,7 @@ def test_a_list_is_registered_to_terrain(tmp_path: Path, capsys: pytest.CaptureF
             level = np.cos(np.radians(north))
             # Radius 5 km, rim 200 m, depth 1,000 m.
             r = np.hypot(lat - north, (lon - east) * level) * METRES_PER_DEG / 5_000.0
-            height += np.where(
-                r < 1.0, 1_000.0 * np.minimum(r, 1.0) ** 2 - 800.0, 200.0 * np.maximum(r, 1.0) ** -4.0
-            )
+            height += np.where(r < 1.0, 1_000.0 * np.minimum(r, 1.0) ** 2 - 800.0, 200.0 * np.maximum(r, 1.0) ** -4.0)
         return height
 
     raster = write_raster(tmp_path / "bowls.tif", 300.0, 9.0, 9.0, bowls, ppd=128)

@@ -18,9 +18,7 @@ from tests.scenarios import still_scenario
 
 
 def linna(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "linna", *arguments], capture_output=True, text=True, check=False
-    )
+    return subprocess.run([sys.executable, "-m", "linna", *arguments], capture_output=True, text=True, check=False)
 
 
 def test_help_groups_the_commands_by_task() -> None:
@@ -43,9 +41,7 @@ def test_help_imports_no_numerical_library() -> None:
 def test_an_unknown_command_is_one_line_with_the_nearest_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["dmo"]) == 2
     captured = capsys.readouterr()
-    assert (
-        captured.err.strip() == "linna: error: unknown command 'dmo' (did you mean 'demo'?); see linna --help"
-    )
+    assert captured.err.strip() == "linna: error: unknown command 'dmo' (did you mean 'demo'?); see linna --help"
 
 
 def test_every_command_has_a_description_and_an_example_and_states_required_options() -> None:
@@ -115,9 +111,7 @@ def test_a_scenario_is_checked_without_a_flight(tmp_path: Path, capsys: pytest.C
     assert "duration_s" in capsys.readouterr().err
 
 
-def test_a_mission_description_is_checked_by_a_dry_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mission_description_is_checked_by_a_dry_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "mission.toml"
     path.write_text('name = "m"\n[spacecraft]\nid = 76\n')
     assert cli.run(["mission", "check", str(path)]) == 0

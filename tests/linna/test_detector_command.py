@@ -103,10 +103,7 @@ def test_a_picture_without_craters_leaves_the_sun_unknown(write_image, capsys):
 
 def write_labelled(tmp_path, write_image):
     write_image("a.png", bowl_image())
-    boxes = [
-        {"id": k, "image_id": 1, "bbox": [u - 19.5, v - 19.5, 40, 40]}
-        for k, (u, v) in enumerate(BOWL_CENTRES)
-    ]
+    boxes = [{"id": k, "image_id": 1, "bbox": [u - 19.5, v - 19.5, 40, 40]} for k, (u, v) in enumerate(BOWL_CENTRES)]
     document = {"images": [{"id": 1, "file_name": "a.png"}], "annotations": boxes, "categories": []}
     (tmp_path / "labels.json").write_text(json.dumps(document))
 
@@ -158,10 +155,7 @@ def test_a_camera_that_cannot_be_is_refused(write_image, capsys, extra, words):
 
 
 def test_a_black_picture_is_a_verdict_not_an_error(write_image, capsys):
-    assert (
-        run(["detector", "detect", str(write_image("black.png", np.zeros((512, 512), np.uint8))), "--json"])
-        == 1
-    )
+    assert run(["detector", "detect", str(write_image("black.png", np.zeros((512, 512), np.uint8))), "--json"]) == 1
     (item,) = json.loads(capsys.readouterr().out)["images"]
     assert item["quality"] == "dark" and item["detections"] == []
     assert item["reason"] == "0.00% of the pixels over 4.0% of full scale, expected over 0.2%"

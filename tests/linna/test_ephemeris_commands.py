@@ -71,9 +71,7 @@ def test_an_ephemeris_goes_through_spice_and_back(oem_path, tmp_path, capsys):
     kernel, back = tmp_path / "orbit.bsp", tmp_path / "back.oem"
     made = run_json(capsys, "orbit", "convert", oem_path, "--out", kernel, "--spice-id", "-85")
     assert made["spk_type"] == 3 and made["error_m"] < 1e-4
-    older = run_json(
-        capsys, "orbit", "convert", oem_path, "--out", kernel, "--spice-id", "-85", "--type", "13"
-    )
+    older = run_json(capsys, "orbit", "convert", oem_path, "--out", kernel, "--spice-id", "-85", "--type", "13")
     assert (older["spk_type"], older["states"], older["error_m"]) == (13, 2881, None)
     run_json(capsys, "orbit", "convert", kernel, "--out", back, "--spice-id", "-85", "--step", "30")
     # A float64 of seconds is good to 0.2 mm at orbital speed.
@@ -137,9 +135,7 @@ def test_interpolate_gives_states_at_the_epochs_of_a_file(oem_path, tmp_path, ca
     epochs.write_text("# two epochs\n2029-08-07T00:00:00Z\n\n2029-08-07T12:34:56.789123Z  # odd\n")
     figures = run_json(capsys, "orbit", "interpolate", oem_path, "--epochs", epochs)
     first, second = figures["states"]
-    assert set(first) == {
-        *("epoch", "position_km", "velocity_km_s", "latitude_deg", "longitude_deg", "altitude_km"),
-    }
+    assert set(first) == {*("epoch", "position_km", "velocity_km_s", "latitude_deg", "longitude_deg", "altitude_km")}
     assert second["epoch"] == "2029-08-07T12:34:56.789123000Z"
     assert np.linalg.norm(second["position_km"]) == pytest.approx(1768.18, abs=1e-6)
     assert first["altitude_km"] == pytest.approx(30.78, abs=1e-6)
@@ -148,9 +144,7 @@ def test_interpolate_gives_states_at_the_epochs_of_a_file(oem_path, tmp_path, ca
     assert len(capsys.readouterr().out.splitlines()) == 3
 
 
-def test_interpolate_names_the_epoch_that_is_not_covered_and_the_line_that_is_no_epoch(
-    oem_path, tmp_path, capsys
-):
+def test_interpolate_names_the_epoch_that_is_not_covered_and_the_line_that_is_no_epoch(oem_path, tmp_path, capsys):
     epochs = tmp_path / "epochs.txt"
     epochs.write_text("2029-09-07T00:00:00Z\n")
     line = error_line(capsys, "orbit", "interpolate", oem_path, "--epochs", epochs)

@@ -98,9 +98,7 @@ def test_a_failed_job_is_reported_in_one_line_that_names_the_file(tmp_path: Path
     assert (done.returncode, done.stdout) == (2, "")
     progress, line = done.stderr.splitlines()
     assert progress == f"ingesting {archive} ..."
-    assert line.startswith(
-        f"linna: error: {archive}: manifest.json, schema_version: expected int, found None (help: "
-    )
+    assert line.startswith(f"linna: error: {archive}: manifest.json, schema_version: expected int, found None (help: ")
 
 
 def test_an_unusable_file_does_not_keep_the_others_from_being_ingested(
@@ -123,6 +121,4 @@ def test_a_user_of_an_unknown_mission_is_warned_of(capsys: pytest.CaptureFixture
         add_user=lambda *_, **__: SimpleNamespace(token="T"),
     )
     assert user._add(service, "ann", "viewer", missions=["selenito", "selenita"])["token"] == "T"
-    assert capsys.readouterr().err == (
-        "linna: warning: no spacecraft has the mission 'selenito'; known: selenita\n"
-    )
+    assert capsys.readouterr().err == ("linna: warning: no spacecraft has the mission 'selenito'; known: selenita\n")

@@ -47,15 +47,11 @@ def test_a_part_that_ends_is_named_after_the_documents_were_posted(
         living.living_demo(*demo)  # goes on: nothing is posted again
     assert client.method_calls == [] and said[-3].startswith("going on from the state of the spacecraft")
     other = (load_scenario("live-pictures"), *demo[1:])
-    with pytest.raises(
-        ScenarioError, match="that of a living demo of this scenario, found one with other files"
-    ):
+    with pytest.raises(ScenarioError, match="that of a living demo of this scenario, found one with other files"):
         living.living_demo(*other)
 
 
-def test_a_spacecraft_that_goes_on_has_its_state_and_ports_and_the_terrain_of_the_demo(
-    tmp_path: Path,
-) -> None:
+def test_a_spacecraft_that_goes_on_has_its_state_and_ports_and_the_terrain_of_the_demo(tmp_path: Path) -> None:
     command = living._parts(tmp_path, 60.0, 8042, {"madrid": (1, 2)})["spacecraft"]._command
     assert {"--state", "--journal", "madrid:1:2"} <= {*command}
     assert load_scenario("live-demo").terrain == load_scenario("selenita").terrain

@@ -14,13 +14,7 @@ from studies import paper_steps
 from studies.paper_steps import Effort, StepFolder
 
 SMALL = Effort(
-    hours=0.1,
-    unseen_passes=1,
-    sample_frames=8,
-    method_frames=8,
-    training_steps=1,
-    days=1.0,
-    fov_step_s=600.0,
+    hours=0.1, unseen_passes=1, sample_frames=8, method_frames=8, training_steps=1, days=1.0, fov_step_s=600.0
 )
 
 
@@ -30,9 +24,7 @@ def document(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
     lines: list[str] = []
     with pytest.MonkeyPatch.context() as patch:
         find_spec = importlib.util.find_spec
-        patch.setattr(
-            importlib.util, "find_spec", lambda name, *a: None if name == "torch" else find_spec(name, *a)
-        )
+        patch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "torch" else find_spec(name, *a))
         patch.setattr(paper_steps, "QUICK", SMALL)
         patch.setattr("linna.commands.paper.log", lines.append)
         patch.delenv("LINNA_DATA", raising=False)
@@ -43,26 +35,15 @@ def document(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
     return out, json.loads((out / "paper.json").read_text()), lines[first:]
 
 
-def test_the_document_has_the_figures_tables_and_differences(
-    document: tuple[Path, dict[str, Any], list[str]],
-) -> None:
+def test_the_document_has_the_figures_tables_and_differences(document: tuple[Path, dict[str, Any], list[str]]) -> None:
     out, index, _ = document
     rows = list(csv.DictReader((out / "paper.csv").read_text().splitlines()))
     assert [row["quantity"] for row in rows] == [one["quantity"] for one in index["values"]]
-    assert {f"{figure['key']}.png" for figure in index["figures"]} <= {
-        one.name for one in (out / "figures").iterdir()
-    }
+    assert {f"{figure['key']}.png" for figure in index["figures"]} <= {one.name for one in (out / "figures").iterdir()}
     assert (out / "paper.pdf").read_bytes().startswith(b"%PDF")
     assert {
-        "fov",
-        "classes",
-        "region",
-        "samples",
-        "ours-outcomes",
-        "ours-ground",
-        "ours-altitude",
-        "ours-simulator",
-    } <= {figure["key"] for figure in index["figures"]}
+        "fov", "classes", "region", "samples", "ours-outcomes", "ours-ground", "ours-altitude", "ours-simulator",
+    } <= {figure["key"] for figure in index["figures"]}  # fmt: skip
     assert index["tables"][-1]["columns"] == ["subject", "paper", "this system", "reason"]
     images = next(row for row in index["differences"] if row["subject"] == "Images of the session")
     assert "5" in images["paper"] and "0.1 h" in images["here"] and "32.5 h" in images["reason"]
@@ -74,9 +55,7 @@ def test_a_second_run_repeats_no_step(document: tuple[Path, dict[str, Any], list
     assert all(line.endswith(": already done") for line in steps)
 
 
-def test_without_torch_the_document_says_what_it_lacks(
-    document: tuple[Path, dict[str, Any], list[str]],
-) -> None:
+def test_without_torch_the_document_says_what_it_lacks(document: tuple[Path, dict[str, Any], list[str]]) -> None:
     assert "torch" in document[1]["not_available"]["sessions"]
     assert not [figure for figure in document[1]["figures"] if figure["key"].startswith("own-")]
 
@@ -95,9 +74,7 @@ def test_a_step_is_done_again_when_what_it_is_made_from_changes(tmp_path: Path) 
         calls.append(len(calls))
         return len(calls)
 
-    steps = StepFolder(
-        tmp_path, find_data(None), SMALL, None, lambda _: None, lambda items, total: iter(items)
-    )
+    steps = StepFolder(tmp_path, find_data(None), SMALL, None, lambda _: None, lambda items, total: iter(items))
     assert [
         steps.step("one", {"a": 1}, make),
         steps.step("one", {"a": 1}, make),

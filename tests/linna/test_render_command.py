@@ -53,14 +53,10 @@ def test_a_frame_is_written_with_its_metadata_and_labels(scenario, tmp_path, cap
     assert cv2.imread(str(out)).shape == (96, 96, 3)
     assert figures["metadata"]["renderer"] == "fast" and figures["metadata"]["photometry"] == "lunar-lambert"
     assert figures["labels"] and figures["data"]
-    assert {"u_px", "ellipse", "visible_fraction", "lit_fraction", "sight_fraction"} <= figures["labels"][
-        0
-    ].keys()
+    assert {"u_px", "ellipse", "visible_fraction", "lit_fraction", "sight_fraction"} <= figures["labels"][0].keys()
 
 
-def test_law_and_renderer_are_chosen_on_the_command_line_pointing_and_depth_by_the_scenario(
-    scenario, tmp_path, capsys
-):
+def test_law_and_renderer_are_chosen_on_the_command_line_pointing_and_depth_by_the_scenario(scenario, tmp_path, capsys):
     out = tmp_path / "b.png"
     chosen = ("--photometry", "hapke", "--renderer", "raymarch")
     turned = SMALL + "tilt_deg = 4.0\nyaw_deg = 90.0\n[sensor]\nbits = 12\n"
@@ -80,9 +76,7 @@ def test_labels_are_drawn_in_the_colours_of_their_classes(scenario, tmp_path, ca
     assert status == 0
     # Cyan, lime and yellow are the only saturated colours on the Moon.
     saturated = drawn.max(axis=2) - drawn.min(axis=2) > 120
-    assert saturated.any() == any(
-        label["class"] in (0, 1, 2) and label["inside"] for label in figures["labels"]
-    )
+    assert saturated.any() == any(label["class"] in (0, 1, 2) and label["inside"] for label in figures["labels"])
 
 
 def test_a_sheet_holds_the_epochs_named(scenario, tmp_path, capsys):
@@ -133,8 +127,7 @@ def test_an_unknown_renderer_is_refused_with_the_known_ones(scenario, capsys):
 def test_an_ephemeris_below_the_terrain_and_epochs_outside_it_are_one_line(scenario, tmp_path, capsys):
     oem = tmp_path / "low.oem"
     states = "\n".join(
-        f"2029-08-07T00:{minute:02d}:00.000 1730.0 {0.1 * minute:.1f} 0.0 0.0 0.0016 0.0"
-        for minute in range(30)
+        f"2029-08-07T00:{minute:02d}:00.000 1730.0 {0.1 * minute:.1f} 0.0 0.0 0.0016 0.0" for minute in range(30)
     )
     oem.write_text(
         "CCSDS_OEM_VERS = 2.0\nCREATION_DATE = 2029-01-01T00:00:00\nORIGINATOR = T\nMETA_START\nOBJECT_NAME = A\n"
@@ -145,6 +138,4 @@ def test_an_ephemeris_below_the_terrain_and_epochs_outside_it_are_one_line(scena
     file.write_text(SMALL + f'[orbit]\noem = "{oem}"\n')
     out = str(tmp_path / "x.png")
     assert "below" in refused(capsys, str(file), "--epoch", EPOCHS[0], "--out", out)
-    assert "2029-08-07T00:29:00" in refused(
-        capsys, str(file), "--epoch", "2029-08-08T00:00:00Z", "--out", out
-    )
+    assert "2029-08-07T00:29:00" in refused(capsys, str(file), "--epoch", "2029-08-08T00:00:00Z", "--out", out)

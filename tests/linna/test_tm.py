@@ -107,10 +107,7 @@ def test_a_file_without_telemetry_is_refused_in_one_line(tmp_path, capsys, conte
     path.write_bytes(content)
     assert run(["tm", "check", str(path)]) == 2
     error = capsys.readouterr().err
-    assert (
-        error
-        == f"linna: error: {path}: expected CADUs or space packets, found none in its {len(content)} octets\n"
-    )
+    assert error == f"linna: error: {path}: expected CADUs or space packets, found none in its {len(content)} octets\n"
 
 
 def test_frames_of_an_unknown_coding_are_refused_with_the_name_of_the_file(tmp_path, capsys):
@@ -134,16 +131,7 @@ def test_an_unwritable_place_leaves_nothing_behind(downlink, tmp_path, capsys):
 
 
 def test_settings_of_the_link_may_be_given(downlink, capsys):
-    arguments = [
-        "--frame-length",
-        "1115",
-        "--coding",
-        "rs",
-        "--randomiser",
-        "none",
-        "--spacecraft-id",
-        "0x4C",
-    ]
+    arguments = ["--frame-length", "1115", "--coding", "rs", "--randomiser", "none", "--spacecraft-id", "0x4C"]
     assert run(["tm", "check", str(downlink), "--json", *arguments]) == 0
     told = figures(capsys)
     assert told["link"]["randomiser"] == "none" and told["packets"] == 0
@@ -210,9 +198,7 @@ def test_packets_of_another_mission_are_decoded_through_their_definition(foreign
     raw = json.loads(capsys.readouterr().out)
     chosen = [p for p in expected if "MODE" in p]
     assert [r["MODE"] for r in raw] == [p["MODE"].raw_value for p in chosen]
-    assert [r["SERIAL"] for r in raw] == [p["SERIAL"] for p in chosen] and max(
-        r["SERIAL"] for r in raw
-    ) >= 2**63
+    assert [r["SERIAL"] for r in raw] == [p["SERIAL"] for p in chosen] and max(r["SERIAL"] for r in raw) >= 2**63
     out = tmp_path / "bus.csv"
     assert run(["tm", "decode", str(capture), *options, "--format", "csv", "--out", str(out), "--json"]) == 0
     told = figures(capsys)
@@ -235,22 +221,11 @@ def test_packets_of_another_mission_are_decoded_through_their_definition(foreign
         (("", ""), ["--packet", "Absent"], "expected a container"),
     ],
 )
-def test_a_definition_that_cannot_be_used_is_refused_in_one_line(
-    foreign, tmp_path, change, options, words, capsys
-):
+def test_a_definition_that_cannot_be_used_is_refused_in_one_line(foreign, tmp_path, change, options, words, capsys):
     definition, capture, _ = foreign
     definition.write_text(definition.read_text().replace(*change) if change[0] else definition.read_text())
     out = tmp_path / "out.json"
-    command = [
-        "tm",
-        "decode",
-        str(capture),
-        "--xtce",
-        str(definition),
-        "--no-error-control",
-        "--out",
-        str(out),
-    ]
+    command = ["tm", "decode", str(capture), "--xtce", str(definition), "--no-error-control", "--out", str(out)]
     assert run([*command, *options]) == 2
     error = capsys.readouterr().err
     assert words in error and error.count("\n") == 1 and not out.exists()
@@ -267,19 +242,13 @@ def test_arrays_and_aggregates_are_lists_and_mappings_and_columns_of_a_table(tmp
     from tests.tmtc.foreign import container, document, integer
     from tests.tmtc.xtce.test_decode import ARRAY_ENTRY, aggregate, array_type, dimension
 
-    types = (
-        integer("u8", 8)
-        + aggregate("pair", {"a": "u8", "b": "u8"})
-        + array_type("list", "u8", dimension("n"))
-    )
+    types = integer("u8", 8) + aggregate("pair", {"a": "u8", "b": "u8"}) + array_type("list", "u8", dimension("n"))
     parameters = {"head": "head", "n": "u8", "pair": "pair", "packet": "u8", "list": "list"}
     types += integer("head", 48)
     definition, capture = tmp_path / "d.xml", tmp_path / "c.bin"
     entries = ["head", "n", "pair", "packet", ARRAY_ENTRY("list")]
     definition.write_text(document(types, parameters, container("P", entries)))
-    capture.write_bytes(
-        bytes((0, 5, 0xC0, 0, 0, 5, 2, 3, 4, 5, 6, 7)) + bytes((0, 5, 0xC0, 1, 0, 3, 0, 8, 9, 10))
-    )
+    capture.write_bytes(bytes((0, 5, 0xC0, 0, 0, 5, 2, 3, 4, 5, 6, 7)) + bytes((0, 5, 0xC0, 1, 0, 3, 0, 8, 9, 10)))
     options = ["tm", "decode", str(capture), "--xtce", str(definition), "--no-error-control"]
     assert run(options) == 0
     first, second = json.loads(capsys.readouterr().out)
@@ -299,14 +268,7 @@ def bus_packet(count: int, data: bytes, *, secondary: bool = True, flags: int = 
 @pytest.fixture
 def timed(tmp_path):
     """A definition whose packets have a time of four octets, and a function that checks or decodes packets with it."""
-    from tests.tmtc.foreign import (
-        HEADER_CONTAINER,
-        HEADER_PARAMETERS,
-        HEADER_TYPES,
-        comparison,
-        container,
-        document,
-    )
+    from tests.tmtc.foreign import HEADER_CONTAINER, HEADER_PARAMETERS, HEADER_TYPES, comparison, container, document
 
     parameters = {**HEADER_PARAMETERS, "time": "U32", "value": "U16"}
     entries = container("hk", ["time", "value"], "CCSDSPacket", comparison("PKT_APID", 200))
@@ -345,10 +307,7 @@ def test_counts_that_restart_are_told_from_conflicts(timed, capsys):
     assert "conflicts 0" in out
     assert "counts restart once; how many packets are missing around a restart is unknown" in out
     assert run(timed("check", [*packets[:25], bus_packet(20, bytes(6)), *packets[25:25]])) == 0
-    assert (
-        "conflict: a packet with the count of another one of its APID and other content"
-        in capsys.readouterr().out
-    )
+    assert "conflict: a packet with the count of another one of its APID and other content" in capsys.readouterr().out
 
 
 def test_the_configuration_of_yamcs_is_written_for_a_spacecraft_and_a_station(tmp_path, capsys):
@@ -356,17 +315,7 @@ def test_the_configuration_of_yamcs_is_written_for_a_spacecraft_and_a_station(tm
 
     from lunar.timescales import ONBOARD_EPOCH_TAI_NS, parse_utc, tai_ns_from_utc_ns
 
-    command = [
-        "tm",
-        "yamcs",
-        "--out",
-        str(tmp_path / "y"),
-        "--spacecraft-id",
-        "77",
-        "--station",
-        "host:1234",
-        "--json",
-    ]
+    command = ["tm", "yamcs", "--out", str(tmp_path / "y"), "--spacecraft-id", "77", "--station", "host:1234", "--json"]
     assert run(command) == 0
     files = figures(capsys)["files"]
     assert sorted(files) == sorted(str(path) for path in (tmp_path / "y").rglob("*.*"))
@@ -392,10 +341,7 @@ def test_plain_frames_of_a_downlink_are_sent_as_datagrams(downlink, capsys):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(5)
-        assert (
-            run(["tm", "frames", str(downlink), "--to", f"127.0.0.1:{receiver.getsockname()[1]}", "--json"])
-            == 0
-        )
+        assert run(["tm", "frames", str(downlink), "--to", f"127.0.0.1:{receiver.getsockname()[1]}", "--json"]) == 0
         count = figures(capsys)["frames"]
         received = [receiver.recv(2000) for _ in range(count)]
     assert count == len(damaged) // 1279 - 1

@@ -29,6 +29,4 @@ def polar_orbit(hours, step_s=60.0, radius_m=RADIUS_M):
     pole = IauOrientation().mcmf_from_icrf(9.34e8)[2]
     node = np.cross([0.0, 0.0, 1.0], pole)
     elapsed = np.arange(0.0, hours * 3600.0 + 1.0, step_s)
-    return ephemeris_from_states(
-        times(elapsed), *circle(elapsed, radius_m, node / np.linalg.norm(node), pole)
-    )
+    return ephemeris_from_states(times(elapsed), *circle(elapsed, radius_m, node / np.linalg.norm(node), pole))

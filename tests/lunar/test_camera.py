@@ -40,9 +40,7 @@ def test_projection_is_that_of_opencv():
     rng = np.random.default_rng(1)
     points = rng.uniform([-50e3, -50e3, 10e3], [50e3, 50e3, 60e3], (100, 3))
     f, (cx, cy) = CAMERA.focal_px, CAMERA.centre_px
-    theirs, _ = cv2.projectPoints(
-        points, np.zeros(3), np.zeros(3), np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]]), None
-    )
+    theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]]), None)
     assert np.allclose(CAMERA.project(points), theirs[:, 0], atol=1e-9)
 
 
@@ -64,9 +62,7 @@ def test_the_nadir_camera_looks_down_with_north_up_and_east_right(latitude, long
     assert v[1] < 255.4 and abs(u[1] - 255.5) < 1e-6
 
 
-@given(
-    latitudes, longitudes, altitudes_m, st.floats(-0.5, 511.5), st.floats(-0.5, 511.5), st.floats(-5000, 5000)
-)
+@given(latitudes, longitudes, altitudes_m, st.floats(-0.5, 511.5), st.floats(-0.5, 511.5), st.floats(-5000, 5000))
 def test_what_a_pixel_sees_projects_back_into_it(latitude, longitude, altitude_m, u, v, height_m):
     position = mcmf_from_spherical(latitude, longitude, altitude_m)
     rotation = nadir_camera_from_mcmf(position)
@@ -90,9 +86,7 @@ def test_points_behind_the_camera_and_rays_past_the_limb_are_nan():
 @given(latitudes, longitudes, altitudes_m, st.floats(0.0, 1.2))
 def test_the_range_to_the_sphere_is_that_of_the_cosine_rule(latitude, longitude, altitude_m, off_nadir):
     distance = MOON_RADIUS_M + altitude_m
-    expected = distance * math.cos(off_nadir) - math.sqrt(
-        MOON_RADIUS_M**2 - (distance * math.sin(off_nadir)) ** 2
-    )
+    expected = distance * math.cos(off_nadir) - math.sqrt(MOON_RADIUS_M**2 - (distance * math.sin(off_nadir)) ** 2)
     rotation = enu_from_mcmf(latitude, longitude)
     direction = math.sin(off_nadir) * rotation[0] - math.cos(off_nadir) * rotation[2]
     found = intersect_sphere(mcmf_from_spherical(latitude, longitude, altitude_m), direction)

@@ -221,10 +221,7 @@ OWN = """id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete
     [
         (OWN, "lines 2 and 3, column id: expected an id of its own for each crater .* found 1 twice"),
         (OWN.replace("\n1,-36", "\n1.7,-36"), "line 3, column id: expected a whole number, found 1.7"),
-        (
-            OWN.replace("\n1,-36", "\n3,-36").replace(",112.0,", ",1737512.0,"),
-            "line 2: expected a rim height",
-        ),
+        (OWN.replace("\n1,-36", "\n3,-36").replace(",112.0,", ",1737512.0,"), "line 2: expected a rim height"),
         (OWN.replace("\n1,-36", "\n3,-36").replace(",1060.0,1", ",1060.0,yes"), "line 2, column complete"),
     ],
 )
@@ -235,10 +232,12 @@ def test_two_craters_of_one_id_and_impossible_values_are_refused(tmp_path, text,
         load_catalogue(path)
 
 
-def test_a_crater_that_is_listed_twice_with_one_id_counts_once(tmp_path):
+def test_a_crater_that_is_listed_twice_with_one_id_counts_once_and_a_worn_one_on_a_hill_is_read(tmp_path):
     path = tmp_path / "own.csv"
     path.write_text(OWN.replace("\n1,-36", "\n2,-36"))
     assert load_catalogue(path).ids.tolist() == [1, 2]
+    path.write_text(OWN.replace("\n1,-36.2,260.3,8000.0,10.0,1200.0", "\n3,-36.4,260.3,8000.0,10.0,-8.0"))
+    assert load_catalogue(path).depth_m.min() == -8.0
 
 
 @pytest.mark.parametrize("column", ["latitude_deg", "longitude_deg", "diameter_m", "rim_height_m", "depth_m"])

@@ -144,12 +144,7 @@ def test_nothing_is_interpolated_across_the_edge_of_a_segment():
 
 def test_epochs_between_segments_are_refused():
     ephemeris = two_arcs(second_start_s=900.0)
-    assert ephemeris.covers(START + np.array([600, 601, 899, 900]) * NS).tolist() == [
-        True,
-        False,
-        False,
-        True,
-    ]
+    assert ephemeris.covers(START + np.array([600, 601, 899, 900]) * NS).tolist() == [True, False, False, True]
     with pytest.raises(EphemerisCoverageError, match=r"00:10:00.000Z, 2029-08-07T00:15:00.000Z"):
         at_s(ephemeris, 700.0)
 
@@ -157,16 +152,9 @@ def test_epochs_between_segments_are_refused():
 def test_a_hole_in_the_states_of_a_segment_is_a_gap():
     elapsed = np.concatenate([np.arange(0.0, 601.0, 30.0), np.arange(3600.0, 4201.0, 30.0)])
     ephemeris = arc(elapsed)
-    assert ephemeris.covers(START + np.array([600, 601, 3599, 3600]) * NS).tolist() == [
-        True,
-        False,
-        False,
-        True,
-    ]
+    assert ephemeris.covers(START + np.array([600, 601, 3599, 3600]) * NS).tolist() == [True, False, False, True]
     at_s(ephemeris, [600.0, 3600.0])
-    with pytest.raises(
-        EphemerisCoverageError, match=r"with a gap 2029-08-07T00:10:00.000Z..2029-08-07T01:00:00.000Z"
-    ):
+    with pytest.raises(EphemerisCoverageError, match=r"with a gap 2029-08-07T00:10:00.000Z..2029-08-07T01:00:00.000Z"):
         at_s(ephemeris, [30.0, 2000.0])
 
 
@@ -215,8 +203,7 @@ def test_a_file_of_neither_format_is_refused(tmp_path, text):
     path = tmp_path / "orbit.txt"
     path.write_text(text)
     with pytest.raises(
-        DataFileError,
-        match=r"orbit\.txt: first line: expected CCSDS_OEM_VERS, stk\.v\., XML or a Horizons table",
+        DataFileError, match=r"orbit\.txt: first line: expected CCSDS_OEM_VERS, stk\.v\., XML or a Horizons table"
     ):
         load_ephemeris(path)
 
@@ -246,8 +233,7 @@ def test_resampling_keeps_arcs_with_both_states_of_a_shared_epoch_and_crosses_no
         found = resampled(ephemeris, step_s)
         assert tuple(len(one.utc_ns) for one in found.segments) == counts
         spans = [
-            tuple((value - START) // NS for value in (one.start_utc_ns, one.stop_utc_ns))
-            for one in found.segments
+            tuple((value - START) // NS for value in (one.start_utc_ns, one.stop_utc_ns)) for one in found.segments
         ]
         assert spans == [(0, 630), (630, 900), (3600, 3850)]
         ends = [found.segments[0].position_m[-1], found.segments[1].position_m[0]]
@@ -277,9 +263,7 @@ def test_states_that_gravity_moves_are_accepted_also_with_an_orbit_determination
     check_gravity(orbit)
     burn = np.where(np.arange(241)[:, None] > 120, 1.0001, 1.0)
     check_gravity(with_states(orbit, lambda one: {"velocity_m_s": burn * one.velocity_m_s}))
-    check_gravity(
-        with_states(polar_orbit(0.01, step_s=1.0), scaled(1.003, 1.003))
-    )  # 36 s of 0.9 %: a mascon?
+    check_gravity(with_states(polar_orbit(0.01, step_s=1.0), scaled(1.003, 1.003)))  # 36 s of 0.9 %: a mascon?
 
 
 @pytest.mark.parametrize(
@@ -290,23 +274,16 @@ def test_states_that_gravity_moves_are_accepted_also_with_an_orbit_determination
             r"gravity 1\.76818e\+06 km from the centre of the Moon, found 423\.6 m/s2, 1\.59e\+07 % off",
         ),
         (scaled(1e-3, 1e-3), "gravity 1.76818 km from .*, found 0.0015"),
-        (
-            scaled(1.0, 1e-3),
-            r"expected an acceleration of 1\.6 m/s2 by gravity 1768.18 km .* found 9\.197 m/s2",
-        ),
+        (scaled(1.0, 1e-3), r"expected an acceleration of 1\.6 m/s2 by gravity 1768.18 km .* found 9\.197 m/s2"),
         (scaled(3.95, 4.5), "gravity 6984.31 km from .* another centre"),
         (scaled(1.003, 1.003), r"found 1\.5\d+ m/s2, 0\.9\d\d % off"),
         (fixed_to_the_moon, r"found 1\.5\d+ m/s2, 0\.\d+ % off; rotating axes"),
     ],
     ids=[
-        "metres for kilometres",
-        "kilometres for metres",
-        "velocity in km/s",
-        "orbit about the Earth",
-        "scale",
+        "metres for kilometres", "kilometres for metres", "velocity in km/s", "orbit about the Earth", "scale",
         "axes",
     ],
-)
+)  # fmt: skip
 def test_states_that_gravity_does_not_move_are_refused_with_the_numbers(change, message):
     with pytest.raises(UnmovedByGravity, match=message):
         check_gravity(with_states(polar_orbit(4.0), change))

@@ -33,17 +33,13 @@ from lunar.frames import (
 from lunar.ground_track import even_epochs, ground_track
 from tests.lunar.orbits import polar_orbit
 
-SPICE = json.loads(
-    Path(__file__).parents[1].joinpath("references/lunar/spice_moon_rotations.json").read_text()
-)
+SPICE = json.loads(Path(__file__).parents[1].joinpath("references/lunar/spice_moon_rotations.json").read_text())
 SPICE_EPOCHS_TDB_S = np.array(SPICE["epochs_tdb_s"])
 
 # The same model in the same arithmetic: 1e-9 rad is 1.7 mm on the ground.
 SAME_MODEL_RAD = 1e-9
 
-unit_quaternions = st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4).filter(
-    lambda q: np.linalg.norm(q) > 0.1
-)
+unit_quaternions = st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1)
 latitudes = st.floats(-np.pi / 2, np.pi / 2)
 longitudes = st.floats(-2 * np.pi, 2 * np.pi)
 
@@ -58,9 +54,7 @@ def angle_rad(first, second):
 
 @pytest.fixture(scope="module")
 def de421(data_path):
-    return load_orientation(
-        data_path / "kernels/moon_pa_de421_1900-2050.bpc", data_path / "kernels/moon_080317.tf"
-    )
+    return load_orientation(data_path / "kernels/moon_pa_de421_1900-2050.bpc", data_path / "kernels/moon_080317.tf")
 
 
 @pytest.fixture(scope="module")
@@ -253,9 +247,7 @@ def test_a_pass_within_sixty_degrees_lasts_37_minutes(day):
     track = ground_track(day, IauOrientation())
     inside = np.abs(track.latitude_rad) <= math.radians(60)
     edges = np.flatnonzero(np.diff(inside.astype(int)))
-    lengths = (
-        np.diff(edges)[0::2] * 15.0 / 60.0 if not inside[edges[0]] else np.diff(edges)[1::2] * 15.0 / 60.0
-    )
+    lengths = np.diff(edges)[0::2] * 15.0 / 60.0 if not inside[edges[0]] else np.diff(edges)[1::2] * 15.0 / 60.0
     assert np.mean(lengths) == pytest.approx(111.20 / 3, abs=0.1)
 
 

@@ -11,14 +11,7 @@ import pytest
 
 from lunar import _gravity_kernel as kernel
 from lunar.errors import DataFileError, OrbitError
-from lunar.gravity import (
-    GravityField,
-    acceleration,
-    builtin_gravity,
-    gradient,
-    load_gravity,
-    packed,
-)
+from lunar.gravity import GravityField, acceleration, builtin_gravity, gradient, load_gravity, packed
 
 
 def kaula_field(degree: int, seed: int = 1) -> GravityField:
@@ -50,13 +43,9 @@ def exact_acceleration(field: GravityField, position: np.ndarray, degree: int) -
             for n in range(m, degree + 1):
                 if n > m:
                     a = mpmath.sqrt(mpmath.mpf((2 * n - 1) * (2 * n + 1)) / ((n - m) * (n + m)))
-                    b = mpmath.mpf((2 * n + 1) * (n + m - 1) * (n - m - 1)) / (
-                        (n - m) * (n + m) * (2 * n - 3)
-                    )
+                    b = mpmath.mpf((2 * n + 1) * (n + m - 1) * (n - m - 1)) / ((n - m) * (n + m) * (2 * n - 3))
                     before, now = now, a * u * now - mpmath.sqrt(b) * before
-                weight = (
-                    mpmath.mpf(float(field.c_bar[n, m])) * cos + mpmath.mpf(float(field.s_bar[n, m])) * sin
-                )
+                weight = mpmath.mpf(float(field.c_bar[n, m])) * cos + mpmath.mpf(float(field.s_bar[n, m])) * sin
                 total += (mpmath.mpf(field.radius_m) / r) ** n * now * weight
         return mpmath.mpf(field.gm_m3_s2) / r * total
 
@@ -164,9 +153,7 @@ def test_the_other_vector_width_gives_the_same_sums(tmp_path: Path) -> None:
         spec.loader.exec_module(other)
         field = kaula_field(51)
         places = np.array([at(-77.0, 3.0), at(5.0, 250.0)])
-        found = other.accelerations(
-            other.pack(field.c_bar, field.s_bar, field.gm_m3_s2, field.radius_m), places
-        )
+        found = other.accelerations(other.pack(field.c_bar, field.s_bar, field.gm_m3_s2, field.radius_m), places)
     finally:
         del sys.modules["other_width"]
     assert np.allclose(found, acceleration(field, places), rtol=1e-14)
@@ -257,9 +244,7 @@ SHTOOLS_KM = "1.738E+03, 4.9E+03, 2.66E-06, 2, 2\n" + SHADR.partition("\n")[2]
 
 
 @pytest.mark.parametrize(
-    "text",
-    [ICGEM, COF, SHADR, SHTOOLS, SHTOOLS_KM],
-    ids=["icgem", "cof", "shadr", "pyshtools", "pyshtools in km"],
+    "text", [ICGEM, COF, SHADR, SHTOOLS, SHTOOLS_KM], ids=["icgem", "cof", "shadr", "pyshtools", "pyshtools in km"]
 )
 def test_the_formats_hold_the_same_field(text: str, tmp_path: Path) -> None:
     path = tmp_path / "tiny"
@@ -274,11 +259,7 @@ def test_the_formats_hold_the_same_field(text: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "where", "expected"),
     [
-        (
-            ICGEM.replace("gfc 2 2 3.4e-05 -1.0e-10\n", ""),
-            "degree 2, order 2",
-            "all coefficients to degree 2",
-        ),
+        (ICGEM.replace("gfc 2 2 3.4e-05 -1.0e-10\n", ""), "degree 2, order 2", "all coefficients to degree 2"),
         (ICGEM.replace("gfc 2 1", "gfc 1 2"), "line 10", "order <= degree <= 2"),
         (ICGEM.replace("gfc 2 1", "gfc 2 0"), "line 10", "every coefficient once"),
         (ICGEM.replace("fully_normalized", "unnormalized"), "header, norm", "fully_normalized"),
@@ -291,18 +272,10 @@ def test_the_formats_hold_the_same_field(text: str, tmp_path: Path) -> None:
         (SHADR.replace("1.738E+03", "3.396E+03"), "header", "radius of 1.7374e+06 m"),
         (SHTOOLS.replace("1.738", "3.396"), "header", "radius of 1.7374e+06 m"),
         (SHTOOLS.replace("-9.0e-05", "-2.032e-04"), "degree 2, order 0", "normalised flattening"),
-        (
-            SHTOOLS.replace("2, 2, 3.4e-05, -1.0e-10\n", ""),
-            "degree 2, order 2",
-            "all coefficients to degree 2",
-        ),
+        (SHTOOLS.replace("2, 2, 3.4e-05, -1.0e-10\n", ""), "degree 2, order 2", "all coefficients to degree 2"),
         (ICGEM.replace("-9.0D-05", "-9.0"), "degree 2, order 0", "normalised flattening"),
         (COF.replace("END\n", ""), "end of file", "END"),
-        (
-            COF.replace("1.00000000000000e+00\n", "0.00000000000000e+00\n"),
-            "line 3",
-            "normalised coefficients",
-        ),
+        (COF.replace("1.00000000000000e+00\n", "0.00000000000000e+00\n"), "line 3", "normalised coefficients"),
         (COF.replace("RECOEF    2  2", "RECOEF    3  2"), "line 6", "order <= degree <= 2"),
         (SHADR.replace("2, 2, 1,", "2, 2, 0,"), "line 1, normalisation state", "fully normalised"),
         (SHADR[:-30], "line 4", "degree, order and two coefficients"),

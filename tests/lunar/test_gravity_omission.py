@@ -35,11 +35,7 @@ class Omission:
 
 
 def measured_omission(
-    truth: GravityField,
-    flown: GravityField,
-    revolutions: int = 16,
-    seed: int = 1,
-    inclination_rad: float = 0.5 * np.pi,
+    truth: GravityField, flown: GravityField, revolutions: int = 16, seed: int = 1, inclination_rad: float = 0.5 * np.pi
 ) -> Omission:
     """Measure the errors of `flown` relative to `truth`, over revolutions with random nodes and perilunes."""
     rng = np.random.default_rng(seed)
@@ -78,9 +74,7 @@ def revolution(
     return radius[:, None] * radial, rtn
 
 
-def field_psd_m2_s3(
-    name: str, degree: int, inclination_rad: float = 0.5 * np.pi
-) -> tuple[FloatArray, FloatArray]:
+def field_psd_m2_s3(name: str, degree: int, inclination_rad: float = 0.5 * np.pi) -> tuple[FloatArray, FloatArray]:
     """Spectral densities of what a field by its name, cut at a degree, lacks or has wrong: near side and far side."""
     model, omitted = noise_model, np.array(omission_psd_m2_s3(degree))
     if name == "GRGM":
@@ -120,9 +114,7 @@ def test_density_of_a_zonal_term_against_its_closed_form() -> None:
     c = 1e-5
     found = measured_omission(zonal_field(2, c), zonal_field(0, 1.0), revolutions=60)
     # Mean square of P2(sin) around a circle is 11/32.
-    expected = (
-        3.0 * GM / 1_768_180.0**2 * (RADIUS / 1_768_180.0) ** 2 * c * np.sqrt(5.0) * np.sqrt(11.0 / 32.0)
-    )
+    expected = 3.0 * GM / 1_768_180.0**2 * (RADIUS / 1_768_180.0) ** 2 * c * np.sqrt(5.0) * np.sqrt(11.0 / 32.0)
     assert found.rms_m_s2[0] == pytest.approx(expected, rel=0.01)
 
 
@@ -131,8 +123,7 @@ def test_noise_by_altitude_has_the_mean_over_the_orbit_that_the_table_gives(name
     """Averaged over the paper's orbit (30.8 km, +-12.2 km), by adding it up; the far side is one field's alone."""
     noise, near, far = field_noise(name, degree), *field_psd_m2_s3(name, degree)
     altitude_m = (
-        1_768_180.0 * (1.0 - 0.006908 * np.cos(np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False)))
-        - 1_737_400.0
+        1_768_180.0 * (1.0 - 0.006908 * np.cos(np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False))) - 1_737_400.0
     )
     for psd, height_m, mean in (
         (noise.near_psd_m2_s3, noise.near_scale_height_m, near),

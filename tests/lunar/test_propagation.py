@@ -19,13 +19,7 @@ from lunar.errors import EphemerisCoverageError, ImpactError
 from lunar.frames import IauOrientation
 from lunar.gravity import builtin_gravity
 from lunar.maneuvers import ManeuverRule, propagate_with_maneuvers
-from lunar.propagation import (
-    ForceModel,
-    SolarPressure,
-    force_arrays,
-    propagate,
-    propagate_with_stm,
-)
+from lunar.propagation import ForceModel, SolarPressure, force_arrays, propagate, propagate_with_stm
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from tests.lunar.orbits import POLAR, RADIUS_M, RATE_RAD_S, START, circle, times
@@ -47,13 +41,9 @@ def kepler_place(elements: Elements, gm: float, elapsed_s: float) -> np.ndarray:
         anomaly -= (anomaly - e * math.sin(anomaly) - mean) / (1 - e * math.cos(anomaly))
     true = 2.0 * math.atan(math.sqrt((1 + e) / (1 - e)) * math.tan(anomaly / 2.0))
     moved = Elements(
-        elements.semi_major_axis_m,
-        e,
-        elements.inclination_rad,
-        elements.raan_rad,
-        elements.argument_of_perilune_rad,
-        true,
-    )
+        elements.semi_major_axis_m, e, elements.inclination_rad, elements.raan_rad,
+        elements.argument_of_perilune_rad, true,
+    )  # fmt: skip
     return state_from_elements(moved, gm)[0]
 
 
@@ -61,13 +51,7 @@ def test_elements_come_back_from_the_state_they_give() -> None:
     gm = builtin_gravity().gm_m3_s2
     back = elements_from_state(*state_from_elements(TABLE_I, gm), gm)
     assert back.semi_major_axis_m == pytest.approx(TABLE_I.semi_major_axis_m, abs=1e-5)  # m
-    for name in (
-        "eccentricity",
-        "inclination_rad",
-        "raan_rad",
-        "argument_of_perilune_rad",
-        "true_anomaly_rad",
-    ):
+    for name in ("eccentricity", "inclination_rad", "raan_rad", "argument_of_perilune_rad", "true_anomaly_rad"):
         assert getattr(back, name) == pytest.approx(getattr(TABLE_I, name), abs=1e-11), name
 
 
@@ -96,11 +80,7 @@ def test_an_orbit_into_the_ground_stops_with_the_place_of_impact() -> None:
     # Kepler: the radius meets the sphere where 1 + e cos(nu) = p / R.
     p = falling.semi_major_axis_m * (1 - falling.eccentricity**2)
     nu = 2.0 * math.pi - math.acos((p / MOON_RADIUS_M - 1.0) / falling.eccentricity)
-    anomaly = (
-        2.0
-        * math.atan2(math.sqrt(0.97) * math.sin(nu / 2), math.sqrt(1.03) * math.cos(nu / 2))
-        % (2 * math.pi)
-    )
+    anomaly = 2.0 * math.atan2(math.sqrt(0.97) * math.sin(nu / 2), math.sqrt(1.03) * math.cos(nu / 2)) % (2 * math.pi)
     mean = anomaly - 0.03 * math.sin(anomaly)
     expected_s = (mean - math.pi) * math.sqrt(falling.semi_major_axis_m**3 / gm)
     impact_s = float(tdb_s_from_utc_ns(end.value.utc_ns)) - EPOCH_S
@@ -111,9 +91,7 @@ def test_an_orbit_into_the_ground_stops_with_the_place_of_impact() -> None:
 def test_burns_bring_the_orbit_back_to_the_rule() -> None:
     gm = builtin_gravity().gm_m3_s2
     rule = ManeuverRule(15e3, 1_768_180.0, 0.006)
-    trajectory, burns = propagate_with_maneuvers(
-        EPOCH_S, *state_from_elements(TABLE_I, gm), 12 * 86_400.0, FULL, rule
-    )
+    trajectory, burns = propagate_with_maneuvers(EPOCH_S, *state_from_elements(TABLE_I, gm), 12 * 86_400.0, FULL, rule)
     times = np.arange(EPOCH_S, EPOCH_S + 12 * 86_400.0, 30.0)
     altitude_m = np.linalg.norm(trajectory.state(times)[:, :3], axis=1) - MOON_RADIUS_M
     assert burns, "the orbit of Table I sinks below 15 km within days"
@@ -215,9 +193,7 @@ def test_the_transition_matrix_is_the_change_of_the_end_with_the_start(duration_
         np.testing.assert_allclose(matrix[3:, column], slope[3:], atol=2e-4 * np.abs(slope[3:]).max())
 
 
-REFERENCE = json.loads(
-    (Path(__file__).parents[1] / "references" / "lunar" / "third_bodies_de421.json").read_text()
-)
+REFERENCE = json.loads((Path(__file__).parents[1] / "references" / "lunar" / "third_bodies_de421.json").read_text())
 ORBIT_RADIUS_M = 1_768_180.0
 
 
@@ -229,10 +205,7 @@ def tide(gm: float, body_m: np.ndarray, orbiter_m: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("body", ["earth", "sun"])
 def test_pulls_on_a_low_orbit_are_those_of_de421(body: str) -> None:
-    position, gm = {
-        "earth": (earth_position_icrf_m, GM_EARTH_M3_S2),
-        "sun": (sun_position_icrf_m, GM_SUN_M3_S2),
-    }[body]
+    position, gm = {"earth": (earth_position_icrf_m, GM_EARTH_M3_S2), "sun": (sun_position_icrf_m, GM_SUN_M3_S2)}[body]
     rng = np.random.default_rng(1)
     for epoch in REFERENCE["epochs"]:
         ours_m = position((epoch["jd_tdb"] - 2_451_545.0) * 86_400.0)

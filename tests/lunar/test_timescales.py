@@ -37,20 +37,12 @@ def test_the_start_of_the_papers_month_is_the_posix_count_of_gnu_date():
 
 
 def test_day_of_year_calendar_space_and_missing_time_name_the_same_epoch():
-    texts = (
-        "2029-08-07T00:00:00Z",
-        "2029-219T00:00:00",
-        "2029-08-07 00:00:00.0",
-        "2029-08-07",
-        "2029-08-07T00:00",
-    )
+    texts = ("2029-08-07T00:00:00Z", "2029-219T00:00:00", "2029-08-07 00:00:00.0", "2029-08-07", "2029-08-07T00:00")
     assert {parse_utc(text) for text in texts} == {1_880_755_200 * NS}
 
 
 def test_an_epoch_within_a_leap_second_is_refused_with_that_reason_where_it_has_no_count():
-    with pytest.raises(
-        LeapSecondError, match=r"epoch outside of a leap second, .* found '2016-12-31T23:59:60.5Z'"
-    ):
+    with pytest.raises(LeapSecondError, match=r"epoch outside of a leap second, .* found '2016-12-31T23:59:60.5Z'"):
         parse_utc("2016-12-31T23:59:60.5Z")
 
 
@@ -84,12 +76,7 @@ def leap_day(request):
 @pytest.mark.filterwarnings("ignore:ERFA function")
 def test_instants_around_and_within_a_leap_second_are_those_of_erfa_in_every_time_system(leap_day):
     next_day = str(np.datetime64(leap_day) + 1)
-    texts = [
-        f"{leap_day}T23:59:59.25",
-        f"{leap_day}T23:59:60",
-        f"{leap_day}T23:59:60.999",
-        f"{next_day}T00:00:00.5",
-    ]
+    texts = [f"{leap_day}T23:59:59.25", f"{leap_day}T23:59:60", f"{leap_day}T23:59:60.999", f"{next_day}T00:00:00.5"]
     for text in texts:
         tai = parse_tai(text)
         # Two float64 of days are good to 0.01 ns, the text to a nanosecond.

@@ -7,14 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lunar.constants import (
-    ASTRONOMICAL_UNIT_M,
-    EARTH_RADIUS_M,
-    MOON_RADIUS_M,
-    NS,
-    SPEED_OF_LIGHT_M_S,
-    SUN_RADIUS_M,
-)
+from lunar.constants import ASTRONOMICAL_UNIT_M, EARTH_RADIUS_M, MOON_RADIUS_M, NS, SPEED_OF_LIGHT_M_S, SUN_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.errors import EphemerisCoverageError, LunarError
 from lunar.frames import IauOrientation, mcmf_from_spherical
@@ -45,9 +38,7 @@ from tests.lunar.orbits import POLAR, START, circle, times
         ("1972-12-11T19:54:58", 20.19080, 30.77168, 13.3),
     ],
 )
-def test_the_sun_stood_where_the_apollo_crews_found_it(
-    landing_utc, latitude_deg, longitude_deg, sun_angle_deg
-):
+def test_the_sun_stood_where_the_apollo_crews_found_it(landing_utc, latitude_deg, longitude_deg, sun_angle_deg):
     tdb_s = tdb_s_from_utc_ns(parse_utc(landing_utc))
     sun_mcmf_m = IauOrientation().mcmf_from_icrf(tdb_s) @ sun_position_icrf_m(tdb_s)
     place = np.radians([latitude_deg, longitude_deg])
@@ -121,9 +112,7 @@ def test_azimuth_runs_clockwise_from_north():
 def test_the_subsatellite_point_undoes_the_orientation():
     tdb_s = tdb_s_from_utc_ns(START + np.arange(3) * 3600 * NS)
     rotation = IauOrientation().mcmf_from_icrf(tdb_s)
-    position = np.einsum(
-        "nji,nj->ni", rotation, mcmf_from_spherical([0.1, -0.2, 0.3], [1.0, 2.0, -3.0], 20e3)
-    )
+    position = np.einsum("nji,nj->ni", rotation, mcmf_from_spherical([0.1, -0.2, 0.3], [1.0, 2.0, -3.0], 20e3))
     latitude, longitude, altitude = subsatellite(position, tdb_s, IauOrientation())
     assert latitude == pytest.approx([0.1, -0.2, 0.3])
     assert longitude == pytest.approx([1.0, 2.0, -3.0])
@@ -138,13 +127,7 @@ def test_the_limb_hides_the_earth_on_the_far_side_only():
     dip = math.acos(MOON_RADIUS_M / radius)
     parallax = MOON_RADIUS_M / 384_400e3
     limit = math.pi / 2 + dip - parallax
-    for angle, seen in (
-        (0.0, True),
-        (1.5, True),
-        (limit - 1e-3, True),
-        (limit + 1e-3, False),
-        (math.pi, False),
-    ):
+    for angle, seen in ((0.0, True), (1.5, True), (limit - 1e-3, True), (limit + 1e-3, False), (math.pi, False)):
         position = radius * np.array([math.cos(angle), math.sin(angle), 0.0])
         assert bool(limb_clearance_m(position, earth) > 0.0) is seen
     assert limb_clearance_m([0.0, radius, 0.0], [384_400e3, radius, 0.0]) == np.inf
@@ -201,9 +184,7 @@ def test_range_and_light_time_are_those_of_the_signal_that_arrives():
     distance = np.linalg.norm(spacecraft - station_icrf_m(GOLDSTONE, received), axis=1)
     assert np.allclose(found.range_m, distance, rtol=0, atol=1e-3)
     assert np.all((found.light_time_s > 1.15) & (found.light_time_s < 1.37))
-    assert np.array_equal(
-        found.visible, (found.limb_clearance_m > 0) & (found.elevation_rad >= math.radians(10))
-    )
+    assert np.array_equal(found.visible, (found.limb_clearance_m > 0) & (found.elevation_rad >= math.radians(10)))
 
 
 def test_the_spacecraft_is_behind_the_moon_about_half_of_a_revolution_that_faces_the_earth():

@@ -9,16 +9,12 @@ def bowl_image(centres=BOWL_CENTRES, radius=20.0, sun_azimuth_deg=0.0):
     """Bowls of spherical section under a Sun at an image azimuth (clockwise from the top), Lambert, 15 degrees up."""
     row, column = np.mgrid[0:512, 0:512].astype(float)
     azimuth, elevation = np.radians(sun_azimuth_deg), np.radians(15.0)
-    sun = np.array(
-        [np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation), np.sin(elevation)]
-    )
+    sun = np.array([np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
     height = np.zeros((512, 512))
     for u, v in centres:
         s = np.hypot(column - u, row - v) / radius
         inside = s < 1
-        height += np.where(
-            inside, 0.36 * radius * (s**2 - 1) + 0.08 * radius, 0.08 * radius * np.maximum(s, 1) ** -4
-        )
+        height += np.where(inside, 0.36 * radius * (s**2 - 1) + 0.08 * radius, 0.08 * radius * np.maximum(s, 1) ** -4)
     down, right = np.gradient(height)
     shade = (-right * sun[0] - down * sun[1] + sun[2]) / np.sqrt(1 + right**2 + down**2)
     noise = np.random.default_rng(0).normal(0, 0.004, shade.shape)

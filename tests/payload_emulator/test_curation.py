@@ -112,9 +112,7 @@ def test_centres_sizes_and_rim_heights_are_refitted(field: Field, curation: Cura
     assert np.abs(np.median(curation.table.rim_height_m - rim)) < 25.0
 
 
-def test_every_crater_is_kept_or_dropped_for_one_reason_and_the_shallow_ones_are_dropped(
-    field: Field,
-) -> None:
+def test_every_crater_is_kept_or_dropped_for_one_reason_and_the_shallow_ones_are_dropped(field: Field) -> None:
     listed = field.listed()
     curation = curate(listed, field)
     assert len(curation.table) + sum(curation.dropped.values()) == len(listed)
@@ -153,9 +151,7 @@ def test_a_region_over_the_zero_meridian_holds_both_sides() -> None:
     assert inside.tolist() == [True, True, False, True]
 
 
-def test_the_table_survives_upload_and_its_sigmas_are_never_below_the_floor(
-    curation: Curation,
-) -> None:
+def test_the_table_survives_upload_and_its_sigmas_are_never_below_the_floor(curation: Curation) -> None:
     table = unpack_catalogue_table(pack_catalogue_table(curation.table))
     assert len(table) == len(curation.table)
     assert np.all(table.sigma_m[:, :2] >= CurationRules().centre_sigma_m)

@@ -91,16 +91,12 @@ def test_every_octet_of_a_lossy_downlink_is_accounted_for(archive: tuple[dict[st
     assert json.loads((out / "summary.json").read_text())["link"] == link
 
 
-def test_the_machine_tells_of_its_faults_and_finishes_the_window(
-    archive: tuple[dict[str, Any], Path],
-) -> None:
+def test_the_machine_tells_of_its_faults_and_finishes_the_window(archive: tuple[dict[str, Any], Path]) -> None:
     summary, out = archive
     assert summary["resets"] == ["watchdog"]
     assert summary["mode"] in ("standby", "downlinking")
     tables = decode((out / "downlink.cadu").read_bytes()).tables()
-    events = {
-        int(code) for name, t in tables.items() if name.startswith("event_") for code in t.columns["event_id"]
-    }
+    events = {int(code) for name, t in tables.items() if name.startswith("event_") for code in t.columns["event_id"]}
     # boot, activity released, image dark, watchdog reset, state recovered
     assert {1, 5, 16, 50, 57} <= events
     quantities = tables["housekeeping"].columns
@@ -188,11 +184,7 @@ def test_an_anchoring_table_that_is_none_is_refused_before_the_flight(tmp_path: 
     damaged = tmp_path / "damaged.table"
     damaged.write_bytes(b"no table")
     with pytest.raises(TableError):
-        emulate(
-            parse_scenario(SHORT).with_choices(anchoring_catalogue=damaged),
-            find_data(None),
-            tmp_path / "pass",
-        )
+        emulate(parse_scenario(SHORT).with_choices(anchoring_catalogue=damaged), find_data(None), tmp_path / "pass")
     assert not (tmp_path / "pass").exists()
 
 
@@ -215,9 +207,7 @@ def test_reads_of_the_truth_are_counted_where_they_happen(
 
     monkeypatch.setattr(emulator, "build_world", seen)
     monkeypatch.setattr(Payload, "step", stealing)
-    text = SCENARIO.replace("duration_s = 6600.0", "duration_s = 90.0").replace(
-        'name = "lossy"', 'name = "short"'
-    )
+    text = SCENARIO.replace("duration_s = 6600.0", "duration_s = 90.0").replace('name = "lossy"', 'name = "short"')
     text = text.replace('estimators = ["spherical"]', 'estimators = ["paper"]')
     text = text.replace("2029-08-08T02:30:00Z", "2029-08-07T01:40:00Z")
     summary = emulate(parse_scenario(text), find_data(None), tmp_path / "pass")

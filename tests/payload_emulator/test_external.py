@@ -89,16 +89,7 @@ def test_a_pass_that_is_given_back_shows_the_payload_the_same(flown, tmp_path, c
     from linna.cli import run
 
     out = tmp_path / "again"
-    command = [
-        "emulate",
-        "--images",
-        str(flown / "given"),
-        "--evidence",
-        "photographs",
-        "--out",
-        str(out),
-        "--json",
-    ]
+    command = ["emulate", "--images", str(flown / "given"), "--evidence", "photographs", "--out", str(out), "--json"]
     assert run(command) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["frames"] == summary["frames_kept"] == 3
@@ -116,9 +107,7 @@ def test_a_pass_that_is_given_back_shows_the_payload_the_same(flown, tmp_path, c
     assert replayed["frames"] == 3
 
 
-def test_frames_whose_sun_is_not_that_of_the_ephemeris_are_named_with_both_azimuths(
-    flown, tmp_path, monkeypatch
-):
+def test_frames_whose_sun_is_not_that_of_the_ephemeris_are_named_with_both_azimuths(flown, tmp_path, monkeypatch):
     folder, data, scenario = copied(flown, tmp_path / "given"), DataFolder(), parse_scenario(TEXT)
     detector = OnnxDetector(load_shipped_model())
     for image in sorted(folder.glob("*.png"))[1:]:
@@ -159,6 +148,8 @@ def test_attitudes_between_two_epochs_lie_on_the_arc_between_them(flown, tmp_pat
     # A quarter of forty degrees, whatever the sign of the quaternion.
     assert np.degrees(np.arccos((np.trace(quarter) - 1.0) / 2.0)) == pytest.approx(10.0, abs=1e-6)
     assert np.trace(frames.camera_from_icrf(int(start))) == pytest.approx(3.0)
+    (folder / "attitude.aem").unlink()
+    assert load_external(folder, parse_scenario(TEXT)).camera_from_icrf(int(start)) is None
 
 
 def edited(name, old, new):
@@ -172,10 +163,7 @@ def edited(name, old, new):
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
-        (
-            lambda folder: (folder / "frames.csv").unlink(),
-            "frames.csv: expected a table with columns file and utc",
-        ),
+        (lambda folder: (folder / "frames.csv").unlink(), "frames.csv: expected a table with columns file and utc"),
         (edited("frames.csv", "file,utc", "name,utc"), "frames.csv, line 2: expected a file and a UTC"),
         (edited("frames.csv", "2029-", "20x9-"), "frames.csv, line 2: expected a UTC, found '20x9-"),
         (
@@ -186,10 +174,7 @@ def edited(name, old, new):
         (edited("frames.csv", "000001.png", "000000.png"), "lines 2 and 3: expected an image of its own"),
         (lambda folder: (folder / "frames.csv").write_text("file,utc\n"), "expected at least one frame"),
         (lambda folder: (folder / "orbit.oem").unlink(), "expected one ephemeris *.oem, found 0"),
-        (
-            lambda folder: shutil.copy(folder / "orbit.oem", folder / "b.oem"),
-            "expected one ephemeris *.oem, found 2",
-        ),
+        (lambda folder: shutil.copy(folder / "orbit.oem", folder / "b.oem"), "expected one ephemeris *.oem, found 2"),
         (edited("attitude.aem", "ICRF", "MOON_ME"), "attitude.aem"),
         (
             edited("frames.csv", "000000.png,2029-08-08T02:58:00", "000000.png,2029-08-08T02:48:00"),

@@ -75,9 +75,7 @@ def server() -> Iterator[ThreadingHTTPServer]:
 
 def wanted(server: ThreadingHTTPServer, **changes: object) -> ProductFile:
     url = f"http://127.0.0.1:{server.server_address[1]}/a.bin"
-    plain = ProductFile(
-        "dem/a.bin", url, len(BODY), sha256=SHA256, origin="published", checksum_source="the test"
-    )
+    plain = ProductFile("dem/a.bin", url, len(BODY), sha256=SHA256, origin="published", checksum_source="the test")
     return replace(plain, **changes)
 
 

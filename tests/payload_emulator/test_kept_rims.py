@@ -66,9 +66,7 @@ def test_rims_are_measured_once_and_again_for_other_ground(folder: Path) -> None
     assert makes_ground(opened())
 
 
-def test_tiles_are_made_once_and_again_for_other_ground(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tiles_are_made_once_and_again_for_other_ground(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made, make = list[ProceduralTerrain](), ProceduralTerrain.make_heights
 
     def counted(terrain: ProceduralTerrain, *places: FloatArray) -> Heights:
@@ -119,9 +117,7 @@ def test_sources_change_with_the_seed_the_section_and_each_file_of_a_raster(tmp_
     assert len(set(texts)) == len(texts)
 
 
-def test_a_long_measurement_is_watched_in_parts_and_a_kept_one_is_not(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_long_measurement_is_watched_in_parts_and_a_kept_one_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rims, "PART", 4)
     seen: list[list[int]] = []
 

@@ -116,10 +116,7 @@ def test_the_receiver_reports_what_it_accepted_and_whether_it_hears_anybody() ->
     assert receiver.take(ping * 3) == ping * 3
     assert unpack_clcw(receiver.clcw) == Clcw(0, 0, farm_b_counter=3)
     # A sequence-controlled frame that does not follow is not accepted, and one far off locks the receiver.
-    assert (
-        receiver.decoder.decode(UplinkEncoder(76, bypass=False, sequence_number=1).encode([ping])).packets
-        == ()
-    )
+    assert receiver.decoder.decode(UplinkEncoder(76, bypass=False, sequence_number=1).encode([ping])).packets == ()
     assert unpack_clcw(receiver.clcw).retransmit
     receiver.decoder.decode(UplinkEncoder(76, bypass=False, sequence_number=99).encode([ping]))
     assert unpack_clcw(receiver.clcw).lockout

@@ -62,9 +62,7 @@ class Watcher:
 
     def __init__(self, live: LiveSession) -> None:
         self.telemetry = socket.create_connection(("127.0.0.1", live.ports["telemetry earth"]), timeout=900.0)
-        self.telecommands = socket.create_connection(
-            ("127.0.0.1", live.ports["telecommand earth"]), timeout=900.0
-        )
+        self.telecommands = socket.create_connection(("127.0.0.1", live.ports["telecommand earth"]), timeout=900.0)
         self.console = socket.create_connection(("127.0.0.1", live.ports["console"]), timeout=900.0)
         self.lines = self.console.makefile("r")
         self.say("watch")
@@ -147,9 +145,7 @@ def test_rings_of_the_catalogue_lie_on_the_rims_of_the_rendered_ground() -> None
     assert all(one["minor_px"] <= one["diameter_px"] <= one["major_px"] for one in rings)
 
 
-def test_detections_that_the_payload_identified_have_their_craters(
-    flown: tuple[World, LoadedPayload],
-) -> None:
+def test_detections_that_the_payload_identified_have_their_craters(flown: tuple[World, LoadedPayload]) -> None:
     world, loaded = flown
     frame = {"frame_number": 0, "image_ticks": 0}
     found = {"u_px": 1.0, "v_px": 2.0, "diameter_px": 9.0, "score": 0.5, "size_class": 0, "sigma_px": 0.5}
@@ -205,20 +201,13 @@ def test_the_scenario_runs_through_and_the_machine_goes_on(running: tuple[LiveSe
     live, watcher = running
     watcher.say("run")
     messages = watcher.until(
-        lambda message: (
-            message["kind"] == "turn" and message["mode"] == "standby" and live.account.frames == 16
-        )
+        lambda message: message["kind"] == "turn" and message["mode"] == "standby" and live.account.frames == 16
     )
     frames = [message["frame"] for message in messages if message["kind"] == "frame"]
     assert frames == list(range(16))
-    assert {
-        message["estimates"]["spherical"]["outcome"] for message in messages if message["kind"] == "frame"
-    } <= {
-        "anchored",
-        "multi",
-        "single",
-        "predicted",
-    }
+    assert {message["estimates"]["spherical"]["outcome"] for message in messages if message["kind"] == "frame"} <= {
+        "anchored", "multi", "single", "predicted",
+    }  # fmt: skip
     watcher.say("rate 5")
     watcher.until(lambda message: message.get("rate") == 5.0)
 
@@ -346,9 +335,7 @@ def test_a_reader_that_does_not_read_is_disconnected_and_delays_nobody() -> None
 
 
 @pytest.mark.parametrize("leave", [socket.socket.close, reset], ids=["closed", "reset"])
-def test_words_of_a_client_that_left_without_reading_are_received(
-    leave: Callable[[socket.socket], None],
-) -> None:
+def test_words_of_a_client_that_left_without_reading_are_received(leave: Callable[[socket.socket], None]) -> None:
     received: list[bytes] = []
     server = Server("console", 0, "127.0.0.1", lambda number, octets: received.append(octets))
     selector = served(server)
@@ -372,9 +359,7 @@ def test_words_of_a_client_that_left_without_reading_are_received(
 def test_no_more_connections_are_held_than_the_limit() -> None:
     server = Server("telemetry", 0, "127.0.0.1", lambda number, octets: None)
     selector = served(server)
-    clients = [
-        socket.create_connection(("127.0.0.1", server.port), timeout=900.0) for _ in range(CLIENT_LIMIT + 3)
-    ]
+    clients = [socket.create_connection(("127.0.0.1", server.port), timeout=900.0) for _ in range(CLIENT_LIMIT + 3)]
     while server._accepted < CLIENT_LIMIT:
         turn(selector)
     for _ in range(3):
@@ -391,9 +376,7 @@ def test_telecommands_come_out_of_any_noise_whole_or_not_at_all() -> None:
     rng = np.random.default_rng(6)
     for trial in range(200):
         telecommands = [ping(k) for k in range(4)]
-        noise = [
-            bytes(rng.integers(0x30, 0x80, int(rng.integers(0, 9))).astype(np.uint8)) for _ in telecommands
-        ]
+        noise = [bytes(rng.integers(0x30, 0x80, int(rng.integers(0, 9))).astype(np.uint8)) for _ in telecommands]
         encoder = UplinkEncoder(0x4C)
         parts = [
             quiet + (encoder.encode([telecommand]) if (trial >> k) & 1 else telecommand)
@@ -421,9 +404,7 @@ def test_a_processor_that_hangs_is_reset_and_the_payload_goes_on(flown: tuple[Wo
     flights = []
     for _ in range(2):
         spacecraft = new_spacecraft(replace(world, scenario=scenario), loaded)
-        packets = [
-            packet for result in fly_scenario(spacecraft.world, spacecraft) for packet in result.packets
-        ]
+        packets = [packet for result in fly_scenario(spacecraft.world, spacecraft) for packet in result.packets]
         flights.append(packets)
         assert len(spacecraft.resets) == 1 and spacecraft.payload.mode is PayloadMode.standby
     unpacked = list(map(DICTIONARY.unpack, flights[0]))

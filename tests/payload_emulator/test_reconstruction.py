@@ -20,15 +20,7 @@ from payload_emulator.session.live.station_ports import RECORD_HEADER
 from payload_emulator.session.scenario import Scenario, format_scenario, parse_scenario
 from payload_emulator.session.spacecraft.loading import launch_payload
 from payload_emulator.session.world.world import clock_ticks, first_utc_ns, open_world
-from tests.payload_emulator.test_continuous import (
-    CADU,
-    EPOCH,
-    HOUR_NS,
-    NS,
-    Ground,
-    flown,
-    scenario,
-)
+from tests.payload_emulator.test_continuous import CADU, EPOCH, HOUR_NS, NS, Ground, flown, scenario
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode
 from tmtc.link.settings import LinkSettings
@@ -109,9 +101,7 @@ def of_kind(name: str, octets: bytes) -> list[dict[str, Any]]:
     return found
 
 
-def test_the_flown_build_says_of_the_images_made_again_what_it_said_in_flight(
-    live: Path, tmp_path: Path
-) -> None:
+def test_the_flown_build_says_of_the_images_made_again_what_it_said_in_flight(live: Path, tmp_path: Path) -> None:
     """The detector looked at the same pixels: its reports have the same octets, and so have those of the images."""
     whole = tmp_path / "whole"
     manifest = complete_archive(live, whole, DataFolder(None))

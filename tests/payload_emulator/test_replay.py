@@ -29,11 +29,7 @@ from payload_emulator.session.archive.replay import (
 )
 from payload_emulator.session.archive.suite import SUITE, suite_scenarios
 from payload_emulator.session.scenario import format_scenario, parse_scenario
-from payload_emulator.session.spacecraft.parameter_file import (
-    BuildParameters,
-    format_parameters,
-    parse_parameters,
-)
+from payload_emulator.session.spacecraft.parameter_file import BuildParameters, format_parameters, parse_parameters
 from payload_emulator.session.world import world
 from tests.lazy import Lazy
 from tests.scenarios import short_scenario
@@ -73,12 +69,6 @@ def packets_of(name: str, octets: bytes) -> list[bytes]:
     return [every[i] for i in table.packet_index.tolist()]
 
 
-def test_the_same_build_gives_the_same_octets(archive: Path, tmp_path: Path) -> None:
-    for name in ("one", "two"):
-        replay_archive(archive, FlightBuild(), tmp_path / name)
-    assert (tmp_path / "one/downlink.cadu").read_bytes() == (tmp_path / "two/downlink.cadu").read_bytes()
-
-
 def test_the_service_renders_the_frames_that_an_archive_lacks(copy: Path, tmp_path: Path) -> None:
     """Of the files that a scenario can name, the renderer opens only those that the service refuses."""
     shutil.rmtree(copy / "frames")
@@ -87,9 +77,7 @@ def test_the_service_renders_the_frames_that_an_archive_lacks(copy: Path, tmp_pa
     named = replace(
         scenario,
         detector=replace(scenario.detector, network="/nowhere/network.onnx"),
-        navigation=replace(
-            scenario.navigation, filter_gravity="/nowhere/field", anchoring_catalogue="/nowhere/table"
-        ),
+        navigation=replace(scenario.navigation, filter_gravity="/nowhere/field", anchoring_catalogue="/nowhere/table"),
     )
     manifest["scenario_toml"] = format_scenario(named)
     manifest["files"] = file_entries(copy)
@@ -152,9 +140,7 @@ def test_a_replay_asks_no_clock_for_what_it_says(archive: Path) -> None:
     assert all((values == 0.0).all() for values in untimed.stages_ms.values())
 
 
-def test_costs_are_reported_for_every_frame_and_stay_out_of_the_downlink(
-    archive: Path, tmp_path: Path
-) -> None:
+def test_costs_are_reported_for_every_frame_and_stay_out_of_the_downlink(archive: Path, tmp_path: Path) -> None:
     summary = replay_archive(archive, FlightBuild(), tmp_path / "out")
     costs = json.loads((tmp_path / "out/performance.json").read_text())
     assert set(costs["stages"]) == {"network", "detector", "navigation"}
@@ -277,20 +263,14 @@ def test_a_parameter_can_be_set_by_its_dotted_name() -> None:
         ("detector.score_threshold = nan", "expected a finite number from 0 to 1, found nan"),
         ("flight.anchored.search_radius_m = inf", "expected a finite number from 0, found inf"),
         ("flight.anchored.detection_sigma_px = -0.1", "expected a finite number from 0, found -0.1"),
-        (
-            "flight.anchored.errors.catalogue_offset_m = [1.0, -1.0, 1.0]",
-            "catalogue_offset_m[1]: expected a finite",
-        ),
+        ("flight.anchored.errors.catalogue_offset_m = [1.0, -1.0, 1.0]", "catalogue_offset_m[1]: expected a finite"),
         ("flight.housekeeping_interval_s = 0", "expected a finite number from 0.001, found 0"),
         ("detector.max_detections = 0", "expected a finite number from 1, found 0"),
         (
             "flight.anchored.lost.minimum_altitude_m = 60000",
             "flight.anchored.lost.minimum_altitude_m: expected at most maximum_altitude_m = 55000.0, found 60000.0",
         ),
-        (
-            "flight.anchored.limits.highest_radius_m = 1",
-            "lowest_radius_m: expected at most highest_radius_m = 1.0",
-        ),
+        ("flight.anchored.limits.highest_radius_m = 1", "lowest_radius_m: expected at most highest_radius_m = 1.0"),
     ],
 )
 def test_a_bad_parameter_is_told_by_its_name(text: str, told: str) -> None:

@@ -14,13 +14,7 @@ from lunar.frames import mci_from_icrf
 from lunar.propagation import SolarPressure
 from lunar.timescales import tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError
-from payload_emulator.session.scenario import (
-    SHIPPED,
-    Scenario,
-    format_scenario,
-    load_scenario,
-    parse_scenario,
-)
+from payload_emulator.session.scenario import SHIPPED, Scenario, format_scenario, load_scenario, parse_scenario
 from payload_emulator.session.spacecraft.loading import SEEN_BELOW_RIM_M, onboard_catalogue
 from payload_emulator.session.world.orbit import (
     force_model,
@@ -55,19 +49,13 @@ def test_an_empty_scenario_is_the_papers_orbit() -> None:
         ("", "key 'name' is missing"),
         ("name = 3", "name must be a text, found 3"),
         ('name = "x"\nsed = 4', "unknown key 'sed'; did you mean 'seed'?"),
-        (
-            'name = "x"\n[orbit]\nexcentricity = 0.1',
-            "unknown key 'orbit.excentricity'; did you mean 'eccentricity'?",
-        ),
+        ('name = "x"\n[orbit]\nexcentricity = 0.1', "unknown key 'orbit.excentricity'; did you mean 'eccentricity'?"),
         ('name = "x"\n[orbit]\neccentricity = "round"', "orbit.eccentricity must be a number, found 'round'"),
         (
             'name = "x"\n[dynamics]\nsolar_area_to_mass_m2_kg = -1.0',
             "dynamics.solar_area_to_mass_m2_kg must be from 0 to 1000, found -1.0",
         ),
-        (
-            'name = "x"\n[orbit]\neccentricity = 1.2',
-            "orbit.eccentricity must be from 0 to below 1, found 1.2",
-        ),
+        ('name = "x"\n[orbit]\neccentricity = 1.2', "orbit.eccentricity must be from 0 to below 1, found 1.2"),
         ('name = "x"\n[orbit]\nsemi_major_axis_km = 1700.0', "an orbit above the ground"),
         ('name = "x"\n[orbit]\nepoch = "tomorrow"', "orbit.epoch must be a UTC time"),
         ('name = "x"\n[orbit]\nraan_deg = nan', "orbit.raan_deg must be finite"),
@@ -87,10 +75,7 @@ def test_an_empty_scenario_is_the_papers_orbit() -> None:
             'name = "x"\n[orbit]\nposition_km = [1800.0, 0.0, 0.0]\nvelocity_km_s = [0.0, 1.6, 0.0]\nraan_deg = 4.0',
             "orbit.raan_deg must be absent where orbit.position_km is given, found 4.0",
         ),
-        (
-            'name = "x"\n[orbit]\nposition_km = ["far", 0.0, 0.0]',
-            "orbit.position_km[0] must be a number, found 'far'",
-        ),
+        ('name = "x"\n[orbit]\nposition_km = ["far", 0.0, 0.0]', "orbit.position_km[0] must be a number, found 'far'"),
         (
             'name = "x"\n[window]\nlatitude_min_deg = 30.0\nlatitude_max_deg = 20.0',
             "window.latitude_min_deg and latitude_max_deg must be a band of latitudes",
@@ -103,10 +88,7 @@ def test_an_empty_scenario_is_the_papers_orbit() -> None:
             'name = "x"\n[detector]\nscore_threshold = 1.5',
             "detector.score_threshold must be between 0 and 1, or negative for that of the network, found 1.5",
         ),
-        (
-            'name = "x"\n[detector]\nmax_detections = 256',
-            "detector.max_detections must be from 1 to 255, found 256",
-        ),
+        ('name = "x"\n[detector]\nmax_detections = 256', "detector.max_detections must be from 1 to 255, found 256"),
         (
             'name = "x"\n[terrain]\nregistration_north_east_m = [10.0]',
             "terrain.registration_north_east_m must be empty or two numbers of at most 5000 m, found (10.0,)",
@@ -161,18 +143,12 @@ def test_what_cannot_be_flown_is_refused(text: str, message: str) -> None:
             '[window]\nsearch = "none"\nduration_s = 600\nsearch_days = 3',
             "window.search_days has no effect where window.search is 'none': expected it left out, found 3.0",
         ),
-        (
-            '[orbit]\noem = "a.oem"\ninclination_deg = 40',
-            "orbit.inclination_deg has no effect with orbit.oem",
-        ),
+        ('[orbit]\noem = "a.oem"\ninclination_deg = 40', "orbit.inclination_deg has no effect with orbit.oem"),
         ("[dynamics]\nsolar_reflection = 2", "solar_reflection has no effect without a solar area"),
         ("[maneuvers]\nenabled = false\neccentricity = 0.1", "maneuvers.eccentricity has no effect without"),
         ("[maneuvers]\nenabled = false\nexecution_error_fraction = 0.1", "no effect without burns"),
         ('[light]\nmode = "real"\nelevation_max_deg = 50', "light.elevation_max_deg has no effect where"),
-        (
-            '[camera]\nimages = "reduced"\n[sensor]\nbits = 12',
-            "sensor.bits has no effect with reduced images",
-        ),
+        ('[camera]\nimages = "reduced"\n[sensor]\nbits = 12', "sensor.bits has no effect with reduced images"),
         (
             '[navigation]\nanchoring_catalogue = "a"\ncatalogue_height_error_m = 9',
             "catalogue_height_error_m has no effect with anchoring_catalogue",

@@ -18,19 +18,8 @@ from payload_emulator.errors import RecordError
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.session.live.session import LiveSession
-from payload_emulator.session.live.state import (
-    VERSION,
-    load_state,
-    pack_state,
-    save_state,
-    unpack_state,
-)
-from payload_emulator.session.live.station_ports import (
-    JournalEntry,
-    StationPorts,
-    add_to_journal,
-    load_journal,
-)
+from payload_emulator.session.live.state import VERSION, load_state, pack_state, save_state, unpack_state
+from payload_emulator.session.live.station_ports import JournalEntry, StationPorts, add_to_journal, load_journal
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.spacecraft.loading import launch
 from payload_emulator.sim.board.faults import parse_fault
@@ -144,9 +133,7 @@ def test_a_damaged_file_is_refused_with_its_name(tmp_path: Path) -> None:
             load_state(path, "a", {})
 
 
-def test_a_failure_while_writing_leaves_the_state_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failure_while_writing_leaves_the_state_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "exact"
     save_state(path, "a", {"one": 1}, {})
 
@@ -276,9 +263,7 @@ def test_a_session_repeats_the_newer_transmissions_of_its_journal_at_their_times
     later = JournalEntry(epoch + 10, "madrid", 512, b"later")
     for entry in (later, JournalEntry(epoch, "madrid", 256, b"now")):
         add_to_journal(journal, entry)
-    session = LiveSession(
-        *launch(parse_scenario(SCENARIO), DataFolder(None)), keeps=True, journal_file=journal
-    )
+    session = LiveSession(*launch(parse_scenario(SCENARIO), DataFolder(None)), keeps=True, journal_file=journal)
     contacts = session.contacts
     try:
         assert contacts.stations["madrid"].taken == {256, 512}
@@ -289,10 +274,7 @@ def test_a_session_repeats_the_newer_transmissions_of_its_journal_at_their_times
         contacts.repeat_journal(session.utc_ns)
         assert [octets for _, octets in contacts._uplink] == [b"now", b"later"]
         # Without a contact nothing is taken, and nothing is written.
-        assert (
-            not contacts.receive(lambda: session.utc_ns, "madrid", 768, b"new")
-            and len(load_journal(journal)) == 2
-        )
+        assert not contacts.receive(lambda: session.utc_ns, "madrid", 768, b"new") and len(load_journal(journal)) == 2
     finally:
         session.close()
 

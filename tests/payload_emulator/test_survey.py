@@ -37,20 +37,10 @@ filter_degree = 8
 
 def window(seed: int = 1, **changed: object) -> SurveyWindow:
     values = {
-        "seed": seed,
-        "longitude_deg": 10.0,
-        "altitude_km": (20.0, 30.0),
-        "frames": 4,
-        "fixed": 3,
-        "median_m": 25.0,
-        "p95_m": 40.0,
-        "bias_rtn_m": (1.0, 2.0, 3.0),
-        "inside_2_sigma": (1.0, 0.5, 0.0),
-        "nees": 6.0,
-        "nis": 1.0,
-        "coast_end_m": 100.0,
-        "position_m": (10.0, 20.0, 30.0, 40.0),
-    }
+        "seed": seed, "longitude_deg": 10.0, "altitude_km": (20.0, 30.0), "frames": 4, "fixed": 3, "median_m": 25.0,
+        "p95_m": 40.0, "bias_rtn_m": (1.0, 2.0, 3.0), "inside_2_sigma": (1.0, 0.5, 0.0), "nees": 6.0, "nis": 1.0,
+        "coast_end_m": 100.0, "position_m": (10.0, 20.0, 30.0, 40.0),
+    }  # fmt: skip
     return SurveyWindow.model_validate(values | changed)
 
 
@@ -119,9 +109,7 @@ def test_windows_of_all_seeds_are_counted_together_each_by_its_frames() -> None:
 def test_recall_is_counted_by_size_and_by_depth_with_the_limits_in_their_groups() -> None:
     diameter_m = np.array([2.9e3, 3e3, 4.999e3, 5e3, 30e3, 30.1e3, 10e3, 10e3, 10e3, 10e3])
     depth_ratio = np.array([0.08, 0.08, 0.2, 0.0599, 0.06, 0.08, 0.0999, 0.10, 0.2, np.nan])
-    catalogue = make_catalogue(
-        np.zeros(10), np.zeros(10), diameter_m, source="test", depth_m=depth_ratio * diameter_m
-    )
+    catalogue = make_catalogue(np.zeros(10), np.zeros(10), diameter_m, source="test", depth_m=depth_ratio * diameter_m)
     in_image = np.array([7, 6, 4, 5, 5, 9, 4, 8, 5, 10])
     detected = np.array([7, 1, 4, 2, 1, 9, 4, 3, 5, 0])
     assert recall_counts(catalogue, np.stack([in_image, detected], axis=1)) == {

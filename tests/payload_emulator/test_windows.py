@@ -91,9 +91,7 @@ def test_a_window_before_the_impact_of_the_orbit_is_found_and_the_impact_is_name
     assert format_utc(int(world.frame_utc_ns[0]), 0) == "2029-08-07T01:05:00Z"
     assert world.ends.startswith("the orbit hits the Moon at 2029-08-11T15:5")
     many = parse_scenario(f"{FALLING}[window]\npasses = 900")
-    with pytest.raises(
-        ScenarioError, match=r"within 30\.0 days .* found \d+; the orbit hits the Moon at 2029-08-11"
-    ):
+    with pytest.raises(ScenarioError, match=r"within 30\.0 days .* found \d+; the orbit hits the Moon at 2029-08-11"):
         build_world(many, DataFolder())
 
 
@@ -122,12 +120,8 @@ duration_s = 600
 """
 
 
-def test_a_flight_over_a_pole_is_refused_before_it_starts_by_its_first_frame_that_sees_too_far(
-    tmp_path,
-) -> None:
-    message = (
-        r"expected ground within 84 deg of latitude .* found 8\d\.\d+ deg needed by frame \d of 40 at 2029"
-    )
+def test_a_flight_over_a_pole_is_refused_before_it_starts_by_its_first_frame_that_sees_too_far(tmp_path) -> None:
+    message = r"expected ground within 84 deg of latitude .* found 8\d\.\d+ deg needed by frame \d of 40 at 2029"
     with pytest.raises(ScenarioError, match=message):
         checked_world(parse_scenario(POLAR), DataFolder())
     with pytest.raises(ScenarioError, match=message):

@@ -51,9 +51,7 @@ class Tab:
     def theme(self, scheme: str, media: str = "screen") -> None:
         """Prefer light or dark, on a screen or on paper."""
         self.call(
-            "Emulation.setEmulatedMedia",
-            media=media,
-            features=[{"name": "prefers-color-scheme", "value": scheme}],
+            "Emulation.setEmulatedMedia", media=media, features=[{"name": "prefers-color-scheme", "value": scheme}]
         )
 
     def value(self, expression: str) -> Any:
@@ -98,9 +96,7 @@ def tab(profile: Path) -> Iterator[Tab]:
             root.send(json.dumps({"id": 1, "method": "Target.getTargets"}))
             message = json.loads(root.recv(timeout=_WAIT_S))
             page = next(t for t in message["result"]["targetInfos"] if t["type"] == "page")
-        with connect(
-            f"ws://127.0.0.1:{port}/devtools/page/{page['targetId']}", max_size=None, proxy=None
-        ) as socket:
+        with connect(f"ws://127.0.0.1:{port}/devtools/page/{page['targetId']}", max_size=None, proxy=None) as socket:
             yield Tab(socket)
     finally:
         process.terminate()

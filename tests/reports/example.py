@@ -81,9 +81,7 @@ def _quantiles(error_rtn_m: Array, drift_percent: float, path_m: float) -> Navig
     if not len(length):
         return NavigationStatistics()
     p50, p68, p95, p99 = (float(v) for v in np.quantile(length, (0.5, 0.68, 0.95, 0.99)))
-    return NavigationStatistics(
-        p50, p68, p95, p99, float(length.max()), drift_percent, float(length[-1]), path_m
-    )
+    return NavigationStatistics(p50, p68, p95, p99, float(length.max()), drift_percent, float(length[-1]), path_m)
 
 
 def _series(
@@ -104,9 +102,7 @@ def _odometry(
     """Errors that walk from the start of each arc, with outcomes, reset triggers and errors before a reset."""
     n = len(imaging)
     starts = imaging & ~np.append(False, imaging[:-1])
-    outcome = rng.choice(
-        ("multi", "single", "predicted", "missed", "rejected"), n, p=(0.8, 0.02, 0.15, 0.02, 0.01)
-    )
+    outcome = rng.choice(("multi", "single", "predicted", "missed", "rejected"), n, p=(0.8, 0.02, 0.15, 0.02, 0.01))
     trigger = np.where(np.cumsum(starts) == 1, "initialization", "time_gap")
     walked = np.cumsum(rng.normal(drift_m, drift_m, (n, 3)), axis=0)
     error = walked - walked[np.maximum.accumulate(np.where(starts, np.arange(n), 0))]
@@ -135,18 +131,11 @@ def _filter(rng: np.random.Generator, imaging: NDArray[np.bool_], cadence_s: flo
     fixed = np.where(rng.random(n) > 0.02, "fixed", "refused")
     outcome = np.where(matched > 0, fixed, np.where(imaging, "coasted", "no_image"))
     return {
-        "error_rtn_m": error,
-        "sigma_rtn_m": sigma,
-        "outcome": tuple(outcome.tolist()),
-        "matched": matched,
-        "nis": np.where(matched > 0, rng.chisquare(np.maximum(2 * matched, 1)), np.nan),
-        "nis_dof": 2 * matched,
-        "nees": np.sum((error / sigma) ** 2, axis=1),
-        "time_since_fix_s": age,
-        "wrong_fixes": 0,
-        "anchor_reads": 0,
+        "error_rtn_m": error, "sigma_rtn_m": sigma, "outcome": tuple(outcome.tolist()), "matched": matched,
+        "nis": np.where(matched > 0, rng.chisquare(np.maximum(2 * matched, 1)), np.nan), "nis_dof": 2 * matched,
+        "nees": np.sum((error / sigma) ** 2, axis=1), "time_since_fix_s": age, "wrong_fixes": 0, "anchor_reads": 0,
         "anchor_reads_after_start": 0,
-    }
+    }  # fmt: skip
 
 
 def crater_image(seed: int) -> tuple[NDArray[np.uint8], tuple[Array, Array, Array]]:
@@ -171,8 +160,7 @@ def gallery_frame(seed: int, frame_number: int = 1, utc_ns: int | None = None) -
     seen = rng.random(len(u)) < 0.72
     false = int(rng.integers(0, 3))
     found_u, found_v, found_d = (
-        np.append((one + rng.normal(0.0, 1.1, len(u)))[seen], rng.uniform(20, 490, false))
-        for one in (u, v, diameter)
+        np.append((one + rng.normal(0.0, 1.1, len(u)))[seen], rng.uniform(20, 490, false)) for one in (u, v, diameter)
     )
     return GalleryFrame(
         frame_number=frame_number, utc_ns=utc_ns, image=image, detection_u_px=found_u, detection_v_px=found_v,
@@ -191,9 +179,7 @@ def detector_score(seed: int = 3) -> DetectorScore:
     du, dv = rng.normal(0.0, 1.2, (2, n)) + 0.2 * np.array([np.sin(azimuth), -np.cos(azimuth)])
     threshold = np.linspace(0.05, 0.95, 46)
     curves = tuple(
-        PrecisionRecallCurve(
-            label, threshold, 1 - 0.2 * (1.35 - threshold) ** 2.2, best * (1 - threshold**3.2)
-        )
+        PrecisionRecallCurve(label, threshold, 1 - 0.2 * (1.35 - threshold) ** 2.2, best * (1 - threshold**3.2))
         for label, best in (("5–10 km", 0.79), ("10–15 km", 0.74), ("15–30 km", 0.86))
     )
     return DetectorScore(
@@ -204,9 +190,7 @@ def detector_score(seed: int = 3) -> DetectorScore:
         ),
         micro=ClassScore(-1, "all", 2_253, 1_587, 274, 0.8528, 0.7044, 1.33),
         method="One-to-one, same class, within the larger of 10 px and half the radius.",
-        by_altitude_km=tuple(
-            BinScore(a, a + 5, 30 * a, 0.79, 0.80 - 0.007 * a, 1.2) for a in range(15, 45, 5)
-        ),
+        by_altitude_km=tuple(BinScore(a, a + 5, 30 * a, 0.79, 0.80 - 0.007 * a, 1.2) for a in range(15, 45, 5)),
         by_sun_elevation_deg=tuple(
             BinScore(e, e + 2, 420 - 18 * e, 0.8, 0.52 + 0.018 * e, 1.2) for e in range(5, 15, 2)
         ),
@@ -232,8 +216,7 @@ def pass_report(
     edges = np.flatnonzero(np.diff(np.concatenate([[0], imaging.astype(int), [0]])))
     half = int(cadence_s * 5e8)
     arcs = tuple(
-        TimeSpan(int(utc_ns[a]) - half, int(utc_ns[b - 1]) + half)
-        for a, b in zip(edges[::2], edges[1::2], strict=True)
+        TimeSpan(int(utc_ns[a]) - half, int(utc_ns[b - 1]) + half) for a, b in zip(edges[::2], edges[1::2], strict=True)
     )
     path = float(n * cadence_s * 1_636.0)
     sun = 10.0 + 4.0 * np.sin(elapsed / 300.0)
@@ -256,9 +239,7 @@ def pass_report(
             for m in lengths
         )
 
-    def flown(
-        name: str, kind: str, error_rtn_m: Array, drift_percent: float, **more: object
-    ) -> NavigationSeries:
+    def flown(name: str, kind: str, error_rtn_m: Array, drift_percent: float, **more: object) -> NavigationSeries:
         statistics = _quantiles(error_rtn_m, drift_percent, path)
         return _series(name, kind, utc_ns, elapsed, error_rtn_m, statistics=statistics, **more)
 
@@ -267,28 +248,18 @@ def pass_report(
     catalogue = "catalogue filter; never reads the anchor ephemeris"
     navigation = (
         flown(
-            "paper",
-            "estimate",
-            **paper,
-            **seen,
-            drift_percent=1.71,
-            drift_by_length=sweep(1.7, -0.05),
+            "paper", "estimate", **paper, **seen, drift_percent=1.71, drift_by_length=sweep(1.7, -0.05),
             description=planar,
         ),
         flown(
-            "spherical",
-            "estimate",
-            **rounds,
-            **seen,
-            drift_percent=0.014,
-            drift_by_length=sweep(0.05, -0.5),
+            "spherical", "estimate", **rounds, **seen, drift_percent=0.014, drift_by_length=sweep(0.05, -0.5),
             description=spherical,
         ),
         flown("anchored", "estimate", **anchored, **seen, drift_percent=0.002, description=catalogue),
         flown("Kepler", "baseline", growth * (420.0, 2_050.0, 260.0), 0.04),
         flown("propagate only, degree 50", "baseline", growth * (24.0, 118.0, 22.0), 0.003),
         flown("snapshot fix", "baseline", snapshot, float("nan")),
-    )
+    )  # fmt: skip
 
     frames = int(imaging.sum())
     bins = min(60, n)
@@ -303,9 +274,7 @@ def pass_report(
     stripes = 128 + 40 * np.sin(np.add.outer(np.arange(180) / 7.0, np.arange(360) / 11.0))
     fast = utc_ns[:: max(1, n // 400)]
     power_w = 3.2 + 0.8 * imaging[:: max(1, n // 400)]
-    known = ReceptionQuality(
-        "madrid", "mission", 100, 99, 27, 2.5e-5, 1, 129_900, 0, START_UTC_NS, START_UTC_NS + 60
-    )
+    known = ReceptionQuality("madrid", "mission", 100, 99, 27, 2.5e-5, 1, 129_900, 0, START_UTC_NS, START_UTC_NS + 60)
     unknown = ReceptionQuality("", "default", 68, 68, 0, None, 0, 86_972, 3)
     accounting = FrameAccounting(
         expected=frames, acquired=max(0, frames - 2), lit=max(0, frames - 2), processed=max(0, frames - 3),
@@ -338,9 +307,7 @@ def pass_report(
             HeadlineFigure("Packets lost", 9, "of 1 204", "one gap of 42 s"),
         ),
         provenance={
-            "Payload build": "flight 0.1.0",
-            "Model SHA-256": "7f0c" * 16,
-            "Parameters SHA-256": "91ab" * 16,
+            "Payload build": "flight 0.1.0", "Model SHA-256": "7f0c" * 16, "Parameters SHA-256": "91ab" * 16,
             "Seed": str(seed),
         },
         data_sources=("LROC GLD100 terrain, 118 m/px, longitude 270–330° E", "LU1319381 crater catalogue"),
@@ -353,20 +320,14 @@ def pass_report(
         gaps=(TimeSpan(int(cut[bins // 2]), int(cut[bins // 2 + 1])),) if bins > 20 else (),
         detector=detector_score(seed),
         gallery=tuple(
-            gallery_frame(seed + 10 * i, 20 * i + 3, int(utc_ns[min(n - 1, 20 * i + 3)]))
-            for i in range(gallery)
+            gallery_frame(seed + 10 * i, 20 * i + 3, int(utc_ns[min(n - 1, 20 * i + 3)])) for i in range(gallery)
         ),
         worst_frames=tuple(
-            gallery_frame(seed + 500 + 10 * i, 12 * i + 5, int(utc_ns[min(n - 1, 12 * i + 5)]))
-            for i in range(worst)
+            gallery_frame(seed + 500 + 10 * i, 12 * i + 5, int(utc_ns[min(n - 1, 12 * i + 5)])) for i in range(worst)
         ),
         craters=CraterMap(
-            latitude[pick] + rng.normal(0.0, 1.1, map_n),
-            (longitude[pick] + rng.normal(0.0, 1.1, map_n)) % 360.0,
-            5_000.0 * rng.pareto(1.8, map_n) + 5_000.0,
-            seen_often,
-            rng.binomial(seen_often, 0.66),
-            "LU1319381",
+            latitude[pick] + rng.normal(0.0, 1.1, map_n), (longitude[pick] + rng.normal(0.0, 1.1, map_n)) % 360.0,
+            5_000.0 * rng.pareto(1.8, map_n) + 5_000.0, seen_often, rng.binomial(seen_often, 0.66), "LU1319381",
         ),
         payload_map=payload_map,
         terrain=TerrainMap(stripes.astype(np.uint8), 0.0, 360.0, -90.0, 90.0, "synthetic stripes"),
@@ -394,13 +355,11 @@ def pass_report(
         },
         scenario_text='name = "gld100-window"\nseed = 7\n\n[camera]\nfov_deg = 120.0\n',
         remarks=("The truth and the baseline use different gravity fields.",),
-    )
+    )  # fmt: skip
 
 
 def _regression_pass(i: int, rng: np.random.Generator) -> RegressionPass:
-    recall, precision, median = (
-        tuple(one.tolist()) for one in rng.normal((0.68, 0.84, 40.0), 0.04, (2, 3)).T
-    )
+    recall, precision, median = (tuple(one.tolist()) for one in rng.normal((0.68, 0.84, 40.0), 0.04, (2, 3)).T)
     return RegressionPass(f"W-{i:04d}", 148, i if i % 3 else None, recall, precision, median)
 
 

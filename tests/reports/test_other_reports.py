@@ -9,12 +9,7 @@ import pytest
 
 from reports.json_form import to_json
 from reports.render import render_html, render_pages
-from reports.values import (
-    DetectorReport,
-    DetectorScore,
-    HeadlineFigure,
-    RegressionReport,
-)
+from reports.values import DetectorReport, DetectorScore, HeadlineFigure, RegressionReport
 from tests.reports import example
 from tests.reports.page import Page
 
@@ -116,6 +111,4 @@ def test_a_verdict_is_named_by_its_level_and_has_its_colour(level: str, role: st
 
 def test_accuracies_without_an_evidence_level_are_marked() -> None:
     figures = (HeadlineFigure("Frames", 3),)
-    assert (
-        "No evidence level was stated" in Page(render_html(DetectorReport("M", "m", headline=figures))).text
-    )
+    assert "No evidence level was stated" in Page(render_html(DetectorReport("M", "m", headline=figures))).text

@@ -11,10 +11,7 @@ from reports.render import render_html
 from tests.reports import example
 from tests.reports.browser import CHROMIUM, Tab, tab
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")]
 
 # WCAG 2.1 contrast of text against the ground of the page, for the page and its figures.
 _CONTRAST = """
@@ -58,14 +55,10 @@ def test_the_page_loads_without_a_word_on_the_console_and_without_a_request(brow
 
 
 def test_every_figure_is_drawn(browser: Tab) -> None:
-    sizes = browser.value(
-        "[...document.querySelectorAll('figure svg')].map(s => s.getBoundingClientRect().height)"
-    )
+    sizes = browser.value("[...document.querySelectorAll('figure svg')].map(s => s.getBoundingClientRect().height)")
     assert len(sizes) > 15
     assert min(sizes) > 60
-    assert browser.value(
-        "[...document.querySelectorAll('svg image')].every(i => i.getBoundingClientRect().width > 50)"
-    )
+    assert browser.value("[...document.querySelectorAll('svg image')].every(i => i.getBoundingClientRect().width > 50)")
 
 
 @pytest.mark.parametrize("width", [1280, 1000, 800])
@@ -105,9 +98,7 @@ def test_the_contents_lead_to_the_sections(browser: Tab) -> None:
 
 
 def test_figures_have_words_for_those_who_cannot_see_them(browser: Tab) -> None:
-    assert browser.value(
-        "[...document.querySelectorAll('figure svg')].every(s => s.getAttribute('aria-label'))"
-    )
+    assert browser.value("[...document.querySelectorAll('figure svg')].every(s => s.getAttribute('aria-label'))")
     assert browser.value("[...document.querySelectorAll('table')].every(t => t.caption && t.tHead)")
 
 
@@ -115,9 +106,7 @@ def test_on_paper_no_figure_is_taller_than_a_page_and_paper_is_white(browser: Ta
     browser.theme("dark", media="print")
     # A4 less the margins of the sheet is 265 mm or 1001 CSS pixels high, 178 mm or 673 wide.
     browser.size(673, 1001)
-    heights = browser.value(
-        "[...document.querySelectorAll('figure')].map(f => f.getBoundingClientRect().height)"
-    )
+    heights = browser.value("[...document.querySelectorAll('figure')].map(f => f.getBoundingClientRect().height)")
     ground = browser.value("getComputedStyle(document.body).backgroundColor")
     browser.size(1280, 900)
     browser.theme("light")
@@ -193,8 +182,7 @@ def test_nothing_is_cut_and_every_number_can_be_read(browser: Tab, kind: str, pa
 def test_long_names_of_solutions_cut_no_column(browser: Tab, path: Path) -> None:
     report = example.pass_report()
     renamed = tuple(
-        dataclasses.replace(one, name=f"{one.name}, propagate-only with a perfect start")
-        for one in report.navigation
+        dataclasses.replace(one, name=f"{one.name}, propagate-only with a perfect start") for one in report.navigation
     )
     other = path.with_name("long-names.html")
     other.write_text(render_html(dataclasses.replace(report, navigation=renamed)), encoding="utf-8")

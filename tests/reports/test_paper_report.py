@@ -9,14 +9,7 @@ import pytest
 from reports.document import Absent, Cell, Picture, Table
 from reports.drawings import picture_files
 from reports.paper_report import paper_document, paper_figures, paper_index
-from reports.paper_values import (
-    CatalogueClasses,
-    DetectorResult,
-    Difference,
-    PaperOrbit,
-    PaperReport,
-    PaperSession,
-)
+from reports.paper_values import CatalogueClasses, DetectorResult, Difference, PaperOrbit, PaperReport, PaperSession
 from reports.render import render_pages
 from reports.text import count_text, percent_text
 from reports.values import ClassScore, NavigationSeries, TrackSeries
@@ -97,9 +90,7 @@ def test_every_figure_and_table_with_an_accuracy_states_its_evidence_level() -> 
 def test_the_index_has_figures_tables_and_differences() -> None:
     index = paper_index(report())
     assert {"own-outcomes", "own-ground", "own-altitude", "classes"} <= {f["key"] for f in index["figures"]}
-    assert index["differences"] == [
-        {"subject": "Images", "paper": "5,196", "here": "4", "reason": "A test has few."}
-    ]
+    assert index["differences"] == [{"subject": "Images", "paper": "5,196", "here": "4", "reason": "A test has few."}]
     values = {one["quantity"]: one for one in index["values"]}
     assert values["images of 24 h at 15 s within 60° of latitude"]["difference"] == 3834 - 5196
     assert values["own, paper, median error"] == {

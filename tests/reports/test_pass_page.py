@@ -208,16 +208,12 @@ def test_settings_are_compared_with_those_of_the_previous_pass(changes: tuple[An
 
 def test_series_of_nothing_but_nan_are_dashes_not_numbers() -> None:
     n = 25
-    numbers = dict.fromkeys(
-        ("latitude_deg", "longitude_deg", "altitude_m", "nees", "nis"), np.full(n, np.nan)
-    )
+    numbers = dict.fromkeys(("latitude_deg", "longitude_deg", "altitude_m", "nees", "nis"), np.full(n, np.nan))
     vectors = dict.fromkeys(("error_rtn_m", "sigma_rtn_m"), np.full((n, 3), np.nan))
     one = _series(n, **numbers, **vectors, nis_dof=np.zeros(n, np.int64))
     track = TrackSeries(one.utc_ns, np.linspace(-5, 5, n), np.full(n, 10.0), np.full(n, np.nan))
     headline = (HeadlineFigure("Error", float("nan"), "m"), HeadlineFigure("Recall", None))
-    text = Page(
-        render_html(PassReport("NaN", "p3", navigation=(one,), reference=track, headline=headline))
-    ).text
+    text = Page(render_html(PassReport("NaN", "p3", navigation=(one,), reference=track, headline=headline))).text
     assert text.count("not available") >= 4
     absent = "Position error not available: no downlinked state has both values and a reference"
     assert text.count(absent) == 2
@@ -236,9 +232,7 @@ def test_single_wild_values_do_not_break_a_page() -> None:
 
 
 def test_half_a_downlink_shows_the_share_that_came() -> None:
-    report = replace(
-        example.pass_report(gallery=0, worst=0), accounting=FrameAccounting(expected=148, processed=74)
-    )
+    report = replace(example.pass_report(gallery=0, worst=0), accounting=FrameAccounting(expected=148, processed=74))
     text = Page(render_html(report)).text
     assert "Of 148 expected, 74 (50.0 %) are processed." in text
 

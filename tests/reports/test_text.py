@@ -31,14 +31,7 @@ from reports.text import (
     significant_text,
     utc_text,
 )
-from reports.values import (
-    BinScore,
-    GalleryFrame,
-    HousekeepingParameter,
-    NavigationSeries,
-    PassReport,
-    TrackSeries,
-)
+from reports.values import BinScore, GalleryFrame, HousekeepingParameter, NavigationSeries, PassReport, TrackSeries
 from tests.lazy import Lazy
 from tests.reports import example
 from tests.reports.page import Page
@@ -104,17 +97,11 @@ def test_evidence_levels_are_read_from_their_number_and_never_guessed_from_words
 
 def test_a_level_on_terrain_seen_in_training_keeps_its_mark_and_words() -> None:
     text = "3s (real terrain seen in training; 25 % of frames over unseen terrain)"
-    assert (
-        evidence_label(text) == "3s"
-        and evidence_label("3 (real terrain)") == "3"
-        and evidence_label("") == ""
-    )
+    assert evidence_label(text) == "3s" and evidence_label("3 (real terrain)") == "3" and evidence_label("") == ""
     assert evidence_text(text) == f"level 3s of 5, {text[4:-1]}"
     assert evidence_text("3s") == "level 3s of 5, real terrain seen in training"
     assert evidence_text("3") == "level 3 of 5, real terrain never used in training"
-    assert (
-        evidence_text("2") == "level 2 of 5, procedural Moon" and evidence_text("") == "evidence not stated"
-    )
+    assert evidence_text("2") == "level 2 of 5, procedural Moon" and evidence_text("") == "evidence not stated"
 
 
 @pytest.mark.parametrize(

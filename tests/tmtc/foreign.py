@@ -16,13 +16,9 @@ from spacepackets.ccsds import PacketType, SpacePacketHeader
 NAMESPACE = "http://www.omg.org/spec/XTCE/20180204"
 
 
-def document(
-    types: str, parameters: dict[str, str], containers: str, name: str = "BUS", more: str = ""
-) -> str:
+def document(types: str, parameters: dict[str, str], containers: str, name: str = "BUS", more: str = "") -> str:
     """An XTCE document of types, parameters (name: type) and containers."""
-    listed = "".join(
-        f'<Parameter name="{key}" parameterTypeRef="{kind}"/>' for key, kind in parameters.items()
-    )
+    listed = "".join(f'<Parameter name="{key}" parameterTypeRef="{kind}"/>' for key, kind in parameters.items())
     return (
         f'<?xml version="1.0" encoding="UTF-8"?><SpaceSystem name="{name}" xmlns="{NAMESPACE}"><TelemetryMetaData>'
         f"<ParameterTypeSet>{types}</ParameterTypeSet><ParameterSet>{listed}</ParameterSet>"
@@ -77,12 +73,9 @@ def comparison(parameter: str, value: object, operator: str = "==", calibrated: 
     )
 
 
-def container(
-    name: str, entries: list[str], base: str = "", criteria: str = "", *, abstract: bool = False
-) -> str:
+def container(name: str, entries: list[str], base: str = "", criteria: str = "", *, abstract: bool = False) -> str:
     listed = "".join(
-        entry if entry.startswith("<") else f'<ParameterRefEntry parameterRef="{entry}"/>'
-        for entry in entries
+        entry if entry.startswith("<") else f'<ParameterRefEntry parameterRef="{entry}"/>' for entry in entries
     )
     inherits = ""
     if base:
@@ -101,9 +94,7 @@ def both(*comparisons: str) -> str:
 HEADER = {
     "VERSION": 3, "TYPE": 1, "SEC_HDR_FLG": 1, "PKT_APID": 11, "SEQ_FLGS": 2, "SRC_SEQ_CTR": 14, "PKT_LEN": 16,
 }  # fmt: skip
-HEADER_TYPES = "".join(
-    integer(f"U{bits}", bits) for bits in sorted(set(HEADER.values()) | {4, 5, 8, 12, 24, 32})
-)
+HEADER_TYPES = "".join(integer(f"U{bits}", bits) for bits in sorted(set(HEADER.values()) | {4, 5, 8, 12, 24, 32}))
 HEADER_PARAMETERS = {name: f"U{bits}" for name, bits in HEADER.items()}
 HEADER_CONTAINER = container("CCSDSPacket", list(HEADER), abstract=True)
 
@@ -272,18 +263,14 @@ def housekeeping(rng: np.random.Generator, count: int) -> bytes:
     bits.add(int(rng.integers(-64, 64)), 7).add(int(rng.integers(-(2**32), 2**32)), 33)
     bits.add(int(rng.integers(0, 2**64, dtype=np.uint64)), 64)
     bits.add(int(rng.integers(-(2**63), 2**63 - 1)), 64)
-    bits.add(int(rng.integers(-32768, 32768)), 16).add(int(rng.integers(255)), 8).add(
-        int(rng.integers(255)), 8
-    )
+    bits.add(int(rng.integers(-32768, 32768)), 16).add(int(rng.integers(255)), 8).add(int(rng.integers(255)), 8)
     bits.add(int(rng.integers(65536)), 16)
     bits.octets(struct.pack(">e", rng.normal())).octets(struct.pack(">f", rng.normal()))
     bits.octets(struct.pack(">d", rng.normal() * 1e200))
     bits.octets(struct.pack("<H", int(rng.integers(65536)))).octets(
         struct.pack("<i", int(rng.integers(-(2**31), 2**31)))
     )
-    bits.octets(rng.bytes(3)).octets(struct.pack("<d", rng.normal())).octets(rng.bytes(4)).octets(
-        rng.bytes(4)
-    )
+    bits.octets(rng.bytes(3)).octets(struct.pack("<d", rng.normal())).octets(rng.bytes(4)).octets(rng.bytes(4))
     bits.add(int(rng.integers(2)), 1).add(int(rng.integers(2**63)), 63)
     bits.octets(bytes(rng.integers(32, 127, 8).tolist()))
     label = "häuser"[: int(rng.integers(7))].encode()

@@ -189,9 +189,7 @@ def test_a_valid_frame_is_preferred_to_an_undamaged_likeness_that_others_follow(
     frames[:, 3] ^= 0b00000101
     stream = np.hstack((np.tile(header, (12, 1)), frames)).reshape(-1)
     expected = [(PERIOD + 8) * k + 8 for k in range(12)]
-    sync = synchronise(
-        stream, PERIOD, verify=lambda sync: np.isin(sync.offsets, expected), record_octets=header.size
-    )
+    sync = synchronise(stream, PERIOD, verify=lambda sync: np.isin(sync.offsets, expected), record_octets=header.size)
     assert sync.offsets.tolist() == expected
 
 

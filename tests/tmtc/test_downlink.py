@@ -43,17 +43,13 @@ def make_packets(count: int, seed: int = 0, boot: int = 1, start_s: int = 0) -> 
             "score": rng.uniform(0, 1, n), "size_class": rng.integers(-1, 4, n), "sigma_px": np.full(n, np.nan),
         }  # fmt: skip
         values = {"frame_number": k, "image_ticks": ticks, "image_quality": 0, "items": items}
-        packets.append(
-            DICTIONARY.pack("detections", values, ticks=ticks, sequence_count=sequencer.next(0xA1))
-        )
+        packets.append(DICTIONARY.pack("detections", values, ticks=ticks, sequence_count=sequencer.next(0xA1)))
         event = {"event_id": "fix_refused", "frame_number": k, "value_1": 1.0, "value_2": 2.0}
         packets.append(DICTIONARY.pack("event_low", event, ticks=ticks, sequence_count=sequencer.next(0xA4)))
         if k % 10 == 0:
             zeros = {f.name: 0 for f in DICTIONARY.packet("housekeeping").fields}
             values = {**zeros, "structure_id": 1, "boot_count": boot}
-            packets.append(
-                DICTIONARY.pack("housekeeping", values, ticks=ticks, sequence_count=sequencer.next(0xA0))
-            )
+            packets.append(DICTIONARY.pack("housekeeping", values, ticks=ticks, sequence_count=sequencer.next(0xA0)))
     return packets
 
 
@@ -227,9 +223,7 @@ def test_a_lost_frame_costs_the_packets_that_touch_it_and_no_other():
         at += len(packet)
     lost = 5
     hit = [k for k, (first, last) in enumerate(spans) if first <= lost <= last]
-    damaged = (
-        octets[: frame_of(octets, settings, lost).start] + octets[frame_of(octets, settings, lost).stop :]
-    )
+    damaged = octets[: frame_of(octets, settings, lost).start] + octets[frame_of(octets, settings, lost).stop :]
     decoded = decode(damaged)
     assert list(decoded.cut.packets(decoded.buffer)) == [p for k, p in enumerate(sent()) if k not in hit]
     assert decoded.frames_lost == 1 and decoded.frames_bad == 0
@@ -394,17 +388,14 @@ def test_the_largest_frame_of_the_standard_is_a_frame():
 
 
 SENT = make_packets(30, seed=7)
-STREAMS = {
-    coding: encode_cadus(SENT, spacecraft_id=76, frame_length=223, coding=coding) for coding in ("rs", "none")
-}
+STREAMS = {coding: encode_cadus(SENT, spacecraft_id=76, frame_length=223, coding=coding) for coding in ("rs", "none")}
 
 
 @settings(max_examples=60, deadline=None)
 @given(
     st.sampled_from(["rs", "none"]),
     st.lists(
-        st.tuples(st.sampled_from(["flip", "insert", "delete"]), st.integers(0, 10**9), st.integers(0, 300)),
-        max_size=6,
+        st.tuples(st.sampled_from(["flip", "insert", "delete"]), st.integers(0, 10**9), st.integers(0, 300)), max_size=6
     ),
 )
 def test_whatever_the_link_does_no_packet_is_invented_and_every_octet_is_accounted_for(coding, injuries):

@@ -82,9 +82,7 @@ def read_parquet(octets: bytes):
 
 
 def test_parquet_columns_keep_values_and_gaps():
-    table = read_parquet(
-        parquet_octets({"n": [1, None, -3], "x": [0.5, 1, None], "t": ["a", None, "\u00b5"]})
-    )
+    table = read_parquet(parquet_octets({"n": [1, None, -3], "x": [0.5, 1, None], "t": ["a", None, "\u00b5"]}))
     assert table.to_pydict() == {"n": [1, None, -3], "x": [0.5, 1.0, None], "t": ["a", None, "\u00b5"]}
     assert [str(field.type) for field in table.schema] == ["int64", "double", "string"]
 
@@ -101,9 +99,7 @@ def test_parquet_without_rows_keeps_its_columns():
 
 def test_parquet_without_its_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(
-        MissingLibrary, match=r"expected the library pyarrow, found none; install linna\[parquet\]"
-    ):
+    with pytest.raises(MissingLibrary, match=r"expected the library pyarrow, found none; install linna\[parquet\]"):
         parquet_octets({"n": [1]})
 
 

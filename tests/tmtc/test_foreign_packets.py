@@ -117,9 +117,7 @@ def test_cuc_times_of_every_width_are_read_through_a_definition(coarse, fine):
     parameters = {"COARSE": "C", **({"FINE": "F"} if fine else {}), "N": "U8"}
     types = HEADER_TYPES + integer("C", 8 * coarse) + (integer("F", 8 * fine) if fine else "")
     text = document(
-        types,
-        {**HEADER_PARAMETERS, **parameters},
-        HEADER_CONTAINER + container("P", list(parameters), "CCSDSPacket"),
+        types, {**HEADER_PARAMETERS, **parameters}, HEADER_CONTAINER + container("P", list(parameters), "CCSDSPacket")
     )
     times = [(rng.bytes(coarse), rng.bytes(fine)) for _ in range(20)]
     packets = [space_packet(5, c + f + b"\x2a", k) for k, (c, f) in enumerate(times)]
@@ -213,9 +211,7 @@ def test_packets_behind_octets_of_a_recorder_are_found_and_damage_costs_no_other
     form, rng = PacketForm(error_control), np.random.default_rng(3)
     packets = capture(200, 4)
     if error_control:
-        packets = [
-            append_crc(packet[:4] + (len(packet) - 5).to_bytes(2, "big") + packet[6:]) for packet in packets
-        ]
+        packets = [append_crc(packet[:4] + (len(packet) - 5).to_bytes(2, "big") + packet[6:]) for packet in packets]
     stream = b"".join(rng.bytes(12) + packet for packet in packets)
     assert find_prefix(np.frombuffer(stream, dtype=np.uint8), form) == 12
     prefixed = replace(form, prefix_octets=12)

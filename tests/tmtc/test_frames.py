@@ -31,9 +31,7 @@ FIELDS = (
 
 
 def test_header_fields_are_the_bits_that_the_standard_draws():
-    frames = np.frombuffer(bytes.fromhex("".join(octets for octets, _ in HEADERS)), dtype=np.uint8).reshape(
-        3, 6
-    )
+    frames = np.frombuffer(bytes.fromhex("".join(octets for octets, _ in HEADERS)), dtype=np.uint8).reshape(3, 6)
     columns = frame_headers(frames)
     for k, name in enumerate(FIELDS):
         assert getattr(columns, name).tolist() == [values[k] for _, values in HEADERS], name
@@ -43,14 +41,8 @@ def test_headers_agree_with_spacepackets():
     octets = bytes.fromhex("04C5 05 06 180A")
     theirs = TmFramePrimaryHeader.unpack(octets)
     ours = frame_headers(np.frombuffer(octets, dtype=np.uint8).reshape(1, 6))
-    assert (theirs.master_channel_id.spacecraft_id, theirs.vc_id) == (
-        ours.spacecraft_id[0],
-        ours.virtual_channel[0],
-    )
-    assert (theirs.master_ch_frame_count, theirs.vc_frame_count) == (
-        ours.master_count[0],
-        ours.channel_count[0],
-    )
+    assert (theirs.master_channel_id.spacecraft_id, theirs.vc_id) == (ours.spacecraft_id[0], ours.virtual_channel[0])
+    assert (theirs.master_ch_frame_count, theirs.vc_frame_count) == (ours.master_count[0], ours.channel_count[0])
     assert theirs.frame_datafield_status.first_header_pointer == ours.first_header_pointer[0]
 
 
@@ -63,12 +55,7 @@ def test_frame_checksums_hold_until_a_bit_flips():
 
 
 @pytest.mark.parametrize(
-    "clcw",
-    [
-        Clcw(0, 0),
-        Clcw(63, 255, True, True, True, True, True, 3, 7),
-        Clcw(5, 17, lockout=True, farm_b_counter=2),
-    ],
+    "clcw", [Clcw(0, 0), Clcw(63, 255, True, True, True, True, True, 3, 7), Clcw(5, 17, lockout=True, farm_b_counter=2)]
 )
 def test_command_link_control_words_come_back(clcw):
     assert unpack_clcw(pack_clcw(clcw)) == clcw
@@ -77,9 +64,7 @@ def test_command_link_control_words_come_back(clcw):
 def test_a_control_word_has_the_bits_that_the_standard_draws():
     # type 0, version 00, status 000, COP 01 | VC 000101, spare 00 |
     # no RF 0, no lock 0, lockout 1, wait 0, retransmit 1, FARM-B 10, spare 0 | 17
-    assert pack_clcw(Clcw(5, 17, lockout=True, retransmit=True, farm_b_counter=2)) == bytes.fromhex(
-        "01142C11"
-    )
+    assert pack_clcw(Clcw(5, 17, lockout=True, retransmit=True, farm_b_counter=2)) == bytes.fromhex("01142C11")
     with pytest.raises(FrameError):
         unpack_clcw(b"\xff\xff\xff\xff")
 
@@ -138,9 +123,7 @@ def test_sequences_begin_as_the_standards_print_them(name, start):
 def test_sequences_repeat_after_their_full_period_and_not_before(name, bits):
     stream = np.unpackbits(sequence(name, (2 * bits + 7) // 8 + 1))
     assert np.array_equal(stream[:bits], stream[bits : 2 * bits])
-    assert (
-        np.count_nonzero(stream[:bits]) == (bits + 1) // 2
-    )  # a maximal sequence has one more one than zeros
+    assert np.count_nonzero(stream[:bits]) == (bits + 1) // 2  # a maximal sequence has one more one than zeros
     for divisor in (3, 5, 17):
         if bits % divisor == 0:
             assert not np.array_equal(stream[: bits - bits // divisor], stream[bits // divisor : bits])
@@ -162,8 +145,7 @@ TYPE_TWO_REPORT = 0x8000_0001
 
 def words(*clcws: Clcw | int) -> np.ndarray:
     return np.array(
-        [one if isinstance(one, int) else int.from_bytes(pack_clcw(one), "big") for one in clcws],
-        dtype=np.uint32,
+        [one if isinstance(one, int) else int.from_bytes(pack_clcw(one), "big") for one in clcws], dtype=np.uint32
     )
 
 

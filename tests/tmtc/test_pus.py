@@ -19,13 +19,7 @@ from tmtc.packets.pus import (
     unpack_tc_header,
     unpack_tm_header,
 )
-from tmtc.packets.space_packets import (
-    PacketSequencer,
-    PrimaryHeader,
-    idle_packet,
-    pack_packet,
-    unpack_primary_header,
-)
+from tmtc.packets.space_packets import PacketSequencer, PrimaryHeader, idle_packet, pack_packet, unpack_primary_header
 
 
 def test_a_telemetry_packet_is_what_spacepackets_reads():

@@ -89,9 +89,7 @@ def test_frames_that_no_code_carries_are_refused():
         encode(np.zeros((1, 10), dtype=np.uint8), ReedSolomon())
 
 
-@pytest.mark.parametrize(
-    "code", [ReedSolomon(), ReedSolomon(8, 2, 5), ReedSolomon(16, 1, 40, False)], ids=str
-)
+@pytest.mark.parametrize("code", [ReedSolomon(), ReedSolomon(8, 2, 5), ReedSolomon(16, 1, 40, False)], ids=str)
 def test_as_many_wrong_symbols_as_promised_are_repaired_and_counted_in_each_codeword(code):
     rng = np.random.default_rng(1)
     frames = frames_for(code, code.errors + 2)

@@ -16,9 +16,7 @@ def always_same(a: int, b: int) -> bool:
 
 def report(counts, ticks=None, apid=None, same=always_same, boot=None):
     counts = np.asarray(counts, dtype=np.int64)
-    ticks = (
-        np.arange(counts.size, dtype=np.int64) << 16 if ticks is None else np.asarray(ticks, dtype=np.int64)
-    )
+    ticks = np.arange(counts.size, dtype=np.int64) << 16 if ticks is None else np.asarray(ticks, dtype=np.int64)
     apid = np.full(counts.size, 5, dtype=np.int64) if apid is None else np.asarray(apid, dtype=np.int64)
     return account(apid, counts % 16384, ticks, same, boot)
 
@@ -62,10 +60,7 @@ def test_order_of_arrival_does_not_matter():
     ticks = counts << 16
     order = rng.permutation(counts.size)
     shuffled = report(counts[order], ticks[order])
-    assert (
-        shuffled.accounts[0].missing_ranges.tolist()
-        == report(counts, ticks).accounts[0].missing_ranges.tolist()
-    )
+    assert shuffled.accounts[0].missing_ranges.tolist() == report(counts, ticks).accounts[0].missing_ranges.tolist()
     assert shuffled.missing == 4 and shuffled.gaps == 3
     assert shuffled.extended_count.tolist() == counts[order].tolist()
 
@@ -100,9 +95,7 @@ def test_a_burst_from_yesterday_in_the_middle_of_today_is_told_apart():
     today = np.arange(9000, 9100)
     yesterday = np.arange(8900, 9000)
     counts = np.concatenate((today[:50], yesterday, today[50:]))
-    ticks = np.concatenate(
-        (2 * day + (today[:50] << 16), day + (yesterday << 16), 2 * day + (today[50:] << 16))
-    )
+    ticks = np.concatenate((2 * day + (today[:50] << 16), day + (yesterday << 16), 2 * day + (today[50:] << 16)))
     result = report(counts, ticks)
     assert (result.gaps, result.duplicates) == (0, 0)
 
@@ -126,10 +119,7 @@ def test_boots_are_accounted_apart():
     counts = np.concatenate((np.arange(100), np.arange(100)))
     boot = np.repeat([7, 8], 100)
     result = report(counts, boot=boot, same=never_same)
-    assert [(a.boot, a.received, a.gaps, a.conflicts) for a in result.accounts] == [
-        (7, 100, 0, 0),
-        (8, 100, 0, 0),
-    ]
+    assert [(a.boot, a.received, a.gaps, a.conflicts) for a in result.accounts] == [(7, 100, 0, 0), (8, 100, 0, 0)]
 
 
 def test_a_counter_that_begins_again_is_a_restart_and_no_gap():
@@ -178,9 +168,7 @@ def test_any_losses_copies_and_orders_are_accounted_for(start, steps, copies, ra
     rows = list(range(sent.size)) + [c % sent.size for c in copies]
     random.shuffle(rows)
     counts = sent[rows]
-    result = account(
-        np.full(counts.size, 3), counts % 16384, counts * 100, lambda a, b: bool(counts[a] == counts[b])
-    )
+    result = account(np.full(counts.size, 3), counts % 16384, counts * 100, lambda a, b: bool(counts[a] == counts[b]))
     assert result.accounts[0].received == sent.size
     assert result.missing == int(sent[-1] - sent[0] + 1 - sent.size)
     assert result.gaps == int(np.count_nonzero(np.diff(sent) > 1))

@@ -26,9 +26,7 @@ def good_packets(octets: bytes) -> list[bytes]:
 
 def assert_every_octet_is_accounted_for(octets: bytes) -> None:
     cut = cut_packets(octets)
-    ranges = np.concatenate(
-        (np.stack((cut.offsets, cut.offsets + cut.lengths), axis=1), cut.skipped, cut.idle)
-    )
+    ranges = np.concatenate((np.stack((cut.offsets, cut.offsets + cut.lengths), axis=1), cut.skipped, cut.idle))
     ranges = ranges[np.argsort(ranges[:, 0], kind="stable")]
     edges = ranges.reshape(-1)
     if len(octets):

@@ -21,8 +21,7 @@ from tmtc.link.uplink import (
 from tmtc.packets.stream import cut_packets
 
 COMMANDS = [
-    DICTIONARY.pack_command("set_parameter", {"parameter_id": k, "value": k / 3}, sequence_count=k)
-    for k in range(6)
+    DICTIONARY.pack_command("set_parameter", {"parameter_id": k, "value": k / 3}, sequence_count=k) for k in range(6)
 ]
 LONG = DICTIONARY.pack_command(
     "uplink_first",
@@ -128,9 +127,7 @@ def test_a_number_far_off_locks_the_receiver_until_it_is_unlocked():
         frame = pack_tc_frame(TcFrame(76, 0, 0, command, bypass=True, control=True))
         decoder.decode(encode_cltu(frame, randomised=True))
     assert (
-        list(
-            decoder.decode(UplinkEncoder(76, bypass=False, sequence_number=100).encode(COMMANDS[:1])).packets
-        )
+        list(decoder.decode(UplinkEncoder(76, bypass=False, sequence_number=100).encode(COMMANDS[:1])).packets)
         == COMMANDS[:1]
     )
     assert decoder.farms[0].clcw.farm_b_counter == 3

@@ -5,8 +5,6 @@ one telecommand and for a parameter table that is uploaded in many. A telecomman
 effect of that function; a telecommand that schedules another one has the effect of the scheduled telecommand.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -92,9 +90,7 @@ EFFECTS: Mapping[str, CommandEffect] = {
 _FUNCTION_NAMES = dict(FUNCTIONS)
 
 
-def effect_of(
-    dictionary: Dictionary, name: str, arguments: Mapping[str, Any], octets: bytes
-) -> CommandEffect:
+def effect_of(dictionary: Dictionary, name: str, arguments: Mapping[str, Any], octets: bytes) -> CommandEffect:
     """Return the effect of a telecommand; an unknown telecommand counts as the most severe.
 
     Parameters

@@ -1,7 +1,5 @@
 """Estimates of the navigation filter with full covariances, from the packets of any dictionary version."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -57,10 +55,7 @@ def filter_estimates(tables: Mapping[str, Table]) -> FilterEstimates:
         none = np.zeros(0, dtype=np.int64)
         states = np.zeros((0, STATES)), np.zeros((0, STATES, STATES))
         return FilterEstimates(none, none, none, none, *states, none)
-    columns = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in FilterEstimates.__dataclass_fields__
-    )
+    columns = (np.concatenate([getattr(part, name) for part in parts]) for name in FilterEstimates.__dataclass_fields__)
     return FilterEstimates(*columns)
 
 

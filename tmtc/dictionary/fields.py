@@ -1,7 +1,5 @@
 """One number of a packet: how it is stored and what it means. Tables of names need no numerical library."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

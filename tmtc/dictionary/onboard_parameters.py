@@ -1,7 +1,5 @@
 """On-board parameters (PUS service 20): what can be changed in flight, between which limits."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

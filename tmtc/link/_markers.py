@@ -3,8 +3,6 @@
 # numba wants numpy integers where annotations say int
 # mypy: disable-error-code="return-value,arg-type,no-any-return"
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np
@@ -43,9 +41,7 @@ def find_markers(
             if bit >= stop:
                 break
             here = (word >> np.uint64(8 - shift)) & np.uint64(0xFFFFFFFF)
-            wrong = np.int64(distance[0, here >> np.uint64(16)]) + np.int64(
-                distance[1, here & np.uint64(0xFFFF)]
-            )
+            wrong = np.int64(distance[0, here >> np.uint64(16)]) + np.int64(distance[1, here & np.uint64(0xFFFF)])
             if wrong <= tolerance or wrong >= 32 - tolerance:
                 found[count] = bit
                 count += 1

@@ -13,8 +13,6 @@ Transmission, chapter 7).
 # numba wants numpy integers where annotations say int
 # mypy: disable-error-code="return-value,arg-type,no-any-return"
 
-from __future__ import annotations
-
 import numpy as np
 
 from kernels.compiled import njit

@@ -1,7 +1,5 @@
 """Frames of synchronised CADUs: de-randomised, corrected and checked."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 

@@ -8,8 +8,6 @@ synchronisation flag, packet order flag (1 each), segment length id 11 (2), firs
 232.0-B 4.2 for the CLCW.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Survey of the undamaged sync markers of a whole stream, in bounded memory."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

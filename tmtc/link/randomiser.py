@@ -7,8 +7,6 @@ h(x) = x^17 + x^14 + 1, 131071 bits. CCSDS 231.0-B section 6 (telecommand): h(x)
 x^2 + x + 1, all ones at the start, 255 bits.
 """
 
-from __future__ import annotations
-
 import functools
 from typing import Literal
 

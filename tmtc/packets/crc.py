@@ -5,8 +5,6 @@ References
 ECSS-E-ST-70-41C annex B.1; CCSDS 132.0-B 4.1.6. The check value of `b"123456789"` is 0x29B1.
 """
 
-from __future__ import annotations
-
 import binascii
 
 from tmtc.errors import ChecksumError, TruncatedPacket

@@ -9,8 +9,6 @@ References
 CCSDS 301.0-B-4 section 3.2.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -5,8 +5,6 @@ References
 CCSDS 301.0-B-4 sections 3.2 (CUC) and 3.3 (CDS).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -5,8 +5,6 @@ References
 ECSS-E-ST-70-41C sections 7.4.3.1 (telemetry) and 7.4.4.1 (telecommand).
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ CCSDS 133.0-B-2 section 4.1. Octets of the primary header: version (3 bits), typ
 (1), APID (11) | sequence flags (2), sequence count (14) | octets of the data field minus one (16).
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass, field
 
@@ -44,12 +42,7 @@ class PrimaryHeader:
 
 
 def pack_packet(
-    apid: int,
-    data: bytes,
-    *,
-    sequence_count: int,
-    packet_type: int = TYPE_TELEMETRY,
-    secondary_header: bool = True,
+    apid: int, data: bytes, *, sequence_count: int, packet_type: int = TYPE_TELEMETRY, secondary_header: bool = True
 ) -> bytes:
     """A space packet with `data` as its data field (secondary header and error control included)."""
     if not 0 <= apid < APID_LIMIT:

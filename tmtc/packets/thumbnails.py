@@ -3,8 +3,6 @@
 The levels are u8, row by row, compressed with zlib; numbers are big-endian.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from dataclasses import dataclass

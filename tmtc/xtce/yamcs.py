@@ -4,8 +4,6 @@ The form is that of Yamcs 5.12. Its frame link takes one plain frame a datagram.
 fills in sequence count, length and checksum of packets.
 """
 
-from __future__ import annotations
-
 from tmtc.xtce.export import format_xtce
 
 _SERVER = """services:

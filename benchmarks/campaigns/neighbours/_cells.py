@@ -1,10 +1,4 @@
-"""Cells of one row of the table of compatibility, as the environment of the other program records them.
-
-    python SCRIPT.py FUNCTION SAMPLES OUT
-
-A function gets `Cells`. `reads` records what the program found in a file of ours, `writes` which values it wrote to a
-file for us. The campaign compares both with the values of this project. One cell that fails does not stop the others.
-"""
+"""Cells of a row, as the environment of the other program records them: `SCRIPT.py FUNCTION SAMPLES OUT`."""
 
 import json
 import sys
@@ -13,22 +7,17 @@ from pathlib import Path
 
 
 class Cells:
-    """Cells of a row: our files in `samples`, files of the program in `out`."""
+    """Values that a program reads in our files (`samples`) and writes to files of its own (`out`)."""
 
     def __init__(self, samples, out):
-        self.samples, self.out = Path(samples), Path(out)
-        self.entries = []
+        self.samples, self.out, self.entries = Path(samples), Path(out), []
+        self.expected = json.loads((self.samples / "expected.json").read_text())
 
     def sample(self, name):
-        """Return the path of a file of ours."""
         return str(self.samples / name)
 
-    def expected(self, name):
-        """Return values of ours, for files that the program is to write."""
-        return json.loads((self.samples / "expected.json").read_text())[name]
-
     def reads(self, what, expects, function, **more):
-        """Record what the program reads in a file of ours; `expects` names the values that are right."""
+        """Record values of a file of ours; `expects` are the right ones, or their name."""
         self._record("reads", what, function, expects=expects, **more)
 
     def writes(self, what, file, reader, function, **more):
@@ -37,7 +26,6 @@ class Cells:
         self._record("writes", what, lambda: function(str(path)), file=str(path), reader=reader, **more)
 
     def not_tried(self, way, what, reason):
-        """Record why something was not tried."""
         self.entries.append({"way": way, "what": what, "not_tried": reason})
 
     def _record(self, way, what, function, **more):
@@ -45,8 +33,6 @@ class Cells:
         try:
             entry["values"] = function()
         except BaseException as error:  # errors of Java and Rust are no Exception
-            if isinstance(error, KeyboardInterrupt):
-                raise
             traceback.print_exc()
             text = " ".join(str(error).split()) or "no message"
             entry["refused"] = f"{type(error).__name__.rpartition('.')[2]}: {text[:160]}"

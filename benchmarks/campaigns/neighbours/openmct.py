@@ -38,7 +38,7 @@ def openmct(cells):
     server = subprocess.Popen(command, env=environment, stdout=sys.stderr, stderr=sys.stderr)
     try:
         _wait(f"http://127.0.0.1:{port}/mct")
-        header, *rows = cells.expected("tables")["housekeeping"]
+        header, *rows = cells.expected["tables"]["housekeeping"]
         start, end = _milliseconds(rows[0][0]) - 1000, _milliseconds(rows[-1][0]) + 1000
         with _page(port) as page:
             for name in ("temperature_c", "bus_voltage_v"):

@@ -7,34 +7,58 @@ from pathlib import Path
 from _cells import run
 
 _MOON, _CRAFT = 301, -85
+_READS = (
+    ("OEM", "states", "pass.oem"),
+    ("OEM in XML", "states", "pass.xml"),
+    ("AEM 2.0", "attitude", "pass.aem"),
+    ("AEM 1.0", "attitude", "pass-1.0.aem"),
+)
 
 
-def _seconds(times):
-    return [(time - times[0]).total_seconds() for time in times]
+def _messages(cells, states, attitudes, write, why_not=("", ""), aem="pass.aem"):
+    """Cells of the messages of CCSDS; `why_not` is the form that a program does not read, and the reason."""
+    for what, kind, name in _READS:
+        read = states if kind == "states" else attitudes
+        cells.reads(
+            what, kind, lambda read=read, name=name: read(name), why=why_not[1] * (what == why_not[0])
+        )
+    for what, kind, name in (("OEM", "states", "pass.oem"), ("AEM", "attitude", aem)):
+        for form in ("kvn", "xml"):
+            reader = "orbit" if kind == "states" else kind
 
+            def written(path, kind=kind, name=name, form=form):
+                write(kind, name, form, path)
+                return cells.expected[kind]
 
-def _utc(text):
-    return dt.datetime.fromisoformat(str(text).rstrip("Z")[:26].ljust(19, "0"))
+            cells.writes(what + " in XML" * (form == "xml"), f"{what}.{form}".lower(), reader, written)
 
 
 def _rows(epochs, values):
-    return [
-        [at, *map(float, one)] for at, one in zip(_seconds([_utc(e) for e in epochs]), values, strict=True)
-    ]
+    times = [dt.datetime.fromisoformat(str(one).rstrip("Z")[:26].replace(" ", "T")) for one in epochs]
+    rows = zip(times, values, strict=True)
+    return [[(at - times[0]).total_seconds(), *map(float, one)] for at, one in rows]
+
+
+def _at_times(cells, state):
+    """Return the rows of `state(et)` at the times of the arc."""
+    times = zip(cells.expected["arc"], cells.expected["arc_et"], strict=True)
+    return [[row[0], *map(float, state(et))] for row, et in times]
 
 
 def skyfield(cells):
     from skyfield.api import load, load_file
 
-    def states(name):
-        segment = next(one for one in load_file(cells.sample(name)).segments if one.target == _CRAFT)
-        scale, found = load.timescale(builtin=True), []
-        for (at, *_), et in zip(cells.expected("arc"), cells.expected("arc_et"), strict=True):
-            place = segment.at(scale.tdb_jd(2451545.0, et / 86400.0))
-            found.append([at, *place.position.km, *place.velocity.km_per_s])
-        return [[float(value) for value in row] for row in found]
+    def states():
+        scale = load.timescale(builtin=True)
+        segment = next(one for one in load_file(cells.sample("pass.bsp")).segments if one.target == _CRAFT)
 
-    cells.reads("SPK type 3", "arc", lambda: states("pass.bsp"))
+        def state(et):
+            at = segment.at(scale.tdb_jd(2451545.0, et / 86400.0))
+            return [*at.position.km, *at.velocity.km_per_s]
+
+        return _at_times(cells, state)
+
+    cells.reads("SPK type 3", "arc", states)
 
 
 def jplephem(cells):
@@ -43,10 +67,7 @@ def jplephem(cells):
     def states():
         with SPK.open(cells.sample("pass.bsp")) as kernel:
             segment = next(one for one in kernel.segments if one.target == _CRAFT)
-            found = []
-            for (at, *_), et in zip(cells.expected("arc"), cells.expected("arc_et"), strict=True):
-                found.append([at, *segment.compute(2451545.0, et / 86400.0)])
-        return [[float(value) for value in row] for row in found]
+            return _at_times(cells, lambda et: segment.compute(2451545.0, et / 86400.0))
 
     cells.reads("SPK type 3", "arc", states)
 
@@ -56,33 +77,25 @@ def spiceypy(cells):
 
     def states(name):
         spice.furnsh(cells.sample(name))
-        ets = cells.expected("arc_et")
-        found = [spice.spkgeo(_CRAFT, et, "J2000", _MOON)[0] for et in ets]
+        found = _at_times(cells, lambda et: spice.spkgeo(_CRAFT, et, "J2000", _MOON)[0])
         spice.kclear()
-        return [[row[0], *map(float, one)] for row, one in zip(cells.expected("arc"), found, strict=True)]
+        return found
 
     def attitudes():
         os.chdir(cells.samples / "spice")
-        meta = next(Path().glob("*.tm"))
-        spice.furnsh(str(meta))
-        found, first = [], None
-        for at in cells.expected("attitude_utc"):
-            et = spice.str2et(at)
-            first = et if first is None else first
-            frame = spice.frmnam(cells.expected("camera_frame"))
-            w, x, y, z = map(float, spice.m2q(spice.pxform("J2000", frame, et)))
-            sign = -1.0 if w < 0 else 1.0
-            found.append([et - first, sign * w, sign * x, sign * y, sign * z])
+        spice.furnsh(str(next(Path().glob("*.tm"))))
+        ets = [spice.str2et(at) for at in cells.expected["attitude_utc"]]
+        frame = spice.frmnam(cells.expected["camera_frame"])
+        found = [[et - ets[0], *map(float, spice.m2q(spice.pxform("J2000", frame, et)))] for et in ets]
         spice.kclear()
         return found
 
     def written(path):
-        ets = cells.expected("arc_et")
-        states = [row[1:] for row in cells.expected("arc")]
+        ets, states = cells.expected["arc_et"], [row[1:] for row in cells.expected["arc"]]
         handle = spice.spkopn(path, "spiceypy", 0)
         spice.spkw13(handle, _CRAFT, _MOON, "J2000", ets[0], ets[-1], "spiceypy", 7, len(ets), states, ets)
         spice.spkcls(handle)
-        return cells.expected("arc")
+        return cells.expected["arc"]
 
     cells.reads("SPK type 3", "arc", lambda: states("pass.bsp"))
     cells.reads("SPK type 13", "arc", lambda: states("pass-13.bsp"))
@@ -92,113 +105,62 @@ def spiceypy(cells):
 
 def anise(cells):
     from anise import Almanac
-    from anise.astro import DataType, Ephemeris
+    from anise.astro import DataType, Ephemeris, Frame
     from anise.constants import Frames
     from anise.time import Duration, Epoch
 
-    def listed(ephemeris, almanac, rows):
-        found = []
-        start = Epoch(cells.expected(f"{rows}_utc")[0] + " UTC")
-        for at, *_ in cells.expected(rows):
-            orbit = ephemeris.nearest_orbit_before(
-                start + Duration.from_total_nanoseconds(round(at * 1e9)), almanac
-            )
-            offset = (orbit.epoch - start).to_seconds()
-            found.append(
-                [offset, orbit.x_km, orbit.y_km, orbit.z_km, orbit.vx_km_s, orbit.vy_km_s, orbit.vz_km_s]
-            )
+    almanac, craft = Almanac(cells.sample("pass.bsp")), Frame(_CRAFT, 1)
+
+    def listed(rows, state):
+        start, found = Epoch(cells.expected[f"{rows}_utc"][0] + " UTC"), []
+        for at, *_ in cells.expected[rows]:
+            one = state(start + Duration.from_total_nanoseconds(round(at * 1e9)))
+            place = (one.x_km, one.y_km, one.z_km, one.vx_km_s, one.vy_km_s, one.vz_km_s)
+            found.append([(one.epoch - start).to_seconds(), *place])
         return found
 
-    def kernel(name):
-        almanac = Almanac(cells.sample(name))
-        from anise.astro import Frame
+    def in_file(rows, ephemeris):
+        return listed(rows, lambda at: ephemeris.nearest_orbit_before(at, almanac))
 
-        craft = Frame(_CRAFT, 1)
-        start, found = Epoch(cells.expected("arc_utc")[0] + " UTC"), []
-        for at, *_ in cells.expected("arc"):
-            one = almanac.translate_geometric(
-                craft, Frames.MOON_J2000, start + Duration.from_total_nanoseconds(round(at * 1e9))
-            )
-            found.append([at, one.x_km, one.y_km, one.z_km, one.vx_km_s, one.vy_km_s, one.vz_km_s])
-        return found
+    def oem():
+        return Ephemeris.from_ccsds_oem_file(cells.sample("pass.oem"))
 
-    def oem(path):
-        ephemeris = Ephemeris.from_ccsds_oem_file(cells.sample("pass.oem"))
-        ephemeris.write_ccsds_oem(path, "anise", "SELENITA")
-        return cells.expected("states")
+    def written(write):
+        return lambda path: write(path) or cells.expected["states"]
 
-    def bsp(path):
-        kind = DataType.Type13HermiteUnequalStep
-        Ephemeris.from_ccsds_oem_file(cells.sample("pass.oem")).write_spice_bsp(_CRAFT, path, kind)
-        return cells.expected("states")
-
-    empty = Almanac(cells.sample("pass.bsp"))
-    cells.reads("SPK type 3", "arc", lambda: kernel("pass.bsp"))
-    cells.reads(
-        "OEM",
-        "states",
-        lambda: listed(Ephemeris.from_ccsds_oem_file(cells.sample("pass.oem")), empty, "states"),
-    )
-    cells.reads(
-        "STK `.e`", "arc", lambda: listed(Ephemeris.from_stk_e_file(cells.sample("pass.e")), empty, "arc")
-    )
-    cells.writes("OEM", "anise.oem", "orbit", oem)
-    cells.writes(
-        "SPK", "anise.bsp", "orbit", bsp, step=10, why="it states frame 22, which SPICE does not know"
-    )
+    kernel = lambda: listed("arc", lambda at: almanac.translate_geometric(craft, Frames.MOON_J2000, at))  # noqa: E731
+    stk = lambda: in_file("arc", Ephemeris.from_stk_e_file(cells.sample("pass.e")))  # noqa: E731
+    bsp = written(lambda path: oem().write_spice_bsp(_CRAFT, path, DataType.Type13HermiteUnequalStep))
+    why = "it states frame 22, which SPICE does not know"
+    cells.reads("SPK type 3", "arc", kernel)
+    cells.reads("OEM", "states", lambda: in_file("states", oem()))
+    cells.reads("STK `.e`", "arc", stk)
+    cells.writes("OEM", "anise.oem", "orbit", written(lambda path: oem().write_ccsds_oem(path, "anise", "A")))
+    cells.writes("SPK", "anise.bsp", "orbit", bsp, step=10, why=why)
 
 
 def brahe(cells):
     from brahe.ccsds import AEM, OEM
 
+    def rows(states, parts):
+        found = [[*one.epoch.to_datetime(), *map(float, parts(one))] for one in states]
+        epochs = [
+            f"{y:.0f}-{o:02.0f}-{d:02.0f}T{h:02.0f}:{m:02.0f}:{s:09.6f}" for y, o, d, h, m, s, *_ in found
+        ]
+        return _rows(epochs, [row[7:] for row in found])
+
     def states(name):
-        found = []
-        for one in OEM.from_file(cells.sample(name)).segments[0].states:
-            found.append(
-                [
-                    _day_s(one.epoch),
-                    *(value / 1000 for value in one.position),
-                    *(value / 1000 for value in one.velocity),
-                ]
-            )
-        first = found[0][0]
-        return [[row[0] - first, *row[1:]] for row in found]
+        listed = OEM.from_file(cells.sample(name)).segments[0].states
+        return rows(listed, lambda one: [value / 1000 for value in (*one.position, *one.velocity)])
 
     def attitudes(name):
-        found = []
-        for one in AEM.from_file(cells.sample(name)).segments[0].states:
-            q = one.quaternion
-            w, x, y, z = q.to_vector(True)
-            found.append([_day_s(one.epoch), x, y, z, w])
-        first = found[0][0]
-        return [[row[0] - first, *map(float, row[1:])] for row in found]
+        listed = AEM.from_file(cells.sample(name)).segments[0].states
+        return rows(listed, lambda one: [one.quaternion.to_vector(False)[k] for k in range(4)])
 
-    def written(kind, name, values, form):
-        def write(path):
-            kind.from_file(cells.sample(name)).to_file(path, form)
-            return cells.expected(values)
+    def write(kind, name, form, path):
+        (OEM if kind == "states" else AEM).from_file(cells.sample(name)).to_file(path, form.upper())
 
-        return write
-
-    cells.reads("OEM", "states", lambda: states("pass.oem"))
-    cells.reads("OEM in XML", "states", lambda: states("pass.xml"))
-    cells.reads("AEM 2.0", "attitude", lambda: attitudes("pass.aem"))
-    cells.reads(
-        "AEM 1.0",
-        "attitude",
-        lambda: attitudes("pass-1.0.aem"),
-        why="it reads AEM 2.0 only, which is our default",
-    )
-    cells.writes("OEM", "brahe.oem", "orbit", written(OEM, "pass.oem", "states", "KVN"))
-    cells.writes("OEM in XML", "brahe.xml", "orbit", written(OEM, "pass.oem", "states", "XML"))
-    cells.writes("AEM", "brahe.aem", "attitude", written(AEM, "pass.aem", "attitude", "KVN"))
-    cells.writes("AEM in XML", "brahe-aem.xml", "attitude", written(AEM, "pass.aem", "attitude", "XML"))
-
-
-def _day_s(epoch):
-    year, month, day, hour, minute, second, nanosecond = epoch.to_datetime()
-    days = dt.date(int(year), int(month), int(day)).toordinal() - 740_000
-    return days * 86400.0 + hour * 3600 + minute * 60 + second + nanosecond * 1e-9
+    _messages(cells, states, attitudes, write, ("AEM 1.0", "it reads AEM 2.0 only, our default"))
 
 
 def ccsds_ndm(cells):
@@ -217,56 +179,29 @@ def ccsds_ndm(cells):
         parts = [[getattr(r.quaternion, f) for f in ("q1", "q2", "q3", "qc")] for r in rows]
         return _rows([r.epoch for r in rows], parts)
 
-    def written(name, values, form):
-        def write(path):
-            NdmIo().to_file(load(name), getattr(NDMFileFormats, form), Path(path))
-            return cells.expected(values)
+    def write(_, name, form, path):
+        NdmIo().to_file(load(name), getattr(NDMFileFormats, form.upper()), Path(path))
 
-        return write
-
-    cells.reads("OEM", "states", lambda: states("pass.oem"))
-    cells.reads("OEM in XML", "states", lambda: states("pass.xml"))
-    cells.reads(
-        "AEM 2.0", "attitude", lambda: attitudes("pass.aem"), why="it reads AEM 1.0 only: `--version 1.0`"
-    )
-    cells.reads("AEM 1.0", "attitude", lambda: attitudes("pass-1.0.aem"))
-    cells.writes("OEM", "ndm.oem", "orbit", written("pass.oem", "states", "KVN"))
-    cells.writes("OEM in XML", "ndm.xml", "orbit", written("pass.oem", "states", "XML"))
-    cells.writes("AEM", "ndm.aem", "attitude", written("pass-1.0.aem", "attitude", "KVN"))
-    cells.writes("AEM in XML", "ndm-aem.xml", "attitude", written("pass-1.0.aem", "attitude", "XML"))
+    why = ("AEM 2.0", "it reads AEM 1.0 only: `--version 1.0`")
+    _messages(cells, states, attitudes, write, why, "pass-1.0.aem")
 
 
 def ccsds_ndm_py(cells):
     import ccsds_ndm
 
+    def load(name):
+        return ccsds_ndm.from_file(cells.sample(name))
+
     def states(name):
-        data = ccsds_ndm.from_file(cells.sample(name)).segments[0].data
+        data = load(name).segments[0].data
         return _rows(data.state_vector_epochs, data.state_vector_numpy.tolist())
 
     def attitudes(name):
-        data = ccsds_ndm.from_file(cells.sample(name)).segments[0].data
+        data = load(name).segments[0].data
         return _rows(data.attitude_states_epochs, data.attitude_states_numpy.tolist())
 
-    def written(name, values, form):
-        def write(path):
-            ccsds_ndm.from_file(cells.sample(name)).to_file(path, form)
-            return cells.expected(values)
-
-        return write
-
-    cells.reads("OEM", "states", lambda: states("pass.oem"))
-    cells.reads("OEM in XML", "states", lambda: states("pass.xml"))
-    cells.reads("AEM 2.0", "attitude", lambda: attitudes("pass.aem"))
-    cells.reads(
-        "AEM 1.0",
-        "attitude",
-        lambda: attitudes("pass-1.0.aem"),
-        why="it reads AEM 2.0 only, which is our default",
-    )
-    cells.writes("OEM", "ndmpy.oem", "orbit", written("pass.oem", "states", "kvn"))
-    cells.writes("OEM in XML", "ndmpy.xml", "orbit", written("pass.oem", "states", "xml"))
-    cells.writes("AEM", "ndmpy.aem", "attitude", written("pass.aem", "attitude", "kvn"))
-    cells.writes("AEM in XML", "ndmpy-aem.xml", "attitude", written("pass.aem", "attitude", "xml"))
+    why = ("AEM 1.0", "it reads AEM 2.0 only, our default")
+    _messages(cells, states, attitudes, lambda _, name, form, path: load(name).to_file(path, form), why)
 
 
 def oem(cells):
@@ -278,7 +213,7 @@ def oem(cells):
 
     def written(path):
         OrbitEphemerisMessage.open(cells.sample("pass.oem")).save_as(path)
-        return cells.expected("states")
+        return cells.expected["states"]
 
     cells.reads("OEM", "states", lambda: states("pass.oem"))
     cells.reads("OEM in XML", "states", lambda: states("pass.xml"))
@@ -286,13 +221,12 @@ def oem(cells):
 
 
 def gmat(cells):
-    """Readers of the files that GMAT exchanges; GMAT itself is in no package registry."""
     from gmat_run.parsers import ephemeris, stk_ephemeris
 
     def states(parser, name, scale):
         frame = parser.parse(cells.sample(name))
         parts = frame[["X", "Y", "Z", "VX", "VY", "VZ"]].to_numpy() * scale
-        return _rows([str(t).replace(" ", "T") for t in frame["Epoch"]], parts.tolist())
+        return _rows(frame["Epoch"], parts.tolist())
 
     cells.reads("OEM", "states", lambda: states(ephemeris, "pass.oem", 1.0))
     cells.reads("STK `.e`", "arc", lambda: states(stk_ephemeris, "pass.e", 1e-3))
@@ -306,147 +240,73 @@ def orekit(cells):
     import orekit_jpype
 
     orekit_jpype.initVM()
-    from java.io import File
-    from jpype import JImplements, JOverride
+    from java.io import File, FileWriter
+    from java.util import EnumMap
+    from jpype import JProxy
     from org.orekit.bodies import CelestialBodyFactory
     from org.orekit.data import DataContext, DataSource, DirectoryCrawler
     from org.orekit.files.ccsds.ndm import ParserBuilder, WriterBuilder
+    from org.orekit.files.ccsds.utils.generation import KvnGenerator, XmlGenerator
+    from org.orekit.files.stk import STKEphemerisFile, STKEphemerisFileParser
     from org.orekit.frames import FramesFactory
 
-    (cells.out / "leap").mkdir(exist_ok=True)
-    (cells.out / "leap/tai-utc.dat").write_text(cells.expected("tai_utc_dat"))
-    context = DataContext.getDefault()
+    (cells.out / "leap").mkdir()
+    (cells.out / "leap/tai-utc.dat").write_text(cells.expected["tai_utc_dat"])
+    context, gm, gcrf = DataContext.getDefault(), 4.9028001184575496e12, FramesFactory.getGCRF()
     context.getDataProvidersManager().addProvider(DirectoryCrawler(File(str(cells.out / "leap"))))
-
-    @JImplements("org.orekit.bodies.CelestialBody")
-    class Body:
-        """A body without ephemeris: values are compared in the frame of the file."""
-
-        @JOverride
-        def getName(self):
-            return "Moon"
-
-        @JOverride
-        def getGM(self):
-            return 4.9028001184575496e12
-
-        @JOverride
-        def getInertiallyOrientedFrame(self):
-            return FramesFactory.getGCRF()
-
-        @JOverride
-        def getBodyOrientedFrame(self):
-            return FramesFactory.getGCRF()
-
-        @JOverride
-        def toExtendedPositionProvider(self):
-            raise NotImplementedError
-
-        getPVCoordinates = getPosition = getVelocity = toFieldPVCoordinatesProvider = (
-            toExtendedPositionProvider
-        )
-
-    @JImplements("org.orekit.bodies.CelestialBodyLoader")
-    class Loader:
-        @JOverride
-        def loadCelestialBody(self, name):
-            return Body()
-
+    # Bodies without ephemerides: values are compared in the frame of the file.
+    names = {"getName": lambda: "Moon", "getGM": lambda: gm, "getInertiallyOrientedFrame": lambda: gcrf}
+    body = JProxy("org.orekit.bodies.CelestialBody", dict={**names, "getBodyOrientedFrame": lambda: gcrf})
+    loader = JProxy("org.orekit.bodies.CelestialBodyLoader", dict={"loadCelestialBody": lambda _: body})
     for name in ("SOLAR_SYSTEM_BARYCENTER", "EARTH_MOON", "MOON", "EARTH"):
-        context.getCelestialBodies().addCelestialBodyLoader(getattr(CelestialBodyFactory, name), Loader())
-    utc = context.getTimeScales().getUTC()
+        context.getCelestialBodies().addCelestialBodyLoader(getattr(CelestialBodyFactory, name), loader)
+    builder = ParserBuilder()
+    parsers = {"states": builder.buildOemParser, "attitude": builder.buildAemParser}
 
-    def row(state, first):
-        place, speed = state.getPosition(), state.getVelocity()
-        numbers = [f() / 1000 for v in (place, speed) for f in (v.getX, v.getY, v.getZ)]
-        return [float(state.getDate().durationFrom(first)), *map(float, numbers)]
+    def load(kind, name):
+        return parsers[kind]().parseMessage(DataSource(cells.sample(name)))
 
-    def load_oem(name):
-        return ParserBuilder().buildOemParser().parseMessage(DataSource(cells.sample(name)))
+    def rows(lines, parts):
+        first = lines.get(0).getDate()
+        return [[float(one.getDate().durationFrom(first)), *map(float, parts(one))] for one in lines]
 
-    def load_aem(name):
-        return ParserBuilder().buildAemParser().parseMessage(DataSource(cells.sample(name)))
+    def state(one):
+        vectors = one.getPosition(), one.getVelocity()
+        return [part / 1000 for v in vectors for part in (v.getX(), v.getY(), v.getZ())]
+
+    def quaternion(one):
+        q = one.getRotation()
+        return q.getQ1(), q.getQ2(), q.getQ3(), q.getQ0()
 
     def states(name):
-        lines = load_oem(name).getSegments().get(0).getData().getEphemeridesDataLines()
-        return [row(one, lines.get(0).getDate()) for one in lines]
+        return rows(load("states", name).getSegments().get(0).getData().getEphemeridesDataLines(), state)
 
     def attitudes(name):
-        lines = load_aem(name).getSegments().get(0).getData().getAngularCoordinates()
-        first, found = lines.get(0).getDate(), []
-        for one in lines:
-            q = one.getRotation()
-            sign = -1.0 if q.getQ0() < 0 else 1.0
-            parts = [sign * f() for f in (q.getQ1, q.getQ2, q.getQ3, q.getQ0)]
-            found.append([float(one.getDate().durationFrom(first)), *map(float, parts)])
-        return found
+        return rows(load("attitude", name).getSegments().get(0).getData().getAngularCoordinates(), quaternion)
 
     def stk():
-        from java.util import EnumMap
-        from org.orekit.files.stk import STKEphemerisFile, STKEphemerisFileParser
-
-        frames = EnumMap(STKEphemerisFile.STKCoordinateSystem.class_)
-        frames.put(STKEphemerisFile.STKCoordinateSystem.ICRF, FramesFactory.getGCRF())
-        parser = STKEphemerisFileParser("SELENITA", 4.9028001184575496e12, utc, frames)
+        system = STKEphemerisFile.STKCoordinateSystem
+        frames = EnumMap(system.class_)
+        frames.put(system.ICRF, gcrf)
+        parser = STKEphemerisFileParser("SELENITA", gm, context.getTimeScales().getUTC(), frames)
         file = parser.parse(DataSource(cells.sample("pass.e")))
-        lines = file.getSatellites().values().iterator().next().getSegments().get(0).getCoordinates()
-        return [row(one, lines.get(0).getDate()) for one in lines]
+        return rows(
+            file.getSatellites().values().iterator().next().getSegments().get(0).getCoordinates(), state
+        )
 
-    def write(writer, message, values, form):
-        def written(path):
-            from java.io import FileWriter
-            from org.orekit.files.ccsds.utils.generation import KvnGenerator, XmlGenerator
+    def write(kind, name, form, path):
+        out, gap, schema = FileWriter(path), float("nan"), "ndmxml-3.0.0-master-3.0.xsd"
+        is_xml = form == "xml"
+        generator = (
+            XmlGenerator(out, 2, "", gap, True, schema) if is_xml else KvnGenerator(out, 25, "", gap, 60)
+        )
+        writer = WriterBuilder().buildOemWriter() if kind == "states" else WriterBuilder().buildAemWriter()
+        writer.writeMessage(generator, load(kind, name))
+        generator.close()
+        out.close()
 
-            out = FileWriter(path)
-            kind = KvnGenerator if form == "kvn" else XmlGenerator
-            extra = (
-                ("https://sanaregistry.org/r/ndmxml_unqualified/ndmxml-3.0.0-master-3.0.xsd",)
-                if form == "xml"
-                else ()
-            )
-            sizes = (25,) if form == "kvn" else (2,)
-            generator = (
-                kind(out, *sizes, "out", float("nan"), True, *extra)
-                if form == "xml"
-                else kind(out, 25, "out", float("nan"), 60)
-            )
-            writer().writeMessage(generator, message())
-            generator.close()
-            out.close()
-            return cells.expected(values)
-
-        return written
-
-    builder = WriterBuilder()
-    cells.reads("OEM", "states", lambda: states("pass.oem"))
-    cells.reads("OEM in XML", "states", lambda: states("pass.xml"))
-    cells.reads("AEM 2.0", "attitude", lambda: attitudes("pass.aem"))
-    cells.reads("AEM 1.0", "attitude", lambda: attitudes("pass-1.0.aem"))
+    _messages(cells, states, attitudes, write)
     cells.reads("STK `.e`", "arc", stk)
-    cells.writes(
-        "OEM",
-        "orekit.oem",
-        "orbit",
-        write(builder.buildOemWriter, lambda: load_oem("pass.oem"), "states", "kvn"),
-    )
-    cells.writes(
-        "OEM in XML",
-        "orekit.xml",
-        "orbit",
-        write(builder.buildOemWriter, lambda: load_oem("pass.oem"), "states", "xml"),
-    )
-    cells.writes(
-        "AEM",
-        "orekit.aem",
-        "attitude",
-        write(builder.buildAemWriter, lambda: load_aem("pass.aem"), "attitude", "kvn"),
-    )
-    cells.writes(
-        "AEM in XML",
-        "orekit-aem.xml",
-        "attitude",
-        write(builder.buildAemWriter, lambda: load_aem("pass.aem"), "attitude", "xml"),
-    )
 
 
 run(globals())

@@ -8,87 +8,65 @@ from pathlib import Path
 from _cells import run
 
 
-def _columns(cells, table, available):
-    """Return names of columns of numbers that a program has, and their values by row."""
-    header, *rows = cells.expected("tables")[table]
-    chosen = [
-        k
-        for k, name in enumerate(header)
-        if name in available and all(isinstance(row[k], float) or row[k] is None for row in rows)
-    ]
-    return [header[k] for k in chosen], [[row[k] for k in chosen] for row in rows]
-
-
 def _plain(value):
     number = None if value is None else float(value)
     return None if number is None or math.isnan(number) else number
 
 
 def _table(cells, what, table, load):
-    """Compare a table whose columns `load()` gives by name."""
-    try:
-        found = load()
-    except Exception as error:  # recorded as what the program says
-
-        def refuse(error=error):
-            raise error
-
-        cells.reads(what, [], refuse)
-        return
-    names, right = _columns(cells, table, set(found))
+    """Compare the columns of numbers of a table that `load()` gives by name."""
+    header, *rows = cells.expected["tables"][table]
+    numbers = [k for k in range(len(header)) if all(isinstance(row[k], float | None) for row in rows)]
+    found = load()
+    chosen = [k for k in numbers if header[k] in found]
+    columns = [found[header[k]] for k in chosen]
     cells.reads(
-        what, right, lambda: [list(map(_plain, row)) for row in zip(*(found[n] for n in names), strict=True)]
+        what,
+        [[row[k] for k in chosen] for row in rows],
+        lambda: [list(map(_plain, row)) for row in zip(*columns, strict=True)],
     )
 
 
-def _parquet(cells):
-    return cells.sample("parquet/housekeeping.parquet")
+def _parquet(read):
+    return lambda cells: _table(
+        cells, "Parquet", "housekeeping", lambda: read(cells.sample("parquet/housekeeping.parquet"))
+    )
 
 
-def pyarrow(cells):
+@_parquet
+def pyarrow(path):
     import pyarrow.parquet as pq
 
-    _table(cells, "Parquet", "housekeeping", lambda: pq.read_table(_parquet(cells)).to_pydict())
+    return pq.read_table(path).to_pydict()
 
 
-def fastparquet(cells):
+@_parquet
+def fastparquet(path):
     import fastparquet as fp
 
-    _table(
-        cells, "Parquet", "housekeeping", lambda: dict(fp.ParquetFile(_parquet(cells)).to_pandas().items())
-    )
+    return dict(fp.ParquetFile(path).to_pandas().items())
 
 
-def duckdb(cells):
+@_parquet
+def duckdb(path):
     import duckdb as db
 
-    def load():
-        found = db.sql(f"select * from '{_parquet(cells)}'")
-        rows = found.fetchall()
-        return {name: [row[k] for row in rows] for k, name in enumerate(found.columns)}
-
-    _table(cells, "Parquet", "housekeeping", load)
+    found = db.sql(f"select * from '{path}'")
+    return dict(zip(found.columns, zip(*found.fetchall(), strict=True), strict=True))
 
 
-def polars(cells):
+@_parquet
+def polars(path):
     import polars as pl
 
-    _table(
-        cells, "Parquet", "housekeeping", lambda: pl.read_parquet(_parquet(cells)).to_dict(as_series=False)
-    )
-    _table(
-        cells,
-        "CSV",
-        "residuals",
-        lambda: pl.read_csv(cells.sample("csv/residuals.csv")).to_dict(as_series=False),
-    )
+    return pl.read_parquet(path).to_dict(as_series=False)
 
 
 def pandas(cells):
     import pandas as pd
 
     _table(cells, "CSV", "residuals", lambda: dict(pd.read_csv(cells.sample("csv/residuals.csv")).items()))
-    _table(cells, "Parquet", "housekeeping", lambda: dict(pd.read_parquet(_parquet(cells)).items()))
+    _parquet(lambda path: dict(pd.read_parquet(path).items()))(cells)
 
 
 def xarray(cells):
@@ -109,21 +87,12 @@ def compliance_checker(cells):
 
     def failures():
         CheckSuite.load_all_available_checkers()
-        out = cells.out / "cf.json"
-        ComplianceChecker.run_checker(
-            cells.sample("pass.nc"),
-            ["cf:1.11"],
-            verbose=0,
-            criteria="normal",
-            output_filename=str(out),
-            output_format="json",
-        )
-        report = json.loads(out.read_text())
-        report = report[next(iter(report))] if "high_priorities" not in report else report
-        print(json.dumps(report, indent=1)[:4000])
-        return [len([one for one in report["high_priorities"] if one["value"][0] < one["value"][1]])]
+        out, form = str(cells.out / "cf.json"), {"criteria": "normal", "output_format": "json"}
+        ComplianceChecker.run_checker(cells.sample("pass.nc"), ["cf:1.11"], 0, output_filename=out, **form)
+        (report,) = json.loads(Path(out).read_text()).values()
+        return [report["high_count"], report["possible_points"] - report["scored_points"]]
 
-    cells.reads("netCDF, failures of the CF conventions 1.11", [0], failures)
+    cells.reads("netCDF, failures of the CF conventions 1.11", [0, 0], failures)
 
 
 def evo(cells):
@@ -135,26 +104,17 @@ def evo(cells):
 
     def values():
         one = load("anchored")
-        q = one.orientations_quat_wxyz
-        return [
-            [float(t), *map(float, p), *map(float, o[[1, 2, 3, 0]])]
-            for t, p, o in zip(one.timestamps, one.positions_xyz, q, strict=True)
-        ]
+        parts = zip(one.timestamps, one.positions_xyz, one.orientations_quat_wxyz, strict=True)
+        return [[float(v) for v in (t, *p, x, y, z, w)] for t, p, (w, x, y, z) in parts]
 
     def error():
-        pair = sync.associate_trajectories(load("anchored-reference"), load("anchored"))
         ape = metrics.APE(metrics.PoseRelation.translation_part)
-        ape.process_data(pair)
-        return [
-            [
-                float(ape.get_statistic(metrics.StatisticsType.rmse)),
-                float(ape.get_statistic(metrics.StatisticsType.max)),
-            ]
-        ]
+        ape.process_data(sync.associate_trajectories(load("anchored-reference"), load("anchored")))
+        return [[float(ape.get_statistic(metrics.StatisticsType[name])) for name in ("rmse", "max")]]
 
-    header, *rows = cells.expected("tables")["residuals"]
+    header, *rows = cells.expected["tables"]["residuals"]
     place = header.index("error_3d_m")
-    errors = [row[place] for row in rows if row[1] == "anchored" and row[2] == "estimate"]
+    errors = [row[place] for row in rows if row[1:3] == ["anchored", "estimate"]]
     right = [[math.sqrt(sum(one * one for one in errors) / len(errors)), max(errors)]]
     cells.reads("TUM", "tum", values)
     cells.reads("rms and greatest error of the trajectory", right, error)
@@ -165,64 +125,47 @@ def gdal(cells):
     import pyogrio
     import rasterio
 
-    features = json.loads(Path(cells.sample("pass.geojson")).read_text())["features"]
-
-    def points(layer, key):
-        return [
-            [float(one["properties"][key]), *map(float, one["geometry"]["coordinates"][:2])]
-            for one in features
-            if one["properties"]["layer"] == layer
-        ]
+    path, json_path = cells.sample("pass.gpkg"), cells.sample("pass.geojson")
+    features = json.loads(Path(json_path).read_text())["features"]
+    layers = [one["properties"]["layer"] for one in features]
 
     def read(layer, key):
-        meta, _, geometry, values = pyogrio.raw.read(cells.sample("pass.gpkg"), layer=layer, columns=[key])
+        meta, _, geometry, values = pyogrio.raw.read(path, layer=layer, columns=[key])
         if "Moon" not in meta["crs"]:
             raise ValueError(f"coordinate reference system {meta['crs'][:60]}")
         places = [np.frombuffer(one, dtype="<f8", offset=5)[:2].tolist() for one in geometry]
-        return [[float(v), *p] for v, p in zip(values[0].tolist(), places, strict=True)]
-
-    names = sorted({one["properties"]["layer"] for one in features})
-    counts = {name: sum(one["properties"]["layer"] == name for one in features) for name in names}
+        return [[float(v), *p] for v, p in zip(values[0], places, strict=True)]
 
     def listed():
-        layers = sorted(str(name) for name, _ in pyogrio.list_layers(cells.sample("pass.gpkg")))
         return {
-            name: int(pyogrio.read_info(cells.sample("pass.gpkg"), layer=name)["features"]) for name in layers
+            str(name): int(pyogrio.read_info(path, layer=name)["features"])
+            for name, _ in pyogrio.list_layers(path)
         }
 
     def types():
-        info = pyogrio.read_info(cells.sample("pass.gpkg"), layer="footprints")
-        return {
-            str(k): str(v)
-            for k, v in zip(info["fields"], info["dtypes"], strict=True)
-            if k in ("utc", "complete")
-        }
+        info = pyogrio.read_info(path, layer="footprints")
+        kinds = dict(zip(map(str, info["fields"]), map(str, info["dtypes"]), strict=True))
+        return {name: kinds[name] for name in ("utc", "complete")}
 
-    cells.reads("GeoPackage, layers", counts, listed)
-    cells.reads(
-        "GeoPackage, detections", points("detections", "crater_id"), lambda: read("detections", "crater_id")
-    )
-    cells.reads("GeoPackage, craters", points("craters", "crater"), lambda: read("craters", "crater"))
-    cells.reads(
-        "GeoPackage, types for the temporal controller", {"utc": "datetime64[ms]", "complete": "bool"}, types
-    )
-    cells.reads(
-        "GeoJSON, features",
-        [len(features)],
-        lambda: [int(pyogrio.read_info(cells.sample("pass.geojson"))["features"])],
-    )
-
-    def raster(path):
-        crs = "IAU_2015:30100"
+    def raster(name):
         heights = (np.arange(64 * 64, dtype="float32").reshape(64, 64) % 97) * 3.5 - 100
-        step = 1 / 64
-        with rasterio.open(
-            path, "w", driver="GTiff", width=64, height=64, count=1, dtype="float32", crs=crs,
-            transform=rasterio.transform.from_origin(10.0, 5.0, step, step),
-        ) as file:  # fmt: skip
+        place = rasterio.transform.from_origin(10.0, 5.0, 1 / 64, 1 / 64)
+        form = {"width": 64, "height": 64, "count": 1, "dtype": "float32", "crs": "IAU_2015:30100"}
+        with rasterio.open(name, "w", driver="GTiff", transform=place, **form) as file:
             file.write(heights, 1)
         return heights.astype(float).tolist()
 
+    cells.reads("GeoPackage, layers", {name: layers.count(name) for name in set(layers)}, listed)
+    for layer, key in (("detections", "crater_id"), ("craters", "crater")):
+        chosen = [one for one, name in zip(features, layers, strict=True) if name == layer]
+        right = [
+            [float(one["properties"][key]), *map(float, one["geometry"]["coordinates"][:2])] for one in chosen
+        ]
+        cells.reads(f"GeoPackage, {layer}", right, lambda layer=layer, key=key: read(layer, key))
+    cells.reads(
+        "GeoPackage, types for the temporal controller", {"utc": "datetime64[ms]", "complete": "bool"}, types
+    )
+    cells.reads("GeoJSON, features", [len(features)], lambda: [int(pyogrio.read_info(json_path)["features"])])
     cells.writes("GeoTIFF of heights", "heights.tif", "raster", raster, window=[85 * 64, 10 * 64, 64, 64])
 
 
@@ -231,71 +174,50 @@ def craterpy(cells):
     import pandas as pd
 
     table = pd.read_csv(cells.sample("catalogue.csv"))
+    names = {"lat_col": "latitude_deg", "lon_col": "longitude_deg", "diam_col": "diameter_m"}
+
+    def rows(latitude, longitude, radius):
+        return [
+            [float(a), float(b) % 360, float(r)] for a, b, r in zip(latitude, longitude, radius, strict=True)
+        ]
 
     def values():
-        found = cp.CraterDatabase(
-            table, "Moon", units="m", lat_col="latitude_deg", lon_col="longitude_deg", diam_col="diameter_m"
-        )
-        return [
-            [float(a), float(b) % 360, float(r)]
-            for a, b, r in zip(found.lat, found.lon, found.rad, strict=True)
-        ]
+        found = cp.CraterDatabase(table, "Moon", units="m", **names)
+        return rows(found.lat, found.lon, found.rad)
 
-    right = [
-        [float(a), float(b) % 360, float(d) / 2]
-        for a, b, d in zip(table["latitude_deg"], table["longitude_deg"], table["diameter_m"], strict=True)
+    latitude, longitude, diameter = (table[name] for name in names.values())
+    cells.reads("crater catalogue (CSV)", rows(latitude, longitude, diameter / 2), values)
+
+
+def _labels(cells, coco, evaluation):
+    folder = Path(cells.sample("dataset"))
+    truth = coco(str(folder / "coco_val.json"))
+    right = json.loads((folder / "coco_val.json").read_text())["annotations"]
+    results = [
+        {key: one[key] for key in ("image_id", "category_id", "bbox")} | {"score": 1.0} for one in right
     ]
-    cells.reads("crater catalogue (CSV)", right, values)
 
-
-def _labels(cells, COCO, COCOeval):
-    """Read our labels, score them against themselves, and write labels of our own kind."""
-    source = Path(cells.sample("dataset")) / "coco_val.json"
-    right = json.loads(source.read_text())
-    boxes = sorted((one["id"], *map(float, one["bbox"])) for one in right["annotations"])
-    cells.reads(
-        "labels of a data set", [list(map(float, one)) for one in boxes],
-        lambda: [[float(k), *map(float, one["bbox"])] for k, one in sorted(COCO(str(source)).anns.items())],
-    )  # fmt: skip
+    def boxes(annotations):
+        return sorted(list(map(float, one["bbox"])) for one in annotations)
 
     def score():
-        truth = COCO(str(source))
-        results = [
-            {
-                "image_id": one["image_id"],
-                "category_id": one["category_id"],
-                "bbox": one["bbox"],
-                "score": 1.0,
-            }
-            for one in right["annotations"]
-        ]
-        judged = COCOeval(truth, truth.loadRes(results), "bbox")
-        judged.params.maxDets = [10000, 10000, 10000]
+        judged = evaluation(truth, truth.loadRes(results), "bbox")
+        judged.params.maxDets = [10000] * 3
         judged.evaluate()
         judged.accumulate()
         precision = judged.eval["precision"]
         return [float(precision[precision >= 0].mean())]
 
-    cells.reads("score of labels against themselves", [1.0], score)
-
     def written(path):
-        results = [
-            {
-                "image_id": one["image_id"],
-                "category_id": one["category_id"],
-                "bbox": one["bbox"],
-                "score": 1.0,
-            }
-            for one in right["annotations"]
-        ]
-        made = COCO(str(source)).loadRes(results).dataset
-        made = {name: made[name] for name in ("images", "annotations", "categories")}
-        Path(path).write_text(json.dumps(made))
-        shutil.copytree(
-            Path(cells.sample("dataset")) / "images", Path(path).parent / "images", dirs_exist_ok=True
+        made = truth.loadRes(results).dataset
+        Path(path).write_text(
+            json.dumps({name: made[name] for name in ("images", "annotations", "categories")})
         )
-        return sorted(list(map(float, one["bbox"])) for one in made["annotations"])
+        shutil.copytree(folder / "images", Path(path).parent / "images")
+        return boxes(made["annotations"])
 
+    cells.reads("labels of a data set", boxes(right), lambda: boxes(truth.anns.values()))
+    cells.reads("score of labels against themselves", [1.0], score)
     cells.writes("labels made of results", "labels.json", "labels", written)
 
 

@@ -6,8 +6,6 @@ same octets were sent again. Reports that come late, even after a time-out was d
 stays on record.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

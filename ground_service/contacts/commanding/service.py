@@ -6,8 +6,6 @@ it. Every step is a compare-and-set in the database (`store.states`) and
 goes into the audit log in the transaction that makes it.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -216,9 +214,7 @@ def take_released(
     return stream, ids
 
 
-def hold_spacecraft(
-    ground: Ground, spacecraft_id: int, instance: str, *, reason: str, actor: str
-) -> Handover:
+def hold_spacecraft(ground: Ground, spacecraft_id: int, instance: str, *, reason: str, actor: str) -> Handover:
     """Stop the release and the transmission of all telecommands of a spacecraft until `resume_spacecraft`.
 
     A transmission that a station has begun is not recalled.
@@ -243,9 +239,7 @@ def resume_spacecraft(ground: Ground, spacecraft_id: int, instance: str, *, acto
     return _change_hold(ground, spacecraft_id, instance, actor=actor, reason=None)
 
 
-def _change_hold(
-    ground: Ground, spacecraft_id: int, instance: str, *, actor: str, reason: str | None
-) -> Handover:
+def _change_hold(ground: Ground, spacecraft_id: int, instance: str, *, actor: str, reason: str | None) -> Handover:
     with ground.database.writing() as connection:
         vehicle = find_vehicle(connection, spacecraft_id, instance).id
         lock_spacecraft(connection, vehicle)  # what is being released or taken now comes before the hold
@@ -424,13 +418,7 @@ def _second_person(
 def _require_approval(
     connection: Connection, vehicle: int, name: str, arguments: Mapping[str, Any], approval: Approval | None
 ) -> None:
-    """Refuse the immediate release of a telecommand that needs a second person if no second person approved its window.
-
-    Raises
-    ------
-    Conflict
-        If the window was not approved, or approved by the person who entered it.
-    """
+    """Refuse to release a telecommand that needs a second person if no second person approved its window."""
     effect = _second_person(connection, vehicle, name, arguments)
     if effect is None or (approval is not None and approval.entered_by != approval.approved_by):
         return
@@ -440,8 +428,6 @@ def _require_approval(
     )
 
 
-def _note(
-    connection: Connection, actor: str, action: str, command_id: int, state: str, detail: dict[str, Any]
-) -> None:
+def _note(connection: Connection, actor: str, action: str, command_id: int, state: str, detail: dict[str, Any]) -> None:
     audit(connection, actor, f"{action} telecommand", str(command_id), detail)
     publish(connection, CommandStateChanged(id=command_id, state=state))

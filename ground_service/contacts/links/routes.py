@@ -1,7 +1,5 @@
 """HTTP operations on links and contacts."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from fastapi import Path, Query

@@ -5,8 +5,6 @@ octets are on disk before they are acknowledged, and a full spool stops reading,
 the station back. What an ended process has left in the spool is ingested by the next owner.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import logging
@@ -508,9 +506,7 @@ class LinkRunner:
         if other is None:
             self._refused_until_s = time.monotonic() + REFUSED_S
             return False
-        log.info(
-            "link %s: telecommands %s given to link %s", self._name, list(transmission.telecommands), other
-        )
+        log.info("link %s: telecommands %s given to link %s", self._name, list(transmission.telecommands), other)
         return True
 
     def _transmit(self, up: Connector, transmission: TransmissionRow) -> bool:

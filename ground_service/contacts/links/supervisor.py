@@ -1,7 +1,5 @@
 """All links of a deployment: this process operates those whose lease it gets, also after other processes have ended."""
 
-from __future__ import annotations
-
 import logging
 import os
 import socket

@@ -17,8 +17,6 @@ A. N. Pettitt, "A non-parametric approach to the change-point problem", Applied 
 E. B. Wilson, "Probable inference, the law of succession, and statistical inference", JASA 22, 1927.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -192,9 +190,7 @@ def wilson(successes: int, trials: int) -> Share:
     return Share(share, max((middle - reach) / scale, 0.0), min((middle + reach) / scale, 1.0))
 
 
-def rolling_counts(
-    times_ns: Sequence[int], statuses: Sequence[str], window_ns: int
-) -> list[Mapping[str, int]]:
+def rolling_counts(times_ns: Sequence[int], statuses: Sequence[str], window_ns: int) -> list[Mapping[str, int]]:
     """Return the numbers of passes by status within the window that ends at each pass.
 
     Parameters

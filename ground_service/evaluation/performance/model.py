@@ -1,7 +1,5 @@
 """Entities of the performance over many passes."""
 
-from __future__ import annotations
-
 from pydantic import Field
 
 from ground_service.http.model import Entity, Paging, SpacecraftNumber, UtcTime

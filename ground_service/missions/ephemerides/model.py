@@ -1,7 +1,5 @@
 """Entities of reference ephemerides."""
 
-from __future__ import annotations
-
 from pydantic import Field
 
 from ground_service.http.model import Entity, UtcTime

@@ -4,8 +4,6 @@ A correlation is a straight line over a stretch of on-board time. Ticks outside 
 without any, the clock is taken as ideal (correlation 0).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -126,12 +124,10 @@ class CorrelationFit:
     rejected: int
 
 
-def fit_correlation(
-    ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray, *, rejection: float = REJECTION
-) -> CorrelationFit:
+def fit_correlation(ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray) -> CorrelationFit:
     """The line through time reports: on-board ticks (n,), UTC of reception on Earth, and light time to there.
 
-    Points further off than `rejection` times the usual deviation (by the median, which outliers do not move) are
+    Points further off than `REJECTION` times the usual deviation (by the median, which outliers do not move) are
     left out. One point gives an offset without drift.
 
     Raises
@@ -142,9 +138,7 @@ def fit_correlation(
     ticks = np.asarray(ticks, dtype=np.int64)
     if len(ticks) == 0:
         raise EvaluationError("time correlation: expected at least one time report, found none")
-    sent_tai = np.asarray(tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - np.asarray(
-        light_time_ns
-    )
+    sent_tai = np.asarray(tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - np.asarray(light_time_ns)
     middle = int(np.argsort(ticks, kind="stable")[len(ticks) // 2])
     nominal = (ticks - ticks[middle]) * _NS_NUMERATOR // _NS_DENOMINATOR
     # Small numbers from here on: what the clock is off by, against the middle point.
@@ -155,7 +149,7 @@ def fit_correlation(
         offset, slope = _line(nominal[kept].astype(np.float64), deviation[kept])
         residual = deviation - offset - slope * nominal
         spread = 1.4826 * float(np.median(np.abs(residual[kept] - np.median(residual[kept]))))
-        still = np.abs(residual) <= max(rejection * spread, RESOLUTION_NS)
+        still = np.abs(residual) <= max(REJECTION * spread, RESOLUTION_NS)
         if (still == kept).all() or not still.any():
             break
         kept = still
@@ -310,9 +304,7 @@ def _is_whole(difference_ns: float) -> bool:
     return whole in WHOLE_SECONDS and abs(abs(difference_ns) - whole * 1e9) <= STATION_DIFFERENCE_NS
 
 
-def clock_runs(
-    ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray, boot: IntArray
-) -> list[IntArray]:
+def clock_runs(ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray, boot: IntArray) -> list[IntArray]:
     """Indices of the time reports (n,) of each run of the clock, in the order in which they were sent.
 
     A run ends with a boot, and where the clock was set: where it is off by more than `JUMP_NS` from where its drift

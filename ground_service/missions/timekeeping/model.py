@@ -1,7 +1,5 @@
 """Entities of time reports and time correlations."""
 
-from __future__ import annotations
-
 from pydantic import Field
 
 from ground_service.http.model import Entity, RequestModel, RequestTime, UtcTime

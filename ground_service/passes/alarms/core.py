@@ -5,8 +5,6 @@ when it has been acknowledged and its condition has ended. An alarm whose condit
 acknowledged, so that no alarm disappears unseen. The condition of an event report ends with the report.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -132,9 +130,7 @@ def _conditions(tables: Mapping[str, Table]) -> Iterator[Condition]:
             broken = np.flatnonzero(states)
             if broken.size:
                 last = broken[np.argmax(table.ticks[broken])]
-                yield _condition(
-                    "parameter", field.name, int(states.max()), table.ticks[broken], float(values[last])
-                )
+                yield _condition("parameter", field.name, int(states.max()), table.ticks[broken], float(values[last]))
 
 
 def _limited(packet: PacketDefinition) -> tuple[Field, ...]:

@@ -1,20 +1,10 @@
 """Entities of alarms."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field
 
-from ground_service.http.model import (
-    Entity,
-    InstanceName,
-    Paging,
-    RequestModel,
-    RequestTime,
-    SpacecraftNumber,
-    UtcTime,
-)
+from ground_service.http.model import Entity, InstanceName, Paging, RequestModel, RequestTime, SpacecraftNumber, UtcTime
 
 AlarmState = Literal["raised", "acknowledged", "cleared", "shelved"]
 Severity = Literal["warning", "alarm"]

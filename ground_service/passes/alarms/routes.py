@@ -1,7 +1,5 @@
 """HTTP operations on alarms."""
 
-from __future__ import annotations
-
 from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.http.common import GroundOf, RowId
 from ground_service.http.requests import operations

@@ -6,21 +6,12 @@ verdict, is rejected if it fails, at the level of the policy. A gate is uncalibr
 probability below `DOUBT` (binomial test). Passes of one night have noise of their own and count as independent.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from ground_service.regression.gates.core import (
-    EXACT_METRICS,
-    FAIL,
-    NOT_JUDGED,
-    PASS_SPREAD,
-    GatePolicy,
-    verdict_of,
-)
+from ground_service.regression.gates.core import EXACT_METRICS, FAIL, NOT_JUDGED, PASS_SPREAD, GatePolicy, verdict_of
 from ground_service.regression.gates.metrics import metrics_of
 from ground_service.regression.gates.samples import PassFrames
 from ground_service.regression.gates.statistics import (

@@ -11,8 +11,6 @@ N. A. Obuchowski, "On the comparison of correlated proportions for clustered dat
 V. L. Durkalski et al., "Analysis of clustered matched-pair data", Statistics in Medicine 22, 2003.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -135,7 +135,9 @@ function drawTimeline() {
   drawn.append(cursor, svg("line", { y1: HEAD_PX - 6, y2: height, class: "now" }), svg("text", { y: height - 4, class: "now" }, "now"));
   show(place, drawn);
   markNow();
-  readAt(readShare === null ? missionNow() : view[0] + readShare * (view[1] - view[0]));
+  const follows = readShare === null;
+  readAt(follows ? missionNow() : view[0] + readShare * (view[1] - view[0]));
+  if (follows) readShare = null;
   drawTrack(windows.map((row) => ({ id: row.id, ...selectable(row) })), chosen);
 }
 
@@ -150,7 +152,7 @@ function markNow() {
 setInterval(markNow, 5000);
 
 // The values of the forecast at the pointer, or at the time of the slider.
-let readShare = null; // of the view; null: at the mission time
+let readShare = null; // of the view; null: it follows the mission time
 function readAt(time) {
   readShare = Math.min(Math.max((time - view[0]) / (view[1] - view[0]), 0), 1);
   const readTime = view[0] + readShare * (view[1] - view[0]);

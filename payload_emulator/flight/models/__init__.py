@@ -1,7 +1,5 @@
 """Networks shipped with the project, as octets."""
 
-from __future__ import annotations
-
 import hashlib
 from importlib import resources
 

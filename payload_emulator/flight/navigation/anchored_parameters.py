@@ -1,7 +1,5 @@
 """Parameters of the anchored estimator: what may be tuned, and the limits of plausibility."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from lunar.constants import MOON_RADIUS_M

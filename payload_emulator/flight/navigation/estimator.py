@@ -4,8 +4,6 @@ Another estimator is a module that implements `Estimator` and a row of `ESTIMATO
 is a module with the functions of `KalmanFilter` and its row `AnchoredEstimator(module)`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Protocol
@@ -15,12 +13,7 @@ import numpy as np
 from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
 from payload_emulator.flight.navigation import anchored
-from payload_emulator.flight.navigation.anchored import (
-    AnchoredReport,
-    AnchoredSetup,
-    AnchoredState,
-    Observation,
-)
+from payload_emulator.flight.navigation.anchored import AnchoredReport, AnchoredSetup, AnchoredState, Observation
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.filter import KalmanFilter
@@ -29,6 +22,9 @@ from payload_emulator.flight.navigation.odometry.odometry import OdometryParamet
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.vision.detections import Detections
 from tmtc.dictionary.tables import AnchorTable, CatalogueTable
+
+OdometryRun = tuple[AnchorTable, OdometryState | None]
+AnchoredRun = tuple[AnchoredSetup, AnchoredState]
 
 _NAN = float("nan")
 _UNKNOWN = (_NAN, _NAN, _NAN)
@@ -112,14 +108,10 @@ class Estimator(Protocol):
     tables: ClassVar[tuple[str, ...]]
     outcomes: ClassVar[tuple[Outcome, ...]]
 
-    def start(
-        self, tables: Mapping[str, Any], parameters: NavigationParameters, before: Any | None
-    ) -> Any | None:
+    def start(self, tables: Mapping[str, Any], parameters: NavigationParameters, before: Any | None) -> Any | None:
         """Return the first state, with what a state `before` learned of the same tables; None without a table."""
 
-    def step(
-        self, state: Any | None, frame: Frame, parameters: NavigationParameters
-    ) -> tuple[Any | None, Report]:
+    def step(self, state: Any | None, frame: Frame, parameters: NavigationParameters) -> tuple[Any | None, Report]:
         """Return the state after a frame and the report of it."""
 
     def widen(self, state: Any, position_m: float, velocity_m_s: float) -> Any:
@@ -138,30 +130,21 @@ class OdometryEstimator:
     outcomes: ClassVar[tuple[Outcome, ...]] = tuple(Outcome)[: Outcome.fixed]
 
     def start(
-        self, tables: Mapping[str, Any], parameters: NavigationParameters, before: Any | None
-    ) -> tuple[AnchorTable, OdometryState | None] | None:
+        self, tables: Mapping[str, Any], parameters: NavigationParameters, before: OdometryRun | None
+    ) -> OdometryRun | None:
         anchor = tables["anchor_ephemeris"]
         return None if anchor is None else (anchor, None)
 
     def step(
-        self,
-        state: tuple[AnchorTable, OdometryState | None] | None,
-        frame: Frame,
-        parameters: NavigationParameters,
-    ) -> tuple[tuple[AnchorTable, OdometryState | None] | None, Report]:
+        self, state: OdometryRun | None, frame: Frame, parameters: NavigationParameters
+    ) -> tuple[OdometryRun | None, Report]:
         if state is None:
             return None, Report(Outcome.missed, len(frame.found))
         anchor, before = state
         after, report = odometry.step(
-            before,
-            frame.ticks,
-            frame.found,
-            anchor,
-            parameters.camera,
-            self.mode,
-            parameters.odometry,
+            before, frame.ticks, frame.found, anchor, parameters.camera, self.mode, parameters.odometry,
             manual_step=frame.manual_step,
-        )
+        )  # fmt: skip
         return (anchor, after), Report(
             report.outcome,
             len(frame.found),
@@ -177,7 +160,7 @@ class OdometryEstimator:
         """Return the state as it is: an odometry has no uncertainty."""
         return state
 
-    def summary(self, state: tuple[AnchorTable, OdometryState | None] | None) -> tuple[int, int]:
+    def summary(self, state: OdometryRun | None) -> tuple[int, int]:
         if state is None or state[1] is None:
             return 0, 0
         return state[1].altitude_reads, state[1].resets
@@ -192,33 +175,19 @@ class AnchoredEstimator:
     outcomes: ClassVar[tuple[Outcome, ...]] = tuple(Outcome)[Outcome.fixed :]
 
     def start(
-        self,
-        tables: Mapping[str, Any],
-        parameters: NavigationParameters,
-        before: tuple[AnchoredSetup, AnchoredState] | None,
-    ) -> tuple[AnchoredSetup, AnchoredState] | None:
+        self, tables: Mapping[str, Any], parameters: NavigationParameters, before: AnchoredRun | None
+    ) -> AnchoredRun | None:
         catalogue, gravity, orientation, initial, burns = (tables[name] for name in self.tables)
         if not (catalogue and gravity and orientation and initial):
             return None
         known = None if before is None or not _same(before[0].catalogue, catalogue) else before[1].offset
         return anchored.start(
-            catalogue,
-            gravity,
-            orientation,
-            initial,
-            parameters.camera,
-            parameters.anchored,
-            burns,
-            self.method,
-            known,
-        )
+            catalogue, gravity, orientation, initial, parameters.camera, parameters.anchored, burns, self.method, known
+        )  # fmt: skip
 
     def step(
-        self,
-        state: tuple[AnchoredSetup, AnchoredState] | None,
-        frame: Frame,
-        parameters: NavigationParameters,
-    ) -> tuple[tuple[AnchoredSetup, AnchoredState] | None, Report]:
+        self, state: AnchoredRun | None, frame: Frame, parameters: NavigationParameters
+    ) -> tuple[AnchoredRun | None, Report]:
         found = frame.found if frame.usable else None
         count = 0 if found is None else len(found)
         if state is None:
@@ -239,12 +208,10 @@ class AnchoredEstimator:
             filter=(after, report) if known else None,
         )
 
-    def widen(
-        self, state: tuple[AnchoredSetup, AnchoredState], position_m: float, velocity_m_s: float
-    ) -> tuple[AnchoredSetup, AnchoredState]:
+    def widen(self, state: AnchoredRun, position_m: float, velocity_m_s: float) -> AnchoredRun:
         return state[0], anchored.widened(state[1], position_m, velocity_m_s)
 
-    def summary(self, state: tuple[AnchoredSetup, AnchoredState] | None) -> tuple[int, int]:
+    def summary(self, state: AnchoredRun | None) -> tuple[int, int]:
         return 0, 0
 
 

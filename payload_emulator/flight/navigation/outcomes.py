@@ -1,7 +1,5 @@
 """Codes shared by the estimators and the telemetry: estimator, outcome of a frame, trigger of a reset."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 

@@ -1,7 +1,5 @@
 """Telecommand octets to commands: cut, checked, named, never twice; others are refused with a reason."""
 
-from __future__ import annotations
-
 import zlib
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator

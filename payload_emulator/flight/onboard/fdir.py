@@ -1,7 +1,5 @@
 """Fault detection: what the payload notices about itself. Each monitor reports once and says what is to be done."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import IntEnum
 

@@ -1,7 +1,5 @@
 """Housekeeping (PUS service 3): which structures are sent when, and the processor time of every stage."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """The state of the payload as a machine, and what of it survives a reset."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Mapping
@@ -10,12 +8,7 @@ from typing import Any
 
 from payload_emulator.flight.onboard.commanding import CommandHistory
 from payload_emulator.flight.onboard.fdir import Monitors
-from payload_emulator.flight.onboard.housekeeping import (
-    STATE,
-    Housekeeping,
-    StageTimer,
-    Structure,
-)
+from payload_emulator.flight.onboard.housekeeping import STATE, Housekeeping, StageTimer, Structure
 from payload_emulator.flight.onboard.loads import MODEL_NUMBER, FlightParameters, FlightTables
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.onboard.observer import Observer

@@ -1,7 +1,5 @@
 """Modes of the payload as a machine: which follows which, and what is allowed in each."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 

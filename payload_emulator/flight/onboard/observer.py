@@ -1,7 +1,5 @@
 """One frame from image to telemetry: detector, estimators, and the packets that report its outcome."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -67,11 +65,7 @@ class Observer:
     """
 
     def __init__(
-        self,
-        detector: Detector,
-        parameters: FlightParameters,
-        telemetry: Telemetry,
-        timer: StageTimer,
+        self, detector: Detector, parameters: FlightParameters, telemetry: Telemetry, timer: StageTimer
     ) -> None:
         self.detector = detector
         self.last_quality = ImageQuality.OK
@@ -119,12 +113,7 @@ class Observer:
                 self._states[mode] = ESTIMATORS[mode].widen(state, position_m, velocity_m_s)
 
     def frame(
-        self,
-        image: NDArray[Any],
-        attitude: FloatArray,
-        score_floor: float,
-        timeout_s: float,
-        quiet: bool,
+        self, image: NDArray[Any], attitude: FloatArray, score_floor: float, timeout_s: float, quiet: bool
     ) -> None:
         """Detect craters in one frame, run every estimator on them, report both.
 
@@ -208,9 +197,7 @@ class Observer:
         self._telemetry.event("info", "table_loaded", number, identity)
         return table
 
-    def _detect(
-        self, image: NDArray[Any], sun: FloatArray | None, timeout_s: float
-    ) -> tuple[ImageQuality, Detections]:
+    def _detect(self, image: NDArray[Any], sun: FloatArray | None, timeout_s: float) -> tuple[ImageQuality, Detections]:
         """Run the detector; what fails or comes too late is an event and no detection."""
         started_ns = self._timer.enter(Stage.detector)
         self.detector_failed = False
@@ -298,7 +285,7 @@ class Observer:
         self._report_attitude(report)
         offset = None if report.offset is None else (report.offset.sigma_m, float(report.offset.fixes))
         if offset is not None and offset != self._map_offset:
-            self._telemetry.event("info", "map_offset", *offset)
+            self._telemetry.event("info", "map_offset", offset[0], offset[1])
             self._map_offset = offset
 
     def _send_filter(self, state: AnchoredState, report: AnchoredReport, found: Detections | None) -> None:

@@ -1,7 +1,5 @@
 """Values of on-board parameters in force (PUS service 20)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

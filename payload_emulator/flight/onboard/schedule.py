@@ -1,7 +1,5 @@
 """The time-tagged schedule (PUS service 11): telecommands that wait for their on-board time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 

@@ -5,8 +5,6 @@ content (u32), content (JSON, UTF-8); big-endian. Both are written at every chan
 middle of writing costs that change at most, and flipped bits in one copy cost nothing.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 import zlib

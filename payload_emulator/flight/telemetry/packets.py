@@ -1,7 +1,5 @@
 """Telemetry of the payload: packets of the dictionary with their counts, into the store; events as they are wanted."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -10,8 +10,6 @@ elevation of the Sun above the image plane and distance from the middle of the i
 board is not included.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping
@@ -153,13 +151,7 @@ def _numbers(part: Mapping[str, Any], name: str, count: int) -> tuple[float, ...
 
 
 def _top_fields(model_octets: bytes) -> list[tuple[int, memoryview]]:
-    """Number and octets (key included) of the fields of a protobuf message, in order.
-
-    Raises
-    ------
-    ModelError
-        The octets are no protobuf message.
-    """
+    """Number and octets (key included) of the fields of a protobuf message, in order."""
     view = memoryview(model_octets)
     fields: list[tuple[int, memoryview]] = []
     place = 0

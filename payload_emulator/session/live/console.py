@@ -4,8 +4,6 @@ The words control the flow of simulated time: `run`, `pause`, `step`, `until UTC
 `state`, `watch`, `save`, `quit`.
 """
 
-from __future__ import annotations
-
 import json
 import threading
 from collections.abc import Callable, Mapping

@@ -5,8 +5,6 @@ the uplink; telemetry leaves it at the rate of the downlink. Without stations, o
 their place.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -105,9 +103,7 @@ class Contacts:
     _last_step_ns: int = 0
 
     def __post_init__(self) -> None:
-        self._transmitter = Transmitter(
-            self.scenario.spacecraft_id, LinkSettings(coding=self.scenario.link.coding)
-        )
+        self._transmitter = Transmitter(self.scenario.spacecraft_id, LinkSettings(coding=self.scenario.link.coding))
 
     @property
     def is_limited(self) -> bool:

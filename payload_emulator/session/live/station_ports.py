@@ -12,8 +12,6 @@ before, and with 0 when it cannot send it up now. A number is sent up once.
 With an exact state, it makes the inputs of a session complete: a session that was killed repeats them at their times.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

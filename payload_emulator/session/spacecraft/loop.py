@@ -4,8 +4,6 @@ Every way to fly is `fly` over a schedule of steps: a scenario with its operator
 Time, power, faults and resets are around `Payload.step`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -117,9 +115,7 @@ class BreakableDetector:
     throws: bool = False
     hangs: bool = False
 
-    def examine(
-        self, image: NDArray[Any], sun_in_camera: FloatArray | None = None
-    ) -> tuple[ImageQuality, Detections]:
+    def examine(self, image: NDArray[Any], sun_in_camera: FloatArray | None = None) -> tuple[ImageQuality, Detections]:
         if self.hangs:
             self.hangs = False
             raise ProcessorHang

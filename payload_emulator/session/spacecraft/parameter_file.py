@@ -60,10 +60,7 @@ def format_parameters(parameters: BuildParameters) -> str:
 
 
 def parse_parameters(
-    text: str,
-    flown: BuildParameters = BuildParameters(),
-    source: str = "parameters",
-    dropped: list[str] | None = None,
+    text: str, flown: BuildParameters = BuildParameters(), source: str = "parameters", dropped: list[str] | None = None
 ) -> BuildParameters:
     """Return `flown` with the values of a TOML text.
 
@@ -104,9 +101,7 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _read(
-    flown: BuildParameters, table: dict[str, Any], source: str, dropped: list[str] | None
-) -> BuildParameters:
+def _read(flown: BuildParameters, table: dict[str, Any], source: str, dropped: list[str] | None) -> BuildParameters:
     """Return parameters with the values of a table."""
     try:
         kept = table if dropped is None else _known(flown, table, "", dropped)
@@ -136,13 +131,7 @@ def _bounds(name: str) -> tuple[float, float]:
 
 
 def _refuse_crossed(value: Any, table: Any, path: str) -> None:
-    """Refuse a lower limit that a table puts above its upper limit, in any section.
-
-    Raises
-    ------
-    TableFault
-        A changed limit crosses its counterpart.
-    """
+    """Refuse a lower limit that a table puts above its upper limit, in any section."""
     for key, given in table.items():
         place = f"{path}.{key}" if path else key
         if isinstance(given, dict) and dataclasses.is_dataclass(getattr(value, key)):

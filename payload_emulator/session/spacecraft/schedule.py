@@ -1,7 +1,5 @@
 """The schedule of a scenario: its frames, steps without frames, contacts, and the telecommands of its operator."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -93,9 +91,7 @@ class Operator:
 
     def command(self, name: str, **values: object) -> bytes:
         """Return the next telecommand packet."""
-        packet = DICTIONARY.pack_command(
-            name, values, sequence_count=self.sequence_count, source=_PLANNING_SOURCE
-        )
+        packet = DICTIONARY.pack_command(name, values, sequence_count=self.sequence_count, source=_PLANNING_SOURCE)
         self.sequence_count = (self.sequence_count + 1) % (1 << 14)
         return packet
 

@@ -1,7 +1,5 @@
 """Ground that is observed: where the crater catalogue and the height rasters describe it, and the craters around it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace

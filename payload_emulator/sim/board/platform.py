@@ -7,8 +7,6 @@ Processor: every stage of flight software takes a set time, with a spread of a t
 The counts of stages, loads and sensors are those of the interface control document.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

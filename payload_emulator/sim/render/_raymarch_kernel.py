@@ -1,7 +1,5 @@
 """Compiled ray march over the terrain's own grid; `raymarch` explains the frame (MCMF, metres)."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

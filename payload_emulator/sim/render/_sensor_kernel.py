@@ -1,7 +1,5 @@
 """Compiled loop of the sensor: electrons, noise, levels."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -7,8 +7,6 @@ boresight.
 # NumPy's single-precision numbers count as floats for numba.
 # mypy: disable-error-code="arg-type,no-any-return,type-var,assignment"
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -183,13 +181,20 @@ def find_hit(
 
 
 @njit(
-    ahead="f4[:, ::1], f4[:, ::1], Grid(f8, f8, f8), Viewpoint(f8, f8[:, ::1], f8, f8, f8), f4[:, ::1]",
-    **FAST,
+    ahead="f4[:, ::1], f4[:, ::1], f8, f8, Grid(f8, f8, f8), Viewpoint(f8, f8[:, ::1], f8, f8, f8), f4[:, ::1]", **FAST
 )
 def trace_pixels(
-    heights: Float32Array, peaks: Float32Array, grid: Grid, viewpoint: Viewpoint, depth_along: Float32Array
+    heights: Float32Array,
+    peaks: Float32Array,
+    low: float,
+    top: float,
+    grid: Grid,
+    viewpoint: Viewpoint,
+    depth_along: Float32Array,
 ) -> None:
     """Fill ``depth_along`` (H, W) with the distance of the first hit along the boresight; -1 where there is none.
+
+    All heights lie between ``low`` and ``top``.
 
     The image is walked outward from the nadir, in lines of four sectors. The ray of a pixel passes above those of its
     two neighbours nearer the nadir, so the ground up to their hits is clear and the search starts at the nearer of
@@ -206,8 +211,6 @@ def trace_pixels(
         np.float32(rows - 2.01),
         np.float32(columns - 2.01),
     )
-    top = float(peaks.max()) + 1.0
-    low = float(heights.min()) - 1.0
     close = np.float32(CLOSE_TEXELS * grid.texel_m)
     nadir_u, nadir_v = _nadir_pixel(viewpoint, high, wide)
     inner = np.empty(high + wide, np.float32)
@@ -252,12 +255,8 @@ def _nadir_pixel(viewpoint: Viewpoint, high: int, wide: int) -> tuple[int, int]:
     nadir_u = wide // 2
     nadir_v = high // 2
     if down > 0.05:
-        nadir_u = min(
-            max(int(viewpoint.centre_u_px - viewpoint.focal_px * rotation[2, 0] / down), 0), wide - 1
-        )
-        nadir_v = min(
-            max(int(viewpoint.centre_v_px - viewpoint.focal_px * rotation[2, 1] / down), 0), high - 1
-        )
+        nadir_u = min(max(int(viewpoint.centre_u_px - viewpoint.focal_px * rotation[2, 0] / down), 0), wide - 1)
+        nadir_v = min(max(int(viewpoint.centre_v_px - viewpoint.focal_px * rotation[2, 1] / down), 0), high - 1)
     return nadir_u, nadir_v
 
 
@@ -431,6 +430,8 @@ def _settle(
 def trace_shifted(
     heights: Float32Array,
     peaks: Float32Array,
+    low: float,
+    top: float,
     grid: Grid,
     viewpoint: Viewpoint,
     shift_u: Float32Array,
@@ -444,8 +445,6 @@ def trace_shifted(
     inverse = 1.0 / grid.texel_m
     i0 = -grid.x0_m * inverse
     j0 = -grid.y0_m * inverse
-    top = float(peaks.max()) + 1.0
-    low = float(heights.min()) - 1.0
     rotation = viewpoint.tangent_from_camera
     for v in range(depth_along.shape[0]):
         for u in range(depth_along.shape[1]):
@@ -454,9 +453,7 @@ def trace_shifted(
             di = (rotation[0, 0] * right + rotation[0, 1] * below + rotation[0, 2]) * inverse
             dj = (rotation[1, 0] * right + rotation[1, 1] * below + rotation[1, 2]) * inverse
             dz = rotation[2, 0] * right + rotation[2, 1] * below + rotation[2, 2]
-            depth_along[v, u] = _search(
-                heights, peaks, i0, j0, viewpoint.altitude_m, di, dj, dz, 0.0, top, low
-            )
+            depth_along[v, u] = _search(heights, peaks, i0, j0, viewpoint.altitude_m, di, dj, dz, 0.0, top, low)
 
 
 @njit(**FAST)

@@ -4,8 +4,6 @@ Everything is in the east-north-up frame on the map sphere below the camera, in 
 in single precision is good to centimetres.  The scene is arrays and numbers only; Blender is not needed to make it.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -22,14 +20,7 @@ from payload_emulator.errors import RendererError, TerrainError
 from payload_emulator.sim.render.light import SUN_ANGULAR_RADIUS_RAD
 from payload_emulator.sim.render.photometry import Photometry
 from payload_emulator.sim.render.raymarch import height_above_ground_m, rays_window
-from payload_emulator.sim.terrain.tiles import (
-    ALBEDO_SHIFT,
-    MEAN_ALBEDO,
-    TILE_PIXELS,
-    TILE_SHIFT,
-    Terrain,
-    TerrainPatch,
-)
+from payload_emulator.sim.terrain.tiles import ALBEDO_SHIFT, MEAN_ALBEDO, TILE_PIXELS, TILE_SHIFT, Terrain, TerrainPatch
 
 Image = npt.NDArray[np.float32]
 

@@ -5,8 +5,6 @@ no sweep, no interpolated map coordinates, double precision throughout.  Slopes 
 terrain's level in both, for that is part of what a picture of this terrain means.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -119,10 +117,7 @@ def _ground(patch: TerrainPatch) -> Ground:
 
 
 def rays_window(
-    camera: PinholeCamera,
-    position: FloatArray,
-    rotation: FloatArray,
-    sun: FloatArray,
+    camera: PinholeCamera, position: FloatArray, rotation: FloatArray, sun: FloatArray
 ) -> tuple[FloatArray, FloatArray, float]:
     """Places over all ground that any ray, toward the ground or on to the Sun, can pass, and their spacing."""
     edge = np.linspace(-0.5, 1.0, 9)

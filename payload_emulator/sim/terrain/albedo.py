@@ -1,7 +1,5 @@
 """Albedo of the Moon from a picture of its whole surface or from georeferenced tiles, relative to the mean."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Sequence

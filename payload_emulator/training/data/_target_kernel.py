@@ -1,8 +1,6 @@
 """Compiled loop of `targets.make_targets`; it lets other threads run, which a loop of small numpy calls does not."""
 
 # ruff: noqa: RUF046 (compiled, ceil and floor give floats)
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Craters learned from flight as further labels of a training (labels of `linna landmarks`)."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -66,8 +64,7 @@ def with_landmarks(dataset: Dataset, frame: Frame, landmarks: Landmarks) -> Fram
         "visible": np.ones(index.size),
     }
     craters: dict[str, NDArray[Any]] = {
-        key: np.concatenate([values, added[key].astype(values.dtype)])
-        for key, values in frame.craters.items()
+        key: np.concatenate([values, added[key].astype(values.dtype)]) for key, values in frame.craters.items()
     }
     return replace(frame, craters=craters)
 
@@ -85,9 +82,7 @@ def load_landmarks(path: Path) -> Landmarks:
             rows = list(csv.DictReader(stream))
         column = {name: np.array([float(row[name]) for row in rows]) for name in _COLUMNS}
     except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        raise DatasetError(
-            f"{path}: expected landmarks (CSV with {', '.join(_COLUMNS)}), found: {error}"
-        ) from error
+        raise DatasetError(f"{path}: expected landmarks (CSV with {', '.join(_COLUMNS)}), found: {error}") from error
     return Landmarks(
         np.radians(column["latitude_deg"]),
         np.radians(column["longitude_deg"]),

@@ -5,8 +5,6 @@ too shallow, too small, cut, or in shadow) takes the loss away around its centre
 All coordinates are pixels of the image as given to the network; pixel centres are integers.
 """
 
-from __future__ import annotations
-
 import enum
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Places of a data set along an ephemeris, by the paper's rule (section V-B.4), and the paper's split of them (V-C)."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,9 +41,7 @@ class Track:
         return hashlib.sha256(octets + self.order.tobytes()).hexdigest()
 
 
-def lay_track(
-    source: Source, camera: PinholeCamera, terrain: Any, data: DataFolder, wanted: int, seed: int
-) -> Track:
+def lay_track(source: Source, camera: PinholeCamera, terrain: Any, data: DataFolder, wanted: int, seed: int) -> Track:
     """The first `wanted` places of a source's ephemeris from which frames can be taken.
 
     Left out are places beyond the latitude limit, footprints that leave the terrain, and, where the source has boxes or

@@ -1,7 +1,5 @@
 """Catalogued craters in view of a frame: what detections are scored against."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from lunar.arrays import FloatArray, IntArray

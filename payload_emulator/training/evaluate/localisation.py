@@ -4,8 +4,6 @@ Errors are detection minus crater in pixels, u right and v down. They are given 
 Sun in the image and across it (to the right of who looks toward it): shadows would draw a detector along the first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -7,8 +7,6 @@ expected, a detection that takes one of them is not counted, and a detection tha
 diameter lies in the range. Labels of such sets are often incomplete, so precision is a lower bound.
 """
 
-from __future__ import annotations
-
 import enum
 import itertools
 import math
@@ -212,9 +210,7 @@ def _between(values: FloatArray, limits: tuple[float, float]) -> BoolArray:
     return inside
 
 
-def _matched(
-    picture: LabelledPicture, found: Detections, criterion: Criterion, expected: BoolArray
-) -> IntArray:
+def _matched(picture: LabelledPicture, found: Detections, criterion: Criterion, expected: BoolArray) -> IntArray:
     """Label that each detection (best first) takes, -1 for none; an expected label before any other."""
     taken = np.full(len(found), -1, np.int64)
     free = ~picture.crowd

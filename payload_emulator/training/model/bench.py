@@ -1,7 +1,5 @@
 """Latency and memory of the flight detector on this machine."""
 
-from __future__ import annotations
-
 import resource
 import time
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from benchmarks.campaigns._clients import Answer, Session, cut_pieces
-from benchmarks.campaigns._ledger import FAULTS, AuditLine, Entered, HandOut, Ledger, Told, judge
+from benchmarks.campaigns._ledger import FAULTS, AuditLine, Decision, Entered, HandOut, Ledger, judge
 from benchmarks.campaigns.kill import holds, main, the_pass, totals
 
 SHORT = "--laptop --packets 400 --pieces 4 --reports 0 --pause 0.3 --json"
@@ -71,7 +71,12 @@ LINES = [
 def what_clients_were_told() -> Ledger:
     return Ledger(
         entered=[Entered(11, 1, "ann"), Entered(12, 2, "ann"), Entered(13, 3, "ann")],
-        told=[Told(1, "released", "ann"), Told(2, "rejected", "bob"), Told(3, "released"), Told(4, "queued")],
+        decisions=[
+            Decision(1, "released", "ann"),
+            Decision(2, "rejected", "bob"),
+            Decision(3, "released"),
+            Decision(4, "queued"),
+        ],
         hand_outs=[HandOut("bob", (1,), b"one"), HandOut("ann", (), b"")],
     )
 

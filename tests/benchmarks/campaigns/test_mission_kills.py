@@ -49,9 +49,7 @@ def test_kills_do_not_change_the_figures_of_a_run(tmp_path: Path, monkeypatch: p
     scenario, data = parse_scenario(SCENARIO), DataFolder(None)
     terms = RunTerms(days=0.25, windows_per_day=4, window_s=600.0)
     whole = run_mission(scenario, data, tmp_path / "whole", terms, print)
-    planned = tuple(
-        PlannedKill(scenario.epoch_utc_ns, phase, part, delay_s, 0.1) for phase, part, delay_s in KILLED
-    )
+    planned = tuple(PlannedKill(scenario.epoch_utc_ns, phase, part, delay_s, 0.1) for phase, part, delay_s in KILLED)
     monkeypatch.setattr("benchmarks.campaigns.mission_kills.plan_kills", lambda *_: planned)
     hold_telecommands_until_the_spacecraft_was_killed(monkeypatch)
     folder = tmp_path / "killed"
@@ -139,10 +137,7 @@ def made_keeper(parts: dict[str, Part], planned: tuple[PlannedKill, ...], folder
 
 def test_a_part_is_killed_at_its_stop_once_and_a_part_that_ends_is_started_again(tmp_path: Path) -> None:
     part = sleeper(tmp_path)
-    planned = (
-        PlannedKill(5, "ended", "api", 0.0, 0.0),
-        PlannedKill(5, "started", "api", 0.0, 0.0),
-    )
+    planned = (PlannedKill(5, "ended", "api", 0.0, 0.0), PlannedKill(5, "started", "api", 0.0, 0.0))
     keeper = made_keeper({"api": part}, planned, tmp_path)
     part.start()
     try:
@@ -194,9 +189,7 @@ def test_a_part_that_ends_while_the_spacecraft_is_down_is_started_again(tmp_path
         part.end()
 
 
-def test_a_part_that_does_not_start_ends_the_run_with_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_part_that_does_not_start_ends_the_run_with_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("studies.harness.parts.START_S", 0.5)
     part = Part([sys.executable, "-c", "raise SystemExit('no home')"], tmp_path / "log", lambda: False)
     keeper = made_keeper({"api": part}, (), tmp_path)

@@ -78,11 +78,7 @@ class OpenIdProvider:
         query = self.codes.pop(code, None) if self.codes_once else self.codes.get(code)
         verifier = hashlib.sha256(form.get("code_verifier", "").encode()).digest()
         challenge = base64.urlsafe_b64encode(verifier).rstrip(b"=").decode()
-        if (
-            query is None
-            or query["redirect_uri"] != form.get("redirect_uri")
-            or query["code_challenge"] != challenge
-        ):
+        if query is None or query["redirect_uri"] != form.get("redirect_uri") or query["code_challenge"] != challenge:
             return 400, {"error": "invalid_grant"}
         claims = self.change({**self.common(), "nonce": query["nonce"], **self.claims})
         return 200, {"access_token": "a", "token_type": "Bearer", "id_token": self.signed(claims)}

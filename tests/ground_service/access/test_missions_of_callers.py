@@ -116,9 +116,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
             row_of(connection, tables["vehicles"], id=1, ccsds_id=THEIRS, instance="flight")
             row_of(connection, tables["vehicles"], id=2, ccsds_id=OURS, instance="flight")
             row_of(connection, tables["passes"], id=1, vehicle_id=1)
-            row_of(
-                connection, tables["missions"], id=9, revision=REVISION, ccsds_id=THEIRS, entered_by="archive"
-            )
+            row_of(connection, tables["missions"], id=9, revision=REVISION, ccsds_id=THEIRS, entered_by="archive")
             row_of(connection, tables["links"], name="theirs", ccsds_id=THEIRS)
             row_of(connection, tables["ingests"], id=1, vehicle_id=1)
             for name in ("landmarks", "monthly_reports"):
@@ -221,9 +219,7 @@ def test_a_description_or_ephemeris_of_another_mission_is_refused(fleet: Fleet, 
         answer = fleet.client.post(f"{V1}/missions", content=text.encode(), headers=fleet.headers)
         assert answer.status_code == 403, answer.text
     text = DESCRIPTION.format(name="ours", number=OURS) + "[evidence]\nseed = 1\n"
-    assert (
-        fleet.client.post(f"{V1}/missions", content=text.encode(), headers=fleet.headers).status_code == 201
-    )
+    assert fleet.client.post(f"{V1}/missions", content=text.encode(), headers=fleet.headers).status_code == 201
     orbit = save_circle(tmp_path / "orbit.oem").read_text()
     added = {}
     for name in ("THEIRS", "OURS"):
@@ -231,12 +227,8 @@ def test_a_description_or_ephemeris_of_another_mission_is_refused(fleet: Fleet, 
         answer = fleet.client.post(f"{V1}/ephemerides", content=named.encode(), headers=fleet.headers)
         added[name] = answer.status_code
         if name == "THEIRS":
-            unlimited = {
-                "Authorization": f"Bearer {add_user(fleet.client.app.state.ground, 'eve', 'operator')}"
-            }
-            foreign = fleet.client.post(
-                f"{V1}/ephemerides", content=named.encode(), headers=unlimited
-            ).json()["id"]
+            unlimited = {"Authorization": f"Bearer {add_user(fleet.client.app.state.ground, 'eve', 'operator')}"}
+            foreign = fleet.client.post(f"{V1}/ephemerides", content=named.encode(), headers=unlimited).json()["id"]
         else:
             own = answer.json()["id"]
     assert added == {"THEIRS": 403, "OURS": 201}

@@ -90,10 +90,7 @@ def test_a_user_of_the_provider_is_added_with_the_role_and_gets_a_session(client
     ground = client.app.state.ground
     (user,), (token,) = users.list_users(ground), users.list_tokens(ground)
     assert user.provider == provider.issuer and token.kind == "provider session"
-    assert [one.action for one in ground.read(list_audit, AuditFilter()).items] == [
-        "start session",
-        "add user",
-    ]
+    assert [one.action for one in ground.read(list_audit, AuditFilter()).items] == ["start session", "add user"]
 
 
 def test_the_request_to_the_provider_has_fresh_secrets(client, provider):
@@ -330,12 +327,7 @@ def test_no_other_address_is_opened_after_a_sign_in(client, provider, subtests):
 
 
 def test_control_characters_and_spaces_are_no_part_of_a_page():
-    assert [oidc.own_page(text) for text in ("/\t/evil.example", "/ /a", "/\n", "/a?b#c")] == [
-        "/",
-        "/",
-        "/",
-        "/a?b#c",
-    ]
+    assert [oidc.own_page(text) for text in ("/\t/evil.example", "/ /a", "/\n", "/a?b#c")] == ["/", "/", "/", "/a?b#c"]
 
 
 def test_the_page_in_the_cookie_is_checked_as_well(client, provider):
@@ -349,9 +341,7 @@ def test_the_page_in_the_cookie_is_checked_as_well(client, provider):
 def test_a_provider_that_is_down_is_no_traceback_and_tokens_still_work(tmp_path):
     with running_provider() as provider:
         pass
-    with TestClient(
-        create_app(settings(tmp_path, provider), inline_jobs=True), follow_redirects=False
-    ) as client:
+    with TestClient(create_app(settings(tmp_path, provider), inline_jobs=True), follow_redirects=False) as client:
         refused(client.get("/sign-in/provider"), "Bearer tokens still work", status=503)
         token = users.add_user(client.app.state.ground, "bob", "viewer")
         assert client.get("/api/v1/session", headers={"Authorization": f"Bearer {token}"}).status_code == 200
@@ -360,8 +350,7 @@ def test_a_provider_that_is_down_is_no_traceback_and_tokens_still_work(tmp_path)
 
 
 @pytest.mark.parametrize(
-    "metadata",
-    [{"issuer": "https://evil.example"}, {"token_endpoint": None}, {"jwks_uri": "http://127.0.0.1:1/keys"}],
+    "metadata", [{"issuer": "https://evil.example"}, {"token_endpoint": None}, {"jwks_uri": "http://127.0.0.1:1/keys"}]
 )
 def test_a_provider_whose_configuration_is_wrong_cannot_be_used(client, provider, metadata):
     provider.metadata = metadata

@@ -33,9 +33,7 @@ def test_without_users_an_open_service_has_a_local_caller_who_may_do_everything(
 
 
 def test_a_service_that_others_reach_is_closed_even_without_users(ground: Ground) -> None:
-    with pytest.raises(
-        NotAuthorised, match="expected a bearer token in the Authorization header, found none"
-    ):
+    with pytest.raises(NotAuthorised, match="expected a bearer token in the Authorization header, found none"):
         caller_of(request(ground, False), None)
 
 
@@ -49,9 +47,7 @@ def test_the_first_user_closes_an_open_service_even_once_disabled(ground: Ground
 
 
 @pytest.mark.parametrize("open_without_users", [True, False])
-def test_a_token_names_its_caller_whatever_the_service_is_open_to(
-    ground: Ground, open_without_users: bool
-) -> None:
+def test_a_token_names_its_caller_whatever_the_service_is_open_to(ground: Ground, open_without_users: bool) -> None:
     token = add_user(ground, "ann", "operator")
     asked = request(ground, open_without_users)
     caller = caller_of(asked, bearer(token))

@@ -83,9 +83,7 @@ def test_a_session_ends_with_the_validity_of_its_token(client: TestClient) -> No
     assert len(expires) == 1
 
 
-def test_an_expired_session_is_refused_with_its_reason_and_changes_nothing(
-    client: TestClient, token: str
-) -> None:
+def test_an_expired_session_is_refused_with_its_reason_and_changes_nothing(client: TestClient, token: str) -> None:
     ground = client.app.state.ground
     start(client, token)
     with ground.database.writing() as connection:
@@ -203,11 +201,6 @@ def test_operators_read_who_did_what(guarded: Guarded) -> None:
     ):
         found = client.get(f"{V1}/audit?{query}", headers=heads["operator"]).json()
         assert [one["number"] for one in found["items"]] == numbers, query
-    for query in (
-        "since=yesterday",
-        "actor=%00",
-        "limit=0",
-        f"since={newest['time']}&until=2020-01-01T00:00:00Z",
-    ):
+    for query in ("since=yesterday", "actor=%00", "limit=0", f"since={newest['time']}&until=2020-01-01T00:00:00Z"):
         assert client.get(f"{V1}/audit?{query}", headers=heads["operator"]).status_code == 422, query
     assert client.get(f"{V1}/audit", headers=heads["admin"]).status_code == 200

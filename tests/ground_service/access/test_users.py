@@ -113,8 +113,7 @@ def test_of_two_administrators_who_disable_each_other_one_stays(either: Ground) 
             elif get_user(either, name).state == "disabled":
                 change_user(either, name, state="active")
         results = race(
-            lambda: change_user(either, "ann", state="disabled"),
-            lambda: change_user(either, "bob", state="disabled"),
+            lambda: change_user(either, "ann", state="disabled"), lambda: change_user(either, "bob", state="disabled")
         )
         assert sum(isinstance(one, Conflict) for one in results) == 1, results
         assert sorted(user.state for user in list_users(either)) == ["active", "disabled"]
@@ -236,17 +235,13 @@ def test_further_tokens_expire_too(ground: Ground, clock: Callable[[int], None])
     assert list_tokens(ground)[0].expires == "2027-01-15T20:00:01.234567Z"
     clock(NOW + 12 * HOUR_NS)
     assert not token_valid(ground, token)
-    with pytest.raises(
-        InvalidInput, match=r"^token, days valid: expected more than 0, at most 36500, found -1"
-    ):
+    with pytest.raises(InvalidInput, match=r"^token, days valid: expected more than 0, at most 36500, found -1"):
         add_token(ground, "ann", days_valid=-1)
     with pytest.raises(NotFound):
         add_token(ground, "bob")
 
 
-def test_the_use_of_a_token_is_noted_after_an_hour_and_not_before(
-    ground: Ground, clock: Callable[[int], None]
-) -> None:
+def test_the_use_of_a_token_is_noted_after_an_hour_and_not_before(ground: Ground, clock: Callable[[int], None]) -> None:
     """The stored time is the full hour; an hour after that, not after the use, it is written again."""
     token = add_user(ground, "ann", "viewer")
     authenticate(ground, token)
@@ -258,9 +253,7 @@ def test_the_use_of_a_token_is_noted_after_an_hour_and_not_before(
     assert list_tokens(ground)[0].used == "2027-02-26T00:00:00.000000Z"
 
 
-def test_of_two_requests_at_once_the_first_notes_the_use(
-    ground: Ground, clock: Callable[[int], None]
-) -> None:
+def test_of_two_requests_at_once_the_first_notes_the_use(ground: Ground, clock: Callable[[int], None]) -> None:
     """Both read that the token was not used; the second finds the hour written when it comes to write."""
     add_user(ground, "ann", "viewer")
     _note_use(ground, 1, NOW)
@@ -326,9 +319,7 @@ def test_two_users_of_a_deployment_have_tokens_of_their_own(ground: Ground, exis
 
 
 @pytest.mark.parametrize(("length", "accepted"), [(23, False), (24, True)])
-def test_a_token_of_a_deployment_has_24_characters_or_more(
-    ground: Ground, length: int, accepted: bool
-) -> None:
+def test_a_token_of_a_deployment_has_24_characters_or_more(ground: Ground, length: int, accepted: bool) -> None:
     if accepted:
         assert ensure_user(ground, "ann", "viewer", "t" * length)
     else:

@@ -49,9 +49,7 @@ def polar() -> Ephemeris:
     zero = np.zeros_like(angle)
     outward = np.stack([np.cos(angle), zero, np.sin(angle)], axis=1)
     ahead = np.stack([-np.sin(angle), zero, np.cos(angle)], axis=1)
-    return ephemeris_from_states(
-        EPOCH + (seconds * 1e9).astype(np.int64), RADIUS_M * outward, SPEED_M_S * ahead
-    )
+    return ephemeris_from_states(EPOCH + (seconds * 1e9).astype(np.int64), RADIUS_M * outward, SPEED_M_S * ahead)
 
 
 def after(*seconds: float) -> np.ndarray:

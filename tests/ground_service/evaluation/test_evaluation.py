@@ -31,9 +31,7 @@ def imported(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> I
         yield ground, pass_id, evaluate(ground, pass_id)
 
 
-def test_importing_again_gives_the_same_pass_and_the_same_archive(
-    imported: Imported, synthetic_pass: Any
-) -> None:
+def test_importing_again_gives_the_same_pass_and_the_same_archive(imported: Imported, synthetic_pass: Any) -> None:
     ground, pass_id, _ = imported
     with ground.database.reading() as connection:
         vehicle = repository.get(connection, repository.PASSES, pass_id, "pass")["vehicle_id"]
@@ -84,10 +82,7 @@ def test_a_pdf_is_made_on_request_and_reproducible(
         (lambda m: m.pop("start_utc"), "start_utc: expected str, found None"),
         (lambda m: m.update(stop_utc="yesterday"), "expected UTC epochs"),
         (lambda m: m.update(stop_utc="2020-01-01T00:00:00Z"), "stop_utc: expected an epoch after"),
-        (
-            lambda m: m.update(schema_version=99),
-            "schema_version: expected 1 or less, found 99 of a newer version",
-        ),
+        (lambda m: m.update(schema_version=99), "schema_version: expected 1 or less, found 99 of a newer version"),
         (lambda m: m["files"].update({"../x": {"sha256": "0"}}), "expected a path inside the archive"),
         (lambda m: m["files"].update({"no.bin": {"sha256": "0"}}), "no.bin: expected a file of the archive"),
         (lambda m: m["files"]["reference.oem"].update(sha256="0" * 64), "damaged or cut short"),

@@ -43,8 +43,7 @@ def pairs(noise_px: float = 0.0, seed: int = 3) -> Pairs:
     """Eight craters seen in both of two frames."""
     rng = np.random.default_rng(seed)
     uv = [
-        CAMERA.project((craters() - place) @ nadir_camera_from_mcmf(place).T)
-        + rng.normal(0.0, noise_px, (8, 2))
+        CAMERA.project((craters() - place) @ nadir_camera_from_mcmf(place).T) + rng.normal(0.0, noise_px, (8, 2))
         for place in POSITION
     ]
     frame = np.repeat([0, 1], 8)
@@ -133,9 +132,7 @@ def test_identifications_are_joined_by_time_place_and_number() -> None:
     ids = catalogue.ids
     found = IdentificationSamples(
         utc_ns=np.array([1000, 2000, 2000, 1500, 1000, 1000]),
-        detection=np.array(
-            [1, 0, 1, 0, 0, 0]
-        ),  # the third names a detection that is not there, the fourth a time
+        detection=np.array([1, 0, 1, 0, 0, 0]),  # the third names a detection that is not there, the fourth a time
         # the last two a crater that is not there, and one of unknown height
         crater_id=np.array([ids[2], ids[0], ids[1], ids[1], 10**6, ids[3]]),
     )
@@ -202,9 +199,7 @@ def test_the_last_report_of_a_landmark_counts() -> None:
     assert np.array_equal(latest(MappedCraters(*both)).latitude_deg, late.latitude_deg)
 
 
-def test_a_report_counts_the_landmarks_the_fixes_that_used_them_and_their_distance_from_the_catalogue() -> (
-    None
-):
+def test_a_report_counts_the_landmarks_the_fixes_that_used_them_and_their_distance_from_the_catalogue() -> None:
     craters = catalogue()
     reports = mapped(craters, 100.0)
     # The catalogue's crater 7, and landmark 0 twice and landmark 1 once.

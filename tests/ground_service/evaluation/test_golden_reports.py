@@ -142,11 +142,7 @@ def test_a_whole_pass(made, report_on) -> None:
 
 @pytest.mark.parametrize(
     ("seen_frames", "level"),
-    [
-        (0, "3 (real terrain never"),
-        (8, "3s (real terrain seen in training; 33 %"),
-        (FRAMES, "3s (real terrain seen"),
-    ],
+    [(0, "3 (real terrain never"), (8, "3s (real terrain seen in training; 33 %"), (FRAMES, "3s (real terrain seen")],
 )
 def test_the_share_over_unseen_terrain_is_that_of_the_frames_of_the_pass(
     made, report_on, seen_frames: int, level: str
@@ -264,9 +260,7 @@ def test_a_damaged_file_of_another_pass_changes_nothing(made, ground: Ground, tm
     assert replace(completeness(ground, key), completeness=None) == replace(counted, completeness=None)
 
 
-def test_two_spacecraft_in_one_file(
-    made, ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_spacecraft_in_one_file(made, ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each spacecraft has its own duplicates and frames; only files that may hold something of the pass are read."""
     flown = made(46)
     first, stop = int(flown.utc_ns[0]), int(flown.utc_ns[-1]) + CADENCE_S * NS

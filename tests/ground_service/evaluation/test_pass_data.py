@@ -33,9 +33,7 @@ from reports.render import to_json
 from tests.ground_service.conftest import define_pass_of, enter_files
 from tests.ground_service.evaluation.still import TurnedOrientation
 
-MISSING_FILES = DataFolder(
-    orientation_bpc=Path("no.bpc"), gravity=Path("no.gfc"), gravity_alternative=Path("no.cof")
-)
+MISSING_FILES = DataFolder(orientation_bpc=Path("no.bpc"), gravity=Path("no.gfc"), gravity_alternative=Path("no.cof"))
 """A data folder with other models; none of them may even be opened."""
 
 
@@ -149,9 +147,7 @@ def test_the_attitude_of_an_archive_is_found_by_the_time_of_the_image(
     synthetic_pass: Any, ground: Ground, tmp_path: Path
 ) -> None:
     ticks = ticks_from_utc_ns(synthetic_pass.utc_ns[[5, 2]])
-    folder = changed_archive(
-        synthetic_pass, tmp_path / "a", attitude="{},0,1,0,0\n{},1,0,0,0\n".format(*ticks)
-    )
+    folder = changed_archive(synthetic_pass, tmp_path / "a", attitude="{},0,1,0,0\n{},1,0,0,0\n".format(*ticks))
     viewing = load_pass_inputs(ground, import_archive(ground, folder)).viewing
     assert np.flatnonzero(viewing.known(synthetic_pass.utc_ns)).tolist() == [2, 5]
     assert viewing.q_wxyz.tolist() == [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]
@@ -224,10 +220,7 @@ UNREADABLE = "expected on-board ticks and a unit quaternion"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "CCSDS_AEM_VERS = 9",
-            ": expected a CCSDS AEM, found line 1: expected an AEM version out of 1.0, 2.0",
-        ),
+        ("CCSDS_AEM_VERS = 9", ": expected a CCSDS AEM, found line 1: expected an AEM version out of 1.0, 2.0"),
         ("", ", line 1: expected image_ticks,q_w"),
         ("ticks,q", ", line 1: expected image_ticks,q_w"),
         (f"{HEADER}\n5,1,0,0,0\n6,1,0,0", f", line 3: {UNREADABLE}"),

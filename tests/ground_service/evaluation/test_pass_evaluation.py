@@ -22,12 +22,7 @@ from ground_service.evaluation.model import PassFigures
 from ground_service.evaluation.recall import Viewing
 from ground_service.evaluation.smoother import ONBOARD, FilterStates, StartState
 from ground_service.missions.model import Requirements
-from ground_service.telemetry.samples import (
-    DetectionSamples,
-    NavigationSamples,
-    OutcomeSamples,
-    no_detections,
-)
+from ground_service.telemetry.samples import DetectionSamples, NavigationSamples, OutcomeSamples, no_detections
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, make_catalogue
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
@@ -339,10 +334,7 @@ def test_the_filter_is_smoothed_in_icrf_with_its_own_field() -> None:
     [
         ({}, ["no field or orientation on board is given"]),
         ({"refused": {"onboard_gravity": "field X is not here"}}, ["field X is not here"]),
-        (
-            {"onboard_gravity": POINT, "onboard_orientation": None},
-            ["no field or orientation on board is given"],
-        ),
+        ({"onboard_gravity": POINT, "onboard_orientation": None}, ["no field or orientation on board is given"]),
         ({"filter_states": filter_states().select(np.zeros(13, dtype=np.bool_))}, []),
     ],
 )
@@ -462,9 +454,7 @@ def test_without_reference_or_orientation_the_report_says_what_was_flown_and_why
         assert unturned.not_available == dict.fromkeys(("error", "reference", "detector", "craters"), reason)
 
 
-def test_a_pass_over_ground_without_a_catalogue_has_no_recall_and_no_precision_and_says_why(
-    report: PassReport,
-) -> None:
+def test_a_pass_over_ground_without_a_catalogue_has_no_recall_and_no_precision_and_says_why(report: PassReport) -> None:
     count = 3 * FRAMES
     unknown = evaluated(catalogue=replace(catalogue(), rim_height_m=np.full(count, np.nan)))
     assert unknown.not_available["recall"] == "rim heights unknown"
@@ -472,9 +462,7 @@ def test_a_pass_over_ground_without_a_catalogue_has_no_recall_and_no_precision_a
     nowhere = evaluated(catalogue=replace(catalogue(), complete=np.zeros(count, dtype=np.bool_)))
     micro, _ = scored(nowhere)
     assert np.isnan([micro.recall, micro.precision]).all()
-    assert (
-        nowhere.not_available["recall"] == "the crater catalogue has no complete crater of 5 to 30 km in view"
-    )
+    assert nowhere.not_available["recall"] == "the crater catalogue has no complete crater of 5 to 30 km in view"
     assert "recall" not in report.not_available
 
 
@@ -552,9 +540,9 @@ def test_the_pointing_is_told_from_what_is_known_of_it() -> None:
     assert "into the camera in its telemetered attitude;" in scored(every)[1]
     assert len(every.remarks) == 1
     # The first five frames were told a quarter of a turn off: of the four that see anything, only the centre is found.
-    turned = Rotation.from_matrix(
-        np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) @ nadir
-    ).as_quat()[:, [3, 0, 1, 2]]
+    turned = Rotation.from_matrix(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) @ nadir).as_quat()[
+        :, [3, 0, 1, 2]
+    ]
     some = evaluated(viewing=Viewing(CAMERA, attitude_utc_ns=TIMES[:5], q_wxyz=turned[:5]))
     assert [one.detected_true for one in some.detector.per_class] == [10, 6, 5]
     assert "into the camera in its telemetered attitude, if available;" in scored(some)[1]
@@ -599,9 +587,7 @@ def test_the_map_of_the_payload_is_compared_with_the_catalogue(report: PassRepor
     )  # fmt: skip
     some = identified()
     own = IdentificationSamples(
-        np.append(some.utc_ns, TIMES[5]),
-        np.append(some.detection, 0),
-        np.append(some.crater_id, 3_000_000_000),
+        np.append(some.utc_ns, TIMES[5]), np.append(some.detection, 0), np.append(some.crater_id, 3_000_000_000)
     )
     found = evaluated(landmarks=landmark, identifications=own).payload_map
     assert (found.mapped, found.mapped_again, found.used, found.pairs, found.pairs_of_all) == (1, 1, 1, 1, 13)
@@ -653,9 +639,7 @@ def test_no_other_estimator_stands_in_for_the_declared_one(estimator: str | None
     assert (report.headline[3].value, report.headline[3].note) == (None, "not evaluated")
 
 
-@pytest.mark.parametrize(
-    ("error_m", "text"), [(9_940.0, "9940 m"), (9_960.0, "10.0 km"), (52_340.0, "52.3 km")]
-)
+@pytest.mark.parametrize(("error_m", "text"), [(9_940.0, "9940 m"), (9_960.0, "10.0 km"), (52_340.0, "52.3 km")])
 def test_lengths_from_ten_kilometres_on_are_in_kilometres(error_m: float, text: str) -> None:
     high = paper(altitude_m=np.full(FRAMES, ALTITUDE_M + error_m), longitude_deg=LONGITUDE_DEG)
     report = evaluated(navigation=(high,))
@@ -781,10 +765,7 @@ def test_outcomes_are_joined_by_frame_number_in_any_order() -> None:
         np.array([1, 1, 1]),
     )
     triggers, candidates, reads = _joined(paper(), found)
-    assert {100 + k: one for k, one in enumerate(triggers) if one != "none"} == {
-        104: "time_gap",
-        109: "manual_step",
-    }
+    assert {100 + k: one for k, one in enumerate(triggers) if one != "none"} == {104: "time_gap", 109: "manual_step"}
     assert candidates.tolist() == [0, 1, 0, 0, 4, 0, 0, 0, 0, 9, 0, 0]
     assert reads.tolist() == [1, 1, 1]
     none = replace(found, frame_number=np.zeros(0, dtype=np.int64))

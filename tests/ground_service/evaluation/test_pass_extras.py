@@ -358,9 +358,7 @@ def test_a_tilted_distorted_camera_sees_craters_on_high_ground_where_they_are() 
 
 def test_a_camera_that_leans_far_sees_craters_beyond_a_nadir_footprint() -> None:
     """2.5 degrees north of the track is 76 km, past the corner of a nadir image from 30 km (73 km)."""
-    far = make_catalogue(
-        np.radians([3.0]), np.radians([0.0]), np.array([9e3]), source="made", rim_height_m=np.zeros(1)
-    )
+    far = make_catalogue(np.radians([3.0]), np.radians([0.0]), np.array([9e3]), source="made", rim_height_m=np.zeros(1))
     narrow = BrownCamera(512, 512, math.radians(60.0))
     assert len(expected_craters(far, narrow, POSITION).index) == 0
     leaning = Viewing(narrow, math.radians(65.0)).pointed(POSITION)

@@ -94,9 +94,7 @@ def test_a_perfect_detector_scores_one(expected: ExpectedCraters) -> None:
 
 def test_one_detection_serves_one_crater_and_the_second_is_a_false_alarm(expected: ExpectedCraters) -> None:
     twice = [1, 1]
-    found = detections(
-        expected.u_px[twice] + [0.0, 2.0], expected.v_px[twice], expected.diameter_px[twice], twice
-    )
+    found = detections(expected.u_px[twice] + [0.0, 2.0], expected.v_px[twice], expected.diameter_px[twice], twice)
     middle = scored(found, expected).per_class[1]
     assert (middle.detected_true, middle.false_alarms, middle.precision, middle.recall) == (1, 1, 0.5, 1.0)
     assert middle.localisation_px == 0.0

@@ -100,9 +100,7 @@ def batch(session: Session) -> Arrays:
     return state, np.linalg.inv(normal)
 
 
-def test_without_process_noise_the_first_smoothed_state_is_that_of_one_least_squares_over_everything() -> (
-    None
-):
+def test_without_process_noise_the_first_smoothed_state_is_that_of_one_least_squares_over_everything() -> None:
     """The last state is the filter's, and the uncertainty never grows."""
     session = Session(1)
     smoothed = smooth(session.filtered, QUIET)
@@ -204,10 +202,7 @@ def straight(seconds: list[float], seed: int = 9) -> FilterStates:
 
 
 def rauch_tung_striebel(
-    filtered: FilterStates,
-    legs: list[list[float]],
-    kicks: list[list[float]],
-    sigma_m_s: float = 0.0,
+    filtered: FilterStates, legs: list[list[float]], kicks: list[list[float]], sigma_m_s: float = 0.0
 ) -> Arrays:
     """Return smoothed states and covariances by equations 3.28 to 3.30, with plain inverses.
 
@@ -320,8 +315,7 @@ def test_the_smoother_has_the_noise_of_the_field_on_each_side_of_the_moon() -> N
     assert_allclose(far, model.field_noise.far_psd_m2_s3, rtol=1e-3)
     # The noise of a step is that of the place at its beginning.
     carried = [
-        _carried(state[None], np.array([EPOCH]), np.array([EPOCH + 60 * 10**9]), model)[2][0]
-        for state in states
+        _carried(state[None], np.array([EPOCH]), np.array([EPOCH + 60 * 10**9]), model)[2][0] for state in states
     ]
     ratio = np.trace(carried[1][3:6, 3:6]) / np.trace(carried[0][3:6, 3:6])
     assert ratio == approx(far.sum() / near.sum(), rel=0.02)

@@ -32,9 +32,7 @@ from reports.values import (
 N = 10
 
 
-def series(
-    name: str, kind: str = "estimate", median: float = 50.0, p95: float = 90.0, **more
-) -> NavigationSeries:
+def series(name: str, kind: str = "estimate", median: float = 50.0, p95: float = 90.0, **more) -> NavigationSeries:
     nothing = np.zeros(N)
     return NavigationSeries(
         name,
@@ -97,9 +95,7 @@ def test_nees_is_judged_by_both_bounds_for_its_independent_draws(
     """Too bold is a failure, too cautious a remark."""
     times = np.arange(N, dtype=np.int64) * gap_s * 10**9
     flown = replace(series("anchored", nees=np.full(N, 3.0 * factor)), utc_ns=times)
-    judged = row(
-        "consistency.nees", Requirements(estimator="anchored", consistency_inside_percent=95.0), found(flown)
-    )
+    judged = row("consistency.nees", Requirements(estimator="anchored", consistency_inside_percent=95.0), found(flown))
     assert (judged.value, judged.status) == (approx(factor), status)
     assert judged.note.endswith(f"; {bounds} with 95 % for {draws} independent draws{wrong}")
     cautious = ["mean NEES per degree of freedom 0.31: sigmas 1.8 times too large"]
@@ -175,18 +171,14 @@ def test_a_baseline_has_to_be_beaten_and_not_only_matched(baseline: float, statu
 
 def test_every_baseline_is_shown_and_one_that_is_missing_is_unknown() -> None:
     limits = Requirements(estimator="anchored", better_than=("snapshot",))
-    evaluated = found(
-        series("anchored"), series("Kepler", "baseline", 1.0), series("smoothed", "smoothed", 1.0)
-    )
+    evaluated = found(series("anchored"), series("Kepler", "baseline", 1.0), series("smoothed", "smoothed", 1.0))
     assert row("better_than.snapshot", limits, evaluated).status == "unknown"
     for name in ("Kepler", "smoothed"):
         shown = row(f"better_than.{name}", limits, evaluated)
         assert (shown.status, shown.value, shown.limit) == ("not judged", 50.0, 1.0)
     rival = limits.model_copy(update={"better_than": ("Kepler",)})
     assert row("better_than.Kepler", rival, evaluated).status == "not judged"  # from the best known orbit
-    assert (
-        row("better_than.Kepler", rival, replace(evaluated, experiment=StartOrbit(1e3))).status == "not met"
-    )
+    assert row("better_than.Kepler", rival, replace(evaluated, experiment=StartOrbit(1e3))).status == "not met"
 
 
 def test_an_experiment_is_judged_apart_and_its_accuracy_from_convergence_on() -> None:
@@ -199,11 +191,7 @@ def test_an_experiment_is_judged_apart_and_its_accuracy_from_convergence_on() ->
         sigma_rtn_m=np.column_stack([np.where(np.arange(N) < 3, 100.0, 20.0)] * 3),
     )
     limits = Requirements(
-        estimator="anchored",
-        median_error_m=60.0,
-        p95_error_m=100.0,
-        better_than=("Kepler",),
-        convergence_s=80.0,
+        estimator="anchored", median_error_m=60.0, p95_error_m=100.0, better_than=("Kepler",), convergence_s=80.0
     )
     evaluated = replace(found(flown, series("Kepler", "baseline", 10.0)), experiment=StartOrbit(1e3, 24.0))
     table = {one.key: one for one in requirements(limits, evaluated)}

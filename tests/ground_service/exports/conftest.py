@@ -73,9 +73,7 @@ def rich_pass(make_pass: Callable[..., SyntheticPass]) -> RichPass:
     sent, craters = Downlink(), []
     for k, tick in enumerate(ticks.tolist()):
         uv = _detections(made.packets, tick)
-        projected = PinholeCamera().project(
-            (catalogue.position_mcmf_m - position_mcmf[k]) @ camera_from_mcmf[k].T
-        )
+        projected = PinholeCamera().project((catalogue.position_mcmf_m - position_mcmf[k]) @ camera_from_mcmf[k].T)
         distance = np.linalg.norm(projected[None] + PIXEL_OFFSET - uv[:-1, None], axis=2)
         nearest = np.nanargmin(distance, axis=1)
         craters.append(catalogue.ids[nearest].tolist())

@@ -220,9 +220,7 @@ def test_geojson_and_geopackage_have_the_same_features_on_the_moon(
         assert 'SPHEROID["Moon (2015) - Sphere",1737400,0' in info["crs"]
     assert (counts["footprints"], counts["tracks"]) == (FRAMES, 4)
     with sqlite3.connect(tmp_path / "pass.gpkg") as database:
-        columns = {
-            row[1]: row[2] for name in layers for row in database.execute(f"PRAGMA table_info({name})")
-        }
+        columns = {row[1]: row[2] for name in layers for row in database.execute(f"PRAGMA table_info({name})")}
         times = database.execute("SELECT start, stop FROM tracks").fetchall()
     expected = {"utc": "DATETIME", "start": "DATETIME", "stop": "DATETIME", "complete": "BOOLEAN"}
     assert {name: columns[name] for name in expected} == expected
@@ -230,9 +228,7 @@ def test_geojson_and_geopackage_have_the_same_features_on_the_moon(
     assert "1737400" in pyogrio.read_info(tmp_path / "pass.geojson")["crs"]
 
 
-def test_located_detections_lie_on_their_craters(
-    rich_ground: Ground, rich_pass: RichPass, tmp_path: Path
-) -> None:
+def test_located_detections_lie_on_their_craters(rich_ground: Ground, rich_pass: RichPass, tmp_path: Path) -> None:
     path = tmp_path / "pass.gpkg"
     path.write_bytes(export(rich_ground, "gpkg"))
     catalogue = load_catalogue(rich_pass.folder / "catalogue.csv")
@@ -250,9 +246,7 @@ def test_located_detections_lie_on_their_craters(
     assert np.median(np.linalg.norm(found - true, axis=1)) < 1000.0
 
 
-def test_footprints_hold_the_sub_satellite_point_and_detections(
-    rich_ground: Ground, rich_pass: RichPass
-) -> None:
+def test_footprints_hold_the_sub_satellite_point_and_detections(rich_ground: Ground, rich_pass: RichPass) -> None:
     latitude, longitude, _ = spherical_from_mcmf(rich_pass.position_mcmf_m)
     below = mcmf_from_spherical(latitude, longitude, 0.0) / 1_737_400.0
     places = np.degrees(np.column_stack([(longitude + np.pi) % (2 * np.pi) - np.pi, latitude]))
@@ -280,9 +274,7 @@ def test_maps_of_an_estimator_move_with_its_error(rich_ground: Ground) -> None:
     assert np.median(shift) == approx(horizontal, rel=0.25)
 
 
-def test_czml_is_read_by_czml3_with_the_positions_of_the_reference(
-    rich_ground: Ground, rich_pass: RichPass
-) -> None:
+def test_czml_is_read_by_czml3_with_the_positions_of_the_reference(rich_ground: Ground, rich_pass: RichPass) -> None:
     from czml3 import Packet
     from scipy.spatial.transform import Rotation
 
@@ -331,9 +323,7 @@ def test_netcdf_has_the_tables_as_groups(rich_ground: Ground, rich_pass: RichPas
     rows = unzipped(export(rich_ground, "csv"))
     with xarray.open_datatree(path, engine="h5netcdf") as tree:
         assert tree.attrs["title"] == "synthetic pass"
-        assert re.fullmatch(
-            r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ LINNA: pass 1 exported as netCDF", tree.attrs["history"]
-        )
+        assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ LINNA: pass 1 exported as netCDF", tree.attrs["history"])
         frames = tree["frames"].to_dataset()
         assert_array_equal(frames["utc"].values.astype("datetime64[ns]").astype(np.int64), rich_pass.utc_ns)
         assert tree["detections"]["u_px"].attrs["units"] == "px"
@@ -364,9 +354,7 @@ def test_parquet_has_a_file_for_each_packet_type_with_units(rich_ground: Ground,
 
 def test_tum_trajectories_differ_by_the_error(rich_ground: Ground) -> None:
     files = unzipped(export(rich_ground, "tum"))
-    solution, reference = (
-        np.loadtxt(io.BytesIO(files[name])) for name in ("spherical.tum", "spherical-reference.tum")
-    )
+    solution, reference = (np.loadtxt(io.BytesIO(files[name])) for name in ("spherical.tum", "spherical-reference.tum"))
     assert len(solution) == FRAMES
     distance = np.linalg.norm(solution[:, 1:4] - reference[:, 1:4], axis=1)
     assert_allclose(distance, np.linalg.norm(SPHERICAL_ERROR_RTN_M), atol=1.0)
@@ -400,9 +388,7 @@ def test_a_damaged_image_refuses_the_export_and_leaves_no_file(
     rich_ground: Ground, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files = rich_ground.files
-    whole, damaged = (
-        files.put_octets(one).sha256 for one in (bytes(service.SPOOLED_OCTETS + 1), b"an image")
-    )
+    whole, damaged = (files.put_octets(one).sha256 for one in (bytes(service.SPOOLED_OCTETS + 1), b"an image"))
     files.path(damaged).chmod(0o600)
     files.path(damaged).write_bytes(b"another one")
     monkeypatch.setattr(service.store, "frame_files", lambda *_: {1: whole, 2: damaged})
@@ -430,18 +416,14 @@ def test_every_format_is_listed_and_gives_the_same_octets_twice(rich_ground: Gro
         ("geojson", "truth", "reference or paper or spherical or anchored"),
     ],
 )
-def test_states_that_do_not_exist_are_one_line(
-    rich_ground: Ground, kind: str, states: str, expected: str
-) -> None:
+def test_states_that_do_not_exist_are_one_line(rich_ground: Ground, kind: str, states: str, expected: str) -> None:
     with raises(EvaluationError, match=f"states: expected {expected}, found '{states}'"):
         export(rich_ground, kind, states)
 
 
 def test_a_pass_without_content_of_a_format_is_one_line(rich_ground: Ground) -> None:
     start = 10**18
-    empty = define_pass(
-        rich_ground, name="empty", start_utc_ns=start, stop_utc_ns=start + 1, spacecraft_id=SPACECRAFT
-    )
+    empty = define_pass(rich_ground, name="empty", start_utc_ns=start, stop_utc_ns=start + 1, spacecraft_id=SPACECRAFT)
     for kind, message in (
         ("aem", "expected attitudes of its frames, found none"),
         ("parquet", "expected packets, found none"),
@@ -460,9 +442,7 @@ def test_a_missing_library_is_one_line_with_its_extra(
     rich_ground: Ground, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     usual, chosen = importlib.util.find_spec, FORMATS[kind]
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name == chosen.library else usual(name)
-    )
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == chosen.library else usual(name))
     expected = rf"export as {kind}: expected the library {chosen.library}, found none; install linna\[{chosen.extra}\]"
     with raises(MissingLibrary, match=expected):
         export(rich_ground, kind)
@@ -474,9 +454,7 @@ def linna(rich_ground: Ground, tmp_path: Path, capsys: pytest.CaptureFixture[str
     """Run an export to a place below `tmp_path`; return its status and what it prints."""
 
     def export(arguments: str, place: str) -> tuple[int, str, str]:
-        status = run(
-            ["export", *arguments.split(), "--out", str(tmp_path / place), "--home", str(rich_ground.home)]
-        )
+        status = run(["export", *arguments.split(), "--out", str(tmp_path / place), "--home", str(rich_ground.home)])
         return status, *capsys.readouterr()
 
     return export

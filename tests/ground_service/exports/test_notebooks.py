@@ -43,9 +43,7 @@ def check(archive: Archive) -> None:
     assert sorted(one.images) == [0, 4, 8]
     assert one.images[4][0, 0] == 40
     summary = archive.summary()
-    assert summary.loc[one.id, "spherical median_3d_m"] == pytest.approx(
-        spherical["error_3d_m"].median(), rel=1e-3
-    )
+    assert summary.loc[one.id, "spherical median_3d_m"] == pytest.approx(spherical["error_3d_m"].median(), rel=1e-3)
 
 
 def test_a_home_folder_is_opened(rich_ground: Ground) -> None:
@@ -126,9 +124,7 @@ def test_a_source_of_no_kind_is_one_line(tmp_path: Path, name: str) -> None:
     assert list((tmp_path / "empty").iterdir()) == []
 
 
-def test_without_pandas_one_line_names_the_extra(
-    rich_ground: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_pandas_one_line_names_the_extra(rich_ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
     usual = builtins.__import__
 
     def without(name: str, *rest: object) -> object:

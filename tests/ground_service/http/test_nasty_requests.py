@@ -78,9 +78,7 @@ def test_no_request_makes_the_server_fail(client: TestClient, every: int) -> Non
             # Reports of a pass that is not there: those of one that is take seconds each, and are tested elsewhere.
             plain = template.replace("{pass_id}/reports", "99/reports")
             for name in in_path:
-                plain = plain.replace(
-                    "{" + name + "}", {"parameter": "power_w", "spacecraft_id": "76"}.get(name, "1")
-                )
+                plain = plain.replace("{" + name + "}", {"parameter": "power_w", "spacecraft_id": "76"}.get(name, "1"))
             for name in in_path:
                 for value in some((*NUMBERS, "ä", "a" * 300, "0" * 32)):
                     if template.endswith(("/reports", "/summary")) and value == "1":

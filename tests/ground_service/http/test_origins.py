@@ -116,11 +116,7 @@ def test_a_page_of_another_site_does_not_read_but_may_link(client: TestClient) -
 
 @pytest.mark.parametrize(
     ("proxies", "client", "secure"),
-    [
-        (("10.0.0.0/24",), "198.51.100.4", True),
-        (("10.0.1.0/24",), "10.0.0.5", False),
-        ((), "10.0.0.5", False),
-    ],
+    [(("10.0.0.0/24",), "198.51.100.4", True), (("10.0.1.0/24",), "10.0.0.5", False), ((), "10.0.0.5", False)],
 )
 def test_forwarded_headers_count_only_from_a_trusted_proxy(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, proxies: tuple[str, ...], client: str, secure: bool

@@ -51,9 +51,7 @@ def detail(answer: Any, status: int) -> str:
     return str(answer.json()["detail"])
 
 
-@pytest.mark.parametrize(
-    "query", ["kind=%00", "kind=a%0Ab", "kind=%1b[31m", "kind=%7f", "kind=%C2%85", "%00=1"]
-)
+@pytest.mark.parametrize("query", ["kind=%00", "kind=a%0Ab", "kind=%1b[31m", "kind=%7f", "kind=%C2%85", "%00=1"])
 def test_control_characters_in_a_query_are_refused(client: TestClient, query: str) -> None:
     assert detail(client.get(f"{V1}/jobs?{query}"), 422).startswith("query: expected no control characters")
 
@@ -69,9 +67,7 @@ def test_control_characters_in_a_path_are_refused(client: TestClient) -> None:
         ("x=1", "expected one of kind, limit, offset, found 'x'"), ("limit=5&__=", "found '__'"),
     ],
 )  # fmt: skip
-def test_an_unknown_query_key_is_refused_with_the_nearest_known(
-    client: TestClient, query: str, words: str
-) -> None:
+def test_an_unknown_query_key_is_refused_with_the_nearest_known(client: TestClient, query: str, words: str) -> None:
     assert words in detail(client.get(f"{V1}/jobs?{query}"), 422)
 
 
@@ -146,11 +142,7 @@ def test_no_request_model_takes_a_value_of_one_type_for_another(client: TestClie
 
 @pytest.mark.parametrize(
     ("method", "path", "allowed"),
-    [
-        ("DELETE", "/passes", "GET, POST"),
-        ("PUT", "/windows/1", "DELETE, GET, PATCH"),
-        ("GET", "/uplink", "POST"),
-    ],
+    [("DELETE", "/passes", "GET, POST"), ("PUT", "/windows/1", "DELETE, GET, PATCH"), ("GET", "/uplink", "POST")],
 )
 def test_a_method_that_is_not_allowed_is_answered_with_those_that_are(
     client: TestClient, method: str, path: str, allowed: str
@@ -268,9 +260,7 @@ def test_a_log_entry_is_one_json_object_with_what_was_passed() -> None:
     try:
         raise ValueError("broken")
     except ValueError:
-        record = logging.LogRecord(
-            "linna", logging.ERROR, "f.py", 1, "job %s\nfailed", ("7",), sys.exc_info()
-        )
+        record = logging.LogRecord("linna", logging.ERROR, "f.py", 1, "job %s\nfailed", ("7",), sys.exc_info())
     record.job = "7"
     assert "trace_id" not in json.loads(JsonFormatter().format(record))
     with logs.span("request"):

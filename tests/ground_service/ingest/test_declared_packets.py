@@ -18,6 +18,8 @@ from ground_service.app import create_app
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
+from ground_service.ingest.doubt_store import list_implausible
+from ground_service.ingest.model import ImplausibleFilter
 from ground_service.ingest.service import Place, decode_all_again, ingest_file, undecoded_vehicles
 from ground_service.missions import definitions
 from ground_service.missions import store as missions
@@ -26,6 +28,8 @@ from ground_service.missions.model import XTCE_COMPRESSED, Mission, PacketTime, 
 from ground_service.missions.service import add_mission, check_mission_file
 from ground_service.missions.store import packets_in_force
 from ground_service.passes import series
+from ground_service.passes.alarms.model import AlarmFilter
+from ground_service.passes.alarms.service import list_alarms
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.live import live_parameters
 from ground_service.passes.parameters import export_packets, pass_parameters
@@ -33,11 +37,11 @@ from ground_service.passes.service import completeness, define_pass, get_pass, p
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.telemetry import decoding
-from ground_service.telemetry.values import readable_decoding
+from ground_service.telemetry.values import newest_declared_ticks, readable_decoding
 from ground_service.toml import read_table
 from ground_service.worker import follow_up
 from ground_service.worker.integrity import verify
-from lunar.timescales import parse_utc, utc_ns_from_ticks
+from lunar.timescales import parse_utc, ticks_from_utc_ns, utc_ns_from_ticks
 from tests.serving import TestClient
 from tests.tmtc import foreign
 from tmtc.dictionary.payload import DICTIONARY
@@ -99,9 +103,7 @@ def downlink(folder: Path, packets: list[bytes], name: str = "bus.cadu") -> Path
 
 
 def define(ground: Ground, seconds: float = 600.0) -> int:
-    return define_pass(
-        ground, name="p", start_utc_ns=START, stop_utc_ns=START + round(seconds * 1e9), spacecraft_id=76
-    )
+    return define_pass(ground, name="p", start_utc_ns=START, stop_utc_ns=START + round(seconds * 1e9), spacecraft_id=76)
 
 
 def payload_packets(made: Any) -> list[bytes]:
@@ -141,9 +143,7 @@ def test_packets_without_a_checksum_between_others_become_series(
     assert (voltage.packet, voltage.value, voltage.unit) == ("Housekeeping", expected[-1], "V")
     assert voltage.time.utc_ns == pytest.approx(START + 299 * NS, abs=15_259)
     assert "temperature_c" in newest
-    assert found.buckets.start_utc_ns.tolist() == pytest.approx(
-        [START + k * NS for k in range(300)], abs=15_259
-    )
+    assert found.buckets.start_utc_ns.tolist() == pytest.approx([START + k * NS for k in range(300)], abs=15_259)
     assert parameter_series(either, 1, "MODE", 1000).samples == 300  # codes
     listed = pass_parameters(either, 1)
     assert {one.packet: one.packets for one in listed.packets} == {
@@ -184,9 +184,7 @@ def test_a_minimal_description_is_one_that_the_check_accepts(tmp_path: Path) -> 
         foreign.HEADER_TYPES,
         foreign.HEADER_PARAMETERS,
         foreign.HEADER_CONTAINER
-        + foreign.container(
-            "A", [], "CCSDSPacket", foreign._either(("PKT_APID", "==", 7), ("PKT_APID", "==", 2047))
-        ),
+        + foreign.container("A", [], "CCSDSPacket", foreign._either(("PKT_APID", "==", 7), ("PKT_APID", "==", 2047))),
     )
     found, faults = check_mission_file(saved(tmp_path, written(tmp_path / "a", bus)))
     assert not faults and found is not None and found.packets is not None and found.packets[0].apids == (7,)
@@ -228,9 +226,7 @@ def test_parts_of_segmented_packets_are_counted_and_packets_without_header_have_
     """The definition asks for the secondary header flag, but not for the sequence flags."""
     enter(ground, tmp_path / "m")
     packets = bus_packets(8)
-    parts = [
-        packets[3][:2] + struct.pack(">H", flags << 14 | 50 + flags) + packets[3][4:] for flags in (1, 0, 2)
-    ]
+    parts = [packets[3][:2] + struct.pack(">H", flags << 14 | 50 + flags) + packets[3][4:] for flags in (1, 0, 2)]
     boot = bytes((packets[2][0] & ~0x08, *packets[2][1:]))
     ingest_file(ground, downlink(tmp_path, [*packets, *parts, boot]))
     listed = pass_parameters(ground, define(ground))
@@ -239,21 +235,14 @@ def test_parts_of_segmented_packets_are_counted_and_packets_without_header_have_
 
 
 def test_an_entry_may_name_several_containers_and_the_unit_of_sizes(tmp_path: Path) -> None:
-    text = DEFINED.replace(
-        "time = ", "container = ['CCSDSPacket', 'TIMED']\nleading_size = 'octets'\ntime = "
-    )
+    text = DEFINED.replace("time = ", "container = ['CCSDSPacket', 'TIMED']\nleading_size = 'octets'\ntime = ")
     found, faults = check_mission_file(mission(tmp_path, text))
     assert not faults and found is not None
     assert definition_remarks(found) == ["packets bus: sizes before texts count octets"]
-    assert (
-        "expected the name of a container"
-        in check_mission_file(mission(tmp_path, text.replace("TIMED", "X")))[1][0]
-    )
+    assert "expected the name of a container" in check_mission_file(mission(tmp_path, text.replace("TIMED", "X")))[1][0]
 
 
-def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground: Ground, tmp_path: Path) -> None:
     limits = (
         "<DefaultAlarm><StaticAlarmRanges><WarningRange minInclusive='-1' maxInclusive='1000.5'/>"
         "<CriticalRange maxExclusive='1020'/></StaticAlarmRanges></DefaultAlarm>"
@@ -305,9 +294,7 @@ def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_k
     either: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(decoding, "BLOCK_PACKETS", 50)
-    monkeypatch.setitem(
-        cast(dict[str, Any], follow_up.DOING), "decode", lambda *_given: None
-    )  # no job decodes
+    monkeypatch.setitem(cast(dict[str, Any], follow_up.DOING), "decode", lambda *_given: None)  # no job decodes
     declared = "[[packets]]\nname = 'bus'\napids = [100, 101]\npacket_checksum = 'none'\n"
     enter(either, tmp_path / "m", declared)
     result = ingest_file(either, downlink(tmp_path, bus_packets(100)))
@@ -333,9 +320,7 @@ def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_k
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(decoding, "_next_block", killed)
         decoding.decode_declared(either, result.vehicle_id)
-    assert (
-        parameter_series(either, pass_id, "VOLTAGE", 100).samples == 100
-    )  # still as the earlier one decoded it
+    assert parameter_series(either, pass_id, "VOLTAGE", 100).samples == 100  # still as the earlier one decoded it
     assert decoding.decode_declared(either, result.vehicle_id) == 75
     assert parameter_series(either, pass_id, "BATTERY", 100).samples == 100
     with pytest.raises(NotFound):
@@ -459,10 +444,7 @@ def test_an_archive_is_decoded_with_the_packets_that_it_declares_and_the_live_sp
     assert found.samples == 40 and found.buckets.mean.tolist()[:1] == expected
     assert pass_parameters(either, pass_id).outcomes == {"100": {"decoded": 40}, "101": {"decoded": 10}}
     rows = json.loads(export_packets(either, pass_id, "Housekeeping", "json"))
-    assert (
-        len(rows)
-        == {one.packet: one.packets for one in pass_parameters(either, pass_id).packets}["Housekeeping"]
-    )
+    assert len(rows) == {one.packet: one.packets for one in pass_parameters(either, pass_id).packets}["Housekeeping"]
     assert pass_parameters(either, live).packets == ()
     with either.database.reading() as connection:
         assert packets_in_force(connection, 76, "flight") is None
@@ -547,9 +529,7 @@ def test_a_bare_stream_without_checksums_is_read_in_windows(
     assert parameter_series(ground, define(ground), "VOLTAGE", 1000).samples == 400
 
 
-def test_decoded_packets_of_a_pass_are_exported_with_utc(
-    ground: Ground, tmp_path: Path, synthetic_pass: Any
-) -> None:
+def test_decoded_packets_of_a_pass_are_exported_with_utc(ground: Ground, tmp_path: Path, synthetic_pass: Any) -> None:
     enter(ground, tmp_path / "m")
     packets = payload_packets(synthetic_pass)
     (event,) = (one for one in map(DICTIONARY.unpack_packet, packets) if one.name == "event_info")
@@ -587,15 +567,9 @@ def test_the_http_interface_gives_parameters_series_and_packets(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            DEFINED.replace("[100, 101]", "[100, 2047]"),
-            "packets.0.apids.1: expected less than or equal to 2046",
-        ),
+        (DEFINED.replace("[100, 101]", "[100, 2047]"), "packets.0.apids.1: expected less than or equal to 2046"),
         (DEFINED.replace("'none'", "'maybe'"), "packets.0.packet_checksum: expected 'crc16' or 'none'"),
-        (
-            DEFINED.replace("whole_octets = 2", "whole_octets = 4"),
-            "packets.0.time: expected 2 or 3 octets of days",
-        ),
+        (DEFINED.replace("whole_octets = 2", "whole_octets = 4"), "packets.0.time: expected 2 or 3 octets of days"),
         (DEFINED.replace("1958-01-01T00:00:00Z", "long ago"), "packets.0.time: expected an epoch such as"),
         (DEFINED.replace("clock", "clok"), "packets.0.time.clok: expected 'clock', found unknown key 'clok'"),
         (DEFINED + DEFINED.replace("'bus'", "'two'"), "each APID in one entry of packets, found 100"),
@@ -627,9 +601,7 @@ def test_documents_have_one_limit_for_their_sum(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(definitions, "DOCUMENTS_LIMIT_OCTETS", 1000)
     packed = XTCE_COMPRESSED + base64.b64encode(gzip.compress(b"<x>" + b" " * 600)).decode()
     source = {"name": "a", "apids": [5], "packet_checksum": "none", "xtce": [packed]}
-    mission = Mission.model_validate(
-        {"name": "m", "packets": [source, {**source, "name": "b", "apids": [6]}]}
-    )
+    mission = Mission.model_validate({"name": "m", "packets": [source, {**source, "name": "b", "apids": [6]}]})
     faults = [str(one) for one in definitions.definition_faults(mission, "m")]
     assert "of documents in all, found more" in faults[-1] and "in all" not in faults[0]
 
@@ -643,3 +615,28 @@ def test_a_long_document_is_embedded_compressed(ground: Ground, tmp_path: Path) 
     assert add_mission(ground, read_mission_file(path)).id == entered.id
     ingest_file(ground, downlink(tmp_path, bus_packets(5)))
     assert parameter_series(ground, define(ground), "VOLTAGE", 100).samples == 5
+
+
+def test_a_declared_packet_from_the_future_is_kept_apart_until_others_agree(ground: Ground, tmp_path: Path) -> None:
+    enter(ground, tmp_path / "m")
+    rng = np.random.default_rng(7)
+    ingest_file(ground, downlink(tmp_path, bus_packets(40)))
+    pass_id = define(ground)
+    late = [at(foreign.housekeeping(rng, 40 + k), 3 * 86_400.0 + k) for k in range(12)]
+    for number, packets in enumerate(([at(foreign.housekeeping(rng, 99), 70 * 365 * 86_400.0)], late[:1])):
+        ingest_file(ground, downlink(tmp_path, packets, f"{number}.cadu"))
+    [one, other] = ground.read(list_implausible, ImplausibleFilter(limit=9)).items
+    assert (one.apid, other.apid) == (100, 100) and "after all other telemetry" in one.reason
+    assert parameter_series(ground, pass_id, "VOLTAGE", 500).samples == 40
+    assert alarm_names(ground) == {"implausible_time"}
+    ingest_file(ground, downlink(tmp_path, late[1:], "3.cadu"))
+    assert len(ground.read(list_implausible, ImplausibleFilter(limit=9)).items) == 1
+    assert newest_declared_ticks_of(ground) < int(ticks_from_utc_ns(START + 4 * 86_400 * NS))
+
+
+def alarm_names(ground: Ground) -> set[str]:
+    return {one.name for one in ground.read(list_alarms, AlarmFilter(limit=99, state=["raised"])).items}
+
+
+def newest_declared_ticks_of(ground: Ground) -> int:
+    return ground.read(newest_declared_ticks, 1) or 0

@@ -11,15 +11,10 @@ import pytest
 from ground_service.access.model import AuditFilter
 from ground_service.access.store import list_audit
 from ground_service.clock import TelemetryTime, set_mission_clock
-from ground_service.contacts.commanding.service import (
-    enter_command,
-    get_command,
-    release_command,
-    take_uplink,
-)
+from ground_service.contacts.commanding.service import enter_command, get_command, release_command, take_uplink
 from ground_service.contacts.links import store as links
 from ground_service.errors import Conflict, StateConflict
-from ground_service.ground import Ground
+from ground_service.ground import Ground, open_ground
 from ground_service.ingest.core import fits_between, implausible_times
 from ground_service.ingest.doubt_store import list_implausible
 from ground_service.ingest.model import ImplausibleFilter
@@ -100,9 +95,7 @@ def test_the_same_report_again_is_kept_once(either: Ground, tmp_path: Path) -> N
     assert len(reasons(either)) == 1 and alarms(either) == {"implausible_time": 1}
 
 
-def test_the_archive_does_not_depend_on_whether_the_wrong_report_came_first(
-    either: Ground, tmp_path: Path
-) -> None:
+def test_the_archive_does_not_depend_on_whether_the_wrong_report_came_first(either: Ground, tmp_path: Path) -> None:
     receive(either, tmp_path, report(TICKS + DAY, 12, temperature_c=99.0))
     receive(either, tmp_path, report(5 << 16, 13, temperature_c=-99.0))
     assert "temperature_c" in alarms(either)
@@ -113,9 +106,7 @@ def test_the_archive_does_not_depend_on_whether_the_wrong_report_came_first(
     assert verify(either, rebuild=True).verdict == "intact"
 
 
-def test_the_next_contact_is_believed_and_puts_back_what_was_kept_apart(
-    either: Ground, tmp_path: Path
-) -> None:
+def test_the_next_contact_is_believed_and_puts_back_what_was_kept_apart(either: Ground, tmp_path: Path) -> None:
     receive(either, tmp_path, contact())
     assert receive(either, tmp_path, contact(TICKS + DAY, 1440, number=2)) == 2
     assert receive(either, tmp_path, contact(TICKS + DAY + (120 << 16), 1442)) == 0
@@ -130,17 +121,13 @@ def test_a_wrong_report_does_not_become_right_when_its_time_comes(ground: Ground
     assert len(reasons(ground)) == 1
 
 
-def test_a_clock_of_the_mission_believes_a_single_report_after_a_silence(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_a_clock_of_the_mission_believes_a_single_report_after_a_silence(ground: Ground, tmp_path: Path) -> None:
     receive(ground, tmp_path, contact())
     set_mission_clock(lambda: NOW + 86_400 * 10**9)
     assert receive(ground, tmp_path, report(TICKS + DAY, 12)) == 0
 
 
-def test_a_clock_that_was_not_set_and_a_stamp_from_the_past_are_kept_apart(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_a_clock_that_was_not_set_and_a_stamp_from_the_past_are_kept_apart(ground: Ground, tmp_path: Path) -> None:
     receive(ground, tmp_path, contact(TICKS - DAY))
     receive(ground, tmp_path, contact(TICKS, 1440))
     assert receive(ground, tmp_path, report(100 << 16, 1452)) == 1
@@ -191,9 +178,7 @@ def test_a_withdrawn_ingest_leaves_no_trace_but_its_record(either: Ground, tmp_p
     assert entry.detail["reason"] == "another flight"
 
 
-def test_telecommands_are_verified_again_after_a_foreign_flight_is_withdrawn(
-    either: Ground, tmp_path: Path
-) -> None:
+def test_telecommands_are_verified_again_after_a_foreign_flight_is_withdrawn(either: Ground, tmp_path: Path) -> None:
     def verification(ticks: int, request: int) -> bytes:
         values = {"request_id": request}
         return DICTIONARY.pack("verification_completed", values, ticks=ticks, sequence_count=0)
@@ -220,19 +205,13 @@ def test_reports_from_before_the_release_do_not_verify_a_telecommand(either: Gro
     take_uplink(either, spacecraft_id=76, actor="ann")
     request = get_command(either, key).record.request_id or 0
     late = {"request_id": request}
-    receive(
-        either,
-        tmp_path,
-        DICTIONARY.pack("verification_completed", late, ticks=TICKS - 2 * HOUR, sequence_count=1),
-    )
+    receive(either, tmp_path, DICTIONARY.pack("verification_completed", late, ticks=TICKS - 2 * HOUR, sequence_count=1))
     assert get_command(either, key).state == "sent"
 
 
 def test_reports_of_an_earlier_boot_do_not_verify_a_telecommand(either: Ground, tmp_path: Path) -> None:
     def completed(ticks: int) -> bytes:
-        return DICTIONARY.pack(
-            "verification_completed", {"request_id": request}, ticks=ticks, sequence_count=1
-        )
+        return DICTIONARY.pack("verification_completed", {"request_id": request}, ticks=ticks, sequence_count=1)
 
     request = 5
     receive(either, tmp_path, contact(boot=3) + completed(TICKS + HOUR // 2))
@@ -243,9 +222,7 @@ def test_reports_of_an_earlier_boot_do_not_verify_a_telecommand(either: Ground, 
     later = TICKS + HOUR
     receive(either, tmp_path, report(later, 900, boot=1) + completed(later + 9))  # of another flight
     assert get_command(either, key).state == "sent"
-    receive(
-        either, tmp_path, report(later + HOUR, 13, boot=4) + completed(later + HOUR + 9)
-    )  # after a reboot
+    receive(either, tmp_path, report(later + HOUR, 13, boot=4) + completed(later + HOUR + 9))  # after a reboot
     assert get_command(either, key).state == "completed"
 
 
@@ -259,11 +236,7 @@ def test_commanding_starts_from_the_count_that_the_payload_reports(either: Groun
     assert record.sequence_count == 42
     take_uplink(either, spacecraft_id=76, actor="ann")
     refused = {"request_id": record.request_id, "failure_code": "out_of_sequence"}
-    receive(
-        either,
-        tmp_path,
-        DICTIONARY.pack("verification_not_accepted", refused, ticks=TICKS + 9, sequence_count=0),
-    )
+    receive(either, tmp_path, DICTIONARY.pack("verification_not_accepted", refused, ticks=TICKS + 9, sequence_count=0))
     assert "send perform_function resynchronise_commands first" in get_command(either, key).remark
 
 
@@ -285,3 +258,37 @@ def test_a_lease_that_ended_in_a_standstill_is_renewed_with_its_state(either: Gr
         assert found is not None and (found.state, found.lease_utc_ns) == ("contact", 55)
         assert links.acquire(connection, "l", 76, "flight", wall_utc_ns=70, **given | {"owner": "b"})
         assert not links.acquire(connection, "l", 76, "flight", wall_utc_ns=10, **given)
+
+
+@pytest.mark.parametrize("ahead", [26 * HOUR, YEARS, 100 * (1 << 16) - TICKS])
+def test_a_detection_of_an_image_at_another_time_is_kept_apart(ground: Ground, tmp_path: Path, ahead: int) -> None:
+    def detections(image_ticks: int, count: int) -> bytes:
+        none = {name: np.zeros(0) for name in ("u_px", "v_px", "diameter_px", "score", "size_class", "sigma_px")}
+        values = {"frame_number": count, "image_ticks": image_ticks, "image_quality": 0, "items": none}
+        return DICTIONARY.pack("detections", values, ticks=TICKS + (11 << 16), sequence_count=count)
+
+    assert receive(ground, tmp_path, contact() + detections(TICKS, 0)) == 0
+    before = hash_of(ground)
+    assert receive(ground, tmp_path, detections(TICKS + ahead, 1)) == 1
+    assert hash_of(ground) == before and alarms(ground) == {"implausible_time": 1}
+    assert reasons(ground)[0].startswith("the time of its image is ")
+    receive(ground, tmp_path, report(TICKS + 12 * (60 << 16), 12))
+    assert len(reasons(ground)) == 1
+
+
+def test_a_day_with_disturbances_ends_with_the_archive_of_the_day_without(tmp_path: Path) -> None:
+    contacts = [contact(TICKS + 2 * HOUR * k, 12 * k) for k in range(12)]
+    with open_ground(tmp_path / "calm") as calm, open_ground(tmp_path / "disturbed") as disturbed:
+        for octets in contacts:
+            receive(calm, tmp_path, octets)
+        late = contacts.copy()
+        late[3], late[4], late[7], late[9] = late[4], late[3], late[9], late[7]
+        for k, octets in enumerate(late):
+            receive(disturbed, tmp_path, octets)
+            wrong = (TICKS + 26 * HOUR * (k + 2), YEARS + TICKS, (100 + k) << 16)[k % 3]
+            if k:
+                receive(disturbed, tmp_path, report(wrong, 4000 + k, temperature_c=99.0))
+            receive(disturbed, tmp_path, late[k // 2])
+        assert hash_of(disturbed) == hash_of(calm)
+        assert disturbed.read(newest_ticks, 1) == calm.read(newest_ticks, 1)
+        assert len(reasons(disturbed)) == 11

@@ -20,7 +20,7 @@ from sqlalchemy import func, select
 
 from benchmarks.campaigns.cuts import KINDS, ORDERS, Archive, Piece, archive, case_of, ingest
 from ground_service.ground import Ground, open_ground
-from ground_service.ingest.core import NO_RECORD, Found
+from ground_service.ingest.core import NO_RECORD, LinkContent
 from ground_service.ingest.frames import FrameReader, PacketReader, Section
 from ground_service.ingest.reception import Reading, Run
 from ground_service.ingest.service import Place, ingest_file
@@ -49,11 +49,11 @@ def reader_of(octets: bytes, spacecraft_id: int | None = None) -> FrameReader | 
     sections = plan_of(octets).sections
     section = Section(None, 0, len(octets), 0, len(octets))
     if not sections:
-        return PacketReader(section, Found(), spacecraft_id=spacecraft_id)
-    return FrameReader(section, sections[0].settings, Found(), spacecraft_id=spacecraft_id, record=NO_RECORD)
+        return PacketReader(section, LinkContent(), spacecraft_id=spacecraft_id)
+    return FrameReader(section, sections[0].settings, LinkContent(), spacecraft_id=spacecraft_id, record=NO_RECORD)
 
 
-def read(octets: bytes, window: int, spacecraft_id: int | None = None) -> tuple[list[bytes], Found, int]:
+def read(octets: bytes, window: int, spacecraft_id: int | None = None) -> tuple[list[bytes], LinkContent, int]:
     """The packets, the counts, and the octets in no frame or packet."""
     reader = reader_of(octets, spacecraft_id)
     packets = [packet for batch in reader.batches(windows(octets, window)) for packet in batch.octets]
@@ -116,7 +116,7 @@ def test_memory_does_not_grow_with_the_stream(packets: list[bytes]) -> None:
     read(stream, 1 << 20)  # imports and compiles
     section = Section(None, 0, 75 * len(stream), 0, 75 * len(stream))
     settings = LinkSettings(frame_length=223)
-    reader = FrameReader(section, settings, Found(), spacecraft_id=SPACECRAFT, record=NO_RECORD)
+    reader = FrameReader(section, settings, LinkContent(), spacecraft_id=SPACECRAFT, record=NO_RECORD)
     peaks: list[int] = []
     tracemalloc.start()
     for _ in reader.batches((as_octets(5 * stream), False) for _ in range(15)):
@@ -132,9 +132,7 @@ def test_memory_does_not_grow_with_the_stream(packets: list[bytes]) -> None:
 @pytest.mark.parametrize("window", [1 << 20, 60_000])
 def test_the_uplink_is_seen_alike_in_windows_and_at_once(packets: list[bytes], window: int) -> None:
     encoder = DownlinkEncoder(SPACECRAFT, LinkSettings(frame_length=223))
-    clcws = [
-        pack_clcw(Clcw(0, k // 9, lockout=40 < k < 60, farm_b_counter=k % 4)) for k in range(len(packets))
-    ]
+    clcws = [pack_clcw(Clcw(0, k // 9, lockout=40 < k < 60, farm_b_counter=k % 4)) for k in range(len(packets))]
     stream = encoder.encode(packets, clcw=clcws)
     (whole,) = decode(stream).uplink
     found, accounting, _ = read(stream, window)
@@ -172,9 +170,7 @@ def several_processes(
 
 def test_each_kind_meets_each_order_and_each_piece_is_of_its_recording() -> None:
     cases = [case_of(number) for number in range(len(KINDS) * len(ORDERS))]
-    assert {(case.kind, case.order) for case in cases} == {
-        (kind, order) for kind in KINDS for order in ORDERS
-    }
+    assert {(case.kind, case.order) for case in cases} == {(kind, order) for kind in KINDS for order in ORDERS}
     for case in cases:
         for recording in case.recordings:
             octets = bytearray(len(recording.octets))
@@ -279,9 +275,7 @@ def test_an_ingest_killed_at_any_moment_loses_and_doubles_nothing(downlink: Path
     rng = np.random.default_rng(11)
     for _ in range(KILLS):
         process = subprocess.Popen(
-            [sys.executable, "-c", INGEST, str(home), str(downlink)],
-            stdout=subprocess.PIPE,
-            env=dict(os.environ),
+            [sys.executable, "-c", INGEST, str(home), str(downlink)], stdout=subprocess.PIPE, env=dict(os.environ)
         )
         assert process.stdout is not None
         process.stdout.readline()

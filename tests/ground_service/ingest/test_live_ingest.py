@@ -14,7 +14,7 @@ import pytest
 from ground_service.errors import InvalidInput, StorageFull
 from ground_service.ground import Ground
 from ground_service.ingest import store
-from ground_service.ingest.core import NO_TIME, Found, RecordFormat
+from ground_service.ingest.core import NO_TIME, LinkContent, RecordFormat
 from ground_service.ingest.frames import FrameReader, Section
 from ground_service.ingest.live import Spool, WatchedFolder
 from ground_service.ingest.service import Place, ingest_file
@@ -187,7 +187,7 @@ def test_a_packet_has_the_reception_time_of_the_frame_in_which_it_begins(window_
     times = START + np.arange(len(rows), dtype=np.int64) * NS
     stream = b"".join(struct.pack(">q", time) + row for time, row in zip(times.tolist(), rows, strict=True))
     section = Section(SETTINGS, 0, len(stream), 0, len(stream))
-    reader = FrameReader(section, SETTINGS, Found(), spacecraft_id=76, record=RECORD)
+    reader = FrameReader(section, SETTINGS, LinkContent(), spacecraft_id=76, record=RECORD)
     blocks = [stream[at : at + window_octets] for at in range(0, len(stream), window_octets)]
     found: dict[int, int] = {}
     for batch in reader.batches((as_octets(one), one is blocks[-1]) for one in blocks):
@@ -199,9 +199,7 @@ def test_a_packet_has_the_reception_time_of_the_frame_in_which_it_begins(window_
     for k in range(len(packets)):
         first, last = int(starts[k]) // zone, (int(starts[k + 1]) - 1) // zone
         # A packet that is continued in a later window of the reader has the time of its end.
-        expected = (
-            {int(times[first])} if window_octets > len(stream) else {int(times[first]), int(times[last])}
-        )
+        expected = {int(times[first])} if window_octets > len(stream) else {int(times[first]), int(times[last])}
         assert found[k] in expected
     assert reader.found.first_utc_ns == times[0]
     assert reader.found.last_utc_ns == times[-1]

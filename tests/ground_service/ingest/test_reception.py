@@ -116,9 +116,7 @@ def test_an_archive_is_read_with_the_settings_of_its_own_mission(ground: Ground,
     assert {one["source"] for one in accounting["reception"]["sections"]} == {"mission"}
 
 
-def test_stated_settings_are_used_as_they_are_and_impossible_ones_are_refused(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_stated_settings_are_used_as_they_are_and_impossible_ones_are_refused(ground: Ground, tmp_path: Path) -> None:
     octets = cadus(30).tobytes()
     right = "frame_length=1115,coding=rs,randomiser=legacy,checksum=true"
     wrong = ingest(ground, tmp_path, octets, link=right.replace("legacy", "long"))
@@ -137,18 +135,14 @@ def test_a_station_may_have_settings_of_its_own(ground: Ground, tmp_path: Path) 
     assert (section(result)["source"], section(result)["frame_length"]) == ("mission", 892)
 
 
-def test_octets_that_do_not_fit_the_declared_settings_are_kept_with_a_remark(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_octets_that_do_not_fit_the_declared_settings_are_kept_with_a_remark(ground: Ground, tmp_path: Path) -> None:
     add_mission(ground, MISSION.encode())
     settings = LinkSettings(frame_length=1024, coding="none")
     octets = cadus(30, 1, settings).tobytes()
     result = ingest(ground, tmp_path, octets, spacecraft_id=SPACECRAFT)
     assert (section(result)["source"], result.packets) == ("mission", 0)
     assert (result.octets, result.octets_skipped > 0) == (len(octets), True)
-    assert (
-        f"0 of {result.frames} frames are valid with the mission link settings (frame_length" in result.remark
-    )
+    assert f"0 of {result.frames} frames are valid with the mission link settings (frame_length" in result.remark
     assert "`linna link check FILE`" in result.remark
     add_mission(ground, MISSION.replace("1115", "1024").replace('"rs"', '"none"').encode())
     again = ingest(ground, tmp_path, octets, spacecraft_id=SPACECRAFT)
@@ -184,11 +178,7 @@ def test_records_of_a_station_give_reception_times_and_their_octets_are_accounte
     n = len(rows)
     assert result.packets == len(packets_of(can_be_read(rows, LinkSettings()), telemetry(60), LinkSettings()))
     assert (quality.first_utc_ns, quality.last_utc_ns) == (START, START + (n - 1) * NS)
-    assert (quality.octets_frames, quality.octets_records, quality.octets_other) == (
-        n * 1279,
-        n * 20,
-        0,
-    )
+    assert (quality.octets_frames, quality.octets_records, quality.octets_other) == (n * 1279, n * 20, 0)
     assert (quality.frames, quality.lock_losses, quality.station) == (n, 0, "madrid")
 
 
@@ -209,9 +199,7 @@ def test_lost_bits_and_inverted_frames_are_lock_losses(ground: Ground, tmp_path:
     assert quality is not None and quality.frames_inverted == len(cadus(30))
 
 
-def test_packets_without_error_control_are_read_if_the_mission_says_so(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_packets_without_error_control_are_read_if_the_mission_says_so(ground: Ground, tmp_path: Path) -> None:
     capture = without_error_control()
     with pytest.raises(InvalidInput):
         ingest(ground, tmp_path, capture.files[0], spacecraft_id=SPACECRAFT)
@@ -222,9 +210,7 @@ def test_packets_without_error_control_are_read_if_the_mission_says_so(
     assert stored(ground) == capture.packets[SPACECRAFT]
 
 
-def test_packets_behind_octets_of_a_recorder_are_read_if_the_mission_says_so(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_packets_behind_octets_of_a_recorder_are_read_if_the_mission_says_so(ground: Ground, tmp_path: Path) -> None:
     packets = without_error_control().packets[SPACECRAFT]
     octets = b"".join(bytes(3) + packet for packet in sorted(packets))
     with pytest.raises(InvalidInput, match=r"`linna link check FILE` shows"):
@@ -285,10 +271,7 @@ def test_the_link_quality_of_both_stations_is_shown_with_the_merged_packets_of_t
     assert found.packets == stream.true
     assert (goldstone.station, madrid.station) == ("goldstone", "madrid")
     assert (goldstone.first_utc_ns, madrid.first_utc_ns) == (None, START)
-    assert [one.frames for one in found.receptions] == [
-        len(stream.files[1]) // 1279,
-        len(stream.files[0]) // 1279,
-    ]
+    assert [one.frames for one in found.receptions] == [len(stream.files[1]) // 1279, len(stream.files[0]) // 1279]
     assert found.frames == sum(one.frames for one in found.receptions)
     assert {one.source for one in found.receptions} == {"mission"}
     told = Completeness.of_accounting(found).receptions

@@ -44,13 +44,9 @@ def test_a_wrap_is_no_gap() -> None:
     seed=st.integers(0, 2**32 - 1),
     first=st.integers(0, COUNT_MODULUS - 1),
 )
-def test_what_is_missing_is_found_whatever_the_order_of_arrival(
-    lost: set[int], seed: int, first: int
-) -> None:
+def test_what_is_missing_is_found_whatever_the_order_of_arrival(lost: set[int], seed: int, first: int) -> None:
     ticks, counts = stream(3000, first)
-    keep = np.random.default_rng(seed).permutation(
-        np.setdiff1d(np.arange(3000), np.array(sorted(lost), dtype=int))
-    )
+    keep = np.random.default_rng(seed).permutation(np.setdiff1d(np.arange(3000), np.array(sorted(lost), dtype=int)))
     account = account_sequence(ticks[keep], counts[keep])
     assert account.lost == len(lost)
     assert account.restarts == 0
@@ -74,9 +70,7 @@ def test_more_than_a_whole_wrap_lost_in_a_silence_is_counted_by_the_usual_rate()
 def test_a_restart_begins_a_new_run_and_loses_nothing() -> None:
     before, counts_before = stream(500)
     after, counts_after = stream(300)
-    account = account_sequence(
-        np.r_[before, after + before[-1] + 60 * SECOND], np.r_[counts_before, counts_after]
-    )
+    account = account_sequence(np.r_[before, after + before[-1] + 60 * SECOND], np.r_[counts_before, counts_after])
     assert (account.restarts, account.lost) == (1, 0)
 
 
@@ -108,18 +102,14 @@ def test_few_packets_have_no_rate_and_a_silence_hides_no_wraps() -> None:
 
 
 @pytest.mark.parametrize(("silence_s", "restarts", "lost"), [(600, 1, 0), (1000, 0, 8383)])
-def test_wraps_are_looked_for_where_half_of_one_could_have_been_made(
-    silence_s: int, restarts: int, lost: int
-) -> None:
+def test_wraps_are_looked_for_where_half_of_one_could_have_been_made(silence_s: int, restarts: int, lost: int) -> None:
     """At ten packets a second 600 s hold 6000 of them and 1000 s hold 10,000; half a wrap is 8192.
 
     A fall of 8000 is then a restart, or 8384 packets further on, of which the last came.
     """
     ticks, counts = stream(9000)
     after, counts_after = stream(100)
-    account = account_sequence(
-        np.r_[ticks, after + ticks[-1] + silence_s * SECOND], np.r_[counts, counts_after + 999]
-    )
+    account = account_sequence(np.r_[ticks, after + ticks[-1] + silence_s * SECOND], np.r_[counts, counts_after + 999])
     assert (account.restarts, account.lost) == (restarts, lost)
 
 
@@ -139,9 +129,7 @@ def test_counts_go_on_from_the_first_of_each_run() -> None:
 
 def test_an_impossible_on_board_time_is_none_and_never_negative_garbage():
     octets = b"".join(
-        DICTIONARY.pack(
-            "time_report", {"reported_ticks": ticks, "rate_exponent": 0}, ticks=9, sequence_count=k
-        )
+        DICTIONARY.pack("time_report", {"reported_ticks": ticks, "rate_exponent": 0}, ticks=9, sequence_count=k)
         for k, ticks in enumerate((0, 2**48 - 1, 2**48, 2**63, 2**64 - 1))
     )
     rows = batch_of_cut(octets, cut_packets(octets)).rows

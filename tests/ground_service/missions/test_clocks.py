@@ -9,13 +9,7 @@ import pytest
 
 from ground_service.access.service import LOCAL_CALLER, session_of
 from ground_service.app import create_app
-from ground_service.clock import (
-    follow_missions,
-    independent_now_ns,
-    is_recorded,
-    mission_now_ns,
-    set_mission_clock,
-)
+from ground_service.clock import follow_missions, independent_now_ns, is_recorded, mission_now_ns, set_mission_clock
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
 from ground_service.missions import clocks
@@ -97,9 +91,9 @@ def test_the_clock_of_telemetry_stands_at_the_newest(ground: Ground, synthetic_p
         last = synthetic_pass.utc_ns[-1]
         assert 0 <= mission_now_ns() - last < 1e9
         assert parse_utc(client.get("/api/v1/session").json()["time"]) // 1000 == mission_now_ns() // 1000
-        assert {
-            one["age_s"] < 600.0 for one in client.get("/api/v1/parameters?spacecraft_id=76").json()["items"]
-        } == {True}
+        assert {one["age_s"] < 600.0 for one in client.get("/api/v1/parameters?spacecraft_id=76").json()["items"]} == {
+            True
+        }
 
 
 def test_archives_alone_have_the_time_of_their_data(ground: Ground, synthetic_pass: Any) -> None:
@@ -110,9 +104,7 @@ def test_archives_alone_have_the_time_of_their_data(ground: Ground, synthetic_pa
     assert seen.recorded and seen.time.utc_ns == mission_now_ns()
     status = service_status(ground, None)
     assert status.mission_time == seen.time and abs(status.time.utc_ns - time.time_ns()) < 600e9
-    assert (
-        abs((independent_now_ns() or 0) - time.time_ns()) < 600e9
-    )  # new telemetry is judged by the wall clock
+    assert abs((independent_now_ns() or 0) - time.time_ns()) < 600e9  # new telemetry is judged by the wall clock
     add_mission(ground, b'name = "m"\n[spacecraft]\nid = 76\n')
     read_mission_clock(ground)
     assert not is_recorded() and abs(mission_now_ns() - time.time_ns()) < 600e9
@@ -145,8 +137,7 @@ def test_a_worker_and_a_scheduler_have_the_clock_of_the_service(ground: Ground) 
 
 
 @pytest.mark.parametrize(
-    "clock",
-    ['source = "simulated"', 'source = "wall", mission = "2029-08-07T06:00:00Z"', 'source = "moon"'],
+    "clock", ['source = "simulated"', 'source = "wall", mission = "2029-08-07T06:00:00Z"', 'source = "moon"']
 )
 def test_an_incomplete_clock_is_refused(clock: str) -> None:
     with pytest.raises(InvalidInput, match="mission_clock"):

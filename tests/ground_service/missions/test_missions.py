@@ -34,12 +34,7 @@ from ground_service.missions.service import (
     read_mission,
     without_tokens,
 )
-from ground_service.missions.store import (
-    approval_in_force,
-    find_revision,
-    list_missions,
-    newest_of_spacecraft,
-)
+from ground_service.missions.store import approval_in_force, find_revision, list_missions, newest_of_spacecraft
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.model import PassDetail
 from ground_service.passes.service import define_pass, get_pass
@@ -73,9 +68,7 @@ sigma_rtn_m = [10, 30, 15.5]
         ("fov_deg =", "m.toml: expected TOML"),
     ],
 )
-def test_a_fault_is_named_with_its_place_what_was_expected_and_what_was_found(
-    line: str, message: str
-) -> None:
+def test_a_fault_is_named_with_its_place_what_was_expected_and_what_was_found(line: str, message: str) -> None:
     text = f'name = "test"\n[camera]\n{line}\n'
     with pytest.raises(InvalidInput) as caught:
         parse_mission(text, "m.toml")
@@ -152,8 +145,7 @@ def test_a_revision_that_is_not_entered_is_not_found(ground, name: str) -> None:
 def test_a_pass_refers_to_the_newest_description_of_its_spacecraft(ground) -> None:
     def define(spacecraft: int) -> PassDetail:
         return get_pass(
-            ground,
-            define_pass(ground, name="p", start_utc_ns=0, stop_utc_ns=10**9, spacecraft_id=spacecraft),
+            ground, define_pass(ground, name="p", start_utc_ns=0, stop_utc_ns=10**9, spacecraft_id=spacecraft)
         )
 
     assert define(76).mission_revision is None
@@ -188,9 +180,7 @@ def test_the_description_of_an_archive_holds_for_its_own_pass_only(ground, make_
     folder = make_pass(frames=2, seed=33, mission=TEXT).folder
 
     def define() -> PassDetail:
-        return get_pass(
-            ground, define_pass(ground, name="p", start_utc_ns=0, stop_utc_ns=10**9, spacecraft_id=76)
-        )
+        return get_pass(ground, define_pass(ground, name="p", start_utc_ns=0, stop_utc_ns=10**9, spacecraft_id=76))
 
     import_archive(ground, folder)
     assert define().mission_revision is None
@@ -199,9 +189,7 @@ def test_the_description_of_an_archive_holds_for_its_own_pass_only(ground, make_
     assert define().mission_revision == entered.revision
 
 
-def test_a_description_that_came_with_an_archive_is_in_force_once_a_person_enters_it(
-    ground, make_pass
-) -> None:
+def test_a_description_that_came_with_an_archive_is_in_force_once_a_person_enters_it(ground, make_pass) -> None:
     text = TEXT + '\n[approval]\none_person_for = ["perform_function/set_mode"]\n'
     import_archive(ground, make_pass(frames=2, seed=35, mission=text).folder)
     add_mission(ground, TEXT.replace("120", "90").encode(), actor="ada")
@@ -312,9 +300,7 @@ def test_a_rule_about_a_telecommand_that_does_not_exist_or_twice_is_refused(line
     assert message in str(fault)
 
 
-def test_windows_approved_automatically_with_critical_telecommands_are_refused(
-    ground, tmp_path: Path
-) -> None:
+def test_windows_approved_automatically_with_critical_telecommands_are_refused(ground, tmp_path: Path) -> None:
     extra = '\n[approval]\nwindows = "automatic"\n[uploads]\ntables = ["orientation"]\n'
     found = "a second person needed for perform_function/set_mode, uplink_first, uplink_middle, uplink_last"
     with pytest.raises(InvalidInput, match=found):
@@ -337,9 +323,7 @@ def test_a_check_of_texts_that_take_long_to_compare_counts_their_lines(ground) -
 
 
 def test_a_wrong_address_of_a_webhook_is_not_shown(ground) -> None:
-    (fault,) = check_mission(
-        ground, (TEXT + '[notify.ops]\nwebhook = "htp://ann:S3CRET@x"\n').encode()
-    ).faults
+    (fault,) = check_mission(ground, (TEXT + '[notify.ops]\nwebhook = "htp://ann:S3CRET@x"\n').encode()).faults
     assert "notify.ops.webhook" in fault and "S3CRET" not in fault
 
 
@@ -467,9 +451,7 @@ PEOPLE = '[automation.channels.people]\nemail = ["a@b"]\n'
         ("[notify.ops]\nemail = ['a@b']\nsigning_secret = 'x'\n", "notify.ops: expected signing_secret with a webhook"),
     ],
 )  # fmt: skip
-def test_a_new_description_with_rules_or_an_impossible_receiver_is_refused_with_one_line(
-    text: str, line: str
-) -> None:
+def test_a_new_description_with_rules_or_an_impossible_receiver_is_refused_with_one_line(text: str, line: str) -> None:
     [fault] = read_document(HEAD + text, "mission.toml")
     assert str(fault).startswith(f"mission.toml, {line}")
 

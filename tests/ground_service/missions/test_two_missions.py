@@ -136,9 +136,7 @@ def test_a_window_is_predicted_with_the_camera_of_its_spacecraft(
     add_reference(ground, made.folder / "reference.oem")
     planners = []
     made_planner = planning.planner_of
-    monkeypatch.setattr(
-        planning, "planner_of", lambda *given: planners.append(made_planner(*given)) or planners[-1]
-    )
+    monkeypatch.setattr(planning, "planner_of", lambda *given: planners.append(made_planner(*given)) or planners[-1])
     for spacecraft in (76, 77):
         entry = planning.WindowEntry("w", START, STOP - 60_000_000_000, 15.0, spacecraft)
         planning.add_window(ground, entry, actor="ann")
@@ -205,11 +203,7 @@ def test_a_description_without_links_keeps_its_revision() -> None:
         ((LINK.replace("downlink", "downlnk"),), "links.0.downlnk", "'downlink'"),
         ((LINK, LINK), "", "each name of links once, found 'lab' again"),
         (('[[links]]\nname = "a"\nkind = "file"\ndownlink = "in"',), "links.0", "absolute path of a folder"),
-        (
-            ('[[links]]\nname = "a"\nkind = "file"\ndownlink = "/x"\nuplink = "/x"',),
-            "links.0",
-            "different folders",
-        ),
+        (('[[links]]\nname = "a"\nkind = "file"\ndownlink = "/x"\nuplink = "/x"',), "links.0", "different folders"),
         (('[[links]]\nname = "a"\nkind = "tcp"',), "links.0", "downlink, uplink or both, found neither"),
         ((LINK.replace('"lab"', '"../lab"'),), "links.0.name", "pattern"),
         (("[resources]\nobserve_hours_per_day = 25.0",), "resources.observe_hours_per_day", "24"),

@@ -61,10 +61,7 @@ def test_a_bomb_is_stopped_before_it_fills_the_disk(ground: Ground, tmp_path: Pa
 def test_too_many_files_files_twice_and_no_zip_at_all_are_refused(
     ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with (
-        pytest.warns(UserWarning, match="Duplicate name"),
-        zipfile.ZipFile(tmp_path / "twice.zip", "w") as archive,
-    ):
+    with pytest.warns(UserWarning, match="Duplicate name"), zipfile.ZipFile(tmp_path / "twice.zip", "w") as archive:
         archive.writestr("a", "1")
         archive.writestr("a", "2")
     refused(ground, tmp_path / "twice.zip", "expected each file once")
@@ -77,11 +74,7 @@ def test_too_many_files_files_twice_and_no_zip_at_all_are_refused(
     with raises(InvalidInput, match="expected a whole file"), unpacked(whole, tmp_path, "whole.zip"):
         pass
     monkeypatch.setattr(archive_import, "ENTRIES_LIMIT", 3)
-    refused(
-        ground,
-        zipped(tmp_path / "many.zip", {str(i): b"" for i in range(4)}),
-        "expected at most 3 files, found 4",
-    )
+    refused(ground, zipped(tmp_path / "many.zip", {str(i): b"" for i in range(4)}), "expected at most 3 files, found 4")
 
 
 def with_directory(folder: Path, entries: int, claimed: int) -> Path:
@@ -94,9 +87,7 @@ def with_directory(folder: Path, entries: int, claimed: int) -> Path:
 
 
 @pytest.mark.parametrize("claimed", [None, 1])
-def test_a_great_directory_is_refused_before_it_is_read(
-    ground: Ground, tmp_path: Path, claimed: int | None
-) -> None:
+def test_a_great_directory_is_refused_before_it_is_read(ground: Ground, tmp_path: Path, claimed: int | None) -> None:
     """The number of entries is counted in the directory, not taken from the end record."""
     entries = 1_200_000 if claimed is None else 100_000
     path = with_directory(tmp_path, entries, claimed or 0xFFFF)

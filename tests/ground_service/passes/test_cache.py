@@ -34,9 +34,7 @@ class Archive:
 
     def telemetry(self, first: int | None, last: int | None, **more: int) -> None:
         vehicle = more.pop("vehicle", self.vehicle)
-        self.happens(
-            TelemetryReceived(vehicle_id=vehicle, packets=1, first_ticks=first, last_ticks=last, **more)
-        )
+        self.happens(TelemetryReceived(vehicle_id=vehicle, packets=1, first_ticks=first, last_ticks=last, **more))
 
     def make(self) -> int:
         self.made += 1

@@ -56,9 +56,7 @@ def utc_ns(second: int) -> int:
 
 
 def defined(ground: Ground, start_utc_ns: int, stop_utc_ns: int, name: str = "p") -> int:
-    return define_pass(
-        ground, name=name, start_utc_ns=start_utc_ns, stop_utc_ns=stop_utc_ns, spacecraft_id=76
-    )
+    return define_pass(ground, name=name, start_utc_ns=start_utc_ns, stop_utc_ns=stop_utc_ns, spacecraft_id=76)
 
 
 @pytest.fixture
@@ -137,10 +135,7 @@ def test_a_pass_without_a_catalogue_has_no_craters(passed: Ground) -> None:
 def receive(ground: Ground, tmp_path: Path, second: int, **values: float) -> None:
     zeros: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
     packet = DICTIONARY.pack(
-        "housekeeping",
-        zeros | values | {"structure_id": 1},
-        ticks=TICKS + second * 65_536,
-        sequence_count=second,
+        "housekeeping", zeros | values | {"structure_id": 1}, ticks=TICKS + second * 65_536, sequence_count=second
     )
     file = tmp_path / f"{second}.cadu"
     file.write_bytes(encode_cadus([packet], spacecraft_id=76))
@@ -317,13 +312,9 @@ def test_passes_are_listed_by_the_verdict_of_their_newest_report(either: Ground)
     assert listed(either) == ([1, 2, 3], 3)
 
 
-def test_the_interval_of_a_pass_takes_time_in_proportion_to_its_starts(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_the_interval_of_a_pass_takes_time_in_proportion_to_its_starts(ground: Ground, tmp_path: Path) -> None:
     file = tmp_path / "starts.packets"
-    file.write_bytes(
-        b"".join(event_packet(TICKS + 65_536 * k, k, "observation_started") for k in range(4_000))
-    )
+    file.write_bytes(b"".join(event_packet(TICKS + 65_536 * k, k, "observation_started") for k in range(4_000)))
     ingest_file(ground, file, spacecraft_id=76)
     key = defined(ground, utc_ns(0), utc_ns(4_000))
     record, begun = ground.read(get_pass, key), time.process_time()

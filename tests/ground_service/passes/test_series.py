@@ -40,14 +40,7 @@ from ground_service.telemetry.writing import store_samples
 from lunar.frames import IauOrientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.messages.oem import load_oem
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
-from tests.ground_service.conftest import (
-    NS,
-    SPACECRAFT,
-    SyntheticPass,
-    define_pass_of,
-    encode_downlink,
-    enter_files,
-)
+from tests.ground_service.conftest import NS, SPACECRAFT, SyntheticPass, define_pass_of, encode_downlink, enter_files
 from tests.lazy import Lazy
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
@@ -194,13 +187,7 @@ def test_few_texts_of_the_query_for_buckets_find_any_number_of_them(ground: Grou
         )
         buckets = np.unique(list(rows.scalars()))
         texts.clear()
-        key = {
-            "vehicle_id": vehicle,
-            "dictionary_version": DICTIONARY.version,
-            "kind": 2,
-            "part": 0,
-            "level": 0,
-        }
+        key = {"vehicle_id": vehicle, "dictionary_version": DICTIONARY.version, "kind": 2, "part": 0, "level": 0}
         for count in range(1, 25):
             wanted = [(key, (buckets[start : start + 4], *[np.zeros(0)] * 4)) for start in range(0, count, 4)]
             whole = {(0, 0): sorted({b for _, (some, *_) in wanted for b in some.tolist()})}
@@ -318,9 +305,7 @@ def test_what_version_2_decoded_is_decoded_again_to_the_same_states(ground: Grou
     assert versions(ground) == {2, DICTIONARY.version}
 
 
-def test_the_report_weighs_errors_with_the_whole_covariance(
-    flown: tuple[Path, Any, int], ground: Ground
-) -> None:
+def test_the_report_weighs_errors_with_the_whole_covariance(flown: tuple[Path, Any, int], ground: Ground) -> None:
     _, made, version = flown
     series = reported(ground, made, anchored_packets(made, version))
     # A hundredth of the error: the reference is interpolated, and places are reported on the sphere.

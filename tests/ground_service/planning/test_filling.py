@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ground_service.planning.filling import NS, Option, ResourceGrid, choose, take_in_order, violation
+from ground_service.planning.filling import Option, ResourceGrid, choose, take_in_order, violation
+from lunar.constants import NS
 
 HOUR = 3600 * NS
 STEP_S = 600.0
@@ -54,10 +55,7 @@ def test_stored_data_leave_in_contacts() -> None:
     silent[60:63] = 1000.0
     assert violation(grid(downlink_octets=silent), [window(1, 1, 3000)]) is None
     assert violation(grid(), [window(1, 1, 10_000)]) is None
-    assert (
-        violation(grid(), [window(1, 1, 10_001)])
-        == "10001 octets would be stored on board, expected at most 10000"
-    )
+    assert violation(grid(), [window(1, 1, 10_001)]) == "10001 octets would be stored on board, expected at most 10000"
     full = grid(downlink_octets=silent)
     assert violation(full, [window(1, 1, 6000), window(3, 1, 5000)]) is not None
     assert violation(full, [window(1, 1, 6000), window(11, 1, 5000)]) is None  # 3000 left in between
@@ -98,9 +96,9 @@ def test_nothing_is_chosen_of_nothing() -> None:
 
 
 options_of_a_day = st.lists(
-    st.tuples(
-        st.integers(0, 40), st.integers(1, 8), st.integers(1, 4000), st.integers(1, 5), st.integers(0, 1)
-    ).map(lambda v: window(v[0] / 2, v[1] / 4, v[2], float(v[3]), v[4])),
+    st.tuples(st.integers(0, 40), st.integers(1, 8), st.integers(1, 4000), st.integers(1, 5), st.integers(0, 1)).map(
+        lambda v: window(v[0] / 2, v[1] / 4, v[2], float(v[3]), v[4])
+    ),
     max_size=7,
     unique=True,
 )
@@ -108,9 +106,7 @@ options_of_a_day = st.lists(
 
 @settings(max_examples=60, deadline=None)
 @given(options_of_a_day, st.integers(0, 4), st.integers(0, 4))
-def test_a_plan_is_feasible_and_not_worse_than_any_order(
-    options: list[Option], first: int, second: int
-) -> None:
+def test_a_plan_is_feasible_and_not_worse_than_any_order(options: list[Option], first: int, second: int) -> None:
     tight = grid(downlink_octets=np.full(144, 150.0), storage_octets=5000.0, observe_s_per_day=4 * 3600.0)
     quota = {0: first, 1: second}
     chosen, reasons = choose(tight, options, quota=quota)

@@ -14,11 +14,12 @@ from ground_service.ground import Ground
 from ground_service.missions.catalogues import add_catalogue, withdraw_catalogue
 from ground_service.missions.service import add_mission
 from ground_service.planning import forecast, service
-from ground_service.planning.filling import NS, Option, ResourceGrid, curves
+from ground_service.planning.filling import Option, ResourceGrid, curves
 from ground_service.planning.model import WindowEntry, WindowSearch
 from ground_service.planning.service import search_windows
 from ground_service.planning.store import get_window
 from lunar.catalogue import CraterCatalogue, save_catalogue
+from lunar.constants import NS
 from lunar.timescales import parse_utc
 from tests.ground_service.conftest import add_reference
 
@@ -68,25 +69,14 @@ def enter(ground: Ground, start_s: float, stop_s: float) -> int:
 
 def shown(ground: Ground, start_s: float = 0.0, stop_s: float = 600.0) -> Any:
     start, stop = (START + round(one * NS) for one in (start_s, stop_s))
-    return forecast.get_forecast(
-        ground, spacecraft_id=76, instance="flight", start_utc_ns=start, stop_utc_ns=stop
-    )
+    return forecast.get_forecast(ground, spacecraft_id=76, instance="flight", start_utc_ns=start, stop_utc_ns=stop)
 
 
-def test_a_forecast_has_the_conditions_of_the_ephemeris_and_the_resources_of_the_mission(
-    planned: Ground,
-) -> None:
+def test_a_forecast_has_the_conditions_of_the_ephemeris_and_the_resources_of_the_mission(planned: Ground) -> None:
     found = shown(planned)
     assert found.step_s == 60.0 and len(found.time_s) == 10
     assert found.time_s[0] == START / NS + 30.0
-    for name in (
-        "latitude_deg",
-        "sunlit",
-        "battery_share",
-        "stored_octets",
-        "sent_octets",
-        "downlink_octets",
-    ):
+    for name in ("latitude_deg", "sunlit", "battery_share", "stored_octets", "sent_octets", "downlink_octets"):
         assert len(getattr(found, name)) == 10
     assert found.altitude_km == pytest.approx([30.0] * 10, abs=0.1)
     assert found.battery_floor == 0.5 and found.storage_octets == 1 << 20

@@ -17,29 +17,13 @@ from ground_service.access.store import list_audit
 from ground_service.contacts.links.core import PredictedContact
 from ground_service.errors import InvalidInput, PlanConflicts
 from ground_service.ground import Ground
-from ground_service.missions.ephemerides.service import (
-    add_ephemeris,
-    covering_ephemerides,
-    withdraw_ephemeris,
-)
+from ground_service.missions.ephemerides.service import add_ephemeris, covering_ephemerides, withdraw_ephemeris
 from ground_service.missions.service import add_mission
-from ground_service.planning.core import (
-    Constraints,
-    Planner,
-    Resources,
-    data_octets,
-    frames_between,
-    storage_peak,
-)
+from ground_service.planning.core import Constraints, Planner, Resources, data_octets, frames_between, storage_peak
 from ground_service.planning.filling import Option
 from ground_service.planning.service import WindowEntry, add_window
 from ground_service.planning.store import get_record
-from ground_service.planning.window_states import (
-    PlannedSpan,
-    WindowEvidence,
-    span_conflicts,
-    state_of,
-)
+from ground_service.planning.window_states import PlannedSpan, WindowEvidence, span_conflicts, state_of
 from lunar.camera import PinholeCamera
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
@@ -74,9 +58,7 @@ def planner(ephemeris: Ephemeris, **resources: Any) -> Planner:
 
 
 def search(plan: Planner, **constraints: Any) -> Any:
-    return plan.search(
-        Constraints(**constraints), plan.ephemeris.start_utc_ns, plan.ephemeris.stop_utc_ns, 15.0
-    )
+    return plan.search(Constraints(**constraints), plan.ephemeris.start_utc_ns, plan.ephemeris.stop_utc_ns, 15.0)
 
 
 def test_altitude_is_kept_all_along_and_missed_just_outside() -> None:
@@ -100,9 +82,7 @@ def test_sunlight_on_the_ground_and_on_the_spacecraft() -> None:
         epochs = np.linspace(candidate.start_utc_ns, candidate.stop_utc_ns, 20).astype(np.int64)
         position, _ = plan.ephemeris.at(epochs)
         sun = np.asarray(sun_position_icrf_m(np.asarray(tdb_s_from_utc_ns(epochs))))
-        cosine = (
-            np.sum(position * sun, axis=1) / np.linalg.norm(position, axis=1) / np.linalg.norm(sun, axis=1)
-        )
+        cosine = np.sum(position * sun, axis=1) / np.linalg.norm(position, axis=1) / np.linalg.norm(sun, axis=1)
         # The Sun stands at 90 degrees less the angle between the zenith and it, parallax below 0.01 degrees.
         assert np.all(np.degrees(np.arcsin(cosine)) > 9.98)
         assert candidate.sunlit_share == 1.0
@@ -141,10 +121,7 @@ def test_an_empty_result_names_the_smallest_set_of_constraints_and_the_nearest_r
     high = search(plan, altitude_m=(80e3, 90e3), latitude_rad=north)
     assert "excluded by altitude 80 to 90 km with" in high.reason
     limited = search(plan, latitude_rad=north, limit_rad=np.radians(50.0))
-    assert (
-        "excluded by latitude 60 to 90 deg, latitude limit of the mission description 50 deg"
-        in limited.reason
-    )
+    assert "excluded by latitude 60 to 90 deg, latitude limit of the mission description 50 deg" in limited.reason
     assert "latitude 60 to 90 deg relaxed by" in limited.reason and "without" not in limited.reason
 
 
@@ -175,9 +152,7 @@ def test_an_observation_has_a_frame_at_its_start_and_none_at_its_stop(duration_s
 
 
 def test_terrain_is_asked_of_the_map() -> None:
-    north = Planner(
-        circle(), IauOrientation(), Resources(), PinholeCamera(), mare=lambda latitude, _: latitude > 0.0
-    )
+    north = Planner(circle(), IauOrientation(), Resources(), PinholeCamera(), mare=lambda latitude, _: latitude > 0.0)
     for wanted, sign in ((True, 1.0), (False, -1.0)):
         found = search(north, mare=wanted).candidates
         assert found
@@ -222,9 +197,7 @@ def test_data_of_a_frame_are_as_long_as_its_packets() -> None:
     # Packet lengths by the ICD: detections 35 + 9 n, navigation state 84, frame outcome 59, housekeeping 92 octets.
     from tmtc.dictionary.payload import DICTIONARY
 
-    lengths = {
-        n: DICTIONARY.packet(n).base_length for n in ("navigation_state", "frame_outcome", "housekeeping")
-    }
+    lengths = {n: DICTIONARY.packet(n).base_length for n in ("navigation_state", "frame_outcome", "housekeeping")}
     one = (
         DICTIONARY.packet("detections").base_length
         + 10 * 9
@@ -236,12 +209,9 @@ def test_data_of_a_frame_are_as_long_as_its_packets() -> None:
 def test_windows_conflict_where_they_overlap() -> None:
     mine = PlannedSpan(1, 100, 200, "draft")
     others = [
-        PlannedSpan(2, 50, 101, "approved"),
-        PlannedSpan(3, 200, 300, "approved"),
-        PlannedSpan(4, 120, 130, "draft"),
-        PlannedSpan(5, 120, 130, "failed"),
-        PlannedSpan(6, 199, 400, "executed"),
-    ]
+        PlannedSpan(2, 50, 101, "approved"), PlannedSpan(3, 200, 300, "approved"),
+        PlannedSpan(4, 120, 130, "draft"), PlannedSpan(5, 120, 130, "failed"), PlannedSpan(6, 199, 400, "executed"),
+    ]  # fmt: skip
     assert [one.window_id for one in span_conflicts(mine, None, others)] == [2, 6]
     near = span_conflicts(mine, None, others, gap_ns=1)
     assert [one.window_id for one in near] == [2, 3, 6]
@@ -270,14 +240,9 @@ SENT = ("completed", "accepted")
         (WindowEvidence("approved", command_states=SENT, frames=2), "executing"),
         (WindowEvidence("approved", command_states=SENT, started=True, stopped=True, lost=2), "executed"),
         (WindowEvidence("approved", command_states=SENT, frames=9, received_after=True, lost=1), "executed"),
+        (WindowEvidence("approved", command_states=SENT, frames=9, received_after=True, lost=0), "downlinked"),
         (
-            WindowEvidence("approved", command_states=SENT, frames=9, received_after=True, lost=0),
-            "downlinked",
-        ),
-        (
-            WindowEvidence(
-                "approved", command_states=SENT, frames=9, received_after=True, lost=0, reported=True
-            ),
+            WindowEvidence("approved", command_states=SENT, frames=9, received_after=True, lost=0, reported=True),
             "processed",
         ),
     ],
@@ -289,9 +254,7 @@ def test_the_state_follows_from_the_facts(evidence: WindowEvidence, expected: st
 
 
 def test_a_window_that_failed_names_the_telecommand_and_its_failure() -> None:
-    evidence = WindowEvidence(
-        "approved", command_states=("failed",), failure="insert_activity not accepted: busy"
-    )
+    evidence = WindowEvidence("approved", command_states=("failed",), failure="insert_activity not accepted: busy")
     assert state_of(evidence)[1] == "a telecommand of it failed: insert_activity not accepted: busy"
 
 
@@ -312,9 +275,7 @@ def test_a_window_outside_the_ephemerides_has_no_prediction(ground: Ground, synt
     assert (predicted.frames, predicted.battery_minimum, predicted.downlinked_by) == (40, None, None)
 
 
-def test_a_window_whose_tables_need_the_ephemeris_is_refused_outside_it(
-    ground: Ground, synthetic_pass: Any
-) -> None:
+def test_a_window_whose_tables_need_the_ephemeris_is_refused_outside_it(ground: Ground, synthetic_pass: Any) -> None:
     add_reference(ground, synthetic_pass.folder / "reference.oem")
     add_mission(ground, (MISSION + "[uploads]\n").encode())
     with pytest.raises(PlanConflicts, match="expected a time that a reference ephemeris covers"):
@@ -334,9 +295,7 @@ def test_an_ephemeris_that_gravity_does_not_move_is_refused_with_the_acceleratio
     (one,) = load_oem(save_circle(tmp_path / "km.oem")).segments
     metres = replace(one, position_m=1e3 * one.position_m, velocity_m_s=1e3 * one.velocity_m_s)
     save_oem(Ephemeris((metres,)), tmp_path / "m.oem")
-    message = (
-        r"ephemeris, states of SELENITA: expected an acceleration of \S+ m/s2 .* found .*metres for kilo"
-    )
+    message = r"ephemeris, states of SELENITA: expected an acceleration of \S+ m/s2 .* found .*metres for kilo"
     with pytest.raises(InvalidInput, match=message):
         add_ephemeris(ground, ground.files.put_file(tmp_path / "m.oem"), name="metres")
     assert add_ephemeris(ground, ground.files.put_file(tmp_path / "km.oem"), name="km").states == 240
@@ -350,9 +309,7 @@ def test_an_ephemeris_belongs_to_a_spacecraft_and_can_be_withdrawn(
     own = add_ephemeris(ground, ground.files.put_file(synthetic_pass.folder / "reference.oem"), name="own")
     add_mission(ground, (MISSION + 'name = "SelenITA"\n').encode())
     other = ground.files.put_file(tmp_path / "other.oem")
-    with pytest.raises(
-        InvalidInput, match=r"OBJECT_NAME: expected a spacecraft .* \(SelenITA, .*, found OTHER"
-    ):
+    with pytest.raises(InvalidInput, match=r"OBJECT_NAME: expected a spacecraft .* \(SelenITA, .*, found OTHER"):
         add_ephemeris(ground, other, name="other", precedence=9)
     add_mission(ground, b'name = "second"\n[spacecraft]\nid = 77\nobject_names = ["Other"]\n')
     foreign = add_ephemeris(ground, other, name="other", precedence=9)

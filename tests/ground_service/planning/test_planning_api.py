@@ -93,9 +93,7 @@ def test_drafts_may_overlap_but_only_one_can_be_approved(client: TestClient) -> 
     keys = [window(client, 0, 300).json()["id"] for _ in range(2)]
     assert client.patch(f"{V1}/windows/{keys[0]}", json={"state": "approved"}).status_code == 200
     assert client.patch(f"{V1}/windows/{keys[1]}", json={"state": "approved"}).status_code == 409
-    moved = client.patch(
-        f"{V1}/windows/{keys[1]}", json={"start": at(300), "stop": at(400), "state": "approved"}
-    )
+    moved = client.patch(f"{V1}/windows/{keys[1]}", json={"start": at(300), "stop": at(400), "state": "approved"})
     assert moved.status_code == 200
     assert client.patch(f"{V1}/windows/{keys[1]}", json={"cadence_s": 5}).status_code == 409
 
@@ -131,11 +129,7 @@ def test_an_approved_window_becomes_time_tagged_telecommands(client: TestClient)
     assert client.get(f"{V1}/telecommands").json()["total"] == 0
     assert client.post(f"{V1}/windows/{key}/uplink").json()["total"] == 3
     again = client.post(f"{V1}/windows/{key}/uplink").json()
-    assert [one["name"] for one in again["items"]] == [
-        "enable_schedule",
-        "insert_activity",
-        "insert_activity",
-    ]
+    assert [one["name"] for one in again["items"]] == ["enable_schedule", "insert_activity", "insert_activity"]
     stream = client.post(f"{V1}/uplink", params={"spacecraft_id": 76}).content
     packets = [DICTIONARY.unpack_command(packet) for packet in UplinkDecoder(76).decode(stream).packets]
     assert [packet.name for packet in packets] == ["enable_schedule", "insert_activity", "insert_activity"]
@@ -150,9 +144,7 @@ def test_an_approved_window_becomes_time_tagged_telecommands(client: TestClient)
     assert client.get(f"{V1}/windows/{key}").json()["state"] == "uplinked"
     assert client.delete(f"{V1}/windows/{key}").status_code == 409
     assert client.patch(f"{V1}/windows/{key}", json={"state": "draft"}).status_code == 409
-    failed = client.patch(
-        f"{V1}/windows/{key}", json={"state": "failed", "reason": "spacecraft in safe mode"}
-    )
+    failed = client.patch(f"{V1}/windows/{key}", json={"state": "failed", "reason": "spacecraft in safe mode"})
     assert failed.json()["reason"] == "spacecraft in safe mode"
 
 
@@ -194,9 +186,7 @@ def telemetry(frames: int = 5) -> list[bytes]:
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
-def test_the_state_follows_telemetry_in_whatever_order_it_comes(
-    client: TestClient, order: tuple[int, ...]
-) -> None:
+def test_the_state_follows_telemetry_in_whatever_order_it_comes(client: TestClient, order: tuple[int, ...]) -> None:
     key = approved(client, 60, 120)
     client.post(f"{V1}/windows/{key}/uplink")
     client.post(f"{V1}/uplink", params={"spacecraft_id": 76})

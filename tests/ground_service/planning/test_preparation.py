@@ -18,9 +18,7 @@ NS = 1_000_000_000
 START = parse_utc("2029-08-08T10:00:00Z")
 STOP = START + 600 * NS
 ALL = Uploads(
-    tables=("orientation", "anchor_ephemeris", "initial_state"),
-    sigma_position_m=500.0,
-    sigma_velocity_m_s=0.5,
+    tables=("orientation", "anchor_ephemeris", "initial_state"), sigma_position_m=500.0, sigma_velocity_m_s=0.5
 )
 
 

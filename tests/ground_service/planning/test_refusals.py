@@ -25,14 +25,7 @@ from linna.cli import run
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc, ticks_from_utc_ns
-from tests.ground_service.conftest import (
-    START,
-    Clock,
-    add_reference,
-    circular_states,
-    event_packet,
-    save_circle,
-)
+from tests.ground_service.conftest import START, Clock, add_reference, circular_states, event_packet, save_circle
 from tmtc.dictionary.payload import DICTIONARY
 
 NS = 10**9
@@ -70,9 +63,7 @@ def receive(ground: Ground, folder: Path, *packets: bytes) -> None:
     ingest_file(ground, file, spacecraft_id=76)
 
 
-def verified(
-    ground: Ground, window: Window, after: int, outcome: str = "verification_completed"
-) -> list[bytes]:
+def verified(ground: Ground, window: Window, after: int, outcome: str = "verification_completed") -> list[bytes]:
     """Reports of the telecommands of a window that delete activities."""
     found = [get_command(ground, key).record for key in ground.read(get_window, window.id).telecommands]
     values = {} if outcome == "verification_completed" else {"failure_code": "no_such_activity"}
@@ -83,9 +74,7 @@ def verified(
     ]
 
 
-def test_a_window_that_has_begun_is_neither_entered_nor_approved_nor_released(
-    either: Ground, now: Clock
-) -> None:
+def test_a_window_that_has_begun_is_neither_entered_nor_approved_nor_released(either: Ground, now: Clock) -> None:
     add_mission(either, MISSION)
     with pytest.raises(PlanConflicts, match="expected a start after the mission time 2029-08-07T06:00:00"):
         planning.add_window(either, entry(START), actor="ann")
@@ -139,9 +128,7 @@ def test_a_spacecraft_without_a_description_is_not_planned(either: Ground, now: 
     with pytest.raises(Conflict, match=r"spacecraft 77"):
         planning.search_windows(either, WindowSearch(spacecraft_id=77))
     with pytest.raises(Conflict, match=r"spacecraft 77"):
-        get_forecast(
-            either, spacecraft_id=77, instance="flight", start_utc_ns=START, stop_utc_ns=START + MINUTE
-        )
+        get_forecast(either, spacecraft_id=77, instance="flight", start_utc_ns=START, stop_utc_ns=START + MINUTE)
 
 
 def test_a_window_on_board_is_cancelling_until_its_activities_are_deleted(
@@ -184,31 +171,20 @@ def test_a_cancelled_window_that_flies_all_the_same_becomes_a_pass_with_a_remark
     assert made.name == "w (it was flown although it was cancelled)"
 
 
-def test_a_window_that_has_begun_on_board_cannot_be_cancelled(
-    either: Ground, tmp_path: Path, now: Clock
-) -> None:
+def test_a_window_that_has_begun_on_board_cannot_be_cancelled(either: Ground, tmp_path: Path, now: Clock) -> None:
     window = on_board(either)
     now.utc_ns += 61 * MINUTE
     for state in ("uplinked", "executing"):
         assert either.read(get_window, window.id).state == state
-        with pytest.raises(
-            Conflict, match="too late to delete its activities; perform_function stop_observation"
-        ):
+        with pytest.raises(Conflict, match="too late to delete its activities; perform_function stop_observation"):
             decided(either, window, "failed")
-        receive(
-            either,
-            tmp_path,
-            event_packet(int(ticks_from_utc_ns(window.start.utc_ns)), 0, "observation_started"),
-        )
+        receive(either, tmp_path, event_packet(int(ticks_from_utc_ns(window.start.utc_ns)), 0, "observation_started"))
 
 
 def save_with_hole(path: Path) -> Path:
     """Write an ephemeris of four hours without the second one."""
     utc_ns = START + np.arange(0, 240, dtype=np.int64) * MINUTE
-    parts = [
-        ephemeris_from_states(times, *circular_states(times)).segments[0]
-        for times in (utc_ns[:60], utc_ns[120:])
-    ]
+    parts = [ephemeris_from_states(times, *circular_states(times)).segments[0] for times in (utc_ns[:60], utc_ns[120:])]
     save_oem(Ephemeris(tuple(parts)), path)
     return path
 
@@ -222,9 +198,7 @@ def test_a_search_goes_around_a_hole_or_takes_the_ephemeris_that_has_none(
     found = planning.search_windows(ground, asked)
     assert found.ephemeris_id == hole and found.candidates
     inside = (START + 60 * MINUTE, START + 119 * MINUTE)
-    assert not [
-        one for one in found.candidates if one.start.utc_ns < inside[1] and one.stop.utc_ns > inside[0]
-    ]
+    assert not [one for one in found.candidates if one.start.utc_ns < inside[1] and one.stop.utc_ns > inside[0]]
     assert "without 1 spans that it does not cover" in found.data[0]
     whole = add_reference(ground, save_circle(tmp_path / "whole.oem"))
     later = add_reference(ground, save_with_hole(tmp_path / "hole2.oem"))

@@ -124,19 +124,13 @@ def test_the_coming_days_are_filled_approved_and_released(either: Ground, oem: P
         assert one.state == "approved" and one.start.utc_ns >= now.utc_ns + standing.LEAD_NS
         assert one.predicted.sun_elevation_deg is not None and one.predicted.sun_elevation_deg.min >= -0.1
     plan = either.read(get_plan, key)
-    assert [one.window_id for one in plan.candidates if one.outcome == "planned"] == sorted(
-        one.id for one in windows
-    )
+    assert [one.window_id for one in plan.candidates if one.outcome == "planned"] == sorted(one.id for one in windows)
     left = [one.reason for one in plan.candidates if one.outcome == "rejected"]
     assert left and all(left) and "the number of windows of its period is planned" in left
     assert either.read(get_request, key).windows == {"approved": 2}
     commands = either.read(list_telecommands, TelecommandFilter(state="released")).items
-    assert len(commands) == 6 and all(
-        get_command(either, one.id).record.send_before_utc_ns for one in commands
-    )
-    assert [e.payload["request_id"] for e in read_events(either.database, 0, 9999) if e.kind == "plan"] == [
-        key
-    ]
+    assert len(commands) == 6 and all(get_command(either, one.id).record.send_before_utc_ns for one in commands)
+    assert [e.payload["request_id"] for e in read_events(either.database, 0, 9999) if e.kind == "plan"] == [key]
 
 
 def test_doing_it_again_changes_nothing(either: Ground, oem: Path, now: Clock) -> None:
@@ -169,9 +163,7 @@ def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, oem
     failed = either.read(get_window, first.id)
     assert (failed.state, failed.reason) == ("failed", standing.NO_CONTACT)
     assert {
-        get.state
-        for get in either.read(list_telecommands, TelecommandFilter()).items
-        if get.window_id == first.id
+        get.state for get in either.read(list_telecommands, TelecommandFilter()).items if get.window_id == first.id
     } == {"rejected"}
     assert either.read(get_plan, key).replaced == [{"window_id": first.id, "reason": standing.NO_CONTACT}]
     assert either.read(get_request, key).windows == {"approved": 2, "failed": 1}
@@ -198,9 +190,7 @@ def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(
     assert found[0].reason == "a telecommand of it failed"
 
 
-def test_windows_of_the_present_period_count_long_after_they_ended(
-    ground: Ground, oem: Path, now: Clock
-) -> None:
+def test_windows_of_the_present_period_count_long_after_they_ended(ground: Ground, oem: Path, now: Clock) -> None:
     prepare(ground, oem)
     key = request(ground, windows=1)
     standing.plan_tick(ground, now.utc_ns)
@@ -295,9 +285,7 @@ def test_a_window_that_cannot_be_released_states_the_reason(ground: Ground, oem:
 
 
 def test_windows_keep_the_limits_of_images(ground: Ground, oem: Path, now: Clock) -> None:
-    prepare(
-        ground, oem, AUTOMATIC + LINKS + "[observation]\nlatitude_limit_deg = 50\nneeds_daylight = false\n"
-    )
+    prepare(ground, oem, AUTOMATIC + LINKS + "[observation]\nlatitude_limit_deg = 50\nneeds_daylight = false\n")
     request(ground, windows=20, minimum_duration_s=200.0)
     standing.plan_tick(ground, now.utc_ns)
     windows = windows_of(ground)
@@ -309,15 +297,10 @@ def test_windows_keep_the_limits_of_images(ground: Ground, oem: Path, now: Clock
     key = request(ground, regions=[region], minimum_duration_s=60.0)
     standing.plan_tick(ground, now.utc_ns)
     reason = ground.read(get_plan, key).reason
-    assert (
-        reason is not None
-        and "excluded by latitude limit of the mission description 50 deg, regions" in reason
-    )
+    assert reason is not None and "excluded by latitude limit of the mission description 50 deg, regions" in reason
     start = windows[0].start.utc_ns + HOUR // 2
     entry = WindowEntry("pole", start, start + HOUR, 15.0, 76)
-    with pytest.raises(
-        PlanConflicts, match="expected latitudes within the 50 deg of the mission description"
-    ):
+    with pytest.raises(PlanConflicts, match="expected latitudes within the 50 deg of the mission description"):
         planning.add_window(ground, entry, actor="ann")
 
 

@@ -43,14 +43,7 @@ from ground_service.regression.pass_archives import LIVE, NO_INPUTS, archive_of_
 from ground_service.regression.service import find_replay, run_regression
 from linna.commands import regress
 from lunar.datafolder import find_data
-from tests.ground_service.conftest import (
-    SPACECRAFT,
-    START,
-    FlyablePass,
-    SyntheticPass,
-    encode_downlink,
-    enter_files,
-)
+from tests.ground_service.conftest import SPACECRAFT, START, FlyablePass, SyntheticPass, encode_downlink, enter_files
 
 REPLAY = KeptReplay(
     outcome="ok", detail="", downlink_sha256=None, performance_sha256=None, wall_s=1.0, cpu_s=1.0, peak_rss_mib=1.0,
@@ -99,19 +92,14 @@ def test_an_imported_pass_is_kept_without_a_request(either: Ground, flown: Flyab
     assert keep_pass(either, pass_id).digest == digest
     [kept] = kept_archives(either)
     told = {"frames": 4, "state": "complete", "reason": ""}
-    assert (
-        kept.model_dump().items()
-        >= {**told, "digest": digest, "pass_id": pass_id, "frames_stored": 4}.items()
-    )
+    assert kept.model_dump().items() >= {**told, "digest": digest, "pass_id": pass_id, "frames_stored": 4}.items()
     [job] = either.read(list_jobs, JobFilter(kind="automation")).items
     assert job.result["archive of pass 1"] == {**told, "archive": digest}
     given = Comparison(candidate="current", passes=[pass_id])
     assert compared(either, given)["archives"] == [digest]
 
 
-def test_an_archive_without_inputs_of_the_payload_is_telemetry_only(
-    ground: Ground, archive: SyntheticPass
-) -> None:
+def test_an_archive_without_inputs_of_the_payload_is_telemetry_only(ground: Ground, archive: SyntheticPass) -> None:
     pass_id = import_archive(ground, archive.folder)
     [kept] = kept_archives(ground)
     assert (kept.pass_id, kept.state, kept.reason) == (pass_id, "telemetry only", NO_INPUTS)
@@ -294,9 +282,7 @@ def test_an_archive_that_cannot_be_rendered_is_settled_once(
     assert rendering.settle_archive(ground, first.digest) == first
 
 
-def test_an_unchanged_archive_keeps_its_replays(
-    ground: Ground, unrendered: Path, make_build: Callable
-) -> None:
+def test_an_unchanged_archive_keeps_its_replays(ground: Ground, unrendered: Path, make_build: Callable) -> None:
     digest = keep_archive(ground, unrendered).digest
     rendering.settle_archive(ground, digest)
     build = good(ground, make_build, {})
@@ -353,9 +339,7 @@ def test_detections_besides_all_frames_are_refused_and_not_given_to_a_build(
     assert not (tmp_path / "partial/frames").exists()
 
 
-def test_a_placebo_sees_images_with_noise_of_its_seed_and_their_hashes(
-    flown: FlyablePass, tmp_path: Path
-) -> None:
+def test_a_placebo_sees_images_with_noise_of_its_seed_and_their_hashes(flown: FlyablePass, tmp_path: Path) -> None:
     images, hashes = [], []
     for k, seed in enumerate((5, 5, 6)):
         view = tmp_path / str(k)
@@ -428,9 +412,7 @@ def test_files_are_removed_after_the_commit_and_only_if_all_kept_archives_are_kn
     assert keep_archive(either, unrendered).digest == second.digest
 
 
-def test_an_archive_is_rendered_again_on_request(
-    ground: Ground, unrendered: Path, render_whole: Callable
-) -> None:
+def test_an_archive_is_rendered_again_on_request(ground: Ground, unrendered: Path, render_whole: Callable) -> None:
     digest = keep_archive(ground, unrendered).digest
     assert rendering.settle_archive(ground, digest).state == "telemetry only"
     render_whole()
@@ -441,9 +423,7 @@ def test_an_archive_is_rendered_again_on_request(
     assert [one.state for one in kept_archives(ground)] == ["complete"]
 
 
-def test_an_archive_of_an_older_version_asks_for_another_import(
-    ground: Ground, archive: SyntheticPass
-) -> None:
+def test_an_archive_of_an_older_version_asks_for_another_import(ground: Ground, archive: SyntheticPass) -> None:
     pass_id = import_archive(ground, archive.folder)
     ground.files.path(read_manifest(archive.folder)[1]).unlink()
     with raises(InvalidInput, match="import the archive again"):

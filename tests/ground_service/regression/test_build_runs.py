@@ -38,9 +38,7 @@ def archive(make_flyable: Callable) -> Path:
 @pytest.fixture
 def fly(make_build: Callable, archive: Path, tmp_path: Path) -> Callable[..., BuildRun]:
     def run(program: str, limits: str = LIMITS) -> BuildRun:
-        build = load_build(
-            make_build("bad", program="import os, pathlib, sys, time\n" + program, extra=limits)
-        )
+        build = load_build(make_build("bad", program="import os, pathlib, sys, time\n" + program, extra=limits))
         return run_build(build, archive, tmp_path / "out")
 
     return run
@@ -62,9 +60,7 @@ def test_builds_do_not_run_without_bubblewrap(fly, monkeypatch: pytest.MonkeyPat
     host.protection.cache_clear()
     run = fly("pathlib.Path(sys.argv[2], 'downlink.packets').write_bytes(b'abc')")
     assert (run.outcome, run.downlink) == ("refused", None)
-    assert run.detail.startswith(
-        "expected the program bwrap (Debian package bubblewrap), found none; remedy: "
-    )
+    assert run.detail.startswith("expected the program bwrap (Debian package bubblewrap), found none; remedy: ")
 
 
 def test_a_refusal_has_a_reason_if_python_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -114,16 +110,12 @@ def test_a_program_that_makes_too_many_files_is_stopped(fly, monkeypatch: pytest
         ),
     ],
 )
-def test_a_program_that_kills_itself_or_exceeds_a_limit_is_told_so(
-    fly, program: str, outcome: str, told: str
-) -> None:
+def test_a_program_that_kills_itself_or_exceeds_a_limit_is_told_so(fly, program: str, outcome: str, told: str) -> None:
     run = fly(program, LIMITS.replace("cpu_s = 10", "cpu_s = 1"))
     assert run.outcome == outcome and told in run.detail
 
 
-def test_a_program_that_is_not_there_is_a_crash_and_no_error_of_the_ground(
-    archive: Path, tmp_path: Path
-) -> None:
+def test_a_program_that_is_not_there_is_a_crash_and_no_error_of_the_ground(archive: Path, tmp_path: Path) -> None:
     file = tmp_path / "build.toml"
     file.write_text('name = "gone"\ncommand = ["/nonexistent/program", "{archive}", "{out}"]\n')
     run = run_build(load_build(file), archive, tmp_path / "out")
@@ -162,9 +154,7 @@ def test_a_program_gets_no_socket_but_pairs_of_its_own(fly) -> None:
     assert run.downlink.read_text() == "[1, 1, 1, 1, 1, 'x', 1]"
 
 
-def test_a_program_sees_what_the_payload_was_given_and_no_truth_or_secret(
-    fly, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_program_sees_what_the_payload_was_given_and_no_truth_or_secret(fly, monkeypatch: pytest.MonkeyPatch) -> None:
     for secret in ("LINNA_DATABASE_URL", "HTTPS_PROXY", "LINNA_DATA"):
         monkeypatch.setenv(secret, "postgresql://secret")
     run = fly(
@@ -292,8 +282,7 @@ def write(tmp_path: Path) -> Callable[[str], str]:
     [
         (
             "flight.anchored.gravity_degre = 60",
-            "p.toml, flight.anchored.gravity_degre: expected gravity_degree (nearest known key), "
-            "found an unknown key",
+            "p.toml, flight.anchored.gravity_degre: expected gravity_degree (nearest known key), found an unknown key",
         ),
         (
             "detector.score_threshold = 7.0",
@@ -356,9 +345,7 @@ def test_a_build_that_cannot_be_checked_is_not_registered(
     assert ground.read(list_builds, Paging()).items == []
 
 
-def test_the_command_checks_a_build_file(
-    write: Callable[[str], str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_checks_a_build_file(write: Callable[[str], str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["replay", "--check-build", write("detector.max_detection = 3")]) == 2
     assert "expected max_detections (nearest known key), found an unknown key" in capsys.readouterr().out
     file = write("detector.max_detections = 3")

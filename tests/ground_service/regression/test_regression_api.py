@@ -95,24 +95,17 @@ def test_something_else_than_a_zip_is_no_build(client: TestClient) -> None:
     assert "expected a complete zip file, found something else, or a part of one" in refused.text
 
 
-def test_only_an_administrator_registers_a_program(
-    guarded: Any, make_build: Callable, tmp_path: Path
-) -> None:
+def test_only_an_administrator_registers_a_program(guarded: Any, make_build: Callable, tmp_path: Path) -> None:
     client, heads = guarded
     body = zipped(make_build("program").parent, tmp_path / "b.zip")
-    found = {
-        role: client.post(f"{V1}/builds", content=body, headers=one).status_code
-        for role, one in heads.items()
-    }
+    found = {role: client.post(f"{V1}/builds", content=body, headers=one).status_code for role, one in heads.items()}
     assert found == {"viewer": 403, "operator": 403, "admin": 201}
 
 
 def test_the_suite_states_what_its_passes_can_detect_before_anything_is_run(capsys) -> None:
     assert run(["regress", "suite", "low", "plains", "--frames", "49", "--seeds", "2", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["passes"] == [
-        {"scenario": name, "frames": 49} for name in ("low", "low-1", "plains", "plains-1")
-    ]
+    assert found["passes"] == [{"scenario": name, "frames": 49} for name in ("low", "low-1", "plains", "plains-1")]
     rows = {one["metric"]: one for one in found["detectable"]}
     assert (rows["detector.recall"]["frames"], rows["detector.recall"]["minutes"]) == (196, 1.0)
     assert 0.03 < rows["detector.recall"]["change"] < 0.15

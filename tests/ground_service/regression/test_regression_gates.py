@@ -147,9 +147,7 @@ def largest_count(trials: int, rate: float) -> int:
 
 @pytest.mark.parametrize("passes", [1, 5])
 def test_equal_builds_fail_once_in_a_hundred_at_most_and_pass_on_five_windows(passes: int) -> None:
-    outcomes = [
-        verdict_of(judge(suite(0, passes, 100 * k), suite(1, passes, 100 * k), POLICY)) for k in range(100)
-    ]
+    outcomes = [verdict_of(judge(suite(0, passes, 100 * k), suite(1, passes, 100 * k), POLICY)) for k in range(100)]
     assert outcomes.count("fail") <= largest_count(100, 0.01)
     assert outcomes.count("pass") >= 95
 
@@ -166,9 +164,7 @@ def test_equal_builds_fail_once_in_a_hundred_at_most_and_pass_on_five_windows(pa
         (20, {"error": 1.25}, "navigation.anchored.p50"),
     ],
 )
-def test_a_degraded_build_fails_by_the_metric_that_is_worse(
-    passes: int, faults: dict[str, Any], name: str
-) -> None:
+def test_a_degraded_build_fails_by_the_metric_that_is_worse(passes: int, faults: dict[str, Any], name: str) -> None:
     for noise in range(1, 6):
         assert failed(suite(0, passes), suite(noise, passes, **faults)) == {name}
 
@@ -198,8 +194,7 @@ def test_identical_octets_pass_at_once_whatever_the_number_of_frames() -> None:
 
 def test_few_tracks_claim_only_a_loss_beyond_the_margin_and_say_how_many_frames_are_needed() -> None:
     before, after, slight, great = (
-        suite(noise, 1, tracks=30, recall=recall)
-        for noise, recall in ((0, 0.7), (1, 0.7), (1, 0.6), (1, 0.2))
+        suite(noise, 1, tracks=30, recall=recall) for noise, recall in ((0, 0.7), (1, 0.7), (1, 0.6), (1, 0.2))
     )
     recall = judged(before, after)
     assert (recall.outcome, recall.reason) == ("inconclusive", "30 of 90 tracks")
@@ -267,9 +262,7 @@ def test_an_open_gate_says_how_many_frames_decide_it() -> None:
 
 def test_position_errors_are_judged_by_passes_from_ten_on() -> None:
     before, after = suite(0, 12), suite(1, 12, error=1.2)
-    medians = [
-        [np.median(one.estimators["anchored"].error_m) for one in build.values()] for build in (before, after)
-    ]
+    medians = [[np.median(one.estimators["anchored"].error_m) for one in build.values()] for build in (before, after)]
     change = np.diff(np.log(medians), axis=0)
     error = np.std(change, ddof=1) / np.sqrt(12)
     median = "navigation.anchored.p50"
@@ -315,16 +308,8 @@ EXACT = [
     ),
     ("navigation.wrong_fixes", {"wrong": 3}, "3 fixes are wrong, against 0 of the baseline"),
     ("memory", {"memory_mib": 320.0}, "peak memory rises from 250 to 320 MiB"),
-    (
-        "latency.total",
-        {"latency_ms": {"a": np.full(FRAMES, 56.0)}},
-        "processor time of a frame rises from 40 to 56 ms",
-    ),
-    (
-        "latency.start",
-        {"cpu_s": TIMES["cpu_s"] + 2.0},
-        "processor time of the start rises from 3 to 5 s",
-    ),
+    ("latency.total", {"latency_ms": {"a": np.full(FRAMES, 56.0)}}, "processor time of a frame rises from 40 to 56 ms"),
+    ("latency.start", {"cpu_s": TIMES["cpu_s"] + 2.0}, "processor time of the start rises from 3 to 5 s"),
 ]
 
 
@@ -419,9 +404,7 @@ def test_a_position_without_a_reference_is_a_value() -> None:
 
 def test_wrong_fixes_are_not_judged_without_a_reference() -> None:
     before = suite(1, passes=1)
-    unknown = _estimator(
-        np.ones(FRAMES, np.bool_), np.full((FRAMES, 3), np.nan), np.ones((FRAMES, 3)), {0: "fixed"}
-    )
+    unknown = _estimator(np.ones(FRAMES, np.bool_), np.full((FRAMES, 3), np.nan), np.ones((FRAMES, 3)), {0: "fixed"})
     after = changed(before, estimators={"anchored": unknown})
     assert judged(before, after, "navigation.wrong_fixes").outcome == "not judged"
 
@@ -459,8 +442,7 @@ def test_a_metric_that_neither_build_has_is_not_judged() -> None:
 def test_other_metrics_inform_and_never_decide() -> None:
     before = suite(0, 12)
     after = {
-        name: replace(one, octets=one.octets * (1.5 + 0.01 * k))
-        for k, (name, one) in enumerate(suite(1, 12).items())
+        name: replace(one, octets=one.octets * (1.5 + 0.01 * k)) for k, (name, one) in enumerate(suite(1, 12).items())
     }
     gates = judge(before, after, POLICY)
     volume = by_name(gates)["telemetry.octets_per_frame"]
@@ -472,9 +454,7 @@ def test_other_metrics_inform_and_never_decide() -> None:
 
 def test_levels_are_shared_by_weight_and_between_all_passes_and_parts() -> None:
     gates = by_name(judge(suite(0, 2), suite(1, 2), POLICY))
-    levels = {
-        name: gate.level for name, gate in gates.items() if gate.level < 0.005 and gate.outcome == "pass"
-    }
+    levels = {name: gate.level for name, gate in gates.items() if gate.level < 0.005 and gate.outcome == "pass"}
     assert levels == approx(
         {
             "detector.recall": 0.0015,
@@ -583,11 +563,7 @@ def sums(unit: list[int], numerator: list[float], denominator: list[float], stra
 
 def test_rows_are_summed_by_unit_and_units_of_either_build_are_aligned() -> None:
     before, after = sums([7, 3, 7], [1, 1, 0], [1, 1, 1]), sums([3, 9], [1, 0], [1, 1])
-    assert (before.unit.tolist(), before.numerator.tolist(), before.denominator.tolist()) == (
-        [3, 7],
-        [1, 1],
-        [1, 2],
-    )
+    assert (before.unit.tolist(), before.numerator.tolist(), before.denominator.tolist()) == ([3, 7], [1, 1], [1, 2])
     first, second = aligned(before, after)
     assert first.unit.tolist() == second.unit.tolist() == [3, 7, 9]
     assert (first.denominator.tolist(), second.denominator.tolist()) == ([1, 2, 0], [1, 0, 1])
@@ -620,8 +596,7 @@ def test_a_one_sided_test_is_wrong_as_often_as_it_says(correlated: bool) -> None
     for _ in range(400):
         draws = rng.random((2, 120))[:, track] if correlated else rng.random((2, len(track)))
         before, after = (
-            unit_sums(track, np.zeros_like(track), (row < 0.7).astype(float), np.ones(len(track)))
-            for row in draws
+            unit_sums(track, np.zeros_like(track), (row < 0.7).astype(float), np.ones(len(track))) for row in draws
         )
         change = ratio_change(before, after)
         wrong += student_upper_tail(-change.estimate / change.error, change.units - 1) < 0.05

@@ -109,21 +109,12 @@ def judge(home: Ground, passes: list[Any], packets: Packets, make_build: Callabl
     """Hold a build that sends these packets against the build that flew."""
 
     def run(
-        given: Packets | None = None,
-        archives: list[Path] | None = None,
-        repeated: bool = False,
-        **options: Any,
+        given: Packets | None = None, archives: list[Path] | None = None, repeated: bool = False, **options: Any
     ) -> RegressionOutcome:
         baseline = register_build(home, load_build(make_build("good", packets)))
         candidate = register_build(home, load_build(make_build("candidate", given or packets, **options)))
         return run_regression(
-            home,
-            archives or [one.folder for one in passes],
-            candidate,
-            baseline,
-            policy,
-            workers=2,
-            repeated=repeated,
+            home, archives or [one.folder for one in passes], candidate, baseline, policy, workers=2, repeated=repeated
         )
 
     return run
@@ -150,9 +141,7 @@ def test_a_build_that_says_the_same_passes(judge) -> None:
     assert ended(outcome) == ("pass", 0)
     assert failed(outcome) == set()
     # One scored crater in four is left out by the synthetic pass, and some at the edges.
-    assert (
-        0.6 < gate(outcome, "detector.recall").baseline == gate(outcome, "detector.recall").candidate < 0.76
-    )
+    assert 0.6 < gate(outcome, "detector.recall").baseline == gate(outcome, "detector.recall").candidate < 0.76
     assert gate(outcome, "detector.bias").baseline == approx(np.hypot(0.5, 1.25), abs=0.02)
     assert gate(outcome, "navigation.spherical.p50").baseline == approx(130.0, abs=0.5)
 
@@ -166,9 +155,7 @@ def test_a_bias_of_seven_tenths_of_a_pixel_fails_as_a_centre_error(judge, packet
     assert told.endswith("navigation holds: share of fixes 1 to 1, median position error 30 to 30 m")
 
 
-def test_processor_times_are_compared_only_of_replays_at_the_same_time(
-    judge, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge, monkeypatch: pytest.MonkeyPatch) -> None:
     judge()  # the baseline is replayed before
     outcome = judge(network_ms=20.0)
     assert (outcome.verdict, gate(outcome, "latency.total").outcome) == ("pass", "not judged")
@@ -182,11 +169,7 @@ def test_processor_times_are_compared_only_of_replays_at_the_same_time(
     # Short replays of a loaded machine may miss each other.
     monkeypatch.setattr(KeptReplay, "overlaps", lambda _one, _other: True)
     again = judge(network_ms=20.0, repeated=True)
-    assert (
-        {gate.name for gate in again.gates if gate.name.startswith("latency.")}
-        >= failed(again)
-        >= {"latency.total"}
-    )
+    assert {gate.name for gate in again.gates if gate.name.startswith("latency.")} >= failed(again) >= {"latency.total"}
 
 
 @pytest.mark.parametrize(
@@ -314,9 +297,7 @@ def test_something_that_is_no_archive_is_told(judge, first: Path, tmp_path: Path
     assert [item.state for item in outcome.passes] == ["unusable", "unusable", "judged"]
 
 
-def test_a_replay_is_done_once_and_one_that_failed_again(
-    home, judge, first: Path, make_build, policy
-) -> None:
+def test_a_replay_is_done_once_and_one_that_failed_again(home, judge, first: Path, make_build, policy) -> None:
     outcome = judge()
     digest = keep_archive(home, first).digest
     before = find_replay(home, digest, outcome.candidate)
@@ -388,9 +369,7 @@ def test_the_verdict_is_written_as_json_junit_and_text(judge, packets: Packets, 
     assert "detector.localisation" in told and "unusable" in told
 
 
-def test_a_crash_is_one_failure_and_the_last_lines_of_its_program_are_in_every_output(
-    home, judge, first: Path
-) -> None:
+def test_a_crash_is_one_failure_and_the_last_lines_of_its_program_are_in_every_output(home, judge, first: Path) -> None:
     program = "for k in range(50): print('line', k)\nraise RuntimeError('no network')"
     outcome = judge(archives=[first], program=program)
     verdict = verdict_document(outcome)
@@ -447,9 +426,7 @@ def test_a_zip_of_an_archive_is_the_archive(first: Path, tmp_path: Path, ground:
     assert (out / "downlink.cadu").read_bytes() == (first / "downlink.cadu").read_bytes()
 
 
-def test_archives_that_are_pinned_stay_and_shared_files_stay_with_them(
-    passes, ground: Ground, tmp_path: Path
-) -> None:
+def test_archives_that_are_pinned_stay_and_shared_files_stay_with_them(passes, ground: Ground, tmp_path: Path) -> None:
     first, second = (keep_archive(ground, one.folder) for one in passes)
     pin_archive(ground, second.digest, True)
     assert let_go(ground, unused_for_ns=10**18) == []
@@ -470,9 +447,7 @@ def test_archives_go_by_age_and_by_size_with_a_record(passes, ground: Ground) ->
     assert let_go(ground, unused_for_ns=None, limit_octets=octets[first.digest]) == [second.digest]
     keep_archive(ground, passes[1].folder)
     # The one that was used before the other goes first, and only as many as need to go.
-    assert let_go(ground, unused_for_ns=None, limit_octets=octets[second.digest], actor="ann") == [
-        first.digest
-    ]
+    assert let_go(ground, unused_for_ns=None, limit_octets=octets[second.digest], actor="ann") == [first.digest]
     pin_archive(ground, second.digest, True)
     assert let_go(ground, unused_for_ns=None, limit_octets=0) == []
     pin_archive(ground, second.digest, False)
@@ -497,10 +472,7 @@ def test_the_archive_of_a_rare_condition_outlasts_one_that_was_used_later(passes
             change_if(connection, ARCHIVES, kept[0], {}, used_utc_ns=0)  # the longest unused
     place = {kept[0]: "sparse", "x": "cratered", "y": "cratered", "z": "cratered"}
     octets = kept_archives(ground)[0].octets
-    assert let_go(ground, unused_for_ns=None, limit_octets=2 * octets, condition=place.__getitem__) == [
-        "x",
-        "y",
-    ]
+    assert let_go(ground, unused_for_ns=None, limit_octets=2 * octets, condition=place.__getitem__) == ["x", "y"]
     assert condition_of_archive(ground, kept[0]) == "cratered, above 25 km"
 
 
@@ -523,9 +495,7 @@ def test_the_settings_say_how_long_archives_are_kept(tmp_path: Path, monkeypatch
     assert kept_for.items() <= called.call_args.kwargs.items()
 
 
-def test_a_registered_build_is_found_by_the_beginning_of_its_identity(
-    ground: Ground, make_build, packets
-) -> None:
+def test_a_registered_build_is_found_by_the_beginning_of_its_identity(ground: Ground, make_build, packets) -> None:
     build: Build = register_build(ground, load_build(make_build("kept", packets)))
     assert registered_build(ground, build.digest[:12]).digest == build.digest
     (build.folder / "fly.py").write_text("changed behind its back")
@@ -556,12 +526,7 @@ fail = {level=1.5, reason='y'} -> fail.level: expected less than or equal to 0.2
 def test_a_bad_policy_is_told_by_its_key(row: str, tmp_path: Path) -> None:
     text, told = row.split(" -> ")
     good = "{metric='detector.recall', weight=1, margin=0.1, reason='small'}"
-    whole = {
-        "schema_version": "3",
-        "version": "'1'",
-        "fail": "{level=0.01, reason='usual'}",
-        "gate": f"[{good}]",
-    }
+    whole = {"schema_version": "3", "version": "'1'", "fail": "{level=0.01, reason='usual'}", "gate": f"[{good}]"}
     if text.startswith("{"):
         text = f"gate = [{good}, {text}]"
     whole.pop(text.partition(" ")[0] or "schema_version", None)
@@ -616,9 +581,7 @@ def test_a_build_that_differs_on_few_frames_is_inconclusive_with_the_frames_need
     assert (figures["verdict"], figures["frames"]) == ("inconclusive", 60)
     assert figures["frames_needed"] == outcome.frames_needed
     for policy, kind in (("failure", "failure"), ("skip", "skipped")):
-        chosen = verdict.model_copy(
-            update={"policy": verdict.policy.model_copy(update={"inconclusive": policy})}
-        )
+        chosen = verdict.model_copy(update={"policy": verdict.policy.model_copy(update={"inconclusive": policy})})
         case = ET.fromstring(regression_junit(chosen, 0)).find(f"testcase[@name='detector.recall']/{kind}")
         assert "frames decide it, 60 compared" in case.attrib["message"]
 

@@ -78,10 +78,7 @@ def test_numbers_that_are_not_finite_and_keys_that_are_no_text_are_kept_as_text(
 @pytest.mark.parametrize("statement", ["UPDATE audit SET actor = 'bob'", "DELETE FROM audit WHERE id = 1"])
 def test_the_database_refuses_to_change_the_log(database: Database, statement: str) -> None:
     add(database, "first")
-    with (
-        pytest.raises(GroundError, match="audit entries cannot be changed or removed"),
-        database.writing() as one,
-    ):
+    with pytest.raises(GroundError, match="audit entries cannot be changed or removed"), database.writing() as one:
         one.execute(text(statement))
     assert broken(database) == []
     with database.reading() as connection:
@@ -166,8 +163,7 @@ def test_several_processes_at_once_make_one_chain(database: Database) -> None:
     with database.writing() as connection:
         for key in (1, 2, 3):
             connection.execute(
-                text("INSERT INTO vehicles (id, ccsds_id, instance) VALUES (:k, 0, :i)"),
-                {"k": key, "i": str(key)},
+                text("INSERT INTO vehicles (id, ccsds_id, instance) VALUES (:k, 0, :i)"), {"k": key, "i": str(key)}
             )
     url = database.engine.url.render_as_string(hide_password=False)
     running = [
@@ -181,9 +177,7 @@ def test_several_processes_at_once_make_one_chain(database: Database) -> None:
     with database.reading() as connection:
         rows = connection.execute(TABLE.select().order_by(TABLE.c.id)).mappings().all()
         assert connection.execute(text("SELECT sum(ccsds_id) FROM vehicles")).scalar_one() == PROCESSES * EACH
-    for one in range(
-        PROCESSES
-    ):  # each process's own entries come in its order, the two of a transaction together
+    for one in range(PROCESSES):  # each process's own entries come in its order, the two of a transaction together
         mine = [(row["target"], row["action"], row["id"]) for row in rows if row["actor"] == f"p{one}"]
         assert [target for target, _, _ in mine[::2]] == [str(k) for k in range(EACH)]
         assert all(b[2] == a[2] + 1 for a, b in zip(mine[::2], mine[1::2], strict=True))

@@ -31,12 +31,7 @@ from ground_service.errors import (
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.store import repository
-from ground_service.store.database import (
-    database_error,
-    open_database,
-    prepare_database,
-    schema_revisions,
-)
+from ground_service.store.database import database_error, open_database, prepare_database, schema_revisions
 from ground_service.store.files import FileArchive
 from ground_service.store.models import METADATA
 from ground_service.store.repository import VEHICLES
@@ -76,9 +71,7 @@ def test_samples_are_clustered_by_time(tmp_path: Path) -> None:
     """The primary key leads with vehicle, dictionary and time: a time range is one contiguous read."""
     database = prepare_database(url(tmp_path))
     with database.reading() as connection:
-        made = connection.execute(
-            text("SELECT sql FROM sqlite_master WHERE name = 'navigation_states'")
-        ).scalar_one()
+        made = connection.execute(text("SELECT sql FROM sqlite_master WHERE name = 'navigation_states'")).scalar_one()
         key = inspect(connection).get_pk_constraint("navigation_states")["constrained_columns"]
     assert "WITHOUT ROWID" in made
     assert key == ["vehicle_id", "dictionary_version", "ticks", "packet_id"]
@@ -90,16 +83,12 @@ def test_a_database_of_a_newer_version_is_left_alone(tmp_path: Path) -> None:
     with database.writing() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
     database.engine.dispose()
-    with pytest.raises(
-        DatabaseTooNew, match=r"linna\.db: expected schema revision \S+, found 9999 of a newer"
-    ):
+    with pytest.raises(DatabaseTooNew, match=r"linna\.db: expected schema revision \S+, found 9999 of a newer"):
         prepare_database(url(tmp_path))
 
 
 @pytest.mark.parametrize("revision", ["0001", "0011"])
-def test_a_database_before_version_1_is_refused_with_the_way_to_carry_it_over(
-    tmp_path: Path, revision: str
-) -> None:
+def test_a_database_before_version_1_is_refused_with_the_way_to_carry_it_over(tmp_path: Path, revision: str) -> None:
     database = prepare_database(url(tmp_path))
     with database.writing() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = :found"), {"found": revision})
@@ -123,9 +112,7 @@ def test_a_file_that_is_no_database_is_refused_in_one_line(tmp_path: Path) -> No
         prepare_database(url(tmp_path))
 
 
-@pytest.mark.parametrize(
-    "wrong", ["nonsense", "oracle+what://x", "postgresql+psycopg://nobody:secret@127.0.0.1:1/x"]
-)
+@pytest.mark.parametrize("wrong", ["nonsense", "oracle+what://x", "postgresql+psycopg://nobody:secret@127.0.0.1:1/x"])
 def test_a_database_that_cannot_be_reached_is_named_without_its_password(wrong: str) -> None:
     with pytest.raises(DatabaseUnavailable) as caught:
         prepare_database(wrong)
@@ -164,8 +151,7 @@ def test_a_full_database_is_one_clear_line(tmp_path: Path) -> None:
         connection.execute(text(f"PRAGMA max_page_count = {pages}"))
         for number in range(2000):
             connection.execute(
-                text("INSERT INTO vehicles (ccsds_id, instance) VALUES (:n, :i)"),
-                {"n": number, "i": "x" * 90},
+                text("INSERT INTO vehicles (ccsds_id, instance) VALUES (:n, :i)"), {"n": number, "i": "x" * 90}
             )
     database.engine.dispose()
 
@@ -179,8 +165,7 @@ def test_a_read_only_database_is_one_clear_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "kind"),
-    [(errno.ENOSPC, StorageFull), (errno.EROFS, StorageReadOnly), (errno.EACCES, StorageReadOnly)],
+    ("number", "kind"), [(errno.ENOSPC, StorageFull), (errno.EROFS, StorageReadOnly), (errno.EACCES, StorageReadOnly)]
 )
 def test_errors_of_the_disk_are_named(number: int, kind: type[Exception]) -> None:
     error = storage_error(OSError(number, os.strerror(number)), "/archive")
@@ -239,9 +224,7 @@ def test_a_commit_waits_for_the_standby_even_if_the_role_is_set_up_otherwise(
         database.engine.dispose()
 
 
-def test_a_database_of_another_encoding_is_refused_in_one_line(
-    new_postgres_database: Callable[[], str],
-) -> None:
+def test_a_database_of_another_encoding_is_refused_in_one_line(new_postgres_database: Callable[[], str]) -> None:
     """Its texts come back as octets."""
     url = new_postgres_database()
     engine = open_database(url).engine.execution_options(isolation_level="AUTOCOMMIT")
@@ -265,9 +248,7 @@ def test_a_value_that_no_database_can_hold_is_refused(either: Ground, values: di
         "created_utc_ns": 1, **values,
     }  # fmt: skip
     with (
-        pytest.raises(
-            InvalidInput, match="request: expected text and numbers that the database can hold"
-        ) as refused,
+        pytest.raises(InvalidInput, match="request: expected text and numbers that the database can hold") as refused,
         either.database.writing() as connection,
     ):
         repository.add(connection, repository.JOBS, **row)

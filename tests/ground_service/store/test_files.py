@@ -97,9 +97,7 @@ def test_leftovers_of_ended_processes_are_removed_at_the_start(tmp_path: Path, e
     assert folders == [name.replace("incoming", "unpacking") for name in left]
 
 
-def test_a_folder_is_whole_on_the_disk_before_it_has_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_is_whole_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "partial" / "files").mkdir(parents=True)
     (tmp_path / "partial" / "files" / "a").write_bytes(b"a")
     (tmp_path / "partial" / "list").write_bytes(b"list")

@@ -146,9 +146,7 @@ def test_files_of_the_last_hour_stay_in_the_cache(server, tmp_path: Path) -> Non
     assert files.trim(time.time() + files_module.CACHED_S + 1) == 1
 
 
-def test_the_cache_is_trimmed_at_times_and_without_the_store_not_at_all(
-    server, tmp_path, monkeypatch
-) -> None:
+def test_the_cache_is_trimmed_at_times_and_without_the_store_not_at_all(server, tmp_path, monkeypatch) -> None:
     settings = Settings(**server.settings(), objects_cache_gib=0.0)
     files = files_of(tmp_path, objects_of(settings))
     monkeypatch.setattr(files_module, "TRIM_S", 0.0)
@@ -182,7 +180,5 @@ def test_keys_come_from_files_and_are_not_shown(monkeypatch, tmp_path: Path) -> 
     assert found is not None and (found.access_key, found.secret_key) == ("access-value", "secret-value")
     assert found.prefix == "" and "secret-value" not in repr(found)
     monkeypatch.delenv("LINNA_OBJECTS_SECRET_KEY_FILE")
-    with pytest.raises(
-        SettingsError, match="LINNA_OBJECTS_ACCESS_KEY: expected an access key and a secret key"
-    ):
+    with pytest.raises(SettingsError, match="LINNA_OBJECTS_ACCESS_KEY: expected an access key and a secret key"):
         objects_of(load_settings())

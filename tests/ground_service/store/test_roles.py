@@ -173,9 +173,7 @@ def test_granting_for_backups_takes_away_what_is_too_much(
     assert cli.run(["db", "grant", "--backup", "--role", BACKUP]) == 0
     with owner.connect() as connection:
         rights = connection.execute(
-            text(
-                "SELECT DISTINCT privilege_type FROM information_schema.role_table_grants WHERE grantee = :name"
-            ),
+            text("SELECT DISTINCT privilege_type FROM information_schema.role_table_grants WHERE grantee = :name"),
             {"name": BACKUP},
         )
         assert set(rights.scalars()) == {"SELECT"}

@@ -35,9 +35,7 @@ def test_a_transition_happens_once_and_the_second_is_told_the_state_that_won(eit
     key = add_command(either)
     either.write(move, TELECOMMAND, key, "released", reason="first")
     with (
-        pytest.raises(
-            StateConflict, match=f"telecommand {key}: expected state queued, found released"
-        ) as lost,
+        pytest.raises(StateConflict, match=f"telecommand {key}: expected state queued, found released") as lost,
         either.database.writing() as connection,
     ):
         move(connection, TELECOMMAND, key, "released", reason="second")

@@ -88,10 +88,7 @@ def test_an_expansion_keeps_the_version_before_it_working(
         ('op.drop_column("leases", "owner")', "leases.owner: removed"),
         ('op.execute("ALTER TABLE users ADD COLUMN n INTEGER NOT NULL DEFAULT 1")', None),
         ('op.create_index("ux", "users", ["role"], unique=True)', "users: new unique index ux"),
-        (
-            'with op.batch_alter_table("users") as b: b.alter_column("role", type_=sa.Integer())',
-            "users.role: VARCHAR",
-        ),
+        ('with op.batch_alter_table("users") as b: b.alter_column("role", type_=sa.Integer())', "users.role: VARCHAR"),
     ],
 )
 def test_a_change_that_breaks_the_version_before_it_is_named(
@@ -214,8 +211,6 @@ def test_a_migration_gives_way_to_requests_that_hold_locks(
             connection.execute(text("UPDATE users SET role = role"))
         upgrade.join(60.0)
         assert not upgrade.is_alive()
-        assert set(METADATA.tables["users"].columns.keys()) < set(
-            reflected(other).tables["users"].columns.keys()
-        )
+        assert set(METADATA.tables["users"].columns.keys()) < set(reflected(other).tables["users"].columns.keys())
         assert [one.name for one in list_users(ground)] == ["ann"]
         other.engine.dispose()

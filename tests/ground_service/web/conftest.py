@@ -61,14 +61,9 @@ window.fetch = async (...given) => {
 NOTE_VIOLATIONS = """document.addEventListener("securitypolicyviolation", (event) =>
     console.error(`policy: ${event.violatedDirective} ${event.blockedURI}`))"""
 FLAGS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync",
+]  # fmt: skip
 
 
 def press(page: Page, name: str) -> None:
@@ -134,9 +129,7 @@ def live_frame(number: int) -> dict[str, object]:
         "mode": "observing",
         "paused": False,
         "rate": 1.0,
-        "events": [
-            {"severity": "medium", "event": "image_dark", "values": [1.0, 2.0], "text": "mean grey level 1"}
-        ]
+        "events": [{"severity": "medium", "event": "image_dark", "values": [1.0, 2.0], "text": "mean grey level 1"}]
         if number == 3
         else [],
         "verifications": [],
@@ -147,16 +140,12 @@ def live_frame(number: int) -> dict[str, object]:
         "catalogue": [{"id": 1, "u_px": 101.0, "v_px": 121.0, "diameter_px": 41.0}],
         "estimates": {
             "anchored": {
-                "outcome": "fixed",
-                "reset_trigger": "none",
-                "latitude_deg": -50.0 + number,
-                "longitude_deg": 294.001,
-                "altitude_m": 30e3,
-                "error_m": 80.0 + number,
+                "outcome": "fixed", "reset_trigger": "none", "latitude_deg": -50.0 + number,
+                "longitude_deg": 294.001, "altitude_m": 30e3, "error_m": 80.0 + number,
             }
         },
         "image_jpeg": base64.b64encode(jpeg.tobytes()).decode(),
-    }
+    }  # fmt: skip
 
 
 @pytest.fixture
@@ -169,11 +158,7 @@ class Service:
     """A running `linna serve`."""
 
     def __init__(
-        self,
-        home: Path,
-        console_port: int,
-        openmct: Path | None = None,
-        settings: dict[str, str] | None = None,
+        self, home: Path, console_port: int, openmct: Path | None = None, settings: dict[str, str] | None = None
     ) -> None:
         self.home = home
         environment = {key: value for key, value in os.environ.items() if not key.startswith("LINNA_")}

@@ -23,9 +23,7 @@ def compared(tmp_path_factory, make_pass, console, serve):
             key = import_archive(ground, make_pass(frames=frames, seed=seed).folder)
             make_report(ground, key, pdf=False)
         start = 1_900_000_000_000_000_000
-        define_pass(
-            ground, name="empty", start_utc_ns=start, stop_utc_ns=start + 60 * 10**9, spacecraft_id=76
-        )
+        define_pass(ground, name="empty", start_utc_ns=start, stop_utc_ns=start + 60 * 10**9, spacecraft_id=76)
     with serve(home, console.port) as running:
         yield running
 
@@ -39,9 +37,7 @@ def view(browser, compared):
 
 def row(page, name):
     """Cells of the row of a figure."""
-    line = page.locator("tbody tr").filter(
-        has=page.locator("td:first-child", has_text=re.compile(f"^{name}$"))
-    )
+    line = page.locator("tbody tr").filter(has=page.locator("td:first-child", has_text=re.compile(f"^{name}$")))
     return line.locator("td").all_inner_texts()[1:]
 
 
@@ -58,9 +54,7 @@ def test_passes_chosen_on_the_list_are_compared_side_by_side(view):
     button.press("Enter")
     expect(view).to_have_url(re.compile(r"/comparison\?pass=1&pass=2"))
     answered(view)
-    reports = [
-        view.request.get("/api/v1/reports", params={"pass_id": key}).json()["items"][0] for key in (1, 2)
-    ]
+    reports = [view.request.get("/api/v1/reports", params={"pass_id": key}).json()["items"][0] for key in (1, 2)]
     figures = [view.request.get(f"/api/v1/reports/{one['id']}/summary").json() for one in reports]
     estimator = reports[0]["estimator"]
     expect(view.get_by_label("Navigation solution")).to_have_value(estimator)
@@ -126,8 +120,7 @@ def test_passes_are_filtered_by_their_verdict(view):
 
 
 @pytest.mark.parametrize(
-    ("level", "colour"),
-    [("met", "--good"), ("not met", "--bad"), ("unknown", "--caution"), ("", "--caution")],
+    ("level", "colour"), [("met", "--good"), ("not met", "--bad"), ("unknown", "--caution"), ("", "--caution")]
 )
 def test_a_verdict_has_the_same_word_and_colour_on_every_page(view, level, colour):
     def with_level(route):
@@ -166,6 +159,4 @@ def test_a_service_of_archives_alone_shows_the_date_of_its_data_and_the_next_ste
     expect(view.locator("#clock")).to_have_text(re.compile(r"^data of 20\d\d-\d\d-\d\d, recorded$"))
     card = view.get_by_role("region", name="Spacecraft 76 flight")
     expect(card).to_contain_text("A finished recording. Next step: open its pass and report")
-    expect(card.get_by_role("link", name="pass", exact=True)).to_have_attribute(
-        "href", re.compile("^/passes/")
-    )
+    expect(card.get_by_role("link", name="pass", exact=True)).to_have_attribute("href", re.compile("^/passes/"))

@@ -115,14 +115,7 @@ def test_files_of_open_mct_are_compressed_kept_and_no_others_are_reached(shown, 
     _, packed, headers = ask(f"{shown.url}/mct/{version}/openmct.js", **{"Accept-Encoding": "gzip"})
     assert headers["Content-Encoding"] == "gzip" and gzip.decompress(packed) == plain
     assert len(packed) < len(plain) / 3
-    for path in (
-        "../package.json",
-        "%2e%2e/package.json",
-        "openmct.js.map",
-        "package.json",
-        "",
-        "/etc/passwd",
-    ):
+    for path in ("../package.json", "%2e%2e/package.json", "openmct.js.map", "package.json", "", "/etc/passwd"):
         assert ask(f"{shown.url}/mct/{version}/{path}")[0] == 404, path
     assert ask(f"{shown.url}/mct/4.1.0/openmct.js")[0] == 404
 
@@ -149,16 +142,12 @@ def test_values_alarms_and_limits_follow_the_telemetry(mct, shown):
     expect(row).to_contain_text("95.25", timeout=WAIT_MS)
     expect(row.locator(".is-limit--red")).to_have_count(1, timeout=WAIT_MS)
     mode = mct.get_by_label("lad row").filter(has=mct.get_by_text("mode", exact=True))
-    expect(mode).to_contain_text(
-        DICTIONARY.labels("housekeeping", "mode")[1].replace("_", " "), timeout=WAIT_MS
-    )
+    expect(mode).to_contain_text(DICTIONARY.labels("housekeeping", "mode")[1].replace("_", " "), timeout=WAIT_MS)
     fault = mct.get_by_label("Select fault: temperature")
     fault.check()
     mct.get_by_role("button", name="Acknowledge").click()
     mct.get_by_label("Save", exact=True).click()
-    expect(mct.locator(".c-fault-mgmt__list.is-acknowledged, .is-acknowledged").first).to_be_visible(
-        timeout=WAIT_MS
-    )
+    expect(mct.locator(".c-fault-mgmt__list.is-acknowledged, .is-acknowledged").first).to_be_visible(timeout=WAIT_MS)
     mct.get_by_label("Select fault: camera fault").check()
     mct.get_by_role("button", name="Shelve").click()
     mct.get_by_label("Save", exact=True).click()
@@ -234,9 +223,7 @@ def test_the_annotation_of_a_plot_is_kept_in_the_browser(mct, shown):
     for scheme in ("dark", "light"):
         mct.emulate_media(color_scheme=scheme)
         again = open_plot(mct, shown.url)
-        wait_for(
-            lambda plot=again: marked(plot) > plain + 300, f"the marks are not drawn in the {scheme} theme"
-        )
+        wait_for(lambda plot=again: marked(plot) > plain + 300, f"the marks are not drawn in the {scheme} theme")
 
 
 FOLLOW = """async (key) => {

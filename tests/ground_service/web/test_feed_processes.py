@@ -138,9 +138,7 @@ def test_a_wake_up_of_another_process_is_heard_and_an_own_one_is_not(redis_url: 
     assert heard == ["wake", "wake"]
 
 
-def test_an_unavailable_broker_is_reported_once_and_not_asked_at_each_commit(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_unavailable_broker_is_reported_once_and_not_asked_at_each_commit(monkeypatch: pytest.MonkeyPatch) -> None:
     log = MagicMock()
     monkeypatch.setattr(wakeups, "log", log)
     waker = wakeups.Waker("redis://127.0.0.1:1/0")

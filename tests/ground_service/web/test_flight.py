@@ -118,9 +118,7 @@ class Flown:
 
 
 @pytest.fixture(scope="module")
-def flown(
-    tmp_path_factory: pytest.TempPathFactory, serve: Any, openmct: Path, browser: Browser
-) -> Iterator[Flown]:
+def flown(tmp_path_factory: pytest.TempPathFactory, serve: Any, openmct: Path, browser: Browser) -> Iterator[Flown]:
     """A payload flown live with its operator and `ORDERS`, started on the live page, followed in a layout."""
     folder = tmp_path_factory.mktemp("flight")
     data = find_data(None)
@@ -143,10 +141,7 @@ def flown(
             ]
             station.sendall(b"".join(sent))
             octets = sum(len(one) for one in sent)
-            wait_for(
-                lambda: sum(len(one) for _, one in payload._uplinked) == octets,
-                "no telecommands have arrived",
-            )
+            wait_for(lambda: sum(len(one) for _, one in payload._uplinked) == octets, "no telecommands have arrived")
             clients = payload.contacts.stations["earth"].telemetry.clients
             wait_for(lambda: bool(clients), "the link is not connected")
             found = Flown(service.url, layout, live)
@@ -196,9 +191,7 @@ def address(kind: str) -> str:
     return f"/mct#/browse/{'/'.join(objects)}?{SHOWN}"
 
 
-SHOWN = (
-    "tc.mode=newest&tc.startDelta=480000&tc.endDelta=60000&tc.timeSystem=utc&hideInspector=true&hideTree=true"
-)
+SHOWN = "tc.mode=newest&tc.startDelta=480000&tc.endDelta=60000&tc.timeSystem=utc&hideInspector=true&hideTree=true"
 PLOT_GREYS = (239, 40)  # backgrounds of plots in the light and the dark theme
 PLOT = ".gl-plot-display-area canvas"
 IMAGES_LOADED = """() => {
@@ -287,9 +280,7 @@ def activity(page: Page, name: str) -> Locator:
     return page.locator(".c-plan__activity").filter(has_text=name)
 
 
-def test_the_layout_of_a_payload_engineer_shows_the_flight(
-    flown: Flown, opened: Page, tmp_path: Path
-) -> None:
+def test_the_layout_of_a_payload_engineer_shows_the_flight(flown: Flown, opened: Page, tmp_path: Path) -> None:
     opened.goto(address("payload-engineer"))
     expect(lad_row(opened, "frames processed")).to_contain_text(str(FRAMES))
     expect(opened.locator(PLOT)).to_have_count(2 * 6)
@@ -302,10 +293,7 @@ def test_the_live_page_shows_what_the_payload_matched(flown: Flown, tmp_path: Pa
     expect(flown.live.locator("#numbers")).to_contain_text("matched")
     expect(flown.live.locator("#state")).to_have_text("the scenario has ended")
     background, reference = (
-        [
-            int(part)
-            for part in re.findall(r"\d+", one.evaluate("one => getComputedStyle(one).backgroundColor"))[:3]
-        ]
+        [int(part) for part in re.findall(r"\d+", one.evaluate("one => getComputedStyle(one).backgroundColor"))[:3]]
         for one in (
             flown.live.locator("#map"),
             flown.live.locator("#map-legend li", has_text="reference").locator(".mark"),
@@ -316,9 +304,7 @@ def test_the_live_page_shows_what_the_payload_matched(flown: Flown, tmp_path: Pa
 
 
 @pytest.mark.parametrize(("kind", "width_px"), [("images", 128), ("detections", 512)])
-def test_downlinked_images_are_shown(
-    flown: Flown, opened: Page, tmp_path: Path, kind: str, width_px: int
-) -> None:
+def test_downlinked_images_are_shown(flown: Flown, opened: Page, tmp_path: Path, kind: str, width_px: int) -> None:
     opened.goto(address(kind))
     # The camera gave no image of one of every second frame.
     expect(opened.locator(".c-imagery__thumb")).to_have_count(FRAMES // 2 - 1)
@@ -335,9 +321,7 @@ def test_events_are_shown_once_in_their_order(flown: Flown, opened: Page, tmp_pa
     cells = "(rows) => rows.map((one) => [...one.querySelectorAll('td')].slice(-2).map((td) => td.textContent.trim()))"
     shown = event_rows(opened).evaluate_all(cells)
     assert shown == [[one["name"].replace("_", " "), one["detail"]] for one in listed]
-    expect(event_rows(opened).filter(has_text="temperature high").locator(".is-limit--yellow")).to_have_count(
-        1
-    )
+    expect(event_rows(opened).filter(has_text="temperature high").locator(".is-limit--yellow")).to_have_count(1)
     Pictures(tmp_path, documented=False).take(opened, "displays-events")
 
 

@@ -155,9 +155,7 @@ def test_passes_are_searched_and_show_their_verdict(page):
     row = page.locator("#passes tbody tr").first
     expect(row).to_contain_text("76")
     expect(row.locator(".state")).not_to_be_empty()
-    expect(row.get_by_role("link", name="open")).to_have_attribute(
-        "href", re.compile("/reports/[0-9a-f]{32}")
-    )
+    expect(row.get_by_role("link", name="open")).to_have_attribute("href", re.compile("/reports/[0-9a-f]{32}"))
     page.get_by_label("Search").fill("no such pass")
     press(page, "Search")
     shows(page, "#passes", "No pass matches.")
@@ -509,9 +507,7 @@ def focused(page):
 
 def queue(page):
     """Enter a telecommand; return its number."""
-    answer = page.request.post(
-        "/api/v1/telecommands", data={"name": "test_connection", "spacecraft_id": KEYBOARD}
-    )
+    answer = page.request.post("/api/v1/telecommands", data={"name": "test_connection", "spacecraft_id": KEYBOARD})
     return str(answer.json()["id"])
 
 

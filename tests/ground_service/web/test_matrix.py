@@ -97,9 +97,7 @@ VISIT = """() => {
 }"""
 MISSED = """() => [...linnaUsable].filter((one) => one.isConnected && !linnaVisited.has(one))
     .map((one) => one.outerHTML.slice(0, 120))"""
-FRAMES_DRAWN = (
-    "() => new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(() => drawn())))"
-)
+FRAMES_DRAWN = "() => new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(() => drawn())))"
 # Width of the content; charts take the width of the window in the frame after the change.
 WIDTH = "document.documentElement.scrollWidth"
 
@@ -176,9 +174,7 @@ def work(api: Client, spacecraft: Spacecraft, packets: list[bytes]) -> int:
     spacecraft.replay(packets)
     spacecraft.report("event_high", event_id=20, frame_number=7)
     wait_for(lambda: api.list_alarms().total > 0, "no alarm was raised")
-    live = api.define_pass(
-        "live pass", format_utc(START - 600 * NS), format_utc(START + 1200 * NS), SPACECRAFT
-    ).id
+    live = api.define_pass("live pass", format_utc(START - 600 * NS), format_utc(START + 1200 * NS), SPACECRAFT).id
     window = api.add_window(
         {
             "name": "morning", "start": format_utc(START - 300 * NS), "stop": format_utc(START + 300 * NS),
@@ -209,9 +205,7 @@ class Faults:
         page.evaluate(LONG_LOG)
         for scheme, font, width in looks:
             page.emulate_media(color_scheme=scheme)
-            page.evaluate(
-                "(one) => document.documentElement.style.setProperty('--sans', `\"${one}\"`)", FONTS[font]
-            )
+            page.evaluate("(one) => document.documentElement.style.setProperty('--sans', `\"${one}\"`)", FONTS[font])
             page.set_viewport_size({"width": width, "height": 844})
             page.evaluate(FRAMES_DRAWN)
             if (wide := page.evaluate(WIDTH)) > width:
@@ -291,9 +285,7 @@ def administrator(browser: Browser, worked: Worked) -> Iterator[BrowserContext]:
 @pytest.fixture(scope="module")
 def newcomer(browser: Browser, empty_service: Service) -> Iterator[BrowserContext]:
     """The browser of somebody at a service without data."""
-    context = patient(
-        browser.new_context(base_url=empty_service.url, viewport={"width": 1280, "height": 844})
-    )
+    context = patient(browser.new_context(base_url=empty_service.url, viewport={"width": 1280, "height": 844}))
     yield context
     context.close()
 
@@ -342,9 +334,7 @@ def test_a_telephone_shows_what_a_shift_needs_without_scrolling_tables(
 
 @LOOKS
 @pytest.mark.parametrize("path", [path for path in PATHS if path not in DETAILS])
-def test_a_page_without_data_has_no_fault(
-    newcomer: BrowserContext, rows: list[str], path: str, looks: Looks
-) -> None:
+def test_a_page_without_data_has_no_fault(newcomer: BrowserContext, rows: list[str], path: str, looks: Looks) -> None:
     page = new_page(newcomer)
     found = Faults(page)
     settled(page, path)

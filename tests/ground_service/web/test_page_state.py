@@ -16,14 +16,7 @@ from ground_service.planning.service import add_window
 from ground_service.regression.pass_archives import NO_INPUTS
 from ground_service.web.pages import PAGES
 from lunar.timescales import parse_utc
-from tests.ground_service.web.conftest import (
-    COUNT_REQUESTS,
-    Pictures,
-    patient,
-    press,
-    shows,
-    strict_page,
-)
+from tests.ground_service.web.conftest import COUNT_REQUESTS, Pictures, patient, press, shows, strict_page
 from tests.ground_service.web.test_in_browser import answered, camera_fault, receive, settled
 from tests.lazy import expect
 from tests.serving import wait_for
@@ -128,9 +121,7 @@ def test_the_map_of_a_pass_shows_the_flown_terrain_and_tracks_that_differ(page):
     shows(page, "#terrain", "Terrain:")
     shows(page, "#terrain", "craters of the catalogue of the pass")
     expect(page.locator("#map-legend li")).to_have_count(2)
-    expect(page.locator("#map")).to_have_class(
-        re.compile("bare")
-    )  # no picture of the Moon under other terrain
+    expect(page.locator("#map")).to_have_class(re.compile("bare"))  # no picture of the Moon under other terrain
     expect(page.locator("#map img")).to_have_count(0)
     assert page.evaluate("window.zooms") == 0  # drawn at its scale at once, not blurred by an animation
     page.locator("#map-legend").get_by_label("spherical").uncheck()
@@ -140,9 +131,7 @@ def test_the_map_of_a_pass_shows_the_flown_terrain_and_tracks_that_differ(page):
 def test_an_archive_without_frames_is_listed_with_its_reason_and_not_chosen(page):
     kept = "/api/v1/regression-archives"
     # The service keeps the archive of the imported pass, which has no images, some time after the start.
-    wait_for(
-        lambda: 1 in [one["pass_id"] for one in page.request.get(kept).json()], "the archive is not kept"
-    )
+    wait_for(lambda: 1 in [one["pass_id"] for one in page.request.get(kept).json()], "the archive is not kept")
     settled(page, "/regression")
     row = page.locator("#archives label").filter(has=page.get_by_role("link", name="pass 1", exact=True))
     expect(row).to_contain_text(f"pass 1: telemetry only, {NO_INPUTS}")
@@ -150,9 +139,7 @@ def test_an_archive_without_frames_is_listed_with_its_reason_and_not_chosen(page
     expect(row.locator("input")).not_to_be_checked()
 
 
-def test_passes_without_a_kept_archive_are_listed_with_what_to_do(
-    browser, tmp_path, console, serve, synthetic_pass
-):
+def test_passes_without_a_kept_archive_are_listed_with_what_to_do(browser, tmp_path, console, serve, synthetic_pass):
     home = tmp_path / "home"
     with open_ground(home) as ground:
         text = 'name = "manual"\n[spacecraft]\nid = 76\n[camera]\nfov_deg = 120.0\n[automation]\nevaluate = false\n'
@@ -356,11 +343,7 @@ def test_a_draft_is_moved_and_resized_by_keys_by_the_form_and_with_the_pointer(p
     bar = page.locator('#timeline [data-window="1"]')
     bar.press("ArrowRight")
     wait_for(lambda: times(page, 1) == (61.0, 81.0), "not moved")
-    for key, expected in (
-        ("ArrowDown", (61.0, 80.0)),
-        ("]", (62.0, 80.0)),
-        ("Shift+ArrowUp", (62.0, 80.0 + 1 / 6)),
-    ):
+    for key, expected in (("ArrowDown", (61.0, 80.0)), ("]", (62.0, 80.0)), ("Shift+ArrowUp", (62.0, 80.0 + 1 / 6))):
         answered(page)
         bar.press(key)
         wait_for(lambda expected=expected: times(page, 1) == pytest.approx(expected), key)

@@ -44,14 +44,7 @@ def test_files_with_a_version_are_kept_and_without_one_are_asked_for_again(servi
 
 
 @pytest.mark.parametrize(
-    "path",
-    [
-        "/static/../pages.py",
-        "/static/%2e%2e/pages.py",
-        "/static/nothing.js",
-        "/static/",
-        "/static//etc/passwd",
-    ],
+    "path", ["/static/../pages.py", "/static/%2e%2e/pages.py", "/static/nothing.js", "/static/", "/static//etc/passwd"]
 )
 def test_no_other_file_can_be_reached(service, path):
     assert ask(service.url + path)[0] == 404

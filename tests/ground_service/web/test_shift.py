@@ -307,17 +307,13 @@ def test_an_operator_works_a_shift(operator: Page, shift: Shift) -> None:
 
     # The page says what is released and what is sent before it does so.
     window.get_by_role("button", name=re.compile("^Release")).click()
-    page.get_by_role("dialog", name=re.compile("^Release")).get_by_role(
-        "button", name="Release", exact=True
-    ).click()
+    page.get_by_role("dialog", name=re.compile("^Release")).get_by_role("button", name="Release", exact=True).click()
     expect(window).to_contain_text("waits for transmission")
     go(page, "Commands")
     expect(page.get_by_role("button", name="Send now").first).to_be_enabled()
     go(page, "Shift")
     window.get_by_role("button", name=re.compile("^Send")).click()
-    question = page.get_by_role(
-        "dialog", name=re.compile(r"^Send \d+ telecommands over (madrid|canberra) now\?$")
-    )
+    question = page.get_by_role("dialog", name=re.compile(r"^Send \d+ telecommands over (madrid|canberra) now\?$"))
     expect(question).to_contain_text("insert activity")
     question.get_by_role("button", name="Send").click()
     expect(window.locator(".chain .now")).to_have_text("executed")  # all telecommands are verified

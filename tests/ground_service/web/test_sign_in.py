@@ -103,9 +103,7 @@ def test_the_sign_in_is_used_with_the_keyboard(stranger, guarded):
     visited = []
     for _ in range(8):
         stranger.keyboard.press("Tab")
-        visited.append(
-            stranger.evaluate("document.activeElement.closest('dialog, main, header, footer')?.id")
-        )
+        visited.append(stranger.evaluate("document.activeElement.closest('dialog, main, header, footer')?.id"))
     assert "sign-in" in visited and set(visited) <= {"sign-in", None}  # None: controls of the browser
     stranger.keyboard.press("Escape")
     expect(dialog).to_be_hidden()
@@ -140,9 +138,7 @@ def signed_in_elsewhere(tmp_path_factory, serve, console, provider):
         yield running.url.replace("127.0.0.1", "localhost")
 
 
-def test_a_user_comes_back_signed_in_to_the_page_and_signs_out_everywhere(
-    browser, signed_in_elsewhere, provider
-):
+def test_a_user_comes_back_signed_in_to_the_page_and_signs_out_everywhere(browser, signed_in_elsewhere, provider):
     """The session cookie is strict: a redirect from the provider to the page would come without it."""
     url = signed_in_elsewhere
     assert "localhost" in url and "127.0.0.1" in provider.issuer
@@ -183,10 +179,7 @@ def test_the_api_page_shows_and_calls_operations_without_console_errors(page):
 def test_the_api_page_uses_the_session_of_the_signed_in_user(browser, serve, console, tmp_path):
     with open_ground(tmp_path / "home") as ground:
         token = add_user(ground, "ann", "viewer")
-    with (
-        serve(tmp_path / "home", console.port) as running,
-        strict_page(browser, running.url, strict=False) as page,
-    ):
+    with serve(tmp_path / "home", console.port) as running, strict_page(browser, running.url, strict=False) as page:
         page.goto("/licences")
         page.get_by_label("Token").fill(token)
         page.locator("dialog").get_by_role("button", name="Sign in").click()
@@ -235,9 +228,7 @@ def test_a_user_is_added_and_the_token_shown_once(admin, managed):
     with open_ground(managed[1]) as ground:
         assert token_valid(ground, token)
         (found,) = [one for one in list_tokens(ground) if one.user == "ola"]
-        assert (
-            found.expires is not None and 6.9 < (found.expires.utc_ns - found.created.utc_ns) / 86_400e9 < 7.1
-        )
+        assert found.expires is not None and 6.9 < (found.expires.utc_ns - found.created.utc_ns) / 86_400e9 < 7.1
         assert {one.name: one.missions for one in list_users(ground)} == {
             "ann": None, "vic": None, "ola": ["selenita", "other"],
         }  # fmt: skip
@@ -259,10 +250,7 @@ def test_a_user_is_disabled_enabled_and_given_another_role(admin, managed):
     admin.get_by_label("role of vic").select_option("operator")
     expect(admin.locator("#notices")).to_contain_text("vic is operator now.")
     with open_ground(managed[1]) as ground:
-        assert {one.name: (one.role, one.state) for one in list_users(ground)}["vic"] == (
-            "operator",
-            "active",
-        )
+        assert {one.name: (one.role, one.state) for one in list_users(ground)}["vic"] == ("operator", "active")
 
 
 def test_a_token_is_revoked(admin, managed):
@@ -290,9 +278,7 @@ def test_the_status_states_what_is_known_and_what_is_not(admin):
     expect(admin.locator("#correlations")).to_contain_text("No time correlation.")
     expect(admin.get_by_role("row").filter(has_text="Free disk space")).to_contain_text("GiB")
     # The server gets the lease of the recurring work some seconds after its start; the page asks again.
-    expect(admin.get_by_role("row").filter(has_text="Recurring work is done by")).not_to_contain_text(
-        "no process"
-    )
+    expect(admin.get_by_role("row").filter(has_text="Recurring work is done by")).not_to_contain_text("no process")
     expect(admin.locator("#complaints")).to_contain_text("No backup is known.")
     for text in ("No process does the recurring work.", "The newest backup is"):
         expect(admin.locator("#complaints")).not_to_contain_text(text)

@@ -234,9 +234,7 @@ def messages_until(socket: Any, kind: str) -> list[dict[str, Any]]:
     return found
 
 
-def test_newest_values_are_sent_on_request_and_only_those_that_changed(
-    client: TestClient, tmp_path: Path
-) -> None:
+def test_newest_values_are_sent_on_request_and_only_those_that_changed(client: TestClient, tmp_path: Path) -> None:
     ground = ground_of(client)
     with client.websocket_connect(f"{LIVE}?values=true") as socket, client.websocket_connect(LIVE) as plain:
         receive(ground, tmp_path, 1, structure_id=1, temperature_c=70.25, mode=2)
@@ -245,11 +243,7 @@ def test_newest_values_are_sent_on_request_and_only_those_that_changed(
         assert telemetry["payload"]["kinds"] == ["housekeeping"]
         assert first["sequence"] >= telemetry["sequence"]
         packet = first["payload"]
-        assert (packet["spacecraft_id"], packet["instance"], packet["packet"]) == (
-            76,
-            "flight",
-            "housekeeping",
-        )
+        assert (packet["spacecraft_id"], packet["instance"], packet["packet"]) == (76, "flight", "housekeeping")
         values = {one["name"]: one for one in packet["values"]}
         assert values["temperature_c"] == {
             "name": "temperature_c", "value": 70.25, "text": "70.25", "limit_state": "warning",

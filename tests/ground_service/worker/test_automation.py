@@ -91,12 +91,7 @@ def deliver_reference(ground: Ground, flown: SyntheticPass) -> None:
 
 
 def prepared(
-    ground: Ground,
-    flown: SyntheticPass,
-    settings: str = "",
-    *,
-    mission: str = MISSION,
-    reference: bool = True,
+    ground: Ground, flown: SyntheticPass, settings: str = "", *, mission: str = MISSION, reference: bool = True
 ) -> int:
     """Enter what a ground knows before a pass; return an approved window."""
     held = add_catalogue(ground, ground.files.put_file(flown.folder / "catalogue.csv"), "craters.csv")
@@ -167,10 +162,7 @@ def test_a_live_pass_is_complete_and_processed_without_a_request(
     assert after.result["monthly report"] == {}  # the month of the pass is not complete
     document = report_of(either, window.pass_id)
     assert document["evidence_level"].startswith("2 ")
-    assert {one["name"] for one in document["navigation"] if one["kind"] == "baseline"} >= {
-        "propagate-only",
-        "Kepler",
-    }
+    assert {one["name"] for one in document["navigation"] if one["kind"] == "baseline"} >= {"propagate-only", "Kepler"}
     assert 0.6 < document["detector"]["micro"]["recall"] < 0.8  # a quarter of the craters is not detected
     assert {one["key"]: one["status"] for one in document["requirements"]}["detector.recall"] == "met"
     assert not {"detector", "reference", "error"} & set(document["not_available"])
@@ -231,18 +223,14 @@ def test_a_mission_without_a_camera_is_processed_and_its_report_says_what_that_m
     window = ground.read(get_window, window_id)
     assert window.state == "processed" and window.pass_id is not None
     report = report_of(ground, window.pass_id)
-    said = (
-        "the mission description does not state sizes of the camera, which are assumed: image width (512 px)"
-    )
+    said = "the mission description does not state sizes of the camera, which are assumed: image width (512 px)"
     assert [one for one in report["remarks"] if one.startswith(said)]
     [made, _] = follow_up(ground)
     assert made.result is not None
     assert made.result["report of pass 1"]["inputs"]["missing"]["camera"].startswith(said)
 
 
-def test_an_event_that_is_followed_again_has_one_result(
-    ground: Ground, flown: SyntheticPass, tmp_path: Path
-) -> None:
+def test_an_event_that_is_followed_again_has_one_result(ground: Ground, flown: SyntheticPass, tmp_path: Path) -> None:
     prepared(ground, flown)
     receive(ground, flown.packets, tmp_path)
     for job in follow_up(ground):
@@ -324,9 +312,7 @@ def test_a_mission_that_evaluates_nothing_leaves_its_windows_to_persons(
     assert follow_up(ground) == [] and ground.read(get_window, window_id).state == "downlinked"
 
 
-def test_the_catalogue_of_a_live_pass_is_cut_to_its_track(
-    ground: Ground, flown: SyntheticPass, tmp_path: Path
-) -> None:
+def test_the_catalogue_of_a_live_pass_is_cut_to_its_track(ground: Ground, flown: SyntheticPass, tmp_path: Path) -> None:
     window_id = prepared(ground, flown)
     receive(ground, flown.packets, tmp_path)
     pass_id = ground.read(get_window, window_id).pass_id
@@ -338,9 +324,7 @@ def test_the_catalogue_of_a_live_pass_is_cut_to_its_track(
 
 def test_a_mission_without_an_available_catalogue_is_refused_with_the_reason(ground: Ground) -> None:
     missing = parse_mission(f'name = "m"\n[catalogue]\nsha256 = "{"0" * 64}"\n')
-    with pytest.raises(
-        InvalidInput, match=r"m, catalogue.sha256: expected a catalogue that the ground holds"
-    ):
+    with pytest.raises(InvalidInput, match=r"m, catalogue.sha256: expected a catalogue that the ground holds"):
         catalogue_of(ground, missing)
     with pytest.raises(InvalidInput, match="linna catalogue add FILE"):
         catalogue_of(ground, parse_mission('name = "m"\n[catalogue]\nsource = "x"\n'))
@@ -369,9 +353,7 @@ def test_a_worker_that_only_reads_events_enters_no_job_twice(tmp_path: Path, flo
         assert jobs == ground.read(unfinished_jobs) == [one.id for one in follow_up(ground)] != []
 
 
-def test_a_processed_pass_is_searched_for_landmarks(
-    either: Ground, flown: SyntheticPass, tmp_path: Path
-) -> None:
+def test_a_processed_pass_is_searched_for_landmarks(either: Ground, flown: SyntheticPass, tmp_path: Path) -> None:
     full = load_catalogue(flown.folder / "catalogue.csv")
     thin = SyntheticPass(tmp_path / "thin", flown.packets, flown.utc_ns, flown.expected, flown.missed)
     shutil.copytree(flown.folder, thin.folder)

@@ -38,9 +38,7 @@ def everything(ground: Ground) -> dict[str, list[Any]]:
 
 def rows_of_an_empty_service(ground: Ground) -> bool:
     """Check that the database contains only the head of an empty audit chain."""
-    return {name: rows for name, rows in everything(ground).items() if rows} == {
-        "audit_head": [(1, 0, "0" * 64)]
-    }
+    return {name: rows for name, rows in everything(ground).items() if rows} == {"audit_head": [(1, 0, "0" * 64)]}
 
 
 @pytest.fixture
@@ -48,13 +46,9 @@ def filled(ground: Ground, synthetic_pass: Any) -> tuple[Ground, str]:
     import_archive(ground, synthetic_pass.folder)
     for k in (2, 1):
         add_window(
-            ground,
-            WindowEntry(f"w{k}", START + k * 100 * NS, START + (k * 100 + 50) * NS, 15.0, 76),
-            actor="ann",
+            ground, WindowEntry(f"w{k}", START + k * 100 * NS, START + (k * 100 + 50) * NS, 15.0, 76), actor="ann"
         )
-    change_window(
-        ground, 1, actor="ann", changes={"predecessor_id": 2}
-    )  # it names a window with a greater key
+    change_window(ground, 1, actor="ann", changes={"predecessor_id": 2})  # it names a window with a greater key
     return ground, add_user(ground, "ann", "operator")
 
 
@@ -104,18 +98,13 @@ def test_a_damaged_file_is_found_before_anything_is_restored(saved: Path, tmp_pa
     [
         ("UPDATE windows SET cadence_s = 15.000000000000002", "windows: expected the rows that were saved"),
         ("UPDATE packets SET ticks = ticks + 1 WHERE id = 3", "packets: expected the rows that were saved"),
-        (
-            "UPDATE housekeeping SET power_w = power_w + 1e-9",
-            "housekeeping: expected the rows that were saved",
-        ),
+        ("UPDATE housekeeping SET power_w = power_w + 1e-9", "housekeeping: expected the rows that were saved"),
         ("DELETE FROM tokens", "tokens: expected 1 rows, found 0"),
         ("INSERT INTO vehicles (ccsds_id, instance) VALUES (3, 'x')", "vehicles: expected"),
         ("UPDATE audit_head SET number = 2", "audit_head: expected the rows that were saved"),
     ],
 )
-def test_a_changed_row_of_a_backup_is_not_restored(
-    saved: Path, tmp_path: Path, statement: str, reason: str
-) -> None:
+def test_a_changed_row_of_a_backup_is_not_restored(saved: Path, tmp_path: Path, statement: str, reason: str) -> None:
     with sqlite3.connect(saved / "linna.db") as connection:
         connection.execute(statement)
     connection.close()
@@ -158,9 +147,7 @@ def test_a_backup_of_version_1_0_is_restored(tmp_path: Path) -> None:
     upgrade_database(database, "1.0")
     with database.writing() as connection:
         connection.execute(
-            text(
-                "INSERT INTO users (name, role, state, created_utc_ns) VALUES ('ann', 'viewer', 'active', 1)"
-            )
+            text("INSERT INTO users (name, role, state, created_utc_ns) VALUES ('ann', 'viewer', 'active', 1)")
         )
         connection.execute(text("INSERT INTO row_digests VALUES ('users', '1', 'x')"))
     with database.snapshot() as connection:

@@ -125,16 +125,12 @@ def test_a_job_that_the_disk_stops_is_held_back_longer_each_time(
         assert row_of(ground, job)["state"] in ("done", "queued")
 
 
-def test_a_job_is_done_once_the_disk_has_space(
-    downlink: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_job_is_done_once_the_disk_has_space(downlink: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with open_ground(tmp_path) as ground:
         job = enter(ground, downlink)
         dispatcher = ThreadDispatcher(ground)
         with monkeypatch.context() as disk:
-            disk.setattr(
-                ingest_store, "store_batch", lambda *_: (_ for _ in ()).throw(StorageFull("database"))
-            )
+            disk.setattr(ingest_store, "store_batch", lambda *_: (_ for _ in ()).throw(StorageFull("database")))
             dispatcher.resume()
             dispatcher._pool.submit(int).result()
         assert row_of(ground, job)["state"] == "queued"
@@ -181,18 +177,12 @@ SPACECRAFT = 76
 
 
 def stream_of(spacecraft: int, count: int = 40) -> bytes:
-    return encode_cadus(
-        [event_packet(k << 16, k, "boot") for k in range(1, count + 1)], spacecraft_id=spacecraft
-    )
+    return encode_cadus([event_packet(k << 16, k, "boot") for k in range(1, count + 1)], spacecraft_id=spacecraft)
 
 
 @pytest.mark.parametrize(
     "stated",
-    [
-        {"spacecraft_id": SPACECRAFT},
-        {"spacecraft_id": SPACECRAFT, "place": Place("s", 100)},
-        {"instance": "twin"},
-    ],
+    [{"spacecraft_id": SPACECRAFT}, {"spacecraft_id": SPACECRAFT, "place": Place("s", 100)}, {"instance": "twin"}],
 )
 def test_what_was_stated_with_a_downlink_holds_for_its_verification(
     ground: Ground, tmp_path: Path, stated: dict[str, Any]
@@ -224,9 +214,7 @@ def test_a_damaged_row_is_named(either: Ground, tmp_path: Path, damage: str, rea
     assert verify(either, rebuild=True).damaged == []
     with either.database.writing() as connection:
         connection.execute(text(damage))
-    assert reason in " ".join(
-        f"{one.kind} {one.key}: {one.reason}" for one in verify(either, rebuild=True).damaged
-    )
+    assert reason in " ".join(f"{one.kind} {one.key}: {one.reason}" for one in verify(either, rebuild=True).damaged)
     assert verify(either).damaged == []
 
 

@@ -12,12 +12,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from ground_service.contacts.commanding.service import (
-    enter_command,
-    note_timeouts,
-    release_command,
-    take_uplink,
-)
+from ground_service.contacts.commanding.service import enter_command, note_timeouts, release_command, take_uplink
 from ground_service.errors import DatabaseNotMigrated, SettingsError
 from ground_service.evaluation.service import pass_summary
 from ground_service.ground import Ground, open_ground
@@ -26,9 +21,7 @@ from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from ground_service.store import repository
-from ground_service.store.database import (
-    prepare_database,
-)
+from ground_service.store.database import prepare_database
 from ground_service.store.vehicles import vehicle_id
 from ground_service.worker import app as app_module
 from ground_service.worker.app import queued_jobs, run_worker, worker_answers
@@ -63,9 +56,7 @@ def ground_on_postgres(upgraded: str, tmp_path_factory: pytest.TempPathFactory) 
         yield ground
 
 
-def test_the_archive_is_the_same_as_on_sqlite(
-    ground_on_postgres: Ground, ground: Ground, synthetic_pass: Any
-) -> None:
+def test_the_archive_is_the_same_as_on_sqlite(ground_on_postgres: Ground, ground: Ground, synthetic_pass: Any) -> None:
     stream = synthetic_pass.folder / "downlink.cadu"
     hashes = []
     for one in (ground, ground_on_postgres):
@@ -98,9 +89,7 @@ def test_a_worker_makes_the_report(
     environment.pop("LINNA_DATA")
     environment["LINNA_LOG_FORMAT"] = "json"
     with (tmp_path / "worker.log").open("wb") as log:
-        worker = subprocess.Popen(
-            [sys.executable, "-m", "linna", "worker"], env=environment, stdout=log, stderr=log
-        )
+        worker = subprocess.Popen([sys.executable, "-m", "linna", "worker"], env=environment, stdout=log, stderr=log)
         try:
             row = finished(ground, waiting)
             assert row["state"] == "done", row
@@ -137,9 +126,7 @@ def test_a_worker_without_a_broker_is_refused(tmp_path: Path) -> None:
         worker_answers(Settings(home=tmp_path))
 
 
-def test_jobs_that_the_broker_lost_are_sent_again(
-    ground_on_postgres: Ground, redis_url: str, upgraded: str
-) -> None:
+def test_jobs_that_the_broker_lost_are_sent_again(ground_on_postgres: Ground, redis_url: str, upgraded: str) -> None:
     """The queue is emptied as if the broker had been killed; a job that somebody is doing is left to him."""
     import redis
 
@@ -162,16 +149,12 @@ def test_jobs_that_the_broker_lost_are_sent_again(
     assert run_job(ground, lost).error == "pass 4712: not found"
 
 
-def test_messages_of_other_programs_in_the_queue_are_no_jobs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_messages_of_other_programs_in_the_queue_are_no_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     messages = [b'{"headers": {"linna-job": "a1"}}', b"{}", b'{"headers": {}}', b"[1]", b"nothing"]
     answered = SimpleNamespace(lrange=lambda *_: messages)
     connection = MagicMock()
     connection.__enter__.return_value.default_channel.client = answered
-    monkeypatch.setattr(
-        app_module, "_app_of", lambda _: SimpleNamespace(connection_for_read=lambda: connection)
-    )
+    monkeypatch.setattr(app_module, "_app_of", lambda _: SimpleNamespace(connection_for_read=lambda: connection))
     assert queued_jobs(Settings(home=tmp_path)) == ["a1"]
 
 
@@ -186,9 +169,7 @@ def test_a_broker_that_breaks_off_is_a_broker_that_is_away(
     connection = MagicMock()
     connection.__enter__.return_value.default_channel.client = client
     connection.__exit__.return_value = False
-    monkeypatch.setattr(
-        app_module, "_app_of", lambda _: SimpleNamespace(connection_for_read=lambda: connection)
-    )
+    monkeypatch.setattr(app_module, "_app_of", lambda _: SimpleNamespace(connection_for_read=lambda: connection))
     enter_job(ground, "report", {"pass_id": 1})
     dispatcher_for(ground, Settings(home=tmp_path, broker_url="redis://127.0.0.1:1/0")).resume()
     ((text, error), _) = log.warning.call_args
@@ -203,9 +184,7 @@ def test_a_broker_that_is_away_refuses_nothing(ground: Ground, tmp_path: Path) -
     assert job_row(ground, job)["state"] == "queued"
 
 
-def test_two_files_that_are_ingested_at_once_are_joined(
-    ground_on_postgres: Ground, synthetic_pass: Any
-) -> None:
+def test_two_files_that_are_ingested_at_once_are_joined(ground_on_postgres: Ground, synthetic_pass: Any) -> None:
     """The packets that the cut between them goes through belong to neither, and come to light in any order."""
     from concurrent.futures import ThreadPoolExecutor
 
@@ -217,8 +196,6 @@ def test_two_files_that_are_ingested_at_once_are_joined(
     for number, piece in enumerate(pieces):
         (folder / f"{number}.cadu").write_bytes(piece)
     with ThreadPoolExecutor(4) as pool:
-        list(
-            pool.map(lambda path: ingest_file(ground_on_postgres, path, instance="pieces"), folder.iterdir())
-        )
+        list(pool.map(lambda path: ingest_file(ground_on_postgres, path, instance="pieces"), folder.iterdir()))
     whole = ingest_file(ground_on_postgres, synthetic_pass.folder / "downlink.cadu", instance="pieces")
     assert whole.packets_new == 0

@@ -24,13 +24,7 @@ from ground_service.settings import Settings
 from ground_service.store import event_kinds as events
 from ground_service.store import events as log
 from ground_service.store import repository
-from ground_service.store.event_kinds import (
-    CommandsSent,
-    FollowUpFailed,
-    PassEvaluated,
-    TelemetryReceived,
-    publish,
-)
+from ground_service.store.event_kinds import CommandsSent, FollowUpFailed, PassEvaluated, TelemetryReceived, publish
 from ground_service.worker import follow_up
 from ground_service.worker.follow_up import FollowUp, follow_in_process
 from lunar.timescales import parse_utc
@@ -215,9 +209,7 @@ def test_old_events_are_deleted_only_after_they_were_handled(ground: Ground, rec
 
 
 @pytest.fixture(scope="module")
-def halves(
-    make_pass: Callable[..., SyntheticPass], tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, Path]:
+def halves(make_pass: Callable[..., SyntheticPass], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Downlink of the first three quarters of a pass, and the rest."""
     made = make_pass(frames=24, seed=6)
     folder = tmp_path_factory.mktemp("late")
@@ -270,9 +262,7 @@ def test_the_same_data_again_make_no_report(ground: Ground, halves: tuple[Path, 
     assert len(reports_of(ground, pass_id)) == 1 and jobs_of(ground, "re-evaluation") == []
 
 
-def test_an_event_that_changes_nothing_of_a_pass_makes_no_report(
-    ground: Ground, halves: tuple[Path, Path]
-) -> None:
+def test_an_event_that_changes_nothing_of_a_pass_makes_no_report(ground: Ground, halves: tuple[Path, Path]) -> None:
     pass_id = reported_pass(ground, halves[0])
     with ground.database.reading() as connection:
         vehicle = repository.get(connection, repository.PASSES, pass_id, "pass")["vehicle_id"]
@@ -285,9 +275,7 @@ def test_an_event_that_changes_nothing_of_a_pass_makes_no_report(
     assert len(reports_of(ground, pass_id)) == 1
 
 
-def test_a_re_evaluation_that_waits_already_is_not_added_again(
-    tmp_path: Path, halves: tuple[Path, Path]
-) -> None:
+def test_a_re_evaluation_that_waits_already_is_not_added_again(tmp_path: Path, halves: tuple[Path, Path]) -> None:
     with open_ground(tmp_path) as ground:
         follow = FollowUp(ground, start=lambda _job: None)
         pass_id = reported_pass(ground, halves[0])

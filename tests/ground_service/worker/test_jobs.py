@@ -9,14 +9,7 @@ import pytest
 from ground_service.client.local import local_client
 from ground_service.client.problems import Conflict as ClientConflict
 from ground_service.clock import utc_now_ns
-from ground_service.errors import (
-    Conflict,
-    DatabaseUnavailable,
-    FileDamaged,
-    InvalidInput,
-    StorageFull,
-    public_text,
-)
+from ground_service.errors import Conflict, DatabaseUnavailable, FileDamaged, InvalidInput, StorageFull, public_text
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import enter_ingest
@@ -143,17 +136,13 @@ def test_a_full_disk_is_no_fault_of_the_job(ground: Ground, monkeypatch: pytest.
     assert (row_of(ground, job)["state"], row_of(ground, job)["attempts"]) == ("queued", 0)
 
 
-def test_a_result_that_the_database_cannot_hold_fails_the_job(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_result_that_the_database_cannot_hold_fails_the_job(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
     row = run_job(ground, job_that(monkeypatch, ground, lambda *_: {"median": float("nan")}))
     assert row.state == "failed"
     assert "JSON" in row.error
 
 
-def test_an_attempt_that_another_has_overtaken_changes_nothing(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_attempt_that_another_has_overtaken_changes_nothing(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
     """This occurs after a network failure, if the database grants the lock of the first worker to a second one."""
 
     def work(_ground: Ground, _arguments: Any, job_id: str) -> Row:
@@ -197,9 +186,7 @@ def test_an_ingest_asked_for_twice_is_one_and_of_another_file_is_refused(ground:
         (InvalidInput("x", "", "a number from 0/1 to 3", "and/or"), "x: expected a number from 0/1 to 3, found and/or"),
     ],
 )  # fmt: skip
-def test_what_is_shown_of_an_error_is_one_line_without_places_of_the_server(
-    error: Exception, shown: str
-) -> None:
+def test_what_is_shown_of_an_error_is_one_line_without_places_of_the_server(error: Exception, shown: str) -> None:
     assert public_text(error) == shown
 
 

@@ -163,9 +163,7 @@ def test_a_webhook_gets_a_signed_document_with_its_id(webhook: Webhook, tmp_path
     )
 
 
-def test_a_webhook_that_is_out_of_order_is_tried_again_with_the_same_id(
-    webhook: Webhook, tmp_path: Path
-) -> None:
+def test_a_webhook_that_is_out_of_order_is_tried_again_with_the_same_id(webhook: Webhook, tmp_path: Path) -> None:
     webhook.statuses = [503, 500]
     assert send(tmp_path, Channel(webhook=webhook.url), "id-2", "s", {}, wait=no_wait) == ATTEMPTS
     assert {headers["Idempotency-Key"] for headers, _ in webhook.received} == {"id-2"}
@@ -359,9 +357,7 @@ def test_signed_heads_that_a_webhook_and_an_e_mail_got_are_checked(
     (heads / "mail.eml").write_text(mailbox.received[0][1])
     now = audit_head(local)
     assert kept_heads(local, str(heads)) == [Head(now.number, now.sha256)] * 2
-    with pytest.raises(
-        InvalidInput, match="expected a channel of a mission description in force, found none"
-    ):
+    with pytest.raises(InvalidInput, match="expected a channel of a mission description in force, found none"):
         nightly(local, {"audit_heads": "channel:none"})
 
 

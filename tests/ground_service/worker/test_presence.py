@@ -42,9 +42,7 @@ def opened(settings: Settings) -> Iterator[Ground]:
         yield ground
 
 
-def test_a_process_is_known_while_it_runs(
-    opened: Ground, settings: Settings, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_is_known_while_it_runs(opened: Ground, settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(condition, "BEAT_S", 0.05)
     assert not running_processes(opened.database)
     with present(opened, settings, "worker"):
@@ -87,9 +85,7 @@ def test_a_start_with_disagreeing_peers_fails(
         assert len(running_processes(opened.database)) == 1
 
 
-def test_another_home_folder_and_other_data_are_noticed(
-    opened: Ground, settings: Settings, tmp_path: Path
-) -> None:
+def test_another_home_folder_and_other_data_are_noticed(opened: Ground, settings: Settings, tmp_path: Path) -> None:
     mine = statement_of(opened, settings)
     (tmp_path / "elsewhere").mkdir()
     other = replace(opened, home=tmp_path / "elsewhere")
@@ -112,9 +108,7 @@ def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
     opened: Ground, settings: Settings, redis_url: str, synthetic_pass: Any, tmp_path: Path
 ) -> None:
     with_broker = settings.model_copy(update={"broker_url": None})
-    given = Settings(
-        **{**with_broker.model_dump(), "broker_url": redis_url, "database_url": settings.database_url}
-    )
+    given = Settings(**{**with_broker.model_dump(), "broker_url": redis_url, "database_url": settings.database_url})
     ingest_file(opened, synthetic_pass.folder / "downlink.cadu")
     with opened.database.writing() as connection:
         leases.acquire(connection, "scheduler", "somebody", 60_000_000_000)
@@ -140,11 +134,7 @@ def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
 
         # 3. The provider is down.
         with running_provider() as provider:
-            oidc = {
-                "oidc_issuer": provider.issuer,
-                "oidc_client_id": "linna",
-                "oidc_roles": ("admin=a",),
-            }
+            oidc = {"oidc_issuer": provider.issuer, "oidc_client_id": "linna", "oidc_roles": ("admin=a",)}
             signed = given.model_copy(update=oidc)
             assert "provider" not in faults(opened, signed)
         assert "provider" in faults(opened, signed)
@@ -172,10 +162,7 @@ def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
         assert "audit heads" not in faults(opened, opened_to_people)
 
         # 6. Audit heads go to a channel that no mission description has, or to a folder that does not exist.
-        for target, told in (
-            ("channel:nobody", "found nobody"),
-            (str(tmp_path / "none"), "a folder that can"),
-        ):
+        for target, told in (("channel:nobody", "found nobody"), (str(tmp_path / "none"), "a folder that can")):
             given_heads = given.model_copy(update={"audit_heads": target})
             assert told in faults(opened, given_heads)["audit heads"]
     found = faults(opened, given)

@@ -36,9 +36,7 @@ def test_any_fault_fails_the_campaign_and_is_in_its_table(name: str) -> None:
 def test_answers_are_counted() -> None:
     tally = Tally()
     told, untold = b'{"state": "released"}', b"{}"
-    tally.add(
-        "release", [Answer("release", 200, told), Answer("release", 409, told), Answer("reject", 409, untold)]
-    )
+    tally.add("release", [Answer("release", 200, told), Answer("release", 409, told), Answer("reject", 409, untold)])
     tally.add("uplink", [Answer("hand out", 200, b"", (7, 8)), Answer("hand out", 200, b"", (8,))])
     tally.add("ingest", [Answer("upload", 503, b"gone")])
     assert (tally.requests["release"], tally.won["release"]) == (3, 1)

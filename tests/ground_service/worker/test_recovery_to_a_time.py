@@ -51,11 +51,7 @@ class Server:
         named = ["max_connections", "wal_level", "archive_mode", "archive_timeout", "archive_command"]
         assert [name for name, _ in options] == named
         lines = [f"{name} = {value}" for name, value in options]
-        own = [
-            f"port = {self.port}",
-            f"unix_socket_directories = '{self.folder}'",
-            "listen_addresses = '127.0.0.1'",
-        ]
+        own = [f"port = {self.port}", f"unix_socket_directories = '{self.folder}'", "listen_addresses = '127.0.0.1'"]
         settings = "\n".join([*lines, *own]).replace("/linna/", f"{self.scripts}/")
         (self.data / "archive.conf").write_text(settings + "\n")
         with (self.data / "postgresql.conf").open("a") as configuration:
@@ -66,9 +62,7 @@ class Server:
             *self.user, str(self.bin / "pg_ctl"), "-D", str(self.data), "-w", "-t", "120", "-l", log, "start",
         ]  # fmt: skip
         environment = {"PATH": SYSTEM, "LINNA_WAL": str(self.wal)}
-        started = subprocess.run(
-            command, cwd=self.folder, env=environment, stdout=subprocess.DEVNULL, check=False
-        )
+        started = subprocess.run(command, cwd=self.folder, env=environment, stdout=subprocess.DEVNULL, check=False)
         assert started.returncode == 0, Path(log).read_text()
 
     def stop(self) -> None:

@@ -114,9 +114,7 @@ def test_the_nightly_job_is_entered_once_after_half_past_midnight(
     assert work.submitted == [nightly_job_id(midnight), nightly_job_id(midnight + DAY_NS)]
 
 
-def test_each_night_a_placebo_takes_kept_archives_by_turns(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_night_a_placebo_takes_kept_archives_by_turns(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
     kept = [MagicMock(digest=f"{k}" * 64, state=COMPLETE if k else TELEMETRY_ONLY) for k in range(5)]
     monkeypatch.setattr(jobs, "kept_archives", lambda ground: kept)
     chosen = []
@@ -149,9 +147,7 @@ def test_without_the_hourly_plan_only_events_plan(
     assert (plan_job_id(begin) in work.submitted) == hourly
 
 
-def test_the_plan_is_entered_once_an_hour_of_mission_time(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_plan_is_entered_once_an_hour_of_mission_time(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
     one, work = make(ground)
     monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
     begin = parse_utc("2029-08-07T05:00:00Z")
@@ -180,9 +176,7 @@ def test_one_part_of_the_work_that_fails_does_not_stop_the_others(
     ]
 
 
-def test_a_night_that_was_missed_is_made_up_for_after_a_while(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_night_that_was_missed_is_made_up_for_after_a_while(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scheduling, "utc_now_ns", lambda: parse_utc("2029-08-07T12:00:00Z"))
     one, work = make(ground)
     one.tick()

@@ -72,9 +72,7 @@ def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pyte
             audit(connection, "ann", "look", "", {})
     with ground.database.writing() as connection:
         connection.execute(repository.EVENT_LOG.update().values(utc_ns=0))
-        connection.execute(
-            repository.ANSWERS.insert().values(key="k", request="r", answer={"id": 1}, created_utc_ns=0)
-        )
+        connection.execute(repository.ANSWERS.insert().values(key="k", request="r", answer={"id": 1}, created_utc_ns=0))
     for name in (".incoming-old", ".incoming-new"):
         ground.files.root.mkdir(exist_ok=True)
         (ground.files.root / name).write_bytes(b"")
@@ -136,9 +134,7 @@ def test_ten_years_later_the_record_is_complete_and_the_operation_is_gone(
     assert files == sorted(ground.files.root.rglob("*"))
 
 
-def test_expired_sessions_are_deleted_and_tokens_are_kept(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_expired_sessions_are_deleted_and_tokens_are_kept(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
     token = users.add_user(ground, "ann", "operator", days_valid=0.001)
     old, _ = users.start_session(ground, token)
     later = utc_now_ns() + DAY_NS

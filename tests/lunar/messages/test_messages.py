@@ -39,14 +39,10 @@ def ephemeris() -> Ephemeris:
         ),
     )
     second = EphemerisSegment(
-        START + np.arange(4, 9) * 60 * NS + 123_456_789,
-        rng.normal(size=(5, 3)) * 1e6,
-        rng.normal(size=(5, 3)) * 1e3,
-        time_system="TDB",
-        interpolation="LAGRANGE",
-        degree=5,
+        START + np.arange(4, 9) * 60 * NS + 123_456_789, rng.normal(size=(5, 3)) * 1e6,
+        rng.normal(size=(5, 3)) * 1e3, time_system="TDB", interpolation="LAGRANGE", degree=5,
         useable_start_utc_ns=START + 300 * NS,
-    )
+    )  # fmt: skip
     return Ephemeris((first, second), "TEST", ("two arcs",))
 
 
@@ -80,12 +76,8 @@ def test_another_reader_gives_the_same_states_from_xml(tmp_path: Path) -> None:
     expected = ephemeris()
     path.write_text(format_oem_xml(Ephemeris(expected.segments[:1])))
     segment = next(iter(independent.OrbitEphemerisMessage.open(path)))
-    np.testing.assert_allclose(
-        [one.position for one in segment.states], expected.segments[0].position_m / 1e3
-    )
-    np.testing.assert_allclose(
-        [one.velocity for one in segment.states], expected.segments[0].velocity_m_s / 1e3
-    )
+    np.testing.assert_allclose([one.position for one in segment.states], expected.segments[0].position_m / 1e3)
+    np.testing.assert_allclose([one.velocity for one in segment.states], expected.segments[0].velocity_m_s / 1e3)
     covariances = list(segment.covariances)
     assert len(covariances) == 2
     np.testing.assert_allclose(covariances[1].matrix, expected.segments[0].covariances[1].matrix / 1e6)
@@ -321,11 +313,7 @@ def test_a_quaternion_in_xml_without_its_scalar_is_named_with_its_line() -> None
     ("old", "new", "message"),
     [
         ("CCSDS_AEM_VERS = 2.0", "CCSDS_OEM_VERS = 2.0", "line 1: expected CCSDS_AEM_VERS"),
-        (
-            "CCSDS_AEM_VERS = 2.0",
-            "CCSDS_AEM_VERS = 7.0",
-            "expected an AEM version out of 1.0, 2.0, found '7.0'",
-        ),
+        ("CCSDS_AEM_VERS = 2.0", "CCSDS_AEM_VERS = 7.0", "expected an AEM version out of 1.0, 2.0, found '7.0'"),
         ("ATTITUDE_TYPE = QUATERNION", "ATTITUDE_TYPE = EULER_ANGLE", "expected ATTITUDE_TYPE = QUATERNION"),
         ("DATA_STOP", "", "expected more lines, found the end of the file"),
         ("REF_FRAME_B = INSTRUMENT_1\n", "", "expected REF_FRAME_B before META_STOP, found none"),
@@ -384,30 +372,15 @@ def test_a_horizons_table_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "error", "message"),
     [
-        (
-            "Moon (301) ",
-            "Earth (399) ",
-            DataFileError,
-            r"Center body name: expected Moon \(301\), found Earth \(399\)",
-        ),
+        ("Moon (301) ", "Earth (399) ", DataFileError, r"Center body name: expected Moon \(301\), found Earth \(399\)"),
         ("KM-S", "AU-D", DataFileError, "line 8: expected Output units of KM-S, M-S, KM-D, found 'AU-D'"),
-        (
-            ": ICRF",
-            ": Ecliptic of J2000.0",
-            UnknownFrameError,
-            "line 10: expected a reference frame out of ICRF",
-        ),
+        (": ICRF", ": Ecliptic of J2000.0", UnknownFrameError, "line 10: expected a reference frame out of ICRF"),
         ("$$EOE", "", DataFileError, r"expected a table between \$\$SOE and \$\$EOE, found 1 of the marks"),
         ("00:01:00", "00:00:00", DataFileError, "line 16: expected an epoch after 2029-08-06T23:58:50"),
         ("9.0E+01", "nan", DataFileError, "line 16: expected finite numbers"),
         ("9.0E+01", "ninety", DataFileError, "line 16: expected a date like .* and six numbers"),
         (" VZ,", " LT,", DataFileError, "columns: expected a column VZ, found none"),
-        (
-            "Calendar Date (TDB)",
-            "Date",
-            DataFileError,
-            r"columns: expected columns with Calendar Date \(TDB\)",
-        ),
+        ("Calendar Date (TDB)", "Date", DataFileError, r"columns: expected columns with Calendar Date \(TDB\)"),
     ],
 )
 def test_faults_of_a_horizons_table_are_named(
@@ -422,9 +395,7 @@ def test_faults_of_a_horizons_table_are_named(
 
 def test_a_horizons_table_with_steps_of_a_second_across_a_leap_second_is_read(tmp_path: Path) -> None:
     head, _, _ = HORIZONS.partition("$$SOE\n")
-    row = (
-        "2457754.5, A.D. 2017-Jan-01 00:01:{:02d}.0000, 1.8E+03, 0.0E+00, {}E+00, 0.0E+00, 0.0E+00, 1.6E+00,"
-    )
+    row = "2457754.5, A.D. 2017-Jan-01 00:01:{:02d}.0000, 1.8E+03, 0.0E+00, {}E+00, 0.0E+00, 0.0E+00, 1.6E+00,"
     path = tmp_path / "leap.csv"
     path.write_text(head + "\n".join(["$$SOE", *(row.format(5 + k, k) for k in range(6)), "$$EOE"]))
     segment = load_ephemeris(path).segments[0]
@@ -436,9 +407,7 @@ def test_a_horizons_table_with_steps_of_a_second_across_a_leap_second_is_read(tm
 def test_an_attitude_within_a_leap_second_is_refused_with_that_reason() -> None:
     for system, clock in (("UTC", "2016-12-31T23:59:60.000"), ("TT", "2017-01-01T00:01:08.184")):
         text = format_aem((attitudes(1),)).replace("TIME_SYSTEM = UTC", f"TIME_SYSTEM = {system}")
-        with pytest.raises(
-            DataFileError, match=f"epoch outside of a leap second, .* found '{clock}' {system}"
-        ):
+        with pytest.raises(DataFileError, match=f"epoch outside of a leap second, .* found '{clock}' {system}"):
             parse_aem(text.replace("2029-08-07T00:00:00.000 ", f"{clock} "))
 
 

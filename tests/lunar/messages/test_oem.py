@@ -101,9 +101,7 @@ def example_ephemeris(n=50, covariances=()):
     velocity = 1665.0 * np.stack([-np.sin(angle), 0.6 * np.cos(angle), 0.8 * np.cos(angle)], -1)
     utc_ns = START + np.arange(n) * 30 * NS
     later = utc_ns + (n - 1) * 30 * NS
-    first = EphemerisSegment(
-        utc_ns, position, velocity, comments=("first", "of two"), covariances=covariances
-    )
+    first = EphemerisSegment(utc_ns, position, velocity, comments=("first", "of two"), covariances=covariances)
     second = EphemerisSegment(later, position, velocity, degree=5, useable_stop_utc_ns=int(later[-3]))
     return Ephemeris((first, second), comments=("whole file",))
 
@@ -237,10 +235,7 @@ def replaced(old, new):
     ("text", "message"),
     [
         ("", "line 1: expected CCSDS_OEM_VERS = 1.0, 2.0 or 3.0, found nothing"),
-        (
-            replaced("VERS = 1.0", "VERS = 4.0"),
-            "line 1: expected an OEM version out of 1.0, 2.0, 3.0, found '4.0'",
-        ),
+        (replaced("VERS = 1.0", "VERS = 4.0"), "line 1: expected an OEM version out of 1.0, 2.0, 3.0, found '4.0'"),
         (replaced("ORIGINATOR = ESA", ""), "expected ORIGINATOR in the header"),
         (
             replaced("OBJECT_ID            = 2029-123A\n", ""),
@@ -255,18 +250,9 @@ def replaced(old, new):
             "line 9: expected CENTER_NAME = MOON, found 'EARTH'",
         ),
         (replaced("= HERMITE", "= SPLINE"), "line 16: expected an INTERPOLATION out of"),
-        (
-            replaced("INTERPOLATION_DEGREE = 5", "INTERPOLATION_DEGREE = x"),
-            "line 17: expected an INTERPOLATION_DEGREE",
-        ),
-        (
-            replaced("INTERPOLATION_DEGREE = 5\n", ""),
-            "line 16: expected INTERPOLATION_DEGREE with INTERPOLATION",
-        ),
-        (
-            replaced("START_TIME           = 2029-08-07", "START_TIME           = 2029-08-32"),
-            "expected an epoch like",
-        ),
+        (replaced("INTERPOLATION_DEGREE = 5", "INTERPOLATION_DEGREE = x"), "line 17: expected an INTERPOLATION_DEGREE"),
+        (replaced("INTERPOLATION_DEGREE = 5\n", ""), "line 16: expected INTERPOLATION_DEGREE with INTERPOLATION"),
+        (replaced("START_TIME           = 2029-08-07", "START_TIME           = 2029-08-32"), "expected an epoch like"),
         (replaced("OBJECT_NAME  ", "OBJEKT_NAME  "), "line 7: expected one of OBJECT_NAME"),
         (replaced("1765.2    99.8", "1765.2    ninety"), "line 21: expected a number, found 'ninety'"),
         (replaced("1765.2    99.8", "1765.2    nan"), "line 21: expected finite numbers"),
@@ -276,21 +262,12 @@ def replaced(old, new):
         ),
         (replaced("00:01:00.000   1765.2", "00:00:00.000   1765.2"), "line 21: expected an epoch after"),
         (replaced("2029-219T00:02:00", "2029-219T00:62:00"), "line 22: expected an epoch like"),
-        (
-            VERSION_1[: VERSION_1.index("2029-08-07T00:03:00.000Z")],
-            "line 22: expected a last state at STOP_TIME",
-        ),
-        (
-            VERSION_1[: VERSION_1.index("COMMENT propagated")],
-            "expected a state: epoch x y z vx vy vz, found the end",
-        ),
+        (VERSION_1[: VERSION_1.index("2029-08-07T00:03:00.000Z")], "line 22: expected a last state at STOP_TIME"),
+        (VERSION_1[: VERSION_1.index("COMMENT propagated")], "expected a state: epoch x y z vx vy vz, found the end"),
         (VERSION_1[: VERSION_1.index("META_STOP")], "expected more lines, found the end of the file"),
         (VERSION_1[: VERSION_1.index("META_START")], "expected META_START, found the end of the file"),
         (VERSION_1[:-8], "line 24: expected 7 values as in the line before, found 6"),
-        (
-            VERSION_1 + "COVARIANCE_START\nEPOCH = 2029-08-07T00:00:00\n1\n1\n",
-            "line 28: expected 2 numbers of row 2",
-        ),
+        (VERSION_1 + "COVARIANCE_START\nEPOCH = 2029-08-07T00:00:00\n1\n1\n", "line 28: expected 2 numbers of row 2"),
         (
             VERSION_1 + "COVARIANCE_START\nEPOCH = 2029-08-07T00:00:00\n1\n",
             "expected more lines, found the end of the file",
@@ -335,9 +312,7 @@ def over_the_leap_second(step_s, time_system="UTC"):
     elapsed = np.arange(0, 1200 if step_s > 1 else 620, step_s)
     tai_ns = parse_tai("2016-12-31T23:50:00") + elapsed * NS
     fields = {"tai_ns": tai_ns, "time_system": time_system}
-    return Ephemeris(
-        (EphemerisSegment(utc_ns_from_tai_ns(tai_ns), *circle(elapsed.astype(float)), **fields),)
-    )
+    return Ephemeris((EphemerisSegment(utc_ns_from_tai_ns(tai_ns), *circle(elapsed.astype(float)), **fields),))
 
 
 @pytest.mark.parametrize("step_s", [1, 60])
@@ -373,7 +348,5 @@ def test_an_epoch_that_is_none_among_a_thousand_is_named_with_its_line(fault):
     """Numpy ends the process by a segmentation fault where it refuses one of more than 500 texts."""
     lines = format_oem(over_the_leap_second(1)).splitlines()
     lines[-20] = fault + lines[-20][19:]
-    with pytest.raises(
-        DataFileError, match=f"line {len(lines) - 19}: expected an epoch like .*, found '{fault}"
-    ):
+    with pytest.raises(DataFileError, match=f"line {len(lines) - 19}: expected an epoch like .*, found '{fault}"):
         parse_oem("\n".join(lines))

@@ -52,12 +52,7 @@ def arc(first_s: int, last_s: int, step_s: int = 60, **fields: object) -> Epheme
 
 
 def test_ephemeris_time_is_that_of_spice(tmp_path: Path) -> None:
-    texts = [
-        "2016-12-31T23:59:59.5",
-        "2017-01-01T00:00:00",
-        "2029-08-07T12:34:56.789012",
-        "2035-02-03T00:00:00",
-    ]
+    texts = ["2016-12-31T23:59:59.5", "2017-01-01T00:00:00", "2029-08-07T12:34:56.789012", "2035-02-03T00:00:00"]
     utc_ns = np.array([parse_utc(text) for text in texts])
     with kernels(tmp_path) as spice:
         expected = [spice.str2et(text) for text in texts]
@@ -76,9 +71,7 @@ def test_ephemeris_time_within_a_leap_second_is_that_of_spice(tmp_path: Path) ->
 
 @pytest.mark.parametrize("data_type", [3, 13])
 @pytest.mark.parametrize(("interpolation", "degree"), [("HERMITE", 7), ("LAGRANGE", 9), ("LINEAR", 1)])
-def test_spk_gives_the_states_of_the_ephemeris(
-    tmp_path: Path, interpolation: str, degree: int, data_type: int
-) -> None:
+def test_spk_gives_the_states_of_the_ephemeris(tmp_path: Path, interpolation: str, degree: int, data_type: int) -> None:
     ephemeris = Ephemeris((arc(0, 7200, interpolation=interpolation, degree=degree),))
     asked = START + np.arange(0, 7200 * NS, 13 * NS + 7_000_001)
     position, velocity = ephemeris.at(asked)
@@ -94,9 +87,7 @@ def test_spk_keeps_the_segments_and_their_useable_intervals(tmp_path: Path) -> N
     burn = START + 1800 * NS
     before = arc(0, 2400, useable_stop_utc_ns=burn)
     seconds = np.arange(1200, 3601, 60)
-    after = EphemerisSegment(
-        START + seconds * NS, *circular(seconds.astype(float), 1e-3), useable_start_utc_ns=burn
-    )
+    after = EphemerisSegment(START + seconds * NS, *circular(seconds.astype(float), 1e-3), useable_start_utc_ns=burn)
     ephemeris = Ephemeris((before, after))
     with kernels(tmp_path, orbit=spk_kernel(ephemeris, CRAFT).octets) as spice:
         for seconds_after in (-1, 1):
@@ -228,10 +219,7 @@ def test_ck_clock_and_frame_turn_vectors_as_the_attitudes_do(tmp_path: Path) -> 
 def test_clock_of_two_correlations_shows_each_from_its_start(tmp_path: Path) -> None:
     fast = 1.0 + 5e-6
     ticks = int(ticks_from_utc_ns(START))
-    lines = [
-        ClockLine(ticks, START + 250_000_000),
-        ClockLine(ticks + 3600 * TICKS_PER_SECOND, START + 3601 * NS, fast),
-    ]
+    lines = [ClockLine(ticks, START + 250_000_000), ClockLine(ticks + 3600 * TICKS_PER_SECOND, START + 3601 * NS, fast)]
     with kernels(tmp_path, clock=format_sclk(lines, CRAFT)) as spice:
         for clock_s, real_s in ((1800, 1800.25), (3600, 3601.0), (7200, 3601.0 + 3600 * fast)):
             et = spice.sct2e(CRAFT, float(ticks + clock_s * TICKS_PER_SECOND))
@@ -242,9 +230,7 @@ def test_clock_of_two_correlations_shows_each_from_its_start(tmp_path: Path) -> 
 def test_field_of_view_is_that_of_the_camera(tmp_path: Path) -> None:
     camera = PinholeCamera()
     number = camera_id(CRAFT)
-    with kernels(
-        tmp_path, camera=format_ik(camera, CRAFT, "SELENITA"), frame=format_fk(CRAFT, "SELENITA")
-    ) as spice:
+    with kernels(tmp_path, camera=format_ik(camera, CRAFT, "SELENITA"), frame=format_fk(CRAFT, "SELENITA")) as spice:
         shape, frame, boresight, count, corners = spice.getfov(number, 8)
     assert (shape, frame, count) == ("POLYGON", "SELENITA_CAMERA", 4)
     np.testing.assert_array_equal(boresight, [0.0, 0.0, 1.0])
@@ -262,7 +248,5 @@ def test_without_spiceypy_one_line_names_the_extra(monkeypatch: pytest.MonkeyPat
         return usual(name, *rest)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(
-        MissingLibrary, match=r"expected the library spiceypy, found none; install linna\[spice\]"
-    ):
+    with pytest.raises(MissingLibrary, match=r"expected the library spiceypy, found none; install linna\[spice\]"):
         spk_kernel(Ephemeris((arc(0, 600),)), CRAFT)

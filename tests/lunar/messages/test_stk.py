@@ -57,9 +57,7 @@ def test_the_example_is_read_with_units_bias_and_segments():
     assert format_utc(int(second.utc_ns[0])) == "2029-08-07T00:02:00.000Z"
     assert (first.interpolation, first.degree) == ("LAGRANGE", 5)
     assert np.allclose(first.position_m[1], icrf_from_j2000() @ [1765e3, 99.8e3, 16e3], atol=1e-6)
-    assert np.allclose(
-        ephemeris.at(START + 120 * NS)[1], icrf_from_j2000() @ [-200.0, 1660.0, 100.0], atol=1e-9
-    )
+    assert np.allclose(ephemeris.at(START + 120 * NS)[1], icrf_from_j2000() @ [-200.0, 1660.0, 100.0], atol=1e-9)
 
 
 def test_what_is_written_is_read_back_to_a_micrometre(tmp_path):
@@ -93,9 +91,7 @@ def test_a_boundary_listed_for_a_single_state_splits_there_too():
 
 
 def test_accelerations_are_passed_over():
-    text = EXAMPLE.replace("EphemerisTimePosVel", "EphemerisTimePosVelAcc").replace(
-        "1.0e-01\n", "1.0e-01 0 0 0\n"
-    )
+    text = EXAMPLE.replace("EphemerisTimePosVel", "EphemerisTimePosVelAcc").replace("1.0e-01\n", "1.0e-01 0 0 0\n")
     assert len(parse_stk(text).utc_ns) == 4
 
 
@@ -114,23 +110,11 @@ def replaced(old, new):
     ("text", "message"),
     [
         ("", "line 1: expected stk.v.<version>, found nothing"),
-        (
-            replaced("BEGIN Ephemeris", "BEGIN Attitude"),
-            "line 5: expected BEGIN Ephemeris, found 'BEGIN Attitude'",
-        ),
+        (replaced("BEGIN Ephemeris", "BEGIN Attitude"), "line 5: expected BEGIN Ephemeris, found 'BEGIN Attitude'"),
         (replaced("END Ephemeris", ""), "expected END Ephemeris, found the end of the file: it is cut short"),
-        (
-            EXAMPLE[: EXAMPLE.index("EphemerisTimePosVel")],
-            "expected EphemerisTimePosVel, found the end of the file",
-        ),
-        (
-            replaced("EphemerisTimePosVel", "EphemerisTimePos"),
-            "expected EphemerisTimePosVel, EphemerisTimePosVelAcc",
-        ),
-        (
-            replaced("ScenarioEpoch            7 Aug", "ScenarioEpoch  7 Ogs"),
-            "line 8: expected an epoch like",
-        ),
+        (EXAMPLE[: EXAMPLE.index("EphemerisTimePosVel")], "expected EphemerisTimePosVel, found the end of the file"),
+        (replaced("EphemerisTimePosVel", "EphemerisTimePos"), "expected EphemerisTimePosVel, EphemerisTimePosVelAcc"),
+        (replaced("ScenarioEpoch            7 Aug", "ScenarioEpoch  7 Ogs"), "line 8: expected an epoch like"),
         (replaced("7 Aug 2029", "31 Feb 2029"), "line 8: expected an epoch that exists"),
         (
             replaced("CentralBody              Moon", "CentralBody Mars"),
@@ -145,14 +129,8 @@ def replaced(old, new):
         (replaced("Lagrange", "Spline"), "line 9: expected InterpolationMethod"),
         (replaced("1.765e+03", "1.765e+o3"), "line 22: expected a number, found '1.765e+o3'"),
         (replaced("1.765e+03", "nan"), "line 22: expected finite numbers"),
-        (
-            replaced("1.765e+03 9.980e+01", "1.765e+03"),
-            "line 22: expected a time and 6 numbers, found 6 values",
-        ),
-        (
-            replaced(" 6.00000000000000e+01", " 6.00000000000000e+03"),
-            "line 23: expected a time after the one before",
-        ),
+        (replaced("1.765e+03 9.980e+01", "1.765e+03"), "line 22: expected a time and 6 numbers, found 6 values"),
+        (replaced(" 6.00000000000000e+01", " 6.00000000000000e+03"), "line 23: expected a time after the one before"),
     ],
 )
 def test_a_faulty_file_is_refused_in_one_line_with_its_place(tmp_path, text, message):

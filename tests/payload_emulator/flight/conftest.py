@@ -40,9 +40,7 @@ def paper_orbit_mcmf_m(seconds: Iterable[float] | FloatArray) -> FloatArray:
     eccentric = mean.copy()
     for _ in range(12):
         eccentric = mean + e * np.sin(eccentric)
-    true = 2.0 * np.arctan2(
-        np.sqrt(1.0 + e) * np.sin(eccentric / 2.0), np.sqrt(1.0 - e) * np.cos(eccentric / 2.0)
-    )
+    true = 2.0 * np.arctan2(np.sqrt(1.0 + e) * np.sin(eccentric / 2.0), np.sqrt(1.0 - e) * np.cos(eccentric / 2.0))
     radius, u, turned = a * (1.0 - e * np.cos(eccentric)), perilune + true, node - MOON_RATE_RAD_S * time
     return radius[:, None] * np.stack(
         [
@@ -78,9 +76,7 @@ class CraterField:
         reach = RADIUS_M * np.sin(np.arccos(RADIUS_M / (RADIUS_M + altitude)))
         low, high = np.searchsorted(self.position_m[:, 2], [position_m[2] - reach, position_m[2] + reach])
         points, diameter = self.position_m[low:high], self.diameter_m[low:high]
-        up = np.array(
-            [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)]
-        )
+        up = np.array([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
         east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
         away = points - position_m
         depth = -away @ up
@@ -185,9 +181,7 @@ class Rig:
         """Let time pass, then take a step; `image` None: none is taken."""
         self.second += seconds
         self.board.advance(seconds, 1.0)
-        picture = (
-            np.zeros((0, 0), np.uint8) if image is None else self.image if isinstance(image, str) else image
-        )
+        picture = np.zeros((0, 0), np.uint8) if image is None else self.image if isinstance(image, str) else image
         packets = self.payload.step(picture, self.attitude, self.ticks, orders)
         if self.board.reset_requested is not None:
             self.boot(self.board.reset_requested)

@@ -44,12 +44,7 @@ def pose_at(east_m: float, north_m: float, altitude_m: float = ALTITUDE_M) -> Po
 
 
 def detected(
-    landmarks: LandmarkMap,
-    pose: Pose,
-    keep: float = 0.7,
-    noise_px: float = 0.5,
-    false: int = 4,
-    seed: int = 1,
+    landmarks: LandmarkMap, pose: Pose, keep: float = 0.7, noise_px: float = 0.5, false: int = 4, seed: int = 1
 ) -> tuple[Detections, np.ndarray]:
     """Some of the craters in the image with noise, false detections among them; which crater each is, -1 for none."""
     rng = np.random.default_rng(seed)
@@ -58,12 +53,7 @@ def detected(
     index = np.flatnonzero((seen[:, 2] > 0.0) & np.all(np.abs(uv - 255.5) < 255.0, axis=1))
     index = index[rng.uniform(size=index.size) < keep]
     noisy = uv[index] + noise_px * rng.standard_normal((index.size, 2))
-    diameter = (
-        landmarks.diameter_m[index]
-        * FOCAL_PX
-        / seen[index, 2]
-        * np.exp(0.1 * rng.standard_normal(index.size))
-    )
+    diameter = landmarks.diameter_m[index] * FOCAL_PX / seen[index, 2] * np.exp(0.1 * rng.standard_normal(index.size))
     noisy = np.concatenate([noisy, rng.uniform(0.0, 511.0, (false, 2))])
     diameter = np.concatenate([diameter, rng.uniform(20.0, 60.0, false)])
     order = rng.permutation(len(noisy))
@@ -213,9 +203,7 @@ def test_more_is_asked_of_a_wider_search_and_of_a_smaller_risk() -> None:
     seen = (landmarks.position_mcmf_m - true.position_icrf_m) @ NADIR.T
     uv = 255.5 + FOCAL_PX * seen[:, :2] / seen[:, 2:]
     inside = np.flatnonzero((seen[:, 2] > 0.0) & np.all(np.abs(uv - 255.5) < 256.0, axis=1))
-    ratio = np.abs(
-        np.log(found.diameter_px[:, None] * seen[inside, 2] / (landmarks.diameter_m[inside] * FOCAL_PX))
-    )
+    ratio = np.abs(np.log(found.diameter_px[:, None] * seen[inside, 2] / (landmarks.diameter_m[inside] * FOCAL_PX)))
     pairs = np.count_nonzero(ratio < 0.45)
     share = pairs * np.pi * tight_px**2 / 512.0**2 / len(found)
     # Poisson in the expected number of chance pairs at a place, all detections together; the pair that makes the place

@@ -73,9 +73,7 @@ class Flight:
         )  # fmt: skip
 
     def payload(self, **changes: bytes) -> Payload:
-        return Payload(
-            Script(self.frames), FlightParameters(modes=(Mode.anchored,)), replace(self.tables, **changes)
-        )
+        return Payload(Script(self.frames), FlightParameters(modes=(Mode.anchored,)), replace(self.tables, **changes))
 
     def fly(self, payload: Payload) -> list[bytes]:
         return [
@@ -141,9 +139,7 @@ def test_frames_without_image_attitude_or_detections_are_coasted_over_and_named(
     assert outcomes[9:] == [Outcome.fixed] * (FRAMES - 9)
 
 
-def test_detections_with_numbers_that_are_none_are_passed_over_and_nothing_becomes_nan(
-    flight: Flight,
-) -> None:
+def test_detections_with_numbers_that_are_none_are_passed_over_and_nothing_becomes_nan(flight: Flight) -> None:
     bad = np.array([np.nan, np.inf, -np.inf, -5.0, 0.0, 1e300])
     for k in range(4, 9):
         found = flight.frames[k][1]

@@ -12,12 +12,7 @@ from lunar.camera import nadir_camera_from_mcmf
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
 from payload_emulator.flight.navigation import anchored, correction, recovery
-from payload_emulator.flight.navigation.anchored import (
-    AnchoredReport,
-    AnchoredSetup,
-    AnchoredState,
-    Observation,
-)
+from payload_emulator.flight.navigation.anchored import AnchoredReport, AnchoredSetup, AnchoredState, Observation
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredLimits, AnchoredParameters
 from payload_emulator.flight.navigation.correction import Fix, frame_limit, is_usable
 from payload_emulator.flight.navigation.filter import filter as kalman
@@ -54,9 +49,7 @@ class Navigator:
     def step(self, ticks: int, found: Detections | None, camera_from_icrf: Any) -> AnchoredReport:
         before = frozen_copy(self.state)
         given = self.state
-        self.state, self.report = anchored.step(
-            given, Observation(ticks, found, camera_from_icrf), self.setup
-        )
+        self.state, self.report = anchored.step(given, Observation(ticks, found, camera_from_icrf), self.setup)
         # A step changes nothing of the state that it is given.
         np.testing.assert_array_equal(given.estimate.mean, before[0])
         np.testing.assert_array_equal(given.estimate.covariance, before[1])
@@ -85,9 +78,7 @@ class Orbit:
         return nadir_camera_from_mcmf(self.rotations[k] @ self.states[k, :3]) @ self.rotations[k]
 
     def detections(self, k: int, shift_px: float = 0.0) -> Detections:
-        pose = Pose(
-            self.states[k, :3], self.attitude(k), self.rotations[k], np.zeros(3), np.zeros(2), np.zeros(3)
-        )
+        pose = Pose(self.states[k, :3], self.attitude(k), self.rotations[k], np.zeros(3), np.zeros(2), np.zeros(3))
         seen = in_view(self.map, pose, self.case.camera, 0.0)
         one = np.ones(len(seen))
         return Detections(seen.uv_px[:, 0] + shift_px, seen.uv_px[:, 1], seen.diameter_px, one, one)
@@ -99,9 +90,7 @@ class Orbit:
             start_velocity_m_s=0.3,
             parameters=replace(AnchoredParameters(gravity_degree=50), **changes),
         )
-        table = replace(
-            montecarlo.catalogue_table(case.craters), sigma_m=np.full((len(case.craters), 3), 60.0)
-        )
+        table = replace(montecarlo.catalogue_table(case.craters), sigma_m=np.full((len(case.craters), 3), 60.0))
         return Navigator(
             *montecarlo._started(case, table, self.states[0], int(self.ticks[0]), np.random.default_rng(1))
         )
@@ -116,10 +105,7 @@ def orbit(navigation_case: Any) -> Orbit:
 
 
 def fly(orbit: Orbit, navigator: Navigator, first: int, last: int) -> list[Any]:
-    return [
-        navigator.step(int(orbit.ticks[k]), orbit.detections(k), orbit.attitude(k))
-        for k in range(first, last)
-    ]
+    return [navigator.step(int(orbit.ticks[k]), orbit.detections(k), orbit.attitude(k)) for k in range(first, last)]
 
 
 def test_the_gate_of_a_frame_is_the_chi_square_quantile_it_says() -> None:
@@ -173,9 +159,7 @@ def test_outside_the_orientation_table_the_old_state_stays(orbit: Orbit) -> None
     navigator = orbit.navigator()
     fly(orbit, navigator, 0, 3)
     before = navigator.state
-    report = navigator.step(
-        int(orbit.ticks[3]) + 400 * 86_400 * SECOND, orbit.detections(3), orbit.attitude(3)
-    )
+    report = navigator.step(int(orbit.ticks[3]) + 400 * 86_400 * SECOND, orbit.detections(3), orbit.attitude(3))
     assert report.outcome is Outcome.refused and np.isnan(report.latitude_rad)
     assert navigator.state is before
 
@@ -222,9 +206,7 @@ def test_detection_noise_is_split_between_frame_and_crater(orbit: Orbit) -> None
     index = np.array([3, 8])
     altitude_m, low_m = 30_000.0, 400.0
     catalogue_m = navigator.state.landmarks.sigma_m[index]
-    lasting = correction.crater_sigma_m(
-        catalogue_m, np.array([1.2, 2.7]), altitude_m, orbit.case.camera, parameters
-    )
+    lasting = correction.crater_sigma_m(catalogue_m, np.array([1.2, 2.7]), altitude_m, orbit.case.camera, parameters)
     low = correction.crater_sigma_m(catalogue_m, np.array([1.2, 2.7]), low_m, orbit.case.camera, parameters)
     focal_px = 256.0 / np.tan(np.radians(60.0))
     for row, px2 in enumerate((4.0, 9.0)):
@@ -364,9 +346,7 @@ def test_a_wide_prior_is_searched_by_votes_and_says_so(orbit: Orbit) -> None:
     assert following.outcome is Outcome.fixed and not following.reacquired
 
 
-def recorded(
-    monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, answer: Any = None
-) -> list[tuple[Any, ...]]:
+def recorded(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, answer: Any = None) -> list[tuple[Any, ...]]:
     """Put a stand-in in place of a function that keeps what it is given."""
     calls: list[tuple[Any, ...]] = []
 
@@ -378,9 +358,7 @@ def recorded(
     return calls
 
 
-def test_a_place_found_without_a_prior_turns_the_orbit_with_it(
-    orbit: Orbit, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_place_found_without_a_prior_turns_the_orbit_with_it(orbit: Orbit, monkeypatch: pytest.MonkeyPatch) -> None:
     """The velocity turns by the shortest rotation from the believed place to the one that was found."""
     navigator = orbit.navigator()
     prior = navigator.estimate
@@ -477,9 +455,7 @@ def test_a_reacquisition_leaves_out_the_pair_that_all_others_contradict(
     landmarks, camera, parameters = navigator.state.landmarks, orbit.case.camera, navigator.setup.parameters
     pose = Pose(prior.mean[:3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3))
     sighting = in_view(landmarks, pose, camera, 0.0)
-    true = Pose(
-        orbit.states[0, :3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3)
-    )
+    true = Pose(orbit.states[0, :3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3))
     seen = in_view(orbit.map, true, camera, 0.0).index.tolist()
     pairs = [(seen.index(crater), k) for k, crater in enumerate(sighting.index.tolist()) if crater in seen]
     detection, sighted = (np.array(column) for column in zip(*pairs, strict=True))
@@ -549,9 +525,7 @@ def test_a_reset_of_the_filter_drops_the_predictions_of_the_window(
     fly(orbit, navigator, 0, 4)
     assert len(navigator.state.trusted) == 4 == len(navigator.state.attitude.window)
     fix = replace(navigator.fix, reacquired=True)
-    monkeypatch.setattr(
-        anchored, "search_around", lambda state, *_: anchored.Search(state.estimate, None, 5, 5)
-    )
+    monkeypatch.setattr(anchored, "search_around", lambda state, *_: anchored.Search(state.estimate, None, 5, 5))
     monkeypatch.setattr(anchored, "rotation_evidence", lambda *_: None)
     monkeypatch.setattr(anchored, "recovered", lambda state, *_: (state, fix))
     navigator.step(int(orbit.ticks[4]), orbit.detections(4), orbit.attitude(4))
@@ -564,9 +538,7 @@ def test_frames_under_examination_by_the_monitor_are_not_searched_widely(
     navigator = orbit.navigator(suspicion_frames=1, lost_frames=100)
     fly(orbit, navigator, 0, 3)
     evidence = replace(navigator.fix.update.rotation, trial=True)
-    monkeypatch.setattr(
-        anchored, "search_around", lambda state, *_: anchored.Search(state.estimate, None, 9, 9)
-    )
+    monkeypatch.setattr(anchored, "search_around", lambda state, *_: anchored.Search(state.estimate, None, 9, 9))
     monkeypatch.setattr(anchored, "rotation_evidence", lambda *_: evidence)
     widened = recorded(monkeypatch, recovery, "search_widely")
     searches = []
@@ -582,9 +554,7 @@ def test_an_estimate_that_left_the_moon_starts_again_from_the_tables(orbit: Orbi
     fly(orbit, navigator, 0, 3)
     below = navigator.estimate.mean.copy()
     below[:3] *= 0.9
-    broken = FilterState(
-        navigator.estimate.ticks, below, navigator.estimate.covariance, navigator.estimate.craters
-    )
+    broken = FilterState(navigator.estimate.ticks, below, navigator.estimate.covariance, navigator.estimate.craters)
     navigator.state = replace(navigator.state, estimate=broken)
     report = navigator.step(int(orbit.ticks[3]), orbit.detections(3), orbit.attitude(3))
     assert report.outcome is Outcome.fixed and orbit.error_m(navigator, 3) < 200.0
@@ -630,9 +600,7 @@ def test_craters_are_looked_for_as_far_outside_as_the_position_may_be_off(
         wide = np.zeros_like(prior.covariance)
         wide[:3, :3] = np.eye(3) * sigma_m**2
         prior = replace(prior, covariance=wide)
-        pose = Pose(
-            prior.mean[:3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3)
-        )
+        pose = Pose(prior.mean[:3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3))
         nothing = in_view(orbit.map, pose, orbit.case.camera, 0.0).select(np.zeros(0, dtype=np.int64))
         calls = recorded(monkeypatch, anchored, "in_view", nothing)
         state = replace(navigator.state, estimate=prior)
@@ -692,12 +660,9 @@ def at_altitude(altitude_m: float) -> FilterState:
 
 
 @pytest.mark.parametrize(
-    ("altitude_m", "limit_m"),
-    [(14e3, 1_500.0), (50e3, 1_500.0), (100e3, 1_500.0), (150e3, 2_250.0), (200e3, 3_000.0)],
+    ("altitude_m", "limit_m"), [(14e3, 1_500.0), (50e3, 1_500.0), (100e3, 1_500.0), (150e3, 2_250.0), (200e3, 3_000.0)]
 )
-def test_the_limit_of_the_linear_search_grows_with_the_ground_in_a_pixel(
-    altitude_m: float, limit_m: float
-) -> None:
+def test_the_limit_of_the_linear_search_grows_with_the_ground_in_a_pixel(altitude_m: float, limit_m: float) -> None:
     found = correction.tracking_limit_m(at_altitude(altitude_m), AnchoredParameters())
     assert found == pytest.approx(limit_m)
 
@@ -747,17 +712,12 @@ def test_the_map_is_shown_the_frame_as_corrected_and_what_no_crater_explains(
         np.hypot(errors.attitude_bias_rad, errors.attitude_noise_rad)
     )
     turn = Rotation.from_rotvec(-state.mean[9:12]).as_matrix()
-    np.testing.assert_allclose(
-        calls[1][1].camera_from_mcmf, turn @ orbit.attitude(2) @ rotation.T, atol=1e-12
-    )
+    np.testing.assert_allclose(calls[1][1].camera_from_mcmf, turn @ orbit.attitude(2) @ rotation.T, atol=1e-12)
 
 
 def coasted_then_empty(orbit: Orbit, navigator: Navigator, seconds: int) -> list[AnchoredReport]:
     start, nothing = int(orbit.ticks[2]), orbit.detections(3).select(np.zeros(0, dtype=np.int64))
-    return [
-        navigator.step(start + 100 * SECOND, None, None),
-        navigator.step(start + seconds * SECOND, nothing, None),
-    ]
+    return [navigator.step(start + 100 * SECOND, None, None), navigator.step(start + seconds * SECOND, nothing, None)]
 
 
 def test_a_pass_ends_when_nothing_was_seen_for_the_memory_of_craters(

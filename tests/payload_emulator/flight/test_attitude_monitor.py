@@ -178,9 +178,7 @@ def test_a_bad_sensor_is_detected_and_tolerated_on_passes(
     assert without.nees[20:].mean() > 30.0
 
 
-def test_moderate_noise_is_detected_within_a_window_of_frames(
-    navigation_case: Callable[..., NavigationCase],
-) -> None:
+def test_moderate_noise_is_detected_within_a_window_of_frames(navigation_case: Callable[..., NavigationCase]) -> None:
     for seed in (41, 42, 43):
         run = flown(navigation_case, seed, 0.2)
         assert np.flatnonzero(run.attitude_noise_rad)[0] < 45
@@ -241,11 +239,7 @@ def looks(case: NavigationCase, state: FloatArray, rotation: FloatArray) -> tupl
 
 
 def seen(
-    case: NavigationCase,
-    craters: Any,
-    state: FloatArray,
-    camera_from_icrf: FloatArray,
-    rotation: FloatArray,
+    case: NavigationCase, craters: Any, state: FloatArray, camera_from_icrf: FloatArray, rotation: FloatArray
 ) -> Any:
     lasting = np.zeros((len(craters), 2))
     found, _ = montecarlo._detect(

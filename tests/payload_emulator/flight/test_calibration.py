@@ -90,9 +90,7 @@ def test_text_that_is_no_calibration_is_refused(plain):
 def test_standard_deviations_are_stated_in_two_parts():
     found = detections()
     features = sigma_features(found, SUN, 512, 512)
-    assert features[0] == pytest.approx(
-        [1.0, 0.0, np.log(2.0), 1.0, 1.7 / np.linalg.norm(SUN), 0.0], abs=1e-12
-    )
+    assert features[0] == pytest.approx([1.0, 0.0, np.log(2.0), 1.0, 1.7 / np.linalg.norm(SUN), 0.0], abs=1e-12)
     assert features[1, 5] == pytest.approx(255.5 / 256.0)
     stated = with_sigma(found, SIGMA, features)
     # ln(80 / 20) is beyond what was seen: the last value holds.

@@ -4,25 +4,13 @@ import binascii
 
 import pytest
 
-from payload_emulator.flight.onboard.commanding import (
-    Command,
-    CommandHistory,
-    Refusal,
-    failure,
-    parse_commands,
-)
+from payload_emulator.flight.onboard.commanding import Command, CommandHistory, Refusal, failure, parse_commands
 
 UNKNOWN_PACKET, BAD_CHECKSUM, BAD_LENGTH, DUPLICATE, OUT_OF_SEQUENCE = 1, 2, 3, 6, 8
 
 
 def packet(
-    count: int,
-    body: bytes = b"",
-    *,
-    service: int = 17,
-    subtype: int = 1,
-    source: int = 0,
-    acknowledge: int = 15,
+    count: int, body: bytes = b"", *, service: int = 17, subtype: int = 1, source: int = 0, acknowledge: int = 15
 ) -> bytes:
     """A telecommand to APID 160 with CRC-16/CCITT-FALSE; service 17, subtype 1 is the connection test."""
     secondary = bytes([0x20 | acknowledge, service, subtype]) + source.to_bytes(2, "big")

@@ -118,15 +118,7 @@ def test_the_shipped_network_is_small_and_tells_what_it_is(detector):
     assert len(detector.model_octets) <= 6_000_000
     assert detector.model_hash == int(hashlib.sha256(detector.model_octets).hexdigest()[:8], 16)
     assert 0.1 <= detector.score_threshold <= 0.9
-    for key in (
-        "input",
-        "outputs",
-        "navigation_threshold",
-        "data",
-        "validation",
-        "git_revision",
-        "training_seed",
-    ):
+    for key in ("input", "outputs", "navigation_threshold", "data", "validation", "git_revision", "training_seed"):
         assert detector.metadata[key]
     tested = json.loads(detector.metadata["test_figures"])
     assert set(tested) == {"real-strip", "real-block", "procedural-world"}
@@ -165,13 +157,9 @@ def test_a_flat_heatmap_gives_no_detections():
 def detections(u, v, diameter=40.0, ratio=None):
     n = len(u)
     return Detections(
-        np.array(u, float),
-        np.array(v, float),
-        np.full(n, diameter),
-        np.full(n, 0.9),
-        np.ones(n),
+        np.array(u, float), np.array(v, float), np.full(n, diameter), np.full(n, 0.9), np.ones(n),
         None if ratio is None else np.array(ratio, float),
-    )
+    )  # fmt: skip
 
 
 def test_parallax_is_taken_out_radially_and_in_proportion_to_the_depth():

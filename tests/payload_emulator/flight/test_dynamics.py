@@ -99,9 +99,7 @@ def test_the_filter_and_the_smoother_have_the_same_noise(field: str) -> None:
     velocities = 1_650.0 * rng.standard_normal((40, 3))
     flown = model(process_noise(50, field))
     expected = [flown._white_psd(*one) for one in zip(positions, velocities, strict=True)]
-    np.testing.assert_allclose(
-        densities_at(field_noise(field, 50), positions, velocities), expected, rtol=1e-12
-    )
+    np.testing.assert_allclose(densities_at(field_noise(field, 50), positions, velocities), expected, rtol=1e-12)
 
 
 POLAR_M_S = np.array([0.0, 0.0, 1_665.0])
@@ -130,9 +128,7 @@ def test_noise_falls_with_altitude_and_differs_by_side() -> None:
 @pytest.mark.parametrize("inclination_deg", [90.0, 60.0, 120.0, 0.0])
 def test_noise_over_the_far_side_grows_with_the_cosine_of_the_inclination(inclination_deg: float) -> None:
     noise = ProcessNoise(
-        (4e-7, 2e-7, 1e-7),
-        far_side_psd_m2_s3=(3e-6, 2e-6, 1e-6),
-        far_side_oblique_psd_m2_s3=(8e-6, 0.0, 6e-6),
+        (4e-7, 2e-7, 1e-7), far_side_psd_m2_s3=(3e-6, 2e-6, 1e-6), far_side_oblique_psd_m2_s3=(8e-6, 0.0, 6e-6)
     )
     inclination = np.radians(inclination_deg)
     # Over 180 degrees of longitude on the equator, going up: east is -y there.

@@ -91,8 +91,7 @@ def test_an_inference_library_that_throws_costs_frames_not_the_payload(observing
 
 
 @pytest.mark.parametrize(
-    ("region", "event"),
-    [(MODEL_NUMBER, "model_hash_mismatch"), (PARAMETERS_NUMBER, "parameters_hash_mismatch")],
+    ("region", "event"), [(MODEL_NUMBER, "model_hash_mismatch"), (PARAMETERS_NUMBER, "parameters_hash_mismatch")]
 )
 def test_flipped_bits_in_memory_are_found_told_and_restored(observing: Any, region: int, event: str) -> None:
     observing.board.memory[region][1] ^= 0x08

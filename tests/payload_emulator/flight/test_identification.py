@@ -11,25 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lunar.camera import PinholeCamera, project_mcmf
-from payload_emulator.flight.navigation.odometry.matcher import (
-    GroundFeatures,
-    MatcherParameters,
-    match_frames,
-)
+from payload_emulator.flight.navigation.odometry.matcher import GroundFeatures, MatcherParameters, match_frames
 from payload_emulator.flight.navigation.search.identification import (
     IdentificationParameters,
     _consistent,
     identify,
     minimum_members,
 )
-from payload_emulator.flight.navigation.sighting import (
-    LandmarkMap,
-    Pose,
-    Sighting,
-    in_view,
-    landmark_map,
-    look,
-)
+from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, Sighting, in_view, landmark_map, look
 from payload_emulator.flight.vision.detections import Detections
 from tmtc.dictionary.tables import CatalogueTable
 
@@ -153,9 +142,7 @@ def moved(frame: GroundFeatures, east_m: float, north_m: float) -> GroundFeature
 
 @given(seed=st.integers(0, 10_000), count=st.integers(2, 30), direction=st.sampled_from([1, -1]))
 @settings(max_examples=60, deadline=None)
-def test_the_common_shift_is_found_whatever_the_order_of_detections(
-    seed: int, count: int, direction: int
-) -> None:
+def test_the_common_shift_is_found_whatever_the_order_of_detections(seed: int, count: int, direction: int) -> None:
     rng = np.random.default_rng(seed)
     earlier = features(rng.uniform(-50e3, 50e3, (count, 2)), rng.integers(0, 3, count))
     order = rng.permutation(count)
@@ -174,12 +161,8 @@ def test_the_densest_cluster_wins_over_clutter_of_the_same_class() -> None:
     common = features(rng.uniform(-40e3, 40e3, (6, 2)), np.zeros(6))
     clutter = [rng.uniform(-50e3, 50e3, (6, 2)) for _ in range(2)]
     shifted = moved(common, -300.0, 24_800.0)
-    earlier = features(
-        np.concatenate([np.stack([common.east_m, common.north_m], 1), clutter[0]]), np.zeros(12)
-    )
-    later = features(
-        np.concatenate([np.stack([shifted.east_m, shifted.north_m], 1), clutter[1]]), np.zeros(12)
-    )
+    earlier = features(np.concatenate([np.stack([common.east_m, common.north_m], 1), clutter[0]]), np.zeros(12))
+    later = features(np.concatenate([np.stack([shifted.east_m, shifted.north_m], 1), clutter[1]]), np.zeros(12))
     match = match_frames(earlier, later, 15.0, 1)
     pairs = set(zip(match.earlier.tolist(), match.later.tolist(), strict=True))
     assert {(k, k) for k in range(6)} <= pairs
@@ -256,9 +239,7 @@ def craters() -> LandmarkMap:
     rng = np.random.default_rng(0)
     place = rng.uniform(-0.02, 0.02, (2, 20))
     return landmark_map(
-        CatalogueTable(
-            INDEX, place[0], place[1], np.full(20, 5e3), rng.uniform(-3e3, 3e3, 20), np.full((20, 3), 90.0)
-        )
+        CatalogueTable(INDEX, place[0], place[1], np.full(20, 5e3), rng.uniform(-3e3, 3e3, 20), np.full((20, 3), 90.0))
     )
 
 

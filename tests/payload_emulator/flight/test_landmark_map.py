@@ -50,9 +50,7 @@ class Mapper:
     def observe(
         self, view: View, found: Detections, variance: np.ndarray, free: np.ndarray, surface_m: float
     ) -> tuple[Landmark, ...]:
-        self.state, made = observe(
-            self.state, view, found, variance, free, surface_m, CAMERA, self.parameters
-        )
+        self.state, made = observe(self.state, view, found, variance, free, surface_m, CAMERA, self.parameters)
         return made
 
     def close(self) -> tuple[Landmark, ...]:
@@ -101,8 +99,7 @@ def test_craters_become_landmarks_where_they_are_and_with_errors_as_claimed() ->
     errors, nees = [], []
     for landmark in made:
         offset = (
-            landmark.position_mcmf_m
-            - craters[np.argmin(np.linalg.norm(craters - landmark.position_mcmf_m, axis=1))]
+            landmark.position_mcmf_m - craters[np.argmin(np.linalg.norm(craters - landmark.position_mcmf_m, axis=1))]
         )
         own = landmark.covariance_m2 - SPACECRAFT_M**2 * np.eye(3)
         errors.append(float(np.linalg.norm(offset)))
@@ -182,9 +179,7 @@ def test_landmarks_stand_beside_the_catalogue_with_identities_of_their_own() -> 
     craters = ground(25, 1)
     fly(mapper, craters, 2)
     one = np.ones(1)
-    catalogue = CatalogueTable(
-        np.array([7]), 0.1 * one, 0.2 * one, 6e3 * one, 50.0 * one, 80.0 * np.ones((1, 3))
-    )
+    catalogue = CatalogueTable(np.array([7]), 0.1 * one, 0.2 * one, 6e3 * one, 50.0 * one, 80.0 * np.ones((1, 3)))
     merged = with_catalogue(mapper.state.landmarks, catalogue)
     assert len(merged) == 1 + len(mapper)
     assert set(merged.ids[merged.ids < FIRST_LANDMARK_ID].tolist()) == {7}

@@ -11,7 +11,7 @@ import pytest
 from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
 from lunar.frames import enu_from_mcmf, mcmf_from_spherical
-from payload_emulator.flight.navigation.search._fit_kernel import Found, Image, Seen, log_evidence
+from payload_emulator.flight.navigation.search._fit_kernel import DetectedCraters, Image, Seen, log_evidence
 from payload_emulator.flight.navigation.search.lost_in_space import (
     NADIR_NORTH_UP,
     LostParameters,
@@ -78,9 +78,7 @@ def frame(
     count = int(inside.sum())
     uv = np.stack([u[inside], v[inside]], axis=1) + SIGMA_PX * rng.standard_normal((count, 2))
     uv = np.concatenate([uv, rng.uniform(0.0, 511.0, (false, 2))])
-    size = np.concatenate(
-        [size[inside] * np.exp(0.05 * rng.standard_normal(count)), rng.uniform(20.0, 60.0, false)]
-    )
+    size = np.concatenate([size[inside] * np.exp(0.05 * rng.standard_normal(count)), rng.uniform(20.0, 60.0, false)])
     total = count + false
     return place, Detections(uv[:, 0], uv[:, 1], size, rng.uniform(size=total), np.full(total, SIGMA_PX))
 
@@ -178,9 +176,7 @@ def test_craters_are_sorted_by_tile_height_and_diameter(west_deg: float) -> None
 
 def test_a_map_without_craters_has_an_index_and_gives_no_fix() -> None:
     empty = np.empty(0)
-    landmarks = landmark_map(
-        CatalogueTable(np.empty(0, np.int64), empty, empty, empty, empty, np.empty((0, 3)))
-    )
+    landmarks = landmark_map(CatalogueTable(np.empty(0, np.int64), empty, empty, empty, empty, np.empty((0, 3))))
     index = place_index(landmarks)
     assert len(index) == 0 and index.tile_start.tolist() == [0]
     assert find_place(no_detections(), empty, index, CAMERA, RULES) is None
@@ -224,13 +220,11 @@ IMAGE = Image(100.0, np.array([50.0, 50.0]), np.array([50.0, 50.0]))
 PREDICTED_PX = np.array([[20.0, 20.0], [80.0, 30.0], [40.0, 70.0], [75.0, 80.0]])
 
 
-def evidence_of(
-    uv_px: FloatArray, diameter_px: FloatArray, pairs: list[int], score: FloatArray | None = None
-) -> float:
+def evidence_of(uv_px: FloatArray, diameter_px: FloatArray, pairs: list[int], score: FloatArray | None = None) -> float:
     """Return the evidence of detections for four craters of 8 to 64 px predicted in an image of 100 by 100."""
     seen = Seen(PREDICTED_PX, np.log([8.0, 16.0, 32.0, 64.0]), np.zeros((4, 3)), np.zeros(4))
     score = np.full(len(uv_px), 0.5) if score is None else score
-    found = Found(uv_px, np.log(diameter_px), np.full(len(uv_px), 3.0**2), score)
+    found = DetectedCraters(uv_px, np.log(diameter_px), np.full(len(uv_px), 3.0**2), score)
     return log_evidence(np.array(pairs), seen, found, IMAGE, 0.1)
 
 

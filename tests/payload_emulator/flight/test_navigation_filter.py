@@ -43,15 +43,9 @@ MCMF_FROM_ICRF = Rotation.from_rotvec([0.3, -0.2, 1.1]).as_matrix()
 CAMERA_FROM_ICRF = CAMERA_FROM_MCMF @ MCMF_FROM_ICRF
 POSITION_ICRF = MCMF_FROM_ICRF.T @ np.array([RADIUS_M + 30e3, 2_000.0, -1_500.0])
 ERRORS = CommonErrors(
-    attitude_noise_rad=4e-4,
-    attitude_bias_rad=2e-4,
-    attitude_correlation_s=1_000.0,
-    pixel_bias_px=0.25,
-    pixel_correlation_s=500.0,
-    catalogue_offset_m=(15.0, 12.0, 10.0),
-    scale=2e-4,
-    scale_sigma=5e-4,
-)
+    attitude_noise_rad=4e-4, attitude_bias_rad=2e-4, attitude_correlation_s=1_000.0, pixel_bias_px=0.25,
+    pixel_correlation_s=500.0, catalogue_offset_m=(15.0, 12.0, 10.0), scale=2e-4, scale_sigma=5e-4,
+)  # fmt: skip
 
 
 def craters(count: int = 7, seed: int = 2) -> LandmarkMap:
@@ -59,9 +53,7 @@ def craters(count: int = 7, seed: int = 2) -> LandmarkMap:
     place = rng.uniform(-0.015, 0.015, (2, count))
     heights = rng.uniform(-1e3, 1e3, count)
     return landmark_map(
-        CatalogueTable(
-            np.arange(count), place[0], place[1], np.full(count, 6e3), heights, np.full((count, 3), 60.0)
-        )
+        CatalogueTable(np.arange(count), place[0], place[1], np.full(count, 6e3), heights, np.full((count, 3), 60.0))
     )
 
 
@@ -83,9 +75,7 @@ def projected(state: np.ndarray, landmarks: LandmarkMap, index: np.ndarray, turn
 def prior_state(landmarks: LandmarkMap, index: np.ndarray, seed: int = 5) -> FilterState:
     """A correlated prior over the common states and the given craters."""
     rng = np.random.default_rng(seed)
-    sigma = np.concatenate(
-        [[60.0] * 3, [0.08] * 3, [2e-6] * 3, [2e-4] * 3, [0.25] * 2, [15.0, 12.0, 10.0], [5e-4]]
-    )
+    sigma = np.concatenate([[60.0] * 3, [0.08] * 3, [2e-6] * 3, [2e-4] * 3, [0.25] * 2, [15.0, 12.0, 10.0], [5e-4]])
     sigma = np.concatenate([sigma, np.full(3 * index.size, 60.0)])
     root = np.eye(sigma.size) + 0.15 * rng.standard_normal((sigma.size, sigma.size))
     covariance = (root @ root.T) * sigma[:, None] * sigma[None]
@@ -181,9 +171,7 @@ def test_an_update_is_the_least_squares_solution_with_its_covariance() -> None:
         assert found.contradiction[k] == pytest.approx(expected, rel=0.02)
     # A rotation of the camera: gradient and information of the innovations.
     errors = replace(ERRORS, attitude_noise_rad=1e-3 * ERRORS.attitude_noise_rad)
-    free = kalman.update(
-        prior, CAMERA_FROM_ICRF, MCMF_FROM_ICRF, landmarks, index, uv, variance, CAMERA, errors
-    )
+    free = kalman.update(prior, CAMERA_FROM_ICRF, MCMF_FROM_ICRF, landmarks, index, uv, variance, CAMERA, errors)
     assert free is not None and free.rotation.sigma_rad == errors.attitude_noise_rad
     # With a small attitude noise the estimated rotation is the gradient times its variance.
     np.testing.assert_allclose(
@@ -312,9 +300,7 @@ def test_a_prediction_carries_each_part_by_its_own_law() -> None:
     np.testing.assert_allclose(found.mean, transition @ prior.mean, rtol=1e-12)
     expected = transition @ prior.covariance @ transition.T + noise
     scale = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(
-        found.covariance / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-12
-    )
+    np.testing.assert_allclose(found.covariance / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-12)
     np.testing.assert_array_equal(found.covariance, found.covariance.T)
     assert found.ticks == 1_300 * SECOND and found.craters.tolist() == [2, 0]
     assert kalman.predict(prior, 6_000 * SECOND, model, ERRORS) is None
@@ -341,9 +327,7 @@ def test_the_first_state_holds_what_it_is_given() -> None:
     state = kalman.initial_filter_state(
         77, POSITION_ICRF, np.array([1.0, 2.0, 3.0]), 500.0, 0.5, (1e-6, 2e-6, 3e-6), ERRORS
     )
-    expected = (
-        [500.0] * 3 + [0.5] * 3 + [1e-6, 2e-6, 3e-6] + [2e-4] * 3 + [0.25] * 2 + [15.0, 12.0, 10.0, 5e-4]
-    )
+    expected = [500.0] * 3 + [0.5] * 3 + [1e-6, 2e-6, 3e-6] + [2e-4] * 3 + [0.25] * 2 + [15.0, 12.0, 10.0, 5e-4]
     np.testing.assert_allclose(state.covariance, np.diag(np.square(expected)), rtol=1e-12)
     np.testing.assert_array_equal(state.mean[:6], [*POSITION_ICRF, 1.0, 2.0, 3.0])
     assert state.mean[17] == 2e-4 and not state.mean[6:17].any()
@@ -404,9 +388,7 @@ def test_joseph_form_holds_for_a_gain_that_is_not_optimal() -> None:
     found = kalman.corrected_covariance(covariance, design, gain, noise)
     scale = np.sqrt(np.diag(found))
     # 400,000 draws know a covariance to 0.2 %; four of that.
-    np.testing.assert_allclose(
-        np.cov(after.T) / scale / scale[:, None], found / scale / scale[:, None], atol=0.01
-    )
+    np.testing.assert_allclose(np.cov(after.T) / scale / scale[:, None], found / scale / scale[:, None], atol=0.01)
 
 
 def test_a_hundred_thousand_updates_leave_the_covariance_symmetric_and_positive() -> None:

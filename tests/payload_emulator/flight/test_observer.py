@@ -102,12 +102,9 @@ class Navigator:
 
 def detections(count: int) -> Detections:
     return Detections(
-        100.0 + 10.0 * np.arange(count),
-        np.full(count, 200.0),
-        np.full(count, 30.0),
-        np.linspace(0.9, 0.4, count),
+        100.0 + 10.0 * np.arange(count), np.full(count, 200.0), np.full(count, 30.0), np.linspace(0.9, 0.4, count),
         np.full(count, 0.7),
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -120,15 +117,11 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     return SimpleNamespace(eye=eye, telemetry=telemetry, clock=clock, navigator=navigator, observer=observer)
 
 
-def look(
-    rig: SimpleNamespace, score_floor: float = 0.0, attitude: Any = ATTITUDE, quiet: bool = False
-) -> None:
+def look(rig: SimpleNamespace, score_floor: float = 0.0, attitude: Any = ATTITUDE, quiet: bool = False) -> None:
     rig.observer.frame(IMAGE, attitude, score_floor, 1.0, quiet)
 
 
-def test_the_estimate_goes_down_with_the_upper_triangle_and_the_degrees_of_its_innovation(
-    rig: SimpleNamespace,
-) -> None:
+def test_the_estimate_goes_down_with_the_upper_triangle_and_the_degrees_of_its_innovation(rig: SimpleNamespace) -> None:
     rig.navigator.outcome = Outcome.fixed
     rig.navigator.fix = SimpleNamespace(
         identification=SimpleNamespace(detection=np.array([0, 3, 5])), index=np.array([7, 2, 40])
@@ -137,9 +130,7 @@ def test_the_estimate_goes_down_with_the_upper_triangle_and_the_degrees_of_its_i
     (sent,) = rig.telemetry.named("filter_estimate")
     covariance = rig.navigator.state.estimate.covariance
     assert sent["covariance"].tolist() == [covariance[i, j] for i in range(9) for j in range(i, 9)]
-    assert [*sent["position_icrf_m"], *sent["velocity_icrf_m_s"], *sent["acceleration_rtn_m_s2"]] == list(
-        range(9)
-    )
+    assert [*sent["position_icrf_m"], *sent["velocity_icrf_m_s"], *sent["acceleration_rtn_m_s2"]] == list(range(9))
     assert sent["innovation_degrees"] == 6
     (pairs,) = rig.telemetry.named("identifications")
     assert pairs["items"]["detection"].tolist() == [0, 3, 5]
@@ -180,9 +171,7 @@ def test_pairs_name_the_detection_by_its_place_among_those_reported(rig: SimpleN
 
 def test_weak_detections_and_those_far_outside_reach_nobody(rig: SimpleNamespace) -> None:
     u = np.array([100.0, 2e5, np.nan, 120.0, 130.0, 140.0])
-    rig.eye.found = Detections(
-        u, *(np.full(6, 50.0),) * 2, np.array([0.9, 0.9, 0.9, 0.3, np.nan, 0.5]), np.ones(6)
-    )
+    rig.eye.found = Detections(u, *(np.full(6, 50.0),) * 2, np.array([0.9, 0.9, 0.9, 0.3, np.nan, 0.5]), np.ones(6))
     look(rig, score_floor=0.5)
     ((_, given, _),) = rig.navigator.given
     # A score at the floor is used; one that is no number is not below it.
@@ -289,9 +278,7 @@ def test_what_cannot_be_inverted_ends_in_a_fresh_start(rig: SimpleNamespace) -> 
     assert ("high", "estimator_error", 2.0, 0.0) in rig.telemetry.events
     # No tables are loaded: there is nothing to begin again with, and frames are refused.
     look(rig)
-    assert [values["outcome"] for values in rig.telemetry.named("frame_outcome")] == [
-        int(Outcome.refused)
-    ] * 2
+    assert [values["outcome"] for values in rig.telemetry.named("frame_outcome")] == [int(Outcome.refused)] * 2
     assert rig.observer.summary()["outcomes"]["refused"] == 2
 
 
@@ -308,19 +295,14 @@ def test_reads_of_the_anchor_are_counted_beyond_the_first(moon: Any) -> None:
         observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
     assert observer.anchor_reads == 5 + 2
     summary = observer.summary()
-    assert (
-        summary["estimators"]["paper"]["altitude_reads"] == 5
-        and summary["estimators"]["paper"]["resets"] == 2
-    )
+    assert summary["estimators"]["paper"]["altitude_reads"] == 5 and summary["estimators"]["paper"]["resets"] == 2
     assert summary["anchor_reads_after_start"] == 4 + 1
     assert "truth_reads_after_start" not in summary
     assert telemetry.names().count("anchor_read") == 2
     assert [values["anchor_reads"] for values in telemetry.named("frame_outcome")] == [1, 2, 3, 4, 5]
 
 
-def test_a_frame_of_odometry_is_reported_in_full(
-    rig: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_frame_of_odometry_is_reported_in_full(rig: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
     """Longitude -0.3 rad is 342.8 degrees east; velocities, sigmas and NIS do not exist for odometry."""
     observer = Observer(rig.eye, FlightParameters(modes=(Mode.spherical,)), rig.telemetry, rig.clock)
     anchor: Any = object()
@@ -393,9 +375,7 @@ def test_odometry_without_a_position_reports_its_outcome_alone(
         outcome=Outcome.rejected, reset_trigger=ResetTrigger.none, candidate_pairs=3, pairs=0, shift_east_m=np.nan,
         shift_north_m=np.nan,
     )  # fmt: skip
-    monkeypatch.setattr(
-        "payload_emulator.flight.navigation.odometry.odometry.step", lambda *_, **__: (None, report)
-    )
+    monkeypatch.setattr("payload_emulator.flight.navigation.odometry.odometry.step", lambda *_, **__: (None, report))
     observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
     assert rig.telemetry.named("frame_outcome")[1] == {
         **expected, "frame_number": 1, "outcome": int(Outcome.rejected), "candidate_pairs": 3,
@@ -429,21 +409,14 @@ def test_a_frame_of_the_filter_is_reported_in_full(rig: SimpleNamespace) -> None
     assert (sent["frame_number"], sent["image_ticks"]) == (8, ticks)
     assert rig.navigator.given[0][0] == ticks
     summary = rig.observer.summary()
-    assert summary["estimators"]["anchored"]["outcomes"] == {
-        "fixed": 1,
-        "coasted": 0,
-        "refused": 0,
-        "no_image": 0,
-    }
+    assert summary["estimators"]["anchored"]["outcomes"] == {"fixed": 1, "coasted": 0, "refused": 0, "no_image": 0}
     assert summary["fixes"] == {"fixed": 1, "coasted": 0, "refused": 0, "no_image": 0, "reacquired": 0}
     assert {name: summary[name] for name in ("frames_processed", "frames_bad", "detections", "events")} == {
         "frames_processed": 1, "frames_bad": 0, "detections": 6, "events": 0,
     }  # fmt: skip
 
 
-def test_new_landmarks_go_down_forty_to_a_packet(
-    rig: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_new_landmarks_go_down_forty_to_a_packet(rig: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
     def rows(landmarks: tuple[int, ...]) -> SimpleNamespace:
         n = np.array(landmarks, dtype=np.float64)
         return SimpleNamespace(
@@ -464,9 +437,7 @@ def test_new_landmarks_go_down_forty_to_a_packet(
     }  # fmt: skip
 
 
-def test_detections_are_reported_within_the_range_of_their_fields_and_with_their_class(
-    rig: SimpleNamespace,
-) -> None:
+def test_detections_are_reported_within_the_range_of_their_fields_and_with_their_class(rig: SimpleNamespace) -> None:
     """From 30 km a crater in the centre of 6, 12 and 20 km is as wide as f D / h; 4 km is no class of 5 to 30 km."""
     focal_px = 256.0 / np.tan(np.radians(60.0))
     diameter = focal_px * np.array([6e3, 12e3, 20e3, 4e3, 6e3]) / 30e3

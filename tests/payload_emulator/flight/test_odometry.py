@@ -10,11 +10,7 @@ from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from payload_emulator.flight.navigation.odometry import odometry
 from payload_emulator.flight.navigation.odometry.matcher import GroundFeatures, Match
-from payload_emulator.flight.navigation.odometry.odometry import (
-    OdometryParameters,
-    OdometryState,
-    frame_features,
-)
+from payload_emulator.flight.navigation.odometry.odometry import OdometryParameters, OdometryState, frame_features
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.vision.detections import Detections
 from tmtc.dictionary.tables import AnchorTable, pack_anchor_table, unpack_anchor_table
@@ -102,9 +98,7 @@ def test_the_planar_system_recovers_an_exact_planar_motion() -> None:
         u = 255.5 + CAMERA.focal_px * local[:, 0] / altitude
         v = 255.5 - CAMERA.focal_px * local[:, 1] / altitude
         kinds = np.zeros(10, dtype=np.int64)
-        features.append(
-            odometry.FrameFeatures(u, v, GroundFeatures(local[:, 0], local[:, 1], kinds), altitude)
-        )
+        features.append(odometry.FrameFeatures(u, v, GroundFeatures(local[:, 0], local[:, 1], kinds), altitude))
     match = Match(np.arange(10), np.arange(10), 10, True)
     motion = odometry.solve_planar(features[0], features[1], match, CAMERA, 15.0)
     assert motion is not None
@@ -123,19 +117,13 @@ def test_one_pair_locks_the_change_of_altitude_to_zero(moon: Any) -> None:
         # Of all craters leave the pair nearest the middle of the overlap, and only that one.
         north = state.features.ground.north_m
         pick = int(np.argmin(np.hypot(state.features.ground.east_m, north - 12_250.0)))
-        lone, _ = odometry.step(
-            None, moon.ticks_at(7_000.0), seen[0].select(np.array([pick])), anchor, CAMERA, mode
-        )
+        lone, _ = odometry.step(None, moon.ticks_at(7_000.0), seen[0].select(np.array([pick])), anchor, CAMERA, mode)
         after, report = odometry.step(lone, moon.ticks_at(7_015.0), seen[1], anchor, CAMERA, mode)
         assert lone is not None and after is not None
         if report.outcome is Outcome.single:
             assert after.altitude_m == lone.altitude_m
-    plane = odometry.FrameFeatures(
-        np.array([200.0]), np.array([150.0]), _one_place(1_000.0, 12_000.0), 30_000.0
-    )
-    later = odometry.FrameFeatures(
-        np.array([198.0]), np.array([270.0]), _one_place(900.0, -12_000.0), 30_100.0
-    )
+    plane = odometry.FrameFeatures(np.array([200.0]), np.array([150.0]), _one_place(1_000.0, 12_000.0), 30_000.0)
+    later = odometry.FrameFeatures(np.array([198.0]), np.array([270.0]), _one_place(900.0, -12_000.0), 30_100.0)
     match = Match(np.array([0]), np.array([0]), 1, False)
     planar = odometry.solve_planar(plane, later, match, CAMERA, 15.0)
     spherical = odometry.solve_spherical(plane, later, match, CAMERA, 0.3, 15.0)
@@ -171,9 +159,7 @@ class Stream:
         return report
 
 
-def test_a_frame_without_detections_repeats_the_last_motion_for_k_frames_and_then_is_missed(
-    moon: Any,
-) -> None:
+def test_a_frame_without_detections_repeats_the_last_motion_for_k_frames_and_then_is_missed(moon: Any) -> None:
     stream = Stream(moon)
     stream.frame()
     assert stream.frame().outcome is Outcome.multi

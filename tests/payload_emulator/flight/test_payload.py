@@ -135,9 +135,7 @@ def test_outside_observing_no_frame_is_processed(moon: Any) -> None:
     packets = flown.step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S), standby)
     assert not named(packets, "detections")
     assert named(packets, "housekeeping")[0]["mode"] == 1
-    observe = command(
-        "perform_function", 6, function_id="start_observation", argument_1=60.0, argument_2=15.0
-    )
+    observe = command("perform_function", 6, function_id="start_observation", argument_1=60.0, argument_2=15.0)
     packets = flown.step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S + 15.0), observe)
     assert len(named(packets, "detections")) == 1
 

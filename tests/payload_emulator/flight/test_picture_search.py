@@ -5,12 +5,7 @@ import pytest
 
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.vision.detections import Detections
-from payload_emulator.flight.vision.detector import (
-    MANY_DETECTIONS,
-    DetectorParameters,
-    OnnxDetector,
-    drop_duplicates,
-)
+from payload_emulator.flight.vision.detector import MANY_DETECTIONS, DetectorParameters, OnnxDetector, drop_duplicates
 from payload_emulator.flight.vision.picture_search import (
     SMALL_CRATERS_PX,
     _merge,
@@ -118,8 +113,7 @@ def test_enlarging_puts_pixel_x_at_two_x_and_a_half():
 
 
 @pytest.mark.parametrize(
-    ("shape", "count"),
-    [((512, 512), 4), ((351, 640), 4), ((200, 300), 2), ((100, 90), 1), ((2000, 3000), 4)],
+    ("shape", "count"), [((512, 512), 4), ((351, 640), 4), ((200, 300), 2), ((100, 90), 1), ((2000, 3000), 4)]
 )
 def test_evidence_comes_from_up_to_four_squares(shape, count):
     squares = _squares(np.zeros(shape, np.float32))

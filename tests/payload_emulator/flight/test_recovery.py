@@ -20,9 +20,7 @@ def frames_until_back(run: NavigationRun) -> int:
     return int(good[0]) + 1 if good.size else 999
 
 
-@pytest.mark.parametrize(
-    ("distance_m", "told", "limit"), [(5e3, False, 8), (20e3, True, 4), (20e3, False, 8)]
-)
+@pytest.mark.parametrize(("distance_m", "told", "limit"), [(5e3, False, 8), (20e3, True, 4), (20e3, False, 8)])
 def test_a_kidnapped_spacecraft_is_back_within_the_frames_allowed(
     navigation_case: Callable[..., NavigationCase], distance_m: float, told: bool, limit: int
 ) -> None:
@@ -70,9 +68,7 @@ def turn_deg(case: NavigationCase, rows: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("wrong_share", [0.3, 1.0])
-def test_a_stale_catalogue_misleads_nobody(
-    navigation_case: Callable[..., NavigationCase], wrong_share: float
-) -> None:
+def test_a_stale_catalogue_misleads_nobody(navigation_case: Callable[..., NavigationCase], wrong_share: float) -> None:
     errors = CatalogueErrors(wrong_share=wrong_share)
     # Without the search of the whole Moon, which takes a second a frame on this map.
     parameters = replace(PARAMETERS, lost_frames=10_000)

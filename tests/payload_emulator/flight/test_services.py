@@ -30,9 +30,7 @@ NUMBERS = {parameter.name: parameter.number for parameter in PARAMETERS}
 def test_every_stage_that_was_asked_for_is_reported_and_no_other(rig: Any) -> None:
     for flags, stages in ((0b1111, 3), (0b0001, 1), (0b1000, 1), (0b0000, 0)):
         rig.count += 1
-        order = DICTIONARY.pack_command(
-            "test_connection", {}, sequence_count=rig.count, acknowledgements=flags
-        )
+        order = DICTIONARY.pack_command("test_connection", {}, sequence_count=rig.count, acknowledgements=flags)
         packets = rig.step(order)
         found = [DICTIONARY.unpack(packet)[0] for packet in packets]
         assert sum(name.startswith("verification_") for name in found) == stages
@@ -85,9 +83,7 @@ def test_values_out_of_range_are_refused_at_acceptance(rig: Any) -> None:
         with_number(rig.function("start_observation", 1.5), 1.5, math.nan),
         rig.function("widen_estimate", -1.0),
         rig.command("replay_store", start_ticks=5, stop_ticks=5),
-        with_number(
-            rig.command("set_parameter", parameter_id=NUMBERS["scrub_interval_s"], value=1.5), 1.5, math.inf
-        ),
+        with_number(rig.command("set_parameter", parameter_id=NUMBERS["scrub_interval_s"], value=1.5), 1.5, math.inf),
         rig.command("set_parameter", parameter_id=NUMBERS["store_overwrite"], value=0.5),
     ):
         assert rig.refusals(rig.step(order)) == ["value_out_of_range"]
@@ -220,9 +216,7 @@ def test_a_parameter_is_changed_reported_and_kept_through_resets(rig: Any) -> No
 
 def test_a_structure_defined_by_telecommand_is_sent_reported_and_deleted(rig: Any) -> None:
     quantities = ["boot_count", "queue_depth", "camera_temperature_c", "cpu_detector_ms"]
-    create = rig.command(
-        "create_housekeeping", structure_id=16, interval_s=30, items={"quantity": quantities}
-    )
+    create = rig.command("create_housekeeping", structure_id=16, interval_s=30, items={"quantity": quantities})
     first = rig.named(rig.step(create), "housekeeping_report")
     assert [v["structure_id"] for v in first] == [16]
     labels = DICTIONARY.labels("housekeeping_report", "quantity")
@@ -238,16 +232,12 @@ def test_a_structure_defined_by_telecommand_is_sent_reported_and_deleted(rig: An
     assert not any(rig.named(rig.step(), "housekeeping_report") for _ in range(4))
     for name in ("delete_housekeeping", "report_housekeeping_definition"):
         assert rig.refusals(rig.step(rig.command(name, structure_id=17))) == ["unknown_structure"]
-    assert rig.refusals(rig.step(rig.command("request_housekeeping", structure_id=20))) == [
-        "unknown_structure"
-    ]
+    assert rig.refusals(rig.step(rig.command("request_housekeeping", structure_id=20))) == ["unknown_structure"]
 
 
 def test_only_so_many_structures_can_be_defined(rig: Any) -> None:
     def create(number: int) -> bytes:
-        return rig.command(
-            "create_housekeeping", structure_id=number, interval_s=0, items={"quantity": ["mode"]}
-        )
+        return rig.command("create_housekeeping", structure_id=number, interval_s=0, items={"quantity": ["mode"]})
 
     assert rig.refusals(rig.step(b"".join(create(16 + k) for k in range(8)))) == []
     assert rig.refusals(rig.step(create(24))) == ["structures_full"]

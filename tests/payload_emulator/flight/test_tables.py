@@ -70,9 +70,7 @@ def test_a_catalogue_table_comes_back_within_its_quantisation(moon: Any) -> None
     order = np.argsort(table.latitude_rad)
     assert len(octets) == 20 + 4 + 22 * 50
     np.testing.assert_array_equal(back.ids, table.ids[order])
-    np.testing.assert_allclose(
-        back.latitude_rad * moon.radius_m, table.latitude_rad[order] * moon.radius_m, atol=2e-3
-    )
+    np.testing.assert_allclose(back.latitude_rad * moon.radius_m, table.latitude_rad[order] * moon.radius_m, atol=2e-3)
     np.testing.assert_allclose(
         back.longitude_rad * moon.radius_m, table.longitude_rad[order] * moon.radius_m, atol=2e-3
     )
@@ -134,10 +132,7 @@ def all_tables(moon: Any) -> list[tuple[bytes, Any]]:
     return [
         (small_anchor(moon), tables.unpack_anchor_table),
         (tables.pack_catalogue_table(catalogue_table()), tables.unpack_catalogue_table),
-        (
-            tables.pack_gravity_table(tables.GravityTable("X", 1.0, 1.0, lower, lower)),
-            tables.unpack_gravity_table,
-        ),
+        (tables.pack_gravity_table(tables.GravityTable("X", 1.0, 1.0, lower, lower)), tables.unpack_gravity_table),
         (
             tables.pack_orientation_table([0, 10, 20], np.stack([np.eye(3)] * 3), np.eye(3)),
             tables.unpack_orientation_table,

@@ -96,12 +96,9 @@ def update(
     attitude, both = np.r_[kalman.ATTITUDE, turns], np.tile(np.eye(3), 2)
     left = both @ covariance[np.ix_(attitude, attitude)] @ both.T
     return Update(
-        state.only_craters(state.craters[state.craters != kalman.TURN[0]]),
-        float(innovation @ solved[:, 0]),
-        innovation.reshape(-1, 2).sum(axis=0) / np.sqrt(np.diag(summed)),
-        uv_px - seen(mean).reshape(-1, 2),
-        mean[turns],
-        float(np.sqrt(np.max(np.linalg.eigvalsh(left)))),
+        state.only_craters(state.craters[state.craters != kalman.TURN[0]]), float(innovation @ solved[:, 0]),
+        innovation.reshape(-1, 2).sum(axis=0) / np.sqrt(np.diag(summed)), uv_px - seen(mean).reshape(-1, 2),
+        mean[turns], float(np.sqrt(np.max(np.linalg.eigvalsh(left)))),
         RotationEvidence(turning.T @ solved[:, 0], turning.T @ solved[:, 1:], errors.attitude_noise_rad),
         kalman._contradiction(spread, innovation),
-    )
+    )  # fmt: skip

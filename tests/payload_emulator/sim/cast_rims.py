@@ -23,10 +23,7 @@ LEAST_FOUND = 0.9
 
 
 def rim_errors(
-    terrain: Terrain,
-    camera: PinholeCamera,
-    position_mcmf_m: npt.ArrayLike,
-    camera_from_mcmf: npt.ArrayLike,
+    terrain: Terrain, camera: PinholeCamera, position_mcmf_m: npt.ArrayLike, camera_from_mcmf: npt.ArrayLike
 ) -> tuple[IntArray, FloatArray]:
     """Labels of a picture against rims found by casting rays onto the terrain.
 
@@ -40,9 +37,7 @@ def rim_errors(
     rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
     labels = label_frame(terrain, camera, position, rotation, 5_000.0)
     craters = terrain.measured(labels.index)
-    chosen = np.flatnonzero(
-        labels.inside & (labels.visible_fraction == 1.0) & np.isfinite(craters.rim_height_m)
-    )
+    chosen = np.flatnonzero(labels.inside & (labels.visible_fraction == 1.0) & np.isfinite(craters.rim_height_m))
     index, craters = labels.index[chosen], craters.select(chosen)
     if not index.size:
         return index, np.empty((0, 2))
@@ -70,9 +65,7 @@ def rim_errors(
     return index[good], middle[good] + mean - place[good]
 
 
-def _circle(
-    latitude: FloatArray, longitude: FloatArray, diameter_m: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _circle(latitude: FloatArray, longitude: FloatArray, diameter_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Places (n, 48) on the rims."""
     radius = (0.5 * diameter_m / MOON_RADIUS_M)[:, None]
     sine0, cosine0 = np.sin(latitude)[:, None], np.cos(latitude)[:, None]

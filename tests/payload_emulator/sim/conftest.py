@@ -20,9 +20,7 @@ class FormulaTerrain(Terrain):
 
     def make_heights(self, latitude_rad, longitude_rad):
         heights = self._formula(latitude_rad[:, None], longitude_rad[None, :])
-        return np.ascontiguousarray(
-            np.broadcast_to(heights, (latitude_rad.size, longitude_rad.size)), dtype=np.float32
-        )
+        return np.ascontiguousarray(np.broadcast_to(heights, (latitude_rad.size, longitude_rad.size)), dtype=np.float32)
 
     def make_albedo(self, latitude_rad, longitude_rad):
         return np.full((latitude_rad.size, longitude_rad.size), 0.12, np.float32)

@@ -95,10 +95,7 @@ def test_the_light_time_of_a_contact_is_the_range_over_the_speed_of_light(epheme
     earth = np.asarray(earth_position_icrf_m(float(tdb_s_from_utc_ns(utc_ns))))
     centre_s = np.linalg.norm(position - earth) / SPEED_OF_LIGHT_M_S
     # At elevation e the station is R sin(e) nearer than the centre of the Earth: here near 10 deg.
-    expected = (
-        centre_s
-        - 6.371e6 * np.sin(np.radians(elevation_deg(ephemeris, utc_ns, "madrid"))) / SPEED_OF_LIGHT_M_S
-    )
+    expected = centre_s - 6.371e6 * np.sin(np.radians(elevation_deg(ephemeris, utc_ns, "madrid"))) / SPEED_OF_LIGHT_M_S
     assert contact.light_s(utc_ns) == pytest.approx(expected, abs=3e-4)
 
 

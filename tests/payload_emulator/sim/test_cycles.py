@@ -35,9 +35,7 @@ def pose(altitude_m=25e3):
 
 @pytest.fixture
 def hilly(formula_terrain):
-    return formula_terrain(
-        lambda latitude, longitude: 1500.0 * np.sin(90.0 * latitude) * np.cos(80.0 * longitude)
-    )
+    return formula_terrain(lambda latitude, longitude: 1500.0 * np.sin(90.0 * latitude) * np.cos(80.0 * longitude))
 
 
 @pytest.fixture
@@ -96,9 +94,7 @@ def test_camera_and_sun_are_in_blenders_axes(scene):
     np.testing.assert_allclose(camera[:3, :3], np.eye(3), atol=1e-12)
     toward = [math.cos(0.1745329) * 0.5, math.cos(0.1745329) * math.cos(math.pi / 6.0), math.sin(0.1745329)]
     np.testing.assert_allclose(scene.sun_to_world[:3, 2], toward, atol=1e-6)
-    np.testing.assert_allclose(
-        scene.sun_to_world[:3, :3] @ scene.sun_to_world[:3, :3].T, np.eye(3), atol=1e-12
-    )
+    np.testing.assert_allclose(scene.sun_to_world[:3, :3] @ scene.sun_to_world[:3, :3].T, np.eye(3), atol=1e-12)
     assert math.degrees(scene.sun_angle_rad) == pytest.approx(0.533, abs=0.001)
 
 
@@ -156,9 +152,7 @@ def test_a_tilted_camera_tilts(hilly):
     position, rotation = pose()
     tilted = describe_scene(hilly, CAMERA, position, axis_rotation(1, 0.1) @ rotation, SUN)
     # The boresight, -z of Blender's camera, leans to the north.
-    np.testing.assert_allclose(
-        -tilted.camera_to_world[:3, 2], [0.0, math.sin(0.1), -math.cos(0.1)], atol=1e-12
-    )
+    np.testing.assert_allclose(-tilted.camera_to_world[:3, 2], [0.0, math.sin(0.1), -math.cos(0.1)], atol=1e-12)
 
 
 def test_a_distorting_lens_is_refused(hilly):
@@ -300,9 +294,7 @@ def test_what_another_process_renders_comes_back(tmp_path, hilly, scene):
 def test_without_blender_one_line_says_how_to_get_it(tmp_path, monkeypatch, scene):
     (tmp_path / "bpy.py").write_text("raise ImportError('no Blender here')\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with pytest.raises(
-        RendererError, match=r"expected Blender as a module \(bpy\).*LINNA_BLENDER_PYTHON"
-    ) as caught:
+    with pytest.raises(RendererError, match=r"expected Blender as a module \(bpy\).*LINNA_BLENDER_PYTHON") as caught:
         cycles.render_scene(scene, CyclesSettings())
     assert "\n" not in str(caught.value)
 

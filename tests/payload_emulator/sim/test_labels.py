@@ -12,10 +12,7 @@ from lunar.frames import axis_rotation, mcmf_from_spherical
 from payload_emulator.errors import RendererError
 from payload_emulator.sim.render import raymarch
 from payload_emulator.sim.render.cycles import read_exr
-from payload_emulator.sim.render.labels import (
-    label_frame,
-    project_craters,
-)
+from payload_emulator.sim.render.labels import label_frame, project_craters
 from payload_emulator.sim.render.light import sun_direction_mcmf
 from tests.payload_emulator.sim.exr_file import exr_octets
 
@@ -60,9 +57,7 @@ def test_labels_lie_on_rims_found_by_casting_rays(formula_terrain):
     errors = []
     for tilt, yaw, east in ((0.0, 0.0, 0.25), (3.0, 1.0, 0.35), (-2.0, 2.0, -0.3)):
         position = mcmf_from_spherical(0.3, 2.0, 20e3)
-        rotation = (
-            axis_rotation(3, yaw) @ axis_rotation(1, math.radians(tilt)) @ nadir_camera_from_mcmf(position)
-        )
+        rotation = axis_rotation(3, yaw) @ axis_rotation(1, math.radians(tilt)) @ nadir_camera_from_mcmf(position)
         latitude, longitude = 0.3 + math.radians(0.2), 2.0 + math.radians(east)
         catalogue = crater_at(math.degrees(latitude), math.degrees(longitude), 9000.0, height)
         label = project_craters(catalogue, CAMERA, position, rotation)
@@ -91,9 +86,7 @@ def project_rim_middle(catalogue, position, rotation):
     arc, azimuth = radius * np.sqrt(n / 4000.0), n * math.pi * (3.0 - math.sqrt(5.0))
     latitude, longitude = catalogue.latitude_rad[0], catalogue.longitude_rad[0]
     sine = math.sin(latitude) * np.cos(arc) + math.cos(latitude) * np.sin(arc) * np.cos(azimuth)
-    east = np.arctan2(
-        np.sin(azimuth) * np.sin(arc) * math.cos(latitude), np.cos(arc) - math.sin(latitude) * sine
-    )
+    east = np.arctan2(np.sin(azimuth) * np.sin(arc) * math.cos(latitude), np.cos(arc) - math.sin(latitude) * sine)
     spread = make_catalogue(
         np.arcsin(sine), longitude + east, np.full(n.size, 3000.0), source="t",
         rim_height_m=np.full(n.size, catalogue.rim_height_m[0]),
@@ -160,9 +153,7 @@ def test_the_ellipse_of_a_crater_at_the_edge_is_that_of_perspective():
     """Seen at 45 degrees a circle is foreshortened to cos 45 across and stretched by the flat image plane."""
     position = mcmf_from_spherical(0.0, 0.0, 20e3)
     longitude = math.degrees(20e3 / MOON_RADIUS_M)
-    label = project_craters(
-        crater_at(0.0, longitude, 3000.0, 0.0), CAMERA, position, nadir_camera_from_mcmf(position)
-    )
+    label = project_craters(crater_at(0.0, longitude, 3000.0, 0.0), CAMERA, position, nadir_camera_from_mcmf(position))
     # On a plane below a nadir pinhole circles stay circles: f D / z, z = 20 km + the fall of 115 m.
     flat = CAMERA.focal_px * 3.0 / 20.115
     assert label.minor_px[0] == pytest.approx(flat, rel=0.02)

@@ -51,11 +51,7 @@ def terrain_of(folder, formula=ramp, ppd=64, size_deg=4.0, **options):
 def pose(altitude_m, tilt_deg=0.0):
     latitude, longitude = math.radians(LATITUDE), math.radians(LONGITUDE)
     up = np.array(
-        [
-            math.cos(latitude) * math.cos(longitude),
-            math.cos(latitude) * math.sin(longitude),
-            math.sin(latitude),
-        ]
+        [math.cos(latitude) * math.cos(longitude), math.cos(latitude) * math.sin(longitude), math.sin(latitude)]
     )
     position = (MOON_RADIUS_M + altitude_m) * up
     rotation = pointed_camera_from_mcmf(position, math.radians(tilt_deg), 0.3)
@@ -115,9 +111,7 @@ def test_a_finer_photograph_is_averaged_to_the_pixels_of_the_camera(tmp_path):
 
 
 def test_eight_bits_are_a_share_of_full_scale(tmp_path):
-    terrain = terrain_of(
-        tmp_path, lambda latitude, longitude: 51.0 + flat(latitude, longitude), dtype="uint8"
-    )
+    terrain = terrain_of(tmp_path, lambda latitude, longitude: 51.0 + flat(latitude, longitude), dtype="uint8")
     place = np.array([[math.radians(LATITUDE)]]), np.array([[math.radians(LONGITUDE)]])
     assert terrain.brightness(*place, 100.0)[0, 0] == pytest.approx(0.2, abs=1e-6)
 
@@ -149,10 +143,7 @@ def test_files_are_named_in_the_data_folder(tmp_path):
     [
         ('source = "photograph"', "terrain.photographs must be files where terrain.source is 'photograph'"),
         ('source = "raster"\nphotographs = ["a.tif"]', "terrain.photographs must be files where"),
-        (
-            'source = "raster"\nheights = ["a.tif"]',
-            "terrain.heights must be empty where terrain.source is 'raster'",
-        ),
+        ('source = "raster"\nheights = ["a.tif"]', "terrain.heights must be empty where terrain.source is 'raster'"),
     ],
 )
 def test_a_scenario_has_photographs_where_its_terrain_is_photographic(section, words):
@@ -196,9 +187,7 @@ def test_a_kidnap_moves_by_its_distance_on_the_sphere_and_keeps_the_shape_of_the
     assert after[:3] @ after[3:] == pytest.approx(before[:3] @ before[3:], abs=1e-3)
 
 
-def test_before_a_change_the_flight_is_the_old_one_and_after_it_goes_on_from_the_new_state(
-    truth: Truth,
-) -> None:
+def test_before_a_change_the_flight_is_the_old_one_and_after_it_goes_on_from_the_new_state(truth: Truth) -> None:
     kick = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 5.0])
     burnt = changed(truth, JUMP, lambda state: state + kick, MODEL)
     times = EPOCH + np.array([0, 599, 600, 601, 1_700]) * 10**9

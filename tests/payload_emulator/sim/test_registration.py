@@ -16,12 +16,7 @@ from lunar.frames import mcmf_from_spherical
 from payload_emulator.errors import TerrainError
 from payload_emulator.session.world.world import _register, _registration_name
 from payload_emulator.sim.terrain.opening import open_terrain
-from payload_emulator.sim.terrain.registering import (
-    PRODUCT,
-    file_sha256,
-    find_registration,
-    save_registration,
-)
+from payload_emulator.sim.terrain.registering import PRODUCT, file_sha256, find_registration, save_registration
 from payload_emulator.sim.terrain.registration import (
     FLOOR_SIGMA_M,
     LATTICE_DEG,
@@ -41,9 +36,7 @@ from tests.payload_emulator.test_curation import OFFSET_M, Field
 RADIUS_M = 1_737_400.0
 
 
-def rims(
-    count: int, shift_m: tuple[float, float], noise_m: float, seed: int = 1, size_deg: float = 15.0
-) -> Rims:
+def rims(count: int, shift_m: tuple[float, float], noise_m: float, seed: int = 1, size_deg: float = 15.0) -> Rims:
     """Rims spread over a square about 300 E, 10 N, with a constant shift and normal errors."""
     rng = np.random.default_rng(seed)
     latitude, longitude = rng.uniform(-0.5, 0.5, (2, count)) * size_deg
@@ -95,9 +88,7 @@ def test_the_stated_uncertainty_is_that_of_the_errors() -> None:
 
 
 def test_the_shift_follows_the_place_without_steps() -> None:
-    latitude, longitude = np.meshgrid(
-        np.radians(np.arange(-30.0, 30.1, 0.5)), np.radians(np.arange(290.0, 310.1, 0.5))
-    )
+    latitude, longitude = np.meshgrid(np.radians(np.arange(-30.0, 30.1, 0.5)), np.radians(np.arange(290.0, 310.1, 0.5)))
     latitude, longitude = latitude.ravel(), longitude.ravel()
     slope = Rims(latitude, longitude, 0.0 * latitude, np.degrees(latitude), np.full(latitude.size, 30.0))
     registration = fit_registration(slope)
@@ -173,11 +164,7 @@ def folder_of(root: Path, *others: Any) -> DataFolder:
     made = replace(made, longitude_rad=made.longitude_rad - math.radians(286.0))
     save_registration(
         root / PRODUCT,
-        replace(
-            fit_registration(made),
-            catalogue=file_sha256(catalogue),
-            terrain={raster.name: file_sha256(raster)},
-        ),
+        replace(fit_registration(made), catalogue=file_sha256(catalogue), terrain={raster.name: file_sha256(raster)}),
     )
     return DataFolder(root=root, dem_tiles=(raster,), catalogue_lu=catalogue)
 

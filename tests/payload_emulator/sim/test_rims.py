@@ -50,9 +50,7 @@ def test_a_label_on_a_slope_sits_on_the_slopes_rim(formula_terrain):
     position = mcmf_from_spherical(0.2, 1.0, 25e3)
     index, offsets = rim_errors(terrain, CAMERA, position, nadir_camera_from_mcmf(position))
     assert index.tolist() == [0] and math.hypot(*offsets[0]) < 0.01
-    level = project_craters(
-        terrain.measured(np.array([0])), CAMERA, position, nadir_camera_from_mcmf(position)
-    )
+    level = project_craters(terrain.measured(np.array([0])), CAMERA, position, nadir_camera_from_mcmf(position))
     tilted = label_frame(terrain, CAMERA, position, nadir_camera_from_mcmf(position))
     assert math.hypot(level.u_px[0] - tilted.u_px[0], level.v_px[0] - tilted.v_px[0]) > 0.1
     tilt = terrain.rim_tilts_m(np.array([0]))[0]

@@ -66,9 +66,7 @@ def test_the_same_generator_gives_the_same_bits():
 def test_blur_keeps_light_and_spreads_a_point_as_a_gaussian():
     scene = field(0.0)
     scene[64, 64] = 0.5
-    sensor = SensorModel(
-        exposure=1.0, read_noise_e=1e-3, full_well_e=1e12, bits=16, **(PLAIN | {"psf_sigma_px": 1.2})
-    )
+    sensor = SensorModel(exposure=1.0, read_noise_e=1e-3, full_well_e=1e12, bits=16, **(PLAIN | {"psf_sigma_px": 1.2}))
     image = shot(scene, sensor)[..., 1] / 65535.0
     assert image.sum() == pytest.approx(0.5, rel=0.01)
     rows = np.arange(128) - 64
@@ -82,9 +80,7 @@ def test_sunlit_ground_is_slightly_red():
     assert image[2] / image[1] == pytest.approx(COLOUR[2], abs=0.01)
 
 
-@pytest.mark.parametrize(
-    ("bits", "steps", "kind"), [(8, 256, "uint8"), (12, 4096, "uint16"), (16, 65536, "uint16")]
-)
+@pytest.mark.parametrize(("bits", "steps", "kind"), [(8, 256, "uint8"), (12, 4096, "uint16"), (16, 65536, "uint16")])
 def test_depth_limits_the_number_of_levels_and_the_scene_is_left_as_it_was(bits, steps, kind):
     scene = np.linspace(0.0, 1.0, 128 * 128, dtype=np.float32).reshape(128, 128)
     before = scene.copy()
@@ -102,9 +98,7 @@ def test_random_sensors_differ_but_are_reproducible():
 
 def quiet(**options):
     """A sensor that shows one thing at a time, without noise that matters, in 16 bits."""
-    return SensorModel(
-        **{**PLAIN, "exposure": 1.0, "read_noise_e": 1e-3, "full_well_e": 1e12, "bits": 16, **options}
-    )
+    return SensorModel(**{**PLAIN, "exposure": 1.0, "read_noise_e": 1e-3, "full_well_e": 1e12, "bits": 16, **options})
 
 
 def green(scene, sensor):
@@ -120,8 +114,7 @@ def test_gain_brightens_and_makes_noisier():
     assert bright.mean() == pytest.approx(0.4, abs=1e-3)
     # At the same output level four times the gain is a quarter of the electrons: noise doubles.
     deviations = [
-        green(field(0.4 / gain), quiet(gain=gain, full_well_e=10_000.0, read_noise_e=0.0)).std()
-        for gain in (1.0, 4.0)
+        green(field(0.4 / gain), quiet(gain=gain, full_well_e=10_000.0, read_noise_e=0.0)).std() for gain in (1.0, 4.0)
     ]
     assert deviations[1] / deviations[0] == pytest.approx(2.0, rel=0.05)
 
@@ -329,12 +322,8 @@ def test_a_law_over_lambert_is_what_the_renderers_make_of_it(formula_terrain, la
     rotation = pointed_camera_from_mcmf(position, 0.0, 0.0)
     sun = sun_direction_mcmf(elevation, 1.0, *place)
     camera = PinholeCamera(33, 33)
-    one, matt = (
-        renderer.render(terrain, camera, position, rotation, sun, Photometry(name)) for name in (law, "matt")
-    )
-    ratio = Photometry(law).over_lambert(
-        np.float32(math.sin(elevation)), np.float32(1.0), math.sin(elevation)
-    )
+    one, matt = (renderer.render(terrain, camera, position, rotation, sun, Photometry(name)) for name in (law, "matt"))
+    ratio = Photometry(law).over_lambert(np.float32(math.sin(elevation)), np.float32(1.0), math.sin(elevation))
     assert one.radiance[16, 16] / matt.radiance[16, 16] == pytest.approx(float(ratio), rel=2e-3)
 
 

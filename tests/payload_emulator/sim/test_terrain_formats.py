@@ -93,9 +93,7 @@ def test_sldem2015_kilometres_with_a_detached_label(tmp_path):
     ppd = 16
     values = (plane(*grid(8.0, 22.0, 160, 160, ppd)) / 1000.0).astype("<f4")
     # The labels of SLDEM2015 give OFFSET = 1737.4 and kilometres, and count longitudes from 180 degrees.
-    path = write_pds3(
-        tmp_path / "SLDEM", 8.0, 22.0, 160, 160, ppd, values, "PC_REAL", "KILOMETER", 1737.4, 180.0
-    )
+    path = write_pds3(tmp_path / "SLDEM", 8.0, 22.0, 160, 160, ppd, values, "PC_REAL", "KILOMETER", 1737.4, 180.0)
     terrain = RasterTerrain([path], NONE, **AS_IT_IS)
     # Single precision of 2 km in kilometres is 0.1 mm; pixels from projected metres are good to a millimetre.
     heights_agree(terrain, np.array([14.3, 17.1]), np.array([12.2, 15.9]), 0.05)
@@ -115,9 +113,7 @@ def test_gld100_metres_of_16_bits_with_holes(tmp_path):
     latitude, longitude = grid(8.0, 22.0, 160, 160, ppd)
     values = np.rint(plane(latitude, longitude)).astype("<i2")
     values[(np.abs(latitude - 15.0) < 0.2) & (np.abs(longitude - 13.0) < 0.2)] = -32768
-    fine = write_pds3(
-        tmp_path / "GLD", 8.0, 22.0, 160, 160, ppd, values, "LSB_INTEGER", "METER", 1_737_400, 180.0
-    )
+    fine = write_pds3(tmp_path / "GLD", 8.0, 22.0, 160, 160, ppd, values, "LSB_INTEGER", "METER", 1_737_400, 180.0)
     coarse = write_tiff(
         tmp_path / "c.tif",
         rasterio.Affine(0.25, 0, 0.0, 0, -0.25, 30.0),
@@ -136,9 +132,7 @@ def test_projected_metres_join_across_tiles_whose_pixels_do_not_divide_the_degre
     # LROC's products of 100 m have 303.23 pixels per degree; tiles of 90 degrees are 27,291.02 pixels wide.
     step, rows, columns = 100.0, 60, 27_291
     north = 0.5 * rows * step
-    values = np.repeat(np.rint(north - (np.arange(rows) + 0.5) * step)[:, None], columns, axis=1).astype(
-        "int16"
-    )
+    values = np.repeat(np.rint(north - (np.arange(rows) + 0.5) * step)[:, None], columns, axis=1).astype("int16")
     crs = "+proj=eqc +lat_ts=0 +lat_0=0 +lon_0=180 +x_0=0 +y_0=0 +R=1737400 +units=m +no_defs"
     paths = []
     for name, west in (("w", 270.0), ("e", 0.0)):
@@ -157,14 +151,9 @@ def test_projected_metres_join_across_tiles_whose_pixels_do_not_divide_the_degre
 def test_jpeg_2000_of_16_bits(tmp_path):
     values = np.rint(plane(*grid(8.0, 22.0, 256, 256, 16))).astype("int16")
     path = write_tiff(
-        tmp_path / "a.jp2",
-        rasterio.Affine(1 / 16, 0, 8.0, 0, -1 / 16, 22.0),
-        values,
-        "+proj=longlat +R=1737400 +no_defs",
-        driver="JP2OpenJPEG",
-        quality="100",
-        reversible="YES",
-    )
+        tmp_path / "a.jp2", rasterio.Affine(1 / 16, 0, 8.0, 0, -1 / 16, 22.0), values,
+        "+proj=longlat +R=1737400 +no_defs", driver="JP2OpenJPEG", quality="100", reversible="YES",
+    )  # fmt: skip
     heights_agree(RasterTerrain([path], NONE, **AS_IT_IS), np.array([14.3]), np.array([12.2]), 1.0)
 
 
@@ -254,34 +243,23 @@ def write_form(
 @pytest.mark.parametrize(
     "form",
     [
-        {},
-        {"convert": lambda h: h + 1_737_400.0, "dtype": "float64"},
-        {"convert": lambda h: h + 1_737_400.0},
-        {"convert": lambda h: h / 1e3 + 1_737.4, "dtype": "float64"},
-        {"convert": lambda h: h / 1e3, "unit": "km"},
-        {"convert": lambda h: h / 1e3 + 1_737.4, "unit": "km"},
-        {"convert": lambda h: h / 0.3048, "unit": "ft"},
+        {}, {"convert": lambda h: h + 1_737_400.0, "dtype": "float64"}, {"convert": lambda h: h + 1_737_400.0},
+        {"convert": lambda h: h / 1e3 + 1_737.4, "dtype": "float64"}, {"convert": lambda h: h / 1e3, "unit": "km"},
+        {"convert": lambda h: h / 1e3 + 1_737.4, "unit": "km"}, {"convert": lambda h: h / 0.3048, "unit": "ft"},
         {"convert": lambda h: h * 3937 / 1200, "unit": "US survey foot"},
         {"convert": lambda h: h * 10.0, "unit": "dm"},
         {"convert": lambda h: np.rint(2 * h), "dtype": "int16", "scales": (0.5, 0.0)},
         {"convert": lambda h: np.rint(2 * h), "dtype": "int16", "scales": (0.5, 1_737_400.0)},
         {"convert": lambda h: h / 1e3, "scales": (1.0, 1_737.4)},
-        {"convert": np.rint, "dtype": "int16", "edge": -32768},
-        {"edge": -32768.0},
-        {"edge": -99_999.0},
-        {"edge": 1e20},
-        {"edge": np.nan},
-        {"edge": 0.0, "mask": True},
-        {"edge": 5.0, "nodata": 5.0},
-        {"west": -350.0},
-        {"west": 370.0},
+        {"convert": np.rint, "dtype": "int16", "edge": -32768}, {"edge": -32768.0}, {"edge": -99_999.0},
+        {"edge": 1e20}, {"edge": np.nan}, {"edge": 0.0, "mask": True}, {"edge": 5.0, "nodata": 5.0},
+        {"west": -350.0}, {"west": 370.0},
         {"crs": "+proj=eqc +R=1737400 +units=km", "scale": METRES_PER_DEGREE / 1e3},
         {"crs": "+proj=eqc +R=1737400 +lon_0=180", "scale": METRES_PER_DEGREE, "west": -170.0},
-        {"crs": "+proj=eqc +R=1737400", "scale": METRES_PER_DEGREE, "west": -350.0},
-        {"high": 1 / 32},
+        {"crs": "+proj=eqc +R=1737400", "scale": METRES_PER_DEGREE, "west": -350.0}, {"high": 1 / 32},
         {"high": -1 / 16},
     ],
-)
+)  # fmt: skip
 def test_a_form_of_the_same_ground_gives_the_same_heights(tmp_path, form):
     terrain = RasterTerrain([write_form(tmp_path / "a.tif", **form)], NONE, **AS_IT_IS)
     found = terrain.height_m(*np.radians(PLACES))
@@ -293,19 +271,13 @@ def test_a_form_of_the_same_ground_gives_the_same_heights(tmp_path, form):
     ("form", "message"),
     [
         ({"convert": lambda h: h / 1e3}, r"differ by 3 m .* found 0\.\d+ .* no unit stated\): kilometres"),
-        (
-            {"convert": lambda h: h * 1e3},
-            r"expected heights of -9200 to 10800 m .* found -\d+ to \d\.\d+e\+06",
-        ),
+        ({"convert": lambda h: h * 1e3}, r"expected heights of -9200 to 10800 m .* found -\d+ to \d\.\d+e\+06"),
         ({"convert": lambda h: h / 1e3 + 1_737.4, "unit": "m"}, None),
         ({"convert": lambda h: 30.0 * h}, "expected heights of -9200 to 10800 m"),
         ({"unit": "K"}, "in a unit of length .* found 'k'"),
         ({"count": 2}, "one band of heights of 16 bits or more, found 2 of float32"),
         ({"convert": lambda h: h / 20 + 120, "dtype": "uint8"}, "found 1 of uint8: a picture"),
-        (
-            {"crs": "+proj=longlat +a=1738100 +b=1736000 +no_defs"},
-            "found an ellipsoid of 1738.1 by 1736.0 km",
-        ),
+        ({"crs": "+proj=longlat +a=1738100 +b=1736000 +no_defs"}, "found an ellipsoid of 1738.1 by 1736.0 km"),
         ({"crs": "+proj=longlat +R=1738000 +no_defs"}, r"a sphere of 1737\.4 km, found one of 1738\.000 km"),
         ({"crs": "EPSG:4326"}, "found a body of 6378"),
     ],
@@ -377,9 +349,7 @@ def test_any_projection_that_gdal_knows_is_read_at_its_places(tmp_path, crs):
 def test_a_polar_map_holds_the_pole_and_nothing_beyond_its_edge(tmp_path):
     transform = rasterio.Affine(1e4, 0, -3e5, 0, -1e4, 3e5)
     values = np.arange(3600, dtype="float32").reshape(60, 60)
-    (layer,) = open_layers(
-        [write_tiff(tmp_path / "a.tif", transform, values, "+proj=stere +lat_0=-90 +R=1737400")]
-    )
+    (layer,) = open_layers([write_tiff(tmp_path / "a.tif", transform, values, "+proj=stere +lat_0=-90 +R=1737400")])
     latitude, longitude = np.radians([-90.0, -81.0, -79.5, -79.5]), np.radians([0.0, 271.0, 45.0, 0.0])
     assert layer.holds(latitude, longitude).tolist() == [True, True, True, False]
 

@@ -35,9 +35,7 @@ def spectrum(terrain, latitude_deg, longitude_deg):
     ramp = np.polyfit(np.arange(n), heights, 1)
     heights = heights - (ramp[0] * np.arange(n)[:, None] + ramp[1])
     window = np.hanning(n)[:, None]
-    power = (
-        (np.abs(np.fft.rfft(heights * window, axis=0)) ** 2).mean(axis=1) * 2.0 * PIXEL_M / (window**2).sum()
-    )
+    power = (np.abs(np.fft.rfft(heights * window, axis=0)) ** 2).mean(axis=1) * 2.0 * PIXEL_M / (window**2).sum()
     wave_km = 1.0 / np.maximum(np.fft.rfftfreq(n, PIXEL_M / 1000.0), 1e-9)
     return np.array([np.log10(power[(wave_km >= a) & (wave_km < b)].mean()) for a, b in BANDS_KM])
 
@@ -79,11 +77,7 @@ def test_the_density_of_craters_goes_on_across_the_join(data_path):
         )
         diameter_m = 2.0 * small.radius_rad[inside] * MOON_RADIUS_M
         counts += [np.count_nonzero(diameter_m >= 1000.0), np.count_nonzero(diameter_m >= 500.0)]
-        area_km2 += (
-            (MOON_RADIUS_M / 1e3) ** 2
-            * math.radians(24.0)
-            * (math.sin(window[0][1]) - math.sin(window[0][0]))
-        )
+        area_km2 += (MOON_RADIUS_M / 1e3) ** 2 * math.radians(24.0) * (math.sin(window[0][1]) - math.sin(window[0][0]))
     of_2km = np.count_nonzero(catalogue.diameter_m >= 2000.0) / (37.93e6 * 53 / 72)
     density = counts / area_km2 + of_2km
     # Density follows the catalogue by place; this strip has more upland than the Moon's mean: within a third.

@@ -36,9 +36,7 @@ def test_registration_moves_the_raster_over_the_ground(tmp_path):
     place = math.radians(15.0), math.radians(14.0)
     shift_deg = math.degrees(59.0 / MOON_RADIUS_M)
     # What was 59 m farther north is now here: higher, on ground that rises to the north.
-    assert float(moved.height_m(*place) - still.height_m(*place)) == pytest.approx(
-        100.0 * shift_deg, abs=0.01
-    )
+    assert float(moved.height_m(*place) - still.height_m(*place)) == pytest.approx(100.0 * shift_deg, abs=0.01)
 
 
 def test_a_scenario_may_give_the_registration_of_height_rasters(tmp_path):
@@ -63,9 +61,7 @@ def test_files_join_without_a_seam_and_across_the_prime_meridian(tmp_path):
     heights = terrain.height_m(np.radians(4.0), np.radians(longitude))
     # Cubic resampling of waves of 40 degrees from pixels of 1/32 degree: centimetres.
     np.testing.assert_allclose(heights, hills(4.0, longitude), atol=0.05)
-    np.testing.assert_allclose(
-        heights, terrain.height_m(np.radians(4.0), np.radians(longitude + 360.0)), atol=0.01
-    )
+    np.testing.assert_allclose(heights, terrain.height_m(np.radians(4.0), np.radians(longitude + 360.0)), atol=0.01)
 
 
 def test_a_coarse_raster_fills_in_around_but_does_not_count_as_covered(tmp_path):

@@ -64,9 +64,7 @@ def polar_truth() -> Truth:
         angle = 2.0 * np.pi * (tdb_s - start_s) / PERIOD_S
         zero = np.zeros_like(angle)
         position = RADIUS_M * np.stack([np.cos(angle), zero, np.sin(angle)], axis=-1)
-        velocity = (
-            RADIUS_M * 2.0 * np.pi / PERIOD_S * np.stack([-np.sin(angle), zero, np.cos(angle)], axis=-1)
-        )
+        velocity = RADIUS_M * 2.0 * np.pi / PERIOD_S * np.stack([-np.sin(angle), zero, np.cos(angle)], axis=-1)
         return np.concatenate([position, velocity], axis=-1)
 
     return Truth(state, START_NS, START_NS + int(3 * PERIOD_S) * NS, StillMoon())
@@ -86,9 +84,7 @@ def test_a_window_runs_across_the_band_in_the_wanted_direction(polar_truth, dire
     found = crossings(polar_truth, everywhere, direction=direction)[0]
     assert found.observable
     first, last = found.start_utc_ns, found.stop_utc_ns
-    assert (last - first) / NS == pytest.approx(
-        PERIOD_S / 3.0, abs=61.0
-    )  # a search step and a margin at each end, s
+    assert (last - first) / NS == pytest.approx(PERIOD_S / 3.0, abs=61.0)  # a search step and a margin at each end, s
     _, longitude, _ = spherical_from_mcmf(polar_truth.positions_mcmf([first, (first + last) // 2, last]))
     assert np.degrees(longitude) % 360.0 == pytest.approx(longitude_deg, abs=1e-6)
 
@@ -167,9 +163,7 @@ def test_a_trajectory_below_the_terrain_is_refused_with_epoch_and_depth(polar_tr
     times = np.array([START_NS, START_NS + 60 * NS])
     require_above_ground(polar_truth, times, lambda latitude, longitude: np.full(latitude.shape, 29_000.0))
     with pytest.raises(ScenarioError, match=r"1000 m below at 2029-07-2\dT.*latitude .*longitude"):
-        require_above_ground(
-            polar_truth, times, lambda latitude, longitude: np.full(latitude.shape, 31_000.0)
-        )
+        require_above_ground(polar_truth, times, lambda latitude, longitude: np.full(latitude.shape, 31_000.0))
 
 
 def test_reads_of_the_truth_are_counted_by_the_thread_that_asks_for_it(polar_truth: Truth) -> None:
@@ -186,9 +180,7 @@ def test_reads_of_the_truth_are_counted_by_the_thread_that_asks_for_it(polar_tru
 
 
 def board(**options: object) -> SimulatedBoard:
-    return SimulatedBoard(
-        PlatformModel(), 1, np.zeros(1000, dtype=np.uint8), np.zeros(1000, dtype=np.uint8), **options
-    )
+    return SimulatedBoard(PlatformModel(), 1, np.zeros(1000, dtype=np.uint8), np.zeros(1000, dtype=np.uint8), **options)
 
 
 def test_the_sensors_and_stages_are_those_that_flight_reads() -> None:

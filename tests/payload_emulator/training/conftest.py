@@ -69,8 +69,7 @@ def write_blob_dataset(
             split=split,
             complete=True,
             frames={
-                key: np.broadcast_to(np.asarray(values[key], float), (count,)).copy()
-                for key in store.FRAME_COLUMNS
+                key: np.broadcast_to(np.asarray(values[key], float), (count,)).copy() for key in store.FRAME_COLUMNS
             },
             sun_camera=np.tile([0.0, -0.98, -0.17], (count, 1)),
             camera_from_mcmf=np.tile(rotation, (count, 1, 1)),

@@ -26,9 +26,7 @@ RECIPE = Recipe(
     7,
     (
         Source("world", "train", "procedural", 0.5, (41,), altitude_km=(14.0, 16.0)),
-        Source(
-            "world-test", "test", "procedural", 0.5, (41,), light="low", vary=False, altitude_km=(14.0, 16.0)
-        ),
+        Source("world-test", "test", "procedural", 0.5, (41,), light="low", vary=False, altitude_km=(14.0, 16.0)),
     ),
     frames_per_shard=1,
 )
@@ -104,9 +102,7 @@ def test_a_build_killed_at_work_goes_on_to_the_same_bytes(built, tmp_path):
     assert 1 <= done < 4
     list(build(load_recipe(recipe), target, 3, find_data(None)))
     assert check(target) == []
-    ours, theirs = (
-        {p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()} for f in (folder, target)
-    )
+    ours, theirs = ({p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()} for f in (folder, target))
     assert ours == theirs
 
 
@@ -118,9 +114,7 @@ def test_a_full_disk_loses_nothing_that_was_finished(tmp_path):
     try:
         # A picture has more than a hundred thousand octets.
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
-        with pytest.raises(
-            DatasetError, match=r"File too large.*; 1 of 4 frames are kept, the same command goes on"
-        ):
+        with pytest.raises(DatasetError, match=r"File too large.*; 1 of 4 frames are kept, the same command goes on"):
             list(steps)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -186,18 +180,8 @@ def test_ellipses_of_coco_lie_in_their_boxes(built):
     for a in annotations:
         u, v, half_major, half_minor, angle_deg = a["ellipse"]
         angle, around = np.radians(angle_deg), np.linspace(0.0, 2.0 * np.pi, 181)
-        x = (
-            u
-            + half_major * np.cos(around) * np.cos(angle)
-            - half_minor * np.sin(around) * np.sin(angle)
-            + 0.5
-        )
-        y = (
-            v
-            + half_major * np.cos(around) * np.sin(angle)
-            + half_minor * np.sin(around) * np.cos(angle)
-            + 0.5
-        )
+        x = u + half_major * np.cos(around) * np.cos(angle) - half_minor * np.sin(around) * np.sin(angle) + 0.5
+        y = v + half_major * np.cos(around) * np.sin(angle) + half_minor * np.sin(around) * np.cos(angle) + 0.5
         assert half_major >= half_minor > 0.0 and 0.0 < a["visible"] <= 1.0
         left, top, width, height = a["bbox"]
         assert (
@@ -267,9 +251,7 @@ def test_training_frames_keep_sixty_kilometres_from_every_held_out_box(tmp_path,
         for corner in corners:
             for box in shard.source.avoid:
                 middle = 0.5 * (box.west_deg + box.east_deg)
-                east = abs((corner["longitude"] - middle + 180) % 360 - 180) - 0.5 * (
-                    box.east_deg - box.west_deg
-                )
+                east = abs((corner["longitude"] - middle + 180) % 360 - 180) - 0.5 * (box.east_deg - box.west_deg)
                 east_km = max(east, 0.0) * km_per_degree * np.cos(np.radians(corner["latitude"]))
                 north = max(box.south_deg - corner["latitude"], corner["latitude"] - box.north_deg, 0.0)
                 # A parallel is no great circle: up to 1 % short over such distances.

@@ -247,9 +247,7 @@ def test_the_ground_diameter_undoes_the_projection(blob_dataset):
     ground = store.diameter_on_ground_m(blob_dataset, frame, c["u_px"], c["v_px"], c["diameter_px"])
     # Labels of this set were made flat; the curved ground is up to 4 % farther in the corners from 30 km.
     assert ground == pytest.approx(c["diameter_m"], rel=0.05)
-    middle = store.diameter_on_ground_m(
-        blob_dataset, frame, np.array([255.5]), np.array([255.5]), np.array([25.0])
-    )
+    middle = store.diameter_on_ground_m(blob_dataset, frame, np.array([255.5]), np.array([255.5]), np.array([25.0]))
     assert middle == pytest.approx(25.0 * 30_000.0 / 147.8017, rel=1e-6)
 
 
@@ -585,13 +583,9 @@ def test_counted_statistics_leave_outputs_and_make_training_mode_agree(shipped) 
     np.testing.assert_allclose(outputs(average, image)[0], after[0], atol=1e-6)
     first = network.stem[1]
     with torch.no_grad():
-        seen = network.stem[0](
-            torch.from_numpy(np.concatenate([Crops().batch(k, 1)["image"] for k in range(32)]))
-        )
+        seen = network.stem[0](torch.from_numpy(np.concatenate([Crops().batch(k, 1)["image"] for k in range(32)])))
     np.testing.assert_allclose(first.running_mean.numpy(), seen.mean((0, 2, 3)).numpy(), atol=1e-4)
-    np.testing.assert_allclose(
-        first.running_var.numpy(), seen.var((0, 2, 3), unbiased=False).numpy(), rtol=1e-3
-    )
+    np.testing.assert_allclose(first.running_var.numpy(), seen.var((0, 2, 3), unbiased=False).numpy(), rtol=1e-3)
 
 
 def test_what_is_no_exported_network_is_refused(tmp_path) -> None:
@@ -620,9 +614,7 @@ def test_an_enlarging_network_gives_maps_of_half_the_stride_and_flies() -> None:
 
 
 def test_older_networks_name_the_only_backbone_and_stride() -> None:
-    assert networks.parse_config({"enlarge": 2, "backbone": "small", "stride_px": 4}) == networks.ModelConfig(
-        enlarge=2
-    )
+    assert networks.parse_config({"enlarge": 2, "backbone": "small", "stride_px": 4}) == networks.ModelConfig(enlarge=2)
     with pytest.raises(ModelError, match="expected backbone small, found 'large'"):
         networks.parse_config({"backbone": "large"})
     with pytest.raises(ModelError, match="expected stride_px 4, found 2"):

@@ -66,13 +66,7 @@ def test_the_report_shows_the_worst_frames_and_says_what_it_lacks(detector, blob
     report = detector_report(detector, scored, figures)
     assert len(report.worst_frames) == 4
     page = render_html(report)
-    for words in (
-        "By type of terrain",
-        "By altitude",
-        "By Sun elevation",
-        "Predicted uncertainty",
-        "ignore-aware",
-    ):
+    for words in ("By type of terrain", "By altitude", "By Sun elevation", "Predicted uncertainty", "ignore-aware"):
         assert words in page
     assert "no training run was given" in page
     assert json.loads(to_json(report))["kind"] == "DetectorReport"
@@ -123,9 +117,7 @@ def test_real_terrain_that_fixed_thresholds_or_weights_counts_as_seen(blob_datas
     assert level((test, True)) == "2 (procedural Moon, held out)"
 
 
-ONE_STEP = TrainParameters(
-    minutes=0.0, steps=1, batch=2, crop_px=96, validation_frames=1, replicas=1, detail_blocks=0
-)
+ONE_STEP = TrainParameters(minutes=0.0, steps=1, batch=2, crop_px=96, validation_frames=1, replicas=1, detail_blocks=0)
 
 
 @pytest.fixture(scope="module")
@@ -133,9 +125,7 @@ def exported(blob_dataset, tmp_path_factory):
     run = tmp_path_factory.mktemp("export")
     train([blob_dataset], run, ONE_STEP)
     path = run / "m.onnx"
-    figures = export(
-        run / "checkpoint.pt", path, [blob_dataset], revision="abc", paper_classes=True, test=True
-    )
+    figures = export(run / "checkpoint.pt", path, [blob_dataset], revision="abc", paper_classes=True, test=True)
     return path.read_bytes(), figures
 
 
@@ -207,9 +197,7 @@ def shifted_scene(azimuth_deg, shift, number=0):
         u, v, size, np.full(u.size, 7_000.0), np.full(u.size, 0.1), np.arange(u.size) + 100 * number, 512, 512,
         np.radians(azimuth_deg), number,
     )  # fmt: skip
-    found = FrameDetections(
-        u + shift[0], v + shift[1], size, truth.diameter_m, np.full(u.size, 0.9), np.ones(u.size)
-    )
+    found = FrameDetections(u + shift[0], v + shift[1], size, truth.diameter_m, np.full(u.size, 0.9), np.ones(u.size))
     return truth, found
 
 
@@ -314,9 +302,7 @@ def test_too_few_craters_give_no_correction():
 def test_the_papers_threshold_is_chosen_over_its_classes_together():
     # One crater of class 0 found at 0.7, a false detection of class 1 at 0.5: anything in between is best.
     one = np.array([100.0])
-    truth = FrameTruth(
-        one, one, np.array([30.0]), np.array([7e3]), np.array([0.1]), np.array([1]), 512, 512, 0.0, 0
-    )
+    truth = FrameTruth(one, one, np.array([30.0]), np.array([7e3]), np.array([0.1]), np.array([1]), 512, 512, 0.0, 0)
     found = FrameDetections(
         np.array([100.0, 300.0]), np.array([100.0, 300.0]), np.full(2, 30.0), np.array([7e3, 12e3]),
         np.array([0.7, 0.5]), np.ones(2), size_class=np.array([0, 1], np.int8),
@@ -357,14 +343,8 @@ def test_groups_hold_their_own_frames_and_no_others():
     nothing = scene(GRID[0].ravel(), GRID[1].ravel(), found=np.zeros(64, bool))
     figures = figures_of([everything, nothing], [LOW, HIGH])
     assert [row["strict"]["recall"] for row in figures["by_altitude_km"]] == [1.0, 0.0]
-    assert {row["name"]: row["strict"]["recall"] for row in figures["by_terrain"]} == {
-        "lowland": 1.0,
-        "upland": 0.0,
-    }
-    assert {row["name"]: row["ignore_aware"]["recall"] for row in figures["by_source"]} == {
-        "mare": 1.0,
-        "hills": 0.0,
-    }
+    assert {row["name"]: row["strict"]["recall"] for row in figures["by_terrain"]} == {"lowland": 1.0, "upland": 0.0}
+    assert {row["name"]: row["ignore_aware"]["recall"] for row in figures["by_source"]} == {"mare": 1.0, "hills": 0.0}
     assert [(row["low"], row["strict"]["recall"]) for row in figures["by_sun_elevation_deg"]] == [
         (3.0, 1.0),
         (12.0, 0.0),

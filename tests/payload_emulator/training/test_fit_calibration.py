@@ -80,12 +80,8 @@ def pairs(pull=(0.3, 0.2, 0.4), ground_m=((60.0, -30.0), (-20.0, 10.0)), lasting
             size.append(np.log(diameter / 20.0))
     count = len(error)
     one = np.ones(count)
-    features = np.stack(
-        [one, np.array(size), np.log(1.5) * one, one, 1.7 * one, rng.uniform(0, 1.4, count)], axis=1
-    )
-    return Pairs(
-        np.array(error), features, np.array(directions), np.array(scale), np.array(place), np.array(crater)
-    )
+    features = np.stack([one, np.array(size), np.log(1.5) * one, one, 1.7 * one, rng.uniform(0, 1.4, count)], axis=1)
+    return Pairs(np.array(error), features, np.array(directions), np.array(scale), np.array(place), np.array(crater))
 
 
 def test_pull_and_registration_are_told_apart():

@@ -42,9 +42,7 @@ def test_each_channel_is_normalised_before_the_average() -> None:
     np.testing.assert_allclose(paper, expected, atol=1e-4)
     assert np.abs(paper - prepare_image(image).gray).max() > 0.02
     gray = gray_levels(image)
-    np.testing.assert_array_equal(
-        prepare_image(gray, Preparation.normalise_first).gray, prepare_image(gray).gray
-    )
+    np.testing.assert_array_equal(prepare_image(gray, Preparation.normalise_first).gray, prepare_image(gray).gray)
 
 
 def test_a_gain_of_one_channel_makes_no_difference_in_the_papers_order() -> None:
@@ -61,9 +59,7 @@ def test_a_crop_of_a_colour_frame_is_that_of_its_gray_where_channels_agree() -> 
         rng = np.random.Generator(np.random.Philox(key=[1, 2]))
         none = np.zeros(0)
         crops.append(
-            make_crop(
-                picture, np.array([0.0, -1.0, 0.2]), none, none, none, none > 0, 96, AugmentParameters(), rng
-            )
+            make_crop(picture, np.array([0.0, -1.0, 0.2]), none, none, none, none > 0, 96, AugmentParameters(), rng)
         )
     np.testing.assert_allclose(crops[0].image, crops[1].image, atol=1e-5)
 
@@ -138,9 +134,7 @@ def test_a_network_of_classes_without_medians_is_refused(classes_only) -> None:
     metadata = {item.key: item.value for item in model.metadata_props}
     assert json.loads(metadata["class_median_diameter_m"])
     onnx.helper.set_model_props(model, metadata | {"class_median_diameter_m": "[1, 2]"})
-    with pytest.raises(
-        ModelError, match=r"three median diameters in class_median_diameter_m, found '\[1, 2\]'"
-    ):
+    with pytest.raises(ModelError, match=r"three median diameters in class_median_diameter_m, found '\[1, 2\]'"):
         OnnxDetector(model.SerializeToString())
 
 

@@ -32,9 +32,7 @@ def write_set(folder, images=None, annotations=None, pixels=None):
     cv2.imwrite(str(folder / "a.png"), pixels)
     document = {
         "images": [{"id": 1, "file_name": "a.png"}] if images is None else images,
-        "annotations": [{"id": 1, "image_id": 1, "bbox": [10, 20, 20, 20]}]
-        if annotations is None
-        else annotations,
+        "annotations": [{"id": 1, "image_id": 1, "bbox": [10, 20, 20, 20]}] if annotations is None else annotations,
         "categories": [],
     }
     (folder / "labels.json").write_text(json.dumps(document))
@@ -95,14 +93,8 @@ def test_several_files_at_any_depth_are_one_set(tmp_path):
         ({"annotations": [{"id": 1}]}, "annotations[0].image_id: expected a value, found none"),
         ({"annotations": label()}, "expected a box (bbox) or polygons (segmentation), found neither"),
         ({"annotations": label(segmentation={"counts": "x"})}, "found a run-length mask"),
-        (
-            {"annotations": label(segmentation=[[1, 2, 3, 4]])},
-            "segmentation[0]: expected at least three pairs",
-        ),
-        (
-            {"annotations": label(segmentation=[[1, 1, 2, 2, 3, 3]])},
-            "segmentation[0]: expected a polygon with an area",
-        ),
+        ({"annotations": label(segmentation=[[1, 2, 3, 4]])}, "segmentation[0]: expected at least three pairs"),
+        ({"annotations": label(segmentation=[[1, 1, 2, 2, 3, 3]])}, "segmentation[0]: expected a polygon with an area"),
         ({"annotations": {}}, "annotations: expected a list of objects"),
         ({"images": [{"id": 1}]}, "images[0].file_name: expected a value, found none"),
         ({"images": [{"id": 1, "file_name": "none.png"}]}, "images[0].file_name: expected an image file"),
@@ -140,9 +132,7 @@ def write_labels(folder, boxes=BOXES, change=lambda document: None, **keys):
     """A set of one image of 96 x 64 pixels with a label for each box."""
     document = {
         "images": [{"id": 0, "file_name": "a.png"}],
-        "annotations": [
-            {"id": k, "image_id": 0, "category_id": 0, "bbox": box} | keys for k, box in enumerate(boxes)
-        ],
+        "annotations": [{"id": k, "image_id": 0, "category_id": 0, "bbox": box} | keys for k, box in enumerate(boxes)],
         "categories": [dict(CRATER), dict(BOULDER)],
     }
     change(document)
@@ -170,9 +160,7 @@ def test_a_supercategory_says_crater_too_and_a_set_without_craters_is_refused(tm
 
     (picture,) = load_pictures(write_labels(tmp_path / "a", change=renamed))
     assert len(picture.u_px) == 4
-    with pytest.raises(
-        DatasetError, match="expected a category that says crater, or --category, found boulder"
-    ):
+    with pytest.raises(DatasetError, match="expected a category that says crater, or --category, found boulder"):
         load_pictures(write_labels(tmp_path / "b", change=lambda d: d["categories"].pop(0)))
 
 
@@ -301,9 +289,7 @@ def detections(rows):
 
 
 def figures(boxes, rows, criterion, limits=(8.0, 150.0), crowd=()):
-    tallied = tally_pictures(
-        [picture(boxes, crowd)], [detections(rows)], criterion, [limits], np.array([np.nan])
-    )
+    tallied = tally_pictures([picture(boxes, crowd)], [detections(rows)], criterion, [limits], np.array([np.nan]))
     at = tallied.figures(0.5)
     return at.detected_true, at.false_alarms, at.expected
 

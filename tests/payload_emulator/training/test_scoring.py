@@ -49,8 +49,7 @@ def test_the_better_detection_takes_the_crater():
 def test_precision_recall_and_f1_of_a_case_counted_by_hand():
     # 4 craters, 3 detections of which 2 are right: P 2/3, R 1/2, F1 = 2*2/(3+4).
     figures = tally(
-        [truth([50, 150, 250, 350], [50, 50, 50, 50])],
-        [found([52, 150, 450], [50, 53, 450], [0.9, 0.8, 0.7])],
+        [truth([50, 150, 250, 350], [50, 50, 50, 50])], [found([52, 150, 450], [50, 53, 450], [0.9, 0.8, 0.7])]
     ).figures(0.5)
     assert figures.precision == pytest.approx(2 / 3)
     assert figures.recall == pytest.approx(0.5)

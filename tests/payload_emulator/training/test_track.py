@@ -98,11 +98,7 @@ def test_boxes_and_buffers_hold_along_an_orbit_too(polar_orbit):
 def test_the_papers_split_keeps_one_arc_for_testing():
     names = split_track(PAPER_SPLIT, 2000, 7)
     assert names[-100:] == ("test",) * 100
-    assert {name: names.count(name) for name in ("train", "val", "test")} == {
-        "train": 1600,
-        "val": 300,
-        "test": 100,
-    }
+    assert {name: names.count(name) for name in ("train", "val", "test")} == {"train": 1600, "val": 300, "test": 100}
     # Validation is drawn from all over the rest, by the seed.
     where = np.flatnonzero(np.array(names) == "val")
     assert where.min() < 100 and where.max() > 1800
@@ -115,9 +111,7 @@ def test_an_ephemeris_below_the_ground_is_refused_with_the_place(polar_orbit):
     position = lay_track(along, CAMERA, Everywhere(), find_data(None), 1, 1).position_mcmf_m[0]
     rng = np.random.default_rng(1)
     assert pose_at(Everywhere(), CAMERA, along, position, "frame 3", rng).ground_m == 0.0
-    with pytest.raises(
-        DatasetError, match=r"frame 3: expected a place above the ground at .* found the camera at"
-    ):
+    with pytest.raises(DatasetError, match=r"frame 3: expected a place above the ground at .* found the camera at"):
         pose_at(Everywhere(31_000.0), CAMERA, along, position, "frame 3", rng)
 
 

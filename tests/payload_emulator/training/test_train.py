@@ -82,9 +82,7 @@ def pits_at(places, dataset):
     return Landmarks(-north, east, 0.0 * ones, 40.0 * metres_per_px * ones, ones, ones, ones)
 
 
-def test_a_network_retrained_with_learned_craters_finds_them_elsewhere_and_no_fewer_others(
-    make_blob_dataset, tmp_path
-):
+def test_a_network_retrained_with_learned_craters_finds_them_elsewhere_and_no_fewer_others(make_blob_dataset, tmp_path):
     """Dark pits are not listed: the network leaves them out, also if it is trained further with the list alone."""
     here, elsewhere = (list(product(at, at)) for at in ((90.0, 256.0, 420.0), (140.0, 330.0, 470.0)))
     listed = make_blob_dataset(tmp_path / "set", {"train": 12, "val": 2}, pits=here)
@@ -122,9 +120,7 @@ def test_the_weight_of_small_craters_is_bounded_below(blob_dataset, monkeypatch)
 
 
 @pytest.mark.parametrize(("splits", "lacking"), [({"test": 1}, "train"), ({"train": 1}, "val")])
-def test_a_data_set_without_training_or_validation_frames_is_refused(
-    make_blob_dataset, tmp_path, splits, lacking
-):
+def test_a_data_set_without_training_or_validation_frames_is_refused(make_blob_dataset, tmp_path, splits, lacking):
     empty = make_blob_dataset(tmp_path / "set", splits)
     with pytest.raises(DatasetError, match=f"split '{lacking}', found none"):
         train([empty], tmp_path / "run", SHORT)

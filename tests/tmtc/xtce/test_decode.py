@@ -157,30 +157,15 @@ def test_other_signs_are_read():
 @pytest.mark.parametrize(
     ("octets", "value"),
     [
-        ("7FFFFF7F", 0.9999998807907104 * 2.0**127),
-        ("4000007F", 0.5 * 2.0**127),
-        ("50000004", 0.625 * 2.0**4),
-        ("40000001", 0.5 * 2.0**1),
-        ("40000000", 0.5),
-        ("400000FF", 0.5 * 2.0**-1),
-        ("40000080", 0.5 * 2.0**-128),
-        ("00000000", 0.0),
-        ("80000000", -1.0),
-        ("BFFFFF80", -0.5000001192092896 * 2.0**-128),
-        ("9FFFFF04", -0.7500001192092896 * 2.0**4),
-        ("4000007F0000", 0.5 * 2.0**127),
-        ("400000000000", 0.5),
-        ("400000FF0000", 0.5 * 2.0**-1),
-        ("400000800000", 0.5 * 2.0**-128),
-        ("8000007F0000", -(2.0**127)),
-        ("800000000000", -1.0),
-        ("800000FF0000", -1.0 * 2.0**-1),
-        ("800000800000", -(2.0**-128)),
-        ("000000000000", 0.0),
-        ("A00000FF0000", -0.75 * 2.0**-1),
-        ("000000000001", 2.0**-39),
+        ("7FFFFF7F", 0.9999998807907104 * 2.0**127), ("4000007F", 0.5 * 2.0**127), ("50000004", 0.625 * 2.0**4),
+        ("40000001", 0.5 * 2.0**1), ("40000000", 0.5), ("400000FF", 0.5 * 2.0**-1), ("40000080", 0.5 * 2.0**-128),
+        ("00000000", 0.0), ("80000000", -1.0), ("BFFFFF80", -0.5000001192092896 * 2.0**-128),
+        ("9FFFFF04", -0.7500001192092896 * 2.0**4), ("4000007F0000", 0.5 * 2.0**127), ("400000000000", 0.5),
+        ("400000FF0000", 0.5 * 2.0**-1), ("400000800000", 0.5 * 2.0**-128), ("8000007F0000", -(2.0**127)),
+        ("800000000000", -1.0), ("800000FF0000", -1.0 * 2.0**-1), ("800000800000", -(2.0**-128)),
+        ("000000000000", 0.0), ("A00000FF0000", -0.75 * 2.0**-1), ("000000000001", 2.0**-39),
     ],
-)
+)  # fmt: skip
 def test_floats_of_mil_std_1750a_are_those_of_the_standard(octets, value):
     data = bytes.fromhex(octets)
     assert one(floating("M", 8 * len(data), "MILSTD_1750A"), {"A": "M"}, ["A"], data)["A"] == [value]
@@ -193,9 +178,7 @@ def test_ieee_floats_stand_at_every_place(bits, phase):
     types = floating("F", bits) + floating("L", bits, order=foreign.LITTLE) + integer("PAD", 3)
     parameters = {**({"P": "PAD"} if phase else {}), "A": "F", "B": "L"}
     for value in (0.0, -1.5, math.inf, 2.0**-14, 65504.0):
-        packed = (
-            Bits().add(0, phase).octets(struct.pack(f">{code}", value)).octets(struct.pack(f"<{code}", value))
-        )
+        packed = Bits().add(0, phase).octets(struct.pack(f">{code}", value)).octets(struct.pack(f"<{code}", value))
         data = packed.add(0, -packed.count % 8).packed()
         found = one(types, parameters, list(parameters), data)
         assert found["A"] == found["B"] == [value]
@@ -219,12 +202,7 @@ def test_a_value_outside_its_spline_is_unknown_and_keeps_its_raw_value_unless_ex
     assert found.tables["P"].columns["A"].to_list(raw=True) == [9, 10, 19, 20, 25, 40, 41]
     differs = container("Q", [], "P", comparison("A", 1.0, "!="))
     text = document(lines, {"A": "T"}, container("P", ["A"]) + differs)
-    assert decoded(text, packets).tables["Q"].packet_index.tolist() == [
-        2,
-        3,
-        4,
-        5,
-    ]  # nothing is known of the others
+    assert decoded(text, packets).tables["Q"].packet_index.tolist() == [2, 3, 4, 5]  # nothing is known of the others
 
 
 def test_splines_of_yamcs_are_extrapolated_and_its_sizes_before_texts_count_octets():
@@ -238,10 +216,7 @@ def test_splines_of_yamcs_are_extrapolated_and_its_sizes_before_texts_count_octe
     assert parse_xtce(text).remarks == ("sizes before texts count bits",)
     made = text.replace("<TelemetryMetaData>", "<!-- generated with Yamcs PyMDB --><TelemetryMetaData>")
     assert values(made, [packet]) == {"A": [20.0], "B": ["ABCDEFGH"]}
-    assert parse_xtce(made).remarks == (
-        "sizes before texts count octets",
-        "splines are extrapolated, as Yamcs does",
-    )
+    assert parse_xtce(made).remarks == ("sizes before texts count octets", "splines are extrapolated, as Yamcs does")
     stated = Decoder(parse_xtce(text, "octets")).decode(*whole([packet]))
     assert stated.tables["P"].columns["B"].to_list() == ["ABCDEFGH"]
 
@@ -253,15 +228,7 @@ def test_a_code_without_a_name_stays_a_number_and_ranges_of_codes_share_one():
         "</EnumerationList></EnumeratedParameterType>"
     )
     text = document(types, {"A": "E"}, container("P", ["A"]))
-    assert values(text, [bytes((k,)) for k in (0, 1, 2, 9, 10, 19, 20)])["A"] == [
-        0,
-        "ONE",
-        2,
-        9,
-        "TEENS",
-        "TEENS",
-        20,
-    ]
+    assert values(text, [bytes((k,)) for k in (0, 1, 2, 9, 10, 19, 20)])["A"] == [0, "ONE", 2, 9, "TEENS", "TEENS", 20]
 
 
 # texts and octets
@@ -332,9 +299,7 @@ def test_a_text_without_terminator_fills_its_field_and_one_that_is_no_text_is_un
 
 def test_a_terminator_of_two_octets_stands_at_a_whole_character():
     size = "<SizeInBits><Fixed><FixedValue>64</FixedValue></Fixed><TerminationChar>0000</TerminationChar></SizeInBits>"
-    data = (
-        "aĀ".encode("utf-16-be") + b"\0\0\0x"
-    )  # 00 61 01 00 00 00: the first two zeros are of two characters
+    data = "aĀ".encode("utf-16-be") + b"\0\0\0x"  # 00 61 01 00 00 00: the first two zeros are of two characters
     assert one(text_type(size, "UTF-16BE"), {"A": "T"}, ["A"], data)["A"] == ["aĀ"]
 
 
@@ -363,12 +328,10 @@ def test_texts_and_octets_that_begin_inside_an_octet_are_read():
 
 def test_a_size_may_be_looked_up():
     lookup = "".join(
-        f'<DiscreteLookup value="{bits}">{comparison("N", n)}</DiscreteLookup>'
-        for n, bits in ((1, 8), (2, 24))
+        f'<DiscreteLookup value="{bits}">{comparison("N", n)}</DiscreteLookup>' for n, bits in ((1, 8), (2, 24))
     )
     types = (
-        integer("N", 8)
-        + f'<BinaryParameterType name="B"><BinaryDataEncoding><SizeInBits><DiscreteLookupList>{lookup}'
+        integer("N", 8) + f'<BinaryParameterType name="B"><BinaryDataEncoding><SizeInBits><DiscreteLookupList>{lookup}'
         "</DiscreteLookupList></SizeInBits></BinaryDataEncoding></BinaryParameterType>"
     )
     text = document(types, {"N": "N", "B": "B"}, container("P", ["N", "B"]))
@@ -417,9 +380,7 @@ def test_arrays_of_aggregates_follow_their_count_as_in_the_pus_examples_of_yamcs
         + array_type("REPORT", "ELEMENT", dimension("count"))
     )
     text = document(
-        types,
-        {"count": "N", "report": "REPORT", "end": "N"},
-        container("P", ["count", ARRAY_ENTRY("report"), "end"]),
+        types, {"count": "N", "report": "REPORT", "end": "N"}, container("P", ["count", ARRAY_ENTRY("report"), "end"])
     )
     expected = [[(k * 100 + i, i % 16 - 8) for i in range(n)] for k, n in enumerate((3, 0, 1, 40))]
     packets = []
@@ -467,10 +428,7 @@ def test_elements_that_say_their_own_length_are_read_one_after_another():
     )
     text = document(types, {"n": "N", "a": "A", "z": "N"}, container("P", ["n", "a", "z"]))
     rows = [[], [(1, "a")], [(2, "bcd"), (3, ""), (4, "efghij")], [(5, "x" * 31)]]
-    packets = [
-        bytes((len(row),)) + b"".join(bytes((k, len(t))) + t.encode() for k, t in row) + b"\x63"
-        for row in rows
-    ]
+    packets = [bytes((len(row),)) + b"".join(bytes((k, len(t))) + t.encode() for k, t in row) + b"\x63" for row in rows]
     broken = bytes((2, 9, 1, 65, 9, 25, 65))  # the second text is longer than the packet
     found = decoded(text, [*packets, broken])
     columns = found.tables["P"].columns
@@ -510,15 +468,9 @@ def test_entries_may_stand_at_places_counted_from_the_start_or_from_the_entry_be
     )
     base = container(
         "BASE",
-        [
-            location("a", "containerStart", 8),
-            location("b", "previousEntry", 8),
-            location("c", "previousEntry", -24),
-        ],
+        [location("a", "containerStart", 8), location("b", "previousEntry", 8), location("c", "previousEntry", -24)],
     )
-    child = container(
-        "P", ["t", location("d", "containerStart", 0), location("e", "previousEntry", 40)], "BASE"
-    )
+    child = container("P", ["t", location("d", "containerStart", 0), location("e", "previousEntry", 40)], "BASE")
     text = document(types, dict.fromkeys("abde", "N") | {"c": "W", "t": "T"}, base + child)
     assert values(text, [bytes((0, 1, 2, 65, 66, 5, 6, 7))]) == {
         "a": [1], "b": [65], "c": [0x0102], "t": ["AB"], "d": [0], "e": [6],
@@ -633,9 +585,7 @@ def test_definitions_may_be_spread_over_documents():
 
 
 def bus_like(*containers: str) -> str:
-    return document(
-        HEADER_TYPES, {**HEADER_PARAMETERS, "N": "U8", "M": "U8"}, HEADER_CONTAINER + "".join(containers)
-    )
+    return document(HEADER_TYPES, {**HEADER_PARAMETERS, "N": "U8", "M": "U8"}, HEADER_CONTAINER + "".join(containers))
 
 
 def test_a_packet_is_decoded_by_one_container_or_told_why_not():
@@ -644,12 +594,9 @@ def test_a_packet_is_decoded_by_one_container_or_told_why_not():
         container("B", ["N", "M"], "CCSDSPacket", comparison("PKT_APID", 10, ">=")),
     )
     packets = [
-        space_packet(9, b"\x01", 0),
-        space_packet(10, b"\x01\x02", 0),
-        space_packet(11, b"\x01\x02", 0),
-        space_packet(11, b"\x01", 0),
-        space_packet(9, b"\x01\x02\x03", 0),
-    ]
+        space_packet(9, b"\x01", 0), space_packet(10, b"\x01\x02", 0), space_packet(11, b"\x01\x02", 0),
+        space_packet(11, b"\x01", 0), space_packet(9, b"\x01\x02\x03", 0),
+    ]  # fmt: skip
     found = decoded(text, packets)
     assert verdicts(text, packets) == ["decoded", "ambiguous", "decoded", "too_short", "decoded"]
     assert found.tables["A"].unread_bits.tolist() == [0, 16]
@@ -662,9 +609,7 @@ def test_a_packet_is_decoded_by_one_container_or_told_why_not():
 
 def test_damaged_packets_are_left_out():
     octets, cut = whole([b"\x01", b"\x02"])
-    damaged = PacketCut(
-        cut.offsets, cut.lengths, np.array([True, False]), cut.skipped, cut.idle, cut.consumed
-    )
+    damaged = PacketCut(cut.offsets, cut.lengths, np.array([True, False]), cut.skipped, cut.idle, cut.consumed)
     definition = parse_xtce(document(integer("N", 8), {"a": "N"}, container("P", ["a"])))
     found = Decoder(definition).decode(octets, damaged)
     assert found.tables["P"].columns["a"].to_list() == [1] and found.verdict.tolist() == [0, 5]
@@ -721,9 +666,7 @@ def test_noise_is_decoded_or_given_a_verdict_and_never_stops_the_others():
     rng = np.random.default_rng(4)
     definition = parse_xtce(foreign.BUS)
     good = foreign.capture(50, 6)
-    noise = [
-        space_packet(int(rng.integers(100, 103)), rng.bytes(int(rng.integers(1, 200))), 0) for _ in range(500)
-    ]
+    noise = [space_packet(int(rng.integers(100, 103)), rng.bytes(int(rng.integers(1, 200))), 0) for _ in range(500)]
     mixed = [p for pair in zip(good, noise[:50], strict=True) for p in pair] + noise[50:]
     found = Decoder(definition).decode(*whole(mixed))
     assert found.verdict[0:100:2].tolist() == [0] * 50
@@ -746,9 +689,7 @@ def of_apid(name: str, apid: int, entries: list[str], *, abstract: bool = True) 
 def test_first_containers_are_told_apart_by_their_conditions():
     containers = of_apid("A", 1, ["N"]) + of_apid("B", 2, ["N", "M"]) + of_apid("C", 3, ["N"], abstract=False)
     text = document(HEADER_TYPES, {**HEADER_PARAMETERS, "N": "U8", "M": "U8"}, containers)
-    packets = [
-        space_packet(apid, data, 0) for apid, data in ((1, b"a"), (2, b"ab"), (3, b"c"), (4, b"d"), (2, b"x"))
-    ]
+    packets = [space_packet(apid, data, 0) for apid, data in ((1, b"a"), (2, b"ab"), (3, b"c"), (4, b"d"), (2, b"x"))]
     found = decoded(text, packets)
     assert {name: table.packet_index.tolist() for name, table in found.tables.items()} == {
         "A": [0], "B": [1], "C": [2], "C_Base": [3],
@@ -761,9 +702,7 @@ def test_first_containers_are_told_apart_by_their_conditions():
 
 def test_the_first_container_is_named_where_several_have_no_conditions():
     text = document(integer("N", 8), {"a": "N"}, container("P", ["a"]) + container("Q", ["a"]))
-    with pytest.raises(
-        DefinitionError, match=r"BUS: expected one container without a base, found 2 \(P, Q\)"
-    ):
+    with pytest.raises(DefinitionError, match=r"BUS: expected one container without a base, found 2 \(P, Q\)"):
         decoded(text, [b"\x01"])
     with pytest.raises(DefinitionError, match="expected the name of a container"):
         decoded(text, [b"\x01"], "R")
@@ -782,9 +721,7 @@ def parts(apid: int, first_count: int, *pieces: bytes, flags: tuple[int, ...] = 
     """Parts of a segmented packet: the first alone has a secondary header."""
     chosen = flags or (1, *[0] * (len(pieces) - 2), 2)
     return [
-        struct.pack(
-            ">HHH", apid | (0x0800 if k == 0 else 0), flag << 14 | (first_count + k) % 16384, len(piece) - 1
-        )
+        struct.pack(">HHH", apid | (0x0800 if k == 0 else 0), flag << 14 | (first_count + k) % 16384, len(piece) - 1)
         + piece
         for k, (piece, flag) in enumerate(zip(pieces, chosen, strict=True))
     ]
@@ -811,14 +748,7 @@ def test_parts_of_segmented_packets_are_joined_also_between_others_and_over_the_
     whole_one = space_packet(7, b"\x00\x05\x00\x00\x00\x06", 0)
     found, verdict = stream_of([one[0], whole_one, two[0], one[1], two[1], one[2]])
     assert found == [(0, 1, 2), (1, 5, 6), (2, 3, 4)]
-    assert verdict == [
-        "decoded",
-        "decoded",
-        "decoded",
-        "segments_joined",
-        "segments_joined",
-        "segments_joined",
-    ]
+    assert verdict == ["decoded", "decoded", "decoded", "segments_joined", "segments_joined", "segments_joined"]
 
 
 def test_each_part_has_its_checksum():

@@ -123,9 +123,7 @@ def random_value(f: Field, rng: np.random.Generator):
 
 def random_packet(definition: PacketDefinition, count: int, rng: np.random.Generator) -> bytes:
     group = definition.group
-    values = {
-        f.name: random_value(f, rng) for f in definition.fields if not (group and f.name == group.count)
-    }
+    values = {f.name: random_value(f, rng) for f in definition.fields if not (group and f.name == group.count)}
     if group:
         values[group.name] = [{f.name: random_value(f, rng) for f in group.fields} for _ in range(count)]
     return DICTIONARY.pack(
@@ -151,9 +149,7 @@ def test_an_independent_decoder_reads_every_packet_to_equal_values(definition, d
         assert theirs["TIME_COARSE"] << 16 | theirs["TIME_FINE"] == ours.ticks
         for f in definition.fields:
             if f.size == 1:
-                assert_equal(
-                    theirs[parameter_name(definition.name, f.name)], ours.values[f.name], ours.raw[f.name], f
-                )
+                assert_equal(theirs[parameter_name(definition.name, f.name)], ours.values[f.name], ours.raw[f.name], f)
             for k in range(f.size if f.size > 1 else 0):
                 name = parameter_name(definition.name, f.name, k + 1)
                 assert_equal(theirs[name], ours.values[f.name][k], ours.raw[f.name][k], f)
@@ -164,9 +160,7 @@ def test_an_independent_decoder_reads_every_packet_to_equal_values(definition, d
             for f in definition.group.fields:
                 for k in range(count):
                     name = parameter_name(definition.name, f.name, k + 1)
-                    assert_equal(
-                        theirs[name], ours.values["items"][f.name][k], ours.raw["items"][f.name][k], f
-                    )
+                    assert_equal(theirs[name], ours.values["items"][f.name][k], ours.raw["items"][f.name][k], f)
 
 
 def assert_equal(theirs, value, raw, f: Field) -> None:

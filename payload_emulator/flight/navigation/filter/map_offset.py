@@ -6,8 +6,6 @@ fixes x moves by the sum of the scores over the information collected so far, wh
 prior counts as information; older information fades, so that the size follows the ground.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

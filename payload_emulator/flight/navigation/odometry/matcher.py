@@ -8,8 +8,6 @@ Places are metres east and north of the sub-satellite point of their own frame. 
 motion of the spacecraft that explains it: place in the earlier frame minus place in the later frame.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -109,11 +107,7 @@ def match_frames(
 
 
 def _candidate_pairs(
-    earlier: GroundFeatures,
-    later: GroundFeatures,
-    scale: float,
-    direction: int,
-    parameters: MatcherParameters,
+    earlier: GroundFeatures, later: GroundFeatures, scale: float, direction: int, parameters: MatcherParameters
 ) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
     """Return shift east, shift north and both indices of every same-class pair inside the bounds."""
     east = earlier.east_m[:, None] - later.east_m[None, :]

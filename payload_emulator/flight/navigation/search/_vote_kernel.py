@@ -3,8 +3,6 @@
 Directions at the camera are east, north, up of the point below it; angles in rad, lengths in m.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

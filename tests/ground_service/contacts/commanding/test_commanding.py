@@ -12,13 +12,7 @@ import pytest
 from sqlalchemy import event, update
 
 from ground_service.contacts.commanding import service as commanding
-from ground_service.contacts.commanding.core import (
-    FAILURES,
-    STAGES,
-    SentCommand,
-    VerificationReport,
-    fate_of,
-)
+from ground_service.contacts.commanding.core import FAILURES, STAGES, SentCommand, VerificationReport, fate_of
 from ground_service.contacts.commanding.model import HandoverFilter, TelecommandFilter
 from ground_service.contacts.commanding.service import (
     change_handover,
@@ -40,12 +34,7 @@ from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.model import Approval
 from ground_service.planning.model import WindowFilter
-from ground_service.planning.service import (
-    WindowEntry,
-    add_window,
-    change_window,
-    uplink_window,
-)
+from ground_service.planning.service import WindowEntry, add_window, change_window, uplink_window
 from ground_service.planning.store import list_windows
 from ground_service.store import repository
 from ground_service.store.event_kinds import read_events
@@ -75,8 +64,7 @@ def downlink(ground: Ground, folder: Path, *reports: tuple[str, int, dict[str, A
     path = folder / "reports.bin"
     path.write_bytes(
         b"".join(
-            DICTIONARY.pack(name, values, ticks=ticks, sequence_count=ticks % 16384)
-            for name, ticks, values in reports
+            DICTIONARY.pack(name, values, ticks=ticks, sequence_count=ticks % 16384) for name, ticks, values in reports
         )
     )
     ingest_file(ground, path, spacecraft_id=SPACECRAFT)
@@ -93,9 +81,7 @@ def test_a_command_goes_its_way_from_the_queue_to_its_completion(ground: Ground,
     request = {"request_id": view.record.request_id}
     downlink(ground, tmp_path, ("verification_accepted", 1000, request))
     assert get_command(ground, command).state == "accepted"
-    downlink(
-        ground, tmp_path, ("verification_completed", 3000, request), ("verification_started", 2000, request)
-    )
+    downlink(ground, tmp_path, ("verification_completed", 3000, request), ("verification_started", 2000, request))
     view = get_command(ground, command)
     assert view.state == "completed"
     assert view.fate is not None
@@ -130,24 +116,12 @@ def test_bare_packets_can_be_taken_instead_of_frames(ground: Ground) -> None:
         ("set_parameter", {"parameter_id": "x", "value": []}, "expected"),
         ("test_connection", {"extra": 1}, "no such field"),
         *(
-            (
-                "set_parameter",
-                {"parameter_id": 1, "value": value},
-                "set_parameter.value: expected a finite number",
-            )
+            ("set_parameter", {"parameter_id": 1, "value": value}, "set_parameter.value: expected a finite number")
             for value in (float("nan"), float("inf"), -float("inf"), 1e400, True, False)
         ),
-        (
-            "set_parameter",
-            {"parameter_id": True, "value": 1.0},
-            "parameter_id: expected a finite number, found True",
-        ),
+        ("set_parameter", {"parameter_id": True, "value": 1.0}, "parameter_id: expected a finite number, found True"),
         ("set_parameter", {"parameter_id": 1, "value": 10**400}, "value: expected a number"),
-        (
-            "set_housekeeping_interval",
-            {"structure_id": 1, "interval_s": True},
-            "interval_s: expected a finite number",
-        ),
+        ("set_housekeeping_interval", {"structure_id": 1, "interval_s": True}, "interval_s: expected a finite number"),
         ("delete_activity", {"request_id": -1}, "request_id: expected"),
         ("delete_activity", {"request_id": 1e20}, "request_id: expected"),
         (
@@ -185,9 +159,7 @@ def test_a_failure_says_why(ground: Ground, tmp_path: Path) -> None:
     command = sent(ground)
     request = get_command(ground, command).record.request_id
     downlink(
-        ground,
-        tmp_path,
-        ("verification_not_accepted", 500, {"request_id": request, "failure_code": "wrong_mode"}),
+        ground, tmp_path, ("verification_not_accepted", 500, {"request_id": request, "failure_code": "wrong_mode"})
     )
     view = get_command(ground, command)
     assert view.state == "failed"
@@ -283,8 +255,7 @@ def test_what_changes_the_state_of_the_payload_needs_a_second_person(
     assert bool(get_command(ground, command).record.critical) == critical
     if critical:
         with pytest.raises(
-            Conflict,
-            match=r"critical; expected a person other than ann .*\((changes on-board state|destroys data): ",
+            Conflict, match=r"critical; expected a person other than ann .*\((changes on-board state|destroys data): "
         ):
             release_command(ground, command, actor="ann")
         release_command(ground, command, actor="bob")
@@ -361,9 +332,7 @@ def told(ground: Ground) -> list[Any]:
 def test_each_step_keeps_what_was_done_when_by_whom_and_tells_those_who_watch(
     ground: Ground, clock: Callable[[int], None]
 ) -> None:
-    command = enter_command(
-        ground, "perform_function", START, spacecraft_id=SPACECRAFT, timeout_s=90, actor="ann"
-    )
+    command = enter_command(ground, "perform_function", START, spacecraft_id=SPACECRAFT, timeout_s=90, actor="ann")
     view = get_command(ground, command)
     assert (view.spacecraft_id, view.instance, view.fate) == (SPACECRAFT, "flight", None)
     expected = {
@@ -411,16 +380,12 @@ def test_a_rejection_keeps_its_reason(ground: Ground, clock: Callable[[int], Non
 )
 def test_a_time_out_lasts_a_second_to_68_years(ground: Ground, timeout_s: int, accepted: bool) -> None:
     def enter() -> int:
-        return enter_command(
-            ground, "test_connection", {}, spacecraft_id=SPACECRAFT, timeout_s=timeout_s, actor="ann"
-        )
+        return enter_command(ground, "test_connection", {}, spacecraft_id=SPACECRAFT, timeout_s=timeout_s, actor="ann")
 
     if accepted:
         assert get_command(ground, enter()).record.timeout_s == timeout_s
     else:
-        with pytest.raises(
-            InvalidInput, match=f"telecommand, timeout_s: expected 1 to 2147483647, found {timeout_s}"
-        ):
+        with pytest.raises(InvalidInput, match=f"telecommand, timeout_s: expected 1 to 2147483647, found {timeout_s}"):
             enter()
 
 
@@ -434,9 +399,7 @@ def test_an_unknown_name_is_answered_with_the_nearest_one(ground: Ground) -> Non
             entered(ground, name)
 
 
-def test_commands_are_sent_in_the_order_of_their_release(
-    ground: Ground, clock: Callable[[int], None]
-) -> None:
+def test_commands_are_sent_in_the_order_of_their_release(ground: Ground, clock: Callable[[int], None]) -> None:
     first, second, third = (entered(ground, "test_connection") for _ in range(3))
     for offset, command in ((1, second), (2, third), (2, first)):
         clock(NOW + offset)
@@ -450,9 +413,7 @@ def test_commands_are_sent_in_the_order_of_their_release(
 
 def test_an_uplink_holds_only_what_is_meant_for_its_spacecraft(ground: Ground) -> None:
     mine = entered(ground, "test_connection")
-    twin = enter_command(
-        ground, "test_connection", {}, spacecraft_id=SPACECRAFT, instance="twin", actor="ann"
-    )
+    twin = enter_command(ground, "test_connection", {}, spacecraft_id=SPACECRAFT, instance="twin", actor="ann")
     other = enter_command(ground, "test_connection", {}, spacecraft_id=77, actor="ann")
     waiting = entered(ground, "test_connection")
     for command in (mine, twin, other):
@@ -464,9 +425,7 @@ def test_an_uplink_holds_only_what_is_meant_for_its_spacecraft(ground: Ground) -
     assert [get_command(ground, one).record.sequence_count for one in (mine, twin, other)] == [0, 0, 0]
 
 
-def test_a_command_is_judged_by_reports_newer_than_those_known_when_it_was_sent(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_a_command_is_judged_by_reports_newer_than_those_known_when_it_was_sent(ground: Ground, tmp_path: Path) -> None:
     first = sent(ground)
     request = get_command(ground, first).record.request_id
     downlink(
@@ -517,11 +476,7 @@ def test_time_outs_are_noted_from_the_first_instant_asked_for_to_before_the_last
     assert note_timeouts(ground, 0, due) == []
     assert note_timeouts(ground, due, due + 1) == [command]
     assert get_command(ground, command).record.timeout_noted_utc_ns == due + 1
-    assert notes(ground, command)[-1] == (
-        "service",
-        "time out telecommand",
-        {"state": "sent", "timeout_s": 600},
-    )
+    assert notes(ground, command)[-1] == ("service", "time out telecommand", {"state": "sent", "timeout_s": 600})
     assert note_timeouts(ground, 0, due + 100) == []
 
 
@@ -541,9 +496,7 @@ def vehicle_of(ground: Ground) -> int:
     return int(get_command(ground, command).record.vehicle_id)
 
 
-def test_an_activity_carries_the_octets_of_its_telecommand(
-    ground: Ground, clock: Callable[[int], None]
-) -> None:
+def test_an_activity_carries_the_octets_of_its_telecommand(ground: Ground, clock: Callable[[int], None]) -> None:
     vehicle = vehicle_of(ground)
     with ground.database.writing() as connection:
         outer = commanding.add_scheduled(
@@ -579,11 +532,7 @@ REBOOT = {"function_id": "reboot", "argument_1": 0.0, "argument_2": 0.0}
 
 @pytest.mark.parametrize(
     ("approval", "released"),
-    [
-        (None, False),
-        (commanding.Approval("ann", "ann"), False),
-        (commanding.Approval("ann", "bob"), True),
-    ],
+    [(None, False), (commanding.Approval("ann", "ann"), False), (commanding.Approval("ann", "bob"), True)],
 )
 def test_a_telecommand_released_at_once_needs_an_approval_by_two_persons(
     ground: Ground, approval: commanding.Approval | None, released: bool
@@ -682,12 +631,7 @@ def test_whatever_is_not_routine_needs_a_second_person() -> None:
         "perform_function/synchronise_clock", "perform_function/reboot", "delete_store",
     ):  # fmt: skip
         assert needs(critical)
-    for routine in (
-        "test_connection",
-        "enable_schedule",
-        "perform_function/start_observation",
-        "replay_store",
-    ):
+    for routine in ("test_connection", "enable_schedule", "perform_function/start_observation", "replay_store"):
         assert not needs(routine)
 
 
@@ -707,9 +651,7 @@ SENT_NS, TIMEOUT_NS = 5_000, 600
 COMMAND = SentCommand(REQUEST, SENT_NS, 100, 200, TIMEOUT_NS)
 
 
-def report(
-    subtype: int, ticks: int = 150, request: int = REQUEST, step: int | None = None
-) -> VerificationReport:
+def report(subtype: int, ticks: int = 150, request: int = REQUEST, step: int | None = None) -> VerificationReport:
     return VerificationReport(subtype, request, ticks, step, None)
 
 
@@ -738,9 +680,7 @@ def test_every_set_of_reports_has_the_state_of_its_worst_or_furthest_one() -> No
             assert found.timed_out is (expected not in ("failed", "completed")), subtypes
 
 
-@pytest.mark.parametrize(
-    ("now_ns", "overdue"), [(SENT_NS + TIMEOUT_NS, False), (SENT_NS + TIMEOUT_NS + 1, True)]
-)
+@pytest.mark.parametrize(("now_ns", "overdue"), [(SENT_NS + TIMEOUT_NS, False), (SENT_NS + TIMEOUT_NS + 1, True)])
 def test_a_command_is_overdue_after_its_time_out_and_not_at_it(now_ns: int, overdue: bool) -> None:
     assert fate_of(COMMAND, [], now_ns).timed_out is overdue
 

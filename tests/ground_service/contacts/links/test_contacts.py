@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from ground_service.contacts.links.core import (
     BLOCK_NS,
     CLOCK_LIMIT_S,
-    NS,
     PredictedContact,
     clock_fault,
     contact_at,
@@ -19,6 +18,7 @@ from ground_service.contacts.links.core import (
 )
 from ground_service.missions.model import parse_mission
 from ground_service.missions.places import outages_of, station_of, stations_of
+from lunar.constants import NS
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.visibility import GroundStation, link
 from tests.ground_service.conftest import START, circular_states
@@ -50,15 +50,10 @@ def test_contacts_of_a_query_are_a_cut_of_those_of_a_longer_one(orbit: Ephemeris
     edges = range(BLOCK_NS * (START // BLOCK_NS + 1), START + DAY, BLOCK_NS)
     above = predict_contacts(orbit, [ALWAYS], START, START + DAY)
     assert any(one.start_utc_ns < edge < one.stop_utc_ns for one in above for edge in edges)
-    for start, stop in (
-        (START + 3 * NS, START + DAY),
-        (whole[0].start_utc_ns + NS, whole[-1].stop_utc_ns - NS),
-    ):
+    for start, stop in ((START + 3 * NS, START + DAY), (whole[0].start_utc_ns + NS, whole[-1].stop_utc_ns - NS)):
         found = predict_contacts(orbit, [MADRID], start, stop)
         cut = [(max(one.start_utc_ns, start), min(one.stop_utc_ns, stop)) for one in whole]
-        assert [(one.start_utc_ns, one.stop_utc_ns) for one in found] == [
-            span for span in cut if span[0] < span[1]
-        ]
+        assert [(one.start_utc_ns, one.stop_utc_ns) for one in found] == [span for span in cut if span[0] < span[1]]
 
 
 def test_contacts_end_where_the_ephemeris_does_and_outages_are_left_out(orbit: Ephemeris) -> None:
@@ -70,21 +65,14 @@ def test_contacts_end_where_the_ephemeris_does_and_outages_are_left_out(orbit: E
     closed = predict_contacts(orbit, [MADRID], START, START + DAY, {"madrid": [(middle - NS, middle + NS)]})
     assert [one.start_utc_ns for one in closed[:2]] == [first.start_utc_ns, middle + NS]
     assert closed[0].stop_utc_ns == middle - NS
-    assert (
-        predict_contacts(orbit, [MADRID], START, START + DAY, {"canberra": [(START, START + DAY)]})
-        == contacts
-    )
+    assert predict_contacts(orbit, [MADRID], START, START + DAY, {"canberra": [(START, START + DAY)]}) == contacts
 
 
 @given(
     st.tuples(st.integers(0, 50), st.integers(51, 100)),
-    st.lists(
-        st.tuples(st.integers(0, 100), st.integers(0, 100)).map(lambda ab: (min(ab), max(ab))), max_size=4
-    ),
+    st.lists(st.tuples(st.integers(0, 100), st.integers(0, 100)).map(lambda ab: (min(ab), max(ab))), max_size=4),
 )
-def test_without_keeps_what_no_closed_span_covers(
-    span: tuple[int, int], closed: list[tuple[int, int]]
-) -> None:
+def test_without_keeps_what_no_closed_span_covers(span: tuple[int, int], closed: list[tuple[int, int]]) -> None:
     parts = without(span, closed)
     for halves in range(2 * span[0] + 1, 2 * span[1], 2):  # the middle of every unit
         kept = any(2 * a < halves < 2 * b for a, b in parts)

@@ -15,13 +15,7 @@ from sqlalchemy import func, select
 from ground_service.clock import mission_now_ns
 from ground_service.contacts.links import runner as runners
 from ground_service.contacts.links import service, store
-from ground_service.contacts.links.runner import (
-    ACKNOWLEDGEMENT,
-    DISCARDED_BLOCKS,
-    Connector,
-    LinkRunner,
-    ended_holder,
-)
+from ground_service.contacts.links.runner import ACKNOWLEDGEMENT, DISCARDED_BLOCKS, Connector, LinkRunner, ended_holder
 from ground_service.contacts.links.supervisor import LinkSupervisor
 from ground_service.errors import DatabaseBusy, Stopping, StorageFull
 from ground_service.ground import Ground
@@ -110,9 +104,7 @@ def test_a_full_disk_loses_nothing_and_the_link_shows_it(
         wait_for(lambda: service.get_link(ground, "lab").state == "failed", "the state")
         assert "no space left" in (service.get_link(ground, "lab").reason or "")
         threading.Event().wait(0.3)
-        states = [
-            one.payload["state"] for one in read_events(ground.database, 0, 10_000) if one.kind == "link"
-        ]
+        states = [one.payload["state"] for one in read_events(ground.database, 0, 10_000) if one.kind == "link"]
         assert states.count("failed") == 1
         full[0] = False
         wait_for(lambda: runner.octets_received == len(stream), "all octets")
@@ -201,9 +193,7 @@ def test_a_link_that_could_not_be_opened_is_opened_later_with_its_spool_and_its_
         assert runner.alive
 
 
-def test_a_gap_in_the_ephemeris_is_a_reason_and_not_an_error(
-    ground: Ground, station: Station, tmp_path: Path
-) -> None:
+def test_a_gap_in_the_ephemeris_is_a_reason_and_not_an_error(ground: Ground, station: Station, tmp_path: Path) -> None:
     declare(ground, PLACES + station.link('station = "here"'))
     parts = []
     for begin in (0, 7200):
@@ -293,9 +283,7 @@ def test_a_process_that_never_held_the_spool_ingests_nothing_of_it(
     with (folder / "lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with operated(ground):
-            wait_for(
-                lambda: "holds the spool" in (service.get_link(ground, "lab").reason or ""), "the reason"
-            )
+            wait_for(lambda: "holds the spool" in (service.get_link(ground, "lab").reason or ""), "the reason")
         assert segment.exists()
 
 
@@ -381,9 +369,7 @@ def test_a_file_whose_ingest_is_stopped_is_read_again(tmp_path: Path) -> None:
     path = tmp_path / "in" / "pass.cadu"
     path.write_bytes(b"octets")
     seen: list[Any] = []
-    folder = WatchedFolder(
-        tmp_path / "in", tmp_path / "ledger.json", stopping, lambda _, result: seen.append(result)
-    )
+    folder = WatchedFolder(tmp_path / "in", tmp_path / "ledger.json", stopping, lambda _, result: seen.append(result))
     with pytest.raises(Stopping):
         folder.look(path.stat().st_mtime + 2 * SETTLED_S)
     assert seen == [] and not (tmp_path / "ledger.json").exists()

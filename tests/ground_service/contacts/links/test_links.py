@@ -72,10 +72,7 @@ def expected(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> s
 
 
 def released(ground: Ground, count: int = 1) -> list[int]:
-    keys = [
-        enter_command(ground, "test_connection", {}, spacecraft_id=SPACECRAFT, actor="ann")
-        for _ in range(count)
-    ]
+    keys = [enter_command(ground, "test_connection", {}, spacecraft_id=SPACECRAFT, actor="ann") for _ in range(count)]
     for key in keys:
         release_command(ground, key, actor="bob")
     return keys
@@ -192,9 +189,7 @@ def test_what_an_ended_process_has_left_in_its_spool_is_ingested_by_the_next(
     assert hash_of(either) == expected
 
 
-def test_octets_are_acknowledged_when_they_are_on_disk(
-    ground: Ground, station: Station, stream: bytes
-) -> None:
+def test_octets_are_acknowledged_when_they_are_on_disk(ground: Ground, station: Station, stream: bytes) -> None:
     declare(ground, station.link("acknowledge = true"))
     with operated(ground):
         connection = station.accept()
@@ -325,18 +320,13 @@ def test_transmissions_of_which_nothing_was_heard_are_repeated_in_the_next_conta
             connection.sendall(rows[0] + rows[1])
             wanted = min(contact + 1, service.REPEAT_ATTEMPTS)
             wait_for(lambda n=wanted: len(sent_to(station)) == n, "the transmission")
-            wait_for(
-                lambda: not ground.read(store.pending_transmissions, "lab"), "the record of the transmission"
-            )
+            wait_for(lambda: not ground.read(store.pending_transmissions, "lab"), "the record of the transmission")
             mission_time.advance(0.1)
             connection.sendall(rows[2] + rows[3])  # telemetry from after the transmission
             received = 4 * (contact + 1) * CADU
             wait_for(lambda n=received: runner.octets_received == n, "the telemetry")
             mission_time.advance(3600.0)
-            wait_for(
-                lambda n=contact: contact_events(ground).count("contact ended") == n + 1,
-                "the end of the contact",
-            )
+            wait_for(lambda n=contact: contact_events(ground).count("contact ended") == n + 1, "the end of the contact")
         sent = sent_to(station)
     assert sent == octets_of(ground, keys) * service.REPEAT_ATTEMPTS
 
@@ -464,9 +454,7 @@ def test_folders_are_watched_and_telecommands_written(
     ground: Ground, tmp_path: Path, stream: bytes, expected: str
 ) -> None:
     incoming, outgoing = tmp_path / "in", tmp_path / "out"
-    declare(
-        ground, f'[[links]]\nname = "lab"\nkind = "file"\ndownlink = "{incoming}"\nuplink = "{outgoing}"\n'
-    )
+    declare(ground, f'[[links]]\nname = "lab"\nkind = "file"\ndownlink = "{incoming}"\nuplink = "{outgoing}"\n')
     with operated(ground) as runner:
         wait_for(lambda: "expected a folder" in (service.get_link(ground, "lab").reason or ""), "the reason")
         incoming.mkdir()
@@ -481,9 +469,7 @@ def test_folders_are_watched_and_telecommands_written(
     assert contact_events(ground) == ["contact started", "contact ended"]
 
 
-def test_the_file_is_not_read_again_by_the_next_process(
-    ground: Ground, tmp_path: Path, stream: bytes
-) -> None:
+def test_the_file_is_not_read_again_by_the_next_process(ground: Ground, tmp_path: Path, stream: bytes) -> None:
     declare(ground, f'[[links]]\nname = "lab"\nkind = "file"\ndownlink = "{tmp_path}/in"\n')
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "pass.cadu").write_bytes(stream)
@@ -497,12 +483,7 @@ def test_the_file_is_not_read_again_by_the_next_process(
 
 @pytest.mark.parametrize(("share", "missed"), [(1.0, 0), (0.3, 1)])
 def test_a_contact_in_which_another_station_received_is_not_missed(
-    ground: Ground,
-    station: Station,
-    synthetic_pass: Any,
-    mission_time: Clock,
-    share: float,
-    missed: int,
+    ground: Ground, station: Station, synthetic_pass: Any, mission_time: Clock, share: float, missed: int
 ) -> None:
     declare(ground, PLACES + both_links(station, station, 'station = "here"'))
     add_reference(ground, synthetic_pass.folder / "reference.oem")
@@ -640,9 +621,7 @@ def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(
                 wait_for(lambda: first.transmissions, "the refused transmission")
                 # Also when its contact has ended, the station is asked.
                 mission_time.advance(100.0)
-                wait_for(
-                    lambda: either.read(store.open_contact, "lab") is None, "the end of the first contact"
-                )
+                wait_for(lambda: either.read(store.open_contact, "lab") is None, "the end of the first contact")
                 assert not second.transmissions and runner.commands_unsent == 2
                 second.accept().sendall(stream[2 * CADU : 4 * CADU])
                 wait_for(lambda: runner.commands_unsent + other.commands_unsent == 0, "the transmission")
@@ -652,9 +631,7 @@ def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(
         assert packets_of(octets) == octets_of(either, keys)
         assert len({number for number, _ in first.transmissions + second.transmissions}) == 1
         with either.database.reading() as connection:
-            query = select(repository.AUDIT.c.detail).where(
-                repository.AUDIT.c.action == "hand over transmission"
-            )
+            query = select(repository.AUDIT.c.detail).where(repository.AUDIT.c.action == "hand over transmission")
             (detail,) = connection.execute(query).scalars()
         assert detail == {"telecommands": keys, "from": "lab", "to": "other"}
     finally:

@@ -71,9 +71,7 @@ def learned(linna: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory)
     thin = full.select(np.arange(len(full)) % KEPT == 0)
     save_catalogue(thin, folder / "old.csv")
     with open_ground(linna.home) as ground:
-        ids = [
-            import_archive(ground, _pass(written.folder, folder, name, thin)) for name in ("first", "second")
-        ]
+        ids = [import_archive(ground, _pass(written.folder, folder, name, thin)) for name in ("first", "second")]
 
     before = linna("landmarks", "find", *ids)["passes"][1]
     proposed = linna("landmarks", "list", "--state", "proposed", "--limit", 500)["landmarks"]

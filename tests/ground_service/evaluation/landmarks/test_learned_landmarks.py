@@ -200,9 +200,7 @@ def test_only_proposed_landmarks_are_decided_and_decisions_remain(ground: Ground
         decide("ann", key=99_999)
 
 
-def test_a_place_that_later_frames_do_not_see_again_is_not_proposed(
-    ground: Ground, thinned, make_pass
-) -> None:
+def test_a_place_that_later_frames_do_not_see_again_is_not_proposed(ground: Ground, thinned, make_pass) -> None:
     """The second pass has no detections at the withheld craters: its catalogue has them, and its frames look."""
     folder, _, _ = thinned
     rewrite(folder, "first pass")
@@ -321,9 +319,7 @@ def _landmark(key: int, state: str = "accepted") -> Landmark:
 
 def _table() -> CatalogueTable:
     one = np.array([0.1])
-    return CatalogueTable(
-        np.array([7]), one, one, np.array([5000.0]), np.array([10.0]), np.full((1, 3), 60.0)
-    )
+    return CatalogueTable(np.array([7]), one, one, np.array([5000.0]), np.array([10.0]), np.full((1, 3), 60.0))
 
 
 def test_the_anchoring_table_gets_accepted_landmarks_once_with_their_uncertainty() -> None:
@@ -340,9 +336,7 @@ def test_the_anchoring_table_gets_accepted_landmarks_once_with_their_uncertainty
 
 def test_the_catalogue_gets_accepted_landmarks(tmp_path: Path) -> None:
     path = tmp_path / "old.csv"
-    path.write_text(
-        "id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete\n5,1,2,6000,10,300,1\n"
-    )
+    path.write_text("id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete\n5,1,2,6000,10,300,1\n")
     base = load_catalogue(path)
     extended = extended_catalogue(base, [_landmark(1), _landmark(2, "seen")])
     save_catalogue(extended, tmp_path / "new.csv")

@@ -73,9 +73,7 @@ def test_two_steps_are_found_in_order() -> None:
 def test_constant_levels_seldom_give_a_change() -> None:
     """Of 200 series without a change, the expected number with one is at most 200 * 0.01 / 3 < 1."""
     rng = np.random.default_rng(2)
-    alarms = sum(
-        bool(change_points(values.tolist(), permutations=999)) for values in rng.standard_cauchy((200, 24))
-    )
+    alarms = sum(bool(change_points(values.tolist(), permutations=999)) for values in rng.standard_cauchy((200, 24)))
     # With a probability of 0.0033 in each, more than 5 of 200 have a probability below 1e-4.
     assert alarms <= 5
 

@@ -223,10 +223,7 @@ def test_a_requirement_that_is_unknown_on_some_passes_is_not_good(ground: Ground
         add_pass(ground, number, status="met" if number == 3 else "unknown")
     value = monthly_value(performance(ground, SPACECRAFT, window_days=31.0), "2029-08")
     assert value.verdict_level == "unknown"
-    assert (
-        value.verdict
-        == "requirements judged: 1 of 1, none missed; median 3-D error not judged on 3 of 4 passes"
-    )
+    assert value.verdict == "requirements judged: 1 of 1, none missed; median 3-D error not judged on 3 of 4 passes"
 
 
 def test_a_requirement_without_a_limit_may_be_unknown(ground: Ground) -> None:
@@ -413,7 +410,5 @@ def test_operations_and_commands_give_the_same_report(
         ("accuracy.median", [0.1] * 12, ""),
     ],
 )
-def test_a_filter_is_judged_over_passes_by_both_bounds(
-    key: str, values: list[float | None], remark: str
-) -> None:
+def test_a_filter_is_judged_over_passes_by_both_bounds(key: str, values: list[float | None], remark: str) -> None:
     assert _consistency_remark(key, values) == remark

@@ -93,9 +93,7 @@ MINUTE = 60 * 10**9
 NAMES = {"a": "canberra", "b": "madrid", "c": "goldstone"}
 
 
-def reports_of_stations(
-    pattern: str, clocks_s: dict[str, list[float]], steps_s: list[float] | None = None
-) -> Any:
+def reports_of_stations(pattern: str, clocks_s: dict[str, list[float]], steps_s: list[float] | None = None) -> Any:
     """Time reports, one a minute: station, error of its clock and of the on-board clock by number of the report."""
     sent = START + np.arange(len(pattern), dtype=np.int64) * MINUTE
     on_board = np.asarray(steps_s if steps_s is not None else np.zeros(len(pattern)))
@@ -114,9 +112,7 @@ def reports_of_stations(
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("pattern", ["abababababababab", "bbbbaaaabbbbaaaa", "abcabcabcabcabca"])
-def test_a_station_whose_clock_is_wrong_is_named_and_left_out(
-    pattern: str, difference: float, cause: str
-) -> None:
+def test_a_station_whose_clock_is_wrong_is_named_and_left_out(pattern: str, difference: float, cause: str) -> None:
     clocks = {"a": [difference] * 16, "b": [0.0] * 16, "c": [0.0] * 16}
     kept, doubts = doubted_stations(*reports_of_stations(pattern, clocks))
     assert kept.tolist() == [name != "a" for name in pattern]

@@ -97,9 +97,7 @@ def spacecraft() -> Spacecraft:
 
 @pytest.fixture(autouse=True)
 def fixed_light_time(monkeypatch: Any) -> None:
-    monkeypatch.setattr(
-        recorrelation, "_light_time_ns", lambda *given: np.full(len(given[3]), round(LIGHT_S * NS))
-    )
+    monkeypatch.setattr(recorrelation, "_light_time_ns", lambda *given: np.full(len(given[3]), round(LIGHT_S * NS)))
 
 
 def ingest(ground: Ground, folder: Path, octets: bytes, name: str = "d.cadu") -> int:
@@ -139,9 +137,7 @@ def test_every_boot_gets_its_line_and_every_derived_time_names_it(
     assert max(abs(one.residual_ns) for one in left) < 20_000
 
 
-def test_the_order_of_telemetry_and_receptions_does_not_matter(
-    spacecraft: Spacecraft, tmp_path: Path
-) -> None:
+def test_the_order_of_telemetry_and_receptions_does_not_matter(spacecraft: Spacecraft, tmp_path: Path) -> None:
     cut = spacecraft.downlink(0, 12), spacecraft.downlink(12, 20), spacecraft.downlink(20)
     found = []
     for number, seed in enumerate(range(4)):
@@ -225,13 +221,10 @@ def test_what_an_operator_entered_can_be_withdrawn_with_a_trace(
     assert [(one.actor, one.detail) for one in trace] == [("ann", {"ids": [entered.id]})]
 
 
-def test_an_earlier_reception_of_the_same_report_counts(
-    ground: Ground, spacecraft: Spacecraft, tmp_path: Path
-) -> None:
+def test_an_earlier_reception_of_the_same_report_counts(ground: Ground, spacecraft: Spacecraft, tmp_path: Path) -> None:
     ingest(ground, tmp_path, spacecraft.downlink())
     played_back = [
-        ReceivedReport(one.ticks, one.sequence_count, one.earth_utc_ns + 3600 * NS)
-        for one in spacecraft.reports
+        ReceivedReport(one.ticks, one.sequence_count, one.earth_utc_ns + 3600 * NS) for one in spacecraft.reports
     ]
     for order in itertools.permutations([spacecraft.reports, played_back]):
         for reports in order:
@@ -277,11 +270,7 @@ def test_an_operator_correlates_from_a_file(
 
     linna("ingest", str(tmp_path / "d.cadu"))
     made = linna("correlate", "receptions", str(table), *who)["correlations"]
-    assert (
-        made
-        == linna("correlate", "list", *who)["correlations"]
-        == linna("correlate", "run", *who)["correlations"]
-    )
+    assert made == linna("correlate", "list", *who)["correlations"] == linna("correlate", "run", *who)["correlations"]
     assert len(linna("correlate", "residuals", *who)["time_reports"]) == REPORTS
 
 

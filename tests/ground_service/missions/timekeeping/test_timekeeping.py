@@ -20,13 +20,10 @@ def test_times_of_samples_follow_the_correlation_in_force(ground: Ground, synthe
     vehicle = ingest_file(ground, synthetic_pass.folder / "downlink.cadu").vehicle_id
     assert vehicle is not None
     first, last = int(synthetic_pass.utc_ns[0]), int(synthetic_pass.utc_ns[-1])
-    pass_id = define_pass(
-        ground, name="p", start_utc_ns=first - 60 * NS, stop_utc_ns=last + 60 * NS, spacecraft_id=76
-    )
+    pass_id = define_pass(ground, name="p", start_utc_ns=first - 60 * NS, stop_utc_ns=last + 60 * NS, spacecraft_id=76)
     ideal = parameter_series(ground, pass_id, "power_w", 1000)
     points = [
-        TimePoint(int(ticks_from_utc_ns(first + k * 60 * NS)), first + k * 60 * NS + 5 * NS + NS, NS)
-        for k in range(10)
+        TimePoint(int(ticks_from_utc_ns(first + k * 60 * NS)), first + k * 60 * NS + 5 * NS + NS, NS) for k in range(10)
     ]
     correlate(ground, vehicle, points)
     moved = parameter_series(ground, pass_id, "power_w", 1000)

@@ -45,9 +45,7 @@ def housekeeping(second: int, temperature_c: float) -> bytes:
     """A housekeeping packet with one value outside its limits, if that of the temperature is."""
     values: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
     values |= {"structure_id": 1, "bus_voltage_v": 12.0, "temperature_c": temperature_c}
-    return DICTIONARY.pack(
-        "housekeeping", values, ticks=START + second * SECOND, sequence_count=second % 16_384
-    )
+    return DICTIONARY.pack("housekeeping", values, ticks=START + second * SECOND, sequence_count=second % 16_384)
 
 
 def event(second: int, name: str = "event_high", event_id: int = 20) -> bytes:
@@ -124,9 +122,7 @@ def test_an_alarm_does_not_depend_on_the_order_of_arrival(ground: Ground, order:
     ]
     for part in order:
         receive(ground, *parts[part])
-    assert sorted(
-        (one.name, one.severity, one.count, one.active, one.state, one.value) for one in alarms(ground)
-    ) == [
+    assert sorted((one.name, one.severity, one.count, one.active, one.state, one.value) for one in alarms(ground)) == [
         ("camera_fault", "alarm", 3, False, "raised", None),
         ("temperature_c", "alarm", 3, True, "raised", 61.0),
     ]
@@ -212,9 +208,7 @@ def condition(ticks: int, severity: int, value: float) -> core.Condition:
 
 @given(
     st.lists(
-        st.builds(condition, st.integers(0, 5), st.sampled_from([1, 2]), st.floats(-90, 90)),
-        min_size=3,
-        max_size=6,
+        st.builds(condition, st.integers(0, 5), st.sampled_from([1, 2]), st.floats(-90, 90)), min_size=3, max_size=6
     ),
     st.randoms(),
 )
@@ -292,8 +286,6 @@ def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path: Path) -> None
 def test_an_alarm_states_the_procedure_of_the_mission_in_force(ground: Ground) -> None:
     receive(ground, housekeeping(0, 70.0), event(1))
     known = {one.name: one.id for one in alarms(ground, "raised")}
-    add_mission(
-        ground, b'name="w"\nspacecraft.id=76\nprocedures.temperature_c="Check the heaters."', actor="ann"
-    )
+    add_mission(ground, b'name="w"\nspacecraft.id=76\nprocedures.temperature_c="Check the heaters."', actor="ann")
     procedures = {name: ground.read(get_alarm, key).procedure for name, key in known.items()}
     assert procedures == {"temperature_c": "Check the heaters.", "camera_fault": None}
