@@ -46,12 +46,6 @@ def check(archive: Archive) -> None:
     assert summary.loc[one.id, "spherical median_3d_m"] == pytest.approx(spherical["error_3d_m"].median(), rel=1e-3)
 
 
-def test_a_home_folder_is_opened(rich_ground: Ground) -> None:
-    with linna.open(rich_ground.home) as archive:
-        check(archive)
-        assert "passes" in repr(archive)
-
-
 @pytest.mark.filterwarnings("ignore:ERFA function")  # leap seconds of 2029 are not announced
 def test_the_examples_of_other_tools_run_where_the_tool_is_installed(
     rich_ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -102,8 +96,10 @@ def test_a_server_is_opened_with_a_token(server: tuple[str, str]) -> None:
         check(archive)
 
 
-def test_tables_have_the_types_of_their_columns(rich_ground: Ground) -> None:
+def test_a_home_folder_is_opened_and_its_tables_have_the_types_of_their_columns(rich_ground: Ground) -> None:
     with linna.open(rich_ground.home) as archive:
+        check(archive)
+        assert "passes" in repr(archive)
         one = archive[1]
         assert set(one.tables) >= {"states", "residuals", "frames", "detections", "events", "reference"}
         detections = one.detections
@@ -140,6 +136,7 @@ def test_without_pandas_one_line_names_the_extra(rich_ground: Ground, monkeypatc
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_is_stored_without_outputs_and_small(path: Path) -> None:
+    assert [one.stem for one in NOTEBOOKS] == ["campaign", "detector", "pass"]
     assert path.stat().st_size < 20_000
     for cell in json.loads(path.read_text())["cells"]:
         assert cell.get("outputs", []) == [] and cell.get("execution_count") is None
@@ -198,7 +195,3 @@ def test_a_page_shows_outputs_in_the_order_of_the_cells() -> None:
         "```text\n7\n```\n",
     ]
     assert pictures == {"pass-1.png": b"\x89PNG"}
-
-
-def test_there_are_three_notebooks() -> None:
-    assert [path.stem for path in NOTEBOOKS] == ["campaign", "detector", "pass"]
