@@ -437,5 +437,5 @@ def test_the_operations_keep_and_render_the_archive_of_a_pass(ground: Ground, fl
     with local_client(ground, "ann") as service:
         kept = service.keep_pass_archive(pass_id, pinned=True)
         assert (kept.pass_id, kept.pinned) == (pass_id, True)
-        job: Any = service.wait(service.render_kept_archive(kept.digest).id)
+        job = service.wait(service.render_kept_archive(kept.digest).id)
         assert job.result["state"] == "complete"

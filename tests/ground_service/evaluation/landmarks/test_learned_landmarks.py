@@ -1,6 +1,5 @@
 """Landmarks learned from synthetic passes whose ground catalogue lacks known craters."""
 
-import json
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -43,7 +42,7 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder
 from lunar.frames import mcmf_from_spherical
 from payload_emulator.training.data.landmarks import load_landmarks
-from tests.ground_service.conftest import SyntheticPass, write_manifest
+from tests.ground_service.conftest import SyntheticPass, enter_files
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.tables import CatalogueTable, pack_catalogue_table, unpack_catalogue_table
 from tmtc.packets.large_data import LargeDataReceiver
@@ -61,14 +60,8 @@ def thinned(make_pass: Callable[..., SyntheticPass]) -> tuple[Path, CraterCatalo
     full = load_catalogue(made.folder / "catalogue.csv")
     withheld = np.arange(len(full)) % 3 == 0
     save_catalogue(full.select(~withheld), made.folder / "catalogue.csv")
-    rewrite(made.folder, "first pass")
+    enter_files(made.folder, pass_name="first pass")
     return made.folder, full, full.select(withheld)
-
-
-def rewrite(folder: Path, name: str) -> None:
-    manifest = json.loads((folder / "manifest.json").read_text())
-    manifest.pop("files")
-    write_manifest(folder, manifest | {"pass_name": name})
 
 
 def distances_m(catalogue: CraterCatalogue, one: Landmark) -> np.ndarray:
@@ -78,11 +71,11 @@ def distances_m(catalogue: CraterCatalogue, one: Landmark) -> np.ndarray:
     return MOON_RADIUS_M * np.hypot(east, latitude - catalogue.latitude_rad)
 
 
-def both_passes(ground: Ground, folder: Path) -> list[int]:
+def both_passes(ground: Ground, thinned: tuple[Path, ...]) -> list[int]:
     """Import one archive under two names, as two passes over the same ground."""
-    ids = []
+    folder, ids = thinned[0], []
     for name in ("first pass", "second pass"):
-        rewrite(folder, name)
+        enter_files(folder, pass_name=name)
         ids.append(import_archive(ground, folder))
     return ids
 
@@ -94,8 +87,8 @@ def landmarks(ground: Ground, **terms: str) -> list[Landmark]:
 
 
 def test_withheld_craters_become_proposals_at_their_places(either: Ground, thinned) -> None:
-    folder, _, withheld = thinned
-    first, second = both_passes(either, folder)
+    _, _, withheld = thinned
+    first, second = both_passes(either, thinned)
     update = update_landmarks(either, first)
     assert update.unmatched > update.places > 30 and update.controls > 30
     assert update.proposed == 0 and update.added == update.places  # one pass is not enough
@@ -145,7 +138,7 @@ def test_craters_of_the_full_list_are_not_proposed_where_the_catalogue_of_the_pa
         held = ground.files.put_file(tmp_path / "list.csv")
         add_catalogue(ground, held, "list.csv")
         (tmp_path / "pass/mission.toml").write_text(MISSION + stated.format(held=held.sha256))
-        updates = [update_landmarks(ground, one) for one in both_passes(ground, tmp_path / "pass")]
+        updates = [update_landmarks(ground, one) for one in both_passes(ground, (tmp_path / "pass",))]
         proposed = landmarks(ground, state="proposed")
     assert [one.listed > 15 for one in updates] == [listed, listed]
     found = {int(distances_m(withheld, one).argmin()) % 2 for one in proposed}
@@ -156,8 +149,7 @@ def test_a_place_is_in_view_of_every_frame_that_saw_it(
     ground: Ground, thinned, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also if its mean place lies just outside the image: here it always does."""
-    folder, _, _ = thinned
-    first, _ = both_passes(ground, folder)
+    first, _ = both_passes(ground, thinned)
     nowhere = "ground_service.evaluation.landmarks.core.in_view"
     monkeypatch.setattr(nowhere, lambda _, frames: np.zeros(len(frames.position_mcmf_m), dtype=np.bool_))
     update_landmarks(ground, first)
@@ -166,8 +158,7 @@ def test_a_place_is_in_view_of_every_frame_that_saw_it(
 
 
 def test_the_same_pass_from_two_processes_adds_each_landmark_once(either: Ground, thinned) -> None:
-    folder, _, _ = thinned
-    first, _ = both_passes(either, folder)
+    first, _ = both_passes(either, thinned)
 
     with ThreadPoolExecutor(3) as pool:
         for one in [pool.submit(update_landmarks, either, first) for _ in range(3)]:
@@ -178,8 +169,7 @@ def test_the_same_pass_from_two_processes_adds_each_landmark_once(either: Ground
 
 
 def test_only_proposed_landmarks_are_decided_and_decisions_remain(ground: Ground, thinned) -> None:
-    folder, _, _ = thinned
-    first, second = both_passes(ground, folder)
+    first, second = both_passes(ground, thinned)
     update_landmarks(ground, first)
     seen = landmarks(ground)[0].id
 
@@ -203,7 +193,7 @@ def test_only_proposed_landmarks_are_decided_and_decisions_remain(ground: Ground
 def test_a_place_that_later_frames_do_not_see_again_is_not_proposed(ground: Ground, thinned, make_pass) -> None:
     """The second pass has no detections at the withheld craters: its catalogue has them, and its frames look."""
     folder, _, _ = thinned
-    rewrite(folder, "first pass")
+    enter_files(folder, pass_name="first pass")
     first = import_archive(ground, folder)
     update_landmarks(ground, first)
     before = {one.id: one.looks for one in landmarks(ground)}
@@ -219,7 +209,7 @@ def test_a_place_that_later_frames_do_not_see_again_is_not_proposed(ground: Grou
 def test_a_pass_without_a_catalogue_is_refused_with_the_reason(ground: Ground, make_pass) -> None:
     folder = make_pass(frames=4).folder
     (folder / "catalogue.csv").unlink()
-    rewrite(folder, "bare")
+    enter_files(folder, pass_name="bare")
     with raises(EvaluationError, match="expected a crater catalogue, found none"):
         update_landmarks(ground, import_archive(ground, folder))
 
