@@ -178,9 +178,7 @@ def test_half_a_downlink(made, report_on) -> None:
 
 def test_a_gap_is_not_counted_twice(made, report_on) -> None:
     """Frames 4 and 5 are lost in between, frames 10 and 11 at the end: 12 packets in gaps, 2 x 5 at the edge."""
-    n = PACKETS_PER_FRAME
-
-    cut = made(43, encode=lambda packets: encode_downlink([*packets[: 4 * n], *packets[6 * n : 10 * n]]))
+    cut = made(43, encode=lambda packets: encode_downlink([*packets[:24], *packets[36:60]]))
     report = report_on(cut)
     assert counts(report) == (48, 12, 10)
     series = report.packets.completeness
@@ -205,8 +203,7 @@ def test_frames_that_were_never_made_are_no_lost_packets(made, report_on) -> Non
 
 
 def test_packets_that_came_twice(made, report_on) -> None:
-    twice = 2 * PACKETS_PER_FRAME
-    report = report_on(made(44, encode=lambda packets: encode_downlink([*packets, *packets[:twice]])))
+    report = report_on(made(44, encode=lambda packets: encode_downlink([*packets, *packets[:12]])))
     assert (report.packets.packets, report.packets.duplicates) == (FRAMES * PACKETS_PER_FRAME + 1, 12)
     came_again = {apid: one.duplicates for apid, one in report.packets.by_apid.items() if one.duplicates}
     assert came_again == {HOUSEKEEPING: 2, DETECTIONS: 2, STATES: 4, OUTCOMES: 4}

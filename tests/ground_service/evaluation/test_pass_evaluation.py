@@ -118,7 +118,7 @@ EAST_M = 200.0 * (np.arange(FRAMES) % 6)
 
 
 def paper(**changed: Any) -> NavigationSamples:
-    values: dict[str, Any] = {
+    values = {
         "estimator": "paper",
         "frame_number": 100 + np.arange(FRAMES),
         "utc_ns": TIMES,
@@ -136,7 +136,7 @@ def paper(**changed: Any) -> NavigationSamples:
 def anchored(**changed: Any) -> NavigationSamples:
     """30 m too high, with a fix at the frames 1 and 4."""
     fixed = np.isin(np.arange(FRAMES), (1, 4))
-    values: dict[str, Any] = {
+    values = {
         "estimator": "anchored",
         "longitude_deg": LONGITUDE_DEG,
         "altitude_m": np.full(FRAMES, ALTITUDE_M + 30.0),
@@ -183,7 +183,7 @@ START = StartState(EPOCH, circle(0.0)[0] + np.array([100.0, 0.0, 0.0]), circle(0
 
 
 def inputs(**changed: Any) -> PassInputs:
-    values: dict[str, Any] = {
+    values = {
         "pass_id": "7",
         "title": "a made pass",
         "start_utc_ns": EPOCH,
@@ -753,21 +753,16 @@ def test_baselines_have_their_own_place_in_the_summary() -> None:
 
 
 def test_outcomes_are_joined_by_frame_number_in_any_order() -> None:
+    number, triggers = np.array([4, 1, 9]), ("time_gap", "none", "manual_step")
     found = OutcomeSamples(
-        "paper",
-        np.array([104, 101, 109]),
-        TIMES[:3],
-        ("matched",) * 3,
-        ("time_gap", "none", "manual_step"),
-        np.array([4, 1, 9]),
-        np.array([1, 1, 1]),
+        "paper", 100 + number, TIMES[:3], ("matched",) * 3, triggers, number, np.ones(3, dtype=np.int64)
     )
     triggers, candidates, reads = _joined(paper(), found)
-    assert {100 + k: one for k, one in enumerate(triggers) if one != "none"} == {104: "time_gap", 109: "manual_step"}
+    assert {k: one for k, one in enumerate(triggers) if one != "none"} == {4: "time_gap", 9: "manual_step"}
     assert candidates.tolist() == [0, 1, 0, 0, 4, 0, 0, 0, 0, 9, 0, 0]
     assert reads.tolist() == [1, 1, 1]
     none = replace(found, frame_number=np.zeros(0, dtype=np.int64))
-    assert _joined(paper(), none)[:2] == ((), None) and _joined(paper(), None)[:2] == ((), None)
+    assert _joined(paper(), none)[:2] == _joined(paper(), None)[:2] == ((), None)
 
 
 def test_reads_are_listed_in_order_of_time_and_estimator() -> None:

@@ -73,9 +73,7 @@ def test_samples_over_dark_ground_are_mare_and_those_outside_the_reference_nothi
     series = NavigationSeries(
         "anchored", "estimate", times, nothing, nothing, nothing, np.full((len(terrain), 3), np.nan)
     )
-    track: Any = SimpleNamespace(
-        utc_ns=times, latitude_deg=np.array(latitude_deg), longitude_deg=np.array(longitude_deg)
-    )
+    track = SimpleNamespace(utc_ns=times, latitude_deg=np.array(latitude_deg), longitude_deg=np.array(longitude_deg))
     assert with_terrain(series, track, two_tones(45)).terrain == terrain
 
 

@@ -31,6 +31,7 @@ from tests.payload_emulator.flight.test_dynamics import start_state
 
 Arrays = tuple[np.ndarray, np.ndarray]
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
+START_S = float(tdb_s_from_utc_ns(EPOCH))
 STEP_S, STATES = 60.0, 30
 SIGMA_M = 100.0
 FORCES = ForceModel(builtin_gravity(), IauOrientation(), 8)
@@ -288,29 +289,27 @@ def test_sigmas_lie_along_the_axes_of_the_orbit() -> None:
 
 def test_long_steps_are_cut_into_equal_ones_of_a_minute_at_most() -> None:
     """TDB runs with UTC but for a second or two at the epoch; a burn ends a step."""
-    start_s = float(tdb_s_from_utc_ns(EPOCH))
     second = 10**9
-    assert _legs(EPOCH, EPOCH + 150 * second, start_s, ()) == [
-        (start_s, 50.0, None), (start_s + 50.0, 50.0, None), (start_s + 100.0, 50.0, None),
+    assert _legs(EPOCH, EPOCH + 150 * second, START_S, ()) == [
+        (START_S, 50.0, None), (START_S + 50.0, 50.0, None), (START_S + 100.0, 50.0, None),
     ]  # fmt: skip
-    assert _legs(EPOCH, EPOCH + 60 * second, start_s, ()) == [(start_s, 60.0, None)]
-    assert _legs(EPOCH, EPOCH, start_s, ()) == []
+    assert _legs(EPOCH, EPOCH + 60 * second, START_S, ()) == [(START_S, 60.0, None)]
+    assert _legs(EPOCH, EPOCH, START_S, ()) == []
     burn = CommandedBurn(EPOCH + 90 * second, np.zeros(3), 0.1)
-    first, last, after = _legs(EPOCH, EPOCH + 100 * second, start_s, (burn,))
-    assert (first, last[1:]) == ((start_s, 45.0, None), (45.0, burn)) and after[1:] == (10.0, None)
+    first, last, after = _legs(EPOCH, EPOCH + 100 * second, START_S, (burn,))
+    assert (first, last[1:]) == ((START_S, 45.0, None), (45.0, burn)) and after[1:] == (10.0, None)
     # Microseconds are what a float64 of seconds past J2000 tells.
-    assert (last[0] - start_s, after[0] - start_s) == approx((45.0, 90.0), abs=1e-5)
+    assert (last[0] - START_S, after[0] - START_S) == approx((45.0, 90.0), abs=1e-5)
 
 
 def test_the_smoother_has_the_noise_of_the_field_on_each_side_of_the_moon() -> None:
     field = replace(builtin_gravity(), name="LP165P")
     model = smoother_model(field, IauOrientation(), ())
     assert model.field_noise == field_noise("LP165P", min(100, field.degree))
-    tdb_s = float(tdb_s_from_utc_ns(EPOCH))
-    axes = IauOrientation().mcmf_from_icrf(tdb_s)
+    axes = IauOrientation().mcmf_from_icrf(START_S)
     # Over 0 and 180 degrees of longitude, going north.
     states = [np.r_[side * 1_767.4e3 * axes[0], 1_650.0 * axes[2], np.zeros(3)] for side in (1.0, -1.0)]
-    near, far = model.densities(np.full(2, tdb_s), np.array(states))
+    near, far = model.densities(np.full(2, START_S), np.array(states))
     assert_allclose(near, model.field_noise.near_psd_m2_s3, rtol=1e-6)
     assert_allclose(far, model.field_noise.far_psd_m2_s3, rtol=1e-3)
     # The noise of a step is that of the place at its beginning.

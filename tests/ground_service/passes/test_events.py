@@ -43,6 +43,7 @@ from tmtc.downlink import encode_cadus
 
 TICKS = 900_000_000 * 65_536
 HOUR_S = 1000
+ZEROS = {name: {field.name: 0 for field in DICTIONARY.packet(name).fields} for name in ("housekeeping", "performance")}
 CODES = {name: code for code, name in DICTIONARY.labels("event_info", "event_id").items()}
 
 
@@ -133,10 +134,8 @@ def test_a_pass_without_a_catalogue_has_no_craters(passed: Ground) -> None:
 
 
 def receive(ground: Ground, tmp_path: Path, second: int, **values: float) -> None:
-    zeros: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
-    packet = DICTIONARY.pack(
-        "housekeeping", zeros | values | {"structure_id": 1}, ticks=TICKS + second * 65_536, sequence_count=second
-    )
+    given = ZEROS["housekeeping"] | values | {"structure_id": 1}
+    packet = DICTIONARY.pack("housekeeping", given, ticks=TICKS + second * 65_536, sequence_count=second)
     file = tmp_path / f"{second}.cadu"
     file.write_bytes(encode_cadus([packet], spacecraft_id=76))
     ingest_file(ground, file)
@@ -181,11 +180,10 @@ def test_a_mistyped_spacecraft_is_listed_until_its_telecommand_is_rejected(eithe
 def test_a_parameter_of_a_further_structure_has_a_series_a_live_value_an_alarm_and_a_drawing(
     ground: Ground, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    zeros = {field.name: 0 for field in DICTIONARY.packet("performance").fields} | {"structure_id": 2}
     values = [10.0, 61.25, 20.0]
     name, packets = "camera_temperature_c", []
     for k, value in enumerate(values):
-        given = zeros | {name: value}
+        given = ZEROS["performance"] | {"structure_id": 2, name: value}
         packets.append(DICTIONARY.pack("performance", given, ticks=TICKS + (k << 16), sequence_count=k))
     with local_client(ground, "ann") as client:
         client.ingest_file(encode_cadus(packets[::-1], spacecraft_id=76))
@@ -218,7 +216,7 @@ orientation = "IAU WGCCRE 2009"
 
 def housekeeping(day: int) -> list[bytes]:
     """A packet every ten seconds; the counts of a day go on where those of the day before ended."""
-    values: dict[str, Any] = {field.name: 1 for field in DICTIONARY.packet("housekeeping").fields}
+    values = dict.fromkeys(ZEROS["housekeeping"], 1)
     first = int(ticks_from_utc_ns(START + day * DAY * NS))
     return [
         DICTIONARY.pack(

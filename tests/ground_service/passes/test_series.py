@@ -65,7 +65,7 @@ def columns() -> dict[str, Any]:
     seconds[1500:] += 4000
     seconds[2500:] += 90_000
     seconds[7] = seconds[6]
-    made: dict[str, Any] = {name: rng.normal(size=COUNT) * 1e3 for name in STATE_VALUES}
+    made = {name: rng.normal(size=COUNT) * 1e3 for name in STATE_VALUES}
     made["nis"][::7] = np.nan
     ticks = FIRST + seconds * SECOND
     return made | {
@@ -101,7 +101,7 @@ def read(ground: Ground, span: tuple[int, ...], name: str = "altitude_m", points
 
 
 def rollup_statistics(ground: Ground) -> tuple[list[Any], np.ndarray]:
-    table: Any = ROLLUPS
+    table = ROLLUPS
     with ground.database.reading() as connection:
         rows = connection.execute(table.select().order_by(*table.primary_key.columns)).all()
     return [tuple(row[:-1]) for row in rows], np.frombuffer(b"".join(row[-1] for row in rows), "<f8")

@@ -43,7 +43,7 @@ START = 1_900_000_000 * SECOND
 
 def housekeeping(second: int, temperature_c: float) -> bytes:
     """A housekeeping packet with one value outside its limits, if that of the temperature is."""
-    values: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
+    values = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
     values |= {"structure_id": 1, "bus_voltage_v": 12.0, "temperature_c": temperature_c}
     return DICTIONARY.pack("housekeeping", values, ticks=START + second * SECOND, sequence_count=second % 16_384)
 
@@ -62,6 +62,11 @@ def receive(ground: Ground, *packets: bytes) -> None:
 
 def alarms(ground: Ground, *states: str) -> list[Alarm]:
     return ground.read(list_alarms, AlarmFilter(state=list(states))).items
+
+
+def acknowledge(ground: Ground) -> Alarm:
+    """Acknowledge the newest alarm."""
+    return acknowledge_alarm(ground, alarms(ground)[0].id, "", actor="eva")
 
 
 def active(ground: Ground) -> set[str]:
@@ -95,7 +100,7 @@ def test_a_limit_is_broken_once_and_cleared_after_acknowledgement_and_return(eit
     (alarm,) = alarms(either, "raised")
     assert (alarm.name, alarm.severity, alarm.count, alarm.value) == ("temperature_c", "warning", 5, 74.0)
     assert (alarm.active, alarm.limits, alarm.unit) == (True, "-20 to 60", "degC")
-    assert acknowledge_alarm(either, alarm.id, "", actor="eva").state == "acknowledged"
+    assert acknowledge(either).state == "acknowledged"
     receive(either, housekeeping(10, 20.0))
     assert either.read(get_alarm, alarm.id).state == "cleared"
     receive(either, housekeeping(20, 65.0))
@@ -104,13 +109,11 @@ def test_a_limit_is_broken_once_and_cleared_after_acknowledgement_and_return(eit
 
 def test_a_worse_condition_must_be_acknowledged_again(ground: Ground) -> None:
     receive(ground, housekeeping(0, 70.0))
-    (alarm,) = alarms(ground)
-    acknowledge_alarm(ground, alarm.id, "", actor="eva")
-    receive(ground, housekeeping(1, 75.0))
-    assert ground.read(get_alarm, alarm.id).state == "acknowledged"
-    receive(ground, housekeeping(2, 90.0))
-    found = ground.read(get_alarm, alarm.id)
-    assert (found.state, found.severity) == ("raised", "alarm")
+    acknowledge(ground)
+    for second, temperature_c, told in ((1, 75.0, ("acknowledged", "warning")), (2, 90.0, ("raised", "alarm"))):
+        receive(ground, housekeeping(second, temperature_c))
+        (alarm,) = alarms(ground)
+        assert (alarm.state, alarm.severity) == told
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
@@ -140,7 +143,7 @@ def test_packets_that_arrive_again_are_not_counted_again(ground: Ground) -> None
 
 def test_late_packets_of_a_cleared_alarm_do_not_raise_it_again(ground: Ground) -> None:
     receive(ground, event(10))
-    acknowledge_alarm(ground, alarms(ground)[0].id, "", actor="eva")
+    acknowledge(ground)
     receive(ground, event(5))
     assert states(ground) == [("cleared", 2)]
     receive(ground, event(20))
@@ -150,7 +153,7 @@ def test_late_packets_of_a_cleared_alarm_do_not_raise_it_again(ground: Ground) -
 def test_an_alarm_is_acknowledged_by_one_user(either: Ground) -> None:
     receive(either, housekeeping(0, 70.0))
     (alarm,) = alarms(either)
-    acknowledge_alarm(either, alarm.id, "", actor="eva")
+    acknowledge(either)
     with raises(Conflict, match=f"alarm {alarm.id}: expected state raised, found acknowledged by eva"):
         acknowledge_alarm(either, alarm.id, "", actor="max")
     with raises(NotFound):
@@ -169,7 +172,7 @@ def test_a_shelved_alarm_returns_at_its_time(either: Ground) -> None:
     assert ended.state == "raised" and len(alarms(either, "raised")) == 1
     with raises(InvalidInput, match="expected a time within 30 days"):
         shelve_alarm(either, alarm.id, now + 31 * 24 * hour, "", actor="eva")
-    acknowledge_alarm(either, alarm.id, "", actor="eva")
+    acknowledge(either)
     with raises(Conflict, match="expected an open alarm, found cleared"):
         shelve_alarm(either, alarm.id, now + hour, "", actor="eva")
 
@@ -189,7 +192,7 @@ def test_an_alarm_is_shelved_in_mission_time_and_its_records_are_in_time_of_day(
 
 def test_changes_are_published(ground: Ground) -> None:
     receive(ground, event(0))
-    acknowledge_alarm(ground, alarms(ground)[0].id, "", actor="eva")
+    acknowledge(ground)
     assert published(ground) == ["raised", "cleared"]
     for second, value in enumerate((70.0, 71.0, 20.0, 21.0, 72.0)):
         receive(ground, housekeeping(second, value))
