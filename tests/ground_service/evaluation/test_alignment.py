@@ -60,7 +60,7 @@ def flown(*seconds: float) -> ReferenceStates:
     return reference_states(polar(), Turning(), after(*seconds))
 
 
-def test_the_reference_has_its_place_over_the_turned_moon() -> None:
+def test_the_reference_has_its_place_over_the_turned_moon():
     track = flown(0.0, 105.0, 600.0)
     angle = SPEED_M_S / RADIUS_M * np.array([0.0, 105.0, 600.0])
     assert track.covered.all()
@@ -71,7 +71,7 @@ def test_the_reference_has_its_place_over_the_turned_moon() -> None:
     assert_allclose(np.linalg.norm(track.velocity_icrf_m_s, axis=1), SPEED_M_S, atol=1e-6)
 
 
-def test_epochs_outside_the_reference_have_no_state() -> None:
+def test_epochs_outside_the_reference_have_no_state():
     track = flown(-1.0, 0.0, 601.0)
     assert track.covered.tolist() == [False, True, False]
     _, _, *names = ReferenceStates.__slots__
@@ -79,7 +79,7 @@ def test_epochs_outside_the_reference_have_no_state() -> None:
         assert np.isnan(values[[0, 2]]).all() and np.isfinite(values[1]).all()
 
 
-def test_rows_of_a_track_are_those_rows_of_all_of_it_and_no_epochs_are_no_error() -> None:
+def test_rows_of_a_track_are_those_rows_of_all_of_it_and_no_epochs_are_no_error():
     track = flown(0.0, 100.0, 200.0)
     some = track.at_rows(np.array([2, 0]))
     for name in ReferenceStates.__slots__:
@@ -88,7 +88,7 @@ def test_rows_of_a_track_are_those_rows_of_all_of_it_and_no_epochs_are_no_error(
     assert none.position_mcmf_m.shape == (0, 3) and ground_path_m(none, MOON_M).shape == (0,)
 
 
-def test_an_error_of_place_splits_along_the_orbit() -> None:
+def test_an_error_of_place_splits_along_the_orbit():
     """Northward flight over the turned Moon: radial is up, transverse north and normal west."""
     track = flown(300.0, 300.0, 300.0)
     latitude, longitude = track.latitude_deg[0], track.longitude_deg[0]
@@ -102,7 +102,7 @@ def test_an_error_of_place_splits_along_the_orbit() -> None:
     assert_allclose(error, expected, atol=1e-3)
 
 
-def test_an_error_of_position_is_estimate_minus_reference_and_its_place_is_found() -> None:
+def test_an_error_of_position_is_estimate_minus_reference_and_its_place_is_found():
     track = flown(0.0)
     # At the epoch radial is x, transverse z and normal -y.
     position = track.position_icrf_m + np.array([[5.0, 7.0, 11.0]])
@@ -113,7 +113,7 @@ def test_an_error_of_position_is_estimate_minus_reference_and_its_place_is_found
     assert longitude[0] == pytest.approx(360.0 - math.degrees(0.06))
 
 
-def test_the_ground_path_is_the_arc_over_the_moon_that_does_not_turn_back() -> None:
+def test_the_ground_path_is_the_arc_over_the_moon_that_does_not_turn_back():
     """Over the still Moon 1.6 km/s at 1787.4 km; the turning ground adds 174 m/s across, less toward the pole."""
     track = flown(0.0, 10.0, 20.0, 40.0)
     path = ground_path_m(track, MOON_M)
@@ -123,14 +123,14 @@ def test_the_ground_path_is_the_arc_over_the_moon_that_does_not_turn_back() -> N
     assert_allclose(ground_path_m(track, 1.0), path / MOON_M, rtol=1e-12)
 
 
-def test_a_quarter_of_the_way_round_is_a_quarter_of_the_circumference() -> None:
+def test_a_quarter_of_the_way_round_is_a_quarter_of_the_circumference():
     place = np.array([[2e6, 0.0, 0.0], [0.0, 5e6, 0.0], [0.0, -1e6, 0.0]])
     track = replace(flown(0.0, 1.0, 2.0), position_mcmf_m=place)
     assert_allclose(ground_path_m(track, 2.0), [0.0, math.pi, 3.0 * math.pi])
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 50.0, 130.0])
-def test_the_angle_of_the_track_with_the_meridian_is_that_of_the_velocity(angle_deg: float) -> None:
+def test_the_angle_of_the_track_with_the_meridian_is_that_of_the_velocity(angle_deg):
     states = flown(10.0, 60.0)
     angle = math.radians(angle_deg)
     normal = np.cross(states.position_icrf_m, states.velocity_icrf_m_s)

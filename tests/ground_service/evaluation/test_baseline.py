@@ -72,18 +72,18 @@ def integrated(j2: float = J2, bodies: tuple[Body, ...] = ()) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degree", [0, 1])
-def test_a_field_is_not_flown_past_the_degree_that_is_asked_for(degree: int) -> None:
+def test_a_field_is_not_flown_past_the_degree_that_is_asked_for(degree):
     assert_allclose(flown(degree, third_bodies=False), circle(), atol=0.01)
 
 
 @pytest.mark.parametrize("degree", [2, 50])
-def test_a_field_is_flown_to_the_degree_that_it_has(degree: int) -> None:
+def test_a_field_is_flown_to_the_degree_that_it_has(degree):
     found = flown(degree, third_bodies=False)
     assert_allclose(found, integrated(), atol=0.05)
     assert np.linalg.norm(found[-1] - circle()[-1]) > 1_000.0
 
 
-def test_earth_and_sun_pull_unless_they_are_left_out() -> None:
+def test_earth_and_sun_pull_unless_they_are_left_out():
     """Each pulls by its GM (DE440): the Earth moves the orbit by tens of metres, the Sun by some tenths of a metre."""
     moved = [integrated(0.0, bodies) for bodies in ((), (EARTH,), (EARTH, SUN))]
     assert np.linalg.norm(moved[1][-1] - moved[0][-1]) > 10.0
@@ -91,7 +91,7 @@ def test_earth_and_sun_pull_unless_they_are_left_out() -> None:
     assert_allclose(flown(0, oblate(0)), moved[2], atol=0.02)
 
 
-def test_samples_before_the_start_have_no_position() -> None:
+def test_samples_before_the_start_have_no_position():
     early = np.concatenate([[EPOCH - 1], TIMES])
     found = propagated_positions(START, early, oblate(), 0, Still(), third_bodies=False)
     assert np.isnan(found[0]).all() and found[1].tolist() == START.position_icrf_m.tolist()
@@ -100,11 +100,11 @@ def test_samples_before_the_start_have_no_position() -> None:
     assert none.shape == (4, 3) and np.isnan(none).all()
 
 
-def test_an_orbit_that_meets_the_ground_is_refused() -> None:
+def test_an_orbit_that_meets_the_ground_is_refused():
     falling = StartState(EPOCH, START.position_icrf_m, 0.9 * START.velocity_icrf_m_s)
     with pytest.raises(ImpactError):
         propagated_positions(falling, TIMES, oblate(), 0, Still(), third_bodies=False)
 
 
-def test_the_baseline_is_flown_to_degree_fifty() -> None:
+def test_the_baseline_is_flown_to_degree_fifty():
     assert BASELINE_DEGREE == 50

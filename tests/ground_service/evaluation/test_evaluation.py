@@ -3,7 +3,6 @@
 import json
 import shutil
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -31,7 +30,7 @@ def imported(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> I
         yield ground, pass_id, evaluate(ground, pass_id)
 
 
-def test_importing_again_gives_the_same_pass_and_the_same_archive(imported: Imported, synthetic_pass: Any) -> None:
+def test_importing_again_gives_the_same_pass_and_the_same_archive(imported, synthetic_pass):
     ground, pass_id, _ = imported
     vehicle = ground.read(repository.get, repository.PASSES, pass_id, "pass")["vehicle_id"]
     before = ground.read(archive_hash, vehicle)
@@ -40,7 +39,7 @@ def test_importing_again_gives_the_same_pass_and_the_same_archive(imported: Impo
     assert pass_summary(ground, pass_id)["packets"] == len(synthetic_pass.packets)
 
 
-def test_a_report_is_written_and_kept(imported: Imported, tmp_path: Path) -> None:
+def test_a_report_is_written_and_kept(imported, tmp_path):
     ground, pass_id, _ = imported
     made = make_report(ground, pass_id, out=tmp_path / "out")
     assert "synthetic pass" in made.html.read_text()
@@ -49,9 +48,7 @@ def test_a_report_is_written_and_kept(imported: Imported, tmp_path: Path) -> Non
     assert ground.files.get(row["html_sha256"]) == made.html.read_bytes()
 
 
-def test_settings_are_compared_with_those_of_the_pass_before(
-    imported: Imported, synthetic_pass: Any, tmp_path: Path
-) -> None:
+def test_settings_are_compared_with_those_of_the_pass_before(imported, synthetic_pass, tmp_path):
     ground, _, first = imported
     assert first.comparison is None
     folder = shutil.copytree(synthetic_pass.folder, tmp_path / "later")
@@ -62,9 +59,7 @@ def test_settings_are_compared_with_those_of_the_pass_before(
     assert later.comparison == SettingsComparison(first.title, changes)
 
 
-def test_a_pdf_is_made_on_request_and_reproducible(
-    imported: Imported, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pdf_is_made_on_request_and_reproducible(imported, tmp_path, monkeypatch):
     ground, pass_id, _ = imported
     monkeypatch.setattr(reports, "utc_now_ns", lambda: 0)
     first = make_report(ground, pass_id, out=tmp_path / "first", pdf=True)
@@ -86,9 +81,7 @@ def test_a_pdf_is_made_on_request_and_reproducible(
         ({"reference.oem": "0" * 64}, "damaged or cut short"),
     ],
 )
-def test_a_wrong_manifest_is_refused_and_nothing_is_stored(
-    synthetic_pass: Any, ground: Ground, tmp_path: Path, change: Any, message: str
-) -> None:
+def test_a_wrong_manifest_is_refused_and_nothing_is_stored(synthetic_pass, ground, tmp_path, change, message):
     folder = shutil.copytree(synthetic_pass.folder, tmp_path / "wrong")
     manifest = json.loads((folder / "manifest.json").read_text())
     for key, value in change.items():
@@ -103,7 +96,7 @@ def test_a_wrong_manifest_is_refused_and_nothing_is_stored(
         assert ground.read(repository.newest, table, Paging())[1] == 0
 
 
-def test_no_archive_and_no_pass_are_refused(ground: Ground, tmp_path: Path) -> None:
+def test_no_archive_and_no_pass_are_refused(ground, tmp_path):
     with pytest.raises(InvalidInput, match=r"expected a pass archive with manifest.json"):
         import_archive(ground, tmp_path)
     with pytest.raises(NotFound, match="pass 5: not found"):

@@ -55,28 +55,28 @@ def some(values: Any, rows: Any) -> Any:
     return type(values)(*(getattr(values, name)[rows] for name in values.__slots__))
 
 
-def test_a_frame_gives_its_position_back_from_a_start_kilometres_off() -> None:
+def test_a_frame_gives_its_position_back_from_a_start_kilometres_off():
     start = POSITION + np.array([[1500.0, -900.0, 700.0], [-400.0, 2500.0, 100.0]])
     solved = snapshot_positions(pairs(), CAMERA, UTC_NS, start)
     # exact projections: the residue is that of the last step, a centimetre at most
     assert np.abs(solved - POSITION).max() < 0.02
 
 
-def test_noise_of_a_pixel_moves_it_by_hundreds_of_metres_at_most() -> None:
+def test_noise_of_a_pixel_moves_it_by_hundreds_of_metres_at_most():
     solved = snapshot_positions(pairs(noise_px=1.0), CAMERA, UTC_NS, POSITION + 500.0)
     error = np.linalg.norm(solved - POSITION, axis=1)
     # a pixel is 203 m at nadir from 30 km (design figure); eight craters halve it, the geometry may triple it
     assert np.all((error > 1.0) & (error < 1000.0))
 
 
-def test_too_few_craters_give_no_position() -> None:
+def test_too_few_craters_give_no_position():
     solved = snapshot_positions(some(pairs(), np.array([0, 1, 8, 9, 10])), CAMERA, UTC_NS, POSITION)
     assert np.isnan(solved[0]).all()
     assert np.isfinite(solved[1]).all()
 
 
 @pytest.mark.parametrize(("swapped", "expected"), [(0, 0), (3, 0), (4, 1), (8, 1)])
-def test_a_fix_is_wrong_when_half_of_its_identifications_are(swapped: int, expected: int) -> None:
+def test_a_fix_is_wrong_when_half_of_its_identifications_are(swapped, expected):
     found = pairs()
     moved = found.uv_px.copy()
     moved[:swapped] += 30.0
@@ -85,7 +85,7 @@ def test_a_fix_is_wrong_when_half_of_its_identifications_are(swapped: int, expec
 
 
 @pytest.mark.parametrize("frame", [0, 1])
-def test_a_wrong_fix_counts_in_whichever_frame_it_is(frame: int) -> None:
+def test_a_wrong_fix_counts_in_whichever_frame_it_is(frame):
     found = pairs()
     moved = found.uv_px + np.where(found.frame == frame, 30.0, 0.0)[:, None]
     found = replace(found, uv_px=moved)
@@ -100,21 +100,19 @@ def test_a_wrong_fix_counts_in_whichever_frame_it_is(frame: int) -> None:
 @pytest.mark.parametrize(
     ("offset_px", "diameter_px", "wrong"), [(4.9, 20.0, 0), (5.1, 20.0, 1), (9.9, 100.0, 0), (10.1, 100.0, 1)]
 )
-def test_an_identification_is_right_within_half_a_radius_and_ten_pixels(
-    offset_px: float, diameter_px: float, wrong: int
-) -> None:
+def test_an_identification_is_right_within_half_a_radius_and_ten_pixels(offset_px, diameter_px, wrong):
     found = pairs()
     moved = found.uv_px + np.array([offset_px, 0.0]) * (found.frame == 0)[:, None]
     found = replace(found, uv_px=moved, diameter_px=np.full(16, diameter_px))
     assert wrong_fixes(found, CAMERA, UTC_NS, POSITION) == wrong
 
 
-def test_without_times_or_pairs_no_fix_is_wrong() -> None:
+def test_without_times_or_pairs_no_fix_is_wrong():
     assert wrong_fixes(pairs(), CAMERA, UTC_NS[:0], POSITION[:0]) == 0
     assert wrong_fixes(some(pairs(), slice(0)), CAMERA, UTC_NS, POSITION) == 0
 
 
-def test_identifications_are_joined_by_time_place_and_number() -> None:
+def test_identifications_are_joined_by_time_place_and_number():
     latitude, heights = np.radians([10.0, 11.0, 12.0, 13.0]), [0.0, 0.0, 0.0, np.nan]
     catalogue = make_catalogue(latitude, np.zeros(4), np.full(4, 5e3), source="test", rim_height_m=heights)
     detections = DetectionSamples(
@@ -171,7 +169,7 @@ def mapped(known: CraterCatalogue, sigma_m: float, seed: int = 2, shift_m: float
     )
 
 
-def test_landmarks_are_found_in_the_catalogue_on_both_sides_of_the_meridian_with_honest_sigmas() -> None:
+def test_landmarks_are_found_in_the_catalogue_on_both_sides_of_the_meridian_with_honest_sigmas():
     craters = catalogue()
     result = compare_map(mapped(craters, 150.0), craters)
     assert result.crater.tolist() == list(range(len(craters)))
@@ -183,7 +181,7 @@ def test_landmarks_are_found_in_the_catalogue_on_both_sides_of_the_meridian_with
     assert shifted.normalised_square > 3.0
 
 
-def test_what_the_catalogue_lacks_is_new_and_a_crater_serves_one_landmark_only() -> None:
+def test_what_the_catalogue_lacks_is_new_and_a_crater_serves_one_landmark_only():
     craters = catalogue()
     listed = craters.select(np.arange(0, 200, 2))
     result = compare_map(mapped(craters, 100.0), listed)
@@ -193,13 +191,13 @@ def test_what_the_catalogue_lacks_is_new_and_a_crater_serves_one_landmark_only()
     assert compare_map(first, craters).known == 1
 
 
-def test_the_last_report_of_a_landmark_counts() -> None:
+def test_the_last_report_of_a_landmark_counts():
     early, late = mapped(catalogue(4), 300.0, 3), mapped(catalogue(4), 50.0, 4)
     both = (np.concatenate([getattr(one, name) for one in (early, late)]) for name in early.__slots__)
     assert np.array_equal(latest(MappedCraters(*both)).latitude_deg, late.latitude_deg)
 
 
-def test_a_report_counts_the_landmarks_the_fixes_that_used_them_and_their_distance_from_the_catalogue() -> None:
+def test_a_report_counts_the_landmarks_the_fixes_that_used_them_and_their_distance_from_the_catalogue():
     craters = catalogue()
     reports = mapped(craters, 100.0)
     # The catalogue's crater 7, and landmark 0 twice and landmark 1 once.
@@ -212,7 +210,7 @@ def test_a_report_counts_the_landmarks_the_fixes_that_used_them_and_their_distan
     assert result.horizontal_rms_m == approx(141.0, rel=0.15)
 
 
-def test_a_pass_without_landmarks_has_no_map() -> None:
+def test_a_pass_without_landmarks_has_no_map():
     result = compare_map(mapped(catalogue(0), 100.0), catalogue())
     assert result.known == 0 and math.isnan(result.median_horizontal_m)
     assert payload_map(None, None, catalogue()) is None

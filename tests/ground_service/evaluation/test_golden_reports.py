@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -105,7 +104,7 @@ def report_on(ground: Ground) -> Callable[[Any], PassReport]:
     return lambda made: evaluate(ground, import_archive(ground, made.folder))
 
 
-def test_a_whole_pass(made, report_on) -> None:
+def test_a_whole_pass(made, report_on):
     """130 m in 3-D put in, the reference good to 5 m: 129.9 m are the estimate's. Two thirds of four craters found."""
     flown = made(41)
     report = report_on(flown)
@@ -144,9 +143,7 @@ def test_a_whole_pass(made, report_on) -> None:
     ("seen_frames", "level"),
     [(0, "3 (real terrain never"), (8, "3s (real terrain seen in training; 33 %"), (FRAMES, "3s (real terrain seen")],
 )
-def test_the_share_over_unseen_terrain_is_that_of_the_frames_of_the_pass(
-    made, report_on, seen_frames: int, level: str
-) -> None:
+def test_the_share_over_unseen_terrain_is_that_of_the_frames_of_the_pass(made, report_on, seen_frames, level):
     """The pass flies to the north: the ground of training ends between two southern edges of its footprints."""
     times = START + np.arange(-1, FRAMES + 1) * CADENCE_S * NS
     track = ground_track(ephemeris_from_states(times, *circular_states(times)), IauOrientation())
@@ -162,7 +159,7 @@ def counts(report: PassReport) -> tuple[int, int, int]:
     return report.packets.packets, report.packets.lost, report.packets.lost_at_edges
 
 
-def test_half_a_downlink(made, report_on) -> None:
+def test_half_a_downlink(made, report_on):
     """Six of twelve frames were received: no count has a gap, but half of the image packets are missing."""
     half = made(42, encode=lambda packets: encode_downlink(packets[: 6 * PACKETS_PER_FRAME]))
     report = report_on(half)
@@ -176,7 +173,7 @@ def test_half_a_downlink(made, report_on) -> None:
     assert summary_of(report)["packets_lost"] == 30
 
 
-def test_a_gap_is_not_counted_twice(made, report_on) -> None:
+def test_a_gap_is_not_counted_twice(made, report_on):
     """Frames 4 and 5 are lost in between, frames 10 and 11 at the end: 12 packets in gaps, 2 x 5 at the edge."""
     cut = made(43, encode=lambda packets: encode_downlink([*packets[:24], *packets[36:60]]))
     report = report_on(cut)
@@ -186,7 +183,7 @@ def test_a_gap_is_not_counted_twice(made, report_on) -> None:
     assert rows(report)["completeness.frames"].value == approx(100.0 * 8 / 12)
 
 
-def test_frames_that_were_never_made_are_no_lost_packets(made, report_on) -> None:
+def test_frames_that_were_never_made_are_no_lost_packets(made, report_on):
     """Twelve frames were planned; the payload counted from 0 to 6, and all of its packets came."""
 
     def six(packets: list[bytes]) -> bytes:
@@ -202,7 +199,7 @@ def test_frames_that_were_never_made_are_no_lost_packets(made, report_on) -> Non
     assert rows(report)["completeness.frames"].value == 50.0
 
 
-def test_packets_that_came_twice(made, report_on) -> None:
+def test_packets_that_came_twice(made, report_on):
     report = report_on(made(44, encode=lambda packets: encode_downlink([*packets, *packets[:12]])))
     assert (report.packets.packets, report.packets.duplicates) == (FRAMES * PACKETS_PER_FRAME + 1, 12)
     came_again = {apid: one.duplicates for apid, one in report.packets.by_apid.items() if one.duplicates}
@@ -210,7 +207,7 @@ def test_packets_that_came_twice(made, report_on) -> None:
     assert rows(report)["completeness.packets"].status == "met"
 
 
-def test_of_two_reports_on_one_image_one_counts(made, ground: Ground) -> None:
+def test_of_two_reports_on_one_image_one_counts(made, ground):
     """Image 3 comes down again with another detection and another state of each estimator."""
     ticks = int(ticks_from_utc_ns(START + 3 * CADENCE_S * NS))
     image = {"frame_number": 3, "image_ticks": ticks}
@@ -239,7 +236,7 @@ def test_of_two_reports_on_one_image_one_counts(made, ground: Ground) -> None:
     assert [part.frame_number.tolist() for part in inputs.navigation] == 2 * [list(range(FRAMES))]
 
 
-def test_a_damaged_file_of_another_pass_changes_nothing(made, ground: Ground, tmp_path: Path) -> None:
+def test_a_damaged_file_of_another_pass_changes_nothing(made, ground, tmp_path):
     flown = made(45)
     key = import_archive(ground, flown.folder)
     before = to_json(evaluate(ground, key))
@@ -257,7 +254,7 @@ def test_a_damaged_file_of_another_pass_changes_nothing(made, ground: Ground, tm
     assert replace(completeness(ground, key), completeness=None) == replace(counted, completeness=None)
 
 
-def test_two_spacecraft_in_one_file(made, ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_spacecraft_in_one_file(made, ground, tmp_path, monkeypatch):
     """Each spacecraft has its own duplicates and frames; only files that may hold something of the pass are read."""
     flown = made(46)
     first, stop = int(flown.utc_ns[0]), int(flown.utc_ns[-1]) + CADENCE_S * NS
@@ -282,7 +279,7 @@ def later_events(start_utc_ns: int, count: int, spacecraft_id: int = SPACECRAFT)
     return encode_cadus(packets, spacecraft_id=spacecraft_id)
 
 
-def test_no_reference(made, report_on) -> None:
+def test_no_reference(made, report_on):
     flown = made(47)
     (flown.folder / "reference.oem").unlink()
     enter_files(flown.folder)
@@ -294,7 +291,7 @@ def test_no_reference(made, report_on) -> None:
     assert "not met" in judged.values() and "median 3-D error" in report.verdict.partition("unknown")[2]
 
 
-def test_the_wrong_orientation_is_refused(made, report_on) -> None:
+def test_the_wrong_orientation_is_refused(made, report_on):
     """Values that need the orientation of the Moon are unknown if the declared one is not available."""
     report = report_on(made(48, MISSION.replace("IAU WGCCRE 2009", "DE421")))
     judged = statuses(report)
@@ -308,7 +305,7 @@ TILT_DEG = 10.0
 """Corners of the image then look up to 78 degrees from nadir; the horizon lies at 79."""
 
 
-def test_a_tilted_camera_with_a_lens(made, report_on) -> None:
+def test_a_tilted_camera_with_a_lens(made, report_on):
     """The declared camera finds all detections; a nadir pinhole camera would find almost none."""
     tilted = MISSION.replace("k1 = 0.0", f"k1 = -0.02\np1 = 5e-4\ntilt_deg = {TILT_DEG}\nyaw_deg = 0.0")
 
@@ -325,7 +322,7 @@ def test_a_tilted_camera_with_a_lens(made, report_on) -> None:
 
 
 @pytest.mark.parametrize(("nis", "mean", "status"), [(10.0, 1.0, "met"), (100.0, 10.0, "not met")])
-def test_an_overconfident_filter(made, report_on, nis: float, mean: float, status: str) -> None:
+def test_an_overconfident_filter(made, report_on, nis, mean, status):
     """Five craters give ten degrees of freedom."""
     mission = MISSION.replace('"spherical"', '"anchored"').replace(
         "median_error_m = 129.0", "median_error_m = 100.0\nconsistency_inside_percent = 90.0"

@@ -14,7 +14,7 @@ from ground_service.errors import EvaluationError, InvalidInput
 from ground_service.evaluation.inputs import load_pass_inputs, orientation_of
 from ground_service.evaluation.recall import Viewing
 from ground_service.evaluation.service import evaluate
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions import frames as declared
 from ground_service.missions.ephemerides.service import HEADER, load_attitudes
@@ -51,15 +51,13 @@ def report_text(home: Path, data: DataFolder, archive: Path) -> str:
         return to_json(evaluate(ground, import_archive(ground, archive)))
 
 
-def test_a_report_does_not_depend_on_the_data_of_the_machine(synthetic_pass: Any, tmp_path: Path) -> None:
+def test_a_report_does_not_depend_on_the_data_of_the_machine(synthetic_pass, tmp_path):
     without = report_text(tmp_path / "a", DataFolder(), synthetic_pass.folder)
     assert report_text(tmp_path / "b", MISSING_FILES, synthetic_pass.folder) == without
     assert json.loads(without)["provenance"]["lunar orientation"] == "IAU WGCCRE 2009"
 
 
-def test_a_pass_of_a_spacecraft_without_a_mission_description_says_so_and_how_to_enter_one(
-    synthetic_pass: Any, ground: Ground
-) -> None:
+def test_a_pass_of_a_spacecraft_without_a_mission_description_says_so_and_how_to_enter_one(synthetic_pass, ground):
     """As of a pass flown live, whose mission description nobody has entered: the packets come, no document does."""
     ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
     report = evaluate(ground, define_pass_of(ground, synthetic_pass))
@@ -78,9 +76,7 @@ def test_a_pass_of_a_spacecraft_without_a_mission_description_says_so_and_how_to
 
 
 @pytest.mark.parametrize("stated", [b"", b"[observation]\nneeds_daylight = false\n"])
-def test_the_sun_of_images_is_unknown_where_a_simulated_world_draws_its_light(
-    synthetic_pass: Any, ground: Ground, stated: bytes
-) -> None:
+def test_the_sun_of_images_is_unknown_where_a_simulated_world_draws_its_light(synthetic_pass, ground, stated):
     add_mission(ground, MISSION_76 + stated)
     ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
     assert load_pass_inputs(ground, define_pass_of(ground, synthetic_pass)).sun_known == (stated == b"")
@@ -94,9 +90,7 @@ packets_percent = 10.0
 """
 
 
-def test_a_pass_is_evaluated_in_the_orientation_that_it_declares(
-    synthetic_pass: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pass_is_evaluated_in_the_orientation_that_it_declares(synthetic_pass, tmp_path, monkeypatch):
     """Turning the ground by 0.01 degrees moves an estimate by 308 m times the cosine of its latitude."""
     monkeypatch.setattr(declared, "_kernel", lambda data: TurnedOrientation())
     folder = changed_archive(synthetic_pass, tmp_path / "a", data_sources=["orientation DE421"])
@@ -111,7 +105,7 @@ def test_a_pass_is_evaluated_in_the_orientation_that_it_declares(
     )
 
 
-def test_declared_models_are_used_and_others_are_named_as_missing() -> None:
+def test_declared_models_are_used_and_others_are_named_as_missing():
     built_in = builtin_gravity()
     found = declared_frames(
         Frames(orientation="IAU WGCCRE 2009", gravity_field=built_in.name, gravity_degree=6), DataFolder()
@@ -127,15 +121,15 @@ def test_declared_models_are_used_and_others_are_named_as_missing() -> None:
 
 
 def test_a_regression_refuses_an_archive_whose_orientation_is_not_there_and_takes_no_kernel_of_another_name(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     monkeypatch.setattr(declared, "_kernel", lambda data: TurnedOrientation("DE440"))
     with raises(EvaluationError, match="DE421, which is not available"):
         orientation_of(Mission(name="m", frames=Frames(orientation="DE421")), MISSING_FILES)
     assert orientation_of(Mission(name="m", frames=Frames(orientation="IAU WGCCRE 2009")), DataFolder())
 
 
-def test_the_camera_is_the_declared_one_with_its_lens() -> None:
+def test_the_camera_is_the_declared_one_with_its_lens():
     assert camera_of(Camera()) == PinholeCamera()
     assert camera_of(Camera(width_px=256, height_px=128, fov_deg=90.0, k1=0.0)) == PinholeCamera(
         256, 128, math.pi / 2.0
@@ -143,9 +137,7 @@ def test_the_camera_is_the_declared_one_with_its_lens() -> None:
     assert camera_of(Camera(k1=-0.01, p2=1e-4)) == BrownCamera(k1=-0.01, p2=1e-4)
 
 
-def test_the_attitude_of_an_archive_is_found_by_the_time_of_the_image(
-    synthetic_pass: Any, ground: Ground, tmp_path: Path
-) -> None:
+def test_the_attitude_of_an_archive_is_found_by_the_time_of_the_image(synthetic_pass, ground, tmp_path):
     ticks = ticks_from_utc_ns(synthetic_pass.utc_ns[[5, 2]])
     folder = changed_archive(synthetic_pass, tmp_path / "a", attitude="{},0,1,0,0\n{},1,0,0,0\n".format(*ticks))
     viewing = load_pass_inputs(ground, import_archive(ground, folder)).viewing
@@ -167,9 +159,7 @@ def with_attitude_message(synthetic_pass: Any, folder: Path, **fields: Any) -> A
     return segment
 
 
-def test_an_attitude_message_is_interpolated_to_the_times_of_the_images(
-    synthetic_pass: Any, ground: Ground, tmp_path: Path
-) -> None:
+def test_an_attitude_message_is_interpolated_to_the_times_of_the_images(synthetic_pass, ground, tmp_path):
     with_attitude_message(synthetic_pass, tmp_path / "a")
     viewing = load_pass_inputs(ground, import_archive(ground, tmp_path / "a")).viewing
     utc_ns = synthetic_pass.utc_ns
@@ -182,7 +172,7 @@ def test_an_attitude_message_is_interpolated_to_the_times_of_the_images(
     np.testing.assert_allclose(angles, 3.0 * np.arange(9), atol=1e-9)
 
 
-def test_attitudes_are_not_interpolated_over_a_gap() -> None:
+def test_attitudes_are_not_interpolated_over_a_gap():
     times = np.array([0, 1, 2, 3, 20, 21], dtype=np.int64) * 10**9
     viewing = Viewing(attitude_utc_ns=times, q_wxyz=np.tile([1.0, 0, 0, 0], (6, 1)), interpolated=True)
     asked = np.array([-1, 0, 2_500_000_000, 10 * 10**9, 20 * 10**9, 22 * 10**9])
@@ -196,15 +186,13 @@ def test_attitudes_are_not_interpolated_over_a_gap() -> None:
         ({"frame_a": "LVLH"}, "found LVLH and INSTRUMENT_1"),
     ],
 )  # fmt: skip
-def test_an_attitude_message_in_other_axes_is_refused(
-    synthetic_pass: Any, ground: Ground, tmp_path: Path, fields: dict[str, str], message: str
-) -> None:
+def test_an_attitude_message_in_other_axes_is_refused(synthetic_pass, ground, tmp_path, fields, message):
     with_attitude_message(synthetic_pass, tmp_path / "a", **fields)
     with raises(InvalidInput, match=message):
         import_archive(ground, tmp_path / "a")
 
 
-def test_two_attitude_files_are_refused(synthetic_pass: Any, ground: Ground, tmp_path: Path) -> None:
+def test_two_attitude_files_are_refused(synthetic_pass, ground, tmp_path):
     folder = tmp_path / "a"
     with_attitude_message(synthetic_pass, folder)
     (folder / "attitude.csv").write_text(f"{HEADER}\n")
@@ -227,7 +215,7 @@ UNREADABLE = "expected on-board ticks and a unit quaternion"
         *((f"{HEADER}\n{row}", f", line 2: {UNREADABLE}") for row in ROWS),
     ],
 )
-def test_a_table_of_attitudes_that_cannot_be_is_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_a_table_of_attitudes_that_cannot_be_is_refused(tmp_path, text, message):
     (tmp_path / "a.csv").write_text(text and text + "\n")
     with raises(InvalidInput) as caught:
         load_attitudes(tmp_path / "a.csv", "a.csv")

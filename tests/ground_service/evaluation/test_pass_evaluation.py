@@ -233,7 +233,7 @@ DRIFT = approx(100.0 * 200.0 / STEP_M, rel=1e-6)
 REFERENCE_M = approx(22.9129, abs=1e-4)
 
 
-def test_odometry_is_compared_with_the_reference_in_its_axes(report: PassReport) -> None:
+def test_odometry_is_compared_with_the_reference_in_its_axes(report):
     found = series(report, "paper")
     angle = EAST_M / RADIUS_M
     expected = RADIUS_M * np.stack([np.cos(angle) - 1.0, np.sin(angle), np.zeros(FRAMES)], axis=1)
@@ -257,7 +257,7 @@ def test_odometry_is_compared_with_the_reference_in_its_axes(report: PassReport)
     assert found.error_budget.estimate_rms_m == approx(math.sqrt(rms**2 - 525.0), rel=1e-6)
 
 
-def test_what_the_matcher_did_stands_at_the_frames_it_did_it_at(report: PassReport) -> None:
+def test_what_the_matcher_did_stands_at_the_frames_it_did_it_at(report):
     found = series(report, "paper")
     assert found.reset_trigger == TRIGGERS
     assert found.candidates.tolist() == [50, 51, 0, *range(53, 62)]
@@ -271,7 +271,7 @@ def test_what_the_matcher_did_stands_at_the_frames_it_did_it_at(report: PassRepo
     )
 
 
-def test_the_filter_has_a_sum_over_its_sigmas_and_neither_resets_nor_reads(report: PassReport) -> None:
+def test_the_filter_has_a_sum_over_its_sigmas_and_neither_resets_nor_reads(report):
     found = series(report, "anchored")
     assert_allclose(found.error_rtn_m, FRAMES * [[30.0, 0.0, 0.0]], atol=1e-4)
     assert found.nees is None and found.sigma_rtn_m is not None and found.nis is not None
@@ -283,7 +283,7 @@ def test_the_filter_has_a_sum_over_its_sigmas_and_neither_resets_nor_reads(repor
     assert found.description == "navigation filter on catalogued craters"
 
 
-def test_full_covariances_of_filter_and_reference_make_a_nees() -> None:
+def test_full_covariances_of_filter_and_reference_make_a_nees():
     """Radially 10 m of the filter and 20 m of the reference: 30^2 / (10^2 + 20^2)."""
     states = filter_states()
     report = evaluated(filter_states=states)
@@ -304,7 +304,7 @@ def test_full_covariances_of_filter_and_reference_make_a_nees() -> None:
     assert np.flatnonzero(np.isfinite(some.nees)).tolist() == [0, 3, 5, 7, 9, 11]
 
 
-def test_the_filter_is_smoothed_in_icrf_with_its_own_field() -> None:
+def test_the_filter_is_smoothed_in_icrf_with_its_own_field():
     """States that follow on one another need no correction: the smoothed orbit errs as the filter does.
 
     The inertial axes of the payload are turned against ICRF by a degree.
@@ -337,7 +337,7 @@ def test_the_filter_is_smoothed_in_icrf_with_its_own_field() -> None:
         ({"filter_states": filter_states().select(np.zeros(13, dtype=np.bool_))}, []),
     ],
 )
-def test_why_there_is_no_smoothed_orbit(changed: dict[str, Any], reasons: list[str]) -> None:
+def test_why_there_is_no_smoothed_orbit(changed, reasons):
     report = evaluated(**{"filter_states": filter_states(), **changed})
     assert "smoothed" not in [one.name for one in report.navigation]
     remarks = [one for one in report.remarks if "smoothed" in one]
@@ -348,7 +348,7 @@ def of_baselines(report: PassReport) -> list[NavigationSeries]:
     return [one for one in report.navigation if one.kind == "baseline"]
 
 
-def test_the_start_state_is_propagated_with_every_field_and_from_the_reference() -> None:
+def test_the_start_state_is_propagated_with_every_field_and_from_the_reference():
     """100 m too high at the same velocity: Clohessy and Wiltshire give 100 (2 - cos nt) and 200 sin nt - 300 nt."""
     report = evaluated(start_state=START, onboard_gravity=replace(builtin_gravity(), name="other"))
     baselines = of_baselines(report)
@@ -382,14 +382,14 @@ def test_the_start_state_is_propagated_with_every_field_and_from_the_reference()
     assert report.headline[1].value == approx(flown.statistics.median_3d_m)
 
 
-def test_a_start_state_as_good_as_the_reference_needs_no_perfect_one() -> None:
+def test_a_start_state_as_good_as_the_reference_needs_no_perfect_one():
     position, velocity = circle(0.0)
     for east_m, names in ((0.9, ["propagate-only", "Kepler"]), (1.1, [*BASELINES])):
         start = StartState(EPOCH, position + np.array([0.0, east_m, 0.0]), velocity)
         assert [one.name for one in of_baselines(evaluated(start_state=start))] == names
 
 
-def test_a_start_within_the_pass_is_propagated_from_there() -> None:
+def test_a_start_within_the_pass_is_propagated_from_there():
     state = circle(20.0)
     report = evaluated(start_state=StartState(EPOCH + 20 * SECOND, *state))
     # The first sample is 10 s after the start: no distance of two states of one instant, and no perfect start.
@@ -400,7 +400,7 @@ def test_a_start_within_the_pass_is_propagated_from_there() -> None:
     assert of_baselines(evaluated(start_state=StartState(int(TIMES[-1]) + 1, *state))) == []
 
 
-def test_why_there_is_no_baseline(report: PassReport, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_why_there_is_no_baseline(report, monkeypatch):
     assert report.remarks == ("no propagate-only baseline: the pass names no start state",)
     refused = evaluated(start_state=START, gravity=None, refused={"gravity": "field Y is not here"})
     assert refused.remarks == ("no propagate-only baseline: field Y is not here",)
@@ -414,7 +414,7 @@ def test_why_there_is_no_baseline(report: PassReport, monkeypatch: pytest.Monkey
     assert "gravity of the baseline" not in crashed.provenance
 
 
-def test_samples_outside_the_reference_have_no_error_and_are_counted() -> None:
+def test_samples_outside_the_reference_have_no_error_and_are_counted():
     """The reference ends at 150 s; the last sample is at 165 s."""
     report = evaluated(reference=reference(150.0))
     assert report.remarks[0] == "1 of 12 sample times lie outside the reference ephemeris and have no error"
@@ -424,7 +424,7 @@ def test_samples_outside_the_reference_have_no_error_and_are_counted() -> None:
     assert math.isnan(report.reference.altitude_m[-1])
 
 
-def test_the_reference_is_given_at_every_sample_time_of_any_kind() -> None:
+def test_the_reference_is_given_at_every_sample_time_of_any_kind():
     shifted = anchored(utc_ns=TIMES + SECOND)
     report = evaluated(navigation=(paper(), shifted))
     track = report.reference
@@ -434,7 +434,7 @@ def test_the_reference_is_given_at_every_sample_time_of_any_kind() -> None:
     assert_allclose(track.latitude_deg, 0.0, atol=1e-9)
 
 
-def test_without_reference_or_orientation_the_report_says_what_was_flown_and_why_no_more() -> None:
+def test_without_reference_or_orientation_the_report_says_what_was_flown_and_why_no_more():
     report = evaluated(reference=None)
     assert report.not_available == {
         **dict.fromkeys(("error", "reference"), "no reference ephemeris covers this pass"),
@@ -454,7 +454,7 @@ def test_without_reference_or_orientation_the_report_says_what_was_flown_and_why
         assert unturned.not_available == dict.fromkeys(("error", "reference", "detector", "craters"), reason)
 
 
-def test_a_pass_over_ground_without_a_catalogue_has_no_recall_and_no_precision_and_says_why(report: PassReport) -> None:
+def test_a_pass_over_ground_without_a_catalogue_has_no_recall_and_no_precision_and_says_why(report):
     count = 3 * FRAMES
     unknown = evaluated(catalogue=replace(catalogue(), rim_height_m=np.full(count, np.nan)))
     assert unknown.not_available["recall"] == "rim heights unknown"
@@ -466,7 +466,7 @@ def test_a_pass_over_ground_without_a_catalogue_has_no_recall_and_no_precision_a
     assert "recall" not in report.not_available
 
 
-def test_what_did_not_come_down_is_named() -> None:
+def test_what_did_not_come_down_is_named():
     nothing = evaluated(detections=no_detections(), navigation=(), images={})
     assert nothing.not_available == {
         "baselines": "the pass names no start state",
@@ -483,7 +483,7 @@ def test_what_did_not_come_down_is_named() -> None:
     assert evaluated(reference=None, navigation=(first(0),)).navigation == ()
 
 
-def test_the_map_counts_each_crater_as_often_as_it_was_in_view(report: PassReport) -> None:
+def test_the_map_counts_each_crater_as_often_as_it_was_in_view(report):
     craters = report.craters
     detected = np.ones((FRAMES, 3), dtype=int)
     detected[[LOST, DARK]] = detected[PARTLY, 2] = 0
@@ -494,7 +494,7 @@ def test_the_map_counts_each_crater_as_often_as_it_was_in_view(report: PassRepor
     assert (craters.diameter_m[:3].tolist(), craters.source) == ([6e3, 12e3, 20e3], "made")
 
 
-def test_the_galleries_show_the_images_and_the_worst_frames(report: PassReport) -> None:
+def test_the_galleries_show_the_images_and_the_worst_frames(report):
     captions = [(one.frame_number, one.caption) for one in (*report.gallery, *report.worst_frames)]
     assert captions == [
         (frame, f"{hits} of 3 craters of 5–30 km detected")
@@ -517,14 +517,14 @@ def test_the_galleries_show_the_images_and_the_worst_frames(report: PassReport) 
         assert_allclose(found, values, rtol=0, atol=1e-3)
 
 
-def test_many_images_are_thinned_out_evenly() -> None:
+def test_many_images_are_thinned_out_evenly():
     every = {100 + frame: np.zeros((2, 2), dtype=np.uint8) for frame in range(FRAMES)}
     report = evaluated(images=every)
     # Six of twelve: 0, 2.2, 4.4, 6.6, 8.8 and 11, rounded.
     assert [one.frame_number for one in report.gallery] == [100, 102, 104, 107, 109, 111]
 
 
-def test_frames_are_accounted_for(report: PassReport) -> None:
+def test_frames_are_accounted_for(report):
     assert report.accounting == FrameAccounting(
         expected=14, acquired=12, processed=11, with_detections=11, navigated=12, bad_image=1,
         quality={"ok": 11, "dark": 1},
@@ -533,7 +533,7 @@ def test_frames_are_accounted_for(report: PassReport) -> None:
     assert evaluated(navigation=(more,)).accounting.navigated == 6
 
 
-def test_the_pointing_is_told_from_what_is_known_of_it() -> None:
+def test_the_pointing_is_told_from_what_is_known_of_it():
     nadir = Viewing(CAMERA).pointed(circle(CADENCE_S * np.arange(FRAMES))[0])
     every = evaluated(viewing=Viewing(CAMERA, attitude_utc_ns=TIMES, q_wxyz=quaternion_from_matrix(nadir)))
     assert scored(every)[0].detected_true == 29
@@ -558,7 +558,7 @@ def identified() -> IdentificationSamples:
     return IdentificationSamples(TIMES[frames], place, 10 * frames + named)
 
 
-def test_fixes_are_repeated_from_single_frames_and_told_right_from_wrong() -> None:
+def test_fixes_are_repeated_from_single_frames_and_told_right_from_wrong():
     """A shift of 0.6 and 0.8 px is one of 20 and 27 m over the ground, on a camera that looks straight down."""
     report = evaluated(identifications=identified())
     assert series(report, "anchored").wrong_fixes == 1
@@ -577,7 +577,7 @@ def test_fixes_are_repeated_from_single_frames_and_told_right_from_wrong() -> No
     assert series(bare, "anchored").wrong_fixes is None
 
 
-def test_the_map_of_the_payload_is_compared_with_the_catalogue(report: PassReport) -> None:
+def test_the_map_of_the_payload_is_compared_with_the_catalogue(report):
     """One landmark 100 m north of the first crater, reported twice, and used in one pair of thirteen."""
     landmark = MappedCraters(
         np.full(2, 3_000_000_000), np.full(2, math.degrees(100.0 / MOON_M)), np.zeros(2), np.zeros(2), np.full(2, 6e3),
@@ -594,7 +594,7 @@ def test_the_map_of_the_payload_is_compared_with_the_catalogue(report: PassRepor
     assert report.payload_map is None
 
 
-def test_the_sun_and_the_ground_stand_beside_every_estimate() -> None:
+def test_the_sun_and_the_ground_stand_beside_every_estimate():
     dark_west = np.full((4, 360), 200, dtype=np.uint8)
     dark_west[:, :4] = 50
     surface = TerrainMap(dark_west, 0.0, 360.0, -90.0, 90.0)
@@ -614,7 +614,7 @@ def test_the_sun_and_the_ground_stand_beside_every_estimate() -> None:
     assert report.terrain is surface
 
 
-def test_the_headline_is_that_of_the_declared_estimator(report: PassReport) -> None:
+def test_the_headline_is_that_of_the_declared_estimator(report):
     size = 2.0 * RADIUS_M * np.sin(EAST_M / RADIUS_M / 2.0)
     p95 = float(np.percentile(size, 95.0))
     assert [(one.label, one.value, one.unit, one.note) for one in report.headline] == [
@@ -629,7 +629,7 @@ def test_the_headline_is_that_of_the_declared_estimator(report: PassReport) -> N
 @pytest.mark.parametrize(
     ("estimator", "reason"), [(None, "no estimator is declared"), ("spherical", "spherical is not known")]
 )
-def test_no_other_estimator_stands_in_for_the_declared_one(estimator: str | None, reason: str) -> None:
+def test_no_other_estimator_stands_in_for_the_declared_one(estimator, reason):
     report = evaluated(limits=Requirements(estimator=estimator), detections=no_detections())
     assert [(one.value, one.note) for one in report.headline[::2]] == [
         (None, reason), (None, reason), (100, "of 2\u202f000 expected"),
@@ -638,24 +638,24 @@ def test_no_other_estimator_stands_in_for_the_declared_one(estimator: str | None
 
 
 @pytest.mark.parametrize(("error_m", "text"), [(9_940.0, "9940 m"), (9_960.0, "10.0 km"), (52_340.0, "52.3 km")])
-def test_lengths_from_ten_kilometres_on_are_in_kilometres(error_m: float, text: str) -> None:
+def test_lengths_from_ten_kilometres_on_are_in_kilometres(error_m, text):
     high = paper(altitude_m=np.full(FRAMES, ALTITUDE_M + error_m), longitude_deg=LONGITUDE_DEG)
     report = evaluated(navigation=(high,))
     assert report.headline[0].note == f"paper; 95 % below {text}"
 
 
-def test_one_sample_is_no_headline() -> None:
+def test_one_sample_is_no_headline():
     assert evaluated(navigation=(first(1),)).headline[0].value is None
 
 
-def test_the_verdict_is_that_of_the_limits(report: PassReport) -> None:
+def test_the_verdict_is_that_of_the_limits(report):
     assert (report.verdict, report.verdict_level) == ("1 of 1 requirement met.", "met")
     failed = evaluated(limits=Requirements(estimator="paper", median_error_m=499.0))
     assert failed.verdict_level == "not met"
     assert {one.key for one in report.requirements if one.status == "met"} == {"accuracy.median"}
 
 
-def test_silences_part_the_imaging_arcs(report: PassReport) -> None:
+def test_silences_part_the_imaging_arcs(report):
     (arc,) = report.imaging_arcs
     assert arc == TimeSpan(int(TIMES[0]), int(TIMES[-1]) + 1, "frames") and report.gaps == ()
     some = detections()
@@ -675,7 +675,7 @@ def test_silences_part_the_imaging_arcs(report: PassReport) -> None:
     assert len(_imaging_arcs(inputs(detections=replace(some, utc_ns=exact)))) == 1
 
 
-def test_what_is_given_is_passed_on() -> None:
+def test_what_is_given_is_passed_on():
     given = {
         "generated_for": "ann", "created_utc": "2029-08-08T00:00:00Z", "evidence_level": "procedural",
         "data_sources": ("a", "b"), "scenario_text": "[pass]", "configuration": {"x": {"y": 1}},
@@ -687,7 +687,7 @@ def test_what_is_given_is_passed_on() -> None:
     assert report.span == TimeSpan(EPOCH, EPOCH + 200 * SECOND, "pass")
 
 
-def test_the_summary_holds_the_figures_of_the_report(report: PassReport) -> None:
+def test_the_summary_holds_the_figures_of_the_report(report):
     summary = summary_of(report)
     stored = {**summary, "instruments": {"altimeter": {"samples": 3}}}  # as older versions stored it
     assert PassFigures.model_validate(stored) == PassFigures.model_validate(summary)
@@ -735,7 +735,7 @@ def test_the_summary_holds_the_figures_of_the_report(report: PassReport) -> None
     }
 
 
-def test_the_summary_of_a_pass_without_figures_holds_none() -> None:
+def test_the_summary_of_a_pass_without_figures_holds_none():
     report = evaluated(detections=no_detections(), navigation=(), reference=None, catalogue=None)
     empty = {
         "frames": None, "packets": 0, "packets_lost": 0, "packets_expected": 0,
@@ -746,13 +746,13 @@ def test_the_summary_of_a_pass_without_figures_holds_none() -> None:
     assert {name: bare[name] for name in empty} == empty
 
 
-def test_baselines_have_their_own_place_in_the_summary() -> None:
+def test_baselines_have_their_own_place_in_the_summary():
     baselines = summary_of(evaluated(start_state=START))["baselines"]
     assert tuple(baselines) == BASELINES
     assert baselines["Kepler"]["max_3d_m"] > 100.0
 
 
-def test_outcomes_are_joined_by_frame_number_in_any_order() -> None:
+def test_outcomes_are_joined_by_frame_number_in_any_order():
     number, triggers = np.array([4, 1, 9]), ("time_gap", "none", "manual_step")
     found = OutcomeSamples(
         "paper", 100 + number, TIMES[:3], ("matched",) * 3, triggers, number, np.ones(3, dtype=np.int64)
@@ -765,7 +765,7 @@ def test_outcomes_are_joined_by_frame_number_in_any_order() -> None:
     assert _joined(paper(), none)[:2] == _joined(paper(), None)[:2] == ((), None)
 
 
-def test_reads_are_listed_in_order_of_time_and_estimator() -> None:
+def test_reads_are_listed_in_order_of_time_and_estimator():
     both = (replace(outcomes(), estimator="spherical"), outcomes())
     ledger = evaluated(outcomes=both).truth_ledger
     assert [(one.utc_ns, one.estimator) for one in ledger] == [

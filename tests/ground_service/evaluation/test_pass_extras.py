@@ -7,7 +7,6 @@ over high terrain, against a projection written out here.
 """
 
 import math
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -53,7 +52,7 @@ def two_tones(dark_rows: int) -> TerrainMap:
 
 
 @pytest.mark.parametrize("dark_rows", [20, 90, 160])
-def test_the_limit_lies_between_two_tones_however_much_there_is_of_each(dark_rows: int) -> None:
+def test_the_limit_lies_between_two_tones_however_much_there_is_of_each(dark_rows):
     assert 59 < dark_limit(two_tones(dark_rows)) <= 200
 
 
@@ -66,8 +65,8 @@ def test_the_limit_lies_between_two_tones_however_much_there_is_of_each(dark_row
     ids=["outside the reference", "edges of the map"],
 )
 def test_samples_over_dark_ground_are_mare_and_those_outside_the_reference_nothing(
-    latitude_deg: list[float], longitude_deg: list[float], terrain: tuple[str, ...]
-) -> None:
+    latitude_deg, longitude_deg, terrain
+):
     times = np.arange(len(terrain))
     nothing = np.full(len(terrain), np.nan)
     series = NavigationSeries(
@@ -84,7 +83,7 @@ def event(seconds: int, name: str, detail: str = "") -> PassEvent:
     return PassEvent(START + seconds * 10**9, "medium", name, detail)
 
 
-def test_times_with_a_degraded_attitude_and_the_newest_offset_of_the_list_on_board_are_remarks() -> None:
+def test_times_with_a_degraded_attitude_and_the_newest_offset_of_the_list_on_board_are_remarks():
     noise = "noise 0.2 deg per axis, declared 0.01 deg"
     events = (
         event(5, "attitude_restored"),
@@ -112,7 +111,7 @@ def test_times_with_a_degraded_attitude_and_the_newest_offset_of_the_list_on_boa
 FRAMES, CRATERS = 40, 5
 
 
-def test_the_worst_frames_are_chosen_from_all_frames_and_not_from_those_with_an_image() -> None:
+def test_the_worst_frames_are_chosen_from_all_frames_and_not_from_those_with_an_image():
     """Five craters a frame; 20 to 27 lose all, 30 is unfit, and only 0, 10 and 39 have an image."""
     number, row = np.arange(FRAMES), np.arange(FRAMES * CRATERS)
     frame, zeros = row // CRATERS, 0.0 * row
@@ -154,7 +153,7 @@ def poses(text: str) -> tuple[np.ndarray, np.ndarray]:
     return rows[:, 0], matrices
 
 
-def test_orientations_are_those_of_the_orbit() -> None:
+def test_orientations_are_those_of_the_orbit():
     _, true = poses(format_tum(UTC_NS, orbit(), orbit()))
     radial, normal = true[:, :3, 0], true[:, :3, 2]
     assert_allclose(radial, orbit() / np.linalg.norm(orbit(), axis=1)[:, None], atol=1e-9)
@@ -162,12 +161,12 @@ def test_orientations_are_those_of_the_orbit() -> None:
     assert_allclose(normal, [[0.0, -0.0995037, 0.9950372]] * COUNT, atol=1e-4)
 
 
-def test_times_keep_their_nanoseconds() -> None:
+def test_times_keep_their_nanoseconds():
     line = format_tum(UTC_NS[:2] + 123_456_789, orbit()[:2], orbit()[:2]).splitlines()[1]
     assert line.split()[0] == "1881735115.123456789"
 
 
-def test_a_map_of_minus_180_to_180_is_turned_to_begin_at_0(tmp_path: Path) -> None:
+def test_a_map_of_minus_180_to_180_is_turned_to_begin_at_0(tmp_path):
     columns = np.repeat(np.linspace(0, 255, 64).astype(np.uint8)[None], 32, axis=0)
     Image.fromarray(columns).save(tmp_path / "albedo.png")
     found = surface_map(tmp_path / "albedo.png")
@@ -176,14 +175,14 @@ def test_a_map_of_minus_180_to_180_is_turned_to_begin_at_0(tmp_path: Path) -> No
     assert int(found.image[512, 1030]) < 50
 
 
-def test_a_file_that_is_no_picture_is_told(tmp_path: Path) -> None:
+def test_a_file_that_is_no_picture_is_told(tmp_path):
     (tmp_path / "albedo.jpg").write_text("no picture")
     with pytest.raises(InvalidInput, match="cannot be read"):
         surface_map(tmp_path / "albedo.jpg")
 
 
 @pytest.mark.real_data
-def test_a_fifth_of_the_real_moon_is_dark_and_the_sea_of_tranquillity_is(data_path: Path) -> None:
+def test_a_fifth_of_the_real_moon_is_dark_and_the_sea_of_tranquillity_is(data_path):
     # Maria cover about 17 % of the Moon (Head 1976, Reviews of Geophysics 14, 265); other ground is dark beside them.
     albedo = find_data(data_path).albedo
     assert albedo is not None
@@ -205,7 +204,7 @@ NEVER = np.zeros(100, dtype=bool)
 STEADY = np.arange(100)[:, None] * np.array([0.0, 245.0, 0.0])
 
 
-def test_a_steady_drift_is_its_share_of_the_path_and_a_reset_hides_none() -> None:
+def test_a_steady_drift_is_its_share_of_the_path_and_a_reset_hides_none():
     """Sawtooth: 2 % between resets, although the error at the end of the pass is nearly nothing."""
     assert drift_percent(STEADY, PATH_M, NEVER) == approx(1.0, rel=1e-12)
     height = STEADY[:, [1, 0, 2]]
@@ -215,13 +214,13 @@ def test_a_steady_drift_is_its_share_of_the_path_and_a_reset_hides_none() -> Non
     assert drift_percent(sawtooth, PATH_M, phase == 0) == approx(2.0, rel=1e-12)
 
 
-def test_the_error_before_a_reset_is_that_of_the_sample_before() -> None:
+def test_the_error_before_a_reset_is_that_of_the_sample_before():
     error = np.arange(6)[:, None] * np.array([0.0, 3.0, 4.0])
     before = error_before_reset_m(error, np.isin(np.arange(6), (0, 3)))
     assert_allclose(before, [np.nan, np.nan, np.nan, 10.0, np.nan, np.nan])
 
 
-def test_drift_by_length_crosses_no_reset() -> None:
+def test_drift_by_length_crosses_no_reset():
     place = np.arange(100)
     samples = drift_by_length(STEADY * (place < 50)[:, None], PATH_M, place == 50)
     assert [sample.path_length_m for sample in samples] == [100e3, 200e3, 500e3, 1000e3]
@@ -230,7 +229,7 @@ def test_drift_by_length_crosses_no_reset() -> None:
     assert samples[0].p95_percent == approx(1.0)
 
 
-def test_statistics_leave_out_samples_without_reference() -> None:
+def test_statistics_leave_out_samples_without_reference():
     error = np.array([[3.0, 4.0, 0.0], [np.nan] * 3, [0.0, 0.0, 10.0]])
     found = navigation_statistics(error, np.array([0.0, np.nan, 1000.0]), NEVER[:3])
     assert (found.median_3d_m, found.max_3d_m, found.end_of_pass_m, found.path_length_m) == approx(
@@ -241,7 +240,7 @@ def test_statistics_leave_out_samples_without_reference() -> None:
         assert np.isnan(few.drift_percent)
 
 
-def test_a_correlated_error_is_weighted_with_the_whole_matrix() -> None:
+def test_a_correlated_error_is_weighted_with_the_whole_matrix():
     # P = [[4, 2], [2, 3]], inverse [[3, -2], [-2, 4]] / 8; e = (2, -1): (12 + 8 + 4) / 8 = 3. The diagonal alone gives
     # 4/4 + 1/3.
     covariance = [[4.0, 2.0], [2.0, 3.0]]
@@ -251,7 +250,7 @@ def test_a_correlated_error_is_weighted_with_the_whole_matrix() -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 6))
-def test_it_does_not_depend_on_the_axes_or_units(seed: int, size: int) -> None:
+def test_it_does_not_depend_on_the_axes_or_units(seed, size):
     rng = np.random.default_rng(seed)
     root, turn = rng.standard_normal((2, size, size)) + 2.0 * np.eye(size)
     error, covariance = rng.standard_normal(size), root @ root.T + 0.1 * np.eye(size)
@@ -262,7 +261,7 @@ def test_it_does_not_depend_on_the_axes_or_units(seed: int, size: int) -> None:
         assert nees(change @ error, change @ covariance @ change.T) == approx(expected, rel=1e-4)
 
 
-def test_what_is_not_known_is_not_guessed() -> None:
+def test_what_is_not_known_is_not_guessed():
     good, error = np.diag([4.0, 9.0]), np.array([2.0, 3.0])
     singular = np.array([[1.0, 1.0], [1.0, 1.0]])
     indefinite = np.array([[1.0, 2.0], [2.0, 1.0]])
@@ -277,14 +276,14 @@ def test_what_is_not_known_is_not_guessed() -> None:
     assert np.isnan(squared_normalised_errors([[1.0, 1.0], [np.nan, 1.0]], [[0.0, 1.0], [1.0, 1.0]])).all()
 
 
-def test_no_samples_and_shapes_that_do_not_fit() -> None:
+def test_no_samples_and_shapes_that_do_not_fit():
     assert nees(np.zeros((0, 3)), np.zeros((0, 3, 3))).shape == (0,)
     assert nees(np.ones((4, 5, 3)), np.eye(3)).shape == (4, 5)
     with pytest.raises(ValueError, match=r"expected errors \(..., d\)"):
         nees(np.ones(3), np.eye(2))
 
 
-def test_bounds_are_those_of_printed_tables() -> None:
+def test_bounds_are_those_of_printed_tables():
     # Quantiles of chi-square at 0.025 and 0.975 as tables print them (NIST/SEMATECH e-Handbook, 1.3.6.7.4).
     low, high = bounds([1, 3, 6, 100])
     assert_allclose(high, [5.024, 9.348, 14.449, 129.561], atol=6e-4)
@@ -294,7 +293,7 @@ def test_bounds_are_those_of_printed_tables() -> None:
     assert np.isnan(bounds(0)[0]) and np.isnan(bounds_per_degree(6, 0.5, 0.95)).all()
 
 
-def test_correlated_samples_are_worth_fewer() -> None:
+def test_correlated_samples_are_worth_fewer():
     rng = np.random.default_rng(1)
     white = rng.standard_normal(4_000)
     assert independent_samples(white) > 2_000
@@ -344,7 +343,7 @@ def catalogue():
     )
 
 
-def test_a_tilted_distorted_camera_sees_craters_on_high_ground_where_they_are() -> None:
+def test_a_tilted_distorted_camera_sees_craters_on_high_ground_where_they_are():
     viewing = Viewing(CAMERA, TILT_RAD)
     expected = expected_craters(catalogue(), CAMERA, POSITION, viewing.pointed(POSITION))
     assert expected.index.tolist() == [0, 1, 2, 3]
@@ -354,7 +353,7 @@ def test_a_tilted_distorted_camera_sees_craters_on_high_ground_where_they_are() 
     assert len(expected_craters(catalogue(), CAMERA, lost, viewing.pointed(lost)).index) == 0
 
 
-def test_a_camera_that_leans_far_sees_craters_beyond_a_nadir_footprint() -> None:
+def test_a_camera_that_leans_far_sees_craters_beyond_a_nadir_footprint():
     """2.5 degrees north of the track is 76 km, past the corner of a nadir image from 30 km (73 km)."""
     far = make_catalogue(np.radians([3.0]), np.radians([0.0]), np.array([9e3]), source="made", rim_height_m=np.zeros(1))
     narrow = BrownCamera(512, 512, math.radians(60.0))
@@ -363,7 +362,7 @@ def test_a_camera_that_leans_far_sees_craters_beyond_a_nadir_footprint() -> None
     assert expected_craters(far, narrow, POSITION, leaning).index.tolist() == [0]
 
 
-def test_a_telemetered_attitude_wins_over_the_declared_pointing() -> None:
+def test_a_telemetered_attitude_wins_over_the_declared_pointing():
     tilted = Viewing(CAMERA, TILT_RAD).pointed(POSITION)
     mcmf_from_icrf = np.array([[[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
     q = quaternion_from_matrix(tilted @ mcmf_from_icrf)
@@ -376,7 +375,7 @@ def test_a_telemetered_attitude_wins_over_the_declared_pointing() -> None:
 
 
 @pytest.mark.parametrize("telemetered", [True, False])
-def test_a_snapshot_of_a_tilted_distorted_camera_finds_its_place(telemetered: bool) -> None:
+def test_a_snapshot_of_a_tilted_distorted_camera_finds_its_place(telemetered):
     craters = catalogue()
     pairs = Pairs(
         np.zeros(4, dtype=np.int64),

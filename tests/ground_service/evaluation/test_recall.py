@@ -62,7 +62,7 @@ def scored(found: Any, expected: Any) -> Any:
     return score_detections(found, expected, match_detections(found, expected), np.array([ALTITUDE_M]))
 
 
-def test_craters_project_where_the_picture_shows_them(expected: ExpectedCraters) -> None:
+def test_craters_project_where_the_picture_shows_them(expected):
     """East is right, south is down; the crater below is at the centre and as wide as f D / h."""
     assert expected.index.tolist() == [0, 1, 2, 3]
     assert expected.u_px[0] == approx(255.5, abs=1e-9)
@@ -71,7 +71,7 @@ def test_craters_project_where_the_picture_shows_them(expected: ExpectedCraters)
     assert min(expected.u_px[2], expected.v_px[2]) > 255.5
 
 
-def test_a_crater_of_unknown_height_is_neither_missed_nor_a_false_alarm() -> None:
+def test_a_crater_of_unknown_height_is_neither_missed_nor_a_false_alarm():
     known = field(rim_height_m=3_000.0)
     heights = np.where(np.arange(5) == 1, np.nan, known.rim_height_m)
     expected = expected_craters(replace(known, rim_height_m=heights), CAMERA, POSITION)
@@ -83,7 +83,7 @@ def test_a_crater_of_unknown_height_is_neither_missed_nor_a_false_alarm() -> Non
         assert (score.expected, score.detected_true, score.false_alarms) == (2, 2, 0)
 
 
-def test_a_perfect_detector_scores_one(expected: ExpectedCraters) -> None:
+def test_a_perfect_detector_scores_one(expected):
     found = detections(expected.u_px + 0.3, expected.v_px - 0.4, expected.diameter_px, [0, 1, 2, 3])
     score = scored(found, expected)
     micro = score.micro
@@ -92,7 +92,7 @@ def test_a_perfect_detector_scores_one(expected: ExpectedCraters) -> None:
     assert_allclose(score.residuals.du_px, 0.3)
 
 
-def test_one_detection_serves_one_crater_and_the_second_is_a_false_alarm(expected: ExpectedCraters) -> None:
+def test_one_detection_serves_one_crater_and_the_second_is_a_false_alarm(expected):
     twice = [1, 1]
     found = detections(expected.u_px[twice] + [0.0, 2.0], expected.v_px[twice], expected.diameter_px[twice], twice)
     middle = scored(found, expected).per_class[1]
@@ -104,28 +104,28 @@ def test_one_detection_serves_one_crater_and_the_second_is_a_false_alarm(expecte
     ("offset_px", "width", "hit"),
     [(9.9, 1.0, True), (10.1, 1.0, False), (0.0, 2.1, False), (0.0, 0.45, False), (0.0, 1.9, True)],
 )
-def test_the_limits_of_a_match(expected: ExpectedCraters, offset_px: float, width: float, hit: bool) -> None:
+def test_the_limits_of_a_match(expected, offset_px, width, hit):
     """The 20 km crater is some 98 px wide: half a radius is 24 px, so the paper's 10 px decide."""
     u, v, d = (one[[2]] for one in (expected.u_px, expected.v_px, expected.diameter_px))
     found = match_detections(detections(u - offset_px, v, d * width, [2]), expected)
     assert bool(found.crater_of_detection[0] >= 0) is hit
 
 
-def test_small_craters_count_neither_for_nor_against(expected: ExpectedCraters) -> None:
+def test_small_craters_count_neither_for_nor_against(expected):
     small = (expected.u_px[3], expected.v_px[3], expected.diameter_px[3])
     score = scored(detections(*zip(small, (3.0, 3.0, 15.0), strict=True), [3, 3]), expected)
     assert (score.micro.expected, score.micro.false_alarms) == (3, 0)
 
 
 @pytest.mark.parametrize(("usable", "complete"), [(False, True), (True, False)])
-def test_unfit_images_and_incomplete_regions_are_left_out(usable: bool, complete: bool) -> None:
+def test_unfit_images_and_incomplete_regions_are_left_out(usable, complete):
     expected = expected_craters(field(complete), CAMERA, POSITION)
     micro = scored(detections([3.0], [3.0], [30.0], [1], usable), expected).micro
     assert (micro.expected, micro.false_alarms) == (0, 0)
     assert np.isnan(micro.recall)
 
 
-def test_no_craters_and_no_frames_are_no_error() -> None:
+def test_no_craters_and_no_frames_are_no_error():
     empty = field().select(np.zeros(0, dtype=np.int64))
     expected = expected_craters(empty, CAMERA, POSITION)
     micro = scored(detections([10.0], [10.0], [30.0], [1]), expected).micro
@@ -165,7 +165,7 @@ def three_frames() -> tuple[DetectionSamples, ExpectedCraters, Matches]:
     return found, expected, match_detections(found, expected)
 
 
-def test_scores_are_given_by_class_and_by_bins_of_altitude_and_of_the_sun() -> None:
+def test_scores_are_given_by_class_and_by_bins_of_altitude_and_of_the_sun():
     found, expected, matches = three_frames()
     assert matches.crater_of_detection.tolist() == [1, 2, -1, 4, 5, 6, -1]
     assert matches.detection_of_crater.tolist() == [-1, 0, 1, -1, 3, 4, 5]
@@ -207,7 +207,7 @@ def test_scores_are_given_by_class_and_by_bins_of_altitude_and_of_the_sun() -> N
     assert "into a nadir camera; a detection is true within 0.5 radii and 10 px of the centre" in score.method
 
 
-def test_curves_and_calibration_follow_the_scores() -> None:
+def test_curves_and_calibration_follow_the_scores():
     """True at 0.9, 0.8, 0.7, 0.6 and 0.95, an alarm at 0.35; the detection of class 3 counts nowhere."""
     found, expected, matches = three_frames()
     score = score_detections(found, expected, matches, np.full(3, 25e3))
@@ -230,7 +230,7 @@ def test_curves_and_calibration_follow_the_scores() -> None:
     assert score.residuals.sun_azimuth_deg is None
 
 
-def test_alarms_count_where_most_of_the_view_is_complete() -> None:
+def test_alarms_count_where_most_of_the_view_is_complete():
     """Two craters of a frame, one of them in an incomplete region: half is not most."""
     found, expected, _ = three_frames()
     for complete, alarms in (([True, True, False, False], 0), ([True, True, True, False], 1)):
@@ -239,7 +239,7 @@ def test_alarms_count_where_most_of_the_view_is_complete() -> None:
         assert score.micro.false_alarms == alarms
 
 
-def test_the_closest_pair_in_radii_is_matched_first() -> None:
+def test_the_closest_pair_in_radii_is_matched_first():
     """A detection 4 px from a crater of 40 px (0.2 radii) and 3 px from one of 20 px (0.3) belongs to the former."""
     two = ExpectedCraters(
         offsets=np.array([0, 2]),
@@ -257,7 +257,7 @@ def test_the_closest_pair_in_radii_is_matched_first() -> None:
     assert match_detections(both, two).crater_of_detection.tolist() == [0, 1]
 
 
-def test_craters_of_many_frames_are_those_of_each_frame_alone() -> None:
+def test_craters_of_many_frames_are_those_of_each_frame_alone():
     """More frames than are projected together: every one sees what it sees alone, and lost ones see nothing."""
     longitude = np.radians(np.linspace(-0.5, 0.5, 501))
     position = mcmf_from_spherical(np.zeros(501), longitude, np.full(501, ALTITUDE_M))
@@ -272,7 +272,7 @@ def test_craters_of_many_frames_are_those_of_each_frame_alone() -> None:
     assert every.offsets[-1] == len(every.index)
 
 
-def test_classes_and_completeness_are_those_of_the_catalogue() -> None:
+def test_classes_and_completeness_are_those_of_the_catalogue():
     mixed = replace(field(), complete=np.array([True, False, True, True, True]))
     expected = expected_craters(mixed, CAMERA, POSITION)
     assert expected.size_class.tolist()[:3] == [0, 1, 2] and expected.size_class[3] not in (0, 1, 2)

@@ -1,7 +1,6 @@
 """The smoother against a batch solution of the same measurements, and on what it was not told of."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -101,7 +100,7 @@ def batch(session: Session) -> Arrays:
     return state, np.linalg.inv(normal)
 
 
-def test_without_process_noise_the_first_smoothed_state_is_that_of_one_least_squares_over_everything() -> None:
+def test_without_process_noise_the_first_smoothed_state_is_that_of_one_least_squares_over_everything():
     """The last state is the filter's, and the uncertainty never grows."""
     session = Session(1)
     smoothed = smooth(session.filtered, QUIET)
@@ -114,7 +113,7 @@ def test_without_process_noise_the_first_smoothed_state_is_that_of_one_least_squ
     assert_allclose(np.sqrt(np.diag(smoothed.covariance[0])[:6]), sigma, rtol=0.02)
 
 
-def test_smoothing_gains_by_half_and_keeps_its_own_account() -> None:
+def test_smoothing_gains_by_half_and_keeps_its_own_account():
     filtered, smoothed, nees = [], [], []
     for seed in range(8):
         session = Session(seed)
@@ -131,7 +130,7 @@ def test_smoothing_gains_by_half_and_keeps_its_own_account() -> None:
 KICK = np.array([0.0, 0.0, 3.0])
 
 
-def test_a_commanded_burn_is_flown_over() -> None:
+def test_a_commanded_burn_is_flown_over():
     session = Session(4, KICK, kick_at=14)
     # The burn falls between the samples 14 and 15, a moment after the former.
     burn = CommandedBurn(int(TIMES[14]) + 1, KICK, 1e-6)
@@ -140,14 +139,14 @@ def test_a_commanded_burn_is_flown_over() -> None:
     assert np.linalg.norm(error, axis=1).max() < 160.0
 
 
-def test_a_burn_that_nobody_commanded_parts_the_orbit_in_two() -> None:
+def test_a_burn_that_nobody_commanded_parts_the_orbit_in_two():
     session = Session(5, KICK, kick_at=14)
     known = smooth(session.filtered, QUIET)
     alone = smooth(session.filtered.select(np.arange(STATES) < 15), QUIET)
     assert_allclose(known.state[:15], alone.state, rtol=1e-12)
 
 
-def test_a_clock_that_went_backwards_parts_the_orbit_in_two() -> None:
+def test_a_clock_that_went_backwards_parts_the_orbit_in_two():
     session = Session(6)
     times = TIMES.copy()
     times[20:] -= 3_600 * 10**9
@@ -156,7 +155,7 @@ def test_a_clock_that_went_backwards_parts_the_orbit_in_two() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_few_states_come_back_as_they_are(count: int) -> None:
+def test_few_states_come_back_as_they_are(count):
     few = Session(7).filtered.select(np.arange(STATES) < count)
     assert_array_equal(smooth(few, QUIET).state, few.state)
 
@@ -235,7 +234,7 @@ def assert_same(found: FilterStates, expected: Arrays, start: FilterStates) -> N
     assert np.abs(state - start.state).max() > 0.1  # and there was something to smooth
 
 
-def test_pushed_motion_is_smoothed_as_the_textbook_does_it() -> None:
+def test_pushed_motion_is_smoothed_as_the_textbook_does_it():
     """Half a second, a step of 50 s, and 100 s in two steps of 50 s."""
     filtered = straight([0.0, 0.5, 50.5, 150.5])
     found = smooth(filtered, PUSHED)
@@ -252,7 +251,7 @@ def test_pushed_motion_is_smoothed_as_the_textbook_does_it() -> None:
         ([0, 50], [(20, 0.05), (20, 0.03)], [[20.0, 0.0, 30.0]], [[0.05, 0.03, 0.0]]),
     ],
 )
-def test_burns_part_the_steps_and_count_once(seconds: Any, pushes: Any, legs: Any, kicks: Any) -> None:
+def test_burns_part_the_steps_and_count_once(seconds, pushes, legs, kicks):
     """Burns of some cm/s, with a sigma of 0.3 m/s each."""
     filtered = straight(seconds)
     burns = tuple(CommandedBurn(EPOCH + at * 10**9, np.array([0.0, push, 0.0]), 0.3) for at, push in pushes)
@@ -260,7 +259,7 @@ def test_burns_part_the_steps_and_count_once(seconds: Any, pushes: Any, legs: An
     assert_same(found, rauch_tung_striebel(filtered, legs, kicks, 0.3), filtered)
 
 
-def test_a_jump_of_a_hundred_in_chi_square_parts_the_orbit() -> None:
+def test_a_jump_of_a_hundred_in_chi_square_parts_the_orbit():
     filtered = straight([0.0, 30.0])
     transition, noise = step_matrices(30.0)
     prior = transition @ filtered.covariance[0] @ transition.T + noise
@@ -272,12 +271,12 @@ def test_a_jump_of_a_hundred_in_chi_square_parts_the_orbit() -> None:
         assert bool(np.any(found.state[0] != filtered.state[0])) is smoothed
 
 
-def test_a_selection_keeps_the_degrees_of_its_states() -> None:
+def test_a_selection_keeps_the_degrees_of_its_states():
     some = straight([0.0, 1.0, 2.0]).select(np.array([True, False, True]))
     assert some.innovation_degrees.tolist() == [0, 2]
 
 
-def test_sigmas_lie_along_the_axes_of_the_orbit() -> None:
+def test_sigmas_lie_along_the_axes_of_the_orbit():
     """Position along y and velocity along -x: radial is y, transverse -x, normal z."""
     covariance = np.zeros((1, 9, 9))
     covariance[0, :3, :3] = np.diag([4.0, 9.0, 16.0])
@@ -287,7 +286,7 @@ def test_sigmas_lie_along_the_axes_of_the_orbit() -> None:
     assert_allclose(one.position_covariance_rtn_m2[0], np.diag([9.0, 4.0, 16.0]), atol=1e-12)
 
 
-def test_long_steps_are_cut_into_equal_ones_of_a_minute_at_most() -> None:
+def test_long_steps_are_cut_into_equal_ones_of_a_minute_at_most():
     """TDB runs with UTC but for a second or two at the epoch; a burn ends a step."""
     second = 10**9
     assert _legs(EPOCH, EPOCH + 150 * second, START_S, ()) == [
@@ -302,7 +301,7 @@ def test_long_steps_are_cut_into_equal_ones_of_a_minute_at_most() -> None:
     assert (last[0] - START_S, after[0] - START_S) == approx((45.0, 90.0), abs=1e-5)
 
 
-def test_the_smoother_has_the_noise_of_the_field_on_each_side_of_the_moon() -> None:
+def test_the_smoother_has_the_noise_of_the_field_on_each_side_of_the_moon():
     field = replace(builtin_gravity(), name="LP165P")
     model = smoother_model(field, IauOrientation(), ())
     assert model.field_noise == field_noise("LP165P", min(100, field.degree))
@@ -320,7 +319,7 @@ def test_the_smoother_has_the_noise_of_the_field_on_each_side_of_the_moon() -> N
     assert ratio == approx(far.sum() / near.sum(), rel=0.02)
 
 
-def test_the_shift_of_the_map_is_renewed_over_the_ground() -> None:
+def test_the_shift_of_the_map_is_renewed_over_the_ground():
     """A share 1 - exp(-2 angle / 30 degrees) of its variance is new after a step; 10, 40 and 40 m."""
     model = smoother_model(builtin_gravity(), IauOrientation(), ())
     without = replace(model, map_sigma_rtn_m=(0.0, 0.0, 0.0))
@@ -343,6 +342,6 @@ def test_the_shift_of_the_map_is_renewed_over_the_ground() -> None:
     assert model.map_correlation_rad == errors.catalogue_correlation_rad
 
 
-def test_states_in_the_axes_of_the_payload_are_not_smoothed() -> None:
+def test_states_in_the_axes_of_the_payload_are_not_smoothed():
     with pytest.raises(EvaluationError, match="expected states in ICRF, found inertial axes of the payload"):
         smooth(replace(straight([0.0, 60.0]), frame=ONBOARD), QUIET)

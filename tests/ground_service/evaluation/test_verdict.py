@@ -1,7 +1,6 @@
 """Verdict tables: every requirement at, below and past its limit, and the sentence on them."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -89,9 +88,7 @@ CONSISTENT = series(
         (3600, 0.31, "met", 10, "0.56 to 1.57", "; sigmas 1.8 times too large"),
     ],
 )
-def test_nees_is_judged_by_both_bounds_for_its_independent_draws(
-    gap_s: int, factor: float, status: str, draws: int, bounds: str, wrong: str
-) -> None:
+def test_nees_is_judged_by_both_bounds_for_its_independent_draws(gap_s, factor, status, draws, bounds, wrong):
     """Too bold is a failure, too cautious a remark."""
     times = np.arange(N, dtype=np.int64) * gap_s * 10**9
     flown = replace(series("anchored", nees=np.full(N, 3.0 * factor)), utc_ns=times)
@@ -121,9 +118,7 @@ def test_nees_is_judged_by_both_bounds_for_its_independent_draws(
         ("resources.temperature_min", "temperature_min_c", 10.0, HOUSED),
     ],
 )  # fmt: skip
-def test_a_requirement_is_met_at_its_limit_not_past_it_and_unknown_without_a_value(
-    key: str, limit: str, at_limit: float, evaluated: dict[str, Any]
-) -> None:
+def test_a_requirement_is_met_at_its_limit_not_past_it_and_unknown_without_a_value(key, limit, at_limit, evaluated):
     what = found(CONSISTENT, **evaluated)
 
     def judged(bound: float | None, what: Evaluated = what) -> Requirement:
@@ -141,7 +136,7 @@ def test_a_requirement_is_met_at_its_limit_not_past_it_and_unknown_without_a_val
     assert judged(None).status == "not judged" and judged(None).value == approx(at_limit)
 
 
-def test_the_declared_estimator_is_judged_and_not_the_best_one() -> None:
+def test_the_declared_estimator_is_judged_and_not_the_best_one():
     evaluated = found(series("anchored", median=70.0), series("spherical", median=30.0))
     limits = Requirements(estimator="anchored", median_error_m=50.0)
     assert (row("accuracy.median", limits, evaluated).value, verdict_of(requirements(limits, evaluated))[1]) == (
@@ -152,7 +147,7 @@ def test_the_declared_estimator_is_judged_and_not_the_best_one() -> None:
     assert undeclared.note == "the mission description declares no estimator"
 
 
-def test_a_pass_for_which_the_estimator_is_not_made_is_named() -> None:
+def test_a_pass_for_which_the_estimator_is_not_made_is_named():
     words = "paper assumes a pass to the north or south, this track runs 50° from the meridian"
     limits = Requirements(estimator="paper", median_error_m=100.0)
     named = row("accuracy.median", limits, found(series("paper", not_applicable=words)))
@@ -163,13 +158,13 @@ def test_a_pass_for_which_the_estimator_is_not_made_is_named() -> None:
 @pytest.mark.parametrize(
     ("baseline", "status"), [(51.0, "met"), (50.0, "not met"), (49.0, "not met"), (float("nan"), "unknown")]
 )
-def test_a_baseline_has_to_be_beaten_and_not_only_matched(baseline: float, status: str) -> None:
+def test_a_baseline_has_to_be_beaten_and_not_only_matched(baseline, status):
     limits = Requirements(estimator="anchored", better_than=("snapshot",))
     evaluated = found(series("anchored"), series("snapshot", "baseline", baseline))
     assert row("better_than.snapshot", limits, evaluated).status == status
 
 
-def test_every_baseline_is_shown_and_one_that_is_missing_is_unknown() -> None:
+def test_every_baseline_is_shown_and_one_that_is_missing_is_unknown():
     limits = Requirements(estimator="anchored", better_than=("snapshot",))
     evaluated = found(series("anchored"), series("Kepler", "baseline", 1.0), series("smoothed", "smoothed", 1.0))
     assert row("better_than.snapshot", limits, evaluated).status == "unknown"
@@ -181,7 +176,7 @@ def test_every_baseline_is_shown_and_one_that_is_missing_is_unknown() -> None:
     assert row("better_than.Kepler", rival, replace(evaluated, experiment=StartOrbit(1e3))).status == "not met"
 
 
-def test_an_experiment_is_judged_apart_and_its_accuracy_from_convergence_on() -> None:
+def test_an_experiment_is_judged_apart_and_its_accuracy_from_convergence_on():
     """Errors of 900 m, and 30 m from the fourth sample on, where the filter states it."""
     size = np.array([900.0] * 3 + [30.0, 31.0, 500.0] + [30.0, 31.0, 32.0, 33.0])
     flown = replace(
@@ -217,7 +212,7 @@ def test_an_experiment_is_judged_apart_and_its_accuracy_from_convergence_on() ->
     assert table["accuracy.median"].value == approx(200.0 * 3**0.5)
 
 
-def test_packets_whose_loss_at_the_edges_is_not_known_are_never_complete() -> None:
+def test_packets_whose_loss_at_the_edges_is_not_known_are_never_complete():
     def judged(*counts: int) -> Requirement:
         return row("completeness.packets", EVERY_LIMIT, found(packets=PacketAccounting(*counts)))
 
@@ -228,7 +223,7 @@ def test_packets_whose_loss_at_the_edges_is_not_known_are_never_complete() -> No
     assert judged(0).value is None
 
 
-def test_two_frames_are_judged_and_one_is_not() -> None:
+def test_two_frames_are_judged_and_one_is_not():
     for count, told in (
         (2, ("met", "anchored, 2 samples")),
         (1, ("unknown", "only one frame was navigated, too few for a judgement")),
@@ -255,19 +250,17 @@ def table(*statuses: str) -> list[Requirement]:
         ([], "unknown", "No requirement has a limit in the mission description: nothing is judged."),
     ],
 )  # fmt: skip
-def test_the_sentence_is_derived_from_the_table_and_names_failures_first(
-    statuses: list[str], level: str, sentence: str
-) -> None:
+def test_the_sentence_is_derived_from_the_table_and_names_failures_first(statuses, level, sentence):
     assert verdict_of(table(*statuses)) == (sentence, level)
 
 
-def test_many_failures_are_counted_and_the_first_five_named() -> None:
+def test_many_failures_are_counted_and_the_first_five_named():
     text, _ = verdict_of(table(*["not met"] * 7))
     assert text.startswith("7 of 7 requirements not met: thing 0") and "; and 2 more." in text
     assert "thing 4" in text and "thing 5" not in text
 
 
-def test_the_error_budget_takes_the_reference_off_in_squares() -> None:
+def test_the_error_budget_takes_the_reference_off_in_squares():
     """A 3-4-12 error is 13 m long; a reference of 3, 4 and 0 m takes 5 m off in squares: 12 m are left."""
     error = np.array([[3.0, 4.0, 12.0], [-3.0, 4.0, -12.0], [np.nan, 0.0, 0.0]])
     budget = error_budget(error, (3.0, 4.0, 0.0))
@@ -302,7 +295,7 @@ EVERY_LIMIT = Requirements(
 )
 
 
-def test_the_table_of_a_pass_in_full() -> None:
+def test_the_table_of_a_pass_in_full():
     """Each row as it is printed: key, name, unit, value, limit, whether at most, status and note."""
     evaluated = Evaluated(
         (replace(CONSISTENT, statistics=NavigationStatistics(median_3d_m=50.0, p95_3d_m=90.0)),
@@ -353,7 +346,7 @@ def test_the_table_of_a_pass_in_full() -> None:
     )  # fmt: skip
 
 
-def test_the_table_of_a_pass_of_which_nothing_is_known() -> None:
+def test_the_table_of_a_pass_of_which_nothing_is_known():
     table = requirements(EVERY_LIMIT, Evaluated())
     assert {(one.value, one.status) for one in table} == {(None, "unknown")}
     assert {one.key: one.note for one in table if one.note} == {
@@ -370,25 +363,25 @@ def test_the_table_of_a_pass_of_which_nothing_is_known() -> None:
     assert {one.status for one in requirements(Requirements(), Evaluated())} == {"not judged"}
 
 
-def test_housekeeping_without_a_finite_value_is_unknown() -> None:
+def test_housekeeping_without_a_finite_value_is_unknown():
     cold = (HousekeepingParameter("temperature_c", "", np.arange(2), np.full(2, np.nan)),)
     for key in ("resources.temperature_max", "resources.temperature_min"):
         assert (row(key, EVERY_LIMIT, found(housekeeping=cold)).status) == "unknown"
 
 
-def test_the_first_sample_is_no_reset_and_a_series_without_outcomes_has_no_count() -> None:
+def test_the_first_sample_is_no_reset_and_a_series_without_outcomes_has_no_count():
     for triggers, resets in (((), None), (("initialization", "none"), 0.0)):
         started = found(series("anchored", reset_trigger=triggers))
         assert row("resets", EVERY_LIMIT, started).value == resets
 
 
 @pytest.mark.parametrize("limit", [float("nan"), float("inf")])
-def test_a_limit_that_is_no_number_judges_nothing_as_met(limit: float) -> None:
+def test_a_limit_that_is_no_number_judges_nothing_as_met(limit):
     one = row("accuracy.median", EVERY_LIMIT.model_copy(update={"median_error_m": limit}), found())
     assert (one.limit, one.status) == (None, "unknown")
 
 
-def test_without_a_mission_description_every_requirement_is_unknown_and_the_remedy_is_said_first() -> None:
+def test_without_a_mission_description_every_requirement_is_unknown_and_the_remedy_is_said_first():
     plain = requirements(Requirements(), found(CONSISTENT, detector=DETECTOR, housekeeping=HOUSEKEEPING))
     assert {one.status for one in plain} == {"not judged"}
     table = without_mission(plain, "none is registered; enter one")

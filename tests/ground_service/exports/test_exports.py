@@ -93,7 +93,7 @@ def features(export: Callable[..., bytes], layer: str, states: str = "reference"
 # Orbit, attitude, SPICE
 
 
-def test_oem_is_the_reference_in_the_interval_of_the_pass(export, rich_pass: RichPass) -> None:
+def test_oem_is_the_reference_in_the_interval_of_the_pass(export, rich_pass):
     found = parse_oem(export("oem").decode())
     assert (found.start_utc_ns, found.stop_utc_ns) == (rich_pass.utc_ns[0], rich_pass.utc_ns[-1])
     between = rich_pass.utc_ns[:-1] + 7_123_456_789
@@ -113,9 +113,7 @@ def rows_of(files: dict[str, bytes], name: str) -> list[dict[str, str]]:
 
 
 @pytest.mark.filterwarnings("ignore:ERFA function")
-def test_states_of_the_payload_have_the_errors_of_the_report_in_each_format(
-    export, rich_pass: RichPass, tmp_path: Path
-) -> None:
+def test_states_of_the_payload_have_the_errors_of_the_report_in_each_format(export, rich_pass, tmp_path):
     """The inertial axes of the payload are turned by 300 m against ICRF; read by oem, SPICE, json and csv."""
     utc_ns, found = rich_pass.utc_ns, {}
     tdb_s = np.asarray(tdb_s_from_utc_ns(utc_ns))
@@ -141,7 +139,7 @@ def test_states_of_the_payload_have_the_errors_of_the_report_in_each_format(
         assert_allclose(one, np.tile(FILTER_ERROR_RTN_M, (FRAMES, 1)), atol=0.01, err_msg=kind)
 
 
-def test_oem_of_the_filter_has_its_covariances_in_icrf(export, rich_pass: RichPass) -> None:
+def test_oem_of_the_filter_has_its_covariances_in_icrf(export, rich_pass):
     segment = parse_oem(export("oem", "anchored").decode()).segments[0]
     assert segment.comments[-1] == "evidence level: not stated"
     assert_array_equal(segment.utc_ns, rich_pass.utc_ns)
@@ -151,24 +149,20 @@ def test_oem_of_the_filter_has_its_covariances_in_icrf(export, rich_pass: RichPa
         assert_allclose(one.matrix, both.T @ COVARIANCE[:6, :6] @ both, rtol=1e-6, atol=1e-4)
 
 
-def test_states_without_the_orientation_of_the_payload_are_not_exported(
-    export, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_states_without_the_orientation_of_the_payload_are_not_exported(export, monkeypatch):
     monkeypatch.setattr(declared, "_kernel", lambda data: TurnedOrientation("another"))
     with raises(EvaluationError, match=r"turn anchored into ICRF; .* on board DE421, which is not"):
         export("oem", "anchored")
 
 
-def test_aem_has_the_attitude_of_each_frame(export, rich_pass: RichPass) -> None:
+def test_aem_has_the_attitude_of_each_frame(export, rich_pass):
     (segment,) = parse_aem(export("aem").decode())
 
     assert_array_equal(segment.utc_ns, rich_pass.utc_ns)
     assert_allclose(matrix_from_quaternion(segment.q_wxyz), rich_pass.camera_from_icrf, atol=1e-11)
 
 
-def test_spice_kernels_together_see_the_detected_crater_in_its_pixel(
-    export, rich_pass: RichPass, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_spice_kernels_together_see_the_detected_crater_in_its_pixel(export, rich_pass, tmp_path, monkeypatch):
     reference = load_ephemeris(rich_pass.folder / "reference.oem")
     for name, octets in unzipped(export("spice")).items():
         (tmp_path / name).write_bytes(octets)
@@ -203,7 +197,7 @@ def test_spice_kernels_together_see_the_detected_crater_in_its_pixel(
 # Maps
 
 
-def test_geojson_and_geopackage_have_the_same_features_on_the_moon(export, rich_pass: RichPass, tmp_path: Path) -> None:
+def test_geojson_and_geopackage_have_the_same_features_on_the_moon(export, rich_pass, tmp_path):
     (tmp_path / "pass.geojson").write_bytes(export("geojson"))
     (tmp_path / "pass.gpkg").write_bytes(export("gpkg"))
     document = json.loads((tmp_path / "pass.geojson").read_text())
@@ -227,7 +221,7 @@ def test_geojson_and_geopackage_have_the_same_features_on_the_moon(export, rich_
     assert "1737400" in pyogrio.read_info(tmp_path / "pass.geojson")["crs"]
 
 
-def test_located_detections_lie_on_their_craters(export, rich_pass: RichPass, tmp_path: Path) -> None:
+def test_located_detections_lie_on_their_craters(export, rich_pass, tmp_path):
     path = tmp_path / "pass.gpkg"
     path.write_bytes(export("gpkg"))
     catalogue = load_catalogue(rich_pass.folder / "catalogue.csv")
@@ -245,7 +239,7 @@ def test_located_detections_lie_on_their_craters(export, rich_pass: RichPass, tm
     assert np.median(np.linalg.norm(found - true, axis=1)) < 1000.0
 
 
-def test_footprints_hold_the_sub_satellite_point_and_detections(export, rich_pass: RichPass) -> None:
+def test_footprints_hold_the_sub_satellite_point_and_detections(export, rich_pass):
     latitude, longitude, _ = spherical_from_mcmf(rich_pass.position_mcmf_m)
     below = mcmf_from_spherical(latitude, longitude, 0.0) / 1_737_400.0
     places = np.degrees(np.column_stack([(longitude + np.pi) % (2 * np.pi) - np.pi, latitude]))
@@ -262,7 +256,7 @@ def test_footprints_hold_the_sub_satellite_point_and_detections(export, rich_pas
         assert_array_equal(rings[k][0], rings[k][-1])
 
 
-def test_maps_of_an_estimator_move_with_its_error(export) -> None:
+def test_maps_of_an_estimator_move_with_its_error(export):
     moved, true = (
         np.array([one["geometry"]["coordinates"] for one in features(export, "detections", states)])
         for states in ("spherical", "reference")
@@ -273,7 +267,7 @@ def test_maps_of_an_estimator_move_with_its_error(export) -> None:
     assert np.median(shift) == approx(horizontal, rel=0.25)
 
 
-def test_czml_is_read_by_czml3_with_the_positions_of_the_reference(export, rich_pass: RichPass) -> None:
+def test_czml_is_read_by_czml3_with_the_positions_of_the_reference(export, rich_pass):
     from czml3 import Packet
     from scipy.spatial.transform import Rotation
 
@@ -296,7 +290,7 @@ def test_czml_is_read_by_czml3_with_the_positions_of_the_reference(export, rich_
 # Tables and packets
 
 
-def test_csv_tables_have_every_sample_with_units(export, rich_pass: RichPass) -> None:
+def test_csv_tables_have_every_sample_with_units(export, rich_pass):
     files = unzipped(export("csv"))
     tables = {one["url"]: one for one in json.loads(files["csv-metadata.json"])["tables"]}
     assert {*tables, "csv-metadata.json"} == set(files)
@@ -312,7 +306,7 @@ def test_csv_tables_have_every_sample_with_units(export, rich_pass: RichPass) ->
     assert len(known) == sum(map(len, rich_pass.craters))
 
 
-def test_netcdf_has_the_tables_as_groups(export, rich_pass: RichPass, tmp_path: Path) -> None:
+def test_netcdf_has_the_tables_as_groups(export, rich_pass, tmp_path):
     import pandas
     import xarray
 
@@ -335,7 +329,7 @@ def test_netcdf_has_the_tables_as_groups(export, rich_pass: RichPass, tmp_path: 
                     assert list(values) == list(table[column])
 
 
-def test_parquet_has_a_file_for_each_packet_type_with_units(export, rich_pass: RichPass) -> None:
+def test_parquet_has_a_file_for_each_packet_type_with_units(export, rich_pass):
     files = unzipped(export("parquet"))
     named = ("detections", "housekeeping", "filter_state", "event_info")
     assert {f"{name}.parquet" for name in named} <= set(files)
@@ -350,7 +344,7 @@ def test_parquet_has_a_file_for_each_packet_type_with_units(export, rich_pass: R
     assert_allclose(times - rich_pass.utc_ns, 400 / 65_536 * 1e9, atol=20_000)
 
 
-def test_tum_trajectories_differ_by_the_error(export) -> None:
+def test_tum_trajectories_differ_by_the_error(export):
     files = unzipped(export("tum"))
     solution, reference = (np.loadtxt(io.BytesIO(files[name])) for name in ("spherical.tum", "spherical-reference.tum"))
     assert len(solution) == FRAMES
@@ -358,15 +352,13 @@ def test_tum_trajectories_differ_by_the_error(export) -> None:
     assert_allclose(distance, np.linalg.norm(SPHERICAL_ERROR_RTN_M), atol=1.0)
 
 
-def test_images_are_those_of_the_archive(export) -> None:
+def test_images_are_those_of_the_archive(export):
     files = unzipped(export("images"))
     assert sorted(files) == ["000000.png", "000004.png", "000008.png"]
     assert np.asarray(Image.open(io.BytesIO(files["000004.png"])))[0, 0] == 40
 
 
-def test_an_export_of_images_needs_the_memory_of_a_few_of_them(
-    rich_ground: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_export_of_images_needs_the_memory_of_a_few_of_them(rich_ground, monkeypatch):
     image = np.random.default_rng(1).bytes(1 << 20)
     stored = rich_ground.files.put_octets(image)
     monkeypatch.setattr(service.store, "frame_files", lambda *_: dict.fromkeys(range(64), stored.sha256))
@@ -382,9 +374,7 @@ def test_an_export_of_images_needs_the_memory_of_a_few_of_them(
     assert peak < 2 * service.SPOOLED_OCTETS + (6 << 20)
 
 
-def test_a_damaged_image_refuses_the_export_and_leaves_no_file(
-    rich_ground: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_damaged_image_refuses_the_export_and_leaves_no_file(rich_ground, monkeypatch):
     files = rich_ground.files
     whole, damaged = (files.put_octets(one).sha256 for one in (bytes(service.SPOOLED_OCTETS + 1), b"an image"))
     files.path(damaged).chmod(0o600)
@@ -399,7 +389,7 @@ def test_a_damaged_image_refuses_the_export_and_leaves_no_file(
 # Requests
 
 
-def test_every_format_is_listed_and_gives_the_same_octets_twice(export) -> None:
+def test_every_format_is_listed_and_gives_the_same_octets_twice(export):
     assert [one.name for one in list_formats()] == list(FORMATS)
     assert all(one.available for one in list_formats())
     for name in ("oem", "aem", "geojson", "csv", "parquet", "sclk"):
@@ -414,12 +404,12 @@ def test_every_format_is_listed_and_gives_the_same_octets_twice(export) -> None:
         ("geojson", "truth", "reference or paper or spherical or anchored"),
     ],
 )
-def test_states_that_do_not_exist_are_one_line(export, kind: str, states: str, expected: str) -> None:
+def test_states_that_do_not_exist_are_one_line(export, kind, states, expected):
     with raises(EvaluationError, match=f"states: expected {expected}, found '{states}'"):
         export(kind, states)
 
 
-def test_a_pass_without_content_of_a_format_is_one_line(rich_ground: Ground) -> None:
+def test_a_pass_without_content_of_a_format_is_one_line(rich_ground):
     start = 10**18
     empty = define_pass(rich_ground, name="empty", start_utc_ns=start, stop_utc_ns=start + 1, spacecraft_id=SPACECRAFT)
     for kind, message in (
@@ -436,7 +426,7 @@ def test_a_pass_without_content_of_a_format_is_one_line(rich_ground: Ground) -> 
 
 
 @pytest.mark.parametrize("kind", [name for name, one in FORMATS.items() if one.library])
-def test_a_missing_library_is_one_line_with_its_extra(export, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+def test_a_missing_library_is_one_line_with_its_extra(export, monkeypatch, kind):
     usual, chosen = importlib.util.find_spec, FORMATS[kind]
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == chosen.library else usual(name))
     expected = rf"export as {kind}: expected the library {chosen.library}, found none; install linna\[{chosen.extra}\]"
@@ -456,14 +446,14 @@ def linna(rich_ground: Ground, tmp_path: Path, capsys: pytest.CaptureFixture[str
     return export
 
 
-def test_the_command_writes_one_file(linna: Any, tmp_path: Path) -> None:
+def test_the_command_writes_one_file(linna, tmp_path):
     status, text, _ = linna("1 --format oem --json", "pass.oem")
     out = tmp_path / "pass.oem"
     assert (status, json.loads(text)["files"]) == (0, [str(out)])
     assert parse_oem(out.read_text()).segments[0].object_name == "SELENITA"
 
 
-def test_the_command_writes_several_files_into_a_folder_or_a_zip(linna: Any, tmp_path: Path) -> None:
+def test_the_command_writes_several_files_into_a_folder_or_a_zip(linna, tmp_path):
     status, text, _ = linna("1 --format csv --json", "tables")
     assert status == linna("1 --format csv", "tables.zip")[0] == 0
     assert len((tmp_path / "tables/frames.csv").read_text().splitlines()) == 1 + FRAMES
@@ -480,9 +470,7 @@ def test_the_command_writes_several_files_into_a_folder_or_a_zip(linna: Any, tmp
         ("1 --format oem --states paper", "new", "expected reference or anchored"),
     ],
 )
-def test_faults_of_the_command_are_one_line(
-    linna: Any, tmp_path: Path, arguments: str, place: str, message: str
-) -> None:
+def test_faults_of_the_command_are_one_line(linna, tmp_path, arguments, place, message):
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("")
     status, text, errors = linna(arguments, place)
@@ -491,7 +479,7 @@ def test_faults_of_the_command_are_one_line(
     assert not (tmp_path / "new").exists()
 
 
-def test_the_client_lists_formats_and_names_a_fault(rich_ground: Ground, tmp_path: Path) -> None:
+def test_the_client_lists_formats_and_names_a_fault(rich_ground, tmp_path):
     with local_client(open_ground(rich_ground.home), "test") as client:
         assert {"oem", "gpkg", "netcdf"} <= {one.name for one in client.list_export_formats()}
         with raises(ServiceProblem, match=r"expected .*reference"):
@@ -499,7 +487,7 @@ def test_the_client_lists_formats_and_names_a_fault(rich_ground: Ground, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_server_gives_the_file_with_its_name(rich_pass: RichPass, tmp_path: Path) -> None:
+def test_the_server_gives_the_file_with_its_name(rich_pass, tmp_path):
     with TestClient(create_app(Settings(home=tmp_path), inline_jobs=True)) as client:
         ground = client.app.state.ground
         import_archive(ground, rich_pass.folder)
@@ -520,7 +508,7 @@ def area(ring: np.ndarray) -> float:
     return float(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) / 2.0
 
 
-def test_a_line_or_ring_across_the_meridian_is_cut_on_it_and_no_other() -> None:
+def test_a_line_or_ring_across_the_meridian_is_cut_on_it_and_no_other():
     west, east = cut_line(np.array([[178.0, 10.0], [-178.0, 20.0], [-170.0, 20.0]]))
     assert_allclose(west, [[178.0, 10.0], [180.0, 15.0]])
     assert_allclose(east, [[-180.0, 15.0], [-178.0, 20.0], [-170.0, 20.0]])
@@ -541,9 +529,7 @@ RING = np.array([[178.0, 0.0], [178.0, 10.0], [-176.0, 10.0], [-176.0, 0.0]])
     points=st.integers(3, 40),
     backwards=st.booleans(),
 )
-def test_cut_rings_keep_the_area_and_turn_counterclockwise(
-    east: float, north: float, size: float, points: int, backwards: bool
-) -> None:
+def test_cut_rings_keep_the_area_and_turn_counterclockwise(east, north, size, points, backwards):
     angle = np.arange(points) / points * 2.0 * np.pi
     ring = np.column_stack([east + size * np.cos(angle), north + size * np.sin(angle)])
     wrapped = np.column_stack([(ring[:, 0] + 180.0) % 360.0 - 180.0, ring[:, 1]])
@@ -556,14 +542,14 @@ def test_cut_rings_keep_the_area_and_turn_counterclockwise(
 
 
 @pytest.mark.parametrize("pole", [90.0, -90.0])
-def test_a_ring_around_a_pole_is_closed_over_it(pole: float) -> None:
+def test_a_ring_around_a_pole_is_closed_over_it(pole):
     east = np.arange(-170.0, 180.0, 20.0)
     parts = cut_ring(np.column_stack([east, np.full(len(east), np.sign(pole) * 85.0)]))
     assert sum(area(part) for part in parts) == approx(360.0 * 5.0)
     assert any((part[:, 1] == pole).any() for part in parts)
 
 
-def test_gdal_reads_the_geometries_as_written(tmp_path) -> None:
+def test_gdal_reads_the_geometries_as_written(tmp_path):
     rings = cut_ring(RING)
     lines = cut_line(np.array([[178.0, 10.0], [-178.0, 20.0]]))
     layers = (

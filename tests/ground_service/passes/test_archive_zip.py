@@ -27,7 +27,7 @@ def zipped(path: Path, entries: dict[Any, bytes], method: int = zipfile.ZIP_DEFL
     return path
 
 
-def test_a_zipped_archive_is_the_same_pass_as_its_folder(ground: Ground, synthetic_pass: Any) -> None:
+def test_a_zipped_archive_is_the_same_pass_as_its_folder(ground, synthetic_pass):
 
     packed = zip_folder(synthetic_pass.folder)
     try:
@@ -38,29 +38,27 @@ def test_a_zipped_archive_is_the_same_pass_as_its_folder(ground: Ground, synthet
 
 
 @pytest.mark.parametrize("name", ["../evil", "/etc/evil", "a/../../evil", "..\\evil", "C:evil", "a" * 2000])
-def test_paths_that_lead_elsewhere_are_refused(ground: Ground, tmp_path: Path, name: str) -> None:
+def test_paths_that_lead_elsewhere_are_refused(ground, tmp_path, name):
     path = zipped(tmp_path / "bad.zip", {"manifest.json": b"{}", name: b"x"})
     refused(ground, path, "expected a plain file inside the archive")
     assert not list(tmp_path.rglob("evil"))
     assert not list(ground.home.glob(".unpacking-*"))
 
 
-def test_links_are_refused(ground: Ground, tmp_path: Path) -> None:
+def test_links_are_refused(ground, tmp_path):
     entry = zipfile.ZipInfo("link")
     entry.external_attr = (stat.S_IFLNK | 0o777) << 16
     path = zipped(tmp_path / "link.zip", {entry: b"/etc/passwd"})
     refused(ground, path, "expected a plain file inside the archive")
 
 
-def test_a_bomb_is_stopped_before_it_fills_the_disk(ground: Ground, tmp_path: Path) -> None:
+def test_a_bomb_is_stopped_before_it_fills_the_disk(ground, tmp_path):
     path = zipped(tmp_path / "bomb.zip", {"a": b"\0" * (64 << 20)})
     assert path.stat().st_size < 100_000
     refused(ground, path, "octets when unpacked, found 67108864")
 
 
-def test_too_many_files_files_twice_and_no_zip_at_all_are_refused(
-    ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_too_many_files_files_twice_and_no_zip_at_all_are_refused(ground, tmp_path, monkeypatch):
     with pytest.warns(UserWarning, match="Duplicate name"), zipfile.ZipFile(tmp_path / "twice.zip", "w") as archive:
         archive.writestr("a", "1")
         archive.writestr("a", "2")
@@ -87,7 +85,7 @@ def with_directory(folder: Path, entries: int, claimed: int) -> Path:
 
 
 @pytest.mark.parametrize("claimed", [None, 1])
-def test_a_great_directory_is_refused_before_it_is_read(ground: Ground, tmp_path: Path, claimed: int | None) -> None:
+def test_a_great_directory_is_refused_before_it_is_read(ground, tmp_path, claimed):
     """The number of entries is counted in the directory, not taken from the end record."""
     entries = 1_200_000 if claimed is None else 100_000
     path = with_directory(tmp_path, entries, claimed or 0xFFFF)
@@ -99,6 +97,6 @@ def test_a_great_directory_is_refused_before_it_is_read(ground: Ground, tmp_path
         tracemalloc.stop()
 
 
-def test_a_directory_of_too_many_octets_is_refused(ground: Ground, tmp_path: Path) -> None:
+def test_a_directory_of_too_many_octets_is_refused(ground, tmp_path):
     path = with_directory(tmp_path, 200_000, 1)
     refused(ground, path, "expected at most 8388608 octets of its directory")

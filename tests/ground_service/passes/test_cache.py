@@ -51,7 +51,7 @@ def archive(ground: Ground) -> Archive:
     return Archive(ground)
 
 
-def test_an_answer_is_kept_while_data_of_other_intervals_and_vehicles_come(archive: Archive) -> None:
+def test_an_answer_is_kept_while_data_of_other_intervals_and_vehicles_come(archive):
     assert archive.ask() == 1
     archive.telemetry(0, START - 1)
     archive.telemetry(STOP + 1, STOP + 9)
@@ -62,15 +62,13 @@ def test_an_answer_is_kept_while_data_of_other_intervals_and_vehicles_come(archi
 
 
 @pytest.mark.parametrize(("first", "last"), [(0, START), (STOP, STOP + 9), (None, None), (1200, 1300)])
-def test_an_answer_is_made_again_with_new_data_of_its_interval(
-    archive: Archive, first: int | None, last: int | None
-) -> None:
+def test_an_answer_is_made_again_with_new_data_of_its_interval(archive, first, last):
     assert archive.ask() == 1
     archive.telemetry(first, last)
     assert archive.ask() == archive.ask() == 2
 
 
-def test_samples_correlations_decodings_and_other_states_make_an_answer_again(archive: Archive) -> None:
+def test_samples_correlations_decodings_and_other_states_make_an_answer_again(archive):
     """Samples may have other times than their packets."""
     assert archive.ask() == 1
     archive.telemetry(STOP + 5, STOP + 9, first_sample_ticks=STOP)
@@ -85,7 +83,7 @@ def test_samples_correlations_decodings_and_other_states_make_an_answer_again(ar
     assert archive.ask("other") == archive.ask("other") == 6
 
 
-def test_a_gap_in_the_events_or_more_than_are_looked_at_forget_all_answers(archive: Archive) -> None:
+def test_a_gap_in_the_events_or_more_than_are_looked_at_forget_all_answers(archive):
     assert archive.ask() == 1
     archive.telemetry(START, STOP)
     archive.telemetry(0, 1)
@@ -98,7 +96,7 @@ def test_a_gap_in_the_events_or_more_than_are_looked_at_forget_all_answers(archi
     assert archive.ask() == 3
 
 
-def test_an_answer_older_than_a_change_that_is_known_is_not_kept(archive: Archive) -> None:
+def test_an_answer_older_than_a_change_that_is_known_is_not_kept(archive):
     with archive.ground.database.reading() as connection:
         cache = Cache(archive.ground, connection, archive.vehicle)
 
@@ -112,7 +110,7 @@ def test_an_answer_older_than_a_change_that_is_known_is_not_kept(archive: Archiv
     assert archive.ask() == 1
 
 
-def test_an_answer_that_many_need_at_once_is_made_once(archive: Archive) -> None:
+def test_an_answer_that_many_need_at_once_is_made_once(archive):
     begun, go_on = threading.Event(), threading.Event()
     found: list[int] = []
 

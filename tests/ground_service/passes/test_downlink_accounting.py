@@ -38,7 +38,7 @@ FIRST, SECOND = stream(10 * HOUR, 300), stream(20 * HOUR, 90)
 """Two passes; an event is 39 octets or so, a frame holds 28 of them."""
 
 
-def test_two_passes_in_one_file_are_told_apart() -> None:
+def test_two_passes_in_one_file_are_told_apart():
     one, two = both(FIRST + SECOND)
     assert (one.frames, two.frames) == (len(FIRST) // CADU, len(SECOND) // CADU)
     assert (one.octets, two.octets) == (len(FIRST), len(SECOND))
@@ -47,7 +47,7 @@ def test_two_passes_in_one_file_are_told_apart() -> None:
     assert read_raw(FIRST + SECOND, SPACECRAFT).span == (10 * HOUR, 20 * HOUR + (89 << 16))
 
 
-def test_frames_that_cannot_be_used_lie_where_their_neighbours_lie() -> None:
+def test_frames_that_cannot_be_used_lie_where_their_neighbours_lie():
     octets = bytearray(FIRST + SECOND)
     middle = 3 * CADU
     octets[middle + 50 : middle + 400] = bytes(350)  # beyond repair, in the first pass
@@ -58,7 +58,7 @@ def test_frames_that_cannot_be_used_lie_where_their_neighbours_lie() -> None:
     assert one.octets == len(FIRST) and two.octets == len(SECOND)
 
 
-def test_octets_between_frames_are_skipped_octets_of_the_frame_before() -> None:
+def test_octets_between_frames_are_skipped_octets_of_the_frame_before():
     octets = FIRST[: 2 * CADU] + bytes(777) + FIRST[2 * CADU :] + SECOND
     one, two = both(octets)
     assert one.octets_skipped == 777 and one.octets == len(FIRST) + 777
@@ -66,13 +66,13 @@ def test_octets_between_frames_are_skipped_octets_of_the_frame_before() -> None:
     assert found(octets, hours=(10, 11)).octets_skipped == 777
 
 
-def test_a_packet_that_came_twice_is_a_duplicate_of_its_process_in_its_pass() -> None:
+def test_a_packet_that_came_twice_is_a_duplicate_of_its_process_in_its_pass():
     again = encode_cadus([event(10 * HOUR, 0), event(10 * HOUR + (5 << 16), 5)], spacecraft_id=SPACECRAFT)
     three = [one.duplicates[EVENTS] for one in (*both(FIRST, again, SECOND), found(FIRST))]
     assert three == [2, 0, 0]
 
 
-def test_a_packet_put_together_from_parts_leaves_no_octets_unused() -> None:
+def test_a_packet_put_together_from_parts_leaves_no_octets_unused():
     """Two frames are exchanged: the packets across their borders are put together, and none of their octets is left."""
     octets = FIRST[: 2 * CADU] + FIRST[3 * CADU : 4 * CADU] + FIRST[2 * CADU : 3 * CADU] + FIRST[4 * CADU :]
     # The packets put together stand in no frame: they give none of another pass their time.
@@ -82,7 +82,7 @@ def test_a_packet_put_together_from_parts_leaves_no_octets_unused() -> None:
     assert two.frames == len(SECOND) // CADU
 
 
-def test_packets_with_a_wrong_checksum_are_counted_by_process() -> None:
+def test_packets_with_a_wrong_checksum_are_counted_by_process():
     good = [event(10 * HOUR + (k << 16), k) for k in range(5)]
     bad = bytearray(good[2])
     bad[-5] ^= 1
@@ -90,20 +90,20 @@ def test_packets_with_a_wrong_checksum_are_counted_by_process() -> None:
     assert (one.crc_errors, one.duplicates, one.frames) == ({EVENTS: 1}, {EVENTS: 0}, None)
 
 
-def test_frames_of_another_spacecraft_are_left_out() -> None:
+def test_frames_of_another_spacecraft_are_left_out():
     other = encode_cadus([event(10 * HOUR + (k << 16), k) for k in range(60)], spacecraft_id=5)
     one = found(FIRST + other)
     assert (one.frames, one.frames_bad) == (len(FIRST) // CADU, 0)
 
 
-def test_a_file_without_a_readable_packet_belongs_to_no_pass() -> None:
+def test_a_file_without_a_readable_packet_belongs_to_no_pass():
     noise = np.random.default_rng(1).integers(0, 256, 5000, dtype=np.uint8).tobytes()
     assert read_raw(noise, SPACECRAFT).span is None
     always = (0, 1 << 20)
     assert found(noise, hours=always).octets_skipped == 0 and found(hours=always).frames is None
 
 
-def test_a_pass_of_one_frame_at_the_start_of_a_file_has_its_own_time() -> None:
+def test_a_pass_of_one_frame_at_the_start_of_a_file_has_its_own_time():
     short = stream(10 * HOUR, 20)
     assert len(short) == CADU
     one = found(short + SECOND, hours=(10, 11))

@@ -83,7 +83,7 @@ def names(ground: Ground, **filters: Any) -> list[str]:
     return [one.name for one in page.items]
 
 
-def test_events_of_all_passes_are_listed_newest_first_with_their_pass(passed: Ground) -> None:
+def test_events_of_all_passes_are_listed_newest_first_with_their_pass(passed):
     page = service.spacecraft_events(passed, EventFilter(spacecraft_id=76))
     found = page.items
     assert page.total == 4
@@ -97,7 +97,7 @@ def test_events_of_all_passes_are_listed_newest_first_with_their_pass(passed: Gr
     assert found[0].detail == service.list_events(passed, 2, Paging(limit=1)).items[0].detail != ""
 
 
-def test_events_are_filtered_by_severity_name_and_time(passed: Ground) -> None:
+def test_events_are_filtered_by_severity_name_and_time(passed):
     assert names(passed, severity=["medium", "high"]) == ["image_dark", "camera_fault"]
     assert names(passed, name="Mode chan") == ["mode_changed", "mode_changed"]
     assert names(passed, name="nothing of the kind") == []
@@ -110,14 +110,14 @@ def test_events_are_filtered_by_severity_name_and_time(passed: Ground) -> None:
     assert names(passed, severity=["info"], limit=1) == ["mode_changed"]
 
 
-def test_events_and_parameters_of_an_unknown_spacecraft_are_not_found(ground: Ground) -> None:
+def test_events_and_parameters_of_an_unknown_spacecraft_are_not_found(ground):
     with pytest.raises(NotFound, match="spacecraft 5"):
         service.spacecraft_events(ground, EventFilter(spacecraft_id=5))
     with pytest.raises(NotFound, match="spacecraft 5"):
         live_parameters(ground, 5, "flight")
 
 
-def test_the_craters_of_a_pass_are_listed_the_largest_first(ground: Ground, synthetic_pass: Any) -> None:
+def test_the_craters_of_a_pass_are_listed_the_largest_first(ground, synthetic_pass):
     pass_id = import_archive(ground, synthetic_pass.folder)
     catalogue = load_catalogue(synthetic_pass.folder / "catalogue.csv")
     page = service.craters(ground, pass_id, Paging(limit=1000))
@@ -129,7 +129,7 @@ def test_the_craters_of_a_pass_are_listed_the_largest_first(ground: Ground, synt
     assert service.craters(ground, pass_id, Paging(limit=2, offset=1)).items == found[1:3]
 
 
-def test_a_pass_without_a_catalogue_has_no_craters(passed: Ground) -> None:
+def test_a_pass_without_a_catalogue_has_no_craters(passed):
     assert service.craters(passed, 1, Paging(limit=10)).total == 0
 
 
@@ -141,7 +141,7 @@ def receive(ground: Ground, tmp_path: Path, second: int, **values: float) -> Non
     ingest_file(ground, file)
 
 
-def test_the_newest_packet_by_on_board_time_counts(either: Ground, tmp_path: Path) -> None:
+def test_the_newest_packet_by_on_board_time_counts(either, tmp_path):
     receive(either, tmp_path, 10, temperature_c=70.25, bus_voltage_v=12.0, mode=2, model_hash=0xDF7F5779)
     receive(either, tmp_path, 5, temperature_c=20.0)  # arrives later, and is older
     found = {one.name: one for one in live_parameters(either, 76, "flight")}
@@ -159,8 +159,8 @@ def test_the_newest_packet_by_on_board_time_counts(either: Ground, tmp_path: Pat
 
 @pytest.mark.parametrize(("later_s", "age_s"), [(42.5, 42.5), (-1e8, 0.0)])
 def test_ages_are_those_of_mission_time_and_count_from_the_newest_packet_where_that_is_later(
-    ground: Ground, tmp_path: Path, later_s: float, age_s: float
-) -> None:
+    ground, tmp_path, later_s, age_s
+):
     receive(ground, tmp_path, 0)
     now = utc_ns(0) + round(later_s * 1e9)
     set_mission_clock(lambda: now)
@@ -170,16 +170,14 @@ def test_ages_are_those_of_mission_time_and_count_from_the_newest_packet_where_t
         set_mission_clock(None)
 
 
-def test_a_mistyped_spacecraft_is_listed_until_its_telecommand_is_rejected(either: Ground) -> None:
+def test_a_mistyped_spacecraft_is_listed_until_its_telecommand_is_rejected(either):
     command = enter_command(either, "test_connection", {}, spacecraft_id=67, actor="ann")
     assert [one.spacecraft_id for one in list_spacecraft(either)] == [67]
     reject_command(either, command, actor="ann", reason="mistyped")
     assert list_spacecraft(either) == []
 
 
-def test_a_parameter_of_a_further_structure_has_a_series_a_live_value_an_alarm_and_a_drawing(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_parameter_of_a_further_structure_has_a_series_a_live_value_an_alarm_and_a_drawing(ground, monkeypatch):
     values = [10.0, 61.25, 20.0]
     name, packets = "camera_temperature_c", []
     for k, value in enumerate(values):
@@ -234,7 +232,7 @@ def day_pass(ground: Ground, day: int) -> int:
     return defined(ground, start, start + 10 * FRAMES * NS)
 
 
-def test_bursts_of_yesterday_in_todays_stream_fall_into_their_own_day(ground: Ground, tmp_path: Path) -> None:
+def test_bursts_of_yesterday_in_todays_stream_fall_into_their_own_day(ground, tmp_path):
     rng = random.Random(1)
     today, yesterday = housekeeping(0), housekeeping(-1)
     stream: list[bytes] = []
@@ -250,9 +248,7 @@ def test_bursts_of_yesterday_in_todays_stream_fall_into_their_own_day(ground: Gr
 
 
 @pytest.mark.parametrize(("share", "covered"), [(0.0, False), (0.5, True)])
-def test_a_reference_that_does_not_cover_gives_figures_where_it_does(
-    ground: Ground, synthetic_pass: Any, tmp_path: Path, share: float, covered: bool
-) -> None:
+def test_a_reference_that_does_not_cover_gives_figures_where_it_does(ground, synthetic_pass, tmp_path, share, covered):
     whole = load_ephemeris(synthetic_pass.folder / "reference.oem")
     first, last = int(synthetic_pass.utc_ns[0]), int(synthetic_pass.utc_ns[-1])
     stop = first + int(share * (last - first))
@@ -296,7 +292,7 @@ def listed(ground: Ground, **terms: Any) -> tuple[list[int], int]:
     return sorted(one.id for one in page.items), page.total
 
 
-def test_passes_are_listed_by_the_verdict_of_their_newest_report(either: Ground) -> None:
+def test_passes_are_listed_by_the_verdict_of_their_newest_report(either):
     for hour in range(3):
         start = (1_900_000_000 + 3600 * hour) * NS
         defined(either, start, start + 60 * NS, f"pass {hour}")
@@ -310,7 +306,7 @@ def test_passes_are_listed_by_the_verdict_of_their_newest_report(either: Ground)
     assert listed(either) == ([1, 2, 3], 3)
 
 
-def test_the_interval_of_a_pass_takes_time_in_proportion_to_its_starts(ground: Ground, tmp_path: Path) -> None:
+def test_the_interval_of_a_pass_takes_time_in_proportion_to_its_starts(ground, tmp_path):
     file = tmp_path / "starts.packets"
     file.write_bytes(b"".join(event_packet(TICKS + 65_536 * k, k, "observation_started") for k in range(4_000)))
     ingest_file(ground, file, spacecraft_id=76)

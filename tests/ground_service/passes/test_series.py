@@ -40,7 +40,7 @@ from ground_service.telemetry.writing import store_samples
 from lunar.frames import IauOrientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.messages.oem import load_oem
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
-from tests.ground_service.conftest import NS, SPACECRAFT, SyntheticPass, define_pass_of, encode_downlink, enter_files
+from tests.ground_service.conftest import NS, SPACECRAFT, define_pass_of, encode_downlink, enter_files
 from tests.lazy import Lazy
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
@@ -118,8 +118,8 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("coarse", [0, 10**9], ids=["samples", "roll-ups"])
 @pytest.mark.parametrize(("skip", "drop"), [(0, 0), (333, 200)])
 def test_a_series_of_samples_or_roll_ups_holds_every_sample_once_and_is_as_fine_as_asked_for(
-    ground: Ground, columns, vehicle: int, skip: int, drop: int, coarse: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    ground, columns, vehicle, skip, drop, coarse, monkeypatch
+):
     monkeypatch.setattr(series, "COARSE", coarse)
     start, stop = int(columns["ticks"][skip]), int(columns["ticks"][-1 - drop])
     mine = (columns["estimator"] == 1) & (columns["ticks"] >= start) & (columns["ticks"] <= stop)
@@ -142,7 +142,7 @@ def test_a_series_of_samples_or_roll_ups_holds_every_sample_once_and_is_as_fine_
 
 
 @pytest.mark.usefixtures("few")
-def test_silences_are_marked(ground: Ground, vehicle: int) -> None:
+def test_silences_are_marked(ground, vehicle):
     found = read(ground, (vehicle, *ALWAYS), points=2000).buckets
     after = np.flatnonzero(found.after_gap)
     silence_s = (found.start_utc_ns[after] - found.stop_utc_ns[after - 1]) / 1e9
@@ -150,7 +150,7 @@ def test_silences_are_marked(ground: Ground, vehicle: int) -> None:
 
 
 @pytest.mark.usefixtures("vehicle")
-def test_late_data_and_split_batches_give_the_same_roll_ups(ground: Ground, columns, tmp_path: Any) -> None:
+def test_late_data_and_split_batches_give_the_same_roll_ups(ground, columns, tmp_path):
     order = np.random.default_rng(5).permutation(COUNT)
     with open_ground(tmp_path / "other") as other:
         stored(other, columns, np.array_split(order, 7))
@@ -162,14 +162,14 @@ def test_late_data_and_split_batches_give_the_same_roll_ups(ground: Ground, colu
     assert np.array_equal(statistics.reshape(-1, 4)[:, [0, 2, 3]], expected.reshape(-1, 4)[:, [0, 2, 3]])
 
 
-def test_every_value_of_a_kind_is_rolled_up() -> None:
+def test_every_value_of_a_kind_is_rolled_up():
     assert len(HOUSEKEEPING_VALUES) == 23
     assert (HOUSEKEEPING_VALUES[0], HOUSEKEEPING_VALUES[-1]) == ("boot_count", "watchdog_resets")
     assert (STATE_VALUES[0], STATE_VALUES[-1], len(STATE_VALUES)) == ("latitude_deg", "matched", 11)
     assert BASE_TICKS == 64 * SECOND
 
 
-def test_trends_of_a_spacecraft_need_no_pass(ground: Ground, synthetic_pass: Any) -> None:
+def test_trends_of_a_spacecraft_need_no_pass(ground, synthetic_pass):
     ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
     found = trend_series(ground, 76, "flight", "temperature_c", 10)
     assert found.samples == 40
@@ -177,7 +177,7 @@ def test_trends_of_a_spacecraft_need_no_pass(ground: Ground, synthetic_pass: Any
     assert found.buckets.high.max() == approx(23.9)
 
 
-def test_few_texts_of_the_query_for_buckets_find_any_number_of_them(ground: Ground, vehicle: int) -> None:
+def test_few_texts_of_the_query_for_buckets_find_any_number_of_them(ground, vehicle):
     """Each text is kept by the program and by the server, so their number must not grow with the numbers of buckets."""
     texts: set[str] = set()
     event.listen(ground.database.engine, "before_cursor_execute", lambda *given: texts.add(given[2]))
@@ -196,7 +196,7 @@ def test_few_texts_of_the_query_for_buckets_find_any_number_of_them(ground: Grou
     assert len(texts) == 4, "for 4, 8, 16 and 32 buckets"
 
 
-def test_a_misspelled_parameter_is_refused_with_the_nearest_one(ground: Ground) -> None:
+def test_a_misspelled_parameter_is_refused_with_the_nearest_one(ground):
     span = PassSpan(1, FIRST, FIRST + SECOND, (), DICTIONARY.version)
     with raises(NotFound, match=r"parameter temprature_c \(nearest: temperature_c\): not found"):
         ground.read(series_source, span, "temprature_c")
@@ -272,9 +272,7 @@ def states_of(ground: Ground, pass_id: int) -> Any:
         return filter_states(connection, pass_span(connection, get_pass(connection, pass_id)))
 
 
-def test_estimates_of_either_version_are_stored_with_covariance_and_degrees(
-    flown: tuple[Path, Any, int], ground: Ground
-) -> None:
+def test_estimates_of_either_version_are_stored_with_covariance_and_degrees(flown, ground):
     path, made, version = flown
     ingest_file(ground, path)
     found = states_of(ground, define_pass_of(ground, made))
@@ -287,7 +285,7 @@ def test_estimates_of_either_version_are_stored_with_covariance_and_degrees(
     assert versions(ground) == {DICTIONARY.version}
 
 
-def test_what_version_2_decoded_is_decoded_again_to_the_same_states(ground: Ground, make_pass: Any) -> None:
+def test_what_version_2_decoded_is_decoded_again_to_the_same_states(ground, make_pass):
     made = make_pass(frames=8, seed=3)
     octets = b"".join(anchored_packets(made, 2))
     with ground.database.writing() as connection:
@@ -305,7 +303,7 @@ def test_what_version_2_decoded_is_decoded_again_to_the_same_states(ground: Grou
     assert versions(ground) == {2, DICTIONARY.version}
 
 
-def test_the_report_weighs_errors_with_the_whole_covariance(flown: tuple[Path, Any, int], ground: Ground) -> None:
+def test_the_report_weighs_errors_with_the_whole_covariance(flown, ground):
     _, made, version = flown
     series = reported(ground, made, anchored_packets(made, version))
     # A hundredth of the error: the reference is interpolated, and places are reported on the sphere.
@@ -315,7 +313,7 @@ def test_the_report_weighs_errors_with_the_whole_covariance(flown: tuple[Path, A
     assert series.nis_dof.tolist() == [24] * 8
 
 
-def test_sigmas_alone_give_a_sum_of_another_name(ground: Ground, make_pass: Any) -> None:
+def test_sigmas_alone_give_a_sum_of_another_name(ground, make_pass):
     made = make_pass(frames=8, seed=3)
     series = reported(ground, made, anchored_packets(made, 3)[1::2])
     assert series.nees is None
@@ -368,7 +366,7 @@ def decoded(png: bytes, how: int) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(png, np.uint8), how)
 
 
-def test_complete_thumbnails_are_listed_at_the_time_of_their_frame(ground: Ground, receive) -> None:
+def test_complete_thumbnails_are_listed_at_the_time_of_their_frame(ground, receive):
     first, octets = thumbnail(1, TICKS)
     second, others = thumbnail(2, TICKS + 15 * SECOND)
     _, incomplete = thumbnail(3, TICKS + 30 * SECOND)
@@ -394,7 +392,7 @@ def test_complete_thumbnails_are_listed_at_the_time_of_their_frame(ground: Groun
         images(ground, stop=START + 32 * 24 * HOUR_NS)
 
 
-def test_frames_of_an_archive_are_listed_and_read(ground: Ground, synthetic_pass: SyntheticPass) -> None:
+def test_frames_of_an_archive_are_listed_and_read(ground, synthetic_pass):
     pass_id = import_archive(ground, synthetic_pass.folder)
     _, png = cv2.imencode(".png", np.full((1024, 1024), 77, np.uint8))
     stored = ground.files.put_octets(png.tobytes())
@@ -434,7 +432,7 @@ def detection(frame_number: int, ticks: int, count: int = 1) -> bytes:
     return DICTIONARY.pack("detections", frame, ticks=ticks + 100, sequence_count=frame_number)
 
 
-def test_detections_are_drawn_on_an_enlarged_thumbnail_of_a_known_camera(ground: Ground, receive) -> None:
+def test_detections_are_drawn_on_an_enlarged_thumbnail_of_a_known_camera(ground, receive):
     made, octets = thumbnail(1, TICKS)  # 12 by 8: one pixel for 8 by 8 of the camera
     later = TICKS + 600 * SECOND
     others = large_data(thumbnail(2, TICKS + 15 * SECOND)[1], 2, later + 200)
@@ -457,7 +455,7 @@ def test_detections_are_drawn_on_an_enlarged_thumbnail_of_a_known_camera(ground:
     assert_array_equal(drawn[::43, ::43, 0][:2], made.levels[:2])  # far from the circle
 
 
-def test_a_thumbnail_of_a_dark_frame_is_enlarged_without_circles(ground: Ground, receive) -> None:
+def test_a_thumbnail_of_a_dark_frame_is_enlarged_without_circles(ground, receive):
     add_mission(ground, MISSION.encode(), actor="ann")
     made, octets = thumbnail(1, TICKS)
     receive(detection(1, TICKS, count=0), *large_data(octets, 1, TICKS + SECOND))
@@ -466,9 +464,7 @@ def test_a_thumbnail_of_a_dark_frame_is_enlarged_without_circles(ground: Ground,
     assert_array_equal(picture(ground)[::43, ::43, 0], made.levels)
 
 
-def test_states_of_each_estimator_are_parameters_of_the_spacecraft(
-    ground: Ground, synthetic_pass: SyntheticPass
-) -> None:
+def test_states_of_each_estimator_are_parameters_of_the_spacecraft(ground, synthetic_pass):
     import_archive(ground, synthetic_pass.folder)
     (one,) = list_spacecraft(ground)
     listed = {found.name: found for found in spacecraft_parameters(ground, SPACECRAFT, one.instance)}

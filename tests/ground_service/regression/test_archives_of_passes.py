@@ -70,7 +70,7 @@ def flown(make_flyable: Callable[..., FlyablePass]) -> FlyablePass:
     return make_flyable(frames=4, seed=5)
 
 
-def test_a_kept_archive_is_found_by_its_pass(either: Ground, archive: SyntheticPass) -> None:
+def test_a_kept_archive_is_found_by_its_pass(either, archive):
     _, digest = read_manifest(archive.folder)
     record = ArchiveRecord(
         digest=digest, name="", frames=4, frames_stored=4, state="complete", reason="", octets=1, pinned=True,
@@ -86,7 +86,7 @@ def test_a_kept_archive_is_found_by_its_pass(either: Ground, archive: SyntheticP
             regress._kept(service, ["99"])
 
 
-def test_an_imported_pass_is_kept_without_a_request(either: Ground, flown: FlyablePass) -> None:
+def test_an_imported_pass_is_kept_without_a_request(either, flown):
     pass_id = import_archive(either, flown.folder)
     _, digest = read_manifest(flown.folder)
     assert keep_pass(either, pass_id).digest == digest
@@ -99,15 +99,13 @@ def test_an_imported_pass_is_kept_without_a_request(either: Ground, flown: Flyab
     assert compared(either, given)["archives"] == [digest]
 
 
-def test_an_archive_without_inputs_of_the_payload_is_telemetry_only(ground: Ground, archive: SyntheticPass) -> None:
+def test_an_archive_without_inputs_of_the_payload_is_telemetry_only(ground, archive):
     pass_id = import_archive(ground, archive.folder)
     [kept] = kept_archives(ground)
     assert (kept.pass_id, kept.state, kept.reason) == (pass_id, "telemetry only", NO_INPUTS)
 
 
-def test_images_that_the_ground_did_not_store_are_left_out(
-    ground: Ground, flown: FlyablePass, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_images_that_the_ground_did_not_store_are_left_out(ground, flown, tmp_path, monkeypatch):
     folder = shutil.copytree(flown.folder, tmp_path / "pass")
     for number in range(4):
         image = Image.fromarray(np.full((512, 512), 90 + number, np.uint8))
@@ -121,9 +119,7 @@ def test_images_that_the_ground_did_not_store_are_left_out(
     assert kept.digest == read_manifest(folder)[1]
 
 
-def test_a_live_pass_keeps_its_received_data_and_is_replaced_by_late_data(
-    either: Ground, archive: SyntheticPass, tmp_path: Path
-) -> None:
+def test_a_live_pass_keeps_its_received_data_and_is_replaced_by_late_data(either, archive, tmp_path):
     half = len(archive.packets) // 2
     for number, packets in enumerate((archive.packets[:half], archive.packets)):
         file = tmp_path / f"{number}.cadu"
@@ -144,7 +140,7 @@ def test_a_live_pass_keeps_its_received_data_and_is_replaced_by_late_data(
     assert missing_replays(either, arguments) == []
 
 
-def test_a_pass_without_telemetry_has_no_archive(ground: Ground) -> None:
+def test_a_pass_without_telemetry_has_no_archive(ground):
     pass_id = live_pass(ground)
     with raises(InvalidInput, match=f"pass {pass_id}: expected received telemetry, found none"):
         keep_pass(ground, pass_id)
@@ -173,8 +169,8 @@ def render_whole(flown: FlyablePass, monkeypatch: pytest.MonkeyPatch) -> Callabl
 
 
 def test_frames_that_cannot_be_rendered_leave_telemetry_only_with_the_reason(
-    either: Ground, unrendered: Path, flown: FlyablePass, make_build: Callable, tmp_path: Path
-) -> None:
+    either, unrendered, flown, make_build, tmp_path
+):
     digest = keep_archive(either, unrendered).digest
     [kept] = kept_archives(either)
     assert (kept.frames, kept.frames_stored, kept.state, kept.reason) == (4, 2, "to render", "")
@@ -199,9 +195,7 @@ def test_frames_that_cannot_be_rendered_leave_telemetry_only_with_the_reason(
     assert all(len(row["u_px"]) == len(row["sigma_px"]) > 0 for row in rows)
 
 
-def test_a_pass_without_frames_does_not_change_the_verdict_on_the_others(
-    ground: Ground, unrendered: Path, make_flyable: Callable, make_build: Callable
-) -> None:
+def test_a_pass_without_frames_does_not_change_the_verdict_on_the_others(ground, unrendered, make_flyable, make_build):
     whole = make_flyable(frames=30, seed=41)
     build = good(ground, make_build, {"synthetic pass 41": whole.packets})
     outcome = run_regression(ground, [whole.folder, unrendered], build, build, load_policy())
@@ -224,14 +218,8 @@ def test_a_pass_without_frames_does_not_change_the_verdict_on_the_others(
     ],
 )
 def test_a_renderer_that_fails_without_a_refusal_leaves_the_archive_to_render(
-    ground: Ground,
-    unrendered: Path,
-    make_build: Callable,
-    monkeypatch: pytest.MonkeyPatch,
-    words: tuple[str, ...],
-    limit: dict[str, int],
-    found: str,
-) -> None:
+    ground, unrendered, make_build, monkeypatch, words, limit, found
+):
     """The renderer exceeds its time, fails, or lacks declared data; the pass is unusable in this verdict only."""
     asked = rendering.RENDERING
     monkeypatch.setattr(
@@ -247,7 +235,7 @@ def test_a_renderer_that_fails_without_a_refusal_leaves_the_archive_to_render(
     assert (kept.state, kept.reason) == ("to render", "")
 
 
-def test_only_a_message_of_the_renderer_itself_is_a_refusal() -> None:
+def test_only_a_message_of_the_renderer_itself_is_a_refusal():
     told = "archive: expected pixels with SHA-256 0, found 1"
     error = f"linna: error: {told}"
     assert rendering._refusal(2, f"progress\n{error}\n") == told
@@ -257,9 +245,7 @@ def test_only_a_message_of_the_renderer_itself_is_a_refusal() -> None:
         assert rendering._refusal(*given) == "", given
 
 
-def test_the_renderer_sees_neither_the_archive_of_the_service_nor_a_network(
-    ground: Ground, unrendered: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_renderer_sees_neither_the_archive_of_the_service_nor_a_network(ground, unrendered, monkeypatch):
     probe = (
         f"import os; seen = os.path.exists({str(ground.home)!r}), os.path.exists('/archive/manifest.json'); "
         "print('linna: error: sees', *seen, len(open('/proc/net/dev').readlines()) - 2); exit(2)"
@@ -270,9 +256,7 @@ def test_the_renderer_sees_neither_the_archive_of_the_service_nor_a_network(
     assert kept.reason == "the frames cannot be rendered: sees False True 1"
 
 
-def test_an_archive_that_cannot_be_rendered_is_settled_once(
-    ground: Ground, unrendered: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_archive_that_cannot_be_rendered_is_settled_once(ground, unrendered, monkeypatch):
     (unrendered / "downlink.cadu").unlink()
     enter_files(unrendered)
     first = rendering.settle_archive(ground, keep_archive(ground, unrendered).digest)
@@ -282,7 +266,7 @@ def test_an_archive_that_cannot_be_rendered_is_settled_once(
     assert rendering.settle_archive(ground, first.digest) == first
 
 
-def test_an_unchanged_archive_keeps_its_replays(ground: Ground, unrendered: Path, make_build: Callable) -> None:
+def test_an_unchanged_archive_keeps_its_replays(ground, unrendered, make_build):
     digest = keep_archive(ground, unrendered).digest
     rendering.settle_archive(ground, digest)
     build = good(ground, make_build, {})
@@ -294,13 +278,8 @@ def test_an_unchanged_archive_keeps_its_replays(ground: Ground, unrendered: Path
 
 
 def test_a_replay_of_an_archive_that_is_completed_meanwhile_is_done_again(
-    either: Ground,
-    unrendered: Path,
-    flown: FlyablePass,
-    make_build: Callable,
-    render_whole: Callable,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    either, unrendered, flown, make_build, render_whole, monkeypatch
+):
     digest = keep_archive(either, unrendered).digest
     assert rendering.settle_archive(either, digest).state == "telemetry only"
     render_whole()
@@ -321,9 +300,7 @@ def test_a_replay_of_an_archive_that_is_completed_meanwhile_is_done_again(
     assert kept.outcome == "ok"
 
 
-def test_detections_besides_all_frames_are_refused_and_not_given_to_a_build(
-    ground: Ground, flown: FlyablePass, tmp_path: Path
-) -> None:
+def test_detections_besides_all_frames_are_refused_and_not_given_to_a_build(ground, flown, tmp_path):
     folder = shutil.copytree(flown.folder, tmp_path / "pass")
     (folder / "payload/detections.jsonl").write_text("")
     enter_files(folder)
@@ -339,7 +316,7 @@ def test_detections_besides_all_frames_are_refused_and_not_given_to_a_build(
     assert not (tmp_path / "partial/frames").exists()
 
 
-def test_a_placebo_sees_images_with_noise_of_its_seed_and_their_hashes(flown: FlyablePass, tmp_path: Path) -> None:
+def test_a_placebo_sees_images_with_noise_of_its_seed_and_their_hashes(flown, tmp_path):
     images, hashes = [], []
     for k, seed in enumerate((5, 5, 6)):
         view = tmp_path / str(k)
@@ -355,9 +332,7 @@ def test_a_placebo_sees_images_with_noise_of_its_seed_and_their_hashes(flown: Fl
     assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 0.01
 
 
-def test_archives_of_one_regression_are_rendered_at_the_same_time(
-    ground: Ground, make_flyable: Callable, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_archives_of_one_regression_are_rendered_at_the_same_time(ground, make_flyable, monkeypatch):
     digests = [keep_archive(ground, make_flyable(frames=4, seed=seed).folder).digest for seed in (1, 2)]
     both, settle = threading.Barrier(2, timeout=900.0), service.settle_archive
 
@@ -372,7 +347,7 @@ def test_archives_of_one_regression_are_rendered_at_the_same_time(
     assert [one.detail for one in outcome.passes] == 2 * ["it was not flown"]
 
 
-def test_data_products_that_are_mounted_later_are_noticed(tmp_path: Path) -> None:
+def test_data_products_that_are_mounted_later_are_noticed(tmp_path):
     listed = tmp_path / "data/craters/lu1319381.csv"
     (tmp_path / "data").mkdir()
     with open_ground(tmp_path / "home", find_data(tmp_path / "data")) as ground:
@@ -383,8 +358,8 @@ def test_data_products_that_are_mounted_later_are_noticed(tmp_path: Path) -> Non
 
 
 def test_files_are_removed_after_the_commit_and_only_if_all_kept_archives_are_known(
-    either: Ground, flown: FlyablePass, unrendered: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    either, flown, unrendered, monkeypatch
+):
     log = MagicMock()
     monkeypatch.setattr("ground_service.regression.archives._log", log)
     first, second = keep_archive(either, flown.folder), keep_archive(either, unrendered, pinned=True)
@@ -412,7 +387,7 @@ def test_files_are_removed_after_the_commit_and_only_if_all_kept_archives_are_kn
     assert keep_archive(either, unrendered).digest == second.digest
 
 
-def test_an_archive_is_rendered_again_on_request(ground: Ground, unrendered: Path, render_whole: Callable) -> None:
+def test_an_archive_is_rendered_again_on_request(ground, unrendered, render_whole):
     digest = keep_archive(ground, unrendered).digest
     assert rendering.settle_archive(ground, digest).state == "telemetry only"
     render_whole()
@@ -423,7 +398,7 @@ def test_an_archive_is_rendered_again_on_request(ground: Ground, unrendered: Pat
     assert [one.state for one in kept_archives(ground)] == ["complete"]
 
 
-def test_an_archive_of_an_older_version_asks_for_another_import(ground: Ground, archive: SyntheticPass) -> None:
+def test_an_archive_of_an_older_version_asks_for_another_import(ground, archive):
     pass_id = import_archive(ground, archive.folder)
     ground.files.path(read_manifest(archive.folder)[1]).unlink()
     with raises(InvalidInput, match="import the archive again"):
@@ -432,7 +407,7 @@ def test_an_archive_of_an_older_version_asks_for_another_import(ground: Ground, 
     assert keep_pass(ground, pass_id).pass_id == pass_id
 
 
-def test_the_operations_keep_and_render_the_archive_of_a_pass(ground: Ground, flown: FlyablePass) -> None:
+def test_the_operations_keep_and_render_the_archive_of_a_pass(ground, flown):
     pass_id = import_archive(ground, flown.folder)
     with local_client(ground, "ann") as service:
         kept = service.keep_pass_archive(pass_id, pinned=True)

@@ -16,7 +16,6 @@ import pytest
 from pytest import raises
 
 from ground_service.errors import BuildNotChecked, InvalidInput
-from ground_service.ground import Ground
 from ground_service.http.model import Paging, UtcTime
 from ground_service.regression import builds
 from ground_service.regression import sandbox as host
@@ -44,7 +43,7 @@ def fly(make_build: Callable, archive: Path, tmp_path: Path) -> Callable[..., Bu
     return run
 
 
-def test_a_program_that_ends_well_leaves_a_downlink_and_its_costs(fly, tmp_path: Path) -> None:
+def test_a_program_that_ends_well_leaves_a_downlink_and_its_costs(fly, tmp_path):
     run = fly("pathlib.Path(sys.argv[2], 'downlink.packets').write_bytes(b'abc')\nx = [0] * 4_000_000")
     assert (run.outcome, run.detail) == ("ok", "")
     assert run.downlink == tmp_path / "out" / "downlink.packets"
@@ -55,7 +54,7 @@ def test_a_program_that_ends_well_leaves_a_downlink_and_its_costs(fly, tmp_path:
     assert not (tmp_path / "out" / ".run").exists()
 
 
-def test_builds_do_not_run_without_bubblewrap(fly, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_builds_do_not_run_without_bubblewrap(fly, monkeypatch):
     monkeypatch.setattr(host.shutil, "which", lambda name: None)
     host.protection.cache_clear()
     run = fly("pathlib.Path(sys.argv[2], 'downlink.packets').write_bytes(b'abc')")
@@ -63,14 +62,14 @@ def test_builds_do_not_run_without_bubblewrap(fly, monkeypatch: pytest.MonkeyPat
     assert run.detail.startswith("expected the program bwrap (Debian package bubblewrap), found none; remedy: ")
 
 
-def test_a_refusal_has_a_reason_if_python_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refusal_has_a_reason_if_python_says_nothing(monkeypatch):
     host.protection.cache_clear()
     monkeypatch.setattr(host, "execute", lambda run: {"exit_status": 1})
     with raises(host.SandboxRefused, match="Python does not run in the sandbox: no text, exit status 1"):
         host.protection()
 
 
-def test_builds_run_where_python_is_installed_below_tmp() -> None:
+def test_builds_run_where_python_is_installed_below_tmp():
     with tempfile.TemporaryDirectory(dir="/tmp") as name:
         Path(name).chmod(0o755)
         venv.create(name)
@@ -80,7 +79,7 @@ def test_builds_run_where_python_is_installed_below_tmp() -> None:
     assert said.stdout.startswith("bubblewrap, private root, user ")
 
 
-def test_the_processor_time_of_ended_processes_counts(fly) -> None:
+def test_the_processor_time_of_ended_processes_counts(fly):
     run = fly(
         "for _ in range(3):\n"
         "    if os.fork() == 0:\n"
@@ -92,7 +91,7 @@ def test_the_processor_time_of_ended_processes_counts(fly) -> None:
     assert 0.29 < run.cpu_s < 3.0
 
 
-def test_a_program_that_makes_too_many_files_is_stopped(fly, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_that_makes_too_many_files_is_stopped(fly, monkeypatch):
     monkeypatch.setattr(host, "INODES", 500)
     run = fly("for k in range(1000): pathlib.Path(sys.argv[2], str(k)).touch()\ntime.sleep(2)")
     assert run.outcome == "disk"
@@ -110,19 +109,19 @@ def test_a_program_that_makes_too_many_files_is_stopped(fly, monkeypatch: pytest
         ),
     ],
 )
-def test_a_program_that_kills_itself_or_exceeds_a_limit_is_told_so(fly, program: str, outcome: str, told: str) -> None:
+def test_a_program_that_kills_itself_or_exceeds_a_limit_is_told_so(fly, program, outcome, told):
     run = fly(program, LIMITS.replace("cpu_s = 10", "cpu_s = 1"))
     assert run.outcome == outcome and told in run.detail
 
 
-def test_a_program_that_is_not_there_is_a_crash_and_no_error_of_the_ground(archive: Path, tmp_path: Path) -> None:
+def test_a_program_that_is_not_there_is_a_crash_and_no_error_of_the_ground(archive, tmp_path):
     file = tmp_path / "build.toml"
     file.write_text('name = "gone"\ncommand = ["/nonexistent/program", "{archive}", "{out}"]\n')
     run = run_build(load_build(file), archive, tmp_path / "out")
     assert run.outcome == "crashed"
 
 
-def test_what_a_program_leaves_running_is_killed_with_it(fly, tmp_path: Path) -> None:
+def test_what_a_program_leaves_running_is_killed_with_it(fly, tmp_path):
     """It forks twice into a session of its own, as a daemon does."""
     marker = tmp_path / "alive"
     fly(
@@ -139,7 +138,7 @@ def test_what_a_program_leaves_running_is_killed_with_it(fly, tmp_path: Path) ->
     assert (marker.stat().st_size if marker.exists() else 0) == before
 
 
-def test_a_program_gets_no_socket_but_pairs_of_its_own(fly) -> None:
+def test_a_program_gets_no_socket_but_pairs_of_its_own(fly):
     run = fly(
         "import socket\n"
         "told = []\n"
@@ -154,7 +153,7 @@ def test_a_program_gets_no_socket_but_pairs_of_its_own(fly) -> None:
     assert run.downlink.read_text() == "[1, 1, 1, 1, 1, 'x', 1]"
 
 
-def test_a_program_sees_what_the_payload_was_given_and_no_truth_or_secret(fly, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_sees_what_the_payload_was_given_and_no_truth_or_secret(fly, monkeypatch):
     for secret in ("LINNA_DATABASE_URL", "HTTPS_PROXY", "LINNA_DATA"):
         monkeypatch.setenv(secret, "postgresql://secret")
     run = fly(
@@ -168,9 +167,7 @@ def test_a_program_sees_what_the_payload_was_given_and_no_truth_or_secret(fly, m
     assert "PATH" in told and not {"LINNA_DATABASE_URL", "HTTPS_PROXY", "LINNA_DATA"} & set(told)
 
 
-def test_a_program_reads_compiled_functions_of_the_service_and_changes_none(
-    fly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_program_reads_compiled_functions_of_the_service_and_changes_none(fly, tmp_path, monkeypatch):
     cache = tmp_path / "kernels"
     cache.mkdir()
     (cache / "one").write_text("code")
@@ -184,13 +181,13 @@ def test_a_program_reads_compiled_functions_of_the_service_and_changes_none(
     assert run.downlink.read_text() == "codeRead-only file system"
 
 
-def test_a_program_that_damages_its_archive_damages_a_copy(fly, archive: Path) -> None:
+def test_a_program_that_damages_its_archive_damages_a_copy(fly, archive):
     before = (archive / "frames/000000.png").read_bytes()
     fly("pathlib.Path(sys.argv[1], 'frames/000000.png').write_bytes(b'')")
     assert (archive / "frames/000000.png").read_bytes() == before
 
 
-def test_a_run_goes_into_a_new_folder_only(fly, tmp_path: Path) -> None:
+def test_a_run_goes_into_a_new_folder_only(fly, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "precious").write_text("x")
     with raises(InvalidInput, match="expected a new or empty folder"):
@@ -217,7 +214,7 @@ name = "x" | command = ["x", "{archive}", "{out}"] | model = "m" -> expected a c
 
 
 @pytest.mark.parametrize("row", WRONG_BUILDS.strip().split("\n"))
-def test_a_bad_build_file_is_told_by_its_key(row: str, tmp_path: Path) -> None:
+def test_a_bad_build_file_is_told_by_its_key(row, tmp_path):
     text, told = row.replace("0xF", f"0x{'f' * 5000}").split(" -> ")
     file = tmp_path / "build.toml"
     file.write_text(text.replace(" | ", "\n"))
@@ -226,7 +223,7 @@ def test_a_bad_build_file_is_told_by_its_key(row: str, tmp_path: Path) -> None:
     assert told in str(error.value)
 
 
-def test_the_identity_of_a_build_is_that_of_what_it_runs(make_build: Callable, tmp_path: Path) -> None:
+def test_the_identity_of_a_build_is_that_of_what_it_runs(make_build, tmp_path):
     first = load_build(make_build("one", program="pass"))
     file = first.folder / "build.toml"
     file.write_text(file.read_text().replace('name = "one"', 'name = "two"'))
@@ -236,9 +233,7 @@ def test_the_identity_of_a_build_is_that_of_what_it_runs(make_build: Callable, t
     assert len(load_build("current").digest) == 64
 
 
-def test_what_differs_between_two_builds_on_the_flight_code_is_named(
-    tmp_path: Path, make_build: Callable[..., Path]
-) -> None:
+def test_what_differs_between_two_builds_on_the_flight_code_is_named(tmp_path, make_build):
     def build(name: str, text: str, parameters: str = "") -> Build:
         folder = tmp_path / name
         folder.mkdir()
@@ -290,9 +285,7 @@ def write(tmp_path: Path) -> Callable[[str], str]:
         ),
     ],
 )
-def test_a_wrong_parameter_is_refused_in_one_line_and_nothing_is_registered(
-    ground: Ground, write: Callable[[str], str], text: str, told: str
-) -> None:
+def test_a_wrong_parameter_is_refused_in_one_line_and_nothing_is_registered(ground, write, text, told):
     with raises(InvalidInput) as error:
         register_build(ground, load_build(write(text)))
     assert str(error.value) == told
@@ -300,9 +293,7 @@ def test_a_wrong_parameter_is_refused_in_one_line_and_nothing_is_registered(
     assert not list((ground.home / "regression" / "builds").glob("*"))
 
 
-def test_right_parameters_are_registered_and_checked_once(
-    ground: Ground, write: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_right_parameters_are_registered_and_checked_once(ground, write, monkeypatch):
     file = write("flight.anchored.gravity_degree = 60")
     first = register_build(ground, load_build(file))
     assert [one.digest for one in ground.read(list_builds, Paging()).items] == [first.digest]
@@ -332,20 +323,14 @@ def _ended(**changes: Any) -> Callable[..., dict[str, Any]]:
         (_ended(cause="timeout"), "ended with timeout"),
     ],
 )
-def test_a_build_that_cannot_be_checked_is_not_registered(
-    ground: Ground,
-    write: Callable[[str], str],
-    monkeypatch: pytest.MonkeyPatch,
-    run: Callable[..., dict[str, Any]],
-    told: str,
-) -> None:
+def test_a_build_that_cannot_be_checked_is_not_registered(ground, write, monkeypatch, run, told):
     monkeypatch.setattr(builds, "run_confined", run)
     with raises(BuildNotChecked, match=told):
         register_build(ground, load_build(write("flight.anchored.gravity_degree = 60")))
     assert ground.read(list_builds, Paging()).items == []
 
 
-def test_the_command_checks_a_build_file(write: Callable[[str], str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_checks_a_build_file(write, capsys):
     assert run_command(["replay", "--check-build", write("detector.max_detection = 3")]) == 2
     assert "expected max_detections (nearest known key), found an unknown key" in capsys.readouterr().out
     file = write("detector.max_detections = 3")
@@ -391,20 +376,20 @@ def regression(verdict: str, gates: list[JudgedGate], **values: Any) -> Regressi
     return Regression(id="1", verdict=verdict, created=UtcTime(0), result=result)
 
 
-def test_a_list_names_builds_and_not_only_their_hashes() -> None:
+def test_a_list_names_builds_and_not_only_their_hashes():
     summary = regression("pass", [gate("recall", "pass")]).summary()
     assert summary.candidate_title == "new 1.2 (abababababab)"
     assert summary.baseline_title == "old 1.2 (abababababab)"
     assert (summary.reasons, summary.headline) == ([], "pass: no loss")
 
 
-def test_a_gate_that_was_waived_in_an_earlier_verdict_does_not_count() -> None:
+def test_a_gate_that_was_waived_in_an_earlier_verdict_does_not_count():
     found = regression("pass", [gate("other", "fail", waived="known"), gate("recall", "pass", waived=None)])
     assert found.result.gates[0].text == "other: waived: known"
     assert found.summary().gates_failed == 0
 
 
-def test_reasons_are_failed_gates_then_open_ones_then_passes_without_a_comparison() -> None:
+def test_reasons_are_failed_gates_then_open_ones_then_passes_without_a_comparison():
     open_gate = gate("drift", "inconclusive", reason="too few frames")
     failed = gate("recall", "fail", pass_id="pass 1", unit="m")
     lost = {"name": "pass 2", "archive": "x", "state": "candidate failed", "detail": "exit status 4"}
@@ -417,7 +402,7 @@ def test_reasons_are_failed_gates_then_open_ones_then_passes_without_a_compariso
     assert len(regression("fail", 9 * [failed]).summary().reasons) == REASONS_LIMIT
 
 
-def test_a_gate_without_figures_states_its_reason_or_outcome() -> None:
+def test_a_gate_without_figures_states_its_reason_or_outcome():
     for candidate, figures in ((None, ""), (0.7, " 0.9 to 0.7,")):
         one = gate("recall", "fail", candidate=candidate, limit=None, reason="no detections")
         assert one.text == f"recall:{figures} no detections"

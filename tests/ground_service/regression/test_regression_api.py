@@ -2,7 +2,6 @@
 
 import json
 import zipfile
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,9 +30,7 @@ def zipped(folder: Path, target: Path) -> bytes:
     return target.read_bytes()
 
 
-def test_a_build_is_registered_held_against_another_and_judged(
-    client: TestClient, make_flyable: Callable, make_build: Callable, tmp_path: Path
-) -> None:
+def test_a_build_is_registered_held_against_another_and_judged(client, make_flyable, make_build, tmp_path):
     flown = make_flyable(frames=12, seed=51)
     pack_archive(flown.folder, tmp_path / "pass.zip")
     kept = client.post(f"{V1}/regression-archives?pinned=true", content=(tmp_path / "pass.zip").read_bytes())
@@ -87,24 +84,24 @@ def test_a_build_is_registered_held_against_another_and_judged(
         {"candidate": "current", "archives": ["0" * 64]}, {},
     ],
 )  # fmt: skip
-def test_a_regression_of_nothing_known_is_refused(client: TestClient, body: dict[str, Any]) -> None:
+def test_a_regression_of_nothing_known_is_refused(client, body):
     assert client.post(f"{V1}/regressions", json=body).status_code == 422
 
 
-def test_something_else_than_a_zip_is_no_build(client: TestClient) -> None:
+def test_something_else_than_a_zip_is_no_build(client):
     refused = client.post(f"{V1}/builds", content=b"name = 'x'")
     assert refused.status_code == 422
     assert "expected a complete zip file, found something else, or a part of one" in refused.text
 
 
-def test_only_an_administrator_registers_a_program(guarded: Any, make_build: Callable, tmp_path: Path) -> None:
+def test_only_an_administrator_registers_a_program(guarded, make_build, tmp_path):
     client, heads = guarded
     body = zipped(make_build("program").parent, tmp_path / "b.zip")
     found = {role: client.post(f"{V1}/builds", content=body, headers=one).status_code for role, one in heads.items()}
     assert found == {"viewer": 403, "operator": 403, "admin": 201}
 
 
-def test_the_suite_states_what_its_passes_can_detect_before_anything_is_run(capsys) -> None:
+def test_the_suite_states_what_its_passes_can_detect_before_anything_is_run(capsys):
     assert run(["regress", "suite", "low", "plains", "--frames", "49", "--seeds", "2", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["passes"] == [{"scenario": name, "frames": 49} for name in ("low", "low-1", "plains", "plains-1")]

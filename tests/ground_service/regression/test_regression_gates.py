@@ -146,7 +146,7 @@ def largest_count(trials: int, rate: float) -> int:
 
 
 @pytest.mark.parametrize("passes", [1, 5])
-def test_equal_builds_fail_once_in_a_hundred_at_most_and_pass_on_five_windows(passes: int) -> None:
+def test_equal_builds_fail_once_in_a_hundred_at_most_and_pass_on_five_windows(passes):
     outcomes = [verdict_of(judge(suite(0, passes, 100 * k), suite(1, passes, 100 * k), POLICY)) for k in range(100)]
     assert outcomes.count("fail") <= largest_count(100, 0.01)
     assert outcomes.count("pass") >= 95
@@ -164,18 +164,18 @@ def test_equal_builds_fail_once_in_a_hundred_at_most_and_pass_on_five_windows(pa
         (20, {"error": 1.25}, "navigation.anchored.p50"),
     ],
 )
-def test_a_degraded_build_fails_by_the_metric_that_is_worse(passes: int, faults: dict[str, Any], name: str) -> None:
+def test_a_degraded_build_fails_by_the_metric_that_is_worse(passes, faults, name):
     for noise in range(1, 6):
         assert failed(suite(0, passes), suite(noise, passes, **faults)) == {name}
 
 
-def test_a_better_build_passes_on_one_window_and_the_bounds_say_that_it_is_better() -> None:
+def test_a_better_build_passes_on_one_window_and_the_bounds_say_that_it_is_better():
     gates = judge(suite(0, 1), suite(1, 1, recall=0.8), POLICY)
     assert verdict_of(gates) == "pass"
     assert by_name(gates)["detector.recall"].change_high < 0.0
 
 
-def test_a_loss_in_one_kind_of_terrain_or_on_one_pass_alone_fails_there() -> None:
+def test_a_loss_in_one_kind_of_terrain_or_on_one_pass_alone_fails_there():
     gates = judge(suite(0), suite(1, recall=0.72, other_kind_recall=0.58), POLICY)
     assert "sparse terrain" in places(gates)
     assert "cratered terrain" not in {gate.pass_id for gate in gates}
@@ -183,7 +183,7 @@ def test_a_loss_in_one_kind_of_terrain_or_on_one_pass_alone_fails_there() -> Non
     assert "pass 3" in found and not found & {"pass 0", "pass 1", "pass 2", "pass 4"}
 
 
-def test_identical_octets_pass_at_once_whatever_the_number_of_frames() -> None:
+def test_identical_octets_pass_at_once_whatever_the_number_of_frames():
     few = suite(0, 1, frames=6, tracks=4)
     assert verdict_of(judge(few, few, POLICY)) == "pass"
     assert judged(few, few).reason == "identical in every octet"
@@ -192,7 +192,7 @@ def test_identical_octets_pass_at_once_whatever_the_number_of_frames() -> None:
     assert judged(few, changed(few, undecodable=1)).reason.startswith("4 of 90")
 
 
-def test_few_tracks_claim_only_a_loss_beyond_the_margin_and_say_how_many_frames_are_needed() -> None:
+def test_few_tracks_claim_only_a_loss_beyond_the_margin_and_say_how_many_frames_are_needed():
     before, after, slight, great = (
         suite(noise, 1, tracks=30, recall=recall) for noise, recall in ((0, 0.7), (1, 0.7), (1, 0.6), (1, 0.2))
     )
@@ -216,7 +216,7 @@ def rows(before: list[list[int]], after: list[list[int]], copies: int = 30) -> t
     return made(before, b"a"), made(after, b"b")
 
 
-def test_the_test_of_recall_is_mcnemars_over_tracks() -> None:
+def test_the_test_of_recall_is_mcnemars_over_tracks():
     """By the formula: d_k = c_k - b_k, D = sum d / N, s^2 = K / (K - 1) sum (d_k - n_k D)^2 / N^2."""
     pair = rows([[1, 1, 0], [1, 0], [1, 1, 1, 1], [0]], [[1, 0, 0], [1, 0], [1, 1, 0, 0], [1]])
     n, d = np.tile([3.0, 2.0, 4.0, 1.0], 30), np.tile([-1.0, 0.0, -2.0, 1.0], 30)
@@ -234,7 +234,7 @@ def test_the_test_of_recall_is_mcnemars_over_tracks() -> None:
     assert (recall.outcome, recall.evidence, recall.frames) == ("fail", "120 tracks", 300)
 
 
-def test_a_failure_needs_a_lower_bound_above_what_is_material() -> None:
+def test_a_failure_needs_a_lower_bound_above_what_is_material():
     """Every thousandth row lost: certain, and not material."""
     whole = [1] * 50
     recall = judged(*rows([whole] * 4, [[0, *whole[1:]], *[whole] * 3]))
@@ -242,13 +242,13 @@ def test_a_failure_needs_a_lower_bound_above_what_is_material() -> None:
     assert recall.p_value < 1e-6 and recall.outcome == "pass"
 
 
-def test_without_a_changed_track_the_error_is_that_of_unseen_pairs() -> None:
+def test_without_a_changed_track_the_error_is_that_of_unseen_pairs():
     recall = judged(*rows([[1, 0]], [[1, 0]], copies=100))
     assert recall.change_high == approx(stats.t(99).ppf(0.95) * 1.8 / 200)
     assert recall.outcome == "pass"
 
 
-def test_an_open_gate_says_how_many_frames_decide_it() -> None:
+def test_an_open_gate_says_how_many_frames_decide_it():
     """A loss near nothing with an error of 0.0157 needs (t + t) s / (margin - loss) to be excluded."""
     rng = np.random.default_rng(5)
     recall = judged(*rows(*(rng.random((2, 200, 1)) < 0.7).tolist(), copies=4))
@@ -260,7 +260,7 @@ def test_an_open_gate_says_how_many_frames_decide_it() -> None:
     assert recall.frames_needed == np.ceil(min(to_pass, to_fail))
 
 
-def test_position_errors_are_judged_by_passes_from_ten_on() -> None:
+def test_position_errors_are_judged_by_passes_from_ten_on():
     before, after = suite(0, 12), suite(1, 12, error=1.2)
     medians = [[np.median(one.estimators["anchored"].error_m) for one in build.values()] for build in (before, after)]
     change = np.diff(np.log(medians), axis=0)
@@ -320,7 +320,7 @@ def wrong(passes: Passes, count: int) -> Passes:
 
 
 @pytest.mark.parametrize(("name", "fault", "told"), EXACT)
-def test_a_gross_failure_on_one_pass_fails_in_one_sentence(name: str, fault: Any, told: str) -> None:
+def test_a_gross_failure_on_one_pass_fails_in_one_sentence(name, fault, told):
     before = suite(0, 1, 1, **TIMES)
     after = wrong(before, fault["wrong"]) if "wrong" in fault else changed(before, **fault)
     assert name in failed(before, after)
@@ -333,7 +333,7 @@ def test_a_gross_failure_on_one_pass_fails_in_one_sentence(name: str, fault: Any
     assert (name in narrow) == name.startswith("telemetry.")
 
 
-def test_processor_times_are_compared_by_the_median_of_their_ratios_from_five_passes_on() -> None:
+def test_processor_times_are_compared_by_the_median_of_their_ratios_from_five_passes_on():
     """Below five passes 35 % are tolerated, then 15 %; one pass of five on a busy machine decides nothing."""
 
     def slower(factor: float) -> dict[str, Any]:
@@ -346,7 +346,7 @@ def test_processor_times_are_compared_by_the_median_of_their_ratios_from_five_pa
     assert judged(suite(0, **TIMES), busy, "latency.total").outcome == "pass"
 
 
-def test_a_program_without_times_of_its_frames_is_judged_by_the_processor_time_of_its_run() -> None:
+def test_a_program_without_times_of_its_frames_is_judged_by_the_processor_time_of_its_run():
     """Four times the processor time fails although all packets are the same; half a second more is tolerated."""
     before = suite(0, 2, cpu_s=5.0)
     for cpu_s, outcome in ((20.0, "fail"), (5.4, "pass"), (float("nan"), "not judged")):
@@ -355,14 +355,14 @@ def test_a_program_without_times_of_its_frames_is_judged_by_the_processor_time_o
     assert judged(suite(0, 2, cpu_s=0.1), suite(0, 2, cpu_s=0.4), "latency.run").passed
 
 
-def test_a_loss_that_is_a_share_of_the_baseline_is_a_percentage() -> None:
+def test_a_loss_that_is_a_share_of_the_baseline_is_a_percentage():
     gates = by_name(judge(suite(0, 12), suite(1, 12), POLICY))
     assert (gates["navigation.anchored.p50"].relative, gates["detector.recall"].relative) == (True, False)
     assert [loss_text(one, True) for one in (0.005, 0.15, 70.7)] == ["0.5 %", "15 %", "7,070 %"]
     assert loss_text(0.0153, False) == "0.0153"
 
 
-def test_placebos_are_rejected_as_often_as_their_level_allows_and_a_noisier_metric_is_uncalibrated() -> None:
+def test_placebos_are_rejected_as_often_as_their_level_allows_and_a_noisier_metric_is_uncalibrated():
     before, after = suite(0, 60), suite(1, 60)
     noise = [
         one
@@ -381,7 +381,7 @@ def test_placebos_are_rejected_as_often_as_their_level_allows_and_a_noisier_metr
     assert told.text == f"uncalibrated: detector.recall: {told.rejected} of 60 placebos rejected at 0.05"
 
 
-def test_exact_gates_and_the_verdict_of_a_placebo_are_rejected_if_they_fail() -> None:
+def test_exact_gates_and_the_verdict_of_a_placebo_are_rejected_if_they_fail():
     gates = judge(suite(0, 1), changed(suite(1, 1), undecodable=1), POLICY)
     noise = gate_noise(gates, POLICY)
     assert gate_noise([], POLICY) == []
@@ -393,7 +393,7 @@ def test_exact_gates_and_the_verdict_of_a_placebo_are_rejected_if_they_fail() ->
     assert doubted == {"telemetry.undecodable", "verdict"}
 
 
-def test_a_position_without_a_reference_is_a_value() -> None:
+def test_a_position_without_a_reference_is_a_value():
     before, silence = suite(0, 1), "telemetry.frames_without_value"
     anchored = replace(before["pass 0"].estimators["anchored"], error_m=np.full(FRAMES, np.nan))
     unknown = changed(before, estimators={"anchored": anchored})
@@ -402,14 +402,14 @@ def test_a_position_without_a_reference_is_a_value() -> None:
     assert silence in failed(unknown, changed(before, estimators={"anchored": silent}))
 
 
-def test_wrong_fixes_are_not_judged_without_a_reference() -> None:
+def test_wrong_fixes_are_not_judged_without_a_reference():
     before = suite(1, passes=1)
     unknown = _estimator(np.ones(FRAMES, np.bool_), np.full((FRAMES, 3), np.nan), np.ones((FRAMES, 3)), {0: "fixed"})
     after = changed(before, estimators={"anchored": unknown})
     assert judged(before, after, "navigation.wrong_fixes").outcome == "not judged"
 
 
-def test_exact_gates_tolerate_what_the_policy_says() -> None:
+def test_exact_gates_tolerate_what_the_policy_says():
     one, five = suite(0, 1), suite(0, 5)
     # One in a hundred of 49 frames is none; a quarter of 250 MiB is 312.5.
     assert "navigation.wrong_fixes" in failed(one, wrong(one, 1))
@@ -424,7 +424,7 @@ def test_exact_gates_tolerate_what_the_policy_says() -> None:
         assert failed(wrong(five, 9), wrong(rest, count)) == names
 
 
-def test_passes_without_images_judge_fixes_and_telemetry_only() -> None:
+def test_passes_without_images_judge_fixes_and_telemetry_only():
     gates = by_name(judge(suite(0, 2), suite(1, 2, recall=0.2, fixes=0.5), POLICY, imaged=()))
     assert gates["detector.recall"].reason == "no pass was replayed from images"
     assert gates["detector.recall"].outcome == gates["memory"].outcome == "not judged"
@@ -432,14 +432,14 @@ def test_passes_without_images_judge_fixes_and_telemetry_only() -> None:
     assert "latency.network" not in gates and "detector.bias" not in gates
 
 
-def test_a_metric_that_neither_build_has_is_not_judged() -> None:
+def test_a_metric_that_neither_build_has_is_not_judged():
     before, after = (changed(suite(noise, 1), estimators={}) for noise in (0, 1))
     gates = judge(before, after, POLICY)
     assert by_name(gates)["navigation.anchored.fixes"].reason == "neither build has this metric"
     assert verdict_of(gates) == "pass"
 
 
-def test_other_metrics_inform_and_never_decide() -> None:
+def test_other_metrics_inform_and_never_decide():
     before = suite(0, 12)
     after = {
         name: replace(one, octets=one.octets * (1.5 + 0.01 * k)) for k, (name, one) in enumerate(suite(1, 12).items())
@@ -452,7 +452,7 @@ def test_other_metrics_inform_and_never_decide() -> None:
     assert {gate.reason for gate in few if gate.outcome == "informs"} == {""}
 
 
-def test_levels_are_shared_by_weight_and_between_all_passes_and_parts() -> None:
+def test_levels_are_shared_by_weight_and_between_all_passes_and_parts():
     gates = by_name(judge(suite(0, 2), suite(1, 2), POLICY))
     levels = {name: gate.level for name, gate in gates.items() if gate.level < 0.005 and gate.outcome == "pass"}
     assert levels == approx(
@@ -476,25 +476,25 @@ def test_levels_are_shared_by_weight_and_between_all_passes_and_parts() -> None:
         ("pass not_judged informs", "pass"),
     ],
 )
-def test_the_verdict_is_that_of_the_worst_deciding_gate(outcomes: str, verdict: str) -> None:
+def test_the_verdict_is_that_of_the_worst_deciding_gate(outcomes, verdict):
     parts = [one.replace("_", " ").rpartition(":") for one in outcomes.split()]
     gates = [Gate(name or "x", outcome, 1.0, 1.0, 0.1, 0.9) for name, _, outcome in parts]
     assert verdict_of(gates) == verdict
 
 
-def test_only_passes_of_both_builds_are_compared() -> None:
+def test_only_passes_of_both_builds_are_compared():
     assert judge({}, {}, POLICY) == []
     before, after = suite(0, 2), suite(1, 2)
     del after["pass 0"]
     assert judged(before, after).frames == FRAMES
 
 
-def test_a_value_that_the_baseline_lacks_leaves_its_gate_open() -> None:
+def test_a_value_that_the_baseline_lacks_leaves_its_gate_open():
     fixes = judged(changed(suite(0, 1), estimators={}), suite(1, 1), "navigation.anchored.fixes")
     assert (fixes.outcome, fixes.reason) == ("inconclusive", "unknown: the baseline has no value")
 
 
-def test_what_the_frames_can_detect_is_stated_before_a_run() -> None:
+def test_what_the_frames_can_detect_is_stated_before_a_run():
     few, many = detectable(POLICY, 80, 2), detectable(POLICY, 1000, 20)
     weighted = [rule.metric for rule in POLICY.rules if rule.weight]
     assert [one["metric"] for one in few] == weighted[:-1]  # position errors need ten passes
@@ -505,7 +505,7 @@ def test_what_the_frames_can_detect_is_stated_before_a_run() -> None:
     assert detectable(POLICY, 0, 0) == []
 
 
-def test_squared_normalised_errors_are_summed_over_the_axes_and_unknown_without_every_sigma() -> None:
+def test_squared_normalised_errors_are_summed_over_the_axes_and_unknown_without_every_sigma():
     error = np.array([[3.0, 8.0, 10.0], [3.0, 8.0, 10.0], [3.0, 8.0, 10.0], [np.nan, 8.0, 10.0]])
     sigma = np.array([[1.0, 2.0, 5.0], [1.0, 2.0, np.nan], [1.0, 0.0, 5.0], [1.0, 2.0, 5.0]])
     frames = _estimator(np.ones(4, np.bool_), error, sigma, {})
@@ -515,7 +515,7 @@ def test_squared_normalised_errors_are_summed_over_the_axes_and_unknown_without_
     assert not hasattr(frames, "nees")
 
 
-def test_a_track_is_one_crater_in_one_visit() -> None:
+def test_a_track_is_one_crater_in_one_visit():
     crater = np.array([7, 3, 7, 7, 3, 7])
     frame = np.array([0, 0, 1, 2 + VISIT_GAP_FRAMES, 1, 1 + VISIT_GAP_FRAMES])
     # Crater 7 is out of view for as long as a visit may have gaps, and is then seen twice: still one track.
@@ -524,7 +524,7 @@ def test_a_track_is_one_crater_in_one_visit() -> None:
     assert _tracks(crater, frame).tolist() == [1, 0, 1, 2, 0, 2]
 
 
-def test_a_ground_cell_is_where_the_line_of_sight_meets_the_sphere() -> None:
+def test_a_ground_cell_is_where_the_line_of_sight_meets_the_sphere():
     """From 100 km above 10.1 N 20 E: nadir, 3 degrees off nadir (5.2 km, below a cell), and above the horizon."""
     up = mcmf_from_spherical(np.radians(10.1), np.radians(20.0))
     up = up / np.linalg.norm(up)
@@ -536,7 +536,7 @@ def test_a_ground_cell_is_where_the_line_of_sight_meets_the_sphere() -> None:
     assert cells.tolist() == [40 * 100_000 + 78, 40 * 100_000 + 79, -1]
 
 
-def test_terrain_is_cratered_by_the_density_of_catalogued_craters() -> None:
+def test_terrain_is_cratered_by_the_density_of_catalogued_craters():
     """Forty craters of 6 km around 0 N 0 E, 32 within 100 km are the limit; one alone at 0 N 90 E."""
     around = np.linspace(-1.0, 1.0, 40)
     longitude = np.radians(np.append(around, 90.0))
@@ -546,7 +546,7 @@ def test_terrain_is_cratered_by_the_density_of_catalogued_craters() -> None:
     assert [KINDS[kind] for kind in kinds] == ["cratered", "sparse"]
 
 
-def test_holm_steps_down_as_in_the_textbook_example() -> None:
+def test_holm_steps_down_as_in_the_textbook_example():
     """Four p-values at 0.05: 0.005 and 0.01 are refused (0.0125, 0.0167), 0.03 is kept at 0.025, all after it too."""
     p_values = [0.01, 0.04, 0.03, 0.005]
     levels = holm_levels(p_values, 0.05)
@@ -561,7 +561,7 @@ def sums(unit: list[int], numerator: list[float], denominator: list[float], stra
     )
 
 
-def test_rows_are_summed_by_unit_and_units_of_either_build_are_aligned() -> None:
+def test_rows_are_summed_by_unit_and_units_of_either_build_are_aligned():
     before, after = sums([7, 3, 7], [1, 1, 0], [1, 1, 1]), sums([3, 9], [1, 0], [1, 1])
     assert (before.unit.tolist(), before.numerator.tolist(), before.denominator.tolist()) == ([3, 7], [1, 1], [1, 2])
     first, second = aligned(before, after)
@@ -571,14 +571,14 @@ def test_rows_are_summed_by_unit_and_units_of_either_build_are_aligned() -> None
     assert np.isnan(sums([], [], []).value)
 
 
-def test_the_error_of_a_ratio_of_equal_units_is_that_of_a_mean() -> None:
+def test_the_error_of_a_ratio_of_equal_units_is_that_of_a_mean():
     values = np.random.default_rng(1).standard_normal(400)
     one = UnitSums(np.arange(400), np.zeros(400, np.int64), values, np.ones(400))
     assert ratio_error(one) == approx(np.std(values, ddof=1) / 20.0)
     assert np.isnan(ratio_error(sums([1], [1], [1])))
 
 
-def test_a_difference_between_kinds_of_terrain_is_no_chance() -> None:
+def test_a_difference_between_kinds_of_terrain_is_no_chance():
     """All units of one kind change by 1, all of the other by 0: within each kind nothing varies."""
     kind = np.repeat([0, 1], 50)
     before = UnitSums(np.arange(100), kind, np.zeros(100), np.ones(100))
@@ -588,7 +588,7 @@ def test_a_difference_between_kinds_of_terrain_is_no_chance() -> None:
 
 
 @pytest.mark.parametrize("correlated", [False, True])
-def test_a_one_sided_test_is_wrong_as_often_as_it_says(correlated: bool) -> None:
+def test_a_one_sided_test_is_wrong_as_often_as_it_says(correlated):
     """400 pairs of equal builds, rows of a track alike or independent, at 5 %."""
     rng, wrong = np.random.default_rng(3), 0
     size = rng.integers(1, 8, 120)
@@ -603,7 +603,7 @@ def test_a_one_sided_test_is_wrong_as_often_as_it_says(correlated: bool) -> None
     assert 0 < wrong <= stats.binom.isf(1e-4, 400, 0.05)
 
 
-def test_the_mean_change_of_passes_is_a_ratio_for_lengths_and_a_difference_for_shares() -> None:
+def test_the_mean_change_of_passes_is_a_ratio_for_lengths_and_a_difference_for_shares():
     before, after = np.array([1.0, 2.0, 4.0, np.nan]), np.array([2.0, 4.0, 8.0, 1.0])
     assert mean_change(before, after, relative=True).estimate == approx(np.log(2.0))
     change = mean_change(before, after, relative=False)
@@ -613,7 +613,7 @@ def test_the_mean_change_of_passes_is_a_ratio_for_lengths_and_a_difference_for_s
     assert mean_change(before[3:], after[3:], relative=True).units == 0
 
 
-def test_the_frames_needed_follow_the_square_of_error_over_distance() -> None:
+def test_the_frames_needed_follow_the_square_of_error_over_distance():
     assert frames_needed(100, 0.05, 0.01, 1.0) == 2500
     assert frames_needed(100, 0.05, 0.0, 1.0) is None
     assert frames_needed(10, 1.0, 1e-6, 1.0) is None

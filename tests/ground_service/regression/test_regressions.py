@@ -136,7 +136,7 @@ def failed(outcome: RegressionOutcome) -> set[str]:
     return {gate.name for gate in outcome.gates if gate.outcome == "fail"}
 
 
-def test_a_build_that_says_the_same_passes(judge) -> None:
+def test_a_build_that_says_the_same_passes(judge):
     outcome = judge()
     assert ended(outcome) == ("pass", 0)
     assert failed(outcome) == set()
@@ -146,7 +146,7 @@ def test_a_build_that_says_the_same_passes(judge) -> None:
     assert gate(outcome, "navigation.spherical.p50").baseline == approx(130.0, abs=0.5)
 
 
-def test_a_bias_of_seven_tenths_of_a_pixel_fails_as_a_centre_error(judge, packets: Packets) -> None:
+def test_a_bias_of_seven_tenths_of_a_pixel_fails_as_a_centre_error(judge, packets):
     outcome = judge(with_detections(packets, lambda items: items | {"u_px": items["u_px"] + 0.7}))
     assert verdict_document(outcome).exit_status == 1
     assert failed(outcome) == {"detector.localisation"}
@@ -155,7 +155,7 @@ def test_a_bias_of_seven_tenths_of_a_pixel_fails_as_a_centre_error(judge, packet
     assert told.endswith("navigation holds: share of fixes 1 to 1, median position error 30 to 30 m")
 
 
-def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge, monkeypatch):
     judge()  # the baseline is replayed before
     outcome = judge(network_ms=20.0)
     assert (outcome.verdict, gate(outcome, "latency.total").outcome) == ("pass", "not judged")
@@ -179,9 +179,7 @@ def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge, mo
         (late_states, "navigation_state packets name a time at which no image was taken"),
     ],
 )
-def test_packets_with_times_that_contradict_their_images_fail_in_one_sentence(
-    judge, packets: Packets, fault: Any, told: str
-) -> None:
+def test_packets_with_times_that_contradict_their_images_fail_in_one_sentence(judge, packets, fault, told):
     given = altered(packets, fault)
     outcome = judge(given)
     assert failed(outcome) - {"telemetry.frames_without_value"} == {"telemetry.times"}
@@ -191,7 +189,7 @@ def test_packets_with_times_that_contradict_their_images_fail_in_one_sentence(
     assert told in verdict_document(outcome).headline
 
 
-def test_packets_out_of_order_fail_in_one_sentence(judge, packets: Packets) -> None:
+def test_packets_out_of_order_fail_in_one_sentence(judge, packets):
     outcome = judge({name: [*some[40:], *some[:40]] for name, some in packets.items()})
     assert failed(outcome) == {"telemetry.times"}
     assert "packets more than in the baseline are out of order in time" in verdict_document(outcome).headline
@@ -214,7 +212,7 @@ def test_packets_out_of_order_fail_in_one_sentence(judge, packets: Packets) -> N
         ("pass", "candidate ended without a downlink"),
     ],
 )
-def test_a_build_that_fails_on_a_pass_is_told_so_and_fails(judge, first, program: str, told: str) -> None:
+def test_a_build_that_fails_on_a_pass_is_told_so_and_fails(judge, first, program, told):
     limits = "[limits]\nwall_s = 2\nmemory_mib = 300\nfile_mib = 4\n"
     outcome = judge(archives=[first], program=program, extra=limits)
     assert ended(outcome) == ("fail", 1)
@@ -222,7 +220,7 @@ def test_a_build_that_fails_on_a_pass_is_told_so_and_fails(judge, first, program
     assert outcome.passes[0].detail.startswith(told)
 
 
-def test_a_build_that_fails_on_one_pass_is_judged_on_the_others(judge, packets: Packets) -> None:
+def test_a_build_that_fails_on_one_pass_is_judged_on_the_others(judge, packets):
     name = "synthetic pass 41"
     outcome = judge({name: packets[name]})
     assert [item.state for item in outcome.passes] == ["judged", "candidate failed"]
@@ -237,8 +235,8 @@ def copy(first: Path, tmp_path: Path) -> Path:
 
 
 def test_a_placebo_leaves_the_noise_of_its_metrics_and_marks_gates_that_reject_equal_builds(
-    judge, home: Ground, passes: list[Any], packets: Packets, make_build: Callable, policy: Any
-) -> None:
+    judge, home, passes, packets, make_build, policy
+):
     build = register_build(home, load_build(make_build("itself", packets)))
     digests = [keep_archive(home, one.folder).digest for one in passes]
     before = home.read(replays)
@@ -263,7 +261,7 @@ def test_a_placebo_leaves_the_noise_of_its_metrics_and_marks_gates_that_reject_e
     assert verdict_document(marked).headline == "pass: identical in every octet on 60 frames"
 
 
-def test_a_tampered_archive_is_told_and_the_rest_goes_on(judge, passes, copy: Path) -> None:
+def test_a_tampered_archive_is_told_and_the_rest_goes_on(judge, passes, copy):
     (copy / "reference.oem").write_text((copy / "reference.oem").read_text().replace("1", "2", 1))
     outcome = judge(archives=[copy, passes[1].folder])
     assert [item.state for item in outcome.passes] == ["unusable", "judged"]
@@ -272,7 +270,7 @@ def test_a_tampered_archive_is_told_and_the_rest_goes_on(judge, passes, copy: Pa
     assert verdict_document(outcome).headline.startswith("inconclusive: copy: ")
 
 
-def test_a_program_does_not_replay_a_pass_without_frames(judge, passes, copy: Path) -> None:
+def test_a_program_does_not_replay_a_pass_without_frames(judge, passes, copy):
     for number in (7, 9):
         (copy / f"frames/{number:06d}.png").unlink()
     enter_files(copy)
@@ -281,7 +279,7 @@ def test_a_program_does_not_replay_a_pass_without_frames(judge, passes, copy: Pa
     assert "2 of 30 frames are not stored, the first 7" in outcome.passes[0].detail
 
 
-def test_an_archive_or_a_build_for_another_camera_is_told(judge, first: Path, copy: Path) -> None:
+def test_an_archive_or_a_build_for_another_camera_is_told(judge, first, copy):
     camera = json.loads((copy / "manifest.json").read_text())["camera"]
     enter_files(copy, camera=camera | {"width_px": 1024})
     of_build = judge(archives=[first], extra="[camera]\nfov_deg = 60\n").passes[0]
@@ -291,13 +289,13 @@ def test_an_archive_or_a_build_for_another_camera_is_told(judge, first: Path, co
     assert "expected an image of the camera of 1024 x 512 px, found 512 x 512 px" in of_archive.detail
 
 
-def test_something_that_is_no_archive_is_told(judge, first: Path, tmp_path: Path) -> None:
+def test_something_that_is_no_archive_is_told(judge, first, tmp_path):
     (tmp_path / "note.txt").write_text("hello")
     outcome = judge(archives=[tmp_path / "note.txt", tmp_path / "gone", first])
     assert [item.state for item in outcome.passes] == ["unusable", "unusable", "judged"]
 
 
-def test_a_replay_is_done_once_and_one_that_failed_again(home, judge, first: Path, make_build, policy) -> None:
+def test_a_replay_is_done_once_and_one_that_failed_again(home, judge, first, make_build, policy):
     outcome = judge()
     digest = keep_archive(home, first).digest
     before = find_replay(home, digest, outcome.candidate)
@@ -333,7 +331,7 @@ JUNIT = {
 """Attributes that both the schema of the Jenkins xUnit plugin (junit-10.xsd) and that of Apache Ant permit and need."""
 
 
-def test_the_verdict_is_written_as_json_junit_and_text(judge, packets: Packets, copy: Path, passes) -> None:
+def test_the_verdict_is_written_as_json_junit_and_text(judge, packets, copy, passes):
     (copy / "catalogue.csv").write_text("")
     worse = with_detections(packets, lambda items: items | {"v_px": items["v_px"] - 1.0})
     outcome = judge(worse, archives=[copy, *(one.folder for one in passes)])
@@ -369,7 +367,7 @@ def test_the_verdict_is_written_as_json_junit_and_text(judge, packets: Packets, 
     assert "detector.localisation" in told and "unusable" in told
 
 
-def test_a_crash_is_one_failure_and_the_last_lines_of_its_program_are_in_every_output(home, judge, first: Path) -> None:
+def test_a_crash_is_one_failure_and_the_last_lines_of_its_program_are_in_every_output(home, judge, first):
     program = "for k in range(50): print('line', k)\nraise RuntimeError('no network')"
     outcome = judge(archives=[first], program=program)
     verdict = verdict_document(outcome)
@@ -386,7 +384,7 @@ def test_a_crash_is_one_failure_and_the_last_lines_of_its_program_are_in_every_o
         assert "Traceback (most recent call last)" in text and "line 49" in text
 
 
-def test_the_report_shows_the_craters_that_changed_side_by_side(home, judge, packets: Packets) -> None:
+def test_the_report_shows_the_craters_that_changed_side_by_side(home, judge, packets):
     def thinned(items: dict[str, Any]) -> dict[str, Any]:
         kept = {name: values[::2] for name, values in items.items()}
         return kept | {"v_px": np.append(511.0 - kept["v_px"][:1], kept["v_px"][1:])}  # and one is elsewhere
@@ -415,7 +413,7 @@ def test_the_report_shows_the_craters_that_changed_side_by_side(home, judge, pac
     assert len(keep_regression(home, outcome)) == 32
 
 
-def test_a_zip_of_an_archive_is_the_archive(first: Path, tmp_path: Path, ground: Ground) -> None:
+def test_a_zip_of_an_archive_is_the_archive(first, tmp_path, ground):
     packed = [tmp_path / name for name in ("a.zip", "b.zip")]
     for one in packed:
         pack_archive(first, one)
@@ -426,9 +424,7 @@ def test_a_zip_of_an_archive_is_the_archive(first: Path, tmp_path: Path, ground:
     assert (out / "downlink.cadu").read_bytes() == (first / "downlink.cadu").read_bytes()
 
 
-def test_archives_go_by_age_and_by_size_with_a_record_and_pinned_ones_stay(
-    passes, ground: Ground, tmp_path: Path
-) -> None:
+def test_archives_go_by_age_and_by_size_with_a_record_and_pinned_ones_stay(passes, ground, tmp_path):
     first, second = (keep_archive(ground, one.folder) for one in passes)
     octets = {one.digest: one.octets for one in kept_archives(ground)}
     assert let_go(ground, unused_for_ns=10**18) == []
@@ -458,7 +454,7 @@ def test_archives_go_by_age_and_by_size_with_a_record_and_pinned_ones_stay(
     assert removals[1].detail["octets"] == octets[first.digest]
 
 
-def test_the_archive_of_a_rare_condition_outlasts_one_that_was_used_later(passes, ground: Ground) -> None:
+def test_the_archive_of_a_rare_condition_outlasts_one_that_was_used_later(passes, ground):
     kept = [keep_archive(ground, passes[0].folder).digest]
     for name in "xyz":
         add = ArchiveRecord(**ground.read(get_archive, kept[0]).model_dump() | {"digest": name})
@@ -471,7 +467,7 @@ def test_the_archive_of_a_rare_condition_outlasts_one_that_was_used_later(passes
     assert condition_of_archive(ground, kept[0]) == "cratered, above 25 km"
 
 
-def test_the_settings_say_how_long_archives_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_settings_say_how_long_archives_are_kept(tmp_path, monkeypatch):
     monkeypatch.setenv("LINNA_ARCHIVE_DAYS", "400")
     monkeypatch.setenv("LINNA_ARCHIVE_LIMIT_MIB", "2000")
     kept = Settings(home=tmp_path).kept
@@ -490,7 +486,7 @@ def test_the_settings_say_how_long_archives_are_kept(tmp_path: Path, monkeypatch
     assert kept_for.items() <= called.call_args.kwargs.items()
 
 
-def test_a_registered_build_is_found_by_the_beginning_of_its_identity(ground: Ground, make_build, packets) -> None:
+def test_a_registered_build_is_found_by_the_beginning_of_its_identity(ground, make_build, packets):
     build: Build = register_build(ground, load_build(make_build("kept", packets)))
     assert registered_build(ground, build.digest[:12]).digest == build.digest
     (build.folder / "fly.py").write_text("changed behind its back")
@@ -518,7 +514,7 @@ fail = {level=1.5, reason='y'} -> fail.level: expected less than or equal to 0.2
 
 
 @pytest.mark.parametrize("row", WRONG_POLICIES.strip("\n").split("\n"))
-def test_a_bad_policy_is_told_by_its_key(row: str, tmp_path: Path) -> None:
+def test_a_bad_policy_is_told_by_its_key(row, tmp_path):
     text, told = row.split(" -> ")
     good = "{metric='detector.recall', weight=1, margin=0.1, reason='small'}"
     whole = {"schema_version": "3", "version": "'1'", "fail": "{level=0.01, reason='usual'}", "gate": f"[{good}]"}
@@ -532,7 +528,7 @@ def test_a_bad_policy_is_told_by_its_key(row: str, tmp_path: Path) -> None:
     assert told in str(error.value)
 
 
-def test_the_shipped_policy_gives_a_reason_for_every_number() -> None:
+def test_the_shipped_policy_gives_a_reason_for_every_number():
     policy = load_policy().policy
     assert (policy.fail_level, policy.inconclusive) == (0.01, "failure")
     assert all(len(rule.reason) > 20 for rule in policy.rules)
@@ -546,9 +542,7 @@ def changed_here_and_there(items: dict[str, Any]) -> dict[str, Any]:
     return {name: values[kept] for name, values in items.items()}
 
 
-def test_a_build_that_differs_on_few_frames_is_inconclusive_with_the_frames_needed(
-    judge, home, packets: Packets, policy
-) -> None:
+def test_a_build_that_differs_on_few_frames_is_inconclusive_with_the_frames_needed(judge, home, packets, policy):
     strict = tuple(
         dataclasses.replace(rule, window_margin=0.045, window_materiality=0.04)
         if rule.metric == "detector.recall"
@@ -581,7 +575,7 @@ def test_a_build_that_differs_on_few_frames_is_inconclusive_with_the_frames_need
         assert "frames decide it, 60 compared" in case.attrib["message"]
 
 
-def test_a_regression_without_a_gate_is_never_a_pass(judge) -> None:
+def test_a_regression_without_a_gate_is_never_a_pass(judge):
     nothing = dataclasses.replace(judge(), gates=())
     assert ended(nothing) == ("inconclusive", 3)
     verdict = verdict_document(nothing)

@@ -88,7 +88,7 @@ def learned(linna: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory)
 
 
 @pytest.mark.campaign
-def test_the_uploaded_table_gives_a_later_pass_more_landmarks(learned: Learned) -> None:
+def test_the_uploaded_table_gives_a_later_pass_more_landmarks(learned):
     """The table goes up by PUS 13, released by a second person; the flight software flies with it."""
     folder, linna = learned.folder, learned.linna
     flown = unpack_catalogue_table((learned.archive / "payload/tables/catalogue.bin").read_bytes())

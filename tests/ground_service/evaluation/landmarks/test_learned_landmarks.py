@@ -86,7 +86,7 @@ def landmarks(ground: Ground, **terms: str) -> list[Landmark]:
     return page.items
 
 
-def test_withheld_craters_become_proposals_at_their_places(either: Ground, thinned) -> None:
+def test_withheld_craters_become_proposals_at_their_places(either, thinned):
     _, _, withheld = thinned
     first, second = both_passes(either, thinned)
     update = update_landmarks(either, first)
@@ -128,8 +128,8 @@ camera = { pointing = "nadir", width_px = 512, height_px = 512, fov_deg = 120.0 
     ],
 )
 def test_craters_of_the_full_list_are_not_proposed_where_the_catalogue_of_the_pass_lacks_them(
-    thinned, tmp_path: Path, stated: str, listed: bool
-) -> None:
+    thinned, tmp_path, stated, listed
+):
     """The list of the mission, or on the real Moon a public one, has every second of the withheld craters."""
     folder, full, withheld = thinned
     shutil.copytree(folder, tmp_path / "pass")
@@ -145,9 +145,7 @@ def test_craters_of_the_full_list_are_not_proposed_where_the_catalogue_of_the_pa
     assert len(proposed) > 15 and found == ({0} if listed else {0, 1})
 
 
-def test_a_place_is_in_view_of_every_frame_that_saw_it(
-    ground: Ground, thinned, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_place_is_in_view_of_every_frame_that_saw_it(ground, thinned, monkeypatch):
     """Also if its mean place lies just outside the image: here it always does."""
     first, _ = both_passes(ground, thinned)
     nowhere = "ground_service.evaluation.landmarks.core.in_view"
@@ -157,7 +155,7 @@ def test_a_place_is_in_view_of_every_frame_that_saw_it(
     assert found and all(one.looks == one.sightings > 0 for one in found)
 
 
-def test_the_same_pass_from_two_processes_adds_each_landmark_once(either: Ground, thinned) -> None:
+def test_the_same_pass_from_two_processes_adds_each_landmark_once(either, thinned):
     first, _ = both_passes(either, thinned)
 
     with ThreadPoolExecutor(3) as pool:
@@ -168,7 +166,7 @@ def test_the_same_pass_from_two_processes_adds_each_landmark_once(either: Ground
     assert {one.passes for one in found} == {1}
 
 
-def test_only_proposed_landmarks_are_decided_and_decisions_remain(ground: Ground, thinned) -> None:
+def test_only_proposed_landmarks_are_decided_and_decisions_remain(ground, thinned):
     first, second = both_passes(ground, thinned)
     update_landmarks(ground, first)
     seen = landmarks(ground)[0].id
@@ -190,7 +188,7 @@ def test_only_proposed_landmarks_are_decided_and_decisions_remain(ground: Ground
         decide("ann", key=99_999)
 
 
-def test_a_place_that_later_frames_do_not_see_again_is_not_proposed(ground: Ground, thinned, make_pass) -> None:
+def test_a_place_that_later_frames_do_not_see_again_is_not_proposed(ground, thinned, make_pass):
     """The second pass has no detections at the withheld craters: its catalogue has them, and its frames look."""
     folder, _, _ = thinned
     enter_files(folder, pass_name="first pass")
@@ -206,7 +204,7 @@ def test_a_place_that_later_frames_do_not_see_again_is_not_proposed(ground: Grou
     assert blind.sightings == [] and blind.looks > 0
 
 
-def test_a_pass_without_a_catalogue_is_refused_with_the_reason(ground: Ground, make_pass) -> None:
+def test_a_pass_without_a_catalogue_is_refused_with_the_reason(ground, make_pass):
     folder = make_pass(frames=4).folder
     (folder / "catalogue.csv").unlink()
     enter_files(folder, pass_name="bare")
@@ -219,7 +217,7 @@ def _place(east_m: float = 0.0, sigma_m: float = 50.0, diameter_m: float = 8000.
     return Place(0.0, east_m / MOON_RADIUS_M, 100.0, (sigma_m,) * 3, diameter_m, 200.0, 0.8, rows, looks)
 
 
-def test_passes_that_agree_reduce_the_variance_but_not_what_is_common_to_them() -> None:
+def test_passes_that_agree_reduce_the_variance_but_not_what_is_common_to_them():
     """The error of the catalogue, and the 30 % of the variance that the detector repeats on every pass."""
     common = 20.0
     place = _place(sigma_m=float(np.hypot(100.0, common)))
@@ -228,7 +226,7 @@ def test_passes_that_agree_reduce_the_variance_but_not_what_is_common_to_them() 
         assert combined([place] * count).sigma_m[0] == approx(left)
 
 
-def test_passes_that_disagree_enlarge_the_uncertainty() -> None:
+def test_passes_that_disagree_enlarge_the_uncertainty():
     apart = combined([_place(-300.0), _place(300.0)])
     assert apart.longitude_rad == approx(0.0, abs=1e-12)
     assert apart.sigma_m[0] == approx(np.hypot(300.0, 20.0), rel=0.01)
@@ -239,13 +237,11 @@ def test_passes_that_disagree_enlarge_the_uncertainty() -> None:
     ("passes", "sightings", "looks", "expected"),
     [(2, 4, 16, True), (1, 9, 9, False), (2, 3, 3, False), (2, 4, 17, False)],
 )
-def test_a_landmark_is_persistent_on_two_passes_in_a_quarter_of_its_frames(
-    passes: int, sightings: int, looks: int, expected: bool
-) -> None:
+def test_a_landmark_is_persistent_on_two_passes_in_a_quarter_of_its_frames(passes, sightings, looks, expected):
     assert is_persistent(passes, sightings, looks) is expected
 
 
-def test_places_are_the_same_within_a_quarter_of_the_diameter_or_the_uncertainty() -> None:
+def test_places_are_the_same_within_a_quarter_of_the_diameter_or_the_uncertainty():
     assert same_place(_place(), _place(1900.0))
     assert not same_place(_place(), _place(2100.0))
     assert same_place(_place(sigma_m=600.0), _place(2100.0))
@@ -254,7 +250,7 @@ def test_places_are_the_same_within_a_quarter_of_the_diameter_or_the_uncertainty
 
 
 @pytest.mark.parametrize("error_px", [0.4, 3.0])
-def test_the_uncertainty_is_that_of_the_errors_on_one_pass_and_on_three(error_px: float) -> None:
+def test_the_uncertainty_is_that_of_the_errors_on_one_pass_and_on_three(error_px):
     """Withheld craters over a simulated track; the detector repeats 30 % of its variance on every pass."""
     rng = np.random.default_rng(7)
     grid = np.array([(a, b) for a in np.arange(-16, 17) for b in np.arange(-5, 6)]) * 0.5
@@ -312,7 +308,7 @@ def _table() -> CatalogueTable:
     return CatalogueTable(np.array([7]), one, one, np.array([5000.0]), np.array([10.0]), np.full((1, 3), 60.0))
 
 
-def test_the_anchoring_table_gets_accepted_landmarks_once_with_their_uncertainty() -> None:
+def test_the_anchoring_table_gets_accepted_landmarks_once_with_their_uncertainty():
     found = [_landmark(2), _landmark(1), _landmark(3, "rejected"), _landmark(4, "proposed")]
     table = extended_table(_table(), found)
     assert table.ids.tolist() == [7, FIRST_ID + 1, FIRST_ID + 2]
@@ -324,7 +320,7 @@ def test_the_anchoring_table_gets_accepted_landmarks_once_with_their_uncertainty
         extended_table(_table(), [_landmark(3, "rejected")])
 
 
-def test_the_catalogue_gets_accepted_landmarks(tmp_path: Path) -> None:
+def test_the_catalogue_gets_accepted_landmarks(tmp_path):
     path = tmp_path / "old.csv"
     path.write_text("id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete\n5,1,2,6000,10,300,1\n")
     base = load_catalogue(path)
@@ -336,7 +332,7 @@ def test_the_catalogue_gets_accepted_landmarks(tmp_path: Path) -> None:
     assert np.isnan(again.depth_m[1]) and again.complete.all()
 
 
-def test_labels_are_what_training_reads(tmp_path: Path) -> None:
+def test_labels_are_what_training_reads(tmp_path):
     (tmp_path / "labels.csv").write_text(format_labels([_landmark(1), _landmark(2, "rejected")]))
     labels = load_landmarks(tmp_path / "labels.csv")
     assert np.degrees(labels.latitude_rad).tolist() == [11.0]
@@ -344,7 +340,7 @@ def test_labels_are_what_training_reads(tmp_path: Path) -> None:
     assert (labels.sightings[0], labels.looks[0], labels.score[0]) == (5, 8, 0.71)
 
 
-def test_an_upload_puts_the_table_together_again_on_board() -> None:
+def test_an_upload_puts_the_table_together_again_on_board():
     assert [name for name, _ in upload_entries(pack_catalogue_table(_table()), 3)] == ["uplink_last"]
     octets = bytes(range(256)) * 150
     receiver, names = LargeDataReceiver(), []

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -130,7 +129,7 @@ def group_means(found: Any) -> dict[tuple[str, str, str], Any]:
     return {(one.factor, one.group, one.metric): one for one in found.groups}
 
 
-def test_a_report_states_the_conditions_of_its_pass(either: Ground, flown: SyntheticPass) -> None:
+def test_a_report_states_the_conditions_of_its_pass(either, flown):
     pass_id = import_archive(either, flown.folder)
     made = make_report(either, pass_id)
     conditions = made.summary["conditions"]
@@ -147,7 +146,7 @@ def test_a_report_states_the_conditions_of_its_pass(either: Ground, flown: Synth
     assert (found.instance, [one.pass_id for one in found.passes]) == ("flight", [flight])
 
 
-def test_passes_are_grouped_and_changes_found(either: Ground) -> None:
+def test_passes_are_grouped_and_changes_found(either):
     low = {"recall": 0.4, "altitude": 35.0, "build": "b", "status": "not met", "error": 120.0}
     for number in range(20):
         add_pass(either, number, **(low if number >= 12 else {}))
@@ -174,7 +173,7 @@ def test_passes_are_grouped_and_changes_found(either: Ground) -> None:
     assert 0.6 < (requirement.low or 0.0) < 0.7
 
 
-def test_unknown_values_stay_unknown(ground: Ground) -> None:
+def test_unknown_values_stay_unknown(ground):
     add_pass(ground, 0, recall=None, altitude=None, status="unknown", build="")
     found = performance(ground, SPACECRAFT)
     groups = group_means(found)
@@ -184,7 +183,7 @@ def test_unknown_values_stay_unknown(ground: Ground) -> None:
     assert (requirement.unknown, requirement.share_met, requirement.low) == (1, None, None)
 
 
-def test_the_same_month_is_stored_once_and_late_data_give_a_new_report(either: Ground) -> None:
+def test_the_same_month_is_stored_once_and_late_data_give_a_new_report(either):
     for number in range(3):
         add_pass(either, number)
     first = make_monthly_report(either, SPACECRAFT, "2029-08")
@@ -203,7 +202,7 @@ def monthly(ground: Ground) -> list[Any]:
     return ground.read(list_monthly_reports, MonthlyReportFilter()).items
 
 
-def test_months() -> None:
+def test_months():
     assert month_span("2028-02") == (parse_utc("2028-02-01T00:00:00Z"), parse_utc("2028-03-01T00:00:00Z"))
     assert last_month(parse_utc("2029-01-01T00:00:00Z")) == "2028-12"
     assert last_month(parse_utc("2029-03-31T23:59:59Z")) == "2029-02"
@@ -218,7 +217,7 @@ def september() -> Iterator[None]:
     set_mission_clock(None)
 
 
-def test_a_requirement_that_is_unknown_on_some_passes_is_not_good(ground: Ground) -> None:
+def test_a_requirement_that_is_unknown_on_some_passes_is_not_good(ground):
     for number in range(4):
         add_pass(ground, number, status="met" if number == 3 else "unknown")
     value = monthly_value(performance(ground, SPACECRAFT, window_days=31.0), "2029-08")
@@ -226,7 +225,7 @@ def test_a_requirement_that_is_unknown_on_some_passes_is_not_good(ground: Ground
     assert value.verdict == "requirements judged: 1 of 1, none missed; median 3-D error not judged on 3 of 4 passes"
 
 
-def test_a_requirement_without_a_limit_may_be_unknown(ground: Ground) -> None:
+def test_a_requirement_without_a_limit_may_be_unknown(ground):
     add_pass(ground, 0)
     add_pass(ground, 1, key="other", limit=None, status="unknown")
     add_pass(ground, 2)
@@ -239,7 +238,7 @@ def test_a_requirement_without_a_limit_may_be_unknown(ground: Ground) -> None:
     assert value.verdict.endswith("median 3-D error not judged on 1 of 3 passes")
 
 
-def test_requirements_that_the_newest_report_lacks_are_judged(ground: Ground) -> None:
+def test_requirements_that_the_newest_report_lacks_are_judged(ground):
     add_pass(ground, 0, key="old", limit=50.0, status="not met")
     add_pass(ground, 1, key="old", limit=60.0, status="not met")
     add_pass(ground, 2)
@@ -249,7 +248,7 @@ def test_requirements_that_the_newest_report_lacks_are_judged(ground: Ground) ->
     assert monthly_value(found, "2029-08").verdict_level == "not met"
 
 
-def test_a_monthly_report_has_the_passes_of_one_instance(either: Ground) -> None:
+def test_a_monthly_report_has_the_passes_of_one_instance(either):
     add_pass(either, 0)
     add_pass(either, 0, instance="replay", status="not met")
     add_pass(either, 1, instance="replay", status="not met")
@@ -263,7 +262,7 @@ def test_a_monthly_report_has_the_passes_of_one_instance(either: Ground) -> None
     assert len(performance(either, SPACECRAFT, instance="replay").passes) == 2
 
 
-def test_passes_without_a_report_are_counted_and_the_month_is_not_good(ground: Ground) -> None:
+def test_passes_without_a_report_are_counted_and_the_month_is_not_good(ground):
     add_pass(ground, 0)
     assert monthly_value(performance(ground, SPACECRAFT), "2029-08").verdict_level == "met"
     start = FIRST + DAY_NS
@@ -276,7 +275,7 @@ def test_passes_without_a_report_are_counted_and_the_month_is_not_good(ground: G
     assert value.verdict.endswith("; 1 of 2 passes have a report")
 
 
-def test_too_many_passes_are_one_clear_error(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_passes_are_one_clear_error(ground, monkeypatch):
     monkeypatch.setattr("ground_service.evaluation.performance.service.PASSES_LIMIT", 2)
     for number in range(3):
         add_pass(ground, number)
@@ -285,9 +284,7 @@ def test_too_many_passes_are_one_clear_error(ground: Ground, monkeypatch: pytest
     assert len(performance(ground, SPACECRAFT, start_utc_ns=FIRST + DAY_NS).passes) == 2
 
 
-def test_the_failed_report_of_a_spacecraft_leaves_the_others(
-    ground: Ground, september: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_failed_report_of_a_spacecraft_leaves_the_others(ground, september, monkeypatch, caplog):
     add_pass(ground, 0)
     with ground.database.writing() as connection:
         other = vehicle_id(connection, 5, FLOWN)
@@ -308,9 +305,7 @@ def test_the_failed_report_of_a_spacecraft_leaves_the_others(
     assert "monthly report of spacecraft 5: failed: report: expected a value, found none" in caplog.text
 
 
-def test_what_is_old_goes_before_anything_of_the_night_can_fail(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_old_goes_before_anything_of_the_night_can_fail(ground, monkeypatch):
     def fail(_: Ground) -> None:
         raise InvalidInput("report", "", "a value", "none")
 
@@ -326,7 +321,7 @@ def test_what_is_old_goes_before_anything_of_the_night_can_fail(
     assert len(list(read_events(ground.database, 0))) == 1  # the newest stays
 
 
-def test_the_first_processed_window_of_a_month_reports_the_last_one(ground: Ground, september: None) -> None:
+def test_the_first_processed_window_of_a_month_reports_the_last_one(ground, september):
     add_pass(ground, 0)
     assert make_due_report(ground, 5) is None
     with ground.database.writing() as connection:
@@ -359,9 +354,7 @@ def test_the_first_processed_window_of_a_month_reports_the_last_one(ground: Grou
     assert len(monthly(ground)) == 1
 
 
-def test_operations_and_commands_give_the_same_report(
-    ground: Ground, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_operations_and_commands_give_the_same_report(ground, tmp_path, capsys):
     for number in range(14):
         add_pass(ground, number, **({"recall": 0.3} if number >= 7 else {}))
     with local_client(ground, "ann") as client:
@@ -410,5 +403,5 @@ def test_operations_and_commands_give_the_same_report(
         ("accuracy.median", [0.1] * 12, ""),
     ],
 )
-def test_a_filter_is_judged_over_passes_by_both_bounds(key: str, values: list[float | None], remark: str) -> None:
+def test_a_filter_is_judged_over_passes_by_both_bounds(key, values, remark):
     assert _consistency_remark(key, values) == remark

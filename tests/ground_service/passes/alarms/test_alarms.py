@@ -1,8 +1,6 @@
 """Alarms: raised once for each cause, kept until acknowledged, equal for any order of arrival."""
 
 import itertools
-from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -82,7 +80,7 @@ def published(ground: Ground) -> list[str]:
     return [AlarmChanged.of(one).state for one in read_events(ground.database, 0) if one.kind == "alarm"]
 
 
-def test_an_event_stays_raised_through_later_passes_until_it_is_acknowledged(either: Ground) -> None:
+def test_an_event_stays_raised_through_later_passes_until_it_is_acknowledged(either):
     receive(either, *[event(k) for k in range(82)])
     receive(either, *[housekeeping(k, 20.0) for k in range(200, 240)])
     (alarm,) = alarms(either)
@@ -95,7 +93,7 @@ def test_an_event_stays_raised_through_later_passes_until_it_is_acknowledged(eit
     assert either.read(list_audit, AuditFilter()).items[0].action == "acknowledge alarm"
 
 
-def test_a_limit_is_broken_once_and_cleared_after_acknowledgement_and_return(either: Ground) -> None:
+def test_a_limit_is_broken_once_and_cleared_after_acknowledgement_and_return(either):
     receive(either, *[housekeeping(k, 70.0 + k) for k in range(5)])
     (alarm,) = alarms(either, "raised")
     assert (alarm.name, alarm.severity, alarm.count, alarm.value) == ("temperature_c", "warning", 5, 74.0)
@@ -107,7 +105,7 @@ def test_a_limit_is_broken_once_and_cleared_after_acknowledgement_and_return(eit
     assert states(either) == [("raised", 1), ("cleared", 5)]
 
 
-def test_a_worse_condition_must_be_acknowledged_again(ground: Ground) -> None:
+def test_a_worse_condition_must_be_acknowledged_again(ground):
     receive(ground, housekeeping(0, 70.0))
     acknowledge(ground)
     for second, temperature_c, told in ((1, 75.0, ("acknowledged", "warning")), (2, 90.0, ("raised", "alarm"))):
@@ -117,7 +115,7 @@ def test_a_worse_condition_must_be_acknowledged_again(ground: Ground) -> None:
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
-def test_an_alarm_does_not_depend_on_the_order_of_arrival(ground: Ground, order: tuple[int, ...]) -> None:
+def test_an_alarm_does_not_depend_on_the_order_of_arrival(ground, order):
     parts = [
         [housekeeping(0, 70.0), event(1)],
         [housekeeping(10, 95.0), event(11), event(12, "event_medium")],
@@ -131,7 +129,7 @@ def test_an_alarm_does_not_depend_on_the_order_of_arrival(ground: Ground, order:
     ]
 
 
-def test_packets_that_arrive_again_are_not_counted_again(ground: Ground) -> None:
+def test_packets_that_arrive_again_are_not_counted_again(ground):
     packets = [event(k) for k in range(4)]
     receive(ground, *packets)
     receive(ground, *packets, event(4))
@@ -141,7 +139,7 @@ def test_packets_that_arrive_again_are_not_counted_again(ground: Ground) -> None
     assert examine_packets(ground, vehicle) == 0
 
 
-def test_late_packets_of_a_cleared_alarm_do_not_raise_it_again(ground: Ground) -> None:
+def test_late_packets_of_a_cleared_alarm_do_not_raise_it_again(ground):
     receive(ground, event(10))
     acknowledge(ground)
     receive(ground, event(5))
@@ -150,7 +148,7 @@ def test_late_packets_of_a_cleared_alarm_do_not_raise_it_again(ground: Ground) -
     assert states(ground) == [("raised", 1), ("cleared", 2)]
 
 
-def test_an_alarm_is_acknowledged_by_one_user(either: Ground) -> None:
+def test_an_alarm_is_acknowledged_by_one_user(either):
     receive(either, housekeeping(0, 70.0))
     (alarm,) = alarms(either)
     acknowledge(either)
@@ -160,7 +158,7 @@ def test_an_alarm_is_acknowledged_by_one_user(either: Ground) -> None:
         acknowledge_alarm(either, alarm.id + 1, "", actor="max")
 
 
-def test_a_shelved_alarm_returns_at_its_time(either: Ground) -> None:
+def test_a_shelved_alarm_returns_at_its_time(either):
     receive(either, event(0))
     (alarm,) = alarms(either)
     now = utc_now_ns()
@@ -177,7 +175,7 @@ def test_a_shelved_alarm_returns_at_its_time(either: Ground) -> None:
         shelve_alarm(either, alarm.id, now + hour, "", actor="eva")
 
 
-def test_an_alarm_is_shelved_in_mission_time_and_its_records_are_in_time_of_day(ground: Ground) -> None:
+def test_an_alarm_is_shelved_in_mission_time_and_its_records_are_in_time_of_day(ground):
     receive(ground, event(0))
     moment = utc_now_ns() + 1000 * 86_400 * 10**9
     set_mission_clock(lambda: moment)
@@ -190,7 +188,7 @@ def test_an_alarm_is_shelved_in_mission_time_and_its_records_are_in_time_of_day(
         set_mission_clock()
 
 
-def test_changes_are_published(ground: Ground) -> None:
+def test_changes_are_published(ground):
     receive(ground, event(0))
     acknowledge(ground)
     assert published(ground) == ["raised", "cleared"]
@@ -199,7 +197,7 @@ def test_changes_are_published(ground: Ground) -> None:
     assert published(ground)[2:] == ["raised", "condition ended", "condition returned"]
 
 
-def test_events_of_low_severity_and_refused_fixes_raise_no_alarm(ground: Ground) -> None:
+def test_events_of_low_severity_and_refused_fixes_raise_no_alarm(ground):
     receive(ground, *[event(k, "event_medium", 36) for k in range(4)])
     receive(ground, event(0, "event_info", 2), event(1, "event_low", 36), housekeeping(2, 20.0))
     assert alarms(ground) == []
@@ -215,7 +213,7 @@ def condition(ticks: int, severity: int, value: float) -> core.Condition:
     ),
     st.randoms(),
 )
-def test_conditions_are_joined_in_any_order(conditions: list[core.Condition], random: Any) -> None:
+def test_conditions_are_joined_in_any_order(conditions, random):
     def whole(parts: list[core.Condition]) -> core.Condition:
         result = parts[0]
         for one in parts[1:]:
@@ -226,7 +224,7 @@ def test_conditions_are_joined_in_any_order(conditions: list[core.Condition], ra
     assert whole(conditions) == whole(shuffled)
 
 
-def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path: Path) -> None:
+def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path):
     text = b'name = "stopped"\n[spacecraft]\nid = 76\n[uploads]\n'
     link = b'[[links]]\nname = "lab"\nkind = "tcp"\nuplink = "127.0.0.1:9"\n'
     moment = START // SECOND * 10**9
@@ -286,7 +284,7 @@ def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path: Path) -> None
         set_mission_clock()
 
 
-def test_an_alarm_states_the_procedure_of_the_mission_in_force(ground: Ground) -> None:
+def test_an_alarm_states_the_procedure_of_the_mission_in_force(ground):
     receive(ground, housekeeping(0, 70.0), event(1))
     known = {one.name: one.id for one in alarms(ground, "raised")}
     add_mission(ground, b'name="w"\nspacecraft.id=76\nprocedures.temperature_c="Check the heaters."', actor="ann")
