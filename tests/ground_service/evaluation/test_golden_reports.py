@@ -155,7 +155,7 @@ def test_the_share_over_unseen_terrain_is_that_of_the_frames_of_the_pass(made, r
     assert found.endswith("unseen terrain)") is (seen_frames == 8)
 
 
-def counts(report: PassReport) -> tuple[int, int, int]:
+def counts(report):
     return report.packets.packets, report.packets.lost, report.packets.lost_at_edges
 
 

@@ -85,7 +85,7 @@ def unzipped(octets: bytes) -> dict[str, bytes]:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-def features(export: Callable[..., bytes], layer: str, states: str = "reference") -> list[Any]:
+def features(export, layer: str, states: str = "reference") -> list[Any]:
     document = json.loads(export("geojson", states))
     return [one for one in document["features"] if one["properties"]["layer"] == layer]
 

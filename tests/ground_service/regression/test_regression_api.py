@@ -20,7 +20,7 @@ def found(client: TestClient, path: str, **params: Any) -> Any:
 
 
 def is_done(client: TestClient, job_id: str) -> bool:
-    return bool(found(client, f"jobs/{job_id}")["state"] == "done")
+    return found(client, f"jobs/{job_id}")["state"] == "done"
 
 
 def zipped(folder: Path, target: Path) -> bytes:
