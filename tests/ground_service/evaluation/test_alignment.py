@@ -79,6 +79,15 @@ def test_epochs_outside_the_reference_have_no_state():
         assert np.isnan(values[[0, 2]]).all() and np.isfinite(values[1]).all()
 
 
+def test_without_reference_or_orientation_nothing_is_covered():
+    for given in ((polar(), None), (None, Turning()), (None, None)):
+        track = reference_states(*given, after(0.0, 10.0))
+        assert track.covered.tolist() == [False, False]
+        assert track.position_icrf_m.shape == (2, 3) and track.mcmf_from_icrf.shape == (2, 3, 3)
+        assert np.isnan(track.position_icrf_m).all() and np.isnan(track.altitude_m).all()
+        assert track.utc_ns.tolist() == after(0.0, 10.0).tolist()
+
+
 def test_rows_of_a_track_are_those_rows_of_all_of_it_and_no_epochs_are_no_error():
     track = flown(0.0, 100.0, 200.0)
     some = track.at_rows(np.array([2, 0]))

@@ -312,7 +312,7 @@ def test_the_filter_is_smoothed_in_icrf_with_its_own_field():
     turn = np.kron(np.diag([1.0, 1.0, 0.0]), axis_rotation(3, -np.radians(1.0)))
 
     class Turned(Still):
-        def mcmf_from_icrf(self, tdb_s: ArrayLike) -> np.ndarray:
+        def mcmf_from_icrf(self, tdb_s):
             return turn[:3, :3].T @ super().mcmf_from_icrf(tdb_s)
 
     own = filter_states()
@@ -386,7 +386,8 @@ def test_a_start_state_as_good_as_the_reference_needs_no_perfect_one():
     position, velocity = circle(0.0)
     for east_m, names in ((0.9, ["propagate-only", "Kepler"]), (1.1, [*BASELINES])):
         start = StartState(EPOCH, position + np.array([0.0, east_m, 0.0]), velocity)
-        assert [one.name for one in of_baselines(evaluated(start_state=start))] == names
+        report = evaluated(start_state=start, onboard_gravity=builtin_gravity())
+        assert [one.name for one in of_baselines(report)] == names
 
 
 def test_a_start_within_the_pass_is_propagated_from_there():
@@ -405,7 +406,7 @@ def test_why_there_is_no_baseline(report, monkeypatch):
     refused = evaluated(start_state=START, gravity=None, refused={"gravity": "field Y is not here"})
     assert refused.remarks == ("no propagate-only baseline: field Y is not here",)
 
-    def fail(*_: object, **__: object) -> np.ndarray:
+    def fail(*_, **__):
         raise LunarError("it hit the ground")
 
     monkeypatch.setattr("ground_service.evaluation.core.propagated_positions", fail)
@@ -725,8 +726,9 @@ def test_the_summary_holds_the_figures_of_the_report(report):
         "note": "paper, 12 samples; not applicable: paper assumes a pass to the north or south, "
         "this track runs 90° from the meridian",
     }  # fmt: skip
-    relations = {one["key"]: one["relation"] for one in summary["requirements"]}
-    assert relations["detector.recall"] == ">="
+    assert [(one.low, one.high) for one in report.detector.by_altitude_km] == [(30.0, 40.0)]
+    assert report.detector.by_sun_elevation_deg == ()
+    assert {one["key"]: one["relation"] for one in summary["requirements"]}["detector.recall"] == ">="
     assert summary["error_budget"]["anchored"] == {
         "observed_rms_m": approx(30.0, abs=1e-3),
         "reference_rms_m": REFERENCE_M,
