@@ -186,7 +186,7 @@ def test_a_gap_is_not_counted_twice(made, report_on):
 def test_frames_that_were_never_made_are_no_lost_packets(made, report_on):
     """Twelve frames were planned; the payload counted from 0 to 6, and all of its packets came."""
 
-    def six(packets: list[bytes]) -> bytes:
+    def six(packets):
         ticks = [int.from_bytes(packets[k][14:20], "big") for k in (0, 6 * PACKETS_PER_FRAME)]
         ticks[0] -= TICKS_PER_SECOND  # the packets of an image are made after it
         started = event_packet(ticks[0], 0, "observation_started", 0)
@@ -216,7 +216,7 @@ def test_of_two_reports_on_one_image_one_counts(made, ground):
     place = {"latitude_deg": 0.0, "longitude_deg": 0.0, "altitude_m": 37_000.0, "matched": 5}
     unknown = {"velocity_icrf_m_s": nothing, "sigma_rtn_m": nothing, "nis": np.nan}
 
-    def again(packets: list[bytes]) -> bytes:
+    def again(packets):
         items = {name: np.array([value]) for name, value in one.items()}
         state = {**image, "outcome": "multi", **place, **unknown}
         more = [

@@ -120,7 +120,7 @@ def test_the_worst_frames_are_chosen_from_all_frames_and_not_from_those_with_an_
     expected = ExpectedCraters(offsets, row, zeros, zeros, zeros + 1.0, 0 * row, zeros == 0.0)
 
     class Detections(SimpleNamespace):
-        def __len__(self) -> int:
+        def __len__(self):
             return FRAMES
 
     inputs = SimpleNamespace(
@@ -192,7 +192,7 @@ def test_a_fifth_of_the_real_moon_is_dark_and_the_sea_of_tranquillity_is(data_pa
     share = float((area * (found.image < limit)).sum() / (area * 2048).sum())
     assert 0.14 < share < 0.25
 
-    def grey(latitude_deg: float, longitude_deg: float) -> int:
+    def grey(latitude_deg, longitude_deg):
         return int(found.image[int((90.0 - latitude_deg) / 180.0 * 1024), int(longitude_deg / 360.0 * 2048)])
 
     # Mare Tranquillitatis and Oceanus Procellarum; Tycho and the far side.

@@ -121,7 +121,7 @@ def test_nees_is_judged_by_both_bounds_for_its_independent_draws(gap_s, factor, 
 def test_a_requirement_is_met_at_its_limit_not_past_it_and_unknown_without_a_value(key, limit, at_limit, evaluated):
     what = found(CONSISTENT, **evaluated)
 
-    def judged(bound: float | None, what: Evaluated = what) -> Requirement:
+    def judged(bound, what=what):
         return row(key, Requirements(**{"estimator": "anchored", limit: bound}), what)
 
     exact = judged(at_limit)
@@ -213,7 +213,7 @@ def test_an_experiment_is_judged_apart_and_its_accuracy_from_convergence_on():
 
 
 def test_packets_whose_loss_at_the_edges_is_not_known_are_never_complete():
-    def judged(*counts: int) -> Requirement:
+    def judged(*counts):
         return row("completeness.packets", EVERY_LIMIT, found(packets=PacketAccounting(*counts)))
 
     assert judged(100).status == "unknown"

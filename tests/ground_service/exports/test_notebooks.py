@@ -121,7 +121,7 @@ def test_a_source_of_no_kind_is_one_line(tmp_path, name):
 def test_without_pandas_one_line_names_the_extra(rich_ground, monkeypatch):
     usual = builtins.__import__
 
-    def without(name: str, *rest: object) -> object:
+    def without(name, *rest):
         if name == "pandas":
             raise ImportError(name)
         return usual(name, *rest)

@@ -1,7 +1,7 @@
 """Cached answers: kept while other data come, made again with new data of their interval, made once for many."""
 
 import threading
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 
 import pytest
 from sqlalchemy import delete
@@ -100,7 +100,7 @@ def test_an_answer_older_than_a_change_that_is_known_is_not_kept(archive):
     with archive.ground.database.reading() as connection:
         cache = Cache(archive.ground, connection, archive.vehicle)
 
-        def slow() -> str:
+        def slow():
             archive.telemetry(START, STOP)
             with archive.ground.database.reading() as other:
                 Cache(archive.ground, other, archive.vehicle)
@@ -114,12 +114,12 @@ def test_an_answer_that_many_need_at_once_is_made_once(archive):
     begun, go_on = threading.Event(), threading.Event()
     found: list[int] = []
 
-    def slow() -> int:
+    def slow():
         begun.set()
         assert go_on.wait(20)
         return archive.make()
 
-    def ask(make: Callable[[], int]) -> None:
+    def ask(make):
         with archive.ground.database.reading() as connection:
             cache = Cache(archive.ground, connection, archive.vehicle)
             found.append(cache.answer("answer", make))

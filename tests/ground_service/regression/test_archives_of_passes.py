@@ -7,7 +7,6 @@ import shutil
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -38,7 +37,7 @@ from ground_service.regression.builds import Build, load_build, register_build
 from ground_service.regression.documents import regression_junit, regression_text, verdict_document
 from ground_service.regression.gates.policy import load_policy
 from ground_service.regression.jobs import compared, missing_replays
-from ground_service.regression.model import ArchiveRecord, Comparison, KeptArchive, KeptReplay
+from ground_service.regression.model import ArchiveRecord, Comparison, KeptReplay
 from ground_service.regression.pass_archives import LIVE, NO_INPUTS, archive_of_pass, keep_pass
 from ground_service.regression.service import find_replay, run_regression
 from linna.commands import regress
@@ -286,7 +285,7 @@ def test_a_replay_of_an_archive_that_is_completed_meanwhile_is_done_again(
     build = good(either, make_build, {"synthetic pass 5": flown.packets})
     replayed, seen = service._replayed, []
 
-    def completed_meanwhile(*given: Any) -> Any:
+    def completed_meanwhile(*given):
         result = replayed(*given)
         seen.append(result[0].outcome)
         if len(seen) == 1:
@@ -336,7 +335,7 @@ def test_archives_of_one_regression_are_rendered_at_the_same_time(ground, make_f
     digests = [keep_archive(ground, make_flyable(frames=4, seed=seed).folder).digest for seed in (1, 2)]
     both, settle = threading.Barrier(2, timeout=900.0), service.settle_archive
 
-    def rendered(ground: Ground, digest: str) -> KeptArchive:
+    def rendered(ground, digest):
         both.wait()  # broken if the second archive waits for the first one
         return settle(ground, digest)
 

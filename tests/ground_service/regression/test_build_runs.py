@@ -20,7 +20,7 @@ from ground_service.http.model import Paging, UtcTime
 from ground_service.regression import builds
 from ground_service.regression import sandbox as host
 from ground_service.regression.build_runs import BuildRun, run_build
-from ground_service.regression.builds import Build, changes, load_build, register_build
+from ground_service.regression.builds import changes, load_build, register_build
 from ground_service.regression.model import REASONS_LIMIT, JudgedGate, Regression, Verdict
 from ground_service.regression.sandbox import SandboxRefused
 from ground_service.regression.store import list_builds
@@ -234,7 +234,7 @@ def test_the_identity_of_a_build_is_that_of_what_it_runs(make_build, tmp_path):
 
 
 def test_what_differs_between_two_builds_on_the_flight_code_is_named(tmp_path, make_build):
-    def build(name: str, text: str, parameters: str = "") -> Build:
+    def build(name, text, parameters=""):
         folder = tmp_path / name
         folder.mkdir()
         (folder / "p.toml").write_text(parameters)

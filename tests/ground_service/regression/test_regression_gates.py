@@ -336,7 +336,7 @@ def test_a_gross_failure_on_one_pass_fails_in_one_sentence(name, fault, told):
 def test_processor_times_are_compared_by_the_median_of_their_ratios_from_five_passes_on():
     """Below five passes 35 % are tolerated, then 15 %; one pass of five on a busy machine decides nothing."""
 
-    def slower(factor: float) -> dict[str, Any]:
+    def slower(factor):
         return {**TIMES, "latency_ms": {"a": np.full(FRAMES, 40.0 * factor)}}
 
     for passes, factor, outcome in ((4, 1.3, "pass"), (4, 1.4, "fail"), (5, 1.2, "fail"), (5, 1.1, "pass")):

@@ -301,8 +301,8 @@ def test_a_replay_is_done_once_and_one_that_failed_again(home, judge, first, mak
     before = find_replay(home, digest, outcome.candidate)
     flown: list[int] = []
 
-    def run(candidate: Build) -> None:
-        def progress(items: Any, total: int) -> Any:
+    def run(candidate):
+        def progress(items, total):
             flown.append(total)
             return iter(items)
 
@@ -385,7 +385,7 @@ def test_a_crash_is_one_failure_and_the_last_lines_of_its_program_are_in_every_o
 
 
 def test_the_report_shows_the_craters_that_changed_side_by_side(home, judge, packets):
-    def thinned(items: dict[str, Any]) -> dict[str, Any]:
+    def thinned(items):
         kept = {name: values[::2] for name, values in items.items()}
         return kept | {"v_px": np.append(511.0 - kept["v_px"][:1], kept["v_px"][1:])}  # and one is elsewhere
 

@@ -171,7 +171,7 @@ def test_only_proposed_landmarks_are_decided_and_decisions_remain(ground, thinne
     update_landmarks(ground, first)
     seen = landmarks(ground)[0].id
 
-    def decide(actor: str, accept: bool = True, key: int = seen) -> Landmark:
+    def decide(actor, accept=True, key=seen):
         return decide_landmark(ground, key, accept=accept, reason="a rim in all frames", actor=actor)
 
     with raises(StateConflict, match="proposed or rejected"):

@@ -18,7 +18,6 @@ from ground_service.evaluation.performance.core import (
     rolling_counts,
     wilson,
 )
-from lunar.arrays import FloatArray, IntArray
 
 NAN = math.nan
 
@@ -114,7 +113,7 @@ def test_permutations_in_blocks_give_the_same_changes(monkeypatch):
     largest: list[int] = []
     permuted = core._largest_cusum
 
-    def seen(ranks: FloatArray) -> tuple[FloatArray, IntArray]:
+    def seen(ranks):
         largest.append(ranks.size)
         return permuted(ranks)
 

@@ -293,7 +293,7 @@ def test_the_failed_report_of_a_spacecraft_leaves_the_others(ground, september, 
         repository.add(connection, repository.PASSES, **{**row, "vehicle_id": other, "name": "other"})
     made = service.make_due_report
 
-    def broken(ground: Ground, spacecraft_id: int, instance: str = FLOWN) -> Any:
+    def broken(ground, spacecraft_id, instance=FLOWN):
         if spacecraft_id == 5:
             raise InvalidInput("report", "", "a value", "none")
         return made(ground, spacecraft_id, instance)
@@ -306,7 +306,7 @@ def test_the_failed_report_of_a_spacecraft_leaves_the_others(ground, september, 
 
 
 def test_what_is_old_goes_before_anything_of_the_night_can_fail(ground, monkeypatch):
-    def fail(_: Ground) -> None:
+    def fail(_):
         raise InvalidInput("report", "", "a value", "none")
 
     monkeypatch.setattr(upkeep, "make_due_reports", fail)
@@ -372,7 +372,7 @@ def test_operations_and_commands_give_the_same_report(ground, tmp_path, capsys):
     assert document["kind"] == "MonthlyReportValue"
     assert [one["metric"] for one in document["changes"]] == ["recall"]
 
-    def command(words: str, *out: object) -> int:
+    def command(words, *out):
         return run(["performance", *words.split(), *map(str, out), "--home", str(ground.home)])
 
     report = f"report --spacecraft-id {SPACECRAFT} --month"

@@ -214,7 +214,7 @@ def condition(ticks: int, severity: int, value: float) -> core.Condition:
     st.randoms(),
 )
 def test_conditions_are_joined_in_any_order(conditions, random):
-    def whole(parts: list[core.Condition]) -> core.Condition:
+    def whole(parts):
         result = parts[0]
         for one in parts[1:]:
             result = core.joined(result, one)
