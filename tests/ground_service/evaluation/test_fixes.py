@@ -3,9 +3,12 @@ beside the catalogue.
 """
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from pytest import approx
 
 from ground_service.evaluation.fixes import (
     FIRST_LANDMARK_ID,
@@ -47,78 +50,83 @@ def pairs(noise_px: float = 0.0, seed: int = 3) -> Pairs:
     return Pairs(frame, UTC_NS[frame], np.concatenate(uv), np.full(16, 40.0), np.tile(craters(), (2, 1)))
 
 
-def test_a_frame_gives_its_position_back_from_a_start_kilometres_off() -> None:
+def some(values: Any, rows: Any) -> Any:
+    """Return rows of pairs or of mapped craters."""
+    return type(values)(*(getattr(values, name)[rows] for name in values.__slots__))
+
+
+def test_a_frame_gives_its_position_back_from_a_start_kilometres_off():
     start = POSITION + np.array([[1500.0, -900.0, 700.0], [-400.0, 2500.0, 100.0]])
     solved = snapshot_positions(pairs(), CAMERA, UTC_NS, start)
     # exact projections: the residue is that of the last step, a centimetre at most
     assert np.abs(solved - POSITION).max() < 0.02
 
 
-def test_noise_of_a_pixel_moves_it_by_hundreds_of_metres_at_most() -> None:
+def test_noise_of_a_pixel_moves_it_by_hundreds_of_metres_at_most():
     solved = snapshot_positions(pairs(noise_px=1.0), CAMERA, UTC_NS, POSITION + 500.0)
     error = np.linalg.norm(solved - POSITION, axis=1)
     # a pixel is 203 m at nadir from 30 km (design figure); eight craters halve it, the geometry may triple it
     assert np.all((error > 1.0) & (error < 1000.0))
 
 
-def test_too_few_craters_give_no_position() -> None:
-    few = pairs()
-    keep = np.array([0, 1, 8, 9, 10])
-    few = Pairs(*(getattr(few, name)[keep] for name in ("frame", "utc_ns", "uv_px", "diameter_px", "crater_mcmf_m")))
-    solved = snapshot_positions(few, CAMERA, UTC_NS, POSITION)
+def test_too_few_craters_give_no_position():
+    solved = snapshot_positions(some(pairs(), np.array([0, 1, 8, 9, 10])), CAMERA, UTC_NS, POSITION)
     assert np.isnan(solved[0]).all()
     assert np.isfinite(solved[1]).all()
 
 
 @pytest.mark.parametrize(("swapped", "expected"), [(0, 0), (3, 0), (4, 1), (8, 1)])
-def test_a_fix_is_wrong_when_half_of_its_identifications_are(swapped: int, expected: int) -> None:
+def test_a_fix_is_wrong_when_half_of_its_identifications_are(swapped, expected):
     found = pairs()
     moved = found.uv_px.copy()
     moved[:swapped] += 30.0
-    found = Pairs(found.frame, found.utc_ns, moved, found.diameter_px, found.crater_mcmf_m)
+    found = replace(found, uv_px=moved)
     assert wrong_fixes(found, CAMERA, UTC_NS, POSITION) == expected
 
 
 @pytest.mark.parametrize("frame", [0, 1])
-def test_a_wrong_fix_counts_in_whichever_frame_it_is(frame: int) -> None:
+def test_a_wrong_fix_counts_in_whichever_frame_it_is(frame):
     found = pairs()
     moved = found.uv_px + np.where(found.frame == frame, 30.0, 0.0)[:, None]
-    found = Pairs(found.frame, found.utc_ns, moved, found.diameter_px, found.crater_mcmf_m)
+    found = replace(found, uv_px=moved)
     assert wrong_fixes(found, CAMERA, UTC_NS, POSITION) == 1
     # A frame at whose time there is no reference is neither right nor wrong.
-    other = 1 - frame
-    assert wrong_fixes(found, CAMERA, UTC_NS[[other]], POSITION[[other]]) == 0
-    lost = POSITION.copy()
-    lost[frame] = np.nan
+    other = [1 - frame]
+    assert wrong_fixes(found, CAMERA, UTC_NS[other], POSITION[other]) == 0
+    lost = np.where(np.arange(2)[:, None] == frame, np.nan, POSITION)
     assert wrong_fixes(found, CAMERA, UTC_NS, lost) == 0
 
 
 @pytest.mark.parametrize(
     ("offset_px", "diameter_px", "wrong"), [(4.9, 20.0, 0), (5.1, 20.0, 1), (9.9, 100.0, 0), (10.1, 100.0, 1)]
 )
-def test_an_identification_is_right_within_half_a_radius_and_ten_pixels(
-    offset_px: float, diameter_px: float, wrong: int
-) -> None:
+def test_an_identification_is_right_within_half_a_radius_and_ten_pixels(offset_px, diameter_px, wrong):
     found = pairs()
     moved = found.uv_px + np.array([offset_px, 0.0]) * (found.frame == 0)[:, None]
-    found = Pairs(found.frame, found.utc_ns, moved, np.full(16, diameter_px), found.crater_mcmf_m)
+    found = replace(found, uv_px=moved, diameter_px=np.full(16, diameter_px))
     assert wrong_fixes(found, CAMERA, UTC_NS, POSITION) == wrong
 
 
-def test_without_times_or_pairs_no_fix_is_wrong() -> None:
+def test_without_times_or_pairs_no_fix_is_wrong():
     assert wrong_fixes(pairs(), CAMERA, UTC_NS[:0], POSITION[:0]) == 0
-    none = Pairs(*(getattr(pairs(), name)[:0] for name in Pairs.__slots__))
-    assert wrong_fixes(none, CAMERA, UTC_NS, POSITION) == 0
+    assert wrong_fixes(some(pairs(), slice(0)), CAMERA, UTC_NS, POSITION) == 0
 
 
-def test_identifications_are_joined_by_time_place_and_number() -> None:
+def test_identifications_are_joined_by_time_place_and_number():
     latitude, heights = np.radians([10.0, 11.0, 12.0, 13.0]), [0.0, 0.0, 0.0, np.nan]
     catalogue = make_catalogue(latitude, np.zeros(4), np.full(4, 5e3), source="test", rim_height_m=heights)
     detections = DetectionSamples(
-        frame_number=np.array([0, 1]), utc_ns=UTC_NS, usable=np.ones(2, dtype=np.bool_), quality=("ok", "ok"),
-        offsets=np.array([0, 2, 3]), u_px=np.array([1.0, 2.0, 3.0]), v_px=np.array([4.0, 5.0, 6.0]),
-        diameter_px=np.array([7.0, 8.0, 9.0]), score=np.ones(3), size_class=np.zeros(3, dtype=np.int64),
-    )  # fmt: skip
+        frame_number=np.array([0, 1]),
+        utc_ns=UTC_NS,
+        usable=np.ones(2, dtype=np.bool_),
+        quality=("ok", "ok"),
+        offsets=np.array([0, 2, 3]),
+        u_px=1.0 + np.arange(3),
+        v_px=4.0 + np.arange(3),
+        diameter_px=np.full(3, 7.0),
+        score=np.ones(3),
+        size_class=np.zeros(3, dtype=np.int64),
+    )
     ids = catalogue.ids
     found = IdentificationSamples(
         utc_ns=np.array([1000, 2000, 2000, 1500, 1000, 1000]),
@@ -151,29 +159,29 @@ def mapped(known: CraterCatalogue, sigma_m: float, seed: int = 2, shift_m: float
     latitude = np.degrees(known.latitude_rad) + (north + shift_m) / METRES_PER_DEG
     longitude = np.degrees(known.longitude_rad) + east / (METRES_PER_DEG * np.cos(known.latitude_rad))
     return MappedCraters(
-        3_000_000_000 + np.arange(len(known)), latitude, longitude % 360.0, known.rim_height_m + up,
-        known.diameter_m * np.exp(0.05 * rng.standard_normal(len(known))), np.full((len(known), 3), sigma_m),
+        3_000_000_000 + np.arange(len(known)),
+        latitude,
+        longitude % 360.0,
+        known.rim_height_m + up,
+        known.diameter_m * np.exp(0.05 * rng.standard_normal(len(known))),
+        np.full((len(known), 3), sigma_m),
         np.ones(len(known), dtype=np.int64),
-    )  # fmt: skip
+    )
 
 
-def test_landmarks_are_found_in_the_catalogue_on_both_sides_of_the_meridian_with_honest_sigmas() -> None:
+def test_landmarks_are_found_in_the_catalogue_on_both_sides_of_the_meridian_with_honest_sigmas():
     craters = catalogue()
     result = compare_map(mapped(craters, 150.0), craters)
     assert result.crater.tolist() == list(range(len(craters)))
     # Median distance of a plane Gaussian: 1.177 sigma; 400 draws leave 5 %.
-    assert result.median_horizontal_m == pytest.approx(1.177 * 150.0, rel=0.15)
-    assert result.normalised_square == pytest.approx(1.0, abs=0.15)
+    assert result.median_horizontal_m == approx(1.177 * 150.0, rel=0.15)
+    assert result.normalised_square == approx(1.0, abs=0.15)
+    shifted = compare_map(mapped(craters, 100.0, shift_m=-250.0), craters)
+    assert shifted.median_offset_m[1] == approx(-250.0, abs=30.0)
+    assert shifted.normalised_square > 3.0
 
 
-def test_a_common_shift_of_the_map_shows() -> None:
-    craters = catalogue()
-    result = compare_map(mapped(craters, 100.0, shift_m=-250.0), craters)
-    assert result.median_offset_m[1] == pytest.approx(-250.0, abs=30.0)
-    assert result.normalised_square > 3.0
-
-
-def test_what_the_catalogue_lacks_is_new_and_a_crater_serves_one_landmark_only() -> None:
+def test_what_the_catalogue_lacks_is_new_and_a_crater_serves_one_landmark_only():
     craters = catalogue()
     listed = craters.select(np.arange(0, 200, 2))
     result = compare_map(mapped(craters, 100.0), listed)
@@ -183,36 +191,27 @@ def test_what_the_catalogue_lacks_is_new_and_a_crater_serves_one_landmark_only()
     assert compare_map(first, craters).known == 1
 
 
-def test_the_last_report_of_a_landmark_counts() -> None:
-    craters = catalogue(4)
-    early, late = mapped(craters, 300.0, 3), mapped(craters, 50.0, 4)
-    both = MappedCraters(
-        *(np.concatenate([getattr(early, name), getattr(late, name)]) for name in MappedCraters.__slots__)
-    )
-    assert np.array_equal(latest(both).latitude_deg, late.latitude_deg)
+def test_the_last_report_of_a_landmark_counts():
+    early, late = mapped(catalogue(4), 300.0, 3), mapped(catalogue(4), 50.0, 4)
+    both = (np.concatenate([getattr(one, name) for one in (early, late)]) for name in early.__slots__)
+    assert np.array_equal(latest(MappedCraters(*both)).latitude_deg, late.latitude_deg)
 
 
-def test_an_empty_map_compares_to_nothing() -> None:
-    nothing = mapped(catalogue(0), 100.0)
-    result = compare_map(nothing, catalogue())
-    assert result.known == 0
-    assert math.isnan(result.median_horizontal_m)
-
-
-def test_a_report_counts_the_landmarks_the_fixes_that_used_them_and_their_distance_from_the_catalogue() -> None:
+def test_a_report_counts_the_landmarks_the_fixes_that_used_them_and_their_distance_from_the_catalogue():
     craters = catalogue()
     reports = mapped(craters, 100.0)
     # The catalogue's crater 7, and landmark 0 twice and landmark 1 once.
     named = np.array([7, FIRST_LANDMARK_ID, FIRST_LANDMARK_ID, FIRST_LANDMARK_ID + 1])
     pairs = IdentificationSamples(np.arange(4), np.zeros(4, dtype=np.int64), named)
     result = payload_map(reports, pairs, craters.select(np.arange(100)))
-    assert result is not None
     assert (result.mapped, result.used, result.pairs, result.pairs_of_all) == (200, 2, 3, 4)
     assert (result.mapped_again, result.catalogued) == (0, 100)
     # Two axes of 100 m: the root mean square of the distance is 141 m; 200 draws leave 5 %.
-    assert result.horizontal_rms_m == pytest.approx(141.0, rel=0.15)
+    assert result.horizontal_rms_m == approx(141.0, rel=0.15)
 
 
-def test_a_pass_without_landmarks_has_no_map() -> None:
+def test_a_pass_without_landmarks_has_no_map():
+    result = compare_map(mapped(catalogue(0), 100.0), catalogue())
+    assert result.known == 0 and math.isnan(result.median_horizontal_m)
     assert payload_map(None, None, catalogue()) is None
     assert payload_map(mapped_craters(None), None, catalogue()) is None

@@ -4,6 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal, assert_array_less
+from numpy.typing import ArrayLike
+from pytest import approx
 
 from ground_service.errors import EvaluationError
 from ground_service.evaluation.smoother import (
@@ -27,6 +30,7 @@ from tests.payload_emulator.flight.test_dynamics import start_state
 
 Arrays = tuple[np.ndarray, np.ndarray]
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
+START_S = float(tdb_s_from_utc_ns(EPOCH))
 STEP_S, STATES = 60.0, 30
 SIGMA_M = 100.0
 FORCES = ForceModel(builtin_gravity(), IauOrientation(), 8)
@@ -46,12 +50,13 @@ def carried(state: np.ndarray, k: int) -> Arrays:
 class Session:
     """A true orbit, positions measured along it, and a plain Kalman filter of them, written out here."""
 
-    def __init__(self, seed: int, kick: np.ndarray | None = None, kick_at: int = -1) -> None:
+    def __init__(self, seed: int, kick: ArrayLike = 0.0, kick_at: int = -1) -> None:
+        push = np.concatenate([np.zeros(3), np.broadcast_to(kick, 3)])
         rng = np.random.default_rng(seed)
         truth = [start_state()[:6]]
         for k in range(STATES - 1):
-            if k == kick_at and kick is not None:
-                truth[-1] = truth[-1] + np.concatenate([np.zeros(3), kick])
+            if k == kick_at:
+                truth[-1] = truth[-1] + push
             truth.append(carried(truth[-1], k)[0])
         self.truth = np.array(truth)
         prior = np.diag([1e3**2] * 3 + [1.0**2] * 3)
@@ -61,8 +66,8 @@ class Session:
         states, covariances = [], []
         for k in range(STATES):
             if k:
-                if k - 1 == kick_at and kick is not None:
-                    mean = mean + np.concatenate([np.zeros(3), kick])
+                if k - 1 == kick_at:
+                    mean = mean + push
                 mean, transition = carried(mean, k - 1)
                 prior = transition @ prior @ transition.T
             spread = prior[:3, :3] + SIGMA_M**2 * np.eye(3)
@@ -95,17 +100,20 @@ def batch(session: Session) -> Arrays:
     return state, np.linalg.inv(normal)
 
 
-def test_without_process_noise_the_first_smoothed_state_is_that_of_one_least_squares_over_everything() -> None:
+def test_without_process_noise_the_first_smoothed_state_is_that_of_one_least_squares_over_everything():
+    """The last state is the filter's, and the uncertainty never grows."""
     session = Session(1)
     smoothed = smooth(session.filtered, QUIET)
+    assert_array_equal(smoothed.state[-1], session.filtered.state[-1])
+    assert np.all(smoothed.sigma_rtn_m <= session.filtered.sigma_rtn_m * (1.0 + 1e-9))
     expected, covariance = batch(session)
     sigma = np.sqrt(np.diag(covariance))
     # The filter linearised about its own states, the batch about the solution: a hundredth of a sigma apart.
-    np.testing.assert_array_less(np.abs(smoothed.state[0, :6] - expected) / sigma, 0.05)
-    np.testing.assert_allclose(np.sqrt(np.diag(smoothed.covariance[0])[:6]), sigma, rtol=0.02)
+    assert_array_less(np.abs(smoothed.state[0, :6] - expected) / sigma, 0.05)
+    assert_allclose(np.sqrt(np.diag(smoothed.covariance[0])[:6]), sigma, rtol=0.02)
 
 
-def test_smoothing_gains_by_half_and_keeps_its_own_account() -> None:
+def test_smoothing_gains_by_half_and_keeps_its_own_account():
     filtered, smoothed, nees = [], [], []
     for seed in range(8):
         session = Session(seed)
@@ -119,43 +127,37 @@ def test_smoothing_gains_by_half_and_keeps_its_own_account() -> None:
     assert 3.2 <= np.mean(nees) <= 10.0
 
 
-def test_the_last_state_is_the_filters_and_uncertainty_never_grows() -> None:
-    session = Session(3)
-    smoothed = smooth(session.filtered, QUIET)
-    np.testing.assert_array_equal(smoothed.state[-1], session.filtered.state[-1])
-    assert np.all(smoothed.sigma_rtn_m <= session.filtered.sigma_rtn_m * (1.0 + 1e-9))
+KICK = np.array([0.0, 0.0, 3.0])
 
 
-def test_a_commanded_burn_is_flown_over() -> None:
-    kick = np.array([0.0, 0.0, 3.0])
-    session = Session(4, kick, kick_at=14)
+def test_a_commanded_burn_is_flown_over():
+    session = Session(4, KICK, kick_at=14)
     # The burn falls between the samples 14 and 15, a moment after the former.
-    burn = CommandedBurn(int(TIMES[14]) + 1, kick, 1e-6)
+    burn = CommandedBurn(int(TIMES[14]) + 1, KICK, 1e-6)
     error = smooth(session.filtered, replace(QUIET, burns=(burn,))).state[:, :3] - session.truth[:, :3]
     # Sigma of the smoothed position is below 40 m here.
     assert np.linalg.norm(error, axis=1).max() < 160.0
 
 
-def test_a_burn_that_nobody_commanded_parts_the_orbit_in_two() -> None:
-    kick = np.array([0.0, 0.0, 3.0])
-    session = Session(5, kick, kick_at=14)
+def test_a_burn_that_nobody_commanded_parts_the_orbit_in_two():
+    session = Session(5, KICK, kick_at=14)
     known = smooth(session.filtered, QUIET)
     alone = smooth(session.filtered.select(np.arange(STATES) < 15), QUIET)
-    np.testing.assert_allclose(known.state[:15], alone.state, rtol=1e-12)
+    assert_allclose(known.state[:15], alone.state, rtol=1e-12)
 
 
-def test_a_clock_that_went_backwards_parts_the_orbit_in_two() -> None:
+def test_a_clock_that_went_backwards_parts_the_orbit_in_two():
     session = Session(6)
     times = TIMES.copy()
     times[20:] -= 3_600 * 10**9
-    torn = smooth(FilterStates(times, session.filtered.state, session.filtered.covariance, ICRF), QUIET)
-    np.testing.assert_array_equal(torn.state[19], session.filtered.state[19])
+    torn = smooth(replace(session.filtered, utc_ns=times), QUIET)
+    assert_array_equal(torn.state[19], session.filtered.state[19])
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_few_states_come_back_as_they_are(count: int) -> None:
+def test_few_states_come_back_as_they_are(count):
     few = Session(7).filtered.select(np.arange(STATES) < count)
-    np.testing.assert_array_equal(smooth(few, QUIET).state, few.state)
+    assert_array_equal(smooth(few, QUIET).state, few.state)
 
 
 # Nearly nothing pulls, 1e-12 m/s^2, and 1e9 m out at 1 m/s the axes of the orbit stay those of ICRF to 1e-7: the
@@ -200,7 +202,7 @@ def straight(seconds: list[float], seed: int = 9) -> FilterStates:
 
 
 def rauch_tung_striebel(
-    filtered: FilterStates, legs: list[list[float]], kicks: list[list[float]] | None = None, sigma_m_s: float = 0.0
+    filtered: FilterStates, legs: list[list[float]], kicks: list[list[float]], sigma_m_s: float = 0.0
 ) -> Arrays:
     """Return smoothed states and covariances by equations 3.28 to 3.30, with plain inverses.
 
@@ -209,12 +211,12 @@ def rauch_tung_striebel(
     state, covariance = filtered.state.copy(), filtered.covariance.copy()
     for k in range(len(legs))[::-1]:
         moved, total, noise = filtered.state[k].copy(), np.eye(9), np.zeros((9, 9))
-        for number, seconds in enumerate(legs[k]):
+        for seconds, kick in zip(legs[k], kicks[k], strict=True):
             transition, added = step_matrices(seconds)
             moved, total = transition @ moved, transition @ total
             noise = transition @ noise @ transition.T + added
-            if kicks is not None and kicks[k][number]:
-                moved[4] += kicks[k][number]
+            if kick:
+                moved[4] += kick
                 noise[3:6, 3:6] += np.eye(3) * sigma_m_s**2
         prior = total @ filtered.covariance[k] @ total.T + noise
         gain = filtered.covariance[k] @ total.T @ np.linalg.inv(prior)
@@ -227,31 +229,37 @@ def assert_same(found: FilterStates, expected: Arrays, start: FilterStates) -> N
     state, covariance = expected
     scale = np.sqrt(np.einsum("nii->ni", start.covariance))
     # Positions of 1e9 m have seven digits behind the point; the axes are turned by 1e-7.
-    np.testing.assert_allclose((found.state - state) / scale, 0.0, atol=1e-5)
-    np.testing.assert_allclose(
-        (found.covariance - covariance) / (scale[:, :, None] * scale[:, None, :]), 0.0, atol=1e-5
-    )
+    assert_allclose((found.state - state) / scale, 0.0, atol=1e-5)
+    assert_allclose((found.covariance - covariance) / (scale[:, :, None] * scale[:, None, :]), 0.0, atol=1e-5)
     assert np.abs(state - start.state).max() > 0.1  # and there was something to smooth
 
 
-def test_pushed_motion_is_smoothed_as_the_textbook_does_it() -> None:
+def test_pushed_motion_is_smoothed_as_the_textbook_does_it():
     """Half a second, a step of 50 s, and 100 s in two steps of 50 s."""
     filtered = straight([0.0, 0.5, 50.5, 150.5])
     found = smooth(filtered, PUSHED)
-    assert_same(found, rauch_tung_striebel(filtered, [[0.5], [50.0], [50.0, 50.0]]), filtered)
-    np.testing.assert_array_equal(found.utc_ns, filtered.utc_ns)
+    legs = [[0.5], [50.0], [50.0, 50.0]]
+    assert_same(found, rauch_tung_striebel(filtered, legs, [[0.0] * len(one) for one in legs]), filtered)
+    assert_array_equal(found.utc_ns, filtered.utc_ns)
 
 
-def test_burns_part_the_steps_and_count_once() -> None:
-    """One burn at the instant of the second state, one 20 s after it: 0.05 m/s to 0.3 m/s each."""
-    filtered = straight([0.0, 50.0, 130.0])
-    burns = tuple(CommandedBurn(EPOCH + at * 10**9, np.array([0.0, 0.05, 0.0]), 0.3) for at in (50, 70))
+@pytest.mark.parametrize(
+    ("seconds", "pushes", "legs", "kicks"),
+    [
+        # At the instant of the second state and 20 s after it; two at one instant.
+        ([0, 50, 130], [(50, 0.05), (70, 0.05)], [[50.0], [20.0, 60.0]], [[0.05], [0.05, 0.0]]),
+        ([0, 50], [(20, 0.05), (20, 0.03)], [[20.0, 0.0, 30.0]], [[0.05, 0.03, 0.0]]),
+    ],
+)
+def test_burns_part_the_steps_and_count_once(seconds, pushes, legs, kicks):
+    """Burns of some cm/s, with a sigma of 0.3 m/s each."""
+    filtered = straight(seconds)
+    burns = tuple(CommandedBurn(EPOCH + at * 10**9, np.array([0.0, push, 0.0]), 0.3) for at, push in pushes)
     found = smooth(filtered, replace(PUSHED, burns=burns))
-    expected = rauch_tung_striebel(filtered, [[50.0], [20.0, 60.0]], [[0.05], [0.05, 0.0]], 0.3)
-    assert_same(found, expected, filtered)
+    assert_same(found, rauch_tung_striebel(filtered, legs, kicks, 0.3), filtered)
 
 
-def test_a_jump_of_a_hundred_in_chi_square_parts_the_orbit() -> None:
+def test_a_jump_of_a_hundred_in_chi_square_parts_the_orbit():
     filtered = straight([0.0, 30.0])
     transition, noise = step_matrices(30.0)
     prior = transition @ filtered.covariance[0] @ transition.T + noise
@@ -263,64 +271,55 @@ def test_a_jump_of_a_hundred_in_chi_square_parts_the_orbit() -> None:
         assert bool(np.any(found.state[0] != filtered.state[0])) is smoothed
 
 
-def test_a_selection_keeps_the_degrees_of_its_states() -> None:
+def test_a_selection_keeps_the_degrees_of_its_states():
     some = straight([0.0, 1.0, 2.0]).select(np.array([True, False, True]))
-    assert some.innovation_degrees is not None and some.innovation_degrees.tolist() == [0, 2]
+    assert some.innovation_degrees.tolist() == [0, 2]
 
 
-def test_sigmas_lie_along_the_axes_of_the_orbit() -> None:
+def test_sigmas_lie_along_the_axes_of_the_orbit():
     """Position along y and velocity along -x: radial is y, transverse -x, normal z."""
     covariance = np.zeros((1, 9, 9))
     covariance[0, :3, :3] = np.diag([4.0, 9.0, 16.0])
     state = np.array([[0.0, 2e6, 0.0, -1.6e3, 0.0, 0.0, 0.0, 0.0, 0.0]])
     one = FilterStates(TIMES[:1], state, covariance, ICRF)
-    np.testing.assert_allclose(one.sigma_rtn_m, [[3.0, 2.0, 4.0]])
-    np.testing.assert_allclose(one.position_covariance_rtn_m2[0], np.diag([9.0, 4.0, 16.0]), atol=1e-12)
+    assert_allclose(one.sigma_rtn_m, [[3.0, 2.0, 4.0]])
+    assert_allclose(one.position_covariance_rtn_m2[0], np.diag([9.0, 4.0, 16.0]), atol=1e-12)
 
 
-def test_two_burns_of_one_instant_both_count() -> None:
-    filtered = straight([0.0, 50.0])
-    burns = tuple(CommandedBurn(EPOCH + 20 * 10**9, np.array([0.0, push, 0.0]), 0.3) for push in (0.05, 0.03))
-    found = smooth(filtered, replace(PUSHED, burns=burns))
-    assert_same(found, rauch_tung_striebel(filtered, [[20.0, 0.0, 30.0]], [[0.05, 0.03, 0.0]], 0.3), filtered)
-
-
-def test_long_steps_are_cut_into_equal_ones_of_a_minute_at_most() -> None:
+def test_long_steps_are_cut_into_equal_ones_of_a_minute_at_most():
     """TDB runs with UTC but for a second or two at the epoch; a burn ends a step."""
-    start_s = float(tdb_s_from_utc_ns(EPOCH))
     second = 10**9
-    assert _legs(EPOCH, EPOCH + 150 * second, start_s, ()) == [
-        (start_s, 50.0, None), (start_s + 50.0, 50.0, None), (start_s + 100.0, 50.0, None),
+    assert _legs(EPOCH, EPOCH + 150 * second, START_S, ()) == [
+        (START_S, 50.0, None), (START_S + 50.0, 50.0, None), (START_S + 100.0, 50.0, None),
     ]  # fmt: skip
-    assert _legs(EPOCH, EPOCH + 60 * second, start_s, ()) == [(start_s, 60.0, None)]
-    assert _legs(EPOCH, EPOCH, start_s, ()) == []
+    assert _legs(EPOCH, EPOCH + 60 * second, START_S, ()) == [(START_S, 60.0, None)]
+    assert _legs(EPOCH, EPOCH, START_S, ()) == []
     burn = CommandedBurn(EPOCH + 90 * second, np.zeros(3), 0.1)
-    first, last, after = _legs(EPOCH, EPOCH + 100 * second, start_s, (burn,))
-    assert (first, last[1:]) == ((start_s, 45.0, None), (45.0, burn)) and after[1:] == (10.0, None)
+    first, last, after = _legs(EPOCH, EPOCH + 100 * second, START_S, (burn,))
+    assert (first, last[1:]) == ((START_S, 45.0, None), (45.0, burn)) and after[1:] == (10.0, None)
     # Microseconds are what a float64 of seconds past J2000 tells.
-    assert (last[0] - start_s, after[0] - start_s) == (pytest.approx(45.0, abs=1e-5), pytest.approx(90.0, abs=1e-5))
+    assert (last[0] - START_S, after[0] - START_S) == approx((45.0, 90.0), abs=1e-5)
 
 
-def test_the_smoother_has_the_noise_of_the_field_on_each_side_of_the_moon() -> None:
+def test_the_smoother_has_the_noise_of_the_field_on_each_side_of_the_moon():
     field = replace(builtin_gravity(), name="LP165P")
     model = smoother_model(field, IauOrientation(), ())
     assert model.field_noise == field_noise("LP165P", min(100, field.degree))
-    tdb_s = float(tdb_s_from_utc_ns(EPOCH))
-    axes = IauOrientation().mcmf_from_icrf(tdb_s)
+    axes = IauOrientation().mcmf_from_icrf(START_S)
     # Over 0 and 180 degrees of longitude, going north.
     states = [np.r_[side * 1_767.4e3 * axes[0], 1_650.0 * axes[2], np.zeros(3)] for side in (1.0, -1.0)]
-    near, far = model.densities(np.full(2, tdb_s), np.array(states))
-    np.testing.assert_allclose(near, model.field_noise.near_psd_m2_s3, rtol=1e-6)
-    np.testing.assert_allclose(far, model.field_noise.far_psd_m2_s3, rtol=1e-3)
+    near, far = model.densities(np.full(2, START_S), np.array(states))
+    assert_allclose(near, model.field_noise.near_psd_m2_s3, rtol=1e-6)
+    assert_allclose(far, model.field_noise.far_psd_m2_s3, rtol=1e-3)
     # The noise of a step is that of the place at its beginning.
     carried = [
         _carried(state[None], np.array([EPOCH]), np.array([EPOCH + 60 * 10**9]), model)[2][0] for state in states
     ]
     ratio = np.trace(carried[1][3:6, 3:6]) / np.trace(carried[0][3:6, 3:6])
-    assert ratio == pytest.approx(far.sum() / near.sum(), rel=0.02)
+    assert ratio == approx(far.sum() / near.sum(), rel=0.02)
 
 
-def test_the_shift_of_the_map_is_renewed_over_the_ground() -> None:
+def test_the_shift_of_the_map_is_renewed_over_the_ground():
     """A share 1 - exp(-2 angle / 30 degrees) of its variance is new after a step; 10, 40 and 40 m."""
     model = smoother_model(builtin_gravity(), IauOrientation(), ())
     without = replace(model, map_sigma_rtn_m=(0.0, 0.0, 0.0))
@@ -332,17 +331,17 @@ def test_the_shift_of_the_map_is_renewed_over_the_ground() -> None:
     added = noise[0] - plain[0]
     axes = rtn_from_inertial(behind, carried[0, 3:6])
     share = 1.0 - np.exp(-2.0 * angle / np.radians(30.0))
-    np.testing.assert_allclose(axes @ added[:3, :3] @ axes.T, share * np.diag([100.0, 1600.0, 1600.0]), atol=1e-6)
-    np.testing.assert_allclose(added[3:], 0.0, atol=1e-12)
+    assert_allclose(axes @ added[:3, :3] @ axes.T, share * np.diag([100.0, 1600.0, 1600.0]), atol=1e-6)
+    assert_allclose(added[3:], 0.0, atol=1e-12)
     errors = CommonErrors()
     east_m, north_m, up_m = errors.catalogue_offset_m
     stated = smoother_model(builtin_gravity(), IauOrientation(), (), MapOffset((20.0, 25.0, 5.0), 80.0))
     assert stated.map_sigma_rtn_m == (5.0, 25.0, 20.0)
-    assert stated.map_correlation_rad == pytest.approx(np.radians(80.0))
+    assert stated.map_correlation_rad == approx(np.radians(80.0))
     assert model.map_sigma_rtn_m == (up_m, north_m, east_m)
     assert model.map_correlation_rad == errors.catalogue_correlation_rad
 
 
-def test_states_in_the_axes_of_the_payload_are_not_smoothed() -> None:
+def test_states_in_the_axes_of_the_payload_are_not_smoothed():
     with pytest.raises(EvaluationError, match="expected states in ICRF, found inertial axes of the payload"):
         smooth(replace(straight([0.0, 60.0]), frame=ONBOARD), QUIET)

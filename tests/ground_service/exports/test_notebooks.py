@@ -23,7 +23,7 @@ from ground_service.settings import Settings
 from linna.errors import UsageError
 from linna.passes import Archive
 from tests.ground_service.conftest import SPHERICAL_ERROR_RTN_M, free_port
-from tests.ground_service.exports.conftest import FRAMES, RichPass
+from tests.ground_service.exports.conftest import FRAMES
 from tmtc.errors import MissingLibrary
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -46,16 +46,8 @@ def check(archive: Archive) -> None:
     assert summary.loc[one.id, "spherical median_3d_m"] == pytest.approx(spherical["error_3d_m"].median(), rel=1e-3)
 
 
-def test_a_home_folder_is_opened(rich_ground: Ground) -> None:
-    with linna.open(rich_ground.home) as archive:
-        check(archive)
-        assert "passes" in repr(archive)
-
-
 @pytest.mark.filterwarnings("ignore:ERFA function")  # leap seconds of 2029 are not announced
-def test_the_examples_of_other_tools_run_where_the_tool_is_installed(
-    rich_ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_examples_of_other_tools_run_where_the_tool_is_installed(rich_ground, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("LINNA_HOME", str(rich_ground.home))
     monkeypatch.chdir(tmp_path)
     text, names = (ROOT / "docs" / "other-tools.md").read_text(), {"__name__": "example"}
@@ -68,7 +60,7 @@ def test_the_examples_of_other_tools_run_where_the_tool_is_installed(
     assert capsys.readouterr().out.splitlines()[-1].endswith(" km")
 
 
-def test_an_archive_is_opened_as_folder_and_as_zip(rich_pass: RichPass) -> None:
+def test_an_archive_is_opened_as_folder_and_as_zip(rich_pass):
     with linna.open(rich_pass.folder) as archive:
         check(archive)
     packed = zip_folder(rich_pass.folder)
@@ -96,14 +88,16 @@ def server(rich_ground: Ground) -> Iterator[tuple[str, str]]:
     thread.join()
 
 
-def test_a_server_is_opened_with_a_token(server: tuple[str, str]) -> None:
+def test_a_server_is_opened_with_a_token(server):
     url, token = server
     with linna.open(url, token=token) as archive:
         check(archive)
 
 
-def test_tables_have_the_types_of_their_columns(rich_ground: Ground) -> None:
+def test_a_home_folder_is_opened_and_its_tables_have_the_types_of_their_columns(rich_ground):
     with linna.open(rich_ground.home) as archive:
+        check(archive)
+        assert "passes" in repr(archive)
         one = archive[1]
         assert set(one.tables) >= {"states", "residuals", "frames", "detections", "events", "reference"}
         detections = one.detections
@@ -116,7 +110,7 @@ def test_tables_have_the_types_of_their_columns(rich_ground: Ground) -> None:
 
 
 @pytest.mark.parametrize("name", ["missing", "empty"])
-def test_a_source_of_no_kind_is_one_line(tmp_path: Path, name: str) -> None:
+def test_a_source_of_no_kind_is_one_line(tmp_path, name):
     (tmp_path / "empty").mkdir()
     found = "another folder" if name == "empty" else "none"
     with pytest.raises(UsageError, match=rf"{name}: expected a home folder with linna.db, .*, found {found}"):
@@ -124,10 +118,10 @@ def test_a_source_of_no_kind_is_one_line(tmp_path: Path, name: str) -> None:
     assert list((tmp_path / "empty").iterdir()) == []
 
 
-def test_without_pandas_one_line_names_the_extra(rich_ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pandas_one_line_names_the_extra(rich_ground, monkeypatch):
     usual = builtins.__import__
 
-    def without(name: str, *rest: object) -> object:
+    def without(name, *rest):
         if name == "pandas":
             raise ImportError(name)
         return usual(name, *rest)
@@ -139,7 +133,8 @@ def test_without_pandas_one_line_names_the_extra(rich_ground: Ground, monkeypatc
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_is_stored_without_outputs_and_small(path: Path) -> None:
+def test_a_notebook_is_stored_without_outputs_and_small(path):
+    assert [one.stem for one in NOTEBOOKS] == ["campaign", "detector", "pass"]
     assert path.stat().st_size < 20_000
     for cell in json.loads(path.read_text())["cells"]:
         assert cell.get("outputs", []) == [] and cell.get("execution_count") is None
@@ -147,7 +142,7 @@ def test_a_notebook_is_stored_without_outputs_and_small(path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs(path: Path, rich_ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notebook_runs(path, rich_ground, monkeypatch):
     import nbformat  # two seconds, which the other tests need not spend
     from nbclient import NotebookClient
 
@@ -166,7 +161,7 @@ def test_a_notebook_runs(path: Path, rich_ground: Ground, monkeypatch: pytest.Mo
     assert len(page) < 40_000
 
 
-def test_a_page_shows_outputs_in_the_order_of_the_cells() -> None:
+def test_a_page_shows_outputs_in_the_order_of_the_cells():
     cells = [
         {"cell_type": "markdown", "source": ["# Title\n", "Text."]},
         {
@@ -198,7 +193,3 @@ def test_a_page_shows_outputs_in_the_order_of_the_cells() -> None:
         "```text\n7\n```\n",
     ]
     assert pictures == {"pass-1.png": b"\x89PNG"}
-
-
-def test_there_are_three_notebooks() -> None:
-    assert [path.stem for path in NOTEBOOKS] == ["campaign", "detector", "pass"]

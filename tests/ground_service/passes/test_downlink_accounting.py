@@ -1,5 +1,7 @@
 """Raw files accounted for by on-board time, against streams whose every frame and packet is known."""
 
+from typing import Any
+
 import numpy as np
 
 from ground_service.passes.downlink_accounting import account_raw, read_raw
@@ -22,85 +24,87 @@ def stream(start_ticks: int, packets: int) -> bytes:
     return encode_cadus([event(start_ticks + (k << 16), k) for k in range(packets)], spacecraft_id=SPACECRAFT)
 
 
+def found(*files: bytes, hours: tuple[int, int] = (0, 11)) -> Any:
+    """Account for raw files between two hours."""
+    return account_raw([read_raw(one, SPACECRAFT) for one in files], *(hour * HOUR for hour in hours))
+
+
+def both(*files: bytes) -> tuple[Any, Any]:
+    """Account for the first and for the second pass."""
+    return found(*files), found(*files, hours=(19, 30))
+
+
 FIRST, SECOND = stream(10 * HOUR, 300), stream(20 * HOUR, 90)
 """Two passes; an event is 39 octets or so, a frame holds 28 of them."""
 
 
-def test_two_passes_in_one_file_are_told_apart() -> None:
-    file = read_raw(FIRST + SECOND, SPACECRAFT)
-    one = account_raw([file], 10 * HOUR, 11 * HOUR)
-    two = account_raw([file], 20 * HOUR, 21 * HOUR)
+def test_two_passes_in_one_file_are_told_apart():
+    one, two = both(FIRST + SECOND)
     assert (one.frames, two.frames) == (len(FIRST) // CADU, len(SECOND) // CADU)
     assert (one.octets, two.octets) == (len(FIRST), len(SECOND))
-    assert account_raw([file], 12 * HOUR, 13 * HOUR).frames == 0
-    assert file.span == (10 * HOUR, 20 * HOUR + (89 << 16))
+    assert found(FIRST + SECOND, hours=(10, 11)) == one
+    assert found(FIRST + SECOND, hours=(12, 13)).frames == 0
+    assert read_raw(FIRST + SECOND, SPACECRAFT).span == (10 * HOUR, 20 * HOUR + (89 << 16))
 
 
-def test_frames_that_cannot_be_used_lie_where_their_neighbours_lie() -> None:
+def test_frames_that_cannot_be_used_lie_where_their_neighbours_lie():
     octets = bytearray(FIRST + SECOND)
     middle = 3 * CADU
     octets[middle + 50 : middle + 400] = bytes(350)  # beyond repair, in the first pass
     octets[len(FIRST) + CADU + 60] ^= 0xFF  # one symbol to repair, in the second
-    file = read_raw(bytes(octets), SPACECRAFT)
-    one, two = account_raw([file], 0, 11 * HOUR), account_raw([file], 19 * HOUR, 30 * HOUR)
+    one, two = both(bytes(octets))
     assert (one.frames, one.frames_bad, one.symbols_corrected) == (len(FIRST) // CADU, 1, 0)
     assert (two.frames, two.frames_bad, two.symbols_corrected) == (len(SECOND) // CADU, 0, 1)
     assert one.octets == len(FIRST) and two.octets == len(SECOND)
 
 
-def test_octets_between_frames_are_skipped_octets_of_the_frame_before() -> None:
-    file = read_raw(FIRST[: 2 * CADU] + bytes(777) + FIRST[2 * CADU :] + SECOND, SPACECRAFT)
-    one, two = account_raw([file], 0, 11 * HOUR), account_raw([file], 19 * HOUR, 30 * HOUR)
+def test_octets_between_frames_are_skipped_octets_of_the_frame_before():
+    octets = FIRST[: 2 * CADU] + bytes(777) + FIRST[2 * CADU :] + SECOND
+    one, two = both(octets)
     assert one.octets_skipped == 777 and one.octets == len(FIRST) + 777
     assert two.octets_skipped == 0
-    assert account_raw([file], 10 * HOUR, 11 * HOUR).octets_skipped == 777
+    assert found(octets, hours=(10, 11)).octets_skipped == 777
 
 
-def test_a_packet_that_came_twice_is_a_duplicate_of_its_process_in_its_pass() -> None:
+def test_a_packet_that_came_twice_is_a_duplicate_of_its_process_in_its_pass():
     again = encode_cadus([event(10 * HOUR, 0), event(10 * HOUR + (5 << 16), 5)], spacecraft_id=SPACECRAFT)
-    files = [read_raw(FIRST, SPACECRAFT), read_raw(again, SPACECRAFT), read_raw(SECOND, SPACECRAFT)]
-    assert account_raw(files, 0, 11 * HOUR).duplicates == {EVENTS: 2}
-    assert account_raw(files, 19 * HOUR, 30 * HOUR).duplicates == {EVENTS: 0}
-    assert account_raw(files[:1], 0, 11 * HOUR).duplicates == {EVENTS: 0}
+    three = [one.duplicates[EVENTS] for one in (*both(FIRST, again, SECOND), found(FIRST))]
+    assert three == [2, 0, 0]
 
 
-def test_a_packet_put_together_from_parts_leaves_no_octets_unused() -> None:
+def test_a_packet_put_together_from_parts_leaves_no_octets_unused():
     """Two frames are exchanged: the packets across their borders are put together, and none of their octets is left."""
     octets = FIRST[: 2 * CADU] + FIRST[3 * CADU : 4 * CADU] + FIRST[2 * CADU : 3 * CADU] + FIRST[4 * CADU :]
-    found = account_raw([read_raw(octets, SPACECRAFT)], 0, 11 * HOUR)
-    assert (found.frames, found.frames_bad, found.octets) == (len(FIRST) // CADU, 0, len(FIRST))
-    assert (found.octets_skipped, found.duplicates) == (0, {EVENTS: 0})
     # The packets put together stand in no frame: they give none of another pass their time.
-    file = read_raw(octets + SECOND, SPACECRAFT)
-    assert account_raw([file], 19 * HOUR, 30 * HOUR).frames == len(SECOND) // CADU
+    alone, (_, two) = found(octets), both(octets + SECOND)
+    assert (alone.frames, alone.frames_bad, alone.octets) == (len(FIRST) // CADU, 0, len(FIRST))
+    assert (alone.octets_skipped, alone.duplicates) == (0, {EVENTS: 0})
+    assert two.frames == len(SECOND) // CADU
 
 
-def test_packets_with_a_wrong_checksum_are_counted_by_process() -> None:
+def test_packets_with_a_wrong_checksum_are_counted_by_process():
     good = [event(10 * HOUR + (k << 16), k) for k in range(5)]
     bad = bytearray(good[2])
     bad[-5] ^= 1
-    file = read_raw(b"".join([*good[:2], bytes(bad), *good[3:]]), SPACECRAFT)
-    found = account_raw([file], 0, 11 * HOUR)
-    assert (found.crc_errors, found.duplicates) == ({EVENTS: 1}, {EVENTS: 0})
-    assert found.frames is None
+    one = found(b"".join([*good[:2], bytes(bad), *good[3:]]))
+    assert (one.crc_errors, one.duplicates, one.frames) == ({EVENTS: 1}, {EVENTS: 0}, None)
 
 
-def test_frames_of_another_spacecraft_are_left_out() -> None:
+def test_frames_of_another_spacecraft_are_left_out():
     other = encode_cadus([event(10 * HOUR + (k << 16), k) for k in range(60)], spacecraft_id=5)
-    found = account_raw([read_raw(FIRST + other, SPACECRAFT)], 0, 11 * HOUR)
-    assert found.frames == len(FIRST) // CADU and found.frames_bad == 0
+    one = found(FIRST + other)
+    assert (one.frames, one.frames_bad) == (len(FIRST) // CADU, 0)
 
 
-def test_a_file_without_a_readable_packet_belongs_to_no_pass() -> None:
+def test_a_file_without_a_readable_packet_belongs_to_no_pass():
     noise = np.random.default_rng(1).integers(0, 256, 5000, dtype=np.uint8).tobytes()
-    file = read_raw(noise, SPACECRAFT)
-    assert file.span is None
-    assert account_raw([file], 0, 1 << 48).octets_skipped == 0
-    assert account_raw([], 0, 1 << 48).frames is None
+    assert read_raw(noise, SPACECRAFT).span is None
+    always = (0, 1 << 20)
+    assert found(noise, hours=always).octets_skipped == 0 and found(hours=always).frames is None
 
 
-def test_a_pass_of_one_frame_at_the_start_of_a_file_has_its_own_time() -> None:
+def test_a_pass_of_one_frame_at_the_start_of_a_file_has_its_own_time():
     short = stream(10 * HOUR, 20)
     assert len(short) == CADU
-    one = account_raw([read_raw(short + SECOND, SPACECRAFT)], 10 * HOUR, 11 * HOUR)
+    one = found(short + SECOND, hours=(10, 11))
     assert (one.frames, one.octets) == (1, CADU)

@@ -22,7 +22,7 @@ from lunar.catalogue import CraterCatalogue, load_catalogue, save_catalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.session.archive.replay import FlightBuild, replay_archive
 from payload_emulator.session.archive.suite import suite_scenarios, write_suite
-from tests.ground_service.conftest import write_manifest
+from tests.ground_service.conftest import enter_files
 from tmtc.dictionary.tables import pack_catalogue_table, unpack_catalogue_table
 
 SCENARIO = "suite-real-sun"
@@ -52,9 +52,9 @@ def linna(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
     """Run a command on one service; return its JSON output."""
     home = tmp_path_factory.mktemp("chain") / "home"
 
-    def run(*words: object, status: int = 0) -> Any:
+    def run(words: str) -> Any:
         with redirect_stdout(io.StringIO()) as output:
-            assert cli.run([str(word) for word in (*words, "--home", home, "--json")]) == status, words
+            assert cli.run([*words.split(), "--home", str(home), "--json"]) == 0, words
         return json.loads(output.getvalue())
 
     run.home = home
@@ -73,33 +73,32 @@ def learned(linna: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory)
     with open_ground(linna.home) as ground:
         ids = [import_archive(ground, _pass(written.folder, folder, name, thin)) for name in ("first", "second")]
 
-    before = linna("landmarks", "find", *ids)["passes"][1]
-    proposed = linna("landmarks", "list", "--state", "proposed", "--limit", 500)["landmarks"]
+    before = linna("landmarks find {} {}".format(*ids))["passes"][1]
+    proposed = [one["id"] for one in linna("landmarks list --state proposed --limit 500")["landmarks"]]
     assert before["proposed"] == len(proposed) > 20
-    linna("landmarks", "reject", proposed[0]["id"], "--reason", "no rim", "--as", "ann")
-    linna("landmarks", "accept", proposed[1]["id"], "--as", "ann")
+    linna(f"landmarks reject {proposed[0]} --reason rimless --as ann")
+    linna(f"landmarks accept {proposed[1]} --as ann")
     with open_ground(linna.home) as ground:
         for one in proposed[2:]:
-            decide_landmark(ground, one["id"], accept=True, reason="", actor="ann")
-    shown = linna("landmarks", "show", proposed[1]["id"])
+            decide_landmark(ground, one, accept=True, reason="", actor="ann")
+    shown = linna(f"landmarks show {proposed[1]}")
     assert (shown["state"], shown["decided_by"], len(shown["evidence"])) == ("accepted", "ann", 2)
-    linna("landmarks", "export", "--catalogue", folder / "old.csv", "--out", folder / "new.csv")
+    linna(f"landmarks export --catalogue {folder}/old.csv --out {folder}/new.csv")
     return Learned(folder, written.folder, thin, len(proposed), before["unmatched"], linna)
 
 
 @pytest.mark.campaign
-def test_the_uploaded_table_gives_a_later_pass_more_landmarks(learned: Learned) -> None:
+def test_the_uploaded_table_gives_a_later_pass_more_landmarks(learned):
     """The table goes up by PUS 13, released by a second person; the flight software flies with it."""
     folder, linna = learned.folder, learned.linna
     flown = unpack_catalogue_table((learned.archive / "payload/tables/catalogue.bin").read_bytes())
     old = flown.select(np.isin(flown.ids, learned.thin.ids))
     (folder / "old.bin").write_bytes(pack_catalogue_table(old))
-    linna("landmarks", "export", "--table", folder / "old.bin", "--out", folder / "new.bin")
-    upload = ("--spacecraft-id", 76, "--instance", "flight", "--as", "ann")
-    queued = linna("landmarks", "upload", folder / "new.bin", *upload)
+    linna(f"landmarks export --table {folder}/old.bin --out {folder}/new.bin")
+    queued = linna(f"landmarks upload {folder}/new.bin --spacecraft-id 76 --instance flight --as ann")
     for one in queued["telecommands"]:
-        linna("command", "release", one, "--as", "bob")
-    linna("command", "uplink", "--spacecraft-id", 76, "--format", "packets", "--out", folder / "uplink.bin")
+        linna(f"command release {one} --as bob")
+    linna(f"command uplink --spacecraft-id 76 --format packets --out {folder}/uplink.bin")
     [onboard] = uploaded_tables((folder / "uplink.bin").read_bytes())
     assert onboard == (folder / "new.bin").read_bytes()
     assert len(unpack_catalogue_table(onboard)) == len(old) + learned.proposed - 1 == queued["craters"]
@@ -115,23 +114,20 @@ def test_the_uploaded_table_gives_a_later_pass_more_landmarks(learned: Learned) 
         unaware, aware = (pass_summary(ground, one)["detector"]["precision"] for one in ids)
         used = [_matched(ground, one) for one in ids]
     for one, name in zip(ids, ("old.bin", "new.bin"), strict=True):
-        made = linna("landmarks", "table", one, "--out", folder / "onboard.bin")
+        made = linna(f"landmarks table {one} --out {folder}/onboard.bin")
         assert (folder / "onboard.bin").read_bytes() == (folder / name).read_bytes()
         assert made["craters"] == len(unpack_catalogue_table((folder / name).read_bytes()))
     assert used[1] > 2 * used[0] > 0
     assert aware > 0.8 > 0.3 > unaware
-    after = linna("landmarks", "find", ids[1])["passes"][0]
+    after = linna(f"landmarks find {ids[1]}")["passes"][0]
     assert after["unmatched"] < 0.3 * learned.unmatched
 
 
 def _pass(archive: Path, folder: Path, name: str, catalogue: CraterCatalogue) -> Path:
     """Copy an archive as another pass, with the catalogue that the ground has."""
-    target = folder / name
-    shutil.copytree(archive, target)
+    target = shutil.copytree(archive, folder / name)
     save_catalogue(catalogue, target / "catalogue.csv")
-    manifest = json.loads((target / "manifest.json").read_text())
-    manifest.pop("files")
-    write_manifest(target, manifest | {"pass_name": name})
+    enter_files(target, pass_name=name)
     return target
 
 
@@ -141,9 +137,7 @@ def _flown(learned: Learned, name: str, table: bytes, catalogue: CraterCatalogue
     (target / "payload/tables/catalogue.bin").write_bytes(table)
     replay_archive(target, FlightBuild(), learned.folder / f"out-{name}")
     shutil.copyfile(learned.folder / f"out-{name}" / "downlink.cadu", target / "downlink.cadu")
-    manifest = json.loads((target / "manifest.json").read_text())
-    manifest.pop("files")
-    write_manifest(target, manifest)
+    enter_files(target)
     return target
 
 

@@ -1,13 +1,13 @@
 """Landmarks learned from synthetic passes whose ground catalogue lacks known craters."""
 
-import json
 import shutil
-import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pytest import approx, raises
 
 from ground_service.errors import EvaluationError, InvalidInput, NotFound, StateConflict
 from ground_service.evaluation.landmarks.core import (
@@ -42,7 +42,7 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder
 from lunar.frames import mcmf_from_spherical
 from payload_emulator.training.data.landmarks import load_landmarks
-from tests.ground_service.conftest import SyntheticPass, write_manifest
+from tests.ground_service.conftest import SyntheticPass, enter_files
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.tables import CatalogueTable, pack_catalogue_table, unpack_catalogue_table
 from tmtc.packets.large_data import LargeDataReceiver
@@ -60,14 +60,8 @@ def thinned(make_pass: Callable[..., SyntheticPass]) -> tuple[Path, CraterCatalo
     full = load_catalogue(made.folder / "catalogue.csv")
     withheld = np.arange(len(full)) % 3 == 0
     save_catalogue(full.select(~withheld), made.folder / "catalogue.csv")
-    rewrite(made.folder, "first pass")
+    enter_files(made.folder, pass_name="first pass")
     return made.folder, full, full.select(withheld)
-
-
-def rewrite(folder: Path, name: str) -> None:
-    manifest = json.loads((folder / "manifest.json").read_text())
-    manifest.pop("files")
-    write_manifest(folder, manifest | {"pass_name": name})
 
 
 def distances_m(catalogue: CraterCatalogue, one: Landmark) -> np.ndarray:
@@ -77,30 +71,35 @@ def distances_m(catalogue: CraterCatalogue, one: Landmark) -> np.ndarray:
     return MOON_RADIUS_M * np.hypot(east, latitude - catalogue.latitude_rad)
 
 
-def both_passes(ground: Ground, folder: Path) -> list[int]:
+def both_passes(ground: Ground, thinned: tuple[Path, ...]) -> list[int]:
     """Import one archive under two names, as two passes over the same ground."""
-    ids = []
+    folder, ids = thinned[0], []
     for name in ("first pass", "second pass"):
-        rewrite(folder, name)
+        enter_files(folder, pass_name=name)
         ids.append(import_archive(ground, folder))
     return ids
 
 
-def test_withheld_craters_become_proposals_at_their_places(either: Ground, thinned) -> None:
-    folder, _, withheld = thinned
-    first, second = both_passes(either, folder)
+def landmarks(ground: Ground, **terms: str) -> list[Landmark]:
+    page = ground.read(list_landmarks, LandmarkFilter(limit=1000, **terms))
+    assert page.total == len(page.items)
+    return page.items
+
+
+def test_withheld_craters_become_proposals_at_their_places(either, thinned):
+    _, _, withheld = thinned
+    first, second = both_passes(either, thinned)
     update = update_landmarks(either, first)
     assert update.unmatched > update.places > 30 and update.controls > 30
     assert update.proposed == 0 and update.added == update.places  # one pass is not enough
-    assert {one.state for one in either.read(list_landmarks, LandmarkFilter(limit=1000)).items} == {"seen"}
+    assert {one.state for one in landmarks(either)} == {"seen"}
     # the detections of these passes are all half a pixel right and 1.25 pixels up of the craters
     assert update.offset_east_m is not None and update.offset_north_m is not None
     assert 60.0 < update.offset_east_m < 140.0 and 170.0 < update.offset_north_m < 340.0
     update = update_landmarks(either, second)
     assert update.added == 0 and update.proposed > 30
-    page = either.read(list_landmarks, LandmarkFilter(state="proposed", limit=1000))
-    proposed, total = page.items, page.total
-    assert total == len(proposed) == update.proposed
+    proposed = landmarks(either, state="proposed")
+    assert len(proposed) == update.proposed
     errors = np.array([distances_m(withheld, one).min() for one in proposed])
     sigma = np.array([np.hypot(one.sigma_east_m, one.sigma_north_m) for one in proposed])
     assert np.median(errors) < 60.0
@@ -108,7 +107,7 @@ def test_withheld_craters_become_proposals_at_their_places(either: Ground, thinn
     assert 0.77 < np.mean((errors / sigma) ** 2) < 2.3
     for one in proposed:
         nearest = int(np.argmin(distances_m(withheld, one)))
-        assert one.diameter_m == pytest.approx(withheld.diameter_m[nearest], rel=0.05)
+        assert one.diameter_m == approx(withheld.diameter_m[nearest], rel=0.05)
         assert one.passes == 2 and one.sightings >= 4 and one.looks >= one.sightings
         assert min(one.sigma_east_m, one.sigma_north_m, one.sigma_up_m) >= 20.0
 
@@ -129,8 +128,8 @@ camera = { pointing = "nadir", width_px = 512, height_px = 512, fov_deg = 120.0 
     ],
 )
 def test_craters_of_the_full_list_are_not_proposed_where_the_catalogue_of_the_pass_lacks_them(
-    thinned, tmp_path: Path, stated: str, listed: bool
-) -> None:
+    thinned, tmp_path, stated, listed
+):
     """The list of the mission, or on the real Moon a public one, has every second of the withheld craters."""
     folder, full, withheld = thinned
     shutil.copytree(folder, tmp_path / "pass")
@@ -139,89 +138,77 @@ def test_craters_of_the_full_list_are_not_proposed_where_the_catalogue_of_the_pa
         held = ground.files.put_file(tmp_path / "list.csv")
         add_catalogue(ground, held, "list.csv")
         (tmp_path / "pass/mission.toml").write_text(MISSION + stated.format(held=held.sha256))
-        updates = [update_landmarks(ground, one) for one in both_passes(ground, tmp_path / "pass")]
-        proposed = ground.read(list_landmarks, LandmarkFilter(state="proposed", limit=1000)).items
+        updates = [update_landmarks(ground, one) for one in both_passes(ground, (tmp_path / "pass",))]
+        proposed = landmarks(ground, state="proposed")
     assert [one.listed > 15 for one in updates] == [listed, listed]
     found = {int(distances_m(withheld, one).argmin()) % 2 for one in proposed}
     assert len(proposed) > 15 and found == ({0} if listed else {0, 1})
 
 
-def test_a_place_is_in_view_of_every_frame_that_saw_it(
-    ground: Ground, thinned, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_place_is_in_view_of_every_frame_that_saw_it(ground, thinned, monkeypatch):
     """Also if its mean place lies just outside the image: here it always does."""
-    folder, _, _ = thinned
-    first, _ = both_passes(ground, folder)
+    first, _ = both_passes(ground, thinned)
     nowhere = "ground_service.evaluation.landmarks.core.in_view"
     monkeypatch.setattr(nowhere, lambda _, frames: np.zeros(len(frames.position_mcmf_m), dtype=np.bool_))
     update_landmarks(ground, first)
-    found = ground.read(list_landmarks, LandmarkFilter(limit=1000)).items
+    found = landmarks(ground)
     assert found and all(one.looks == one.sightings > 0 for one in found)
 
 
-def test_the_same_pass_from_two_processes_adds_each_landmark_once(either: Ground, thinned) -> None:
-    folder, _, _ = thinned
-    first, _ = both_passes(either, folder)
-    faults: list[Exception] = []
+def test_the_same_pass_from_two_processes_adds_each_landmark_once(either, thinned):
+    first, _ = both_passes(either, thinned)
 
-    def search() -> None:
-        try:
-            update_landmarks(either, first)
-        except Exception as error:  # shown by the assertion below
-            faults.append(error)
-
-    threads = [threading.Thread(target=search) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert faults == []
-    page = either.read(list_landmarks, LandmarkFilter(limit=1000))
-    found, total = page.items, page.total
-    assert total == update_landmarks(either, first).places
+    with ThreadPoolExecutor(3) as pool:
+        for one in [pool.submit(update_landmarks, either, first) for _ in range(3)]:
+            one.result()
+    found = landmarks(either)
+    assert len(found) == update_landmarks(either, first).places
     assert {one.passes for one in found} == {1}
 
 
-def test_only_proposed_landmarks_are_decided_and_decisions_remain(ground: Ground, thinned) -> None:
-    folder, _, _ = thinned
-    first, second = both_passes(ground, folder)
+def test_only_proposed_landmarks_are_decided_and_decisions_remain(ground, thinned):
+    first, second = both_passes(ground, thinned)
     update_landmarks(ground, first)
-    seen = ground.read(list_landmarks, LandmarkFilter()).items[0]
-    with pytest.raises(StateConflict, match="proposed or rejected"):
-        decide_landmark(ground, seen.id, accept=True, reason="", actor="ann")
+    seen = landmarks(ground)[0].id
+
+    def decide(actor, accept=True, key=seen):
+        return decide_landmark(ground, key, accept=accept, reason="a rim in all frames", actor=actor)
+
+    with raises(StateConflict, match="proposed or rejected"):
+        decide("ann")
     update_landmarks(ground, second)
-    decided = decide_landmark(ground, seen.id, accept=True, reason="a rim in all frames", actor="ann")
+    decided = decide("ann")
     assert (decided.state, decided.decided_by, decided.reason) == ("accepted", "ann", "a rim in all frames")
-    with pytest.raises(StateConflict):
-        decide_landmark(ground, seen.id, accept=True, reason="", actor="bob")
+    with raises(StateConflict):
+        decide("bob")
     update_landmarks(ground, second)
-    assert get_landmark(ground, seen.id).state == "accepted"
-    assert decide_landmark(ground, seen.id, accept=False, reason="", actor="bob").decided_by == "bob"
-    with pytest.raises(NotFound):
-        decide_landmark(ground, 99_999, accept=True, reason="", actor="ann")
+    assert get_landmark(ground, seen).state == "accepted"
+    assert decide("bob", accept=False).decided_by == "bob"
+    with raises(NotFound):
+        decide("ann", key=99_999)
 
 
-def test_a_place_that_later_frames_do_not_see_again_is_not_proposed(ground: Ground, thinned, make_pass) -> None:
+def test_a_place_that_later_frames_do_not_see_again_is_not_proposed(ground, thinned, make_pass):
     """The second pass has no detections at the withheld craters: its catalogue has them, and its frames look."""
     folder, _, _ = thinned
-    rewrite(folder, "first pass")
+    enter_files(folder, pass_name="first pass")
     first = import_archive(ground, folder)
     update_landmarks(ground, first)
-    before = {one.id: one.looks for one in ground.read(list_landmarks, LandmarkFilter(limit=1000)).items}
+    before = {one.id: one.looks for one in landmarks(ground)}
     complete = make_pass(frames=FRAMES, seed=4)
     update_landmarks(ground, import_archive(ground, complete.folder))
-    after = ground.read(list_landmarks, LandmarkFilter(limit=1000)).items
+    after = landmarks(ground)
     assert {one.state for one in after} == {"seen"} and {one.passes for one in after} == {1}
     assert all(one.looks > before[one.id] for one in after)
     blind = get_landmark(ground, after[0].id).evidence[1]
     assert blind.sightings == [] and blind.looks > 0
 
 
-def test_a_pass_without_a_catalogue_is_refused_with_the_reason(ground: Ground, make_pass) -> None:
+def test_a_pass_without_a_catalogue_is_refused_with_the_reason(ground, make_pass):
     folder = make_pass(frames=4).folder
     (folder / "catalogue.csv").unlink()
-    rewrite(folder, "bare")
-    with pytest.raises(EvaluationError, match="expected a crater catalogue, found none"):
+    enter_files(folder, pass_name="bare")
+    with raises(EvaluationError, match="expected a crater catalogue, found none"):
         update_landmarks(ground, import_archive(ground, folder))
 
 
@@ -230,21 +217,19 @@ def _place(east_m: float = 0.0, sigma_m: float = 50.0, diameter_m: float = 8000.
     return Place(0.0, east_m / MOON_RADIUS_M, 100.0, (sigma_m,) * 3, diameter_m, 200.0, 0.8, rows, looks)
 
 
-def test_passes_that_agree_reduce_the_variance_but_not_what_is_common_to_them() -> None:
+def test_passes_that_agree_reduce_the_variance_but_not_what_is_common_to_them():
     """The error of the catalogue, and the 30 % of the variance that the detector repeats on every pass."""
     common = 20.0
-    sigma = float(np.hypot(100.0, common))
-    assert combined([_place(sigma_m=sigma)]).sigma_m[0] == pytest.approx(sigma)
-    four = combined([_place(sigma_m=sigma)] * 4)
-    assert four.sigma_m[0] == pytest.approx(np.sqrt(100.0**2 * (0.3 + 0.7 / 4.0) + common**2))
-    many = combined([_place(sigma_m=sigma)] * 10_000)
-    assert many.sigma_m[0] == pytest.approx(np.sqrt(0.3 * 100.0**2 + common**2), rel=0.01)
+    place = _place(sigma_m=float(np.hypot(100.0, common)))
+    for count in (1, 4, 10_000):
+        left = np.sqrt(100.0**2 * (0.3 + 0.7 / count) + common**2)
+        assert combined([place] * count).sigma_m[0] == approx(left)
 
 
-def test_passes_that_disagree_enlarge_the_uncertainty() -> None:
+def test_passes_that_disagree_enlarge_the_uncertainty():
     apart = combined([_place(-300.0), _place(300.0)])
-    assert apart.longitude_rad == pytest.approx(0.0, abs=1e-12)
-    assert apart.sigma_m[0] == pytest.approx(np.hypot(300.0, 20.0), rel=0.01)
+    assert apart.longitude_rad == approx(0.0, abs=1e-12)
+    assert apart.sigma_m[0] == approx(np.hypot(300.0, 20.0), rel=0.01)
     assert apart.sigma_m[1] < 50.0
 
 
@@ -252,13 +237,11 @@ def test_passes_that_disagree_enlarge_the_uncertainty() -> None:
     ("passes", "sightings", "looks", "expected"),
     [(2, 4, 16, True), (1, 9, 9, False), (2, 3, 3, False), (2, 4, 17, False)],
 )
-def test_a_landmark_is_persistent_on_two_passes_in_a_quarter_of_its_frames(
-    passes: int, sightings: int, looks: int, expected: bool
-) -> None:
+def test_a_landmark_is_persistent_on_two_passes_in_a_quarter_of_its_frames(passes, sightings, looks, expected):
     assert is_persistent(passes, sightings, looks) is expected
 
 
-def test_places_are_the_same_within_a_quarter_of_the_diameter_or_the_uncertainty() -> None:
+def test_places_are_the_same_within_a_quarter_of_the_diameter_or_the_uncertainty():
     assert same_place(_place(), _place(1900.0))
     assert not same_place(_place(), _place(2100.0))
     assert same_place(_place(sigma_m=600.0), _place(2100.0))
@@ -267,7 +250,7 @@ def test_places_are_the_same_within_a_quarter_of_the_diameter_or_the_uncertainty
 
 
 @pytest.mark.parametrize("error_px", [0.4, 3.0])
-def test_the_uncertainty_is_that_of_the_errors_on_one_pass_and_on_three(error_px: float) -> None:
+def test_the_uncertainty_is_that_of_the_errors_on_one_pass_and_on_three(error_px):
     """Withheld craters over a simulated track; the detector repeats 30 % of its variance on every pass."""
     rng = np.random.default_rng(7)
     grid = np.array([(a, b) for a in np.arange(-16, 17) for b in np.arange(-5, 6)]) * 0.5
@@ -325,35 +308,31 @@ def _table() -> CatalogueTable:
     return CatalogueTable(np.array([7]), one, one, np.array([5000.0]), np.array([10.0]), np.full((1, 3), 60.0))
 
 
-def test_the_anchoring_table_gets_accepted_landmarks_once_with_their_uncertainty() -> None:
+def test_the_anchoring_table_gets_accepted_landmarks_once_with_their_uncertainty():
     found = [_landmark(2), _landmark(1), _landmark(3, "rejected"), _landmark(4, "proposed")]
     table = extended_table(_table(), found)
     assert table.ids.tolist() == [7, FIRST_ID + 1, FIRST_ID + 2]
     back = unpack_catalogue_table(pack_catalogue_table(table))
     assert back.sigma_m[1].tolist() == [80.5, 90.0, 300.0]  # rounded upwards
-    assert back.rim_height_m[1] == pytest.approx(-1200.5, abs=0.5)
+    assert back.rim_height_m[1] == approx(-1200.5, abs=0.5)
     assert len(extended_table(table, found)) == 3
-    with pytest.raises(InvalidInput, match="expected accepted landmarks, found none among 1"):
+    with raises(InvalidInput, match="expected accepted landmarks, found none among 1"):
         extended_table(_table(), [_landmark(3, "rejected")])
 
 
-def test_the_catalogue_gets_accepted_landmarks(tmp_path: Path) -> None:
-    base = load_catalogue(_catalogue_file(tmp_path))
+def test_the_catalogue_gets_accepted_landmarks(tmp_path):
+    path = tmp_path / "old.csv"
+    path.write_text("id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete\n5,1,2,6000,10,300,1\n")
+    base = load_catalogue(path)
     extended = extended_catalogue(base, [_landmark(1), _landmark(2, "seen")])
     save_catalogue(extended, tmp_path / "new.csv")
     again = load_catalogue(tmp_path / "new.csv")
     assert again.ids.tolist() == [5, FIRST_ID + 1]
-    assert np.degrees(again.latitude_rad[1]) == pytest.approx(11.0)
+    assert np.degrees(again.latitude_rad[1]) == approx(11.0)
     assert np.isnan(again.depth_m[1]) and again.complete.all()
 
 
-def _catalogue_file(folder: Path) -> Path:
-    path = folder / "old.csv"
-    path.write_text("id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete\n5,1,2,6000,10,300,1\n")
-    return path
-
-
-def test_labels_are_what_training_reads(tmp_path: Path) -> None:
+def test_labels_are_what_training_reads(tmp_path):
     (tmp_path / "labels.csv").write_text(format_labels([_landmark(1), _landmark(2, "rejected")]))
     labels = load_landmarks(tmp_path / "labels.csv")
     assert np.degrees(labels.latitude_rad).tolist() == [11.0]
@@ -361,15 +340,13 @@ def test_labels_are_what_training_reads(tmp_path: Path) -> None:
     assert (labels.sightings[0], labels.looks[0], labels.score[0]) == (5, 8, 0.71)
 
 
-def test_an_upload_puts_the_table_together_again_on_board() -> None:
+def test_an_upload_puts_the_table_together_again_on_board():
     assert [name for name, _ in upload_entries(pack_catalogue_table(_table()), 3)] == ["uplink_last"]
     octets = bytes(range(256)) * 150
-    receiver, whole = LargeDataReceiver(), None
-    names = []
-    for count, (name, values) in enumerate(upload_entries(octets, 3)):
-        packed = DICTIONARY.pack_command(name, values, sequence_count=count)
-        command = DICTIONARY.unpack_command(packed)
+    receiver, names = LargeDataReceiver(), []
+    for count, entry in enumerate(upload_entries(octets, 3)):
+        command = DICTIONARY.unpack_command(DICTIONARY.pack_command(*entry, sequence_count=count))
         names.append(command.name)
         whole = receiver.accept(command.name, command.values)
     assert names == ["uplink_first", "uplink_middle", "uplink_last"]
-    assert whole is not None and whole.octets == octets and whole.transaction == 3
+    assert whole.octets == octets and whole.transaction == 3

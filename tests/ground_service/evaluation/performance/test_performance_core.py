@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from pytest import approx
 
 from ground_service.evaluation.performance import core
 from ground_service.evaluation.performance.core import (
@@ -17,20 +18,19 @@ from ground_service.evaluation.performance.core import (
     rolling_counts,
     wilson,
 )
-from lunar.arrays import FloatArray, IntArray
 
 NAN = math.nan
 
 
-def test_a_mean_has_the_interval_of_students_t() -> None:
+def test_a_mean_has_the_interval_of_students_t():
     level = mean_level([1.0, 2.0, NAN, 3.0])
     # t with 2 degrees of freedom at 0.975 is 4.302653 (table); standard error 1 / sqrt(3).
     assert (level.passes, level.mean) == (3, 2.0)
-    assert level.high - 2.0 == pytest.approx(4.302653 / math.sqrt(3.0), abs=1e-6)
-    assert 2.0 - level.low == pytest.approx(level.high - 2.0)
+    assert level.high - 2.0 == approx(4.302653 / math.sqrt(3.0), abs=1e-6)
+    assert 2.0 - level.low == approx(level.high - 2.0)
 
 
-def test_a_single_pass_has_no_interval_and_none_no_mean() -> None:
+def test_a_single_pass_has_no_interval_and_none_no_mean():
     one = mean_level([0.5])
     assert (one.passes, one.mean) == (1, 0.5) and math.isnan(one.low) and math.isnan(one.high)
     none = mean_level([NAN])
@@ -44,14 +44,14 @@ def test_a_single_pass_has_no_interval_and_none_no_mean() -> None:
         (NAN, "unknown"),
     ],
 )  # fmt: skip
-def test_a_value_belongs_to_one_interval(value: float, name: str) -> None:
+def test_a_value_belongs_to_one_interval(value, name):
     assert interval_name(value, ALTITUDE_EDGES_KM, "km") == name
     assert interval_names(ALTITUDE_EDGES_KM, "km") == [
         "below 20 km", "20 to 30 km", "30 to 40 km", "40 km and above", "unknown",
     ]  # fmt: skip
 
 
-def test_a_step_is_found_at_its_place_with_the_medians_of_both_sides() -> None:
+def test_a_step_is_found_at_its_place_with_the_medians_of_both_sides():
     values = [0.70, 0.72, NAN, 0.71, 0.69, 0.73, 0.70, 0.71, 0.50, 0.52, 0.51, 0.49, 0.50, 0.53, 0.51]
     [change] = change_points(values)
     assert change.index == 8
@@ -60,7 +60,7 @@ def test_a_step_is_found_at_its_place_with_the_medians_of_both_sides() -> None:
     assert change.p_value <= FALSE_ALARM_RATE / 3.0
 
 
-def test_two_steps_are_found_in_order() -> None:
+def test_two_steps_are_found_in_order():
     rng = np.random.default_rng(1)
     values = np.concatenate([rng.normal(level, 1.0, 20) for level in (0.0, 6.0, -3.0)])
     found = change_points(values.tolist())
@@ -69,7 +69,7 @@ def test_two_steps_are_found_in_order() -> None:
     assert found[0].after == found[1].before
 
 
-def test_constant_levels_seldom_give_a_change() -> None:
+def test_constant_levels_seldom_give_a_change():
     """Of 200 series without a change, the expected number with one is at most 200 * 0.01 / 3 < 1."""
     rng = np.random.default_rng(2)
     alarms = sum(bool(change_points(values.tolist(), permutations=999)) for values in rng.standard_cauchy((200, 24)))
@@ -77,7 +77,7 @@ def test_constant_levels_seldom_give_a_change() -> None:
     assert alarms <= 5
 
 
-def test_the_false_alarm_rate_is_divided_among_the_metrics() -> None:
+def test_the_false_alarm_rate_is_divided_among_the_metrics():
     rng = np.random.default_rng(5)
     values = np.concatenate([rng.normal(0.0, 1.0, 12), rng.normal(2.0, 1.0, 12)]).tolist()
     [alone] = change_points(values, metrics=1)
@@ -86,34 +86,34 @@ def test_the_false_alarm_rate_is_divided_among_the_metrics() -> None:
 
 
 @pytest.mark.parametrize("values", [[], [1.0], [NAN] * 30, [1.0] * 30, [0.0] * 4 + [9.0] * 5])
-def test_nothing_is_found_in_few_or_equal_values(values: list[float]) -> None:
+def test_nothing_is_found_in_few_or_equal_values(values):
     assert change_points(values) == []
     assert len(values) < 2 * LEAST_PASSES or len(set(map(str, values))) == 1
 
 
-def test_a_share_has_the_interval_of_wilson() -> None:
+def test_a_share_has_the_interval_of_wilson():
     # Agresti and Coull, The American Statistician 52 (1998): 10 of 10 gives 0.722 to 1.
     share = wilson(10, 10)
     assert share.share == 1.0
-    assert share.low == pytest.approx(0.7225, abs=1e-4)
-    assert share.high == pytest.approx(1.0)
+    assert share.low == approx(0.7225, abs=1e-4)
+    assert share.high == approx(1.0)
     assert math.isnan(wilson(0, 0).share)
 
 
-def test_a_rolling_window_excludes_passes_of_its_length_ago() -> None:
+def test_a_rolling_window_excludes_passes_of_its_length_ago():
     counts = rolling_counts([0, 10, 20, 21], ["met", "not met", "met", "unknown"], 20)
     assert counts == [
         {"met": 1}, {"met": 1, "not met": 1}, {"met": 1, "not met": 1}, {"met": 1, "not met": 1, "unknown": 1},
     ]  # fmt: skip
 
 
-def test_permutations_in_blocks_give_the_same_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_permutations_in_blocks_give_the_same_changes(monkeypatch):
     values = np.random.default_rng(3).normal(size=60) + np.repeat([0.0, 3.0], 30)
     whole = core.change_points(values.tolist(), permutations=301)
     largest: list[int] = []
     permuted = core._largest_cusum
 
-    def seen(ranks: FloatArray) -> tuple[FloatArray, IntArray]:
+    def seen(ranks):
         largest.append(ranks.size)
         return permuted(ranks)
 

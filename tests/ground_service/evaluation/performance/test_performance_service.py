@@ -2,10 +2,10 @@
 
 import json
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
+from pytest import raises
 
 from ground_service.client.local import local_client
 from ground_service.clock import set_mission_clock, utc_now_ns
@@ -50,18 +50,32 @@ def flown(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
     return make_pass(frames=30, seed=9)
 
 
-def add_pass(ground: Ground, number: int, *, instance: str = FLOWN, **changes: Any) -> int:
+def add_pass(
+    ground: Ground,
+    number: int,
+    *,
+    instance: str = FLOWN,
+    recall: Any = ...,
+    error: float = 80.0,
+    altitude: float | None = 25.0,
+    status: str = "met",
+    build: str = "a",
+    key: str = "accuracy.median",
+    limit: float | None = 100.0,
+) -> int:
     """Add a pass with a report, one a day."""
     start = FIRST + number * DAY_NS
     pass_id = define_pass(
-        ground, name=f"pass {number}", start_utc_ns=start, stop_utc_ns=start + 10**12, spacecraft_id=SPACECRAFT,
+        ground,
+        name=f"pass {number}",
+        start_utc_ns=start,
+        stop_utc_ns=start + 10**12,
+        spacecraft_id=SPACECRAFT,
         instance=instance,
-    )  # fmt: skip
+    )
     blob = ground.files.put_octets(b"x")
-    values: dict[str, Any] = {
-        "recall": 0.70 + 0.01 * (number % 3), "drift": 0.10, "error": 80.0, "altitude": 25.0, "status": "met",
-        "build": "a", "key": "accuracy.median", "limit": 100.0, **changes,
-    }  # fmt: skip
+    if recall is ...:
+        recall = 0.70 + 0.01 * (number % 3)
     errors = dict.fromkeys(("p68_3d_m", "p95_3d_m", "p99_3d_m", "max_3d_m", "end_of_pass_m"))
     summary = {
         "pass_id": pass_id,
@@ -69,9 +83,9 @@ def add_pass(ground: Ground, number: int, *, instance: str = FLOWN, **changes: A
         "packets": 50,
         "packets_lost": 1,
         "packets_expected": 51,
-        "detector": {"precision": 0.8, "recall": values["recall"], "loc_px": 1.0, "per_class": []},
+        "detector": {"precision": 0.8, "recall": recall, "loc_px": 1.0, "per_class": []},
         "navigation": {
-            "anchored": {"median_3d_m": values["error"], "drift_percent": values["drift"], **errors},
+            "anchored": {"median_3d_m": error, "drift_percent": 0.1, **errors},
             "paper": {"median_3d_m": 9e3, "drift_percent": 9.0, **errors},
         },
         "smoothed": {},
@@ -80,30 +94,42 @@ def add_pass(ground: Ground, number: int, *, instance: str = FLOWN, **changes: A
         "verdict_level": "met",
         "requirements": [
             {
-                "key": values["key"], "name": "median 3-D error", "value": values["error"], "limit": values["limit"],
-                "relation": "<=", "unit": "m", "margin": 1.0, "status": values["status"], "note": "",
+                "key": key, "name": "median 3-D error", "value": error, "limit": limit,
+                "relation": "<=", "unit": "m", "margin": 1.0, "status": status, "note": "",
             }
         ],
         "error_budget": {},
         "evidence_level": "2 (procedural Moon)",
         "data": [],
         "conditions": {
-            "altitude_km": values["altitude"], "sun_elevation_deg": 20.0, "build": values["build"],
+            "altitude_km": altitude, "sun_elevation_deg": 20.0, "build": build,
             "estimator": "anchored",
         },
     }  # fmt: skip
     with ground.database.writing() as connection:
         register_file(connection, blob, "report", "x", 1)
         report = StoredReport(
-            id=f"{pass_id:032x}", pass_id=pass_id, html_sha256=blob.sha256, json_sha256=blob.sha256,
-            pdf_sha256=None, summary=summary, mission_id=None, event_number=None, previous_id=None, changes=None,
+            id=f"{pass_id:032x}",
+            pass_id=pass_id,
+            html_sha256=blob.sha256,
+            json_sha256=blob.sha256,
+            pdf_sha256=None,
+            summary=summary,
+            mission_id=None,
+            event_number=None,
+            previous_id=None,
+            changes=None,
             created_utc_ns=start,
-        )  # fmt: skip
+        )
         add_report(connection, report)
     return pass_id
 
 
-def test_a_report_states_the_conditions_of_its_pass(either: Ground, flown: SyntheticPass) -> None:
+def group_means(found: Any) -> dict[tuple[str, str, str], Any]:
+    return {(one.factor, one.group, one.metric): one for one in found.groups}
+
+
+def test_a_report_states_the_conditions_of_its_pass(either, flown):
     pass_id = import_archive(either, flown.folder)
     made = make_report(either, pass_id)
     conditions = made.summary["conditions"]
@@ -120,13 +146,13 @@ def test_a_report_states_the_conditions_of_its_pass(either: Ground, flown: Synth
     assert (found.instance, [one.pass_id for one in found.passes]) == ("flight", [flight])
 
 
-def test_passes_are_grouped_and_changes_found(either: Ground) -> None:
+def test_passes_are_grouped_and_changes_found(either):
     low = {"recall": 0.4, "altitude": 35.0, "build": "b", "status": "not met", "error": 120.0}
     for number in range(20):
         add_pass(either, number, **(low if number >= 12 else {}))
     found = performance(either, SPACECRAFT, instance="flight")
     assert [one.estimator for one in found.passes] == ["anchored"] * 20
-    groups = {(one.factor, one.group, one.metric): one for one in found.groups}
+    groups = group_means(found)
     by_altitude = [groups["altitude", name, "recall"] for name in ("20 to 30 km", "30 to 40 km")]
     assert [(one.passes, round(one.mean or 0.0, 3)) for one in by_altitude] == [(12, 0.71), (8, 0.4)]
     assert by_altitude[0].low is not None and by_altitude[0].low < 0.71 < (by_altitude[0].high or 0.0)
@@ -147,17 +173,17 @@ def test_passes_are_grouped_and_changes_found(either: Ground) -> None:
     assert 0.6 < (requirement.low or 0.0) < 0.7
 
 
-def test_unknown_values_stay_unknown(ground: Ground) -> None:
+def test_unknown_values_stay_unknown(ground):
     add_pass(ground, 0, recall=None, altitude=None, status="unknown", build="")
     found = performance(ground, SPACECRAFT)
-    groups = {(one.factor, one.group, one.metric): one for one in found.groups}
+    groups = group_means(found)
     assert groups["altitude", "unknown", "recall"].mean is None
     assert groups["build", "not stated", "drift_percent"].mean == 0.10
     [requirement] = found.requirements
     assert (requirement.unknown, requirement.share_met, requirement.low) == (1, None, None)
 
 
-def test_the_same_month_is_stored_once_and_late_data_give_a_new_report(either: Ground) -> None:
+def test_the_same_month_is_stored_once_and_late_data_give_a_new_report(either):
     for number in range(3):
         add_pass(either, number)
     first = make_monthly_report(either, SPACECRAFT, "2029-08")
@@ -167,16 +193,20 @@ def test_the_same_month_is_stored_once_and_late_data_give_a_new_report(either: G
     add_pass(either, 5, status="not met")
     second = make_monthly_report(either, SPACECRAFT, "2029-08")
     assert second.id != first.id and second.verdict == "requirements not met in every pass: 1 of 1 judged"
-    assert {one.id for one in either.read(list_monthly_reports, MonthlyReportFilter()).items} == {first.id, second.id}
-    with pytest.raises(InvalidInput, match="2029-09: expected passes with a report, found none"):
+    assert {one.id for one in monthly(either)} == {first.id, second.id}
+    with raises(InvalidInput, match="2029-09: expected passes with a report, found none"):
         make_monthly_report(either, SPACECRAFT, "2029-09")
 
 
-def test_months() -> None:
+def monthly(ground: Ground) -> list[Any]:
+    return ground.read(list_monthly_reports, MonthlyReportFilter()).items
+
+
+def test_months():
     assert month_span("2028-02") == (parse_utc("2028-02-01T00:00:00Z"), parse_utc("2028-03-01T00:00:00Z"))
     assert last_month(parse_utc("2029-01-01T00:00:00Z")) == "2028-12"
     assert last_month(parse_utc("2029-03-31T23:59:59Z")) == "2029-02"
-    with pytest.raises(InvalidInput, match="expected a month such as 2029-08, found 2029-13"):
+    with raises(InvalidInput, match="expected a month such as 2029-08, found 2029-13"):
         month_span("2029-13")
 
 
@@ -187,7 +217,7 @@ def september() -> Iterator[None]:
     set_mission_clock(None)
 
 
-def test_a_requirement_that_is_unknown_on_some_passes_is_not_good(ground: Ground) -> None:
+def test_a_requirement_that_is_unknown_on_some_passes_is_not_good(ground):
     for number in range(4):
         add_pass(ground, number, status="met" if number == 3 else "unknown")
     value = monthly_value(performance(ground, SPACECRAFT, window_days=31.0), "2029-08")
@@ -195,7 +225,7 @@ def test_a_requirement_that_is_unknown_on_some_passes_is_not_good(ground: Ground
     assert value.verdict == "requirements judged: 1 of 1, none missed; median 3-D error not judged on 3 of 4 passes"
 
 
-def test_a_requirement_without_a_limit_may_be_unknown(ground: Ground) -> None:
+def test_a_requirement_without_a_limit_may_be_unknown(ground):
     add_pass(ground, 0)
     add_pass(ground, 1, key="other", limit=None, status="unknown")
     add_pass(ground, 2)
@@ -208,7 +238,7 @@ def test_a_requirement_without_a_limit_may_be_unknown(ground: Ground) -> None:
     assert value.verdict.endswith("median 3-D error not judged on 1 of 3 passes")
 
 
-def test_requirements_that_the_newest_report_lacks_are_judged(ground: Ground) -> None:
+def test_requirements_that_the_newest_report_lacks_are_judged(ground):
     add_pass(ground, 0, key="old", limit=50.0, status="not met")
     add_pass(ground, 1, key="old", limit=60.0, status="not met")
     add_pass(ground, 2)
@@ -218,7 +248,7 @@ def test_requirements_that_the_newest_report_lacks_are_judged(ground: Ground) ->
     assert monthly_value(found, "2029-08").verdict_level == "not met"
 
 
-def test_a_monthly_report_has_the_passes_of_one_instance(either: Ground) -> None:
+def test_a_monthly_report_has_the_passes_of_one_instance(either):
     add_pass(either, 0)
     add_pass(either, 0, instance="replay", status="not met")
     add_pass(either, 1, instance="replay", status="not met")
@@ -232,7 +262,7 @@ def test_a_monthly_report_has_the_passes_of_one_instance(either: Ground) -> None
     assert len(performance(either, SPACECRAFT, instance="replay").passes) == 2
 
 
-def test_passes_without_a_report_are_counted_and_the_month_is_not_good(ground: Ground) -> None:
+def test_passes_without_a_report_are_counted_and_the_month_is_not_good(ground):
     add_pass(ground, 0)
     assert monthly_value(performance(ground, SPACECRAFT), "2029-08").verdict_level == "met"
     start = FIRST + DAY_NS
@@ -245,18 +275,16 @@ def test_passes_without_a_report_are_counted_and_the_month_is_not_good(ground: G
     assert value.verdict.endswith("; 1 of 2 passes have a report")
 
 
-def test_too_many_passes_are_one_clear_error(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_passes_are_one_clear_error(ground, monkeypatch):
     monkeypatch.setattr("ground_service.evaluation.performance.service.PASSES_LIMIT", 2)
     for number in range(3):
         add_pass(ground, number)
-    with pytest.raises(InvalidInput, match=r"expected at most 2 passes .* found 3 passes"):
+    with raises(InvalidInput, match=r"expected at most 2 passes .* found 3 passes"):
         performance(ground, SPACECRAFT)
     assert len(performance(ground, SPACECRAFT, start_utc_ns=FIRST + DAY_NS).passes) == 2
 
 
-def test_the_failed_report_of_a_spacecraft_leaves_the_others(
-    ground: Ground, september: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_failed_report_of_a_spacecraft_leaves_the_others(ground, september, monkeypatch, caplog):
     add_pass(ground, 0)
     with ground.database.writing() as connection:
         other = vehicle_id(connection, 5, FLOWN)
@@ -265,7 +293,7 @@ def test_the_failed_report_of_a_spacecraft_leaves_the_others(
         repository.add(connection, repository.PASSES, **{**row, "vehicle_id": other, "name": "other"})
     made = service.make_due_report
 
-    def broken(ground: Ground, spacecraft_id: int, instance: str = FLOWN) -> Any:
+    def broken(ground, spacecraft_id, instance=FLOWN):
         if spacecraft_id == 5:
             raise InvalidInput("report", "", "a value", "none")
         return made(ground, spacecraft_id, instance)
@@ -277,10 +305,8 @@ def test_the_failed_report_of_a_spacecraft_leaves_the_others(
     assert "monthly report of spacecraft 5: failed: report: expected a value, found none" in caplog.text
 
 
-def test_what_is_old_goes_before_anything_of_the_night_can_fail(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(_: Ground) -> None:
+def test_what_is_old_goes_before_anything_of_the_night_can_fail(ground, monkeypatch):
+    def fail(_):
         raise InvalidInput("report", "", "a value", "none")
 
     monkeypatch.setattr(upkeep, "make_due_reports", fail)
@@ -290,35 +316,45 @@ def test_what_is_old_goes_before_anything_of_the_night_can_fail(
             publish(connection, WindowChanged(id=number, state="processed"))
     with ground.database.writing() as connection:
         connection.execute(repository.EVENT_LOG.update().values(utc_ns=0))
-    with pytest.raises(InvalidInput):
+    with raises(InvalidInput):
         nightly(ground, {})
     assert len(list(read_events(ground.database, 0))) == 1  # the newest stays
 
 
-def test_the_first_processed_window_of_a_month_reports_the_last_one(ground: Ground, september: None) -> None:
+def test_the_first_processed_window_of_a_month_reports_the_last_one(ground, september):
     add_pass(ground, 0)
     assert make_due_report(ground, 5) is None
     with ground.database.writing() as connection:
         row = connection.execute(repository.PASSES.select()).mappings().one()
         values = {
-            "vehicle_id": row["vehicle_id"], "pass_id": row["id"], "name": "w", "start_utc_ns": FIRST,
-            "stop_utc_ns": FIRST + 10**12, "cadence_s": 15.0, "state": "processed", "version": 1,
-            "decision": "approved", "data_octets": 1, "predicted": {}, "closed": 0, "created_by": "a",
-            "edited_by": "a", "created_utc_ns": 1, "changed_utc_ns": 1,
-        }  # fmt: skip
+            "vehicle_id": row["vehicle_id"],
+            "pass_id": row["id"],
+            "name": "w",
+            "start_utc_ns": FIRST,
+            "stop_utc_ns": FIRST + 10**12,
+            "cadence_s": 15.0,
+            "state": "processed",
+            "version": 1,
+            "decision": "approved",
+            "data_octets": 1,
+            "predicted": {},
+            "closed": 0,
+            "created_by": "a",
+            "edited_by": "a",
+            "created_utc_ns": 1,
+            "changed_utc_ns": 1,
+        }
         window = repository.add(connection, repository.WINDOWS, **values)
         publish(connection, WindowChanged(id=int(window), state="processed"))
-    [made] = ground.read(list_monthly_reports, MonthlyReportFilter()).items
+    [made] = monthly(ground)
     assert (made.month, made.passes, made.spacecraft_id) == ("2029-08", 1, SPACECRAFT)
     assert nightly(ground, {})["monthly_reports"] == [
         {"spacecraft_id": SPACECRAFT, "month": "2029-08", "report": made.id}
     ]
-    assert len(ground.read(list_monthly_reports, MonthlyReportFilter()).items) == 1
+    assert len(monthly(ground)) == 1
 
 
-def test_operations_and_commands_give_the_same_report(
-    ground: Ground, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_operations_and_commands_give_the_same_report(ground, tmp_path, capsys):
     for number in range(14):
         add_pass(ground, number, **({"recall": 0.3} if number >= 7 else {}))
     with local_client(ground, "ann") as client:
@@ -335,17 +371,20 @@ def test_operations_and_commands_give_the_same_report(
     document = json.loads((tmp_path / "api.json").read_text())
     assert document["kind"] == "MonthlyReportValue"
     assert [one["metric"] for one in document["changes"]] == ["recall"]
-    home = ("--home", str(ground.home))
-    spacecraft = ("--spacecraft-id", str(SPACECRAFT))
-    assert run(["performance", "report", *spacecraft, "--month", "2029-08", "--out", str(tmp_path / "cli"), *home]) == 0
+
+    def command(words, *out):
+        return run(["performance", *words.split(), *map(str, out), "--home", str(ground.home)])
+
+    report = f"report --spacecraft-id {SPACECRAFT} --month"
+    assert command(f"{report} 2029-08 --out", tmp_path / "cli") == 0
     assert (tmp_path / "cli/report.html").read_text() == page
     capsys.readouterr()
-    assert run(["performance", "show", *spacecraft, *home]) == 0
+    assert command(f"show --spacecraft-id {SPACECRAFT}") == 0
     told = capsys.readouterr().out
     assert "change of recall at pass 8" in told and "14 passes with a report" in told
-    assert run(["performance", "list", *home, "--json"]) == 0
+    assert command("list --json") == 0
     assert [one["id"] for one in json.loads(capsys.readouterr().out)["reports"]] == [made.id]
-    assert run(["performance", "report", *spacecraft, "--month", "2029-10", "--out", str(tmp_path), *home]) == 2
+    assert command(f"{report} 2029-10 --out", tmp_path) == 2
     assert "expected passes with a report, found none" in capsys.readouterr().err
 
 
@@ -364,5 +403,5 @@ def test_operations_and_commands_give_the_same_report(
         ("accuracy.median", [0.1] * 12, ""),
     ],
 )
-def test_a_filter_is_judged_over_passes_by_both_bounds(key: str, values: list[float | None], remark: str) -> None:
+def test_a_filter_is_judged_over_passes_by_both_bounds(key, values, remark):
     assert _consistency_remark(key, values) == remark

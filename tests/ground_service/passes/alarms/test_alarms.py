@@ -1,12 +1,11 @@
 """Alarms: raised once for each cause, kept until acknowledged, equal for any order of arrival."""
 
 import itertools
-from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pytest import raises
 
 from ground_service.access.model import AuditFilter
 from ground_service.access.store import list_audit
@@ -42,7 +41,7 @@ START = 1_900_000_000 * SECOND
 
 def housekeeping(second: int, temperature_c: float) -> bytes:
     """A housekeeping packet with one value outside its limits, if that of the temperature is."""
-    values: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
+    values = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
     values |= {"structure_id": 1, "bus_voltage_v": 12.0, "temperature_c": temperature_c}
     return DICTIONARY.pack("housekeeping", values, ticks=START + second * SECOND, sequence_count=second % 16_384)
 
@@ -52,11 +51,10 @@ def event(second: int, name: str = "event_high", event_id: int = 20) -> bytes:
     return DICTIONARY.pack(name, values, ticks=START + second * SECOND, sequence_count=second % 16_384)
 
 
-def receive(ground: Ground, folder: Path, packets: list[bytes]) -> None:
+def receive(ground: Ground, *packets: bytes) -> None:
     """Ingest packets as a downlink of the flown spacecraft."""
-    folder.mkdir(exist_ok=True)
-    file = folder / f"{len(list(folder.iterdir()))}.cadu"
-    file.write_bytes(encode_cadus(packets, spacecraft_id=SPACECRAFT))
+    file = ground.home / "in.cadu"
+    file.write_bytes(encode_cadus(list(packets), spacecraft_id=SPACECRAFT))
     ingest_file(ground, file)
 
 
@@ -64,15 +62,27 @@ def alarms(ground: Ground, *states: str) -> list[Alarm]:
     return ground.read(list_alarms, AlarmFilter(state=list(states))).items
 
 
-def facts(alarm: Alarm) -> tuple[object, ...]:
-    return (
-        alarm.name, alarm.severity, alarm.count, alarm.active, alarm.state, alarm.value, alarm.first, alarm.last,
-    )  # fmt: skip
+def acknowledge(ground: Ground) -> Alarm:
+    """Acknowledge the newest alarm."""
+    return acknowledge_alarm(ground, alarms(ground)[0].id, "", actor="eva")
 
 
-def test_an_event_stays_raised_through_later_passes_until_it_is_acknowledged(either: Ground, tmp_path: Path) -> None:
-    receive(either, tmp_path / "in", [event(k) for k in range(82)])
-    receive(either, tmp_path / "in", [housekeeping(k, 20.0) for k in range(200, 240)])
+def active(ground: Ground) -> set[str]:
+    return {one.name for one in alarms(ground) if one.active}
+
+
+def states(ground: Ground) -> list[tuple[str, int]]:
+    return [(one.state, one.count) for one in alarms(ground)]
+
+
+def published(ground: Ground) -> list[str]:
+    """Return the states of alarms that were published."""
+    return [AlarmChanged.of(one).state for one in read_events(ground.database, 0) if one.kind == "alarm"]
+
+
+def test_an_event_stays_raised_through_later_passes_until_it_is_acknowledged(either):
+    receive(either, *[event(k) for k in range(82)])
+    receive(either, *[housekeeping(k, 20.0) for k in range(200, 240)])
     (alarm,) = alarms(either)
     assert (alarm.name, alarm.count, alarm.severity, alarm.state) == ("camera_fault", 82, "alarm", "raised")
     assert not alarm.active
@@ -83,78 +93,73 @@ def test_an_event_stays_raised_through_later_passes_until_it_is_acknowledged(eit
     assert either.read(list_audit, AuditFilter()).items[0].action == "acknowledge alarm"
 
 
-def test_a_limit_is_broken_once_and_cleared_after_acknowledgement_and_return(either: Ground, tmp_path: Path) -> None:
-    receive(either, tmp_path / "in", [housekeeping(k, 70.0 + k) for k in range(5)])
+def test_a_limit_is_broken_once_and_cleared_after_acknowledgement_and_return(either):
+    receive(either, *[housekeeping(k, 70.0 + k) for k in range(5)])
     (alarm,) = alarms(either, "raised")
     assert (alarm.name, alarm.severity, alarm.count, alarm.value) == ("temperature_c", "warning", 5, 74.0)
     assert (alarm.active, alarm.limits, alarm.unit) == (True, "-20 to 60", "degC")
-    assert acknowledge_alarm(either, alarm.id, "", actor="eva").state == "acknowledged"
-    receive(either, tmp_path / "in", [housekeeping(10, 20.0)])
+    assert acknowledge(either).state == "acknowledged"
+    receive(either, housekeeping(10, 20.0))
     assert either.read(get_alarm, alarm.id).state == "cleared"
-    receive(either, tmp_path / "in", [housekeeping(20, 65.0)])
-    assert [(one.state, one.count) for one in alarms(either)] == [("raised", 1), ("cleared", 5)]
+    receive(either, housekeeping(20, 65.0))
+    assert states(either) == [("raised", 1), ("cleared", 5)]
 
 
-def test_a_worse_condition_must_be_acknowledged_again(ground: Ground, tmp_path: Path) -> None:
-    receive(ground, tmp_path / "in", [housekeeping(0, 70.0)])
-    (alarm,) = alarms(ground)
-    acknowledge_alarm(ground, alarm.id, "", actor="eva")
-    receive(ground, tmp_path / "in", [housekeeping(1, 75.0)])
-    assert ground.read(get_alarm, alarm.id).state == "acknowledged"
-    receive(ground, tmp_path / "in", [housekeeping(2, 90.0)])
-    found = ground.read(get_alarm, alarm.id)
-    assert (found.state, found.severity) == ("raised", "alarm")
+def test_a_worse_condition_must_be_acknowledged_again(ground):
+    receive(ground, housekeeping(0, 70.0))
+    acknowledge(ground)
+    for second, temperature_c, told in ((1, 75.0, ("acknowledged", "warning")), (2, 90.0, ("raised", "alarm"))):
+        receive(ground, housekeeping(second, temperature_c))
+        (alarm,) = alarms(ground)
+        assert (alarm.state, alarm.severity) == told
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
-def test_an_alarm_does_not_depend_on_the_order_of_arrival(
-    ground: Ground, tmp_path: Path, order: tuple[int, ...]
-) -> None:
+def test_an_alarm_does_not_depend_on_the_order_of_arrival(ground, order):
     parts = [
         [housekeeping(0, 70.0), event(1)],
         [housekeeping(10, 95.0), event(11), event(12, "event_medium")],
         [housekeeping(20, 61.0)],
     ]
     for part in order:
-        receive(ground, tmp_path / "in", parts[part])
-    found = sorted(facts(one)[:6] for one in alarms(ground))
-    assert found == [
+        receive(ground, *parts[part])
+    assert sorted((one.name, one.severity, one.count, one.active, one.state, one.value) for one in alarms(ground)) == [
         ("camera_fault", "alarm", 3, False, "raised", None),
         ("temperature_c", "alarm", 3, True, "raised", 61.0),
     ]
 
 
-def test_packets_that_arrive_again_are_not_counted_again(ground: Ground, tmp_path: Path) -> None:
+def test_packets_that_arrive_again_are_not_counted_again(ground):
     packets = [event(k) for k in range(4)]
-    receive(ground, tmp_path / "in", packets)
-    receive(ground, tmp_path / "in", [*packets, event(4)])
+    receive(ground, *packets)
+    receive(ground, *packets, event(4))
     assert [one.count for one in alarms(ground)] == [5]
     with ground.database.reading() as connection:
         vehicle = connection.exec_driver_sql("SELECT id FROM vehicles").scalar_one()
     assert examine_packets(ground, vehicle) == 0
 
 
-def test_late_packets_of_a_cleared_alarm_do_not_raise_it_again(ground: Ground, tmp_path: Path) -> None:
-    receive(ground, tmp_path / "in", [event(10)])
-    acknowledge_alarm(ground, alarms(ground)[0].id, "", actor="eva")
-    receive(ground, tmp_path / "in", [event(5)])
-    assert [(one.state, one.count) for one in alarms(ground)] == [("cleared", 2)]
-    receive(ground, tmp_path / "in", [event(20)])
-    assert [(one.state, one.count) for one in alarms(ground)] == [("raised", 1), ("cleared", 2)]
+def test_late_packets_of_a_cleared_alarm_do_not_raise_it_again(ground):
+    receive(ground, event(10))
+    acknowledge(ground)
+    receive(ground, event(5))
+    assert states(ground) == [("cleared", 2)]
+    receive(ground, event(20))
+    assert states(ground) == [("raised", 1), ("cleared", 2)]
 
 
-def test_an_alarm_is_acknowledged_by_one_user(either: Ground, tmp_path: Path) -> None:
-    receive(either, tmp_path / "in", [housekeeping(0, 70.0)])
+def test_an_alarm_is_acknowledged_by_one_user(either):
+    receive(either, housekeeping(0, 70.0))
     (alarm,) = alarms(either)
-    acknowledge_alarm(either, alarm.id, "", actor="eva")
-    with pytest.raises(Conflict, match=f"alarm {alarm.id}: expected state raised, found acknowledged by eva"):
+    acknowledge(either)
+    with raises(Conflict, match=f"alarm {alarm.id}: expected state raised, found acknowledged by eva"):
         acknowledge_alarm(either, alarm.id, "", actor="max")
-    with pytest.raises(NotFound):
+    with raises(NotFound):
         acknowledge_alarm(either, alarm.id + 1, "", actor="max")
 
 
-def test_a_shelved_alarm_returns_at_its_time(either: Ground, tmp_path: Path) -> None:
-    receive(either, tmp_path / "in", [event(0)])
+def test_a_shelved_alarm_returns_at_its_time(either):
+    receive(either, event(0))
     (alarm,) = alarms(either)
     now = utc_now_ns()
     hour = 3600 * 10**9
@@ -163,15 +168,15 @@ def test_a_shelved_alarm_returns_at_its_time(either: Ground, tmp_path: Path) -> 
     assert alarms(either, "raised") == [] and len(alarms(either, "shelved")) == 1
     ended = shelve_alarm(either, alarm.id, now - hour, "", actor="eva")
     assert ended.state == "raised" and len(alarms(either, "raised")) == 1
-    with pytest.raises(InvalidInput, match="expected a time within 30 days"):
+    with raises(InvalidInput, match="expected a time within 30 days"):
         shelve_alarm(either, alarm.id, now + 31 * 24 * hour, "", actor="eva")
-    acknowledge_alarm(either, alarm.id, "", actor="eva")
-    with pytest.raises(Conflict, match="expected an open alarm, found cleared"):
+    acknowledge(either)
+    with raises(Conflict, match="expected an open alarm, found cleared"):
         shelve_alarm(either, alarm.id, now + hour, "", actor="eva")
 
 
-def test_an_alarm_is_shelved_in_mission_time_and_its_records_are_in_time_of_day(ground: Ground, tmp_path: Path) -> None:
-    receive(ground, tmp_path / "in", [event(0)])
+def test_an_alarm_is_shelved_in_mission_time_and_its_records_are_in_time_of_day(ground):
+    receive(ground, event(0))
     moment = utc_now_ns() + 1000 * 86_400 * 10**9
     set_mission_clock(lambda: moment)
     try:
@@ -183,23 +188,18 @@ def test_an_alarm_is_shelved_in_mission_time_and_its_records_are_in_time_of_day(
         set_mission_clock()
 
 
-def test_changes_are_published(ground: Ground, tmp_path: Path) -> None:
-    receive(ground, tmp_path / "in", [event(0)])
-    acknowledge_alarm(ground, alarms(ground)[0].id, "", actor="eva")
-    found = [AlarmChanged.of(one) for one in read_events(ground.database, 0) if one.kind == "alarm"]
-    assert [one.state for one in found] == ["raised", "cleared"]
-
-
-def test_the_end_and_the_return_of_a_condition_are_published(ground: Ground, tmp_path: Path) -> None:
+def test_changes_are_published(ground):
+    receive(ground, event(0))
+    acknowledge(ground)
+    assert published(ground) == ["raised", "cleared"]
     for second, value in enumerate((70.0, 71.0, 20.0, 21.0, 72.0)):
-        receive(ground, tmp_path / "in", [housekeeping(second, value)])
-    found = [AlarmChanged.of(one) for one in read_events(ground.database, 0) if one.kind == "alarm"]
-    assert [one.state for one in found] == ["raised", "condition ended", "condition returned"]
+        receive(ground, housekeeping(second, value))
+    assert published(ground)[2:] == ["raised", "condition ended", "condition returned"]
 
 
-def test_events_of_low_severity_and_refused_fixes_raise_no_alarm(ground: Ground, tmp_path: Path) -> None:
-    receive(ground, tmp_path / "in", [event(k, "event_medium", 36) for k in range(4)])
-    receive(ground, tmp_path / "in", [event(0, "event_info", 2), event(1, "event_low", 36), housekeeping(2, 20.0)])
+def test_events_of_low_severity_and_refused_fixes_raise_no_alarm(ground):
+    receive(ground, *[event(k, "event_medium", 36) for k in range(4)])
+    receive(ground, event(0, "event_info", 2), event(1, "event_low", 36), housekeeping(2, 20.0))
     assert alarms(ground) == []
 
 
@@ -213,8 +213,8 @@ def condition(ticks: int, severity: int, value: float) -> core.Condition:
     ),
     st.randoms(),
 )
-def test_conditions_are_joined_in_any_order(conditions: list[core.Condition], random: Any) -> None:
-    def whole(parts: list[core.Condition]) -> core.Condition:
+def test_conditions_are_joined_in_any_order(conditions, random):
+    def whole(parts):
         result = parts[0]
         for one in parts[1:]:
             result = core.joined(result, one)
@@ -224,16 +224,14 @@ def test_conditions_are_joined_in_any_order(conditions: list[core.Condition], ra
     assert whole(conditions) == whole(shuffled)
 
 
-def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path: Path) -> None:
-    text = (
-        'name = "stopped"\n[spacecraft]\nid = 76\n[uploads]\n[[links]]\nname = "lab"\nkind = "tcp"\n'
-        'uplink = "127.0.0.1:9"\n'
-    )
+def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path):
+    text = b'name = "stopped"\n[spacecraft]\nid = 76\n[uploads]\n'
+    link = b'[[links]]\nname = "lab"\nkind = "tcp"\nuplink = "127.0.0.1:9"\n'
     moment = START // SECOND * 10**9
     set_mission_clock(lambda: moment)
     try:
         with open_ground(tmp_path) as ground:
-            add_mission(ground, text.encode())
+            add_mission(ground, text + link)
             add_request(ground, StandingRequestIn(name="none", spacecraft_id=76, windows=1), actor="ann")
             entry = WindowEntry("w", moment + 3600 * 10**9, moment + 4200 * 10**9, 15.0, 76)
             window = add_window(ground, entry, actor="planner").id
@@ -250,54 +248,45 @@ def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path: Path) -> None
             # The process of the links is back; they are refused, and a window is on board.
             assert acquire(ground, declared_links(ground)["lab"], "links", 10**12)
             watch.tick()
-            active = {one.name for one in alarms(ground) if one.active}
-            assert active == {"no_link", "mission_time_stopped", "window_not_released", "plan_empty"}
+            assert active(ground) == {"no_link", "mission_time_stopped", "window_not_released", "plan_empty"}
             ground.write(repository.change, repository.WINDOWS, window, state="uplinked")
             watch.tick()
-            active = {one.name for one in alarms(ground) if one.active}
-            assert active == {"no_link", "mission_time_stopped", "spacecraft_gone", "plan_empty"}
+            assert active(ground) == {"no_link", "mission_time_stopped", "spacecraft_gone", "plan_empty"}
             moment += 10**9
             watch.tick()  # mission time passes: the link alone is missing
-            assert {one.name for one in alarms(ground) if one.active} == {"no_link", "plan_empty"}
+            assert active(ground) == {"no_link", "plan_empty"}
             watch.tick()
             change_state(ground, "lab", "links", "connected", None)
             watch.tick()  # mission time stands still, but the link is there
-            active = {one.name for one in alarms(ground) if one.active}
-            assert active == {"mission_time_stopped", "plan_empty"}
+            assert active(ground) == {"mission_time_stopped", "plan_empty"}
             moment += 10**9
             watch.tick()
-            assert "mission_time_stopped" not in {one.name for one in alarms(ground) if one.active}
+            assert "mission_time_stopped" not in active(ground)
             ground.write(repository.change, repository.WINDOWS, window, state="downlinked")
             watch.tick()
             assert not any(one.name == "report_overdue" for one in alarms(ground))
             moment += 2 * 86_400 * 10**9
             watch.tick()
-            assert any(one.name == "report_overdue" and one.active for one in alarms(ground))
-            before = {one.name for one in alarms(ground) if one.active}
+            assert active(ground) == {"report_overdue", "plan_empty"}
             Watch(ground).tick()  # another process, which knows no ages
-            active = {one.name for one in alarms(ground) if one.active}
-            assert active == before == {"report_overdue", "plan_empty"}
+            assert active(ground) == {"report_overdue", "plan_empty"}
             watch.tick()  # no time has passed since
             other = Watch(ground)
             other.tick()
-            assert any(one.name == "mission_time_stopped" and one.active for one in alarms(ground))
+            assert "mission_time_stopped" in active(ground)
             with ground.database.writing() as connection:
                 repository.change(connection, repository.WINDOWS, window, state="processed")
                 repository.change(connection, repository.STANDING_REQUESTS, 1, state="ended")
-            ended = text.replace('[[links]]\nname = "lab"\nkind = "tcp"\nuplink = "127.0.0.1:9"\n', "")
-            assert ended != text
-            add_mission(ground, ended.encode())
+            add_mission(ground, text)
             other.tick()
-            assert not any(one.active for one in alarms(ground))
+            assert active(ground) == set()
     finally:
         set_mission_clock()
 
 
-def test_an_alarm_states_the_procedure_of_the_mission_in_force(ground: Ground, tmp_path: Path) -> None:
-    receive(ground, tmp_path / "in", [housekeeping(0, 70.0), event(1)])
+def test_an_alarm_states_the_procedure_of_the_mission_in_force(ground):
+    receive(ground, housekeeping(0, 70.0), event(1))
     known = {one.name: one.id for one in alarms(ground, "raised")}
-    assert ground.read(get_alarm, known["camera_fault"]).procedure is None
-    text = '[spacecraft]\nid = 76\n[procedures]\ntemperature_c = "Check the heaters."\n'
-    add_mission(ground, f'name = "warm"\n{text}'.encode(), actor="ann")
-    assert ground.read(get_alarm, known["temperature_c"]).procedure == "Check the heaters."
-    assert ground.read(get_alarm, known["camera_fault"]).procedure is None
+    add_mission(ground, b'name="w"\nspacecraft.id=76\nprocedures.temperature_c="Check the heaters."', actor="ann")
+    procedures = {name: ground.read(get_alarm, key).procedure for name, key in known.items()}
+    assert procedures == {"temperature_c": "Check the heaters.", "camera_fault": None}
