@@ -10,13 +10,13 @@ import warnings
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from ground_service.app import create_app
 from ground_service.errors import InvalidInput, NotFound
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.doubt_store import list_implausible
 from ground_service.ingest.model import ImplausibleFilter
@@ -34,7 +34,6 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.passes.live import live_parameters
 from ground_service.passes.parameters import export_packets, pass_parameters
 from ground_service.passes.service import completeness, define_pass, get_pass, parameter_series, trend_series
-from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.telemetry import decoding
 from ground_service.telemetry.values import newest_declared_ticks, readable_decoding
@@ -45,7 +44,7 @@ from lunar.timescales import parse_utc, ticks_from_utc_ns, utc_ns_from_ticks
 from tests.serving import TestClient
 from tests.tmtc import foreign
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.downlink import decode, encode_cadus
+from tmtc.downlink import encode_cadus
 from tmtc.packets.crc import crc16
 from tmtc.packets.cuc import NO_TICKS
 from tmtc.packets.space_packets import pack_packet
@@ -69,8 +68,17 @@ def mission(folder: Path, text: str = DEFINED, document: str = foreign.BUS) -> P
     return folder / "mission.toml"
 
 
-def enter(ground: Ground, folder: Path, text: str = DEFINED) -> None:
-    add_mission(ground, read_mission_file(mission(folder, text)))
+def enter(ground: Ground, folder: Path, text: str = DEFINED, document: str = foreign.BUS) -> Any:
+    return add_mission(ground, read_mission_file(mission(folder, text, document)))
+
+
+RENAMED = foreign.BUS.replace('"VOLTAGE"', '"BATTERY"')
+
+
+@pytest.fixture
+def declared(ground: Ground, tmp_path: Path) -> Ground:
+    enter(ground, tmp_path / "m")
+    return ground
 
 
 def at(packet: bytes, second: float) -> bytes:
@@ -106,11 +114,6 @@ def define(ground: Ground, seconds: float = 600.0) -> int:
     return define_pass(ground, name="p", start_utc_ns=START, stop_utc_ns=START + round(seconds * 1e9), spacecraft_id=76)
 
 
-def payload_packets(made: Any) -> list[bytes]:
-    found = decode((made.folder / "downlink.cadu").read_bytes())
-    return list(found.cut.packets(found.buffer))
-
-
 def interpreted(packets: list[bytes], tmp_path: Path) -> list[Any]:
     """What space_packet_parser reads in the packets."""
     import space_packet_parser
@@ -127,7 +130,7 @@ def test_packets_without_a_checksum_between_others_become_series(
     either: Ground, tmp_path: Path, synthetic_pass: Any
 ) -> None:
     enter(either, tmp_path / "m")
-    own, bus = payload_packets(synthetic_pass), bus_packets(300)
+    own, bus = synthetic_pass.packets, bus_packets(300)
     mixed = [packet for pair in zip(own, bus, strict=False) for packet in pair]
     mixed += own[len(bus) :] + bus[len(own) :]
     result = ingest_file(either, downlink(tmp_path, mixed))
@@ -159,18 +162,12 @@ def test_packets_without_a_checksum_between_others_become_series(
 
 
 def test_a_minimal_description_of_a_definition_decodes_its_packets(ground: Ground, tmp_path: Path) -> None:
-    (tmp_path / "bus.xml").write_text(foreign.BUS, encoding="utf-8")
-    text = minimal_description(tmp_path / "bus.xml", 76)
-    add_mission(ground, text.encode())
-    ingest_file(ground, downlink(tmp_path, bus_packets(8)))
-    with ground.database.reading() as connection:
-        vehicle = connection.exec_driver_sql("SELECT id FROM vehicles").scalar_one()
-        found = readable_decoding(connection, vehicle)
-    assert found is not None and found.counts["100"] == {"decoded": 8}
+    add_mission(ground, written(tmp_path, foreign.BUS).encode())
+    result = ingest_file(ground, downlink(tmp_path, bus_packets(8)))
+    assert ground.read(readable_decoding, result.vehicle_id).counts["100"] == {"decoded": 8}
     bare = foreign.document(foreign.integer("u8", 8), {"a": "u8"}, foreign.container("P", ["a"]))
-    (tmp_path / "none.xml").write_text(bare, encoding="utf-8")
     with pytest.raises(InvalidInput, match="compares its APID with a number, found none"):
-        minimal_description(tmp_path / "none.xml", 76)
+        written(tmp_path, bare)
 
 
 def written(folder: Path, text: str) -> str:
@@ -221,17 +218,16 @@ def test_a_unix_clock_counts_no_leap_seconds(epoch: str) -> None:
 
 
 def test_parts_of_segmented_packets_are_counted_and_packets_without_header_have_no_time(
-    ground: Ground, tmp_path: Path
+    declared: Ground, tmp_path: Path
 ) -> None:
     """The definition asks for the secondary header flag, but not for the sequence flags."""
-    enter(ground, tmp_path / "m")
     packets = bus_packets(8)
     parts = [packets[3][:2] + struct.pack(">H", flags << 14 | 50 + flags) + packets[3][4:] for flags in (1, 0, 2)]
     boot = bytes((packets[2][0] & ~0x08, *packets[2][1:]))
-    ingest_file(ground, downlink(tmp_path, [*packets, *parts, boot]))
-    listed = pass_parameters(ground, define(ground))
+    ingest_file(declared, downlink(tmp_path, [*packets, *parts, boot]))
+    listed = pass_parameters(declared, define(declared))
     assert listed.outcomes["100"] == {"decoded": 8, "segments_not_joined": 3, "no_container": 1}
-    assert parameter_series(ground, 1, "VOLTAGE", 100).samples == 8
+    assert parameter_series(declared, 1, "VOLTAGE", 100).samples == 8
 
 
 def test_an_entry_may_name_several_containers_and_the_unit_of_sizes(tmp_path: Path) -> None:
@@ -251,7 +247,7 @@ def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground: 
     assert kind in foreign.BUS
     end = foreign.BUS.index("</FloatParameterType>", foreign.BUS.index(kind))
     text = foreign.BUS[:end] + limits + foreign.BUS[end:]
-    add_mission(ground, read_mission_file(mission(tmp_path / "m", document=text)))
+    enter(ground, tmp_path / "m", document=text)
     ingest_file(ground, downlink(tmp_path, bus_packets(4)))
     newest = next(one for one in live_parameters(ground, 76, "flight") if one.name == "VOLTAGE")
     assert newest.limits == "-1 to 1000.5" and newest.value is not None
@@ -305,20 +301,10 @@ def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_k
     enter(either, tmp_path / "m")
     assert decoding.decode_declared(either, result.vehicle_id) == 125
     assert parameter_series(either, pass_id, "VOLTAGE", 100).samples == 100
-    renamed = foreign.BUS.replace('"VOLTAGE"', '"BATTERY"')
-    add_mission(either, read_mission_file(mission(tmp_path / "m", document=renamed)))
-    blocks = 0
-    whole = decoding._next_block
-
-    def killed(*given: Any) -> Any:
-        nonlocal blocks
-        blocks += 1
-        if blocks == 2:
-            raise KeyboardInterrupt
-        return whole(*given)
-
+    enter(either, tmp_path / "m", document=RENAMED)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(decoding, "_next_block", killed)
+        whole = Mock(side_effect=[decoding._next_block, KeyboardInterrupt])
+        patch.setattr(decoding, "_next_block", lambda *given: whole()(*given))
         decoding.decode_declared(either, result.vehicle_id)
     assert parameter_series(either, pass_id, "VOLTAGE", 100).samples == 100  # still as the earlier one decoded it
     assert decoding.decode_declared(either, result.vehicle_id) == 75
@@ -326,38 +312,35 @@ def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_k
     with pytest.raises(NotFound):
         parameter_series(either, pass_id, "VOLTAGE", 100)
     assert decoding.decode_declared(either, result.vehicle_id) == 0
-    with either.database.reading() as connection:
-        samples = connection.execute(repository.PARAMETER_SAMPLES.select()).all()
-        progress = readable_decoding(connection, result.vehicle_id)
-    assert len(samples) == 125
-    assert progress is not None and progress.counts == {"100": {"decoded": 100}, "101": {"decoded": 25}}
+    assert either.read(repository.newest, SAMPLES, Paging())[1] == 125
+    progress = either.read(readable_decoding, result.vehicle_id)
+    assert progress.counts == {"100": {"decoded": 100}, "101": {"decoded": 25}}
 
 
 def test_a_revision_reads_raw_files_again_whose_packets_were_taken_for_damaged(
     either: Ground, tmp_path: Path, synthetic_pass: Any
 ) -> None:
-    own, bus = payload_packets(synthetic_pass), bus_packets(100)
+    own, bus = synthetic_pass.packets, bus_packets(100)
     mixed = [packet for pair in zip(own, bus, strict=False) for packet in pair]
     result = ingest_file(either, downlink(tmp_path, mixed))
     assert result.packets_new <= len(own) and result.crc_errors + result.octets_skipped > 0
     enter(either, tmp_path / "m")  # the event of the revision has the job run
     assert parameter_series(either, define(either), "VOLTAGE", 1000).samples == 100
     assert undecoded_vehicles(either, 76) == []
-    with either.database.reading() as connection:
-        (job,) = repository.newest(connection, repository.JOBS, Paging(), kind="redecode")[0]
-    assert job["state"] == "done"
+    assert [job["state"] for job in redecodings(either)] == ["done"]
     enter(either, tmp_path / "m", DEFINED + "[evidence]\nseed = 1\n")  # the same packets
-    with either.database.reading() as connection:
-        assert repository.newest(connection, repository.JOBS, Paging(), kind="redecode")[1] == 1
+    assert len(redecodings(either)) == 1
 
 
-def test_the_integrity_check_finds_packets_without_a_checksum_intact(ground: Ground, tmp_path: Path) -> None:
-    enter(ground, tmp_path / "m")
-    ingest_file(ground, downlink(tmp_path, bus_packets(30)))
-    found = verify(ground, rebuild=True)
-    assert (found.verdict, found.damaged) == ("intact", [])
-    assert (found.checked["packets"], found.checked["parameter_samples"]) == (38, 38)
-    assert found.unchecked == {}
+def redecodings(ground: Ground) -> list[dict[str, Any]]:
+    return ground.read(repository.newest, repository.JOBS, Paging(), kind="redecode")[0]
+
+
+def test_the_integrity_check_finds_packets_without_a_checksum_intact(declared: Ground, tmp_path: Path) -> None:
+    ingest_file(declared, downlink(tmp_path, bus_packets(30)))
+    found = verify(declared, rebuild=True)
+    assert (found.verdict, found.damaged, found.unchecked) == ("intact", [], {})
+    assert found.checked["packets"] == found.checked["parameter_samples"] == 38
 
 
 SAMPLES = repository.PARAMETER_SAMPLES
@@ -395,18 +378,19 @@ def test_the_integrity_check_does_not_expect_samples_of_packets_that_are_not_yet
     monkeypatch.setitem(cast(dict[str, Any], follow_up.DOING), "decode", lambda *_given: None)
     enter(either, tmp_path / "m")
     result = ingest_file(either, downlink(tmp_path, bus_packets(10)))
-    renamed = foreign.BUS.replace('"VOLTAGE"', '"BATTERY"')
-    add_mission(either, read_mission_file(mission(tmp_path / "m", document=renamed)))
+    enter(either, tmp_path / "m", document=RENAMED)
     found = verify(either, rebuild=True)
     assert found.damaged == []
-    assert found.unchecked["rows of parameter_samples decoded with an earlier mission description"] == 13
-    assert found.unchecked["rows of parameter_samples not yet decoded"] == 13
+    rest = "rows of parameter_samples not yet decoded"
+    assert (
+        found.unchecked["rows of parameter_samples decoded with an earlier mission description"]
+        == found.unchecked[rest]
+        == 13
+    )
     monkeypatch.setattr(decoding, "BLOCK_PACKETS", 5)
-    with either.database.writing() as connection:
-        assert decoding._next_block(connection, result.vehicle_id) == 5
+    assert either.write(decoding._next_block, result.vehicle_id) == 5
     found = verify(either, rebuild=True)
-    assert found.damaged == []
-    assert found.unchecked["rows of parameter_samples not yet decoded"] == 8
+    assert (found.damaged, found.unchecked[rest]) == ([], 8)
     decoding.decode_declared(either, result.vehicle_id)
     found = verify(either, rebuild=True)
     assert (found.damaged, found.unchecked, found.checked["parameter_samples"]) == ([], {}, 13)
@@ -427,16 +411,13 @@ def archived(made: Any, folder: Path, packets: list[bytes], text: str = DEFINED)
     return archive
 
 
-RENAMED = foreign.BUS.replace('"VOLTAGE"', '"BATTERY"')
-
-
 def test_an_archive_is_decoded_with_the_packets_that_it_declares_and_the_live_spacecraft_is_not(
     either: Ground, tmp_path: Path, synthetic_pass: Any
 ) -> None:
     bus = bus_packets(40)
-    folder = archived(synthetic_pass, tmp_path, [*payload_packets(synthetic_pass), *bus])
+    folder = archived(synthetic_pass, tmp_path, [*synthetic_pass.packets, *bus])
     live = define(either)
-    ingest_file(either, downlink(tmp_path, payload_packets(synthetic_pass)))
+    ingest_file(either, downlink(tmp_path, synthetic_pass.packets))
     pass_id = import_archive(either, folder)
     instance = get_pass(either, pass_id).instance
     found = trend_series(either, 76, instance, "VOLTAGE", 1000)
@@ -446,10 +427,9 @@ def test_an_archive_is_decoded_with_the_packets_that_it_declares_and_the_live_sp
     rows = json.loads(export_packets(either, pass_id, "Housekeeping", "json"))
     assert len(rows) == {one.packet: one.packets for one in pass_parameters(either, pass_id).packets}["Housekeeping"]
     assert pass_parameters(either, live).packets == ()
-    with either.database.reading() as connection:
-        assert packets_in_force(connection, 76, "flight") is None
+    assert either.read(packets_in_force, 76, "flight") is None
     # a description that a person adds holds for the spacecraft, and not for the archive
-    add_mission(either, read_mission_file(mission(tmp_path / "later", document=RENAMED)))
+    enter(either, tmp_path / "later", document=RENAMED)
     ingest_file(either, downlink(tmp_path, bus, "live.cadu"))
     assert trend_series(either, 76, "flight", "BATTERY", 1000).samples == 40
     assert trend_series(either, 76, instance, "VOLTAGE", 1000).samples == 40
@@ -487,8 +467,7 @@ def test_an_archive_that_declares_no_packets_is_decoded_with_the_description_of_
     assert trend_series(either, 76, instance, "VOLTAGE", 1000).samples == 20
 
 
-def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(ground: Ground, tmp_path: Path) -> None:
-    enter(ground, tmp_path / "m")
+def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(declared: Ground, tmp_path: Path) -> None:
     octets = downlink(tmp_path, bus_packets(120)).read_bytes()
     rng = np.random.default_rng(5)
     cuts = [0, *sorted(rng.choice(len(octets), 11, replace=False).tolist()), len(octets)]
@@ -497,91 +476,77 @@ def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(ground: Ground, 
         start, stop = pieces[index]
         path = tmp_path / f"{index}.piece"
         path.write_bytes(octets[start:stop])
-        ingest_file(ground, path, spacecraft_id=76, place=Place("s", start))
-    assert parameter_series(ground, define(ground), "VOLTAGE", 1000).samples == 120
+        ingest_file(declared, path, spacecraft_id=76, place=Place("s", start))
+    assert parameter_series(declared, define(declared), "VOLTAGE", 1000).samples == 120
 
 
-@pytest.mark.parametrize("framed", [False, True])
+@pytest.mark.parametrize("window", [0, 5_000, 1 << 20])
 def test_packets_that_nothing_declares_are_kept_between_declared_ones(
-    ground: Ground, tmp_path: Path, framed: bool
+    declared: Ground, tmp_path: Path, window: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    enter(ground, tmp_path / "m")
+    """In frames, and as a bare stream in windows and at once."""
     packets = bus_packets(274)
     for k in range(49):
         packets.insert(8 * k + 3, pack_packet(300, bytes(40), sequence_count=k))
     path = downlink(tmp_path, packets)
-    if not framed:
+    if window:
+        monkeypatch.setattr("ground_service.ingest.reception.WINDOW_OCTETS", window)
         path.write_bytes(b"".join(packets))
-    result = ingest_file(ground, path, spacecraft_id=76)
+    result = ingest_file(declared, path, spacecraft_id=76)
     assert (result.packets_new, result.crc_errors, result.octets_skipped) == (len(packets), 0, 0)
     assert result.unknown == 49
+    assert parameter_series(declared, define(declared), "VOLTAGE", 1000).samples == 274
 
 
-def test_a_bare_stream_without_checksums_is_read_in_windows(
-    ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ground_service.ingest.reception.WINDOW_OCTETS", 5_000)
-    enter(ground, tmp_path / "m")
-    path = tmp_path / "bare.packets"
-    path.write_bytes(b"".join(bus_packets(400)))
-    result = ingest_file(ground, path, spacecraft_id=76)
-    assert (result.packets_new, result.octets_skipped) == (500, 0)
-    assert parameter_series(ground, define(ground), "VOLTAGE", 1000).samples == 400
-
-
-def test_decoded_packets_of_a_pass_are_exported_with_utc(ground: Ground, tmp_path: Path, synthetic_pass: Any) -> None:
-    enter(ground, tmp_path / "m")
-    packets = payload_packets(synthetic_pass)
+def test_decoded_packets_of_a_pass_are_exported_with_utc(declared: Ground, tmp_path: Path, synthetic_pass: Any) -> None:
+    packets = synthetic_pass.packets
     (event,) = (one for one in map(DICTIONARY.unpack_packet, packets) if one.name == "event_info")
     packets.append(DICTIONARY.pack("event_low", event.values, ticks=event.ticks, sequence_count=1))
-    ingest_file(ground, downlink(tmp_path, [*packets, *bus_packets(20)]))
-    pass_id = define(ground, 86_400.0)
-    records = json.loads(export_packets(ground, pass_id, "Housekeeping", "json"))
+    ingest_file(declared, downlink(tmp_path, [*packets, *bus_packets(20)]))
+    pass_id = define(declared, 86_400.0)
+    records = json.loads(export_packets(declared, pass_id, "Housekeeping", "json"))
     assert [one["utc"][:23] for one in records] == [f"2029-08-07T00:00:{k:02d}.000" for k in range(20)]
     assert {one["MODE"] for one in records} <= {"SAFE", "NOMINAL", "DETUMBLE"}
-    lines = export_packets(ground, pass_id, "Event", "csv").decode().splitlines()
+    lines = export_packets(declared, pass_id, "Event", "csv").decode().splitlines()
     assert lines[0].startswith("utc,packet,VERSION")
-    own = json.loads(export_packets(ground, pass_id, "event_low", "json"))
+    own = json.loads(export_packets(declared, pass_id, "event_low", "json"))
     assert {one["packet"] for one in own} == {"event_low"}
     with pytest.raises(NotFound, match="packet"):
-        export_packets(ground, pass_id, "nothing", "csv")
-    assert export_packets(ground, pass_id, "Housekeeping", "parquet")[:4] == b"PAR1"
+        export_packets(declared, pass_id, "nothing", "csv")
+    assert export_packets(declared, pass_id, "Housekeeping", "parquet")[:4] == b"PAR1"
 
 
-def test_the_http_interface_gives_parameters_series_and_packets(tmp_path: Path) -> None:
-    with open_ground(tmp_path / "home") as ground:
-        enter(ground, tmp_path / "m")
-        ingest_file(ground, downlink(tmp_path, bus_packets(20)))
-        define(ground)
-    with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as client:
-        listed = client.get("/api/v1/passes/1/parameters").json()
-        assert "VOLTAGE" in {one["name"] for one in listed["parameters"]}
-        found = client.get("/api/v1/passes/1/telemetry/VOLTAGE").json()
-        assert (found["samples"], found["unit"]) == (20, "V")
-        answer = client.get("/api/v1/passes/1/packets/Housekeeping", params={"format": "csv"})
-        assert answer.headers["content-type"].startswith("text/csv")
-        assert len(answer.text.splitlines()) == 21
-        assert client.get("/api/v1/passes/1/packets/none").status_code == 404
+def test_the_http_interface_gives_parameters_series_and_packets(client: TestClient, tmp_path: Path) -> None:
+    ground = client.app.state.ground
+    enter(ground, tmp_path / "m")
+    ingest_file(ground, downlink(tmp_path, bus_packets(20)))
+    url = f"/api/v1/passes/{define(ground)}"
+    listed = client.get(f"{url}/parameters").json()
+    assert "VOLTAGE" in {one["name"] for one in listed["parameters"]}
+    found = client.get(f"{url}/telemetry/VOLTAGE").json()
+    assert (found["samples"], found["unit"]) == (20, "V")
+    answer = client.get(f"{url}/packets/Housekeeping?format=csv")
+    assert answer.headers["content-type"].startswith("text/csv")
+    assert len(answer.text.splitlines()) == 21
+    assert client.get(f"{url}/packets/none").status_code == 404
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (DEFINED.replace("[100, 101]", "[100, 2047]"), "packets.0.apids.1: expected less than or equal to 2046"),
-        (DEFINED.replace("'none'", "'maybe'"), "packets.0.packet_checksum: expected 'crc16' or 'none'"),
-        (DEFINED.replace("whole_octets = 2", "whole_octets = 4"), "packets.0.time: expected 2 or 3 octets of days"),
-        (DEFINED.replace("1958-01-01T00:00:00Z", "long ago"), "packets.0.time: expected an epoch such as"),
-        (DEFINED.replace("clock", "clok"), "packets.0.time.clok: expected 'clock', found unknown key 'clok'"),
-        (DEFINED + DEFINED.replace("'bus'", "'two'"), "each APID in one entry of packets, found 100"),
-        (DEFINED.replace("[100, 101]", "[160]"), "APIDs that the packet dictionary does not use, found 160"),
-    ],
-)
-def test_each_fault_of_a_declaration_is_one_line(tmp_path: Path, text: str, message: str) -> None:
-    found, faults = check_mission_file(mission(tmp_path, text))
-    assert found is None
-    assert len(faults) == 1, faults
-    assert message in faults[0]
-    assert "\n" not in faults[0]
+FAULTS = """\
+[100, 101] | [100, 2047] | packets.0.apids.1: expected less than or equal to 2046
+'none' | 'maybe' | packets.0.packet_checksum: expected 'crc16' or 'none'
+whole_octets = 2 | whole_octets = 4 | packets.0.time: expected 2 or 3 octets of days
+1958-01-01T00:00:00Z | long ago | packets.0.time: expected an epoch such as
+clock | clok | packets.0.time.clok: expected 'clock', found unknown key 'clok'
+'bus' | 'two' | each APID in one entry of packets, found 100
+[100, 101] | [160] | APIDs that the packet dictionary does not use, found 160"""
+
+
+@pytest.mark.parametrize("row", FAULTS.splitlines())
+def test_each_fault_of_a_declaration_is_one_line(tmp_path: Path, row: str) -> None:
+    old, new, message = row.split(" | ")
+    text = DEFINED * (new == "'two'") + DEFINED.replace(old, new)
+    found, [fault] = check_mission_file(mission(tmp_path, text))
+    assert found is None and message in fault and "\n" not in fault
 
 
 def test_each_faulty_document_is_one_line(tmp_path: Path) -> None:
@@ -611,32 +576,23 @@ def test_a_long_document_is_embedded_compressed(ground: Ground, tmp_path: Path) 
     path = mission(tmp_path, DEFINED, padded)
     octets = read_mission_file(path)
     assert b"gzip:" in octets and len(octets) < 100_000
-    entered = add_mission(ground, octets)
-    assert add_mission(ground, read_mission_file(path)).id == entered.id
+    assert add_mission(ground, octets).id == add_mission(ground, read_mission_file(path)).id
     ingest_file(ground, downlink(tmp_path, bus_packets(5)))
     assert parameter_series(ground, define(ground), "VOLTAGE", 100).samples == 5
 
 
-def test_a_declared_packet_from_the_future_is_kept_apart_until_others_agree(ground: Ground, tmp_path: Path) -> None:
-    enter(ground, tmp_path / "m")
+def test_a_declared_packet_from_the_future_is_kept_apart_until_others_agree(declared: Ground, tmp_path: Path) -> None:
     rng = np.random.default_rng(7)
-    ingest_file(ground, downlink(tmp_path, bus_packets(40)))
-    pass_id = define(ground)
+    ingest_file(declared, downlink(tmp_path, bus_packets(40)))
+    pass_id = define(declared)
     late = [at(foreign.housekeeping(rng, 40 + k), 3 * 86_400.0 + k) for k in range(12)]
     for number, packets in enumerate(([at(foreign.housekeeping(rng, 99), 70 * 365 * 86_400.0)], late[:1])):
-        ingest_file(ground, downlink(tmp_path, packets, f"{number}.cadu"))
-    [one, other] = ground.read(list_implausible, ImplausibleFilter(limit=9)).items
+        ingest_file(declared, downlink(tmp_path, packets, f"{number}.cadu"))
+    [one, other] = declared.read(list_implausible, ImplausibleFilter(limit=9)).items
     assert (one.apid, other.apid) == (100, 100) and "after all other telemetry" in one.reason
-    assert parameter_series(ground, pass_id, "VOLTAGE", 500).samples == 40
-    assert alarm_names(ground) == {"implausible_time"}
-    ingest_file(ground, downlink(tmp_path, late[1:], "3.cadu"))
-    assert len(ground.read(list_implausible, ImplausibleFilter(limit=9)).items) == 1
-    assert newest_declared_ticks_of(ground) < int(ticks_from_utc_ns(START + 4 * 86_400 * NS))
-
-
-def alarm_names(ground: Ground) -> set[str]:
-    return {one.name for one in ground.read(list_alarms, AlarmFilter(limit=99, state=["raised"])).items}
-
-
-def newest_declared_ticks_of(ground: Ground) -> int:
-    return ground.read(newest_declared_ticks, 1) or 0
+    assert parameter_series(declared, pass_id, "VOLTAGE", 500).samples == 40
+    raised = declared.read(list_alarms, AlarmFilter(limit=99, state=["raised"])).items
+    assert {one.name for one in raised} == {"implausible_time"}
+    ingest_file(declared, downlink(tmp_path, late[1:], "3.cadu"))
+    assert len(declared.read(list_implausible, ImplausibleFilter(limit=9)).items) == 1
+    assert declared.read(newest_declared_ticks, 1) < int(ticks_from_utc_ns(START + 4 * 86_400 * NS))
