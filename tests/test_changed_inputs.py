@@ -143,7 +143,7 @@ $$SOE"""
     return "\n".join([head, *rows, "$$EOE", ""])
 
 
-ORBITS: dict[str, tuple[str, Callable[[Ephemeris], str | bytes]]] = {
+ORBITS = {
     "OEM": ("oem", format_oem),
     "OEM in XML": ("xml", format_oem_xml),
     "STK": ("e", format_stk),
@@ -613,7 +613,7 @@ def test_a_changed_field_never_gives_other_figures_in_silence(name: str, tmp_pat
 
 
 def main() -> None:
-    counts: Counter[str] = Counter()
+    counts = Counter()
     for name in READERS:
         for row in changes_of(name):
             with tempfile.TemporaryDirectory() as folder:

@@ -398,7 +398,7 @@ def test_the_integrity_check_does_not_expect_samples_of_packets_that_are_not_yet
 
 def archived(made: Any, folder: Path, packets: list[bytes], text: str = DEFINED) -> Path:
     """The synthetic archive with other packets in its downlink, and a mission description that declares them."""
-    archive: Path = shutil.copytree(made.folder, folder / "archive")
+    archive = shutil.copytree(made.folder, folder / "archive")
     written = {
         "downlink.cadu": encode_cadus(packets, spacecraft_id=76),
         "mission.toml": read_mission_file(mission(folder / "described", text)),

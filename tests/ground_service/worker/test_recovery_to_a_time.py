@@ -103,7 +103,7 @@ def server() -> Iterator[Server]:
 
 def server_time(ground: Ground) -> datetime:
     with ground.database.reading() as connection:
-        found: datetime = connection.execute(text("SELECT clock_timestamp()")).scalar_one()
+        found = connection.execute(text("SELECT clock_timestamp()")).scalar_one()
     return found.astimezone(UTC)
 
 
