@@ -68,16 +68,16 @@ def mission(folder: Path, text: str = DEFINED, document: str = foreign.BUS) -> P
     return folder / "mission.toml"
 
 
-def enter(ground: Ground, folder: Path, text: str = DEFINED, document: str = foreign.BUS) -> Any:
-    return add_mission(ground, read_mission_file(mission(folder, text, document)))
+def enter(ground: Ground, text: str = DEFINED, document: str = foreign.BUS) -> None:
+    add_mission(ground, read_mission_file(mission(ground.home / "m", text, document)))
 
 
 RENAMED = foreign.BUS.replace('"VOLTAGE"', '"BATTERY"')
 
 
 @pytest.fixture
-def declared(ground: Ground, tmp_path: Path) -> Ground:
-    enter(ground, tmp_path / "m")
+def declared(ground: Ground) -> Ground:
+    enter(ground)
     return ground
 
 
@@ -104,10 +104,10 @@ def longer(packet: bytes) -> bytes:
     return packet[:4] + (int.from_bytes(packet[4:6], "big") + 2).to_bytes(2, "big") + packet[6:]
 
 
-def downlink(folder: Path, packets: list[bytes], name: str = "bus.cadu") -> Path:
-    path = folder / name
+def take(ground: Ground, packets: list[bytes]) -> Any:
+    path = ground.home / "bus.cadu"
     path.write_bytes(encode_cadus(packets, spacecraft_id=76))
-    return path
+    return ingest_file(ground, path)
 
 
 def define(ground: Ground, seconds: float = 600.0) -> int:
@@ -129,11 +129,11 @@ def interpreted(packets: list[bytes], tmp_path: Path) -> list[Any]:
 def test_packets_without_a_checksum_between_others_become_series(
     either: Ground, tmp_path: Path, synthetic_pass: Any
 ) -> None:
-    enter(either, tmp_path / "m")
+    enter(either)
     own, bus = synthetic_pass.packets, bus_packets(300)
     mixed = [packet for pair in zip(own, bus, strict=False) for packet in pair]
     mixed += own[len(bus) :] + bus[len(own) :]
-    result = ingest_file(either, downlink(tmp_path, mixed))
+    result = take(either, mixed)
     assert (result.packets, result.packets_new) == (len(mixed), len(mixed))
     assert (result.crc_errors, result.octets_skipped, result.unknown) == (0, 0, 0)
     newest = {one.name: one for one in live_parameters(either, 76, "flight")}  # without a pass
@@ -163,7 +163,7 @@ def test_packets_without_a_checksum_between_others_become_series(
 
 def test_a_minimal_description_of_a_definition_decodes_its_packets(ground: Ground, tmp_path: Path) -> None:
     add_mission(ground, written(tmp_path, foreign.BUS).encode())
-    result = ingest_file(ground, downlink(tmp_path, bus_packets(8)))
+    result = take(ground, bus_packets(8))
     assert ground.read(readable_decoding, result.vehicle_id).counts["100"] == {"decoded": 8}
     bare = foreign.document(foreign.integer("u8", 8), {"a": "u8"}, foreign.container("P", ["a"]))
     with pytest.raises(InvalidInput, match="compares its APID with a number, found none"):
@@ -217,14 +217,12 @@ def test_a_unix_clock_counts_no_leap_seconds(epoch: str) -> None:
         PacketTime.model_validate({**time.model_dump(), "epoch": "1970-01-01T00:00:00 TAI"})
 
 
-def test_parts_of_segmented_packets_are_counted_and_packets_without_header_have_no_time(
-    declared: Ground, tmp_path: Path
-) -> None:
+def test_parts_of_segmented_packets_are_counted_and_packets_without_header_have_no_time(declared: Ground) -> None:
     """The definition asks for the secondary header flag, but not for the sequence flags."""
     packets = bus_packets(8)
     parts = [packets[3][:2] + struct.pack(">H", flags << 14 | 50 + flags) + packets[3][4:] for flags in (1, 0, 2)]
     boot = bytes((packets[2][0] & ~0x08, *packets[2][1:]))
-    ingest_file(declared, downlink(tmp_path, [*packets, *parts, boot]))
+    take(declared, [*packets, *parts, boot])
     listed = pass_parameters(declared, define(declared))
     assert listed.outcomes["100"] == {"decoded": 8, "segments_not_joined": 3, "no_container": 1}
     assert parameter_series(declared, 1, "VOLTAGE", 100).samples == 8
@@ -238,7 +236,7 @@ def test_an_entry_may_name_several_containers_and_the_unit_of_sizes(tmp_path: Pa
     assert "expected the name of a container" in check_mission_file(mission(tmp_path, text.replace("TIMED", "X")))[1][0]
 
 
-def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground: Ground, tmp_path: Path) -> None:
+def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground: Ground) -> None:
     limits = (
         "<DefaultAlarm><StaticAlarmRanges><WarningRange minInclusive='-1' maxInclusive='1000.5'/>"
         "<CriticalRange maxExclusive='1020'/></StaticAlarmRanges></DefaultAlarm>"
@@ -247,8 +245,8 @@ def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground: 
     assert kind in foreign.BUS
     end = foreign.BUS.index("</FloatParameterType>", foreign.BUS.index(kind))
     text = foreign.BUS[:end] + limits + foreign.BUS[end:]
-    enter(ground, tmp_path / "m", document=text)
-    ingest_file(ground, downlink(tmp_path, bus_packets(4)))
+    enter(ground, document=text)
+    take(ground, bus_packets(4))
     newest = next(one for one in live_parameters(ground, 76, "flight") if one.name == "VOLTAGE")
     assert newest.limits == "-1 to 1000.5" and newest.value is not None
     broken = "alarm" if newest.value > 1020.0 else "warning" if newest.value > 1000.5 else "within"
@@ -265,10 +263,10 @@ def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground: 
 def test_a_series_has_least_greatest_and_mean_value_from_samples_and_from_rollups(
     either: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    enter(either, tmp_path / "m")
+    enter(either)
     bus = bus_packets(2000)
-    for part, piece in enumerate((bus[:900], bus[900:])):
-        ingest_file(either, downlink(tmp_path, piece, f"{part}.cadu"))
+    for piece in (bus[:900], bus[900:]):
+        take(either, piece)
     pass_id = define(either, 3000.0)
     exact = parameter_series(either, pass_id, "RATE", 10)
     housekeeping = [packet for packet in bus if packet[1] == foreign.APID_HOUSEKEEPING]
@@ -287,21 +285,21 @@ def test_a_series_has_least_greatest_and_mean_value_from_samples_and_from_rollup
 
 
 def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_kept_as_unknown(
-    either: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    either: Ground, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(decoding, "BLOCK_PACKETS", 50)
     monkeypatch.setitem(cast(dict[str, Any], follow_up.DOING), "decode", lambda *_given: None)  # no job decodes
     declared = "[[packets]]\nname = 'bus'\napids = [100, 101]\npacket_checksum = 'none'\n"
-    enter(either, tmp_path / "m", declared)
-    result = ingest_file(either, downlink(tmp_path, bus_packets(100)))
+    enter(either, declared)
+    result = take(either, bus_packets(100))
     assert (result.packets_new, result.unknown, result.octets_skipped) == (125, 125, 0)
     pass_id = define(either)
     with pytest.raises(NotFound):
         parameter_series(either, pass_id, "VOLTAGE", 100)
-    enter(either, tmp_path / "m")
+    enter(either)
     assert decoding.decode_declared(either, result.vehicle_id) == 125
     assert parameter_series(either, pass_id, "VOLTAGE", 100).samples == 100
-    enter(either, tmp_path / "m", document=RENAMED)
+    enter(either, document=RENAMED)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         whole = Mock(side_effect=[decoding._next_block, KeyboardInterrupt])
         patch.setattr(decoding, "_next_block", lambda *given: whole()(*given))
@@ -318,17 +316,17 @@ def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_k
 
 
 def test_a_revision_reads_raw_files_again_whose_packets_were_taken_for_damaged(
-    either: Ground, tmp_path: Path, synthetic_pass: Any
+    either: Ground, synthetic_pass: Any
 ) -> None:
     own, bus = synthetic_pass.packets, bus_packets(100)
     mixed = [packet for pair in zip(own, bus, strict=False) for packet in pair]
-    result = ingest_file(either, downlink(tmp_path, mixed))
+    result = take(either, mixed)
     assert result.packets_new <= len(own) and result.crc_errors + result.octets_skipped > 0
-    enter(either, tmp_path / "m")  # the event of the revision has the job run
+    enter(either)  # the event of the revision has the job run
     assert parameter_series(either, define(either), "VOLTAGE", 1000).samples == 100
     assert undecoded_vehicles(either, 76) == []
     assert [job["state"] for job in redecodings(either)] == ["done"]
-    enter(either, tmp_path / "m", DEFINED + "[evidence]\nseed = 1\n")  # the same packets
+    enter(either, DEFINED + "[evidence]\nseed = 1\n")  # the same packets
     assert len(redecodings(either)) == 1
 
 
@@ -336,8 +334,8 @@ def redecodings(ground: Ground) -> list[dict[str, Any]]:
     return ground.read(repository.newest, repository.JOBS, Paging(), kind="redecode")[0]
 
 
-def test_the_integrity_check_finds_packets_without_a_checksum_intact(declared: Ground, tmp_path: Path) -> None:
-    ingest_file(declared, downlink(tmp_path, bus_packets(30)))
+def test_the_integrity_check_finds_packets_without_a_checksum_intact(declared: Ground) -> None:
+    take(declared, bus_packets(30))
     found = verify(declared, rebuild=True)
     assert (found.verdict, found.damaged, found.unchecked) == ("intact", [], {})
     assert found.checked["packets"] == found.checked["parameter_samples"] == 38
@@ -359,10 +357,10 @@ SAMPLES = repository.PARAMETER_SAMPLES
     ],
 )
 def test_the_integrity_check_finds_a_damaged_sample(
-    either: Ground, tmp_path: Path, changes: dict[str, Any] | None, reason: str
+    either: Ground, changes: dict[str, Any] | None, reason: str
 ) -> None:
-    enter(either, tmp_path / "m")
-    ingest_file(either, downlink(tmp_path, bus_packets(8)))
+    enter(either)
+    take(either, bus_packets(8))
     with either.database.writing() as connection:
         (row, *_) = connection.execute(SAMPLES.select().order_by(SAMPLES.c.ticks)).mappings()
         here = (SAMPLES.c.ticks == row["ticks"]) & (SAMPLES.c.packet_id == row["packet_id"])
@@ -373,12 +371,12 @@ def test_the_integrity_check_finds_a_damaged_sample(
 
 
 def test_the_integrity_check_does_not_expect_samples_of_packets_that_are_not_yet_decoded(
-    either: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    either: Ground, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(cast(dict[str, Any], follow_up.DOING), "decode", lambda *_given: None)
-    enter(either, tmp_path / "m")
-    result = ingest_file(either, downlink(tmp_path, bus_packets(10)))
-    enter(either, tmp_path / "m", document=RENAMED)
+    enter(either)
+    result = take(either, bus_packets(10))
+    enter(either, document=RENAMED)
     found = verify(either, rebuild=True)
     assert found.damaged == []
     rest = "rows of parameter_samples not yet decoded"
@@ -417,7 +415,7 @@ def test_an_archive_is_decoded_with_the_packets_that_it_declares_and_the_live_sp
     bus = bus_packets(40)
     folder = archived(synthetic_pass, tmp_path, [*synthetic_pass.packets, *bus])
     live = define(either)
-    ingest_file(either, downlink(tmp_path, synthetic_pass.packets))
+    take(either, synthetic_pass.packets)
     pass_id = import_archive(either, folder)
     instance = get_pass(either, pass_id).instance
     found = trend_series(either, 76, instance, "VOLTAGE", 1000)
@@ -429,8 +427,8 @@ def test_an_archive_is_decoded_with_the_packets_that_it_declares_and_the_live_sp
     assert pass_parameters(either, live).packets == ()
     assert either.read(packets_in_force, 76, "flight") is None
     # a description that a person adds holds for the spacecraft, and not for the archive
-    enter(either, tmp_path / "later", document=RENAMED)
-    ingest_file(either, downlink(tmp_path, bus, "live.cadu"))
+    enter(either, document=RENAMED)
+    take(either, bus)
     assert trend_series(either, 76, "flight", "BATTERY", 1000).samples == 40
     assert trend_series(either, 76, instance, "VOLTAGE", 1000).samples == 40
     with pytest.raises(NotFound):
@@ -461,14 +459,14 @@ def test_an_archive_that_was_imported_before_is_decoded_with_its_packets_on_rede
 def test_an_archive_that_declares_no_packets_is_decoded_with_the_description_of_the_spacecraft(
     either: Ground, tmp_path: Path, synthetic_pass: Any
 ) -> None:
-    enter(either, tmp_path / "m")
+    enter(either)
     pass_id = import_archive(either, archived(synthetic_pass, tmp_path, bus_packets(20), ""))
     instance = get_pass(either, pass_id).instance
     assert trend_series(either, 76, instance, "VOLTAGE", 1000).samples == 20
 
 
 def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(declared: Ground, tmp_path: Path) -> None:
-    octets = downlink(tmp_path, bus_packets(120)).read_bytes()
+    octets = encode_cadus(bus_packets(120), spacecraft_id=76)
     rng = np.random.default_rng(5)
     cuts = [0, *sorted(rng.choice(len(octets), 11, replace=False).tolist()), len(octets)]
     pieces = list(pairwise(cuts))
@@ -488,21 +486,21 @@ def test_packets_that_nothing_declares_are_kept_between_declared_ones(
     packets = bus_packets(274)
     for k in range(49):
         packets.insert(8 * k + 3, pack_packet(300, bytes(40), sequence_count=k))
-    path = downlink(tmp_path, packets)
+    path = tmp_path / "bus"
+    path.write_bytes(b"".join(packets) if window else encode_cadus(packets, spacecraft_id=76))
     if window:
         monkeypatch.setattr("ground_service.ingest.reception.WINDOW_OCTETS", window)
-        path.write_bytes(b"".join(packets))
     result = ingest_file(declared, path, spacecraft_id=76)
     assert (result.packets_new, result.crc_errors, result.octets_skipped) == (len(packets), 0, 0)
     assert result.unknown == 49
     assert parameter_series(declared, define(declared), "VOLTAGE", 1000).samples == 274
 
 
-def test_decoded_packets_of_a_pass_are_exported_with_utc(declared: Ground, tmp_path: Path, synthetic_pass: Any) -> None:
+def test_decoded_packets_of_a_pass_are_exported_with_utc(declared: Ground, synthetic_pass: Any) -> None:
     packets = synthetic_pass.packets
     (event,) = (one for one in map(DICTIONARY.unpack_packet, packets) if one.name == "event_info")
     packets.append(DICTIONARY.pack("event_low", event.values, ticks=event.ticks, sequence_count=1))
-    ingest_file(declared, downlink(tmp_path, [*packets, *bus_packets(20)]))
+    take(declared, [*packets, *bus_packets(20)])
     pass_id = define(declared, 86_400.0)
     records = json.loads(export_packets(declared, pass_id, "Housekeeping", "json"))
     assert [one["utc"][:23] for one in records] == [f"2029-08-07T00:00:{k:02d}.000" for k in range(20)]
@@ -516,10 +514,10 @@ def test_decoded_packets_of_a_pass_are_exported_with_utc(declared: Ground, tmp_p
     assert export_packets(declared, pass_id, "Housekeeping", "parquet")[:4] == b"PAR1"
 
 
-def test_the_http_interface_gives_parameters_series_and_packets(client: TestClient, tmp_path: Path) -> None:
+def test_the_http_interface_gives_parameters_series_and_packets(client: TestClient) -> None:
     ground = client.app.state.ground
-    enter(ground, tmp_path / "m")
-    ingest_file(ground, downlink(tmp_path, bus_packets(20)))
+    enter(ground)
+    take(ground, bus_packets(20))
     url = f"/api/v1/passes/{define(ground)}"
     listed = client.get(f"{url}/parameters").json()
     assert "VOLTAGE" in {one["name"] for one in listed["parameters"]}
@@ -577,22 +575,22 @@ def test_a_long_document_is_embedded_compressed(ground: Ground, tmp_path: Path) 
     octets = read_mission_file(path)
     assert b"gzip:" in octets and len(octets) < 100_000
     assert add_mission(ground, octets).id == add_mission(ground, read_mission_file(path)).id
-    ingest_file(ground, downlink(tmp_path, bus_packets(5)))
+    take(ground, bus_packets(5))
     assert parameter_series(ground, define(ground), "VOLTAGE", 100).samples == 5
 
 
-def test_a_declared_packet_from_the_future_is_kept_apart_until_others_agree(declared: Ground, tmp_path: Path) -> None:
+def test_a_declared_packet_from_the_future_is_kept_apart_until_others_agree(declared: Ground) -> None:
     rng = np.random.default_rng(7)
-    ingest_file(declared, downlink(tmp_path, bus_packets(40)))
+    take(declared, bus_packets(40))
     pass_id = define(declared)
     late = [at(foreign.housekeeping(rng, 40 + k), 3 * 86_400.0 + k) for k in range(12)]
-    for number, packets in enumerate(([at(foreign.housekeeping(rng, 99), 70 * 365 * 86_400.0)], late[:1])):
-        ingest_file(declared, downlink(tmp_path, packets, f"{number}.cadu"))
+    for packets in ([at(foreign.housekeeping(rng, 99), 70 * 365 * 86_400.0)], late[:1]):
+        take(declared, packets)
     [one, other] = declared.read(list_implausible, ImplausibleFilter(limit=9)).items
     assert (one.apid, other.apid) == (100, 100) and "after all other telemetry" in one.reason
     assert parameter_series(declared, pass_id, "VOLTAGE", 500).samples == 40
     raised = declared.read(list_alarms, AlarmFilter(limit=99, state=["raised"])).items
     assert {one.name for one in raised} == {"implausible_time"}
-    ingest_file(declared, downlink(tmp_path, late[1:], "3.cadu"))
+    take(declared, late[1:])
     assert len(declared.read(list_implausible, ImplausibleFilter(limit=9)).items) == 1
     assert declared.read(newest_declared_ticks, 1) < int(ticks_from_utc_ns(START + 4 * 86_400 * NS))

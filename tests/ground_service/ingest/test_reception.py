@@ -24,13 +24,14 @@ from benchmarks.downlink import (
 )
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
+from ground_service.http.model import Paging
 from ground_service.ingest.model import IngestResult
 from ground_service.ingest.service import Place, ingest_file
 from ground_service.missions.service import add_mission
 from ground_service.missions.store import links_in_force
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.model import Completeness
-from ground_service.passes.service import completeness, define_pass
+from ground_service.passes.service import completeness, define_pass, get_pass
 from ground_service.store import repository
 from ground_service.store.vehicles import vehicle_id
 from lunar.timescales import utc_ns_from_ticks
@@ -107,13 +108,10 @@ def test_an_archive_is_read_with_the_settings_of_its_own_mission(ground: Ground,
     """The description of the archive holds for its instance only, not for the spacecraft in flight."""
     archive = make_pass(mission=MISSION)
     pass_id = import_archive(ground, archive.folder)
-    with ground.database.reading() as connection:
-        (accounting,) = connection.execute(select(repository.INGESTS.c.accounting)).scalars()
-        vehicle = repository.get(connection, repository.PASSES, pass_id, "pass")["vehicle_id"]
-        instance = repository.get(connection, repository.VEHICLES, vehicle, "vehicle")["instance"]
-        assert set(links_in_force(connection, SPACECRAFT, instance)) == {SPACECRAFT}
-        assert links_in_force(connection, SPACECRAFT, "flight") == {}
-    assert {one["source"] for one in accounting["reception"]["sections"]} == {"mission"}
+    assert set(ground.read(links_in_force, SPACECRAFT, get_pass(ground, pass_id).instance)) == {SPACECRAFT}
+    assert ground.read(links_in_force, SPACECRAFT, "flight") == {}
+    [kept], _ = ground.read(repository.newest, repository.INGESTS, Paging())
+    assert {one["source"] for one in kept["accounting"]["reception"]["sections"]} == {"mission"}
 
 
 def test_stated_settings_are_used_as_they_are_and_impossible_ones_are_refused(ground: Ground) -> None:
@@ -233,15 +231,13 @@ def test_two_spacecraft_have_the_same_archives_whatever_the_split(tmp_path: Path
     stream = two_spacecraft()
     hashes = set()
     for cut in (0, 1279 * 301, 400_001):
-        ground = open_ground(tmp_path / str(cut))
-        for start, part in ((cut, stream.files[0][cut:]), (0, stream.files[0][:cut])):
-            if part:
-                ingest(ground, part, place=Place("both", start))
-        assert {one: stored(ground, one) for one in stream.packets} == stream.packets
-        with ground.database.reading() as connection:
-            vehicles = [vehicle_id(connection, one, "flight") for one in sorted(stream.packets)]
-            hashes.add(tuple(archive_hash(connection, vehicle) for vehicle in vehicles))
-        ground.close()
+        with open_ground(tmp_path / str(cut)) as ground:
+            for start, part in ((cut, stream.files[0][cut:]), (0, stream.files[0][:cut])):
+                if part:
+                    ingest(ground, part, place=Place("both", start))
+            assert {one: stored(ground, one) for one in stream.packets} == stream.packets
+            vehicles = [ground.read(vehicle_id, one, "flight") for one in sorted(stream.packets)]
+            hashes.add(tuple(ground.read(archive_hash, vehicle) for vehicle in vehicles))
     assert len(hashes) == 1
 
 

@@ -119,6 +119,13 @@ def receive(ground: Ground, packets: list[bytes]) -> None:
     ingest_file(ground, file, spacecraft_id=SPACECRAFT)
 
 
+def followed(ground: Ground, flown: SyntheticPass, *given: str, **how: Any) -> int:
+    """Receive a prepared pass; return its window."""
+    window_id = prepared(ground, flown, *given, **how)
+    receive(ground, flown.packets)
+    return window_id
+
+
 def follow_up(ground: Ground) -> list[Job]:
     """Jobs of the follow-up, oldest first."""
     return list(ground.read(list_jobs, JobFilter(kind="automation")).items)[::-1]
@@ -150,8 +157,7 @@ def processed(ground: Ground, window_id: int) -> int:
 
 
 def test_a_live_pass_is_complete_and_processed_without_a_request(either: Ground, flown: SyntheticPass) -> None:
-    window_id = prepared(either, flown)
-    receive(either, flown.packets)
+    window_id = followed(either, flown)
     pass_id = processed(either, window_id)
     report, after = follow_up(either)
     assert (report.state, after.state) == ("done", "done")
@@ -196,8 +202,7 @@ def test_an_incomplete_window_is_processed_after_the_contact_and_late_data_chang
 
 
 def test_a_reference_that_arrives_after_the_report_completes_it(either: Ground, flown: SyntheticPass) -> None:
-    window_id = prepared(either, flown, reference=False)
-    receive(either, flown.packets)
+    window_id = followed(either, flown, reference=False)
     pass_id = processed(either, window_id)
     reasons = report_of(either, pass_id)["not_available"]
     assert reasons["error"] == "no reference ephemeris covers this pass" and "detector" in reasons
@@ -215,8 +220,7 @@ def test_a_mission_without_a_camera_is_processed_and_its_report_says_what_that_m
     ground: Ground, flown: SyntheticPass
 ) -> None:
     before, _, rest = MISSION.partition("[camera]")
-    window_id = prepared(ground, flown, mission=before + "[catalogue]" + rest.partition("[catalogue]")[2])
-    receive(ground, flown.packets)
+    window_id = followed(ground, flown, mission=before + "[catalogue]" + rest.partition("[catalogue]")[2])
     pass_id = processed(ground, window_id)
     report = report_of(ground, pass_id)
     said = "the mission description does not state sizes of the camera, which are assumed: image width (512 px)"
@@ -226,8 +230,7 @@ def test_a_mission_without_a_camera_is_processed_and_its_report_says_what_that_m
 
 
 def test_an_event_that_is_followed_again_has_one_result(ground: Ground, flown: SyntheticPass) -> None:
-    prepared(ground, flown)
-    receive(ground, flown.packets)
+    followed(ground, flown)
     for job in follow_up(ground):
         again = actions.run_steps(ground, job.arguments["event"])
         assert again.get("report of pass 1") == (job.result or {}).get("report of pass 1")
@@ -300,14 +303,12 @@ def test_an_imported_archive_is_kept_once_unless_the_mission_evaluates_nothing(
 
 
 def test_a_mission_that_evaluates_nothing_leaves_its_windows_to_persons(ground: Ground, flown: SyntheticPass) -> None:
-    window_id = prepared(ground, flown, "[automation]\nevaluate = false\n")
-    receive(ground, flown.packets)
+    window_id = followed(ground, flown, "[automation]\nevaluate = false\n")
     assert follow_up(ground) == [] and ground.read(get_window, window_id).state == "downlinked"
 
 
 def test_the_catalogue_of_a_live_pass_is_cut_to_its_track(ground: Ground, flown: SyntheticPass) -> None:
-    window_id = prepared(ground, flown)
-    receive(ground, flown.packets)
+    window_id = followed(ground, flown)
     whole = evaluation.evaluate(ground, processed(ground, window_id))
     assert whole.detector is not None
     assert any("synthetic craters" in one for one in whole.data_sources)

@@ -175,21 +175,24 @@ def stream_of(spacecraft: int = SPACECRAFT) -> bytes:
     return encode_cadus([event_packet(k << 16, k, "boot") for k in range(1, 41)], spacecraft_id=spacecraft)
 
 
+def ingest(ground: Ground, octets: bytes, **stated: Any) -> None:
+    path = ground.home / "d.cadu"
+    path.write_bytes(octets)
+    ingest_file(ground, path, **stated)
+
+
 @pytest.mark.parametrize(
     "stated",
     [{"spacecraft_id": SPACECRAFT}, {"spacecraft_id": SPACECRAFT, "place": Place("s", 100)}, {"instance": "twin"}],
 )
-def test_what_was_stated_with_a_downlink_holds_for_its_verification(
-    ground: Ground, tmp_path: Path, stated: dict[str, Any]
-) -> None:
+def test_what_was_stated_with_a_downlink_holds_for_its_verification(ground: Ground, stated: dict[str, Any]) -> None:
     """A spacecraft filter excludes the same packets; pieces with a position are joined by position."""
     octets = stream_of() + stream_of(SPACECRAFT + 1)
     place = stated.pop("place", None)
     cuts = [0, len(octets)] if place is None else [*range(0, 1200, 60), len(octets)]
     for start, stop in reversed(list(itertools.pairwise(cuts))):
-        (tmp_path / "piece").write_bytes(octets[start:stop])
         stands = None if place is None else Place(place.stream, place.offset + start)
-        ingest_file(ground, tmp_path / "piece", place=stands, **stated)
+        ingest(ground, octets[start:stop], place=stands, **stated)
     result = verify(ground, rebuild=True)
     assert (result.verdict, result.damaged) == ("intact", [])
 
@@ -201,11 +204,10 @@ def test_what_was_stated_with_a_downlink_holds_for_its_verification(
         ("DELETE FROM rollups WHERE level = 6", "expected this row, found none"),
     ],
 )
-def test_a_damaged_row_is_named(either: Ground, tmp_path: Path, damage: str, reason: str) -> None:
+def test_a_damaged_row_is_named(either: Ground, damage: str, reason: str) -> None:
     values = {field.name: 1 for field in DICTIONARY.packet("housekeeping").fields}
     packet = DICTIONARY.pack("housekeeping", values, ticks=1 << 16, sequence_count=0)
-    (tmp_path / "d.cadu").write_bytes(encode_cadus([packet], spacecraft_id=SPACECRAFT))
-    ingest_file(either, tmp_path / "d.cadu")
+    ingest(either, encode_cadus([packet], spacecraft_id=SPACECRAFT))
     assert verify(either, rebuild=True).damaged == []
     with either.database.writing() as connection:
         connection.execute(text(damage))
@@ -213,16 +215,15 @@ def test_a_damaged_row_is_named(either: Ground, tmp_path: Path, damage: str, rea
     assert verify(either).damaged == []
 
 
-def test_an_ingest_before_version_1_has_no_piece(either: Ground, tmp_path: Path) -> None:
+def test_an_ingest_before_version_1_has_no_piece(either: Ground) -> None:
     """The spacecraft of the ingest selects the frames."""
-    (tmp_path / "d.cadu").write_bytes(stream_of() + stream_of(SPACECRAFT + 1))
-    ingest_file(either, tmp_path / "d.cadu", spacecraft_id=SPACECRAFT)
+    ingest(either, stream_of() + stream_of(SPACECRAFT + 1), spacecraft_id=SPACECRAFT)
     with either.database.writing() as connection:
         connection.execute(text("DELETE FROM pieces"))
     assert verify(either, rebuild=True).damaged == []
 
 
-def test_sums_of_roll_ups_may_differ_by_the_order_of_addition(ground: Ground, tmp_path: Path) -> None:
+def test_sums_of_roll_ups_may_differ_by_the_order_of_addition(ground: Ground) -> None:
     row = np.array([3.0, 0.6, 0.1, 0.3, 0.0, 0.0, np.inf, -np.inf])
     for index, change, same in ((1, 1e-16, True), (1, 1e-6, False), (3, 1e-16, False), (0, 1.0, False)):
         other = row.copy()
@@ -231,9 +232,8 @@ def test_sums_of_roll_ups_may_differ_by_the_order_of_addition(ground: Ground, tm
         assert same_values(ROLLUPS, *pair) == same
 
 
-def test_a_rebuild_writes_nothing_to_the_archive(either: Ground, tmp_path: Path) -> None:
-    (tmp_path / "d.cadu").write_bytes(stream_of())
-    ingest_file(either, tmp_path / "d.cadu")
+def test_a_rebuild_writes_nothing_to_the_archive(either: Ground) -> None:
+    ingest(either, stream_of())
     with either.database.snapshot() as connection:
         before = table_digests(connection)
     names = sorted(either.files.names())

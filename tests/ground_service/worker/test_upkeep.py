@@ -88,8 +88,7 @@ def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pyte
     assert removed == {"events": 2, "jobs": 0, "answers": 1, "sessions": 0, "files": 3}
     assert [path.name for path in (regression / "scratch").iterdir()] == []
     assert [item.number for item in read_events(ground.database, 0)] == [3]
-    with ground.database.reading() as connection:
-        assert repository.newest(connection, repository.AUDIT, Paging())[1] == 1
+    assert ground.read(repository.newest, repository.AUDIT, Paging())[1] == 1
 
 
 def test_nothing_is_removed_in_the_first_night_after_a_jump_of_the_clock(
