@@ -98,7 +98,7 @@ def contents_of(name: str, text: str, is_package: bool) -> tuple[set[str], list[
 
 def imported_names(name: str, file: Path) -> set[str]:
     """Dotted names that a module imports."""
-    return contents_of(name, file.read_text(encoding="utf-8"), file.name == "__init__.py")[0]
+    return contents_of(name, file.read_text(), file.name == "__init__.py")[0]
 
 
 def import_cycles(root: Path) -> list[list[str]]:
@@ -195,7 +195,7 @@ def modules_with_sql(root: Path) -> list[str]:
             re.match(r"sqlalchemy\b(?!\.(Connection$|Engine$|exc\b))", one)
             or re.match(r"ground_service\.store\.(repository|models)\b", one)
             for one in imported_names(name, file)
-        ) or re.search(r"connection\.(execute|exec_driver_sql)\(", file.read_text(encoding="utf-8")):
+        ) or re.search(r"connection\.(execute|exec_driver_sql)\(", file.read_text()):
             found.append(name)
     return found
 
@@ -227,7 +227,7 @@ def compiled_functions() -> list[tuple[Path, ast.FunctionDef]]:
     found = []
     for package in PACKAGES:
         for file in sorted((ROOT / package).rglob("*.py")):
-            text = file.read_text(encoding="utf-8")
+            text = file.read_text()
             if "njit" not in text:
                 continue
             for node in ast.walk(ast.parse(text)):
@@ -260,7 +260,7 @@ def test_no_module_reads_data_that_can_name_code() -> None:
     found = [
         f"{name}: {line.strip()}"
         for name, file in modules_of(ROOT).items()
-        for line in file.read_text(encoding="utf-8").splitlines()
+        for line in file.read_text().splitlines()
         if UNSAFE.search(line) and name != "kernels.compiled"
     ]
     assert found == []
@@ -272,7 +272,7 @@ def long_functions(root: Path) -> list[str]:
     return [
         one
         for name, file in modules_of(root).items()
-        for one in contents_of(name, file.read_text(encoding="utf-8"), file.name == "__init__.py")[1]
+        for one in contents_of(name, file.read_text(), file.name == "__init__.py")[1]
     ]
 
 
@@ -302,7 +302,7 @@ def test_names_messages_and_docstrings_use_the_terms_of_the_field() -> None:
         str(file.relative_to(ROOT)): words
         for package in (*PACKAGES, "benchmarks")
         for file in (ROOT / package).rglob("*.py")
-        if (words := DECODED.findall(file.read_text(encoding="utf-8")))
+        if (words := DECODED.findall(file.read_text()))
     }
     assert found == {}
     planted = 'class Moment:\n    """Where it is beside."""\n    def _told(): raise Lost("came to no end")\n'

@@ -62,12 +62,12 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_pinned_package_runs_on_the_oldest_python_that_the_project_states() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     oldest = project["requires-python"].removeprefix(">=") + ".0"
     pins = {
         Requirement(line).name
         for path in (ROOT / "requirements").glob("*.txt")
-        for line in path.read_text(encoding="utf-8").splitlines()
+        for line in path.read_text().splitlines()
         if "==" in line and not line.startswith("#")
     }
     refused, judged = [], 0

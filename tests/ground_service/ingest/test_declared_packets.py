@@ -63,8 +63,8 @@ MISSION = "name = 'test'\nspacecraft = { id = 76 }\n"
 
 def mission(folder: Path, text: str = DEFINED, document: str = foreign.BUS) -> Path:
     folder.mkdir(exist_ok=True)
-    (folder / "bus.xml").write_text(document, encoding="utf-8")
-    (folder / "mission.toml").write_text(MISSION + text, encoding="utf-8")
+    (folder / "bus.xml").write_text(document)
+    (folder / "mission.toml").write_text(MISSION + text)
     return folder / "mission.toml"
 
 
@@ -119,7 +119,7 @@ def interpreted(packets: list[bytes], tmp_path: Path) -> list[Any]:
     import space_packet_parser
 
     path = tmp_path / "interpreter.xml"
-    path.write_text(foreign.BUS, encoding="utf-8")
+    path.write_text(foreign.BUS)
     definition = space_packet_parser.load_xtce(path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -172,7 +172,7 @@ def test_a_minimal_description_of_a_definition_decodes_its_packets(ground: Groun
 
 def written(folder: Path, text: str) -> str:
     folder.mkdir(exist_ok=True)
-    (folder / "bus.xml").write_text(text, encoding="utf-8")
+    (folder / "bus.xml").write_text(text)
     return minimal_description(folder / "bus.xml", 76)
 
 
@@ -194,7 +194,7 @@ def test_a_minimal_description_is_one_that_the_check_accepts(tmp_path: Path) -> 
 
 
 def saved(folder: Path, text: str) -> Path:
-    (folder / "mission.toml").write_text(text, encoding="utf-8")
+    (folder / "mission.toml").write_text(text)
     return folder / "mission.toml"
 
 

@@ -46,11 +46,11 @@ def stream(synthetic_pass: Any) -> bytes:
     return bytes((synthetic_pass.folder / "downlink.cadu").read_bytes())
 
 
-def spool_of(ground: Ground, folder: Path, seen: list[Any]) -> Spool:
+def spool_of(ground: Ground, seen: list[Any]) -> Spool:
     def ingest(path: Path, recording: str, offset: int) -> dict[str, Any]:
         return {"packets_new": ingest_file(ground, path, place=Place(recording, offset)).packets_new}
 
-    return Spool(folder, ingest, lambda _path, result: seen.append(result))
+    return Spool(ground.home / "spool", ingest, lambda _path, result: seen.append(result))
 
 
 def take(spool: Spool, octets: bytes) -> None:
@@ -59,26 +59,23 @@ def take(spool: Spool, octets: bytes) -> None:
     spool.drain()
 
 
-def test_segments_cut_at_any_octet_are_pieces_of_one_recording(
-    ground: Ground, stream: bytes, expected: str, tmp_path: Path
-) -> None:
-    spool = spool_of(ground, tmp_path / "spool", seen := [])
+def test_segments_cut_at_any_octet_are_pieces_of_one_recording(ground: Ground, stream: bytes, expected: str) -> None:
+    spool = spool_of(ground, seen := [])
     assert spool.open() == 0
     for start, stop in pairwise([0, 700, 4 * 1279 + 300, 4 * 1279 + 301, len(stream)]):
         take(spool, stream[start:stop])
     assert len(seen) == 4
     assert hash_of(ground) == expected
     spool.begin()
-    assert list((tmp_path / "spool").iterdir()) == []
+    assert list((ground.home / "spool").iterdir()) == []
 
 
 @pytest.mark.parametrize("drained", [False, True])
 def test_the_recording_of_a_run_that_crashed_goes_on(
-    ground: Ground, stream: bytes, expected: str, tmp_path: Path, drained: bool
+    ground: Ground, stream: bytes, expected: str, drained: bool
 ) -> None:
     """Also if all its segments are ingested."""
-    folder, seen = tmp_path / "spool", []
-    crashed = spool_of(ground, folder, seen)
+    crashed = spool_of(ground, [])
     crashed.open()
     for octets in (stream[:2000], stream[2000:3000]):
         crashed.keep(octets)
@@ -88,7 +85,7 @@ def test_the_recording_of_a_run_that_crashed_goes_on(
     if not drained:
         crashed.keep(stream[3000:4000])
         crashed._stream.close()
-    spool = spool_of(ground, folder, seen)
+    spool = spool_of(ground, [])
     assert spool.open() == (0 if drained else 4000)
     spool.drain()
     take(spool, stream[3000 if drained else 4000 :])
@@ -96,14 +93,14 @@ def test_the_recording_of_a_run_that_crashed_goes_on(
 
 
 def test_the_segments_of_a_version_without_recordings_are_consecutive(
-    ground: Ground, stream: bytes, expected: str, tmp_path: Path
+    ground: Ground, stream: bytes, expected: str
 ) -> None:
-    folder = tmp_path / "spool"
+    folder = ground.home / "spool"
     folder.mkdir()
     (folder / "000000000004.segment").write_bytes(stream[:700])
     (folder / "000000000005.segment").write_bytes(stream[700:3000])
     (folder / "current").write_bytes(stream[3000:])
-    spool = spool_of(ground, folder, [])
+    spool = spool_of(ground, [])
     assert spool.open() == len(stream)
     spool.drain()
     assert hash_of(ground) == expected
@@ -121,9 +118,9 @@ def test_a_segment_stays_in_the_spool_while_the_store_is_full(stream: bytes, tmp
 
 
 def test_noise_is_part_of_the_recording_and_an_unknown_coding_does_not_stop_the_rest(
-    ground: Ground, stream: bytes, expected: str, tmp_path: Path
+    ground: Ground, stream: bytes, expected: str
 ) -> None:
-    spool = spool_of(ground, tmp_path / "spool", seen := [])
+    spool = spool_of(ground, seen := [])
     spool.open()
     markers = bytes.fromhex("1ACFFC1D") + np.random.default_rng(1).bytes(1275)
     for octets in (b"\x00" * 5000, 40 * markers, stream):

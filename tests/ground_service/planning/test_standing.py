@@ -61,17 +61,19 @@ def now(mission_time: Clock) -> Clock:
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
-def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ground]:
-    """An empty service on each database, which does not follow its events: only the tests plan."""
+def either(request: pytest.FixtureRequest, tmp_path: Path, oem: Path) -> Iterator[Ground]:
+    """A service with an ephemeris on each database, which does not follow its events: only the tests plan."""
     url = request.getfixturevalue("migrated_postgres")() if request.param == "postgresql" else None
     with open_ground(tmp_path / "home", database_url=url) as opened:
+        add_reference(opened, oem)
         yield opened
 
 
 @pytest.fixture
-def ground(tmp_path: Path) -> Iterator[Ground]:
+def ground(tmp_path: Path, oem: Path) -> Iterator[Ground]:
     """As `either`, on SQLite."""
     with open_ground(tmp_path / "home") as opened:
+        add_reference(opened, oem)
         yield opened
 
 
@@ -81,9 +83,8 @@ def oem(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save_circle(path, START - 3 * HOUR, 24.0 * DAYS)
 
 
-def prepare(ground: Ground, oem: Path, extra: str = AUTOMATIC + LINKS) -> None:
+def prepare(ground: Ground, extra: str = AUTOMATIC + LINKS) -> None:
     add_mission(ground, MISSION.format(extra=extra).encode(), actor="ann")
-    add_reference(ground, oem)
 
 
 def windows_of(ground: Ground) -> list[Window]:
@@ -101,9 +102,11 @@ def plan(ground: Ground, now: Clock, later_ns: int = 0) -> dict[str, int]:
     return standing.plan_tick(ground, now.utc_ns + later_ns)
 
 
-def planned(ground: Ground, oem: Path, now: Clock, extra: str = AUTOMATIC + LINKS, **changes: object) -> int:
+def planned(ground: Ground, now: Clock, extra: str = AUTOMATIC + LINKS, **changes: object) -> int:
     """Plan a request for the first time; return its key."""
-    key = planned(ground, oem, now, extra, **changes)
+    prepare(ground, extra)
+    key = request(ground, **changes)
+    plan(ground, now)
     return key
 
 
@@ -111,8 +114,8 @@ def change(ground: Ground, key: int, **changes: object) -> None:
     standing.change_request(ground, key, StandingRequestChange.model_validate(changes), actor="ann")
 
 
-def test_no_more_windows_are_planned_than_have_room_on_board(ground: Ground, oem: Path, now: Clock) -> None:
-    prepare(ground, oem, AUTOMATIC + LINKS + "\n[resources]\nwindows_on_board = 1\n")
+def test_no_more_windows_are_planned_than_have_room_on_board(ground: Ground, now: Clock) -> None:
+    prepare(ground, AUTOMATIC + LINKS + "\n[resources]\nwindows_on_board = 1\n")
     key = request(ground)
     assert plan(ground, now)["added"] == 1
     left = [one.reason for one in ground.read(get_plan, key).candidates if one.outcome == "rejected"]
@@ -121,8 +124,8 @@ def test_no_more_windows_are_planned_than_have_room_on_board(ground: Ground, oem
     assert plan(ground, now)["added"] == 1
 
 
-def test_the_coming_days_are_filled_approved_and_released(either: Ground, oem: Path, now: Clock) -> None:
-    prepare(either, oem)
+def test_the_coming_days_are_filled_approved_and_released(either: Ground, now: Clock) -> None:
+    prepare(either)
     key = request(either)
     done = plan(either, now)
     assert done == {"failed": 0, "added": 2, "approved": 2, "released": 2}
@@ -141,8 +144,8 @@ def test_the_coming_days_are_filled_approved_and_released(either: Ground, oem: P
     assert [e.payload["request_id"] for e in read_events(either.database, 0, 9999) if e.kind == "plan"] == [key]
 
 
-def test_doing_it_again_changes_nothing(either: Ground, oem: Path, now: Clock) -> None:
-    planned(either, oem, now)
+def test_doing_it_again_changes_nothing(either: Ground, now: Clock) -> None:
+    planned(either, now)
     first = windows_of(either)
     for later in (0, 600, 1200):
         assert sum(plan(either, now, later * NS).values()) == 0
@@ -151,15 +154,16 @@ def test_doing_it_again_changes_nothing(either: Ground, oem: Path, now: Clock) -
 
 def test_a_request_is_planned_without_further_action(tmp_path: Path, oem: Path, now: Clock) -> None:
     with open_ground(tmp_path / "home") as ground:
+        add_reference(ground, oem)
         follow_in_process(ground)
-        prepare(ground, oem)
+        prepare(ground)
         key = request(ground, windows=2)
         assert ground.read(get_request, key).windows == {"approved": 2}
         assert sum(plan(ground, now).values()) == 0
 
 
-def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, oem: Path, now: Clock) -> None:
-    key = planned(either, oem, now)
+def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, now: Clock) -> None:
+    key = planned(either, now)
     first = windows_of(either)[0]
     now.utc_ns = first.start.utc_ns
     done = plan(either, now)
@@ -173,9 +177,9 @@ def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, oem
 
 
 def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(
-    either: Ground, oem: Path, now: Clock, monkeypatch: pytest.MonkeyPatch
+    either: Ground, now: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    planned(either, oem, now)
+    planned(either, now)
     first = windows_of(either)[0]
     window = either.read(store.get_record, first.id)
     assert either.write(store.change_window, window, state="failed", reason="a telecommand of it failed")
@@ -190,8 +194,8 @@ def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(
     assert found[0].reason == "a telecommand of it failed"
 
 
-def test_windows_of_the_present_period_count_long_after_they_ended(ground: Ground, oem: Path, now: Clock) -> None:
-    key = planned(ground, oem, now, windows=1)
+def test_windows_of_the_present_period_count_long_after_they_ended(ground: Ground, now: Clock) -> None:
+    key = planned(ground, now, windows=1)
     (window,) = ground.read(store.windows_around, 1, now.utc_ns)
     assert ground.write(store.change_window, window, state="processed")
     later = window.stop.utc_ns + 30 * HOUR
@@ -201,10 +205,8 @@ def test_windows_of_the_present_period_count_long_after_they_ended(ground: Groun
     assert standing.plan_tick(ground, later)["added"] >= 1  # that window belongs to an earlier period
 
 
-def test_without_automatic_approval_windows_wait_for_a_person_and_then_are_released(
-    ground: Ground, oem: Path, now: Clock
-) -> None:
-    prepare(ground, oem, LINKS)
+def test_without_automatic_approval_windows_wait_for_a_person_and_then_are_released(ground: Ground, now: Clock) -> None:
+    prepare(ground, LINKS)
     request(ground, windows=2)
     assert plan(ground, now) == {"failed": 0, "added": 2, "approved": 0, "released": 0}
     windows = windows_of(ground)
@@ -216,11 +218,10 @@ def test_without_automatic_approval_windows_wait_for_a_person_and_then_are_relea
     assert ground.read(get_window, first.id).reason == standing.NOT_APPROVED
 
 
-def test_windows_need_a_contact_before_them(ground: Ground, oem: Path, now: Clock) -> None:
+def test_windows_need_a_contact_before_them(ground: Ground, now: Clock) -> None:
     closed = 'outages = ["2029-08-07T00:00:00Z/2029-08-07T18:00:00Z"]\nminimum_elevation_deg = 0.0\n'
     text = MISSION.format(extra=AUTOMATIC + LINKS).replace("minimum_elevation_deg = 0.0\n", closed)
     add_mission(ground, text.encode(), actor="ann")
-    add_reference(ground, oem)
     key = request(ground)
     plan(ground, now)
     made = ground.read(get_plan, key)
@@ -230,16 +231,16 @@ def test_windows_need_a_contact_before_them(ground: Ground, oem: Path, now: Cloc
     assert planned and all(one.start.utc_ns > START + 12 * HOUR for one in planned)
 
 
-def test_the_duty_limit_of_the_mission_description_is_kept(ground: Ground, oem: Path, now: Clock) -> None:
-    prepare(ground, oem, AUTOMATIC + LINKS + "[resources]\nobserve_hours_per_day = 0.5\n")
+def test_the_duty_limit_of_the_mission_description_is_kept(ground: Ground, now: Clock) -> None:
+    prepare(ground, AUTOMATIC + LINKS + "[resources]\nobserve_hours_per_day = 0.5\n")
     key = request(ground, windows=20, maximum_duration_s=900.0, minimum_duration_s=800.0)
     assert plan(ground, now)["added"] == 2
     reasons = {one.reason for one in ground.read(get_plan, key).candidates}
     assert "more than 0.5 h of observation within 24 h" in reasons
 
 
-def test_regions_and_the_end_of_the_ephemeris_bound_the_plan(ground: Ground, oem: Path, now: Clock) -> None:
-    prepare(ground, oem)
+def test_regions_and_the_end_of_the_ephemeris_bound_the_plan(ground: Ground, now: Clock) -> None:
+    prepare(ground)
     region = {"latitude_deg": {"min": -20.0, "max": 20.0}}
     key = request(ground, windows=5, horizon_days=10.0, regions=[region], minimum_duration_s=60.0)
     plan(ground, now)
@@ -256,18 +257,16 @@ UPLOADS = "[uploads]\ntables = []\n"
 ONE_PERSON = AUTOMATIC + 'one_person_for = ["perform_function/set_mode"]\n'
 
 
-def test_sequences_of_windows_do_not_overlap(ground: Ground, oem: Path, now: Clock) -> None:
-    planned(
-        ground, oem, now, ONE_PERSON + LINKS + UPLOADS, windows=9, minimum_duration_s=200.0, maximum_duration_s=400.0
-    )
+def test_sequences_of_windows_do_not_overlap(ground: Ground, now: Clock) -> None:
+    planned(ground, now, ONE_PERSON + LINKS + UPLOADS, windows=9, minimum_duration_s=200.0, maximum_duration_s=400.0)
     windows = windows_of(ground)
     between = [(b.start.utc_ns - a.stop.utc_ns) / NS for a, b in pairwise(windows)]
     # One sequence ends 20 s after its window, and the next begins 60 s before its own.
     assert len(windows) == 9 and min(between) == 81.0
 
 
-def test_a_window_that_cannot_be_released_states_the_reason(ground: Ground, oem: Path, now: Clock) -> None:
-    planned(ground, oem, now, LINKS + UPLOADS, windows=1)
+def test_a_window_that_cannot_be_released_states_the_reason(ground: Ground, now: Clock) -> None:
+    planned(ground, now, LINKS + UPLOADS, windows=1)
     (window,) = windows_of(ground)
     planning.change_window(ground, window.id, actor=standing.PLANNER, changes={}, decision="approved")
     assert plan(ground, now)["released"] == 0
@@ -276,7 +275,7 @@ def test_a_window_that_cannot_be_released_states_the_reason(ground: Ground, oem:
     )
 
 
-def test_windows_keep_the_limits_of_images(ground: Ground, oem: Path, now: Clock) -> None:
+def test_windows_keep_the_limits_of_images(ground: Ground, now: Clock) -> None:
     planned(
         ground,
         oem,
@@ -301,14 +300,14 @@ def test_windows_keep_the_limits_of_images(ground: Ground, oem: Path, now: Clock
 
 
 def test_without_an_ephemeris_the_plan_says_so(ground: Ground, now: Clock) -> None:
-    add_mission(ground, MISSION.format(extra=AUTOMATIC).encode(), actor="ann")
-    key = request(ground)
-    assert plan(ground, now)["added"] == 0
-    assert ground.read(get_plan, key).reason == "no reference ephemeris covers the coming days"
+    now.utc_ns += 9 * 24 * HOUR
+    key = planned(ground, now, AUTOMATIC)
+    made = ground.read(get_plan, key)
+    assert (windows_of(ground), made.reason) == ([], "no reference ephemeris covers the coming days")
 
 
-def test_paused_and_deleted_requests_are_not_planned(ground: Ground, oem: Path, now: Clock) -> None:
-    prepare(ground, oem)
+def test_paused_and_deleted_requests_are_not_planned(ground: Ground, now: Clock) -> None:
+    prepare(ground)
     key = request(ground)
     change(ground, key, state="paused")
     assert plan(ground, now)["added"] == 0
@@ -332,7 +331,8 @@ def test_processes_that_plan_at_the_same_time_make_one_plan(
 ) -> None:
     url = migrated_postgres()
     grounds = [open_ground(tmp_path / "home", database_url=url) for _ in range(4)]
-    prepare(grounds[0], oem)
+    prepare(grounds[0])
+    add_reference(grounds[0], oem)
     key = request(grounds[0])
     with ThreadPoolExecutor(4) as pool:
         added = list(pool.map(lambda one: plan(one, now)["added"], grounds))

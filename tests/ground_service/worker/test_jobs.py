@@ -26,9 +26,15 @@ from ground_service.worker.scheduler import Scheduler
 Row = dict[str, Any]
 
 
-def job_that(monkeypatch: pytest.MonkeyPatch, ground: Ground, work: Any) -> str:
-    monkeypatch.setitem(jobs.WORK, "nightly", work)
-    return enter_job(ground, "nightly", {})
+@pytest.fixture
+def job_that(monkeypatch: pytest.MonkeyPatch, ground: Ground) -> Any:
+    """A function that enters a job with the given work."""
+
+    def enter(work: Any) -> str:
+        monkeypatch.setitem(jobs.WORK, "nightly", work)
+        return enter_job(ground, "nightly", {})
+
+    return enter
 
 
 def row_of(ground: Ground, job: str) -> Row:
@@ -48,10 +54,10 @@ MISSING = FileNotFoundError(errno.ENOENT, "No such file or directory", "/srv/lin
     ],
 )  # fmt: skip
 def test_whatever_error_a_job_meets_it_ends_as_failed_and_is_not_repeated(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch, error: Exception, shown: str
+    ground: Ground, job_that: Any, error: Exception, shown: str
 ) -> None:
     work = Mock(side_effect=error)
-    job = job_that(monkeypatch, ground, work)
+    job = job_that(work)
     for _ in range(3):
         row = run_job(ground, job)
     assert (row.state, row.error, row.attempts, work.call_count) == ("failed", shown, 1, 1)
@@ -80,8 +86,8 @@ def test_a_failed_ingest_is_repeated_with_longer_and_longer_waits(
     assert (row_of(either, job)["state"], row_of(either, other)["attempts"]) == ("done", 1)
 
 
-def test_a_failed_job_is_repeated_by_one_action(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
-    job = job_that(monkeypatch, ground, lambda *_: {}["missing"])
+def test_a_failed_job_is_repeated_by_one_action(ground: Ground, job_that: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = job_that(lambda *_: {}["missing"])
     assert run_job(ground, job).state == "failed"
     monkeypatch.setitem(jobs.WORK, "nightly", lambda *_: {"repeated": True})
     with local_client(ground, "ann") as client:
@@ -93,8 +99,8 @@ def test_a_failed_job_is_repeated_by_one_action(ground: Ground, monkeypatch: pyt
             client.delete_job(job)
 
 
-def test_a_failed_ingest_is_dismissed(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
-    job = job_that(monkeypatch, ground, lambda *_: {}["missing"])
+def test_a_failed_ingest_is_dismissed(ground: Ground, job_that: Any) -> None:
+    job = job_that(lambda *_: {}["missing"])
     run_job(ground, job)
     with local_client(ground, "ann") as client:
         client.delete_job(job)
@@ -103,35 +109,35 @@ def test_a_failed_ingest_is_dismissed(ground: Ground, monkeypatch: pytest.Monkey
 
 
 def test_the_traceback_of_an_unexpected_error_is_in_the_log(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ground: Ground, job_that: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    job = job_that(monkeypatch, ground, lambda *_: {}["missing"])
+    job = job_that(lambda *_: {}["missing"])
     run_job(ground, job)
     [record] = [one for one in caplog.records if one.levelname == "ERROR"]
     assert record.exc_info is not None and job in record.getMessage()
 
 
-def test_a_full_disk_is_no_fault_of_the_job(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
-    job = job_that(monkeypatch, ground, Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
+def test_a_full_disk_is_no_fault_of_the_job(ground: Ground, job_that: Any) -> None:
+    job = job_that(Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
     with pytest.raises(StorageFull):
         run_job(ground, job)
     row = row_of(ground, job)
     assert (row["state"], row["attempts"]) == ("queued", 0)
 
 
-def test_a_result_that_the_database_cannot_hold_fails_the_job(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
-    row = run_job(ground, job_that(monkeypatch, ground, lambda *_: {"median": float("nan")}))
+def test_a_result_that_the_database_cannot_hold_fails_the_job(ground: Ground, job_that: Any) -> None:
+    row = run_job(ground, job_that(lambda *_: {"median": float("nan")}))
     assert row.state == "failed" and "JSON" in row.error
 
 
-def test_an_attempt_that_another_has_overtaken_changes_nothing(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_attempt_that_another_has_overtaken_changes_nothing(ground: Ground, job_that: Any) -> None:
     """This occurs after a network failure, if the database grants the lock of the first worker to a second one."""
 
     def work(_ground: Ground, _arguments: Any, job_id: str) -> Row:
         ground.write(move, JOB, job_id, "running", attempts=2)
         return {"made by": "the first"}
 
-    row = run_job(ground, job_that(monkeypatch, ground, work))
+    row = run_job(ground, job_that(work))
     assert (row.state, row.attempts, row.result) == ("running", 2, None)
 
 

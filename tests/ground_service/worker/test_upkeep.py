@@ -115,7 +115,7 @@ def test_ten_years_later_the_record_is_complete_and_the_operation_is_gone(
     ground: Ground, synthetic_pass: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The documented policy names every table, and the nightly job deletes from no other one."""
-    text = (Path(__file__).parents[3] / "docs/archive.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs/archive.md").read_text()
     rows = text.partition("## Retention")[2].partition("## Schema")[0].splitlines()
     policy = {table: row.split("|")[1].strip() for row in rows for table in re.findall(r"`([a-z_]+)`", row)}
     assert set(policy) == set(METADATA.tables)
