@@ -90,7 +90,7 @@ def test_a_damaged_packet_and_one_cut_short_are_counted_and_the_rest_is_stored(
     octets[len(packets[0]) + 30] ^= 0x10
     result = ingest(ground, octets)
     assert (result.packets, result.crc_errors) == (len(packets) - 2, 1)
-    assert result.octets_skipped - len(packets[-1]) + 5 in (0, len(packets[1]))
+    assert result.octets_skipped == len(packets[-1]) - 5
 
 
 def test_clocks_of_2000_and_of_the_future_are_kept_apart_once(ground: Ground, packets: list[bytes]) -> None:
