@@ -119,7 +119,7 @@ def test_time_that_does_not_wait_gives_reports_too(tmp_path: Path) -> None:
 
 
 def test_a_fleet_has_a_new_folder_and_different_spacecraft(tmp_path: Path) -> None:
-    scenarios = [parse_scenario(SCENARIO)] * 2
+    scenarios = [parse_scenario(text) for text in (SCENARIO, SECOND)]
     (tmp_path / "file").touch()
     with pytest.raises(ScenarioError, match="expected a new folder for a fleet"):
         run_fleet(scenarios, NO_DATA, tmp_path, TERMS, print)
