@@ -11,17 +11,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("lunar", "tmtc", "reports", "payload_emulator", "studies", "ground_service", "linna", "kernels")
+PACKAGES = ["lunar", "tmtc", "reports", "payload_emulator", "studies", "ground_service", "linna", "kernels"]
 LONGEST_FUNCTION = 80
 
 
 def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
-    command = [
-        str(Path(sys.executable).with_name("lint-imports")),
-        "--config",
-        str(folder / "pyproject.toml"),
-        "--no-cache",
-    ]
+    program = str(Path(sys.executable).with_name("lint-imports"))
+    command = [program, "--config", str(folder / "pyproject.toml"), "--no-cache"]
     return subprocess.run(
         command, cwd=folder, capture_output=True, text=True, check=False,
         env={"PYTHONPATH": str(folder), "PATH": "/usr/bin:/bin", "COLUMNS": "300"},
@@ -43,28 +39,32 @@ def test_every_import_contract_is_kept() -> None:
     assert result.returncode == 0, result.stdout
 
 
-WALLS = [
-    ("payload_emulator.flight.navigation.odometry.odometry", "payload_emulator.sim"),
-    ("payload_emulator.flight.navigation.odometry.odometry", "torch"),
-    ("payload_emulator.flight.payload", "payload_emulator.training"),
-    ("payload_emulator.session.archive.emulator", "ground_service"),
-    ("ground_service.errors", "payload_emulator"),
-    ("lunar.camera", "tmtc"),
-    ("ground_service.evaluation.core", "sqlalchemy"),
-    ("ground_service.ingest.service", "ground_service.evaluation.service"),
-    ("payload_emulator.sim.render.renderer", "payload_emulator.session.world.world"),
-    ("tmtc.dictionary.tables", "lunar.constants"),
-]
+WALLS = """\
+payload_emulator.flight.navigation.odometry.odometry -> payload_emulator.sim
+payload_emulator.flight.navigation.odometry.odometry -> torch
+payload_emulator.flight.payload -> payload_emulator.training
+payload_emulator.session.archive.emulator -> ground_service
+ground_service.errors -> payload_emulator
+lunar.camera -> tmtc
+ground_service.evaluation.core -> sqlalchemy
+ground_service.ingest.service -> ground_service.evaluation.service
+payload_emulator.sim.render.renderer -> payload_emulator.session.world.world
+tmtc.dictionary.tables -> lunar.constants""".splitlines()
+
+
+def plant(file: Path, code: str) -> None:
+    with file.open("a") as lines:
+        lines.write(f"\n{code}\n")
 
 
 def test_planted_imports_across_walls_are_refused(copy_of_the_tree: Path) -> None:
-    for module, imported in WALLS:
-        with (copy_of_the_tree / f"{module.replace('.', '/')}.py").open("a") as file:
-            file.write(f"\nimport {imported}\n")
+    for wall in WALLS:
+        module, imported = wall.split(" -> ")
+        plant(copy_of_the_tree / f"{module.replace('.', '/')}.py", f"import {imported}")
     result = lint_imports(copy_of_the_tree)
     assert result.returncode == 1 and "BROKEN" in result.stdout
     told = " ".join(result.stdout.split())
-    assert [wall for wall in WALLS if f"{wall[0]} -> {wall[1]} (" not in told] == []
+    assert [wall for wall in WALLS if f"{wall} (" not in told] == []
 
 
 def modules_of(root: Path) -> dict[str, Path]:
@@ -98,7 +98,7 @@ def contents_of(name: str, text: str, is_package: bool) -> tuple[set[str], list[
 
 def imported_names(name: str, file: Path) -> set[str]:
     """Dotted names that a module imports."""
-    return contents_of(name, file.read_text(encoding="utf-8"), file.name == "__init__.py")[0]
+    return contents_of(name, file.read_text(), file.name == "__init__.py")[0]
 
 
 def import_cycles(root: Path) -> list[list[str]]:
@@ -107,7 +107,7 @@ def import_cycles(root: Path) -> list[list[str]]:
     An import from one module to another is an edge between the members of their closest common package.
     """
     modules = modules_of(root)
-    edges: dict[str, dict[str, set[str]]] = {}
+    edges = {}
     for name, file in modules.items():
         for imported in imported_names(name, file):
             target = imported if imported in modules else imported.rpartition(".")[0]
@@ -133,7 +133,7 @@ def import_cycles(root: Path) -> list[list[str]]:
 
 def reachable(graph: dict[str, set[str]], start: str) -> set[str]:
     """Members that can be reached over at least one edge."""
-    found: set[str] = set()
+    found = set()
     waiting = list(graph.get(start, ()))
     while waiting:
         one = waiting.pop()
@@ -147,27 +147,21 @@ def test_no_import_cycles_also_in_functions_and_for_type_checking() -> None:
     assert import_cycles(ROOT) == []
 
 
-@pytest.mark.parametrize(
-    ("module", "planted", "cycle"),
-    [
-        (
-            "ground_service/ingest/frames.py",
-            "def late():\n    from ground_service.ingest import service",
-            "ground_service.ingest.frames",
-        ),
-        (
-            "ground_service/store/files.py",
-            "if TYPE_CHECKING:\n    from ground_service.store.database import Database",
-            "ground_service.store.files",
-        ),
-        ("lunar/constants.py", "import lunar.frames", "lunar.constants"),
-        ("tmtc/packets/crc.py", "from tmtc.link import frames", "tmtc.packets"),
-    ],
-)
-def test_a_planted_cycle_is_found(copy_of_the_tree: Path, module: str, planted: str, cycle: str) -> None:
-    file = copy_of_the_tree / module
-    file.write_text(file.read_text() + f"\n{planted}\n")
-    assert any(cycle in one for one in import_cycles(copy_of_the_tree))
+CYCLES = """\
+ground_service/ingest/frames|def late():;    from ground_service.ingest import service|ground_service.ingest.frames
+ground_service/store/files|if TYPE_CHECKING:;    from ground_service.store import database|ground_service.store.files
+lunar/constants|import lunar.frames|lunar.constants
+tmtc/packets/crc|from tmtc.link import frames|tmtc.packets"""
+
+
+def test_planted_cycles_are_found(copy_of_the_tree: Path) -> None:
+    for row in CYCLES.splitlines():
+        module, planted, cycle = row.split("|")
+        file = copy_of_the_tree / f"{module}.py"
+        before = file.read_text()
+        plant(file, planted.replace(";", "\n"))
+        assert any(cycle in one for one in import_cycles(copy_of_the_tree)), row
+        file.write_text(before)
 
 
 SMALL = {
@@ -201,7 +195,7 @@ def modules_with_sql(root: Path) -> list[str]:
             re.match(r"sqlalchemy\b(?!\.(Connection$|Engine$|exc\b))", one)
             or re.match(r"ground_service\.store\.(repository|models)\b", one)
             for one in imported_names(name, file)
-        ) or re.search(r"connection\.(execute|exec_driver_sql)\(", file.read_text(encoding="utf-8")):
+        ) or re.search(r"connection\.(execute|exec_driver_sql)\(", file.read_text()):
             found.append(name)
     return found
 
@@ -210,21 +204,22 @@ def test_only_stores_contain_sql() -> None:
     assert modules_with_sql(ROOT) == []
 
 
-@pytest.mark.parametrize(
-    "planted",
-    [
-        "from sqlalchemy import Connection, select",
-        "import sqlalchemy",
-        "from sqlalchemy.dialects import sqlite",
-        "def late():\n    from ground_service.store import repository",
-        "from ground_service.store.models import WINDOWS",
-        "def late(connection):\n    connection.exec_driver_sql('SELECT 1')",
-    ],
-)
-def test_planted_sql_is_found(copy_of_the_tree: Path, planted: str) -> None:
+SQL = """\
+from sqlalchemy import Connection, select
+import sqlalchemy
+from sqlalchemy.dialects import sqlite
+def late():;    from ground_service.store import repository
+from ground_service.store.models import WINDOWS
+def late(connection):;    connection.exec_driver_sql('SELECT 1')"""
+
+
+def test_planted_sql_is_found(copy_of_the_tree: Path) -> None:
     file = copy_of_the_tree / "ground_service/planning/service.py"
-    file.write_text(file.read_text() + f"\n{planted}\n")
-    assert "ground_service.planning.service" in modules_with_sql(copy_of_the_tree)
+    before = file.read_text()
+    for planted in SQL.splitlines():
+        file.write_text(before)
+        plant(file, planted.replace(";", "\n"))
+        assert modules_with_sql(copy_of_the_tree) == ["ground_service.planning.service"], planted
 
 
 def compiled_functions() -> list[tuple[Path, ast.FunctionDef]]:
@@ -232,7 +227,7 @@ def compiled_functions() -> list[tuple[Path, ast.FunctionDef]]:
     found = []
     for package in PACKAGES:
         for file in sorted((ROOT / package).rglob("*.py")):
-            text = file.read_text(encoding="utf-8")
+            text = file.read_text()
             if "njit" not in text:
                 continue
             for node in ast.walk(ast.parse(text)):
@@ -265,7 +260,7 @@ def test_no_module_reads_data_that_can_name_code() -> None:
     found = [
         f"{name}: {line.strip()}"
         for name, file in modules_of(ROOT).items()
-        for line in file.read_text(encoding="utf-8").splitlines()
+        for line in file.read_text().splitlines()
         if UNSAFE.search(line) and name != "kernels.compiled"
     ]
     assert found == []
@@ -277,7 +272,7 @@ def long_functions(root: Path) -> list[str]:
     return [
         one
         for name, file in modules_of(root).items()
-        for one in contents_of(name, file.read_text(encoding="utf-8"), file.name == "__init__.py")[1]
+        for one in contents_of(name, file.read_text(), file.name == "__init__.py")[1]
     ]
 
 
@@ -307,7 +302,7 @@ def test_names_messages_and_docstrings_use_the_terms_of_the_field() -> None:
         str(file.relative_to(ROOT)): words
         for package in (*PACKAGES, "benchmarks")
         for file in (ROOT / package).rglob("*.py")
-        if (words := DECODED.findall(file.read_text(encoding="utf-8")))
+        if (words := DECODED.findall(file.read_text()))
     }
     assert found == {}
     planted = 'class Moment:\n    """Where it is beside."""\n    def _told(): raise Lost("came to no end")\n'

@@ -6,8 +6,6 @@ values in JSON by their place, all others by an expression of numpy. `python -m 
 table of all of them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import io
@@ -117,7 +115,7 @@ def one(x: np.ndarray, row: int, first: int, stop: int, factor: float) -> np.nda
 
 
 def two_objects() -> str:
-    middle, stop = (int(times(second)) for second in (2700.0, 5400.0))
+    middle, stop = map(int, times([2700.0, 5400.0]))
     halves = [clipped(orbit(), a, b).segments for a, b in ((START, middle), (middle, stop))]
     first, _, second = format_oem(Ephemeris(halves[0] + halves[1])).rpartition("META_START")
     return f"{first}META_START{second.replace('SELENITA', 'OTHER')}"
@@ -125,12 +123,8 @@ def two_objects() -> str:
 
 def horizons(ephemeris: Ephemeris) -> str:
     segment = ephemeris.segments[0]
-    rows = []
-    for count, state in zip(
-        from_tai_ns(segment.tai_ns, "TDB").tolist(),
-        np.hstack([segment.position_m, segment.velocity_m_s]) / 1e3,
-        strict=True,
-    ):
+    rows, states = [], np.hstack([segment.position_m, segment.velocity_m_s]) / 1e3
+    for count, state in zip(from_tai_ns(segment.tai_ns, "TDB").tolist(), states, strict=True):
         date = str(np.datetime64(count, "ns")).replace("-08-", "-Aug-").replace("T", " ")
         rows.append(f"{count / 864e11 + 2440587.5:.9f}, A.D. {date}, " + ", ".join(f"{v:.12e}" for v in state) + ",")
     head = """Target body name: SELENITA (-85)                  {source: test}
@@ -143,7 +137,7 @@ $$SOE"""
     return "\n".join([head, *rows, "$$EOE", ""])
 
 
-ORBITS: dict[str, tuple[str, Callable[[Ephemeris], str | bytes]]] = {
+ORBITS = {
     "OEM": ("oem", format_oem),
     "OEM in XML": ("xml", format_oem_xml),
     "STK": ("e", format_stk),
@@ -178,9 +172,8 @@ def external(folder: Path) -> Path:
 
 
 def pointing(path: Path) -> tuple[Any, str]:
-    frames = load_external(
-        path.parent, replace(Scenario("x"), camera=replace(Scenario("x").camera, width_px=64, height_px=64))
-    )
+    plain = Scenario("x")
+    frames = load_external(path.parent, replace(plain, camera=replace(plain.camera, width_px=64, height_px=64)))
     ephemeris = load_orbit(frames.ephemeris)
     check_pointing(ephemeris, frames.attitude_utc_ns, frames.q_wxyz)
     found = [(frames.camera_from_icrf(t), float(np.mean(frames.image(t)))) for t in frames.utc_ns.tolist()]
@@ -398,17 +391,13 @@ def seen(path: Path) -> tuple[Any, str]:
 # Packets.
 
 
+MODE = """<EnumeratedParameterType name="MODE"><UnitSet/><IntegerDataEncoding sizeInBits="8"/><EnumerationList>
+<Enumeration value="1" label="SAFE"/><Enumeration value="2" label="ON"/></EnumerationList></EnumeratedParameterType>"""
+
+
 def bus(folder: Path) -> Path:
     types = x_tce.HEADER_TYPES + x_tce.calibrated("VOLT", 12, "unsigned", x_tce.default(x_tce.polynomial(-1.5, 0.25)))
-    types += (
-        x_tce.integer("I20", 20, "twosComplement")
-        + x_tce.floating("F32", 32)
-        + (
-            '<EnumeratedParameterType name="MODE"><UnitSet/><IntegerDataEncoding sizeInBits="8"/><EnumerationList>'
-            '<Enumeration value="1" label="SAFE"/><Enumeration value="2" label="ON"/></EnumerationList>'
-            "</EnumeratedParameterType>"
-        )
-    )
+    types += x_tce.integer("I20", 20, "twosComplement") + x_tce.floating("F32", 32) + MODE
     names = {"VOLTAGE": "VOLT", "OFFSET": "I20", "RATE": "F32", "STATE": "MODE"}
     packet = x_tce.container("HK", list(names), "CCSDSPacket", x_tce.comparison("PKT_APID", 100))
     octets = b""
@@ -613,7 +602,7 @@ def test_a_changed_field_never_gives_other_figures_in_silence(name: str, tmp_pat
 
 
 def main() -> None:
-    counts: Counter[str] = Counter()
+    counts = Counter()
     for name in READERS:
         for row in changes_of(name):
             with tempfile.TemporaryDirectory() as folder:

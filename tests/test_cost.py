@@ -4,7 +4,6 @@ import csv
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -32,8 +31,8 @@ def test_what_was_measured_is_written_and_read_as_turns_by_folder(
     monkeypatch.setattr(cost, "turn_s", lambda: 0.5)
     measured, lines = cost.Cost(), []
     measured.files = Counter({"tests/b/test_x.py": 0.7, "tests/b/test_y.py": 0.5, "tests/a/test_z.py": 5.0})
-    report: Any = SimpleNamespace(section=lines.append, write_line=lines.append)
-    config: Any = SimpleNamespace(
+    report = SimpleNamespace(section=lines.append, write_line=lines.append)
+    config = SimpleNamespace(
         args_source=pytest.Config.ArgsSource.TESTPATHS, getoption={"keyword": "", "markexpr": "not campaign"}.get
     )
     measured.pytest_terminal_summary(report, config)

@@ -21,7 +21,13 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 README = (ROOT / "README.md").read_text()
 TUTORIALS = sorted(path.name for path in (DOCS / "tutorials").glob("*.md"))
-TUTORIAL_TEXTS = [(DOCS / "tutorials" / name).read_text() for name in TUTORIALS]
+
+
+def read(name: str) -> str:
+    return (DOCS / name).read_text()
+
+
+TUTORIAL_TEXTS = [read(f"tutorials/{name}") for name in TUTORIALS]
 MARK = re.compile(
     r"^ *<!-- (?P<kind>file|run|tour|output)(?:: (?P<name>[\w.-]+))?(?:, status (?P<status>[\d,]+))?[^\n]*-->\n"
     r" *```\w+\n(?P<text>.*?)^ *```$",
@@ -84,9 +90,8 @@ def test_every_page_links_to_help_and_help_needs_no_build(monkeypatch: pytest.Mo
 
 
 def test_links_and_anchors_of_help_lead_to_what_is_there() -> None:
-    found = {
-        one.relative_to(DOCS).as_posix(): pages.page_of(one.relative_to(DOCS).as_posix()) for one in DOCS.rglob("*.md")
-    }
+    names = [one.relative_to(DOCS).as_posix() for one in DOCS.rglob("*.md")]
+    found = {name: pages.page_of(name) for name in names}
     for source, page in found.items():
         for target, anchor in re.findall(r'<a href="([^":#]*)(?:#([^"]*))?"', page):
             if target.startswith("/"):
@@ -104,21 +109,27 @@ def test_spelling() -> None:
 
 
 def test_the_readme_has_the_tour_of_the_first_tutorial() -> None:
-    (tour,) = [
-        m["text"] for m in MARK.finditer((DOCS / "tutorials" / "first-pass.md").read_text()) if m["kind"] == "tour"
-    ]
+    (tour,) = [m["text"] for m in MARK.finditer(read("tutorials/first-pass.md")) if m["kind"] == "tour"]
     assert tour in README
 
 
 def environment(home: Path) -> dict[str, str]:
-    kept = {
-        name: value for name, value in os.environ.items() if name not in ("LINNA_DATA", "LINNA_HOME", "LINNA_SERVER")
-    }
-    return kept | {
+    taken = ("LINNA_DATA", "LINNA_HOME", "LINNA_SERVER")
+    return {name: value for name, value in os.environ.items() if name not in taken} | {
         "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
         "PYTHONPATH": str(ROOT),
         "XDG_DATA_HOME": str(home),
     }
+
+
+def run_script(script: str, folder: Path) -> str:
+    """Return what a shell script prints that ends with status 0."""
+    with (folder / "log").open("w") as log:
+        command, known = ["bash", "-c", script], environment(folder / "data")
+        done = subprocess.run(command, cwd=folder, env=known, stdout=log, stderr=log, check=False)
+    printed = (folder / "log").read_text()
+    assert done.returncode == 0, printed[-3000:]
+    return printed
 
 
 def command_lines(text: str) -> list[list[str]]:
@@ -134,7 +145,7 @@ def command_lines(text: str) -> list[list[str]]:
 
 @pytest.mark.parametrize("name", TUTORIALS)
 def test_the_commands_of_a_tutorial_are_accepted_by_the_parser(name: str) -> None:
-    marks = [m for m in MARK.finditer((DOCS / "tutorials" / name).read_text()) if m["kind"] in ("run", "tour")]
+    marks = [m for m in MARK.finditer(read(f"tutorials/{name}")) if m["kind"] in ("run", "tour")]
     commands = [words for mark in marks for words in command_lines(mark["text"])]
     assert commands
     for words in commands:
@@ -146,7 +157,7 @@ def test_the_commands_of_a_tutorial_are_accepted_by_the_parser(name: str) -> Non
 @pytest.mark.parametrize("name", [name for name in TUTORIALS if name != "first-pass.md"])
 def test_the_commands_of_a_tutorial_run_as_written(name: str, tmp_path: Path) -> None:
     script, expected = ["set -e", "trap 'kill $(jobs -p) || true' EXIT"], list[str]()
-    for mark in MARK.finditer((DOCS / "tutorials" / name).read_text()):
+    for mark in MARK.finditer(read(f"tutorials/{name}")):
         if mark["kind"] == "file":
             (tmp_path / mark["name"]).write_text(mark["text"])
             continue
@@ -156,18 +167,14 @@ def test_the_commands_of_a_tutorial_run_as_written(name: str, tmp_path: Path) ->
         allowed = f' || [[ ",{mark["status"]}," == *",$?,"* ]]' if mark["status"] else ""
         script += [line.strip() + allowed for line in mark["text"].splitlines()]
     assert len(script) > 2
-    with (tmp_path / "log").open("w") as log:
-        command, known = ["bash", "-c", "\n".join(script)], environment(tmp_path / "data")
-        done = subprocess.run(command, cwd=tmp_path, env=known, stdout=log, stderr=log, check=False)
-    printed = (tmp_path / "log").read_text()
-    assert done.returncode == 0, printed[-3000:]
+    printed = run_script("\n".join(script), tmp_path)
     assert [line for line in expected if line.strip() not in printed] == []
     if name == "first-spacecraft.md":
         _check_first_spacecraft(tmp_path)
     if name == "own-build.md":
         told, found = (
             re.search(r"^fail: recall falls by ([\d.]+) .*$", text, re.MULTILINE)
-            for text in ((DOCS / "tutorials" / name).read_text(), (tmp_path / "log").read_text())
+            for text in (read(f"tutorials/{name}"), printed)
         )
         assert told and found and float(found[1]) == pytest.approx(float(told[1]), abs=0.02)
         assert re.sub(r"[\d.]+", "1", found[0]) == re.sub(r"[\d.]+", "1", told[0])
@@ -175,20 +182,15 @@ def test_the_commands_of_a_tutorial_run_as_written(name: str, tmp_path: Path) ->
 
 @pytest.mark.campaign
 def test_the_workflow_of_the_ci_page_runs_with_short_passes(tmp_path: Path) -> None:
-    (workflow,) = re.findall(r"```yaml\n(.*?)```", (DOCS / "ci.md").read_text(), re.DOTALL)
+    (workflow,) = re.findall(r"```yaml\n(.*?)```", read("ci.md"), re.DOTALL)
     steps = [step.get("run", "") for step in yaml.safe_load(workflow)["jobs"]["gates"]["steps"]]
     script = [step for step in steps if "linna regress" in step]
     assert [step.count("linna regress") for step in script] == [1, 1, 1]
-    contract = (DOCS / "build-contract.md").read_text().split("### Template of a program")[1]
+    contract = read("build-contract.md").split("### Template of a program")[1]
     for name, kind in (("build.toml", "toml"), ("fly.py", "python")):
         (tmp_path / name).write_text(re.findall(rf"```{kind}\n(.*?)```", contract, re.DOTALL)[0])
     text = "\n".join(["set -e", *script]).replace("--out passes", "--frames 6 --out passes")
-    with (tmp_path / "log").open("w") as log:
-        known = environment(tmp_path / "data")
-        done = subprocess.run(["bash", "-c", text], cwd=tmp_path, env=known, stdout=log, stderr=log, check=False)
-    told = (tmp_path / "log").read_text()
-    assert done.returncode == 0, told[-3000:]
-    assert "pass: identical in every octet on 12 frames" in told
+    assert "pass: identical in every octet on 12 frames" in run_script(text, tmp_path)
     assert "</testsuite>" in (tmp_path / "junit.xml").read_text() and (tmp_path / "report.html").exists()
 
 
@@ -204,7 +206,7 @@ def _check_first_spacecraft(folder: Path) -> None:
 
 
 def test_the_table_of_changes_names_files_that_exist() -> None:
-    table = (DOCS / "contributing.md").read_text().split("## Where do I change")[1].split("\n## ")[0]
+    table = read("contributing.md").split("## Where do I change")[1].split("\n## ")[0]
     named = re.findall(r"`([\w./]+)`", " ".join(row.split("|")[2] for row in re.findall(r"^\| .*\|$", table, re.M)))
     found = {name for name in named if (ROOT / name).exists() or [*ROOT.glob(f"ground_service/**/{name}")]}
     assert len(named) > 20 and {*named} - found == {"Command", "PAGES", "add_list"}
@@ -212,7 +214,7 @@ def test_the_table_of_changes_names_files_that_exist() -> None:
 
 @pytest.mark.parametrize("page", ["explanation/walks", "results/attempts"])
 def test_the_walks_and_attempts_name_functions_that_exist(page: str) -> None:
-    steps = re.findall(r"`([\w/]+\.py): (\w+)`", (DOCS / f"{page}.md").read_text())
+    steps = re.findall(r"`([\w/]+\.py): (\w+)`", read(f"{page}.md"))
     gone = [
         (file, name)
         for file, name in steps
@@ -235,10 +237,10 @@ def test_figures_of_pages_are_those_of_the_program() -> None:
 def test_the_animation_of_the_readme_shows_the_figures_of_the_text() -> None:
     with Image.open(DOCS / "pictures" / "tour.gif") as picture:
         shown = picture.info["comment"].decode()
-    told = (DOCS / "tutorials" / "first-pass.md").read_text().split("```text\n")[1].split("```")[0].strip()
+    told = read("tutorials/first-pass.md").split("```text\n")[1].split("```")[0].strip()
     assert shown == told
     median, p95, level = re.findall(r"^anchored +(\d+) +(\d+) .*level (\d)", shown, re.MULTILINE | re.DOTALL)[0]
-    navigation = (DOCS / "navigation.md").read_text()
+    navigation = read("navigation.md")
     assert f"| `linna demo` with `LINNA_DATA`, one window | {level} | {median} m | {p95} m |" in navigation
     for name in ("pass", "report", *docs_site.TOUR_PAGES, *docs_site.SHIFT_PAGES):
         with Image.open(DOCS / "pictures" / f"{name}.png") as picture:

@@ -2,6 +2,7 @@
 
 import hashlib
 import importlib.metadata
+import json
 import os
 import re
 import shlex
@@ -18,18 +19,17 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
+from linna import __version__
 from tests.ground_service.conftest import free_port
 from tests.serving import wait_for
 
 ROOT = Path(__file__).resolve().parents[1]
-OUTSIDE = {
-    name: value
-    for name, value in os.environ.items()
-    if name not in ("PYTHONPATH", "LINNA_DATA", "LINNA_HOME", "LINNA_SERVER")
-}
+TAKEN = ["PYTHONPATH", "LINNA_DATA", "LINNA_HOME", "LINNA_SERVER"]
+OUTSIDE = {name: value for name, value in os.environ.items() if name not in TAKEN}
 """Environment of commands that do not know of the checkout."""
 
 SCENARIO_NAMES = sorted(path.name for path in (ROOT / "scenarios").glob("*.toml"))
@@ -62,12 +62,12 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_pinned_package_runs_on_the_oldest_python_that_the_project_states() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     oldest = project["requires-python"].removeprefix(">=") + ".0"
     pins = {
         Requirement(line).name
         for path in (ROOT / "requirements").glob("*.txt")
-        for line in path.read_text(encoding="utf-8").splitlines()
+        for line in path.read_text().splitlines()
         if "==" in line and not line.startswith("#")
     }
     refused, judged = [], 0
@@ -83,18 +83,18 @@ def test_every_pinned_package_runs_on_the_oldest_python_that_the_project_states(
     assert judged > 50 and refused == []
 
 
+OTHERS = """
+payload_emulator/flight/models/craters.onnx reports/pdf_pages.typ db/migrations/env.py db/migrations/schema_1.0.json
+ground_service/web/static/site.css ground_service/web/templates/pass.html
+"""
+
+
 @pytest.mark.slow
 def test_the_wheel_holds_scenarios_models_templates_and_migrations(built: Path) -> None:
     (wheel,) = built.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {f"scenarios/{name}" for name in SCENARIO_NAMES} <= names
-    assert {
-        "payload_emulator/flight/models/craters.onnx",
-        "reports/pdf_pages.typ",
-        "db/migrations/env.py",
-        "db/migrations/schema_1.0.json",
-    } <= names
-    assert {"ground_service/web/static/site.css", "ground_service/web/templates/pass.html"} <= names
+    assert {*OTHERS.split()} <= names
     assert not [name for name in names if name.startswith(("tests/", "benchmarks/", "docs/"))]
 
 
@@ -196,18 +196,12 @@ def answers(port: int) -> bool:
 def test_the_project_has_its_legal_and_citation_files() -> None:
     for name in ("LICENSE", "CITATION.cff", "CODE_OF_CONDUCT.md", "SECURITY.md"):
         assert (ROOT / name).stat().st_size > 300, name
-    import yaml
-
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
-    from linna import __version__
-
     assert citation["version"] == __version__ and citation["cff-version"] == "1.2.0"
 
 
 @pytest.mark.campaign
 def test_the_bill_of_materials_has_hashes_licences_and_the_graph_of_everything_shipped(tmp_path: Path) -> None:
-    import json
-
     from cyclonedx.schema import SchemaVersion
     from cyclonedx.validation.json import JsonStrictValidator
 
@@ -216,7 +210,6 @@ def test_the_bill_of_materials_has_hashes_licences_and_the_graph_of_everything_s
     gone = "Package: gone\nStatus: deinstall ok config-files\nVersion: 1\n"
     status.write_text(f"Package: libc6\nStatus: install ok installed\nVersion: 2.36-9\n\n{gone}")
     shipped = re.search(r"foreach name,([a-z ]+),", (ROOT / "Makefile").read_text())
-    assert shipped is not None
     files = [str(ROOT / f"requirements/hashed/{name}.txt") for name in shipped[1].split()]
     words = ["bom", *files, "--wheel", str(wheel), "--status", str(status)]
     command = [sys.executable, "deploy/materials.py", *words]

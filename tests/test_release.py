@@ -59,16 +59,12 @@ def test_a_release_as_it_was_signed_is_accepted(signed: Path, key: Path) -> None
 
 
 @pytest.mark.parametrize("name", [*FILES, "SHA256SUMS", "SHA256SUMS.sig"])
-def test_one_changed_bit_of_any_file_is_refused(signed: Path, key: Path, name: str, capsys) -> None:
+def test_one_changed_bit_of_any_file_and_a_missing_file_are_refused(signed: Path, key: Path, name: str, capsys) -> None:
     octets = bytearray((signed / name).read_bytes())
     octets[len(octets) // 2] ^= 1
     (signed / name).write_bytes(octets)
     assert verified(signed, key) == 1
     assert "REFUSED" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("name", [*FILES, "SHA256SUMS", "SHA256SUMS.sig"])
-def test_a_missing_file_is_refused(signed: Path, key: Path, name: str, capsys) -> None:
     (signed / name).unlink()
     assert verified(signed, key) == 1
     assert name in capsys.readouterr().err
@@ -112,15 +108,8 @@ def test_the_private_key_is_private_and_outside_of_the_repository(signed: Path, 
 def test_make_release_builds_lists_and_signs() -> None:
     rules = (ROOT / "Makefile").read_text()
     rule = rules[rules.index("\nrelease:") :].split("\n\n")[0]
-    for word in (
-        "release: docs",
-        "-m build",
-        "deploy/materials.py bom",
-        "deploy/materials.py licences",
-        "deploy/release.sh sign",
-        "LINNA_RELEASE_KEY",
-    ):
-        assert word in rule, word
+    words = "release: docs;-m build;deploy/materials.py bom;deploy/materials.py licences;deploy/release.sh sign"
+    assert [word for word in (*words.split(";"), "LINNA_RELEASE_KEY") if word not in rule] == []
     check = rules[rules.index("\ncheck:") :].split("\n\n")[0]
     assert "deploy/materials.py audit $(SHIPPED)" in check
 

@@ -10,13 +10,13 @@ import warnings
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from ground_service.app import create_app
 from ground_service.errors import InvalidInput, NotFound
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.doubt_store import list_implausible
 from ground_service.ingest.model import ImplausibleFilter
@@ -34,7 +34,6 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.passes.live import live_parameters
 from ground_service.passes.parameters import export_packets, pass_parameters
 from ground_service.passes.service import completeness, define_pass, get_pass, parameter_series, trend_series
-from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.telemetry import decoding
 from ground_service.telemetry.values import newest_declared_ticks, readable_decoding
@@ -45,7 +44,7 @@ from lunar.timescales import parse_utc, ticks_from_utc_ns, utc_ns_from_ticks
 from tests.serving import TestClient
 from tests.tmtc import foreign
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.downlink import decode, encode_cadus
+from tmtc.downlink import encode_cadus
 from tmtc.packets.crc import crc16
 from tmtc.packets.cuc import NO_TICKS
 from tmtc.packets.space_packets import pack_packet
@@ -64,13 +63,22 @@ MISSION = "name = 'test'\nspacecraft = { id = 76 }\n"
 
 def mission(folder: Path, text: str = DEFINED, document: str = foreign.BUS) -> Path:
     folder.mkdir(exist_ok=True)
-    (folder / "bus.xml").write_text(document, encoding="utf-8")
-    (folder / "mission.toml").write_text(MISSION + text, encoding="utf-8")
+    (folder / "bus.xml").write_text(document)
+    (folder / "mission.toml").write_text(MISSION + text)
     return folder / "mission.toml"
 
 
-def enter(ground: Ground, folder: Path, text: str = DEFINED) -> None:
-    add_mission(ground, read_mission_file(mission(folder, text)))
+def enter(ground: Ground, text: str = DEFINED, document: str = foreign.BUS) -> None:
+    add_mission(ground, read_mission_file(mission(ground.home / "m", text, document)))
+
+
+RENAMED = foreign.BUS.replace('"VOLTAGE"', '"BATTERY"')
+
+
+@pytest.fixture
+def declared(ground: Ground) -> Ground:
+    enter(ground)
+    return ground
 
 
 def at(packet: bytes, second: float) -> bytes:
@@ -96,19 +104,14 @@ def longer(packet: bytes) -> bytes:
     return packet[:4] + (int.from_bytes(packet[4:6], "big") + 2).to_bytes(2, "big") + packet[6:]
 
 
-def downlink(folder: Path, packets: list[bytes], name: str = "bus.cadu") -> Path:
-    path = folder / name
+def take(ground: Ground, packets: list[bytes]) -> Any:
+    path = ground.home / "bus.cadu"
     path.write_bytes(encode_cadus(packets, spacecraft_id=76))
-    return path
+    return ingest_file(ground, path)
 
 
 def define(ground: Ground, seconds: float = 600.0) -> int:
     return define_pass(ground, name="p", start_utc_ns=START, stop_utc_ns=START + round(seconds * 1e9), spacecraft_id=76)
-
-
-def payload_packets(made: Any) -> list[bytes]:
-    found = decode((made.folder / "downlink.cadu").read_bytes())
-    return list(found.cut.packets(found.buffer))
 
 
 def interpreted(packets: list[bytes], tmp_path: Path) -> list[Any]:
@@ -116,7 +119,7 @@ def interpreted(packets: list[bytes], tmp_path: Path) -> list[Any]:
     import space_packet_parser
 
     path = tmp_path / "interpreter.xml"
-    path.write_text(foreign.BUS, encoding="utf-8")
+    path.write_text(foreign.BUS)
     definition = space_packet_parser.load_xtce(path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -126,11 +129,11 @@ def interpreted(packets: list[bytes], tmp_path: Path) -> list[Any]:
 def test_packets_without_a_checksum_between_others_become_series(
     either: Ground, tmp_path: Path, synthetic_pass: Any
 ) -> None:
-    enter(either, tmp_path / "m")
-    own, bus = payload_packets(synthetic_pass), bus_packets(300)
+    enter(either)
+    own, bus = synthetic_pass.packets, bus_packets(300)
     mixed = [packet for pair in zip(own, bus, strict=False) for packet in pair]
     mixed += own[len(bus) :] + bus[len(own) :]
-    result = ingest_file(either, downlink(tmp_path, mixed))
+    result = take(either, mixed)
     assert (result.packets, result.packets_new) == (len(mixed), len(mixed))
     assert (result.crc_errors, result.octets_skipped, result.unknown) == (0, 0, 0)
     newest = {one.name: one for one in live_parameters(either, 76, "flight")}  # without a pass
@@ -159,23 +162,17 @@ def test_packets_without_a_checksum_between_others_become_series(
 
 
 def test_a_minimal_description_of_a_definition_decodes_its_packets(ground: Ground, tmp_path: Path) -> None:
-    (tmp_path / "bus.xml").write_text(foreign.BUS, encoding="utf-8")
-    text = minimal_description(tmp_path / "bus.xml", 76)
-    add_mission(ground, text.encode())
-    ingest_file(ground, downlink(tmp_path, bus_packets(8)))
-    with ground.database.reading() as connection:
-        vehicle = connection.exec_driver_sql("SELECT id FROM vehicles").scalar_one()
-        found = readable_decoding(connection, vehicle)
-    assert found is not None and found.counts["100"] == {"decoded": 8}
+    add_mission(ground, written(tmp_path, foreign.BUS).encode())
+    result = take(ground, bus_packets(8))
+    assert ground.read(readable_decoding, result.vehicle_id).counts["100"] == {"decoded": 8}
     bare = foreign.document(foreign.integer("u8", 8), {"a": "u8"}, foreign.container("P", ["a"]))
-    (tmp_path / "none.xml").write_text(bare, encoding="utf-8")
     with pytest.raises(InvalidInput, match="compares its APID with a number, found none"):
-        minimal_description(tmp_path / "none.xml", 76)
+        written(tmp_path, bare)
 
 
 def written(folder: Path, text: str) -> str:
     folder.mkdir(exist_ok=True)
-    (folder / "bus.xml").write_text(text, encoding="utf-8")
+    (folder / "bus.xml").write_text(text)
     return minimal_description(folder / "bus.xml", 76)
 
 
@@ -197,7 +194,7 @@ def test_a_minimal_description_is_one_that_the_check_accepts(tmp_path: Path) -> 
 
 
 def saved(folder: Path, text: str) -> Path:
-    (folder / "mission.toml").write_text(text, encoding="utf-8")
+    (folder / "mission.toml").write_text(text)
     return folder / "mission.toml"
 
 
@@ -220,18 +217,15 @@ def test_a_unix_clock_counts_no_leap_seconds(epoch: str) -> None:
         PacketTime.model_validate({**time.model_dump(), "epoch": "1970-01-01T00:00:00 TAI"})
 
 
-def test_parts_of_segmented_packets_are_counted_and_packets_without_header_have_no_time(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_parts_of_segmented_packets_are_counted_and_packets_without_header_have_no_time(declared: Ground) -> None:
     """The definition asks for the secondary header flag, but not for the sequence flags."""
-    enter(ground, tmp_path / "m")
     packets = bus_packets(8)
     parts = [packets[3][:2] + struct.pack(">H", flags << 14 | 50 + flags) + packets[3][4:] for flags in (1, 0, 2)]
     boot = bytes((packets[2][0] & ~0x08, *packets[2][1:]))
-    ingest_file(ground, downlink(tmp_path, [*packets, *parts, boot]))
-    listed = pass_parameters(ground, define(ground))
+    take(declared, [*packets, *parts, boot])
+    listed = pass_parameters(declared, define(declared))
     assert listed.outcomes["100"] == {"decoded": 8, "segments_not_joined": 3, "no_container": 1}
-    assert parameter_series(ground, 1, "VOLTAGE", 100).samples == 8
+    assert parameter_series(declared, 1, "VOLTAGE", 100).samples == 8
 
 
 def test_an_entry_may_name_several_containers_and_the_unit_of_sizes(tmp_path: Path) -> None:
@@ -242,7 +236,7 @@ def test_an_entry_may_name_several_containers_and_the_unit_of_sizes(tmp_path: Pa
     assert "expected the name of a container" in check_mission_file(mission(tmp_path, text.replace("TIMED", "X")))[1][0]
 
 
-def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground: Ground, tmp_path: Path) -> None:
+def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground: Ground) -> None:
     limits = (
         "<DefaultAlarm><StaticAlarmRanges><WarningRange minInclusive='-1' maxInclusive='1000.5'/>"
         "<CriticalRange maxExclusive='1020'/></StaticAlarmRanges></DefaultAlarm>"
@@ -251,8 +245,8 @@ def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground: 
     assert kind in foreign.BUS
     end = foreign.BUS.index("</FloatParameterType>", foreign.BUS.index(kind))
     text = foreign.BUS[:end] + limits + foreign.BUS[end:]
-    add_mission(ground, read_mission_file(mission(tmp_path / "m", document=text)))
-    ingest_file(ground, downlink(tmp_path, bus_packets(4)))
+    enter(ground, document=text)
+    take(ground, bus_packets(4))
     newest = next(one for one in live_parameters(ground, 76, "flight") if one.name == "VOLTAGE")
     assert newest.limits == "-1 to 1000.5" and newest.value is not None
     broken = "alarm" if newest.value > 1020.0 else "warning" if newest.value > 1000.5 else "within"
@@ -269,10 +263,10 @@ def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground: 
 def test_a_series_has_least_greatest_and_mean_value_from_samples_and_from_rollups(
     either: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    enter(either, tmp_path / "m")
+    enter(either)
     bus = bus_packets(2000)
-    for part, piece in enumerate((bus[:900], bus[900:])):
-        ingest_file(either, downlink(tmp_path, piece, f"{part}.cadu"))
+    for piece in (bus[:900], bus[900:]):
+        take(either, piece)
     pass_id = define(either, 3000.0)
     exact = parameter_series(either, pass_id, "RATE", 10)
     housekeeping = [packet for packet in bus if packet[1] == foreign.APID_HOUSEKEEPING]
@@ -291,34 +285,24 @@ def test_a_series_has_least_greatest_and_mean_value_from_samples_and_from_rollup
 
 
 def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_kept_as_unknown(
-    either: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    either: Ground, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(decoding, "BLOCK_PACKETS", 50)
     monkeypatch.setitem(cast(dict[str, Any], follow_up.DOING), "decode", lambda *_given: None)  # no job decodes
     declared = "[[packets]]\nname = 'bus'\napids = [100, 101]\npacket_checksum = 'none'\n"
-    enter(either, tmp_path / "m", declared)
-    result = ingest_file(either, downlink(tmp_path, bus_packets(100)))
+    enter(either, declared)
+    result = take(either, bus_packets(100))
     assert (result.packets_new, result.unknown, result.octets_skipped) == (125, 125, 0)
     pass_id = define(either)
     with pytest.raises(NotFound):
         parameter_series(either, pass_id, "VOLTAGE", 100)
-    enter(either, tmp_path / "m")
+    enter(either)
     assert decoding.decode_declared(either, result.vehicle_id) == 125
     assert parameter_series(either, pass_id, "VOLTAGE", 100).samples == 100
-    renamed = foreign.BUS.replace('"VOLTAGE"', '"BATTERY"')
-    add_mission(either, read_mission_file(mission(tmp_path / "m", document=renamed)))
-    blocks = 0
-    whole = decoding._next_block
-
-    def killed(*given: Any) -> Any:
-        nonlocal blocks
-        blocks += 1
-        if blocks == 2:
-            raise KeyboardInterrupt
-        return whole(*given)
-
+    enter(either, document=RENAMED)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(decoding, "_next_block", killed)
+        whole = Mock(side_effect=[decoding._next_block, KeyboardInterrupt])
+        patch.setattr(decoding, "_next_block", lambda *given: whole()(*given))
         decoding.decode_declared(either, result.vehicle_id)
     assert parameter_series(either, pass_id, "VOLTAGE", 100).samples == 100  # still as the earlier one decoded it
     assert decoding.decode_declared(either, result.vehicle_id) == 75
@@ -326,38 +310,35 @@ def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_k
     with pytest.raises(NotFound):
         parameter_series(either, pass_id, "VOLTAGE", 100)
     assert decoding.decode_declared(either, result.vehicle_id) == 0
-    with either.database.reading() as connection:
-        samples = connection.execute(repository.PARAMETER_SAMPLES.select()).all()
-        progress = readable_decoding(connection, result.vehicle_id)
-    assert len(samples) == 125
-    assert progress is not None and progress.counts == {"100": {"decoded": 100}, "101": {"decoded": 25}}
+    assert either.read(repository.newest, SAMPLES, Paging())[1] == 125
+    progress = either.read(readable_decoding, result.vehicle_id)
+    assert progress.counts == {"100": {"decoded": 100}, "101": {"decoded": 25}}
 
 
 def test_a_revision_reads_raw_files_again_whose_packets_were_taken_for_damaged(
-    either: Ground, tmp_path: Path, synthetic_pass: Any
+    either: Ground, synthetic_pass: Any
 ) -> None:
-    own, bus = payload_packets(synthetic_pass), bus_packets(100)
+    own, bus = synthetic_pass.packets, bus_packets(100)
     mixed = [packet for pair in zip(own, bus, strict=False) for packet in pair]
-    result = ingest_file(either, downlink(tmp_path, mixed))
+    result = take(either, mixed)
     assert result.packets_new <= len(own) and result.crc_errors + result.octets_skipped > 0
-    enter(either, tmp_path / "m")  # the event of the revision has the job run
+    enter(either)  # the event of the revision has the job run
     assert parameter_series(either, define(either), "VOLTAGE", 1000).samples == 100
     assert undecoded_vehicles(either, 76) == []
-    with either.database.reading() as connection:
-        (job,) = repository.newest(connection, repository.JOBS, Paging(), kind="redecode")[0]
-    assert job["state"] == "done"
-    enter(either, tmp_path / "m", DEFINED + "[evidence]\nseed = 1\n")  # the same packets
-    with either.database.reading() as connection:
-        assert repository.newest(connection, repository.JOBS, Paging(), kind="redecode")[1] == 1
+    assert [job["state"] for job in redecodings(either)] == ["done"]
+    enter(either, DEFINED + "[evidence]\nseed = 1\n")  # the same packets
+    assert len(redecodings(either)) == 1
 
 
-def test_the_integrity_check_finds_packets_without_a_checksum_intact(ground: Ground, tmp_path: Path) -> None:
-    enter(ground, tmp_path / "m")
-    ingest_file(ground, downlink(tmp_path, bus_packets(30)))
-    found = verify(ground, rebuild=True)
-    assert (found.verdict, found.damaged) == ("intact", [])
-    assert (found.checked["packets"], found.checked["parameter_samples"]) == (38, 38)
-    assert found.unchecked == {}
+def redecodings(ground: Ground) -> list[dict[str, Any]]:
+    return ground.read(repository.newest, repository.JOBS, Paging(), kind="redecode")[0]
+
+
+def test_the_integrity_check_finds_packets_without_a_checksum_intact(declared: Ground) -> None:
+    take(declared, bus_packets(30))
+    found = verify(declared, rebuild=True)
+    assert (found.verdict, found.damaged, found.unchecked) == ("intact", [], {})
+    assert found.checked["packets"] == found.checked["parameter_samples"] == 38
 
 
 SAMPLES = repository.PARAMETER_SAMPLES
@@ -376,10 +357,10 @@ SAMPLES = repository.PARAMETER_SAMPLES
     ],
 )
 def test_the_integrity_check_finds_a_damaged_sample(
-    either: Ground, tmp_path: Path, changes: dict[str, Any] | None, reason: str
+    either: Ground, changes: dict[str, Any] | None, reason: str
 ) -> None:
-    enter(either, tmp_path / "m")
-    ingest_file(either, downlink(tmp_path, bus_packets(8)))
+    enter(either)
+    take(either, bus_packets(8))
     with either.database.writing() as connection:
         (row, *_) = connection.execute(SAMPLES.select().order_by(SAMPLES.c.ticks)).mappings()
         here = (SAMPLES.c.ticks == row["ticks"]) & (SAMPLES.c.packet_id == row["packet_id"])
@@ -390,23 +371,24 @@ def test_the_integrity_check_finds_a_damaged_sample(
 
 
 def test_the_integrity_check_does_not_expect_samples_of_packets_that_are_not_yet_decoded(
-    either: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    either: Ground, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(cast(dict[str, Any], follow_up.DOING), "decode", lambda *_given: None)
-    enter(either, tmp_path / "m")
-    result = ingest_file(either, downlink(tmp_path, bus_packets(10)))
-    renamed = foreign.BUS.replace('"VOLTAGE"', '"BATTERY"')
-    add_mission(either, read_mission_file(mission(tmp_path / "m", document=renamed)))
+    enter(either)
+    result = take(either, bus_packets(10))
+    enter(either, document=RENAMED)
     found = verify(either, rebuild=True)
     assert found.damaged == []
-    assert found.unchecked["rows of parameter_samples decoded with an earlier mission description"] == 13
-    assert found.unchecked["rows of parameter_samples not yet decoded"] == 13
+    rest = "rows of parameter_samples not yet decoded"
+    assert (
+        found.unchecked["rows of parameter_samples decoded with an earlier mission description"]
+        == found.unchecked[rest]
+        == 13
+    )
     monkeypatch.setattr(decoding, "BLOCK_PACKETS", 5)
-    with either.database.writing() as connection:
-        assert decoding._next_block(connection, result.vehicle_id) == 5
+    assert either.write(decoding._next_block, result.vehicle_id) == 5
     found = verify(either, rebuild=True)
-    assert found.damaged == []
-    assert found.unchecked["rows of parameter_samples not yet decoded"] == 8
+    assert (found.damaged, found.unchecked[rest]) == ([], 8)
     decoding.decode_declared(either, result.vehicle_id)
     found = verify(either, rebuild=True)
     assert (found.damaged, found.unchecked, found.checked["parameter_samples"]) == ([], {}, 13)
@@ -414,7 +396,7 @@ def test_the_integrity_check_does_not_expect_samples_of_packets_that_are_not_yet
 
 def archived(made: Any, folder: Path, packets: list[bytes], text: str = DEFINED) -> Path:
     """The synthetic archive with other packets in its downlink, and a mission description that declares them."""
-    archive: Path = shutil.copytree(made.folder, folder / "archive")
+    archive = shutil.copytree(made.folder, folder / "archive")
     written = {
         "downlink.cadu": encode_cadus(packets, spacecraft_id=76),
         "mission.toml": read_mission_file(mission(folder / "described", text)),
@@ -427,16 +409,13 @@ def archived(made: Any, folder: Path, packets: list[bytes], text: str = DEFINED)
     return archive
 
 
-RENAMED = foreign.BUS.replace('"VOLTAGE"', '"BATTERY"')
-
-
 def test_an_archive_is_decoded_with_the_packets_that_it_declares_and_the_live_spacecraft_is_not(
     either: Ground, tmp_path: Path, synthetic_pass: Any
 ) -> None:
     bus = bus_packets(40)
-    folder = archived(synthetic_pass, tmp_path, [*payload_packets(synthetic_pass), *bus])
+    folder = archived(synthetic_pass, tmp_path, [*synthetic_pass.packets, *bus])
     live = define(either)
-    ingest_file(either, downlink(tmp_path, payload_packets(synthetic_pass)))
+    take(either, synthetic_pass.packets)
     pass_id = import_archive(either, folder)
     instance = get_pass(either, pass_id).instance
     found = trend_series(either, 76, instance, "VOLTAGE", 1000)
@@ -446,11 +425,10 @@ def test_an_archive_is_decoded_with_the_packets_that_it_declares_and_the_live_sp
     rows = json.loads(export_packets(either, pass_id, "Housekeeping", "json"))
     assert len(rows) == {one.packet: one.packets for one in pass_parameters(either, pass_id).packets}["Housekeeping"]
     assert pass_parameters(either, live).packets == ()
-    with either.database.reading() as connection:
-        assert packets_in_force(connection, 76, "flight") is None
+    assert either.read(packets_in_force, 76, "flight") is None
     # a description that a person adds holds for the spacecraft, and not for the archive
-    add_mission(either, read_mission_file(mission(tmp_path / "later", document=RENAMED)))
-    ingest_file(either, downlink(tmp_path, bus, "live.cadu"))
+    enter(either, document=RENAMED)
+    take(either, bus)
     assert trend_series(either, 76, "flight", "BATTERY", 1000).samples == 40
     assert trend_series(either, 76, instance, "VOLTAGE", 1000).samples == 40
     with pytest.raises(NotFound):
@@ -481,15 +459,14 @@ def test_an_archive_that_was_imported_before_is_decoded_with_its_packets_on_rede
 def test_an_archive_that_declares_no_packets_is_decoded_with_the_description_of_the_spacecraft(
     either: Ground, tmp_path: Path, synthetic_pass: Any
 ) -> None:
-    enter(either, tmp_path / "m")
+    enter(either)
     pass_id = import_archive(either, archived(synthetic_pass, tmp_path, bus_packets(20), ""))
     instance = get_pass(either, pass_id).instance
     assert trend_series(either, 76, instance, "VOLTAGE", 1000).samples == 20
 
 
-def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(ground: Ground, tmp_path: Path) -> None:
-    enter(ground, tmp_path / "m")
-    octets = downlink(tmp_path, bus_packets(120)).read_bytes()
+def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(declared: Ground, tmp_path: Path) -> None:
+    octets = encode_cadus(bus_packets(120), spacecraft_id=76)
     rng = np.random.default_rng(5)
     cuts = [0, *sorted(rng.choice(len(octets), 11, replace=False).tolist()), len(octets)]
     pieces = list(pairwise(cuts))
@@ -497,91 +474,77 @@ def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(ground: Ground, 
         start, stop = pieces[index]
         path = tmp_path / f"{index}.piece"
         path.write_bytes(octets[start:stop])
-        ingest_file(ground, path, spacecraft_id=76, place=Place("s", start))
-    assert parameter_series(ground, define(ground), "VOLTAGE", 1000).samples == 120
+        ingest_file(declared, path, spacecraft_id=76, place=Place("s", start))
+    assert parameter_series(declared, define(declared), "VOLTAGE", 1000).samples == 120
 
 
-@pytest.mark.parametrize("framed", [False, True])
+@pytest.mark.parametrize("window", [0, 5_000, 1 << 20])
 def test_packets_that_nothing_declares_are_kept_between_declared_ones(
-    ground: Ground, tmp_path: Path, framed: bool
+    declared: Ground, tmp_path: Path, window: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    enter(ground, tmp_path / "m")
+    """In frames, and as a bare stream in windows and at once."""
     packets = bus_packets(274)
     for k in range(49):
         packets.insert(8 * k + 3, pack_packet(300, bytes(40), sequence_count=k))
-    path = downlink(tmp_path, packets)
-    if not framed:
-        path.write_bytes(b"".join(packets))
-    result = ingest_file(ground, path, spacecraft_id=76)
+    path = tmp_path / "bus"
+    path.write_bytes(b"".join(packets) if window else encode_cadus(packets, spacecraft_id=76))
+    if window:
+        monkeypatch.setattr("ground_service.ingest.reception.WINDOW_OCTETS", window)
+    result = ingest_file(declared, path, spacecraft_id=76)
     assert (result.packets_new, result.crc_errors, result.octets_skipped) == (len(packets), 0, 0)
     assert result.unknown == 49
+    assert parameter_series(declared, define(declared), "VOLTAGE", 1000).samples == 274
 
 
-def test_a_bare_stream_without_checksums_is_read_in_windows(
-    ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ground_service.ingest.reception.WINDOW_OCTETS", 5_000)
-    enter(ground, tmp_path / "m")
-    path = tmp_path / "bare.packets"
-    path.write_bytes(b"".join(bus_packets(400)))
-    result = ingest_file(ground, path, spacecraft_id=76)
-    assert (result.packets_new, result.octets_skipped) == (500, 0)
-    assert parameter_series(ground, define(ground), "VOLTAGE", 1000).samples == 400
-
-
-def test_decoded_packets_of_a_pass_are_exported_with_utc(ground: Ground, tmp_path: Path, synthetic_pass: Any) -> None:
-    enter(ground, tmp_path / "m")
-    packets = payload_packets(synthetic_pass)
+def test_decoded_packets_of_a_pass_are_exported_with_utc(declared: Ground, synthetic_pass: Any) -> None:
+    packets = synthetic_pass.packets
     (event,) = (one for one in map(DICTIONARY.unpack_packet, packets) if one.name == "event_info")
     packets.append(DICTIONARY.pack("event_low", event.values, ticks=event.ticks, sequence_count=1))
-    ingest_file(ground, downlink(tmp_path, [*packets, *bus_packets(20)]))
-    pass_id = define(ground, 86_400.0)
-    records = json.loads(export_packets(ground, pass_id, "Housekeeping", "json"))
+    take(declared, [*packets, *bus_packets(20)])
+    pass_id = define(declared, 86_400.0)
+    records = json.loads(export_packets(declared, pass_id, "Housekeeping", "json"))
     assert [one["utc"][:23] for one in records] == [f"2029-08-07T00:00:{k:02d}.000" for k in range(20)]
     assert {one["MODE"] for one in records} <= {"SAFE", "NOMINAL", "DETUMBLE"}
-    lines = export_packets(ground, pass_id, "Event", "csv").decode().splitlines()
+    lines = export_packets(declared, pass_id, "Event", "csv").decode().splitlines()
     assert lines[0].startswith("utc,packet,VERSION")
-    own = json.loads(export_packets(ground, pass_id, "event_low", "json"))
+    own = json.loads(export_packets(declared, pass_id, "event_low", "json"))
     assert {one["packet"] for one in own} == {"event_low"}
     with pytest.raises(NotFound, match="packet"):
-        export_packets(ground, pass_id, "nothing", "csv")
-    assert export_packets(ground, pass_id, "Housekeeping", "parquet")[:4] == b"PAR1"
+        export_packets(declared, pass_id, "nothing", "csv")
+    assert export_packets(declared, pass_id, "Housekeeping", "parquet")[:4] == b"PAR1"
 
 
-def test_the_http_interface_gives_parameters_series_and_packets(tmp_path: Path) -> None:
-    with open_ground(tmp_path / "home") as ground:
-        enter(ground, tmp_path / "m")
-        ingest_file(ground, downlink(tmp_path, bus_packets(20)))
-        define(ground)
-    with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as client:
-        listed = client.get("/api/v1/passes/1/parameters").json()
-        assert "VOLTAGE" in {one["name"] for one in listed["parameters"]}
-        found = client.get("/api/v1/passes/1/telemetry/VOLTAGE").json()
-        assert (found["samples"], found["unit"]) == (20, "V")
-        answer = client.get("/api/v1/passes/1/packets/Housekeeping", params={"format": "csv"})
-        assert answer.headers["content-type"].startswith("text/csv")
-        assert len(answer.text.splitlines()) == 21
-        assert client.get("/api/v1/passes/1/packets/none").status_code == 404
+def test_the_http_interface_gives_parameters_series_and_packets(client: TestClient) -> None:
+    ground = client.app.state.ground
+    enter(ground)
+    take(ground, bus_packets(20))
+    url = f"/api/v1/passes/{define(ground)}"
+    listed = client.get(f"{url}/parameters").json()
+    assert "VOLTAGE" in {one["name"] for one in listed["parameters"]}
+    found = client.get(f"{url}/telemetry/VOLTAGE").json()
+    assert (found["samples"], found["unit"]) == (20, "V")
+    answer = client.get(f"{url}/packets/Housekeeping?format=csv")
+    assert answer.headers["content-type"].startswith("text/csv")
+    assert len(answer.text.splitlines()) == 21
+    assert client.get(f"{url}/packets/none").status_code == 404
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (DEFINED.replace("[100, 101]", "[100, 2047]"), "packets.0.apids.1: expected less than or equal to 2046"),
-        (DEFINED.replace("'none'", "'maybe'"), "packets.0.packet_checksum: expected 'crc16' or 'none'"),
-        (DEFINED.replace("whole_octets = 2", "whole_octets = 4"), "packets.0.time: expected 2 or 3 octets of days"),
-        (DEFINED.replace("1958-01-01T00:00:00Z", "long ago"), "packets.0.time: expected an epoch such as"),
-        (DEFINED.replace("clock", "clok"), "packets.0.time.clok: expected 'clock', found unknown key 'clok'"),
-        (DEFINED + DEFINED.replace("'bus'", "'two'"), "each APID in one entry of packets, found 100"),
-        (DEFINED.replace("[100, 101]", "[160]"), "APIDs that the packet dictionary does not use, found 160"),
-    ],
-)
-def test_each_fault_of_a_declaration_is_one_line(tmp_path: Path, text: str, message: str) -> None:
-    found, faults = check_mission_file(mission(tmp_path, text))
-    assert found is None
-    assert len(faults) == 1, faults
-    assert message in faults[0]
-    assert "\n" not in faults[0]
+FAULTS = """\
+[100, 101] | [100, 2047] | packets.0.apids.1: expected less than or equal to 2046
+'none' | 'maybe' | packets.0.packet_checksum: expected 'crc16' or 'none'
+whole_octets = 2 | whole_octets = 4 | packets.0.time: expected 2 or 3 octets of days
+1958-01-01T00:00:00Z | long ago | packets.0.time: expected an epoch such as
+clock | clok | packets.0.time.clok: expected 'clock', found unknown key 'clok'
+'bus' | 'two' | each APID in one entry of packets, found 100
+[100, 101] | [160] | APIDs that the packet dictionary does not use, found 160"""
+
+
+@pytest.mark.parametrize("row", FAULTS.splitlines())
+def test_each_fault_of_a_declaration_is_one_line(tmp_path: Path, row: str) -> None:
+    old, new, message = row.split(" | ")
+    text = DEFINED * (new == "'two'") + DEFINED.replace(old, new)
+    found, [fault] = check_mission_file(mission(tmp_path, text))
+    assert found is None and message in fault and "\n" not in fault
 
 
 def test_each_faulty_document_is_one_line(tmp_path: Path) -> None:
@@ -611,32 +574,23 @@ def test_a_long_document_is_embedded_compressed(ground: Ground, tmp_path: Path) 
     path = mission(tmp_path, DEFINED, padded)
     octets = read_mission_file(path)
     assert b"gzip:" in octets and len(octets) < 100_000
-    entered = add_mission(ground, octets)
-    assert add_mission(ground, read_mission_file(path)).id == entered.id
-    ingest_file(ground, downlink(tmp_path, bus_packets(5)))
+    assert add_mission(ground, octets).id == add_mission(ground, read_mission_file(path)).id
+    take(ground, bus_packets(5))
     assert parameter_series(ground, define(ground), "VOLTAGE", 100).samples == 5
 
 
-def test_a_declared_packet_from_the_future_is_kept_apart_until_others_agree(ground: Ground, tmp_path: Path) -> None:
-    enter(ground, tmp_path / "m")
+def test_a_declared_packet_from_the_future_is_kept_apart_until_others_agree(declared: Ground) -> None:
     rng = np.random.default_rng(7)
-    ingest_file(ground, downlink(tmp_path, bus_packets(40)))
-    pass_id = define(ground)
+    take(declared, bus_packets(40))
+    pass_id = define(declared)
     late = [at(foreign.housekeeping(rng, 40 + k), 3 * 86_400.0 + k) for k in range(12)]
-    for number, packets in enumerate(([at(foreign.housekeeping(rng, 99), 70 * 365 * 86_400.0)], late[:1])):
-        ingest_file(ground, downlink(tmp_path, packets, f"{number}.cadu"))
-    [one, other] = ground.read(list_implausible, ImplausibleFilter(limit=9)).items
+    for packets in ([at(foreign.housekeeping(rng, 99), 70 * 365 * 86_400.0)], late[:1]):
+        take(declared, packets)
+    [one, other] = declared.read(list_implausible, ImplausibleFilter(limit=9)).items
     assert (one.apid, other.apid) == (100, 100) and "after all other telemetry" in one.reason
-    assert parameter_series(ground, pass_id, "VOLTAGE", 500).samples == 40
-    assert alarm_names(ground) == {"implausible_time"}
-    ingest_file(ground, downlink(tmp_path, late[1:], "3.cadu"))
-    assert len(ground.read(list_implausible, ImplausibleFilter(limit=9)).items) == 1
-    assert newest_declared_ticks_of(ground) < int(ticks_from_utc_ns(START + 4 * 86_400 * NS))
-
-
-def alarm_names(ground: Ground) -> set[str]:
-    return {one.name for one in ground.read(list_alarms, AlarmFilter(limit=99, state=["raised"])).items}
-
-
-def newest_declared_ticks_of(ground: Ground) -> int:
-    return ground.read(newest_declared_ticks, 1) or 0
+    assert parameter_series(declared, pass_id, "VOLTAGE", 500).samples == 40
+    raised = declared.read(list_alarms, AlarmFilter(limit=99, state=["raised"])).items
+    assert {one.name for one in raised} == {"implausible_time"}
+    take(declared, late[1:])
+    assert len(declared.read(list_implausible, ImplausibleFilter(limit=9)).items) == 1
+    assert declared.read(newest_declared_ticks, 1) < int(ticks_from_utc_ns(START + 4 * 86_400 * NS))

@@ -45,6 +45,9 @@ def clock() -> Iterator[None]:
     set_mission_clock()
 
 
+LAST = TICKS + 11 * (60 << 16)
+
+
 def report(ticks: int, count: int, temperature_c: float = 20.0, boot: int = 1) -> bytes:
     values = _housekeeping(1) | {"temperature_c": temperature_c, "boot_count": boot}
     return DICTIONARY.pack("housekeeping", values, ticks=ticks, sequence_count=count)
@@ -55,9 +58,9 @@ def contact(start: int = TICKS, count: int = 0, number: int = 12, boot: int = 1)
     return b"".join(report(start + (60 << 16) * k, count + k, boot=boot) for k in range(number))
 
 
-def receive(ground: Ground, path: Path, octets: bytes) -> int:
+def receive(ground: Ground, octets: bytes) -> int:
     """Ingest packets; return the number of those that are kept apart."""
-    file = path / f"{abs(hash(octets))}.packets"
+    file = ground.home / f"{abs(hash(octets))}.packets"
     file.write_bytes(octets)
     return ingest_file(ground, file, spacecraft_id=76).packets_implausible
 
@@ -73,72 +76,70 @@ def alarms(ground: Ground) -> dict[str, int]:
 
 @pytest.mark.parametrize("ahead", [2 * HOUR, 26 * HOUR, YEARS])
 @pytest.mark.parametrize("source", ["telemetry", "simulated", "time of day"])
-def test_a_report_from_the_future_is_kept_and_decides_nothing(
-    ground: Ground, tmp_path: Path, ahead: int, source: str
-) -> None:
+def test_a_report_from_the_future_is_kept_and_decides_nothing(ground: Ground, ahead: int, source: str) -> None:
     clocks = {"telemetry": TelemetryTime(NOW), "simulated": lambda: NOW, "time of day": None}
     set_mission_clock(clocks[source])
-    receive(ground, tmp_path, contact())
+    receive(ground, contact())
     before = hash_of(ground)
-    assert receive(ground, tmp_path, report(TICKS + ahead, 12, temperature_c=99.0)) == 1
+    assert receive(ground, report(TICKS + ahead, 12, temperature_c=99.0)) == 1
     assert hash_of(ground) == before
-    assert ground.read(newest_ticks, 1) == TICKS + 11 * (60 << 16)
+    assert ground.read(newest_ticks, 1) == LAST
     assert alarms(ground) == {"implausible_time": 1}
     [reason] = reasons(ground)
     assert ("after the mission time" if source == "simulated" else "after all other telemetry") in reason
 
 
-def test_the_same_report_again_is_kept_once(either: Ground, tmp_path: Path) -> None:
-    receive(either, tmp_path, contact())
-    receive(either, tmp_path, report(TICKS + DAY, 12))
-    assert receive(either, tmp_path, report(TICKS + DAY, 12)) == 0
+def test_the_same_report_again_is_kept_once(either: Ground) -> None:
+    receive(either, contact())
+    receive(either, report(TICKS + DAY, 12))
+    assert receive(either, report(TICKS + DAY, 12)) == 0
     assert len(reasons(either)) == 1 and alarms(either) == {"implausible_time": 1}
 
 
-def test_the_archive_does_not_depend_on_whether_the_wrong_report_came_first(either: Ground, tmp_path: Path) -> None:
-    receive(either, tmp_path, report(TICKS + DAY, 12, temperature_c=99.0))
-    receive(either, tmp_path, report(5 << 16, 13, temperature_c=-99.0))
+def test_the_archive_does_not_depend_on_whether_the_wrong_report_came_first(either: Ground) -> None:
+    receive(either, report(TICKS + DAY, 12, temperature_c=99.0))
+    receive(either, report(5 << 16, 13, temperature_c=-99.0))
     assert "temperature_c" in alarms(either)
-    receive(either, tmp_path, contact())
+    receive(either, contact())
     assert len(reasons(either)) == 2
-    assert either.read(newest_ticks, 1) == TICKS + 11 * (60 << 16)
+    assert either.read(newest_ticks, 1) == LAST
     assert "temperature_c" not in alarms(either)
     assert verify(either, rebuild=True).verdict == "intact"
 
 
-def test_the_next_contact_is_believed_and_puts_back_what_was_kept_apart(either: Ground, tmp_path: Path) -> None:
-    receive(either, tmp_path, contact())
-    assert receive(either, tmp_path, contact(TICKS + DAY, 1440, number=2)) == 2
-    assert receive(either, tmp_path, contact(TICKS + DAY + (120 << 16), 1442)) == 0
+def test_the_next_contact_is_believed_and_puts_back_what_was_kept_apart(either: Ground) -> None:
+    receive(either, contact())
+    assert receive(either, contact(TICKS + DAY, 1440, number=2)) == 2
+    assert receive(either, contact(TICKS + DAY + (120 << 16), 1442)) == 0
     assert reasons(either) == []
     assert either.read(newest_ticks, 1) == TICKS + DAY + 13 * (60 << 16)
 
 
-def test_a_wrong_report_does_not_become_right_when_its_time_comes(ground: Ground, tmp_path: Path) -> None:
-    receive(ground, tmp_path, contact())
-    receive(ground, tmp_path, report(TICKS + DAY + (90 << 16), 12))
-    receive(ground, tmp_path, contact(TICKS + DAY, 1440))
+def test_a_wrong_report_does_not_become_right_when_its_time_comes(ground: Ground) -> None:
+    receive(ground, contact())
+    receive(ground, report(TICKS + DAY + (90 << 16), 12))
+    receive(ground, contact(TICKS + DAY, 1440))
     assert len(reasons(ground)) == 1
 
 
-def test_a_clock_of_the_mission_believes_a_single_report_after_a_silence(ground: Ground, tmp_path: Path) -> None:
-    receive(ground, tmp_path, contact())
+def test_a_clock_of_the_mission_believes_a_single_report_after_a_silence(ground: Ground) -> None:
+    receive(ground, contact())
     set_mission_clock(lambda: NOW + 86_400 * 10**9)
-    assert receive(ground, tmp_path, report(TICKS + DAY, 12)) == 0
+    assert receive(ground, report(TICKS + DAY, 12)) == 0
 
 
-def test_a_clock_that_was_not_set_and_a_stamp_from_the_past_are_kept_apart(ground: Ground, tmp_path: Path) -> None:
-    receive(ground, tmp_path, contact(TICKS - DAY))
-    receive(ground, tmp_path, contact(TICKS, 1440))
-    assert receive(ground, tmp_path, report(100 << 16, 1452)) == 1
-    assert receive(ground, tmp_path, report(TICKS - DAY + (90 << 16), 1453)) == 1
+def test_a_clock_that_was_not_set_and_a_stamp_from_the_past_are_kept_apart(ground: Ground) -> None:
+    receive(ground, contact(TICKS - DAY))
+    receive(ground, contact(TICKS, 1440))
+    assert receive(ground, report(100 << 16, 1452)) == 1
+    assert receive(ground, report(TICKS - DAY + (90 << 16), 1453)) == 1
     assert reasons(ground) == ["its sequence count belongs to another time", "the clock was not set"]
 
 
-def test_a_late_report_and_a_reboot_are_believed(ground: Ground, tmp_path: Path) -> None:
-    receive(ground, tmp_path, contact(TICKS - DAY) + contact(TICKS - DAY + 13 * (60 << 16), 13))
-    receive(ground, tmp_path, contact(TICKS, 0))  # counts begin again with the boot
-    assert receive(ground, tmp_path, report(TICKS - DAY + 12 * (60 << 16), 12)) == 0
+def test_a_late_report_and_a_reboot_are_believed(ground: Ground) -> None:
+    receive(ground, contact(TICKS - DAY) + contact(TICKS - DAY + 13 * (60 << 16), 13))
+    receive(ground, contact(TICKS, 0))  # counts begin again with the boot
+    assert receive(ground, report(TICKS - DAY + 12 * (60 << 16), 12)) == 0
     assert reasons(ground) == []
 
 
@@ -151,21 +152,17 @@ def test_reception_times_decide_for_single_packets_and_not_for_a_station_whose_c
     assert set(implausible_times(ticks[3:], np.array([NO_TICKS]), TICKS, None)) == {0}
 
 
-@pytest.mark.parametrize(
-    ("count", "before", "after", "fits"),
-    [(5, 4, 6, True), (5, 5, 5, True), (7, 4, 6, False), (0, 16_383, 1, True), (9, None, 1, True)],
-)
-def test_a_sequence_count_fits_between_its_neighbours(
-    count: int, before: int | None, after: int | None, fits: bool
-) -> None:
-    assert fits_between(count, before, after) is fits
+def test_a_sequence_count_fits_between_its_neighbours() -> None:
+    for given in ((5, 4, 6), (5, 5, 5), (0, 16_383, 1), (9, None, 1)):
+        assert fits_between(*given) is True, given
+    assert fits_between(7, 4, 6) is False
 
 
-def test_a_withdrawn_ingest_leaves_no_trace_but_its_record(either: Ground, tmp_path: Path) -> None:
-    receive(either, tmp_path, contact())
+def test_a_withdrawn_ingest_leaves_no_trace_but_its_record(either: Ground) -> None:
+    receive(either, contact())
     before, alone = hash_of(either), alarms(either)
     foreign = contact(TICKS - 9 * DAY) + contact(TICKS + (30 << 16), 500) + report(TICKS + 60, 600, 99.0)
-    receive(either, tmp_path, foreign)
+    receive(either, foreign)
     assert hash_of(either) != before and alarms(either) != alone
     job = withdraw_ingest(either, 2, reason="another flight", actor="ann")
     with pytest.raises(StateConflict, match="expected state done, found withdrawing"):
@@ -178,65 +175,62 @@ def test_a_withdrawn_ingest_leaves_no_trace_but_its_record(either: Ground, tmp_p
     assert entry.detail["reason"] == "another flight"
 
 
-def test_telecommands_are_verified_again_after_a_foreign_flight_is_withdrawn(either: Ground, tmp_path: Path) -> None:
-    def verification(ticks: int, request: int) -> bytes:
-        values = {"request_id": request}
-        return DICTIONARY.pack("verification_completed", values, ticks=ticks, sequence_count=0)
+def entered(ground: Ground) -> int:
+    key = enter_command(ground, "test_connection", {}, spacecraft_id=76, actor="ann")
+    release_command(ground, key, actor="ann")
+    return key
 
-    receive(either, tmp_path, contact())
-    receive(either, tmp_path, verification(TICKS + HOUR // 2, 5))  # of another flight
-    key = enter_command(either, "test_connection", {}, spacecraft_id=76, actor="ann")
-    release_command(either, key, actor="ann")
-    take_uplink(either, spacecraft_id=76, actor="ann")
-    request = get_command(either, key).record.request_id or 0
-    receive(either, tmp_path, verification(TICKS + HOUR // 4, request))
+
+def sent(ground: Ground) -> tuple[int, int]:
+    """Send a telecommand; return its keys on the ground and on board."""
+    key = entered(ground)
+    take_uplink(ground, spacecraft_id=76, actor="ann")
+    return key, get_command(ground, key).record.request_id
+
+
+def completed(ticks: int, request: int, count: int = 0) -> bytes:
+    return DICTIONARY.pack("verification_completed", {"request_id": request}, ticks=ticks, sequence_count=count)
+
+
+def test_telecommands_are_verified_again_after_a_foreign_flight_is_withdrawn(either: Ground) -> None:
+    receive(either, contact())
+    receive(either, completed(TICKS + HOUR // 2, 5))  # of another flight
+    key, request = sent(either)
+    receive(either, completed(TICKS + HOUR // 4, request))
     assert get_command(either, key).state == "sent"
     run_job(either, withdraw_ingest(either, 2, reason="another flight", actor="ann"))
     assert get_command(either, key).state == "completed"
 
 
-def test_reports_from_before_the_release_do_not_verify_a_telecommand(either: Ground, tmp_path: Path) -> None:
+def test_reports_from_before_the_release_do_not_verify_a_telecommand(either: Ground) -> None:
     set_mission_clock(lambda: NOW)
-    receive(either, tmp_path, contact())
-    old = DICTIONARY.pack("verification_completed", {"request_id": 5}, ticks=TICKS - DAY, sequence_count=0)
-    receive(either, tmp_path, old)
-    key = enter_command(either, "test_connection", {}, spacecraft_id=76, actor="ann")
-    release_command(either, key, actor="ann")
-    take_uplink(either, spacecraft_id=76, actor="ann")
-    request = get_command(either, key).record.request_id or 0
-    late = {"request_id": request}
-    receive(either, tmp_path, DICTIONARY.pack("verification_completed", late, ticks=TICKS - 2 * HOUR, sequence_count=1))
+    receive(either, contact())
+    receive(either, completed(TICKS - DAY, 5))
+    key, request = sent(either)
+    receive(either, completed(TICKS - 2 * HOUR, request, 1))
     assert get_command(either, key).state == "sent"
 
 
-def test_reports_of_an_earlier_boot_do_not_verify_a_telecommand(either: Ground, tmp_path: Path) -> None:
-    def completed(ticks: int) -> bytes:
-        return DICTIONARY.pack("verification_completed", {"request_id": request}, ticks=ticks, sequence_count=1)
-
-    request = 5
-    receive(either, tmp_path, contact(boot=3) + completed(TICKS + HOUR // 2))
-    key = enter_command(either, "test_connection", {}, spacecraft_id=76, actor="ann")
-    release_command(either, key, actor="ann")
-    take_uplink(either, spacecraft_id=76, actor="ann")
-    request = get_command(either, key).record.request_id or 0
+def test_reports_of_an_earlier_boot_do_not_verify_a_telecommand(either: Ground) -> None:
+    receive(either, contact(boot=3) + completed(TICKS + HOUR // 2, 5, 1))
+    key, request = sent(either)
     later = TICKS + HOUR
-    receive(either, tmp_path, report(later, 900, boot=1) + completed(later + 9))  # of another flight
+    receive(either, report(later, 900, boot=1) + completed(later + 9, request, 1))  # of another flight
     assert get_command(either, key).state == "sent"
-    receive(either, tmp_path, report(later + HOUR, 13, boot=4) + completed(later + HOUR + 9))  # after a reboot
+    receive(either, report(later + HOUR, 13, boot=4) + completed(later + HOUR + 9, request, 1))  # after a reboot
     assert get_command(either, key).state == "completed"
 
 
-def test_commanding_starts_from_the_count_that_the_payload_reports(either: Ground, tmp_path: Path) -> None:
+def test_commanding_starts_from_the_count_that_the_payload_reports(either: Ground) -> None:
     fields = DICTIONARY.packet("performance").fields
     values = {one.name: 0 for one in fields} | {"structure_id": 2, "last_command_count": 41}
-    receive(either, tmp_path, DICTIONARY.pack("performance", values, ticks=TICKS, sequence_count=0))
-    key = enter_command(either, "test_connection", {}, spacecraft_id=76, actor="ann")
-    release_command(either, key, actor="ann")
+    receive(either, DICTIONARY.pack("performance", values, ticks=TICKS, sequence_count=0))
+    key = entered(either)
     record = get_command(either, key).record
     assert record.sequence_count == 42
     take_uplink(either, spacecraft_id=76, actor="ann")
     refused = {"request_id": record.request_id, "failure_code": "out_of_sequence"}
-    receive(either, tmp_path, DICTIONARY.pack("verification_not_accepted", refused, ticks=TICKS + 9, sequence_count=0))
+    receive(either, DICTIONARY.pack("verification_not_accepted", refused, ticks=TICKS + 9, sequence_count=0))
     assert "send perform_function resynchronise_commands first" in get_command(either, key).remark
 
 
@@ -255,24 +249,23 @@ def test_a_lease_that_ended_in_a_standstill_is_renewed_with_its_state(either: Gr
         links.change_link(connection, "l", "a", state="contact")
         assert links.acquire(connection, "l", 76, "flight", wall_utc_ns=40, **given | {"until_utc_ns": 55})
         found = links.find_link(connection, "l")
-        assert found is not None and (found.state, found.lease_utc_ns) == ("contact", 55)
+        assert (found.state, found.lease_utc_ns) == ("contact", 55)
         assert links.acquire(connection, "l", 76, "flight", wall_utc_ns=70, **given | {"owner": "b"})
         assert not links.acquire(connection, "l", 76, "flight", wall_utc_ns=10, **given)
 
 
 @pytest.mark.parametrize("ahead", [26 * HOUR, YEARS, 100 * (1 << 16) - TICKS])
-def test_a_detection_of_an_image_at_another_time_is_kept_apart(ground: Ground, tmp_path: Path, ahead: int) -> None:
+def test_a_detection_of_an_image_at_another_time_is_kept_apart(ground: Ground, ahead: int) -> None:
     def detections(image_ticks: int, count: int) -> bytes:
-        none = {name: np.zeros(0) for name in ("u_px", "v_px", "diameter_px", "score", "size_class", "sigma_px")}
-        values = {"frame_number": count, "image_ticks": image_ticks, "image_quality": 0, "items": none}
+        values = {"frame_number": count, "image_ticks": image_ticks, "image_quality": 0, "items": []}
         return DICTIONARY.pack("detections", values, ticks=TICKS + (11 << 16), sequence_count=count)
 
-    assert receive(ground, tmp_path, contact() + detections(TICKS, 0)) == 0
+    assert receive(ground, contact() + detections(TICKS, 0)) == 0
     before = hash_of(ground)
-    assert receive(ground, tmp_path, detections(TICKS + ahead, 1)) == 1
+    assert receive(ground, detections(TICKS + ahead, 1)) == 1
     assert hash_of(ground) == before and alarms(ground) == {"implausible_time": 1}
     assert reasons(ground)[0].startswith("the time of its image is ")
-    receive(ground, tmp_path, report(TICKS + 12 * (60 << 16), 12))
+    receive(ground, report(TICKS + 12 * (60 << 16), 12))
     assert len(reasons(ground)) == 1
 
 
@@ -280,15 +273,15 @@ def test_a_day_with_disturbances_ends_with_the_archive_of_the_day_without(tmp_pa
     contacts = [contact(TICKS + 2 * HOUR * k, 12 * k) for k in range(12)]
     with open_ground(tmp_path / "calm") as calm, open_ground(tmp_path / "disturbed") as disturbed:
         for octets in contacts:
-            receive(calm, tmp_path, octets)
+            receive(calm, octets)
         late = contacts.copy()
         late[3], late[4], late[7], late[9] = late[4], late[3], late[9], late[7]
         for k, octets in enumerate(late):
-            receive(disturbed, tmp_path, octets)
+            receive(disturbed, octets)
             wrong = (TICKS + 26 * HOUR * (k + 2), YEARS + TICKS, (100 + k) << 16)[k % 3]
             if k:
-                receive(disturbed, tmp_path, report(wrong, 4000 + k, temperature_c=99.0))
-            receive(disturbed, tmp_path, late[k // 2])
+                receive(disturbed, report(wrong, 4000 + k, temperature_c=99.0))
+            receive(disturbed, late[k // 2])
         assert hash_of(disturbed) == hash_of(calm)
         assert disturbed.read(newest_ticks, 1) == calm.read(newest_ticks, 1)
         assert len(reasons(disturbed)) == 11

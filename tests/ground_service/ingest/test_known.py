@@ -1,7 +1,6 @@
 """Small pieces: few statements, the stored result, knowledge that is up to date."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -26,43 +25,29 @@ STATEMENTS = 10
 def pieces(make_pass: Callable[..., Any]) -> list[bytes]:
     """The first one shows the link; the others hold one packet each, in complete frames."""
     packets = list(make_pass(frames=6).packets)
-    return [
-        encode_cadus(packets[:4], spacecraft_id=SPACECRAFT),
-        *(encode_cadus([one], spacecraft_id=SPACECRAFT) for one in packets[4:]),
-    ]
+    return [encode_cadus(one, spacecraft_id=SPACECRAFT) for one in (packets[:4], *([one] for one in packets[4:]))]
 
 
-def ingest_all(ground: Ground, pieces: list[bytes], folder: Path) -> list[dict[str, Any]]:
-    """Ingest the pieces; return their results, as stored, without the numbers of the ingests."""
-    found = []
-    for octets in pieces:
-        path = folder / "piece"
-        path.write_bytes(octets)
-        made = ingest_file(ground, path, spacecraft_id=SPACECRAFT)
-        with ground.database.reading() as connection:
-            kept = store.get_ingest(connection, made.ingest_id)
-        assert kept.accounting == made
-        assert kept.state == "done"
-        found.append(made.model_dump(exclude={"ingest_id"}))
-    return found
+def ingest(ground: Ground, octets: bytes) -> None:
+    """Ingest a piece and check its stored result."""
+    path = ground.home / "piece"
+    path.write_bytes(octets)
+    made = ingest_file(ground, path, spacecraft_id=SPACECRAFT)
+    kept = ground.read(store.get_ingest, made.ingest_id)
+    assert (kept.accounting, kept.state) == (made, "done")
 
 
-def test_a_small_piece_takes_few_statements_in_two_transactions(
-    either: Ground, pieces: list[bytes], tmp_path: Path
-) -> None:
-    ingest_all(either, pieces[:3], tmp_path)
-    path = tmp_path / "next"
-    path.write_bytes(pieces[3])
-    statements: list[str] = []
-    until_commit: list[int] = []
+def test_a_small_piece_takes_few_statements_in_two_transactions(either: Ground, pieces: list[bytes]) -> None:
+    for piece in pieces[:3]:
+        ingest(either, piece)
+    statements = []
+    until_commit = []
     engine = either.database.engine
     event.listen(engine, "before_cursor_execute", lambda *given: statements.append(given[2]))
     event.listen(
         engine, "commit", lambda c: c.get_execution_options()["linna_write"] and until_commit.append(len(statements))
     )
-    result = ingest_file(either, path, spacecraft_id=SPACECRAFT)
-    with either.database.reading() as connection:
-        assert store.get_ingest(connection, result.ingest_id).accounting == result
+    ingest(either, pieces[3])
     # What follows the second commit are the automatic steps. SQLite begins transactions and has the bulk inserts.
     entered, stored = until_commit[:2]
     limit = STATEMENTS if either.database.dialect == "postgresql" else STATEMENTS + 6
@@ -75,13 +60,11 @@ def test_the_declared_link_follows_new_mission_descriptions(either: Ground) -> N
     piece = Piece(1, "flight", SPACECRAFT, "0" * 64, 1279, "", 0)
 
     def known() -> Any:
-        with either.database.reading() as connection:
-            return known_before(connection, piece)
+        return either.read(known_before, piece)
 
     assert known().expected.settings == (LinkSettings().explicit,)
     assert known().around.vehicle_id is None
-    with either.database.writing() as connection:
-        vehicle = vehicle_id(connection, SPACECRAFT, "flight")
+    vehicle = either.write(vehicle_id, SPACECRAFT, "flight")
     assert known().around.vehicle_id == vehicle
     text = f'name = "one"\n[spacecraft]\nid = {SPACECRAFT}\n[link]\nframe_length = 1115\ncoding = "none"\n'
     add_mission(either, text.encode(), actor="ann")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ground_service.errors import InvalidInput, StorageFull
-from ground_service.ground import Ground
+from ground_service.ground import Ground, open_ground
 from ground_service.ingest import store
 from ground_service.ingest.core import NO_TIME, LinkContent, RecordFormat
 from ground_service.ingest.frames import FrameReader, Section
@@ -36,8 +36,6 @@ from tmtc.packets.stream import cut_packets
 
 @pytest.fixture
 def expected(synthetic_pass: Any, tmp_path: Path) -> str:
-    from ground_service.ground import open_ground
-
     with open_ground(tmp_path / "whole") as ground:
         ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
         return hash_of(ground)
@@ -48,36 +46,36 @@ def stream(synthetic_pass: Any) -> bytes:
     return bytes((synthetic_pass.folder / "downlink.cadu").read_bytes())
 
 
-def spool_of(ground: Ground, folder: Path, seen: list[Any]) -> Spool:
+def spool_of(ground: Ground, seen: list[Any]) -> Spool:
     def ingest(path: Path, recording: str, offset: int) -> dict[str, Any]:
         return {"packets_new": ingest_file(ground, path, place=Place(recording, offset)).packets_new}
 
-    return Spool(folder, ingest, lambda _path, result: seen.append(result))
+    return Spool(ground.home / "spool", ingest, lambda _path, result: seen.append(result))
 
 
-def test_segments_cut_at_any_octet_are_pieces_of_one_recording(
-    ground: Ground, stream: bytes, expected: str, tmp_path: Path
-) -> None:
-    seen: list[Any] = []
-    spool = spool_of(ground, tmp_path / "spool", seen)
+def take(spool: Spool, octets: bytes) -> None:
+    spool.keep(octets)
+    spool.cut()
+    spool.drain()
+
+
+def test_segments_cut_at_any_octet_are_pieces_of_one_recording(ground: Ground, stream: bytes, expected: str) -> None:
+    spool = spool_of(ground, seen := [])
     assert spool.open() == 0
     for start, stop in pairwise([0, 700, 4 * 1279 + 300, 4 * 1279 + 301, len(stream)]):
-        spool.keep(stream[start:stop])
-        spool.cut()
-        spool.drain()
+        take(spool, stream[start:stop])
     assert len(seen) == 4
     assert hash_of(ground) == expected
     spool.begin()
-    assert list((tmp_path / "spool").iterdir()) == []
+    assert list((ground.home / "spool").iterdir()) == []
 
 
 @pytest.mark.parametrize("drained", [False, True])
 def test_the_recording_of_a_run_that_crashed_goes_on(
-    ground: Ground, stream: bytes, expected: str, tmp_path: Path, drained: bool
+    ground: Ground, stream: bytes, expected: str, drained: bool
 ) -> None:
     """Also if all its segments are ingested."""
-    folder, seen = tmp_path / "spool", []
-    crashed = spool_of(ground, folder, seen)
+    crashed = spool_of(ground, [])
     crashed.open()
     for octets in (stream[:2000], stream[2000:3000]):
         crashed.keep(octets)
@@ -87,24 +85,22 @@ def test_the_recording_of_a_run_that_crashed_goes_on(
     if not drained:
         crashed.keep(stream[3000:4000])
         crashed._stream.close()
-    spool = spool_of(ground, folder, seen)
+    spool = spool_of(ground, [])
     assert spool.open() == (0 if drained else 4000)
     spool.drain()
-    spool.keep(stream[3000 if drained else 4000 :])
-    spool.cut()
-    spool.drain()
+    take(spool, stream[3000 if drained else 4000 :])
     assert hash_of(ground) == expected
 
 
 def test_the_segments_of_a_version_without_recordings_are_consecutive(
-    ground: Ground, stream: bytes, expected: str, tmp_path: Path
+    ground: Ground, stream: bytes, expected: str
 ) -> None:
-    folder = tmp_path / "spool"
+    folder = ground.home / "spool"
     folder.mkdir()
     (folder / "000000000004.segment").write_bytes(stream[:700])
     (folder / "000000000005.segment").write_bytes(stream[700:3000])
     (folder / "current").write_bytes(stream[3000:])
-    spool = spool_of(ground, folder, [])
+    spool = spool_of(ground, [])
     assert spool.open() == len(stream)
     spool.drain()
     assert hash_of(ground) == expected
@@ -116,24 +112,19 @@ def test_a_segment_stays_in_the_spool_while_the_store_is_full(stream: bytes, tmp
 
     spool = Spool(tmp_path, full, lambda *_: None)
     spool.open()
-    spool.keep(stream)
-    spool.cut()
     with pytest.raises(StorageFull):
-        spool.drain()
+        take(spool, stream)
     assert b"".join(path.read_bytes() for path in tmp_path.glob("*.segment")) == stream
 
 
 def test_noise_is_part_of_the_recording_and_an_unknown_coding_does_not_stop_the_rest(
-    ground: Ground, stream: bytes, expected: str, tmp_path: Path
+    ground: Ground, stream: bytes, expected: str
 ) -> None:
-    seen: list[Any] = []
-    spool = spool_of(ground, tmp_path / "spool", seen)
+    spool = spool_of(ground, seen := [])
     spool.open()
     markers = bytes.fromhex("1ACFFC1D") + np.random.default_rng(1).bytes(1275)
     for octets in (b"\x00" * 5000, 40 * markers, stream):
-        spool.keep(octets)
-        spool.cut()
-        spool.drain()
+        take(spool, octets)
     assert seen[:2] == [{"packets_new": 0}] * 2
     assert hash_of(ground) == expected
 
@@ -147,9 +138,9 @@ def test_files_that_appear_are_ingested_once_when_they_are_whole(tmp_path: Path)
             folder, tmp_path / "ledger.json", lambda path: {"file": path.name}, lambda p, r: seen.append(r)
         )
 
-    for name, age in (("a.cadu", 100), ("b.cadu", 0), ("c.part", 100), (".hidden", 100)):
+    for name in ("a.cadu", "b.cadu", "c.part", ".hidden"):
         (folder / name).write_bytes(b"x")
-        os.utime(folder / name, (1000.0 - age, 1000.0 - age))
+        os.utime(folder / name, (1000.0 - 100.0 * (name[0] != "b"),) * 2)
     assert watched().look(1000.0) == 1
     assert watched().look(1010.0) == 1  # the second one has settled; another process remembers the first
     assert watched().look(1020.0) == 0
@@ -189,9 +180,8 @@ def test_a_packet_has_the_reception_time_of_the_frame_in_which_it_begins(window_
     section = Section(SETTINGS, 0, len(stream), 0, len(stream))
     reader = FrameReader(section, SETTINGS, LinkContent(), spacecraft_id=76, record=RECORD)
     blocks = [stream[at : at + window_octets] for at in range(0, len(stream), window_octets)]
-    found: dict[int, int] = {}
+    found = {}
     for batch in reader.batches((as_octets(one), one is blocks[-1]) for one in blocks):
-        assert batch.received_utc_ns is not None
         found |= dict(zip(batch.sequence_count.tolist(), batch.received_utc_ns.tolist(), strict=True))
     starts = np.cumsum([0, *map(len, packets)])
     zone = SETTINGS.frame_length - FRAME_HEADER_LENGTH - CRC_LENGTH
@@ -201,8 +191,7 @@ def test_a_packet_has_the_reception_time_of_the_frame_in_which_it_begins(window_
         # A packet that is continued in a later window of the reader has the time of its end.
         expected = {int(times[first])} if window_octets > len(stream) else {int(times[first]), int(times[last])}
         assert found[k] in expected
-    assert reader.found.first_utc_ns == times[0]
-    assert reader.found.last_utc_ns == times[-1]
+    assert (reader.found.first_utc_ns, reader.found.last_utc_ns) == (times[0], times[-1])
 
 
 def test_reports_of_clocks_that_differ_are_left_out() -> None:

@@ -25,6 +25,7 @@ from ground_service.planning.service import WindowEntry, add_window
 from ground_service.planning.store import get_record
 from ground_service.planning.window_states import PlannedSpan, WindowEvidence, span_conflicts, state_of
 from lunar.camera import PinholeCamera
+from lunar.catalogue import load_catalogue
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.frames import IauOrientation
@@ -32,6 +33,7 @@ from lunar.messages.oem import load_oem, save_oem
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from tests.ground_service.conftest import add_reference, save_circle
+from tmtc.dictionary.payload import DICTIONARY
 
 NS = 1_000_000_000
 START = parse_utc("2029-08-07T06:00:00Z")
@@ -126,23 +128,13 @@ def test_an_empty_result_names_the_smallest_set_of_constraints_and_the_nearest_r
 
 
 def test_craters_are_counted_in_the_camera(make_pass: Callable[..., Any]) -> None:
-    from lunar.catalogue import load_catalogue
-    from lunar.messages.ephemeris_files import load_ephemeris
-
     folder = make_pass(frames=6, seed=3).folder
-    ephemeris, catalogue = load_ephemeris(folder / "reference.oem"), load_catalogue(folder / "catalogue.csv")
+    ephemeris, catalogue = load_oem(folder / "reference.oem"), load_catalogue(folder / "catalogue.csv")
     plan = Planner(ephemeris, IauOrientation(), Resources(), PinholeCamera(), catalogue)
-    many = plan.search(
-        Constraints(craters_per_frame=30.0, minimum_duration_s=60.0),
-        ephemeris.start_utc_ns,
-        ephemeris.stop_utc_ns,
-        15.0,
-    ).candidates
-    assert len(many) == 1
-    assert many[0].craters_per_frame is not None
-    assert many[0].craters_per_frame[0] >= 30.0
+    (one,) = search(plan, craters_per_frame=30.0, minimum_duration_s=60.0).candidates
+    assert one.craters_per_frame[0] >= 30.0
     # Craters were only placed around the six frames: the search has to find that stretch and no other.
-    middle = (many[0].start_utc_ns + many[0].stop_utc_ns) // 2
+    middle = (one.start_utc_ns + one.stop_utc_ns) // 2
     assert abs(middle - (START + 38 * NS)) < 60 * NS
 
 
@@ -181,29 +173,20 @@ def test_the_battery_falls_with_the_load() -> None:
 def test_data_leave_the_store_in_the_order_they_came() -> None:
     first, second = Option(0, 100 * NS, 1000), Option(200 * NS, 300 * NS, 500)
     contacts = [
-        PredictedContact("a", 400 * NS, 460 * NS),
-        PredictedContact("b", 450 * NS, 500 * NS),
-        PredictedContact("a", 900 * NS, 960 * NS),
+        PredictedContact(one, a * NS, b * NS) for one, a, b in zip("aba", (400, 450, 900), (460, 500, 960), strict=True)
     ]
     # 1000 octets at 80 bit/s take the 100 s of the two contacts that overlap; the next 50 s carry the other 500.
-    peak, by = storage_peak([first, second], contacts, 80.0, second)
-    assert (peak, by) == (1500, 950 * NS)
-    peak, by = storage_peak([first, second], [PredictedContact("a", 100 * NS, 200 * NS)], 80.0, second)
-    assert (peak, by) == (1000, None)
+    assert storage_peak([first, second], contacts, 80.0, second) == (1500, 950 * NS)
+    early = [PredictedContact("a", 100 * NS, 200 * NS)]
+    assert storage_peak([first, second], early, 80.0, second) == (1000, None)
     assert storage_peak([first], contacts, 0.0, first) == (1000, None)
 
 
 def test_data_of_a_frame_are_as_long_as_its_packets() -> None:
     # Packet lengths by the ICD: detections 35 + 9 n, navigation state 84, frame outcome 59, housekeeping 92 octets.
-    from tmtc.dictionary.payload import DICTIONARY
-
-    lengths = {n: DICTIONARY.packet(n).base_length for n in ("navigation_state", "frame_outcome", "housekeeping")}
-    one = (
-        DICTIONARY.packet("detections").base_length
-        + 10 * 9
-        + 2 * sum(lengths[n] for n in ("navigation_state", "frame_outcome"))
-    )
-    assert data_octets(3, 10.0, 2) == 3 * (one + lengths["housekeeping"])
+    names = ("detections", "navigation_state", "frame_outcome", "housekeeping")
+    detections, state, outcome, housekeeping = (DICTIONARY.packet(name).base_length for name in names)
+    assert data_octets(3, 10.0, 2) == 3 * (detections + 10 * 9 + 2 * (state + outcome) + housekeeping)
 
 
 def test_windows_conflict_where_they_overlap() -> None:
@@ -222,35 +205,30 @@ def test_windows_conflict_where_they_overlap() -> None:
 
 
 SENT = ("completed", "accepted")
+STATES = """\
+draft draft started=True
+failed failed frames=5
+approved approved
+approved approved command_states=("released", "carried")
+approved uplinked command_states=SENT
+approved failed command_states=("sent", "failed")
+approved failed predecessor_failed=True, command_states=SENT
+approved failed replaced=True, command_states=SENT, frames=2
+approved failed command_states=SENT, received_after=True
+approved executing command_states=SENT, started=True
+approved executing command_states=SENT, frames=2
+approved executed command_states=SENT, started=True, stopped=True, lost=2
+approved executed command_states=SENT, frames=9, received_after=True, lost=1
+approved downlinked command_states=SENT, frames=9, received_after=True, lost=0
+approved processed command_states=SENT, frames=9, received_after=True, lost=0, reported=True"""
 
 
-@pytest.mark.parametrize(
-    ("evidence", "expected"),
-    [
-        (WindowEvidence("draft", started=True), "draft"),
-        (WindowEvidence("failed", frames=5), "failed"),
-        (WindowEvidence("approved"), "approved"),
-        (WindowEvidence("approved", command_states=("released", "carried")), "approved"),
-        (WindowEvidence("approved", command_states=SENT), "uplinked"),
-        (WindowEvidence("approved", command_states=("sent", "failed")), "failed"),
-        (WindowEvidence("approved", predecessor_failed=True, command_states=SENT), "failed"),
-        (WindowEvidence("approved", replaced=True, command_states=SENT, frames=2), "failed"),
-        (WindowEvidence("approved", command_states=SENT, received_after=True), "failed"),
-        (WindowEvidence("approved", command_states=SENT, started=True), "executing"),
-        (WindowEvidence("approved", command_states=SENT, frames=2), "executing"),
-        (WindowEvidence("approved", command_states=SENT, started=True, stopped=True, lost=2), "executed"),
-        (WindowEvidence("approved", command_states=SENT, frames=9, received_after=True, lost=1), "executed"),
-        (WindowEvidence("approved", command_states=SENT, frames=9, received_after=True, lost=0), "downlinked"),
-        (
-            WindowEvidence("approved", command_states=SENT, frames=9, received_after=True, lost=0, reported=True),
-            "processed",
-        ),
-    ],
-)
-def test_the_state_follows_from_the_facts(evidence: WindowEvidence, expected: str) -> None:
-    state, reason = state_of(evidence)
+@pytest.mark.parametrize("row", STATES.splitlines())
+def test_the_state_follows_from_the_facts(row: str) -> None:
+    decision, expected, facts = f"{row} ".split(" ", 2)
+    state, reason = state_of(WindowEvidence(decision, **eval(f"dict({facts})")))
     assert state == expected
-    assert (reason is not None) == (state == "failed" and evidence.decision == "approved")
+    assert (reason is not None) == (state == "failed" and decision == "approved")
 
 
 def test_a_window_that_failed_names_the_telecommand_and_its_failure() -> None:
@@ -269,24 +247,17 @@ def window(ephemeris_id: int | None = None) -> WindowEntry:
     return WindowEntry("w", OUTSIDE, OUTSIDE + 600 * 10**9, 15.0, 76, ephemeris_id=ephemeris_id)
 
 
-def test_a_window_outside_the_ephemerides_has_no_prediction(ground: Ground, synthetic_pass: Any) -> None:
-    add_reference(ground, synthetic_pass.folder / "reference.oem")
+def test_a_window_outside_the_ephemerides_has_no_prediction_and_is_refused_if_it_needs_one(
+    ground: Ground, synthetic_pass: Any
+) -> None:
+    """It names the ephemeris, or its tables are made of one."""
+    named = add_reference(ground, synthetic_pass.folder / "reference.oem")
     predicted = add_window(ground, window(), actor="ann").predicted
     assert (predicted.frames, predicted.battery_minimum, predicted.downlinked_by) == (40, None, None)
-
-
-def test_a_window_whose_tables_need_the_ephemeris_is_refused_outside_it(ground: Ground, synthetic_pass: Any) -> None:
-    add_reference(ground, synthetic_pass.folder / "reference.oem")
-    add_mission(ground, (MISSION + "[uploads]\n").encode())
-    with pytest.raises(PlanConflicts, match="expected a time that a reference ephemeris covers"):
-        add_window(ground, window(), actor="ann")
-
-
-def test_a_window_must_lie_in_the_ephemeris_that_it_names(ground: Ground, synthetic_pass: Any) -> None:
-    file = ground.files.put_file(synthetic_pass.folder / "reference.oem")
-    named = add_ephemeris(ground, file, name="reference")
-    with pytest.raises(PlanConflicts, match="expected a time that a reference ephemeris covers"):
-        add_window(ground, window(named.id), actor="ann")
+    for key in (named, None):
+        with pytest.raises(PlanConflicts, match="expected a time that a reference ephemeris covers"):
+            add_window(ground, window(key), actor="ann")
+        add_mission(ground, (MISSION + "[uploads]\n").encode())
 
 
 def test_an_ephemeris_that_gravity_does_not_move_is_refused_with_the_accelerations(

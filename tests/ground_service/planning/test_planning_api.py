@@ -37,7 +37,7 @@ def client(synthetic_pass: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def window(client: TestClient, start_s: float, stop_s: float, **fields: Any) -> Any:
-    body = {"start": at(start_s), "stop": at(stop_s), "spacecraft_id": 76, **fields}
+    body = {"start": at(start_s), "stop": at(stop_s), "spacecraft_id": 76} | fields
     return client.post(f"{V1}/windows", json=body)
 
 
@@ -45,25 +45,46 @@ def approved(client: TestClient, start_s: float, stop_s: float, **fields: Any) -
     made = window(client, start_s, stop_s, **fields)
     assert made.status_code == 201, made.text
     key = made.json()["id"]
-    answer = client.patch(f"{V1}/windows/{key}", json={"state": "approved"})
+    answer = change(client, key)
     assert answer.status_code == 200, answer.text
     return int(key)
 
 
+def shown(client: TestClient, key: int) -> Any:
+    return client.get(f"{V1}/windows/{key}").json()
+
+
+def change(client: TestClient, key: int, state: str = "approved", **fields: Any) -> Any:
+    return client.patch(f"{V1}/windows/{key}", json={"state": state, **fields})
+
+
+def uplink(client: TestClient, key: int) -> Any:
+    return client.post(f"{V1}/windows/{key}/uplink")
+
+
+def sent(client: TestClient, key: int) -> bytes:
+    """Release the telecommands of a window and take the uplink."""
+    uplink(client, key)
+    return client.post(f"{V1}/uplink?spacecraft_id=76").content
+
+
+def receive(client: TestClient, packets: list[bytes]) -> None:
+    assert client.post(f"{V1}/telemetry", content=encode_cadus(packets, spacecraft_id=76)).status_code == 202
+
+
 def test_windows_are_searched_over_the_uploaded_ephemeris(client: TestClient) -> None:
+    def search(asked: Any) -> Any:
+        return client.post(f"{V1}/windows/search", json=asked)
+
     body = {
         "altitude_km": {"min": 29, "max": 31}, "maximum_duration_s": 600, "spacecraft_id": 76,
         "minimum_battery": 0.1,
     }  # fmt: skip
-    found = client.post(f"{V1}/windows/search", json=body)
-    assert found.status_code == 200, found.text
-    document = found.json()
-    assert document["candidates"]
-    first = document["candidates"][0]
-    assert 29.9 < first["altitude_km"]["min"] <= first["altitude_km"]["max"] < 30.1
+    document = search(body).json()
+    altitude = document["candidates"][0]["altitude_km"]
+    assert 29.9 < altitude["min"] <= altitude["max"] < 30.1
     assert document["contacts"]
-    none = client.post(f"{V1}/windows/search", json={"altitude_km": {"min": 50, "max": 60}}).json()
-    assert none["candidates"] == []
+    assert search({"altitude_km": {"min": 50, "max": 60}}).json()["candidates"] == []
     for refused in (
         {"craters_per_frame": 5},  # no catalogue here
         {"terrain": "mare"},  # no map here
@@ -72,7 +93,7 @@ def test_windows_are_searched_over_the_uploaded_ephemeris(client: TestClient) ->
         {"altitude_km": {"min": 2, "max": 1}},
         {"start": "yesterday"},
     ):
-        answer = client.post(f"{V1}/windows/search", json=refused)
+        answer = search(refused)
         assert answer.status_code == 422, (refused, answer.text)
 
 
@@ -91,10 +112,9 @@ def test_what_overlaps_a_committed_window_is_answered_with_409(client: TestClien
 
 def test_drafts_may_overlap_but_only_one_can_be_approved(client: TestClient) -> None:
     keys = [window(client, 0, 300).json()["id"] for _ in range(2)]
-    assert client.patch(f"{V1}/windows/{keys[0]}", json={"state": "approved"}).status_code == 200
-    assert client.patch(f"{V1}/windows/{keys[1]}", json={"state": "approved"}).status_code == 409
-    moved = client.patch(f"{V1}/windows/{keys[1]}", json={"start": at(300), "stop": at(400), "state": "approved"})
-    assert moved.status_code == 200
+    assert change(client, keys[0]).status_code == 200
+    assert change(client, keys[1]).status_code == 409
+    assert change(client, keys[1], start=at(300), stop=at(400)).status_code == 200
     assert client.patch(f"{V1}/windows/{keys[1]}", json={"cadence_s": 5}).status_code == 409
 
 
@@ -127,10 +147,10 @@ def test_an_approved_window_becomes_time_tagged_telecommands(client: TestClient)
     assert [one["time"] for one in preview[1:]] == [f"{at(seconds)[:-1]}.000000Z" for seconds in (60, 360)]
     assert preview[1]["text"] == "function start observation, duration 310 s, cadence 10 s"
     assert client.get(f"{V1}/telecommands").json()["total"] == 0
-    assert client.post(f"{V1}/windows/{key}/uplink").json()["total"] == 3
-    again = client.post(f"{V1}/windows/{key}/uplink").json()
+    assert uplink(client, key).json()["total"] == 3
+    again = uplink(client, key).json()
     assert [one["name"] for one in again["items"]] == ["enable_schedule", "insert_activity", "insert_activity"]
-    stream = client.post(f"{V1}/uplink", params={"spacecraft_id": 76}).content
+    stream = client.post(f"{V1}/uplink?spacecraft_id=76").content
     packets = [DICTIONARY.unpack_command(packet) for packet in UplinkDecoder(76).decode(stream).packets]
     assert [packet.name for packet in packets] == ["enable_schedule", "insert_activity", "insert_activity"]
     inner = []
@@ -141,20 +161,20 @@ def test_an_approved_window_becomes_time_tagged_telecommands(client: TestClient)
     assert (inner[0].values["argument_1"], inner[0].values["argument_2"]) == (310.0, 10.0)
     counts = [one.sequence_count for one in (*packets, *inner)]
     assert len(set(counts)) == len(counts)
-    assert client.get(f"{V1}/windows/{key}").json()["state"] == "uplinked"
+    assert shown(client, key)["state"] == "uplinked"
     assert client.delete(f"{V1}/windows/{key}").status_code == 409
-    assert client.patch(f"{V1}/windows/{key}", json={"state": "draft"}).status_code == 409
-    failed = client.patch(f"{V1}/windows/{key}", json={"state": "failed", "reason": "spacecraft in safe mode"})
+    assert change(client, key, "draft").status_code == 409
+    failed = change(client, key, "failed", reason="spacecraft in safe mode")
     assert failed.json()["reason"] == "spacecraft in safe mode"
 
 
 def test_a_draft_or_a_failed_window_is_not_uplinked(client: TestClient) -> None:
     key = window(client, 0, 300).json()["id"]
-    assert client.post(f"{V1}/windows/{key}/uplink").status_code == 409
+    assert uplink(client, key).status_code == 409
     before = approved(client, 400, 500)
     after = approved(client, 600, 700, predecessor_id=before)
-    client.patch(f"{V1}/windows/{before}", json={"state": "failed", "reason": "x"})
-    assert client.post(f"{V1}/windows/{after}/uplink").status_code == 409
+    change(client, before, "failed", reason="x")
+    assert uplink(client, after).status_code == 409
 
 
 def ticks_at(seconds: float) -> int:
@@ -188,22 +208,20 @@ def telemetry(frames: int = 5) -> list[bytes]:
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
 def test_the_state_follows_telemetry_in_whatever_order_it_comes(client: TestClient, order: tuple[int, ...]) -> None:
     key = approved(client, 60, 120)
-    client.post(f"{V1}/windows/{key}/uplink")
-    client.post(f"{V1}/uplink", params={"spacecraft_id": 76})
+    sent(client, key)
     packets = telemetry()
     pieces = [packets[:3], packets[3:7], packets[7:]]
     seen = []
     for number in order:
-        stream = encode_cadus(pieces[number], spacecraft_id=76)
-        assert client.post(f"{V1}/telemetry", content=stream).status_code == 202
-        seen.append(client.get(f"{V1}/windows/{key}").json()["state"])
+        receive(client, pieces[number])
+        seen.append(shown(client, key)["state"])
     assert seen[-1] == "processed"  # the default rules have made its report
     if order == (0, 1, 2):
         assert seen[:2] == ["executing", "executed"]
-    shown = client.get(f"{V1}/windows/{key}").json()
-    assert client.get(f"{V1}/passes/{shown['pass_id']}").json()["manifest"]["window_id"] == key
-    assert client.post(f"{V1}/passes/{shown['pass_id']}/reports").status_code == 202
-    assert client.get(f"{V1}/windows/{key}").json()["state"] == "processed"
+    window = shown(client, key)
+    assert client.get(f"{V1}/passes/{window['pass_id']}").json()["manifest"]["window_id"] == key
+    assert client.post(f"{V1}/passes/{window['pass_id']}/reports").status_code == 202
+    assert shown(client, key)["state"] == "processed"
 
 
 @pytest.mark.parametrize(
@@ -218,34 +236,26 @@ def test_a_window_without_images_fails_when_no_packet_of_its_time_may_come(
     client: TestClient, mission_time: Clock, received: tuple[int, int], last_s: int, expected: str
 ) -> None:
     key = approved(client, 1860, 1920)
-    client.post(f"{V1}/windows/{key}/uplink")
-    client.post(f"{V1}/uplink", params={"spacecraft_id": 76})
+    sent(client, key)
     mission_time.utc_ns = START + (1920 + last_s) * NS
     for count, seconds in zip(received, (1700, 1920 + last_s), strict=True):
-        stream = encode_cadus([event_packet(ticks_at(seconds), count)], spacecraft_id=76)
-        assert client.post(f"{V1}/telemetry", content=stream).status_code == 202
-    assert client.get(f"{V1}/windows/{key}").json()["state"] == expected
+        receive(client, [event_packet(ticks_at(seconds), count)])
+    assert shown(client, key)["state"] == expected
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {"name": "two\nlines"}, {"name": "\x1b[2J"}, {"name": "nul\x00"}, {"cadence_s": True},
-        {"spacecraft_id": True}, {"spacecraft_id": 1024},
-    ],
-)  # fmt: skip
-def test_a_window_with_a_value_of_another_kind_is_refused(client: TestClient, fields: dict[str, Any]) -> None:
-    entry = {"name": "n", "start": at(0), "stop": at(300), "spacecraft_id": 76, **fields}
-    assert client.post(f"{V1}/windows", json=entry).status_code == 422
+def test_a_window_with_a_value_of_another_kind_is_refused(client: TestClient) -> None:
+    names = [("name", name) for name in ("two\nlines", "\x1b[2J", "nul\x00")]
+    for field, value in (*names, ("cadence_s", True), ("spacecraft_id", True), ("spacecraft_id", 1024)):
+        assert window(client, 0, 300, **{"name": "n", field: value}).status_code == 422, field
     assert client.get(f"{V1}/windows").json()["total"] == 0
 
 
 def test_of_two_decisions_the_second_is_told_the_state_that_won(client: TestClient) -> None:
     key = approved(client, 0, 300)
-    assert client.patch(f"{V1}/windows/{key}", json={"state": "failed"}).status_code == 200
-    answer = client.patch(f"{V1}/windows/{key}", json={"state": "approved"})
+    assert change(client, key, "failed").status_code == 200
+    answer = change(client, key)
     assert (answer.status_code, answer.json()["state"]) == (409, "failed")
-    assert client.post(f"{V1}/windows/{key}/uplink").json()["state"] == "failed"
+    assert uplink(client, key).json()["state"] == "failed"
 
 
 def test_each_window_has_the_frames_that_its_event_reports_enclose(client: TestClient) -> None:
@@ -267,9 +277,8 @@ def test_each_window_has_the_frames_that_its_event_reports_enclose(client: TestC
     observe(15, range(240, 270, 10), 262, 260)
     observe(18, range(270, 330, 10), 331, 330, lost=4)
     sent.event("mode_changed", 900)
-    stream = encode_cadus(sent.packets, spacecraft_id=76)
-    assert client.post(f"{V1}/telemetry", content=stream).status_code == 202
-    found = [client.get(f"{V1}/windows/{key}").json() for key in keys]
+    receive(client, sent.packets)
+    found = [shown(client, key) for key in keys]
     counts = []
     for one in found:
         account = client.get(f"{V1}/passes/{one['pass_id']}/completeness").json()

@@ -39,6 +39,10 @@ def reference() -> Ephemeris:
     return Ephemeris((segment,))
 
 
+def prepared(ephemeris: Ephemeris | None, uploads: Uploads = ALL, *start: Any, late: int = 0) -> Any:
+    return prepare_window(uploads, ephemeris, IauOrientation(), START + late, STOP + late, ticks_of, 8, *start)
+
+
 def loaded(activities: list[Any]) -> dict[int, bytes]:
     """Octets by number of the table, as the payload puts the parts together."""
     receiver, found = LargeDataReceiver(), {}
@@ -48,20 +52,19 @@ def loaded(activities: list[Any]) -> dict[int, bytes]:
             octets = np.array([one["octet"] for one in arguments["items"]], dtype=np.uint8)
             values = {**arguments, "table": numbers[arguments["table"]], "items": {"octet": octets}}
             whole = receiver.accept(name, values)
-            assert whole is not None
             found[whole.table] = whole.octets
     return found
 
 
 def test_the_tables_hold_the_reference_at_on_board_times(reference: Ephemeris) -> None:
-    activities, state = prepare_window(ALL, reference, IauOrientation(), START, STOP, ticks_of, 8)
+    activities, state = prepared(reference)
     tables = loaded(activities)
     initial = unpack_initial_state(tables[9])
     assert initial.ticks == ticks_of(START)
     np.testing.assert_allclose(initial.position_icrf_m, [1.768e6, 0.0, 0.0], atol=1e-3)
     np.testing.assert_allclose(initial.velocity_icrf_m_s, [0.0, 0.0, 1664.97], atol=0.01)
     assert (initial.sigma_position_m, initial.sigma_velocity_m_s) == (500.0, 0.5)
-    assert state is not None and state.utc_ns == START
+    assert state.utc_ns == START
     anchor = unpack_anchor_table(tables[1])
     assert anchor.ticks[0] == ticks_of(START - 120 * NS) and anchor.ticks[-1] >= ticks_of(STOP + 100 * NS)
     k = int(np.flatnonzero(anchor.ticks == ticks_of(START))[0])
@@ -86,7 +89,7 @@ def test_a_window_of_the_experiment_starts_from_the_stated_error_with_its_declar
     np.testing.assert_array_equal(again.position_icrf_m, made[0].position_icrf_m)
     assert (experiment_state(reference, 1e3, START, 77).position_icrf_m != again.position_icrf_m).all()
     stated = experiment_accuracy(ALL, 1_000.0, again)
-    activities, state = prepare_window(stated, reference, IauOrientation(), START, STOP, ticks_of, 8, again)
+    activities, state = prepared(reference, stated, again)
     initial = unpack_initial_state(loaded(activities)[9])
     assert state is again and initial.sigma_position_m == 1_000.0
     assert initial.sigma_velocity_m_s == pytest.approx(0.9417, rel=5e-3)
@@ -96,7 +99,7 @@ def test_a_window_of_the_experiment_starts_from_the_stated_error_with_its_declar
 def test_standby_comes_first_then_the_tables_with_the_start_state_last_and_the_downlink_after_the_window(
     reference: Ephemeris,
 ) -> None:
-    activities, _ = prepare_window(ALL, reference, IauOrientation(), START, STOP, ticks_of, 8)
+    activities, _ = prepared(reference)
     times = [utc_ns for utc_ns, _, _ in activities]
     assert times == sorted(times)
     modes = [(utc_ns, one["argument_1"]) for utc_ns, name, one in activities if name == "perform_function"]
@@ -107,13 +110,11 @@ def test_standby_comes_first_then_the_tables_with_the_start_state_last_and_the_d
 
 
 def test_without_tables_only_the_mode_changes() -> None:
-    activities, state = prepare_window(Uploads(), None, IauOrientation(), START, STOP, ticks_of, 8)
+    activities, state = prepared(None, Uploads())
     assert [name for _, name, _ in activities] == ["perform_function"] * 2 and state is None
 
 
 def test_a_window_without_a_reference_that_covers_it_is_refused(reference: Ephemeris) -> None:
-    with pytest.raises(Conflict, match="its tables need a reference ephemeris"):
-        prepare_window(ALL, None, IauOrientation(), START, STOP, ticks_of, 8)
-    late = STOP + 7_200 * NS
-    with pytest.raises(Conflict, match="its tables need a reference ephemeris"):
-        prepare_window(ALL, reference, IauOrientation(), late, late + 600 * NS, ticks_of, 8)
+    for ephemeris, late in ((None, 0), (reference, 7_800 * NS)):
+        with pytest.raises(Conflict, match="its tables need a reference ephemeris"):
+            prepared(ephemeris, late=late)

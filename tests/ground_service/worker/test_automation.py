@@ -113,10 +113,17 @@ def prepared(
     return window.id
 
 
-def receive(ground: Ground, packets: list[bytes], folder: Path) -> None:
-    file = folder / f"{len(packets)}.cadu"
+def receive(ground: Ground, packets: list[bytes]) -> None:
+    file = ground.home / f"{len(packets)}.cadu"
     file.write_bytes(encode_downlink(packets))
     ingest_file(ground, file, spacecraft_id=SPACECRAFT)
+
+
+def followed(ground: Ground, flown: SyntheticPass, *given: str, **how: Any) -> int:
+    """Receive a prepared pass; return its window."""
+    window_id = prepared(ground, flown, *given, **how)
+    receive(ground, flown.packets)
+    return window_id
 
 
 def follow_up(ground: Ground) -> list[Job]:
@@ -139,28 +146,29 @@ def end_contact(ground: Ground, vehicle: int, utc_ns: int) -> None:
 
 def report_of(ground: Ground, pass_id: int) -> dict[str, Any]:
     path = ground.home / "reports" / f"pass-{pass_id}" / "report.json"
-    document: dict[str, Any] = json.loads(path.read_text())
-    return document
+    return json.loads(path.read_text())
 
 
-def test_a_live_pass_is_complete_and_processed_without_a_request(
-    either: Ground, flown: SyntheticPass, tmp_path: Path
-) -> None:
-    window_id = prepared(either, flown)
-    receive(either, flown.packets, tmp_path)
-    window = either.read(get_window, window_id)
-    assert window.state == "processed" and window.pass_id is not None
+def processed(ground: Ground, window_id: int) -> int:
+    """Return the pass of a window that is processed."""
+    window = ground.read(get_window, window_id)
+    assert window.state == "processed"
+    return window.pass_id
+
+
+def test_a_live_pass_is_complete_and_processed_without_a_request(either: Ground, flown: SyntheticPass) -> None:
+    window_id = followed(either, flown)
+    pass_id = processed(either, window_id)
     report, after = follow_up(either)
     assert (report.state, after.state) == ("done", "done")
     log = {one.number: one for one in events.read_events(either.database, 0, 1000)}
-    assert report.result is not None and after.result is not None
     assert log[report.arguments["event"]].payload == {"id": window_id, "state": "downlinked"}
     assert log[after.arguments["event"]].payload == {"id": window_id, "state": "processed"}
     assert set(report.result["report of pass 1"]["inputs"]["missing"]) == {"correlation"}
     kept = after.result["archive of pass 1"]
     assert (kept["state"], kept["reason"]) == ("telemetry only", LIVE)
     assert after.result["monthly report"] == {}  # the month of the pass is not complete
-    document = report_of(either, window.pass_id)
+    document = report_of(either, pass_id)
     assert document["evidence_level"].startswith("2 ")
     assert {one["name"] for one in document["navigation"] if one["kind"] == "baseline"} >= {"propagate-only", "Kepler"}
     assert 0.6 < document["detector"]["micro"]["recall"] < 0.8  # a quarter of the craters is not detected
@@ -169,70 +177,60 @@ def test_a_live_pass_is_complete_and_processed_without_a_request(
 
 
 def test_an_incomplete_window_is_processed_after_the_contact_and_late_data_change_its_report(
-    either: Ground, flown: SyntheticPass, tmp_path: Path
+    either: Ground, flown: SyntheticPass
 ) -> None:
     window_id = prepared(either, flown)
     lost = slice(20, 26)
-    receive(either, flown.packets[: lost.start] + flown.packets[lost.stop :], tmp_path)
+    receive(either, flown.packets[: lost.start] + flown.packets[lost.stop :])
     assert either.read(get_window, window_id).state == "executed" and follow_up(either) == []
-    with either.database.reading() as connection:
-        vehicle = windows.get_record(connection, window_id).vehicle_id
+    vehicle = either.read(windows.get_record, window_id).vehicle_id
     end_contact(either, vehicle, START)  # before the end of the window
     assert follow_up(either) == []
     end_contact(either, vehicle, STOP + NS)
-    window = either.read(get_window, window_id)
-    assert window.state == "processed" and window.pass_id is not None
+    pass_id = processed(either, window_id)
     assert done_steps(either) == ["report of pass 1", "archive of pass 1", "monthly report"]
-    first = report_of(either, window.pass_id)
+    first = report_of(either, pass_id)
     [kept] = kept_archives(either)
-    receive(either, flown.packets[lost], tmp_path)
+    receive(either, flown.packets[lost])
     [replaced] = kept_archives(either)
-    assert replaced.pass_id == kept.pass_id == window.pass_id and replaced.octets > kept.octets
-    again = report_of(either, window.pass_id)
+    assert replaced.pass_id == kept.pass_id == pass_id and replaced.octets > kept.octets
+    again = report_of(either, pass_id)
     assert again["packets"]["lost"] < first["packets"]["lost"]
-    assert either.read(get_window, window_id).state == "processed"
+    assert processed(either, window_id)
     end_contact(either, vehicle, STOP + 2 * NS)
     assert done_steps(either)[3:] == ["archive of pass 1"]
 
 
-def test_a_reference_that_arrives_after_the_report_completes_it(
-    either: Ground, flown: SyntheticPass, tmp_path: Path
-) -> None:
-    window_id = prepared(either, flown, reference=False)
-    receive(either, flown.packets, tmp_path)
-    window = either.read(get_window, window_id)
-    assert window.state == "processed" and window.pass_id is not None
-    reasons = report_of(either, window.pass_id)["not_available"]
+def test_a_reference_that_arrives_after_the_report_completes_it(either: Ground, flown: SyntheticPass) -> None:
+    window_id = followed(either, flown, reference=False)
+    pass_id = processed(either, window_id)
+    reasons = report_of(either, pass_id)["not_available"]
     assert reasons["error"] == "no reference ephemeris covers this pass" and "detector" in reasons
     deliver_reference(either, flown)
-    report = report_of(either, window.pass_id)
+    report = report_of(either, pass_id)
     assert 0.6 < report["detector"]["micro"]["recall"] < 0.8
     assert not {"detector", "reference", "error", "baselines"} & set(report["not_available"])
-    assert either.read(get_window, window_id).state == "processed"
-    newest = either.read(newest_report, window.pass_id, other_than="")
-    assert newest is not None and newest.previous_id is not None and newest.event_number is not None
+    assert processed(either, window_id)
+    newest = either.read(newest_report, pass_id, other_than="")
+    assert newest.previous_id is not None and newest.event_number is not None
     assert {one.state for one in follow_up(either)} == {"done"}
 
 
 def test_a_mission_without_a_camera_is_processed_and_its_report_says_what_that_means(
-    ground: Ground, flown: SyntheticPass, tmp_path: Path
+    ground: Ground, flown: SyntheticPass
 ) -> None:
     before, _, rest = MISSION.partition("[camera]")
-    window_id = prepared(ground, flown, mission=before + "[catalogue]" + rest.partition("[catalogue]")[2])
-    receive(ground, flown.packets, tmp_path)
-    window = ground.read(get_window, window_id)
-    assert window.state == "processed" and window.pass_id is not None
-    report = report_of(ground, window.pass_id)
+    window_id = followed(ground, flown, mission=before + "[catalogue]" + rest.partition("[catalogue]")[2])
+    pass_id = processed(ground, window_id)
+    report = report_of(ground, pass_id)
     said = "the mission description does not state sizes of the camera, which are assumed: image width (512 px)"
     assert [one for one in report["remarks"] if one.startswith(said)]
     [made, _] = follow_up(ground)
-    assert made.result is not None
     assert made.result["report of pass 1"]["inputs"]["missing"]["camera"].startswith(said)
 
 
-def test_an_event_that_is_followed_again_has_one_result(ground: Ground, flown: SyntheticPass, tmp_path: Path) -> None:
-    prepared(ground, flown)
-    receive(ground, flown.packets, tmp_path)
+def test_an_event_that_is_followed_again_has_one_result(ground: Ground, flown: SyntheticPass) -> None:
+    followed(ground, flown)
     for job in follow_up(ground):
         again = actions.run_steps(ground, job.arguments["event"])
         assert again.get("report of pass 1") == (job.result or {}).get("report of pass 1")
@@ -251,18 +249,18 @@ def test_a_follow_up_that_a_process_left_is_done_by_the_next(
         window_id = prepared(ground, flown)
         with monkeypatch.context() as patched:
             patched.setattr(actions, "make_report", full)
-            receive(ground, flown.packets, tmp_path)
+            receive(ground, flown.packets)
         assert [one.state for one in follow_up(ground)] == ["queued"]
         assert ground.read(get_window, window_id).state == "downlinked"
     with open_ground(tmp_path / "home") as ground:
         follow_in_process(ground)
         InlineDispatcher(ground).resume()
-        assert ground.read(get_window, window_id).state == "processed"
+        assert processed(ground, window_id)
         assert ground.read(unfinished_jobs) == []
 
 
 def test_a_report_that_failed_is_stated_at_its_window_and_made_later(
-    either: Ground, flown: SyntheticPass, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    either: Ground, flown: SyntheticPass, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: Any, **__: Any) -> Any:
         raise InvalidInput("report", "", "a renderer", "none")
@@ -270,7 +268,7 @@ def test_a_report_that_failed_is_stated_at_its_window_and_made_later(
     with monkeypatch.context() as patched:
         patched.setattr(actions, "make_report", broken)
         window_id = prepared(either, flown)
-        receive(either, flown.packets, tmp_path)
+        receive(either, flown.packets)
     [failed] = follow_up(either)
     why = "report: expected a renderer, found none"
     assert (failed.state, failed.error) == ("failed", f"report of pass 1: {why}")
@@ -280,7 +278,7 @@ def test_a_report_that_failed_is_stated_at_its_window_and_made_later(
     assert either.read(unfinished_jobs) == []
     either.write(repeat_failed, utc_now_ns() + 61 * NS)
     InlineDispatcher(either).resume()
-    assert either.read(get_window, window_id).state == "processed"
+    assert processed(either, window_id)
     assert {one.state for one in follow_up(either)} == {"done"}
 
 
@@ -304,20 +302,14 @@ def test_an_imported_archive_is_kept_once_unless_the_mission_evaluates_nothing(
     assert done_steps(ground) == ([] if evaluate is False else [f"archive of pass {pass_id}"])
 
 
-def test_a_mission_that_evaluates_nothing_leaves_its_windows_to_persons(
-    ground: Ground, flown: SyntheticPass, tmp_path: Path
-) -> None:
-    window_id = prepared(ground, flown, "[automation]\nevaluate = false\n")
-    receive(ground, flown.packets, tmp_path)
+def test_a_mission_that_evaluates_nothing_leaves_its_windows_to_persons(ground: Ground, flown: SyntheticPass) -> None:
+    window_id = followed(ground, flown, "[automation]\nevaluate = false\n")
     assert follow_up(ground) == [] and ground.read(get_window, window_id).state == "downlinked"
 
 
-def test_the_catalogue_of_a_live_pass_is_cut_to_its_track(ground: Ground, flown: SyntheticPass, tmp_path: Path) -> None:
-    window_id = prepared(ground, flown)
-    receive(ground, flown.packets, tmp_path)
-    pass_id = ground.read(get_window, window_id).pass_id
-    assert pass_id is not None
-    whole = evaluation.evaluate(ground, pass_id)
+def test_the_catalogue_of_a_live_pass_is_cut_to_its_track(ground: Ground, flown: SyntheticPass) -> None:
+    window_id = followed(ground, flown)
+    whole = evaluation.evaluate(ground, processed(ground, window_id))
     assert whole.detector is not None
     assert any("synthetic craters" in one for one in whole.data_sources)
 
@@ -337,17 +329,16 @@ def test_only_a_crater_catalogue_is_held(ground: Ground, flown: SyntheticPass) -
         add_catalogue(ground, ground.files.put_octets(b"a,b\n1,2\n"), "x.csv")
     for _ in range(2):
         add_catalogue(ground, ground.files.put_file(flown.folder / "catalogue.csv"), "craters.csv")
-    page = ground.read(list_catalogues, Paging())
-    held, total = page.items, page.total
-    assert total == 1 and held[0].name == "craters.csv"
+    (held,) = ground.read(list_catalogues, Paging()).items
+    assert held.name == "craters.csv"
 
 
 def test_a_worker_that_only_reads_events_enters_no_job_twice(tmp_path: Path, flown: SyntheticPass) -> None:
     with open_ground(tmp_path / "home") as ground:
-        jobs: list[str] = []
+        jobs = []
         follow = FollowUp(ground, start=jobs.append)
         prepared(ground, flown)
-        receive(ground, flown.packets, tmp_path)
+        receive(ground, flown.packets)
         for _ in range(3):
             follow.drain()
         assert jobs == ground.read(unfinished_jobs) == [one.id for one in follow_up(ground)] != []
@@ -359,10 +350,9 @@ def test_a_processed_pass_is_searched_for_landmarks(either: Ground, flown: Synth
     shutil.copytree(flown.folder, thin.folder)
     save_catalogue(full.select(np.arange(len(full)) % 3 != 0), thin.folder / "catalogue.csv")
     window_id = prepared(either, thin, "[automation]\nlandmarks = true\n")
-    receive(either, thin.packets, tmp_path)
-    assert either.read(get_window, window_id).state == "processed"
+    receive(either, thin.packets)
+    assert processed(either, window_id)
     [_, after] = follow_up(either)
-    assert after.result is not None
     added = after.result["landmarks of pass 1"]["added"]
     page = either.read(list_landmarks, LandmarkFilter(limit=1000))
     assert page.total == added > 20 and {one.state for one in page.items} == {"seen"}

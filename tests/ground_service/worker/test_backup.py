@@ -45,9 +45,8 @@ def rows_of_an_empty_service(ground: Ground) -> bool:
 def filled(ground: Ground, synthetic_pass: Any) -> tuple[Ground, str]:
     import_archive(ground, synthetic_pass.folder)
     for k in (2, 1):
-        add_window(
-            ground, WindowEntry(f"w{k}", START + k * 100 * NS, START + (k * 100 + 50) * NS, 15.0, 76), actor="ann"
-        )
+        start = START + k * 100 * NS
+        add_window(ground, WindowEntry(f"w{k}", start, start + 50 * NS, 15.0, 76), actor="ann")
     change_window(ground, 1, actor="ann", changes={"predecessor_id": 2})  # it names a window with a greater key
     return ground, add_user(ground, "ann", "operator")
 
@@ -93,18 +92,18 @@ def test_a_damaged_file_is_found_before_anything_is_restored(saved: Path, tmp_pa
             restore(saved, other)
 
 
-@pytest.mark.parametrize(
-    ("statement", "reason"),
-    [
-        ("UPDATE windows SET cadence_s = 15.000000000000002", "windows: expected the rows that were saved"),
-        ("UPDATE packets SET ticks = ticks + 1 WHERE id = 3", "packets: expected the rows that were saved"),
-        ("UPDATE housekeeping SET power_w = power_w + 1e-9", "housekeeping: expected the rows that were saved"),
-        ("DELETE FROM tokens", "tokens: expected 1 rows, found 0"),
-        ("INSERT INTO vehicles (ccsds_id, instance) VALUES (3, 'x')", "vehicles: expected"),
-        ("UPDATE audit_head SET number = 2", "audit_head: expected the rows that were saved"),
-    ],
-)
-def test_a_changed_row_of_a_backup_is_not_restored(saved: Path, tmp_path: Path, statement: str, reason: str) -> None:
+CHANGES = """\
+UPDATE windows SET cadence_s = 15.000000000000002 | windows: expected the rows that were saved
+UPDATE packets SET ticks = ticks + 1 WHERE id = 3 | packets: expected the rows that were saved
+UPDATE housekeeping SET power_w = power_w + 1e-9 | housekeeping: expected the rows that were saved
+DELETE FROM tokens | tokens: expected 1 rows, found 0
+INSERT INTO vehicles (ccsds_id, instance) VALUES (3, 'x') | vehicles: expected
+UPDATE audit_head SET number = 2 | audit_head: expected the rows that were saved"""
+
+
+@pytest.mark.parametrize("row", CHANGES.splitlines())
+def test_a_changed_row_of_a_backup_is_not_restored(saved: Path, tmp_path: Path, row: str) -> None:
+    statement, reason = row.split(" | ")
     with sqlite3.connect(saved / "linna.db") as connection:
         connection.execute(statement)
     connection.close()
@@ -145,16 +144,13 @@ def test_a_backup_of_version_1_0_is_restored(tmp_path: Path) -> None:
     saved.mkdir()
     database = open_database(f"sqlite:///{saved / 'linna.db'}")
     upgrade_database(database, "1.0")
+    user = "INSERT INTO users (name, role, state, created_utc_ns) VALUES ('ann', 'viewer', 'active', 1)"
     with database.writing() as connection:
-        connection.execute(
-            text("INSERT INTO users (name, role, state, created_utc_ns) VALUES ('ann', 'viewer', 'active', 1)")
-        )
-        connection.execute(text("INSERT INTO row_digests VALUES ('users', '1', 'x')"))
+        for statement in (user, "INSERT INTO row_digests VALUES ('users', '1', 'x')"):
+            connection.execute(text(statement))
     with database.snapshot() as connection:
-        tables = table_digests(connection)
-        head = read_head(connection)
+        tables, head = table_digests(connection), read_head(connection)
     database.engine.dispose()
-    assert head is not None
     manifest = {
         "schema_version": 2, "rows": {name: one.rows for name, one in tables.items()},
         "tables": {name: one.sha256 for name, one in tables.items()}, "files": 0,

@@ -60,7 +60,7 @@ def test_an_ingest_is_broken_off_when_the_service_stops_and_goes_on_at_the_next_
     with open_ground(tmp_path / "whole") as ground:
         ingest_file(ground, downlink)
         expected = hash_of(ground)
-    stored: list[int] = []
+    stored = []
     middle, go_on = threading.Event(), threading.Event()
     original = ingest_store.store_batch
 
@@ -99,7 +99,7 @@ def test_a_job_that_the_disk_stops_is_held_back_longer_each_time(
     downlink: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = [0.0]
-    tried: list[float] = []
+    tried = []
 
     def no_space(*_: Any) -> Any:
         tried.append(clock[0])
@@ -141,11 +141,6 @@ def test_a_job_is_done_once_the_disk_has_space(downlink: Path, tmp_path: Path, m
         dispatcher.close()
 
 
-def rows_of(ground: Ground, jobs: list[str]) -> list[dict[str, Any]]:
-    with ground.database.reading() as connection:
-        return [repository.get(connection, repository.JOBS, job, "job") for job in jobs]
-
-
 def test_replays_are_separate_jobs_and_the_verdict_follows(
     redis_url: str, make_flyable: Callable, make_build: Callable, tmp_path: Path
 ) -> None:
@@ -165,7 +160,7 @@ def test_replays_are_separate_jobs_and_the_verdict_follows(
         verdict = dispatcher.submit("regression", arguments)
         for job in (*replays, verdict):
             run_job(ground, job)
-        rows = rows_of(ground, [*replays, verdict])
+        rows = [row_of(ground, job) for job in (*replays, verdict)]
         assert [row["state"] for row in rows] == ["done"] * 5
         assert rows[-1]["result"] == {"regression_id": verdict, "verdict": "pass"}
         assert [row["result"]["outcome"] for row in rows[:-1]] == ["ok"] * 4
@@ -176,25 +171,28 @@ def test_replays_are_separate_jobs_and_the_verdict_follows(
 SPACECRAFT = 76
 
 
-def stream_of(spacecraft: int, count: int = 40) -> bytes:
-    return encode_cadus([event_packet(k << 16, k, "boot") for k in range(1, count + 1)], spacecraft_id=spacecraft)
+def stream_of(spacecraft: int = SPACECRAFT) -> bytes:
+    return encode_cadus([event_packet(k << 16, k, "boot") for k in range(1, 41)], spacecraft_id=spacecraft)
+
+
+def ingest(ground: Ground, octets: bytes, **stated: Any) -> None:
+    path = ground.home / "d.cadu"
+    path.write_bytes(octets)
+    ingest_file(ground, path, **stated)
 
 
 @pytest.mark.parametrize(
     "stated",
     [{"spacecraft_id": SPACECRAFT}, {"spacecraft_id": SPACECRAFT, "place": Place("s", 100)}, {"instance": "twin"}],
 )
-def test_what_was_stated_with_a_downlink_holds_for_its_verification(
-    ground: Ground, tmp_path: Path, stated: dict[str, Any]
-) -> None:
+def test_what_was_stated_with_a_downlink_holds_for_its_verification(ground: Ground, stated: dict[str, Any]) -> None:
     """A spacecraft filter excludes the same packets; pieces with a position are joined by position."""
-    octets = stream_of(SPACECRAFT) + stream_of(SPACECRAFT + 1)
+    octets = stream_of() + stream_of(SPACECRAFT + 1)
     place = stated.pop("place", None)
     cuts = [0, len(octets)] if place is None else [*range(0, 1200, 60), len(octets)]
     for start, stop in reversed(list(itertools.pairwise(cuts))):
-        (tmp_path / "piece").write_bytes(octets[start:stop])
         stands = None if place is None else Place(place.stream, place.offset + start)
-        ingest_file(ground, tmp_path / "piece", place=stands, **stated)
+        ingest(ground, octets[start:stop], place=stands, **stated)
     result = verify(ground, rebuild=True)
     assert (result.verdict, result.damaged) == ("intact", [])
 
@@ -206,11 +204,10 @@ def test_what_was_stated_with_a_downlink_holds_for_its_verification(
         ("DELETE FROM rollups WHERE level = 6", "expected this row, found none"),
     ],
 )
-def test_a_damaged_row_is_named(either: Ground, tmp_path: Path, damage: str, reason: str) -> None:
-    values: dict[str, Any] = {field.name: 1 for field in DICTIONARY.packet("housekeeping").fields}
+def test_a_damaged_row_is_named(either: Ground, damage: str, reason: str) -> None:
+    values = {field.name: 1 for field in DICTIONARY.packet("housekeeping").fields}
     packet = DICTIONARY.pack("housekeeping", values, ticks=1 << 16, sequence_count=0)
-    (tmp_path / "d.cadu").write_bytes(encode_cadus([packet], spacecraft_id=SPACECRAFT))
-    ingest_file(either, tmp_path / "d.cadu")
+    ingest(either, encode_cadus([packet], spacecraft_id=SPACECRAFT))
     assert verify(either, rebuild=True).damaged == []
     with either.database.writing() as connection:
         connection.execute(text(damage))
@@ -218,16 +215,15 @@ def test_a_damaged_row_is_named(either: Ground, tmp_path: Path, damage: str, rea
     assert verify(either).damaged == []
 
 
-def test_an_ingest_before_version_1_has_no_piece(either: Ground, tmp_path: Path) -> None:
+def test_an_ingest_before_version_1_has_no_piece(either: Ground) -> None:
     """The spacecraft of the ingest selects the frames."""
-    (tmp_path / "d.cadu").write_bytes(stream_of(SPACECRAFT) + stream_of(SPACECRAFT + 1))
-    ingest_file(either, tmp_path / "d.cadu", spacecraft_id=SPACECRAFT)
+    ingest(either, stream_of() + stream_of(SPACECRAFT + 1), spacecraft_id=SPACECRAFT)
     with either.database.writing() as connection:
         connection.execute(text("DELETE FROM pieces"))
     assert verify(either, rebuild=True).damaged == []
 
 
-def test_sums_of_roll_ups_may_differ_by_the_order_of_addition(ground: Ground, tmp_path: Path) -> None:
+def test_sums_of_roll_ups_may_differ_by_the_order_of_addition(ground: Ground) -> None:
     row = np.array([3.0, 0.6, 0.1, 0.3, 0.0, 0.0, np.inf, -np.inf])
     for index, change, same in ((1, 1e-16, True), (1, 1e-6, False), (3, 1e-16, False), (0, 1.0, False)):
         other = row.copy()
@@ -236,9 +232,8 @@ def test_sums_of_roll_ups_may_differ_by_the_order_of_addition(ground: Ground, tm
         assert same_values(ROLLUPS, *pair) == same
 
 
-def test_a_rebuild_writes_nothing_to_the_archive(either: Ground, tmp_path: Path) -> None:
-    (tmp_path / "d.cadu").write_bytes(stream_of(SPACECRAFT))
-    ingest_file(either, tmp_path / "d.cadu")
+def test_a_rebuild_writes_nothing_to_the_archive(either: Ground) -> None:
+    ingest(either, stream_of())
     with either.database.snapshot() as connection:
         before = table_digests(connection)
     names = sorted(either.files.names())

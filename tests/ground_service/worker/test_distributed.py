@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,12 +23,11 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
 from ground_service.store import repository
 from ground_service.store.database import prepare_database
-from ground_service.store.vehicles import vehicle_id
 from ground_service.worker import app as app_module
 from ground_service.worker.app import queued_jobs, run_worker, worker_answers
 from ground_service.worker.dispatch import dispatcher_for
 from ground_service.worker.jobs import run_job
-from tests.ground_service.archive_hash import archive_hash
+from tests.ground_service.archive_hash import hash_of
 from tests.serving import wait_for
 
 SPACECRAFT = 76
@@ -64,9 +64,7 @@ def test_the_archive_is_the_same_as_on_sqlite(ground_on_postgres: Ground, ground
         again = ingest_file(one, stream)
         assert first.packets_new == first.packets == len(synthetic_pass.packets)
         assert again.packets_new == 0
-        with one.database.reading() as connection:
-            vehicle = vehicle_id(connection, SPACECRAFT, "flight")
-            hashes.append(archive_hash(connection, vehicle))
+        hashes.append(hash_of(one))
     assert hashes[0] == hashes[1]
 
 
@@ -82,18 +80,14 @@ def test_a_worker_makes_the_report(
     assert job_row(ground, waiting)["state"] == "queued"
     hopeless = dispatcher.submit("report", {"pass_id": 4711})
     assert not worker_answers(settings, timeout_s=1.0)
-    environment = {
-        **os.environ, "LINNA_HOME": str(ground.home), "LINNA_DATABASE_URL": upgraded, "LINNA_BROKER_URL": redis_url,
-        "LINNA_DATA": "",
-    }  # fmt: skip
-    environment.pop("LINNA_DATA")
-    environment["LINNA_LOG_FORMAT"] = "json"
+    places = {"LINNA_HOME": str(ground.home), "LINNA_DATABASE_URL": upgraded, "LINNA_BROKER_URL": redis_url}
+    environment = os.environ | places | {"LINNA_LOG_FORMAT": "json"}
+    environment.pop("LINNA_DATA", None)
     with (tmp_path / "worker.log").open("wb") as log:
         worker = subprocess.Popen([sys.executable, "-m", "linna", "worker"], env=environment, stdout=log, stderr=log)
         try:
             row = finished(ground, waiting)
-            assert row["state"] == "done", row
-            assert row["attempts"] == 1
+            assert (row["state"], row["attempts"]) == ("done", 1), row
             failed = finished(ground, hopeless)
             assert (failed["state"], failed["error"]) == ("failed", "pass 4711: not found")
             assert worker_answers(settings, timeout_s=30.0)
@@ -120,10 +114,9 @@ def test_time_outs_are_found_on_a_server_as_well(ground_on_postgres: Ground) -> 
 
 
 def test_a_worker_without_a_broker_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match="LINNA_BROKER_URL: expected a broker"):
-        run_worker(Settings(home=tmp_path))
-    with pytest.raises(SettingsError, match="LINNA_BROKER_URL: expected a broker"):
-        worker_answers(Settings(home=tmp_path))
+    for use in (run_worker, worker_answers):
+        with pytest.raises(SettingsError, match="LINNA_BROKER_URL: expected a broker"):
+            use(Settings(home=tmp_path))
 
 
 def test_jobs_that_the_broker_lost_are_sent_again(ground_on_postgres: Ground, redis_url: str, upgraded: str) -> None:
@@ -149,12 +142,17 @@ def test_jobs_that_the_broker_lost_are_sent_again(ground_on_postgres: Ground, re
     assert run_job(ground, lost).error == "pass 4712: not found"
 
 
+def use_queue(monkeypatch: pytest.MonkeyPatch, **answer: Any) -> None:
+    """Let the queue of the broker give this answer."""
+    connection = MagicMock()
+    connection.__enter__.return_value.default_channel.client.lrange = MagicMock(**answer)
+    connection.__exit__.return_value = False
+    monkeypatch.setattr(app_module, "_app_of", lambda _: SimpleNamespace(connection_for_read=lambda: connection))
+
+
 def test_messages_of_other_programs_in_the_queue_are_no_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     messages = [b'{"headers": {"linna-job": "a1"}}', b"{}", b'{"headers": {}}', b"[1]", b"nothing"]
-    answered = SimpleNamespace(lrange=lambda *_: messages)
-    connection = MagicMock()
-    connection.__enter__.return_value.default_channel.client = answered
-    monkeypatch.setattr(app_module, "_app_of", lambda _: SimpleNamespace(connection_for_read=lambda: connection))
+    use_queue(monkeypatch, return_value=messages)
     assert queued_jobs(Settings(home=tmp_path)) == ["a1"]
 
 
@@ -163,13 +161,9 @@ def test_a_broker_that_breaks_off_is_a_broker_that_is_away(
 ) -> None:
     import redis
 
-    log, client = MagicMock(), MagicMock()
+    log = MagicMock()
     monkeypatch.setattr("ground_service.worker.dispatch.log", log)
-    client.lrange.side_effect = redis.ConnectionError("reset by peer")
-    connection = MagicMock()
-    connection.__enter__.return_value.default_channel.client = client
-    connection.__exit__.return_value = False
-    monkeypatch.setattr(app_module, "_app_of", lambda _: SimpleNamespace(connection_for_read=lambda: connection))
+    use_queue(monkeypatch, side_effect=redis.ConnectionError("reset by peer"))
     enter_job(ground, "report", {"pass_id": 1})
     dispatcher_for(ground, Settings(home=tmp_path, broker_url="redis://127.0.0.1:1/0")).resume()
     ((text, error), _) = log.warning.call_args
@@ -186,8 +180,6 @@ def test_a_broker_that_is_away_refuses_nothing(ground: Ground, tmp_path: Path) -
 
 def test_two_files_that_are_ingested_at_once_are_joined(ground_on_postgres: Ground, synthetic_pass: Any) -> None:
     """The packets that the cut between them goes through belong to neither, and come to light in any order."""
-    from concurrent.futures import ThreadPoolExecutor
-
     octets = (synthetic_pass.folder / "downlink.cadu").read_bytes()
     cadu = 1279
     pieces = [octets[k : k + 2 * cadu] for k in range(0, len(octets), 2 * cadu)]

@@ -3,6 +3,7 @@
 import errno
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -25,45 +26,41 @@ from ground_service.worker.scheduler import Scheduler
 Row = dict[str, Any]
 
 
-def job_that(monkeypatch: pytest.MonkeyPatch, ground: Ground, work: Any) -> str:
-    monkeypatch.setitem(jobs.WORK, "nightly", work)
-    return enter_job(ground, "nightly", {})
+@pytest.fixture
+def job_that(monkeypatch: pytest.MonkeyPatch, ground: Ground) -> Any:
+    """A function that enters a job with the given work."""
+
+    def enter(work: Any) -> str:
+        monkeypatch.setitem(jobs.WORK, "nightly", work)
+        return enter_job(ground, "nightly", {})
+
+    return enter
 
 
 def row_of(ground: Ground, job: str) -> Row:
     return ground.read(repository.get, repository.JOBS, job, "job")
 
 
+MISSING = FileNotFoundError(errno.ENOENT, "No such file or directory", "/srv/linna/files/ab")
+
+
 @pytest.mark.parametrize(
     ("error", "shown"),
     [
-        (
-            OverflowError("Python int too large to convert to SQLite INTEGER"),
-            "OverflowError: Python int too large to convert to SQLite INTEGER",
-        ),
-        (KeyError("vehicle"), "KeyError: 'vehicle'"),
-        (ValueError("first\nsecond"), "ValueError: first second"),
-        (MemoryError(), "MemoryError"),
-        (
-            FileNotFoundError(errno.ENOENT, "No such file or directory", "/srv/linna/files/ab"),
-            "FileNotFoundError: No such file or directory",
-        ),
+        (OverflowError("Python int too large"), "OverflowError: Python int too large"),
+        (KeyError("vehicle"), "KeyError: 'vehicle'"), (ValueError("first\nsecond"), "ValueError: first second"),
+        (MemoryError(), "MemoryError"), (MISSING, "FileNotFoundError: No such file or directory"),
         (InvalidInput("/srv/linna/a.zip", "", "a zip", "none"), "a.zip: expected a zip, found none"),
     ],
-)
+)  # fmt: skip
 def test_whatever_error_a_job_meets_it_ends_as_failed_and_is_not_repeated(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch, error: Exception, shown: str
+    ground: Ground, job_that: Any, error: Exception, shown: str
 ) -> None:
-    tries = []
-
-    def work(*_: Any) -> Row:
-        tries.append(1)
-        raise error
-
-    job = job_that(monkeypatch, ground, work)
+    work = Mock(side_effect=error)
+    job = job_that(work)
     for _ in range(3):
         row = run_job(ground, job)
-    assert (row.state, row.error, row.attempts, len(tries)) == ("failed", shown, 1, 1)
+    assert (row.state, row.error, row.attempts, work.call_count) == ("failed", shown, 1, 1)
     assert ground.read(unfinished_jobs) == []
 
 
@@ -71,13 +68,7 @@ def test_a_failed_ingest_is_repeated_with_longer_and_longer_waits(
     either: Ground, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What was acknowledged is done when its cause is gone, at most 85 minutes later without anybody."""
-    causes, waits_min = [FileNotFoundError("gone")] * 5, (1, 4, 16, 64)
-
-    def work(*_: Any) -> Row:
-        if causes:
-            raise causes.pop()
-        return {}
-
+    work, waits_min = Mock(side_effect=[*[FileNotFoundError("gone")] * 5, {}]), (1, 4, 16, 64)
     monkeypatch.setitem(jobs.WORK, "ingest", work)
     monkeypatch.setitem(jobs.WORK, "report", work)
     job, other = (enter_job(either, kind, {"pass_id": 1, "ingest_id": 1}) for kind in ("ingest", "report"))
@@ -95,8 +86,8 @@ def test_a_failed_ingest_is_repeated_with_longer_and_longer_waits(
     assert (row_of(either, job)["state"], row_of(either, other)["attempts"]) == ("done", 1)
 
 
-def test_a_failed_job_is_repeated_by_one_action(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
-    job = job_that(monkeypatch, ground, lambda *_: {}["missing"])
+def test_a_failed_job_is_repeated_by_one_action(ground: Ground, job_that: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = job_that(lambda *_: {}["missing"])
     assert run_job(ground, job).state == "failed"
     monkeypatch.setitem(jobs.WORK, "nightly", lambda *_: {"repeated": True})
     with local_client(ground, "ann") as client:
@@ -108,8 +99,8 @@ def test_a_failed_job_is_repeated_by_one_action(ground: Ground, monkeypatch: pyt
             client.delete_job(job)
 
 
-def test_a_failed_ingest_is_dismissed(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
-    job = job_that(monkeypatch, ground, lambda *_: {}["missing"])
+def test_a_failed_ingest_is_dismissed(ground: Ground, job_that: Any) -> None:
+    job = job_that(lambda *_: {}["missing"])
     run_job(ground, job)
     with local_client(ground, "ann") as client:
         client.delete_job(job)
@@ -118,38 +109,35 @@ def test_a_failed_ingest_is_dismissed(ground: Ground, monkeypatch: pytest.Monkey
 
 
 def test_the_traceback_of_an_unexpected_error_is_in_the_log(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ground: Ground, job_that: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    job = job_that(monkeypatch, ground, lambda *_: {}["missing"])
+    job = job_that(lambda *_: {}["missing"])
     run_job(ground, job)
     [record] = [one for one in caplog.records if one.levelname == "ERROR"]
     assert record.exc_info is not None and job in record.getMessage()
 
 
-def test_a_full_disk_is_no_fault_of_the_job(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
-    def work(*_: Any) -> Row:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    job = job_that(monkeypatch, ground, work)
+def test_a_full_disk_is_no_fault_of_the_job(ground: Ground, job_that: Any) -> None:
+    job = job_that(Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
     with pytest.raises(StorageFull):
         run_job(ground, job)
-    assert (row_of(ground, job)["state"], row_of(ground, job)["attempts"]) == ("queued", 0)
+    row = row_of(ground, job)
+    assert (row["state"], row["attempts"]) == ("queued", 0)
 
 
-def test_a_result_that_the_database_cannot_hold_fails_the_job(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
-    row = run_job(ground, job_that(monkeypatch, ground, lambda *_: {"median": float("nan")}))
-    assert row.state == "failed"
-    assert "JSON" in row.error
+def test_a_result_that_the_database_cannot_hold_fails_the_job(ground: Ground, job_that: Any) -> None:
+    row = run_job(ground, job_that(lambda *_: {"median": float("nan")}))
+    assert row.state == "failed" and "JSON" in row.error
 
 
-def test_an_attempt_that_another_has_overtaken_changes_nothing(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_attempt_that_another_has_overtaken_changes_nothing(ground: Ground, job_that: Any) -> None:
     """This occurs after a network failure, if the database grants the lock of the first worker to a second one."""
 
     def work(_ground: Ground, _arguments: Any, job_id: str) -> Row:
         ground.write(move, JOB, job_id, "running", attempts=2)
         return {"made by": "the first"}
 
-    row = run_job(ground, job_that(monkeypatch, ground, work))
+    row = run_job(ground, job_that(work))
     assert (row.state, row.attempts, row.result) == ("running", 2, None)
 
 
@@ -157,29 +145,25 @@ def test_an_id_that_stands_for_another_request_is_refused(ground: Ground) -> Non
     enter_job(ground, "report", {"pass_id": 1}, job_id="a" * 32)
     assert enter_job(ground, "report", {"pass_id": 1}, job_id="a" * 32) == "a" * 32
     for kind, arguments in (("report", {"pass_id": 2}), ("nightly", {})):
-        with pytest.raises(Conflict, match="found another"), ground.database.writing() as connection:
-            add_job(connection, kind, arguments, job_id="a" * 32)
+        with pytest.raises(Conflict, match="found another"):
+            ground.write(add_job, kind, arguments, job_id="a" * 32)
 
 
 def test_an_ingest_asked_for_twice_is_one_and_of_another_file_is_refused(ground: Ground) -> None:
     one, other = (ground.files.put_octets(octets) for octets in (b"one", b"other"))
-    given: Row = {"spacecraft_id": 76, "instance": "flight", "job_id": "b" * 32}
+    given = {"spacecraft_id": 76, "instance": "flight", "job_id": "b" * 32}
     first = enter_ingest(ground, one, "one", **given)
     assert enter_ingest(ground, one, "one", **given) == first
     for stored, changed in ((other, {}), (one, {"spacecraft_id": 77}), (one, {"instance": "else"})):
         with pytest.raises(Conflict, match="found another"):
             enter_ingest(ground, stored, "one", **(given | changed))
-    with ground.database.reading() as connection:
-        assert repository.newest(connection, repository.INGESTS, Paging())[1] == 1
+    assert ground.read(repository.newest, repository.INGESTS, Paging())[1] == 1
 
 
 @pytest.mark.parametrize(
     ("error", "shown"),
     [
-        (
-            DatabaseUnavailable("postgresql+psycopg://linna:***@db/linna", "gone"),
-            "database (address) cannot be opened: gone",
-        ),
+        (DatabaseUnavailable("postgresql://linna:***@db/linna", "gone"), "database (address) cannot be opened: gone"),
         (FileDamaged(Path("/srv/linna/files/ab/cdef"), "1", "2"), "cdef: expected octets with SHA-256 1, found 2"),
         (InvalidInput("window", "name", "a line", "'\x1b[2J\n'"), "window, name: expected a line, found ' [2J '"),
         (ValueError(), "ValueError"),
@@ -190,5 +174,5 @@ def test_what_is_shown_of_an_error_is_one_line_without_places_of_the_server(erro
     assert public_text(error) == shown
 
 
-def test_a_long_error_is_cut(ground: Ground) -> None:
+def test_a_long_error_is_cut() -> None:
     assert len(public_text(ValueError("x" * 9000))) == 500

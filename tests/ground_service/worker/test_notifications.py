@@ -52,23 +52,27 @@ from tests.ground_service.conftest import wait_for
 HERE = (ip_network("127.0.0.1"),)
 
 
-def send(*given: Any, networks: Any = HERE, **how: Any) -> int:
-    """Send over a channel; the receivers of these tests are on this machine."""
-    return send_to(*given, networks=networks, **how)
+def send(
+    folder: Path, channel: Channel, key: str = "id", document: Any = None, networks: Any = HERE, **how: Any
+) -> int:
+    """Send over a channel without waits; the receivers of these tests are on this machine."""
+    waits = {"wait": lambda _seconds: None} | how
+    return send_to(folder, channel, key, "subject", document or {}, networks=networks, **waits)
 
 
 class Webhook:
     """Receiver that answers with the given statuses, then 200, and keeps what it was sent."""
 
     def __init__(self) -> None:
-        self.statuses: list[int] = []
-        self.received: list[tuple[dict[str, str], bytes]] = []
+        self.statuses, self.received = [], []
+        self.answered = lambda: None
         receiver = self
 
         class Handler(BaseHTTPRequestHandler):
             def do_POST(self) -> None:
                 body = self.rfile.read(int(self.headers["Content-Length"]))
                 receiver.received.append((dict(self.headers), body))
+                receiver.answered()
                 self.send_response(receiver.statuses.pop(0) if receiver.statuses else 200)
                 self.end_headers()
 
@@ -83,15 +87,15 @@ class Mailbox:
     """SMTP server (RFC 5321) that keeps the envelopes and messages; `refusal` is its answer to recipients."""
 
     def __init__(self) -> None:
-        self.received: list[tuple[list[str], str]] = []
+        self.received = []
         self.refusal = ""
-        self.tls: ssl.SSLContext | None = None
+        self.tls = None
         mailbox = self
 
         class Handler(socketserver.StreamRequestHandler):
             def handle(self) -> None:
                 self.say("220 mailbox")
-                recipients: list[str] = []
+                recipients = []
                 while line := self.rfile.readline().decode().strip():
                     verb = line.split(":")[0].split()[0].upper()
                     if verb == "RCPT":
@@ -125,36 +129,35 @@ class Mailbox:
         self.address = f"127.0.0.1:{self.server.server_address[1]}"
 
 
+@contextlib.contextmanager
+def running(server: socketserver.ThreadingTCPServer) -> Iterator[str]:
+    """Serve in a thread; give the address."""
+    server.daemon_threads = True
+    with server:
+        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}).start()
+        yield "{}:{}".format(*server.server_address)
+        server.shutdown()
+
+
 @pytest.fixture
 def webhook() -> Iterator[Webhook]:
     receiver = Webhook()
-    yield from running(receiver)
+    with running(receiver.server):
+        yield receiver
 
 
 @pytest.fixture
 def mailbox() -> Iterator[Mailbox]:
     receiver = Mailbox()
-    yield from running(receiver)
-
-
-def running(receiver: Any) -> Iterator[Any]:
-    thread = threading.Thread(target=receiver.server.serve_forever, kwargs={"poll_interval": 0.01})
-    thread.start()
-    yield receiver
-    receiver.server.shutdown()
-    thread.join()
-    receiver.server.server_close()
-
-
-def no_wait(_seconds: float) -> None:
-    pass
+    with running(receiver.server):
+        yield receiver
 
 
 def test_a_webhook_gets_a_signed_document_with_its_id(webhook: Webhook, tmp_path: Path) -> None:
     (tmp_path / "secrets").mkdir()
     (tmp_path / "secrets" / "hook").write_text("key\n")
     channel = Channel(webhook=webhook.url, signing_secret="hook")
-    assert send(tmp_path, channel, "id-1", "subject", {"event": 3}) == 1
+    assert send(tmp_path, channel, "id-1", {"event": 3}) == 1
     [(headers, body)] = webhook.received
     assert json.loads(body) == {"event": 3}
     assert headers["Idempotency-Key"] == "id-1" and headers["X-Linna-Signature"] == signature(b"key", body)
@@ -165,36 +168,36 @@ def test_a_webhook_gets_a_signed_document_with_its_id(webhook: Webhook, tmp_path
 
 def test_a_webhook_that_is_out_of_order_is_tried_again_with_the_same_id(webhook: Webhook, tmp_path: Path) -> None:
     webhook.statuses = [503, 500]
-    assert send(tmp_path, Channel(webhook=webhook.url), "id-2", "s", {}, wait=no_wait) == ATTEMPTS
+    assert send(tmp_path, Channel(webhook=webhook.url), "id-2") == ATTEMPTS
     assert {headers["Idempotency-Key"] for headers, _ in webhook.received} == {"id-2"}
 
 
 def test_a_refused_message_is_not_tried_again(webhook: Webhook, tmp_path: Path) -> None:
     webhook.statuses = [404]
     with pytest.raises(NotDelivered, match="status 404"):
-        send(tmp_path, Channel(webhook=webhook.url), "id", "s", {}, wait=no_wait)
+        send(tmp_path, Channel(webhook=webhook.url))
     assert len(webhook.received) == 1
 
 
 def test_a_receiver_that_is_away_is_named_after_all_attempts(tmp_path: Path) -> None:
-    waited: list[float] = []
+    waited = []
     with pytest.raises(NotDelivered, match=f"not delivered in {ATTEMPTS} attempts: ConnectError"):
-        send(tmp_path, Channel(webhook="http://127.0.0.1:9/"), "id", "s", {}, wait=waited.append)
+        send(tmp_path, Channel(webhook="http://127.0.0.1:9/"), wait=waited.append)
     assert waited == [1.0, 2.0]
 
 
 def test_a_missing_key_is_stated(tmp_path: Path) -> None:
     channel = Channel(webhook="http://127.0.0.1:9/", signing_secret="hook")
     with pytest.raises(InvalidInput, match="signing_secret, hook: expected a file in secrets of the service"):
-        send(tmp_path, channel, "id", "s", {})
+        send(tmp_path, channel)
 
 
 def test_an_e_mail_reaches_all_recipients(mailbox: Mailbox, tmp_path: Path) -> None:
     channel = Channel(email=("a@b.example", "c@d.example"), smtp=mailbox.address, sender="ground@x.example")
-    assert send(tmp_path, channel, "id-3", "a window failed", {"event": 3, "pass": None}) == 1
+    assert send(tmp_path, channel, "id-3", {"event": 3, "pass": None}) == 1
     [(recipients, message)] = mailbox.received
     assert recipients == ["<a@b.example>", "<c@d.example>"]
-    assert "Subject: a window failed" in message and "Message-ID: <id-3@linna>" in message
+    assert "Subject: subject" in message and "Message-ID: <id-3@linna>" in message
     assert "event: 3" in message and "pass" not in message.partition("\r\n\r\n")[2]
 
 
@@ -202,7 +205,7 @@ def test_a_mail_server_that_refuses_every_recipient_is_stated(mailbox: Mailbox, 
     mailbox.refusal = "550 unknown"
     channel = Channel(email=("a@b.example",), smtp=mailbox.address)
     with pytest.raises(NotDelivered, match="SMTPRecipientsRefused"):
-        send(tmp_path, channel, "id", "s", {}, wait=no_wait)
+        send(tmp_path, channel)
 
 
 @pytest.fixture
@@ -226,7 +229,7 @@ def test_a_public_mail_server_needs_tls_with_its_certificate(
     channel = Channel(email=("a@b.example",), smtp=mailbox.address)
     told = "SSLCertVerificationError" if offers_tls else "expected a mail server with STARTTLS"
     with pytest.raises(NotDelivered, match=told):
-        send(tmp_path, channel, "id", "subject", {}, wait=no_wait)
+        send(tmp_path, channel)
     assert mailbox.received == []
 
 
@@ -236,13 +239,11 @@ class Dripping(socketserver.StreamRequestHandler):
     octets = b"HTTP/1.1 200 OK\r\nX: "
 
     def handle(self) -> None:
-        try:
+        with contextlib.suppress(OSError):
             self.wfile.write(self.octets)
             for _ in range(200):
                 time.sleep(0.05)
                 self.wfile.write(b"x")
-        except OSError:
-            pass
 
 
 class DrippingMail(Dripping):
@@ -251,15 +252,11 @@ class DrippingMail(Dripping):
 
 @pytest.mark.parametrize("handler", [Dripping, DrippingMail])
 def test_a_receiver_that_drips_is_left_after_the_deadline(handler: type[Dripping], tmp_path: Path) -> None:
-    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), handler) as server:
-        server.daemon_threads = True
-        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}).start()
-        place = f"127.0.0.1:{server.server_address[1]}"
+    with running(socketserver.ThreadingTCPServer(("127.0.0.1", 0), handler)) as place:
         mail = Channel(email=("a@b.example",), smtp=place)
         channel = Channel(webhook=f"http://{place}/") if handler is Dripping else mail
         with pytest.raises(NotDelivered, match="not delivered in 3 attempts"):
-            send(tmp_path, channel, "id", "s", {}, deadline_s=0.3, wait=no_wait)
-        server.shutdown()
+            send(tmp_path, channel, deadline_s=0.3)
 
 
 def test_the_body_of_an_answer_is_not_read(tmp_path: Path) -> None:
@@ -270,26 +267,18 @@ def test_the_body_of_an_answer_is_not_read(tmp_path: Path) -> None:
             nonlocal sent
             self.rfile.readline()
             self.wfile.write(b"HTTP/1.1 200 OK\r\nContent-Length: 1000000000\r\n\r\n")
-            try:
+            with contextlib.suppress(OSError):
                 while sent < 1_000_000_000:
                     sent += self.connection.send(bytes(1 << 16))
-            except OSError:
-                pass
 
-    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Endless) as server:
-        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}).start()
-        url = f"http://127.0.0.1:{server.server_address[1]}/"
-        assert send(tmp_path, Channel(webhook=url), "id", "s", {}) == 1
-        server.shutdown()
+    with running(socketserver.ThreadingTCPServer(("127.0.0.1", 0), Endless)) as place:
+        assert send(tmp_path, Channel(webhook=f"http://{place}/")) == 1
     assert sent < 50_000_000  # what the buffers of the connection hold
 
 
 @pytest.mark.parametrize(
-    "host",
-    [
-        "127.0.0.1", "localhost", "::1", "::ffff:10.0.0.1", "10.1.2.3", "169.254.169.254", "0.0.0.0", "224.0.0.1",
-    ],
-)  # fmt: skip
+    "host", ["127.0.0.1", "localhost", "::1", "::ffff:10.0.0.1", "10.1.2.3", "169.254.169.254", "0.0.0.0", "224.0.0.1"]
+)
 def test_an_address_that_is_not_public_is_refused(host: str) -> None:
     with pytest.raises(NotDelivered, match="expected a public address or one of LINNA_NOTIFY_NETWORKS"):
         permitted_address(host, 80, ())
@@ -304,7 +293,7 @@ def test_one_private_address_of_several_refuses_a_name_and_the_checked_address_i
     webhook: Webhook, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A name server could answer the second question with another address."""
-    asked: list[str] = []
+    asked = []
     answers = [["1.1.1.1", "10.0.0.1"], ["127.0.0.1"]]
     resolve = socket.getaddrinfo
 
@@ -317,8 +306,8 @@ def test_one_private_address_of_several_refuses_a_name_and_the_checked_address_i
     monkeypatch.setattr(outgoing.socket, "getaddrinfo", found)
     url = webhook.url.replace("127.0.0.1", "ops.example")
     with pytest.raises(NotDelivered, match=r"found 10\.0\.0\.1"):
-        send(tmp_path, Channel(webhook=url), "id", "s", {}, networks=())
-    assert send(tmp_path, Channel(webhook=url), "id", "s", {}) == 1
+        send(tmp_path, Channel(webhook=url), networks=())
+    assert send(tmp_path, Channel(webhook=url)) == 1
     assert asked == ["ops.example"] * 2 and webhook.received[0][0]["Host"].startswith("ops.example:")
 
 
@@ -329,18 +318,13 @@ def test_the_networks_are_a_setting(monkeypatch: pytest.MonkeyPatch) -> None:
     assert load_settings().notify_networks == ()
 
 
-def add_channels(ground: Ground, webhook: Webhook, mailbox: Mailbox) -> None:
-    text = f"""
-name = "m"
-[spacecraft]
-id = 76
-[notify.hook]
-webhook = "{webhook.url}"
-[notify.people]
-email = ["a@b.example"]
-smtp = "{mailbox.address}"
-"""
+def add_hook(ground: Ground, webhook: Webhook, more: str = "") -> None:
+    text = f'name = "m"\n[spacecraft]\nid = 76\n[notify.hook]\nwebhook = "{webhook.url}"\n{more}'
     add_mission(ground, text.encode())
+
+
+def add_channels(ground: Ground, webhook: Webhook, mailbox: Mailbox) -> None:
+    add_hook(ground, webhook, f'[notify.people]\nemail = ["a@b.example"]\nsmtp = "{mailbox.address}"\n')
 
 
 def test_signed_heads_that_a_webhook_and_an_e_mail_got_are_checked(
@@ -397,26 +381,26 @@ def broken(spacecraft: int) -> dict[str, Any]:
     return {"spacecraft_id": spacecraft, "instance": "flight", "parameter": "voltage", "limit_state": "low"}
 
 
+def raised(vehicle: int = 1, state: str = "raised") -> Event:
+    return AlarmChanged(id=1, vehicle_id=vehicle, name="voltage", severity="alarm", state=state)
+
+
 @pytest.mark.parametrize(
     ("event", "texts"),
     [
         (LimitsBroken(broken=[broken(76), broken(76), broken(77)]), ["voltage low; voltage low"]),
         (LimitsBroken(broken=[broken(77)]), []),
-        (AlarmChanged(id=1, vehicle_id=1, name="voltage", severity="alarm", state="raised"), ["voltage (alarm)"]),
-        (AlarmChanged(id=1, vehicle_id=1, name="voltage", severity="alarm", state="cleared"), []),
-        (AlarmChanged(id=1, vehicle_id=2, name="voltage", severity="alarm", state="raised"), []),
+        (raised(), ["voltage (alarm)"]), (raised(state="cleared"), []), (raised(2), []),
         (PassEvaluated(report_id="r", pass_id=1, vehicle_id=1), ["report of pass 1: requirements met"]),
         (WindowChanged(id=1, state="failed"), ["window 1 (mare) failed: too late"]),
-        (WindowChanged(id=1, state="executed"), []),
-        (WindowChanged(id=9, state="failed"), []),
+        (WindowChanged(id=1, state="executed"), []), (WindowChanged(id=9, state="failed"), []),
     ],
 )  # fmt: skip
 def test_receivers_get_the_events_of_their_spacecraft_that_a_person_needs(
     webhook: Webhook, local: Ground, monkeypatch: pytest.MonkeyPatch, event: Event, texts: list[str]
 ) -> None:
     follow_in_process(local)
-    hook = f'name = "m"\n[spacecraft]\nid = 76\n[notify.hook]\nwebhook = "{webhook.url}"\n'
-    add_mission(local, hook.encode())
+    add_hook(local, webhook)
     with local.database.writing() as connection:
         for key, spacecraft in ((1, 76), (2, 77)):
             row_of(connection, METADATA.tables["vehicles"], id=key, ccsds_id=spacecraft, instance="flight")
@@ -431,28 +415,15 @@ def test_receivers_get_the_events_of_their_spacecraft_that_a_person_needs(
     assert [json.loads(body)["text"] for _, body in webhook.received] == texts
 
 
-def test_a_slow_receiver_does_not_hold_up_other_jobs(local: Ground) -> None:
+def test_a_slow_receiver_does_not_hold_up_other_jobs(local: Ground, webhook: Webhook) -> None:
     """The embedded service does notifications in a thread of their own."""
     held = threading.Event()
-
-    class Slow(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            held.wait(60.0)
-            self.send_response(200)
-            self.end_headers()
-
-        def log_message(self, *_: Any) -> None:
-            pass
-
+    webhook.answered = lambda: held.wait(60.0)
     dispatcher = ThreadDispatcher(local)
     follow_in_process(local, dispatcher.start)
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Slow)
-    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}).start()
     try:
-        hook = f'[notify.hook]\nwebhook = "http://127.0.0.1:{server.server_port}/"\n'
-        add_mission(local, f'name = "m"\n[spacecraft]\nid = 76\n{hook}'.encode())
-        with local.database.writing() as connection:
-            publish(connection, RegressionJudged(id="1" * 32, verdict="fail"))
+        add_hook(local, webhook)
+        local.write(publish, RegressionJudged(id="1" * 32, verdict="fail"))
 
         def kinds(state: str) -> list[str]:
             return [one.kind for one in local.read(list_jobs, JobFilter()).items if one.state == state]
@@ -468,5 +439,3 @@ def test_a_slow_receiver_does_not_hold_up_other_jobs(local: Ground) -> None:
     finally:
         held.set()
         dispatcher.close()
-        server.shutdown()
-        server.server_close()

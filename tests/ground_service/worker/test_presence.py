@@ -42,6 +42,10 @@ def opened(settings: Settings) -> Iterator[Ground]:
         yield ground
 
 
+def changed(settings: Settings, **fields: Any) -> Settings:
+    return Settings(**settings.model_dump() | fields)
+
+
 def test_a_process_is_known_while_it_runs(opened: Ground, settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(condition, "BEAT_S", 0.05)
     assert not running_processes(opened.database)
@@ -75,9 +79,9 @@ def test_a_start_with_disagreeing_peers_fails(
     opened: Ground, settings: Settings, change: dict[str, Any], group: str
 ) -> None:
     """An upload acknowledged by one process must not be invisible to the other."""
-    other = Settings(**{**settings.model_dump(), **change})
+    other = changed(settings, **change)
     with present(opened, settings, "api"):
-        with present(opened, settings.model_copy(update={"port": 9, "host": "0.0.0.0"}), "worker"):
+        with present(opened, changed(settings, port=9, host="0.0.0.0"), "worker"):
             pass  # what one process has for itself
         refused = pytest.raises(ServerError, match=f"expected the same .*: other {group} than here")
         with refused, present(opened, other, "worker"):
@@ -107,8 +111,7 @@ def faults(ground: Ground, settings: Settings) -> dict[str, str]:
 def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
     opened: Ground, settings: Settings, redis_url: str, synthetic_pass: Any, tmp_path: Path
 ) -> None:
-    with_broker = settings.model_copy(update={"broker_url": None})
-    given = Settings(**{**with_broker.model_dump(), "broker_url": redis_url, "database_url": settings.database_url})
+    given = changed(settings, broker_url=redis_url)
     ingest_file(opened, synthetic_pass.folder / "downlink.cadu")
     with opened.database.writing() as connection:
         leases.acquire(connection, "scheduler", "somebody", 60_000_000_000)
@@ -128,8 +131,7 @@ def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
         (tmp_path / "moved").rename(place)
 
         # 2. This process has another broker, which does not answer.
-        away = Settings(**{**given.model_dump(), "broker_url": "redis://127.0.0.1:1/0"})
-        found = faults(opened, away)
+        found = faults(opened, changed(given, broker_url="redis://127.0.0.1:1/0"))
         assert set(found) == {"processes", "broker"} and "other broker than here" in found["processes"]
 
         # 3. The provider is down.
@@ -141,7 +143,6 @@ def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
 
         # 4. A clock is wrong, and a worker sees no runner.
         [api, _] = running_processes(opened.database)
-        assert api.statement is not None
         with opened.database.writing() as connection:
             late = replace(api.statement, clock_ms=90_000, runner="no")
             leases.state(connection, f"{condition.PREFIX}worker late:1", late.text(), 60_000_000_000)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -26,7 +25,7 @@ def test_of_contradicting_requests_to_two_processes_one_wins_and_all_others_are_
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_any_fault_fails_the_campaign_and_is_in_its_table(name: str) -> None:
-    figures: dict[str, Any] = {one: int(one == name) for one in FAULTS}
+    figures = {one: int(one == name) for one in FAULTS}
     assert not holds(figures)
     text = table({**figures, "kinds": {}, "seconds": 1, "examples": ["what happened"]})
     assert f"{name.replace('_', ' ')} 1".split() in [line.split() for line in text.splitlines()]

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sqlalchemy import text
@@ -58,15 +59,14 @@ class Server:
             configuration.write("include_if_exists 'archive.conf'\n")
         log = str(self.folder / "log")
         # Output to the log, so that no pipe stays open.
-        command = [
-            *self.user, str(self.bin / "pg_ctl"), "-D", str(self.data), "-w", "-t", "120", "-l", log, "start",
-        ]  # fmt: skip
+        words = f"{self.bin / 'pg_ctl'} -D {self.data} -w -t 120 -l {log} start"
+        command = [*self.user, *words.split()]
         environment = {"PATH": SYSTEM, "LINNA_WAL": str(self.wal)}
         started = subprocess.run(command, cwd=self.folder, env=environment, stdout=subprocess.DEVNULL, check=False)
         assert started.returncode == 0, Path(log).read_text()
 
     def stop(self) -> None:
-        self.run(str(self.bin / "pg_ctl"), "-D", str(self.data), "-m", "immediate", "-w", "stop", check=False)
+        self.run(*f"{self.bin / 'pg_ctl'} -D {self.data} -m immediate -w stop".split(), check=False)
 
     def script(self, name: str, *words: str, check: bool = True) -> subprocess.CompletedProcess[str]:
         return self.run("sh", str(self.scripts / name), *words, check=check)
@@ -90,21 +90,23 @@ def server() -> Iterator[Server]:
         shutil.chown(folder, "postgres", "postgres")
     try:
         made.run("mkdir", str(made.wal))
-        made.run(
-            str(made.bin / "initdb"), "-D", str(made.data), "-U", "linna", "-A", "trust", "-E", "UTF8", "--no-sync",
-        )  # fmt: skip
+        made.run(*f"{made.bin / 'initdb'} -D {made.data} -U linna -A trust -E UTF8 --no-sync".split())
         made.start()
-        made.run(str(made.bin / "createdb"), "-h", "127.0.0.1", "-p", str(made.port), "-U", "linna", "linna")
+        made.run(*f"{made.bin / 'createdb'} -h 127.0.0.1 -p {made.port} -U linna linna".split())
         yield made
     finally:
         made.stop()
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def scalar(ground: Ground, statement: str) -> Any:
+    """Return the value of a statement in a transaction that only reads, also while the server recovers."""
+    with ground.database.snapshot() as connection:
+        return connection.execute(text(statement)).scalar()
+
+
 def server_time(ground: Ground) -> datetime:
-    with ground.database.reading() as connection:
-        found: datetime = connection.execute(text("SELECT clock_timestamp()")).scalar_one()
-    return found.astimezone(UTC)
+    return scalar(ground, "SELECT clock_timestamp()").astimezone(UTC)
 
 
 def next_second(ground: Ground) -> datetime:
@@ -120,8 +122,7 @@ def archive_all(ground: Ground) -> None:
         segment = connection.execute(text("SELECT pg_walfile_name(pg_switch_wal())")).scalar_one()
 
     def is_archived() -> bool:
-        with ground.database.reading() as connection:
-            last = connection.execute(text("SELECT last_archived_wal FROM pg_stat_archiver")).scalar()
+        last = scalar(ground, "SELECT last_archived_wal FROM pg_stat_archiver")
         return last is not None and not last.endswith(".backup") and last >= segment
 
     wait_for(is_archived, f"{segment} in the archive")
@@ -178,12 +179,7 @@ def test_the_database_is_restored_to_a_chosen_second(server: Server, tmp_path: P
     assert Path(base).name in server.script("restore-to.sh", str(server.data), target).stdout
     server.start()
     with open_ground(tmp_path / "home", database_url=server.url) as ground:
-
-        def is_recovered() -> bool:
-            with ground.database.snapshot() as connection:
-                return not connection.execute(text("SELECT pg_is_in_recovery()")).scalar()
-
-        wait_for(is_recovered, "the end of the recovery")
+        wait_for(lambda: not scalar(ground, "SELECT pg_is_in_recovery()"), "the end of the recovery")
         assert [one.name for one in users.list_users(ground)] == ["before", "in-the-backup"]
         with ground.database.snapshot() as connection:
             assert list(audit.broken_entries(connection)) == []

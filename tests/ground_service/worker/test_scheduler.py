@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from unittest.mock import MagicMock
+from unittest.mock import MagicMock, Mock
 
 import pytest
 
@@ -29,25 +29,19 @@ class Recorder:
     """A dispatcher that keeps what it gets."""
 
     def __init__(self) -> None:
-        self.resumed = 0
-        self.submitted: list[str | None] = []
+        self.resumed, self.submitted = 0, []
 
     def resume(self) -> None:
         self.resumed += 1
 
-    def submit(self, kind: str, arguments: object, *, job_id: str | None = None) -> str:
+    def submit(self, kind: str, _arguments: object, *, job_id: str | None = None) -> None:
         assert kind in ("nightly", "plan", "regression")
         self.submitted.append(job_id)
-        return str(job_id)
-
-    def start(self, job_id: str) -> None: ...
-
-    def close(self) -> None: ...
 
 
-def make(ground: Ground) -> tuple[Scheduler, Recorder]:
-    recorder = Recorder()
-    return Scheduler(ground, recorder, lambda: None, {"retention_days": 90}), recorder
+def make(ground: Ground, placebo_passes: int = 0, **options: bool) -> tuple[Scheduler, Recorder]:
+    recorder, nightly = Recorder(), {"retention_days": 90, "placebo_passes": placebo_passes}
+    return Scheduler(ground, recorder, lambda: None, nightly, **options), recorder
 
 
 @pytest.fixture(autouse=True)
@@ -122,15 +116,14 @@ def test_each_night_a_placebo_takes_kept_archives_by_turns(ground: Ground, monke
         now = parse_utc(f"2029-08-0{7 + night}T00:40:00Z")
         monkeypatch.setattr(jobs, "utc_now_ns", lambda now=now: now)
         placebo = jobs.nightly_placebo(ground, 3)
-        assert placebo is not None and placebo["candidate"] == placebo["baseline"]
-        assert placebo["placebo"] == now // DAY_NS
+        assert placebo["candidate"] == placebo["baseline"] and placebo["placebo"] == now // DAY_NS
         chosen.append({one[0] for one in placebo["archives"]})
     assert [len(one) for one in chosen] == [3, 3, 3] and chosen[0] | chosen[1] == set("1234")
     assert chosen[0] != chosen[1] != chosen[2] and jobs.nightly_placebo(ground, 0) is None
     monkeypatch.setattr(scheduling, "utc_now_ns", lambda: now)
     monkeypatch.setattr(scheduling, "CATCH_UP_S", -1.0)
-    work = Recorder()
-    Scheduler(ground, work, lambda: None, {"retention_days": 90, "placebo_passes": 3}).tick()
+    one, work = make(ground, 3)
+    one.tick()
     assert work.submitted == [nightly_job_id(now), nightly_job_id(now, "placebo")]
     kept.clear()
     assert jobs.nightly_placebo(ground, 3) is None
@@ -141,9 +134,9 @@ def test_without_the_hourly_plan_only_events_plan(
     ground: Ground, hourly: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
-    begin, work = parse_utc("2029-08-07T05:00:00Z"), Recorder()
+    begin, (one, work) = parse_utc("2029-08-07T05:00:00Z"), make(ground, plan_hourly=hourly)
     monkeypatch.setattr(scheduling, "mission_now_ns", lambda: begin)
-    assert Scheduler(ground, work, lambda: None, {"retention_days": 90}, plan_hourly=hourly).tick()
+    assert one.tick()
     assert (plan_job_id(begin) in work.submitted) == hourly
 
 
@@ -165,11 +158,7 @@ def test_one_part_of_the_work_that_fails_does_not_stop_the_others(
 ) -> None:
     one, work = make(ground)
     monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
-
-    def fail() -> None:
-        raise error
-
-    monkeypatch.setattr(work, "resume", fail)
+    work.resume = Mock(side_effect=error)
     assert one.tick() and len(work.submitted) == 1
     assert [one.message for one in caplog.records if one.levelname == "ERROR"] == [
         f"recurring work (unfinished jobs): failed: {error}"
@@ -246,7 +235,7 @@ def test_processes_on_postgresql_have_the_lease_one_after_the_other(
         found = lines.read_text().splitlines() if lines.exists() else []
         return [(owner, int(until)) for owner, until in (line.split() for line in found)]
 
-    killed: list[str] = []
+    killed = []
     try:
         for _ in range(3):
             wait_for(lambda: any(owner not in killed for owner, _ in seen()), "the next scheduler")

@@ -4,6 +4,7 @@ import os
 import re
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import enter_job
+from ground_service.passes import service as passes
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.core import downsample
 from ground_service.passes.service import spacecraft_trends, trend_of
@@ -29,6 +31,7 @@ from ground_service.worker.jobs import run_job
 from ground_service.worker.upkeep import nightly, nightly_job_id, tidy
 from tests.serving import token_valid
 from tmtc.dictionary.payload import DICTIONARY
+from tmtc.downlink import encode_cadus
 
 DAY_NS = 86_400_000_000_000
 
@@ -37,13 +40,11 @@ def test_a_trend_has_the_slope_of_its_line() -> None:
     field = DICTIONARY.packet("housekeeping").field("temperature_c")
     utc_ns = np.arange(200, dtype=np.int64) * (DAY_NS // 40)
     trend = trend_of(field, downsample(utc_ns, 20.0 + 3.0 * utc_ns / DAY_NS, 50))
-    assert trend is not None
     assert trend.slope_per_day == pytest.approx(3.0, rel=1e-9)
     assert (trend.samples, trend.limit_state) == (200, "within")
     # 62 degrees is above the warning limit of 60 of the dictionary, 90 above the alarm limit of 85
     for value, state in ((62.0, "warning"), (90.0, "alarm")):
         hot = trend_of(field, downsample(utc_ns[:2], np.array([20.0, value]), 50))
-        assert hot is not None
         assert hot.limit_state == state
     assert trend_of(field, downsample(utc_ns[:0], np.zeros(0), 5)) is None
 
@@ -58,9 +59,7 @@ def test_the_night_tells_trends_and_broken_limits(ground: Ground, synthetic_pass
     assert job != nightly_job_id(2 * DAY_NS)
     done = run_job(ground, job)
     assert done.state == "done", done.error
-    assert done.result is not None
-    assert done.result["spacecraft"][0]["spacecraft_id"] == 76
-    assert done.result["limits_broken"] == []
+    assert (done.result["spacecraft"][0]["spacecraft_id"], done.result["limits_broken"]) == (76, [])
 
 
 def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,8 +88,7 @@ def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pyte
     assert removed == {"events": 2, "jobs": 0, "answers": 1, "sessions": 0, "files": 3}
     assert [path.name for path in (regression / "scratch").iterdir()] == []
     assert [item.number for item in read_events(ground.database, 0)] == [3]
-    with ground.database.reading() as connection:
-        assert repository.newest(connection, repository.AUDIT, Paging())[1] == 1
+    assert ground.read(repository.newest, repository.AUDIT, Paging())[1] == 1
 
 
 def test_nothing_is_removed_in_the_first_night_after_a_jump_of_the_clock(
@@ -117,7 +115,7 @@ def test_ten_years_later_the_record_is_complete_and_the_operation_is_gone(
     ground: Ground, synthetic_pass: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The documented policy names every table, and the nightly job deletes from no other one."""
-    text = (Path(__file__).parents[3] / "docs/archive.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs/archive.md").read_text()
     rows = text.partition("## Retention")[2].partition("## Schema")[0].splitlines()
     policy = {table: row.split("|")[1].strip() for row in rows for table in re.findall(r"`([a-z_]+)`", row)}
     assert set(policy) == set(METADATA.tables)
@@ -152,21 +150,14 @@ def test_expired_sessions_are_deleted_and_tokens_are_kept(ground: Ground, monkey
 def test_answers_are_kept_until_telemetry_is_new(
     ground: Ground, synthetic_pass: Any, monkeypatch: Any, tmp_path: Any
 ) -> None:
-    from ground_service.ingest.service import ingest_file
-    from ground_service.passes import service as upkeep
-    from tmtc.downlink import encode_cadus
-
     half = len(synthetic_pass.packets) // 2
     (tmp_path / "a.cadu").write_bytes(encode_cadus(synthetic_pass.packets[:half], spacecraft_id=76))
     vehicle = ingest_file(ground, tmp_path / "a.cadu").vehicle_id
-    assert vehicle is not None
-    made = []
-    read = upkeep._trends
-    monkeypatch.setattr(upkeep, "_trends", lambda *given: made.append(1) or read(*given))
-    first = upkeep.vehicle_trends(ground, vehicle)
-    assert upkeep.vehicle_trends(ground, vehicle) == first
-    assert len(made) == 1
+    read = Mock(wraps=passes._trends)
+    monkeypatch.setattr(passes, "_trends", read)
+    first = passes.vehicle_trends(ground, vehicle)
+    assert passes.vehicle_trends(ground, vehicle) == first and read.call_count == 1
     ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
-    second = upkeep.vehicle_trends(ground, vehicle)
-    assert len(made) == 2
+    second = passes.vehicle_trends(ground, vehicle)
+    assert read.call_count == 2
     assert {one.parameter: one.samples for one in second} != {one.parameter: one.samples for one in first}
