@@ -4,7 +4,7 @@ import hashlib
 import json
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from payload_emulator.errors import ModelError
 from payload_emulator.flight.models import load_shipped_model
@@ -26,12 +26,12 @@ from tests.payload_emulator.bowls import bowl_image
 onnx = Lazy("onnx")
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def detector():
     return OnnxDetector(load_shipped_model())
 
 
-@pytest.mark.parametrize("azimuth", [0.0, 90.0, 180.0, 270.0])
+@mark.parametrize("azimuth", [0.0, 90.0, 180.0, 270.0])
 def test_fresh_bowls_are_found_where_they_are_whatever_the_sun(detector, azimuth):
     angle = np.radians(azimuth)
     found = detector.detect(
@@ -43,7 +43,7 @@ def test_fresh_bowls_are_found_where_they_are_whatever_the_sun(detector, azimuth
         # Four pixels: a fifth of the radius, well inside the matching rule; the network never saw such bowls.
         assert distance[best] < 4.0
         # A diameter within a quarter keeps a crater in its class or the next.
-        assert found.diameter_px[best] == pytest.approx(40.0, rel=0.25)
+        assert found.diameter_px[best] == approx(40.0, rel=0.25)
 
 
 def test_turning_the_frame_with_the_sun_turns_the_detections(detector):
@@ -52,11 +52,11 @@ def test_turning_the_frame_with_the_sun_turns_the_detections(detector):
     turned = detector.detect(np.rot90(image), np.array([-1.0, 0.0, 0.25]))
     assert len(reference) == len(turned) > 0
     # The same pixels reach the network, so only the change of coordinates remains.
-    assert turned.u_px == pytest.approx(reference.v_px, abs=1e-9)
-    assert turned.v_px == pytest.approx(511.0 - reference.u_px, abs=1e-9)
+    assert turned.u_px == approx(reference.v_px, abs=1e-9)
+    assert turned.v_px == approx(511.0 - reference.u_px, abs=1e-9)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("image", "verdict"),
     [
         (np.zeros((512, 512, 3), np.uint8), ImageQuality.DARK),
@@ -125,14 +125,14 @@ def test_the_shipped_network_is_small_and_tells_what_it_is(detector):
 
 
 def test_a_network_of_another_hash_is_refused():
-    with pytest.raises(ModelError, match="expected SHA-256 00"):
+    with raises(ModelError, match="expected SHA-256 00"):
         OnnxDetector(load_shipped_model(), expected_sha256="00" * 32)
 
 
 def test_octets_that_are_no_network_are_refused():
-    with pytest.raises(ModelError, match="expected an ONNX model"):
+    with raises(ModelError, match="expected an ONNX model"):
         OnnxDetector(b"not a network")
-    with pytest.raises(ModelError, match="expected an ONNX model"):
+    with raises(ModelError, match="expected an ONNX model"):
         OnnxDetector(load_shipped_model()[:100_000])
 
 
@@ -145,7 +145,7 @@ def test_a_network_with_other_inputs_is_refused():
         [onnx.helper.make_tensor_value_info("y", tensor, [1, 3])],
     )
     model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=10)
-    with pytest.raises(ModelError, match="expected input image"):
+    with raises(ModelError, match="expected input image"):
         OnnxDetector(model.SerializeToString())
 
 
@@ -158,7 +158,7 @@ def detections(u, v, diameter=40.0, ratio=None):
     n = len(u)
     return Detections(
         np.array(u, float), np.array(v, float), np.full(n, diameter), np.full(n, 0.9), np.ones(n),
-        None if ratio is None else np.array(ratio, float),
+        None if ratio is None else np.array(ratio, float)
     )  # fmt: skip
 
 
@@ -167,8 +167,8 @@ def test_parallax_is_taken_out_radially_and_in_proportion_to_the_depth():
     # the distance from the middle of the picture.
     found = detections([255.5, 455.5, 255.5], [255.5, 255.5, 55.5], ratio=[0.2, 0.2, 0.1])
     moved = remove_parallax(found, 0.1 / 148.0, 512, 512)
-    assert moved.u_px == pytest.approx([255.5, 455.5 + 200 * 0.1 * 8 / 148, 255.5])
-    assert moved.v_px == pytest.approx([255.5, 255.5, 55.5 - 200 * 0.1 * 4 / 148])
+    assert moved.u_px == approx([255.5, 455.5 + 200 * 0.1 * 8 / 148, 255.5])
+    assert moved.v_px == approx([255.5, 255.5, 55.5 - 200 * 0.1 * 4 / 148])
     assert remove_parallax(found, 0.0, 512, 512) is found
 
 
@@ -179,7 +179,7 @@ def test_a_network_that_tells_depth_gives_each_crater_a_state():
         heat[50, column] = 0.9
         geometry[4, 49:52, column - 1 : column + 2] = tenfold
     found = decode(heat, geometry, 0.5)
-    assert found.depth_ratio == pytest.approx([0.16, 0.08, 0.03], abs=1e-6)
+    assert found.depth_ratio == approx([0.16, 0.08, 0.03], abs=1e-6)
     assert states(found) == ["fresh", "worn", "degraded"]
     assert states(found.select(np.array([2]))) == ["degraded"]
     assert states(detections([1], [1])) == [""]

@@ -3,15 +3,12 @@
 import math
 
 import numpy as np
-import numpy.typing as npt
 
-from lunar.arrays import FloatArray, IntArray
-from lunar.camera import PinholeCamera, project_mcmf
+from lunar.camera import project_mcmf
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.sim.render.labels import label_frame
 from payload_emulator.sim.render.raymarch import cast
-from payload_emulator.sim.terrain.tiles import Terrain
 
 AZIMUTH = np.arange(48) * (math.pi / 24.0)
 ROUNDS = 8
@@ -22,9 +19,7 @@ LEAST_FOUND = 0.9
 """Share of a rim that must be in sight: the mean over a part of it would say little of the centre."""
 
 
-def rim_errors(
-    terrain: Terrain, camera: PinholeCamera, position_mcmf_m: npt.ArrayLike, camera_from_mcmf: npt.ArrayLike
-) -> tuple[IntArray, FloatArray]:
+def rim_errors(terrain, camera, position_mcmf_m, camera_from_mcmf):
     """Labels of a picture against rims found by casting rays onto the terrain.
 
     Of the craters that are whole in the picture with their rims in sight: the rows (n,) in the terrain's catalogue, and
@@ -65,7 +60,7 @@ def rim_errors(
     return index[good], middle[good] + mean - place[good]
 
 
-def _circle(latitude: FloatArray, longitude: FloatArray, diameter_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _circle(latitude, longitude, diameter_m):
     """Places (n, 48) on the rims."""
     radius = (0.5 * diameter_m / MOON_RADIUS_M)[:, None]
     sine0, cosine0 = np.sin(latitude)[:, None], np.cos(latitude)[:, None]

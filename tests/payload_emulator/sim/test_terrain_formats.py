@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import mark, raises
 
 from lunar.catalogue import make_catalogue
 from lunar.constants import MOON_RADIUS_M
@@ -86,7 +87,7 @@ def write_tiff(path, transform, values, crs, **profile):
 
 def heights_agree(terrain, latitude, longitude, within_m):
     found = terrain.height_m(np.radians(latitude), np.radians(longitude))
-    np.testing.assert_allclose(found, plane(latitude, longitude), atol=within_m)
+    assert_allclose(found, plane(latitude, longitude), atol=within_m)
 
 
 def test_sldem2015_kilometres_with_a_detached_label(tmp_path):
@@ -99,7 +100,7 @@ def test_sldem2015_kilometres_with_a_detached_label(tmp_path):
     heights_agree(terrain, np.array([14.3, 17.1]), np.array([12.2, 15.9]), 0.05)
 
 
-@pytest.mark.parametrize(("unit", "offset"), [("KILOMETER", 0), ("METER", 1_737_400)])
+@mark.parametrize(("unit", "offset"), [("KILOMETER", 0), ("METER", 1_737_400)])
 def test_the_unit_of_a_label_holds_without_and_with_an_offset(tmp_path, unit, offset):
     ppd = 16
     scale = 1000.0 if unit == "KILOMETER" else 1.0
@@ -124,7 +125,7 @@ def test_gld100_metres_of_16_bits_with_holes(tmp_path):
     # Whole metres, and the hole from pixels of 7.6 km.
     heights_agree(terrain, np.array([17.1, 15.0]), np.array([15.9, 13.0]), 3.0)
     alone = RasterTerrain([fine], NONE, **AS_IT_IS)
-    with pytest.raises(TerrainError, match=r"expected heights at latitude .*, found none"):
+    with raises(TerrainError, match=r"expected heights at latitude .*, found none"):
         alone.height_m(math.radians(15.0), math.radians(13.0))
 
 
@@ -143,7 +144,7 @@ def test_projected_metres_join_across_tiles_whose_pixels_do_not_divide_the_degre
     for first_column in (turn - 6, -6, 2 * turn - 6):
         window = layer.read(first_row, first_column, rows, 12)
         # The file's own rows, the same in the columns on both sides of the meridian: nothing lost between the tiles.
-        np.testing.assert_array_equal(window, np.repeat(values[:, :1], 12, axis=1))
+        assert_array_equal(window, np.repeat(values[:, :1], 12, axis=1))
     places = np.radians([-0.05, 0.05]), np.radians([359.9999, 90.1])
     assert layer.holds(*places).tolist() == [True, False]
 
@@ -152,7 +153,7 @@ def test_jpeg_2000_of_16_bits(tmp_path):
     values = np.rint(plane(*grid(8.0, 22.0, 256, 256, 16))).astype("int16")
     path = write_tiff(
         tmp_path / "a.jp2", rasterio.Affine(1 / 16, 0, 8.0, 0, -1 / 16, 22.0), values,
-        "+proj=longlat +R=1737400 +no_defs", driver="JP2OpenJPEG", quality="100", reversible="YES",
+        "+proj=longlat +R=1737400 +no_defs", driver="JP2OpenJPEG", quality="100", reversible="YES"
     )  # fmt: skip
     heights_agree(RasterTerrain([path], NONE, **AS_IT_IS), np.array([14.3]), np.array([12.2]), 1.0)
 
@@ -161,7 +162,7 @@ def test_a_raster_of_another_body_is_refused(tmp_path):
     path = write_tiff(
         tmp_path / "a.tif", rasterio.Affine(0.1, 0, 0, 0, -0.1, 10), np.zeros((9, 9), "int16"), "EPSG:4326"
     )
-    with pytest.raises(TerrainError, match=r"a\.tif: expected a raster of the Moon .* found a body of 6378"):
+    with raises(TerrainError, match=r"a\.tif: expected a raster of the Moon .* found a body of 6378"):
         open_layers([path])
 
 
@@ -176,10 +177,10 @@ def test_reflectance_tiles_are_averaged_over_the_grid_and_relative_to_their_medi
     places = np.radians(np.linspace(8.0, 2.0, 13)), np.radians(np.linspace(301.0, 309.0, 17))
     found = albedo.relative(*places)
     median = float(np.median(values[32:][values[32:] > 0]))
-    np.testing.assert_allclose(found[:, :7], 0.03 / median, rtol=0.03)
-    np.testing.assert_allclose(found[:, -7:], 0.06 / median, rtol=0.03)
+    assert_allclose(found[:, :7], 0.03 / median, rtol=0.03)
+    assert_allclose(found[:, -7:], 0.06 / median, rtol=0.03)
     beyond = albedo.relative(np.radians([9.9, 9.8]), np.radians([304.0, 306.0]))
-    np.testing.assert_array_equal(beyond, 1.0)
+    assert_array_equal(beyond, 1.0)
 
 
 def test_a_folder_with_sldem2015_uses_it_before_gld100(tmp_path):
@@ -240,7 +241,7 @@ def write_form(
     return path
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "form",
     [
         {}, {"convert": lambda h: h + 1_737_400.0, "dtype": "float64"}, {"convert": lambda h: h + 1_737_400.0},
@@ -258,16 +259,16 @@ def write_form(
         {"crs": "+proj=eqc +R=1737400 +lon_0=180", "scale": METRES_PER_DEGREE, "west": -170.0},
         {"crs": "+proj=eqc +R=1737400", "scale": METRES_PER_DEGREE, "west": -350.0}, {"high": 1 / 32},
         {"high": -1 / 16},
-    ],
+    ]
 )  # fmt: skip
 def test_a_form_of_the_same_ground_gives_the_same_heights(tmp_path, form):
     terrain = RasterTerrain([write_form(tmp_path / "a.tif", **form)], NONE, **AS_IT_IS)
     found = terrain.height_m(*np.radians(PLACES))
     # Half a metre of whole and half metres, and what one pixel of 1.9 km bends.
-    np.testing.assert_allclose(found, ground(*PLACES), atol=1.0)
+    assert_allclose(found, ground(*PLACES), atol=1.0)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("form", "message"),
     [
         ({"convert": lambda h: h / 1e3}, r"differ by 3 m .* found 0\.\d+ .* no unit stated\): kilometres"),
@@ -287,13 +288,13 @@ def test_a_raster_with_another_unit_zero_or_body_is_refused_with_both_numbers(tm
     if message is None:
         # What a file states of its unit counts: this ground is flat, at 1,737 m.
         found = RasterTerrain([path], NONE, **AS_IT_IS).height_m(*np.radians(PLACES))
-        np.testing.assert_allclose(found, 1737.4, atol=2.0)
+        assert_allclose(found, 1737.4, atol=2.0)
         return
-    with pytest.raises(TerrainError, match=message):
+    with raises(TerrainError, match=message):
         RasterTerrain([path], NONE, **AS_IT_IS).height_m(*np.radians(PLACES))
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("convert", "message"),
     [
         (lambda h: h, None),
@@ -311,7 +312,7 @@ def test_heights_of_the_form_of_the_coarse_relief_have_its_scale_and_zero(tmp_pa
         layer.read(128, 160, 160, 240)
         assert "1.00 times the relief of coarse.tif" in layer.readings[0]
         return
-    with pytest.raises(TerrainError, match=message):
+    with raises(TerrainError, match=message):
         layer.read(128, 160, 160, 240)
 
 
@@ -323,7 +324,7 @@ def test_a_layer_says_how_the_values_of_its_files_are_taken(tmp_path):
     assert "as radii in metres; -32768 (not stated) as no data" in words
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "crs",
     [
         "+proj=stere +lat_0=90 +R=1737400",
@@ -342,7 +343,7 @@ def test_any_projection_that_gdal_knows_is_read_at_its_places(tmp_path, crs):
     values = ground(north, east).reshape(size, size).astype("float32")
     terrain = RasterTerrain([write_tiff(tmp_path / "a.tif", transform, values, crs)], NONE, **AS_IT_IS)
     # Two resamplings of pixels of 1 km.
-    np.testing.assert_allclose(terrain.height_m(*np.radians(PLACES)), ground(*PLACES), atol=1.0)
+    assert_allclose(terrain.height_m(*np.radians(PLACES)), ground(*PLACES), atol=1.0)
     assert terrain.covers(*np.radians([(77.5, 10.0), (17.0, 200.0)])).tolist() == [True, False]
 
 
@@ -354,7 +355,7 @@ def test_a_polar_map_holds_the_pole_and_nothing_beyond_its_edge(tmp_path):
     assert layer.holds(latitude, longitude).tolist() == [True, True, True, False]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("line", "message"),
     [
         ('POSITIVE_LONGITUDE_DIRECTION = "WEST"', "expected longitudes to the east, found"),
@@ -366,7 +367,7 @@ def test_a_label_whose_axes_gdal_does_not_read_is_refused(tmp_path, line, messag
     path = write_pds3(tmp_path / "A", 8.0, 22.0, 32, 32, 16, values, "LSB_INTEGER", "METER", 0, 0.0)
     label = path.read_text().replace('POSITIVE_LONGITUDE_DIRECTION = "EAST"', line)
     path.write_text(label)
-    with pytest.raises(TerrainError, match=message):
+    with raises(TerrainError, match=message):
         open_layers([path])
 
 
@@ -383,4 +384,4 @@ def test_a_map_is_read_alike_on_both_sides_of_the_meridian_where_pixels_do_not_d
     for turn in (0.0, 360.0):
         found = terrain.height_m(np.zeros(7), np.radians(longitude + turn))
         # 0.07 m of 2000 m in a degree are a metre on the ground.
-        np.testing.assert_allclose(found, 2000.0 * longitude, atol=0.07)
+        assert_allclose(found, 2000.0 * longitude, atol=0.07)
