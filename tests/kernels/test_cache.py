@@ -176,7 +176,7 @@ def dependencies(module):
         ('"nsz", "contract"', '"nsz", "arcp"', {"outer"}), ("@njit\n", "@njit(error_model='numpy')\n", {"outer"}),
         ("np.arange(2000)", "np.arange(2000) + (np.arange(2000) == 1000)", {"of_array"}),
         ('"nsz", "contract"', '"contract", "nsz"', set()),
-        ("return arguments[0]", "return builder.neg(arguments[0])", set()),
+        ("return arguments[0]", "return builder.neg(arguments[0])", set())
     ]
 )  # fmt: skip
 def test_a_kernel_depends_on_all_that_it_names_and_on_nothing_else(tmp_path, monkeypatch, old, new, changed):

@@ -31,7 +31,7 @@ CLASS_DIAMETERS_M = (7_000.0, 12_000.0, 20_000.0)
 
 def paper_orbit_mcmf_m(seconds):
     """Return positions (n, 3) on the Kepler orbit of the paper's Table I over a uniformly turning Moon."""
-    time = np.asarray(list(seconds) if not isinstance(seconds, np.ndarray) else seconds, dtype=np.float64)
+    time = np.asarray(list(seconds) if not isinstance(seconds, np.ndarray) else seconds, float)
     a, e = 1_768_180.0, 0.006908
     i, node, perilune, start = np.radians([89.076, 3.164, 333.604, 8.882])
     anomaly = 2.0 * np.arctan(np.sqrt((1.0 - e) / (1.0 + e)) * np.tan(start / 2.0))
@@ -98,10 +98,10 @@ def make_crater_field(seed):
 
 
 def detections(u_px, v_px, diameter_px):
-    u = np.atleast_1d(np.asarray(u_px, dtype=np.float64))
+    u = np.atleast_1d(np.asarray(u_px, float))
     return Detections(
-        u, np.atleast_1d(np.asarray(v_px, dtype=np.float64)),
-        np.atleast_1d(np.asarray(diameter_px, dtype=np.float64)), np.ones_like(u), np.full_like(u, np.nan)
+        u, np.atleast_1d(np.asarray(v_px, float)),
+        np.atleast_1d(np.asarray(diameter_px, float)), np.ones_like(u), np.full_like(u, np.nan)
     )  # fmt: skip
 
 

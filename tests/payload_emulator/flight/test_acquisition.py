@@ -34,7 +34,7 @@ def crater_map(seed=3, reach_rad=0.08, mean_in_image=22.0):
     return landmark_map(
         CatalogueTable(
             np.arange(count), place[0], place[1], 5e3 * rng.uniform(0.07, 1.0, count) ** (-1.0 / 1.77),
-            rng.uniform(-1e3, 1e3, count), np.full((count, 3), 50.0),
+            rng.uniform(-1e3, 1e3, count), np.full((count, 3), 50.0)
         )
     )  # fmt: skip
 
@@ -148,7 +148,7 @@ def test_two_places_that_explain_as_much_are_no_place():
             CatalogueTable(
                 np.arange(count), np.tile(place[0], len(longitudes)),
                 np.concatenate([place[1] + shift for shift in longitudes]), np.tile(diameter, len(longitudes)),
-                np.zeros(count), np.full((count, 3), 50.0),
+                np.zeros(count), np.full((count, 3), 50.0)
             )
         )  # fmt: skip
 

@@ -26,7 +26,7 @@ from tmtc.dictionary.tables import (
     pack_orientation_table,
 )
 
-IMAGE = np.zeros((4, 4), dtype=np.uint8)
+IMAGE = np.zeros((4, 4), np.uint8)
 FRAMES = 14
 
 
@@ -35,7 +35,7 @@ class Flight:
 
     def __init__(self, case):
         self.ticks = [int(ticks_from_utc_ns(int(utc_ns))) for utc_ns in case.frame_utc_ns]
-        tdb_s = np.asarray(tdb_s_from_utc_ns(case.frame_utc_ns), dtype=np.float64)
+        tdb_s = np.asarray(tdb_s_from_utc_ns(case.frame_utc_ns), float)
         orbit = propagate(
             float(tdb_s[0]), case.position_icrf_m, case.velocity_icrf_m_s, float(tdb_s[-1] - tdb_s[0]) + 1.0,
             ForceModel(case.gravity, case.orientation)
@@ -54,7 +54,7 @@ class Flight:
             )
             self.attitudes.append(np.concatenate([quaternion_from_matrix(camera), [0.0, 0.0, -1.0]]))
         hours = case.epoch_utc_ns + np.arange(-8, 9) * 3_600 * 10**9
-        rotations = case.orientation.mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(hours), dtype=np.float64))
+        rotations = case.orientation.mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(hours), float))
         pa_from_mcmf = case.orientation.pa_from_icrf(float(tdb_s_from_utc_ns(int(hours[0])))) @ rotations[0].T
         uncertain = replace(catalogue_table(case.craters), sigma_m=np.full((len(case.craters), 3), 80.0))
         field = case.filter_gravity
@@ -67,7 +67,7 @@ class Flight:
             initial_state=pack_initial_state(
                 InitialState(
                     self.ticks[0], self.states[0, :3] + np.array([600.0, -500.0, 400.0]),
-                    self.states[0, 3:] + np.array([0.5, 0.4, -0.3]), 600.0, 0.6,
+                    self.states[0, 3:] + np.array([0.5, 0.4, -0.3]), 600.0, 0.6
                 )
             )
         )  # fmt: skip

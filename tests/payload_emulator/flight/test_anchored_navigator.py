@@ -66,13 +66,13 @@ class Orbit:
 
     def __init__(self, case):
         self.case = case
-        tdb_s = np.asarray(tdb_s_from_utc_ns(case.frame_utc_ns), dtype=np.float64)
+        tdb_s = np.asarray(tdb_s_from_utc_ns(case.frame_utc_ns), float)
         model = ForceModel(case.gravity, case.orientation, case.gravity_degree)
         span_s = float(tdb_s[-1] - tdb_s[0]) + 1.0
         flown = propagate(float(tdb_s[0]), case.position_icrf_m, case.velocity_icrf_m_s, span_s, model)
         self.states = flown.state(tdb_s)
         self.rotations = case.orientation.mcmf_from_icrf(tdb_s)
-        self.ticks = np.asarray(ticks_from_utc_ns(case.frame_utc_ns), dtype=np.int64)
+        self.ticks = np.asarray(ticks_from_utc_ns(case.frame_utc_ns), int)
         self.map = landmark_map(montecarlo.catalogue_table(case.craters))
 
     def attitude(self, k):
@@ -149,9 +149,7 @@ def test_without_an_image_attitude_or_detections_the_orbit_is_coasted(orbit):
     assert none.outcome is Outcome.no_image and np.isnan(none.nis) and none.matched == 0
     assert navigator.estimate.position_sigma_m > before.position_sigma_m
     blind = navigator.step(int(orbit.ticks[7]), orbit.detections(7), None)
-    empty = navigator.step(
-        int(orbit.ticks[8]), orbit.detections(8).select(np.empty(0, dtype=np.int64)), orbit.attitude(8)
-    )
+    empty = navigator.step(int(orbit.ticks[8]), orbit.detections(8).select(np.empty(0, int)), orbit.attitude(8))
     assert blind.outcome is Outcome.coasted and empty.outcome is Outcome.coasted
     assert orbit.error_m(navigator, 8) < 100.0
 
@@ -425,7 +423,7 @@ def test_a_widened_search_adds_the_distance_of_the_place_to_the_uncertainty(
     prior, found = navigator.estimate, orbit.detections(0)
     pose = Pose(prior.mean[:3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3))
     away = replace(pose, position_icrf_m=pose.position_icrf_m + np.array([0.0, moved_m, 0.0]))
-    none = np.empty(0, dtype=np.int64)
+    none = np.empty(0, int)
     place = Acquisition(none, none, away, 5, 3)
     acquired = recorded(monkeypatch, recovery, "acquire", place)
     corrected = []
@@ -587,7 +585,7 @@ def test_craters_are_looked_for_as_far_outside_as_the_position_may_be_off(orbit,
         wide[:3, :3] = np.eye(3) * sigma_m**2
         prior = replace(prior, covariance=wide)
         pose = Pose(prior.mean[:3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3))
-        nothing = in_view(orbit.map, pose, orbit.case.camera, 0.0).select(np.zeros(0, dtype=np.int64))
+        nothing = in_view(orbit.map, pose, orbit.case.camera, 0.0).select(np.zeros(0, int))
         calls = recorded(monkeypatch, anchored, "in_view", nothing)
         state = replace(navigator.state, estimate=prior)
         search = anchored.search_around(state, pose, orbit.detections(0), navigator.setup)
@@ -640,7 +638,7 @@ def test_what_identification_is_given_is_the_spread_of_prediction_and_catalogue(
 def at_altitude(altitude_m):
     mean = np.zeros(18)
     mean[0] = 1_737_400.0 + altitude_m
-    return FilterState(0, mean, np.eye(18), np.empty(0, dtype=np.int64))
+    return FilterState(0, mean, np.eye(18), np.empty(0, int))
 
 
 @mark.parametrize(
@@ -696,7 +694,7 @@ def test_the_map_is_shown_the_frame_as_corrected_and_what_no_crater_explains(orb
 
 
 def coasted_then_empty(orbit, navigator, seconds):
-    start, nothing = int(orbit.ticks[2]), orbit.detections(3).select(np.zeros(0, dtype=np.int64))
+    start, nothing = int(orbit.ticks[2]), orbit.detections(3).select(np.zeros(0, int))
     return [navigator.step(start + 100 * SECOND, None, None), navigator.step(start + seconds * SECOND, nothing, None)]
 
 

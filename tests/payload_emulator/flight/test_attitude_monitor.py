@@ -182,7 +182,7 @@ def test_a_degraded_attitude_takes_back_the_fixes_of_the_window_and_counts_with_
     case = navigation_case(3, start_position_m=100.0, start_velocity_m_s=0.1)
     table = montecarlo.catalogue_table(case.craters)
     states, rotations = montecarlo._truth(case, default_rng(1), default_rng(2))
-    ticks = np.asarray(ticks_from_utc_ns(case.frame_utc_ns), dtype=np.int64)
+    ticks = np.asarray(ticks_from_utc_ns(case.frame_utc_ns), int)
     setup, state = montecarlo._started(case, table, states[0], int(ticks[0]), default_rng(1))
     degraded = AttitudeMonitor(noise_rad=noise)
     before = state.estimate

@@ -89,7 +89,7 @@ def noted(*packets):
     ("count", "code"),
     [
         (100, OUT_OF_SEQUENCE), (99, OUT_OF_SEQUENCE), (101, 0), (8_291, 0), (8_292, OUT_OF_SEQUENCE),
-        (16_383, OUT_OF_SEQUENCE),
+        (16_383, OUT_OF_SEQUENCE)
     ]
 )  # fmt: skip
 def test_counts_go_forward_by_less_than_half_of_their_range(count, code):

@@ -12,7 +12,7 @@ from payload_emulator.flight.vision.preprocess import ImageQuality
 from tmtc.dictionary.onboard_parameters import PARAMETERS
 
 NUMBERS = {parameter.name: parameter.number for parameter in PARAMETERS}
-NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
+NO_IMAGE = np.zeros((0, 0), np.uint8)
 
 
 @fixture
@@ -234,7 +234,7 @@ def test_a_clock_that_jumps_ahead_does_not_release_what_it_has_passed(rig):
     ("heat_c", "drop_v", "event", "safe"),
     [
         (52.0, 0.0, "temperature_high", False), (90.0, 0.0, "temperature_high", True),
-        (-50.0, 0.0, "temperature_low", False), (0.0, 2.3, "power_low", False), (0.0, 3.5, "power_low", True),
+        (-50.0, 0.0, "temperature_low", False), (0.0, 2.3, "power_low", False), (0.0, 3.5, "power_low", True)
     ]
 )  # fmt: skip
 def test_power_and_heat_out_of_limits_are_told_once_and_end_in_safe_beyond(observing, heat_c, drop_v, event, safe):

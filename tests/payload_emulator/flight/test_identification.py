@@ -130,8 +130,8 @@ def test_a_pair_that_contradicts_the_shift_of_all_others_is_removed():
 
 
 def features(places, classes):
-    places = np.asarray(places, dtype=np.float64).reshape(-1, 2)
-    return GroundFeatures(places[:, 0], places[:, 1], np.asarray(classes, dtype=np.int64).reshape(-1))
+    places = np.asarray(places, float).reshape(-1, 2)
+    return GroundFeatures(places[:, 0], places[:, 1], np.asarray(classes, int).reshape(-1))
 
 
 def moved(frame, east_m, north_m):
@@ -178,7 +178,7 @@ def test_craters_of_different_class_never_pair():
     "shift, inside",
     [
         ((0.0, 17_501.0), True), ((0.0, 17_499.0), False), ((0.0, 32_499.0), True), ((0.0, 32_501.0), False),
-        ((1_249.0, 25_000.0), True), ((-1_251.0, 25_000.0), False),
+        ((1_249.0, 25_000.0), True), ((-1_251.0, 25_000.0), False)
     ]
 )  # fmt: skip
 def test_the_paper_bounds_at_30_s_are_halved_at_15_s(shift, inside):

@@ -75,7 +75,7 @@ def fly(mapper, craters, seed, frames=6, start_ticks=0, east_m=0.0, false=0, err
         size = np.concatenate([size, np.full(false, 25.0)])
         found = Detections(uv[:, 0], uv[:, 1], size, np.ones(len(uv)), np.full(len(uv), SIGMA_PX))
         view = View(start_ticks + k * 15 * SECOND, rotation, place + error, SPACECRAFT_M**2 * np.eye(3), 1e-4)
-        free = np.ones(len(uv), dtype=bool)
+        free = np.ones(len(uv), bool)
         made += mapper.observe(view, found, np.full(len(uv), SIGMA_PX**2), free, 300.0)
     made += mapper.close()
     return made
@@ -183,11 +183,11 @@ def test_nothing_is_mapped_while_the_spacecraft_does_not_know_where_it_is_or_see
     nothing = no_detections()
     place = mcmf_from_spherical(0.0, 0.0, 30e3)
     view = View(0, nadir_camera_from_mcmf(place), place, np.eye(3), 1e-4)
-    assert Mapper().observe(view, nothing, np.empty(0), np.empty(0, dtype=bool), 0.0) == ()
+    assert Mapper().observe(view, nothing, np.empty(0), np.empty(0, bool), 0.0) == ()
     lost = replace(view, covariance_m2=np.full((3, 3), np.nan))
     one = np.ones(1)
     found = Detections(200.0 * one, 200.0 * one, 20.0 * one, one, one)
-    assert Mapper().observe(lost, found, one, np.ones(1, dtype=bool), 0.0) == ()
+    assert Mapper().observe(lost, found, one, np.ones(1, bool), 0.0) == ()
 
 
 def test_detections_that_are_no_numbers_are_left_out():
@@ -198,7 +198,7 @@ def test_detections_that_are_no_numbers_are_left_out():
     size = np.array([20.0, np.nan, 25.0])
     found = Detections(values, values, size, np.ones(3), np.ones(3))
     for k in range(4):
-        mapper.observe(replace(view, ticks=k * SECOND), found, np.ones(3), np.ones(3, dtype=bool), 0.0)
+        mapper.observe(replace(view, ticks=k * SECOND), found, np.ones(3), np.ones(3, bool), 0.0)
     assert len(mapper.close()) == 1
 
 

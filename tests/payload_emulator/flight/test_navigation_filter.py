@@ -86,7 +86,7 @@ def prior_state(landmarks, index, seed=5):
     mean[:3], mean[3:6], mean[17] = POSITION_ICRF, [10.0, 1_600.0, -50.0], 2e-4
     mean[9:17] = 0.3 * sigma[9:17] * rng.standard_normal(8)
     mean[18:] = 20.0 * rng.standard_normal(3 * index.size)
-    return FilterState(1_000 * SECOND, mean, covariance, index.astype(np.int64))
+    return FilterState(1_000 * SECOND, mean, covariance, index.astype(int))
 
 
 def dense_update(prior, landmarks, index, uv, variance):
@@ -419,7 +419,7 @@ TABLE = BurnTable(np.array([START + 600 * SECOND]), KICK[None], np.array([0.05])
 def model():
     hours = EPOCH + np.arange(-8, 9) * 3_600 * 10**9
     moon, field = IauOrientation(), builtin_gravity()
-    tdb_s = np.asarray(tdb_s_from_utc_ns(hours), dtype=np.float64)
+    tdb_s = np.asarray(tdb_s_from_utc_ns(hours), float)
     rotations = moon.mcmf_from_icrf(tdb_s)
     table = unpack_orientation_table(
         pack_orientation_table(

@@ -17,7 +17,7 @@ from payload_emulator.flight.vision.preprocess import ImageQuality
 from tmtc.dictionary.tables import pack_anchor_table, table_hash
 
 ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
-IMAGE = np.zeros((4, 4), dtype=np.uint8)
+IMAGE = np.zeros((4, 4), np.uint8)
 RNG = np.random.default_rng(4)
 
 
@@ -392,7 +392,7 @@ def test_a_frame_of_the_filter_is_reported_in_full(rig):
         {
             "frame_number": 8, "image_ticks": ticks, "estimator": 2, "outcome": int(Outcome.fixed), "reset_trigger": 0,
             "detections": 6, "candidate_pairs": 9, "pairs": 3, "shift_east_m": approx(np.nan, nan_ok=True),
-            "shift_north_m": approx(np.nan, nan_ok=True), "anchor_reads": 0,
+            "shift_north_m": approx(np.nan, nan_ok=True), "anchor_reads": 0
         }
     ]  # fmt: skip
     assert rig.telemetry.named("navigation_state") == [
@@ -400,7 +400,7 @@ def test_a_frame_of_the_filter_is_reported_in_full(rig):
             "frame_number": 8, "image_ticks": ticks, "estimator": 2, "outcome": int(Outcome.fixed),
             "latitude_deg": approx(np.degrees(0.1)), "longitude_deg": approx(360.0 - np.degrees(0.2)),
             "altitude_m": 30e3, "velocity_icrf_m_s": (1.0, 2.0, 3.0), "sigma_rtn_m": (4.0, 6.0, 5.0), "nis": 7.0,
-            "matched": 3,
+            "matched": 3
         }
     ]  # fmt: skip
     (sent,) = rig.telemetry.named("filter_estimate")
@@ -416,7 +416,7 @@ def test_a_frame_of_the_filter_is_reported_in_full(rig):
 
 def test_new_landmarks_go_down_forty_to_a_packet(rig, monkeypatch):
     def rows(landmarks):
-        n = np.array(landmarks, dtype=np.float64)
+        n = np.array(landmarks, float)
         return SimpleNamespace(
             identity=n, latitude_rad=0.01 * n, longitude_rad=-0.01 * n, height_m=n + 1.0, diameter_m=n + 2.0,
             sigma_m=np.stack([n + 3.0, n + 4.0, n + 5.0], axis=1), sightings=n + 6.0, passes=n + 7.0

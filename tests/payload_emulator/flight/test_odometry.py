@@ -93,7 +93,7 @@ def test_the_planar_system_recovers_an_exact_planar_motion():
         local = ground - shift
         u = 255.5 + CAMERA.focal_px * local[:, 0] / altitude
         v = 255.5 - CAMERA.focal_px * local[:, 1] / altitude
-        kinds = np.zeros(10, dtype=np.int64)
+        kinds = np.zeros(10, int)
         features.append(odometry.FrameFeatures(u, v, GroundFeatures(local[:, 0], local[:, 1], kinds), altitude))
     match = Match(np.arange(10), np.arange(10), 10, True)
     motion = odometry.solve_planar(features[0], features[1], match, CAMERA, 15.0)
@@ -144,7 +144,7 @@ class Stream:
         self.second += wait_s
         seen = self.field.perfect_detections(self.moon.orbit([self.second])[0])
         if kind == "none":
-            seen = seen.select(np.zeros(len(seen), dtype=bool))
+            seen = seen.select(np.zeros(len(seen), bool))
         self.state, report = odometry.step(
             self.state, self.moon.ticks_at(self.second), seen, self.anchor, CAMERA, Mode.paper, self.parameters,
             manual_step=manual_step

@@ -20,7 +20,7 @@ from tmtc.dictionary.onboard_parameters import PARAMETERS
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.tables import pack_anchor_table, table_hash
 
-IMAGE = np.zeros((4, 4, 3), dtype=np.uint8)
+IMAGE = np.zeros((4, 4, 3), np.uint8)
 ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 FIRST_S = 6_600.0
 
@@ -267,7 +267,7 @@ VALUES = {"boot_count": 3, "parameters": {"scrub_interval_s": 5.0}, "schedule": 
 
 
 def written(*every):
-    memory = np.zeros(1000, dtype=np.uint8)
+    memory = np.zeros(1000, np.uint8)
     settings = Settings(memory)
     for values in every:
         assert settings.write(values)
@@ -275,7 +275,7 @@ def written(*every):
 
 
 def test_new_memory_is_blank():
-    assert Settings(np.zeros(1000, dtype=np.uint8)).read() == (Recovery.blank, {})
+    assert Settings(np.zeros(1000, np.uint8)).read() == (Recovery.blank, {})
 
 
 def test_the_newest_of_many_is_read():
@@ -319,7 +319,7 @@ def test_two_damaged_copies_are_lost_and_what_does_not_fit_is_refused():
 
 
 def test_a_set_of_settings_knows_the_generation_that_it_wrote():
-    memory = np.zeros(1000, dtype=np.uint8)
+    memory = np.zeros(1000, np.uint8)
     settings = Settings(memory)
     for _ in range(3):
         assert settings.write(VALUES)

@@ -18,7 +18,7 @@ def packet(count, seconds=0.0, octets=0):
 
 
 def store(octets=4000, **options):
-    return PacketStore(np.zeros(octets, dtype=np.uint8), **options)
+    return PacketStore(np.zeros(octets, np.uint8), **options)
 
 
 def test_what_goes_in_comes_out_once_in_the_order_it_was_made():

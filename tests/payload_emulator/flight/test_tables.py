@@ -112,7 +112,7 @@ def test_an_orientation_table_of_two_hour_steps_is_a_rotation_good_to_a_millimet
         return rz @ rx
 
     seconds = np.arange(-36_000.0, 122_400.0, 7_200.0)
-    ticks = np.round(seconds * 65_536).astype(np.int64)
+    ticks = np.round(seconds * 65_536).astype(int)
     octets = tables.pack_orientation_table(ticks, [matrix(second) for second in seconds], np.eye(3))
     table = tables.unpack_orientation_table(octets)
     for second in (0.0, 1_234.0, 50_000.0):

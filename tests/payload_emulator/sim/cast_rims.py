@@ -28,8 +28,8 @@ def rim_errors(terrain, camera, position_mcmf_m, camera_from_mcmf):
     The rim at an azimuth is the ground that lies a radius from the centre there, whatever its height.  A ray is turned
     until it meets just that ground; where nearer ground is in the way it never does.
     """
-    position = np.asarray(position_mcmf_m, dtype=np.float64)
-    rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
+    position = np.asarray(position_mcmf_m, float)
+    rotation = np.asarray(camera_from_mcmf, float)
     labels = label_frame(terrain, camera, position, rotation, 5_000.0)
     craters = terrain.measured(labels.index)
     chosen = np.flatnonzero(labels.inside & (labels.visible_fraction == 1.0) & np.isfinite(craters.rim_height_m))

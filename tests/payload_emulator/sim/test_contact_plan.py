@@ -56,7 +56,7 @@ def test_contacts_are_where_pymap3d_sees_the_spacecraft_above_the_lowest_elevati
     section = LinkSection(stations=(station,))
     plan = plan_contacts(ephemeris, section, START, STOP)
     assert plan
-    inside = np.zeros(1440, dtype=bool)
+    inside = np.zeros(1440, bool)
     minutes = START + np.arange(1440) * 60 * NS
     for one in plan:
         inside |= (minutes >= one.start_utc_ns) & (minutes < one.stop_utc_ns)
@@ -111,7 +111,7 @@ def test_outages_cut_contacts(ephemeris):
     "text",
     [
         "madrid", "paris 2029-08-07T00:00:00Z 2029-08-08T00:00:00Z", "madrid tomorrow 2029-08-08T00:00:00Z",
-        "madrid 2029-08-08T00:00:00Z 2029-08-07T00:00:00Z",
+        "madrid 2029-08-08T00:00:00Z 2029-08-07T00:00:00Z"
     ]
 )  # fmt: skip
 def test_an_outage_in_another_form_is_refused(text):

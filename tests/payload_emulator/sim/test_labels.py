@@ -184,7 +184,7 @@ def test_planes_come_back_by_name(tmp_path, options):
         (exr_octets(PLANES, compression=3), "uncompressed EXR, found method 3"),
         (exr_octets(PLANES, version=2 | 0x1000), "single-part EXR"),
         (b"\x89PNG\r\n\x1a\n" + bytes(40), "single-part EXR"), (exr_octets(PLANES)[:30], "damaged"),
-        (b"", "damaged"),
+        (b"", "damaged")
     ]
 )  # fmt: skip
 def test_anything_else_is_refused_with_what_is_wrong(tmp_path, octets, message):

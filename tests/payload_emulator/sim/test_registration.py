@@ -219,7 +219,7 @@ def test_ground_without_a_product_is_registered_from_its_rims(tmp_path):
         place = mcmf_from_spherical(np.radians([latitude_deg]), np.radians([longitude_deg]), 30e3)
         return SimpleNamespace(positions_mcmf=lambda utc_ns: place)
 
-    times = np.zeros(1, dtype=np.int64)
+    times = np.zeros(1, int)
     stated = _registration_name(terrain, beneath(13.0, 303.0), times)
     assert stated == ("crater list not registered to the terrain",)
     _register(terrain, beneath(13.0, 303.0), times)

@@ -215,7 +215,7 @@ def ground(latitude, longitude):
 
 def write_form(
     path, crs=MOON, west=10.0, wide=1 / 16, high=1 / 16, scale=1.0, convert=lambda h: h, dtype="float32",
-    unit=None, scales=None, count=1, nodata=None, edge=None, mask=False,
+    unit=None, scales=None, count=1, nodata=None, edge=None, mask=False
 ):  # fmt: skip
     """The ground from 72 to 82 N and 10 to 25 E as a raster in longitude and latitude times ``scale``, in one form."""
     rows, columns = round(10 / abs(high)), round(15 / wide)
@@ -258,7 +258,7 @@ def write_form(
         {"crs": "+proj=eqc +R=1737400 +units=km", "scale": METRES_PER_DEGREE / 1e3},
         {"crs": "+proj=eqc +R=1737400 +lon_0=180", "scale": METRES_PER_DEGREE, "west": -170.0},
         {"crs": "+proj=eqc +R=1737400", "scale": METRES_PER_DEGREE, "west": -350.0}, {"high": 1 / 32},
-        {"high": -1 / 16},
+        {"high": -1 / 16}
     ]
 )  # fmt: skip
 def test_a_form_of_the_same_ground_gives_the_same_heights(tmp_path, form):

@@ -154,7 +154,7 @@ def test_fresh_craters_of_the_real_catalogue_are_as_deep_on_gld100_as_they_shoul
 def test_smoothing_adds_its_terms_one_by_one_to_the_last_bit():
     """Tiles must be the same on every machine: the sums are those of float32 arrays added in order."""
     values = np.random.default_rng(5).normal(0.0, 900.0, (41, 57)).astype(np.float32)
-    weights = np.array([0.06, 0.24, 0.4, 0.24, 0.06], dtype=np.float32)
+    weights = np.array([0.06, 0.24, 0.4, 0.24, 0.06], np.float32)
     half = values.copy()
     half[2:-2] = sum(w * values[k : 37 + k] for k, w in enumerate(weights))
     expected = half.copy()

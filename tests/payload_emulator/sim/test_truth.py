@@ -35,7 +35,7 @@ BAND_RAD = (np.radians(-60.0), np.radians(60.0))
 
 
 def everywhere(latitude, longitude=None):
-    return np.ones(latitude.shape, dtype=bool)
+    return np.ones(latitude.shape, bool)
 
 
 def crossings(truth, covers, in_reach=everywhere, direction="ascending", band_rad=BAND_RAD):
@@ -181,7 +181,7 @@ def test_reads_of_the_truth_are_counted_by_the_thread_that_asks_for_it(polar_tru
 
 
 def board(**options):
-    return SimulatedBoard(PlatformModel(), 1, np.zeros(1000, dtype=np.uint8), np.zeros(1000, dtype=np.uint8), **options)
+    return SimulatedBoard(PlatformModel(), 1, np.zeros(1000, np.uint8), np.zeros(1000, np.uint8), **options)
 
 
 def test_the_sensors_and_stages_are_those_that_flight_reads():
@@ -259,7 +259,7 @@ def test_every_kind_of_fault_is_read(kind):
     [
         ("camera_dark", "expected KIND at SECONDS"), ("camera_dark at soon for 3", "expected KIND at SECONDS"),
         ("camera_dark at 5", "expected how long it lasts"), ("meteor at 5", "expected one of camera_dark"),
-        ("", "expected KIND at SECONDS"),
+        ("", "expected KIND at SECONDS")
     ]
 )  # fmt: skip
 def test_other_lines_are_refused_with_a_reason(text, message):
