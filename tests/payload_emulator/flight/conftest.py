@@ -203,6 +203,15 @@ class Rig:
         kinds = ("verification_not_accepted", "verification_not_started")
         return [labels[v["failure_code"]] for kind in kinds for v in self.named(packets, kind)]
 
+    def refused(self, orders, **options):
+        """Reasons of the refusals of telecommands."""
+        return self.refusals(self.step(orders, **options))
+
+    def report(self, command):
+        """The report, named like the telecommand that asks for it."""
+        (found,) = self.named(self.step(self.command(command)), command.removeprefix("report_") + "_report")
+        return found
+
 
 @fixture
 def rig():

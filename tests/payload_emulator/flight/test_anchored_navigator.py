@@ -34,9 +34,8 @@ SECOND = 65_536
 class Navigator:
     """Set-up and current state of the estimator under test, with the last report."""
 
-    def __init__(self, setup, state):
-        self.setup, self.state = setup, state
-        self.report = None
+    def __init__(self, orbit, setup, state):
+        self.orbit, self.setup, self.state = orbit, setup, state
 
     @property
     def estimate(self):
@@ -44,21 +43,20 @@ class Navigator:
 
     @property
     def fix(self):
-        assert self.report.fix is not None
         return self.report.fix
 
     def step(self, ticks, found, camera_from_icrf):
-        before = frozen_copy(self.state)
         given = self.state
-        self.state, self.report = anchored.step(given, Observation(ticks, found, camera_from_icrf), self.setup)
+        before = given.estimate.mean.copy(), given.estimate.covariance.copy()
+        self.state, self.report = anchored.step(given, Observation(int(ticks), found, camera_from_icrf), self.setup)
         # A step changes nothing of the state that it is given.
         assert_array_equal(given.estimate.mean, before[0])
         assert_array_equal(given.estimate.covariance, before[1])
         return self.report
 
-
-def frozen_copy(state):
-    return state.estimate.mean.copy(), state.estimate.covariance.copy()
+    def frame(self, k, *seen):
+        """Step to a frame, with its exact detections and attitude or with those given."""
+        return self.step(self.orbit.ticks[k], *(seen or (self.orbit.detections(k), self.orbit.attitude(k))))
 
 
 class Orbit:
@@ -78,9 +76,12 @@ class Orbit:
     def attitude(self, k):
         return nadir_camera_from_mcmf(self.rotations[k] @ self.states[k, :3]) @ self.rotations[k]
 
+    def pose(self, position=None, k=0):
+        position = self.states[k, :3] if position is None else position
+        return Pose(position, self.attitude(k), self.rotations[k], np.zeros(3), np.zeros(2), np.zeros(3))
+
     def detections(self, k, shift_px=0.0):
-        pose = Pose(self.states[k, :3], self.attitude(k), self.rotations[k], np.zeros(3), np.zeros(2), np.zeros(3))
-        seen = in_view(self.map, pose, self.case.camera, 0.0)
+        seen = in_view(self.map, self.pose(k=k), self.case.camera, 0.0)
         one = np.ones(len(seen))
         return Detections(seen.uv_px[:, 0] + shift_px, seen.uv_px[:, 1], seen.diameter_px, one, one)
 
@@ -93,8 +94,15 @@ class Orbit:
         )
         table = replace(montecarlo.catalogue_table(case.craters), sigma_m=np.full((len(case.craters), 3), 60.0))
         return Navigator(
-            *montecarlo._started(case, table, self.states[0], int(self.ticks[0]), np.random.default_rng(1))
+            self, *montecarlo._started(case, table, self.states[0], int(self.ticks[0]), np.random.default_rng(1))
         )
+
+    def flown(self, frames, **changes):
+        """A navigator after its first frames."""
+        navigator = self.navigator(**changes)
+        for k in range(frames):
+            navigator.frame(k)
+        return navigator
 
     def error_m(self, navigator, k):
         return float(norm(navigator.estimate.mean[:3] - self.states[k, :3]))
@@ -103,10 +111,6 @@ class Orbit:
 @fixture(scope="module")
 def orbit(navigation_case):
     return Orbit(navigation_case(40))
-
-
-def fly(orbit, navigator, first, last):
-    return [navigator.step(int(orbit.ticks[k]), orbit.detections(k), orbit.attitude(k)) for k in range(first, last)]
 
 
 def test_the_gate_of_a_frame_is_the_chi_square_quantile_it_says():
@@ -119,11 +123,10 @@ def test_the_gate_of_a_frame_is_the_chi_square_quantile_it_says():
 
 def test_shipped_parameters_hold_the_orbit_and_report_what_the_state_says(orbit):
     navigator = orbit.navigator()
-    reports = fly(orbit, navigator, 0, 12)
-    assert {report.outcome for report in reports} == {Outcome.fixed}
+    assert {navigator.frame(k).outcome for k in range(12)} == {Outcome.fixed}
     # Exact detections: what is left is the start, weighed with 60 m of catalogue and 15 m of its offset.
     assert orbit.error_m(navigator, 11) < 60.0
-    last, state = reports[-1], navigator.estimate
+    last, state = navigator.report, navigator.estimate
     place = orbit.rotations[11] @ state.mean[:3]
     radius = float(norm(place))
     assert last.altitude_m == approx(radius - 1_737_400.0, abs=1e-6)
@@ -142,23 +145,21 @@ def test_shipped_parameters_hold_the_orbit_and_report_what_the_state_says(orbit)
 
 
 def test_without_an_image_attitude_or_detections_the_orbit_is_coasted(orbit):
-    navigator = orbit.navigator()
-    fly(orbit, navigator, 0, 6)
+    navigator = orbit.flown(6)
     before = navigator.estimate
-    none = navigator.step(int(orbit.ticks[6]), None, orbit.attitude(6))
+    none = navigator.frame(6, None, orbit.attitude(6))
     assert none.outcome is Outcome.no_image and np.isnan(none.nis) and none.matched == 0
     assert navigator.estimate.position_sigma_m > before.position_sigma_m
-    blind = navigator.step(int(orbit.ticks[7]), orbit.detections(7), None)
-    empty = navigator.step(int(orbit.ticks[8]), orbit.detections(8).select(np.empty(0, int)), orbit.attitude(8))
+    blind = navigator.frame(7, orbit.detections(7), None)
+    empty = navigator.frame(8, orbit.detections(8).select(slice(0)), orbit.attitude(8))
     assert blind.outcome is Outcome.coasted and empty.outcome is Outcome.coasted
     assert orbit.error_m(navigator, 8) < 100.0
 
 
 def test_outside_the_orientation_table_the_old_state_stays(orbit):
-    navigator = orbit.navigator()
-    fly(orbit, navigator, 0, 3)
+    navigator = orbit.flown(3)
     before = navigator.state
-    report = navigator.step(int(orbit.ticks[3]) + 400 * 86_400 * SECOND, orbit.detections(3), orbit.attitude(3))
+    report = navigator.step(orbit.ticks[3] + 400 * 86_400 * SECOND, orbit.detections(3), orbit.attitude(3))
     assert report.outcome is Outcome.refused and np.isnan(report.latitude_rad)
     assert navigator.state is before
 
@@ -166,21 +167,19 @@ def test_outside_the_orientation_table_the_old_state_stays(orbit):
 def test_craters_stay_among_the_states_for_their_memory_and_no_longer(orbit):
     limit_s = AnchoredLimits().crater_memory_s
     for gap, kept in ((15, True), (17, False)):
-        navigator = orbit.navigator()
-        fly(orbit, navigator, 0, 6)
+        navigator = orbit.flown(6)
         assert navigator.estimate.craters.size > 5
         k = 5 + gap
         assert (gap * 15.0 <= limit_s) is kept
-        navigator.step(int(orbit.ticks[k]), None, None)
+        navigator.frame(k, None, None)
         assert (navigator.estimate.craters.size > 0) is kept
 
 
 def test_only_so_many_craters_are_used_the_surest(orbit):
-    navigator = orbit.navigator(crater_limit=5)
-    fly(orbit, navigator, 0, 1)
+    navigator = orbit.flown(1, crater_limit=5)
     found = orbit.detections(1)
     sigma = np.linspace(3.0, 0.6, len(found))
-    report = navigator.step(int(orbit.ticks[1]), replace(found, sigma_px=sigma), orbit.attitude(1))
+    report = navigator.frame(1, replace(found, sigma_px=sigma), orbit.attitude(1))
     fix = navigator.fix
     assert report.matched == 5
     # Exact detections are all identified: the five smallest sigmas are the last five.
@@ -199,6 +198,10 @@ def test_detection_noise_is_split_between_frame_and_crater(orbit):
     assert_allclose(variance[:3], [9.0, 4.0, 0.25])
     share = correction.detection_persistence(found, parameters)
     assert_allclose(share, 0.3)
+    # A share that the detector states replaces the parameter.
+    stated = np.linspace(0.0, 0.95, count)
+    assert_allclose(correction.detection_persistence(replace(found, persistence=stated), parameters), stated)
+
     fresh = correction.fresh_variance_px2(variance * (1.0 - share), parameters)
     assert_allclose(fresh[:3], [6.3, 2.8, 0.175])
     assert_allclose(correction.fresh_variance_px2(np.array([0.035]), parameters), [0.04])
@@ -224,32 +227,23 @@ def test_craters_enter_the_state_with_the_lasting_share_of_the_detection_error(o
     spread = []
     for share in (0.0, 0.9):
         navigator = orbit.navigator(detection_persistence=share)
-        navigator.step(int(orbit.ticks[0]), found, orbit.attitude(0))
+        navigator.frame(0, found, orbit.attitude(0))
         assert navigator.estimate.craters.size > 5
         spread.append(np.sqrt(np.diag(navigator.estimate.covariance)[kalman.SIZE :: 3]))
     assert spread[0].max() <= 60.0  # the catalogue's own
     assert spread[1].min() > 120.0
 
 
-def test_a_share_that_the_detector_states_replaces_the_parameter(orbit):
-    navigator = orbit.navigator(detection_persistence=0.3)
-    found = orbit.detections(0)
-    stated = np.linspace(0.0, 0.95, len(found))
-    share = correction.detection_persistence(replace(found, persistence=stated), navigator.setup.parameters)
-    assert_allclose(share, stated)
-
-
 def test_an_image_that_contradicts_the_prediction_is_refused_until_it_has_done_so_often(orbit):
-    navigator = orbit.navigator()
-    fly(orbit, navigator, 0, 8)
+    navigator = orbit.flown(8)
     error = orbit.error_m(navigator, 7)
     for k in range(8, 8 + 3):
-        report = navigator.step(int(orbit.ticks[k]), orbit.detections(k, shift_px=60.0), orbit.attitude(k))
+        report = navigator.frame(k, orbit.detections(k, shift_px=60.0), orbit.attitude(k))
         assert report.outcome in (Outcome.refused, Outcome.coasted) or report.matched <= 2
         assert orbit.error_m(navigator, k) < error + 100.0
     assert navigator.state.disagreements == 3
     # Frames that agree take the suspicion away.
-    navigator.step(int(orbit.ticks[11]), orbit.detections(11), orbit.attitude(11))
+    navigator.frame(11)
     assert navigator.state.disagreements == 0
 
 
@@ -298,11 +292,11 @@ def test_corrections_that_are_no_corrections_are_refused(orbit):
 
 def test_a_burn_on_the_way_is_flown_and_its_uncertainty_added(orbit):
     plain, burning = orbit.navigator(), orbit.navigator()
-    at = int(orbit.ticks[0]) + 20 * SECOND
+    at = orbit.ticks[0] + 20 * SECOND
     push = np.array([0.0, 2.0, 0.0])
     burning.setup = replace(burning.setup, burns=BurnTable(np.array([at]), push[None], np.array([0.05])))
     for navigator in (plain, burning):
-        navigator.step(int(orbit.ticks[2]), None, None)
+        navigator.frame(2, None, None)
     moved = burning.estimate.mean - plain.estimate.mean
     # Ten seconds after the burn: 20 m along its axis; gravity changes that by a millionth.
     assert_allclose(moved[:3], 10.0 * push, atol=1e-2)
@@ -311,8 +305,8 @@ def test_a_burn_on_the_way_is_flown_and_its_uncertainty_added(orbit):
     assert_allclose(np.diag(added)[3:6], 0.05**2, rtol=1e-3)
     assert_allclose(np.diag(added)[:3], (10.0 * 0.05) ** 2, rtol=1e-3)
     # Back before the burn it is undone.
-    burning.step(int(orbit.ticks[0]), None, None)
-    plain.step(int(orbit.ticks[0]), None, None)
+    burning.frame(0, None, None)
+    plain.frame(0, None, None)
     assert_allclose(burning.estimate.mean[3:6], plain.estimate.mean[3:6], atol=1e-3)
 
 
@@ -329,17 +323,17 @@ def test_it_is_lost_beyond_its_limit(orbit):
     assert anchored.is_lost(unknown, parameters)
     # The report of a frame says so.
     navigator.state = wider
-    report = navigator.step(int(orbit.ticks[1]), None, None)
-    assert report.lost and not orbit.navigator().step(int(orbit.ticks[1]), None, None).lost
+    report = navigator.frame(1, None, None)
+    assert report.lost and not orbit.navigator().frame(1, None, None).lost
 
 
 def test_a_wide_prior_is_searched_by_votes_and_says_so(orbit):
     navigator = orbit.navigator(start_position_m=9_000.0)
     assert navigator.estimate.position_sigma_m > AnchoredParameters().tracking_limit_m
-    report = navigator.step(int(orbit.ticks[0]), orbit.detections(0), orbit.attitude(0))
+    report = navigator.frame(0)
     assert report.outcome is Outcome.fixed and report.reacquired
     assert orbit.error_m(navigator, 0) < 300.0
-    following = navigator.step(int(orbit.ticks[1]), orbit.detections(1), orbit.attitude(1))
+    following = navigator.frame(1)
     assert following.outcome is Outcome.fixed and not following.reacquired
 
 
@@ -376,7 +370,7 @@ def test_a_place_found_without_a_prior_turns_the_orbit_with_it(orbit, monkeypatc
             prior, pose, found, landmarks, setup.camera, setup.parameters, setup.markov_sigma_m_s2, index
         )
 
-    pose = Pose(prior.mean[:3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3))
+    pose = orbit.pose(prior.mean[:3])
     assert found_anywhere() == "the fix"
     ((given, sigma_px, places, camera, parameters),) = search
     assert given is found and camera is orbit.case.camera and parameters is setup.parameters.lost
@@ -421,7 +415,7 @@ def test_a_widened_search_adds_the_distance_of_the_place_to_the_uncertainty(
     """Half a width of 24 km is three sigma: 8 km, and a velocity of 8 m/s."""
     navigator = orbit.navigator(search_radius_m=24_000.0)
     prior, found = navigator.estimate, orbit.detections(0)
-    pose = Pose(prior.mean[:3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3))
+    pose = orbit.pose(prior.mean[:3])
     away = replace(pose, position_icrf_m=pose.position_icrf_m + np.array([0.0, moved_m, 0.0]))
     none = np.empty(0, int)
     place = Acquisition(none, none, away, 5, 3)
@@ -448,9 +442,9 @@ def test_a_reacquisition_leaves_out_the_pair_that_all_others_contradict(orbit, m
     navigator = orbit.navigator()
     prior, found = navigator.estimate, orbit.detections(0)
     landmarks, camera, parameters = navigator.state.landmarks, orbit.case.camera, navigator.setup.parameters
-    pose = Pose(prior.mean[:3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3))
+    pose = orbit.pose(prior.mean[:3])
     sighting = in_view(landmarks, pose, camera, 0.0)
-    true = Pose(orbit.states[0, :3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3))
+    true = orbit.pose()
     seen = in_view(orbit.map, true, camera, 0.0).index.tolist()
     pairs = [(seen.index(crater), k) for k, crater in enumerate(sighting.index.tolist()) if crater in seen]
     detection, sighted = (np.array(column) for column in zip(*pairs, strict=True))
@@ -503,48 +497,47 @@ def test_the_time_since_the_last_fix_goes_into_the_widened_search(orbit, monkeyp
     widened = recorded(monkeypatch, recovery, "search_widely")
     monkeypatch.setattr(anchored, "rotation_evidence", lambda *_: None)
     empty = Detections(*np.full((5, 6), 5.0))
-    navigator.step(int(orbit.ticks[0]), empty, orbit.attitude(0))
-    fly(orbit, navigator, 1, 3)
+    navigator.frame(0, empty, orbit.attitude(0))
+    for k in (1, 2):
+        navigator.frame(k)
+
     assert navigator.state.fixed_ticks == orbit.ticks[2]
-    navigator.step(int(orbit.ticks[4]), empty, orbit.attitude(4))
+    navigator.frame(4, empty, orbit.attitude(4))
     assert [given[-2] for given in widened] == [np.inf, 30.0]
 
 
 def test_a_reset_of_the_filter_drops_the_predictions_of_the_window(orbit, monkeypatch):
-    navigator = orbit.navigator()
-    fly(orbit, navigator, 0, 4)
+    navigator = orbit.flown(4)
     assert len(navigator.state.trusted) == 4 == len(navigator.state.attitude.window)
     fix = replace(navigator.fix, reacquired=True)
     monkeypatch.setattr(anchored, "search_around", lambda state, *_: anchored.Search(state.estimate, None, 5, 5))
     monkeypatch.setattr(anchored, "rotation_evidence", lambda *_: None)
     monkeypatch.setattr(anchored, "recovered", lambda state, *_: (state, fix))
-    navigator.step(int(orbit.ticks[4]), orbit.detections(4), orbit.attitude(4))
+    navigator.frame(4)
     assert navigator.state.trusted == () and len(navigator.state.attitude.window) == 4
 
 
 def test_frames_under_examination_by_the_monitor_are_not_searched_widely(orbit, monkeypatch):
-    navigator = orbit.navigator(suspicion_frames=1, lost_frames=100)
-    fly(orbit, navigator, 0, 3)
+    navigator = orbit.flown(3, suspicion_frames=1, lost_frames=100)
     evidence = replace(navigator.fix.update.rotation, trial=True)
     monkeypatch.setattr(anchored, "search_around", lambda state, *_: anchored.Search(state.estimate, None, 9, 9))
     monkeypatch.setattr(anchored, "rotation_evidence", lambda *_: evidence)
     widened = recorded(monkeypatch, recovery, "search_widely")
     searches = []
     for k in range(3, 9):
-        navigator.step(int(orbit.ticks[k]), orbit.detections(k), orbit.attitude(k))
+        navigator.frame(k)
         searches.append(len(widened))
     # Four frames tell noise from a common rotation too poorly; from the fifth on the position is searched.
     assert searches == [0, 0, 0, 0, 1, 2]
 
 
 def test_an_estimate_that_left_the_moon_starts_again_from_the_tables(orbit):
-    navigator = orbit.navigator()
-    fly(orbit, navigator, 0, 3)
+    navigator = orbit.flown(3)
     below = navigator.estimate.mean.copy()
     below[:3] *= 0.9
     broken = FilterState(navigator.estimate.ticks, below, navigator.estimate.covariance, navigator.estimate.craters)
     navigator.state = replace(navigator.state, estimate=broken)
-    report = navigator.step(int(orbit.ticks[3]), orbit.detections(3), orbit.attitude(3))
+    report = navigator.frame(3)
     assert report.outcome is Outcome.fixed and orbit.error_m(navigator, 3) < 200.0
 
 
@@ -561,7 +554,7 @@ def test_disagreeing_frames_widen_the_search_and_then_give_the_prior_up(orbit, m
     anywhere = recorded(monkeypatch, recovery, "search_everywhere")
     counts = []
     for k in range(13):
-        report = navigator.step(int(orbit.ticks[k]), orbit.detections(k), orbit.attitude(k))
+        report = navigator.frame(k)
         assert (report.outcome, report.candidates, report.expected) == (Outcome.refused, 7, 10)
         counts.append((len(widened), len(anywhere)))
     assert counts == [
@@ -571,7 +564,7 @@ def test_disagreeing_frames_widen_the_search_and_then_give_the_prior_up(orbit, m
     assert navigator.state.places is not None
     assert {id(given[-2]) for given in anywhere} == {id(navigator.state.places)}
     candidates = 0
-    report = navigator.step(int(orbit.ticks[13]), orbit.detections(13), orbit.attitude(13))
+    report = navigator.frame(13)
     assert report.outcome is Outcome.coasted
 
 
@@ -584,8 +577,8 @@ def test_craters_are_looked_for_as_far_outside_as_the_position_may_be_off(orbit,
         wide = np.zeros_like(prior.covariance)
         wide[:3, :3] = np.eye(3) * sigma_m**2
         prior = replace(prior, covariance=wide)
-        pose = Pose(prior.mean[:3], orbit.attitude(0), orbit.rotations[0], np.zeros(3), np.zeros(2), np.zeros(3))
-        nothing = in_view(orbit.map, pose, orbit.case.camera, 0.0).select(np.zeros(0, int))
+        pose = orbit.pose(prior.mean[:3])
+        nothing = in_view(orbit.map, pose, orbit.case.camera, 0.0).select(slice(0))
         calls = recorded(monkeypatch, anchored, "in_view", nothing)
         state = replace(navigator.state, estimate=prior)
         search = anchored.search_around(state, pose, orbit.detections(0), navigator.setup)
@@ -596,11 +589,10 @@ def test_craters_are_looked_for_as_far_outside_as_the_position_may_be_off(orbit,
 
 
 def test_what_identification_is_given_is_the_spread_of_prediction_and_catalogue(orbit, monkeypatch):
-    navigator = orbit.navigator()
-    fly(orbit, navigator, 0, 3)
+    navigator = orbit.flown(3)
     # Some craters are among the states, others are not.
     prior = navigator.estimate.only_craters(navigator.estimate.craters[::2])
-    pose = Pose(prior.mean[:3], orbit.attitude(2), orbit.rotations[2], np.zeros(3), np.zeros(2), np.zeros(3))
+    pose = orbit.pose(prior.mean[:3], 2)
     landmarks, parameters = navigator.state.landmarks, navigator.setup.parameters
     sighting = in_view(landmarks, pose, orbit.case.camera, 0.0)
     calls = recorded(monkeypatch, correction, "identify", "pairs")
@@ -641,16 +633,11 @@ def at_altitude(altitude_m):
     return FilterState(0, mean, np.eye(18), np.empty(0, int))
 
 
-@mark.parametrize(
-    ("altitude_m", "limit_m"), [(14e3, 1_500.0), (50e3, 1_500.0), (100e3, 1_500.0), (150e3, 2_250.0), (200e3, 3_000.0)]
-)
-def test_the_limit_of_the_linear_search_grows_with_the_ground_in_a_pixel(altitude_m, limit_m):
-    found = correction.tracking_limit_m(at_altitude(altitude_m), AnchoredParameters())
-    assert found == approx(limit_m)
-
-
-def test_a_search_without_a_prior_covers_the_predicted_altitude():
+def test_limits_of_a_search_grow_with_the_altitude():
+    """The ground in a pixel sets the limit of the linear search; one without a prior covers the predicted altitude."""
     parameters = AnchoredParameters()
+    limits = [correction.tracking_limit_m(at_altitude(1e3 * km), parameters) for km in (14, 50, 100, 150, 200)]
+    assert limits == approx([1_500.0, 1_500.0, 1_500.0, 2_250.0, 3_000.0])
     assert recovery._lost_parameters(at_altitude(45e3), parameters) is parameters.lost
     high = recovery._lost_parameters(at_altitude(150e3), parameters)
     assert high == replace(parameters.lost, maximum_altitude_m=approx(180e3))
@@ -658,8 +645,7 @@ def test_a_search_without_a_prior_covers_the_predicted_altitude():
 
 def test_the_map_is_shown_the_frame_as_corrected_and_what_no_crater_explains(orbit, monkeypatch):
     """The attitude turned back by what the filter found of it, the pixels less their bias."""
-    navigator = orbit.navigator()
-    fly(orbit, navigator, 0, 3)
+    navigator = orbit.flown(3)
     found = orbit.detections(2)
     stray = Detections(*(np.append(column, 300.0) for column in (found.u_px, found.v_px)),
         np.append(found.diameter_px, 200.0), np.ones(len(found) + 1), np.ones(len(found) + 1))  # fmt: skip
@@ -694,22 +680,21 @@ def test_the_map_is_shown_the_frame_as_corrected_and_what_no_crater_explains(orb
 
 
 def coasted_then_empty(orbit, navigator, seconds):
-    start, nothing = int(orbit.ticks[2]), orbit.detections(3).select(np.zeros(0, int))
+    start, nothing = orbit.ticks[2], orbit.detections(3).select(slice(0))
     return [navigator.step(start + 100 * SECOND, None, None), navigator.step(start + seconds * SECOND, nothing, None)]
 
 
 def test_a_pass_ends_when_nothing_was_seen_for_the_memory_of_craters(orbit, monkeypatch):
     """240 s without an image, or a clock that went back; coasted frames in between change nothing of that."""
     for seconds, ended in ((240, 0), (241, 1), (-1, 1)):
-        navigator = orbit.navigator()
-        fly(orbit, navigator, 0, 3)
+        navigator = orbit.flown(3)
         with monkeypatch.context() as patched:
             calls = recorded(patched, anchored.mapping, "close", (navigator.state.mapped, ("new",)))
             reports = coasted_then_empty(orbit, navigator, seconds)
         assert [report.new_landmarks for report in reports] == [(), ("new",) * ended]
         assert len(calls) == ended, seconds
         # The search takes up where the image was, not where it was coasted to.
-        assert navigator.state.image_ticks == int(orbit.ticks[2]) + seconds * SECOND
+        assert navigator.state.image_ticks == orbit.ticks[2] + seconds * SECOND
 
 
 def test_the_landmarks_of_a_pass_serve_from_its_end_on(orbit, monkeypatch):

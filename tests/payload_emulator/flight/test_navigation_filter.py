@@ -89,6 +89,24 @@ def prior_state(landmarks, index, seed=5):
     return FilterState(1_000 * SECOND, mean, covariance, index.astype(int))
 
 
+def differences(size):
+    """Steps of the states and of the turn of the frame for numeric derivatives."""
+    return np.repeat([1.0, 1e-6, 1e-3, 0.1, 1e-7, 0.1, 1e-6], [9, 3, 2, 3, 1, size - 18, 3])
+
+
+def first_state(sigma_m=1.0, sigma_m_s=1.0, errors=ERRORS, **options):
+    """The filter over the common place at the start of time."""
+    return kalman.initial_filter_state(
+        0, POSITION_ICRF, np.zeros(3), sigma_m, sigma_m_s, (1e-6,) * 3, errors, **options
+    )
+
+
+def updated(prior, landmarks, index, uv, variance, errors=ERRORS, *iterations):
+    return kalman.update(
+        prior, CAMERA_FROM_ICRF, MCMF_FROM_ICRF, landmarks, index, uv, variance, CAMERA, errors, *iterations
+    )
+
+
 def dense_update(prior, landmarks, index, uv, variance):
     """Mean, covariance, NIS and mean innovation of the least-squares problem; the turn of the frame stands last."""
     size = prior.mean.size
@@ -97,8 +115,7 @@ def dense_update(prior, landmarks, index, uv, variance):
     covariance0[:size, :size] = prior.covariance
     covariance0[size:, size:] = np.eye(3) * ERRORS.attitude_noise_rad**2
     information, weight = np.linalg.inv(covariance0), np.repeat(1.0 / variance, 2)
-    steps = np.concatenate([np.full(9, 1.0), np.full(3, 1e-6), np.full(2, 1e-3), np.full(3, 0.1), [1e-7]])
-    steps = np.concatenate([steps, np.full(size - 18, 0.1), np.full(3, 1e-6)])
+    steps = differences(size)
 
     def measure(x):
         return projected(x[:size], landmarks, index, x[size:]).reshape(-1)
@@ -136,9 +153,7 @@ def test_an_update_is_the_least_squares_solution_with_its_covariance():
     variance = np.array([0.6, 1.1, 0.3, 2.0, 0.8])
     turn = np.array([3e-4, -2e-4, 4e-4])
     uv = projected(truth, landmarks, index, turn) + np.sqrt(variance)[:, None] * rng.standard_normal((5, 2))
-    found = kalman.update(
-        prior, CAMERA_FROM_ICRF, MCMF_FROM_ICRF, landmarks, index, uv, variance, CAMERA, ERRORS, iterations=6
-    )
+    found = updated(prior, landmarks, index, uv, variance, ERRORS, 6)
     mean, covariance, nis, mean_innovation = dense_update(prior, landmarks, index, uv, variance)
     size = prior.mean.size
     sigma = np.sqrt(np.diag(covariance))
@@ -171,7 +186,7 @@ def test_an_update_is_the_least_squares_solution_with_its_covariance():
         assert found.contradiction[k] == approx(expected, rel=0.02)
     # A rotation of the camera: gradient and information of the innovations.
     errors = replace(ERRORS, attitude_noise_rad=1e-3 * ERRORS.attitude_noise_rad)
-    free = kalman.update(prior, CAMERA_FROM_ICRF, MCMF_FROM_ICRF, landmarks, index, uv, variance, CAMERA, errors)
+    free = updated(prior, landmarks, index, uv, variance, errors)
     assert free.rotation.sigma_rad == errors.attitude_noise_rad
     # With a small attitude noise the estimated rotation is the gradient times its variance.
     assert_allclose(free.attitude_rad, errors.attitude_noise_rad**2 * free.rotation.gradient, rtol=0.05, atol=1e-12)
@@ -182,18 +197,14 @@ def test_what_all_craters_share_is_told_apart_from_the_position_by_its_prior_alo
     """A shift of the catalogue to the east looks like one of the camera: they divide it by their variances."""
     landmarks, index = craters(40, seed=1), np.arange(40)
     errors = replace(ERRORS, attitude_noise_rad=1e-9, catalogue_offset_m=(30.0, 1e-3, 1e-3))
-    start = kalman.initial_filter_state(
-        0, POSITION_ICRF, np.zeros(3), 40.0, 1.0, (1e-6,) * 3, replace(errors, attitude_bias_rad=1e-9)
-    )
+    start = first_state(40.0, errors=replace(errors, attitude_bias_rad=1e-9))
     covariance = start.covariance.copy()
     covariance[12:14, 12:14], covariance[17, 17] = np.eye(2) * 1e-12, 1e-16
     prior = replace(start, covariance=covariance).with_craters(index, np.full((40, 3), 1e-3))
     shifted = replace(prior, mean=prior.mean.copy())
     shifted.mean[14] = 100.0
     uv = projected(shifted.mean, landmarks, index, np.zeros(3))
-    found = kalman.update(
-        prior, CAMERA_FROM_ICRF, MCMF_FROM_ICRF, landmarks, index, uv, np.full(40, 1e-2), CAMERA, errors
-    )
+    found = updated(prior, landmarks, index, uv, np.full(40, 1e-2), errors)
     # East offset o and camera shift -p with o + p = 100: o : p = 30^2 : 40^2. Detections know their sum to 3 m and,
     # by the curvature of the ground, their difference to 250 m.
     assert found.state.mean[14] == approx(36.0, abs=1.0)
@@ -209,9 +220,7 @@ def test_craters_seen_where_they_are_predicted_move_nothing_and_tell_much():
     landmarks, index = craters(), np.arange(7)
     prior = prior_state(landmarks, index)
     uv = projected(prior.mean, landmarks, index, np.zeros(3))
-    found = kalman.update(
-        prior, CAMERA_FROM_ICRF, MCMF_FROM_ICRF, landmarks, index, uv, np.full(7, 0.5), CAMERA, ERRORS
-    )
+    found = updated(prior, landmarks, index, uv, np.full(7, 0.5))
     assert_allclose(found.state.mean, prior.mean, atol=1e-5)
     assert found.nis == approx(0.0, abs=1e-9)
     assert np.all(np.diag(found.state.covariance) <= np.diag(prior.covariance) * (1.0 + 1e-9))
@@ -223,9 +232,8 @@ def test_numbers_that_allow_no_update_give_none():
     behind = replace(prior, mean=prior.mean.copy())
     behind.mean[:3] *= 0.9
     uv, variance = np.full((2, 2), 250.0), np.ones(2)
-    arguments = (CAMERA_FROM_ICRF, MCMF_FROM_ICRF, landmarks, index)
-    assert kalman.update(behind, *arguments, uv, variance, CAMERA, ERRORS) is None
-    assert kalman.update(prior, *arguments, np.full((2, 2), np.nan), variance, CAMERA, ERRORS) is None
+    assert updated(behind, landmarks, index, uv, variance) is None
+    assert updated(prior, landmarks, index, np.nan * uv, variance) is None
 
 
 def test_derivatives_stand_in_the_columns_of_their_states():
@@ -244,8 +252,7 @@ def test_derivatives_stand_in_the_columns_of_their_states():
         full = np.concatenate([x[:18], x[21:24], x[18:21], np.zeros(3)])
         return projected(full, landmarks, asked, x[24:])
 
-    steps = np.concatenate([np.full(9, 1.0), np.full(3, 1e-6), np.full(2, 1e-3), np.full(3, 0.1), [1e-7]])
-    steps = np.concatenate([steps, np.full(6, 0.1), np.full(3, 1e-6)])
+    steps = differences(24)
     for k in range(size):
         change = np.zeros(size)
         change[k] = steps[k]
@@ -302,7 +309,7 @@ def test_a_prediction_carries_each_part_by_its_own_law():
 
 
 def test_slow_errors_come_to_rest_at_the_size_they_are_said_to_have():
-    state = kalman.initial_filter_state(0, POSITION_ICRF, np.zeros(3), 1.0, 1.0, (1e-6,) * 3, ERRORS)
+    state = first_state()
 
     class Still(Drift):
         def propagate(self, state, from_ticks, to_ticks):
@@ -328,10 +335,7 @@ def test_the_first_state_holds_what_it_is_given():
     assert state.mean[17] == 2e-4 and not state.mean[6:17].any()
     assert state.ticks == 77 and not state.craters.size
     assert state.position_sigma_m == approx(500.0)
-
-
-def test_the_worst_direction_of_the_position_counts():
-    state = kalman.initial_filter_state(0, POSITION_ICRF, np.zeros(3), 1.0, 1.0, (1e-6,) * 3, ERRORS)
+    # The worst direction counts.
     axes = Rotation.from_rotvec([0.4, 0.5, -0.2]).as_matrix()
     state.covariance[:3, :3] = axes @ np.diag([4.0, 100.0, 9.0]) @ axes.T
     assert state.position_sigma_m == approx(10.0)
@@ -367,7 +371,7 @@ def test_craters_come_and_go_with_their_correlations():
     assert_allclose(np.diag(grown.covariance)[27:], [1.0, 4.0, 9.0, 49.0, 64.0, 81.0])
     assert not grown.covariance[27:, :27].any() and not grown.mean[27:].any()
     assert prior.with_craters(np.array([4]), np.ones((1, 3))) is prior
-    none = kalman.initial_filter_state(0, POSITION_ICRF, np.zeros(3), 1.0, 1.0, (1e-6,) * 3, ERRORS)
+    none = first_state()
     assert none.slots(np.array([3])).tolist() == [-1]
 
 
@@ -439,15 +443,9 @@ def test_a_table_of_burns_comes_back_in_order_of_time():
     assert len(unpack_burn_table(pack_burn_table(no_burns()))) == 0
 
 
-@mark.parametrize(
-    "table",
-    [
-        BurnTable(np.array([START, START]), np.stack([KICK, KICK]), np.array([0.1, 0.1])),
-        BurnTable(np.array([START]), KICK[None], np.array([-0.1])),
-        BurnTable(np.array([START]), np.full((1, 3), np.nan), np.array([0.1])),
-    ],
-)
-def test_burns_at_one_time_negative_sigmas_and_nan_are_refused(table):
+@mark.parametrize("count, kick, sigma", [(2, KICK, 0.1), (1, KICK, -0.1), (1, np.nan * KICK, 0.1)])
+def test_burns_at_one_time_negative_sigmas_and_nan_are_refused(count, kick, sigma):
+    table = BurnTable(np.full(count, START), np.tile(kick, (count, 1)), np.full(count, sigma))
     with raises(TableError, match="burn table"):
         unpack_burn_table(pack_burn_table(table))
 
@@ -458,11 +456,8 @@ def test_a_burn_is_flown_at_its_time_and_not_before(model):
     kicked = half.state.copy()
     kicked[3:6] += KICK
     rest = model.propagate(kicked, START + 600 * SECOND, stop)
-    found = flown(model, state, START, stop, TABLE)
-    assert found is not None
-    assert_array_equal(found, rest.state)
-    before = flown(model, state, START, START + 599 * SECOND, TABLE)
-    coasted = flown(model, state, START, START + 599 * SECOND, no_burns())
+    assert_array_equal(flown(model, state, START, stop, TABLE), rest.state)
+    before, coasted = (flown(model, state, START, START + 599 * SECOND, table) for table in (TABLE, no_burns()))
     assert_array_equal(before, coasted)
 
 
@@ -494,9 +489,7 @@ def test_the_slope_is_the_derivative_of_state_and_likelihood_by_the_size_of_the_
 
     def flown(size_m):
         errors = replace(ERRORS, catalogue_offset_m=(size_m, size_m, 10.0))
-        state = kalman.initial_filter_state(
-            0, POSITION_ICRF, np.zeros(3), 40.0, 1e-3, (1e-6,) * 3, errors, learns_offset=True
-        )
+        state = first_state(40.0, 1e-3, errors, learns_offset=True)
         logarithm = score = information = 0.0
         rng, place = default_rng(3), POSITION_ICRF
         for k in range(4):
@@ -505,9 +498,7 @@ def test_the_slope_is_the_derivative_of_state_and_likelihood_by_the_size_of_the_
             prior = moved.with_craters(index, np.full((5, 3), 50.0)).only_craters(index)
             true = np.concatenate([place, np.zeros(11), [30.0, -20.0, 0.0], np.zeros(16)])
             uv = projected(true, landmarks, index, np.zeros(3)) + 0.8 * rng.standard_normal((5, 2))
-            found = kalman.update(
-                prior, CAMERA_FROM_ICRF, MCMF_FROM_ICRF, landmarks, index, uv, variance, CAMERA, errors, 1
-            )
+            found = updated(prior, landmarks, index, uv, variance, errors, 1)
             logarithm += log_likelihood(prior, landmarks, index, found.nis)
             state, score = found.state, score + found.score[0]
             information += found.score[1]
@@ -527,9 +518,7 @@ def test_the_slope_is_the_derivative_of_state_and_likelihood_by_the_size_of_the_
 
 
 def test_an_offset_of_another_size_scales_its_part_of_state_and_slope():
-    start = kalman.initial_filter_state(
-        0, POSITION_ICRF, np.zeros(3), 40.0, 1.0, (1e-6,) * 3, ERRORS, learns_offset=True
-    )
+    start = first_state(40.0, learns_offset=True)
     covariance = start.covariance.copy()
     covariance[0, 14] = covariance[14, 0] = 100.0
     mean = start.mean.copy()

@@ -114,59 +114,61 @@ def rig(monkeypatch):
     observer._states[Mode.anchored] = ("the tables", navigator.start)
     monkeypatch.setattr(anchored, "step", navigator.step)
     monkeypatch.setattr(anchored, "widened", navigator.widen)
-    return SimpleNamespace(eye=eye, telemetry=telemetry, clock=clock, navigator=navigator, observer=observer)
+    parts = {"eye": eye, "telemetry": telemetry, "clock": clock, "navigator": navigator, "observer": observer}
+    return SimpleNamespace(**parts, named=telemetry.named)
+
+
+def observing(rig, mode):
+    rig.observer = Observer(rig.eye, FlightParameters(modes=(mode,)), rig.telemetry, rig.clock)
+    return rig.observer
 
 
 def look(rig, score_floor=0.0, attitude=ATTITUDE, quiet=False):
     rig.observer.frame(IMAGE, attitude, score_floor, 1.0, quiet)
 
 
-def test_the_estimate_goes_down_with_the_upper_triangle_and_the_degrees_of_its_innovation(rig):
+def look_fixed(rig, detection, index):
     rig.navigator.outcome = Outcome.fixed
-    rig.navigator.fix = SimpleNamespace(
-        identification=SimpleNamespace(detection=np.array([0, 3, 5])), index=np.array([7, 2, 40])
-    )
+    identification = SimpleNamespace(detection=np.array(detection))
+    rig.navigator.fix = SimpleNamespace(identification=identification, index=np.array(index))
     look(rig)
-    (sent,) = rig.telemetry.named("filter_estimate")
+
+
+def items(rig, name, *fields):
+    """Fields of the items of the only packet of a name."""
+    (sent,) = rig.named(name)
+    return [sent["items"][field].tolist() for field in fields]
+
+
+def outcome_of(rig, **values):
+    """The packet `frame_outcome` with these values and those of a frame without estimate."""
+    nothing = approx(np.nan, nan_ok=True)
+    return {
+        "frame_number": 0, "image_ticks": rig.telemetry.ticks, "estimator": 0, "reset_trigger": 0, "detections": 6,
+        "candidate_pairs": 0, "pairs": 0, "shift_east_m": nothing, "shift_north_m": nothing, "anchor_reads": 0, **values
+    }  # fmt: skip
+
+
+def test_the_estimate_goes_down_with_the_upper_triangle_and_the_degrees_of_its_innovation(rig):
+    look_fixed(rig, [0, 3, 5], [7, 2, 40])
+    (sent,) = rig.named("filter_estimate")
     covariance = rig.navigator.state.estimate.covariance
     assert sent["covariance"].tolist() == [covariance[i, j] for i in range(9) for j in range(i, 9)]
     assert [*sent["position_icrf_m"], *sent["velocity_icrf_m_s"], *sent["acceleration_rtn_m_s2"]] == list(range(9))
     assert sent["innovation_degrees"] == 6
-    (pairs,) = rig.telemetry.named("identifications")
-    assert pairs["items"]["detection"].tolist() == [0, 3, 5]
-    assert pairs["items"]["crater_id"].tolist() == [1_007, 1_002, 1_040]
+    pairs = [[0, 3, 5], [1_007, 1_002, 1_040]]
+    assert items(rig, "identifications", "detection", "crater_id") == pairs
     assert rig.observer.sightings == {1_007: 1, 1_002: 1, 1_040: 1}
-    (state,) = rig.telemetry.named("navigation_state")
-    assert state["latitude_deg"] == approx(np.degrees(0.1))
-    assert state["longitude_deg"] == approx(360.0 - np.degrees(0.2))
-    assert (state["nis"], state["matched"], state["sigma_rtn_m"]) == (7.0, 3, (4.0, 6.0, 5.0))
-    (outcome,) = rig.telemetry.named("frame_outcome")
-    assert (outcome["candidate_pairs"], outcome["pairs"], outcome["detections"]) == (9, 3, 6)
-    assert outcome["anchor_reads"] == 0
-
-
-def test_a_frame_without_a_fix_has_no_degrees_and_no_pairs(rig):
-    look(rig)
-    assert rig.telemetry.named("filter_estimate")[0]["innovation_degrees"] == 0
-    assert rig.telemetry.named("identifications") == []
 
 
 def test_pairs_name_the_detection_by_its_place_among_those_reported(rig):
     """Of 300 detections the 255 strongest go down, in their order."""
-    rig.eye.found = detections(300)
     score = np.linspace(0.2, 0.9, 300)
     rig.eye.found = Detections(*(np.full(300, 50.0),) * 3, score, np.full(300, 0.7))
-    rig.navigator.outcome = Outcome.fixed
-    rig.navigator.fix = SimpleNamespace(
-        identification=SimpleNamespace(detection=np.array([10, 45, 299])), index=np.array([1, 2, 3])
-    )
-    look(rig)
-    (pairs,) = rig.telemetry.named("identifications")
+    look_fixed(rig, [10, 45, 299], [1, 2, 3])
     # Rows 0 to 44 are the weakest: the first is not reported, row 45 is the first that is.
-    assert pairs["items"]["detection"].tolist() == [0, 254]
-    assert pairs["items"]["crater_id"].tolist() == [1_002, 1_003]
-    (report,) = rig.telemetry.named("detections")
-    assert_array_equal(report["items"]["score"], score[45:])
+    assert items(rig, "identifications", "detection", "crater_id") == [[0, 254], [1_002, 1_003]]
+    assert items(rig, "detections", "score") == [score[45:].tolist()]
 
 
 def test_weak_detections_and_those_far_outside_reach_nobody(rig):
@@ -176,9 +178,7 @@ def test_weak_detections_and_those_far_outside_reach_nobody(rig):
     ((_, given, _),) = rig.navigator.given
     # A score at the floor is used; one that is no number is not below it.
     assert given.u_px.tolist() == [100.0, 130.0, 140.0]
-    (report,) = rig.telemetry.named("detections")
-    assert report["items"]["u_px"].tolist() == [100.0, 130.0, 140.0]
-    assert report["items"]["score"].tolist() == [0.9, 0.0, 0.5]
+    assert items(rig, "detections", "u_px", "score") == [[100.0, 130.0, 140.0], [0.9, 0.0, 0.5]]
     assert rig.observer.counts["detections"] == 3
 
 
@@ -234,14 +234,12 @@ def test_the_sun_is_handed_on_where_it_is_known(rig):
 
 
 def test_lasting_trouble_is_reported_at_its_beginning(rig):
-    for lost, refused in ((False, False), (True, True), (True, True), (False, False), (True, False)):
-        rig.navigator.lost = lost
-        rig.navigator.outcome = Outcome.refused if refused else Outcome.coasted
+    for lost, outcome in zip((0, 1, 1, 0, 1), ["coasted", "refused", "refused", "coasted", "coasted"], strict=True):
+        rig.navigator.lost, rig.navigator.outcome = lost, Outcome[outcome]
         look(rig)
     names = rig.telemetry.names()
     assert names.count("filter_divergence") == 2 and names.count("fix_refused") == 1
-    first = next(event for event in rig.telemetry.events if event[1] == "filter_divergence")
-    assert first == ("medium", "filter_divergence", 6.0, 0.0)
+    assert ("medium", "filter_divergence", 6.0, 0.0) in rig.telemetry.events
 
 
 def test_an_attitude_noisier_than_declared_is_reported_at_its_beginning_and_end(rig):
@@ -278,7 +276,7 @@ def test_what_cannot_be_inverted_ends_in_a_fresh_start(rig):
     assert ("high", "estimator_error", 2.0, 0.0) in rig.telemetry.events
     # No tables are loaded: there is nothing to begin again with, and frames are refused.
     look(rig)
-    assert [values["outcome"] for values in rig.telemetry.named("frame_outcome")] == [int(Outcome.refused)] * 2
+    assert [values["outcome"] for values in rig.named("frame_outcome")] == [int(Outcome.refused)] * 2
     assert rig.observer.summary()["outcomes"]["refused"] == 2
 
 
@@ -304,7 +302,7 @@ def test_reads_of_the_anchor_are_counted_beyond_the_first(moon):
 
 def test_a_frame_of_odometry_is_reported_in_full(rig, monkeypatch):
     """Longitude -0.3 rad is 342.8 degrees east; velocities, sigmas and NIS do not exist for odometry."""
-    observer = Observer(rig.eye, FlightParameters(modes=(Mode.spherical,)), rig.telemetry, rig.clock)
+    observer = observing(rig, Mode.spherical)
     anchor = object()
     observer._states[Mode.spherical] = (anchor, None)
     observer.manual_step = True
@@ -324,8 +322,8 @@ def test_a_frame_of_odometry_is_reported_in_full(rig, monkeypatch):
 
     monkeypatch.setattr("payload_emulator.flight.navigation.odometry.odometry.step", step)
     rig.telemetry.frame_number = 5
-    observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
-    observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
+    look(rig)
+    look(rig)
     parameters = observer._parameters
     for k, (before, manual) in enumerate(((None, True), (state, False))):
         (was, ticks, found, table, camera, mode, tuned), more = calls[k]
@@ -339,13 +337,12 @@ def test_a_frame_of_odometry_is_reported_in_full(rig, monkeypatch):
         "altitude_m": 31e3, "velocity_icrf_m_s": approx(nothing, nan_ok=True),
         "sigma_rtn_m": approx(nothing, nan_ok=True), "nis": approx(np.nan, nan_ok=True), "matched": 4
     }  # fmt: skip
-    first, second = rig.telemetry.named("navigation_state")
+    first, second = rig.named("navigation_state")
     assert first == expected and second == {**expected, "frame_number": 6}
-    assert rig.telemetry.named("frame_outcome")[0] == {
-        "frame_number": 5, "image_ticks": rig.telemetry.ticks, "estimator": 1, "outcome": 1, "reset_trigger": 2,
-        "detections": 6, "candidate_pairs": 9, "pairs": 4, "shift_east_m": 12.0, "shift_north_m": -5.0,
-        "anchor_reads": 7
-    }  # fmt: skip
+    assert rig.named("frame_outcome")[0] == outcome_of(
+        rig, frame_number=5, estimator=1, outcome=1, reset_trigger=2, candidate_pairs=9, pairs=4, shift_east_m=12.0,
+        shift_north_m=-5.0, anchor_reads=7
+    )  # fmt: skip
     assert rig.telemetry.events == [("info", "anchor_read", 2.0, 1.0)] * 2
     assert observer.anchor_reads == 9
     assert observer.summary()["estimators"]["spherical"] == {
@@ -359,26 +356,19 @@ def test_a_frame_of_odometry_is_reported_in_full(rig, monkeypatch):
 
 
 def test_odometry_without_a_position_reports_its_outcome_alone(rig, monkeypatch):
-    observer = Observer(rig.eye, FlightParameters(modes=(Mode.paper,)), rig.telemetry, rig.clock)
-    nothing = approx(np.nan, nan_ok=True)
-    observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
-    expected = {
-        "frame_number": 0, "image_ticks": rig.telemetry.ticks, "estimator": 0, "outcome": int(Outcome.missed),
-        "reset_trigger": 0, "detections": 6, "candidate_pairs": 0, "pairs": 0, "shift_east_m": nothing,
-        "shift_north_m": nothing, "anchor_reads": 0
-    }  # fmt: skip
-    assert rig.telemetry.named("frame_outcome") == [expected]
+    observer = observing(rig, Mode.paper)
+    look(rig)
+    assert rig.named("frame_outcome") == [outcome_of(rig, outcome=Outcome.missed)]
     observer._states[Mode.paper] = (object(), None)
     report = SimpleNamespace(
         outcome=Outcome.rejected, reset_trigger=ResetTrigger.none, candidate_pairs=3, pairs=0, shift_east_m=np.nan,
         shift_north_m=np.nan
     )  # fmt: skip
     monkeypatch.setattr("payload_emulator.flight.navigation.odometry.odometry.step", lambda *_, **__: (None, report))
-    observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
-    assert rig.telemetry.named("frame_outcome")[1] == {
-        **expected, "frame_number": 1, "outcome": int(Outcome.rejected), "candidate_pairs": 3
-    }  # fmt: skip
-    assert rig.telemetry.named("navigation_state") == [] and rig.telemetry.events == []
+    look(rig)
+    rejected = outcome_of(rig, frame_number=1, outcome=Outcome.rejected, candidate_pairs=3)
+    assert rig.named("frame_outcome")[1] == rejected
+    assert rig.named("navigation_state") == [] and rig.telemetry.events == []
     assert observer.summary()["outcomes"] == {
         "anchored": 0, "multi": 0, "single": 0, "predicted": 0, "missed": 1, "rejected": 1
     }  # fmt: skip
@@ -388,14 +378,9 @@ def test_a_frame_of_the_filter_is_reported_in_full(rig):
     rig.telemetry.frame_number, rig.navigator.outcome = 8, Outcome.fixed
     look(rig)
     ticks = rig.telemetry.ticks
-    assert rig.telemetry.named("frame_outcome") == [
-        {
-            "frame_number": 8, "image_ticks": ticks, "estimator": 2, "outcome": int(Outcome.fixed), "reset_trigger": 0,
-            "detections": 6, "candidate_pairs": 9, "pairs": 3, "shift_east_m": approx(np.nan, nan_ok=True),
-            "shift_north_m": approx(np.nan, nan_ok=True), "anchor_reads": 0
-        }
-    ]  # fmt: skip
-    assert rig.telemetry.named("navigation_state") == [
+    fixed = outcome_of(rig, frame_number=8, estimator=2, outcome=Outcome.fixed, candidate_pairs=9, pairs=3)
+    assert rig.named("frame_outcome") == [fixed]
+    assert rig.named("navigation_state") == [
         {
             "frame_number": 8, "image_ticks": ticks, "estimator": 2, "outcome": int(Outcome.fixed),
             "latitude_deg": approx(np.degrees(0.1)), "longitude_deg": approx(360.0 - np.degrees(0.2)),
@@ -403,8 +388,10 @@ def test_a_frame_of_the_filter_is_reported_in_full(rig):
             "matched": 3
         }
     ]  # fmt: skip
-    (sent,) = rig.telemetry.named("filter_estimate")
-    assert (sent["frame_number"], sent["image_ticks"]) == (8, ticks)
+    (sent,) = rig.named("filter_estimate")
+    # A frame without a fix has no degrees and no pairs.
+    assert (sent["frame_number"], sent["image_ticks"], sent["innovation_degrees"]) == (8, ticks, 0)
+    assert rig.named("identifications") == []
     assert rig.navigator.given[0][0] == ticks
     summary = rig.observer.summary()
     assert summary["estimators"]["anchored"]["outcomes"] == {"fixed": 1, "coasted": 0, "refused": 0, "no_image": 0}
@@ -425,7 +412,7 @@ def test_new_landmarks_go_down_forty_to_a_packet(rig, monkeypatch):
     monkeypatch.setattr("payload_emulator.flight.onboard.observer.map_rows", rows)
     rig.navigator.new_landmarks = tuple(range(41))
     look(rig)
-    first, second = rig.telemetry.named("landmarks")
+    first, second = rig.named("landmarks")
     assert first["items"]["landmark_id"].tolist() == list(range(40))
     assert (second["frame_number"], second["image_ticks"]) == (0, rig.telemetry.ticks)
     assert {name: values.tolist() for name, values in second["items"].items()} == {
@@ -444,7 +431,7 @@ def test_detections_are_reported_within_the_range_of_their_fields_and_with_their
         np.array([0.5, 1.5, -0.5, 0.4, 0.3]), np.arange(5.0)
     )  # fmt: skip
     look(rig, score_floor=-1.0)
-    (sent,) = rig.telemetry.named("detections")
+    (sent,) = rig.named("detections")
     assert (sent["frame_number"], sent["image_ticks"], sent["image_quality"]) == (0, rig.telemetry.ticks, 0)
     items = sent["items"]
     assert items["u_px"].tolist() == [255.5] * 4 + [0.0]
@@ -459,13 +446,12 @@ def test_detections_are_reported_within_the_range_of_their_fields_and_with_their
 def test_without_an_altitude_no_detection_has_a_class(rig):
     rig.observer._states.clear()
     look(rig)
-    (sent,) = rig.telemetry.named("detections")
-    assert set(sent["items"]["size_class"].tolist()) == {-1}
+    assert items(rig, "detections", "size_class") == [[-1] * 6]
 
 
 def test_a_damaged_table_is_told_by_its_number_and_its_hash(rig):
     octets = b"no table at all"
-    observer = Observer(rig.eye, FlightParameters(modes=(Mode.anchored,)), rig.telemetry, rig.clock)
+    observer = observing(rig, Mode.anchored)
     observer.load_tables(FlightTables(catalogue=octets, burns=octets, anchor_ephemeris=octets))
     assert rig.telemetry.events == [
         ("high", "table_refused", float(number), float(table_hash(octets))) for number in (1, 2, 10)

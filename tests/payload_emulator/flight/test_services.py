@@ -51,15 +51,15 @@ def test_counts_go_forward_only_and_each_source_has_its_own(rig):
     def ping(count, source=0):
         return DICTIONARY.pack_command("test_connection", {}, sequence_count=count, source=source)
 
-    assert rig.refusals(rig.step(ping(16_380))) == []
-    assert rig.refusals(rig.step(ping(3))) == []  # over the wrap, some lost
-    assert rig.refusals(rig.step(ping(16_382))) == ["out_of_sequence"]
-    assert rig.refusals(rig.step(ping(3 + 8192))) == ["out_of_sequence"]
-    assert rig.refusals(rig.step(ping(9, source=4))) == []
+    assert rig.refused(ping(16_380)) == []
+    assert rig.refused(ping(3)) == []  # over the wrap, some lost
+    assert rig.refused(ping(16_382)) == ["out_of_sequence"]
+    assert rig.refused(ping(3 + 8192)) == ["out_of_sequence"]
+    assert rig.refused(ping(9, source=4)) == []
     values = {"function_id": "resynchronise_commands", "argument_1": 0.0, "argument_2": 0.0}
     back = DICTIONARY.pack_command("perform_function", values, sequence_count=16_000)
-    assert rig.refusals(rig.step(back)) == []
-    assert rig.refusals(rig.step(ping(16_001))) == []
+    assert rig.refused(back) == []
+    assert rig.refused(ping(16_001)) == []
 
 
 def with_number(command, packed, sent):
@@ -75,7 +75,7 @@ def test_values_out_of_range_are_refused_at_acceptance(rig):
     good = rig.command("set_time_report_rate", rate_exponent=8)
     values = bytearray(good)
     values[11] = 9
-    assert rig.refusals(rig.step(append_crc(bytes(values[:-2])))) == ["value_out_of_range"]
+    assert rig.refused(append_crc(bytes(values[:-2]))) == ["value_out_of_range"]
     for order in (
         rig.function("set_mode", 4.0),
         with_number(rig.function("start_observation", 1.5), 1.5, math.nan),
@@ -84,7 +84,7 @@ def test_values_out_of_range_are_refused_at_acceptance(rig):
         with_number(rig.command("set_parameter", parameter_id=NUMBERS["scrub_interval_s"], value=1.5), 1.5, math.inf),
         rig.command("set_parameter", parameter_id=NUMBERS["store_overwrite"], value=0.5),
     ):
-        assert rig.refusals(rig.step(order)) == ["value_out_of_range"]
+        assert rig.refused(order) == ["value_out_of_range"]
     assert rig.payload.mode is PayloadMode.standby
 
 
@@ -131,18 +131,18 @@ def test_the_cadence_of_a_window_thins_the_frames(rig):
 
 def test_scheduled_telecommands_are_refused_when_expired_copied_nested_or_too_many(rig):
     ping = rig.command("test_connection")
-    assert rig.refusals(rig.step(rig.at(1.0, ping))) == ["expired"]
-    assert rig.refusals(rig.step(rig.at(1e4, ping))) == []
-    assert rig.refusals(rig.step(rig.at(2e4, ping))) == ["duplicate"]
-    assert rig.refusals(rig.step(ping)) == ["duplicate"]
-    assert rig.refusals(rig.step(rig.at(1e4, rig.at(2e4, ping)))) == ["unknown_function"]
-    assert rig.refusals(rig.step(rig.at(1e4, ping[:-1]))) == ["bad_length"]
-    assert rig.refusals(rig.step(rig.at(1e4, ping[:-1] + b"\0"))) == ["bad_checksum"]
+    assert rig.refused(rig.at(1.0, ping)) == ["expired"]
+    assert rig.refused(rig.at(1e4, ping)) == []
+    assert rig.refused(rig.at(2e4, ping)) == ["duplicate"]
+    assert rig.refused(ping) == ["duplicate"]
+    assert rig.refused(rig.at(1e4, rig.at(2e4, ping))) == ["unknown_function"]
+    assert rig.refused(rig.at(1e4, ping[:-1])) == ["bad_length"]
+    assert rig.refused(rig.at(1e4, ping[:-1] + b"\0")) == ["bad_checksum"]
     for k in range(63):
-        assert rig.refusals(rig.step(rig.at(1e4 + k, rig.command("test_connection")), seconds=1.0)) == []
+        assert rig.refused(rig.at(1e4 + k, rig.command("test_connection")), seconds=1.0) == []
     full = rig.step(rig.at(1e4, rig.command("test_connection")))
     assert rig.refusals(full) == ["schedule_full"]
-    report = rig.named(rig.step(rig.command("report_schedule")), "schedule_report")[0]
+    report = rig.report("report_schedule")
     assert report["count"] == 64 and report["enabled"] == 1
     assert sorted(report["items"]["release_ticks"]) == list(report["items"]["release_ticks"])
 
@@ -154,14 +154,14 @@ def test_a_held_schedule_releases_nothing_and_what_is_late_then_expires(rig):
     rig.step(orders + rig.command("disable_schedule"))
     assert not rig.named(rig.step(), "connection_report")  # 30 s
     removed = rig.command("delete_activity", request_id=int.from_bytes(gone[:4], "big"))
-    assert rig.refusals(rig.step(removed)) == []  # 45 s
+    assert rig.refused(removed) == []  # 45 s
     packets = rig.step(rig.command("enable_schedule"))  # 60 s: one is 40 s late, one 20 s
     assert rig.events(packets).count("activity_expired") == 1
     assert rig.refusals(packets) == ["expired"]
     assert len(rig.named(packets, "connection_report")) == 1
-    assert rig.refusals(rig.step(rig.command("delete_activity", request_id=1))) == ["no_such_activity"]
+    assert rig.refused(rig.command("delete_activity", request_id=1)) == ["no_such_activity"]
     rig.step(rig.at(500.0, rig.command("test_connection")) + rig.command("reset_schedule"))
-    report = rig.named(rig.step(rig.command("report_schedule")), "schedule_report")[0]
+    report = rig.report("report_schedule")
     assert report["count"] == 0
 
 
@@ -206,7 +206,7 @@ def test_a_parameter_is_changed_reported_and_kept_through_resets(rig):
     assert find_parameter(0) is None
     for name in ("set_parameter", "request_parameter"):
         values = {"parameter_id": 999, **({"value": 1.0} if name == "set_parameter" else {})}
-        assert rig.refusals(rig.step(rig.command(name, **values))) == ["unknown_parameter"]
+        assert rig.refused(rig.command(name, **values)) == ["unknown_parameter"]
 
 
 # Housekeeping (service 3) and events (service 5)
@@ -226,20 +226,20 @@ def test_a_structure_defined_by_telecommand_is_sent_reported_and_deleted(rig):
     report = rig.step(rig.command("report_housekeeping_definition", structure_id=16))
     definition = rig.named(report, "housekeeping_definition")[0]
     assert (definition["interval_s"], definition["count"]) == (30, 4)
-    assert rig.refusals(rig.step(rig.command("delete_housekeeping", structure_id=16))) == []
+    assert rig.refused(rig.command("delete_housekeeping", structure_id=16)) == []
     assert not any(rig.named(rig.step(), "housekeeping_report") for _ in range(4))
     for name in ("delete_housekeeping", "report_housekeeping_definition"):
-        assert rig.refusals(rig.step(rig.command(name, structure_id=17))) == ["unknown_structure"]
-    assert rig.refusals(rig.step(rig.command("request_housekeeping", structure_id=20))) == ["unknown_structure"]
+        assert rig.refused(rig.command(name, structure_id=17)) == ["unknown_structure"]
+    assert rig.refused(rig.command("request_housekeeping", structure_id=20)) == ["unknown_structure"]
 
 
 def test_only_so_many_structures_can_be_defined(rig):
     def create(number):
         return rig.command("create_housekeeping", structure_id=number, interval_s=0, items={"quantity": ["mode"]})
 
-    assert rig.refusals(rig.step(b"".join(create(16 + k) for k in range(8)))) == []
-    assert rig.refusals(rig.step(create(24))) == ["structures_full"]
-    assert rig.refusals(rig.step(create(23))) == []
+    assert rig.refused(b"".join(create(16 + k) for k in range(8))) == []
+    assert rig.refused(create(24)) == ["structures_full"]
+    assert rig.refused(create(23)) == []
 
 
 def test_housekeeping_can_be_stopped_asked_for_and_sent_more_often(rig):
@@ -368,10 +368,10 @@ def test_the_store_keeps_what_no_link_takes_and_plays_it_again_by_time(rig):
     again = rig.step(rig.command("replay_store", start_ticks=from_ticks, stop_ticks=to_ticks))
     repeated = set(late) & set(again)
     assert len([p for p in repeated if DICTIONARY.unpack(p)[0] == "detections"]) == 5
-    report = rig.named(rig.step(rig.command("report_store")), "store_report")[0]
+    report = rig.report("report_store")
     assert report["items"]["packets"][3] == 5 and report["items"]["unsent"][3] == 0
     rig.step(rig.command("delete_store", stop_ticks=to_ticks))
-    report = rig.named(rig.step(rig.command("report_store")), "store_report")[0]
+    report = rig.report("report_store")
     assert report["items"]["packets"][3] == 0
     rig.step(rig.function("clear_store"))
     assert rig.payload.waiting == 0
