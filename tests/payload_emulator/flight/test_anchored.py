@@ -13,7 +13,7 @@ from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome
 from payload_emulator.flight.navigation.sighting import Pose, in_view, landmark_map
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload
-from payload_emulator.flight.vision.detections import Detections, no_detections
+from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from studies.montecarlo import catalogue_table
 from tmtc.dictionary.payload import DICTIONARY
@@ -127,16 +127,6 @@ def test_a_damaged_table_is_reported_and_every_frame_refused(flight, name):
     assert {values["outcome"] for values in named(packets, "frame_outcome")} == {int(Outcome.refused)}
     assert len(named(packets, "event_high")) == 1
     assert not named(packets, "navigation_state")
-
-
-def test_frames_without_image_attitude_or_detections_are_coasted_over_and_named(flight):
-    flight.frames[5] = (ImageQuality.DARK, no_detections())
-    flight.frames[6] = (ImageQuality.OK, no_detections())
-    flight.attitudes[7] = np.full(7, np.nan)
-    flight.attitudes[8] = np.concatenate([np.zeros(4), [0.0, 0.0, -1.0]])
-    outcomes = [values["outcome"] for values in named(flight.fly(flight.payload()), "frame_outcome")]
-    assert outcomes[5:9] == [Outcome.no_image, Outcome.coasted, Outcome.coasted, Outcome.coasted]
-    assert outcomes[9:] == [Outcome.fixed] * (FRAMES - 9)
 
 
 def test_detections_with_numbers_that_are_none_are_passed_over_and_nothing_becomes_nan(flight):

@@ -14,7 +14,7 @@ from payload_emulator.flight.onboard.loads import FlightParameters, FlightTables
 from payload_emulator.flight.onboard.observer import Observer
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
-from tmtc.dictionary.tables import pack_anchor_table, table_hash
+from tmtc.dictionary.tables import table_hash
 
 ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 IMAGE = np.zeros((4, 4), np.uint8)
@@ -278,26 +278,6 @@ def test_what_cannot_be_inverted_ends_in_a_fresh_start(rig):
     look(rig)
     assert [values["outcome"] for values in rig.named("frame_outcome")] == [int(Outcome.refused)] * 2
     assert rig.observer.summary()["outcomes"]["refused"] == 2
-
-
-def test_reads_of_the_anchor_are_counted_beyond_the_first(moon):
-    """The odometry reads an altitude every frame and a position at each reset: the first of each is the start."""
-    telemetry = Recorder()
-    observer = Observer(Eye(), FlightParameters(modes=(Mode.paper,)), telemetry, Clock())
-    seconds = np.arange(0.0, 400.0, 30.0)
-    octets = pack_anchor_table([moon.ticks_at(second) for second in seconds], moon.orbit(seconds))
-    observer.load_tables(FlightTables(anchor_ephemeris=octets))
-    for k in range(5):
-        # A gap of two minutes before the last frame: one more reset.
-        telemetry.ticks = moon.ticks_at(30.0 + 15.0 * k + (120.0 if k == 4 else 0.0))
-        observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
-    assert observer.anchor_reads == 5 + 2
-    summary = observer.summary()
-    assert summary["estimators"]["paper"]["altitude_reads"] == 5 and summary["estimators"]["paper"]["resets"] == 2
-    assert summary["anchor_reads_after_start"] == 4 + 1
-    assert "truth_reads_after_start" not in summary
-    assert telemetry.names().count("anchor_read") == 2
-    assert [values["anchor_reads"] for values in telemetry.named("frame_outcome")] == [1, 2, 3, 4, 5]
 
 
 def test_a_frame_of_odometry_is_reported_in_full(rig, monkeypatch):

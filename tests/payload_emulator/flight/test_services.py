@@ -35,30 +35,13 @@ def test_every_stage_that_was_asked_for_is_reported_and_no_other(rig):
         assert found.count("connection_report") == 1
 
 
-def test_nothing_executes_twice_however_often_it_comes(rig):
-    orders = [rig.command("test_connection") for _ in range(3)]
-    first = rig.step(orders[0] + orders[0] + orders[1])
-    assert len(rig.named(first, "connection_report")) == 2
-    assert rig.refusals(first) == ["duplicate"]
-    # Nor after a reset, whatever its cause.
-    rig.boot(ResetCause.watchdog)
-    again = rig.step(orders[1] + orders[0] + orders[2])
-    assert rig.refusals(again) == ["duplicate", "duplicate"]
-    assert len(rig.named(again, "connection_report")) == 1
+def test_counts_go_forward_only_until_they_are_synchronised_again(rig):
+    def ping(count):
+        return DICTIONARY.pack_command("test_connection", {}, sequence_count=count)
 
-
-def test_counts_go_forward_only_and_each_source_has_its_own(rig):
-    def ping(count, source=0):
-        return DICTIONARY.pack_command("test_connection", {}, sequence_count=count, source=source)
-
-    assert rig.refused(ping(16_380)) == []
-    assert rig.refused(ping(3)) == []  # over the wrap, some lost
-    assert rig.refused(ping(16_382)) == ["out_of_sequence"]
-    assert rig.refused(ping(3 + 8192)) == ["out_of_sequence"]
-    assert rig.refused(ping(9, source=4)) == []
-    values = {"function_id": "resynchronise_commands", "argument_1": 0.0, "argument_2": 0.0}
-    back = DICTIONARY.pack_command("perform_function", values, sequence_count=16_000)
-    assert rig.refused(back) == []
+    assert [rig.refused(ping(count)) for count in (16_380, 16_370)] == [[], ["out_of_sequence"]]
+    rig.count = 15_999
+    assert rig.refused(rig.function("resynchronise_commands")) == []
     assert rig.refused(ping(16_001)) == []
 
 
@@ -177,17 +160,12 @@ def test_the_schedule_survives_a_reset(rig):
 
 
 @mark.parametrize("parameter", PARAMETERS, ids=lambda p: p.name)
-def test_every_parameter_takes_its_limits_and_nothing_beyond(rig, parameter):
+def test_every_parameter_takes_its_limits_and_nothing_beyond(parameter):
     assert parameter.accepts(parameter.default)
     step = 1.0 if parameter.whole else 1e-3
-    for value, good in (
-        (parameter.minimum, True),
-        (parameter.maximum, True),
-        (parameter.minimum - step, False),
-        (parameter.maximum + step, False),
-        (float("nan"), False),
-    ):
-        assert parameter.accepts(value) is good
+    assert parameter.accepts(parameter.minimum) and parameter.accepts(parameter.maximum)
+    for value in (parameter.minimum - step, parameter.maximum + step, float("nan")):
+        assert not parameter.accepts(value)
 
 
 def test_a_parameter_is_changed_reported_and_kept_through_resets(rig):
@@ -204,9 +182,8 @@ def test_a_parameter_is_changed_reported_and_kept_through_resets(rig):
     assert rig.named(after, "parameter_report")[0]["value"] == 7.5
     assert rig.named(after, "housekeeping")[0]["parameters_hash"] == hashes[-1]
     assert find_parameter(0) is None
-    for name in ("set_parameter", "request_parameter"):
-        values = {"parameter_id": 999, **({"value": 1.0} if name == "set_parameter" else {})}
-        assert rig.refused(rig.command(name, **values)) == ["unknown_parameter"]
+    assert rig.refused(rig.command("set_parameter", parameter_id=999, value=1.0)) == ["unknown_parameter"]
+    assert rig.refused(rig.command("request_parameter", parameter_id=999)) == ["unknown_parameter"]
 
 
 # Housekeeping (service 3) and events (service 5)
@@ -228,9 +205,8 @@ def test_a_structure_defined_by_telecommand_is_sent_reported_and_deleted(rig):
     assert (definition["interval_s"], definition["count"]) == (30, 4)
     assert rig.refused(rig.command("delete_housekeeping", structure_id=16)) == []
     assert not any(rig.named(rig.step(), "housekeeping_report") for _ in range(4))
-    for name in ("delete_housekeeping", "report_housekeeping_definition"):
+    for name in ("delete_housekeeping", "report_housekeeping_definition", "request_housekeeping"):
         assert rig.refused(rig.command(name, structure_id=17)) == ["unknown_structure"]
-    assert rig.refused(rig.command("request_housekeeping", structure_id=20)) == ["unknown_structure"]
 
 
 def test_only_so_many_structures_can_be_defined(rig):
