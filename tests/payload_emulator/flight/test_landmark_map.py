@@ -57,10 +57,16 @@ class Mapper:
         return made
 
 
-def fly(mapper, craters, seed, frames=6, start_ticks=0, east_m=0.0, false=0, error_m=None):
+def offset_m(landmark, craters, shift_m=0.0):
+    """How far a landmark lies from the crater that is nearest once all are shifted."""
+    away = landmark.position_mcmf_m - craters
+    return away[np.argmin(norm(away - shift_m, axis=1))]
+
+
+def fly(mapper, craters, seed, frames=6, start_ticks=0, east_m=0.0, false=0, error_m=(0.0, 0.0, 0.0)):
     """One pass to the north at 30 km, believed to be `error_m` from where it is."""
     rng = np.random.default_rng(seed)
-    error = np.zeros(3) if error_m is None else error_m
+
     made = []
     for k in range(frames):
         place = mcmf_from_spherical(k * STEP_RAD, east_m / RADIUS_M, 30e3)
@@ -74,7 +80,7 @@ def fly(mapper, craters, seed, frames=6, start_ticks=0, east_m=0.0, false=0, err
         uv = np.concatenate([uv, rng.uniform(0.0, 511.0, (false, 2))])
         size = np.concatenate([size, np.full(false, 25.0)])
         found = Detections(uv[:, 0], uv[:, 1], size, np.ones(len(uv)), np.full(len(uv), SIGMA_PX))
-        view = View(start_ticks + k * 15 * SECOND, rotation, place + error, SPACECRAFT_M**2 * np.eye(3), 1e-4)
+        view = View(start_ticks + k * 15 * SECOND, rotation, place + error_m, SPACECRAFT_M**2 * np.eye(3), 1e-4)
         free = np.ones(len(uv), bool)
         made += mapper.observe(view, found, np.full(len(uv), SIGMA_PX**2), free, 300.0)
     made += mapper.close()
@@ -88,7 +94,7 @@ def test_craters_become_landmarks_where_they_are_and_with_errors_as_claimed():
     assert len(made) == len(mapper) >= 15
     errors, nees = [], []
     for landmark in made:
-        offset = landmark.position_mcmf_m - craters[np.argmin(norm(craters - landmark.position_mcmf_m, axis=1))]
+        offset = offset_m(landmark, craters)
         own = landmark.covariance_m2 - SPACECRAFT_M**2 * np.eye(3)
         errors.append(float(norm(offset)))
         nees.append(float(offset @ np.linalg.solve(own, offset)))
@@ -101,15 +107,8 @@ def test_craters_become_landmarks_where_they_are_and_with_errors_as_claimed():
 def test_the_spacecrafts_error_is_in_every_landmark_and_in_its_covariance():
     craters = ground(25, 1)
     wrong = np.array([0.0, 150.0, 120.0])
-    shifted = Mapper()
-    made = fly(shifted, craters, 2, error_m=wrong)
-    mean = np.mean(
-        [
-            landmark.position_mcmf_m - craters[np.argmin(norm(craters + wrong - landmark.position_mcmf_m, axis=1))]
-            for landmark in made
-        ],
-        axis=0,
-    )
+    made = fly(Mapper(), craters, 2, error_m=wrong)
+    mean = np.mean([offset_m(landmark, craters, wrong) for landmark in made], axis=0)
     # East and north shift as the spacecraft does; the mean of 15 landmarks of 150 m each is good to 40 m.
     assert mean[1:] == approx(wrong[1:], abs=90.0)
     for landmark in made:
@@ -157,8 +156,7 @@ def test_memory_is_bounded():
     mapper = Mapper(tracks=10, landmarks=4)
     fly(mapper, ground(40, 1), 2, frames=6)
     assert len(mapper) <= 4
-    best = min(landmark.sightings for landmark in mapper.state.landmarks)
-    assert best >= 3
+    assert min(landmark.sightings for landmark in mapper.state.landmarks) >= 3
 
 
 def test_landmarks_stand_beside_the_catalogue_with_identities_of_their_own():

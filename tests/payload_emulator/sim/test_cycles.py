@@ -76,9 +76,8 @@ def test_displaced_vertices_lie_on_the_terrain(hilly, scene):
 
 
 def test_the_displacement_texture_spans_0_to_1(scene):
-    assert scene.displacement.dtype == np.float32
-    assert scene.displacement.min() == approx(0.0, abs=1e-6)
-    assert scene.displacement.max() == approx(1.0, abs=1e-6)
+    texture = scene.displacement
+    assert texture.dtype == np.float32 and (texture.min(), texture.max()) == approx((0.0, 1.0), abs=1e-6)
 
 
 def test_the_cap_holds_the_footprint_and_reaches_toward_a_low_sun(scene):
@@ -101,6 +100,15 @@ def test_camera_and_sun_are_in_blenders_axes(scene):
     assert math.degrees(scene.sun_angle_rad) == approx(0.533, abs=0.001)
 
 
+def texel(scene, east_km=0.0, north_km=0.0):
+    """Row and column of the colour of a place of the cap."""
+    x, y = scene.vertices_km[32, :, 0], scene.vertices_km[:, 32, 1]
+    return tuple(
+        int(np.interp(at, places, np.linspace(0.0, 1.0, GRID)) * size)
+        for at, places, size in zip((north_km, east_km), (y, x), scene.albedo.shape, strict=True)
+    )
+
+
 def test_the_base_colour_of_a_matt_surface_is_its_albedo_and_of_other_laws_bent_to_them(formula_terrain):
     """On flat ground Lambert's ratio falls with phase alone; Lunar-Lambert is brightest looking away from the Sun."""
     flat = formula_terrain(lambda latitude, longitude: 0.0 * latitude)
@@ -111,10 +119,7 @@ def test_the_base_colour_of_a_matt_surface_is_its_albedo_and_of_other_laws_bent_
     assert np.ptp(matt.albedo) == 0.0
     assert matt.specular_ior > 1.0 and lambert.specular_ior == lunar.specular_ior == 1.0
     # The texel below the camera: the phase angle of nadir is the Sun's distance from the zenith, 80 degrees.
-    x, y = matt.vertices_km[32, :, 0], matt.vertices_km[:, 32, 1]
-    high, wide = matt.albedo.shape
-    row = int(np.interp(0.0, y, np.linspace(0.0, 1.0, GRID)) * high)
-    column = int(np.interp(0.0, x, np.linspace(0.0, 1.0, GRID)) * wide)
+    row, column = texel(matt)
     below = lambert.albedo[row, column] / matt.albedo[row, column]
     assert below == approx(exp(-0.7 * radians(80.0)), rel=0.01)
     degrees = 80.0
@@ -144,11 +149,8 @@ def test_slopes_bend_the_base_colour_as_the_fast_renderer_shades_them(hilly):
             above = norm(point) - MOON_RADIUS_M - float(hilly.height_m(latitude, longitude))
             reach += above / -float(ray @ point / norm(point))
         east, north = enu_from_mcmf(*PLACE)[:2] @ (point - position) / 1e3
-        x, y = scene.vertices_km[32, :, 0], scene.vertices_km[:, 32, 1]
-        high, wide = scene.albedo.shape
-        row = int(np.interp(north, y, np.linspace(0.0, 1.0, GRID)) * high)
-        column = int(np.interp(east, x, np.linspace(0.0, 1.0, GRID)) * wide)
-        assert scene.albedo[row, column] / matt.albedo[row, column] == approx(ratio[v, u], rel=0.03)
+        place = texel(scene, east, north)
+        assert scene.albedo[place] / matt.albedo[place] == approx(ratio[v, u], rel=0.03)
 
 
 def test_a_tilted_camera_tilts(hilly):
