@@ -14,6 +14,7 @@ from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.spacecraft.loop import new_board
 from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.tables import pack_anchor_table
 from tmtc.packets.cuc import TICKS_PER_SECOND
 
 RADIUS_M = 1_737_400.0
@@ -31,7 +32,7 @@ CLASS_DIAMETERS_M = (7_000.0, 12_000.0, 20_000.0)
 
 def paper_orbit_mcmf_m(seconds):
     """Return positions (n, 3) on the Kepler orbit of the paper's Table I over a uniformly turning Moon."""
-    time = np.asarray(list(seconds) if not isinstance(seconds, np.ndarray) else seconds, float)
+    time = np.array(seconds, float)
     a, e = 1_768_180.0, 0.006908
     i, node, perilune, start = np.radians([89.076, 3.164, 333.604, 8.882])
     anomaly = 2.0 * np.arctan(np.sqrt((1.0 - e) / (1.0 + e)) * np.tan(start / 2.0))
@@ -97,12 +98,9 @@ def make_crater_field(seed):
     return CraterField(position, rng.choice(CLASS_DIAMETERS_M, size=count, p=CLASS_SHARES))
 
 
-def detections(u_px, v_px, diameter_px):
-    u = np.atleast_1d(np.asarray(u_px, float))
-    return Detections(
-        u, np.atleast_1d(np.asarray(v_px, float)),
-        np.atleast_1d(np.asarray(diameter_px, float)), np.ones_like(u), np.full_like(u, np.nan)
-    )  # fmt: skip
+def detections(*columns):
+    u, v, diameter = np.atleast_1d(*(np.asarray(column, float) for column in columns))
+    return Detections(u, v, diameter, np.ones_like(u), np.full_like(u, np.nan))
 
 
 @dataclass(frozen=True)
@@ -117,6 +115,10 @@ class Toolbox:
     radius_m: float = RADIUS_M
     focal_px: float = float(FOCAL_PX)
     centre_px: float = CENTRE_PX
+
+    def anchor(self, seconds):
+        """The anchor table of these times, as octets."""
+        return pack_anchor_table([ticks_at(second) for second in seconds], self.orbit(seconds))
 
 
 @fixture(scope="session")
@@ -158,6 +160,10 @@ class Rig:
         if self.failing:
             raise RuntimeError("no such operator")
         return self.quality, detections(np.empty(0), np.empty(0), np.empty(0))
+
+    @property
+    def mode(self):
+        return self.payload.mode
 
     @property
     def ticks(self):

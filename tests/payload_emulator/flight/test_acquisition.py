@@ -39,7 +39,7 @@ def crater_map(seed=3, reach_rad=0.08, mean_in_image=22.0):
     )  # fmt: skip
 
 
-def pose_at(east_m, north_m, altitude_m=ALTITUDE_M):
+def pose_at(east_m=0.0, north_m=0.0, altitude_m=ALTITUDE_M):
     position = np.array([1.0, east_m / RADIUS_M, north_m / RADIUS_M])
     position *= (RADIUS_M + altitude_m) / norm(position)
     return Pose(position, NADIR, np.eye(3), np.zeros(3), np.zeros(2), np.zeros(3))
@@ -112,9 +112,9 @@ def test_the_sag_is_constant_up_to_the_design_altitude():
 
 
 def test_a_place_outside_the_search_is_not_found():
-    landmarks, true = crater_map(), pose_at(0.0, 0.0)
+    landmarks, true = crater_map(), pose_at()
     found, _ = detected(landmarks, true)
-    prior = pose_at(20_000.0, 0.0)
+    prior = pose_at(20_000.0)
     assert search(found, landmarks, prior, 7_000.0) is not None
     # 3.5 sigma are 7 km; cells at the edge of the search and the fit reach 5 km farther.
     assert search(found, landmarks, prior, 2_000.0) is None
@@ -123,15 +123,15 @@ def test_a_place_outside_the_search_is_not_found():
 def test_false_detections_alone_give_no_place():
     landmarks = crater_map()
     for seed in range(12):
-        found, _ = detected(landmarks, pose_at(0.0, 0.0), keep=0.0, false=14, seed=seed)
-        assert search(found, landmarks, pose_at(0.0, 0.0), 5_000.0) is None
+        found, _ = detected(landmarks, pose_at(), keep=0.0, false=14, seed=seed)
+        assert search(found, landmarks, pose_at(), 5_000.0) is None
 
 
 def test_two_detections_are_never_searched():
     landmarks = crater_map()
-    found, owner = detected(landmarks, pose_at(0.0, 0.0), noise_px=0.0, false=0)
+    found, owner = detected(landmarks, pose_at(), noise_px=0.0, false=0)
     for count in (0, 1, 2):
-        assert search(found.select(np.arange(count)), landmarks, pose_at(0.0, 0.0), 3_000.0) is None
+        assert search(found.select(np.arange(count)), landmarks, pose_at(), 3_000.0) is None
     assert acquisition.SEARCHABLE_DETECTIONS == 3 and owner.size > 3
 
 
@@ -153,33 +153,32 @@ def test_two_places_that_explain_as_much_are_no_place():
         )  # fmt: skip
 
     single, double = table([-apart / 2.0]), table([-apart / 2.0, apart / 2.0])
-    true = pose_at(-10_000.0, 0.0)
+    true = pose_at(-10_000.0)
     found, _ = detected(single, true, keep=1.0, noise_px=0.2, false=0)
     assert len(found) == 9
-    prior = pose_at(0.0, 0.0)
+    prior = pose_at()
     alone = search(found, single, prior, 5_000.0)
-    assert alone.detection.size == 9
-    assert norm(alone.pose.position_icrf_m - true.position_icrf_m) < 300.0
+    assert alone.detection.size == 9 and norm(alone.pose.position_icrf_m - true.position_icrf_m) < 300.0
     assert search(found, double, prior, 5_000.0) is None
 
 
 def test_sizes_that_do_not_fit_keep_pairs_apart():
-    landmarks, true = crater_map(), pose_at(0.0, 0.0)
+    landmarks, true = crater_map(), pose_at()
     found, _ = detected(landmarks, true, false=0)
-    assert search(found, landmarks, pose_at(3_000.0, 0.0), 3_000.0) is not None
+    assert search(found, landmarks, pose_at(3_000.0), 3_000.0) is not None
     # Three times the size is 1.1 in the logarithm, beyond a gate of 0.45 at any altitude of the search.
     grown = replace(found, diameter_px=3.0 * found.diameter_px)
-    assert search(grown, landmarks, pose_at(3_000.0, 0.0), 1_000.0) is None
+    assert search(grown, landmarks, pose_at(3_000.0), 1_000.0) is None
 
 
 def test_a_mirrored_image_is_no_place():
     landmarks = crater_map()
-    found, _ = detected(landmarks, pose_at(0.0, 0.0))
-    assert search(replace(found, u_px=511.0 - found.u_px), landmarks, pose_at(0.0, 0.0), 5_000.0) is None
+    found, _ = detected(landmarks, pose_at())
+    assert search(replace(found, u_px=511.0 - found.u_px), landmarks, pose_at(), 5_000.0) is None
 
 
 def test_more_is_asked_of_a_wider_search_and_of_a_smaller_risk():
-    landmarks, true = crater_map(), pose_at(0.0, 0.0)
+    landmarks, true = crater_map(), pose_at()
     found, _ = detected(landmarks, true)
     needed = []
     for sigma_m, limit in ((500.0, 1e-5), (5_000.0, 1e-5), (5_000.0, 1e-12)):

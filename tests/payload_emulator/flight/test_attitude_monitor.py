@@ -28,7 +28,7 @@ from payload_emulator.flight.navigation.sighting import landmark_map
 from studies import montecarlo
 
 FOCAL_PX = PinholeCamera().focal_px
-DECLARED = float(np.radians(0.01))
+DECLARED = np.radians(0.01)
 RULES = MonitorParameters()
 FLOOR = RULES.floor_px / FOCAL_PX
 # What else is uncertain about a rotation in a usual frame, about each axis.
@@ -59,7 +59,7 @@ def judged(evidence, monitor=None):
 @mark.parametrize("noise_deg", [0.01, 0.2, 1.0])
 @mark.parametrize("used_deg", [0.01, 1.0])
 def test_the_variance_of_the_attitude_is_estimated_without_bias(noise_deg, used_deg):
-    evidence = frames(3_000, np.radians(noise_deg), used_rad=float(np.radians(used_deg)))
+    evidence = frames(3_000, np.radians(noise_deg), used_rad=np.radians(used_deg))
     shown = frame_variances(tuple(evidence), FLOOR)
     # 3,000 frames; the best known axis counts most, so that the three count as one and a half.
     error = np.radians(0.25) ** 2 if noise_deg < 0.5 else np.radians(1.03) ** 2
@@ -96,7 +96,7 @@ def test_a_sensor_as_declared_or_better_is_left_alone():
 @mark.parametrize(("noise_deg", "within"), [(0.2, 24), (1.0, 6)])
 def test_more_noise_is_detected_and_estimated(noise_deg, within):
     for seed in range(10):
-        after = judged(frames(60, DECLARED, seed) + frames(40, float(np.radians(noise_deg)), seed + 100))
+        after = judged(frames(60, DECLARED, seed) + frames(40, np.radians(noise_deg), seed + 100))
         first = next(k for k, one in enumerate(after) if one.degraded)
         assert 60 <= first < 60 + within
         # The mean of 24 frames is known to a quarter, and one standard error is added.
@@ -105,12 +105,12 @@ def test_more_noise_is_detected_and_estimated(noise_deg, within):
 
 
 def test_wrong_pairs_in_two_of_five_frames_are_no_bad_sensor():
-    good, bad = frames(30, 0.0), frames(2, float(np.radians(2.0)), seed=9)
+    good, bad = frames(30, 0.0), frames(2, np.radians(2.0), seed=9)
     assert not any(one.degraded for one in judged(good + bad[:1] + good[:1] + bad[1:] + good[:5]))
 
 
 def test_the_declared_noise_is_used_again_once_the_sensor_is_restored():
-    noisy = judged(frames(40, float(np.radians(0.5))))[-1]
+    noisy = judged(frames(40, np.radians(0.5)))[-1]
     assert noisy.degraded
     after = judged(frames(30, DECLARED, seed=5, used_rad=noisy.noise_rad), noisy)
     assert after[0].degraded and not after[-1].degraded
@@ -118,7 +118,7 @@ def test_the_declared_noise_is_used_again_once_the_sensor_is_restored():
 
 
 def test_no_noise_above_the_limit_is_used():
-    assert judged(frames(30, float(np.radians(6.0))))[-1].noise_rad == RULES.largest_rad
+    assert judged(frames(30, np.radians(6.0)))[-1].noise_rad == RULES.largest_rad
 
 
 def test_frames_that_need_a_turn_are_examined_until_there_are_enough_of_them():
@@ -133,9 +133,7 @@ def flown(navigation_case, seed, noise_deg, watched=True):
     if not watched:
         never = DetectionRule(24, 0.2, np.inf)
         parameters = replace(parameters, monitor=replace(parameters.monitor, moderate=never, sudden=never))
-    return montecarlo.fly(
-        navigation_case(60, attitude_noise_rad=float(np.radians(noise_deg)), parameters=parameters), seed
-    )
+    return montecarlo.fly(navigation_case(60, attitude_noise_rad=np.radians(noise_deg), parameters=parameters), seed)
 
 
 @mark.parametrize("noise_deg", [0.001, 0.01])
@@ -171,7 +169,7 @@ def test_moderate_noise_is_detected_within_a_window_of_frames(navigation_case):
 
 
 def test_a_degraded_attitude_takes_back_the_fixes_of_the_window_and_counts_with_its_noise(navigation_case, monkeypatch):
-    noise = float(np.radians(0.5))
+    noise = np.radians(0.5)
     used = []
     usual = kalman.update
 
@@ -207,23 +205,11 @@ def test_a_degraded_attitude_takes_back_the_fixes_of_the_window_and_counts_with_
     usual_one = anchored.with_judged_attitude(state, AttitudeMonitor(), before, setup)
     assert len(usual_one.trusted) == 1 and anchored.widened(usual_one, 1.0, 1.0).trusted == ()
     monkeypatch.setattr(kalman, "update", update)
-    camera_from_icrf, true_map = looks(case, states[0], rotations[0])
-    found = seen(case, true_map, states[0], camera_from_icrf, rotations[0])
+    camera_from_icrf = nadir_camera_from_mcmf(rotations[0] @ states[0, :3]) @ rotations[0]
+    craters, lasting = landmark_map(table), np.zeros((len(case.craters), 2))
+    found, _ = montecarlo._detect(
+        case, craters, states[0, :3], camera_from_icrf, rotations[0], lasting, np.zeros(2), default_rng(3)
+    )
     _, report = anchored.step(after, Observation(int(ticks[0]), found, camera_from_icrf), setup)
     assert report.outcome is Outcome.fixed and set(used) == {noise}
     assert (report.attitude_declared_rad, report.attitude_noise_rad) == (DECLARED, noise)
-
-
-def looks(case, state, rotation):
-    return (
-        nadir_camera_from_mcmf(rotation @ state[:3]) @ rotation,
-        landmark_map(montecarlo.catalogue_table(case.craters)),
-    )
-
-
-def seen(case, craters, state, camera_from_icrf, rotation):
-    lasting = np.zeros((len(craters), 2))
-    found, _ = montecarlo._detect(
-        case, craters, state[:3], camera_from_icrf, rotation, lasting, np.zeros(2), default_rng(3)
-    )
-    return found

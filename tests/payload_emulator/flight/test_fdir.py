@@ -19,7 +19,7 @@ NO_IMAGE = np.zeros((0, 0), np.uint8)
 def observing(rig):
     rig.step(rig.function("start_observation"))
     rig.step()
-    assert rig.payload.mode is PayloadMode.observing
+    assert rig.mode is PayloadMode.observing
     return rig
 
 
@@ -39,7 +39,7 @@ def test_a_streak_of_dark_images_is_told_at_its_beginning_and_its_end_only(obser
     packets = steps(observing, 3)
     assert observing.events(packets).count("image_streak") == 1
     assert observing.named(packets, "event_info")[0]["value_2"] == 30
-    assert observing.payload.mode is PayloadMode.observing
+    assert observing.mode is PayloadMode.observing
 
 
 def test_a_saturated_streak_shorter_than_the_limit_is_told_frame_by_frame(observing):
@@ -55,25 +55,25 @@ def test_a_camera_without_images_is_cycled_and_recovers(observing):
     packets = observing.step()
     assert "camera_recovered" in observing.events(packets)
     assert observing.board.camera_on
-    assert observing.payload.mode is PayloadMode.observing
+    assert observing.mode is PayloadMode.observing
 
 
 def test_a_camera_that_stays_dead_ends_the_observation(observing):
     events = observing.events(steps(observing, 12, image=NO_IMAGE))
     assert events.count("camera_fault") == 4
     assert "observation_stopped" in events
-    assert observing.payload.mode is PayloadMode.standby
+    assert observing.mode is PayloadMode.standby
 
 
 def test_late_detections_are_not_used_and_a_detector_that_stays_slow_ends_in_safe(observing):
     observing.board.detector_factor = 30.0
     packets = steps(observing, 4)
     assert observing.events(packets).count("detector_timeout") == 4
-    assert observing.payload.mode is PayloadMode.observing
+    assert observing.mode is PayloadMode.observing
     assert {v["count"] for v in observing.named(packets, "detections")} == {0}
     packets = steps(observing, 1)
     assert "safe_mode_entered" in observing.events(packets)
-    assert observing.payload.mode is PayloadMode.safe
+    assert observing.mode is PayloadMode.safe
 
 
 def test_an_inference_library_that_throws_costs_frames_not_the_payload(observing):
@@ -81,10 +81,10 @@ def test_an_inference_library_that_throws_costs_frames_not_the_payload(observing
     assert observing.events(steps(observing, 4)).count("detector_error") == 4
     observing.failing = False
     assert len(observing.named(observing.step(), "detections")) == 1
-    assert observing.payload.mode is PayloadMode.observing
+    assert observing.mode is PayloadMode.observing
     observing.failing = True
     steps(observing, 5)
-    assert observing.payload.mode is PayloadMode.safe
+    assert observing.mode is PayloadMode.safe
 
 
 @mark.parametrize(
@@ -95,7 +95,7 @@ def test_flipped_bits_in_memory_are_found_told_and_restored(observing, region, e
     packets = steps(observing, 5)
     assert observing.events(packets).count(event) == 1
     assert observing.events(packets).count("memory_repaired") == 1
-    assert observing.payload.mode is PayloadMode.observing
+    assert observing.mode is PayloadMode.observing
     assert observing.detectors_made == (1 if region == MODEL_NUMBER else 0)
     assert event not in observing.events(steps(observing, 5))
 
@@ -122,12 +122,12 @@ def test_memory_whose_kept_copy_is_damaged_too_ends_in_safe(observing):
     observing.board.tables[MODEL_NUMBER][7] ^= 1
     packets = steps(observing, 5)
     assert "memory_unrepairable" in observing.events(packets)
-    assert observing.payload.mode is PayloadMode.safe
+    assert observing.mode is PayloadMode.safe
     # Back in service once a good model is there again.
     observing.board.write_table(MODEL_NUMBER, observing.model)
     steps(observing, 5)
     observing.step(observing.function("set_mode", PayloadMode.standby))
-    assert observing.payload.mode is PayloadMode.standby
+    assert observing.mode is PayloadMode.standby
 
 
 def test_a_watchdog_reset_resumes_the_observation_and_too_many_end_in_safe(observing):
@@ -137,14 +137,14 @@ def test_a_watchdog_reset_resumes_the_observation_and_too_many_end_in_safe(obser
         packets = observing.step()
         events = observing.events(packets)
         assert {"boot", "watchdog_reset", "state_recovered"} <= set(events)
-        assert observing.payload.mode is PayloadMode.observing
+        assert observing.mode is PayloadMode.observing
         # Frames and sequence counts go on where they were.
         frames += 1
         assert [v["frame_number"] for v in observing.named(packets, "detections")] == [frames]
         assert observing.named(packets, "housekeeping")[0]["watchdog_resets"] == number
     observing.boot(ResetCause.watchdog)
     packets = observing.step()
-    assert observing.payload.mode is PayloadMode.safe
+    assert observing.mode is PayloadMode.safe
     assert "safe_mode_entered" in observing.events(packets)
 
 
@@ -152,14 +152,14 @@ def test_watchdog_resets_an_hour_apart_do_not_add_up(observing):
     for _ in range(4):
         observing.boot(ResetCause.watchdog)
         observing.step(seconds=4_000.0)
-        assert observing.payload.mode is PayloadMode.observing
+        assert observing.mode is PayloadMode.observing
 
 
 def test_a_commanded_reset_comes_up_in_standby_with_the_next_boot_count(observing):
     packets = observing.step(observing.function("reboot"))
     assert len(observing.named(packets, "verification_completed")) == 1
     after = observing.step()
-    assert observing.payload.mode is PayloadMode.standby
+    assert observing.mode is PayloadMode.standby
     assert next(v["value_1"] for v in observing.named(after, "event_info")) == 2.0
 
 
@@ -167,7 +167,7 @@ def test_an_observation_whose_time_is_over_is_not_resumed(rig):
     rig.step(rig.function("start_observation", 60.0))
     rig.boot(ResetCause.brown_out)
     rig.step(seconds=100.0)
-    assert rig.payload.mode is PayloadMode.standby
+    assert rig.mode is PayloadMode.standby
 
 
 def test_settings_lost_in_both_copies_end_in_safe(observing):
@@ -175,7 +175,7 @@ def test_settings_lost_in_both_copies_end_in_safe(observing):
     observing.boot(ResetCause.brown_out)
     packets = observing.step()
     assert "state_lost" in observing.events(packets)
-    assert observing.payload.mode is PayloadMode.safe
+    assert observing.mode is PayloadMode.safe
 
 
 @mark.parametrize("values", [{"boot_count": 3}, {"boot_count": "many"}, {"mode": 9, "boot_count": 1}])
@@ -183,7 +183,7 @@ def test_settings_that_another_build_wrote_count_as_lost(rig, values):
     Settings(rig.board.settings).write(values)
     packets = rig.step()
     assert "state_lost" in rig.events(packets)
-    assert rig.payload.mode is PayloadMode.safe
+    assert rig.mode is PayloadMode.safe
 
 
 def test_settings_damaged_in_one_copy_are_recovered_from_the_other(observing):
@@ -192,7 +192,7 @@ def test_settings_damaged_in_one_copy_are_recovered_from_the_other(observing):
     packets = observing.step()
     assert "state_recovered" in observing.events(packets)
     assert observing.named(packets, "event_low")[0]["value_1"] == 2.0
-    assert observing.payload.mode is PayloadMode.observing
+    assert observing.mode is PayloadMode.observing
 
 
 def test_packets_damaged_in_the_store_are_found_told_and_never_sent(observing):
@@ -241,7 +241,7 @@ def test_power_and_heat_out_of_limits_are_told_once_and_end_in_safe_beyond(obser
     observing.board.heat_c, observing.board.drop_v = heat_c, drop_v
     packets = steps(observing, 6)
     assert observing.events(packets).count(event) == 1
-    assert (observing.payload.mode is PayloadMode.safe) is safe
+    assert (observing.mode is PayloadMode.safe) is safe
     assert observing.board.camera_on is not safe
     observing.board.heat_c = observing.board.drop_v = 0.0
     steps(observing, 3)
@@ -271,4 +271,4 @@ def test_dead_sensors_break_no_limit(observing, monkeypatch):
     monkeypatch.setattr(type(observing.board), "sensors", lambda board: np.full(4, np.nan))
     packets = steps(observing, 6)
     assert observing.named(packets, "housekeeping")[0]["temperature_c"] == 0.0
-    assert observing.payload.mode is PayloadMode.observing
+    assert observing.mode is PayloadMode.observing

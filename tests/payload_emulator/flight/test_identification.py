@@ -11,7 +11,7 @@ from numpy.random import default_rng
 from pytest import mark
 
 from lunar.camera import PinholeCamera, project_mcmf
-from payload_emulator.flight.navigation.odometry.matcher import GroundFeatures, MatcherParameters, match_frames
+from payload_emulator.flight.navigation.odometry.matcher import GroundFeatures, match_frames
 from payload_emulator.flight.navigation.search.identification import (
     IdentificationParameters,
     _consistent,
@@ -122,16 +122,14 @@ def test_a_pair_that_contradicts_the_shift_of_all_others_is_removed():
     prior_px2 = common_shift(4, 15.0)
     noise_px2 = np.zeros((4, 2, 2)) + 0.5 * np.eye(2)
     variance_px2 = np.full(4, 0.5)
-    kept = _consistent(every, every, offset, prior_px2, noise_px2, variance_px2)
-    assert kept.tolist() == [0, 1, 2]
-    agreeing = offset[:3]
-    kept = _consistent(every[:3], every, agreeing, prior_px2, noise_px2, variance_px2)
-    assert kept.tolist() == [0, 1, 2]
+    for count in (4, 3):
+        kept = _consistent(every[:count], every, offset[:count], prior_px2, noise_px2, variance_px2)
+        assert kept.tolist() == [0, 1, 2]
 
 
 def features(places, classes):
     places = np.asarray(places, float).reshape(-1, 2)
-    return GroundFeatures(places[:, 0], places[:, 1], np.asarray(classes, int).reshape(-1))
+    return GroundFeatures(*places.T, np.asarray(classes, int).reshape(-1))
 
 
 def moved(frame, east_m, north_m):
@@ -156,11 +154,10 @@ def test_the_common_shift_is_found_whatever_the_order_of_detections(seed, count,
 
 def test_the_densest_cluster_wins_over_clutter_of_the_same_class():
     rng = default_rng(7)
-    common = features(rng.uniform(-40e3, 40e3, (6, 2)), np.zeros(6))
-    clutter = [rng.uniform(-50e3, 50e3, (6, 2)) for _ in range(2)]
-    shifted = moved(common, -300.0, 24_800.0)
-    earlier = features(np.concatenate([np.stack([common.east_m, common.north_m], 1), clutter[0]]), np.zeros(12))
-    later = features(np.concatenate([np.stack([shifted.east_m, shifted.north_m], 1), clutter[1]]), np.zeros(12))
+    common = rng.uniform(-40e3, 40e3, (6, 2))
+    clutter = rng.uniform(-50e3, 50e3, (2, 6, 2))
+    earlier = features([*common, *clutter[0]], np.zeros(12))
+    later = features([*(common - [-300.0, 24_800.0]), *clutter[1]], np.zeros(12))
     match = match_frames(earlier, later, 15.0, 1)
     pairs = set(zip(match.earlier.tolist(), match.later.tolist(), strict=True))
     assert {(k, k) for k in range(6)} <= pairs
@@ -220,11 +217,9 @@ def test_empty_frames_match_nothing():
 
 def test_a_frame_full_of_false_detections_stays_bounded():
     rng = default_rng(1)
-    crowd = features(rng.uniform(-50e3, 50e3, (255, 2)), np.zeros(255))
-    again = features(rng.uniform(-50e3, 50e3, (255, 2)), np.zeros(255))
-    match = match_frames(crowd, again, 15.0, 1, MatcherParameters())
-    assert len(match) <= 255
-    assert match.candidate_pairs < 2_000
+    crowd, again = (features(rng.uniform(-50e3, 50e3, (255, 2)), np.zeros(255)) for _ in range(2))
+    match = match_frames(crowd, again, 15.0, 1)
+    assert len(match) <= 255 and match.candidate_pairs < 2_000
 
 
 CAMERA = PinholeCamera()
@@ -249,11 +244,8 @@ def test_derivatives_are_those_of_the_projection():
     landmarks, nothing = craters(), np.zeros(11)
     seen = look(landmarks, INDEX, pose(nothing), CAMERA)
     analytic = np.zeros((20, 2, 11))
-    analytic[:, :, 0:3], analytic[:, :, 3:6], analytic[:, :, 8:11] = (
-        seen.by_position,
-        seen.by_attitude,
-        seen.by_offset,
-    )
+    analytic[:, :, :6] = np.concatenate([seen.by_position, seen.by_attitude], axis=2)
+    analytic[:, :, 8:] = seen.by_offset
     analytic[:, 0, 6] = analytic[:, 1, 7] = 1.0
     for k, step in enumerate([1.0] * 3 + [1e-6] * 3 + [1e-3] * 2 + [1.0] * 3):
         change = np.zeros(11)
@@ -288,5 +280,5 @@ def test_what_is_in_view_is_all_that_projects_into_the_image_and_is_above_the_li
         height = np.einsum("ij,ij->i", away, landmarks.enu_from_mcmf[:, 2]) / np.linalg.norm(away, axis=1)
         expected = np.flatnonzero(inside & (height > np.sin(np.radians(5.0))))
         assert set(expected.tolist()) == set(found.tolist())
-    below_ground = Pose(POSITION * 0.5, NADIR_AT_ORIGIN, np.eye(3), np.zeros(3), np.zeros(2), np.zeros(3))
+    below_ground = pose(np.concatenate([-0.5 * POSITION, np.zeros(8)]))
     assert len(in_view(landmarks, below_ground, CAMERA, 0.0)) == 0

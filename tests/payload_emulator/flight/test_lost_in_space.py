@@ -75,6 +75,10 @@ def frame(landmarks, latitude_deg, longitude_deg, altitude_m, seed, recall=0.6, 
     return place, Detections(uv[:, 0], uv[:, 1], size, rng.uniform(size=total), np.full(total, SIGMA_PX))
 
 
+def searched(found, index):
+    return find_place(found, found.sigma_px, index, CAMERA, RULES)
+
+
 def changed(found, u, v):
     return Detections(u, v, found.diameter_px, found.score, found.sigma_px)
 
@@ -83,7 +87,7 @@ def changed(found, u, v):
 @mark.parametrize("place_deg", [(3.0, 359.7), (-12.0, 7.0)])
 def test_a_place_is_found_anywhere_on_the_map_at_any_altitude(index, altitude_m, place_deg):
     place, found = frame(index.landmarks, *place_deg, altitude_m, seed=5)
-    result = find_place(found, found.sigma_px, index, CAMERA, RULES)
+    result = searched(found, index)
     error = norm(result.position_mcmf_m - place)
     # Ten detections and an attitude of half a degree leave about 1 % of the altitude; three times that here.
     assert error < 0.03 * altitude_m
@@ -98,33 +102,29 @@ def test_false_detections_mirrored_and_turned_images_find_no_place(index):
         changed(found, scattered[0], scattered[1]), changed(found, 511.0 - found.u_px, found.v_px),
         changed(found, 511.0 - found.v_px, found.u_px), changed(found, 511.0 - found.u_px, 511.0 - found.v_px)
     ]  # fmt: skip
-    assert find_place(found, found.sigma_px, index, CAMERA, RULES) is not None
+    assert searched(found, index) is not None
     for detections in hostile:
-        assert find_place(detections, found.sigma_px, index, CAMERA, RULES) is None
+        assert searched(detections, index) is None
 
 
 def test_a_place_off_the_map_is_no_fix(index):
     other = craters(west_deg=100.0, seed=8)
     _, found = frame(other, 0.0, 110.0, 30e3, seed=2)
-    assert find_place(found, found.sigma_px, index, CAMERA, RULES) is None
+    assert searched(found, index) is None
 
 
 def test_too_few_detections_and_detections_that_are_no_numbers_are_no_fix(index):
-    nothing = no_detections()
-    assert find_place(nothing, nothing.sigma_px, index, CAMERA, RULES) is None
+    assert searched(no_detections(), index) is None
     _, found = frame(index.landmarks, 3.0, 359.7, 30e3, seed=5)
-    few = found.select(np.arange(2))
-    assert find_place(few, few.sigma_px, index, CAMERA, RULES) is None
-    gone = changed(found, np.full(len(found), np.nan), found.v_px)
-    assert find_place(gone, found.sigma_px, index, CAMERA, RULES) is None
+    assert searched(found.select(np.arange(2)), index) is None
+    assert searched(changed(found, np.nan * found.u_px, found.v_px), index) is None
 
 
 def test_detections_that_are_no_numbers_are_left_out(index):
     place, found = frame(index.landmarks, 3.0, 359.7, 49e3, seed=5)
     u = found.u_px.copy()
     u[::7] = np.nan
-    broken = changed(found, u, found.v_px)
-    result = find_place(broken, found.sigma_px, index, CAMERA, RULES)
+    result = searched(changed(found, u, found.v_px), index)
     assert np.all(np.isfinite(u[result.detection]))
     assert norm(result.position_mcmf_m - place) < 2_000.0
 
@@ -167,7 +167,7 @@ def test_a_map_without_craters_has_an_index_and_gives_no_fix():
     landmarks = landmark_map(CatalogueTable(np.empty(0, np.int64), empty, empty, empty, empty, np.empty((0, 3))))
     index = place_index(landmarks)
     assert len(index) == 0 and index.tile_start.tolist() == [0]
-    assert find_place(no_detections(), empty, index, CAMERA, RULES) is None
+    assert searched(no_detections(), index) is None
 
 
 @mark.parametrize("seed", range(4))
@@ -176,8 +176,7 @@ def test_tiles_do_not_change_the_place_found(seed, index):
     whole = replace(index, tile_start=np.array([0, index.bin_height.size]))
     assert index.tile_start.size > 4
     _, found = frame(index.landmarks, -8.0 + 5.0 * seed, 355.0 + 2.0 * seed, 28_000.0, seed)
-    sigma = np.full(len(found), SIGMA_PX)
-    tiled, single = (find_place(found, sigma, one, CAMERA, RULES) for one in (index, whole))
+    tiled, single = (searched(found, one) for one in (index, whole))
     assert_allclose(tiled.position_mcmf_m, single.position_mcmf_m, atol=1.0)
     assert_array_equal(tiled.detection, single.detection)
 
@@ -199,7 +198,7 @@ def test_a_camera_beyond_the_last_craters_is_found(beyond_deg, index):
     latitude = np.degrees(index.landmarks.latitude_rad)
     edge = latitude.min() if beyond_deg < 0.0 else latitude.max()
     place, found = frame(index.landmarks, edge + beyond_deg, 1.0, 45e3, seed=3, recall=0.9, false=1)
-    result = find_place(found, found.sigma_px, index, CAMERA, RULES)
+    result = searched(found, index)
     assert norm(result.position_mcmf_m - place) < 2_000.0
 
 
@@ -255,11 +254,7 @@ def test_detections_with_a_high_score_count_more():
 
 def test_detections_without_scores_are_searched(index):
     _, found = frame(index.landmarks, -8.0, 355.0, 28_000.0, 0)
-    sigma = np.full(len(found), SIGMA_PX)
-    known, unknown = (
-        find_place(replace(found, score=np.full(len(found), score)), sigma, index, CAMERA, RULES)
-        for score in (0.7, nan)
-    )
+    known, unknown = (searched(replace(found, score=np.full(len(found), score)), index) for score in (0.7, nan))
     assert unknown.log_false == approx(known.log_false)
 
 

@@ -18,7 +18,7 @@ from payload_emulator.flight.vision.detections import Detections, no_detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from tmtc.dictionary.onboard_parameters import PARAMETERS
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.dictionary.tables import pack_anchor_table, table_hash
+from tmtc.dictionary.tables import table_hash
 
 IMAGE = np.zeros((4, 4, 3), np.uint8)
 ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
@@ -42,7 +42,7 @@ class ScriptedDetector:
 
 def anchor_octets(moon):
     seconds = np.arange(6_000.0, 9_000.0, 30.0)
-    return pack_anchor_table([moon.ticks_at(second) for second in seconds], moon.orbit(seconds))
+    return moon.anchor(seconds)
 
 
 def true_frames(moon, count):
@@ -173,7 +173,7 @@ PATHS = {SAFE: [SAFE], STANDBY: [], OBSERVING: [OBSERVING], DOWNLINKING: [DOWNLI
 def in_mode(make_rig, mode):
     rig = make_rig()
     rig.step(b"".join(rig.function("set_mode", step) for step in PATHS[mode]))
-    assert rig.payload.mode is mode
+    assert rig.mode is mode
     return rig
 
 
@@ -183,11 +183,11 @@ def test_a_mode_follows_another_only_as_the_table_says(make_rig, present, wanted
     rig = in_mode(make_rig, present)
     packets = rig.step(rig.function("set_mode", wanted))
     if (present, wanted) in ALLOWED_CHANGES:
-        assert rig.payload.mode is wanted
+        assert rig.mode is wanted
         assert rig.refusals(packets) == []
         assert ("mode_changed" in rig.events(packets)) is (present is not wanted)
     else:
-        assert rig.payload.mode is present
+        assert rig.mode is present
         assert rig.refusals(packets) == ["wrong_mode"]
     assert (wanted in TRANSITIONS[present]) is ((present, wanted) in ALLOWED_CHANGES)
 
@@ -207,7 +207,7 @@ def test_a_command_out_of_its_mode_is_refused_and_does_nothing(make_rig, name, m
     refused = rig.refusals(packets)
     assert ("wrong_mode" in refused) is (mode not in ALLOWED[name])
     if refused:
-        assert rig.payload.mode is mode
+        assert rig.mode is mode
         assert not rig.named(packets, "verification_completed")
 
 

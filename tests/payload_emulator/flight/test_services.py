@@ -14,7 +14,6 @@ from payload_emulator.flight.ports import ResetCause
 from payload_emulator.flight.telemetry.products import map_octets
 from tmtc.dictionary.onboard_parameters import PARAMETERS, find_parameter
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.dictionary.tables import pack_anchor_table
 from tmtc.packets.crc import append_crc
 from tmtc.packets.large_data import LargeDataReceiver, split
 from tmtc.packets.thumbnails import unpack_thumbnail
@@ -68,7 +67,7 @@ def test_values_out_of_range_are_refused_at_acceptance(rig):
         rig.command("set_parameter", parameter_id=NUMBERS["store_overwrite"], value=0.5),
     ):
         assert rig.refused(order) == ["value_out_of_range"]
-    assert rig.payload.mode is PayloadMode.standby
+    assert rig.mode is PayloadMode.standby
 
 
 def test_octets_that_are_no_telecommand_never_stop_the_payload(rig):
@@ -103,7 +102,7 @@ def test_a_window_is_observed_by_the_schedule_and_ends_by_itself(rig):
     assert len(rig.named(rig.step(), "detections")) == 1
     ended = rig.step()  # 90 s
     assert "observation_stopped" in rig.events(ended)
-    assert rig.payload.mode is PayloadMode.standby
+    assert rig.mode is PayloadMode.standby
 
 
 def test_the_cadence_of_a_window_thins_the_frames(rig):
@@ -151,9 +150,9 @@ def test_a_held_schedule_releases_nothing_and_what_is_late_then_expires(rig):
 def test_the_schedule_survives_a_reset(rig):
     rig.step(rig.at(100.0, rig.function("start_observation", 60.0)))
     rig.boot(ResetCause.brown_out)
-    assert rig.payload.mode is PayloadMode.standby
+    assert rig.mode is PayloadMode.standby
     rig.step(seconds=90.0)
-    assert rig.payload.mode is PayloadMode.observing
+    assert rig.mode is PayloadMode.observing
 
 
 # Parameters (service 20)
@@ -303,7 +302,7 @@ def test_the_map_of_landmarks_has_its_documented_octets(rig):
 
 def test_a_table_is_uplinked_in_parts_in_any_order_and_used_after_resets(moon, rig):
     seconds = np.arange(0.0, 3000.0, 30.0)
-    octets = pack_anchor_table([moon.ticks_at(s) for s in seconds], moon.orbit(seconds))
+    octets = moon.anchor(seconds)
     parts = split(octets, transaction=9, table=1, part_length=500, link="uplink")
     orders = [rig.command(name, **values) for name, values in [parts[2], parts[0], parts[1], *parts[3:]]]
     packets = rig.step(b"".join(orders))
@@ -317,7 +316,7 @@ def test_a_table_is_uplinked_in_parts_in_any_order_and_used_after_resets(moon, r
 
 
 def test_a_damaged_or_unknown_table_is_refused_and_the_old_one_stays(moon, rig):
-    octets = pack_anchor_table([moon.ticks_at(s) for s in (0.0, 30.0, 60.0)], moon.orbit([0.0, 30.0, 60.0]))
+    octets = moon.anchor([0.0, 30.0, 60.0])
     for table, content, reason, events in (
         (1, octets[:-1] + b"\0", "table_corrupt", 1),
         (6, b"x", "value_out_of_range", 0),

@@ -45,6 +45,12 @@ def crossings(truth, covers, in_reach=everywhere, direction="ascending", band_ra
     )  # fmt: skip
 
 
+def latitudes(truth, band_rad=BAND_RAD):
+    """Times of frames of an orbit, and the latitudes there."""
+    times = frame_times(truth, START_NS, START_NS + int(PERIOD_S) * NS, 15 * NS, band_rad)
+    return times, spherical_from_mcmf(truth.positions_mcmf(times))[0]
+
+
 class StillMoon:
     """A Moon that does not turn: MCMF axes are ICRF axes."""
 
@@ -72,8 +78,7 @@ def polar_truth():
 
 
 def test_frames_are_taken_at_the_cadence_within_the_latitude_limit(polar_truth):
-    times = frame_times(polar_truth, START_NS, START_NS + int(PERIOD_S) * NS, 15 * NS, BAND_RAD)
-    latitude, _, _ = spherical_from_mcmf(polar_truth.positions_mcmf(times))
+    times, latitude = latitudes(polar_truth)
     assert np.abs(latitude).max() <= np.radians(60.0)
     assert np.all(np.diff(times) % (15 * NS) == 0)
     # Two thirds of the orbit lie within 60 degrees: 440 frames at 15 s less up to one at each of four edges.
@@ -120,8 +125,7 @@ def test_a_crossing_outside_the_wanted_longitudes_is_not_observable(polar_truth)
 
 def test_the_band_may_lie_on_one_side_of_the_equator(polar_truth):
     band_rad = (np.radians(20.0), np.radians(50.0))
-    times = frame_times(polar_truth, START_NS, START_NS + int(PERIOD_S) * NS, 15 * NS, band_rad)
-    latitude, _, _ = spherical_from_mcmf(polar_truth.positions_mcmf(times))
+    _, latitude = latitudes(polar_truth, band_rad)
     assert latitude.min() >= band_rad[0] and latitude.max() <= band_rad[1]
     assert np.degrees(latitude.max() - latitude.min()) > 28.0
     found = crossings(polar_truth, everywhere, band_rad=band_rad)[0]
