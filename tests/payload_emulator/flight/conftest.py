@@ -98,9 +98,8 @@ def make_crater_field(seed):
     return CraterField(position, rng.choice(CLASS_DIAMETERS_M, size=count, p=CLASS_SHARES))
 
 
-def detections(*columns):
-    u, v, diameter = np.atleast_1d(*(np.asarray(column, float) for column in columns))
-    return Detections(u, v, diameter, np.ones_like(u), np.full_like(u, np.nan))
+def detections(u_px, v_px, diameter_px):
+    return Detections(u_px, v_px, diameter_px, np.ones_like(u_px), np.full_like(u_px, np.nan))
 
 
 @dataclass(frozen=True)
@@ -111,10 +110,7 @@ class Toolbox:
     place: Callable[[FloatArray], tuple[float, float, float]] = place
     ticks_at: Callable[[float], int] = ticks_at
     crater_field: Callable[[int], CraterField] = make_crater_field
-    detections: Callable[..., Detections] = detections
     radius_m: float = RADIUS_M
-    focal_px: float = float(FOCAL_PX)
-    centre_px: float = CENTRE_PX
 
     def anchor(self, seconds):
         """The anchor table of these times, as octets."""
@@ -159,7 +155,7 @@ class Rig:
         self.examined += 1
         if self.failing:
             raise RuntimeError("no such operator")
-        return self.quality, detections(np.empty(0), np.empty(0), np.empty(0))
+        return self.quality, detections(*np.empty((3, 0)))
 
     @property
     def mode(self):

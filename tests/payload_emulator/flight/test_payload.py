@@ -51,7 +51,7 @@ def true_frames(moon, count):
 
 
 def payload(moon, frames, **options):
-    tables = FlightTables(anchor_ephemeris=options.pop("anchor", anchor_octets(moon)))
+    tables = FlightTables(anchor_ephemeris=anchor_octets(moon))
     return Payload(ScriptedDetector(frames), FlightParameters(), tables, **options)
 
 

@@ -32,6 +32,7 @@ from tests.payload_emulator.sim.rasters import write_raster
 
 NONE = make_catalogue([], [], [], source="none")
 LATITUDE, LONGITUDE = 15.0, 14.0
+PLACE = np.radians([[[LATITUDE]], [[LONGITUDE]]])
 
 
 def flat(latitude, longitude):
@@ -87,11 +88,10 @@ def test_the_registration_of_the_heights_moves_the_photograph_too(tmp_path):
         [tmp_path / "h.tif"], [tmp_path / "p.tif"], NONE, registration_north_m=3_000.0,
         registration_east_m=-2_000.0
     )  # fmt: skip
-    place = np.array([[radians(LATITUDE)]]), np.array([[radians(LONGITUDE)]])
     north_deg = degrees(3_000.0 / MOON_RADIUS_M)
     east_deg = degrees(-2_000.0 / MOON_RADIUS_M) / cos(radians(LATITUDE))
     # What the file has 3 km farther south and 2 km farther east is here.
-    assert moved.brightness(*place, 10.0)[0, 0] == approx(ramp(LATITUDE - north_deg, LONGITUDE - east_deg), abs=1e-4)
+    assert moved.brightness(*PLACE, 10.0)[0, 0] == approx(ramp(LATITUDE - north_deg, LONGITUDE - east_deg), abs=1e-4)
 
 
 def test_a_finer_photograph_is_averaged_to_the_pixels_of_the_camera(tmp_path):
@@ -110,8 +110,7 @@ def test_a_finer_photograph_is_averaged_to_the_pixels_of_the_camera(tmp_path):
 
 def test_eight_bits_are_a_share_of_full_scale(tmp_path):
     terrain = terrain_of(tmp_path, lambda latitude, longitude: 51.0 + flat(latitude, longitude), dtype="uint8")
-    place = np.array([[radians(LATITUDE)]]), np.array([[radians(LONGITUDE)]])
-    assert terrain.brightness(*place, 100.0)[0, 0] == approx(0.2, abs=1e-6)
+    assert terrain.brightness(*PLACE, 100.0)[0, 0] == approx(0.2, abs=1e-6)
 
 
 def test_no_data_of_the_photograph_is_not_a_number(tmp_path):

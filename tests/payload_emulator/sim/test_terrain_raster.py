@@ -22,14 +22,6 @@ def slope(latitude, longitude):
     return 100.0 * latitude + 50.0 * longitude
 
 
-def test_pixels_are_areas(tmp_path):
-    terrain = RasterTerrain([write_raster(tmp_path / "a.tif", 10.0, 20.0, 8.0, slope)], NONE, **AS_IT_IS)
-    latitude, longitude = np.array([15.3, 16.71]), np.array([13.2, 14.9])
-    # A tilted plane passes unchanged through cubic and bilinear resampling: single precision of 2.5 km is 0.2 mm.
-    heights = terrain.height_m(np.radians(latitude), np.radians(longitude))
-    assert_allclose(heights, slope(latitude, longitude), atol=0.01)
-
-
 def test_registration_moves_the_raster_over_the_ground(tmp_path):
     path = write_raster(tmp_path / "a.tif", 10.0, 20.0, 8.0, slope)
     moved = RasterTerrain([path], NONE, **(AS_IT_IS | {"registration_north_m": -59.0}))
@@ -74,24 +66,6 @@ def test_a_coarse_raster_fills_in_around_but_does_not_count_as_covered(tmp_path)
     assert covered.tolist() == [True, False, False]
     heights = terrain.height_m(np.radians(latitude), np.radians(longitude))
     assert_allclose(heights, slope(latitude, longitude), atol=0.5)
-
-
-def test_ground_without_data_is_refused_with_the_place(tmp_path):
-    terrain = RasterTerrain([write_raster(tmp_path / "a.tif", 10.0, 20.0, 4.0, slope)], NONE, **AS_IT_IS)
-    with raises(TerrainError, match="expected heights at latitude"):
-        terrain.height_m(math.radians(-40.0), math.radians(200.0))
-
-
-def test_holes_are_filled_from_the_coarser_layer(tmp_path):
-    def holed(latitude, longitude):
-        inside = (np.abs(latitude - 17.0) < 0.3) & (np.abs(longitude - 13.0) < 0.3)
-        return np.where(inside, -32768.0, slope(latitude, longitude))
-
-    fine = write_raster(tmp_path / "f.tif", 10.0, 20.0, 6.0, holed, nodata=-32768.0)
-    coarse = write_raster(tmp_path / "c.tif", 0.0, 30.0, 30.0, slope, ppd=8)
-    terrain = RasterTerrain([fine], NONE, coarse_paths=[coarse], **AS_IT_IS)
-    middle = terrain.height_m(np.radians(17.0), np.radians(np.linspace(12.5, 13.5, 30)))
-    assert_allclose(middle, slope(17.0, np.linspace(12.5, 13.5, 30)), atol=5.0)
 
 
 def test_sharpening_is_seeded_and_adds_what_the_raster_cannot_hold(tmp_path):
