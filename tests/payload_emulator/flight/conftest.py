@@ -138,11 +138,11 @@ class Rig:
         self.failing = False
         self.boot()
 
-    def boot(self, cause=None, mode=PayloadMode.standby):
+    def boot(self, cause=None):
         if cause is not None:
             self.board.reset(cause)
         self.payload = Payload(
-            self, FlightParameters(), self.tables, model_octets=self.model, board=self.board, mode=mode,
+            self, FlightParameters(), self.tables, model_octets=self.model, board=self.board, mode=PayloadMode.standby,
             make_detector=self._make_detector
         )  # fmt: skip
 

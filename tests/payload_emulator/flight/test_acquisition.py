@@ -25,9 +25,9 @@ PARAMETERS = AcquisitionParameters()
 ATTITUDE_SIGMA_RAD = 2e-4
 
 
-def crater_map(seed=3, reach_rad=0.08, mean_in_image=22.0):
+def crater_map(reach_rad=0.08, mean_in_image=22.0):
     """About so many craters within the image, of 5 to 20 km; heights of a kilometre."""
-    rng = default_rng(seed)
+    rng = default_rng(3)
     density = mean_in_image / (2.0 * ALTITUDE_M * np.sqrt(3.0)) ** 2
     count = int(density * (2.0 * reach_rad * RADIUS_M) ** 2)
     place = rng.uniform(-reach_rad, reach_rad, (2, count))

@@ -453,10 +453,10 @@ def test_a_reacquisition_leaves_out_the_pair_that_all_others_contradict(orbit, m
     shifted[detection[2]] += 25.0
     wrong = replace(found, u_px=shifted)
 
-    def fix(needed, given, reacquired=True):
+    def fix(needed, given):
         pairs = Identification(detection, sighted, count, needed)
         return correction.correct(
-            prior, pose, given, pairs, sighting, landmarks, camera, parameters, 30e3, reacquired=reacquired
+            prior, pose, given, pairs, sighting, landmarks, camera, parameters, 30e3, reacquired=True
         )
 
     kept = fix(count - 1, wrong)

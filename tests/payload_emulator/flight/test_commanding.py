@@ -9,9 +9,9 @@ from payload_emulator.flight.onboard.commanding import Command, CommandHistory, 
 UNKNOWN_PACKET, BAD_CHECKSUM, BAD_LENGTH, DUPLICATE, OUT_OF_SEQUENCE = 1, 2, 3, 6, 8
 
 
-def packet(count, body=b"", *, service=17, subtype=1, source=0, acknowledge=15):
+def packet(count, body=b"", *, service=17, source=0, acknowledge=15):
     """A telecommand to APID 160 with CRC-16/CCITT-FALSE; service 17, subtype 1 is the connection test."""
-    secondary = bytes([0x20 | acknowledge, service, subtype]) + source.to_bytes(2, "big")
+    secondary = bytes([0x20 | acknowledge, service, 1]) + source.to_bytes(2, "big")
     head = (0x18A0).to_bytes(2, "big") + (0xC000 | count).to_bytes(2, "big")
     whole = head + (len(secondary) + len(body) + 1).to_bytes(2, "big") + secondary + body
     return whole + binascii.crc_hqx(whole, 0xFFFF).to_bytes(2, "big")

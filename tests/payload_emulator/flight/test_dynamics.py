@@ -22,7 +22,7 @@ MOON = IauOrientation()
 
 def orientation_table():
     ticks = START + np.arange(-5, 8) * 7_200 * 65_536
-    tdb_s = np.array([float(tdb_s_from_utc_ns(int(utc_ns_from_ticks(int(tick))))) for tick in ticks])
+    tdb_s = tdb_s_from_utc_ns(utc_ns_from_ticks(ticks))
     rotations = MOON.mcmf_from_icrf(tdb_s)
     return unpack(pack_orientation_table(ticks, rotations, MOON.pa_from_icrf(tdb_s[0]) @ rotations[0].T))
 
@@ -67,8 +67,8 @@ def test_the_transition_matrix_is_the_derivative_of_the_motion(axis, step):
     ahead, here, behind = (orbit.propagate(state + k * change, START, until) for k in (1.0, 0.0, -1.0))
     difference = (ahead.state - behind.state) / (2.0 * step)
     column = here.transition[:, axis]
-    assert_allclose(column[:3], difference[:3], atol=2e-3 * np.linalg.norm(difference[:3]))
-    assert_allclose(column[3:6], difference[3:6], atol=2e-3 * np.linalg.norm(difference[3:6]))
+    for part in (slice(3), slice(3, 6)):
+        assert_allclose(column[part], difference[part], atol=2e-3 * np.linalg.norm(difference[part]))
 
 
 def test_white_acceleration_grows_velocity_variance_with_time():

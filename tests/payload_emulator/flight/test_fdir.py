@@ -254,8 +254,7 @@ def test_too_much_memory_is_told(rig):
     assert rig.events(rig.step(order)).count("memory_high") == 1
 
 
-def test_a_flooded_store_is_told_each_time_that_the_loss_has_doubled(make_rig):
-    rig = make_rig()
+def test_a_flooded_store_is_told_each_time_that_the_loss_has_doubled(rig):
     rig.board.downlink = 0
     rig.step(rig.command("set_housekeeping_interval", structure_id=1, interval_s=1))
     for _ in range(700):

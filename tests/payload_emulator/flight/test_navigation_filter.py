@@ -75,11 +75,11 @@ def projected(state, landmarks, index, turn):
     return seen
 
 
-def prior_state(landmarks, index, seed=5):
+def prior_state(index):
     """A correlated prior over the common states and the given craters."""
-    rng = default_rng(seed)
-    sigma = np.concatenate([[60.0] * 3, [0.08] * 3, [2e-6] * 3, [2e-4] * 3, [0.25] * 2, [15.0, 12.0, 10.0], [5e-4]])
-    sigma = np.concatenate([sigma, np.full(3 * index.size, 60.0)])
+    rng = default_rng(5)
+    sizes = [60.0, 0.08, 2e-6, 2e-4, 0.25, 15.0, 12.0, 10.0, 5e-4, 60.0]
+    sigma = np.repeat(sizes, [3, 3, 3, 3, 2, 1, 1, 1, 1, 3 * index.size])
     root = np.eye(sigma.size) + 0.15 * rng.standard_normal((sigma.size, sigma.size))
     covariance = (root @ root.T) * sigma[:, None] * sigma[None]
     mean = np.zeros(sigma.size)
@@ -146,7 +146,7 @@ def dense_update(prior, landmarks, index, uv, variance):
 
 def test_an_update_is_the_least_squares_solution_with_its_covariance():
     landmarks, index = craters(), np.array([5, 0, 3, 2, 6])
-    prior = prior_state(landmarks, index)
+    prior = prior_state(index)
     rng = default_rng(8)
     truth = prior.mean.copy()
     truth[:3] += [30.0, -20.0, 25.0]
@@ -218,7 +218,7 @@ def test_what_all_craters_share_is_told_apart_from_the_position_by_its_prior_alo
 
 def test_craters_seen_where_they_are_predicted_move_nothing_and_tell_much():
     landmarks, index = craters(), np.arange(7)
-    prior = prior_state(landmarks, index)
+    prior = prior_state(index)
     uv = projected(prior.mean, landmarks, index, np.zeros(3))
     found = updated(prior, landmarks, index, uv, np.full(7, 0.5))
     assert_allclose(found.state.mean, prior.mean, atol=1e-5)
@@ -228,7 +228,7 @@ def test_craters_seen_where_they_are_predicted_move_nothing_and_tell_much():
 
 def test_numbers_that_allow_no_update_give_none():
     landmarks, index = craters(), np.arange(2)
-    prior = prior_state(landmarks, index)
+    prior = prior_state(index)
     behind = replace(prior, mean=prior.mean.copy())
     behind.mean[:3] *= 0.9
     uv, variance = np.full((2, 2), 250.0), np.ones(2)
@@ -238,7 +238,7 @@ def test_numbers_that_allow_no_update_give_none():
 
 def test_derivatives_stand_in_the_columns_of_their_states():
     landmarks, index = craters(), np.array([4, 1])
-    state = prior_state(landmarks, index).with_craters(np.array([-2]), np.full((1, 3), 1e-4))
+    state = prior_state(index).with_craters(np.array([-2]), np.full((1, 3), 1e-4))
     state.mean[-3:] = 0.0
     pose = kalman.pose_of(state, CAMERA_FROM_ICRF, MCMF_FROM_ICRF)
     # Asked for in another order than the states hold them, with a crater that is none.
@@ -278,8 +278,7 @@ class Drift:
 
 
 def test_a_prediction_carries_each_part_by_its_own_law():
-    landmarks, index = craters(), np.array([2, 0])
-    prior, model = prior_state(landmarks, index), Drift()
+    prior, model = prior_state(np.array([2, 0])), Drift()
     found = kalman.predict(prior, 1_300 * SECOND, model, ERRORS)
     # 300 s at memories of 1000 s and 500 s.
     tilt, shift = np.exp(-0.3), np.exp(-0.6)
@@ -342,7 +341,7 @@ def test_the_first_state_holds_what_it_is_given():
 
 
 def test_burns_and_restarts_add_what_they_leave_unknown():
-    prior = prior_state(craters(), np.array([1]))
+    prior = prior_state(np.array([1]))
     burnt = kalman.burn(prior, np.array([1.0, -2.0, 0.5]), 0.03)
     assert_allclose(burnt.mean[3:6], prior.mean[3:6] + np.array([1.0, -2.0, 0.5]))
     assert_allclose(np.delete(burnt.mean, [3, 4, 5]), np.delete(prior.mean, [3, 4, 5]))
@@ -356,7 +355,7 @@ def test_burns_and_restarts_add_what_they_leave_unknown():
 
 
 def test_craters_come_and_go_with_their_correlations():
-    prior = prior_state(craters(), np.array([4, 1, 6]))
+    prior = prior_state(np.array([4, 1, 6]))
     assert prior.slots(np.array([6, 2, 4, 1])).tolist() == [24, -1, 18, 21]
     assert_array_equal(prior.shifts(np.array([1, 5])), [prior.mean[21:24], np.zeros(3)])
     kept = prior.only_craters(np.array([6, 4, 9]))

@@ -55,9 +55,9 @@ def payload(moon, frames, **options):
     return Payload(ScriptedDetector(frames), FlightParameters(), tables, **options)
 
 
-def fly(moon, flown, count, start=0):
+def fly(moon, flown, count):
     packets = []
-    for k in range(start, start + count):
+    for k in range(count):
         packets += flown.step(IMAGE, ATTITUDE, moon.ticks_at(FIRST_S + 15.0 * k), b"")
     return packets
 

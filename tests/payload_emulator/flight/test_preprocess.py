@@ -15,8 +15,8 @@ from payload_emulator.flight.vision.preprocess import (
 )
 
 
-def texture(seed=0, shape=(512, 512, 3), dtype=np.uint8):
-    rng = np.random.default_rng(seed)
+def texture(shape=(512, 512, 3), dtype=np.uint8):
+    rng = np.random.default_rng(0)
     smooth = 100 + 60 * np.sin(np.arange(shape[1]) / 9.0)[None, :] * np.cos(np.arange(shape[0]) / 7.0)[:, None]
     image = smooth + rng.normal(0, 4, shape[:2])
     if len(shape) == 3:

@@ -51,10 +51,7 @@ def about_deg(case):
     model = ForceModel(case.gravity, case.orientation, 10)
     flown = propagate(start, case.position_icrf_m, case.velocity_icrf_m_s, at - start + 1.0, model)
     place = case.orientation.mcmf_from_icrf(at) @ flown.state(at)[:3]
-    return (
-        float(np.degrees(np.arcsin(place[2] / np.linalg.norm(place)))),
-        float(np.degrees(np.arctan2(place[1], place[0]))),
-    )
+    return np.degrees([np.arcsin(place[2] / np.linalg.norm(place)), np.arctan2(place[1], place[0])])
 
 
 def turn_deg(case, rows):

@@ -352,8 +352,7 @@ def test_the_store_keeps_what_no_link_takes_and_plays_it_again_by_time(rig):
     assert rig.payload.waiting == 0
 
 
-def test_standby_sends_what_is_small_and_keeps_the_rest(make_rig):
-    rig = make_rig()
+def test_standby_sends_what_is_small_and_keeps_the_rest(rig):
     rig.board.downlink = 0
     rig.step(rig.function("start_observation"))
     rig.step(rig.function("stop_observation"))

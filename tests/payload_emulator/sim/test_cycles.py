@@ -46,7 +46,7 @@ def scene(hilly):
     return describe_scene(hilly, CAMERA, *pose(), SUN)
 
 
-def test_the_cap_is_a_grid_of_65_on_the_sphere_through_the_middle_of_the_relief(hilly, scene):
+def test_the_cap_is_a_grid_of_65_on_the_sphere_through_the_middle_of_the_relief(scene):
     assert scene.vertices_km.shape == (GRID, GRID, 3) == (65, 65, 3)
     centre = np.array([0.0, 0.0, -MOON_RADIUS_M / 1e3])
     radius = norm(scene.vertices_km - centre, axis=-1)

@@ -44,10 +44,10 @@ def ramp(latitude, longitude):
     return 0.5 - 0.1 * (latitude - LATITUDE) + 0.2 * (longitude - LONGITUDE)
 
 
-def terrain_of(folder, formula=ramp, ppd=64, size_deg=4.0, **options):
+def terrain_of(folder, formula=ramp, size_deg=4.0, **options):
     heights = write_raster(folder / "h.tif", 2.0, 29.0, 28.0, flat, ppd=16)
     corner = LONGITUDE - 0.5 * size_deg, LATITUDE + 0.5 * size_deg
-    photograph = write_raster(folder / "p.tif", *corner, size_deg, formula, ppd=ppd, **options)
+    photograph = write_raster(folder / "p.tif", *corner, size_deg, formula, ppd=64, **options)
     return PhotographTerrain([heights], [photograph], NONE, registration_north_m=0.0)
 
 

@@ -34,10 +34,10 @@ from tests.payload_emulator.test_curation import OFFSET_M, Field
 RADIUS_M = 1_737_400.0
 
 
-def rims(count, shift_m, noise_m, seed=1, size_deg=15.0):
+def rims(count, shift_m, noise_m, seed=1):
     """Rims spread over a square about 300 E, 10 N, with a constant shift and normal errors."""
     rng = np.random.default_rng(seed)
-    latitude, longitude = rng.uniform(-0.5, 0.5, (2, count)) * size_deg
+    latitude, longitude = rng.uniform(-0.5, 0.5, (2, count)) * 15.0
     east, north = noise_m * rng.standard_normal((2, count))
     return Rims(
         np.radians(10.0 + latitude), np.radians(300.0 + longitude), shift_m[0] + east, shift_m[1] + north,
