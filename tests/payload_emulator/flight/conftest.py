@@ -205,13 +205,20 @@ class Rig:
         kinds = ("verification_not_accepted", "verification_not_started")
         return [labels[v["failure_code"]] for kind in kinds for v in self.named(packets, kind)]
 
+    def send(self, name, **values):
+        """Take a step with one telecommand."""
+        return self.step(self.command(name, **values))
+
+    def perform(self, *function):
+        return self.step(self.function(*function))
+
     def refused(self, orders, **options):
         """Reasons of the refusals of telecommands."""
         return self.refusals(self.step(orders, **options))
 
     def report(self, command):
         """The report, named like the telecommand that asks for it."""
-        (found,) = self.named(self.step(self.command(command)), command.removeprefix("report_") + "_report")
+        (found,) = self.named(self.send(command), command.removeprefix("report_") + "_report")
         return found
 
 

@@ -17,7 +17,7 @@ NO_IMAGE = np.zeros((0, 0), np.uint8)
 
 @fixture
 def observing(rig):
-    rig.step(rig.function("start_observation"))
+    rig.perform("start_observation")
     rig.step()
     assert rig.mode is PayloadMode.observing
     return rig
@@ -126,7 +126,7 @@ def test_memory_whose_kept_copy_is_damaged_too_ends_in_safe(observing):
     # Back in service once a good model is there again.
     observing.board.write_table(MODEL_NUMBER, observing.model)
     steps(observing, 5)
-    observing.step(observing.function("set_mode", PayloadMode.standby))
+    observing.perform("set_mode", PayloadMode.standby)
     assert observing.mode is PayloadMode.standby
 
 
@@ -156,7 +156,7 @@ def test_watchdog_resets_an_hour_apart_do_not_add_up(observing):
 
 
 def test_a_commanded_reset_comes_up_in_standby_with_the_next_boot_count(observing):
-    packets = observing.step(observing.function("reboot"))
+    packets = observing.perform("reboot")
     assert len(observing.named(packets, "verification_completed")) == 1
     after = observing.step()
     assert observing.mode is PayloadMode.standby
@@ -164,7 +164,7 @@ def test_a_commanded_reset_comes_up_in_standby_with_the_next_boot_count(observin
 
 
 def test_an_observation_whose_time_is_over_is_not_resumed(rig):
-    rig.step(rig.function("start_observation", 60.0))
+    rig.perform("start_observation", 60.0)
     rig.boot(ResetCause.brown_out)
     rig.step(seconds=100.0)
     assert rig.mode is PayloadMode.standby
@@ -256,7 +256,7 @@ def test_too_much_memory_is_told(rig):
 
 def test_a_flooded_store_is_told_each_time_that_the_loss_has_doubled(rig):
     rig.board.downlink = 0
-    rig.step(rig.command("set_housekeeping_interval", structure_id=1, interval_s=1))
+    rig.send("set_housekeeping_interval", structure_id=1, interval_s=1)
     for _ in range(700):
         rig.step(seconds=1.0, image=None)
     rig.board.downlink = 1 << 30

@@ -170,18 +170,16 @@ ALLOWED_CHANGES = {
 PATHS = {SAFE: [SAFE], STANDBY: [], OBSERVING: [OBSERVING], DOWNLINKING: [DOWNLINKING]}
 
 
-def in_mode(make_rig, mode):
-    rig = make_rig()
+def set_mode(rig, mode):
     rig.step(b"".join(rig.function("set_mode", step) for step in PATHS[mode]))
     assert rig.mode is mode
-    return rig
 
 
 @mark.parametrize("present", PayloadMode)
 @mark.parametrize("wanted", PayloadMode)
-def test_a_mode_follows_another_only_as_the_table_says(make_rig, present, wanted):
-    rig = in_mode(make_rig, present)
-    packets = rig.step(rig.function("set_mode", wanted))
+def test_a_mode_follows_another_only_as_the_table_says(rig, present, wanted):
+    set_mode(rig, present)
+    packets = rig.perform("set_mode", wanted)
     if (present, wanted) in ALLOWED_CHANGES:
         assert rig.mode is wanted
         assert rig.refusals(packets) == []
@@ -201,8 +199,8 @@ COMMANDS = {
 
 @mark.parametrize("name", sorted(ALLOWED))
 @mark.parametrize("mode", PayloadMode)
-def test_a_command_out_of_its_mode_is_refused_and_does_nothing(make_rig, name, mode):
-    rig = in_mode(make_rig, mode)
+def test_a_command_out_of_its_mode_is_refused_and_does_nothing(rig, name, mode):
+    set_mode(rig, mode)
     packets = rig.step(rig.command(name, **COMMANDS[name]) if name in COMMANDS else rig.function(name))
     refused = rig.refusals(packets)
     assert ("wrong_mode" in refused) is (mode not in ALLOWED[name])

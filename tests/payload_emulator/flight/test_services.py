@@ -137,7 +137,7 @@ def test_a_held_schedule_releases_nothing_and_what_is_late_then_expires(rig):
     assert not rig.named(rig.step(), "connection_report")  # 30 s
     removed = rig.command("delete_activity", request_id=int.from_bytes(gone[:4], "big"))
     assert rig.refused(removed) == []  # 45 s
-    packets = rig.step(rig.command("enable_schedule"))  # 60 s: one is 40 s late, one 20 s
+    packets = rig.send("enable_schedule")  # 60 s: one is 40 s late, one 20 s
     assert rig.events(packets).count("activity_expired") == 1
     assert rig.refusals(packets) == ["expired"]
     assert len(rig.named(packets, "connection_report")) == 1
@@ -199,7 +199,7 @@ def test_a_structure_defined_by_telecommand_is_sent_reported_and_deleted(rig):
     seen = [len(rig.named(rig.step(), "housekeeping_report")) for _ in range(6)]
     assert sum(seen) == 3
     rig.boot(ResetCause.brown_out)
-    report = rig.step(rig.command("report_housekeeping_definition", structure_id=16))
+    report = rig.send("report_housekeeping_definition", structure_id=16)
     definition = rig.named(report, "housekeeping_definition")[0]
     assert (definition["interval_s"], definition["count"]) == (30, 4)
     assert rig.refused(rig.command("delete_housekeeping", structure_id=16)) == []
@@ -218,9 +218,9 @@ def test_only_so_many_structures_can_be_defined(rig):
 
 
 def test_housekeeping_can_be_stopped_asked_for_and_sent_more_often(rig):
-    rig.step(rig.command("disable_housekeeping", structure_id=1))
+    rig.send("disable_housekeeping", structure_id=1)
     assert not any(rig.named(rig.step(), "housekeeping") for _ in range(8))
-    asked = rig.step(rig.command("request_housekeeping", structure_id=1))
+    asked = rig.send("request_housekeeping", structure_id=1)
     assert len(rig.named(asked, "housekeeping")) == 1
     rig.step(
         rig.command("enable_housekeeping", structure_id=1)
@@ -230,10 +230,10 @@ def test_housekeeping_can_be_stopped_asked_for_and_sent_more_often(rig):
 
 
 def test_performance_tells_the_time_of_every_stage_and_the_levels_of_the_store(rig):
-    rig.step(rig.function("start_observation"))
+    rig.perform("start_observation")
     for _ in range(3):
         rig.step()
-    report = rig.named(rig.step(rig.command("request_housekeeping", structure_id=2)), "performance")[0]
+    report = rig.named(rig.send("request_housekeeping", structure_id=2), "performance")[0]
     # The board's model: 850 ms of detector, 40 ms of navigation a frame, a tenth of spread.
     assert report["cpu_detector_ms"] == approx(850.0, rel=0.25)
     assert report["cpu_navigation_ms"] == approx(40.0, rel=0.25)
@@ -243,19 +243,19 @@ def test_performance_tells_the_time_of_every_stage_and_the_levels_of_the_store(r
 
 
 def test_an_event_that_is_disabled_is_not_reported_until_it_is_enabled(rig):
-    rig.step(rig.command("disable_event", event_id="frame_skipped"))
-    packets = rig.step(rig.command("report_disabled_events"))
+    rig.send("disable_event", event_id="frame_skipped")
+    packets = rig.send("report_disabled_events")
     assert "frame_skipped" not in rig.events(packets)
     assert list(rig.named(packets, "disabled_events")[0]["items"]["event_id"]) == [22]
     rig.boot(ResetCause.brown_out)
     assert "frame_skipped" not in rig.events(rig.step())
-    assert "frame_skipped" in rig.events(rig.step(rig.command("enable_event", event_id="frame_skipped")))
+    assert "frame_skipped" in rig.events(rig.send("enable_event", event_id="frame_skipped"))
 
 
 def test_a_change_of_the_reported_events_is_itself_an_event_also_for_that_event(rig):
     changed = 70  # event_reporting_changed
     for command, value in (("disable_event", 0.0), ("enable_event", 1.0)):
-        packets = rig.step(rig.command(command, event_id="event_reporting_changed"))
+        packets = rig.send(command, event_id="event_reporting_changed")
         said = [one for one in rig.named(packets, "event_info") if one["event_id"] == changed]
         assert [(one["value_1"], one["value_2"]) for one in said] == [(float(changed), value)]
 
@@ -293,10 +293,10 @@ def test_the_map_of_landmarks_has_its_documented_octets(rig):
     octets = map_octets({7: 3, 4_000_000_000: 70_000})
     assert octets.hex(" ", 2) == "0000 0007 0003 ee6b 2800 ffff"
     assert map_octets({}) == b""
-    packets = rig.step(rig.function("downlink_map"))
+    packets = rig.perform("downlink_map")
     assert [v["table"] for v in rig.named(packets, "large_data_last")] == []
     assert rig.payload.waiting == 1  # bulk waits for a mode that sends it
-    down = rig.step(rig.function("set_mode", PayloadMode.downlinking))
+    down = rig.perform("set_mode", PayloadMode.downlinking)
     assert [v["table"] for v in rig.named(down, "large_data_last")] == [7]
 
 
@@ -311,7 +311,7 @@ def test_a_table_is_uplinked_in_parts_in_any_order_and_used_after_resets(moon, r
     assert rig.board.read_table(TABLE_NUMBERS["anchor_ephemeris"]) == octets
     rig.boot(ResetCause.watchdog)
     assert "table_loaded" in rig.events(rig.step())
-    observed = rig.step(rig.function("start_observation"))
+    observed = rig.perform("start_observation")
     assert {v["outcome"] for v in rig.named(observed, "frame_outcome")} == {0}
 
 
@@ -322,7 +322,7 @@ def test_a_damaged_or_unknown_table_is_refused_and_the_old_one_stays(moon, rig):
         (6, b"x", "value_out_of_range", 0),
     ):
         (name, values), *_ = split(content, transaction=table, table=table, part_length=4096, link="uplink")
-        packets = rig.step(rig.command(name, **values))
+        packets = rig.send(name, **values)
         assert rig.refusals(packets) == [reason]
         assert rig.events(packets).count("table_refused") == events
     assert rig.board.read_table(1) == b""
@@ -330,7 +330,7 @@ def test_a_damaged_or_unknown_table_is_refused_and_the_old_one_stays(moon, rig):
 
 def test_the_store_keeps_what_no_link_takes_and_plays_it_again_by_time(rig):
     rig.board.downlink = 0
-    rig.step(rig.function("start_observation"))
+    rig.perform("start_observation")
     from_ticks = rig.ticks
     for _ in range(4):
         assert rig.step() == []
@@ -340,22 +340,22 @@ def test_the_store_keeps_what_no_link_takes_and_plays_it_again_by_time(rig):
     late = rig.step(rig.function("stop_observation") + rig.function("set_mode", PayloadMode.downlinking))
     assert len(rig.named(late, "detections")) == 5
     to_ticks = rig.ticks
-    again = rig.step(rig.command("replay_store", start_ticks=from_ticks, stop_ticks=to_ticks))
+    again = rig.send("replay_store", start_ticks=from_ticks, stop_ticks=to_ticks)
     repeated = set(late) & set(again)
     assert len([p for p in repeated if DICTIONARY.unpack(p)[0] == "detections"]) == 5
     report = rig.report("report_store")
     assert report["items"]["packets"][3] == 5 and report["items"]["unsent"][3] == 0
-    rig.step(rig.command("delete_store", stop_ticks=to_ticks))
+    rig.send("delete_store", stop_ticks=to_ticks)
     report = rig.report("report_store")
     assert report["items"]["packets"][3] == 0
-    rig.step(rig.function("clear_store"))
+    rig.perform("clear_store")
     assert rig.payload.waiting == 0
 
 
 def test_standby_sends_what_is_small_and_keeps_the_rest(rig):
     rig.board.downlink = 0
-    rig.step(rig.function("start_observation"))
-    rig.step(rig.function("stop_observation"))
+    rig.perform("start_observation")
+    rig.perform("stop_observation")
     rig.board.downlink = 1 << 30
     packets = rig.step(image=None)
     assert packets and not rig.named(packets, "detections")
