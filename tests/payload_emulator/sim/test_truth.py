@@ -188,6 +188,13 @@ def board(**options):
     return SimulatedBoard(PlatformModel(), 1, np.zeros(1000, np.uint8), np.zeros(1000, np.uint8), **options)
 
 
+def run(simulated, steps, sunlight=1.0, minutes=1.0):
+    """Let time pass with camera and accelerator on."""
+    simulated.switch(ports.Load.camera | ports.Load.accelerator)
+    for _ in range(steps):
+        simulated.advance(60.0 * minutes, sunlight)
+
+
 def test_the_sensors_and_stages_are_those_that_flight_reads():
     simulated = board()
     assert simulated.sensors().shape == (len(ports.SENSORS),)
@@ -200,13 +207,11 @@ def test_the_sensors_and_stages_are_those_that_flight_reads():
 
 def test_energy_is_kept_between_arrays_loads_and_battery():
     simulated = board(charge=0.5)
-    simulated.switch(ports.Load.camera | ports.Load.accelerator)
-    for _ in range(60):
-        simulated.advance(60.0, 0.0)
+    run(simulated, 60, 0.0)
     # An hour of 2.2 + 1.6 + 3.4 W out of 20 Wh, by hand.
     assert simulated.charge == approx(0.5 - 7.2 / 20.0, abs=1e-9)
-    for _ in range(60):
-        simulated.advance(60.0, 1.0)
+    run(simulated, 60)
+
     assert simulated.charge == approx(0.5 - 7.2 / 20.0 + (9.0 - 7.2) / 20.0, abs=1e-9)
 
 
@@ -220,16 +225,14 @@ def test_the_bus_obeys_ohms_law():
 
 def test_the_board_settles_at_the_temperature_of_its_balance():
     simulated = board()
-    simulated.switch(ports.Load.camera | ports.Load.accelerator)
-    for _ in range(500):
-        simulated.advance(60.0, 1.0)
+    run(simulated, 500)
+
     # Structure 28 degC in sunlight, and the heat through the conductances.
     assert simulated.board_c == approx(28.0 + (2.2 + 3.4) / 0.35, abs=0.01)
     assert simulated.camera_c == approx(28.0 + 1.6 / 0.25, abs=0.01)
     # The step does not matter: exponentials, not differences.
     once = board()
-    once.switch(ports.Load.camera | ports.Load.accelerator)
-    once.advance(30_000.0, 1.0)
+    run(once, 1, minutes=500.0)
     assert once.board_c == approx(simulated.board_c, abs=0.01)
 
 
