@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -71,7 +70,7 @@ KERNELS = ("outer", "of_array", "of_intrinsic", "of_pair")
 CALL = "import caller; print(caller.outer(1), sum(caller.outer.stats.cache_hits.values()))"
 
 
-def write(folder: Path, old: str = "", new: str = "") -> Path:
+def write(folder, old="", new=""):
     """Write both modules, the first with a change."""
     assert old in CALLEE
     folder.mkdir(exist_ok=True)
@@ -80,15 +79,15 @@ def write(folder: Path, old: str = "", new: str = "") -> Path:
     return folder
 
 
-def start(folder: Path, cache: Path, **variables: str) -> subprocess.Popen[str]:
+def start(folder, cache, **variables):
     environment = {
         **os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)]), "PYTHONDONTWRITEBYTECODE": "1",
-        "NUMBA_CACHE_DIR": str(cache), **variables,
+        "NUMBA_CACHE_DIR": str(cache), **variables
     }  # fmt: skip
     return subprocess.Popen([sys.executable, "-c", CALL], stdout=subprocess.PIPE, text=True, env=environment)
 
 
-def run(folder: Path, cache: Path, **variables: str) -> str:
+def run(folder, cache, **variables):
     """Result of `outer(1)`, and how often it came from the cache."""
     process = start(folder, cache, **variables)
     output, _ = process.communicate()
@@ -96,7 +95,7 @@ def run(folder: Path, cache: Path, **variables: str) -> str:
     return output.strip()
 
 
-def test_clones_share_compiled_code_until_a_callee_changes(tmp_path: Path) -> None:
+def test_clones_share_compiled_code_until_a_callee_changes(tmp_path):
     cache, first, second = tmp_path / "cache", write(tmp_path / "first"), write(tmp_path / "second")
     assert run(first, cache) == "20 0"
     assert run(second, cache) == "20 1"  # compiled by another clone
@@ -106,7 +105,7 @@ def test_clones_share_compiled_code_until_a_callee_changes(tmp_path: Path) -> No
     assert run(first, cache, NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="") == "20 0"
 
 
-def test_a_kernel_that_moved_to_another_module_is_compiled_again(tmp_path: Path) -> None:
+def test_a_kernel_that_moved_to_another_module_is_compiled_again(tmp_path):
     """Compiled code names the module that it came from, which the new version does not have."""
     cache, folder = tmp_path / "cache", write(tmp_path / "code")
     assert run(folder, cache) == "20 0"
@@ -115,7 +114,7 @@ def test_a_kernel_that_moved_to_another_module_is_compiled_again(tmp_path: Path)
     assert run(folder, cache) == "20 0"
 
 
-def test_processes_that_compile_at_once_leave_whole_files(tmp_path: Path) -> None:
+def test_processes_that_compile_at_once_leave_whole_files(tmp_path):
     cache, folder = tmp_path / "cache", write(tmp_path / "code")
     processes = [start(folder, cache) for _ in range(3)]
     assert {process.communicate()[0].split()[0] for process in processes} == {"20"}
@@ -123,7 +122,7 @@ def test_processes_that_compile_at_once_leave_whole_files(tmp_path: Path) -> Non
     assert run(folder, cache) == "20 1"
 
 
-def test_the_folder_is_private_and_files_of_others_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_folder_is_private_and_files_of_others_are_ignored(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     keep("a-1", b"code")
     uid = os.getuid()
@@ -139,7 +138,7 @@ def test_the_folder_is_private_and_files_of_others_are_ignored(tmp_path: Path, m
     assert (tmp_path / "of-a-user").stat().st_mode & 0o777 == 0o700
 
 
-def test_damaged_and_unwritable_caches_are_compiled_around(tmp_path: Path) -> None:
+def test_damaged_and_unwritable_caches_are_compiled_around(tmp_path):
     cache, folder = tmp_path / "cache", write(tmp_path / "code")
     run(folder, cache)
     forgotten = cache / "forgotten"
@@ -153,7 +152,7 @@ def test_damaged_and_unwritable_caches_are_compiled_around(tmp_path: Path) -> No
     assert run(folder, folder / "caller.py") == "20 0"  # not a folder
 
 
-def imported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+def imported(folder, monkeypatch):
     """The modules of a folder, not compiled."""
     with monkeypatch.context() as patch:
         patch.syspath_prepend(folder)
@@ -165,7 +164,7 @@ def imported(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     return module
 
 
-def dependencies(module: Any) -> dict[str, str]:
+def dependencies(module):
     """What the compiled code of each kernel depends on, as a hash."""
     return {name: getattr(module, name)._cache._dependencies for name in KERNELS}
 
@@ -177,19 +176,17 @@ def dependencies(module: Any) -> dict[str, str]:
         ('"nsz", "contract"', '"nsz", "arcp"', {"outer"}), ("@njit\n", "@njit(error_model='numpy')\n", {"outer"}),
         ("np.arange(2000)", "np.arange(2000) + (np.arange(2000) == 1000)", {"of_array"}),
         ('"nsz", "contract"', '"contract", "nsz"', set()),
-        ("return arguments[0]", "return builder.neg(arguments[0])", set()),
-    ],
+        ("return arguments[0]", "return builder.neg(arguments[0])", set())
+    ]
 )  # fmt: skip
-def test_a_kernel_depends_on_all_that_it_names_and_on_nothing_else(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, changed: set[str]
-) -> None:
+def test_a_kernel_depends_on_all_that_it_names_and_on_nothing_else(tmp_path, monkeypatch, old, new, changed):
     before = dependencies(imported(write(tmp_path / "one"), monkeypatch))
     after = dependencies(imported(write(tmp_path / "two", old, new), monkeypatch))
     # An intrinsic writes instructions with any code of its file, so that every change of the file counts.
     assert {name for name in KERNELS if before[name] != after[name]} == changed | {"of_intrinsic"}
 
 
-def test_the_order_of_the_fields_of_a_tuple_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_order_of_the_fields_of_a_tuple_counts(tmp_path, monkeypatch):
     from numba import typeof
     from numba.core.registry import cpu_target
 
@@ -202,9 +199,7 @@ def test_the_order_of_the_fields_of_a_tuple_counts(tmp_path: Path, monkeypatch: 
     assert names[0].startswith("of_pair-")
 
 
-def test_constants_and_variables_call_one_version_without_an_entry_from_python(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_constants_and_variables_call_one_version_without_an_entry_from_python(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     module = imported(write(tmp_path / "code"), monkeypatch)
     assert module.of_constants(1) == 5
@@ -213,9 +208,7 @@ def test_constants_and_variables_call_one_version_without_an_entry_from_python(
     assert gc.isenabled()  # switched off while the kernels compiled
 
 
-def test_declared_versions_are_compiled_at_the_same_time_and_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_declared_versions_are_compiled_at_the_same_time_and_once(tmp_path, monkeypatch):
     from kernels.compiled import compiling_ahead
 
     folder, cache, said = write(tmp_path / "code"), tmp_path / "cache", list[str]()

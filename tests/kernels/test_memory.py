@@ -5,7 +5,7 @@ import subprocess
 import sys
 from unittest.mock import MagicMock
 
-import pytest
+from pytest import fixture, mark
 
 from kernels import memory
 
@@ -24,15 +24,15 @@ print(full, before, resident(), len(kept))
 """
 
 
-@pytest.fixture
-def library(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
+@fixture
+def library(monkeypatch):
     found = MagicMock(spec=["mallopt", "malloc_trim"])
     monkeypatch.setattr(memory, "_c_library", lambda: found)
     monkeypatch.setattr(memory, "_last_s", -memory.INTERVAL_S)
     return found
 
 
-def test_memory_is_given_back_once_in_an_interval(library: MagicMock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_given_back_once_in_an_interval(library, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(memory.time, "monotonic", lambda: now[0])
     done = []
@@ -42,19 +42,19 @@ def test_memory_is_given_back_once_in_an_interval(library: MagicMock, monkeypatc
     assert library.malloc_trim.call_count == 2
 
 
-def test_the_number_of_heaps_is_limited(library: MagicMock) -> None:
+def test_the_number_of_heaps_is_limited(library):
     memory.limit_heaps()
     library.mallopt.assert_called_once_with(-8, memory.HEAPS)
 
 
-def test_another_c_library_is_left_alone(library: MagicMock) -> None:
+def test_another_c_library_is_left_alone(library):
     del library.mallopt, library.malloc_trim
     memory.limit_heaps()
     assert memory.give_back() is False
 
 
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="needs glibc")
-def test_free_memory_between_blocks_in_use_goes_back() -> None:
+@mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="needs glibc")
+def test_free_memory_between_blocks_in_use_goes_back():
     done = subprocess.run([sys.executable, "-c", RESIDENT], capture_output=True, text=True, check=True)
     full, before, after, _ = map(int, done.stdout.split())
     assert full > 200

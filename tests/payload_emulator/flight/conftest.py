@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import pytest
+from pytest import fixture
 
 from lunar.arrays import FloatArray
 from payload_emulator.flight.payload import FlightParameters, FlightTables, Payload, PayloadMode
@@ -15,6 +14,7 @@ from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.spacecraft.loop import new_board
 from tmtc.dictionary.payload import DICTIONARY
+from tmtc.dictionary.tables import pack_anchor_table
 from tmtc.packets.cuc import TICKS_PER_SECOND
 
 RADIUS_M = 1_737_400.0
@@ -30,9 +30,9 @@ CLASS_SHARES = (58_649 / 79_387, 12_830 / 79_387, 7_908 / 79_387)
 CLASS_DIAMETERS_M = (7_000.0, 12_000.0, 20_000.0)
 
 
-def paper_orbit_mcmf_m(seconds: Iterable[float] | FloatArray) -> FloatArray:
+def paper_orbit_mcmf_m(seconds):
     """Return positions (n, 3) on the Kepler orbit of the paper's Table I over a uniformly turning Moon."""
-    time = np.asarray(list(seconds) if not isinstance(seconds, np.ndarray) else seconds, dtype=np.float64)
+    time = np.array(seconds, float)
     a, e = 1_768_180.0, 0.006908
     i, node, perilune, start = np.radians([89.076, 3.164, 333.604, 8.882])
     anomaly = 2.0 * np.arctan(np.sqrt((1.0 - e) / (1.0 + e)) * np.tan(start / 2.0))
@@ -52,14 +52,14 @@ def paper_orbit_mcmf_m(seconds: Iterable[float] | FloatArray) -> FloatArray:
     )
 
 
-def place(position_m: FloatArray) -> tuple[float, float, float]:
+def place(position_m):
     """Return latitude, longitude, altitude."""
     radius = float(np.linalg.norm(position_m))
     latitude = float(np.arcsin(position_m[2] / radius))
     return latitude, float(np.arctan2(position_m[1], position_m[0])), radius - RADIUS_M
 
 
-def ticks_at(second: float) -> int:
+def ticks_at(second):
     return EPOCH_TICKS + round(second * TICKS_PER_SECOND)
 
 
@@ -70,7 +70,7 @@ class CraterField:
     position_m: FloatArray
     diameter_m: FloatArray
 
-    def perfect_detections(self, position_m: FloatArray) -> Detections:
+    def perfect_detections(self, position_m):
         """Return every crater in view of a nadir camera, image up to the north, by true perspective."""
         latitude, longitude, altitude = place(position_m)
         reach = RADIUS_M * np.sin(np.arccos(RADIUS_M / (RADIUS_M + altitude)))
@@ -88,7 +88,7 @@ class CraterField:
         return detections(u[seen], v[seen], (FOCAL_PX * diameter / depth)[seen])
 
 
-def make_crater_field(seed: int) -> CraterField:
+def make_crater_field(seed):
     rng = np.random.default_rng(seed)
     count = int(4.0 * np.pi * RADIUS_M**2 * DENSITY_M2)
     z = np.sort(rng.uniform(-1.0, 1.0, count))
@@ -98,12 +98,8 @@ def make_crater_field(seed: int) -> CraterField:
     return CraterField(position, rng.choice(CLASS_DIAMETERS_M, size=count, p=CLASS_SHARES))
 
 
-def detections(u_px: FloatArray, v_px: FloatArray, diameter_px: FloatArray) -> Detections:
-    u = np.atleast_1d(np.asarray(u_px, dtype=np.float64))
-    return Detections(
-        u, np.atleast_1d(np.asarray(v_px, dtype=np.float64)),
-        np.atleast_1d(np.asarray(diameter_px, dtype=np.float64)), np.ones_like(u), np.full_like(u, np.nan),
-    )  # fmt: skip
+def detections(u_px, v_px, diameter_px):
+    return Detections(u_px, v_px, diameter_px, np.ones_like(u_px), np.full_like(u_px, np.nan))
 
 
 @dataclass(frozen=True)
@@ -114,14 +110,15 @@ class Toolbox:
     place: Callable[[FloatArray], tuple[float, float, float]] = place
     ticks_at: Callable[[float], int] = ticks_at
     crater_field: Callable[[int], CraterField] = make_crater_field
-    detections: Callable[..., Detections] = detections
     radius_m: float = RADIUS_M
-    focal_px: float = float(FOCAL_PX)
-    centre_px: float = CENTRE_PX
+
+    def anchor(self, seconds):
+        """The anchor table of these times, as octets."""
+        return pack_anchor_table([ticks_at(second) for second in seconds], self.orbit(seconds))
 
 
-@pytest.fixture(scope="session")
-def moon() -> Toolbox:
+@fixture(scope="session")
+def moon():
     return Toolbox()
 
 
@@ -131,53 +128,57 @@ class Rig:
     image = np.full((16, 16, 3), 90, dtype=np.uint8)
     attitude = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 
-    def __init__(self, tables: FlightTables | None = None, model: bytes = b"network" * 40) -> None:
+    def __init__(self, tables=None, model=b"network" * 40):
         self.board = new_board(5, store_octets=1 << 18)
         self.tables, self.model = tables or FlightTables(), model
-        self.quality: Any = ImageQuality.OK
+        self.quality = ImageQuality.OK
         self.examined = self.detectors_made = self.count = 0
         self.second = 0.0
         self.skew_ticks = 0
         self.failing = False
         self.boot()
 
-    def boot(self, cause: int | None = None, mode: PayloadMode = PayloadMode.standby) -> None:
+    def boot(self, cause=None):
         if cause is not None:
             self.board.reset(cause)
         self.payload = Payload(
-            self, FlightParameters(), self.tables, model_octets=self.model, board=self.board, mode=mode,
-            make_detector=self._make_detector,
+            self, FlightParameters(), self.tables, model_octets=self.model, board=self.board, mode=PayloadMode.standby,
+            make_detector=self._make_detector
         )  # fmt: skip
 
-    def _make_detector(self, octets: bytes) -> Rig:
+    def _make_detector(self, octets):
         assert octets == self.model
         self.detectors_made += 1
         return self
 
-    def examine(self, image: Any, sun_in_camera: Any = None) -> tuple[ImageQuality, Detections]:
+    def examine(self, image, sun_in_camera=None):
         self.examined += 1
         if self.failing:
             raise RuntimeError("no such operator")
-        return self.quality, detections(np.empty(0), np.empty(0), np.empty(0))
+        return self.quality, detections(*np.empty((3, 0)))
 
     @property
-    def ticks(self) -> int:
+    def mode(self):
+        return self.payload.mode
+
+    @property
+    def ticks(self):
         return ticks_at(self.second) + self.skew_ticks
 
-    def command(self, name: str, **values: Any) -> bytes:
+    def command(self, name, **values):
         """The next telecommand packet."""
         self.count += 1
         return DICTIONARY.pack_command(name, values, sequence_count=self.count)
 
-    def function(self, name: str, first: float = 0.0, second: float = 0.0) -> bytes:
+    def function(self, name, first=0.0, second=0.0):
         return self.command("perform_function", function_id=name, argument_1=first, argument_2=second)
 
-    def at(self, second: float, packet: bytes) -> bytes:
+    def at(self, second, packet):
         """A telecommand that puts another one into the schedule."""
         octets = np.frombuffer(packet, dtype=np.uint8)
         return self.command("insert_activity", release_ticks=ticks_at(second), items={"octet": octets})
 
-    def step(self, orders: bytes = b"", seconds: float = 15.0, image: Any = "frame") -> list[bytes]:
+    def step(self, orders=b"", seconds=15.0, image="frame"):
         """Let time pass, then take a step; `image` None: none is taken."""
         self.second += seconds
         self.board.advance(seconds, 1.0)
@@ -188,28 +189,44 @@ class Rig:
         return packets
 
     @staticmethod
-    def named(packets: list[bytes], name: str) -> list[dict[str, Any]]:
+    def named(packets, name):
         decoded = [DICTIONARY.unpack(packet) for packet in packets]
         return [values for found, values in decoded if found == name]
 
     @staticmethod
-    def events(packets: list[bytes]) -> list[str]:
+    def events(packets):
         labels = DICTIONARY.labels("event_info", "event_id")
         decoded = [DICTIONARY.unpack(packet) for packet in packets]
         return [labels[values["event_id"]] for name, values in decoded if name.startswith("event_")]
 
-    def refusals(self, packets: list[bytes]) -> list[str]:
+    def refusals(self, packets):
         """Reasons of all refusals, at acceptance and at start."""
         labels = DICTIONARY.labels("verification_not_accepted", "failure_code")
         kinds = ("verification_not_accepted", "verification_not_started")
         return [labels[v["failure_code"]] for kind in kinds for v in self.named(packets, kind)]
 
+    def send(self, name, **values):
+        """Take a step with one telecommand."""
+        return self.step(self.command(name, **values))
 
-@pytest.fixture
-def rig() -> Rig:
+    def perform(self, *function):
+        return self.step(self.function(*function))
+
+    def refused(self, orders, **options):
+        """Reasons of the refusals of telecommands."""
+        return self.refusals(self.step(orders, **options))
+
+    def report(self, command):
+        """The report, named like the telecommand that asks for it."""
+        (found,) = self.named(self.send(command), command.removeprefix("report_") + "_report")
+        return found
+
+
+@fixture
+def rig():
     return Rig()
 
 
-@pytest.fixture
-def make_rig() -> Callable[..., Rig]:
+@fixture
+def make_rig():
     return Rig

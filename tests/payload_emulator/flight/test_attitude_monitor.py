@@ -1,14 +1,13 @@
 """Innovation monitoring of the attitude: variance from innovations, decisions, and what the estimator makes of them."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, mark
 from scipy.spatial.transform import Rotation
 
-from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.timescales import ticks_from_utc_ns
 from payload_emulator.flight.navigation import anchored, recovery
@@ -27,26 +26,18 @@ from payload_emulator.flight.navigation.filter.attitude_monitor import (
 from payload_emulator.flight.navigation.outcomes import Outcome
 from payload_emulator.flight.navigation.sighting import landmark_map
 from studies import montecarlo
-from studies.montecarlo import NavigationCase, NavigationRun
 
 FOCAL_PX = PinholeCamera().focal_px
-DECLARED = float(np.radians(0.01))
+DECLARED = np.radians(0.01)
 RULES = MonitorParameters()
 FLOOR = RULES.floor_px / FOCAL_PX
 # What else is uncertain about a rotation in a usual frame, about each axis.
 OTHERS = np.radians([0.15, 0.2, 0.1])
 
 
-def frames(
-    count: int,
-    noise_rad: float,
-    seed: int = 1,
-    common_rad: Any = (0.0, 0.0, 0.0),
-    used_rad: float = DECLARED,
-    trial: bool = False,
-) -> list[RotationEvidence]:
+def frames(count, noise_rad, seed=1, common_rad=(0.0, 0.0, 0.0), used_rad=DECLARED, trial=False):
     """Return evidence drawn as innovations have it: the rotation seen is the true one plus what else is uncertain."""
-    rng, found = np.random.default_rng(seed), []
+    rng, found = default_rng(seed), []
     for _ in range(count):
         axes = Rotation.random(rng=rng).as_matrix()
         variance = axes @ np.diag(OTHERS**2) @ axes.T
@@ -57,7 +48,7 @@ def frames(
     return found
 
 
-def judged(evidence: list[RotationEvidence], monitor: AttitudeMonitor | None = None) -> list[AttitudeMonitor]:
+def judged(evidence, monitor=None):
     monitor, after = monitor or AttitudeMonitor(), []
     for one in evidence:
         monitor = monitored(monitor, one, DECLARED, FOCAL_PX, RULES)
@@ -65,18 +56,18 @@ def judged(evidence: list[RotationEvidence], monitor: AttitudeMonitor | None = N
     return after
 
 
-@pytest.mark.parametrize("noise_deg", [0.01, 0.2, 1.0])
-@pytest.mark.parametrize("used_deg", [0.01, 1.0])
-def test_the_variance_of_the_attitude_is_estimated_without_bias(noise_deg: float, used_deg: float) -> None:
-    evidence = frames(3_000, np.radians(noise_deg), used_rad=float(np.radians(used_deg)))
+@mark.parametrize("noise_deg", [0.01, 0.2, 1.0])
+@mark.parametrize("used_deg", [0.01, 1.0])
+def test_the_variance_of_the_attitude_is_estimated_without_bias(noise_deg, used_deg):
+    evidence = frames(3_000, np.radians(noise_deg), used_rad=np.radians(used_deg))
     shown = frame_variances(tuple(evidence), FLOOR)
     # 3,000 frames; the best known axis counts most, so that the three count as one and a half.
     error = np.radians(0.25) ** 2 if noise_deg < 0.5 else np.radians(1.03) ** 2
     used = max(error, np.radians(used_deg) ** 2)
-    assert shown.mean == pytest.approx(np.radians(noise_deg) ** 2, abs=4.0 * used * np.sqrt(2.0 / 4_500.0))
+    assert shown.mean == approx(np.radians(noise_deg) ** 2, abs=4.0 * used * np.sqrt(2.0 / 4_500.0))
 
 
-def test_a_rotation_common_to_all_frames_is_no_noise() -> None:
+def test_a_rotation_common_to_all_frames_is_no_noise():
     turn = np.radians([0.8, -0.5, 0.3])
     assert frame_variances(tuple(frames(24, 0.0, common_rad=turn)), FLOOR).mean < np.radians(0.1) ** 2
     # Agreeing frames and frames that have to be turned are two groups: the second has the shift of a wrong position.
@@ -86,7 +77,7 @@ def test_a_rotation_common_to_all_frames_is_no_noise() -> None:
     assert any(one.degraded for one in judged(apart))
 
 
-def test_single_frames_have_no_weight_and_no_evidence_changes_nothing() -> None:
+def test_single_frames_have_no_weight_and_no_evidence_changes_nothing():
     one = frames(1, 1.0)
     assert frame_variances(tuple(one), FLOOR).mean == 0.0
     monitor = judged(frames(3, 0.0))[-1]
@@ -96,16 +87,16 @@ def test_single_frames_have_no_weight_and_no_evidence_changes_nothing() -> None:
     assert len(judged(frames(60, 0.0))[-1].window) == RULES.window_frames == 24
 
 
-def test_a_sensor_as_declared_or_better_is_left_alone() -> None:
+def test_a_sensor_as_declared_or_better_is_left_alone():
     for seed in range(40):
         for noise in (DECLARED, 0.1 * DECLARED, 3.0 * DECLARED):
             assert not any(one.degraded for one in judged(frames(60, noise, seed)))
 
 
-@pytest.mark.parametrize(("noise_deg", "within"), [(0.2, 24), (1.0, 6)])
-def test_more_noise_is_detected_and_estimated(noise_deg: float, within: int) -> None:
+@mark.parametrize(("noise_deg", "within"), [(0.2, 24), (1.0, 6)])
+def test_more_noise_is_detected_and_estimated(noise_deg, within):
     for seed in range(10):
-        after = judged(frames(60, DECLARED, seed) + frames(40, float(np.radians(noise_deg)), seed + 100))
+        after = judged(frames(60, DECLARED, seed) + frames(40, np.radians(noise_deg), seed + 100))
         first = next(k for k, one in enumerate(after) if one.degraded)
         assert 60 <= first < 60 + within
         # The mean of 24 frames is known to a quarter, and one standard error is added.
@@ -113,56 +104,48 @@ def test_more_noise_is_detected_and_estimated(noise_deg: float, within: int) -> 
         assert after[-1].sigma_rad(DECLARED) == after[-1].noise_rad
 
 
-def test_wrong_pairs_in_two_of_five_frames_are_no_bad_sensor() -> None:
-    good, bad = frames(30, 0.0), frames(2, float(np.radians(2.0)), seed=9)
+def test_wrong_pairs_in_two_of_five_frames_are_no_bad_sensor():
+    good, bad = frames(30, 0.0), frames(2, np.radians(2.0), seed=9)
     assert not any(one.degraded for one in judged(good + bad[:1] + good[:1] + bad[1:] + good[:5]))
 
 
-def test_the_declared_noise_is_used_again_once_the_sensor_is_restored() -> None:
-    noisy = judged(frames(40, float(np.radians(0.5))))[-1]
+def test_the_declared_noise_is_used_again_once_the_sensor_is_restored():
+    noisy = judged(frames(40, np.radians(0.5)))[-1]
     assert noisy.degraded
     after = judged(frames(30, DECLARED, seed=5, used_rad=noisy.noise_rad), noisy)
     assert after[0].degraded and not after[-1].degraded
     assert after[-1].noise_rad == 0.0 and after[-1].sigma_rad(DECLARED) == DECLARED
 
 
-def test_no_noise_above_the_limit_is_used() -> None:
-    assert judged(frames(30, float(np.radians(6.0))))[-1].noise_rad == RULES.largest_rad
+def test_no_noise_above_the_limit_is_used():
+    assert judged(frames(30, np.radians(6.0)))[-1].noise_rad == RULES.largest_rad
 
 
-def test_frames_that_need_a_turn_are_examined_until_there_are_enough_of_them() -> None:
+def test_frames_that_need_a_turn_are_examined_until_there_are_enough_of_them():
     trials = judged(frames(6, 0.0, trial=True, used_rad=RULES.trial_rad))
     assert [is_examined(one, RULES) for one in trials] == [True] * 4 + [False] * 2
     assert not is_examined(judged(frames(2, 0.0))[-1], RULES)
     assert not is_examined(AttitudeMonitor(), RULES)
 
 
-def flown(
-    navigation_case: Callable[..., NavigationCase], seed: int, noise_deg: float, watched: bool = True
-) -> NavigationRun:
+def flown(navigation_case, seed, noise_deg, watched=True):
     parameters = AnchoredParameters(gravity_degree=50)
     if not watched:
         never = DetectionRule(24, 0.2, np.inf)
         parameters = replace(parameters, monitor=replace(parameters.monitor, moderate=never, sudden=never))
-    return montecarlo.fly(
-        navigation_case(60, attitude_noise_rad=float(np.radians(noise_deg)), parameters=parameters), seed
-    )
+    return montecarlo.fly(navigation_case(60, attitude_noise_rad=np.radians(noise_deg), parameters=parameters), seed)
 
 
-@pytest.mark.parametrize("noise_deg", [0.001, 0.01])
-def test_passes_with_a_sensor_as_declared_or_better_are_those_without_the_monitor(
-    navigation_case: Callable[..., NavigationCase], noise_deg: float
-) -> None:
+@mark.parametrize("noise_deg", [0.001, 0.01])
+def test_passes_with_a_sensor_as_declared_or_better_are_those_without_the_monitor(navigation_case, noise_deg):
     for seed in (31, 32, 33):
         run = flown(navigation_case, seed, noise_deg)
         assert not run.attitude_noise_rad.any()
         without = flown(navigation_case, seed, noise_deg, watched=False)
-        np.testing.assert_array_equal(run.error_rtn_m, without.error_rtn_m)
+        assert_array_equal(run.error_rtn_m, without.error_rtn_m)
 
 
-def test_a_bad_sensor_is_detected_and_tolerated_on_passes(
-    navigation_case: Callable[..., NavigationCase], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bad_sensor_is_detected_and_tolerated_on_passes(navigation_case, monkeypatch):
     searches = []
     usual = recovery.search_everywhere
     monkeypatch.setattr(recovery, "search_everywhere", lambda *a: searches.append(a) or usual(*a))
@@ -170,7 +153,7 @@ def test_a_bad_sensor_is_detected_and_tolerated_on_passes(
     assert not searches
     for run in runs:
         assert np.flatnonzero(run.attitude_noise_rad)[0] < 15
-        assert np.degrees(run.attitude_noise_rad[-1]) == pytest.approx(1.0, rel=0.4)
+        assert np.degrees(run.attitude_noise_rad[-1]) == approx(1.0, rel=0.4)
         assert np.median(run.error_m[20:]) < 250.0 and run.error_m[20:].max() < 500.0
     # One run is one independent draw of six degrees of freedom: three of them exceed 11 once in a thousand.
     assert np.mean([run.nees[20:].mean() for run in runs]) < 11.0
@@ -178,29 +161,27 @@ def test_a_bad_sensor_is_detected_and_tolerated_on_passes(
     assert without.nees[20:].mean() > 30.0
 
 
-def test_moderate_noise_is_detected_within_a_window_of_frames(navigation_case: Callable[..., NavigationCase]) -> None:
+def test_moderate_noise_is_detected_within_a_window_of_frames(navigation_case):
     for seed in (41, 42, 43):
         run = flown(navigation_case, seed, 0.2)
         assert np.flatnonzero(run.attitude_noise_rad)[0] < 45
         assert run.nees[20:].mean() < 12.0
 
 
-def test_a_degraded_attitude_takes_back_the_fixes_of_the_window_and_counts_with_its_noise(
-    navigation_case: Callable[..., NavigationCase], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    noise = float(np.radians(0.5))
+def test_a_degraded_attitude_takes_back_the_fixes_of_the_window_and_counts_with_its_noise(navigation_case, monkeypatch):
+    noise = np.radians(0.5)
     used = []
     usual = kalman.update
 
-    def update(*arguments: Any, **more: Any) -> Any:
+    def update(*arguments, **more):
         used.append(arguments[8].attitude_noise_rad)
         return usual(*arguments, **more)
 
     case = navigation_case(3, start_position_m=100.0, start_velocity_m_s=0.1)
     table = montecarlo.catalogue_table(case.craters)
-    states, rotations = montecarlo._truth(case, np.random.default_rng(1), np.random.default_rng(2))
-    ticks = np.asarray(ticks_from_utc_ns(case.frame_utc_ns), dtype=np.int64)
-    setup, state = montecarlo._started(case, table, states[0], int(ticks[0]), np.random.default_rng(1))
+    states, rotations = montecarlo._truth(case, default_rng(1), default_rng(2))
+    ticks = np.asarray(ticks_from_utc_ns(case.frame_utc_ns), int)
+    setup, state = montecarlo._started(case, table, states[0], int(ticks[0]), default_rng(1))
     degraded = AttitudeMonitor(noise_rad=noise)
     before = state.estimate
     # The estimate goes back to the oldest prediction that the window still has, here one without any error.
@@ -209,40 +190,26 @@ def test_a_degraded_attitude_takes_back_the_fixes_of_the_window_and_counts_with_
     full = (exact, *[later] * (setup.parameters.monitor.window_frames - 1))
     watching = replace(state, trusted=full, attitude=AttitudeMonitor(window=tuple(frames(24, 0.0))))
     back = anchored.with_judged_attitude(watching, degraded, None, setup)
-    np.testing.assert_allclose(back.estimate.mean, exact.mean, rtol=1e-6)
-    np.testing.assert_allclose(back.estimate.covariance, exact.covariance, rtol=1e-6, atol=1e-9)
+    assert_allclose(back.estimate.mean, exact.mean, rtol=1e-6)
+    assert_allclose(back.estimate.covariance, exact.covariance, rtol=1e-6, atol=1e-9)
     assert back.trusted == () and back.attitude is degraded
     # After a reset of the filter within the window nothing is left to go back to: the uncertainty grows.
     after = anchored.with_judged_attitude(state, degraded, None, setup)
     shift = noise * anchored.altitude_above_sphere_m(before)
     added = np.diag(after.estimate.covariance - before.covariance)
-    np.testing.assert_allclose(added[:3], shift**2)
-    np.testing.assert_allclose(added[3:6], (1e-3 * shift) ** 2)
-    np.testing.assert_allclose(added[6:], 0.0)
+    assert_allclose(added[:3], shift**2)
+    assert_allclose(added[3:6], (1e-3 * shift) ** 2)
+    assert_allclose(added[6:], 0.0)
     assert anchored.with_judged_attitude(after, degraded, before, setup).estimate is after.estimate
     # While the attitude is as declared, predictions are kept; an announced change of the orbit drops them.
     usual_one = anchored.with_judged_attitude(state, AttitudeMonitor(), before, setup)
     assert len(usual_one.trusted) == 1 and anchored.widened(usual_one, 1.0, 1.0).trusted == ()
     monkeypatch.setattr(kalman, "update", update)
-    camera_from_icrf, true_map = looks(case, states[0], rotations[0])
-    found = seen(case, true_map, states[0], camera_from_icrf, rotations[0])
+    camera_from_icrf = nadir_camera_from_mcmf(rotations[0] @ states[0, :3]) @ rotations[0]
+    craters, lasting = landmark_map(table), np.zeros((len(case.craters), 2))
+    found, _ = montecarlo._detect(
+        case, craters, states[0, :3], camera_from_icrf, rotations[0], lasting, np.zeros(2), default_rng(3)
+    )
     _, report = anchored.step(after, Observation(int(ticks[0]), found, camera_from_icrf), setup)
     assert report.outcome is Outcome.fixed and set(used) == {noise}
     assert (report.attitude_declared_rad, report.attitude_noise_rad) == (DECLARED, noise)
-
-
-def looks(case: NavigationCase, state: FloatArray, rotation: FloatArray) -> tuple[FloatArray, Any]:
-    return (
-        nadir_camera_from_mcmf(rotation @ state[:3]) @ rotation,
-        landmark_map(montecarlo.catalogue_table(case.craters)),
-    )
-
-
-def seen(
-    case: NavigationCase, craters: Any, state: FloatArray, camera_from_icrf: FloatArray, rotation: FloatArray
-) -> Any:
-    lasting = np.zeros((len(craters), 2))
-    found, _ = montecarlo._detect(
-        case, craters, state[:3], camera_from_icrf, rotation, lasting, np.zeros(2), np.random.default_rng(3)
-    )
-    return found

@@ -3,7 +3,7 @@
 import json
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from payload_emulator.errors import ModelError
 from payload_emulator.flight.models import load_shipped_model
@@ -24,11 +24,11 @@ from tests.payload_emulator.bowls import bowl_image
 SUN = np.array([0.1, -0.95, -0.17])
 SIGMA = SigmaModel(
     fresh=(np.log(0.5), 0.0, 0.0, 0.0, 0.0, 0.0), total=(np.log(1.0), 1.0, 0.0, 0.0, 0.0, 0.0),
-    low=(1.0, -1.0, -5.0, 0.0, 0.0, 0.0), high=(1.0, 1.0, 5.0, 3.0, 10.0, 3.0),
+    low=(1.0, -1.0, -5.0, 0.0, 0.0, 0.0), high=(1.0, 1.0, 5.0, 3.0, 10.0, 3.0)
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def plain():
     """The shipped network without a calibration."""
     octets = load_shipped_model()
@@ -62,7 +62,7 @@ def test_what_was_stored_is_what_is_loaded(plain):
     assert OnnxDetector(plain).calibration is None
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("change", "said"),
     [
         ({"version": 2}, "expected version 1, found 2"),
@@ -75,41 +75,41 @@ def test_what_was_stored_is_what_is_loaded(plain):
 )
 def test_a_calibration_that_does_not_fit_is_refused(plain, change, said):
     document = json.loads(format_calibration(SIGMA, plain)) | change
-    with pytest.raises(ModelError, match=said):
+    with raises(ModelError, match=said):
         load_calibration({CALIBRATION_KEY: json.dumps(document)}, plain)
 
 
 def test_text_that_is_no_calibration_is_refused(plain):
     for text in ("{", "[]", "3"):
-        with pytest.raises(ModelError, match="expected"):
+        with raises(ModelError, match="expected"):
             load_calibration({CALIBRATION_KEY: text}, plain)
-    with pytest.raises(ModelError, match="expected an ONNX file"):
+    with raises(ModelError, match="expected an ONNX file"):
         network_sha256(b"\xff\xff\xff")
 
 
 def test_standard_deviations_are_stated_in_two_parts():
     found = detections()
     features = sigma_features(found, SUN, 512, 512)
-    assert features[0] == pytest.approx([1.0, 0.0, np.log(2.0), 1.0, 1.7 / np.linalg.norm(SUN), 0.0], abs=1e-12)
-    assert features[1, 5] == pytest.approx(255.5 / 256.0)
+    assert features[0] == approx([1.0, 0.0, np.log(2.0), 1.0, 1.7 / np.linalg.norm(SUN), 0.0], abs=1e-12)
+    assert features[1, 5] == approx(255.5 / 256.0)
     stated = with_sigma(found, SIGMA, features)
     # ln(80 / 20) is beyond what was seen: the last value holds.
-    assert stated.sigma_px == pytest.approx([1.0, np.e])
-    assert stated.persistence == pytest.approx([0.75, 1.0 - 0.25 / np.e**2])
-    assert stated.select(np.array([1])).persistence == pytest.approx(stated.persistence[1:])
+    assert stated.sigma_px == approx([1.0, np.e])
+    assert stated.persistence == approx([0.75, 1.0 - 0.25 / np.e**2])
+    assert stated.select(np.array([1])).persistence == approx(stated.persistence[1:])
 
 
 def test_without_a_sun_or_on_another_size_typical_values_are_used():
     found = detections()
-    assert sigma_features(found, None, 512, 512)[0, 4] == pytest.approx(1.7)
-    assert sigma_features(found, np.full(3, np.nan), 512, 512)[0, 4] == pytest.approx(1.7)
-    assert sigma_features(found, SUN, 300, 200, whole=False)[:, 5] == pytest.approx([0.7, 0.7])
+    assert sigma_features(found, None, 512, 512)[0, 4] == approx(1.7)
+    assert sigma_features(found, np.full(3, np.nan), 512, 512)[0, 4] == approx(1.7)
+    assert sigma_features(found, SUN, 300, 200, whole=False)[:, 5] == approx([0.7, 0.7])
 
 
 def test_a_calibrated_detector_states_deviations_and_moves_nothing(plain):
     image = bowl_image()
     raw = OnnxDetector(plain).detect(image, SUN)
     found = OnnxDetector(calibrated(plain, SIGMA)).detect(image, SUN)
-    assert found.u_px == pytest.approx(raw.u_px) and found.score == pytest.approx(raw.score)
+    assert found.u_px == approx(raw.u_px) and found.score == approx(raw.score)
     assert found.persistence is not None and raw.persistence is None
     assert np.all((found.persistence > 0.0) & (found.persistence < 1.0))

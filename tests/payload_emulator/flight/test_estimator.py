@@ -2,8 +2,6 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,18 +21,16 @@ from tests.scenarios import short_scenario
 from tmtc.dictionary.tables import CatalogueTable, GravityTable, InitialState, OrientationTable
 
 
-def test_each_mode_has_a_row() -> None:
+def test_each_mode_has_a_row():
     assert set(ESTIMATORS) == set(Mode)
 
 
-def test_a_sigma_point_filter_in_the_row_of_the_filter_flies_the_demo(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sigma_point_filter_in_the_row_of_the_filter_flies_the_demo(tmp_path, monkeypatch):
     """Five frames that start with an error of 1 km, which the shipped filter reduces to 42 m at most."""
-    craters: list[int] = []
+    craters = []
     update = unscented.update
 
-    def counted(*given: Any) -> Any:
+    def counted(*given):
         craters.append(given[4].size)
         return update(*given)
 
@@ -48,7 +44,7 @@ def test_a_sigma_point_filter_in_the_row_of_the_filter_flies_the_demo(
     assert flown["nis_per_degree"] == pytest.approx(0.603, abs=0.005)
 
 
-def test_what_was_learned_of_a_catalogue_is_kept_until_another_one_is_loaded() -> None:
+def test_what_was_learned_of_a_catalogue_is_kept_until_another_one_is_loaded():
     """A new start state comes with each pass: the size of the offset stays, with another list it is the prior."""
     two = np.array([0.1, 0.2])
     catalogue = CatalogueTable(np.arange(2), two, two, 5e3 * np.ones(2), np.zeros(2), 50.0 * np.ones((2, 3)))
@@ -56,12 +52,12 @@ def test_what_was_learned_of_a_catalogue_is_kept_until_another_one_is_loaded() -
     tables = {
         "catalogue": catalogue, "gravity": gravity, "burns": None,
         "orientation": OrientationTable(np.array([0, 65_536]), np.tile(np.eye(3), (2, 1, 1)), np.eye(3)),
-        "initial_state": InitialState(0, np.array([1.77e6, 0.0, 0.0]), np.array([0.0, 1.6e3, 0.0]), 1e3, 1.0),
+        "initial_state": InitialState(0, np.array([1.77e6, 0.0, 0.0]), np.array([0.0, 1.6e3, 0.0]), 1e3, 1.0)
     }  # fmt: skip
     parameters = FlightParameters(anchored=AnchoredParameters(offset=OffsetRule()))
     estimator = AnchoredEstimator()
 
-    def size_m(before: Any, **changed: Any) -> float:
+    def size_m(before, **changed):
         setup, state = estimator.start(tables | changed, parameters, before)
         assert setup.initial.covariance[14, 14] == state.offset.sigma_m**2
         assert setup.parameters.errors.catalogue_correlation_rad == OffsetRule().correlation_rad
@@ -76,7 +72,7 @@ def test_what_was_learned_of_a_catalogue_is_kept_until_another_one_is_loaded() -
     assert estimator.start(tables, fixed, learned)[1].offset is None
 
 
-def test_a_parameter_file_of_before_learns_nothing_and_keeps_its_hash() -> None:
+def test_a_parameter_file_of_before_learns_nothing_and_keeps_its_hash():
     learning = FlightParameters(anchored=AnchoredParameters(offset=OffsetRule()))
     text = format_parameters(BuildParameters(DetectorParameters(), learning))
     read = parse_parameters(text).flight

@@ -1,10 +1,7 @@
 """Faults of the machine: each is told by an event, and answered."""
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark
 
 from payload_emulator.flight.onboard.loads import MODEL_NUMBER, FlightTables
 from payload_emulator.flight.onboard.machine import PARAMETERS_NUMBER
@@ -15,22 +12,22 @@ from payload_emulator.flight.vision.preprocess import ImageQuality
 from tmtc.dictionary.onboard_parameters import PARAMETERS
 
 NUMBERS = {parameter.name: parameter.number for parameter in PARAMETERS}
-NO_IMAGE = np.zeros((0, 0), dtype=np.uint8)
+NO_IMAGE = np.zeros((0, 0), np.uint8)
 
 
-@pytest.fixture
-def observing(rig: Any) -> Any:
-    rig.step(rig.function("start_observation"))
+@fixture
+def observing(rig):
+    rig.perform("start_observation")
     rig.step()
-    assert rig.payload.mode is PayloadMode.observing
+    assert rig.mode is PayloadMode.observing
     return rig
 
 
-def steps(rig: Any, count: int, **options: Any) -> list[bytes]:
+def steps(rig, count, **options):
     return [packet for _ in range(count) for packet in rig.step(**options)]
 
 
-def test_a_streak_of_dark_images_is_told_at_its_beginning_and_its_end_only(observing: Any) -> None:
+def test_a_streak_of_dark_images_is_told_at_its_beginning_and_its_end_only(observing):
     observing.quality = ImageQuality.DARK
     packets = steps(observing, 30)
     events = observing.events(packets)
@@ -42,68 +39,68 @@ def test_a_streak_of_dark_images_is_told_at_its_beginning_and_its_end_only(obser
     packets = steps(observing, 3)
     assert observing.events(packets).count("image_streak") == 1
     assert observing.named(packets, "event_info")[0]["value_2"] == 30
-    assert observing.payload.mode is PayloadMode.observing
+    assert observing.mode is PayloadMode.observing
 
 
-def test_a_saturated_streak_shorter_than_the_limit_is_told_frame_by_frame(observing: Any) -> None:
+def test_a_saturated_streak_shorter_than_the_limit_is_told_frame_by_frame(observing):
     observing.quality = ImageQuality.SATURATED
     events = observing.events(steps(observing, 5))
     assert events.count("image_saturated") == 5 and "image_streak" not in events
 
 
-def test_a_camera_without_images_is_cycled_and_recovers(observing: Any) -> None:
+def test_a_camera_without_images_is_cycled_and_recovers(observing):
     packets = steps(observing, 3, image=NO_IMAGE)
     assert observing.events(packets).count("camera_fault") == 1
     assert not observing.board.camera_on
     packets = observing.step()
     assert "camera_recovered" in observing.events(packets)
     assert observing.board.camera_on
-    assert observing.payload.mode is PayloadMode.observing
+    assert observing.mode is PayloadMode.observing
 
 
-def test_a_camera_that_stays_dead_ends_the_observation(observing: Any) -> None:
+def test_a_camera_that_stays_dead_ends_the_observation(observing):
     events = observing.events(steps(observing, 12, image=NO_IMAGE))
     assert events.count("camera_fault") == 4
     assert "observation_stopped" in events
-    assert observing.payload.mode is PayloadMode.standby
+    assert observing.mode is PayloadMode.standby
 
 
-def test_late_detections_are_not_used_and_a_detector_that_stays_slow_ends_in_safe(observing: Any) -> None:
+def test_late_detections_are_not_used_and_a_detector_that_stays_slow_ends_in_safe(observing):
     observing.board.detector_factor = 30.0
     packets = steps(observing, 4)
     assert observing.events(packets).count("detector_timeout") == 4
-    assert observing.payload.mode is PayloadMode.observing
+    assert observing.mode is PayloadMode.observing
     assert {v["count"] for v in observing.named(packets, "detections")} == {0}
     packets = steps(observing, 1)
     assert "safe_mode_entered" in observing.events(packets)
-    assert observing.payload.mode is PayloadMode.safe
+    assert observing.mode is PayloadMode.safe
 
 
-def test_an_inference_library_that_throws_costs_frames_not_the_payload(observing: Any) -> None:
+def test_an_inference_library_that_throws_costs_frames_not_the_payload(observing):
     observing.failing = True
     assert observing.events(steps(observing, 4)).count("detector_error") == 4
     observing.failing = False
     assert len(observing.named(observing.step(), "detections")) == 1
-    assert observing.payload.mode is PayloadMode.observing
+    assert observing.mode is PayloadMode.observing
     observing.failing = True
     steps(observing, 5)
-    assert observing.payload.mode is PayloadMode.safe
+    assert observing.mode is PayloadMode.safe
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("region", "event"), [(MODEL_NUMBER, "model_hash_mismatch"), (PARAMETERS_NUMBER, "parameters_hash_mismatch")]
 )
-def test_flipped_bits_in_memory_are_found_told_and_restored(observing: Any, region: int, event: str) -> None:
+def test_flipped_bits_in_memory_are_found_told_and_restored(observing, region, event):
     observing.board.memory[region][1] ^= 0x08
     packets = steps(observing, 5)
     assert observing.events(packets).count(event) == 1
     assert observing.events(packets).count("memory_repaired") == 1
-    assert observing.payload.mode is PayloadMode.observing
+    assert observing.mode is PayloadMode.observing
     assert observing.detectors_made == (1 if region == MODEL_NUMBER else 0)
     assert event not in observing.events(steps(observing, 5))
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("table", "event"),
     [
         ("catalogue", "catalogue_hash_mismatch"),
@@ -111,7 +108,7 @@ def test_flipped_bits_in_memory_are_found_told_and_restored(observing: Any, regi
         ("gravity", "table_hash_mismatch"),
     ],
 )
-def test_every_table_is_scrubbed(make_rig: Callable[..., Any], table: str, event: str) -> None:
+def test_every_table_is_scrubbed(make_rig, table, event):
     rig = make_rig(FlightTables(**{table: b"octets of a table"}))
     rig.step()
     number = {"catalogue": 2, "anchor_ephemeris": 1, "gravity": 3}[table]
@@ -120,85 +117,85 @@ def test_every_table_is_scrubbed(make_rig: Callable[..., Any], table: str, event
     assert rig.board.memory[number].tobytes() == b"octets of a table"
 
 
-def test_memory_whose_kept_copy_is_damaged_too_ends_in_safe(observing: Any) -> None:
+def test_memory_whose_kept_copy_is_damaged_too_ends_in_safe(observing):
     observing.board.memory[MODEL_NUMBER][3] ^= 1
     observing.board.tables[MODEL_NUMBER][7] ^= 1
     packets = steps(observing, 5)
     assert "memory_unrepairable" in observing.events(packets)
-    assert observing.payload.mode is PayloadMode.safe
+    assert observing.mode is PayloadMode.safe
     # Back in service once a good model is there again.
     observing.board.write_table(MODEL_NUMBER, observing.model)
     steps(observing, 5)
-    observing.step(observing.function("set_mode", PayloadMode.standby))
-    assert observing.payload.mode is PayloadMode.standby
+    observing.perform("set_mode", PayloadMode.standby)
+    assert observing.mode is PayloadMode.standby
 
 
-def test_a_watchdog_reset_resumes_the_observation_and_too_many_end_in_safe(observing: Any) -> None:
+def test_a_watchdog_reset_resumes_the_observation_and_too_many_end_in_safe(observing):
     frames = observing.named(observing.step(), "detections")[0]["frame_number"]
     for number in (1, 2):
         observing.boot(ResetCause.watchdog)
         packets = observing.step()
         events = observing.events(packets)
         assert {"boot", "watchdog_reset", "state_recovered"} <= set(events)
-        assert observing.payload.mode is PayloadMode.observing
+        assert observing.mode is PayloadMode.observing
         # Frames and sequence counts go on where they were.
         frames += 1
         assert [v["frame_number"] for v in observing.named(packets, "detections")] == [frames]
         assert observing.named(packets, "housekeeping")[0]["watchdog_resets"] == number
     observing.boot(ResetCause.watchdog)
     packets = observing.step()
-    assert observing.payload.mode is PayloadMode.safe
+    assert observing.mode is PayloadMode.safe
     assert "safe_mode_entered" in observing.events(packets)
 
 
-def test_watchdog_resets_an_hour_apart_do_not_add_up(observing: Any) -> None:
+def test_watchdog_resets_an_hour_apart_do_not_add_up(observing):
     for _ in range(4):
         observing.boot(ResetCause.watchdog)
         observing.step(seconds=4_000.0)
-        assert observing.payload.mode is PayloadMode.observing
+        assert observing.mode is PayloadMode.observing
 
 
-def test_a_commanded_reset_comes_up_in_standby_with_the_next_boot_count(observing: Any) -> None:
-    packets = observing.step(observing.function("reboot"))
+def test_a_commanded_reset_comes_up_in_standby_with_the_next_boot_count(observing):
+    packets = observing.perform("reboot")
     assert len(observing.named(packets, "verification_completed")) == 1
     after = observing.step()
-    assert observing.payload.mode is PayloadMode.standby
+    assert observing.mode is PayloadMode.standby
     assert next(v["value_1"] for v in observing.named(after, "event_info")) == 2.0
 
 
-def test_an_observation_whose_time_is_over_is_not_resumed(rig: Any) -> None:
-    rig.step(rig.function("start_observation", 60.0))
+def test_an_observation_whose_time_is_over_is_not_resumed(rig):
+    rig.perform("start_observation", 60.0)
     rig.boot(ResetCause.brown_out)
     rig.step(seconds=100.0)
-    assert rig.payload.mode is PayloadMode.standby
+    assert rig.mode is PayloadMode.standby
 
 
-def test_settings_lost_in_both_copies_end_in_safe(observing: Any) -> None:
+def test_settings_lost_in_both_copies_end_in_safe(observing):
     observing.board.settings[:] ^= 0xA5
     observing.boot(ResetCause.brown_out)
     packets = observing.step()
     assert "state_lost" in observing.events(packets)
-    assert observing.payload.mode is PayloadMode.safe
+    assert observing.mode is PayloadMode.safe
 
 
-@pytest.mark.parametrize("values", [{"boot_count": 3}, {"boot_count": "many"}, {"mode": 9, "boot_count": 1}])
-def test_settings_that_another_build_wrote_count_as_lost(rig: Any, values: dict[str, Any]) -> None:
+@mark.parametrize("values", [{"boot_count": 3}, {"boot_count": "many"}, {"mode": 9, "boot_count": 1}])
+def test_settings_that_another_build_wrote_count_as_lost(rig, values):
     Settings(rig.board.settings).write(values)
     packets = rig.step()
     assert "state_lost" in rig.events(packets)
-    assert rig.payload.mode is PayloadMode.safe
+    assert rig.mode is PayloadMode.safe
 
 
-def test_settings_damaged_in_one_copy_are_recovered_from_the_other(observing: Any) -> None:
+def test_settings_damaged_in_one_copy_are_recovered_from_the_other(observing):
     observing.board.settings[20] ^= 0x01
     observing.boot(ResetCause.brown_out)
     packets = observing.step()
     assert "state_recovered" in observing.events(packets)
     assert observing.named(packets, "event_low")[0]["value_1"] == 2.0
-    assert observing.payload.mode is PayloadMode.observing
+    assert observing.mode is PayloadMode.observing
 
 
-def test_packets_damaged_in_the_store_are_found_told_and_never_sent(observing: Any) -> None:
+def test_packets_damaged_in_the_store_are_found_told_and_never_sent(observing):
     observing.board.downlink = 0
     steps(observing, 3)
     used = np.flatnonzero(observing.board.store)
@@ -209,22 +206,22 @@ def test_packets_damaged_in_the_store_are_found_told_and_never_sent(observing: A
     assert "storage_corrupt" in observing.events(packets)
 
 
-@pytest.mark.parametrize("jump_s", [3_600.0, 5.0, -5.0, -3_600.0])
-def test_a_clock_that_jumps_is_told_and_housekeeping_begins_again(observing: Any, jump_s: float) -> None:
+@mark.parametrize("jump_s", [3_600.0, 5.0, -5.0, -3_600.0])
+def test_a_clock_that_jumps_is_told_and_housekeeping_begins_again(observing, jump_s):
     observing.skew_ticks += round(jump_s * 65_536)
     packets = observing.step()
     jumps = [v["value_1"] for v in observing.named(packets, "event_medium")]
-    assert jumps == [pytest.approx(jump_s, abs=1e-3)]
+    assert jumps == [approx(jump_s, abs=1e-3)]
     assert observing.named(packets, "housekeeping")[0]["clock_status"] == 2
     assert len(observing.named(observing.step(), "detections")) == 1
 
 
-def test_the_drift_of_a_good_clock_is_no_jump(observing: Any) -> None:
+def test_the_drift_of_a_good_clock_is_no_jump(observing):
     observing.skew_ticks += 65_536
     assert "clock_jump" not in observing.events(observing.step())
 
 
-def test_a_clock_that_jumps_ahead_does_not_release_what_it_has_passed(rig: Any) -> None:
+def test_a_clock_that_jumps_ahead_does_not_release_what_it_has_passed(rig):
     ping = rig.command("test_connection")
     rig.step(rig.at(600.0, ping))
     rig.skew_ticks += 3_600 * 65_536
@@ -233,20 +230,18 @@ def test_a_clock_that_jumps_ahead_does_not_release_what_it_has_passed(rig: Any) 
     assert not rig.named(packets, "connection_report")
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("heat_c", "drop_v", "event", "safe"),
     [
         (52.0, 0.0, "temperature_high", False), (90.0, 0.0, "temperature_high", True),
-        (-50.0, 0.0, "temperature_low", False), (0.0, 2.3, "power_low", False), (0.0, 3.5, "power_low", True),
-    ],
+        (-50.0, 0.0, "temperature_low", False), (0.0, 2.3, "power_low", False), (0.0, 3.5, "power_low", True)
+    ]
 )  # fmt: skip
-def test_power_and_heat_out_of_limits_are_told_once_and_end_in_safe_beyond(
-    observing: Any, heat_c: float, drop_v: float, event: str, safe: bool
-) -> None:
+def test_power_and_heat_out_of_limits_are_told_once_and_end_in_safe_beyond(observing, heat_c, drop_v, event, safe):
     observing.board.heat_c, observing.board.drop_v = heat_c, drop_v
     packets = steps(observing, 6)
     assert observing.events(packets).count(event) == 1
-    assert (observing.payload.mode is PayloadMode.safe) is safe
+    assert (observing.mode is PayloadMode.safe) is safe
     assert observing.board.camera_on is not safe
     observing.board.heat_c = observing.board.drop_v = 0.0
     steps(observing, 3)
@@ -254,15 +249,14 @@ def test_power_and_heat_out_of_limits_are_told_once_and_end_in_safe_beyond(
     assert observing.events(steps(observing, 3)).count(event) == 1
 
 
-def test_too_much_memory_is_told(rig: Any) -> None:
+def test_too_much_memory_is_told(rig):
     order = rig.command("set_parameter", parameter_id=NUMBERS["memory_high_kib"], value=1024.0)
     assert rig.events(rig.step(order)).count("memory_high") == 1
 
 
-def test_a_flooded_store_is_told_each_time_that_the_loss_has_doubled(make_rig: Callable[..., Any]) -> None:
-    rig = make_rig()
+def test_a_flooded_store_is_told_each_time_that_the_loss_has_doubled(rig):
     rig.board.downlink = 0
-    rig.step(rig.command("set_housekeeping_interval", structure_id=1, interval_s=1))
+    rig.send("set_housekeeping_interval", structure_id=1, interval_s=1)
     for _ in range(700):
         rig.step(seconds=1.0, image=None)
     rig.board.downlink = 1 << 30
@@ -272,8 +266,8 @@ def test_a_flooded_store_is_told_each_time_that_the_loss_has_doubled(make_rig: C
     assert lost == sorted(lost)
 
 
-def test_dead_sensors_break_no_limit(observing: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dead_sensors_break_no_limit(observing, monkeypatch):
     monkeypatch.setattr(type(observing.board), "sensors", lambda board: np.full(4, np.nan))
     packets = steps(observing, 6)
     assert observing.named(packets, "housekeeping")[0]["temperature_c"] == 0.0
-    assert observing.payload.mode is PayloadMode.observing
+    assert observing.mode is PayloadMode.observing

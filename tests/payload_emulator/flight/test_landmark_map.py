@@ -3,7 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.linalg import eigvalsh, norm
+from pytest import approx
 
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.frames import mcmf_from_spherical
@@ -32,7 +33,7 @@ STEP_RAD = 24_540.0 / RADIUS_M
 SPACECRAFT_M = 100.0
 
 
-def ground(count: int, seed: int) -> np.ndarray:
+def ground(count, seed):
     rng = np.random.default_rng(seed)
     latitude, longitude = rng.uniform(-0.02, 0.09, count), rng.uniform(-0.02, 0.02, count)
     return mcmf_from_spherical(latitude, longitude, 300.0 + 400.0 * rng.standard_normal(count))
@@ -41,37 +42,32 @@ def ground(count: int, seed: int) -> np.ndarray:
 class Mapper:
     """A map under construction with its rules."""
 
-    def __init__(self, **changes: float) -> None:
+    def __init__(self, **changes):
         self.parameters, self.state = MappingParameters(**changes), MapState()
 
-    def __len__(self) -> int:
+    def __len__(self):
         return len(self.state.landmarks)
 
-    def observe(
-        self, view: View, found: Detections, variance: np.ndarray, free: np.ndarray, surface_m: float
-    ) -> tuple[Landmark, ...]:
+    def observe(self, view, found, variance, free, surface_m):
         self.state, made = observe(self.state, view, found, variance, free, surface_m, CAMERA, self.parameters)
         return made
 
-    def close(self) -> tuple[Landmark, ...]:
+    def close(self):
         self.state, made = close(self.state, CAMERA, self.parameters)
         return made
 
 
-def fly(
-    mapper: Mapper,
-    craters: np.ndarray,
-    seed: int,
-    frames: int = 6,
-    start_ticks: int = 0,
-    east_m: float = 0.0,
-    false: int = 0,
-    error_m: np.ndarray | None = None,
-) -> list[Landmark]:
+def offset_m(landmark, craters, shift_m=0.0):
+    """How far a landmark lies from the crater that is nearest once all are shifted."""
+    away = landmark.position_mcmf_m - craters
+    return away[np.argmin(norm(away - shift_m, axis=1))]
+
+
+def fly(mapper, craters, seed, frames=6, start_ticks=0, east_m=0.0, false=0, error_m=(0.0, 0.0, 0.0)):
     """One pass to the north at 30 km, believed to be `error_m` from where it is."""
     rng = np.random.default_rng(seed)
-    error = np.zeros(3) if error_m is None else error_m
-    made: list[Landmark] = []
+
+    made = []
     for k in range(frames):
         place = mcmf_from_spherical(k * STEP_RAD, east_m / RADIUS_M, 30e3)
         rotation = nadir_camera_from_mcmf(place)
@@ -84,25 +80,23 @@ def fly(
         uv = np.concatenate([uv, rng.uniform(0.0, 511.0, (false, 2))])
         size = np.concatenate([size, np.full(false, 25.0)])
         found = Detections(uv[:, 0], uv[:, 1], size, np.ones(len(uv)), np.full(len(uv), SIGMA_PX))
-        view = View(start_ticks + k * 15 * SECOND, rotation, place + error, SPACECRAFT_M**2 * np.eye(3), 1e-4)
-        free = np.ones(len(uv), dtype=bool)
+        view = View(start_ticks + k * 15 * SECOND, rotation, place + error_m, SPACECRAFT_M**2 * np.eye(3), 1e-4)
+        free = np.ones(len(uv), bool)
         made += mapper.observe(view, found, np.full(len(uv), SIGMA_PX**2), free, 300.0)
     made += mapper.close()
     return made
 
 
-def test_craters_become_landmarks_where_they_are_and_with_errors_as_claimed() -> None:
+def test_craters_become_landmarks_where_they_are_and_with_errors_as_claimed():
     craters = ground(25, 1)
     mapper = Mapper()
     made = fly(mapper, craters, 2)
     assert len(made) == len(mapper) >= 15
     errors, nees = [], []
     for landmark in made:
-        offset = (
-            landmark.position_mcmf_m - craters[np.argmin(np.linalg.norm(craters - landmark.position_mcmf_m, axis=1))]
-        )
+        offset = offset_m(landmark, craters)
         own = landmark.covariance_m2 - SPACECRAFT_M**2 * np.eye(3)
-        errors.append(float(np.linalg.norm(offset)))
+        errors.append(float(norm(offset)))
         nees.append(float(offset @ np.linalg.solve(own, offset)))
     # One pixel at 30 km is 203 m; three sightings under wide parallax place a crater to about that.
     assert np.median(errors) < 250.0
@@ -110,33 +104,25 @@ def test_craters_become_landmarks_where_they_are_and_with_errors_as_claimed() ->
     assert 1.0 < np.mean(nees) < 4.5
 
 
-def test_the_spacecrafts_error_is_in_every_landmark_and_in_its_covariance() -> None:
+def test_the_spacecrafts_error_is_in_every_landmark_and_in_its_covariance():
     craters = ground(25, 1)
     wrong = np.array([0.0, 150.0, 120.0])
-    shifted = Mapper()
-    made = fly(shifted, craters, 2, error_m=wrong)
-    mean = np.mean(
-        [
-            landmark.position_mcmf_m
-            - craters[np.argmin(np.linalg.norm(craters + wrong - landmark.position_mcmf_m, axis=1))]
-            for landmark in made
-        ],
-        axis=0,
-    )
+    made = fly(Mapper(), craters, 2, error_m=wrong)
+    mean = np.mean([offset_m(landmark, craters, wrong) for landmark in made], axis=0)
     # East and north shift as the spacecraft does; the mean of 15 landmarks of 150 m each is good to 40 m.
-    assert mean[1:] == pytest.approx(wrong[1:], abs=90.0)
+    assert mean[1:] == approx(wrong[1:], abs=90.0)
     for landmark in made:
-        assert np.linalg.eigvalsh(landmark.covariance_m2).min() >= SPACECRAFT_M**2
+        assert eigvalsh(landmark.covariance_m2).min() >= SPACECRAFT_M**2
 
 
-def test_false_detections_do_not_become_landmarks() -> None:
+def test_false_detections_do_not_become_landmarks():
     mapper = Mapper()
     fly(mapper, np.empty((0, 3)) + RADIUS_M, 3, frames=8, false=12)
     # Ninety-six of them; chance lines up three now and then.
     assert len(mapper) <= 3
 
 
-def test_a_second_pass_joins_the_landmarks_of_the_first_without_counting_its_error_twice() -> None:
+def test_a_second_pass_joins_the_landmarks_of_the_first_without_counting_its_error_twice():
     craters = ground(25, 1)
     mapper = Mapper()
     first = fly(mapper, craters, 2)
@@ -149,10 +135,10 @@ def test_a_second_pass_joins_the_landmarks_of_the_first_without_counting_its_err
         before = next(item for item in first if item.identity == landmark.identity)
         assert landmark.sightings > before.sightings
         # Both passes may have erred alike: the spacecraft's share does not shrink.
-        assert np.linalg.eigvalsh(landmark.covariance_m2).min() >= 0.999 * SPACECRAFT_M**2
+        assert eigvalsh(landmark.covariance_m2).min() >= 0.999 * SPACECRAFT_M**2
 
 
-def test_the_intersection_never_claims_more_than_the_better_of_two_equal_directions() -> None:
+def test_the_intersection_never_claims_more_than_the_better_of_two_equal_directions():
     covariance = np.diag([100.0, 400.0, 900.0])
     first = Landmark(FIRST_LANDMARK_ID, np.zeros(3), covariance, 5e3, 3, 1, 0)
     second = replace(first, position_mcmf_m=np.array([1.0, 2.0, 3.0]))
@@ -163,18 +149,17 @@ def test_the_intersection_never_claims_more_than_the_better_of_two_equal_directi
     other = intersected(first, turned)
     assert np.trace(other.covariance_m2) <= np.trace(covariance)
     # Julier and Uhlmann: for diag(100, 900) and diag(900, 100) the half and half mixture gives 2/(1/100+1/900) = 180.
-    assert np.diag(other.covariance_m2)[[0, 2]] == pytest.approx([180.0, 180.0])
+    assert np.diag(other.covariance_m2)[[0, 2]] == approx([180.0, 180.0])
 
 
-def test_memory_is_bounded() -> None:
+def test_memory_is_bounded():
     mapper = Mapper(tracks=10, landmarks=4)
     fly(mapper, ground(40, 1), 2, frames=6)
     assert len(mapper) <= 4
-    best = min(landmark.sightings for landmark in mapper.state.landmarks)
-    assert best >= 3
+    assert min(landmark.sightings for landmark in mapper.state.landmarks) >= 3
 
 
-def test_landmarks_stand_beside_the_catalogue_with_identities_of_their_own() -> None:
+def test_landmarks_stand_beside_the_catalogue_with_identities_of_their_own():
     mapper = Mapper()
     craters = ground(25, 1)
     fly(mapper, craters, 2)
@@ -190,20 +175,20 @@ def test_landmarks_stand_beside_the_catalogue_with_identities_of_their_own() -> 
     }
 
 
-def test_nothing_is_mapped_while_the_spacecraft_does_not_know_where_it_is_or_sees_nothing() -> None:
+def test_nothing_is_mapped_while_the_spacecraft_does_not_know_where_it_is_or_sees_nothing():
     mapper = Mapper(position_limit_m=50.0)
     assert fly(mapper, ground(25, 1), 2) == []
     nothing = no_detections()
     place = mcmf_from_spherical(0.0, 0.0, 30e3)
     view = View(0, nadir_camera_from_mcmf(place), place, np.eye(3), 1e-4)
-    assert Mapper().observe(view, nothing, np.empty(0), np.empty(0, dtype=bool), 0.0) == ()
+    assert Mapper().observe(view, nothing, np.empty(0), np.empty(0, bool), 0.0) == ()
     lost = replace(view, covariance_m2=np.full((3, 3), np.nan))
     one = np.ones(1)
     found = Detections(200.0 * one, 200.0 * one, 20.0 * one, one, one)
-    assert Mapper().observe(lost, found, one, np.ones(1, dtype=bool), 0.0) == ()
+    assert Mapper().observe(lost, found, one, np.ones(1, bool), 0.0) == ()
 
 
-def test_detections_that_are_no_numbers_are_left_out() -> None:
+def test_detections_that_are_no_numbers_are_left_out():
     mapper = Mapper()
     place = mcmf_from_spherical(0.0, 0.0, 30e3)
     view = View(0, nadir_camera_from_mcmf(place), place, np.eye(3), 1e-4)
@@ -211,11 +196,11 @@ def test_detections_that_are_no_numbers_are_left_out() -> None:
     size = np.array([20.0, np.nan, 25.0])
     found = Detections(values, values, size, np.ones(3), np.ones(3))
     for k in range(4):
-        mapper.observe(replace(view, ticks=k * SECOND), found, np.ones(3), np.ones(3, dtype=bool), 0.0)
+        mapper.observe(replace(view, ticks=k * SECOND), found, np.ones(3), np.ones(3, bool), 0.0)
     assert len(mapper.close()) == 1
 
 
-def test_a_detection_on_a_catalogued_crater_of_its_size_is_not_free() -> None:
+def test_a_detection_on_a_catalogued_crater_of_its_size_is_not_free():
     nothing, uv, size_px = np.zeros((1, 2, 3)), np.array([[100.0, 100.0]]), np.array([30.0])
     seen = Sighting(np.arange(1), uv, size_px, nothing, nothing, nothing, nothing[:, :, 0])
     u = np.array([105.0, 105.0, 300.0, 400.0])

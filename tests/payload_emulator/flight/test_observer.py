@@ -1,55 +1,55 @@
 """The observer: what of a frame reaches the estimators, what is reported, and how reads and troubles are counted."""
 
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, fixture, mark
 
 from payload_emulator.flight.navigation import anchored
-from payload_emulator.flight.navigation.anchored import AnchoredReport, Observation
+from payload_emulator.flight.navigation.anchored import AnchoredReport
 from payload_emulator.flight.navigation.filter.map_offset import OffsetSize
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.onboard.loads import FlightParameters, FlightTables
 from payload_emulator.flight.onboard.observer import Observer
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
-from tmtc.dictionary.tables import pack_anchor_table, table_hash
+from tmtc.dictionary.tables import table_hash
 
 ATTITUDE = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
-IMAGE = np.zeros((4, 4), dtype=np.uint8)
+IMAGE = np.zeros((4, 4), np.uint8)
 RNG = np.random.default_rng(4)
 
 
 class Recorder:
     """Telemetry that keeps what it is sent."""
 
-    def __init__(self) -> None:
-        self.sent: list[tuple[str, dict[str, Any]]] = []
-        self.events: list[tuple[str, str, float, float]] = []
+    def __init__(self):
+        self.sent = []
+        self.events = []
         self.ticks, self.frame_number = 65_536 * 1_000, 0
         self.counts = {"events": 0, "packets": 0}
 
-    def send(self, name: str, values: dict[str, Any]) -> None:
+    def send(self, name, values):
         self.sent.append((name, values))
 
-    def event(self, severity: str, event: str, value_1: float = 0.0, value_2: float = 0.0) -> None:
+    def event(self, severity, event, value_1=0.0, value_2=0.0):
         self.events.append((severity, event, value_1, value_2))
 
-    def named(self, name: str) -> list[dict[str, Any]]:
+    def named(self, name):
         return [values for found, values in self.sent if found == name]
 
-    def names(self) -> list[str]:
+    def names(self):
         return [event for _, event, _, _ in self.events]
 
 
 class Clock:
     """A timer that says how long the detector takes."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.now_ns, self.detector_ns = 0, 0
 
-    def enter(self, stage: Any) -> int:
+    def enter(self, stage):
         if stage.name == "telemetry":
             self.now_ns += self.detector_ns
         return self.now_ns
@@ -58,10 +58,10 @@ class Clock:
 class Eye:
     """A detector that returns what it is told to."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.quality, self.found, self.fails = ImageQuality.OK, detections(6), False
 
-    def examine(self, image: Any, sun: Any = None) -> tuple[ImageQuality, Detections]:
+    def examine(self, image, sun=None):
         self.sun = sun
         if self.fails:
             raise RuntimeError("twelve chars")
@@ -71,8 +71,8 @@ class Eye:
 class Navigator:
     """An anchored estimator that keeps what it is given and answers as it is told to."""
 
-    def __init__(self) -> None:
-        self.given: list[tuple[int, Detections | None, Any]] = []
+    def __init__(self):
+        self.given = []
         self.outcome, self.lost, self.fix, self.new_landmarks = Outcome.coasted, False, None, ()
         self.breaks = self.reacquired = False
         self.attitude_noise_rad, self.offset = 0.0, None
@@ -82,108 +82,108 @@ class Navigator:
             estimate=SimpleNamespace(mean=np.arange(18.0), covariance=root @ root.T),
             landmarks=SimpleNamespace(ids=np.arange(100) + 1_000),
         )
-        self.widened: list[tuple[float, float]] = []
+        self.widened = []
 
-    def step(self, state: Any, observation: Observation, setup: Any) -> tuple[Any, AnchoredReport]:
+    def step(self, state, observation, setup):
         assert setup == "the tables" and state is (self.state if self.given else self.start)
         self.given.append((observation.ticks, observation.found, observation.camera_from_icrf))
         if self.breaks:
             raise np.linalg.LinAlgError
         return self.state, AnchoredReport(
             self.outcome, 0.1, -0.2, 30e3, (1.0, 2.0, 3.0), (4.0, 6.0, 5.0), 7.0, 3, 9, 11, self.reacquired,
-            self.lost, self.fix, self.new_landmarks, np.radians(0.01), self.attitude_noise_rad, self.offset,
+            self.lost, self.fix, self.new_landmarks, np.radians(0.01), self.attitude_noise_rad, self.offset
         )  # fmt: skip
 
-    def widen(self, state: Any, position_m: float, velocity_m_s: float) -> Any:
+    def widen(self, state, position_m, velocity_m_s):
         assert state is self.start
         self.widened.append((position_m, velocity_m_s))
         return self.start
 
 
-def detections(count: int) -> Detections:
+def detections(count):
     return Detections(
         100.0 + 10.0 * np.arange(count), np.full(count, 200.0), np.full(count, 30.0), np.linspace(0.9, 0.4, count),
-        np.full(count, 0.7),
+        np.full(count, 0.7)
     )  # fmt: skip
 
 
-@pytest.fixture
-def rig(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+@fixture
+def rig(monkeypatch):
     eye, telemetry, clock, navigator = Eye(), Recorder(), Clock(), Navigator()
     observer = Observer(eye, FlightParameters(modes=(Mode.anchored,)), telemetry, clock)
     observer._states[Mode.anchored] = ("the tables", navigator.start)
     monkeypatch.setattr(anchored, "step", navigator.step)
     monkeypatch.setattr(anchored, "widened", navigator.widen)
-    return SimpleNamespace(eye=eye, telemetry=telemetry, clock=clock, navigator=navigator, observer=observer)
+    parts = {"eye": eye, "telemetry": telemetry, "clock": clock, "navigator": navigator, "observer": observer}
+    return SimpleNamespace(**parts, named=telemetry.named)
 
 
-def look(rig: SimpleNamespace, score_floor: float = 0.0, attitude: Any = ATTITUDE, quiet: bool = False) -> None:
+def observing(rig, mode):
+    rig.observer = Observer(rig.eye, FlightParameters(modes=(mode,)), rig.telemetry, rig.clock)
+    return rig.observer
+
+
+def look(rig, score_floor=0.0, attitude=ATTITUDE, quiet=False):
     rig.observer.frame(IMAGE, attitude, score_floor, 1.0, quiet)
 
 
-def test_the_estimate_goes_down_with_the_upper_triangle_and_the_degrees_of_its_innovation(rig: SimpleNamespace) -> None:
+def look_fixed(rig, detection, index):
     rig.navigator.outcome = Outcome.fixed
-    rig.navigator.fix = SimpleNamespace(
-        identification=SimpleNamespace(detection=np.array([0, 3, 5])), index=np.array([7, 2, 40])
-    )
+    identification = SimpleNamespace(detection=np.array(detection))
+    rig.navigator.fix = SimpleNamespace(identification=identification, index=np.array(index))
     look(rig)
-    (sent,) = rig.telemetry.named("filter_estimate")
+
+
+def items(rig, name, *fields):
+    """Fields of the items of the only packet of a name."""
+    (sent,) = rig.named(name)
+    return [sent["items"][field].tolist() for field in fields]
+
+
+def outcome_of(rig, **values):
+    """The packet `frame_outcome` with these values and those of a frame without estimate."""
+    nothing = approx(np.nan, nan_ok=True)
+    return {
+        "frame_number": 0, "image_ticks": rig.telemetry.ticks, "estimator": 0, "reset_trigger": 0, "detections": 6,
+        "candidate_pairs": 0, "pairs": 0, "shift_east_m": nothing, "shift_north_m": nothing, "anchor_reads": 0, **values
+    }  # fmt: skip
+
+
+def test_the_estimate_goes_down_with_the_upper_triangle_and_the_degrees_of_its_innovation(rig):
+    look_fixed(rig, [0, 3, 5], [7, 2, 40])
+    (sent,) = rig.named("filter_estimate")
     covariance = rig.navigator.state.estimate.covariance
     assert sent["covariance"].tolist() == [covariance[i, j] for i in range(9) for j in range(i, 9)]
     assert [*sent["position_icrf_m"], *sent["velocity_icrf_m_s"], *sent["acceleration_rtn_m_s2"]] == list(range(9))
     assert sent["innovation_degrees"] == 6
-    (pairs,) = rig.telemetry.named("identifications")
-    assert pairs["items"]["detection"].tolist() == [0, 3, 5]
-    assert pairs["items"]["crater_id"].tolist() == [1_007, 1_002, 1_040]
+    pairs = [[0, 3, 5], [1_007, 1_002, 1_040]]
+    assert items(rig, "identifications", "detection", "crater_id") == pairs
     assert rig.observer.sightings == {1_007: 1, 1_002: 1, 1_040: 1}
-    (state,) = rig.telemetry.named("navigation_state")
-    assert state["latitude_deg"] == pytest.approx(np.degrees(0.1))
-    assert state["longitude_deg"] == pytest.approx(360.0 - np.degrees(0.2))
-    assert (state["nis"], state["matched"], state["sigma_rtn_m"]) == (7.0, 3, (4.0, 6.0, 5.0))
-    (outcome,) = rig.telemetry.named("frame_outcome")
-    assert (outcome["candidate_pairs"], outcome["pairs"], outcome["detections"]) == (9, 3, 6)
-    assert outcome["anchor_reads"] == 0
 
 
-def test_a_frame_without_a_fix_has_no_degrees_and_no_pairs(rig: SimpleNamespace) -> None:
-    look(rig)
-    assert rig.telemetry.named("filter_estimate")[0]["innovation_degrees"] == 0
-    assert rig.telemetry.named("identifications") == []
-
-
-def test_pairs_name_the_detection_by_its_place_among_those_reported(rig: SimpleNamespace) -> None:
+def test_pairs_name_the_detection_by_its_place_among_those_reported(rig):
     """Of 300 detections the 255 strongest go down, in their order."""
-    rig.eye.found = detections(300)
     score = np.linspace(0.2, 0.9, 300)
     rig.eye.found = Detections(*(np.full(300, 50.0),) * 3, score, np.full(300, 0.7))
-    rig.navigator.outcome = Outcome.fixed
-    rig.navigator.fix = SimpleNamespace(
-        identification=SimpleNamespace(detection=np.array([10, 45, 299])), index=np.array([1, 2, 3])
-    )
-    look(rig)
-    (pairs,) = rig.telemetry.named("identifications")
+    look_fixed(rig, [10, 45, 299], [1, 2, 3])
     # Rows 0 to 44 are the weakest: the first is not reported, row 45 is the first that is.
-    assert pairs["items"]["detection"].tolist() == [0, 254]
-    assert pairs["items"]["crater_id"].tolist() == [1_002, 1_003]
-    (report,) = rig.telemetry.named("detections")
-    np.testing.assert_array_equal(report["items"]["score"], score[45:])
+    assert items(rig, "identifications", "detection", "crater_id") == [[0, 254], [1_002, 1_003]]
+    assert items(rig, "detections", "score") == [score[45:].tolist()]
 
 
-def test_weak_detections_and_those_far_outside_reach_nobody(rig: SimpleNamespace) -> None:
+def test_weak_detections_and_those_far_outside_reach_nobody(rig):
     u = np.array([100.0, 2e5, np.nan, 120.0, 130.0, 140.0])
     rig.eye.found = Detections(u, *(np.full(6, 50.0),) * 2, np.array([0.9, 0.9, 0.9, 0.3, np.nan, 0.5]), np.ones(6))
     look(rig, score_floor=0.5)
     ((_, given, _),) = rig.navigator.given
     # A score at the floor is used; one that is no number is not below it.
     assert given.u_px.tolist() == [100.0, 130.0, 140.0]
-    (report,) = rig.telemetry.named("detections")
-    assert report["items"]["u_px"].tolist() == [100.0, 130.0, 140.0]
-    assert report["items"]["score"].tolist() == [0.9, 0.0, 0.5]
+    assert items(rig, "detections", "u_px", "score") == [[100.0, 130.0, 140.0], [0.9, 0.0, 0.5]]
     assert rig.observer.counts["detections"] == 3
 
 
-@pytest.mark.parametrize("quiet", [False, True])
-def test_a_bad_image_is_counted_reported_and_kept_from_the_filter(rig: SimpleNamespace, quiet: bool) -> None:
+@mark.parametrize("quiet", [False, True])
+def test_a_bad_image_is_counted_reported_and_kept_from_the_filter(rig, quiet):
     rig.eye.quality = ImageQuality.DARK
     look(rig, quiet=quiet)
     assert rig.navigator.given[0][1] is None
@@ -192,7 +192,7 @@ def test_a_bad_image_is_counted_reported_and_kept_from_the_filter(rig: SimpleNam
     assert rig.observer.summary()["no_image_reasons"] == {"dark": 1}
 
 
-def test_a_detector_that_fails_or_is_late_gives_no_detections(rig: SimpleNamespace) -> None:
+def test_a_detector_that_fails_or_is_late_gives_no_detections(rig):
     rig.eye.fails = True
     look(rig)
     assert rig.telemetry.events[0] == ("high", "detector_error", 12.0, 0.0)
@@ -207,57 +207,43 @@ def test_a_detector_that_fails_or_is_late_gives_no_detections(rig: SimpleNamespa
     assert rig.observer.summary()["no_image_reasons"] == {"detector failed": 2}
 
 
-@pytest.mark.parametrize(
-    "attitude, known",
-    [
-        (ATTITUDE, True),
-        (ATTITUDE * np.array([1.0009, 1, 1, 1, 1, 1, 1]), True),
-        (ATTITUDE * np.array([1.0011, 1, 1, 1, 1, 1, 1]), False),
-        (np.array([np.nan, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0]), False),
-        (np.zeros(0), False),
-    ],
-)
-def test_an_attitude_is_a_unit_quaternion_or_none(rig: SimpleNamespace, attitude: Any, known: bool) -> None:
-    look(rig, attitude=attitude)
+@mark.parametrize("length, known", [(1.0, True), (1.0009, True), (1.0011, False), (np.nan, False), (None, False)])
+def test_an_attitude_is_a_unit_quaternion_or_none(rig, length, known):
+    look(rig, attitude=np.zeros(0) if length is None else np.r_[length, ATTITUDE[1:]])
     given = rig.navigator.given[0][2]
     assert (given is not None) is known
     assert ("attitude_missing" in rig.telemetry.names()) is not known
     if known:
-        np.testing.assert_allclose(given, np.eye(3), atol=1e-12)
+        assert_allclose(given, np.eye(3), atol=1e-12)
 
 
-def test_the_sun_is_handed_on_where_it_is_known(rig: SimpleNamespace) -> None:
+def test_the_sun_is_handed_on_where_it_is_known(rig):
     look(rig)
-    np.testing.assert_array_equal(rig.eye.sun, [0.0, 0.0, -1.0])
+    assert_array_equal(rig.eye.sun, [0.0, 0.0, -1.0])
     look(rig, attitude=np.array([1.0, 0, 0, 0, np.nan, 0, 0]))
     assert rig.eye.sun is None
 
 
-def test_lasting_trouble_is_reported_at_its_beginning(rig: SimpleNamespace) -> None:
-    for lost, refused in ((False, False), (True, True), (True, True), (False, False), (True, False)):
-        rig.navigator.lost = lost
-        rig.navigator.outcome = Outcome.refused if refused else Outcome.coasted
+def test_lasting_trouble_is_reported_at_its_beginning(rig):
+    for lost, refused in ((0, 0), (1, 1), (1, 1), (0, 0), (1, 0)):
+        rig.navigator.lost, rig.navigator.outcome = lost, Outcome.refused if refused else Outcome.coasted
         look(rig)
     names = rig.telemetry.names()
     assert names.count("filter_divergence") == 2 and names.count("fix_refused") == 1
-    first = next(event for event in rig.telemetry.events if event[1] == "filter_divergence")
-    assert first == ("medium", "filter_divergence", 6.0, 0.0)
+    assert ("medium", "filter_divergence", 6.0, 0.0) in rig.telemetry.events
 
 
-def test_an_attitude_noisier_than_declared_is_reported_at_its_beginning_and_end(rig: SimpleNamespace) -> None:
+def test_an_attitude_noisier_than_declared_is_reported_at_its_beginning_and_end(rig):
     for noise_deg in (0.0, 0.2, 0.3, 0.0, 0.0, 1.0):
         rig.navigator.attitude_noise_rad = np.radians(noise_deg)
         look(rig)
     found = [event for event in rig.telemetry.events if event[1].startswith("attitude")]
-    assert [event[:2] for event in found] == [
-        ("medium", "attitude_degraded"),
-        ("info", "attitude_restored"),
-        ("medium", "attitude_degraded"),
-    ]
-    np.testing.assert_allclose([event[2:] for event in found], [(0.2, 0.01), (0.01, 0.0), (1.0, 0.01)])
+    degraded, restored = ("medium", "attitude_degraded"), ("info", "attitude_restored")
+    assert [event[:2] for event in found] == [degraded, restored, degraded]
+    assert_allclose([event[2:] for event in found], [(0.2, 0.01), (0.01, 0.0), (1.0, 0.01)])
 
 
-def test_the_size_of_the_map_offset_is_sent_when_it_changes(rig: SimpleNamespace) -> None:
+def test_the_size_of_the_map_offset_is_sent_when_it_changes(rig):
     for sigma_m, fixes, pending in ((60.0, 0, 0), (60.0, 0, 7), (31.0, 40, 0), (31.0, 40, 9), (31.0, 80, 0)):
         rig.navigator.offset = OffsetSize(sigma_m, 0.5, fixes, pending=pending)
         look(rig)
@@ -265,67 +251,47 @@ def test_the_size_of_the_map_offset_is_sent_when_it_changes(rig: SimpleNamespace
     assert sent == [(60.0, 0.0), (31.0, 40.0), (31.0, 80.0)]
 
 
-def test_a_reset_of_the_filter_is_told_and_counted(rig: SimpleNamespace) -> None:
+def test_a_reset_of_the_filter_is_told_and_counted(rig):
     rig.navigator.reacquired = True
     look(rig)
     assert ("medium", "filter_reset", 3.0, 6.0) in rig.telemetry.events
     assert rig.observer.summary()["fixes"]["reacquired"] == 1
 
 
-def test_what_cannot_be_inverted_ends_in_a_fresh_start(rig: SimpleNamespace) -> None:
+def test_what_cannot_be_inverted_ends_in_a_fresh_start(rig):
     rig.navigator.breaks = True
     look(rig)
     assert ("high", "estimator_error", 2.0, 0.0) in rig.telemetry.events
     # No tables are loaded: there is nothing to begin again with, and frames are refused.
     look(rig)
-    assert [values["outcome"] for values in rig.telemetry.named("frame_outcome")] == [int(Outcome.refused)] * 2
+    assert [values["outcome"] for values in rig.named("frame_outcome")] == [int(Outcome.refused)] * 2
     assert rig.observer.summary()["outcomes"]["refused"] == 2
 
 
-def test_reads_of_the_anchor_are_counted_beyond_the_first(moon: Any) -> None:
-    """The odometry reads an altitude every frame and a position at each reset: the first of each is the start."""
-    telemetry = Recorder()
-    observer = Observer(Eye(), FlightParameters(modes=(Mode.paper,)), telemetry, Clock())
-    seconds = np.arange(0.0, 400.0, 30.0)
-    octets = pack_anchor_table([moon.ticks_at(second) for second in seconds], moon.orbit(seconds))
-    observer.load_tables(FlightTables(anchor_ephemeris=octets))
-    for k in range(5):
-        # A gap of two minutes before the last frame: one more reset.
-        telemetry.ticks = moon.ticks_at(30.0 + 15.0 * k + (120.0 if k == 4 else 0.0))
-        observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
-    assert observer.anchor_reads == 5 + 2
-    summary = observer.summary()
-    assert summary["estimators"]["paper"]["altitude_reads"] == 5 and summary["estimators"]["paper"]["resets"] == 2
-    assert summary["anchor_reads_after_start"] == 4 + 1
-    assert "truth_reads_after_start" not in summary
-    assert telemetry.names().count("anchor_read") == 2
-    assert [values["anchor_reads"] for values in telemetry.named("frame_outcome")] == [1, 2, 3, 4, 5]
-
-
-def test_a_frame_of_odometry_is_reported_in_full(rig: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_of_odometry_is_reported_in_full(rig, monkeypatch):
     """Longitude -0.3 rad is 342.8 degrees east; velocities, sigmas and NIS do not exist for odometry."""
-    observer = Observer(rig.eye, FlightParameters(modes=(Mode.spherical,)), rig.telemetry, rig.clock)
-    anchor: Any = object()
+    observer = observing(rig, Mode.spherical)
+    anchor = object()
     observer._states[Mode.spherical] = (anchor, None)
     observer.manual_step = True
     state = SimpleNamespace(
         latitude_rad=0.2, longitude_rad=-0.3, altitude_m=31e3, altitude_reads=7, resets=2,
-        features=SimpleNamespace(altitude_m=30e3),
+        features=SimpleNamespace(altitude_m=30e3)
     )  # fmt: skip
     report = SimpleNamespace(
         outcome=Outcome.multi, reset_trigger=ResetTrigger.time_gap, candidate_pairs=9, pairs=4, shift_east_m=12.0,
-        shift_north_m=-5.0,
+        shift_north_m=-5.0
     )  # fmt: skip
     calls = []
 
-    def step(*given: Any, **more: Any) -> tuple[Any, Any]:
+    def step(*given, **more):
         calls.append((given, more))
         return state, report
 
     monkeypatch.setattr("payload_emulator.flight.navigation.odometry.odometry.step", step)
     rig.telemetry.frame_number = 5
-    observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
-    observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
+    look(rig)
+    look(rig)
     parameters = observer._parameters
     for k, (before, manual) in enumerate(((None, True), (state, False))):
         (was, ticks, found, table, camera, mode, tuned), more = calls[k]
@@ -335,17 +301,16 @@ def test_a_frame_of_odometry_is_reported_in_full(rig: SimpleNamespace, monkeypat
     nothing = (np.nan,) * 3
     expected = {
         "frame_number": 5, "image_ticks": rig.telemetry.ticks, "estimator": 1, "outcome": 1,
-        "latitude_deg": pytest.approx(np.degrees(0.2)), "longitude_deg": pytest.approx(360.0 - np.degrees(0.3)),
-        "altitude_m": 31e3, "velocity_icrf_m_s": pytest.approx(nothing, nan_ok=True),
-        "sigma_rtn_m": pytest.approx(nothing, nan_ok=True), "nis": pytest.approx(np.nan, nan_ok=True), "matched": 4,
+        "latitude_deg": approx(np.degrees(0.2)), "longitude_deg": approx(360.0 - np.degrees(0.3)),
+        "altitude_m": 31e3, "velocity_icrf_m_s": approx(nothing, nan_ok=True),
+        "sigma_rtn_m": approx(nothing, nan_ok=True), "nis": approx(np.nan, nan_ok=True), "matched": 4
     }  # fmt: skip
-    first, second = rig.telemetry.named("navigation_state")
+    first, second = rig.named("navigation_state")
     assert first == expected and second == {**expected, "frame_number": 6}
-    assert rig.telemetry.named("frame_outcome")[0] == {
-        "frame_number": 5, "image_ticks": rig.telemetry.ticks, "estimator": 1, "outcome": 1, "reset_trigger": 2,
-        "detections": 6, "candidate_pairs": 9, "pairs": 4, "shift_east_m": 12.0, "shift_north_m": -5.0,
-        "anchor_reads": 7,
-    }  # fmt: skip
+    assert rig.named("frame_outcome")[0] == outcome_of(
+        rig, frame_number=5, estimator=1, outcome=1, reset_trigger=2, candidate_pairs=9, pairs=4, shift_east_m=12.0,
+        shift_north_m=-5.0, anchor_reads=7
+    )  # fmt: skip
     assert rig.telemetry.events == [("info", "anchor_read", 2.0, 1.0)] * 2
     assert observer.anchor_reads == 9
     assert observer.summary()["estimators"]["spherical"] == {
@@ -358,116 +323,103 @@ def test_a_frame_of_odometry_is_reported_in_full(rig: SimpleNamespace, monkeypat
     }
 
 
-def test_odometry_without_a_position_reports_its_outcome_alone(
-    rig: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    observer = Observer(rig.eye, FlightParameters(modes=(Mode.paper,)), rig.telemetry, rig.clock)
-    nothing = pytest.approx(np.nan, nan_ok=True)
-    observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
-    expected = {
-        "frame_number": 0, "image_ticks": rig.telemetry.ticks, "estimator": 0, "outcome": int(Outcome.missed),
-        "reset_trigger": 0, "detections": 6, "candidate_pairs": 0, "pairs": 0, "shift_east_m": nothing,
-        "shift_north_m": nothing, "anchor_reads": 0,
-    }  # fmt: skip
-    assert rig.telemetry.named("frame_outcome") == [expected]
+def test_odometry_without_a_position_reports_its_outcome_alone(rig, monkeypatch):
+    observer = observing(rig, Mode.paper)
+    look(rig)
+    assert rig.named("frame_outcome") == [outcome_of(rig, outcome=Outcome.missed)]
     observer._states[Mode.paper] = (object(), None)
     report = SimpleNamespace(
         outcome=Outcome.rejected, reset_trigger=ResetTrigger.none, candidate_pairs=3, pairs=0, shift_east_m=np.nan,
-        shift_north_m=np.nan,
+        shift_north_m=np.nan
     )  # fmt: skip
     monkeypatch.setattr("payload_emulator.flight.navigation.odometry.odometry.step", lambda *_, **__: (None, report))
-    observer.frame(IMAGE, ATTITUDE, 0.0, 1.0, False)
-    assert rig.telemetry.named("frame_outcome")[1] == {
-        **expected, "frame_number": 1, "outcome": int(Outcome.rejected), "candidate_pairs": 3,
-    }  # fmt: skip
-    assert rig.telemetry.named("navigation_state") == [] and rig.telemetry.events == []
+    look(rig)
+    rejected = outcome_of(rig, frame_number=1, outcome=Outcome.rejected, candidate_pairs=3)
+    assert rig.named("frame_outcome")[1] == rejected
+    assert rig.named("navigation_state") == [] and rig.telemetry.events == []
     assert observer.summary()["outcomes"] == {
-        "anchored": 0, "multi": 0, "single": 0, "predicted": 0, "missed": 1, "rejected": 1,
+        "anchored": 0, "multi": 0, "single": 0, "predicted": 0, "missed": 1, "rejected": 1
     }  # fmt: skip
 
 
-def test_a_frame_of_the_filter_is_reported_in_full(rig: SimpleNamespace) -> None:
+def test_a_frame_of_the_filter_is_reported_in_full(rig):
     rig.telemetry.frame_number, rig.navigator.outcome = 8, Outcome.fixed
     look(rig)
     ticks = rig.telemetry.ticks
-    assert rig.telemetry.named("frame_outcome") == [
-        {
-            "frame_number": 8, "image_ticks": ticks, "estimator": 2, "outcome": int(Outcome.fixed), "reset_trigger": 0,
-            "detections": 6, "candidate_pairs": 9, "pairs": 3, "shift_east_m": pytest.approx(np.nan, nan_ok=True),
-            "shift_north_m": pytest.approx(np.nan, nan_ok=True), "anchor_reads": 0,
-        }
-    ]  # fmt: skip
-    assert rig.telemetry.named("navigation_state") == [
+    fixed = outcome_of(rig, frame_number=8, estimator=2, outcome=Outcome.fixed, candidate_pairs=9, pairs=3)
+    assert rig.named("frame_outcome") == [fixed]
+    assert rig.named("navigation_state") == [
         {
             "frame_number": 8, "image_ticks": ticks, "estimator": 2, "outcome": int(Outcome.fixed),
-            "latitude_deg": pytest.approx(np.degrees(0.1)), "longitude_deg": pytest.approx(360.0 - np.degrees(0.2)),
+            "latitude_deg": approx(np.degrees(0.1)), "longitude_deg": approx(360.0 - np.degrees(0.2)),
             "altitude_m": 30e3, "velocity_icrf_m_s": (1.0, 2.0, 3.0), "sigma_rtn_m": (4.0, 6.0, 5.0), "nis": 7.0,
-            "matched": 3,
+            "matched": 3
         }
     ]  # fmt: skip
-    (sent,) = rig.telemetry.named("filter_estimate")
-    assert (sent["frame_number"], sent["image_ticks"]) == (8, ticks)
+    (sent,) = rig.named("filter_estimate")
+    # A frame without a fix has no degrees and no pairs.
+    assert (sent["frame_number"], sent["image_ticks"], sent["innovation_degrees"]) == (8, ticks, 0)
+    assert rig.named("identifications") == []
     assert rig.navigator.given[0][0] == ticks
     summary = rig.observer.summary()
     assert summary["estimators"]["anchored"]["outcomes"] == {"fixed": 1, "coasted": 0, "refused": 0, "no_image": 0}
     assert summary["fixes"] == {"fixed": 1, "coasted": 0, "refused": 0, "no_image": 0, "reacquired": 0}
     assert {name: summary[name] for name in ("frames_processed", "frames_bad", "detections", "events")} == {
-        "frames_processed": 1, "frames_bad": 0, "detections": 6, "events": 0,
+        "frames_processed": 1, "frames_bad": 0, "detections": 6, "events": 0
     }  # fmt: skip
 
 
-def test_new_landmarks_go_down_forty_to_a_packet(rig: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
-    def rows(landmarks: tuple[int, ...]) -> SimpleNamespace:
-        n = np.array(landmarks, dtype=np.float64)
+def test_new_landmarks_go_down_forty_to_a_packet(rig, monkeypatch):
+    def rows(landmarks):
+        n = np.array(landmarks, float)
         return SimpleNamespace(
             identity=n, latitude_rad=0.01 * n, longitude_rad=-0.01 * n, height_m=n + 1.0, diameter_m=n + 2.0,
-            sigma_m=np.stack([n + 3.0, n + 4.0, n + 5.0], axis=1), sightings=n + 6.0, passes=n + 7.0,
+            sigma_m=np.stack([n + 3.0, n + 4.0, n + 5.0], axis=1), sightings=n + 6.0, passes=n + 7.0
         )  # fmt: skip
 
     monkeypatch.setattr("payload_emulator.flight.onboard.observer.map_rows", rows)
     rig.navigator.new_landmarks = tuple(range(41))
     look(rig)
-    first, second = rig.telemetry.named("landmarks")
+    first, second = rig.named("landmarks")
     assert first["items"]["landmark_id"].tolist() == list(range(40))
     assert (second["frame_number"], second["image_ticks"]) == (0, rig.telemetry.ticks)
     assert {name: values.tolist() for name, values in second["items"].items()} == {
-        "landmark_id": [40.0], "latitude_deg": [pytest.approx(np.degrees(0.4))],
-        "longitude_deg": [pytest.approx(360.0 - np.degrees(0.4))], "height_m": [41.0], "diameter_m": [42.0],
-        "sigma_east_m": [43.0], "sigma_north_m": [44.0], "sigma_up_m": [45.0], "sightings": [46.0], "passes": [47.0],
+        "landmark_id": [40.0], "latitude_deg": [approx(np.degrees(0.4))],
+        "longitude_deg": [approx(360.0 - np.degrees(0.4))], "height_m": [41.0], "diameter_m": [42.0],
+        "sigma_east_m": [43.0], "sigma_north_m": [44.0], "sigma_up_m": [45.0], "sightings": [46.0], "passes": [47.0]
     }  # fmt: skip
 
 
-def test_detections_are_reported_within_the_range_of_their_fields_and_with_their_class(rig: SimpleNamespace) -> None:
+def test_detections_are_reported_within_the_range_of_their_fields_and_with_their_class(rig):
     """From 30 km a crater in the centre of 6, 12 and 20 km is as wide as f D / h; 4 km is no class of 5 to 30 km."""
     focal_px = 256.0 / np.tan(np.radians(60.0))
     diameter = focal_px * np.array([6e3, 12e3, 20e3, 4e3, 6e3]) / 30e3
     rig.eye.found = Detections(
         np.array([255.5, 255.5, 255.5, 255.5, -3.0]), np.array([255.5, 255.5, 255.5, 255.5, 2_000.0]), diameter,
-        np.array([0.5, 1.5, -0.5, 0.4, 0.3]), np.arange(5.0),
+        np.array([0.5, 1.5, -0.5, 0.4, 0.3]), np.arange(5.0)
     )  # fmt: skip
     look(rig, score_floor=-1.0)
-    (sent,) = rig.telemetry.named("detections")
+    (sent,) = rig.named("detections")
     assert (sent["frame_number"], sent["image_ticks"], sent["image_quality"]) == (0, rig.telemetry.ticks, 0)
     items = sent["items"]
     assert items["u_px"].tolist() == [255.5] * 4 + [0.0]
     # A field of 16 bits in 1/64 px.
     assert items["v_px"].tolist() == [255.5] * 4 + [65_535 / 64.0]
-    np.testing.assert_array_equal(items["diameter_px"], diameter)
+    assert_array_equal(items["diameter_px"], diameter)
     assert items["score"].tolist() == [0.5, 1.0, 0.0, 0.4, 0.3]
     assert items["sigma_px"].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     assert items["size_class"][:3].tolist() == [0, 1, 2] and items["size_class"][3] not in (0, 1, 2)
 
 
-def test_without_an_altitude_no_detection_has_a_class(rig: SimpleNamespace) -> None:
+def test_without_an_altitude_no_detection_has_a_class(rig):
     rig.observer._states.clear()
     look(rig)
-    (sent,) = rig.telemetry.named("detections")
-    assert set(sent["items"]["size_class"].tolist()) == {-1}
+    assert items(rig, "detections", "size_class") == [[-1] * 6]
 
 
-def test_a_damaged_table_is_told_by_its_number_and_its_hash(rig: SimpleNamespace) -> None:
+def test_a_damaged_table_is_told_by_its_number_and_its_hash(rig):
     octets = b"no table at all"
-    observer = Observer(rig.eye, FlightParameters(modes=(Mode.anchored,)), rig.telemetry, rig.clock)
+    observer = observing(rig, Mode.anchored)
     observer.load_tables(FlightTables(catalogue=octets, burns=octets, anchor_ephemeris=octets))
     assert rig.telemetry.events == [
         ("high", "table_refused", float(number), float(table_hash(octets))) for number in (1, 2, 10)
@@ -475,7 +427,7 @@ def test_a_damaged_table_is_told_by_its_number_and_its_hash(rig: SimpleNamespace
     assert observer._states == {Mode.anchored: None}
 
 
-def test_a_widened_orbit_and_a_reset_reach_the_navigator(rig: SimpleNamespace) -> None:
+def test_a_widened_orbit_and_a_reset_reach_the_navigator(rig):
     calls = rig.navigator.widened
     rig.observer.widen(500.0, 0.5)
     assert calls == [(500.0, 0.5)]

@@ -1,7 +1,7 @@
 """Search of single pictures: the Sun that nobody stated, the small craters of the enlarged picture."""
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark
 
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.vision.detections import Detections
@@ -20,7 +20,7 @@ from payload_emulator.flight.vision.preprocess import ImageQuality, prepare_imag
 from tests.payload_emulator.bowls import BOWL_CENTRES, bowl_image
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def detector():
     return OnnxDetector(load_shipped_model())
 
@@ -29,7 +29,7 @@ def off_deg(found, true):
     return abs((found - true + 180.0) % 360.0 - 180.0)
 
 
-@pytest.mark.parametrize("azimuth", [0.0, 30.0, 90.0, 130.0, 180.0, 250.0, 270.0, 330.0])
+@mark.parametrize("azimuth", [0.0, 30.0, 90.0, 130.0, 180.0, 250.0, 270.0, 330.0])
 def test_the_azimuth_of_the_sun_is_found_from_the_craters(detector, azimuth):
     sun = find_sun(detector, prepare_image(bowl_image(sun_azimuth_deg=azimuth)).gray)
     # Bowls have no ejecta and no neighbours, so a few degrees is what their walls can tell.
@@ -89,7 +89,7 @@ def test_craters_of_eight_pixels_are_found_at_two_scales(detector):
     assert found_share(two) > 0.9
     assert found_share(one) < 0.3
     near = two.detections.select(two.detections.score > 0.44)
-    assert np.median(near.diameter_px) == pytest.approx(8.0, rel=0.25)
+    assert np.median(near.diameter_px) == approx(8.0, rel=0.25)
 
 
 def test_what_one_scale_finds_two_scales_find(detector):
@@ -109,10 +109,10 @@ def test_enlarging_puts_pixel_x_at_two_x_and_a_half():
     down, right = np.mgrid[0:40, 0:60]
     expected = 2.0 * (right - 0.5) / 2.0 + 3.0 * (down - 0.5) / 2.0
     # A cubic kernel is exact on a plane, away from the edges that it repeats.
-    assert larger[4:-4, 4:-4] == pytest.approx(expected[4:-4, 4:-4], abs=1e-4)
+    assert larger[4:-4, 4:-4] == approx(expected[4:-4, 4:-4], abs=1e-4)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("shape", "count"), [((512, 512), 4), ((351, 640), 4), ((200, 300), 2), ((100, 90), 1), ((2000, 3000), 4)]
 )
 def test_evidence_comes_from_up_to_four_squares(shape, count):
@@ -127,11 +127,11 @@ def random_detections(count, seed, side):
     diameter[:: max(1, count // 7)] = np.nan
     return Detections(
         rng.uniform(0, side, count), rng.uniform(0, side, count), diameter, np.sort(rng.uniform(0, 1, count))[::-1],
-        np.ones(count),
+        np.ones(count)
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", range(5))
+@mark.parametrize("seed", range(5))
 def test_many_detections_lose_the_same_duplicates_as_few(monkeypatch, seed):
     found = random_detections(MANY_DETECTIONS - 1, seed, 300.0)
     each_with_each = drop_duplicates(found, DetectorParameters())

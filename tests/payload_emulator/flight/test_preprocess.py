@@ -1,9 +1,9 @@
 """Preparation of frames: verdicts, invariance to exposure, and quarter turns that bring the Sun to the top."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pytest import approx, mark
 
 from payload_emulator.flight.vision.preprocess import (
     ImageQuality,
@@ -15,8 +15,8 @@ from payload_emulator.flight.vision.preprocess import (
 )
 
 
-def texture(seed=0, shape=(512, 512, 3), dtype=np.uint8):
-    rng = np.random.default_rng(seed)
+def texture(shape=(512, 512, 3), dtype=np.uint8):
+    rng = np.random.default_rng(0)
     smooth = 100 + 60 * np.sin(np.arange(shape[1]) / 9.0)[None, :] * np.cos(np.arange(shape[0]) / 7.0)[:, None]
     image = smooth + rng.normal(0, 4, shape[:2])
     if len(shape) == 3:
@@ -29,8 +29,8 @@ def test_a_good_frame_comes_out_with_zero_mean_and_unit_deviation():
     prepared = prepare_image(texture())
     assert prepared.quality is ImageQuality.OK
     # Clipping at four deviations moves both by far less than a hundredth.
-    assert float(prepared.gray.mean()) == pytest.approx(0.0, abs=0.01)
-    assert float(prepared.gray.std()) == pytest.approx(1.0, abs=0.01)
+    assert float(prepared.gray.mean()) == approx(0.0, abs=0.01)
+    assert float(prepared.gray.std()) == approx(1.0, abs=0.01)
 
 
 def test_depth_and_colour_of_the_same_scene_make_no_difference():
@@ -45,12 +45,12 @@ def test_depth_and_colour_of_the_same_scene_make_no_difference():
         assert np.abs(prepare_image(other).gray - reference).max() < 0.06
 
 
-@pytest.mark.parametrize("shape", [(512, 512), (512, 512, 3), (300, 200, 4), (64, 64, 1)])
+@mark.parametrize("shape", [(512, 512), (512, 512, 3), (300, 200, 4), (64, 64, 1)])
 def test_eight_bits_go_a_quicker_way_to_the_same_values(shape):
     image = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
     colours = image if image.ndim == 2 else image[..., : 3 if shape[2] >= 3 else 1].mean(axis=2)
     # Rounding of 32-bit numbers up to 4 and the order of sums.
-    assert prepare_image(image).gray == pytest.approx(prepare_image(colours / 255.0).gray, abs=5e-6)
+    assert prepare_image(image).gray == approx(prepare_image(colours / 255.0).gray, abs=5e-6)
 
 
 def test_half_the_exposure_gives_the_same_input():
@@ -59,7 +59,7 @@ def test_half_the_exposure_gives_the_same_input():
     assert np.abs(prepare_image(bright // 2).gray - reference).max() < 1e-3
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("image", "verdict"),
     [
         (np.zeros((512, 512, 3), np.uint8), ImageQuality.DARK),
@@ -100,7 +100,7 @@ def test_after_the_turns_the_sun_is_within_45_degrees_of_the_top(azimuth):
     assert abs(u[0] - 255.5) <= 100 * np.sin(np.pi / 4) + 1e-6
 
 
-@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+@mark.parametrize("turns", [0, 1, 2, 3])
 def test_turned_coordinates_point_at_the_same_pixel_and_come_back(turns):
     image = np.arange(6 * 9).reshape(6, 9)
     turned = np.rot90(image, turns)
@@ -112,6 +112,6 @@ def test_turned_coordinates_point_at_the_same_pixel_and_come_back(turns):
             assert (back_u[0], back_v[0]) == (column, row)
 
 
-@pytest.mark.parametrize("sun", [None, np.array([np.nan, np.nan, np.nan]), np.array([0.0, 0.0, 1.0])])
+@mark.parametrize("sun", [None, np.array([np.nan, np.nan, np.nan]), np.array([0.0, 0.0, 1.0])])
 def test_without_a_sun_direction_the_frame_stays_as_it_is(sun):
     assert sun_up_turns(sun) == 0

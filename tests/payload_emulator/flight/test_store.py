@@ -10,18 +10,18 @@ from tmtc.dictionary.payload import DICTIONARY
 HEADER = 13
 
 
-def packet(count: int, seconds: float = 0.0, octets: int = 0) -> bytes:
+def packet(count, seconds=0.0, octets=0):
     """A large-data packet of 29 octets and more."""
     values = {"transaction": 1, "part": 1, "table": 6, "items": {"octet": [7] * octets}}
     ticks = round(seconds * 65_536)
     return DICTIONARY.pack("large_data_middle", values, ticks=ticks, sequence_count=count)
 
 
-def store(octets: int = 4000, **options: bool) -> PacketStore:
-    return PacketStore(np.zeros(octets, dtype=np.uint8), **options)
+def store(octets=4000, **options):
+    return PacketStore(np.zeros(octets, np.uint8), **options)
 
 
-def test_what_goes_in_comes_out_once_in_the_order_it_was_made() -> None:
+def test_what_goes_in_comes_out_once_in_the_order_it_was_made():
     kept = store()
     packets = [packet(k) for k in range(8)]
     for k, octets in enumerate(packets):
@@ -31,7 +31,7 @@ def test_what_goes_in_comes_out_once_in_the_order_it_was_made() -> None:
     assert kept.waiting == 0 and kept.take(1 << 20) == []
 
 
-def test_a_small_link_takes_the_important_first_and_nothing_overtakes_in_its_class() -> None:
+def test_a_small_link_takes_the_important_first_and_nothing_overtakes_in_its_class():
     kept = store()
     bulk, event, long_one = packet(0), packet(1), packet(2, octets=60)
     kept.append(bulk, StoreClass.bulk)
@@ -45,7 +45,7 @@ def test_a_small_link_takes_the_important_first_and_nothing_overtakes_in_its_cla
     assert store().take(0) == []
 
 
-def test_only_the_classes_asked_for_are_sent() -> None:
+def test_only_the_classes_asked_for_are_sent():
     kept = store()
     kept.append(packet(0), StoreClass.detections)
     kept.append(packet(1), StoreClass.critical)
@@ -53,7 +53,7 @@ def test_only_the_classes_asked_for_are_sent() -> None:
     assert kept.waiting == 1
 
 
-def test_a_full_class_overwrites_its_oldest_and_leaves_the_others_alone() -> None:
+def test_a_full_class_overwrites_its_oldest_and_leaves_the_others_alone():
     kept = store()
     kept.append(packet(0), StoreClass.critical)
     room = int(SHARES[StoreClass.bulk] * 4000) // (HEADER + len(packet(0)))
@@ -63,7 +63,7 @@ def test_a_full_class_overwrites_its_oldest_and_leaves_the_others_alone() -> Non
     assert kept.take(1 << 20) == [packet(0), *(packet(k) for k in range(3, room + 3))]
 
 
-def test_a_class_that_is_full_to_the_last_octet_begins_again() -> None:
+def test_a_class_that_is_full_to_the_last_octet_begins_again():
     # Four packets of 29 octets and their headers fill the class of the most important packets exactly.
     kept = store(round(4 * (29 + HEADER) / SHARES[0]))
     packets = [packet(k) for k in range(9)]
@@ -72,7 +72,7 @@ def test_a_class_that_is_full_to_the_last_octet_begins_again() -> None:
     assert kept.overwritten == 5
 
 
-def test_a_full_class_refuses_the_new_where_nothing_may_be_overwritten() -> None:
+def test_a_full_class_refuses_the_new_where_nothing_may_be_overwritten():
     kept = store(overwrite=False)
     room = int(SHARES[StoreClass.bulk] * 4000) // (HEADER + len(packet(0)))
     assert [kept.append(packet(k), StoreClass.bulk) for k in range(room + 2)] == [True] * room + [False] * 2
@@ -83,7 +83,7 @@ def test_a_full_class_refuses_the_new_where_nothing_may_be_overwritten() -> None
     assert not kept.append(packet(0, octets=5000), StoreClass.bulk)
 
 
-def test_playback_sends_again_what_was_made_between_two_times_once() -> None:
+def test_playback_sends_again_what_was_made_between_two_times_once():
     kept = store()
     packets = [packet(k, seconds=10.0 * k) for k in range(6)]
     for octets in packets:
@@ -99,7 +99,7 @@ def test_playback_sends_again_what_was_made_between_two_times_once() -> None:
     assert kept.replay(0, 1 << 47) == 4
 
 
-def test_a_reset_loses_nothing_and_sends_nothing_twice() -> None:
+def test_a_reset_loses_nothing_and_sends_nothing_twice():
     kept = store()
     for k in range(10):
         kept.append(packet(k), StoreClass.navigation)
@@ -113,7 +113,7 @@ def test_a_reset_loses_nothing_and_sends_nothing_twice() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.integers(0, 40), min_size=1, max_size=80), st.integers(0, 2**32 - 1))
-def test_recovery_believes_no_damaged_packet(lengths: list[int], seed: int) -> None:
+def test_recovery_believes_no_damaged_packet(lengths, seed):
     kept = store(3000)
     made = [packet(k, octets=octets) for k, octets in enumerate(lengths)]
     for octets in made:
@@ -136,7 +136,7 @@ def test_recovery_believes_no_damaged_packet(lengths: list[int], seed: int) -> N
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 200), st.booleans()), max_size=120))
-def test_every_packet_is_sent_or_waiting_or_counted_as_lost(steps: list[tuple[int, int, bool]]) -> None:
+def test_every_packet_is_sent_or_waiting_or_counted_as_lost(steps):
     kept, made, sent = store(6000), 0, []
     for kind, octets, take in steps:
         made += 1
@@ -150,7 +150,7 @@ def test_every_packet_is_sent_or_waiting_or_counted_as_lost(steps: list[tuple[in
     assert all(0 <= permille <= 1000 for _, permille in levels)
 
 
-def test_scrubbing_finds_and_counts_what_was_hit() -> None:
+def test_scrubbing_finds_and_counts_what_was_hit():
     kept = store()
     for k in range(5):
         kept.append(packet(k), StoreClass.critical)

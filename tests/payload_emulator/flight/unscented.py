@@ -13,19 +13,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from lunar.arrays import FloatArray, IntArray
-from lunar.camera import PinholeCamera
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.attitude_monitor import RotationEvidence
-from payload_emulator.flight.navigation.filter.dynamics import OrbitModel
-from payload_emulator.flight.navigation.filter.filter import CommonErrors, FilterState, Update
-from payload_emulator.flight.navigation.sighting import LandmarkMap, look
+from payload_emulator.flight.navigation.filter.filter import FilterState, Update
+from payload_emulator.flight.navigation.sighting import look
 
 # The best distance of the points for a Gaussian, in standard deviations.
 _H = np.sqrt(3.0)
 
 
-def _differences(centre: FloatArray, plus: FloatArray, minus: FloatArray) -> tuple[FloatArray, ...]:
+def _differences(centre, plus, minus):
     """Return mean (m,) of a function, and its first and second differences (m, n), from its values at the points."""
     count = plus.shape[0]
     mean = (_H**2 - count) / _H**2 * centre + (plus + minus).sum(axis=0) / (2.0 * _H**2)
@@ -33,7 +30,7 @@ def _differences(centre: FloatArray, plus: FloatArray, minus: FloatArray) -> tup
     return mean, (plus - minus).T / (2.0 * _H), second.T
 
 
-def predict(state: FilterState, ticks: int, model: OrbitModel, errors: CommonErrors) -> FilterState | None:
+def predict(state, ticks, model, errors):
     """Return the state carried to another time; None where the orbit model has no orientation of the Moon."""
     transition, mean, noise = kalman.transition_to(state, ticks, model, errors)
     if transition is None:
@@ -56,23 +53,13 @@ def predict(state: FilterState, ticks: int, model: OrbitModel, errors: CommonErr
     return FilterState(ticks, mean, 0.5 * (covariance + covariance.T), state.craters)
 
 
-def update(
-    prior: FilterState,
-    camera_from_icrf: FloatArray,
-    mcmf_from_icrf: FloatArray,
-    landmarks: LandmarkMap,
-    index: IntArray,
-    uv_px: FloatArray,
-    variance_px2: FloatArray,
-    camera: PinholeCamera,
-    errors: CommonErrors,
-) -> Update | None:
+def update(prior, camera_from_icrf, mcmf_from_icrf, landmarks, index, uv_px, variance_px2, camera, errors):
     """Return the state after sightings of known craters; None where the numbers allow none."""
     prior = prior.with_craters(kalman.TURN, np.full((1, 3), errors.attitude_noise_rad))
     turn = int(prior.slots(kalman.TURN)[0])
     turns = slice(turn, turn + 3)
 
-    def seen(mean: FloatArray) -> FloatArray:
+    def seen(mean):
         moved = replace(prior, mean=mean)
         pose = kalman.pose_of(moved, camera_from_icrf, mcmf_from_icrf)
         return look(landmarks, index, pose, camera, moved.shifts(index)).uv_px.reshape(-1)
@@ -100,5 +87,5 @@ def update(
         innovation.reshape(-1, 2).sum(axis=0) / np.sqrt(np.diag(summed)), uv_px - seen(mean).reshape(-1, 2),
         mean[turns], float(np.sqrt(np.max(np.linalg.eigvalsh(left)))),
         RotationEvidence(turning.T @ solved[:, 0], turning.T @ solved[:, 1:], errors.attitude_noise_rad),
-        kalman._contradiction(spread, innovation),
+        kalman._contradiction(spread, innovation)
     )  # fmt: skip

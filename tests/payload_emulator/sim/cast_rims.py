@@ -3,15 +3,12 @@
 import math
 
 import numpy as np
-import numpy.typing as npt
 
-from lunar.arrays import FloatArray, IntArray
-from lunar.camera import PinholeCamera, project_mcmf
+from lunar.camera import project_mcmf
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from payload_emulator.sim.render.labels import label_frame
 from payload_emulator.sim.render.raymarch import cast
-from payload_emulator.sim.terrain.tiles import Terrain
 
 AZIMUTH = np.arange(48) * (math.pi / 24.0)
 ROUNDS = 8
@@ -22,9 +19,7 @@ LEAST_FOUND = 0.9
 """Share of a rim that must be in sight: the mean over a part of it would say little of the centre."""
 
 
-def rim_errors(
-    terrain: Terrain, camera: PinholeCamera, position_mcmf_m: npt.ArrayLike, camera_from_mcmf: npt.ArrayLike
-) -> tuple[IntArray, FloatArray]:
+def rim_errors(terrain, camera, position_mcmf_m, camera_from_mcmf):
     """Labels of a picture against rims found by casting rays onto the terrain.
 
     Of the craters that are whole in the picture with their rims in sight: the rows (n,) in the terrain's catalogue, and
@@ -33,8 +28,8 @@ def rim_errors(
     The rim at an azimuth is the ground that lies a radius from the centre there, whatever its height.  A ray is turned
     until it meets just that ground; where nearer ground is in the way it never does.
     """
-    position = np.asarray(position_mcmf_m, dtype=np.float64)
-    rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
+    position = np.asarray(position_mcmf_m, float)
+    rotation = np.asarray(camera_from_mcmf, float)
     labels = label_frame(terrain, camera, position, rotation, 5_000.0)
     craters = terrain.measured(labels.index)
     chosen = np.flatnonzero(labels.inside & (labels.visible_fraction == 1.0) & np.isfinite(craters.rim_height_m))
@@ -65,7 +60,7 @@ def rim_errors(
     return index[good], middle[good] + mean - place[good]
 
 
-def _circle(latitude: FloatArray, longitude: FloatArray, diameter_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _circle(latitude, longitude, diameter_m):
     """Places (n, 48) on the rims."""
     radius = (0.5 * diameter_m / MOON_RADIUS_M)[:, None]
     sine0, cosine0 = np.sin(latitude)[:, None], np.cos(latitude)[:, None]

@@ -1,11 +1,9 @@
 """Terrains of known shape."""
 
-from collections.abc import Callable
-
 import numpy as np
-import pytest
+from pytest import fixture
 
-from lunar.catalogue import CraterCatalogue, make_catalogue
+from lunar.catalogue import make_catalogue
 from payload_emulator.sim.terrain.procedural import ProceduralTerrain
 from payload_emulator.sim.terrain.tiles import Terrain
 
@@ -13,7 +11,7 @@ from payload_emulator.sim.terrain.tiles import Terrain
 class FormulaTerrain(Terrain):
     """Heights from a formula of latitude and longitude, one albedo."""
 
-    def __init__(self, formula: Callable[..., np.ndarray], catalogue: CraterCatalogue | None = None) -> None:
+    def __init__(self, formula, catalogue=None):
         empty = make_catalogue(np.empty(0), np.empty(0), np.empty(0), source="none")
         super().__init__("formula", ("formula",), catalogue or empty, 256, 64)
         self._formula = formula
@@ -29,12 +27,12 @@ class FormulaTerrain(Terrain):
         return np.ones(np.broadcast_shapes(np.shape(latitude_rad), np.shape(longitude_rad)), dtype=bool)
 
 
-@pytest.fixture
-def formula_terrain() -> type[FormulaTerrain]:
+@fixture
+def formula_terrain():
     return FormulaTerrain
 
 
-@pytest.fixture(scope="session")
-def procedural() -> ProceduralTerrain:
+@fixture(scope="session")
+def procedural():
     """A world shared by tests that only read it."""
     return ProceduralTerrain(3)

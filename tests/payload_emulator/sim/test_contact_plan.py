@@ -3,7 +3,8 @@
 import itertools
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from pytest import approx, fixture, mark, raises
 
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.third_bodies import earth_position_icrf_m
@@ -19,15 +20,15 @@ STOP = START + 24 * 3600 * NS
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 
 
-@pytest.fixture(scope="module")
-def ephemeris() -> Ephemeris:
+@fixture(scope="module")
+def ephemeris():
     """A circular polar orbit of 1768 km about the Moon, 111 minutes, whose plane holds the line to the Earth."""
     times = np.arange(START - 600 * NS, STOP + 600 * NS, 30 * NS)
     angle = 2.0 * np.pi * (times - START) / (6_672.0 * NS)
     toward = np.asarray(earth_position_icrf_m(float(tdb_s_from_utc_ns(START))))
-    first = toward / np.linalg.norm(toward)
+    first = toward / norm(toward)
     second = np.array([0.0, 0.0, 1.0]) - first[2] * first
-    second /= np.linalg.norm(second)
+    second /= norm(second)
     rate = 2.0 * np.pi / 6_672.0
     position = 1.768e6 * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
     velocity = 1.768e6 * rate * (-np.sin(angle)[:, None] * first + np.cos(angle)[:, None] * second)
@@ -35,7 +36,7 @@ def ephemeris() -> Ephemeris:
     return Ephemeris((segment,))
 
 
-def elevation_deg(ephemeris: Ephemeris, utc_ns: int, station: str) -> float:
+def elevation_deg(ephemeris, utc_ns, station):
     """Elevation by pymap3d, with the sidereal time of Meeus 1998, equation 12.4, and no precession."""
     position, _ = ephemeris.at(np.array([utc_ns]))
     from_earth = position[0] - np.asarray(earth_position_icrf_m(float(tdb_s_from_utc_ns(utc_ns))))
@@ -50,14 +51,12 @@ def elevation_deg(ephemeris: Ephemeris, utc_ns: int, station: str) -> float:
     return float(elevation)
 
 
-@pytest.mark.parametrize("station", ["goldstone", "canberra"])
-def test_contacts_are_where_pymap3d_sees_the_spacecraft_above_the_lowest_elevation(
-    ephemeris: Ephemeris, station: str
-) -> None:
+@mark.parametrize("station", ["goldstone", "canberra"])
+def test_contacts_are_where_pymap3d_sees_the_spacecraft_above_the_lowest_elevation(ephemeris, station):
     section = LinkSection(stations=(station,))
     plan = plan_contacts(ephemeris, section, START, STOP)
     assert plan
-    inside = np.zeros(1440, dtype=bool)
+    inside = np.zeros(1440, bool)
     minutes = START + np.arange(1440) * 60 * NS
     for one in plan:
         inside |= (minutes >= one.start_utc_ns) & (minutes < one.stop_utc_ns)
@@ -69,15 +68,15 @@ def test_contacts_are_where_pymap3d_sees_the_spacecraft_above_the_lowest_elevati
         elif elevation > 10.5:
             position = ephemeris.at(np.array([utc_ns]))[0][0]
             earth = np.asarray(earth_position_icrf_m(float(tdb_s_from_utc_ns(utc_ns))))
-            toward = earth / np.linalg.norm(earth)
+            toward = earth / norm(earth)
             across = position - (position @ toward) * toward
             # Behind the Moon: beyond its centre as seen from the Earth, and within its disc.
-            assert position @ toward < 0.0 and np.linalg.norm(across) < 1.75e6
+            assert position @ toward < 0.0 and norm(across) < 1.75e6
             hidden += 1
     assert hidden > 60
 
 
-def test_one_station_at_a_time_has_the_contact_and_hands_over(ephemeris: Ephemeris) -> None:
+def test_one_station_at_a_time_has_the_contact_and_hands_over(ephemeris):
     plan = plan_contacts(ephemeris, LinkSection(stations=("goldstone", "madrid", "canberra")), START, STOP)
     assert {one.station for one in plan} == {"goldstone", "madrid", "canberra"}
     for earlier, later in itertools.pairwise(plan):
@@ -88,18 +87,18 @@ def test_one_station_at_a_time_has_the_contact_and_hands_over(ephemeris: Ephemer
     )
 
 
-def test_the_light_time_of_a_contact_is_the_range_over_the_speed_of_light(ephemeris: Ephemeris) -> None:
+def test_the_light_time_of_a_contact_is_the_range_over_the_speed_of_light(ephemeris):
     contact = plan_contacts(ephemeris, LinkSection(stations=("madrid",)), START, STOP)[0]
     utc_ns = contact.start_utc_ns + 137 * NS
     position = ephemeris.at(np.array([utc_ns]))[0][0]
     earth = np.asarray(earth_position_icrf_m(float(tdb_s_from_utc_ns(utc_ns))))
-    centre_s = np.linalg.norm(position - earth) / SPEED_OF_LIGHT_M_S
+    centre_s = norm(position - earth) / SPEED_OF_LIGHT_M_S
     # At elevation e the station is R sin(e) nearer than the centre of the Earth: here near 10 deg.
     expected = centre_s - 6.371e6 * np.sin(np.radians(elevation_deg(ephemeris, utc_ns, "madrid"))) / SPEED_OF_LIGHT_M_S
-    assert contact.light_s(utc_ns) == pytest.approx(expected, abs=3e-4)
+    assert contact.light_s(utc_ns) == approx(expected, abs=3e-4)
 
 
-def test_outages_cut_contacts(ephemeris: Ephemeris) -> None:
+def test_outages_cut_contacts(ephemeris):
     whole = plan_contacts(ephemeris, LinkSection(stations=("madrid",)), START, STOP)[0]
     assert whole.stop_utc_ns - whole.start_utc_ns > 1800 * NS
     cut = LinkSection(stations=("madrid",), outages=("madrid 2029-08-07T00:00:00Z 2029-08-07T23:59:59Z",))
@@ -108,13 +107,13 @@ def test_outages_cut_contacts(ephemeris: Ephemeris) -> None:
     assert plan_contacts(ephemeris, other, START, STOP)[0].stop_utc_ns == whole.stop_utc_ns
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "text",
     [
         "madrid", "paris 2029-08-07T00:00:00Z 2029-08-08T00:00:00Z", "madrid tomorrow 2029-08-08T00:00:00Z",
-        "madrid 2029-08-08T00:00:00Z 2029-08-07T00:00:00Z",
-    ],
+        "madrid 2029-08-08T00:00:00Z 2029-08-07T00:00:00Z"
+    ]
 )  # fmt: skip
-def test_an_outage_in_another_form_is_refused(text: str) -> None:
-    with pytest.raises(ScenarioError, match=r"link\.outages: expected"):
+def test_an_outage_in_another_form_is_refused(text):
+    with raises(ScenarioError, match=r"link\.outages: expected"):
         parse_outage(text)

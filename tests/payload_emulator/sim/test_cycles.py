@@ -8,9 +8,12 @@ import math
 import sys
 import types
 from dataclasses import replace
+from math import asin, atan2, cos, exp, isnan, pi, radians, sin
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, fixture, mark, raises
 
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.constants import MOON_RADIUS_M
@@ -24,8 +27,8 @@ from payload_emulator.sim.render.photometry import Photometry
 from tests.payload_emulator.sim.exr_file import exr_octets
 
 CAMERA = PinholeCamera()
-PLACE = math.radians(-20.0), math.radians(359.8)
-SUN = sun_direction_mcmf(math.radians(10.0), math.radians(30.0), *PLACE)
+PLACE = radians(-20.0), radians(359.8)
+SUN = sun_direction_mcmf(radians(10.0), radians(30.0), *PLACE)
 
 
 def pose(altitude_m=25e3):
@@ -33,20 +36,20 @@ def pose(altitude_m=25e3):
     return position, nadir_camera_from_mcmf(position)
 
 
-@pytest.fixture
+@fixture
 def hilly(formula_terrain):
     return formula_terrain(lambda latitude, longitude: 1500.0 * np.sin(90.0 * latitude) * np.cos(80.0 * longitude))
 
 
-@pytest.fixture
+@fixture
 def scene(hilly):
     return describe_scene(hilly, CAMERA, *pose(), SUN)
 
 
-def test_the_cap_is_a_grid_of_65_on_the_sphere_through_the_middle_of_the_relief(hilly, scene):
+def test_the_cap_is_a_grid_of_65_on_the_sphere_through_the_middle_of_the_relief(scene):
     assert scene.vertices_km.shape == (GRID, GRID, 3) == (65, 65, 3)
     centre = np.array([0.0, 0.0, -MOON_RADIUS_M / 1e3])
-    radius = np.linalg.norm(scene.vertices_km - centre, axis=-1)
+    radius = norm(scene.vertices_km - centre, axis=-1)
     # One sphere, to the rounding of double precision over the Moon's radius in km.
     assert np.ptp(radius) < 1e-8
     low_m = 1e3 * (radius.mean() - MOON_RADIUS_M / 1e3 - scene.displacement_range_km / 2.0)
@@ -56,26 +59,25 @@ def test_the_cap_is_a_grid_of_65_on_the_sphere_through_the_middle_of_the_relief(
 def test_displaced_vertices_lie_on_the_terrain(hilly, scene):
     """Height of the texture at a vertex, put on the vertex's radius, is the terrain's height there."""
     position, _ = pose()
-    east = np.array([-math.sin(PLACE[1]), math.cos(PLACE[1]), 0.0])
-    up = position / np.linalg.norm(position)
+    east = np.array([-sin(PLACE[1]), cos(PLACE[1]), 0.0])
+    up = position / norm(position)
     north = np.cross(up, east)
     for row, column in ((0, 0), (20, 40), (64, 3)):
         local = scene.vertices_km[row, column] * 1e3
         point = up * MOON_RADIUS_M + local[0] * east + local[1] * north + local[2] * up
-        latitude = math.asin(point[2] / np.linalg.norm(point))
-        longitude = math.atan2(point[1], point[0])
+        latitude = asin(point[2] / norm(point))
+        longitude = atan2(point[1], point[0])
         u, v = scene.uv[row, column]
         high, wide = scene.displacement.shape
         share = scene.displacement[min(int(v * high), high - 1), min(int(u * wide), wide - 1)]
-        height = np.linalg.norm(point) - MOON_RADIUS_M + 1e3 * (share - 0.5) * scene.displacement_range_km
+        height = norm(point) - MOON_RADIUS_M + 1e3 * (share - 0.5) * scene.displacement_range_km
         # The texture is read at the nearest of its pixels, on slopes of up to 0.08.
-        assert height == pytest.approx(float(hilly.height_m(latitude, longitude)), abs=20.0)
+        assert height == approx(float(hilly.height_m(latitude, longitude)), abs=20.0)
 
 
 def test_the_displacement_texture_spans_0_to_1(scene):
-    assert scene.displacement.dtype == np.float32
-    assert scene.displacement.min() == pytest.approx(0.0, abs=1e-6)
-    assert scene.displacement.max() == pytest.approx(1.0, abs=1e-6)
+    texture = scene.displacement
+    assert texture.dtype == np.float32 and (texture.min(), texture.max()) == approx((0.0, 1.0), abs=1e-6)
 
 
 def test_the_cap_holds_the_footprint_and_reaches_toward_a_low_sun(scene):
@@ -89,13 +91,22 @@ def test_the_cap_holds_the_footprint_and_reaches_toward_a_low_sun(scene):
 
 def test_camera_and_sun_are_in_blenders_axes(scene):
     camera = scene.camera_to_world
-    np.testing.assert_allclose(camera[:3, 3], [0.0, 0.0, 25.0], atol=1e-9)
+    assert_allclose(camera[:3, 3], [0.0, 0.0, 25.0], atol=1e-9)
     # Nadir, image up to the north: x east, y north, looking along -z.
-    np.testing.assert_allclose(camera[:3, :3], np.eye(3), atol=1e-12)
-    toward = [math.cos(0.1745329) * 0.5, math.cos(0.1745329) * math.cos(math.pi / 6.0), math.sin(0.1745329)]
-    np.testing.assert_allclose(scene.sun_to_world[:3, 2], toward, atol=1e-6)
-    np.testing.assert_allclose(scene.sun_to_world[:3, :3] @ scene.sun_to_world[:3, :3].T, np.eye(3), atol=1e-12)
-    assert math.degrees(scene.sun_angle_rad) == pytest.approx(0.533, abs=0.001)
+    assert_allclose(camera[:3, :3], np.eye(3), atol=1e-12)
+    toward = [cos(0.1745329) * 0.5, cos(0.1745329) * cos(pi / 6.0), sin(0.1745329)]
+    assert_allclose(scene.sun_to_world[:3, 2], toward, atol=1e-6)
+    assert_allclose(scene.sun_to_world[:3, :3] @ scene.sun_to_world[:3, :3].T, np.eye(3), atol=1e-12)
+    assert math.degrees(scene.sun_angle_rad) == approx(0.533, abs=0.001)
+
+
+def texel(scene, east_km=0.0, north_km=0.0):
+    """Row and column of the colour of a place of the cap."""
+    x, y = scene.vertices_km[32, :, 0], scene.vertices_km[:, 32, 1]
+    return tuple(
+        int(np.interp(at, places, np.linspace(0.0, 1.0, GRID)) * size)
+        for at, places, size in zip((north_km, east_km), (y, x), scene.albedo.shape, strict=True)
+    )
 
 
 def test_the_base_colour_of_a_matt_surface_is_its_albedo_and_of_other_laws_bent_to_them(formula_terrain):
@@ -108,16 +119,13 @@ def test_the_base_colour_of_a_matt_surface_is_its_albedo_and_of_other_laws_bent_
     assert np.ptp(matt.albedo) == 0.0
     assert matt.specular_ior > 1.0 and lambert.specular_ior == lunar.specular_ior == 1.0
     # The texel below the camera: the phase angle of nadir is the Sun's distance from the zenith, 80 degrees.
-    x, y = matt.vertices_km[32, :, 0], matt.vertices_km[:, 32, 1]
-    high, wide = matt.albedo.shape
-    row = int(np.interp(0.0, y, np.linspace(0.0, 1.0, GRID)) * high)
-    column = int(np.interp(0.0, x, np.linspace(0.0, 1.0, GRID)) * wide)
+    row, column = texel(matt)
     below = lambert.albedo[row, column] / matt.albedo[row, column]
-    assert below == pytest.approx(math.exp(-0.7 * math.radians(80.0)), rel=0.01)
+    assert below == approx(exp(-0.7 * radians(80.0)), rel=0.01)
     degrees = 80.0
     weight = 1.0 - 0.019 * degrees + 0.242e-3 * degrees**2 - 1.46e-6 * degrees**3
-    mcewen = 2.0 * weight / (1.0 + math.sin(math.radians(10.0))) + 1.0 - weight
-    assert lunar.albedo[row, column] / lambert.albedo[row, column] == pytest.approx(mcewen, rel=0.01)
+    mcewen = 2.0 * weight / (1.0 + sin(radians(10.0))) + 1.0 - weight
+    assert lunar.albedo[row, column] / lambert.albedo[row, column] == approx(mcewen, rel=0.01)
     # Ground 40 km off, away from the Sun and toward it.
     step = round(40.0 / 50.0 * row / 2)
     assert lunar.albedo[row - step, column] > 1.3 * lunar.albedo[row + step, column]
@@ -125,7 +133,7 @@ def test_the_base_colour_of_a_matt_surface_is_its_albedo_and_of_other_laws_bent_
 
 def test_slopes_bend_the_base_colour_as_the_fast_renderer_shades_them(hilly):
     """Base colour times the cosine of incidence is the fast renderer's radiance, where nothing is shaded."""
-    sun = sun_direction_mcmf(math.radians(40.0), math.radians(30.0), *PLACE)
+    sun = sun_direction_mcmf(radians(40.0), radians(30.0), *PLACE)
     position, rotation = pose()
     law = Photometry("lunar-lambert")
     scene = describe_scene(hilly, CAMERA, position, rotation, sun, law)
@@ -137,33 +145,30 @@ def test_slopes_bend_the_base_colour_as_the_fast_renderer_shades_them(hilly):
         reach = 25e3
         for _ in range(20):
             point = position + reach * ray
-            latitude, longitude = math.asin(point[2] / np.linalg.norm(point)), math.atan2(point[1], point[0])
-            above = np.linalg.norm(point) - MOON_RADIUS_M - float(hilly.height_m(latitude, longitude))
-            reach += above / -float(ray @ point / np.linalg.norm(point))
+            latitude, longitude = asin(point[2] / norm(point)), atan2(point[1], point[0])
+            above = norm(point) - MOON_RADIUS_M - float(hilly.height_m(latitude, longitude))
+            reach += above / -float(ray @ point / norm(point))
         east, north = enu_from_mcmf(*PLACE)[:2] @ (point - position) / 1e3
-        x, y = scene.vertices_km[32, :, 0], scene.vertices_km[:, 32, 1]
-        high, wide = scene.albedo.shape
-        row = int(np.interp(north, y, np.linspace(0.0, 1.0, GRID)) * high)
-        column = int(np.interp(east, x, np.linspace(0.0, 1.0, GRID)) * wide)
-        assert scene.albedo[row, column] / matt.albedo[row, column] == pytest.approx(ratio[v, u], rel=0.03)
+        place = texel(scene, east, north)
+        assert scene.albedo[place] / matt.albedo[place] == approx(ratio[v, u], rel=0.03)
 
 
 def test_a_tilted_camera_tilts(hilly):
     position, rotation = pose()
     tilted = describe_scene(hilly, CAMERA, position, axis_rotation(1, 0.1) @ rotation, SUN)
     # The boresight, -z of Blender's camera, leans to the north.
-    np.testing.assert_allclose(-tilted.camera_to_world[:3, 2], [0.0, math.sin(0.1), -math.cos(0.1)], atol=1e-12)
+    assert_allclose(-tilted.camera_to_world[:3, 2], [0.0, sin(0.1), -cos(0.1)], atol=1e-12)
 
 
 def test_a_distorting_lens_is_refused(hilly):
-    with pytest.raises(RendererError, match="without distortion"):
+    with raises(RendererError, match="without distortion"):
         describe_scene(hilly, BrownCamera(k1=-0.01), *pose(), SUN)
 
 
 def test_a_camera_in_the_ground_and_a_view_along_the_horizon_are_refused(hilly):
-    with pytest.raises(TerrainError, match="above the ground"):
+    with raises(TerrainError, match="above the ground"):
         describe_scene(hilly, CAMERA, *pose(40.0), SUN)
-    with pytest.raises(TerrainError):
+    with raises(TerrainError):
         position, rotation = pose(400e3)
         describe_scene(hilly, CAMERA, position, axis_rotation(1, 0.9) @ rotation, SUN)
 
@@ -191,7 +196,7 @@ class Thing:
         return iter(())
 
 
-@pytest.fixture
+@fixture
 def blender(monkeypatch):
     fake = Thing()
     fake.app.version_string = "0.0"
@@ -222,7 +227,7 @@ def test_blender_is_told_what_the_paper_says(tmp_path, scene, blender):
     assert surface.inputs["Roughness"].default_value == 1.0
     assert 1.0 < surface.inputs["IOR"].default_value < 1.1
     lamp = blender.data.lights.new("Sun", "SUN")
-    assert lamp.energy == pytest.approx(math.pi)
+    assert lamp.energy == approx(pi)
     vertices, _, faces = blender.data.meshes.new("cap").from_pydata.calls[0]
     assert len(vertices) == 65 * 65 and len(faces) == 64 * 64
     corners = np.array(vertices)[np.array(faces)]
@@ -247,9 +252,9 @@ def planes_of(scene, cosine, direct, range_km):
 
 def test_passes_become_radiance_share_of_the_sun_and_range(scene):
     picture = cycles.rendering_of_passes(planes_of(scene, 0.4, 0.2, 24.0), scene)
-    assert picture.radiance[1, 1] == pytest.approx(0.03) and picture.radiance[0, 0] == 0.0
-    assert picture.lit[1, 1] == pytest.approx(0.5, abs=1e-6) and picture.lit[0, 0] == 0.0
-    assert picture.range_m[1, 1] == pytest.approx(24e3, rel=1e-6) and math.isnan(picture.range_m[0, 0])
+    assert picture.radiance[1, 1] == approx(0.03) and picture.radiance[0, 0] == 0.0
+    assert picture.lit[1, 1] == approx(0.5, abs=1e-6) and picture.lit[0, 0] == 0.0
+    assert picture.range_m[1, 1] == approx(24e3, rel=1e-6) and isnan(picture.range_m[0, 0])
 
 
 def test_ground_turned_from_the_sun_is_in_shadow(scene):
@@ -259,7 +264,7 @@ def test_ground_turned_from_the_sun_is_in_shadow(scene):
 def test_a_missing_pass_is_named(scene):
     planes = planes_of(scene, 0.4, 0.2, 24.0)
     del planes["V.Position.Y"]
-    with pytest.raises(RendererError, match=r"expected a pass Position\.Y, found V\.Combined"):
+    with raises(RendererError, match=r"expected a pass Position\.Y, found V\.Combined"):
         cycles.rendering_of_passes(planes, scene)
 
 
@@ -286,25 +291,25 @@ def test_what_another_process_renders_comes_back(tmp_path, hilly, scene):
     )
     picture = cycles.render_scene(scene, CyclesSettings(samples=7), python)
     assert picture.filmic_png == b"png" and picture.blender == "5.0" and picture.render_cpu_s == 3.0
-    assert picture.rendering.lit[2, 2] == pytest.approx(1.0)
+    assert picture.rendering.lit[2, 2] == approx(1.0)
     rendering = cycles.render(hilly, CAMERA, *pose(), SUN, settings=CyclesSettings(samples=7), python=python)
-    np.testing.assert_array_equal(rendering.range_m, picture.rendering.range_m)
+    assert_array_equal(rendering.range_m, picture.rendering.range_m)
 
 
 def test_without_blender_one_line_says_how_to_get_it(tmp_path, monkeypatch, scene):
     (tmp_path / "bpy.py").write_text("raise ImportError('no Blender here')\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with pytest.raises(RendererError, match=r"expected Blender as a module \(bpy\).*LINNA_BLENDER_PYTHON") as caught:
+    with raises(RendererError, match=r"expected Blender as a module \(bpy\).*LINNA_BLENDER_PYTHON") as caught:
         cycles.render_scene(scene, CyclesSettings())
     assert "\n" not in str(caught.value)
 
 
 def test_an_interpreter_that_is_not_there_is_named(scene):
-    with pytest.raises(RendererError, match="at /nowhere/python, found none"):
+    with raises(RendererError, match="at /nowhere/python, found none"):
         cycles.render_scene(scene, CyclesSettings(), "/nowhere/python")
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("body", "message"),
     [
         ("sys.exit('out of memory')", "status 1: out of memory"),
@@ -312,5 +317,5 @@ def test_an_interpreter_that_is_not_there_is_named(scene):
     ],
 )
 def test_a_blender_that_fails_is_quoted(tmp_path, scene, body, message):
-    with pytest.raises(RendererError, match=message):
+    with raises(RendererError, match=message):
         cycles.render_scene(scene, CyclesSettings(), interpreter(tmp_path, body))

@@ -1,9 +1,9 @@
 """The EXR reader against files written after the format's description, field by field."""
 
-import math
+from math import cos, degrees, isnan, pi, radians, sin, sqrt
 
 import numpy as np
-import pytest
+from pytest import approx, mark, raises
 
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import make_catalogue
@@ -19,36 +19,38 @@ from tests.payload_emulator.sim.exr_file import exr_octets
 CAMERA = PinholeCamera()
 
 
+def pose(latitude_rad=0.0, longitude_rad=0.0):
+    """Place of a camera at 20 km, and its attitude."""
+    position = mcmf_from_spherical(latitude_rad, longitude_rad, 20e3)
+    return position, nadir_camera_from_mcmf(position)
+
+
 def crater_at(latitude_deg, longitude_deg, diameter_m, rim_height_m):
     return make_catalogue(
         np.radians([latitude_deg]), np.radians([longitude_deg]), [diameter_m], source="t",
-        rim_height_m=[rim_height_m],
+        rim_height_m=[rim_height_m]
     )  # fmt: skip
 
 
 def test_a_crater_below_the_camera_is_in_the_middle_and_as_wide_as_the_lens_makes_it():
-    position = mcmf_from_spherical(0.2, 1.0, 20e3)
-    catalogue = crater_at(math.degrees(0.2), math.degrees(1.0), 5000.0, 2000.0)
-    labels = project_craters(catalogue, CAMERA, position, nadir_camera_from_mcmf(position))
-    assert labels.u_px[0] == pytest.approx(255.5, abs=1e-6)
-    assert labels.v_px[0] == pytest.approx(255.5, abs=1e-6)
+    catalogue = crater_at(degrees(0.2), degrees(1.0), 5000.0, 2000.0)
+    labels = project_craters(catalogue, CAMERA, *pose(0.2, 1.0))
+    assert (labels.u_px[0], labels.v_px[0]) == approx((255.5, 255.5), abs=1e-6)
     # 18 km above the rim, which is wider at 2 km than on the map sphere; its plane lies 1.8 m below its middle.
     width = 5000.0 * (1.0 + 2000.0 / MOON_RADIUS_M)
-    assert labels.diameter_px[0] == pytest.approx(CAMERA.focal_px * width / 18_001.8, rel=1e-5)
+    assert labels.diameter_px[0] == approx(CAMERA.focal_px * width / 18_001.8, rel=1e-5)
     assert labels.size_class[0] == 0 and labels.inside[0] and labels.visible_fraction[0] == 1.0
 
 
 def test_rim_height_moves_a_crater_at_the_edge():
-    position = mcmf_from_spherical(0.0, 1.0, 20e3)
-    rotation = nadir_camera_from_mcmf(position)
-    longitude = math.degrees(1.0 + 30e3 / MOON_RADIUS_M)
+    longitude = degrees(1.0 + 30e3 / MOON_RADIUS_M)
     low, high = (
-        project_craters(crater_at(0.0, longitude, 5000.0, height), CAMERA, position, rotation).u_px[0]
+        project_craters(crater_at(0.0, longitude, 5000.0, height), CAMERA, *pose(0.0, 1.0)).u_px[0]
         for height in (0.0, 1000.0)
     )
     # x = 30 km, and the ground falls 0.26 km over that: u = f x / z, 11.4 px for this kilometre.
     expected = CAMERA.focal_px * 30.0 * (1.0 / 19.26 - 1.0 / 20.26)
-    assert high - low == pytest.approx(expected, rel=0.02)
+    assert high - low == approx(expected, rel=0.02)
 
 
 def test_labels_lie_on_rims_found_by_casting_rays(formula_terrain):
@@ -56,10 +58,10 @@ def test_labels_lie_on_rims_found_by_casting_rays(formula_terrain):
     terrain = formula_terrain(lambda latitude, longitude: height + 0.0 * latitude)
     errors = []
     for tilt, yaw, east in ((0.0, 0.0, 0.25), (3.0, 1.0, 0.35), (-2.0, 2.0, -0.3)):
-        position = mcmf_from_spherical(0.3, 2.0, 20e3)
-        rotation = axis_rotation(3, yaw) @ axis_rotation(1, math.radians(tilt)) @ nadir_camera_from_mcmf(position)
-        latitude, longitude = 0.3 + math.radians(0.2), 2.0 + math.radians(east)
-        catalogue = crater_at(math.degrees(latitude), math.degrees(longitude), 9000.0, height)
+        position, nadir = pose(0.3, 2.0)
+        rotation = axis_rotation(3, yaw) @ axis_rotation(1, radians(tilt)) @ nadir
+        latitude, longitude = 0.3 + radians(0.2), 2.0 + radians(east)
+        catalogue = crater_at(degrees(latitude), degrees(longitude), 9000.0, height)
         label = project_craters(catalogue, CAMERA, position, rotation)
         toward = sun_direction_mcmf(0.6, 0.0, 0.3, 2.0)
         picture = raymarch.render(terrain, CAMERA, position, rotation, toward)
@@ -71,62 +73,51 @@ def test_labels_lie_on_rims_found_by_casting_rays(formula_terrain):
         # The disc within the rim: its centroid and area are those of the label's ellipse.
         share = np.clip((4500.0 - arc) / 135.0 + 0.5, 0.0, 1.0)
         mean_u, mean_v = (share * u).sum() / share.sum(), (share * v).sum() / share.sum()
-        ellipse = math.pi / 4.0 * label.major_px[0] * label.minor_px[0]
-        assert share.sum() == pytest.approx(ellipse, rel=0.02)
+        ellipse = pi / 4.0 * label.major_px[0] * label.minor_px[0]
+        assert share.sum() == approx(ellipse, rel=0.02)
         rim_middle = project_rim_middle(catalogue, position, rotation)
         errors += [mean_u - rim_middle[0], mean_v - rim_middle[1]]
     # Demanded: 0.1 px rms.
-    assert math.sqrt(np.mean(np.square(errors))) <= 0.1
+    assert sqrt(np.mean(np.square(errors))) <= 0.1
 
 
 def project_rim_middle(catalogue, position, rotation):
     """Centroid of the projected disc, by many small craters' centres spread evenly over it."""
     radius = 0.5 * catalogue.diameter_m[0] / MOON_RADIUS_M
     n = np.arange(4000) + 0.5
-    arc, azimuth = radius * np.sqrt(n / 4000.0), n * math.pi * (3.0 - math.sqrt(5.0))
+    arc, azimuth = radius * np.sqrt(n / 4000.0), n * pi * (3.0 - sqrt(5.0))
     latitude, longitude = catalogue.latitude_rad[0], catalogue.longitude_rad[0]
-    sine = math.sin(latitude) * np.cos(arc) + math.cos(latitude) * np.sin(arc) * np.cos(azimuth)
-    east = np.arctan2(np.sin(azimuth) * np.sin(arc) * math.cos(latitude), np.cos(arc) - math.sin(latitude) * sine)
+    sine = sin(latitude) * np.cos(arc) + cos(latitude) * np.sin(arc) * np.cos(azimuth)
+    east = np.arctan2(np.sin(azimuth) * np.sin(arc) * cos(latitude), np.cos(arc) - sin(latitude) * sine)
     spread = make_catalogue(
         np.arcsin(sine), longitude + east, np.full(n.size, 3000.0), source="t",
-        rim_height_m=np.full(n.size, catalogue.rim_height_m[0]),
+        rim_height_m=np.full(n.size, catalogue.rim_height_m[0])
     )  # fmt: skip
     labels = project_craters(spread, CAMERA, position, rotation)
-    weight = 1.0 / area_of_pixels(labels)
+    # Ground per pixel, up to a factor: equal craters cover as many pixels as the picture gives them.
+    weight = labels.major_px * labels.minor_px
     return np.average(labels.u_px, weights=weight), np.average(labels.v_px, weights=weight)
 
 
-def area_of_pixels(labels):
-    """Ground per pixel, up to a factor: equal craters of the ground cover as many pixels as the picture gives them."""
-    return 1.0 / (labels.major_px * labels.minor_px)
-
-
 def test_what_is_cut_by_the_edge_says_so():
-    position = mcmf_from_spherical(0.0, 0.0, 20e3)
-    rotation = nadir_camera_from_mcmf(position)
-    longitude = math.degrees(34.2e3 / MOON_RADIUS_M)
-    labels = project_craters(crater_at(0.0, longitude, 9000.0, 0.0), CAMERA, position, rotation)
+    longitude = degrees(34.2e3 / MOON_RADIUS_M)
+    labels = project_craters(crater_at(0.0, longitude, 9000.0, 0.0), CAMERA, *pose())
     assert 0.3 < labels.visible_fraction[0] < 0.7
 
 
 def test_no_crater_in_sight_gives_empty_labels():
-    position = mcmf_from_spherical(0.0, 0.0, 20e3)
-    rotation = nadir_camera_from_mcmf(position)
-    assert len(project_craters(crater_at(40.0, 100.0, 9000.0, 0.0), CAMERA, position, rotation)) == 0
+    assert len(project_craters(crater_at(40.0, 100.0, 9000.0, 0.0), CAMERA, *pose())) == 0
     empty = make_catalogue([], [], [], source="t")
-    assert len(project_craters(empty, CAMERA, position, rotation)) == 0
+    assert len(project_craters(empty, CAMERA, *pose())) == 0
 
 
 def test_a_crater_behind_the_limb_is_no_label():
-    position = mcmf_from_spherical(0.0, 0.0, 20e3)
     far = crater_at(0.0, 179.0, 9000.0, 0.0)
-    assert len(project_craters(far, CAMERA, position, nadir_camera_from_mcmf(position))) == 0
+    assert len(project_craters(far, CAMERA, *pose())) == 0
 
 
 def test_frame_labels_point_into_the_terrains_catalogue(procedural):
-    latitude, longitude = math.radians(10.0), math.radians(20.0)
-    position = mcmf_from_spherical(latitude, longitude, 20e3)
-    labels = label_frame(procedural, CAMERA, position, nadir_camera_from_mcmf(position))
+    labels = label_frame(procedural, CAMERA, *pose(radians(10.0), radians(20.0)))
     assert len(labels) > 10
     np.testing.assert_array_equal(procedural.catalogue.diameter_m[labels.index], labels.diameter_m)
     measured = procedural.measured(labels.index)
@@ -134,40 +125,35 @@ def test_frame_labels_point_into_the_terrains_catalogue(procedural):
 
 
 def test_ground_in_front_of_a_rim_takes_it_out_of_sight():
-    position = mcmf_from_spherical(0.0, 0.0, 20e3)
-    rotation = nadir_camera_from_mcmf(position)
     catalogue = crater_at(0.0, 0.0, 8000.0, 0.0)
     clear = np.full((512, 512), 20e3, np.float32)
     half = clear.copy()
     half[:, :256] = 12e3
     seen = [
-        project_craters(catalogue, CAMERA, position, rotation, range_m=ranges).sight_fraction[0]
+        project_craters(catalogue, CAMERA, *pose(), range_m=ranges).sight_fraction[0]
         for ranges in (clear, half, np.full_like(clear, np.nan))
     ]
     # 24 rim points; one or two lie on the line between the halves.
-    assert seen[0] == 1.0 and seen[1] == pytest.approx(0.5, abs=0.09) and seen[2] == 0.0
-    assert math.isnan(project_craters(catalogue, CAMERA, position, rotation).sight_fraction[0])
+    assert seen[0] == 1.0 and seen[1] == approx(0.5, abs=0.09) and seen[2] == 0.0
+    assert isnan(project_craters(catalogue, CAMERA, *pose()).sight_fraction[0])
 
 
 def test_the_ellipse_of_a_crater_at_the_edge_is_that_of_perspective():
     """Seen at 45 degrees a circle is foreshortened to cos 45 across and stretched by the flat image plane."""
-    position = mcmf_from_spherical(0.0, 0.0, 20e3)
-    longitude = math.degrees(20e3 / MOON_RADIUS_M)
-    label = project_craters(crater_at(0.0, longitude, 3000.0, 0.0), CAMERA, position, nadir_camera_from_mcmf(position))
+    longitude = degrees(20e3 / MOON_RADIUS_M)
+    label = project_craters(crater_at(0.0, longitude, 3000.0, 0.0), CAMERA, *pose())
     # On a plane below a nadir pinhole circles stay circles: f D / z, z = 20 km + the fall of 115 m.
     flat = CAMERA.focal_px * 3.0 / 20.115
-    assert label.minor_px[0] == pytest.approx(flat, rel=0.02)
+    assert label.minor_px[0] == approx(flat, rel=0.02)
     # The ground leans away by 0.66 degrees there: 1.2 % at 45 degrees.
-    assert label.major_px[0] == pytest.approx(flat, rel=0.02)
+    assert label.major_px[0] == approx(flat, rel=0.02)
 
 
-PLANES = {
-    "A.Position.X": np.arange(12, dtype=np.float32).reshape(3, 4),
-    "A.Combined.R": np.arange(12, dtype=np.float32).reshape(3, 4) * -0.5,
-}
+RAMP = np.arange(12, dtype=np.float32).reshape(3, 4)
+PLANES = {"A.Position.X": RAMP, "A.Combined.R": RAMP * -0.5}
 
 
-@pytest.mark.parametrize("options", [{}, {"first_line": 7}, {"upward": True}, {"version": 2 | 0x400}])
+@mark.parametrize("options", [{}, {"first_line": 7}, {"upward": True}, {"version": 2 | 0x400}])
 def test_planes_come_back_by_name(tmp_path, options):
     file = tmp_path / "a.exr"
     file.write_bytes(exr_octets(PLANES, **options))
@@ -177,18 +163,18 @@ def test_planes_come_back_by_name(tmp_path, options):
         np.testing.assert_array_equal(read[name], plane)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("octets", "message"),
     [
         (exr_octets(PLANES)[:-5], "expected 3 lines"), (exr_octets(PLANES, kind=1), "32-bit floats"),
         (exr_octets(PLANES, compression=3), "uncompressed EXR, found method 3"),
         (exr_octets(PLANES, version=2 | 0x1000), "single-part EXR"),
         (b"\x89PNG\r\n\x1a\n" + bytes(40), "single-part EXR"), (exr_octets(PLANES)[:30], "damaged"),
-        (b"", "damaged"),
-    ],
+        (b"", "damaged")
+    ]
 )  # fmt: skip
 def test_anything_else_is_refused_with_what_is_wrong(tmp_path, octets, message):
     file = tmp_path / "b.exr"
     file.write_bytes(octets)
-    with pytest.raises(RendererError, match=message):
+    with raises(RendererError, match=message):
         read_exr(file)

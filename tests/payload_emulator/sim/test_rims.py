@@ -1,9 +1,9 @@
 """Labels against rims found by casting rays: the demand is 0.1 px rms on the ray march's geometry."""
 
-import math
+from math import hypot, radians, sqrt
 
 import numpy as np
-import pytest
+from pytest import approx, mark
 
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import make_catalogue
@@ -22,9 +22,9 @@ CAMERA = PinholeCamera()
 def errors_px(terrain, latitude_deg, longitude_deg, altitudes_m, camera=CAMERA):
     offsets = []
     for number, altitude_m in enumerate(altitudes_m):
-        place = math.radians(latitude_deg), math.radians(longitude_deg)
+        place = radians(latitude_deg), radians(longitude_deg)
         position = mcmf_from_spherical(*place, altitude_m)
-        rotation = pointed_camera_from_mcmf(position, math.radians(2.0 * number), 0.7 * number)
+        rotation = pointed_camera_from_mcmf(position, radians(2.0 * number), 0.7 * number)
         index, found = rim_errors(terrain, camera, position, rotation)
         offsets += [*found[terrain.catalogue.diameter_m[index] <= 30e3].ravel()]
     return np.array(offsets)
@@ -49,30 +49,30 @@ def test_a_label_on_a_slope_sits_on_the_slopes_rim(formula_terrain):
     terrain = formula_terrain(lambda lat, lon: slope * (lat - latitude) + 0.0 * lon, catalogue)
     position = mcmf_from_spherical(0.2, 1.0, 25e3)
     index, offsets = rim_errors(terrain, CAMERA, position, nadir_camera_from_mcmf(position))
-    assert index.tolist() == [0] and math.hypot(*offsets[0]) < 0.01
+    assert index.tolist() == [0] and hypot(*offsets[0]) < 0.01
     level = project_craters(terrain.measured(np.array([0])), CAMERA, position, nadir_camera_from_mcmf(position))
     tilted = label_frame(terrain, CAMERA, position, nadir_camera_from_mcmf(position))
-    assert math.hypot(level.u_px[0] - tilted.u_px[0], level.v_px[0] - tilted.v_px[0]) > 0.1
+    assert hypot(level.u_px[0] - tilted.u_px[0], level.v_px[0] - tilted.v_px[0]) > 0.1
     tilt = terrain.rim_tilts_m(np.array([0]))[0]
     # 300 m over one radius to the north, by the definition of the slope.
-    assert tilt[0] == pytest.approx(300.0, rel=0.01) and abs(tilt[1]) < 1.0
+    assert tilt[0] == approx(300.0, rel=0.01) and abs(tilt[1]) < 1.0
 
 
 def test_labels_sit_on_procedural_rims(procedural):
     offsets = errors_px(procedural, 10.0, 20.0, (22e3, 45e3))
     assert offsets.size >= 40
-    assert math.sqrt(np.mean(offsets**2)) <= 0.1
+    assert sqrt(np.mean(offsets**2)) <= 0.1
 
 
 def test_labels_sit_on_rims_seen_through_a_distorting_lens(procedural):
     offsets = errors_px(procedural, 10.0, 20.0, (40e3,), BrownCamera(k1=-0.015, p1=5e-4))
     assert offsets.size >= 20
-    assert math.sqrt(np.mean(offsets**2)) <= 0.1
+    assert sqrt(np.mean(offsets**2)) <= 0.1
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_labels_sit_on_real_rims(data_path):
     terrain = open_terrain("raster", find_data(data_path), 3)
     offsets = errors_px(terrain, -30.0, 294.0, (45e3,))
     assert offsets.size >= 20
-    assert math.sqrt(np.mean(offsets**2)) <= 0.1
+    assert sqrt(np.mean(offsets**2)) <= 0.1

@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import mark, raises
 
 from lunar.catalogue import make_catalogue
 from lunar.constants import MOON_RADIUS_M
@@ -17,6 +18,7 @@ from tests.lazy import Lazy
 
 rasterio, warp = Lazy("rasterio"), Lazy("rasterio.warp")
 
+MOON = "+proj=longlat +R=1737400 +no_defs"
 NONE = make_catalogue([], [], [], source="none")
 AS_IT_IS = {"sharpen": False, "registration_north_m": 0.0, "smoothing_pixels": 0.0}
 METRES_PER_DEGREE = math.radians(MOON_RADIUS_M)
@@ -27,14 +29,17 @@ def plane(latitude, longitude):
     return 100.0 * latitude + 50.0 * longitude - 2000.0
 
 
-def grid(west, north, rows, columns, ppd):
+def grid(west=8.0, north=22.0, rows=160, columns=160, ppd=16):
     latitude = north - (np.arange(rows) + 0.5) / ppd
     longitude = west + (np.arange(columns) + 0.5) / ppd
     return latitude[:, None], longitude[None, :]
 
 
-def write_pds3(stem, west, north, rows, columns, ppd, values, kind, unit, offset, middle_deg):
+def write_pds3(
+    stem, values, kind="PC_REAL", unit="KILOMETER", offset=0, middle_deg=180.0, west=8.0, north=22.0, ppd=16
+):
     """An image with a detached label, keywords as in the labels of LOLA's and LROC's archives."""
+    rows, columns = values.shape
     bits = values.dtype.itemsize * 8
     label = f"""PDS_VERSION_ID            = "PDS3"
 RECORD_TYPE               = FIXED_LENGTH
@@ -86,45 +91,36 @@ def write_tiff(path, transform, values, crs, **profile):
 
 def heights_agree(terrain, latitude, longitude, within_m):
     found = terrain.height_m(np.radians(latitude), np.radians(longitude))
-    np.testing.assert_allclose(found, plane(latitude, longitude), atol=within_m)
+    assert_allclose(found, plane(latitude, longitude), atol=within_m)
 
 
-def test_sldem2015_kilometres_with_a_detached_label(tmp_path):
-    ppd = 16
-    values = (plane(*grid(8.0, 22.0, 160, 160, ppd)) / 1000.0).astype("<f4")
-    # The labels of SLDEM2015 give OFFSET = 1737.4 and kilometres, and count longitudes from 180 degrees.
-    path = write_pds3(tmp_path / "SLDEM", 8.0, 22.0, 160, 160, ppd, values, "PC_REAL", "KILOMETER", 1737.4, 180.0)
-    terrain = RasterTerrain([path], NONE, **AS_IT_IS)
+@mark.parametrize(
+    ("unit", "offset", "middle_deg"), [("KILOMETER", 1737.4, 180.0), ("KILOMETER", 0, 0.0), ("METER", 1_737_400, 0.0)]
+)
+def test_the_unit_of_a_label_holds_without_and_with_an_offset(tmp_path, unit, offset, middle_deg):
+    """The labels of SLDEM2015 give OFFSET = 1737.4 and kilometres, and count longitudes from 180 degrees."""
+    values = (plane(*grid()) / (1000.0 if unit == "KILOMETER" else 1.0)).astype("<f4")
+    path = write_pds3(tmp_path / "A", values, "PC_REAL", unit, offset, middle_deg)
     # Single precision of 2 km in kilometres is 0.1 mm; pixels from projected metres are good to a millimetre.
-    heights_agree(terrain, np.array([14.3, 17.1]), np.array([12.2, 15.9]), 0.05)
-
-
-@pytest.mark.parametrize(("unit", "offset"), [("KILOMETER", 0), ("METER", 1_737_400)])
-def test_the_unit_of_a_label_holds_without_and_with_an_offset(tmp_path, unit, offset):
-    ppd = 16
-    scale = 1000.0 if unit == "KILOMETER" else 1.0
-    values = (plane(*grid(8.0, 22.0, 160, 160, ppd)) / scale).astype("<f4")
-    path = write_pds3(tmp_path / "A", 8.0, 22.0, 160, 160, ppd, values, "PC_REAL", unit, offset, 0.0)
-    heights_agree(RasterTerrain([path], NONE, **AS_IT_IS), np.array([14.3]), np.array([12.2]), 0.05)
+    heights_agree(RasterTerrain([path], NONE, **AS_IT_IS), np.array([14.3, 17.1]), np.array([12.2, 15.9]), 0.05)
 
 
 def test_gld100_metres_of_16_bits_with_holes(tmp_path):
-    ppd = 16
-    latitude, longitude = grid(8.0, 22.0, 160, 160, ppd)
+    latitude, longitude = grid()
     values = np.rint(plane(latitude, longitude)).astype("<i2")
     values[(np.abs(latitude - 15.0) < 0.2) & (np.abs(longitude - 13.0) < 0.2)] = -32768
-    fine = write_pds3(tmp_path / "GLD", 8.0, 22.0, 160, 160, ppd, values, "LSB_INTEGER", "METER", 1_737_400, 180.0)
+    fine = write_pds3(tmp_path / "GLD", values, "LSB_INTEGER", "METER", 1_737_400)
     coarse = write_tiff(
         tmp_path / "c.tif",
         rasterio.Affine(0.25, 0, 0.0, 0, -0.25, 30.0),
         plane(*grid(0.0, 30.0, 120, 120, 4)).astype("float32"),
-        "+proj=longlat +R=1737400 +no_defs",
+        MOON,
     )
     terrain = RasterTerrain([fine], NONE, coarse_paths=[coarse], **AS_IT_IS)
     # Whole metres, and the hole from pixels of 7.6 km.
     heights_agree(terrain, np.array([17.1, 15.0]), np.array([15.9, 13.0]), 3.0)
     alone = RasterTerrain([fine], NONE, **AS_IT_IS)
-    with pytest.raises(TerrainError, match=r"expected heights at latitude .*, found none"):
+    with raises(TerrainError, match=r"expected heights at latitude .*, found none"):
         alone.height_m(math.radians(15.0), math.radians(13.0))
 
 
@@ -143,26 +139,18 @@ def test_projected_metres_join_across_tiles_whose_pixels_do_not_divide_the_degre
     for first_column in (turn - 6, -6, 2 * turn - 6):
         window = layer.read(first_row, first_column, rows, 12)
         # The file's own rows, the same in the columns on both sides of the meridian: nothing lost between the tiles.
-        np.testing.assert_array_equal(window, np.repeat(values[:, :1], 12, axis=1))
+        assert_array_equal(window, np.repeat(values[:, :1], 12, axis=1))
     places = np.radians([-0.05, 0.05]), np.radians([359.9999, 90.1])
     assert layer.holds(*places).tolist() == [True, False]
 
 
 def test_jpeg_2000_of_16_bits(tmp_path):
-    values = np.rint(plane(*grid(8.0, 22.0, 256, 256, 16))).astype("int16")
+    values = np.rint(plane(*grid())).astype("int16")
     path = write_tiff(
         tmp_path / "a.jp2", rasterio.Affine(1 / 16, 0, 8.0, 0, -1 / 16, 22.0), values,
-        "+proj=longlat +R=1737400 +no_defs", driver="JP2OpenJPEG", quality="100", reversible="YES",
+        MOON, driver="JP2OpenJPEG", quality="100", reversible="YES"
     )  # fmt: skip
     heights_agree(RasterTerrain([path], NONE, **AS_IT_IS), np.array([14.3]), np.array([12.2]), 1.0)
-
-
-def test_a_raster_of_another_body_is_refused(tmp_path):
-    path = write_tiff(
-        tmp_path / "a.tif", rasterio.Affine(0.1, 0, 0, 0, -0.1, 10), np.zeros((9, 9), "int16"), "EPSG:4326"
-    )
-    with pytest.raises(TerrainError, match=r"a\.tif: expected a raster of the Moon .* found a body of 6378"):
-        open_layers([path])
 
 
 def test_reflectance_tiles_are_averaged_over_the_grid_and_relative_to_their_median(tmp_path):
@@ -171,25 +159,22 @@ def test_reflectance_tiles_are_averaged_over_the_grid_and_relative_to_their_medi
     checks = 0.02 * np.where((np.arange(640)[:, None] + np.arange(640)[None, :]) % 2, 1.0, -1.0)
     values = (np.where(longitude < 305.0, 0.03, 0.06) + checks + 0.0 * latitude).astype("<f4")
     values[:32] = -3.4028227e38  # missing in the archive's floating-point images
-    path = write_pds3(tmp_path / "WAC", 300.0, 10.0, 640, 640, ppd, values, "PC_REAL", "N/A", 0, 180.0)
+    path = write_pds3(tmp_path / "WAC", values, unit="N/A", west=300.0, north=10.0, ppd=ppd)
     albedo = open_albedo([path])
     places = np.radians(np.linspace(8.0, 2.0, 13)), np.radians(np.linspace(301.0, 309.0, 17))
     found = albedo.relative(*places)
     median = float(np.median(values[32:][values[32:] > 0]))
-    np.testing.assert_allclose(found[:, :7], 0.03 / median, rtol=0.03)
-    np.testing.assert_allclose(found[:, -7:], 0.06 / median, rtol=0.03)
+    assert_allclose(found[:, :7], 0.03 / median, rtol=0.03)
+    assert_allclose(found[:, -7:], 0.06 / median, rtol=0.03)
     beyond = albedo.relative(np.radians([9.9, 9.8]), np.radians([304.0, 306.0]))
-    np.testing.assert_array_equal(beyond, 1.0)
+    assert_array_equal(beyond, 1.0)
 
 
 def test_a_folder_with_sldem2015_uses_it_before_gld100(tmp_path):
     (tmp_path / "dem").mkdir()
     (tmp_path / "craters").mkdir()
-    values = (plane(*grid(8.0, 22.0, 160, 160, 16)) / 1000.0).astype("<f4")
-    write_pds3(
-        tmp_path / "dem/SLDEM2015_256_0N_60N_000_120_FLOAT",
-        *(8.0, 22.0, 160, 160, 16, values, "PC_REAL", "KILOMETER", 1737.4, 180.0),
-    )
+    values = (plane(*grid()) / 1000.0).astype("<f4")
+    write_pds3(tmp_path / "dem/SLDEM2015_256_0N_60N_000_120_FLOAT", values, offset=1737.4)
     (tmp_path / "craters/lunar_crater_database_robbins_2018.csv").write_text(
         "CRATER_ID,LAT_CIRC_IMG,LON_CIRC_IMG,LAT_ELLI_IMG,LON_ELLI_IMG,DIAM_CIRC_IMG,DIAM_CIRC_SD_IMG,ARC_IMG\n"
         "00-1-000000,15.0,12.0,15.0,12.0,6.5,0.1,0.9\n00-1-000001,16.0,360.0,16.0,360.0,9.5,0.1,0.9\n"
@@ -203,7 +188,6 @@ def test_a_folder_with_sldem2015_uses_it_before_gld100(tmp_path):
     assert len(terrain.small_craters(np.radians([14.0, 15.0]), np.radians([12.0, 13.0]))) == 0
 
 
-MOON = "+proj=longlat +R=1737400 +no_defs"
 PLACES = np.array([75.3, 77.9, 79.2]), np.array([18.2, 21.7, 15.4])
 
 
@@ -212,9 +196,13 @@ def ground(latitude, longitude):
     return 1500.0 * np.cos(np.radians(6.0 * latitude)) + 800.0 * np.sin(np.radians(5.0 * longitude))
 
 
+def radius(height):
+    return height + 1_737_400.0
+
+
 def write_form(
     path, crs=MOON, west=10.0, wide=1 / 16, high=1 / 16, scale=1.0, convert=lambda h: h, dtype="float32",
-    unit=None, scales=None, count=1, nodata=None, edge=None, mask=False,
+    unit=None, scales=None, count=1, nodata=None, edge=None, mask=False
 ):  # fmt: skip
     """The ground from 72 to 82 N and 10 to 25 E as a raster in longitude and latitude times ``scale``, in one form."""
     rows, columns = round(10 / abs(high)), round(15 / wide)
@@ -240,10 +228,10 @@ def write_form(
     return path
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "form",
     [
-        {}, {"convert": lambda h: h + 1_737_400.0, "dtype": "float64"}, {"convert": lambda h: h + 1_737_400.0},
+        {}, {"convert": radius, "dtype": "float64"}, {"convert": radius},
         {"convert": lambda h: h / 1e3 + 1_737.4, "dtype": "float64"}, {"convert": lambda h: h / 1e3, "unit": "km"},
         {"convert": lambda h: h / 1e3 + 1_737.4, "unit": "km"}, {"convert": lambda h: h / 0.3048, "unit": "ft"},
         {"convert": lambda h: h * 3937 / 1200, "unit": "US survey foot"},
@@ -257,17 +245,17 @@ def write_form(
         {"crs": "+proj=eqc +R=1737400 +units=km", "scale": METRES_PER_DEGREE / 1e3},
         {"crs": "+proj=eqc +R=1737400 +lon_0=180", "scale": METRES_PER_DEGREE, "west": -170.0},
         {"crs": "+proj=eqc +R=1737400", "scale": METRES_PER_DEGREE, "west": -350.0}, {"high": 1 / 32},
-        {"high": -1 / 16},
-    ],
+        {"high": -1 / 16}
+    ]
 )  # fmt: skip
 def test_a_form_of_the_same_ground_gives_the_same_heights(tmp_path, form):
     terrain = RasterTerrain([write_form(tmp_path / "a.tif", **form)], NONE, **AS_IT_IS)
     found = terrain.height_m(*np.radians(PLACES))
     # Half a metre of whole and half metres, and what one pixel of 1.9 km bends.
-    np.testing.assert_allclose(found, ground(*PLACES), atol=1.0)
+    assert_allclose(found, ground(*PLACES), atol=1.0)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("form", "message"),
     [
         ({"convert": lambda h: h / 1e3}, r"differ by 3 m .* found 0\.\d+ .* no unit stated\): kilometres"),
@@ -279,7 +267,7 @@ def test_a_form_of_the_same_ground_gives_the_same_heights(tmp_path, form):
         ({"convert": lambda h: h / 20 + 120, "dtype": "uint8"}, "found 1 of uint8: a picture"),
         ({"crs": "+proj=longlat +a=1738100 +b=1736000 +no_defs"}, "found an ellipsoid of 1738.1 by 1736.0 km"),
         ({"crs": "+proj=longlat +R=1738000 +no_defs"}, r"a sphere of 1737\.4 km, found one of 1738\.000 km"),
-        ({"crs": "EPSG:4326"}, "found a body of 6378"),
+        ({"crs": "EPSG:4326"}, r"a\.tif: expected a raster of the Moon .* found a body of 6378"),
     ],
 )
 def test_a_raster_with_another_unit_zero_or_body_is_refused_with_both_numbers(tmp_path, form, message):
@@ -287,13 +275,13 @@ def test_a_raster_with_another_unit_zero_or_body_is_refused_with_both_numbers(tm
     if message is None:
         # What a file states of its unit counts: this ground is flat, at 1,737 m.
         found = RasterTerrain([path], NONE, **AS_IT_IS).height_m(*np.radians(PLACES))
-        np.testing.assert_allclose(found, 1737.4, atol=2.0)
+        assert_allclose(found, 1737.4, atol=2.0)
         return
-    with pytest.raises(TerrainError, match=message):
+    with raises(TerrainError, match=message):
         RasterTerrain([path], NONE, **AS_IT_IS).height_m(*np.radians(PLACES))
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("convert", "message"),
     [
         (lambda h: h, None),
@@ -311,19 +299,19 @@ def test_heights_of_the_form_of_the_coarse_relief_have_its_scale_and_zero(tmp_pa
         layer.read(128, 160, 160, 240)
         assert "1.00 times the relief of coarse.tif" in layer.readings[0]
         return
-    with pytest.raises(TerrainError, match=message):
+    with raises(TerrainError, match=message):
         layer.read(128, 160, 160, 240)
 
 
 def test_a_layer_says_how_the_values_of_its_files_are_taken(tmp_path):
-    (layer,) = open_layers([write_form(tmp_path / "a.tif", convert=lambda h: h + 1_737_400.0, edge=-32768.0)])
+    (layer,) = open_layers([write_form(tmp_path / "a.tif", convert=radius, edge=-32768.0)])
     layer.read(128, 160, 160, 240)
     (words,) = layer.readings
     assert "a.tif: unit not stated, scale 1, zero 0, no data None; values of 17" in words
     assert "as radii in metres; -32768 (not stated) as no data" in words
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "crs",
     [
         "+proj=stere +lat_0=90 +R=1737400",
@@ -342,7 +330,7 @@ def test_any_projection_that_gdal_knows_is_read_at_its_places(tmp_path, crs):
     values = ground(north, east).reshape(size, size).astype("float32")
     terrain = RasterTerrain([write_tiff(tmp_path / "a.tif", transform, values, crs)], NONE, **AS_IT_IS)
     # Two resamplings of pixels of 1 km.
-    np.testing.assert_allclose(terrain.height_m(*np.radians(PLACES)), ground(*PLACES), atol=1.0)
+    assert_allclose(terrain.height_m(*np.radians(PLACES)), ground(*PLACES), atol=1.0)
     assert terrain.covers(*np.radians([(77.5, 10.0), (17.0, 200.0)])).tolist() == [True, False]
 
 
@@ -354,7 +342,7 @@ def test_a_polar_map_holds_the_pole_and_nothing_beyond_its_edge(tmp_path):
     assert layer.holds(latitude, longitude).tolist() == [True, True, True, False]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("line", "message"),
     [
         ('POSITIVE_LONGITUDE_DIRECTION = "WEST"', "expected longitudes to the east, found"),
@@ -363,10 +351,10 @@ def test_a_polar_map_holds_the_pole_and_nothing_beyond_its_edge(tmp_path):
 )
 def test_a_label_whose_axes_gdal_does_not_read_is_refused(tmp_path, line, message):
     values = np.zeros((32, 32), "<i2")
-    path = write_pds3(tmp_path / "A", 8.0, 22.0, 32, 32, 16, values, "LSB_INTEGER", "METER", 0, 0.0)
+    path = write_pds3(tmp_path / "A", values, "LSB_INTEGER", "METER", 0, 0.0)
     label = path.read_text().replace('POSITIVE_LONGITUDE_DIRECTION = "EAST"', line)
     path.write_text(label)
-    with pytest.raises(TerrainError, match=message):
+    with raises(TerrainError, match=message):
         open_layers([path])
 
 
@@ -383,4 +371,4 @@ def test_a_map_is_read_alike_on_both_sides_of_the_meridian_where_pixels_do_not_d
     for turn in (0.0, 360.0):
         found = terrain.height_m(np.zeros(7), np.radians(longitude + turn))
         # 0.07 m of 2000 m in a degree are a metre on the ground.
-        np.testing.assert_allclose(found, 2000.0 * longitude, atol=0.07)
+        assert_allclose(found, 2000.0 * longitude, atol=0.07)

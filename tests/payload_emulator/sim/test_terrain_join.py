@@ -1,10 +1,10 @@
 """Where the raster ends and seeded relief begins: spectrum, craters, edges, threads."""
 
-import math
 import threading
+from math import log10, pi, radians, sin, sqrt
 
 import numpy as np
-import pytest
+from pytest import approx, mark, raises
 
 from lunar.catalogue import load_catalogue, make_catalogue
 from lunar.constants import MOON_RADIUS_M
@@ -13,9 +13,9 @@ from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.procedural import ProceduralTerrain
 
-PIXEL_M = math.radians(MOON_RADIUS_M) / 256.0
+PIXEL_M = radians(MOON_RADIUS_M) / 256.0
 BANDS_KM = (
-    (14, 20), (10, 14), (7, 10), (5, 7), (3.5, 5), (2.5, 3.5), (1.8, 2.5), (1.3, 1.8), (0.9, 1.3), (0.65, 0.9),
+    (14, 20), (10, 14), (7, 10), (5, 7), (3.5, 5), (2.5, 3.5), (1.8, 2.5), (1.3, 1.8), (0.9, 1.3), (0.65, 0.9)
 )  # fmt: skip
 """Wavelengths on both sides of the join at 1.8 km; down to 3.5 km the raster itself can be believed."""
 
@@ -40,11 +40,11 @@ def spectrum(terrain, latitude_deg, longitude_deg):
     return np.array([np.log10(power[(wave_km >= a) & (wave_km < b)].mean()) for a, b in BANDS_KM])
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_the_power_spectrum_goes_on_across_the_join(data_path):
     """The Moon's uplands have a Hurst exponent of 0.95 (Rosenburg et al. 2011): a spectrum falling as k^-2.9."""
     data = find_data(data_path)
-    middle = np.log10([math.sqrt(a * b) for a, b in BANDS_KM])
+    middle = np.log10([sqrt(a * b) for a, b in BANDS_KM])
     beside = {}
     for sharpen in (False, True):
         terrain = open_terrain("raster", data, 1, sharpen=sharpen)
@@ -53,13 +53,13 @@ def test_the_power_spectrum_goes_on_across_the_join(data_path):
         beside[sharpen] = pooled - np.polyval(line, middle)
     # The raster alone falls to a tenth and less of what its longer waves promise; sharpened it stays within a factor 2.
     assert beside[False][8:].max() < -1.0
-    assert np.abs(beside[True]).max() < math.log10(2.0)
+    assert np.abs(beside[True]).max() < log10(2.0)
     below = np.polyfit(middle[ADDED], pooled[ADDED], 1)
-    assert line[0] == pytest.approx(2.9, abs=0.6)
-    assert below[0] == pytest.approx(2.9, abs=0.8)
+    assert line[0] == approx(2.9, abs=0.6)
+    assert below[0] == approx(2.9, abs=0.8)
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_the_density_of_craters_goes_on_across_the_join(data_path):
     """LU1319381 holds 1,319,381 craters from 1 km up over the Moon's 37.93 million km2 (Wang, Wu et al. 2022)."""
     data = find_data(data_path)
@@ -72,36 +72,36 @@ def test_the_density_of_craters_goes_on_across_the_join(data_path):
         inside = (
             (small.latitude_rad >= window[0][0])
             & (small.latitude_rad < window[0][1])
-            & (small.longitude_rad % (2 * math.pi) >= window[1][0])
-            & (small.longitude_rad % (2 * math.pi) < window[1][1])
+            & (small.longitude_rad % (2 * pi) >= window[1][0])
+            & (small.longitude_rad % (2 * pi) < window[1][1])
         )
         diameter_m = 2.0 * small.radius_rad[inside] * MOON_RADIUS_M
         counts += [np.count_nonzero(diameter_m >= 1000.0), np.count_nonzero(diameter_m >= 500.0)]
-        area_km2 += (MOON_RADIUS_M / 1e3) ** 2 * math.radians(24.0) * (math.sin(window[0][1]) - math.sin(window[0][0]))
+        area_km2 += (MOON_RADIUS_M / 1e3) ** 2 * radians(24.0) * (sin(window[0][1]) - sin(window[0][0]))
     of_2km = np.count_nonzero(catalogue.diameter_m >= 2000.0) / (37.93e6 * 53 / 72)
     density = counts / area_km2 + of_2km
     # Density follows the catalogue by place; this strip has more upland than the Moon's mean: within a third.
-    assert density[0] == pytest.approx(1_319_381 / 37.93e6, rel=0.35)
+    assert density[0] == approx(1_319_381 / 37.93e6, rel=0.35)
     # From 1 km to 500 m the number grows as D^-2.2, as it does from 2 km to 1 km: 4.6 times.
-    assert density[1] / density[0] == pytest.approx(2.0**2.2, rel=0.1)
+    assert density[1] / density[0] == approx(2.0**2.2, rel=0.1)
 
 
-@pytest.mark.real_data
+@mark.real_data
 def test_ground_joins_at_tile_edges_and_ends_clearly_beyond_the_tiles(data_path):
     terrain = open_terrain("raster", find_data(data_path), 1)
     # Along 285 and 0 degrees east tiles meet; across, heights run on as they do beside.
     latitude = np.radians(np.linspace(21.0, 24.0, 300))
     for edge_deg in (285.0, 360.0 + 15.0):
-        step = math.radians(0.25 / 256.0)
-        edge = math.radians(edge_deg)
+        step = radians(0.25 / 256.0)
+        edge = radians(edge_deg)
         across = terrain.height_m(latitude, edge + step) - terrain.height_m(latitude, edge - step)
         beside = terrain.height_m(latitude, edge + 9 * step) - terrain.height_m(latitude, edge + 7 * step)
         assert np.sqrt(np.mean(across**2)) < 1.5 * np.sqrt(np.mean(beside**2)) + 0.2
     assert terrain.covers(np.radians([59.9, 60.1, -59.9]), np.radians(290.0)).tolist() == [True, False, True]
     # The coarse model fills in beyond 60 degrees; nobody has the pole.
-    assert np.isfinite(terrain.height_m(math.radians(60.3), math.radians(290.0)))
-    with pytest.raises(TerrainError, match="expected latitudes within 84 deg, found -88"):
-        terrain.height_m(math.radians(-88.0), 0.0)
+    assert np.isfinite(terrain.height_m(radians(60.3), radians(290.0)))
+    with raises(TerrainError, match="expected latitudes within 84 deg, found -88"):
+        terrain.height_m(radians(-88.0), 0.0)
 
 
 def test_a_terrain_belongs_to_one_thread():
@@ -110,7 +110,7 @@ def test_a_terrain_belongs_to_one_thread():
     here = terrain.height_m(0.1, 0.2)
     caught = []
 
-    def ask() -> None:
+    def ask():
         try:
             terrain.height_m(0.1, 0.2)
         except TerrainError as error:

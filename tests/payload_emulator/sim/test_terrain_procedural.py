@@ -1,7 +1,8 @@
 import math
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, mark
 
 from lunar.catalogue import class_counts, make_catalogue
 from payload_emulator.sim.terrain.procedural import ProceduralTerrain
@@ -14,8 +15,8 @@ def test_the_classes_hold_the_papers_counts(procedural):
     assert np.count_nonzero(procedural.catalogue.diameter_m > 30e3) == 3_674
 
 
-@pytest.mark.parametrize("level", [0, 2])
-@pytest.mark.parametrize(("row", "column"), [(16, 7), (18, -1)])
+@mark.parametrize("level", [0, 2])
+@mark.parametrize(("row", "column"), [(16, 7), (18, -1)])
 def test_neighbouring_tiles_repeat_each_others_edges(procedural, level, row, column):
     columns = 2 * procedural._level_rows[level]
     ppd = procedural._level_rows[level] * 512 / 180.0
@@ -23,8 +24,8 @@ def test_neighbouring_tiles_repeat_each_others_edges(procedural, level, row, col
     east = procedural.make_heights(*tile_angles(row, (column + 1) % columns, ppd))
     south = procedural.make_heights(*tile_angles(row + 1, column % columns, ppd))
     # Craters are stamped in single precision from each tile's own corner: 1 cm.
-    np.testing.assert_allclose(west[:, 512:515], east[:, 0:3], atol=1e-2, rtol=0.0)
-    np.testing.assert_allclose(west[512:515, :], south[0:3, :], atol=1e-2, rtol=0.0)
+    assert_allclose(west[:, 512:515], east[:, 0:3], atol=1e-2, rtol=0.0)
+    assert_allclose(west[512:515, :], south[0:3, :], atol=1e-2, rtol=0.0)
 
 
 def test_heights_depend_neither_on_what_was_asked_before_nor_on_the_tiles_that_are_kept(monkeypatch):
@@ -35,8 +36,8 @@ def test_heights_depend_neither_on_what_was_asked_before_nor_on_the_tiles_that_a
     forward = [first.height_m(a, b) for a, b in zip(latitude, longitude, strict=True)]
     monkeypatch.setattr("payload_emulator.sim.terrain.craters.KEPT_CELLS", 3)
     backward = [second.height_m(a, b) for a, b in zip(latitude[::-1], longitude[::-1], strict=True)]
-    np.testing.assert_array_equal(forward, backward[::-1])
-    np.testing.assert_array_equal(first.height_m(latitude, longitude), second.height_m(latitude, longitude))
+    assert_array_equal(forward, backward[::-1])
+    assert_array_equal(first.height_m(latitude, longitude), second.height_m(latitude, longitude))
     assert len(second._slots) <= 4 < len(first._slots)
     assert len(second._small._cells) == 3
 
@@ -84,5 +85,5 @@ def test_craters_of_a_given_catalogue_stand_where_it_says():
     assert "two" in terrain.name
     measured = terrain.measured(np.array([0, 1]))
     # The base's own relief and the drawn craters below 2 km move it by some tens of metres.
-    assert measured.depth_m[0] == pytest.approx(1500.0, abs=200.0)
+    assert measured.depth_m[0] == approx(1500.0, abs=200.0)
     assert measured.depth_m[1] > 50.0
