@@ -6,7 +6,6 @@ scripts rely keep their names.
 import hashlib
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +25,7 @@ from tmtc.packets.space_packets import pack_packet
 METRES_PER_DEG = math.radians(1.0) * 1_737_400.0
 
 
-def landmarks_packet(latitude: list[float], identity: int = 3_000_000_000) -> bytes:
+def landmarks_packet(latitude, identity=3_000_000_000):
     one = np.ones(len(latitude))
     items = {
         "landmark_id": identity + np.arange(len(latitude)), "latitude_deg": np.array(latitude),
@@ -38,7 +37,7 @@ def landmarks_packet(latitude: list[float], identity: int = 3_000_000_000) -> by
     return DICTIONARY.pack("landmarks", values, ticks=0, sequence_count=0)
 
 
-def test_a_downlinked_map_is_compared_with_a_catalogue(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_downlinked_map_is_compared_with_a_catalogue(tmp_path, capsys):
     path, downlink = tmp_path / "list.csv", tmp_path / "map.bin"
     listed = make_catalogue(np.radians([10.0]), np.radians([300.0]), [6_000.0], source="one", rim_height_m=[50.0])
     save_catalogue(listed, path)
@@ -50,7 +49,7 @@ def test_a_downlinked_map_is_compared_with_a_catalogue(tmp_path: Path, capsys: p
     assert figures["median_horizontal_m"] == pytest.approx(303.2, abs=1.0)
 
 
-def test_a_downlink_without_a_map_has_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_downlink_without_a_map_has_none(tmp_path, capsys):
     path, downlink = tmp_path / "list.csv", tmp_path / "other.bin"
     save_catalogue(make_catalogue([0.1], [0.2], [6_000.0], source="one"), path)
     time_report = {"reported_ticks": 1, "rate_exponent": 0}
@@ -60,10 +59,10 @@ def test_a_downlink_without_a_map_has_none(tmp_path: Path, capsys: pytest.Captur
     assert (figures["landmarks"], figures["median_horizontal_m"]) == (0, None)
 
 
-def test_a_list_is_registered_to_terrain(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_list_is_registered_to_terrain(tmp_path, capsys):
     latitude, longitude = (part.ravel() for part in np.meshgrid(np.arange(1.5, 9, 1.5), np.arange(301.5, 309, 1.5)))
 
-    def bowls(lat: np.ndarray, lon: np.ndarray) -> np.ndarray:
+    def bowls(lat, lon):
         height = np.zeros(np.broadcast_shapes(lat.shape, lon.shape))
         for north, east in zip(latitude, longitude, strict=True):
             level = np.cos(np.radians(north))
@@ -98,9 +97,7 @@ def test_a_list_is_registered_to_terrain(tmp_path: Path, capsys: pytest.CaptureF
         (["catalogue", "curate", "none.csv", "--out", "x", "--min-diameter", "40"], "--min-diameter"),
     ],
 )
-def test_bad_input_is_one_line_that_names_it(
-    arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bad_input_is_one_line_that_names_it(arguments, expected, capsys, monkeypatch):
     monkeypatch.delenv("LINNA_DATA", raising=False)
     assert run(arguments) == 2
     error = capsys.readouterr().err
@@ -109,13 +106,13 @@ def test_bad_input_is_one_line_that_names_it(
 
 
 @pytest.fixture
-def recording(tmp_path: Path) -> Path:
+def recording(tmp_path):
     path = tmp_path / "station.cadu"
     path.write_bytes(encode_cadus(make_packets(120), spacecraft_id=76))
     return path
 
 
-def figures(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict]:
+def figures(capsys, *arguments):
     status = run(["link", "check", *arguments, "--json"])
     return status, json.loads(capsys.readouterr().out)
 
@@ -217,10 +214,10 @@ link check F --mission M
 
 
 @pytest.mark.parametrize("line", RELIED_ON.strip().splitlines())
-def test_a_documented_command_is_understood(line: str) -> None:
+def test_a_documented_command_is_understood(line):
     words = line.split()
     command_parser(GROUPS, words[0]).parse_args(words)
 
 
-def test_the_example_of_a_telecommand_is_one_of_the_dictionary() -> None:
+def test_the_example_of_a_telecommand_is_one_of_the_dictionary():
     assert example("linna command enter").split()[3] in {one.name for one in DICTIONARY.telecommands}

@@ -14,7 +14,7 @@ from tmtc.link.cadu import ASM
 from tmtc.packets.space_packets import PacketSequencer
 
 
-def make_packets(count: int) -> list[bytes]:
+def make_packets(count):
     sequencer = PacketSequencer()
     return [
         DICTIONARY.pack(
@@ -37,7 +37,7 @@ def downlink(tmp_path):
     return path
 
 
-def figures(capsys) -> dict:
+def figures(capsys):
     return json.loads(capsys.readouterr().out)
 
 
@@ -260,7 +260,7 @@ def test_arrays_and_aggregates_are_lists_and_mappings_and_columns_of_a_table(tmp
     assert rows[1][2:] == ["2", "3", "4", "5", "[6, 7]"] and rows[2][2:] == ["0", "8", "9", "10", "[]"]
 
 
-def bus_packet(count: int, data: bytes, *, secondary: bool = True, flags: int = 3, apid: int = 200) -> bytes:
+def bus_packet(count, data, *, secondary=True, flags=3, apid=200):
     first = apid | (0x0800 if secondary else 0)
     return struct.pack(">HHH", first, flags << 14 | count, len(data) - 1) + data
 
@@ -275,7 +275,7 @@ def timed(tmp_path):
     definition = tmp_path / "bus.xml"
     definition.write_text(document(HEADER_TYPES, parameters, HEADER_CONTAINER + entries))
 
-    def told(command: str, packets: list[bytes], *more: str) -> list[str]:
+    def told(command, packets, *more):
         path = tmp_path / "bus.bin"
         path.write_bytes(b"".join(packets))
         return ["tm", command, str(path), "--xtce", str(definition), "--no-error-control", *more]

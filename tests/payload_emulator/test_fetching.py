@@ -5,10 +5,8 @@ import io
 import json
 import threading
 import zipfile
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +22,7 @@ SHA256 = hashlib.sha256(BODY).hexdigest()
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def quick(monkeypatch):
     """Leave out the pauses between attempts."""
     monkeypatch.setattr("pooch.core.time.sleep", lambda _seconds: None)
 
@@ -42,8 +40,8 @@ class Behaviour:
 class Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
 
-    def do_GET(self) -> None:
-        b: Behaviour = self.server.behaviour
+    def do_GET(self):
+        b = self.server.behaviour
         b.requests.append(self.path)
         if b.statuses:
             self.send_response(b.statuses.pop(0))
@@ -58,12 +56,12 @@ class Handler(BaseHTTPRequestHandler):
         if stop < len(b.body):
             self.close_connection = True
 
-    def log_message(self, *arguments: object) -> None:
+    def log_message(self, *arguments):
         pass
 
 
 @pytest.fixture
-def server() -> Iterator[ThreadingHTTPServer]:
+def server():
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as running:
         running.behaviour = Behaviour()
         thread = threading.Thread(target=running.serve_forever)
@@ -73,13 +71,13 @@ def server() -> Iterator[ThreadingHTTPServer]:
         thread.join()
 
 
-def wanted(server: ThreadingHTTPServer, **changes: object) -> ProductFile:
+def wanted(server, **changes):
     url = f"http://127.0.0.1:{server.server_address[1]}/a.bin"
     plain = ProductFile("dem/a.bin", url, len(BODY), sha256=SHA256, origin="published", checksum_source="the test")
     return replace(plain, **changes)
 
 
-def leftovers(root: Path) -> list[str]:
+def leftovers(root):
     return sorted(p.name for p in root.rglob("*") if p.is_file() and p.name not in ("a.bin", "SHA256SUMS"))
 
 
@@ -149,7 +147,7 @@ def test_a_server_that_does_not_answer_is_reported_in_one_line(tmp_path):
 
 
 def test_a_full_disk_is_reported_in_one_line(server, tmp_path, monkeypatch):
-    def full(*_arguments: object) -> None:
+    def full(*_arguments):
         raise OSError(28, "No space left on device", "a.bin")
 
     monkeypatch.setattr("pooch.HTTPDownloader.__call__", full)

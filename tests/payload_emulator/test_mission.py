@@ -25,7 +25,6 @@ from payload_emulator.session.scenario import DetectorSection, parse_scenario
 from payload_emulator.session.spacecraft.loading import launch_payload
 from payload_emulator.session.world.world import build_world
 from payload_emulator.sim.terrain.registration import Rims, fit_registration
-from payload_emulator.sim.terrain.tiles import Terrain
 from tests.scenarios import still_scenario
 
 SCENARIO = (
@@ -45,7 +44,7 @@ def world():
     return build_world(parse_scenario(SCENARIO), DataFolder())
 
 
-def test_the_ground_reads_what_the_emulator_writes(world) -> None:
+def test_the_ground_reads_what_the_emulator_writes(world):
     mission = parse_mission(mission_text(world, DataFolder()))
     assert (mission.name, mission.spacecraft.id) == ("small", 76)
     assert mission.frames.orientation == world.truth.orientation.name == "IAU WGCCRE 2009"
@@ -55,7 +54,7 @@ def test_the_ground_reads_what_the_emulator_writes(world) -> None:
     assert mission.link.frame_length == 1115 and mission.link.interleave == 5
 
 
-def test_the_network_and_the_threshold_in_force_are_stated(world) -> None:
+def test_the_network_and_the_threshold_in_force_are_stated(world):
     own = parse_mission(mission_text(world, DataFolder())).detector
     assert (own.network, own.max_detections) == ("craters", 120)
     assert own.sha256 == hashlib.sha256(load_shipped_model()).hexdigest()
@@ -69,7 +68,7 @@ def test_the_network_and_the_threshold_in_force_are_stated(world) -> None:
         mission_text(lost, DataFolder())
 
 
-def test_the_registration_of_the_terrain_is_stated(world) -> None:
+def test_the_registration_of_the_terrain_is_stated(world):
     text = mission_text(world, DataFolder())
     assert parse_mission(text).catalogue.registration_north_m is None
     latitude, longitude, _ = spherical_from_mcmf(world.truth.positions_mcmf(world.frame_utc_ns))
@@ -91,7 +90,7 @@ def test_the_registration_of_the_terrain_is_stated(world) -> None:
     assert stated.registered_share == 0.0 and stated.registration_sigma_m is None
 
 
-def test_the_offset_of_the_list_that_the_payload_starts_with_is_stated(world) -> None:
+def test_the_offset_of_the_list_that_the_payload_starts_with_is_stated(world):
     stated = parse_mission(mission_text(world, DataFolder())).catalogue
     loaded = launch_payload(world.scenario, world.camera, DataFolder()).parameters.flight.anchored
     assert loaded.offset is not None
@@ -100,7 +99,7 @@ def test_the_offset_of_the_list_that_the_payload_starts_with_is_stated(world) ->
     assert np.radians(stated.offset_correlation_deg) == pytest.approx(loaded.offset.correlation_rad)
 
 
-def test_limits_of_the_scenario_are_stated_and_negative_ones_are_not(world) -> None:
+def test_limits_of_the_scenario_are_stated_and_negative_ones_are_not(world):
     requirements = parse_mission(mission_text(world, DataFolder())).requirements
     assert requirements.estimator == "anchored"
     assert (requirements.median_error_m, requirements.recall, requirements.memory_mib) == (42.0, None, None)
@@ -122,14 +121,12 @@ def test_limits_of_the_scenario_are_stated_and_negative_ones_are_not(world) -> N
         (0.0, 360.0 + 270.0, True),
     ],
 )
-def test_ground_is_seen_where_the_recipe_of_the_shipped_detector_looked(
-    latitude_deg: float, longitude_deg: float, seen: bool
-) -> None:
+def test_ground_is_seen_where_the_recipe_of_the_shipped_detector_looked(latitude_deg, longitude_deg, seen):
     place = np.array([latitude_deg]), np.array([longitude_deg])
     assert any(region.contains(*place).all() for region in trained_ground()) is seen
 
 
-def test_what_windows_need_is_stated(world) -> None:
+def test_what_windows_need_is_stated(world):
     """The light, and the tables that the ground uploads for each estimator."""
     scenario = world.scenario
     for mode, needed in (("paper", False), ("real", True)):
@@ -153,14 +150,14 @@ class RealTerrain:
 
     is_real, name = True, "LROC WAC GLD100"
 
-    def __init__(self, terrain: Terrain) -> None:
+    def __init__(self, terrain):
         self._terrain = terrain
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name):
         return getattr(self._terrain, name)
 
 
-def flown_over(longitudes_deg: list[float], is_real: bool = True) -> SimpleNamespace:
+def flown_over(longitudes_deg, is_real=True):
     """A world whose frames are taken 20 km above the equator; a footprint is 69 km (1.14 degrees) to either side."""
     position = mcmf_from_spherical(0.0, np.radians(longitudes_deg), np.full(len(longitudes_deg), 20e3))
     return SimpleNamespace(
@@ -181,16 +178,16 @@ def flown_over(longitudes_deg: list[float], is_real: bool = True) -> SimpleNames
         ([284.4], 1.0),
     ],
 )
-def test_the_unseen_share_counts_frames_whose_whole_footprint_is_unseen(longitudes_deg, share) -> None:
+def test_the_unseen_share_counts_frames_whose_whole_footprint_is_unseen(longitudes_deg, share):
     assert unseen_share(flown_over(longitudes_deg)) == share
 
 
-def test_the_ground_of_training_is_stated_over_real_terrain(world) -> None:
+def test_the_ground_of_training_is_stated_over_real_terrain(world):
     real = replace(world, terrain=cast(Any, RealTerrain(world.terrain)))
     evidence = parse_mission(mission_text(real, DataFolder())).evidence
     assert evidence.trained_regions == trained_ground()
     assert (evidence.unseen_share, evidence.level) == (None, None)  # each pass has its own
 
 
-def test_there_is_no_unseen_share_away_from_real_terrain() -> None:
+def test_there_is_no_unseen_share_away_from_real_terrain():
     assert unseen_share(flown_over([290.0], is_real=False)) is None

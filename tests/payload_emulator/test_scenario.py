@@ -23,23 +23,22 @@ from payload_emulator.session.world.orbit import (
     propagate_to_impact,
     sample,
 )
-from tmtc.dictionary.tables import CatalogueTable
 
 # A file with a [dataset] table is a recipe of a data set, not a scenario to fly.
 FLOWN = [file for file in sorted(SHIPPED.glob("*.toml")) if "dataset" not in tomllib.loads(file.read_text())]
 
 
 @pytest.mark.parametrize("file", FLOWN, ids=lambda file: file.stem)
-def test_each_shipped_scenario_reads_and_survives_a_round_trip(file) -> None:
+def test_each_shipped_scenario_reads_and_survives_a_round_trip(file):
     scenario = load_scenario(file)
     assert parse_scenario(format_scenario(scenario)) == scenario
 
 
-def test_a_bare_name_means_a_shipped_scenario() -> None:
+def test_a_bare_name_means_a_shipped_scenario():
     assert load_scenario("selenita").orbit.semi_major_axis_km == 1768.180  # paper, Table I
 
 
-def test_an_empty_scenario_is_the_papers_orbit() -> None:
+def test_an_empty_scenario_is_the_papers_orbit():
     assert parse_scenario('name = "x"') == Scenario(name="x")
 
 
@@ -128,7 +127,7 @@ def test_an_empty_scenario_is_the_papers_orbit() -> None:
         ),
     ],
 )
-def test_what_cannot_be_flown_is_refused(text: str, message: str) -> None:
+def test_what_cannot_be_flown_is_refused(text, message):
     with pytest.raises(ScenarioError, match="scenario: ") as refusal:
         parse_scenario(text)
     assert message in str(refusal.value)
@@ -164,9 +163,7 @@ def test_what_cannot_be_flown_is_refused(text: str, message: str) -> None:
         ("[link]\nplayback = true", "link.playback has no effect without link.stations"),
     ],
 )
-def test_a_stated_key_without_effect_is_refused_and_an_archive_that_states_all_is_read(
-    tmp_path, text: str, message: str
-) -> None:
+def test_a_stated_key_without_effect_is_refused_and_an_archive_that_states_all_is_read(tmp_path, text, message):
     file = tmp_path / "a.toml"
     file.write_text(f'name = "x"\n{text}')
     with pytest.raises(ScenarioError) as refusal:
@@ -176,12 +173,12 @@ def test_a_stated_key_without_effect_is_refused_and_an_archive_that_states_all_i
     assert parse_scenario(format_scenario(archived)) == archived
 
 
-def test_a_scenario_of_an_older_archive_reads_as_before() -> None:
+def test_a_scenario_of_an_older_archive_reads_as_before():
     older = 'name = "x"\n[dynamics]\ndegree = 8\nintegrator = "rkn86"'
     assert parse_scenario(older) == parse_scenario('name = "x"\n[dynamics]\ndegree = 8')
 
 
-def measured(source: str) -> CraterCatalogue:
+def measured(source):
     count = 5
     return CraterCatalogue(
         np.arange(count), np.linspace(-0.1, 0.1, count), np.linspace(0.2, 0.3, count), np.full(count, 5_000.0),
@@ -189,7 +186,7 @@ def measured(source: str) -> CraterCatalogue:
     )  # fmt: skip
 
 
-def on_board(source: str, fraction: float = 0.0) -> CatalogueTable:
+def on_board(source, fraction=0.0):
     """On-board table with errors of its centres of a fraction of the diameter, and none of its heights."""
     scenario = load_scenario("selenita")
     navigation = replace(
@@ -198,19 +195,19 @@ def on_board(source: str, fraction: float = 0.0) -> CatalogueTable:
     return onboard_catalogue(replace(scenario, navigation=navigation), measured(source))
 
 
-def test_real_craters_are_placed_below_their_rims_where_the_network_sees_them() -> None:
+def test_real_craters_are_placed_below_their_rims_where_the_network_sees_them():
     rims = measured("LU1319381").rim_height_m
     np.testing.assert_allclose(on_board("LU1319381").rim_height_m - rims, -SEEN_BELOW_RIM_M, atol=1e-9)
     # Of the order of the measured 16 to 23 m: another sign would double the error of the altitude.
     assert 14.0 <= SEEN_BELOW_RIM_M <= 24.0
 
 
-def test_procedural_craters_are_placed_on_their_rims() -> None:
+def test_procedural_craters_are_placed_on_their_rims():
     np.testing.assert_array_equal(on_board("synthetic, seed 1").rim_height_m, measured("").rim_height_m)
 
 
 @pytest.mark.parametrize("source", ["LU1319381", "synthetic, seed 1"])
-def test_centres_have_the_errors_that_are_added_the_error_of_the_list_is_the_detectors(source: str) -> None:
+def test_centres_have_the_errors_that_are_added_the_error_of_the_list_is_the_detectors(source):
     np.testing.assert_array_equal(on_board(source, 0.03).sigma_m[:, :2], 150.0)
     np.testing.assert_array_equal(on_board(source).sigma_m[:, :2], 10.0)
 
@@ -218,14 +215,14 @@ def test_centres_have_the_errors_that_are_added_the_error_of_the_list_is_the_det
 BARE = 'name = "x"\n[maneuvers]\nenabled = false\n[dynamics]\ngravity = "builtin"\norientation = "iau"\n'
 
 
-def test_sunlight_pushes_only_the_scenarios_that_ask_for_it() -> None:
+def test_sunlight_pushes_only_the_scenarios_that_ask_for_it():
     data = find_data(None)
     assert force_model(parse_scenario(BARE), data).solar_pressure is None
     lit = parse_scenario(BARE + "solar_area_to_mass_m2_kg = 0.02\nsolar_reflection = 1.4\n")
     assert force_model(lit, data).solar_pressure == SolarPressure(0.02, 1.4)
 
 
-def test_a_revolution_in_sunlight_moves_the_orbit_by_metres_at_the_most() -> None:
+def test_a_revolution_in_sunlight_moves_the_orbit_by_metres_at_the_most():
     data = find_data(None)
     ends = []
     for extra in ("", "solar_area_to_mass_m2_kg = 0.02\n"):
@@ -236,7 +233,7 @@ def test_a_revolution_in_sunlight_moves_the_orbit_by_metres_at_the_most() -> Non
     assert 0.01 < np.linalg.norm(ends[1] - ends[0]) < 10.0  # m
 
 
-def test_a_cartesian_state_flies_the_orbit_of_the_elements_it_came_from() -> None:
+def test_a_cartesian_state_flies_the_orbit_of_the_elements_it_came_from():
     data = find_data(None)
     elements = parse_scenario(BARE)
     gm_m3_s2 = force_model(elements, data).gm_m3_s2
@@ -257,7 +254,7 @@ def test_a_cartesian_state_flies_the_orbit_of_the_elements_it_came_from() -> Non
         np.testing.assert_allclose(ends[0][:3], ends[1][:3], atol=1e-5)  # m
 
 
-def test_an_orbit_into_the_ground_is_propagated_until_then() -> None:
+def test_an_orbit_into_the_ground_is_propagated_until_then():
     low = parse_scenario(
         'name = "x"\n[orbit]\nsemi_major_axis_km = 1745.0\neccentricity = 0.004\n[dynamics]\ndegree = 8\n'
         'gravity = "builtin"\n[maneuvers]\nenabled = false'

@@ -41,7 +41,7 @@ class Outer:
     free: Mapping[str, Any] = field(default_factory=dict)
 
 
-def test_values_keep_their_types_and_only_whole_numbers_become_floats() -> None:
+def test_values_keep_their_types_and_only_whole_numbers_become_floats():
     found = read_table(
         Outer,
         {
@@ -56,7 +56,7 @@ def test_values_keep_their_types_and_only_whole_numbers_become_floats() -> None:
     assert type(found.share) is float and type(found.inner.limits[0]) is float
 
 
-def test_what_a_table_does_not_name_stays_as_it_was() -> None:
+def test_what_a_table_does_not_name_stays_as_it_was():
     before = Outer("a", 7, inner=Inner(9.0, (1.0, 2.0)))
     after = read_table(Outer, {"inner": {"length_m": 8.0}}, present=before)
     assert after == Outer("a", 7, inner=Inner(8.0, (1.0, 2.0)))
@@ -83,16 +83,14 @@ def test_what_a_table_does_not_name_stays_as_it_was() -> None:
         ({"name": "a", "rest": {"length_m": "x"}}, "rest.length_m", "a number", "'x'"),
     ],
 )
-def test_a_wrong_value_is_told_by_place_expectation_and_finding(
-    table: dict[str, Any], place: str, expected: str, found: str
-) -> None:
+def test_a_wrong_value_is_told_by_place_expectation_and_finding(table, place, expected, found):
     with pytest.raises(TableFault) as fault:
         read_table(Outer, table, "top")
     assert (fault.value.place, fault.value.expected, fault.value.found) == (f"top.{place}", expected, found)
     assert fault.value.known == () and fault.value.nearest is None
 
 
-def test_an_unknown_key_is_told_with_the_nearest_known_one_of_its_section() -> None:
+def test_an_unknown_key_is_told_with_the_nearest_known_one_of_its_section():
     with pytest.raises(TableFault) as fault:
         read_table(Outer, {"name": "a", "inner": {"lenght_m": 1.0}})
     assert (fault.value.place, fault.value.nearest) == ("inner.lenght_m", "length_m")
@@ -102,15 +100,15 @@ def test_an_unknown_key_is_told_with_the_nearest_known_one_of_its_section() -> N
     assert fault.value.place == "zzz" and fault.value.nearest is None and "count" in fault.value.known
 
 
-def test_a_missing_value_and_a_table_that_is_none_are_told() -> None:
+def test_a_missing_value_and_a_table_that_is_none_are_told():
     with pytest.raises(TableFault, match=r"expected all of name, count, .*, found none"):
         read_table(Outer, {})
     with pytest.raises(TableFault, match="top: expected a table, found 3"):
         read_table(Outer, 3, "top")
 
 
-def test_bounds_hold_for_numbers_by_their_name_also_in_lists() -> None:
-    def bounds(name: str) -> tuple[float, float]:
+def test_bounds_hold_for_numbers_by_their_name_also_in_lists():
+    def bounds(name):
         return (0.0, 1.0) if name == "limits" else (0.0, float("inf"))
 
     assert read_table(Inner, {"length_m": 0.0, "limits": [0.0, 1.0]}, bounds=bounds).limits == (0.0, 1.0)
@@ -123,7 +121,7 @@ def test_bounds_hold_for_numbers_by_their_name_also_in_lists() -> None:
             read_table(Inner, table, bounds=bounds)
 
 
-def test_values_are_written_as_toml_that_reads_the_same() -> None:
+def test_values_are_written_as_toml_that_reads_the_same():
     import tomllib
 
     values = {"a": True, "b": 'two "quoted"\nlines \\ here', "c": (1.5, 2.0), "d": 3}

@@ -542,7 +542,7 @@ restoring = Lazy("payload_emulator.training.model.restore")
 class Crops:
     """Stands in for the feeder: seeded images of another brightness than unit deviation."""
 
-    def batch(self, first: int, count: int) -> dict[str, np.ndarray]:
+    def batch(self, first, count):
         rng = np.random.default_rng(first)
         return {"image": 1.7 * rng.standard_normal((count, 1, 64, 64)).astype(np.float32) + 0.4}
 
@@ -560,7 +560,7 @@ def outputs(network, image):
     return torch.sigmoid(heat).numpy(), geometry.numpy()
 
 
-def test_the_restored_network_gives_what_the_exported_one_gives(shipped) -> None:
+def test_the_restored_network_gives_what_the_exported_one_gives(shipped):
     network, document = restoring.network_from_onnx(shipped)
     image = np.random.default_rng(1).standard_normal((1, 1, 512, 512)).astype(np.float32)
     heat, geometry = outputs(network, image)
@@ -571,7 +571,7 @@ def test_the_restored_network_gives_what_the_exported_one_gives(shipped) -> None
     assert document["progress"]["step"] == 5095  # in the metadata of the shipped network
 
 
-def test_counted_statistics_leave_outputs_and_make_training_mode_agree(shipped) -> None:
+def test_counted_statistics_leave_outputs_and_make_training_mode_agree(shipped):
     network, _ = restoring.network_from_onnx(shipped)
     average, _ = restoring.network_from_onnx(shipped)
     image = Crops().batch(1, 16)["image"]
@@ -588,7 +588,7 @@ def test_counted_statistics_leave_outputs_and_make_training_mode_agree(shipped) 
     np.testing.assert_allclose(first.running_var.numpy(), seen.var((0, 2, 3), unbiased=False).numpy(), rtol=1e-3)
 
 
-def test_what_is_no_exported_network_is_refused(tmp_path) -> None:
+def test_what_is_no_exported_network_is_refused(tmp_path):
     with pytest.raises(ModelError, match="expected an exported network, found no file"):
         restoring.network_from_onnx(tmp_path / "none.onnx")
     (tmp_path / "text.onnx").write_text("no model")
@@ -596,7 +596,7 @@ def test_what_is_no_exported_network_is_refused(tmp_path) -> None:
         restoring.network_from_onnx(tmp_path / "text.onnx")
 
 
-def test_an_enlarging_network_gives_maps_of_half_the_stride_and_flies() -> None:
+def test_an_enlarging_network_gives_maps_of_half_the_stride_and_flies():
     network = networks.CraterNet(networks.ModelConfig(16, depth=True, enlarge=2)).eval()
     assert network.config.cell_px == 2
     import onnx
@@ -613,7 +613,7 @@ def test_an_enlarging_network_gives_maps_of_half_the_stride_and_flies() -> None:
         networks.ModelConfig(enlarge=3)
 
 
-def test_older_networks_name_the_only_backbone_and_stride() -> None:
+def test_older_networks_name_the_only_backbone_and_stride():
     assert networks.parse_config({"enlarge": 2, "backbone": "small", "stride_px": 4}) == networks.ModelConfig(enlarge=2)
     with pytest.raises(ModelError, match="expected backbone small, found 'large'"):
         networks.parse_config({"backbone": "large"})
@@ -621,7 +621,7 @@ def test_older_networks_name_the_only_backbone_and_stride() -> None:
         networks.parse_config({"stride_px": 2})
 
 
-def test_a_peak_of_a_fine_map_lies_in_the_middle_of_its_cell() -> None:
+def test_a_peak_of_a_fine_map_lies_in_the_middle_of_its_cell():
     heat = np.zeros((256, 256), np.float32)
     heat[10, 20] = 0.9
     found = decode(heat, np.zeros((5, 256, 256), np.float32), 0.5, 2)
@@ -629,7 +629,7 @@ def test_a_peak_of_a_fine_map_lies_in_the_middle_of_its_cell() -> None:
     assert (found.u_px[0], found.v_px[0]) == (pytest.approx(40.5), pytest.approx(20.5))
 
 
-def test_an_enlarging_copy_sees_the_enlarged_image_and_tells_pixels_of_the_image(shipped) -> None:
+def test_an_enlarging_copy_sees_the_enlarged_image_and_tells_pixels_of_the_image(shipped):
     network, _ = restoring.network_from_onnx(shipped)
     image = np.random.default_rng(5).standard_normal((1, 1, 128, 128)).astype(np.float32)
     large = torch.nn.functional.interpolate(

@@ -31,7 +31,7 @@ class Everywhere:
 
     name = "flat"
 
-    def __init__(self, height_m: float = 0.0) -> None:
+    def __init__(self, height_m=0.0):
         self.height = height_m
 
     def covers(self, latitude_rad, longitude_rad):
