@@ -37,25 +37,23 @@ def landmarks_packet(latitude, identity=3_000_000_000):
     return DICTIONARY.pack("landmarks", values, ticks=0, sequence_count=0)
 
 
-def test_a_downlinked_map_is_compared_with_a_catalogue(tmp_path, capsys):
+def test_a_downlinked_map_is_compared_with_a_catalogue(tmp_path, typed):
     path, downlink = tmp_path / "list.csv", tmp_path / "map.bin"
     listed = make_catalogue(np.radians([10.0]), np.radians([300.0]), [6_000.0], source="one", rim_height_m=[50.0])
     save_catalogue(listed, path)
     # 0.01 degrees are 303 m on the ground; the other landmark is far from any crater.
     downlink.write_bytes(landmarks_packet([10.01, 20.0]))
-    assert run(["catalogue", "landmarks", str(downlink), "--catalogue", str(path), "--json"]) == 0
-    figures = json.loads(capsys.readouterr().out)
+    figures = typed(f"catalogue landmarks {downlink} --catalogue {path} --json")
     assert (figures["landmarks"], figures["in_catalogue"], figures["new"]) == (2, 1, 1)
     assert figures["median_horizontal_m"] == pytest.approx(303.2, abs=1.0)
 
 
-def test_a_downlink_without_a_map_has_none(tmp_path, capsys):
+def test_a_downlink_without_a_map_has_none(tmp_path, typed):
     path, downlink = tmp_path / "list.csv", tmp_path / "other.bin"
     save_catalogue(make_catalogue([0.1], [0.2], [6_000.0], source="one"), path)
     time_report = {"reported_ticks": 1, "rate_exponent": 0}
     downlink.write_bytes(DICTIONARY.pack("time_report", time_report, ticks=0, sequence_count=0))
-    assert run(["catalogue", "landmarks", str(downlink), "--catalogue", str(path), "--json"]) == 0
-    figures = json.loads(capsys.readouterr().out)
+    figures = typed(f"catalogue landmarks {downlink} --catalogue {path} --json")
     assert (figures["landmarks"], figures["median_horizontal_m"]) == (0, None)
 
 
@@ -145,23 +143,21 @@ def test_frames_that_nothing_proves_are_inconclusive(capsys, tmp_path):
     assert status == 3 and found["settings"] is None and found["distances"]["700"] == 29
 
 
-def test_packets_without_frames_are_told_and_noise_is_refused(capsys, tmp_path):
+def test_packets_without_frames_are_told_and_noise_is_refused(capsys, typed, tmp_path):
     path = tmp_path / "packets.bin"
     path.write_bytes(b"".join(make_packets(20)))
     status, found = figures(capsys, str(path))
     assert status == 0 and found["packets_without_frames"] == 42
     path.write_bytes(np.random.default_rng(1).integers(0, 256, 5000, dtype=np.uint8).tobytes())
-    assert run(["link", "check", str(path)]) == 2
-    assert "expected CADUs or space packets, found none in its 5000 octets" in capsys.readouterr().err
+    assert "expected CADUs or space packets, found none in its 5000 octets" in typed(f"link check {path}", 2)
 
 
 @pytest.mark.parametrize("prefix", [0, 3])
-def test_the_form_of_packets_without_checksum_is_proposed(capsys, tmp_path, prefix):
+def test_the_form_of_packets_without_checksum_is_proposed(typed, tmp_path, prefix):
     packets = [bytes(prefix) + pack_packet(0x200, bytes(range(60)), sequence_count=k) for k in range(30)]
     path = tmp_path / "foreign.bin"
     path.write_bytes(b"".join(packets))
-    assert run(["link", "check", str(path)]) == 0
-    shown = capsys.readouterr().out
+    shown = typed(f"link check {path}")
     assert "30 space packets without checksum" in shown and 'packet_checksum = "none"' in shown
     assert (f"packet_prefix_octets = {prefix}" in shown) == (prefix > 0)
 

@@ -1,6 +1,5 @@
 """The commands on ephemerides as users run them."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -29,9 +28,8 @@ def oem_path(tmp_path):
     return path
 
 
-def run_json(capsys, *arguments):
-    assert cli.run([*map(str, arguments), "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
+def run_json(typed, *arguments):
+    return typed("", 0, *map(str, arguments), "--json")
 
 
 def error_line(capsys, *arguments):
@@ -42,7 +40,7 @@ def error_line(capsys, *arguments):
     return line
 
 
-def test_compare_tells_the_difference_of_an_oem_and_an_stk_file(oem_path, tmp_path, capsys):
+def test_compare_tells_the_difference_of_an_oem_and_an_stk_file(oem_path, tmp_path, capsys, typed):
     other = tmp_path / "orbit.e"
     other.write_text(format_stk(polar_orbit(48.0, radius_m=1_768_190.0)))
     figures = run_json(capsys, "orbit", "compare", oem_path, other)
@@ -50,8 +48,7 @@ def test_compare_tells_the_difference_of_an_oem_and_an_stk_file(oem_path, tmp_pa
     assert figures["max_m"] == pytest.approx(10.0, abs=1e-5)
     assert figures["rms_rtn_m"] == pytest.approx([10.0, 0.0, 0.0], abs=1e-5)
     assert figures["mean_rtn_m"] == pytest.approx([10.0, 0.0, 0.0], abs=1e-5)
-    assert cli.run(["orbit", "compare", str(oem_path), str(other), "--step", "3600"]) == 0
-    text = capsys.readouterr().out
+    text = typed(f"orbit compare {oem_path} {other} --step 3600")
     assert text.startswith("49 epochs from 2029-08-07T00:00:00.000Z")
     assert "mean radial 10 m, transverse" in text and "rms  radial 10 m, transverse" in text
 
@@ -130,7 +127,7 @@ def test_a_station_that_cannot_be_read_is_one_line(oem_path, capsys, station):
     )
 
 
-def test_interpolate_gives_states_at_the_epochs_of_a_file(oem_path, tmp_path, capsys):
+def test_interpolate_gives_states_at_the_epochs_of_a_file(oem_path, tmp_path, capsys, typed):
     epochs = tmp_path / "epochs.txt"
     epochs.write_text("# two epochs\n2029-08-07T00:00:00Z\n\n2029-08-07T12:34:56.789123Z  # odd\n")
     figures = run_json(capsys, "orbit", "interpolate", oem_path, "--epochs", epochs)
@@ -140,8 +137,7 @@ def test_interpolate_gives_states_at_the_epochs_of_a_file(oem_path, tmp_path, ca
     assert np.linalg.norm(second["position_km"]) == pytest.approx(1768.18, abs=1e-6)
     assert first["altitude_km"] == pytest.approx(30.78, abs=1e-6)
     assert abs(first["latitude_deg"]) < 0.1
-    assert cli.run(["orbit", "interpolate", str(oem_path), "--epochs", str(epochs)]) == 0
-    assert len(capsys.readouterr().out.splitlines()) == 3
+    assert len(typed(f"orbit interpolate {oem_path} --epochs {epochs}").splitlines()) == 3
 
 
 def test_interpolate_names_the_epoch_that_is_not_covered_and_the_line_that_is_no_epoch(oem_path, tmp_path, capsys):

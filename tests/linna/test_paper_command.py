@@ -6,7 +6,6 @@ import json
 
 import pytest
 
-from linna import cli
 from lunar.datafolder import find_data
 from studies import paper_steps
 from studies.paper_steps import Effort, StepFolder
@@ -17,7 +16,7 @@ SMALL = Effort(
 
 
 @pytest.fixture(scope="module")
-def document(tmp_path_factory):
+def document(tmp_path_factory, typed):
     out = tmp_path_factory.mktemp("paper") / "paper"
     lines = []
     with pytest.MonkeyPatch.context() as patch:
@@ -27,9 +26,9 @@ def document(tmp_path_factory):
         patch.setattr("linna.commands.paper.log", lines.append)
         patch.delenv("LINNA_DATA", raising=False)
         patch.setenv("XDG_DATA_HOME", str(out.parent))
-        assert cli.run(["paper", "--quick", "--out", str(out)]) == 0
+        typed(f"paper --quick --out {out}")
         first = len(lines)
-        assert cli.run(["paper", "--quick", "--out", str(out)]) == 0
+        typed(f"paper --quick --out {out}")
     return out, json.loads((out / "paper.json").read_text()), lines[first:]
 
 
@@ -78,9 +77,8 @@ def test_a_step_is_done_again_when_what_it_is_made_from_changes(tmp_path):
     ] == [1, 1, 2]
 
 
-def test_hours_out_of_range_are_refused(tmp_path, capsys):
-    assert cli.run(["paper", "--out", str(tmp_path / "p"), "--hours", "0"]) == 2
-    assert capsys.readouterr().err == (
+def test_hours_out_of_range_are_refused(tmp_path, typed):
+    assert typed(f"paper --out {tmp_path}/p --hours 0", 2) == (
         "linna paper: error: argument --hours: expected a number from 0.5 and up to 240, found '0'\n"
     )
     assert not (tmp_path / "p").exists()

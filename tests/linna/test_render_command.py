@@ -39,9 +39,8 @@ def run(capsys, *arguments):
     return status, json.loads(captured.out) if captured.out else None, captured.err
 
 
-def refused(capsys, *arguments):
-    assert cli.run(["render", *arguments]) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
+def refused(typed, *arguments):
+    lines = typed("render", 2, *arguments).strip().splitlines()
     assert len(lines) == 1
     return lines[0]
 
@@ -119,9 +118,10 @@ def test_what_cannot_be_rendered_is_one_line(scenario, tmp_path, monkeypatch, ca
     assert not (tmp_path / "x.png").exists()
 
 
-def test_an_unknown_renderer_is_refused_with_the_known_ones(scenario, capsys):
-    assert cli.run(["render", scenario, "--epoch", EPOCHS[0], "--out", "x.png", "--renderer", "magic"]) == 2
-    assert "'fast', 'raymarch', 'cycles'" in capsys.readouterr().err
+def test_an_unknown_renderer_is_refused_with_the_known_ones(scenario, typed):
+    assert "'fast', 'raymarch', 'cycles'" in typed(
+        f"render {scenario} --epoch {EPOCHS[0]} --out x.png --renderer magic", 2
+    )
 
 
 def test_an_ephemeris_below_the_terrain_and_epochs_outside_it_are_one_line(scenario, tmp_path, capsys):

@@ -1,0 +1,19 @@
+"""Commands as their users type them."""
+
+import json
+
+import pytest
+
+from linna.cli import run
+
+
+@pytest.fixture
+def typed(capsys):
+    """Run a command line that ends with a status; return its document or text, or the words of its refusal."""
+
+    def typed(line, status=0, *words):
+        assert run([*line.split(), *map(str, words)]) == status
+        out, err = capsys.readouterr()
+        return err if status == 2 else json.loads(out) if out[:1] in ("{", "[") else out
+
+    return typed
