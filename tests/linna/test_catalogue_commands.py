@@ -4,13 +4,12 @@ scripts rely keep their names.
 """
 
 import hashlib
-import json
 import math
 
 import numpy as np
 import pytest
 
-from linna.cli import GROUPS, run
+from linna.cli import GROUPS
 from linna.help import example
 from linna.parser import command_parser
 from lunar.catalogue import make_catalogue, save_catalogue
@@ -57,7 +56,7 @@ def test_a_downlink_without_a_map_has_none(tmp_path, typed):
     assert (figures["landmarks"], figures["median_horizontal_m"]) == (0, None)
 
 
-def test_a_list_is_registered_to_terrain(tmp_path, capsys):
+def test_a_list_is_registered_to_terrain(tmp_path, typed):
     latitude, longitude = (part.ravel() for part in np.meshgrid(np.arange(1.5, 9, 1.5), np.arange(301.5, 309, 1.5)))
 
     def bowls(lat, lon):
@@ -75,9 +74,7 @@ def test_a_list_is_registered_to_terrain(tmp_path, capsys):
     )
     path, out = tmp_path / "list.csv", tmp_path / "made" / "registration.json"
     save_catalogue(listed, path)
-    words = ["catalogue", "register", str(path), "--terrain", str(raster), "--out", str(out), "--json"]
-    assert run(words) == 0
-    figures = json.loads(capsys.readouterr().out)
+    figures = typed(f"catalogue register {path} --terrain {raster} --out {out} --json")
     assert (figures["rims"], figures["out"]) == (25, str(out))
     made = parse_registration(out.read_text(), "made")
     shift, sigma = made.at(np.radians([5.0]), np.radians([305.0]))
@@ -89,18 +86,15 @@ def test_a_list_is_registered_to_terrain(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["catalogue", "register"], "CATALOGUE: expected a crater list"),
-        (["catalogue", "register", "none.csv"], "--terrain: expected height rasters"),
-        (["catalogue", "curate", "none.csv", "--out", "x", "--region", "5"], "--region"),
-        (["catalogue", "curate", "none.csv", "--out", "x", "--min-diameter", "40"], "--min-diameter"),
+        ("register", "CATALOGUE: expected a crater list"),
+        ("register none.csv", "--terrain: expected height rasters"),
+        ("curate none.csv --out x --region 5", "--region"),
+        ("curate none.csv --out x --min-diameter 40", "--min-diameter"),
     ],
 )
-def test_bad_input_is_one_line_that_names_it(arguments, expected, capsys, monkeypatch):
+def test_bad_input_is_one_line_that_names_it(arguments, expected, typed, monkeypatch):
     monkeypatch.delenv("LINNA_DATA", raising=False)
-    assert run(arguments) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert expected in error
+    assert expected in typed(f"catalogue {arguments}", 2)
 
 
 @pytest.fixture
@@ -110,14 +104,9 @@ def recording(tmp_path):
     return path
 
 
-def figures(capsys, *arguments):
-    status = run(["link", "check", *arguments, "--json"])
-    return status, json.loads(capsys.readouterr().out)
-
-
-def test_settings_come_with_their_evidence(recording, capsys):
-    status, found = figures(capsys, str(recording))
-    assert status == 0 and not found["ambiguous"]
+def test_settings_come_with_their_evidence(recording, typed):
+    found = typed(f"link check {recording} --json")
+    assert not found["ambiguous"]
     assert found["settings"]["frame_length"] == 1115 and found["settings"]["randomiser"] == "legacy"
     best = found["evidence"][0]
     assert best["codewords_clean"] == best["checksums_hold"] == best["headers_regular"] == 1.0
@@ -125,29 +114,27 @@ def test_settings_come_with_their_evidence(recording, capsys):
 
 
 @pytest.mark.parametrize(("randomiser", "status"), [("legacy", 0), ("long", 1)])
-def test_a_mission_description_is_compared(recording, capsys, tmp_path, randomiser, status):
+def test_a_mission_description_is_compared(recording, typed, tmp_path, randomiser, status):
     mission = tmp_path / "mission.toml"
     mission.write_text(f'name = "test"\n[link]\nframe_length = 1115\nrandomiser = "{randomiser}"\n')
-    code, found = figures(capsys, str(recording), "--mission", str(mission))
-    assert code == status
+    found = typed(f"link check {recording} --mission {mission} --json", status)
     expected = ["randomiser: the mission states long, the recording has legacy"] if status else []
     assert found["contradicts_mission"] == expected
 
 
-def test_frames_that_nothing_proves_are_inconclusive(capsys, tmp_path):
+def test_frames_that_nothing_proves_are_inconclusive(typed, tmp_path):
     noise = np.random.default_rng(3).integers(0, 256, (30, 700), dtype=np.uint8)
     noise[:, :4] = np.frombuffer(ASM, dtype=np.uint8)
     path = tmp_path / "noise.cadu"
     path.write_bytes(noise.tobytes())
-    status, found = figures(capsys, str(path))
-    assert status == 3 and found["settings"] is None and found["distances"]["700"] == 29
+    found = typed(f"link check {path} --json", 3)
+    assert found["settings"] is None and found["distances"]["700"] == 29
 
 
-def test_packets_without_frames_are_told_and_noise_is_refused(capsys, typed, tmp_path):
+def test_packets_without_frames_are_told_and_noise_is_refused(typed, tmp_path):
     path = tmp_path / "packets.bin"
     path.write_bytes(b"".join(make_packets(20)))
-    status, found = figures(capsys, str(path))
-    assert status == 0 and found["packets_without_frames"] == 42
+    assert typed(f"link check {path} --json")["packets_without_frames"] == 42
     path.write_bytes(np.random.default_rng(1).integers(0, 256, 5000, dtype=np.uint8).tobytes())
     assert "expected CADUs or space packets, found none in its 5000 octets" in typed(f"link check {path}", 2)
 

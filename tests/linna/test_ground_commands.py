@@ -37,23 +37,16 @@ def downlink(tmp_path):
 def server(tmp_path):
     """A served service with one operator: the options that name it."""
     with served(Settings(home=tmp_path / "served")) as (url, token):
-        yield ["--server", url, "--token", token]
+        yield f"--server {url} --token {token}"
 
 
-def asked(capsys, *words, status=0):
-    code = run([*map(str, words), "--json"])
-    printed = capsys.readouterr()
-    assert code == status, printed.err
-    return json.loads(printed.out) if status == 0 else printed.err
-
-
-def test_a_pass_archive_is_imported_and_reported_over_the_wire(capsys, server, synthetic_archive, tmp_path):
+def test_a_pass_archive_is_imported_and_reported_over_the_wire(typed, server, synthetic_archive, tmp_path):
     with open_ground(tmp_path / "here") as ground:
         import_archive(ground, synthetic_archive)
-    here = asked(capsys, "pass", "show", 1, "--home", tmp_path / "here")
-    assert asked(capsys, "ingest", synthetic_archive, *server)["ingested"][0]["pass_id"] == 1
-    assert asked(capsys, "pass", "show", 1, *server) == here
-    made = asked(capsys, "report", 1, "--out", tmp_path / "out", *server)
+    here = typed(f"pass show {1} --home {tmp_path}/here --json")
+    assert typed(f"ingest {synthetic_archive} --json {server}")["ingested"][0]["pass_id"] == 1
+    assert typed(f"pass show 1 --json {server}") == here
+    made = typed(f"report 1 --out {tmp_path}/out --json {server}")
     for kind, start in (("html", b"<!"), ("json", b"{"), ("pdf", b"%PDF")):
         assert (tmp_path / "out" / f"report.{kind}").read_bytes().startswith(start)
     assert made["packets"] == here["packets"]
@@ -73,12 +66,12 @@ def synthetic_archive(tmp_path, downlink, reference):
     return folder
 
 
-def test_a_wrong_token_and_a_wrong_server_are_told_in_one_line(capsys, server):
-    wrong = asked(capsys, "pass", "list", *server[:3], "x", status=2)
+def test_a_wrong_token_and_a_wrong_server_are_told_in_one_line(typed, server):
+    wrong = typed(f"pass list --json {server}x", 2)
     assert wrong.strip() == "linna: error: token: expected one that 'linna user add' gave out, found another"
-    gone = asked(capsys, "pass", "list", "--server", "http://127.0.0.1:1", status=2)
+    gone = typed("pass list --server http://127.0.0.1:1 --json", 2)
     assert gone.startswith("linna: error: http://127.0.0.1:1: cannot be reached")
-    odd = asked(capsys, "pass", "list", "--server", "ftp://x", status=2)
+    odd = typed("pass list --server ftp://x --json", 2)
     assert "expected a URL such as" in odd
 
 

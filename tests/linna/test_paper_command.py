@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from linna.cli import run
 from lunar.datafolder import find_data
 from studies import paper_steps
 from studies.paper_steps import Effort, StepFolder
@@ -16,7 +17,7 @@ SMALL = Effort(
 
 
 @pytest.fixture(scope="module")
-def document(tmp_path_factory, typed):
+def document(tmp_path_factory):
     out = tmp_path_factory.mktemp("paper") / "paper"
     lines = []
     with pytest.MonkeyPatch.context() as patch:
@@ -26,9 +27,10 @@ def document(tmp_path_factory, typed):
         patch.setattr("linna.commands.paper.log", lines.append)
         patch.delenv("LINNA_DATA", raising=False)
         patch.setenv("XDG_DATA_HOME", str(out.parent))
-        typed(f"paper --quick --out {out}")
+        words = ["paper", "--quick", "--out", str(out)]
+        assert run(words) == 0
         first = len(lines)
-        typed(f"paper --quick --out {out}")
+        assert run(words) == 0
     return out, json.loads((out / "paper.json").read_text()), lines[first:]
 
 
@@ -79,6 +81,6 @@ def test_a_step_is_done_again_when_what_it_is_made_from_changes(tmp_path):
 
 def test_hours_out_of_range_are_refused(tmp_path, typed):
     assert typed(f"paper --out {tmp_path}/p --hours 0", 2) == (
-        "linna paper: error: argument --hours: expected a number from 0.5 and up to 240, found '0'\n"
+        "linna paper: error: argument --hours: expected a number from 0.5 and up to 240, found '0'"
     )
     assert not (tmp_path / "p").exists()
