@@ -170,8 +170,7 @@ def main(arguments: list[str]) -> int:
             write_figures()
         case _:
             print(
-                "docs_site.py: expected 'notebooks FOLDER', 'tour FOLDER', 'shift FOLDER' or 'figures'",
-                file=sys.stderr,
+                "docs_site.py: expected 'notebooks FOLDER', 'tour FOLDER', 'shift FOLDER' or 'figures'", file=sys.stderr
             )
             return 2
     return 0
@@ -289,15 +288,7 @@ def cli_page() -> str:
             if name.split()[1] != group:
                 continue
             depth = "##" if name.count(" ") == 1 else "###"
-            lines += [
-                "",
-                f"{depth} {name}",
-                "",
-                _cell(parser.description or ""),
-                "",
-                f"    {example(name)}",
-                "",
-            ]
+            lines += ["", f"{depth} {name}", "", _cell(parser.description or ""), "", f"    {example(name)}", ""]
             lines += _options(parser)
     return "\n".join(lines) + "\n"
 
@@ -312,9 +303,7 @@ def _options(parser: argparse.ArgumentParser) -> list[str]:
         value = "" if action.nargs == 0 else formatter._format_args(action, str(metavar))
         name = f"{', '.join(action.option_strings)} {value}".strip() if action.option_strings else value
         text = formatter._expand_help(action) if action.help else ""
-        needed = (
-            " (required)" if action.required and action.option_strings and "(required)" not in text else ""
-        )
+        needed = " (required)" if action.required and action.option_strings and "(required)" not in text else ""
         rows.append(f"| {_code(name)} | {_cell(text + needed)} |")
     return ["| argument | meaning |", "|---|---|", *rows] if rows else []
 
@@ -427,9 +416,7 @@ def layers_svg(container: str) -> str:
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
         "contracts"
     ]
-    (layers,) = (
-        one["layers"] for one in contracts if "layers" in one and one.get("containers", [""]) == [container]
-    )
+    (layers,) = (one["layers"] for one in contracts if "layers" in one and one.get("containers", [""]) == [container])
     parts, top = [], 0
     for layer in layers:
         names = [name.strip() for name in layer.split("|")]
@@ -492,10 +479,7 @@ def mutation_table(samples: str) -> str:
             f"docs/results/mutation.csv: expected a sample of the last 60 days, found none: {sorted(stale)}"
         )
 
-    lines = [
-        "| group | commit, date | seed | tested | killed | score | interval |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines = ["| group | commit, date | seed | tested | killed | score | interval |", "|---|---|---|---|---|---|---|"]
     for row in rows:
         killed, tested = int(row["killed"]), int(row["tested"])
         interval = binomtest(killed, tested).proportion_ci(method="wilson")

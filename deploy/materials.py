@@ -38,9 +38,7 @@ def licences_of(package: str) -> list[str]:
     about = metadata.distribution(package).metadata
     stated = [about.get("License-Expression") or "", *(about.get("License") or "").splitlines()[:1]]
     stated += [
-        line.rpartition(" :: ")[2]
-        for line in about.get_all("Classifier") or []
-        if line.startswith("License ::")
+        line.rpartition(" :: ")[2] for line in about.get_all("Classifier") or [] if line.startswith("License ::")
     ]
     return list(dict.fromkeys(text.strip()[:100] for text in stated if text.strip()))
 
@@ -86,9 +84,7 @@ def print_licences(files: list[Path]) -> int:
 def audited(files: list[Path], url: str, strict: bool) -> int:
     """Print the known vulnerabilities of the packages of requirement files."""
     packages = [(name, str(pin.specifier).removeprefix("==")) for name, (pin, _) in pinned(files).items()]
-    queries = [
-        {"package": {"name": name, "ecosystem": "PyPI"}, "version": version} for name, version in packages
-    ]
+    queries = [{"package": {"name": name, "ecosystem": "PyPI"}, "version": version} for name, version in packages]
     body, kind = json.dumps({"queries": queries}).encode(), {"Content-Type": "application/json"}
     try:
         with urllib.request.urlopen(urllib.request.Request(url, body, kind), timeout=TIMEOUT_S) as answer:
@@ -99,9 +95,7 @@ def audited(files: list[Path], url: str, strict: bool) -> int:
             if (ids := sorted(str(one["id"]) for one in (result or {}).get("vulns", [])))
         }
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        print(
-            f"audit: NOT CHECKED: the vulnerability database {url} cannot be used: {error}", file=sys.stderr
-        )
+        print(f"audit: NOT CHECKED: the vulnerability database {url} cannot be used: {error}", file=sys.stderr)
         return 2 if strict else 0
     for (name, version), ids in vulnerable.items():
         print(f"audit: {name} {version}: {', '.join(ids)}", file=sys.stderr)
@@ -122,9 +116,7 @@ def bill_of_materials(files: list[Path], wheel: Path | None, lock: Path, status:
         List of the packages of Debian, for the image.
     """
     command = [sys.executable, "-m", "cyclonedx_py", "environment", "--pyproject", "pyproject.toml"]
-    made = subprocess.run(
-        [*command, "--output-reproducible", sys.executable], check=True, stdout=subprocess.PIPE
-    )
+    made = subprocess.run([*command, "--output-reproducible", sys.executable], check=True, stdout=subprocess.PIPE)
     document: Json = json.loads(made.stdout)
     pins, root = pinned(files), document["metadata"]["component"]
     parts = [one for one in document["components"] if canonicalize_name(one["name"]) in pins]
@@ -138,10 +130,7 @@ def bill_of_materials(files: list[Path], wheel: Path | None, lock: Path, status:
         if place:
             part = _part("npm", place.removeprefix("node_modules/"), one["version"])
             sha512 = base64.b64decode(one["integrity"].removeprefix("sha512-")).hex()
-            part |= {
-                "hashes": [{"alg": "SHA-512", "content": sha512}],
-                "licenses": [{"expression": one["license"]}],
-            }
+            part |= {"hashes": [{"alg": "SHA-512", "content": sha512}], "licenses": [{"expression": one["license"]}]}
             parts.append(part)
     for entry in status.read_text("utf-8").split("\n\n") if status else ():
         field = dict(re.findall(r"^(Package|Version|Status): (.*)$", entry, re.MULTILINE))
@@ -161,9 +150,7 @@ def _part(kind: str, name: str, version: str) -> Json:
 
 def main(words: list[str] | None = None) -> int:
     """Print what is asked about the packages."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("licences", "audit", "bom"))
     parser.add_argument("files", nargs="+", type=Path, help="requirement files with exact versions")
     parser.add_argument("--url", default=OSV, help="address of the database")

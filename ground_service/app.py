@@ -117,11 +117,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         )
         sockets = asyncio.create_task(app.state.sockets.run())
         scheduler = Scheduler(
-            ground,
-            app.state.dispatcher,
-            app.state.follow_up.drain,
-            settings.kept,
-            plan_hourly=settings.plan_hourly,
+            ground, app.state.dispatcher, app.state.follow_up.drain, settings.kept, plan_hourly=settings.plan_hourly
         )
         scheduler.start()
         try:
@@ -174,9 +170,7 @@ def _add_middleware(app: FastAPI, settings: Settings) -> None:
     """Add what runs around each request; the last one added runs first."""
     app.add_middleware(
         BodyLimit,
-        upload_paths=tuple(
-            path for one in OPERATIONS for path in getattr(one.imported(), "UPLOAD_PATHS", ())
-        ),
+        upload_paths=tuple(path for one in OPERATIONS for path in getattr(one.imported(), "UPLOAD_PATHS", ())),
         upload_limit_octets=settings.upload_limit_mib << 20,
     )
     app.add_middleware(PlainText)
@@ -305,9 +299,7 @@ def bind(host: str, port: int) -> socket.socket:
     except OSError as error:
         listener.close()
         reason = (
-            "is in use by another program"
-            if error.errno == errno.EADDRINUSE
-            else f"cannot be bound ({error.strerror})"
+            "is in use by another program" if error.errno == errno.EADDRINUSE else f"cannot be bound ({error.strerror})"
         )
         raise ServerError(f"address {host} port {port}: {reason}; choose another with --port") from None
     return listener

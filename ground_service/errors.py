@@ -93,8 +93,7 @@ class DatabaseTooOld(OtherRevision):
     """The database was written before version 1.0; it cannot be migrated."""
 
     remedy = (
-        " of a version before 1.0; ingest the raw files under LINNA_HOME/files into a new database with "
-        "'linna ingest'"
+        " of a version before 1.0; ingest the raw files under LINNA_HOME/files into a new database with 'linna ingest'"
     )
 
 
@@ -115,9 +114,7 @@ class StorageReadOnly(StoreError):
     """The archive cannot be written."""
 
     def __init__(self, where: str, reason: str = "read-only") -> None:
-        super().__init__(
-            f"{where}: cannot be written ({reason}); expected a folder that this user may write to"
-        )
+        super().__init__(f"{where}: cannot be written ({reason}); expected a folder that this user may write to")
 
 
 class Draining(StoreError):

@@ -27,9 +27,7 @@ def default_home() -> Path:
 
 def _words(value: object) -> object:
     """Return the entries of a comma-separated list."""
-    return (
-        tuple(word.strip() for word in value.split(",") if word.strip()) if isinstance(value, str) else value
-    )
+    return tuple(word.strip() for word in value.split(",") if word.strip()) if isinstance(value, str) else value
 
 
 Words = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_words)]
@@ -40,9 +38,7 @@ class Settings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix="LINNA_", env_ignore_empty=True, extra="ignore")
 
-    home: Path = Field(
-        default_factory=default_home, description="Folder of the database, raw files and reports"
-    )
+    home: Path = Field(default_factory=default_home, description="Folder of the database, raw files and reports")
     database_url: SecretStr | None = Field(
         default=None, description="SQLAlchemy URL; default: SQLite file linna.db under the home folder"
     )
@@ -52,8 +48,7 @@ class Settings(BaseSettings):
         "LINNA_DATABASE_URL its rights; default: LINNA_DATABASE_URL",
     )
     backup_role: str | None = Field(
-        default=None,
-        description="Database role for backups: `linna db upgrade` grants it the right to read all tables",
+        default=None, description="Database role for backups: `linna db upgrade` grants it the right to read all tables"
     )
     allow_database_owner: bool = Field(
         default=False,
@@ -62,9 +57,7 @@ class Settings(BaseSettings):
     broker_url: SecretStr | None = Field(
         default=None, description="Celery broker such as redis://host:6379/0; default: jobs run in-process"
     )
-    data: Path | None = Field(
-        default=None, description="Folder of the public data products (gravity, kernels)"
-    )
+    data: Path | None = Field(default=None, description="Folder of the public data products (gravity, kernels)")
     clock_file: Path | None = Field(
         default=None,
         description="File with the mission time of a simulated mission, written by `linna emulate --live`; "
@@ -95,9 +88,7 @@ class Settings(BaseSettings):
         description="Issuer of an OpenID provider for sign-in, such as https://login.example.org/realms/ops; needs the "
         "extra `oidc`; default: sign-in with tokens only",
     )
-    oidc_client_id: str | None = Field(
-        default=None, description="Name of this service at the OpenID provider"
-    )
+    oidc_client_id: str | None = Field(default=None, description="Name of this service at the OpenID provider")
     oidc_client_secret: SecretStr | None = Field(
         default=None, description="Secret of this service at the OpenID provider; default: a public client"
     )
@@ -165,18 +156,14 @@ class Settings(BaseSettings):
         description="Comma-separated addresses or networks of webhooks and mail servers that are not public, such as "
         "127.0.0.1 or 10.0.0.0/8; notifications to other addresses that are not public are refused",
     )
-    retention_days: int = Field(
-        default=90, ge=1, description="Days for which the feed and finished jobs are kept"
-    )
+    retention_days: int = Field(default=90, ge=1, description="Days for which the feed and finished jobs are kept")
     archive_days: int = Field(
         default=0,
         ge=0,
         description="Days after their last use for which regression archives are kept; 0: without limit",
     )
     archive_limit_mib: int = Field(
-        default=0,
-        ge=0,
-        description="Size of the kept regression archives in MiB, pinned ones included; 0: any",
+        default=0, ge=0, description="Size of the kept regression archives in MiB, pinned ones included; 0: any"
     )
     placebo_passes: int = Field(
         default=3,

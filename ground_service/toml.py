@@ -122,9 +122,7 @@ def _fault(kind: type[BaseModel], error: Any, source: str) -> InvalidInput:
         key = str(error["loc"][-1])
         known = keys_at(kind, error["loc"][:-1])
         near = difflib.get_close_matches(key, known, n=1)
-        return InvalidInput(
-            source, place, f"'{near[0]}'" if near else ", ".join(known), f"unknown key '{key}'"
-        )
+        return InvalidInput(source, place, f"'{near[0]}'" if near else ", ".join(known), f"unknown key '{key}'")
     message = str(error["msg"])
     expected = (message[:1].lower() + message[1:]).removeprefix("value error, ")
     expected, _, found = expected.removeprefix("input should be ").partition(", found ")

@@ -103,9 +103,7 @@ event.register("numba:compile", _Collection())
 
 
 @contextmanager
-def compiling_ahead(
-    groups: Sequence[Sequence[str]], log: Callable[[str], None]
-) -> Iterator[Callable[[], None]]:
+def compiling_ahead(groups: Sequence[Sequence[str]], log: Callable[[str], None]) -> Iterator[Callable[[], None]]:
     """Compile the kernels of groups of modules that have no file, each group in a process of its own.
 
     Yields a function that waits for them and logs how many are done.  A kernel that fails there is compiled on its
@@ -164,10 +162,7 @@ def declared(group: Sequence[str]) -> Iterator[tuple[Any, tuple[Any, ...]]]:
         importlib.import_module(module)
         for kernel, text in _ahead.get(module, {}).values():
             values = eval(f"[{text}]", {**vars(types), **kernel.py_func.__globals__})
-            yield (
-                kernel,
-                tuple(BaseTuple.from_types(v, type(v)) if isinstance(v, tuple) else v for v in values),
-            )
+            yield (kernel, tuple(BaseTuple.from_types(v, type(v)) if isinstance(v, tuple) else v for v in values))
 
 
 class _KernelCache:

@@ -35,10 +35,7 @@ TASKS: dict[str, dict[str, tuple[str, str]]] = {
         "correlate": ("correlate", "time correlation of a spacecraft: segments, residuals, reception times"),
         "plan": ("plan", "search, enter, approve and uplink observation windows"),
         "alarm": ("alarm", "list, acknowledge and shelve alarms"),
-        "landmarks": (
-            "landmarks",
-            "craters learned from flight: candidates, decisions, new catalogue, labels, upload",
-        ),
+        "landmarks": ("landmarks", "craters learned from flight: candidates, decisions, new catalogue, labels, upload"),
         "command": ("command", "queue, release, uplink and verify telecommands"),
     },
     "build and gate": {
@@ -49,10 +46,7 @@ TASKS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "study": {
         "paper": ("paper", "every figure and table of the LINNA paper, next to the values of the paper"),
-        "montecarlo": (
-            "montecarlo",
-            "Monte Carlo runs of anchored navigation: errors compared with covariances",
-        ),
+        "montecarlo": ("montecarlo", "Monte Carlo runs of anchored navigation: errors compared with covariances"),
         "navigation": ("navigation", "survey detection and navigation over the terrain of a region"),
         "camera": ("camera", "probability of craters in the footprint over the field of view"),
         "catalogue": ("catalogue", "crater catalogues: registration to terrain and on-board curation"),
@@ -113,9 +107,7 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 def _guarded(
-    handler: Callable[[argparse.Namespace], int | None],
-    namespace: argparse.Namespace,
-    arguments: Sequence[str],
+    handler: Callable[[argparse.Namespace], int | None], namespace: argparse.Namespace, arguments: Sequence[str]
 ) -> int:
     try:
         return int(handler(namespace) or 0)

@@ -64,9 +64,7 @@ def log(message: str) -> None:
     print(message, file=sys.stderr, flush=True)
 
 
-def progress(
-    items: Iterable[Item], total: int | None = None, label: str = "", unit: str = ""
-) -> Iterator[Item]:
+def progress(items: Iterable[Item], total: int | None = None, label: str = "", unit: str = "") -> Iterator[Item]:
     """Yield `items`, showing a bar with rate and time left on a terminal, plain lines otherwise."""
     if sys.stderr.isatty():
         from tqdm import tqdm

@@ -79,12 +79,7 @@ class _Subcommands(argparse._SubParsersAction):  # type: ignore[type-arg]  # gen
 
 
 def option(
-    parser: argparse._ActionsContainer,
-    name: str,
-    kind: Any = str,
-    help: str = "",
-    default: Any = None,
-    **words: Any,
+    parser: argparse._ActionsContainer, name: str, kind: Any = str, help: str = "", default: Any = None, **words: Any
 ) -> argparse.Action:
     """Add an argument to a parser.
 

@@ -79,9 +79,7 @@ class Archive(Mapping[int, "Pass"]):
     `client` gives access to everything else that the ground service offers.
     """
 
-    def __init__(
-        self, client: Client, source: str, folder: tempfile.TemporaryDirectory[str] | None = None
-    ) -> None:
+    def __init__(self, client: Client, source: str, folder: tempfile.TemporaryDirectory[str] | None = None) -> None:
         self.client = client
         self.source = source
         self._folder = folder
@@ -200,9 +198,7 @@ class Pass:
         )
         for one in columns:
             if one["datatype"] == "dateTime":
-                frame[one["name"]] = pandas.to_datetime(frame[one["name"]], utc=True).astype(
-                    "datetime64[ns, UTC]"
-                )
+                frame[one["name"]] = pandas.to_datetime(frame[one["name"]], utc=True).astype("datetime64[ns, UTC]")
         frame.attrs = {
             "description": self._schema[name]["dc:description"],
             "units": {one["name"]: one["linna:unit"] for one in columns if "linna:unit" in one},

@@ -84,9 +84,7 @@ def look_up(table: FloatArray, force: FloatArray, t: float, out: FloatArray) -> 
 
 
 @njit(error_model="numpy", boundscheck=False, fastmath={"contract", "nsz"})
-def _tide(
-    gm: float, sx: float, sy: float, sz: float, x: float, y: float, z: float
-) -> tuple[float, float, float]:
+def _tide(gm: float, sx: float, sy: float, sz: float, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Acceleration by a distant body at s, less that of the Moon's centre, without cancellation (Battin 1999, 8.62)."""
     s2 = sx * sx + sy * sy + sz * sz
     dx, dy, dz = x - sx, y - sy, z - sz
@@ -119,11 +117,7 @@ def _visible_share(
     # Two discs that overlap (Montenbruck and Gill, section 3.4.2).
     u = (c * c + a * a - b * b) / (2.0 * c)
     v = math.sqrt(max(0.0, a * a - u * u))
-    area = (
-        a * a * math.acos(min(1.0, max(-1.0, u / a)))
-        + b * b * math.acos(min(1.0, max(-1.0, (c - u) / b)))
-        - c * v
-    )
+    area = a * a * math.acos(min(1.0, max(-1.0, u / a))) + b * b * math.acos(min(1.0, max(-1.0, (c - u) / b))) - c * v
     return 1.0 - area / (math.pi * a * a)
 
 
@@ -173,9 +167,7 @@ def force_acceleration(
 
 
 @njit(error_model="numpy", boundscheck=False)
-def interpolate(
-    times: FloatArray, states: FloatArray, rates: FloatArray, k: int, s: float, out: FloatArray
-) -> None:
+def interpolate(times: FloatArray, states: FloatArray, rates: FloatArray, k: int, s: float, out: FloatArray) -> None:
     """Write the state at the fraction ``s`` of the step from knot ``k``: the quintic through both ends (r, v, a)."""
     h = times[k + 1] - times[k]
     for d in range(3):
@@ -192,9 +184,7 @@ def interpolate(
 
 
 @njit(error_model="numpy", boundscheck=False)
-def evaluate(
-    times: FloatArray, states: FloatArray, rates: FloatArray, wanted: FloatArray, out: FloatArray
-) -> None:
+def evaluate(times: FloatArray, states: FloatArray, rates: FloatArray, wanted: FloatArray, out: FloatArray) -> None:
     """Write the states at ``wanted`` times; where two knots share a time (a burn) the later one rules from there on."""
     for i in range(len(wanted)):
         low = 0
@@ -207,9 +197,7 @@ def evaluate(
                 high = middle
         while low > 0 and times[low + 1] == times[low]:
             low -= 1
-        interpolate(
-            times, states, rates, low, (wanted[i] - times[low]) / (times[low + 1] - times[low]), out[i]
-        )
+        interpolate(times, states, rates, low, (wanted[i] - times[low]) / (times[low + 1] - times[low]), out[i])
 
 
 @njit(error_model="numpy", boundscheck=False)
@@ -269,13 +257,7 @@ def _events(
 
 @njit(error_model="numpy", boundscheck=False, nogil=True)
 def _stage_place(
-    work: FloatArray,
-    k: FloatArray,
-    y: FloatArray,
-    a: FloatArray,
-    c: FloatArray,
-    stage: int,
-    signed: float,
+    work: FloatArray, k: FloatArray, y: FloatArray, a: FloatArray, c: FloatArray, stage: int, signed: float
 ) -> None:
     """Put the position of a stage into ``work``, from the accelerations ``k`` of the stages before it."""
     for d in range(3):
@@ -321,13 +303,7 @@ def _step_end(
 
 @njit(error_model="numpy", boundscheck=False, nogil=True)
 def _keep_knot(
-    times: FloatArray,
-    states: FloatArray,
-    rates: FloatArray,
-    count: int,
-    t: float,
-    y: FloatArray,
-    k: FloatArray,
+    times: FloatArray, states: FloatArray, rates: FloatArray, count: int, t: float, y: FloatArray, k: FloatArray
 ) -> None:
     times[count] = t
     for d in range(6):
@@ -374,14 +350,7 @@ def _next_end(t: float, stop_s: float, sign: float, h: float) -> tuple[float, fl
 
 @njit(error_model="numpy", boundscheck=False, nogil=True)
 def _search_step(
-    knots: Knots,
-    count: int,
-    status: int,
-    sign: float,
-    control: Control,
-    y: FloatArray,
-    k: FloatArray,
-    work: FloatArray,
+    knots: Knots, count: int, status: int, sign: float, control: Control, y: FloatArray, k: FloatArray, work: FloatArray
 ) -> tuple[int, float]:
     """Return what happened in the step to the newest knot, and the time from there to the event that ends it."""
     times, states, rates = knots
@@ -476,9 +445,7 @@ def integrate(
 
 
 @njit(error_model="numpy", boundscheck=False)
-def _tide_gradient(
-    gm: float, sx: float, sy: float, sz: float, x: float, y: float, z: float, g: FloatArray
-) -> None:
+def _tide_gradient(gm: float, sx: float, sy: float, sz: float, x: float, y: float, z: float, g: FloatArray) -> None:
     dx, dy, dz = x - sx, y - sy, z - sz
     d2 = dx * dx + dy * dy + dz * dz
     f = gm / (d2 * math.sqrt(d2))
@@ -551,9 +518,7 @@ def transition(
                 for d in range(42):
                     work[d] += factor * k[j, d]
             t = (number + c[stage]) * h
-            ax, ay, az = force_acceleration(
-                t, work[0], work[1], work[2], gravity, force, table, scratch, frame
-            )
+            ax, ay, az = force_acceleration(t, work[0], work[1], work[2], gravity, force, table, scratch, frame)
             _force_gradient(low, force, frame, work[0], work[1], work[2], g)
             for d in range(3):
                 k[stage, d] = work[d + 3]

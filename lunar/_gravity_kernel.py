@@ -153,8 +153,7 @@ class _VectorCode:
         """Return the six sums with one degree added: C at m-1, m, m+1, then S."""
         places = [0, 1, 2, LANES + 2, LANES + 3, LANES + 4]
         return [
-            self.fma(self.load(pointer, offset + k), harmonic, total)
-            for k, total in zip(places, sums, strict=True)
+            self.fma(self.load(pointer, offset + k), harmonic, total) for k, total in zip(places, sums, strict=True)
         ]
 
     def phis(self, count: int) -> list[ir.PhiInstr]:
@@ -176,10 +175,7 @@ class _VectorCode:
             self.spread(builder.fmul(builder.fmul(n_less_1, n_less_1), rho2)),
             self.spread(builder.fmul(odd, rho2)),
         ]
-        seeds = [
-            ir.Constant(self.vector, [1.0 if lane == j else 0.0 for lane in range(LANES)])
-            for j in range(LANES)
-        ]
+        seeds = [ir.Constant(self.vector, [1.0 if lane == j else 0.0 for lane in range(LANES)]) for j in range(LANES)]
         ladder = self.climb(ladder)
         before, last, sums = seeds[0], self.fma(ladder[0], seeds[0], seeds[1]), [self.zero] * 6
         for j in range(2, LANES):
@@ -234,8 +230,7 @@ def _emit(
     """
     entry = builder.block
     block_loop, degree_test, degree_loop, block_end, done = (
-        builder.append_basic_block(f"gravity.{name}")
-        for name in ("block", "test", "degree", "block_end", "done")
+        builder.append_basic_block(f"gravity.{name}") for name in ("block", "test", "degree", "block_end", "done")
     )
     code = _VectorCode(builder, builder.fmul(ir.Constant(ir.DoubleType(), 2.0), zeta), rho2)
     powers = [code.load(scratch, _POWER_RE), code.load(scratch, _POWER_IM)]
@@ -312,9 +307,7 @@ def sums(
 
 
 @njit(error_model="numpy", boundscheck=False)
-def acceleration(
-    packed: FloatArray, scratch: FloatArray, x: float, y: float, z: float
-) -> tuple[float, float, float]:
+def acceleration(packed: FloatArray, scratch: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Return the acceleration (m/s^2) at a body-fixed position (m), central term included, as three floats.
 
     ``packed`` comes from `pack`; ``scratch`` is a float64 array of at least `scratch_size` that the caller keeps.
@@ -402,9 +395,7 @@ def acceleration_gradient(
         harmonic[m, m + 2] = sectorial
         for n in range(m + 1, size):
             older = harmonic[n - 2, m + 2] if n > m + 1 else 0.0j
-            harmonic[n, m + 2] = (2 * n - 1) * zeta * harmonic[n - 1, m + 2] - (
-                (n - 1) ** 2 - m * m
-            ) * rho2 * older
+            harmonic[n, m + 2] = (2 * n - 1) * zeta * harmonic[n - 1, m + 2] - ((n - 1) ** 2 - m * m) * rho2 * older
     for n in range(size):
         harmonic[n, 1] = -harmonic[n, 3].conjugate()
         harmonic[n, 0] = harmonic[n, 4].conjugate() if size > 2 else 0.0j
@@ -436,9 +427,7 @@ def gradients(packed: FloatArray, positions: FloatArray) -> FloatArray:
     """Return the gradients at positions of shape (n, 3), shape (n, 3, 3)."""
     out = np.empty((len(positions), 3, 3))
     for i in range(len(positions)):
-        xx, xy, xz, yy, yz, zz = acceleration_gradient(
-            packed, positions[i, 0], positions[i, 1], positions[i, 2]
-        )
+        xx, xy, xz, yy, yz, zz = acceleration_gradient(packed, positions[i, 0], positions[i, 1], positions[i, 2])
         out[i, 0, 0] = xx
         out[i, 1, 1] = yy
         out[i, 2, 2] = zz

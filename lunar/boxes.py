@@ -27,25 +27,18 @@ class Box:
         width = min(self.east_deg - self.west_deg + 2.0 * margin_deg, 360.0)
         west_deg = self.west_deg - margin_deg
         return Box(
-            west_deg,
-            west_deg + width,
-            max(self.south_deg - margin_deg, -90.0),
-            min(self.north_deg + margin_deg, 90.0),
+            west_deg, west_deg + width, max(self.south_deg - margin_deg, -90.0), min(self.north_deg + margin_deg, 90.0)
         )
 
 
-def inside_box(
-    box: Box, latitude_deg: FloatArray, longitude_deg: FloatArray, buffer_km: float = 0.0
-) -> BoolArray:
+def inside_box(box: Box, latitude_deg: FloatArray, longitude_deg: FloatArray, buffer_km: float = 0.0) -> BoolArray:
     """Return which places lie in a box or within `buffer_km` of it."""
     margin = math.degrees(buffer_km * 1000.0 / MOON_RADIUS_M)
     widen = margin / np.cos(np.radians(np.minimum(np.abs(latitude_deg) + margin, 85.0)))
     middle = 0.5 * (box.west_deg + box.east_deg)
     offset = np.mod(longitude_deg - middle + 180.0, 360.0) - 180.0
     across = np.abs(offset) <= 0.5 * (box.east_deg - box.west_deg) + widen
-    inside: BoolArray = (
-        across & (latitude_deg >= box.south_deg - margin) & (latitude_deg <= box.north_deg + margin)
-    )
+    inside: BoolArray = across & (latitude_deg >= box.south_deg - margin) & (latitude_deg <= box.north_deg + margin)
     return inside
 
 

@@ -71,9 +71,7 @@ def nadir_camera_from_mcmf(position_mcmf_m: ArrayLike) -> FloatArray:
     return np.asarray(CAMERA_FROM_ENU @ enu_from_mcmf(latitude_rad, longitude_rad))
 
 
-def intersect_sphere(
-    origin_m: ArrayLike, direction: ArrayLike, radius_m: ArrayLike = MOON_RADIUS_M
-) -> FloatArray:
+def intersect_sphere(origin_m: ArrayLike, direction: ArrayLike, radius_m: ArrayLike = MOON_RADIUS_M) -> FloatArray:
     """Return the range ``(...)`` in m along unit directions to a sphere about the frame's origin.
 
     NaN where the line misses the sphere or the sphere lies behind.  From inside the sphere, the range to the
@@ -103,9 +101,7 @@ def project_mcmf(
     `above_horizon`.
     """
     rotation = np.asarray(camera_from_mcmf, dtype=np.float64)
-    line_of_sight = np.asarray(points_mcmf_m, dtype=np.float64) - np.asarray(
-        position_mcmf_m, dtype=np.float64
-    )
+    line_of_sight = np.asarray(points_mcmf_m, dtype=np.float64) - np.asarray(position_mcmf_m, dtype=np.float64)
     return camera.project(np.einsum("...ij,...j->...i", rotation, line_of_sight))
 
 
@@ -150,6 +146,4 @@ def ground_arc_m(off_nadir_rad: ArrayLike, altitude_m: ArrayLike) -> FloatArray:
 
 def horizon_arc_m(altitude_m: ArrayLike) -> FloatArray:
     """Return the arc in m on the sphere from the sub-camera point to the horizon."""
-    return np.asarray(
-        MOON_RADIUS_M * np.arccos(1.0 / (1.0 + np.asarray(altitude_m, dtype=np.float64) / MOON_RADIUS_M))
-    )
+    return np.asarray(MOON_RADIUS_M * np.arccos(1.0 / (1.0 + np.asarray(altitude_m, dtype=np.float64) / MOON_RADIUS_M)))

@@ -24,14 +24,7 @@ from lunar.compressed import EXPANDED_LIMIT_OCTETS, open_expanded
 from lunar.constants import MOON_RADIUS_M
 from lunar.errors import DataFileError, LunarError
 from lunar.frames import mcmf_from_spherical
-from lunar.plausible import (
-    CRATER_COVER,
-    CRATER_DEPTH,
-    CRATER_DEPTH_RATIO,
-    CRATER_DIAMETER_M,
-    CRATER_MEDIAN_M,
-    HEIGHT_M,
-)
+from lunar.plausible import CRATER_COVER, CRATER_DEPTH, CRATER_DEPTH_RATIO, CRATER_DIAMETER_M, CRATER_MEDIAN_M, HEIGHT_M
 
 TWO_PI = 2.0 * math.pi
 
@@ -163,11 +156,7 @@ class CraterCatalogue:
         candidates = np.unique(np.concatenate(pieces))
         cos_latitude = math.cos(latitude_rad)
         place = np.array(
-            [
-                cos_latitude * math.cos(longitude_rad),
-                cos_latitude * math.sin(longitude_rad),
-                math.sin(latitude_rad),
-            ]
+            [cos_latitude * math.cos(longitude_rad), cos_latitude * math.sin(longitude_rad), math.sin(latitude_rad)]
         )
         chord = np.linalg.norm(unit[candidates] - place, axis=-1)
         return np.asarray(candidates[chord <= 2.0 * math.sin(min(arc, math.pi) / 2.0)])
@@ -263,9 +252,7 @@ def completed_to_paper(catalogue: CraterCatalogue, seed: int) -> CraterCatalogue
     in_range = catalogue.complete & (size_class(catalogue.diameter_m) >= 0)
     known = catalogue.select(in_range & (catalogue.diameter_m >= CLASS_LIMITS_M[0]))
     missing = np.array(PAPER_CLASS_COUNTS) - class_counts(known)
-    tiles = np.bincount(
-        _tile(catalogue.latitude_rad, catalogue.longitude_rad)[catalogue.complete], minlength=72
-    )
+    tiles = np.bincount(_tile(catalogue.latitude_rad, catalogue.longitude_rad)[catalogue.complete], minlength=72)
     empty = tiles == 0
     if np.any(missing < 0) or not np.any(empty):
         raise LunarError(
@@ -344,9 +331,7 @@ def _reader_of(path: Path, columns: _Columns) -> Reader:
         if needed <= set(columns):
             return reader
     known = "; ".join(", ".join(sorted(needed)) for _, needed in _READERS)
-    raise DataFileError(
-        path, "line 1", f"the columns of a crater catalogue ({known})", ", ".join(columns) or "nothing"
-    )
+    raise DataFileError(path, "line 1", f"the columns of a crater catalogue ({known})", ", ".join(columns) or "nothing")
 
 
 def _joined(blocks: list[CraterCatalogue]) -> CraterCatalogue:
@@ -538,9 +523,7 @@ def _ids(path: Path, columns: _Columns) -> IntArray:
     whole = (np.rint(numbers) == numbers) & (np.abs(numbers) < 2.0**53)
     if not whole.all():
         row = int(np.argmin(whole))
-        raise DataFileError(
-            path, f"line {row + columns.first}, column id", "a whole number", columns["id"][row]
-        )
+        raise DataFileError(path, f"line {row + columns.first}, column id", "a whole number", columns["id"][row])
     return numbers.astype(np.int64)
 
 
@@ -553,9 +536,7 @@ def _flags(path: Path, columns: _Columns, name: str) -> BoolArray:
     texts = [text.strip().lower() for text in columns[name]]
     for row, text in enumerate(texts):
         if text not in ("1", "true", "0", "false", ""):
-            raise DataFileError(
-                path, f"line {row + columns.first}, column {name}", "1, 0, true or false", repr(text)
-            )
+            raise DataFileError(path, f"line {row + columns.first}, column {name}", "1, 0, true or false", repr(text))
     return np.array([text in ("1", "true") for text in texts], dtype=np.bool_)
 
 
@@ -622,11 +603,7 @@ _KNOWN_COLUMNS = frozenset().union(*(needed for _, needed in _READERS), {"rim_he
 
 def _check_ranges(path: Path, catalogue: CraterCatalogue) -> None:
     checks = (
-        (
-            CRATER_DIAMETER_M.holds(catalogue.diameter_m),
-            f"a diameter of {CRATER_DIAMETER_M}",
-            catalogue.diameter_m,
-        ),
+        (CRATER_DIAMETER_M.holds(catalogue.diameter_m), f"a diameter of {CRATER_DIAMETER_M}", catalogue.diameter_m),
         (
             HEIGHT_M.holds(catalogue.rim_height_m) | np.isnan(catalogue.rim_height_m),
             f"a rim height of {HEIGHT_M} above the map sphere",
@@ -665,9 +642,7 @@ def _check_whole(path: Path, catalogue: CraterCatalogue) -> None:
     diameter_m = catalogue.diameter_m
     median_m = float(np.median(diameter_m))
     if not CRATER_MEDIAN_M.holds(median_m):
-        raise DataFileError(
-            path, "", f"a median diameter of {CRATER_MEDIAN_M}", f"{median_m:.6g} m; another unit?"
-        )
+        raise DataFileError(path, "", f"a median diameter of {CRATER_MEDIAN_M}", f"{median_m:.6g} m; another unit?")
     ratio = (catalogue.depth_m / diameter_m)[catalogue.depth_m > 0.0]
     if ratio.size and not CRATER_DEPTH_RATIO.holds(np.median(ratio)):
         found = f"{np.median(ratio):.3g}; another unit of depths?"
@@ -675,15 +650,11 @@ def _check_whole(path: Path, catalogue: CraterCatalogue) -> None:
     heights_m = catalogue.rim_height_m[np.isfinite(catalogue.rim_height_m)]
     if heights_m.size >= _MANY and heights_m.std() > 0.0 and np.abs(heights_m).max() <= HEIGHT_M.high / 1e3:
         found = f"none over {np.abs(heights_m).max():.3g} m; kilometres?"
-        raise DataFileError(
-            path, "", f"some of {heights_m.size} rim heights over {HEIGHT_M.high / 1e3:g} m", found
-        )
+        raise DataFileError(path, "", f"some of {heights_m.size} rim heights over {HEIGHT_M.high / 1e3:g} m", found)
     cover = len(catalogue) * 0.25 * math.pi * median_m**2 / _spanned_m2(catalogue, median_m)
     if len(catalogue) >= _MANY and cover > CRATER_COVER:
         found = f"{cover:.3g} times that ground; angles or diameters in another unit?"
-        raise DataFileError(
-            path, "", f"craters that cover at most {CRATER_COVER:g} of the ground they span", found
-        )
+        raise DataFileError(path, "", f"craters that cover at most {CRATER_COVER:g} of the ground they span", found)
 
 
 _MANY = 20
@@ -695,9 +666,7 @@ def _spanned_m2(catalogue: CraterCatalogue, margin_m: float) -> float:
     low, high = catalogue.latitude_rad.min() - margin, catalogue.latitude_rad.max() + margin
     south, north = max(low, -0.5 * math.pi), min(high, 0.5 * math.pi)
     gaps = np.diff(np.sort(catalogue.longitude_rad), append=catalogue.longitude_rad.min() + TWO_PI)
-    width = min(
-        TWO_PI, TWO_PI - float(gaps.max()) + margin / max(math.cos(max(abs(south), abs(north))), 1e-3)
-    )
+    width = min(TWO_PI, TWO_PI - float(gaps.max()) + margin / max(math.cos(max(abs(south), abs(north))), 1e-3))
     return float(MOON_RADIUS_M**2 * (math.sin(north) - math.sin(south)) * width)
 
 

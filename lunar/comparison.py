@@ -188,9 +188,7 @@ def _deviations(arc: EphemerisSegment) -> FloatArray:
     span = (seconds[last] - seconds[first])[:, None]
     middle = (arc.tai_ns[first] + arc.tai_ns[last]) // 2
     start, speed = arc.position_m[first], arc.velocity_m_s[first]
-    fallen = (
-        _moved(start, speed, span, earth_position_icrf_m(tdb_s_from_tai_ns(middle))) - start - span * speed
-    )
+    fallen = _moved(start, speed, span, earth_position_icrf_m(tdb_s_from_tai_ns(middle))) - start - span * speed
     found = arc.position_m[last] - start - span * speed
     expected_m, found_m, off_m = (np.linalg.norm(one, axis=1) for one in (fallen, found, found - fallen))
     kept = np.maximum(expected_m, found_m) > _FALL_M

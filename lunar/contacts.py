@@ -11,14 +11,7 @@ from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns
-from lunar.visibility import (
-    GroundStation,
-    find_windows,
-    link,
-    subsatellite,
-    sun_elevation_azimuth,
-    sunlit_fraction,
-)
+from lunar.visibility import GroundStation, find_windows, link, subsatellite, sun_elevation_azimuth, sunlit_fraction
 
 Span = tuple[int, int]
 
@@ -46,10 +39,7 @@ class VisibilitySpans:
 
 
 def visibility_spans(
-    ephemeris: Ephemeris,
-    orientation: Orientation,
-    stations: tuple[GroundStation, ...] = (),
-    step_s: float = 60.0,
+    ephemeris: Ephemeris, orientation: Orientation, stations: tuple[GroundStation, ...] = (), step_s: float = 60.0
 ) -> VisibilitySpans:
     """Return what sees what over a whole ephemeris, to a second.
 
@@ -66,9 +56,7 @@ def visibility_spans(
 
     def eclipsed(utc_ns: IntArray) -> BoolArray:
         tdb_s = tdb_s_from_utc_ns(utc_ns)
-        share = sunlit_fraction(
-            ephemeris.at(utc_ns)[0], sun_position_icrf_m(tdb_s), earth_position_icrf_m(tdb_s)
-        )
+        share = sunlit_fraction(ephemeris.at(utc_ns)[0], sun_position_icrf_m(tdb_s), earth_position_icrf_m(tdb_s))
         return np.asarray(share < 0.5)
 
     def night(utc_ns: IntArray) -> BoolArray:
@@ -87,9 +75,7 @@ def visibility_spans(
         return lambda utc_ns: link(ephemeris, utc_ns, station).visible
 
     found = {station.name: spans(seen_from(station)) for station in stations}
-    whole = link(
-        ephemeris, np.linspace(start, stop, 1 + int((stop - start) // (600 * NS)) + 1).astype(np.int64)
-    )
+    whole = link(ephemeris, np.linspace(start, stop, 1 + int((stop - start) // (600 * NS)) + 1).astype(np.int64))
     return VisibilitySpans(
         start,
         stop,

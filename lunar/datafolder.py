@@ -51,15 +51,9 @@ class DataFolder:
             (self.gravity_alternative, f"gravity {_stem(self.gravity_alternative)} (Lunar Prospector, JPL)"),
             (self.orientation_bpc, "lunar orientation DE421 (JPL, NAIF)"),
             (self.catalogue_lu, "crater catalogue LU1319381 (Wang et al. 2022)"),
-            (
-                self.catalogue_composite,
-                "crater catalogue composite (LU1319381; Robbins 2019; Povilaitis et al. 2018)",
-            ),
+            (self.catalogue_composite, "crater catalogue composite (LU1319381; Robbins 2019; Povilaitis et al. 2018)"),
             (self.catalogue_robbins, f"crater catalogue {listed}"),
-            (
-                self.dem_tiles or None,
-                self.own_heights or "height model LROC WAC GLD100 (Scholten et al. 2012)",
-            ),
+            (self.dem_tiles or None, self.own_heights or "height model LROC WAC GLD100 (Scholten et al. 2012)"),
             (self.dem_global, "height model LROC WAC GLD100, 16 px/deg"),
             (self.dem_sldem or None, "height model SLDEM2015 (Barker et al. 2016)"),
             (self.albedo, "albedo map"),
@@ -83,9 +77,7 @@ def find_data(path: Path | str | None) -> DataFolder:
     if not root.is_dir():
         raise DataFileError(root, "", "a data folder", "a file" if root.exists() else "nothing there")
     global_dem = _first(root, "dem/*_global.jp2", "dem/*_global.tif")
-    tiles = _all(
-        root, "dem/*ppd_*E_*.jp2", "dem/*ppd_*E_*.tif", "dem/WAC_GLD100_E*.IMG", "dem/WAC_GLD100_E*.tif"
-    )
+    tiles = _all(root, "dem/*ppd_*E_*.jp2", "dem/*ppd_*E_*.tif", "dem/WAC_GLD100_E*.IMG", "dem/WAC_GLD100_E*.tif")
     return DataFolder(
         root=root,
         gravity=_first(root, "gravity/GRGM*.gfc", "gravity/*.gfc", "gravity/*GRGM*", "gravity/*.tab"),

@@ -58,9 +58,7 @@ def state_from_elements(elements: Elements, gm_m3_s2: float) -> tuple[FloatArray
     speed = math.sqrt(gm_m3_s2 / p)
     omega = elements.argument_of_perilune_rad
     position = radius * (math.cos(u) * node + math.sin(u) * across)
-    velocity = speed * (
-        -(math.sin(u) + e * math.sin(omega)) * node + (math.cos(u) + e * math.cos(omega)) * across
-    )
+    velocity = speed * (-(math.sin(u) + e * math.sin(omega)) * node + (math.cos(u) + e * math.cos(omega)) * across)
     return position, velocity
 
 
@@ -91,18 +89,12 @@ def elements_from_state(position_m: ArrayLike, velocity_m_s: ArrayLike, gm_m3_s2
     node = np.array([math.cos(raan), math.sin(raan), 0.0])
     across = np.cross(h / momentum, node)
     u = math.atan2(float(r @ across), float(r @ node))
-    omega = (
-        math.atan2(float(eccentricity_vector @ across), float(eccentricity_vector @ node))
-        if e > 1e-12
-        else 0.0
-    )
+    omega = math.atan2(float(eccentricity_vector @ across), float(eccentricity_vector @ node)) if e > 1e-12 else 0.0
     turn = 2.0 * math.pi
     return Elements(a, e, inclination, raan % turn, omega % turn, (u - omega) % turn)
 
 
-def icrf_state_from_elements(
-    elements: Elements, tdb_s: float, gm_m3_s2: float
-) -> tuple[FloatArray, FloatArray]:
+def icrf_state_from_elements(elements: Elements, tdb_s: float, gm_m3_s2: float) -> tuple[FloatArray, FloatArray]:
     """Return position and velocity along ICRF axes from elements in MCI at ``tdb_s``."""
     from lunar.frames import mci_from_icrf
 

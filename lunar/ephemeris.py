@@ -83,9 +83,7 @@ class EphemerisSegment:
         elif not np.array_equal(utc_ns_from_tai_ns(self.tai_ns), self.utc_ns):
             raise EphemerisError("an ephemeris segment: expected TAI epochs of its UTC epochs, found others")
         if self.frame != ICRF:
-            raise EphemerisError(
-                f"an ephemeris segment: expected states turned into ICRF, found {self.frame}"
-            )
+            raise EphemerisError(f"an ephemeris segment: expected states turned into ICRF, found {self.frame}")
         if n == 0:
             raise EphemerisError("an ephemeris segment: expected at least one state, found none")
         for name, values in (("positions", self.position_m), ("velocities", self.velocity_m_s)):
@@ -93,15 +91,11 @@ class EphemerisSegment:
                 raise EphemerisError(f"an ephemeris segment: expected {name} ({n}, 3), found {values.shape}")
             bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
             if bad.size:
-                raise EphemerisError(
-                    f"ephemeris state {bad[0]}: expected finite {name}, found NaN or infinity"
-                )
+                raise EphemerisError(f"ephemeris state {bad[0]}: expected finite {name}, found NaN or infinity")
         late = np.flatnonzero(np.diff(self.tai_ns) <= 0)
         if late.size:
             before, after = (format_tai(int(self.tai_ns[late[0] + k])) for k in (0, 1))
-            raise EphemerisError(
-                f"ephemeris state {late[0] + 1}: expected an epoch after {before}, found {after}"
-            )
+            raise EphemerisError(f"ephemeris state {late[0] + 1}: expected an epoch after {before}, found {after}")
         if self.interpolation not in INTERPOLATIONS or self.degree < 1:
             raise EphemerisError(
                 f"an ephemeris segment: expected an interpolation of {', '.join(INTERPOLATIONS)} of "
@@ -142,9 +136,7 @@ class EphemerisSegment:
     def _gaps(self) -> BoolArray:
         """Return which steps (n - 1,) are gaps."""
         steps = np.diff(self.tai_ns)
-        return (
-            steps > GAP_FACTOR * np.median(steps) if len(steps) > 2 else np.zeros(len(steps), dtype=np.bool_)
-        )
+        return steps > GAP_FACTOR * np.median(steps) if len(steps) > 2 else np.zeros(len(steps), dtype=np.bool_)
 
 
 @dataclass(frozen=True, eq=False)
@@ -404,18 +396,14 @@ def _in_gap(segment: EphemerisSegment, flat: IntArray) -> BoolArray:
     return np.asarray(segment._gaps[step] & ~at_node)
 
 
-def _interpolate(
-    segment: EphemerisSegment, flat: IntArray, position: FloatArray, velocity: FloatArray
-) -> None:
+def _interpolate(segment: EphemerisSegment, flat: IntArray, position: FloatArray, velocity: FloatArray) -> None:
     """Fill positions and velocities (m, 3) at TAI epochs (m,) inside the segment."""
     gap = _in_gap(segment, flat)
     if np.any(gap):
         asked = int(flat[np.flatnonzero(gap)[0]])
         k = int(_steps_of(segment, np.array([asked], dtype=np.int64))[0])
         before, after = (format_tai(int(epoch)) for epoch in segment.tai_ns[k : k + 2])
-        raise EphemerisCoverageError(
-            format_tai(asked), f"the states of a segment with a gap {before}..{after}"
-        )
+        raise EphemerisCoverageError(format_tai(asked), f"the states of a segment with a gap {before}..{after}")
     nodes = segment.tai_ns
     n = len(nodes)
     if n == 1:
@@ -434,9 +422,7 @@ def _interpolate(
     origin_ns = nodes[needed]
     half_s = (nodes[needed + 1] - origin_ns) / (2 * NS)
     node = ((nodes[window] - origin_ns[:, None]) / NS / half_s[:, None] - 1.0).T
-    states = np.concatenate([segment.position_m[window], segment.velocity_m_s[window]], axis=2).transpose(
-        1, 2, 0
-    )
+    states = np.concatenate([segment.position_m[window], segment.velocity_m_s[window]], axis=2).transpose(1, 2, 0)
     if hermite:
         table = _hermite_polynomials(node, states[:, :3], states[:, 3:] * half_s)
     else:

@@ -94,9 +94,7 @@ class EphemerisError(LunarError):
 class UnmovedByGravity(EphemerisError):
     """States that do not move as the gravity of the Moon moves them: radius in m, accelerations in m/s2."""
 
-    def __init__(
-        self, name: str, radius_m: float, expected_m_s2: float, found_m_s2: float, off: float
-    ) -> None:
+    def __init__(self, name: str, radius_m: float, expected_m_s2: float, found_m_s2: float, off: float) -> None:
         self.where = f"states of {name}"
         self.expected = (
             f"an acceleration of {expected_m_s2:.4g} m/s2 by gravity {radius_m / 1e3:.6g} km "
@@ -115,9 +113,7 @@ class EphemerisCoverageError(LunarError):
     def __init__(self, requested: str, covered: str, what: str = "ephemeris") -> None:
         self.requested = requested
         self.covered = covered
-        super().__init__(
-            f"{what}: expected an epoch within {covered}, found {requested}; nothing is extrapolated"
-        )
+        super().__init__(f"{what}: expected an epoch within {covered}, found {requested}; nothing is extrapolated")
 
 
 class OrbitError(LunarError):

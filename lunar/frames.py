@@ -43,21 +43,7 @@ CENTURY_S = 36_525.0 * DAY_S
 # WGCCRE 2009: E1 to E13 in degrees at J2000 and degrees per day, then their coefficients in degrees for right
 # ascension (sine) and declination (cosine) of the pole, and for the prime meridian (sine).
 IAU_E_DEG = np.array(
-    [
-        125.045,
-        250.089,
-        260.008,
-        176.625,
-        357.529,
-        311.589,
-        134.963,
-        276.617,
-        34.226,
-        15.134,
-        119.743,
-        239.961,
-        25.053,
-    ]
+    [125.045, 250.089, 260.008, 176.625, 357.529, 311.589, 134.963, 276.617, 34.226, 15.134, 119.743, 239.961, 25.053]
 )
 IAU_E_RATE_DEG_DAY = np.array(
     [
@@ -65,17 +51,10 @@ IAU_E_RATE_DEG_DAY = np.array(
         *(0.3287146, 1.7484877, -0.1589763, 0.0036096, 0.1643573, 12.9590088),
     ]
 )
-IAU_POLE_RA_TERMS_DEG = np.array(
-    [-3.8787, -0.1204, 0.0700, -0.0172, 0, 0.0072, 0, 0, 0, -0.0052, 0, 0, 0.0043]
-)
-IAU_POLE_DEC_TERMS_DEG = np.array(
-    [1.5419, 0.0239, -0.0278, 0.0068, 0, -0.0029, 0.0009, 0, 0, 0.0008, 0, 0, -0.0009]
-)
+IAU_POLE_RA_TERMS_DEG = np.array([-3.8787, -0.1204, 0.0700, -0.0172, 0, 0.0072, 0, 0, 0, -0.0052, 0, 0, 0.0043])
+IAU_POLE_DEC_TERMS_DEG = np.array([1.5419, 0.0239, -0.0278, 0.0068, 0, -0.0029, 0.0009, 0, 0, 0.0008, 0, 0, -0.0009])
 IAU_MERIDIAN_TERMS_DEG = np.array(
-    [
-        *(3.5610, 0.1208, -0.0642, 0.0158, 0.0252, -0.0066, -0.0047),
-        *(-0.0046, 0.0028, 0.0052, 0.0040, 0.0019, -0.0044),
-    ]
+    [*(3.5610, 0.1208, -0.0642, 0.0158, 0.0252, -0.0066, -0.0047), *(-0.0046, 0.0028, 0.0052, 0.0040, 0.0019, -0.0044)]
 )
 
 IAU_POLE_RA_DEG, IAU_POLE_DEC_DEG = (269.9949, 0.0031, 0.0), (66.5392, 0.0130, 0.0)
@@ -222,11 +201,7 @@ def load_orientation(bpc_path: Path | str, tf_path: Path | str | None = None) ->
     frame, words = _pck_segment(path, octets)
     start, record_s, record_words, record_count = (float(v) for v in words[-4:])
     values = words[:-4]
-    if (
-        values.size != int(record_words) * int(record_count)
-        or record_words < 5
-        or (int(record_words) - 2) % 3
-    ):
+    if values.size != int(record_words) * int(record_count) or record_words < 5 or (int(record_words) - 2) % 3:
         expected = f"{record_count:.0f} records of {record_words:.0f} words"
         raise DataFileError(path, "coefficients", expected, f"{values.size} words")
     if not np.all(np.isfinite(values)):
@@ -307,9 +282,7 @@ def spherical_from_mcmf(position_mcmf_m: ArrayLike) -> tuple[FloatArray, FloatAr
     return np.arctan2(z, equatorial), np.arctan2(y, x), np.asarray(np.hypot(equatorial, z) - MOON_RADIUS_M)
 
 
-def mcmf_from_spherical(
-    latitude_rad: ArrayLike, longitude_rad: ArrayLike, altitude_m: ArrayLike = 0.0
-) -> FloatArray:
+def mcmf_from_spherical(latitude_rad: ArrayLike, longitude_rad: ArrayLike, altitude_m: ArrayLike = 0.0) -> FloatArray:
     """Return positions in m, shape ``(..., 3)``, of places at altitudes above `MOON_RADIUS_M`."""
     latitude, longitude, altitude = np.broadcast_arrays(
         np.asarray(latitude_rad, dtype=np.float64),
@@ -411,10 +384,7 @@ def _me_from_pa_of_kernel(path: Path, pa_frame: int) -> FloatArray:
         turns = [axis_rotation(axis, angle * scale) for axis, angle in zip(axes, angles, strict=True)]
         return np.ascontiguousarray((turns[0] @ turns[1] @ turns[2]).T)
     raise DataFileError(
-        path,
-        "frame specifications",
-        f"three angles of a mean-Earth frame relative to frame {pa_frame}",
-        "none",
+        path, "frame specifications", f"three angles of a mean-Earth frame relative to frame {pa_frame}", "none"
     )
 
 
@@ -429,9 +399,7 @@ def _pck_segment(path: Path, octets: bytes) -> tuple[int, FloatArray]:
     (first_summary,) = struct.unpack_from(order + "i", octets, 76)
     at = (first_summary - 1) * _DAF_RECORD
     if (nd, ni) != (2, 5) or not 0 < at <= len(octets) - _DAF_RECORD:
-        raise DataFileError(
-            path, "file header", "ND = 2, NI = 5 and a summary record", f"ND = {nd}, NI = {ni}"
-        )
+        raise DataFileError(path, "file header", "ND = 2, NI = 5 and a summary record", f"ND = {nd}, NI = {ni}")
     following, _, count = struct.unpack_from(order + "3d", octets, at)
     frame, axes, kind, first, last = struct.unpack_from(order + "5i", octets, at + 24 + 16)
     if count != 1 or following != 0 or axes != 1 or kind != 2:

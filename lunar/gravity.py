@@ -66,15 +66,11 @@ class GravityField:
     def truncated(self, degree: int) -> GravityField:
         """Return the field without its terms above ``degree``."""
         if not 0 <= degree <= self.degree:
-            raise OrbitError(
-                f"gravity field {self.name}: expected a degree from 0 to {self.degree}, found {degree}"
-            )
+            raise OrbitError(f"gravity field {self.name}: expected a degree from 0 to {self.degree}, found {degree}")
         if degree == self.degree:
             return self
         keep = slice(0, degree + 1)
-        return GravityField(
-            self.name, self.gm_m3_s2, self.radius_m, self.c_bar[keep, keep], self.s_bar[keep, keep]
-        )
+        return GravityField(self.name, self.gm_m3_s2, self.radius_m, self.c_bar[keep, keep], self.s_bar[keep, keep])
 
 
 def acceleration(gravity: GravityField, position_pa_m: ArrayLike, degree: int | None = None) -> FloatArray:
@@ -95,9 +91,7 @@ def gradient(gravity: GravityField, position_pa_m: ArrayLike, degree: int | None
     return np.asarray(kernel.gradients(packed_gradient(gravity, degree), flat)).reshape(*positions.shape, 3)
 
 
-_PACKED: weakref.WeakKeyDictionary[GravityField, dict[tuple[str, int], FloatArray]] = (
-    weakref.WeakKeyDictionary()
-)
+_PACKED: weakref.WeakKeyDictionary[GravityField, dict[tuple[str, int], FloatArray]] = weakref.WeakKeyDictionary()
 
 
 def packed(gravity: GravityField, degree: int | None = None) -> FloatArray:
@@ -164,10 +158,7 @@ def builtin_gravity() -> GravityField:
 
 
 def _kept(
-    gravity: GravityField,
-    purpose: str,
-    degree: int,
-    pack: Callable[[FloatArray, FloatArray, float, float], FloatArray],
+    gravity: GravityField, purpose: str, degree: int, pack: Callable[[FloatArray, FloatArray, float, float], FloatArray]
 ) -> FloatArray:
     kept = _PACKED.setdefault(gravity, {})
     key = (purpose, degree)
@@ -195,9 +186,7 @@ def _parse_icgem(file: Path, lines: list[str]) -> Parsed:
     normalisation = header.get("norm", "fully_normalized")
     if normalisation != "fully_normalized":
         raise DataFileError(file, "header, norm", "fully_normalized", normalisation)
-    gm = _real(
-        file, "header, gravity_constant", header.get("gravity_constant", header.get("earth_gravity_constant"))
-    )
+    gm = _real(file, "header, gravity_constant", header.get("gravity_constant", header.get("earth_gravity_constant")))
     radius = _real(file, "header, radius", header.get("radius"))
     degree = int(_real(file, "header, max_degree", header.get("max_degree")))
 
@@ -207,9 +196,7 @@ def _parse_icgem(file: Path, lines: list[str]) -> Parsed:
             if not words or words[0] == "key":
                 continue
             if words[0] not in ("gfc", "gfct"):
-                raise DataFileError(
-                    file, f"line {number}", "a line that begins with gfc", repr(line.strip()[:40])
-                )
+                raise DataFileError(file, f"line {number}", "a line that begins with gfc", repr(line.strip()[:40]))
             yield _record(file, number, words[1:5])
 
     return header.get("modelname", file.stem), gm, radius, degree, records()
@@ -220,9 +207,7 @@ def _parse_cof(file: Path, lines: list[str]) -> Parsed:
     head = lines[at]
     words = head[15:].split()
     if not head[8:14].strip().replace(" ", "").isdigit() or len(words) < 3:
-        raise DataFileError(
-            file, f"line {at + 1}", "POTFIELD with degree, order, GM and radius", repr(head[:60])
-        )
+        raise DataFileError(file, f"line {at + 1}", "POTFIELD with degree, order, GM and radius", repr(head[:60]))
     degree = int(head[8:11])
     gm, radius = (_real(file, f"line {at + 1}", word) for word in words[1:3])
     if len(words) > 3 and _real(file, f"line {at + 1}", words[3]) != 1.0:
@@ -311,13 +296,7 @@ def _real(file: Path, where: str, text: str | None) -> float:
 
 
 def _assembled(
-    file: Path,
-    name: str,
-    gm: float,
-    radius: float,
-    degree: int,
-    records: Iterator[Record],
-    max_degree: int | None,
+    file: Path, name: str, gm: float, radius: float, degree: int, records: Iterator[Record], max_degree: int | None
 ) -> GravityField:
     wanted = degree if max_degree is None else min(degree, max_degree)
     c_bar = np.zeros((wanted + 1, wanted + 1))
@@ -325,15 +304,11 @@ def _assembled(
     seen = np.zeros_like(c_bar, dtype=bool)
     for number, n, m, c, s in records:
         if not (0 <= m <= n <= degree):
-            raise DataFileError(
-                file, f"line {number}", f"order <= degree <= {degree}", f"degree {n}, order {m}"
-            )
+            raise DataFileError(file, f"line {number}", f"order <= degree <= {degree}", f"degree {n}, order {m}")
         if n > wanted:
             continue
         if seen[n, m]:
-            raise DataFileError(
-                file, f"line {number}", "every coefficient once", f"degree {n}, order {m} again"
-            )
+            raise DataFileError(file, f"line {number}", "every coefficient once", f"degree {n}, order {m} again")
         if not (np.isfinite(c) and np.isfinite(s)):
             raise DataFileError(file, f"line {number}", "finite coefficients", f"{c:g} {s:g}")
         c_bar[n, m], s_bar[n, m], seen[n, m] = c, s, True

@@ -24,9 +24,7 @@ class GroundTrack:
     altitude_m: FloatArray
 
 
-def ground_track(
-    ephemeris: Ephemeris, orientation: Orientation, utc_ns: ArrayLike | None = None
-) -> GroundTrack:
+def ground_track(ephemeris: Ephemeris, orientation: Orientation, utc_ns: ArrayLike | None = None) -> GroundTrack:
     """Return the ground track at epochs (n,), or at all states of the ephemeris."""
     epochs = ephemeris.utc_ns if utc_ns is None else np.atleast_1d(np.asarray(utc_ns, dtype=np.int64))
     position_m, _ = ephemeris.at(epochs)

@@ -98,9 +98,7 @@ class BrownCamera(PinholeCamera):
         )
 
 
-def pointed_camera_from_mcmf(
-    position_mcmf_m: npt.ArrayLike, tilt_rad: float = 0.0, yaw_rad: float = 0.0
-) -> FloatArray:
+def pointed_camera_from_mcmf(position_mcmf_m: npt.ArrayLike, tilt_rad: float = 0.0, yaw_rad: float = 0.0) -> FloatArray:
     """Return the rotation (..., 3, 3) to a camera at positions (..., 3), turned from nadir with image up to the north.
 
     ``yaw`` turns the camera clockwise seen from above (image up to that azimuth), then ``tilt`` leans its boresight

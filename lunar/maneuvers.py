@@ -16,16 +16,7 @@ from lunar import constants
 from lunar.arrays import FloatArray
 from lunar.elements import Elements, elements_from_icrf_state
 from lunar.errors import OrbitError
-from lunar.propagation import (
-    MAX_STEP_S,
-    RTOL,
-    Arc,
-    ForceModel,
-    Trajectory,
-    integrate_arc,
-    join,
-    state_vector,
-)
+from lunar.propagation import MAX_STEP_S, RTOL, Arc, ForceModel, Trajectory, integrate_arc, join, state_vector
 from lunar.timescales import utc_ns_from_tdb_s
 
 
@@ -117,9 +108,7 @@ def propagate_with_maneuvers(
             break
         if phase:
             target = wanted_periselene if phase == 1 else wanted_aposelene
-            state, burn = _burn(
-                epoch_tdb_s + time, "aposelene" if phase == 1 else "periselene", state, target, model
-            )
+            state, burn = _burn(epoch_tdb_s + time, "aposelene" if phase == 1 else "periselene", state, target, model)
             burns.append(burn)
         phase = (phase + 1) % 3
     return join(epoch_tdb_s, arcs), tuple(burns)

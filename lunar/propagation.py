@@ -250,9 +250,7 @@ def integrate_arc(
     status = kernel.STEP_LIMIT
     while status == kernel.STEP_LIMIT:
         knots = kernel.Knots(np.empty(_KNOTS), np.empty((_KNOTS, 6)), np.empty((_KNOTS, 3)))
-        count, status, cost, step = kernel.integrate(
-            time, y, float(stop_s), forces, tableau, control, step, knots
-        )
+        count, status, cost, step = kernel.integrate(time, y, float(stop_s), forces, tableau, control, step, knots)
         first = 1 if parts else 0  # a part begins with the last knot of the one before
         parts.append((knots.times[first:count], knots.states[first:count], knots.rates[first:count]))
         time, y = knots.times[count - 1], knots.states[count - 1].copy()
@@ -268,9 +266,7 @@ def integrate_arc(
     return Arc(elapsed, states, rates, status, evaluations, step)
 
 
-def _check_arc(
-    state: FloatArray, stop_s: float, rtol: float, max_step_s: float, ground_radius_m: float
-) -> None:
+def _check_arc(state: FloatArray, stop_s: float, rtol: float, max_step_s: float, ground_radius_m: float) -> None:
     """Refuse limits that no integration can keep, and a start in the ground."""
     if not (1e-15 <= rtol <= 1e-3 and max_step_s > 0.0 and np.isfinite(stop_s)):
         raise OrbitError(
@@ -297,11 +293,7 @@ def join(epoch_tdb_s: float, arcs: list[Arc]) -> Trajectory:
     states = np.concatenate([arc.states[skip:] for arc, skip in zip(arcs, skips, strict=True)])
     rates = np.concatenate([arc.accelerations[skip:] for arc, skip in zip(arcs, skips, strict=True)])
     if len(elapsed) == 1:  # a propagation over no time at all
-        elapsed, states, rates = (
-            np.repeat(elapsed, 2),
-            np.repeat(states, 2, axis=0),
-            np.repeat(rates, 2, axis=0),
-        )
+        elapsed, states, rates = (np.repeat(elapsed, 2), np.repeat(states, 2, axis=0), np.repeat(rates, 2, axis=0))
         elapsed[1] += 1e-6
         states[1, :3] += 1e-6 * states[0, 3:]
     if elapsed[-1] < elapsed[0]:
@@ -339,9 +331,7 @@ def force_arrays(
     force[kernel.GM_SUN] = constants.GM_SUN_M3_S2 if model.sun else 0.0
     if model.solar_pressure is not None:
         pressure = constants.SOLAR_PRESSURE_1AU_N_M2 * constants.ASTRONOMICAL_UNIT_M**2
-        force[kernel.PRESSURE] = (
-            pressure * model.solar_pressure.area_to_mass_m2_kg * model.solar_pressure.reflection
-        )
+        force[kernel.PRESSURE] = pressure * model.solar_pressure.area_to_mass_m2_kg * model.solar_pressure.reflection
     force[kernel.MOON_RADIUS] = constants.MOON_RADIUS_M
     force[kernel.EARTH_RADIUS] = constants.EARTH_RADIUS_M
     force[kernel.SUN_RADIUS] = constants.SUN_RADIUS_M
@@ -406,12 +396,7 @@ def _ground_time(elapsed: FloatArray, states: FloatArray, rates: FloatArray, gro
 
 
 def _impact(
-    epoch_tdb_s: float,
-    ground_s: float,
-    elapsed: FloatArray,
-    states: FloatArray,
-    rates: FloatArray,
-    model: ForceModel,
+    epoch_tdb_s: float, ground_s: float, elapsed: FloatArray, states: FloatArray, rates: FloatArray, model: ForceModel
 ) -> ImpactError:
     from lunar.frames import spherical_from_mcmf
     from lunar.timescales import format_utc, utc_ns_from_tdb_s

@@ -51,9 +51,7 @@ def _moon_from_earth_m(tdb_s: FloatArray) -> FloatArray:
     import erfa
 
     # The theory asks for TT; the Moon moves 2 m in the 2 ms between TT and TDB.
-    short = ASTRONOMICAL_UNIT_M * np.asarray(
-        erfa.moon98(_J2000_JD, tdb_s / SECONDS_PER_DAY)["p"], dtype=np.float64
-    )
+    short = ASTRONOMICAL_UNIT_M * np.asarray(erfa.moon98(_J2000_JD, tdb_s / SECONDS_PER_DAY)["p"], dtype=np.float64)
     cos, sin = np.cos(_OBLIQUITY_RAD), np.sin(_OBLIQUITY_RAD)
     x, y = short[..., 0], cos * short[..., 1] + sin * short[..., 2]
     z = cos * short[..., 2] - sin * short[..., 1]

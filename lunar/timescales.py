@@ -148,9 +148,7 @@ def tdb_minus_tt_s(tt_s: FloatArray | float) -> FloatArray:
     centuries = np.asarray(tt_s, dtype=np.float64) / (36_525.0 * 86_400.0)
     amplitude, rate, phase = _TDB_TERMS.T
     periodic = np.sum(amplitude * np.sin(rate * centuries[..., None] + phase), axis=-1)
-    return np.asarray(
-        periodic + 0.000010 * centuries * np.sin(628.3076 * centuries + 4.2490), dtype=np.float64
-    )
+    return np.asarray(periodic + 0.000010 * centuries * np.sin(628.3076 * centuries + 4.2490), dtype=np.float64)
 
 
 def to_tai_ns(counts: Any, time_system: str) -> Any:

@@ -7,8 +7,7 @@ from lunar.constants import NS
 from lunar.errors import LeapSecondError, TimeFormatError
 
 _ISO = re.compile(
-    r"(\d{4})-(?:(\d{2})-(\d{2})|(\d{3}))(?:[T ](\d{2}):(\d{2})(?::(\d{2})(?:\.(\d*))?)?)?(?:Z|\+00:00)?\Z",
-    re.ASCII,
+    r"(\d{4})-(?:(\d{2})-(\d{2})|(\d{3}))(?:[T ](\d{2}):(\d{2})(?::(\d{2})(?:\.(\d*))?)?)?(?:Z|\+00:00)?\Z", re.ASCII
 )
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 

@@ -73,9 +73,7 @@ def sun_elevation_azimuth(
 ) -> tuple[FloatArray, FloatArray]:
     """Return elevation and azimuth (from north, clockwise, 0..2 pi) in rad of the Sun at places on the sphere."""
     place = mcmf_from_spherical(latitude_rad, longitude_rad)
-    enu = _rotate(
-        enu_from_mcmf(latitude_rad, longitude_rad), np.asarray(sun_mcmf_m, dtype=np.float64) - place
-    )
+    enu = _rotate(enu_from_mcmf(latitude_rad, longitude_rad), np.asarray(sun_mcmf_m, dtype=np.float64) - place)
     east, north, up = np.moveaxis(enu, -1, 0)
     azimuth = np.mod(np.arctan2(east, north), 2.0 * math.pi)
     return np.asarray(np.arctan2(up, np.hypot(east, north))), np.asarray(azimuth)
@@ -186,9 +184,7 @@ def _rotate(matrix: FloatArray, vector: ArrayLike) -> FloatArray:
     return np.asarray(np.einsum("...ij,...j->...i", matrix, np.asarray(vector, dtype=np.float64)))
 
 
-def _disc_overlap(
-    to_far: FloatArray, far_radius_m: float, to_near: FloatArray, near_radius_m: float
-) -> FloatArray:
+def _disc_overlap(to_far: FloatArray, far_radius_m: float, to_near: FloatArray, near_radius_m: float) -> FloatArray:
     """Return the share of the far body's disc that the near one covers; 0 where the near one is farther away."""
     far_distance = np.linalg.norm(to_far, axis=-1)
     near_distance = np.linalg.norm(to_near, axis=-1)

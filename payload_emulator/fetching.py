@@ -109,9 +109,7 @@ def verify(root: Path, products: Sequence[Product] = PRODUCTS) -> list[Checked]:
 
 def survey(root: Path, products: Sequence[Product] = PRODUCTS) -> list[dict[str, Any]]:
     """Return each product with its state and its size in the data folder."""
-    there = {
-        str(path.relative_to(root)) for folder in _folders(products) for path in (root / folder).glob("**/*")
-    }
+    there = {str(path.relative_to(root)) for folder in _folders(products) for path in (root / folder).glob("**/*")}
     return [
         {
             **{name: getattr(product, name) for name in ("name", "title", "basic", "octets")},
@@ -163,9 +161,7 @@ def _check(root: Path, path: str, file: ProductFile | None, recorded: str) -> Ch
         return Checked(path, "missing", f"{RECORD} of the folder", "")
     sha256, md5 = digests(root / path)
     if file is not None and file.origin == "published":
-        return Checked(
-            path, "damaged" if _differs(file, sha256, md5) else "whole", file.checksum_source, sha256
-        )
+        return Checked(path, "damaged" if _differs(file, sha256, md5) else "whole", file.checksum_source, sha256)
     if recorded:
         return Checked(path, "whole" if recorded == sha256 else "damaged", f"{RECORD} of the folder", sha256)
     if file is not None and file.origin == "copy" and not _differs(file, sha256, md5):
@@ -179,9 +175,7 @@ def _status_of(file: ProductFile, path: Path, recorded: dict[str, str]) -> str:
         return "damaged"
     if file.origin != "published" and file.path not in recorded:
         return "unknown"
-    return _check(
-        path.parents[len(Path(file.path).parts) - 1], file.path, file, recorded.get(file.path, "")
-    ).status
+    return _check(path.parents[len(Path(file.path).parts) - 1], file.path, file, recorded.get(file.path, "")).status
 
 
 def _differs(file: ProductFile, sha256: str, md5: str) -> bool:

@@ -36,9 +36,7 @@ def detector_values(figures: dict[str, Any]) -> dict[str, Any]:
     verdict, level = _verdict(figures)
     return {
         "by_degradation": tuple(
-            NamedScore(
-                f"depth/diameter {row['low']:g}–{row['high']:g}", row["expected"], float("nan"), row["recall"]
-            )
+            NamedScore(f"depth/diameter {row['low']:g}–{row['high']:g}", row["expected"], float("nan"), row["recall"])
             for row in figures["recall_by_degradation"]
         ),
         "by_source": _named(figures["by_source"], lambda row: str(row["name"])),
@@ -57,9 +55,7 @@ def detector_values(figures: dict[str, Any]) -> dict[str, Any]:
 def detector_score(figures: dict[str, Any], residuals: ResidualSeries) -> DetectorScore:
     """Return the scores of a `DetectorReport`."""
     curves = zip(
-        (*CLASS_LABELS, "5–30 km"),
-        (*figures["precision_recall_per_class"], figures["precision_recall"]),
-        strict=True,
+        (*CLASS_LABELS, "5–30 km"), (*figures["precision_recall_per_class"], figures["precision_recall"]), strict=True
     )
     return DetectorScore(
         per_class=tuple(
@@ -75,11 +71,7 @@ def detector_score(figures: dict[str, Any], residuals: ResidualSeries) -> Detect
         by_sun_elevation_deg=_bins(figures["by_sun_elevation_deg"]),
         curves=tuple(
             PrecisionRecallCurve(
-                label,
-                *(
-                    np.array([point[name] for point in curve])
-                    for name in ("threshold", "precision", "recall")
-                ),
+                label, *(np.array([point[name] for point in curve]) for name in ("threshold", "precision", "recall"))
             )
             for label, curve in curves
         ),
@@ -93,9 +85,7 @@ def _class_score(k: int, label: str, row: dict[str, Any]) -> ClassScore:
 
 
 def _bins(rows: Sequence[dict[str, Any]]) -> tuple[BinScore, ...]:
-    return tuple(
-        _filled(BinScore, row | row["strict"], localisation_px=row["strict"]["loc_px"]) for row in rows
-    )
+    return tuple(_filled(BinScore, row | row["strict"], localisation_px=row["strict"]["loc_px"]) for row in rows)
 
 
 def _named(rows: Sequence[dict[str, Any]], label: Any) -> tuple[NamedScore, ...]:
@@ -114,11 +104,7 @@ def _named(rows: Sequence[dict[str, Any]], label: Any) -> tuple[NamedScore, ...]
 
 def _groups(figures: dict[str, Any]) -> tuple[ScoreGroup, ...]:
     rule = "Strict scores drawn; the table also gives the ignore-aware scores."
-    on_board = {
-        "threshold": figures["threshold"],
-        "strict": figures["micro"],
-        "ignore_aware": figures["ignore_aware"],
-    }
+    on_board = {"threshold": figures["threshold"], "strict": figures["micro"], "ignore_aware": figures["ignore_aware"]}
     at = [
         {"name": f"{name} {row['threshold']:.2f}", **row}
         for name, row in (
@@ -128,9 +114,7 @@ def _groups(figures: dict[str, Any]) -> tuple[ScoreGroup, ...]:
         )
     ]
     return (
-        ScoreGroup(
-            "By threshold", _named(at, lambda row: row["name"]), f"Thresholds fixed on validation. {rule}"
-        ),
+        ScoreGroup("By threshold", _named(at, lambda row: row["name"]), f"Thresholds fixed on validation. {rule}"),
         ScoreGroup(
             "By type of terrain",
             _named(figures["by_terrain"], lambda row: f"{row['name']} ({row['frames']} frames)"),
@@ -145,12 +129,7 @@ def _groups(figures: dict[str, Any]) -> tuple[ScoreGroup, ...]:
             for name, key, unit, meaning in (
                 ("altitude", "by_altitude_km", " km", "Altitude"),
                 ("Sun elevation", "by_sun_elevation_deg", "°", "Elevation of the Sun"),
-                (
-                    "Sun azimuth",
-                    "by_sun_octant",
-                    "°",
-                    "Azimuth of the Sun in the image, clockwise from its top",
-                ),
+                ("Sun azimuth", "by_sun_octant", "°", "Azimuth of the Sun in the image, clockwise from its top"),
             )
         ),
     )
@@ -163,19 +142,9 @@ def _bias(figures: dict[str, Any]) -> tuple[BiasBin, ...]:
         for row in figures["bias_px_by_sun_octant"]
         for low, high in (row["sun_azimuth_image_deg"],)
     ]
-    keys = {
-        "right_px": "du_px",
-        "down_px": "dv_px",
-        "sunward_px": "toward_sun_px",
-        "across_px": "across_sun_px",
-    }
+    keys = {"right_px": "du_px", "down_px": "dv_px", "sunward_px": "toward_sun_px", "across_px": "across_sun_px"}
     return tuple(
-        _filled(
-            BiasBin,
-            row,
-            label=label,
-            **{name: (row[key], *row["interval_95"][key]) for name, key in keys.items()},
-        )
+        _filled(BiasBin, row, label=label, **{name: (row[key], *row["interval_95"][key]) for name, key in keys.items()})
         for label, row in rows
         if row["pairs"]
     )
@@ -195,10 +164,7 @@ def _headline(figures: dict[str, Any]) -> tuple[HeadlineFigure, ...]:
         HeadlineFigure("Precision", micro["precision"], "", f"strict; ignore-aware {fair['precision']:.2f}"),
         HeadlineFigure("Recall", micro["recall"], "", f"strict; ignore-aware {fair['recall']:.2f}"),
         HeadlineFigure(
-            "F1",
-            micro["f1"],
-            "",
-            f"strict, 95 % {low:.2f} to {high:.2f} over blocks; ignore-aware {fair['f1']:.2f}",
+            "F1", micro["f1"], "", f"strict, 95 % {low:.2f} to {high:.2f} over blocks; ignore-aware {fair['f1']:.2f}"
         ),
         HeadlineFigure("Localisation", micro["loc_px"], "px", f"mean; median {micro['loc_median_px']:.2f}"),
         HeadlineFigure(
@@ -233,9 +199,7 @@ def _remarks(figures: dict[str, Any]) -> tuple[str, ...]:
     remarks = [
         f"Average precision within half a radius: {average['strict']:.3f} strict, {average['ignore_aware']:.3f} "
         "ignore-aware; by class "
-        + ", ".join(
-            f"{label} {value:.3f}" for label, value in zip(CLASS_LABELS, average["per_class"], strict=True)
-        )
+        + ", ".join(f"{label} {value:.3f}" for label, value in zip(CLASS_LABELS, average["per_class"], strict=True))
         + ".",
         f"Craters of 3 to 5 km: precision {figures['class_3_to_5_km']['precision']:.2f}, recall "
         f"{figures['class_3_to_5_km']['recall']:.2f} strict, "

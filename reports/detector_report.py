@@ -9,14 +9,7 @@ from reports.document import Block, Column, Document, Heading, Picture, Properti
 from reports.figures import training
 from reports.figures.detector import OCTANTS, octant_bias
 from reports.sections.detection import detector_blocks, gallery_picture
-from reports.sections.opening import (
-    about,
-    absent,
-    judgement,
-    missing_and_remarks,
-    provenance_and_data,
-    settings,
-)
+from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data, settings
 from reports.text import NOT_A_VALUE, count_text, number_text
 from reports.values import BiasBin, DetectorReport, NamedScore, ResidualSeries, SigmaBin
 
@@ -39,12 +32,7 @@ def detector_document(report: DetectorReport) -> Document:
             "Scores by state of degradation. A false alarm is no crater and has no state, so that precision may be "
             "missing.",
         ),
-        (
-            "By source of the images",
-            "sources",
-            report.by_source,
-            "Precision and recall by where the images come from.",
-        ),
+        ("By source of the images", "sources", report.by_source, "Precision and recall by where the images come from."),
     ):
         if scores:
             blocks += [Heading(heading), *_named(key, scores, caption)]
@@ -79,9 +67,7 @@ def detector_document(report: DetectorReport) -> Document:
     if report.worst_frames:
         worst = report.worst_frames[:24]
         blocks.append(
-            gallery_picture(
-                "worst", worst, 4, f"The worst {len(worst)} frames, chosen by number, not by hand."
-            )
+            gallery_picture("worst", worst, 4, f"The worst {len(worst)} frames, chosen by number, not by hand.")
         )
     blocks += provenance_and_data(report)
     if report.configuration:
@@ -103,15 +89,8 @@ def _named(key: str, scores: Sequence[NamedScore], caption: str) -> list[Block]:
     )
     table = Table(
         caption,
-        (
-            Column("group", numeric=False),
-            Column("expected", unit="craters"),
-            *(column for column, _ in columns),
-        ),
-        tuple(
-            (s.label, count_text(s.expected), *(shown[row] for _, shown in columns))
-            for row, s in enumerate(scores)
-        ),
+        (Column("group", numeric=False), Column("expected", unit="craters"), *(column for column, _ in columns)),
+        tuple((s.label, count_text(s.expected), *(shown[row] for _, shown in columns)) for row, s in enumerate(scores)),
     )
     picture = Picture(
         key, caption, caption, 0.85 + 0.3 * len(scores), partial(training.draw_named_scores, scores=scores)

@@ -39,9 +39,7 @@ def html_page(document: Document, drawings: Drawings | None = None) -> str:
     policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
     footer = " · ".join(t for t in ("LINNA", document.kicker, document.identity) if t)
     sections = [b.text for b in document.blocks if isinstance(b, Heading) and b.level == 2]
-    about = "".join(
-        f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in document.facts
-    )
+    about = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in document.facts)
     contents = "".join(
         f'<li><a href="#s{i}"><span>{i}</span><span>{escape(text)}</span></a></li>'
         for i, text in enumerate(sections, 1)
@@ -152,9 +150,7 @@ def _table(block: Table, number: int) -> str:
     rows = []
     for row in block.rows:
         pairs = zip(cells(row), block.columns, strict=True)
-        rows.append(
-            f"<tr>{''.join(_cell(cell, column, i == 0) for i, (cell, column) in enumerate(pairs))}</tr>"
-        )
+        rows.append(f"<tr>{''.join(_cell(cell, column, i == 0) for i, (cell, column) in enumerate(pairs))}</tr>")
     note = f'<p class="tablenote">{escape(block.note)}</p>' if block.note else ""
     short = " short" if len(rows) <= _SHORT_TABLE_ROWS else ""
     narrow = ' class="narrow"' if len(block.columns) <= 4 else ""

@@ -2,18 +2,7 @@
 
 import numpy as np
 
-from reports.document import (
-    VERDICT_ROLES,
-    Block,
-    Bullets,
-    Cell,
-    Column,
-    Document,
-    Heading,
-    Paragraph,
-    Picture,
-    Table,
-)
+from reports.document import VERDICT_ROLES, Block, Bullets, Cell, Column, Document, Heading, Paragraph, Picture, Table
 from reports.figures import monthly
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
 from reports.text import count_text, number_text, percent_text, significant_text, utc_text
@@ -141,11 +130,7 @@ def _groups(report: MonthlyReportValue) -> list[Block]:
     found = {(one.factor, one.group, one.metric): one for one in report.groups}
     rows = []
     for factor, group in names:
-        cells: list[Cell | str] = [
-            factor,
-            group,
-            count_text(max(found[factor, group, m].passes for m in METRICS)),
-        ]
+        cells: list[Cell | str] = [factor, group, count_text(max(found[factor, group, m].passes for m in METRICS))]
         for metric, (_, _, scale, decimals) in METRICS.items():
             one = found[factor, group, metric]
             cells.append(number_text(scale * one.mean, decimals))
@@ -160,10 +145,7 @@ def _groups(report: MonthlyReportValue) -> list[Block]:
         return [absent(report, "groups", "Conditions", "no pass has a report")]
     columns = [Column("condition", numeric=False), Column("group", numeric=False), Column("passes")]
     for label, unit, _, _ in METRICS.values():
-        columns += [
-            Column("mean", group=f"{label}, {unit}"),
-            Column("95 % interval", group=f"{label}, {unit}"),
-        ]
+        columns += [Column("mean", group=f"{label}, {unit}"), Column("95 % interval", group=f"{label}, {unit}")]
     return [
         Table(
             "Mean of the passes of each group. Each pass counts once; the interval is Student's t over the passes.",

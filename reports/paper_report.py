@@ -52,10 +52,7 @@ def paper_document(report: PaperReport) -> Document:
     for session in report.sessions:
         blocks += [Heading(session.heading), *_session(session)]
     if not report.sessions:
-        blocks += [
-            Heading("State estimation (Figs. 7 to 10)"),
-            absent(report, "sessions", "Sessions", "not flown"),
-        ]
+        blocks += [Heading("State estimation (Figs. 7 to 10)"), absent(report, "sessions", "Sessions", "not flown")]
     blocks += [Heading("Differences from the paper"), *_differences(report)]
     blocks += [*missing_and_remarks(report), *provenance_and_data(report)]
     return Document("The paper's figures", report.title, report.identity, about(report), tuple(blocks))
@@ -132,9 +129,7 @@ def _compared(report: PaperReport, place: str, caption: str, note: str = "") -> 
     for one in paper_values(report):
         if one.place == place and one.paper is not None:
             numbers = (one.paper, one.here, one.difference)
-            rows.append(
-                (f"{one.quantity}{f', {one.unit}' if one.unit else ''}", *map(significant_text, numbers))
-            )
+            rows.append((f"{one.quantity}{f', {one.unit}' if one.unit else ''}", *map(significant_text, numbers)))
     columns = (Column("", numeric=False), Column("paper"), Column("this system"), Column("difference"))
     return Table(caption, columns, tuple(rows), note=note)
 
@@ -235,8 +230,7 @@ def _detection(report: PaperReport) -> list[Block]:
     if not report.detectors:
         return [absent(report, "detectors", "Table II", "no network was evaluated")]
     levels = " ".join(
-        f"{d.name}: {d.description}, {count_text(d.frames)} test images. {_evidence(d.level)}"
-        for d in report.detectors
+        f"{d.name}: {d.description}, {count_text(d.frames)} test images. {_evidence(d.level)}" for d in report.detectors
     )
     caption = "The paper's Table II: precision, recall and mean localisation error."
     blocks: list[Block] = [_compared(report, "Table II", caption, levels)]
@@ -267,9 +261,7 @@ def _session(session: PaperSession) -> list[Block]:
             + f"; {_NO_NUMBER}. {_evidence(session.level)}",
             "Errors in latitude and longitude over time, resets marked.",
             3.7,
-            lambda c: navigation.draw_ground_error(
-                c, series, session.track, styles, hour or time, session.arcs
-            ),
+            lambda c: navigation.draw_ground_error(c, series, session.track, styles, hour or time, session.arcs),
         )
     )
     if session.view is not None:
@@ -284,10 +276,7 @@ def _session(session: PaperSession) -> list[Block]:
                 lambda c: drawn.draw_simulator(c, session, view),
             )
         )
-    for key, span, words in (
-        ("altitude", time, "over the session"),
-        ("altitude-hour", hour, "over one hour"),
-    ):
+    for key, span, words in (("altitude", time, "over the session"), ("altitude-hour", hour, "over one hour")):
         if span is not None:
             blocks.append(
                 Picture(

@@ -4,15 +4,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 from reports.arrays import FloatArray
-from reports.values import (
-    ByteArray,
-    ClassScore,
-    GalleryFrame,
-    NavigationSeries,
-    ReportCommon,
-    TimeSpan,
-    TrackSeries,
-)
+from reports.values import ByteArray, ClassScore, GalleryFrame, NavigationSeries, ReportCommon, TimeSpan, TrackSeries
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,20 +79,14 @@ def check(report: PassReport) -> None:
         for name, (value, shape) in shapes.items():
             if value is not None and value.shape != shape:
                 raise InconsistentReport(f"{where}, {name}", f"shape {shape}", f"shape {value.shape}")
-        for name, labels in (
-            ("outcome", one.outcome),
-            ("reset_trigger", one.reset_trigger),
-            ("terrain", one.terrain),
-        ):
+        for name, labels in (("outcome", one.outcome), ("reset_trigger", one.reset_trigger), ("terrain", one.terrain)):
             if labels and len(labels) != n:
                 raise InconsistentReport(f"{where}, {name}", f"{n} labels", str(len(labels)))
     track = report.reference
     if track is not None and not (
         len(track.utc_ns) == len(track.latitude_deg) == len(track.longitude_deg) == len(track.altitude_m)
     ):
-        raise InconsistentReport(
-            "reference track", f"{len(track.utc_ns)} samples in every array", "another number"
-        )
+        raise InconsistentReport("reference track", f"{len(track.utc_ns)} samples in every array", "another number")
 
 
 def _time_scale(report: PassReport) -> TimeScale:

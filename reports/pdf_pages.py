@@ -147,9 +147,7 @@ def _plain(block: Block) -> dict[str, Any]:
         case Headline():
             return _headline(block)
         case Listing(title):
-            return _plain(
-                Paragraph(f"{title}: in full in the HTML and JSON forms of this report.", small=True)
-            )
+            return _plain(Paragraph(f"{title}: in full in the HTML and JSON forms of this report.", small=True))
         case _:
             return {"kind": type(block).__name__.lower(), **asdict(block)}
 

@@ -68,9 +68,7 @@ def _outcome_text(gate: Gate) -> str:
     """Return the outcome of a gate with its reason and evidence."""
     parts = [{"pass": "passed", "fail": "failed"}.get(gate.outcome, gate.outcome), gate.reason, gate.evidence]
     if gate.outcome == "inconclusive" and gate.frames_needed is not None:
-        parts.append(
-            f"about {count_text(gate.frames_needed)} frames decide, {count_text(gate.frames)} compared"
-        )
+        parts.append(f"about {count_text(gate.frames_needed)} frames decide, {count_text(gate.frames)} compared")
     return ", ".join(filter(None, parts))
 
 

@@ -67,10 +67,7 @@ class DownlinkEncoder:
             raise ValueRefused("transfer frame", "spacecraft_id", self.spacecraft_id, "0..1023")
 
     def encode(
-        self,
-        packets: Iterable[bytes],
-        virtual_channel: int = 0,
-        clcw: bytes | Sequence[bytes] | None = None,
+        self, packets: Iterable[bytes], virtual_channel: int = 0, clcw: bytes | Sequence[bytes] | None = None
     ) -> bytes:
         """CADUs that carry `packets` whole, the last frame filled up with an idle packet; nothing for none.
 
@@ -115,9 +112,7 @@ class DownlinkEncoder:
             - (CRC_LENGTH if self.settings.checksum else 0)
         )
 
-    def _cadus(
-        self, data: OctetArray, pointers: IntArray, virtual_channel: int, clcw: OctetArray | None
-    ) -> bytes:
+    def _cadus(self, data: OctetArray, pointers: IntArray, virtual_channel: int, clcw: OctetArray | None) -> bytes:
         """CADUs of packet zones (n, zone) with operational control fields (n or 1, 4)."""
         if not 0 <= virtual_channel < 8:
             raise ValueRefused("transfer frame", "virtual_channel", virtual_channel, "0..7")
@@ -160,9 +155,7 @@ def _control_fields(clcw: bytes | Sequence[bytes] | None, count: int) -> OctetAr
     return np.frombuffer(b"".join(fields), dtype=np.uint8).reshape(count, OCF_LENGTH)
 
 
-def encode_cadus(
-    packets: Iterable[bytes], *, spacecraft_id: int, virtual_channel: int = 0, **settings: Any
-) -> bytes:
+def encode_cadus(packets: Iterable[bytes], *, spacecraft_id: int, virtual_channel: int = 0, **settings: Any) -> bytes:
     """A whole downlink: CADUs that carry `packets`, frame counts from zero; `settings` are those of `LinkSettings`."""
     return DownlinkEncoder(spacecraft_id, LinkSettings(**settings)).encode(packets, virtual_channel)
 
@@ -304,8 +297,7 @@ class DownlinkDecode:
             "spacecraft_id": self.spacecraft_id,
             "link": None if self.settings is None else self.settings.describe(),
             "link_sections": [
-                {"start": one.start, "stop": one.stop, **one.settings.describe()}
-                for one in self.plan.sections
+                {"start": one.start, "stop": one.stop, **one.settings.describe()} for one in self.plan.sections
             ],
             "link_ambiguous": self.plan.ambiguous,
         }
@@ -369,9 +361,7 @@ def propose_packets(octets: Octets) -> tuple[int, PacketForm | None]:
     """
     stream = as_octets(octets)
     for tried in (CHECKED, replace(CHECKED, error_control=False)):
-        fits = [
-            _packets_of_form(stream, replace(tried, prefix_octets=n)) for n in (0, find_prefix(stream, tried))
-        ]
+        fits = [_packets_of_form(stream, replace(tried, prefix_octets=n)) for n in (0, find_prefix(stream, tried))]
         octets_used, packets, form = max(fits, key=lambda one: one[0])
         if 2 * octets_used >= stream.size > 0:
             return packets, form
@@ -473,10 +463,7 @@ def _read_section(part: OctetArray, sync: cadu.CaduSync, section: LinkSection) -
 
 def _commonest_spacecraft(sections: Sequence[_Section]) -> int | None:
     ids = np.concatenate(
-        [
-            one.found.header.spacecraft_id[one.found.valid & (one.found.header.version == 0)]
-            for one in sections
-        ]
+        [one.found.header.spacecraft_id[one.found.valid & (one.found.header.version == 0)] for one in sections]
     )
     return int(np.bincount(ids).argmax()) if ids.size else None
 
@@ -521,10 +508,7 @@ class _Filling:
         for channel, start, stop in np.unique(layout[good & (zone_start < zone_stop)], axis=0).tolist():
             mine = np.flatnonzero(good & (layout == (channel, start, stop)).all(axis=1))
             rebuilt = _rebuild(
-                frames[mine, start:stop],
-                header.channel_count[mine],
-                header.first_header_pointer[mine],
-                error_control,
+                frames[mine, start:stop], header.channel_count[mine], header.first_header_pointer[mine], error_control
             )
             used = mine[header.first_header_pointer[mine] != ONLY_IDLE_DATA]
             buffer_offset[used] = self.filled + (stop - start) * np.arange(used.size)
@@ -563,9 +547,7 @@ class _Filling:
         """Return the frames of all sections."""
         if len(self.tables) == 1:
             return self.tables[0]
-        return FrameTable(
-            *(np.concatenate([getattr(one, f.name) for one in self.tables]) for f in fields(FrameTable))
-        )
+        return FrameTable(*(np.concatenate([getattr(one, f.name) for one in self.tables]) for f in fields(FrameTable)))
 
 
 def _frames_to_packets(
@@ -678,9 +660,7 @@ def _split_where_damaged(buffer: OctetArray, segments: IntArray, run: IntArray, 
     """
     cut = cut_packets(buffer, segments=segments)
     bad = ~cut.crc_ok
-    ranges = np.concatenate(
-        [cut.skipped, np.stack((cut.offsets[bad], cut.offsets[bad] + cut.lengths[bad]), axis=1)]
-    )
+    ranges = np.concatenate([cut.skipped, np.stack((cut.offsets[bad], cut.offsets[bad] + cut.lengths[bad]), axis=1)])
     border = -(-(ranges[:, 0] + 1) // zone)
     # not at the end of the run, where there is nothing to split
     parted = border[(border * zone < ranges[:, 1]) & (border < run.size)]
@@ -691,12 +671,7 @@ def _split_where_damaged(buffer: OctetArray, segments: IntArray, run: IntArray, 
 
 
 def _complete(
-    zones: OctetArray,
-    count: IntArray,
-    pointer: IntArray,
-    run: IntArray,
-    buffer: OctetArray,
-    segments: IntArray,
+    zones: OctetArray, count: IntArray, pointer: IntArray, run: IntArray, buffer: OctetArray, segments: IntArray
 ) -> tuple[OctetArray, IntArray]:
     """Return buffer and segments with the packets reassembled from the end of one run and the start of another.
 
@@ -721,15 +696,11 @@ def _complete(
         row = ends.get(stop)
         if row is None:
             continue
-        path = _continuation(
-            buffer[start:stop].tobytes(), int(count[stop // zone - 1]), zones, pointer, orphans, used
-        )
+        path = _continuation(buffer[start:stop].tobytes(), int(count[stop // zone - 1]), zones, pointer, orphans, used)
         if path:
             used.update(path)
             segments[row, 1] = start
-            extra.append(
-                np.concatenate([buffer[start:stop], *(zones[k, : min(pointer[k], zone)] for k in path)])
-            )
+            extra.append(np.concatenate([buffer[start:stop], *(zones[k, : min(pointer[k], zone)] for k in path)]))
     lengths = np.array([part.size for part in extra], dtype=np.int64)
     stops = buffer.size + np.cumsum(lengths)
     added = np.stack((stops - lengths, stops), axis=1)
@@ -737,12 +708,7 @@ def _complete(
 
 
 def _continuation(
-    begun: bytes,
-    count: int,
-    zones: OctetArray,
-    pointer: IntArray,
-    orphans: dict[int, list[int]],
-    used: set[int],
+    begun: bytes, count: int, zones: OctetArray, pointer: IntArray, orphans: dict[int, list[int]], used: set[int]
 ) -> list[int]:
     """Return the frames whose first octets complete a packet that began in a frame with that count; empty if none do.
 
@@ -826,9 +792,7 @@ def _unknown(buffer: OctetArray, cut: PacketCut, dictionary: Dictionary) -> int:
     return int(np.count_nonzero(cut.crc_ok & (dictionary.identify(buffer, cut) < 0)))
 
 
-def _account(
-    buffer: OctetArray, cut: PacketCut, headers: PrimaryHeaders, dictionary: Dictionary
-) -> SequenceReport:
+def _account(buffer: OctetArray, cut: PacketCut, headers: PrimaryHeaders, dictionary: Dictionary) -> SequenceReport:
     """Completeness of the packets whose checksum holds; on-board time where they have it, else arrival."""
     good = np.flatnonzero(cut.crc_ok)
     offsets, lengths = cut.offsets[good], cut.lengths[good]
@@ -849,13 +813,7 @@ def _account(
         first = view[offsets[a] : offsets[a] + lengths[a]]
         return bool(first == view[offsets[b] : offsets[b] + lengths[b]])
 
-    return account(
-        apid,
-        headers.sequence_count[good],
-        ticks,
-        same,
-        boot=_boots(buffer, cut, ticks, dictionary),
-    )
+    return account(apid, headers.sequence_count[good], ticks, same, boot=_boots(buffer, cut, ticks, dictionary))
 
 
 def _boots(buffer: OctetArray, cut: PacketCut, ticks: IntArray, dictionary: Dictionary) -> IntArray | None:

@@ -25,10 +25,7 @@ def run() -> None:
 
 def _migrate(connection: Connection) -> None:
     context.configure(
-        connection=connection,
-        target_metadata=METADATA,
-        render_as_batch=True,
-        transaction_per_migration=False,
+        connection=connection, target_metadata=METADATA, render_as_batch=True, transaction_per_migration=False
     )
     context.run_migrations()
     if inspect(connection).has_table("audit"):

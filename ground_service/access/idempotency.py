@@ -21,12 +21,7 @@ Added = TypeVar("Added", bound=BaseModel)
 
 
 def added_once(
-    ground: Ground,
-    kind: type[Added],
-    actor: str,
-    key: str | None,
-    given: BaseModel,
-    work: Callable[[], Added],
+    ground: Ground, kind: type[Added], actor: str, key: str | None, given: BaseModel, work: Callable[[], Added]
 ) -> Added:
     """Return the entity that `work` adds as `once` does; its kind is the operation."""
     answer = once(

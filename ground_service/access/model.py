@@ -142,9 +142,7 @@ class Session(Entity):
     )
     expires: UtcTime | None = Field(description="null: unlimited")
     browser: bool = Field(description="Whether the request used the cookie of a browser session")
-    provider: bool = Field(
-        default=False, description="Whether the session was started with an OpenID provider"
-    )
+    provider: bool = Field(default=False, description="Whether the session was started with an OpenID provider")
     time: UtcTime = Field(description="Mission time of the service: its clock, unless a simulation sets it")
     recorded: bool = Field(
         default=False, description="Whether the mission time is that of recorded passes, and nothing flies"

@@ -89,9 +89,7 @@ class PendingSignIn:
         """
         words = (cookie or "").split(".", 3)
         if len(words) != 4 or not all(words):
-            raise SignInRefused(
-                "state", "a sign-in that this browser began within the last 10 minutes", "none"
-            )
+            raise SignInRefused("state", "a sign-in that this browser began within the last 10 minutes", "none")
         if not hmac.compare_digest(words[0].encode(), state.encode()):
             raise SignInRefused("state", "that of the sign-in this browser began last", "another")
         return cls(words[0], words[1], words[2], own_page(unquote(words[3])))
@@ -145,9 +143,7 @@ class Provider:
             raise SignInRefused("iss of the answer", self.issuer, issuer or "none")
         try:
             with _unavailable(client.server_metadata["token_endpoint"]):
-                answer = await client.fetch_access_token(
-                    redirect_uri, code=code, code_verifier=begun.verifier
-                )
+                answer = await client.fetch_access_token(redirect_uri, code=code, code_verifier=begun.verifier)
         except OAuthError as error:
             raise SignInRefused("code", "one that the provider accepts", _word(error.error)) from None
         token = answer.get("id_token")
@@ -193,9 +189,7 @@ class Provider:
             raise SignInRefused("logout token", f"the event {LOGOUT_EVENT}", "another")
         if "nonce" in claims:
             raise SignInRefused("logout token", "no nonce", "one")
-        subject, session = (
-            claims.get(name) if isinstance(claims.get(name), str) else None for name in ("sub", "sid")
-        )
+        subject, session = (claims.get(name) if isinstance(claims.get(name), str) else None for name in ("sub", "sid"))
         identity = claims.get("jti")
         if (subject is None and session is None) or not isinstance(identity, str):
             raise SignInRefused("logout token", "jti, and sub or sid", "none")
@@ -281,9 +275,7 @@ class Provider:
             name = getattr(error, "claim", None)
             reason = getattr(error, "error", None) or str(error)
             raise SignInRefused(
-                "ID token",
-                "issuer, audience, times and nonce of this sign-in",
-                _word(f"{reason} {name or ''}".strip()),
+                "ID token", "issuer, audience, times and nonce of this sign-in", _word(f"{reason} {name or ''}".strip())
             ) from None
 
     def _identity(self, claims: Mapping[str, Any]) -> ProviderIdentity:
@@ -443,9 +435,7 @@ def start_provider_session(ground: Ground, who: ProviderIdentity, state: str) ->
     return secret, started
 
 
-def end_provider_sessions(
-    ground: Ground, issuer: str, subject: str | None, session: str | None, identity: str
-) -> int:
+def end_provider_sessions(ground: Ground, issuer: str, subject: str | None, session: str | None, identity: str) -> int:
     """End the browser sessions that a provider names in a logout token; return their number.
 
     Parameters
@@ -495,9 +485,7 @@ def _record_refusal(
     if user is None:
         return  # strangers cannot fill the audit log
     revoked = store.revoke_tokens(connection, user, now)
-    service.audit(
-        connection, user.name, "refuse sign-in", user.name, {"reason": str(reason), "revoked": revoked}
-    )
+    service.audit(connection, user.name, "refuse sign-in", user.name, {"reason": str(reason), "revoked": revoked})
 
 
 def _user(connection: Connection, who: ProviderIdentity, user: UserRecord | None, now: int) -> UserRecord:

@@ -80,12 +80,7 @@ def list_users(ground: GroundOf, _: Admin) -> PageOf[User]:
 def add_user(ground: GroundOf, caller: Admin, given: NewUser) -> UserWithToken:
     """Add a user; the response contains the token, which cannot be read again."""
     token = users.add_user(
-        ground,
-        given.name,
-        given.role,
-        days_valid=given.days_valid,
-        missions=given.missions,
-        actor=caller.name,
+        ground, given.name, given.role, days_valid=given.days_valid, missions=given.missions, actor=caller.name
     )
     return UserWithToken(user=users.get_user(ground, given.name), token=token)
 
@@ -105,9 +100,7 @@ def change_user(ground: GroundOf, caller: Admin, name: UserName, given: UserChan
 
 
 @access.post("/users/{name}/tokens", status_code=201)
-def add_token(
-    ground: GroundOf, caller: Admin, name: UserName, given: NewToken = _LONGEST_TOKEN
-) -> UserWithToken:
+def add_token(ground: GroundOf, caller: Admin, name: UserName, given: NewToken = _LONGEST_TOKEN) -> UserWithToken:
     """Create a token for a user; the response contains it, and it cannot be read again."""
     token = users.add_token(
         ground,

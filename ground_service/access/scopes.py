@@ -77,11 +77,7 @@ def scope_of(route: APIRoute) -> Scope | None:
         if route.name in names:
             return Scope(decision)
     dependant = route.dependant
-    body = {
-        name
-        for one in dependant.body_params
-        for name in getattr(one.field_info.annotation, "model_fields", ())
-    }
+    body = {name for one in dependant.body_params for name in getattr(one.field_info.annotation, "model_fields", ())}
     places: tuple[tuple[Literal["path", "query", "body"], Collection[str]], ...] = (
         ("path", [one.name for one in dependant.path_params]),
         ("query", query_keys(dependant).known),

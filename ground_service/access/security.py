@@ -25,9 +25,7 @@ SESSION_COOKIE = "linna_session"
 _bearer = HTTPBearer(auto_error=False, description="Token issued by 'linna user add'")
 
 
-def caller_of(
-    request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
-) -> Caller:
+def caller_of(request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]) -> Caller:
     """Return the owner of the token or session cookie of a request; the local user of a service without users."""
     local: Caller | None = getattr(request.app.state, "local_caller", None)
     if local is not None:

@@ -171,9 +171,7 @@ def ensure_user(ground: Ground, name: str, role: str, token: str, *, actor: str 
         token_id = (
             known.id
             if known is not None
-            else store.add_token(
-                connection, user, hashed, hint=token[:4], now_utc_ns=now, expires_utc_ns=None
-            )
+            else store.add_token(connection, user, hashed, hint=token[:4], now_utc_ns=now, expires_utc_ns=None)
         )
         audit(connection, actor, "ensure user", name, {"role": role, "token_id": token_id})
     return True
@@ -309,16 +307,9 @@ def start_session(ground: Ground, token: str) -> tuple[str, Session]:
             expires = min(expires, parent.expires_utc_ns)
         user = store.get_user(connection, caller.name)
         key, secret = _add_token(
-            connection,
-            user,
-            now,
-            expires - now,
-            parent_id=parent.parent_id or parent.id,
-            missions=parent.missions,
+            connection, user, now, expires - now, parent_id=parent.parent_id or parent.id, missions=parent.missions
         )
-        audit(
-            connection, caller.name, "start session", caller.name, {"token_id": key, "parent_id": parent.id}
-        )
+        audit(connection, caller.name, "start session", caller.name, {"token_id": key, "parent_id": parent.id})
     started = Session(
         name=caller.name,
         role=user.role,
@@ -369,9 +360,7 @@ def audit(connection: Connection, actor: str, action: str, target: str, detail: 
     audit_log.add_note(connection, audit_log.Note(utc_now_ns(), actor, action, target, detail))
 
 
-def add_session_token(
-    connection: Connection, user: UserRecord, now: int, provider_session: str
-) -> tuple[int, str]:
+def add_session_token(connection: Connection, user: UserRecord, now: int, provider_session: str) -> tuple[int, str]:
     """Add the token of a browser session that an OpenID provider started; return its id and secret."""
     return _add_token(connection, user, now, PROVIDER_SESSION_NS, provider_session=provider_session)
 

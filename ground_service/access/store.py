@@ -6,15 +6,7 @@ from typing import Any, Literal
 from sqlalchemy import Connection, String, delete, false, func, null, or_, select, update
 from sqlalchemy.sql import Select
 
-from ground_service.access.model import (
-    AuditEntry,
-    AuditFilter,
-    AuditHead,
-    StoredAnswer,
-    TokenRecord,
-    User,
-    UserRecord,
-)
+from ground_service.access.model import AuditEntry, AuditFilter, AuditHead, StoredAnswer, TokenRecord, User, UserRecord
 from ground_service.errors import AuditBroken, Conflict, NotFound
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf
@@ -162,9 +154,7 @@ def revoke_token(connection: Connection, token_id: int, now_utc_ns: int) -> bool
     return change_if(connection, TOKENS, token_id, {"revoked_utc_ns": None}, revoked_utc_ns=now_utc_ns)
 
 
-def revoke_tokens(
-    connection: Connection, user: UserRecord, now_utc_ns: int, *, kept: int | None = None
-) -> int:
+def revoke_tokens(connection: Connection, user: UserRecord, now_utc_ns: int, *, kept: int | None = None) -> int:
     """Revoke the tokens of a user, except one and the sessions started with it; return their number."""
     others = [] if kept is None else [TOKENS.c.id != kept, func.coalesce(TOKENS.c.parent_id, 0) != kept]
     query = update(TOKENS).where(TOKENS.c.user_id == user.id, TOKENS.c.revoked_utc_ns.is_(None), *others)

@@ -57,9 +57,7 @@ class Connection:
         Replaces the network, for a service in this process or for tests.
     """
 
-    def __init__(
-        self, server: str, token: str | None = None, *, transport: httpx.BaseTransport | None = None
-    ) -> None:
+    def __init__(self, server: str, token: str | None = None, *, transport: httpx.BaseTransport | None = None) -> None:
         if not server.startswith(("http://", "https://")):
             raise InvalidInput("--server", "", "a URL such as http://127.0.0.1:8042", repr(server))
         self._server = server.rstrip("/")
@@ -104,9 +102,7 @@ class Connection:
         if get_origin(kind) is not Listing:
             return self._validated(kind, self._send(verb, path, **request))
         query = request["query"]
-        return Listing(
-            lambda limit, offset: self._page(reads, item, path, query | {"limit": limit, "offset": offset})
-        )
+        return Listing(lambda limit, offset: self._page(reads, item, path, query | {"limit": limit, "offset": offset}))
 
     def _page(self, reads: str, item: Any, path: str, query: dict[str, Any]) -> PageOf[Any]:
         """Return a page of a list; `reads` is the function of the service that reads it, if one alone does."""
@@ -121,8 +117,7 @@ class Connection:
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"])
             raise ServiceProblem(
-                0,
-                f"{self._server}: expected JSON of a LINNA service, found other: {where or 'body'}: {first['msg']}",
+                0, f"{self._server}: expected JSON of a LINNA service, found other: {where or 'body'}: {first['msg']}"
             ) from None
 
     def _download(self, verb: str, path: str, target: Path, **request: Any) -> None:

@@ -42,9 +42,7 @@ class Operations(Connection):
     # passes
 
     @operation("POST /archives")
-    def upload_archive(
-        self, file: Path | bytes, *, name: str | None = None, key: str | None = None
-    ) -> jobs.Job:
+    def upload_archive(self, file: Path | bytes, *, name: str | None = None, key: str | None = None) -> jobs.Job:
         """Import a zipped pass archive: manifest, downlink, reference, catalogue and images."""
 
     @operation("GET /passes", reads="passes.store.list_passes")
@@ -60,14 +58,7 @@ class Operations(Connection):
 
     @operation("POST /passes", body=("name", "start", "stop", "spacecraft_id", "instance"))
     def define_pass(
-        self,
-        name: str,
-        start: str,
-        stop: str,
-        spacecraft_id: int,
-        *,
-        instance: str = "flight",
-        key: str | None = None,
+        self, name: str, start: str, stop: str, spacecraft_id: int, *, instance: str = "flight", key: str | None = None
     ) -> passes.PassDetail:
         """Define a pass: an interval of a spacecraft's time."""
 
@@ -85,12 +76,7 @@ class Operations(Connection):
 
     @operation("GET /passes/{pass_id}/states")
     def get_states(
-        self,
-        pass_id: int,
-        *,
-        estimator: str = "paper",
-        value: Sequence[str] | None = None,
-        max_points: int = 1000,
+        self, pass_id: int, *, estimator: str = "paper", value: Sequence[str] | None = None, max_points: int = 1000
     ) -> passes.States:
         """Return series of one estimator's states: minimum, maximum and mean per interval, gaps marked."""
 
@@ -120,15 +106,11 @@ class Operations(Connection):
         """List the parameters with series: of the payload, and of packets that the mission description defines."""
 
     @operation("GET /passes/{pass_id}/packets/{packet}")
-    def get_packets(
-        self, pass_id: int, packet: str, out: Path, *, format: passes.ExportFormat = "json"
-    ) -> None:
+    def get_packets(self, pass_id: int, packet: str, out: Path, *, format: passes.ExportFormat = "json") -> None:
         """Return the decoded packets of one kind in a pass, in order of on-board time, with UTC."""
 
     @operation("GET /passes/{pass_id}/telemetry/{parameter}")
-    def get_parameter(
-        self, pass_id: int, parameter: str, *, max_points: int = 1000
-    ) -> passes.ParameterSeries:
+    def get_parameter(self, pass_id: int, parameter: str, *, max_points: int = 1000) -> passes.ParameterSeries:
         """Return the series of a housekeeping parameter of a pass."""
 
     @operation("GET /spacecraft/{spacecraft_id}/telemetry/{parameter}")
@@ -149,15 +131,11 @@ class Operations(Connection):
         """List the spacecraft, flown ones first."""
 
     @operation("GET /spacecraft/{spacecraft_id}/parameters")
-    def list_spacecraft_parameters(
-        self, spacecraft_id: int, *, instance: str = "flight"
-    ) -> list[passes.ParameterInfo]:
+    def list_spacecraft_parameters(self, spacecraft_id: int, *, instance: str = "flight") -> list[passes.ParameterInfo]:
         """List the parameters of a spacecraft with series."""
 
     @operation("GET /spacecraft/{spacecraft_id}/images")
-    def list_images(
-        self, spacecraft_id: int, start: str, stop: str, *, instance: str = "flight"
-    ) -> list[passes.Image]:
+    def list_images(self, spacecraft_id: int, start: str, stop: str, *, instance: str = "flight") -> list[passes.Image]:
         """List the images of an interval: downlinked thumbnails, and frames of pass archives; at most 2000."""
 
     @operation("GET /spacecraft/{spacecraft_id}/thumbnails/{ticks}")
@@ -227,9 +205,7 @@ class Operations(Connection):
         """Request a report of a pass; a job creates it."""
 
     @operation("GET /reports/{report_id}")
-    def get_report(
-        self, report_id: str, out: Path, *, format: Literal["html", "pdf", "json"] | None = None
-    ) -> None:
+    def get_report(self, report_id: str, out: Path, *, format: Literal["html", "pdf", "json"] | None = None) -> None:
         """Return a report as HTML, PDF or JSON."""
 
     @operation("GET /reports")
@@ -273,9 +249,7 @@ class Operations(Connection):
         """List the monthly reports, newest month first."""
 
     @operation("GET /monthly-reports/{report_id}")
-    def get_monthly_report(
-        self, report_id: str, out: Path, *, format: Literal["html", "pdf", "json"] = "html"
-    ) -> None:
+    def get_monthly_report(self, report_id: str, out: Path, *, format: Literal["html", "pdf", "json"] = "html") -> None:
         """Return a monthly report as HTML, PDF or JSON."""
 
     # landmarks
@@ -310,13 +284,7 @@ class Operations(Connection):
 
     @operation("POST /exports", body=("pass_id", "format", "states", "version"))
     def export_pass(
-        self,
-        pass_id: int,
-        format: str,
-        out: Path,
-        *,
-        states: str = "reference",
-        version: Literal["1.0", "2.0"] = "2.0",
+        self, pass_id: int, format: str, out: Path, *, states: str = "reference", version: Literal["1.0", "2.0"] = "2.0"
     ) -> None:
         """Return a pass in a format of other tools."""
 
@@ -387,9 +355,7 @@ class Operations(Connection):
     # time
 
     @operation("GET /spacecraft/{spacecraft_id}/correlations")
-    def list_correlations(
-        self, spacecraft_id: int, *, instance: str = "flight"
-    ) -> list[timekeeping.Correlation]:
+    def list_correlations(self, spacecraft_id: int, *, instance: str = "flight") -> list[timekeeping.Correlation]:
         """List all time correlations of a spacecraft, newest first."""
 
     @operation("POST /spacecraft/{spacecraft_id}/correlations", body=("points",))
@@ -399,15 +365,11 @@ class Operations(Connection):
         """Add time reports and correlate on-board time with UTC from them; the correlations then in force."""
 
     @operation("DELETE /spacecraft/{spacecraft_id}/correlations")
-    def withdraw_correlations(
-        self, spacecraft_id: int, *, instance: str = "flight"
-    ) -> list[timekeeping.Correlation]:
+    def withdraw_correlations(self, spacecraft_id: int, *, instance: str = "flight") -> list[timekeeping.Correlation]:
         """Withdraw correlations that were added by hand: those of the received time reports are in force again."""
 
     @operation("POST /spacecraft/{spacecraft_id}/correlations/run")
-    def run_correlation(
-        self, spacecraft_id: int, *, instance: str = "flight"
-    ) -> list[timekeeping.Correlation]:
+    def run_correlation(self, spacecraft_id: int, *, instance: str = "flight") -> list[timekeeping.Correlation]:
         """Run the correlation from the received time reports; it also replaces correlations that were added by hand."""
 
     @operation("POST /spacecraft/{spacecraft_id}/receptions", body=("receptions",))
@@ -417,9 +379,7 @@ class Operations(Connection):
         """Add Earth reception times of time reports; the correlations then in force."""
 
     @operation("GET /spacecraft/{spacecraft_id}/time-reports")
-    def list_time_reports(
-        self, spacecraft_id: int, *, instance: str = "flight"
-    ) -> list[timekeeping.TimeReport]:
+    def list_time_reports(self, spacecraft_id: int, *, instance: str = "flight") -> list[timekeeping.TimeReport]:
         """List the received time reports with their light time and residuals."""
 
     # planning
@@ -433,9 +393,7 @@ class Operations(Connection):
         """Search candidate windows by constraints over a reference ephemeris."""
 
     @operation("GET /windows", reads="planning.store.list_windows")
-    def list_windows(
-        self, *, state: Sequence[planning.WindowState] | None = None
-    ) -> Listing[planning.Window]:
+    def list_windows(self, *, state: Sequence[planning.WindowState] | None = None) -> Listing[planning.Window]:
         """List the planned windows, newest first."""
 
     @operation("POST /windows", body="window")
@@ -447,9 +405,7 @@ class Operations(Connection):
         """Show a planned window."""
 
     @operation("PATCH /windows/{window_id}", body="change")
-    def change_window(
-        self, window_id: int, change: Document, *, if_match: str | None = None
-    ) -> planning.Window:
+    def change_window(self, window_id: int, change: Document, *, if_match: str | None = None) -> planning.Window:
         """Change a draft, approve a window, make it a draft again, or declare it failed."""
 
     @operation("DELETE /windows/{window_id}")
@@ -466,13 +422,7 @@ class Operations(Connection):
 
     @operation("GET /plan/forecast")
     def get_forecast(
-        self,
-        spacecraft_id: int,
-        start: str,
-        stop: str,
-        *,
-        instance: str = "flight",
-        ephemeris_id: int | None = None,
+        self, spacecraft_id: int, start: str, stop: str, *, instance: str = "flight", ephemeris_id: int | None = None
     ) -> planning.PlanForecast:
         """Return Sun elevation, ground track, battery, storage and downlink of the plan, and its conflicts."""
 
@@ -573,15 +523,11 @@ class Operations(Connection):
         """List the notes of the last shift and the holds, by spacecraft."""
 
     @operation("PUT /spacecraft/{spacecraft_id}/handover", body=("note",))
-    def change_handover(
-        self, spacecraft_id: int, note: str, *, instance: str = "flight"
-    ) -> commanding.Handover:
+    def change_handover(self, spacecraft_id: int, note: str, *, instance: str = "flight") -> commanding.Handover:
         """Change the note for the next shift."""
 
     @operation("POST /spacecraft/{spacecraft_id}/hold", body=("reason",))
-    def hold_spacecraft(
-        self, spacecraft_id: int, reason: str, *, instance: str = "flight"
-    ) -> commanding.Handover:
+    def hold_spacecraft(self, spacecraft_id: int, reason: str, *, instance: str = "flight") -> commanding.Handover:
         """Suppress release and transmission of telecommands of a spacecraft at once, automatic ones included."""
 
     @operation("DELETE /spacecraft/{spacecraft_id}/hold")
@@ -706,12 +652,7 @@ class Operations(Connection):
 
     @operation("POST /users", body=("name", "role", "missions", "days_valid"))
     def add_user(
-        self,
-        name: str,
-        role: access.Role,
-        *,
-        missions: Sequence[str] | None = None,
-        days_valid: float | None = None,
+        self, name: str, role: access.Role, *, missions: Sequence[str] | None = None, days_valid: float | None = None
     ) -> access.UserWithToken:
         """Add a user; the response contains the token, which cannot be read again."""
 

@@ -125,9 +125,7 @@ class LocalTransport(httpx.BaseTransport):
 
     async def _exchange(self, request: httpx.Request) -> httpx.Response:
         assert isinstance(request.stream, httpx.SyncByteStream)
-        passed = httpx.Request(
-            request.method, request.url, headers=request.headers, stream=_Blocks(request.stream)
-        )
+        passed = httpx.Request(request.method, request.url, headers=request.headers, stream=_Blocks(request.stream))
         response = await self._asgi.handle_async_request(passed)
         octets = await response.aread()
         return httpx.Response(response.status_code, headers=response.headers, stream=httpx.ByteStream(octets))

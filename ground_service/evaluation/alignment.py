@@ -66,9 +66,7 @@ class ReferenceStates:
         return np.degrees(self.longitude_rad) % 360.0
 
 
-def reference_states(
-    reference: Ephemeris | None, orientation: Orientation | None, utc_ns: IntArray
-) -> ReferenceStates:
+def reference_states(reference: Ephemeris | None, orientation: Orientation | None, utc_ns: IntArray) -> ReferenceStates:
     """Return the reference at `utc_ns` (n,); epochs that it does not cover are NaN.
 
     Without a reference, or without an orientation to relate it to the ground, all epochs are NaN.
@@ -86,9 +84,7 @@ def reference_states(
         rotation[covered] = orientation.mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(utc_ns[covered])))
     position_mcmf = np.einsum("nij,nj->ni", rotation, position)
     latitude, longitude, altitude = spherical_from_mcmf(position_mcmf)
-    return ReferenceStates(
-        utc_ns, covered, position, velocity, rotation, position_mcmf, latitude, longitude, altitude
-    )
+    return ReferenceStates(utc_ns, covered, position, velocity, rotation, position_mcmf, latitude, longitude, altitude)
 
 
 def error_of_places_rtn_m(
@@ -164,9 +160,7 @@ def nees(error: ArrayLike, covariance: ArrayLike) -> FloatArray:
     e, p = np.asarray(error, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
     size = e.shape[-1] if e.ndim else 0
     if size == 0 or p.shape[-2:] != (size, size):
-        raise ValueError(
-            f"expected errors (..., d) and covariances (..., d, d), found {e.shape} and {p.shape}"
-        )
+        raise ValueError(f"expected errors (..., d) and covariances (..., d, d), found {e.shape} and {p.shape}")
     shape = np.broadcast_shapes(e.shape[:-1], p.shape[:-2])
     errors = np.broadcast_to(e, (*shape, size)).reshape(-1, size)
     matrices = np.broadcast_to(p, (*shape, size, size)).reshape(-1, size, size)
@@ -176,9 +170,7 @@ def nees(error: ArrayLike, covariance: ArrayLike) -> FloatArray:
     known &= np.all(variance > 0.0, axis=1)
     # Position and velocity have different scales: solve with the correlation matrix, not the covariance.
     scale = np.sqrt(np.where(known[:, None], variance, 1.0))
-    correlation = np.where(known[:, None, None], matrices, np.eye(size)) / (
-        scale[:, :, None] * scale[:, None, :]
-    )
+    correlation = np.where(known[:, None, None], matrices, np.eye(size)) / (scale[:, :, None] * scale[:, None, :])
     known &= np.all(np.abs(correlation - np.swapaxes(correlation, 1, 2)) < 1e-6, axis=(1, 2))
     least_and_greatest = np.linalg.eigvalsh(0.5 * (correlation + np.swapaxes(correlation, 1, 2)))[:, [0, -1]]
     known &= least_and_greatest[:, 0] > least_and_greatest[:, 1] / _LARGEST_CONDITION
@@ -253,9 +245,7 @@ LENGTH_TOLERANCE = 0.15
 """A sub-track may be this much longer or shorter than its nominal length: steps of 24.5 km hit 100 km within 2 %."""
 
 
-def navigation_statistics(
-    error_rtn_m: FloatArray, path_m: FloatArray, is_reset: BoolArray
-) -> NavigationStatistics:
+def navigation_statistics(error_rtn_m: FloatArray, path_m: FloatArray, is_reset: BoolArray) -> NavigationStatistics:
     """Percentiles of the 3-D error, end-of-pass error and drift of n samples; NaN samples are left out.
 
     Parameters
@@ -298,9 +288,7 @@ def drift_percent(error_rtn_m: FloatArray, path_m: FloatArray, is_reset: BoolArr
     return float(100.0 * np.median(gained[moved] / length[moved]))
 
 
-def drift_by_length(
-    error_rtn_m: FloatArray, path_m: FloatArray, is_reset: BoolArray
-) -> tuple[DriftSample, ...]:
+def drift_by_length(error_rtn_m: FloatArray, path_m: FloatArray, is_reset: BoolArray) -> tuple[DriftSample, ...]:
     """Relative drift over every sub-track of each of `PATH_LENGTHS_M` that holds no reset."""
     known = np.isfinite(error_rtn_m).all(axis=-1) & np.isfinite(path_m)
     horizontal, path = error_rtn_m[known, 1:], path_m[known]
@@ -319,9 +307,7 @@ def drift_by_length(
         gained = np.linalg.norm(horizontal[stop] - horizontal[start], axis=-1)[fits]
         percent = 100.0 * gained / length[fits]
         samples.append(
-            DriftSample(
-                nominal, float(np.median(percent)), float(np.percentile(percent, 95.0)), int(fits.sum())
-            )
+            DriftSample(nominal, float(np.median(percent)), float(np.percentile(percent, 95.0)), int(fits.sum()))
         )
     return tuple(samples)
 

@@ -31,12 +31,7 @@ from ground_service.evaluation.extras import (
     with_terrain,
     with_wrong_fixes,
 )
-from ground_service.evaluation.fixes import (
-    IdentificationSamples,
-    MappedCraters,
-    join_pairs,
-    payload_map,
-)
+from ground_service.evaluation.fixes import IdentificationSamples, MappedCraters, join_pairs, payload_map
 from ground_service.evaluation.recall import (
     ExpectedCraters,
     Matches,
@@ -274,11 +269,7 @@ def _reference_px(inputs: PassInputs, reference: TrackSeries | None) -> float:
     sigma = inputs.reference_sigma_rtn_m
     if sigma is None or reference is None or not np.isfinite(reference.altitude_m).any():
         return 0.0
-    return (
-        inputs.viewing.camera.focal_px
-        * float(np.hypot(*sigma[1:]))
-        / float(np.nanmedian(reference.altitude_m))
-    )
+    return inputs.viewing.camera.focal_px * float(np.hypot(*sigma[1:])) / float(np.nanmedian(reference.altitude_m))
 
 
 def event_remarks(events: Sequence[PassEvent]) -> list[str]:
@@ -373,9 +364,7 @@ def _navigation(
         )
     if inputs.start_state is not None and inputs.gravity is not None and inputs.orientation is not None:
         try:
-            series += _baselines(
-                inputs, inputs.start_state, inputs.gravity, inputs.orientation, track, path_m
-            )
+            series += _baselines(inputs, inputs.start_state, inputs.gravity, inputs.orientation, track, path_m)
             provenance["gravity of the baseline"] = (
                 f"{inputs.gravity.name}, degree {min(BASELINE_DEGREE, inputs.gravity.degree)}, with Earth and Sun"
             )
@@ -385,10 +374,7 @@ def _navigation(
         reason = inputs.refused.get("gravity") if inputs.start_state is not None else None
         remarks.append(f"{NO_BASELINE}: {reason or 'the pass names no start state'}")
     series = _with_extras(inputs, series, track, path_m)
-    return (
-        TrackSeries(times, track.latitude_deg, track.longitude_deg, track.altitude_m),
-        tuple(series),
-    )
+    return (TrackSeries(times, track.latitude_deg, track.longitude_deg, track.altitude_m), tuple(series))
 
 
 def _estimates(inputs: PassInputs, track: ReferenceStates, path_m: FloatArray) -> list[NavigationSeries]:
@@ -433,9 +419,7 @@ def _estimate_series(
 ) -> NavigationSeries:
     outcomes = next((one for one in inputs.outcomes if one.estimator == samples.estimator), None)
     rows = np.searchsorted(track.utc_ns, samples.utc_ns)
-    error = error_of_places_rtn_m(
-        track.at_rows(rows), samples.latitude_deg, samples.longitude_deg, samples.altitude_m
-    )
+    error = error_of_places_rtn_m(track.at_rows(rows), samples.latitude_deg, samples.longitude_deg, samples.altitude_m)
     triggers, candidates, reads = _joined(samples, outcomes)
     is_reset = np.array([trigger in RESETS for trigger in triggers], dtype=np.bool_)
     if not triggers:
@@ -486,10 +470,7 @@ def _not_applicable(estimator: str, track: ReferenceStates) -> str:
 
 
 def _consistency(
-    samples: NavigationSamples,
-    filtered: FilterStates | None,
-    error_rtn_m: FloatArray,
-    reference_covariance: FloatArray,
+    samples: NavigationSamples, filtered: FilterStates | None, error_rtn_m: FloatArray, reference_covariance: FloatArray
 ) -> tuple[FloatArray | None, IntArray | None]:
     """Return the NEES of the position (n,; None without a covariance) and the degrees of freedom of each NIS.
 
@@ -513,11 +494,7 @@ def _consistency(
 
 
 def _smoothed(
-    inputs: PassInputs,
-    track: ReferenceStates,
-    path_m: FloatArray,
-    provenance: dict[str, str],
-    remarks: list[str],
+    inputs: PassInputs, track: ReferenceStates, path_m: FloatArray, provenance: dict[str, str], remarks: list[str]
 ) -> list[NavigationSeries]:
     """Return the filter's orbit smoothed on the ground, if complete states and a reference are available.
 
@@ -529,26 +506,18 @@ def _smoothed(
     gravity, onboard = inputs.onboard_gravity, inputs.onboard_orientation
     if gravity is None or onboard is None or inputs.orientation is None:
         reasons = (inputs.refused.get(name) for name in ("onboard_gravity", "onboard_orientation"))
-        remarks.append(
-            f"no smoothed orbit: {next(filter(None, reasons), 'no field or orientation on board is given')}"
-        )
+        remarks.append(f"no smoothed orbit: {next(filter(None, reasons), 'no field or orientation on board is given')}")
         return []
     rows = np.minimum(np.searchsorted(track.utc_ns, filtered.utc_ns), len(track.utc_ns) - 1)
     kept = track.covered[rows] & (track.utc_ns[rows] == filtered.utc_ns)
     filtered, rows = filtered.select(kept).in_icrf(inputs.orientation, onboard), rows[kept]
     model = smoother_model(gravity, inputs.orientation, inputs.burns, inputs.map_offset)
     series = smoothed_series(
-        filtered,
-        track.at_rows(rows),
-        path_m[rows],
-        model,
-        reference_covariance_m2(inputs.reference_sigma_rtn_m),
+        filtered, track.at_rows(rows), path_m[rows], model, reference_covariance_m2(inputs.reference_sigma_rtn_m)
     )
     if series is None:
         return []
-    provenance["gravity of the smoother"] = (
-        f"{gravity.name}, degree {model.forces.degree}, with Earth and Sun"
-    )
+    provenance["gravity of the smoother"] = f"{gravity.name}, degree {model.forces.degree}, with Earth and Sun"
     return [replace(series, error_budget=error_budget(series.error_rtn_m, inputs.reference_sigma_rtn_m))]
 
 
@@ -563,9 +532,7 @@ def _joined(
     at = np.minimum(np.searchsorted(numbers, samples.frame_number), len(numbers) - 1)
     same = numbers[at] == samples.frame_number
     rows = order[at]
-    triggers = tuple(
-        outcomes.reset_trigger[row] if hit else "none" for row, hit in zip(rows, same, strict=True)
-    )
+    triggers = tuple(outcomes.reset_trigger[row] if hit else "none" for row, hit in zip(rows, same, strict=True))
     candidates = np.where(same, outcomes.candidate_pairs[rows], 0).astype(np.int64)
     return triggers, candidates, outcomes.anchor_reads
 
@@ -600,9 +567,7 @@ def _baselines(
     if _apart_m(start, perfect) > PERFECT_START_M:
         runs.append((PERFECT_START, perfect, gravity, runs[0][3]))
     for name, begin, field_used, degree in (*runs, ("Kepler", start, gravity, 0)):
-        position = propagated_positions(
-            begin, here.utc_ns, field_used, degree, orientation, third_bodies=degree > 0
-        )
+        position = propagated_positions(begin, here.utc_ns, field_used, degree, orientation, third_bodies=degree > 0)
         origin = "state of the reference" if begin is perfect else "start state of the filter"
         text = (
             f"{origin} propagated with {field_used.name} to degree {degree}, Earth and Sun"
@@ -651,9 +616,7 @@ def _detector(
         return None, (), (), None
     unknown = np.count_nonzero(~np.isfinite(inputs.catalogue.rim_height_m))
     if unknown:
-        remarks.append(
-            f"rim heights unknown for {unknown} of {len(inputs.catalogue)} craters: they are not scored"
-        )
+        remarks.append(f"rim heights unknown for {unknown} of {len(inputs.catalogue)} craters: they are not scored")
     if "camera sizes" in inputs.refused:
         remarks.append(inputs.refused["camera sizes"])
     track = reference_states(inputs.reference, inputs.orientation, detections.utc_ns)
@@ -712,25 +675,19 @@ def _pointing_text(inputs: PassInputs, remarks: list[str]) -> str:
     if "camera" in inputs.refused:
         remarks.append(inputs.refused["camera"])
     if known:
-        remarks.append(
-            f"the attitude of {total - known} of {total} frames is unknown; the declared attitude is used"
-        )
+        remarks.append(f"the attitude of {total - known} of {total} frames is unknown; the declared attitude is used")
         return "the camera in its telemetered attitude, if available"
     return "the camera in its declared attitude" if "camera" not in inputs.refused else "a nadir camera"
 
 
-def _choose_frames(
-    inputs: PassInputs, expected: ExpectedCraters, matches: Matches
-) -> tuple[list[int], list[int]]:
+def _choose_frames(inputs: PassInputs, expected: ExpectedCraters, matches: Matches) -> tuple[list[int], list[int]]:
     """Rows of frames for the galleries: some spread over the pass, and those where the detector did worst."""
     detections = inputs.detections
     with_image = np.array([int(n) in inputs.images for n in detections.frame_number], dtype=np.bool_)
     rows = np.flatnonzero(with_image)
     if len(rows) == 0:
         return [], []
-    spread = rows[
-        np.unique(np.linspace(0, len(rows) - 1, min(GALLERY_FRAMES, len(rows))).round().astype(np.int64))
-    ]
+    spread = rows[np.unique(np.linspace(0, len(rows) - 1, min(GALLERY_FRAMES, len(rows))).round().astype(np.int64))]
     owner = np.repeat(np.arange(len(detections)), np.diff(expected.offsets))
     scored = np.isin(expected.size_class, (0, 1, 2)) & expected.complete
     total = np.bincount(owner[scored], minlength=len(detections))
@@ -819,11 +776,7 @@ def _imaging_arcs(inputs: PassInputs) -> tuple[TimeSpan, ...]:
     times = inputs.detections.utc_ns
     if len(times) == 0:
         return ()
-    edges = [
-        int(times[0]),
-        *(t for gap in _gaps(inputs) for t in (gap.start_utc_ns, gap.stop_utc_ns)),
-        int(times[-1]),
-    ]
+    edges = [int(times[0]), *(t for gap in _gaps(inputs) for t in (gap.start_utc_ns, gap.stop_utc_ns)), int(times[-1])]
     return tuple(TimeSpan(a, b + 1, "frames") for a, b in zip(edges[::2], edges[1::2], strict=True))
 
 
@@ -834,8 +787,7 @@ def _gaps(inputs: PassInputs) -> tuple[TimeSpan, ...]:
         return ()
     limit = 1.5 * inputs.cadence_s * NS
     return tuple(
-        TimeSpan(int(times[i]), int(times[i + 1]), "no frames")
-        for i in np.flatnonzero(np.diff(times) > limit)
+        TimeSpan(int(times[i]), int(times[i + 1]), "no frames") for i in np.flatnonzero(np.diff(times) > limit)
     )
 
 
@@ -846,10 +798,7 @@ def _anchor_reads(outcomes: tuple[OutcomeSamples, ...]) -> tuple[AnchorRead, ...
         rose = np.flatnonzero(np.diff(samples.anchor_reads, prepend=0) > 0)
         reads += [
             AnchorRead(
-                samples.estimator,
-                int(samples.utc_ns[i]),
-                samples.reset_trigger[i],
-                int(samples.frame_number[i]),
+                samples.estimator, int(samples.utc_ns[i]), samples.reset_trigger[i], int(samples.frame_number[i])
             )
             for i in rose
         ]

@@ -8,11 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.errors import InvalidInput
-from ground_service.evaluation.alignment import (
-    ReferenceStates,
-    error_of_places_rtn_m,
-    navigation_statistics,
-)
+from ground_service.evaluation.alignment import ReferenceStates, error_of_places_rtn_m, navigation_statistics
 from ground_service.evaluation.fixes import Pairs, snapshot_positions, wrong_fixes
 from ground_service.evaluation.recall import Viewing
 from ground_service.telemetry.samples import NavigationSamples
@@ -61,9 +57,7 @@ def with_terrain(series: NavigationSeries, track: ReferenceStates, surface: Terr
     height, width = surface.image.shape
     down = (surface.north_deg - latitude[known]) / (surface.north_deg - surface.south_deg) * height
     right = (longitude[known] - surface.west_deg) % 360.0 / (surface.east_deg - surface.west_deg) * width
-    grey = surface.image[
-        np.clip(down.astype(np.int64), 0, height - 1), np.clip(right.astype(np.int64), 0, width - 1)
-    ]
+    grey = surface.image[np.clip(down.astype(np.int64), 0, height - 1), np.clip(right.astype(np.int64), 0, width - 1)]
     kinds = np.full(len(rows), "", dtype="<U8")
     kinds[known] = np.where(grey < dark_limit(surface), "mare", "highland")
     return replace(series, terrain=tuple(kinds.tolist()))
@@ -98,17 +92,12 @@ def with_wrong_fixes(
         return series
     rotations = viewing.camera_from_mcmf(track.utc_ns, track.position_mcmf_m, track.mcmf_from_icrf)
     return replace(
-        series,
-        wrong_fixes=wrong_fixes(pairs, viewing.camera, track.utc_ns, track.position_mcmf_m, rotations),
+        series, wrong_fixes=wrong_fixes(pairs, viewing.camera, track.utc_ns, track.position_mcmf_m, rotations)
     )
 
 
 def snapshot_series(
-    pairs: Pairs,
-    samples: NavigationSamples,
-    viewing: Viewing,
-    track: ReferenceStates,
-    path_m: FloatArray,
+    pairs: Pairs, samples: NavigationSamples, viewing: Viewing, track: ReferenceStates, path_m: FloatArray
 ) -> NavigationSeries | None:
     """Positions of single frames as a baseline, at the epochs of the filter's states; None without any."""
     if len(pairs.frame) == 0 or len(samples.utc_ns) == 0:

@@ -54,9 +54,7 @@ class Pairs:
     crater_mcmf_m: FloatArray
 
 
-def join_pairs(
-    found: IdentificationSamples, detections: DetectionSamples, catalogue: CraterCatalogue
-) -> Pairs:
+def join_pairs(found: IdentificationSamples, detections: DetectionSamples, catalogue: CraterCatalogue) -> Pairs:
     """Identifications whose detection came down and whose crater the catalogue holds with its height."""
     order = np.argsort(catalogue.ids, kind="stable")
     ids = catalogue.ids[order]
@@ -192,11 +190,7 @@ def _solved(
 
 
 def _projected(
-    camera: PinholeCamera,
-    positions_m: FloatArray,
-    crater_m: FloatArray,
-    pointing: Pointing,
-    fixed: FloatArray,
+    camera: PinholeCamera, positions_m: FloatArray, crater_m: FloatArray, pointing: Pointing, fixed: FloatArray
 ) -> FloatArray:
     """Return the pixels (..., n, 2) of craters (..., n, 3) for cameras at (..., 3), in fixed attitudes if known."""
     rotations = np.where(np.isfinite(fixed), fixed, pointing(positions_m))
@@ -336,9 +330,7 @@ def compare_map(mapped: MappedCraters, catalogue: CraterCatalogue) -> MapCompari
 
 
 def payload_map(
-    reports: MappedCraters | None,
-    identifications: IdentificationSamples | None,
-    catalogue: CraterCatalogue | None,
+    reports: MappedCraters | None, identifications: IdentificationSamples | None, catalogue: CraterCatalogue | None
 ) -> PayloadMap | None:
     """Return what a report says of the payload's map; None where nothing of it came down."""
     if reports is None or not len(reports):

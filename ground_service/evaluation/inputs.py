@@ -19,14 +19,7 @@ from ground_service.evaluation.core import PassInputs
 from ground_service.evaluation.fixes import IdentificationSamples, MappedCraters, mapped_craters
 from ground_service.evaluation.model import changed_figures
 from ground_service.evaluation.recall import Viewing
-from ground_service.evaluation.smoother import (
-    ONBOARD,
-    SIZE,
-    CommandedBurn,
-    FilterStates,
-    MapOffset,
-    StartState,
-)
+from ground_service.evaluation.smoother import ONBOARD, SIZE, CommandedBurn, FilterStates, MapOffset, StartState
 from ground_service.evaluation.verdict import StartOrbit
 from ground_service.ground import Ground
 from ground_service.missions.catalogues import catalogue_of, read_catalogue
@@ -52,10 +45,7 @@ from ground_service.passes.sample_store import code_labels, detection_samples, e
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.store.files import FileArchive, register_file
 from ground_service.store.vehicles import Vehicle, get_vehicle
-from ground_service.telemetry.samples import (
-    NavigationSamples,
-    OutcomeSamples,
-)
+from ground_service.telemetry.samples import NavigationSamples, OutcomeSamples
 from ground_service.telemetry.store import unpack_filter_states, unpack_identifications
 from ground_service.toml import read_table
 from lunar.boxes import share_outside
@@ -150,8 +140,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
             filter_states=filter_states(connection, span),
             identifications=identification_samples(connection, span),
             landmarks=landmark_reports(connection, span),
-            sun_known=manifest.get("light", "real") == "real"
-            and mission.observation.needs_daylight is not False,
+            sun_known=manifest.get("light", "real") == "real" and mission.observation.needs_daylight is not False,
             burns=burns_of(manifest),
             onboard_orientation=declared.onboard_orientation,
             gravity=declared.gravity,
@@ -380,9 +369,7 @@ def burns_of(manifest: Mapping[str, Any]) -> tuple[CommandedBurn, ...]:
     """The burns that were commanded during a pass, as the manifest names them."""
     return tuple(
         CommandedBurn(
-            parse_utc(burn["utc"]),
-            np.array(burn["delta_v_icrf_m_s"], dtype=np.float64),
-            float(burn["sigma_m_s"]),
+            parse_utc(burn["utc"]), np.array(burn["delta_v_icrf_m_s"], dtype=np.float64), float(burn["sigma_m_s"])
         )
         for burn in manifest.get("burns", ())
     )
@@ -400,9 +387,7 @@ def _by_estimator(columns: dict[str, NDArray[Any]], packet: str) -> list[tuple[s
     parts = []
     for code in np.unique(columns["estimator"]).tolist():
         rows = order[columns["estimator"][order] == code]
-        parts.append(
-            (names.get(code, f"estimator {code}"), {name: column[rows] for name, column in columns.items()})
-        )
+        parts.append((names.get(code, f"estimator {code}"), {name: column[rows] for name, column in columns.items()}))
     return parts
 
 
@@ -416,17 +401,12 @@ def _housekeeping(connection: Connection, span: PassSpan) -> tuple[HousekeepingP
         else:
             columns = {}
             for field in drawn:
-                columns["ticks"], columns[field.name] = sample_store.packet_values(
-                    connection, span, packet, field.name
-                )
+                columns["ticks"], columns[field.name] = sample_store.packet_values(connection, span, packet, field.name)
         if drawn and len(columns["ticks"]):
             utc_ns = span.utc_ns(columns["ticks"].tolist())
             found += [
                 HousekeepingParameter(
-                    field.name,
-                    _UNITS.get(field.unit, field.unit),
-                    utc_ns,
-                    columns[field.name].astype(np.float64),
+                    field.name, _UNITS.get(field.unit, field.unit), utc_ns, columns[field.name].astype(np.float64)
                 )
                 for field in drawn
             ]
@@ -467,9 +447,7 @@ def _catalogue(ground: Ground, record: PassRecord) -> CraterCatalogue | None:
     if sha256 is None:
         return None
     sources = [name for name in record.manifest.get("data_sources", ()) if "catalogue" in str(name)]
-    return replace(
-        read_catalogue(ground.files.path(sha256)), source="; ".join(sources) or "catalogue of the pass"
-    )
+    return replace(read_catalogue(ground.files.path(sha256)), source="; ".join(sources) or "catalogue of the pass")
 
 
 def _correlation_text(lines: Sequence[Correlation]) -> str:
@@ -508,18 +486,14 @@ def _provenance(
         if "truth" in gravity
         else "",
         "mission description": (
-            "none registered"
-            if record.mission_id is None
-            else f"{mission.name}, revision {mission.revision[:16]}"
+            "none registered" if record.mission_id is None else f"{mission.name}, revision {mission.revision[:16]}"
         ),
         "lunar orientation": declared.orientation.name if declared.orientation is not None else "",
         "registration of the crater list": _registration_text(mission.catalogue),
         "dictionary": _dictionary_text(span.dictionary_version),
         "time correlation": _correlation_text(correlations),
         "reference ephemeris": (
-            f"{ephemeris.object_name}, {ephemeris.frame}, SHA-256 {ephemeris.sha256[:16]}"
-            if ephemeris
-            else ""
+            f"{ephemeris.object_name}, {ephemeris.frame}, SHA-256 {ephemeris.sha256[:16]}" if ephemeris else ""
         ),
         "crater catalogue SHA-256": str(record.catalogue_sha256 or "")[:16],
         "archive": str(record.archive_digest or "")[:16],
@@ -630,9 +604,7 @@ def align_pass(ground: Ground, pass_id: int) -> dict[str, Any]:
         except GroundError as error:
             missing["catalogue"] = str(error)
     elif sha256 is None:
-        missing["catalogue"] = (
-            "no reference to cut the catalogue along" if reference is None else "none archived"
-        )
+        missing["catalogue"] = "no reference to cut the catalogue along" if reference is None else "none archived"
     return {
         "reference": None if reference is None else reference.name,
         "correlations": [one.id for one in span.correlations],

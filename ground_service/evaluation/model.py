@@ -167,9 +167,7 @@ class PassFigures(Entity):
     baselines: dict[str, NavigationFigures]
     verdict: str
     verdict_level: str = Field(description="met, not met or unknown", examples=["met"])
-    experiment: str = Field(
-        default="", description="The same for navigation without help; empty: no experiment"
-    )
+    experiment: str = Field(default="", description="The same for navigation without help; empty: no experiment")
     experiment_level: str = ""
     requirements: list[RequirementFigures]
     error_budget: dict[str, ErrorBudget]

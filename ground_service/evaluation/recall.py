@@ -18,14 +18,7 @@ from lunar.camera import PinholeCamera, above_horizon, ground_arc_m, horizon_arc
 from lunar.catalogue import CraterCatalogue, size_class
 from lunar.frames import matrix_from_quaternion, mcmf_from_spherical
 from lunar.lens import pointed_camera_from_mcmf
-from reports.values import (
-    BinScore,
-    CalibrationBin,
-    ClassScore,
-    DetectorScore,
-    PrecisionRecallCurve,
-    ResidualSeries,
-)
+from reports.values import BinScore, CalibrationBin, ClassScore, DetectorScore, PrecisionRecallCurve, ResidualSeries
 
 CLASS_LABELS = ("5–10 km", "10–15 km", "15–30 km")
 SCORED_CLASSES = (0, 1, 2)
@@ -100,9 +93,7 @@ def expected_craters(
         for position, rotation, range_m, reach in zip(
             position_mcmf_m[frames], rotations[frames], distance[frames], reach_m[frames], strict=True
         ):
-            near = catalogue.near(
-                math.asin(position[2] / range_m), math.atan2(position[1], position[0]), float(reach)
-            )
+            near = catalogue.near(math.asin(position[2] / range_m), math.atan2(position[1], position[0]), float(reach))
             nearby.append(near)
             lines.append((points[near] - position) @ rotation.T)
         if not nearby:
@@ -119,13 +110,7 @@ def expected_craters(
     uv = np.concatenate([p[1] for p in pieces]) if pieces else np.zeros((0, 2))
     diameter = np.concatenate([p[2] for p in pieces]) if pieces else np.zeros(0)
     return ExpectedCraters(
-        np.cumsum(counts, dtype=np.int64),
-        index,
-        uv[:, 0],
-        uv[:, 1],
-        diameter,
-        classes[index],
-        scored[index],
+        np.cumsum(counts, dtype=np.int64), index, uv[:, 0], uv[:, 1], diameter, classes[index], scored[index]
     )
 
 
@@ -320,18 +305,13 @@ def _calibration(tally: _Tally) -> tuple[CalibrationBin, ...]:
     is_true = np.concatenate((np.ones(len(true)), np.zeros(len(tally.alarm_score))))
     number = np.clip((score * 10.0).astype(np.int64), 0, 9)
     return tuple(
-        CalibrationBin(
-            float(score[number == k].mean()), float(is_true[number == k].mean()), int((number == k).sum())
-        )
+        CalibrationBin(float(score[number == k].mean()), float(is_true[number == k].mean()), int((number == k).sum()))
         for k in np.unique(number)
     )
 
 
 def _residuals(
-    detections: DetectionSamples,
-    expected: ExpectedCraters,
-    tally: _Tally,
-    sun_azimuth_deg: FloatArray | None,
+    detections: DetectionSamples, expected: ExpectedCraters, tally: _Tally, sun_azimuth_deg: FloatArray | None
 ) -> ResidualSeries | None:
     found = np.isfinite(tally.crater_error_px)
     at, by = tally.crater_rows[found], tally.crater_detection[found]
@@ -410,9 +390,7 @@ class Viewing:
         """Return whether the attitude of the frames at `utc_ns` (n,) was telemetered."""
         return self._attitudes(utc_ns)[1]
 
-    def camera_from_mcmf(
-        self, utc_ns: IntArray, position_mcmf_m: FloatArray, mcmf_from_icrf: FloatArray
-    ) -> FloatArray:
+    def camera_from_mcmf(self, utc_ns: IntArray, position_mcmf_m: FloatArray, mcmf_from_icrf: FloatArray) -> FloatArray:
         """Return the rotations (n, 3, 3) from MCMF to the camera of frames.
 
         Parameters

@@ -8,15 +8,7 @@ from ground_service.access.security import Operator, Viewer, idempotent_id
 from ground_service.errors import NotFound
 from ground_service.evaluation import service, store
 from ground_service.evaluation.model import PassFigures, Report, ReportOverview, ReportSummary
-from ground_service.http.common import (
-    API_PREFIX,
-    GroundOf,
-    IdempotencyKey,
-    Key,
-    PagingOf,
-    PassId,
-    linked,
-)
+from ground_service.http.common import API_PREFIX, GroundOf, IdempotencyKey, Key, PagingOf, PassId, linked
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
 from ground_service.jobs.model import Job
@@ -62,9 +54,7 @@ def get_report(
     ground: GroundOf,
     _: Viewer,
     report_id: Key,
-    format: Annotated[
-        Literal["html", "pdf", "json"] | None, Query(description="Default: by the Accept header")
-    ] = None,
+    format: Annotated[Literal["html", "pdf", "json"] | None, Query(description="Default: by the Accept header")] = None,
 ) -> Response:
     """Return a report as HTML, PDF or JSON."""
     report = ground.read(store.get_report, report_id)
@@ -103,9 +93,7 @@ def list_newest_reports(
 
 
 @evaluation.get("/passes/{pass_id}/reports")
-def list_reports(
-    ground: GroundOf, _: Viewer, request: Request, pass_id: PassId, asked: PagingOf
-) -> PageOf[Report]:
+def list_reports(ground: GroundOf, _: Viewer, request: Request, pass_id: PassId, asked: PagingOf) -> PageOf[Report]:
     """List the reports of a pass, newest first, with the changes that a re-evaluation made."""
     return linked(request, ground.read(store.list_reports, pass_id, asked))
 
@@ -118,10 +106,7 @@ def get_report_summary(ground: GroundOf, _: Viewer, report_id: Key) -> PassFigur
 
 @evaluation.get("/reports/{report_id}/overview")
 def get_report_overview(
-    ground: GroundOf,
-    _: Viewer,
-    report_id: Key,
-    max_points: Annotated[int, Query(ge=1, le=10_000)] = 600,
+    ground: GroundOf, _: Viewer, report_id: Key, max_points: Annotated[int, Query(ge=1, le=10_000)] = 600
 ) -> ReportOverview:
     """Return the verdict and headline figures of a report, and the 3-D error of every solution over time."""
     return service.report_overview(ground, report_id, max_points)

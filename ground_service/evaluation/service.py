@@ -19,13 +19,7 @@ from ground_service.evaluation.alignment import reference_states
 from ground_service.evaluation.core import PassInputs, evaluate_pass, summary_of
 from ground_service.evaluation.extras import sun_angles, surface_map
 from ground_service.evaluation.inputs import align_pass, load_pass_inputs
-from ground_service.evaluation.model import (
-    PassFigures,
-    ReportOverview,
-    ReportSummary,
-    StoredReport,
-    changed_figures,
-)
+from ground_service.evaluation.model import PassFigures, ReportOverview, ReportSummary, StoredReport, changed_figures
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime
 from ground_service.passes.core import downsample
@@ -191,11 +185,7 @@ def reevaluate(ground: Ground, pass_id: int, *, report_id: str, event: int) -> M
         if hashlib.sha256(to_json(report).encode()).hexdigest() == previous.json_sha256:
             return None
     return make_report(
-        ground,
-        pass_id,
-        report_id=report_id,
-        pdf=previous.pdf_sha256 is not None,
-        again=Reevaluation(event, previous),
+        ground, pass_id, report_id=report_id, pdf=previous.pdf_sha256 is not None, again=Reevaluation(event, previous)
     )
 
 
@@ -212,11 +202,7 @@ def _documents(report: PassReport, *, pdf: bool) -> dict[str, bytes]:
 
 
 def _summary(report: PassReport, inputs: PassInputs) -> dict[str, Any]:
-    return {
-        **plain(summary_of(report)),
-        "pass_id": int(inputs.pass_id),
-        "conditions": plain(conditions_of(inputs)),
-    }
+    return {**plain(summary_of(report)), "pass_id": int(inputs.pass_id), "conditions": plain(conditions_of(inputs))}
 
 
 def plain(value: Any) -> Any:

@@ -75,9 +75,7 @@ class FilterStates:
     def select(self, which: NDArray[np.bool_]) -> FilterStates:
         """Return the states that a mask selects."""
         degrees = None if self.innovation_degrees is None else self.innovation_degrees[which]
-        return FilterStates(
-            self.utc_ns[which], self.state[which], self.covariance[which], self.frame, degrees
-        )
+        return FilterStates(self.utc_ns[which], self.state[which], self.covariance[which], self.frame, degrees)
 
     def in_icrf(self, orientation: Orientation, onboard: Orientation) -> FilterStates:
         """Return states of the payload, whose lunar orientation is `onboard`, turned into ICRF by that of the pass."""
@@ -159,9 +157,7 @@ class SmootherModel:
             return np.tile(self.white_psd_m2_s3, (len(state), 1))
         rotation = self.forces.orientation.mcmf_from_icrf(tdb_s)
         position = np.einsum("nij,nj->ni", rotation, state[:, _POSITION])
-        return densities_at(
-            self.field_noise, position, np.einsum("nij,nj->ni", rotation, state[:, _VELOCITY])
-        )
+        return densities_at(self.field_noise, position, np.einsum("nij,nj->ni", rotation, state[:, _VELOCITY]))
 
 
 def smooth(filtered: FilterStates, model: SmootherModel) -> FilterStates:
@@ -185,9 +181,7 @@ def smooth(filtered: FilterStates, model: SmootherModel) -> FilterStates:
     state, covariance = filtered.state.copy(), filtered.covariance.copy()
     before = np.flatnonzero(np.diff(filtered.utc_ns) > 0)
     known, known_covariance = filtered.state[before], filtered.covariance[before]
-    predicted, transition, noise = _carried(
-        known, filtered.utc_ns[before], filtered.utc_ns[before + 1], model
-    )
+    predicted, transition, noise = _carried(known, filtered.utc_ns[before], filtered.utc_ns[before + 1], model)
     moved = transition @ known_covariance
     prior = moved @ _turned(transition) + noise
     jump = (filtered.state[before + 1] - predicted)[:, None, :]
@@ -215,9 +209,7 @@ def _carried(
     starts_s = np.asarray(tdb_s_from_utc_ns(from_utc_ns), dtype=np.float64)
     legs = [
         _legs(start, stop, start_s, model.burns)
-        for start, stop, start_s in zip(
-            from_utc_ns.tolist(), to_utc_ns.tolist(), starts_s.tolist(), strict=True
-        )
+        for start, stop, start_s in zip(from_utc_ns.tolist(), to_utc_ns.tolist(), starts_s.tolist(), strict=True)
     ]
     lengths = np.array([len(one) for one in legs], dtype=np.int64)
     for number in range(int(lengths.max(initial=0))):
@@ -283,9 +275,7 @@ def _step(
     renewed = (1.0 - np.exp(-2.0 * turned_rad / model.map_correlation_rad))[:, None]
     shift = renewed * np.square(model.map_sigma_rtn_m)
     noise[:, _POSITION, _POSITION] += (axes * shift[:, None, :]) @ _turned(axes)
-    noise[:, _ACCELERATION, _ACCELERATION] = np.diag(model.markov_sigma_m_s2) ** 2 * (
-        1.0 - decay[:, None, None] ** 2
-    )
+    noise[:, _ACCELERATION, _ACCELERATION] = np.diag(model.markov_sigma_m_s2) ** 2 * (1.0 - decay[:, None, None] ** 2)
     return carried, transition, noise
 
 
@@ -357,10 +347,7 @@ UNSTATED_OFFSET = MapOffset((40.0, 40.0, 10.0), 30.0)
 
 
 def smoother_model(
-    gravity: GravityField,
-    orientation: Orientation,
-    burns: tuple[CommandedBurn, ...],
-    offset: MapOffset | None = None,
+    gravity: GravityField, orientation: Orientation, burns: tuple[CommandedBurn, ...], offset: MapOffset | None = None
 ) -> SmootherModel:
     """Return the smoother's model of the motion, with gravity to `SMOOTHER_DEGREE` or the degree of the field.
 

@@ -169,9 +169,7 @@ def _row(
 
 
 def _declared(limits: Requirements, found: Evaluated) -> NavigationSeries | None:
-    return next(
-        (one for one in found.navigation if one.kind == "estimate" and one.name == limits.estimator), None
-    )
+    return next((one for one in found.navigation if one.kind == "estimate" and one.name == limits.estimator), None)
 
 
 def _converged_errors(series: NavigationSeries, limit_m: float | None) -> FloatArray:
@@ -209,17 +207,9 @@ def _accuracy(limits: Requirements, found: Evaluated) -> Iterable[Requirement]:
         if len(errors):
             median, p95 = (float(one) for one in np.percentile(errors, (50.0, 95.0)))
             note += f", {count_text(len(errors))} of them from convergence on"
+    yield _row("accuracy.median", "median 3-D error", "m", median, limits.median_error_m, at_most=True, note=note)
     yield _row(
-        "accuracy.median", "median 3-D error", "m", median, limits.median_error_m, at_most=True, note=note
-    )
-    yield _row(
-        "accuracy.p95",
-        "95th percentile of the 3-D error",
-        "m",
-        p95,
-        limits.p95_error_m,
-        at_most=True,
-        note=note,
+        "accuracy.p95", "95th percentile of the 3-D error", "m", p95, limits.p95_error_m, at_most=True, note=note
     )
 
 
@@ -363,12 +353,7 @@ def _completeness(limits: Requirements, found: Evaluated) -> Iterable[Requiremen
     )
     expected = None if frames is None else frames.expected
     counts = (
-        (
-            "frames",
-            "frames reported of those expected",
-            limits.frames_percent,
-            frames.acquired if frames else None,
-        ),
+        ("frames", "frames reported of those expected", limits.frames_percent, frames.acquired if frames else None),
         (
             "images",
             "frames with a usable image of those expected",
@@ -385,9 +370,7 @@ def _completeness(limits: Requirements, found: Evaluated) -> Iterable[Requiremen
             value,
             limit,
             at_most=False,
-            note="no plan of the frames"
-            if value is None
-            else f"{count_text(count)} of {count_text(expected)} frames",
+            note="no plan of the frames" if value is None else f"{count_text(count)} of {count_text(expected)} frames",
         )
 
 
@@ -396,9 +379,7 @@ def _detector(limits: Requirements, found: Evaluated) -> Iterable[Requirement]:
     note = "" if micro is None else f"{count_text(micro.expected)} craters of {micro.label} expected"
     recall, precision = (None, None) if micro is None else (micro.recall, micro.precision)
     yield _row("detector.recall", "detector recall", "", recall, limits.recall, at_most=False, note=note)
-    yield _row(
-        "detector.precision", "detector precision", "", precision, limits.precision, at_most=False, note=note
-    )
+    yield _row("detector.precision", "detector precision", "", precision, limits.precision, at_most=False, note=note)
 
 
 def _pointing(limits: Requirements, found: Evaluated) -> Iterable[Requirement]:

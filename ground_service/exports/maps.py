@@ -29,12 +29,7 @@ from ground_service.exports.tables import identified_craters
 from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera, ground_point_sphere
 from lunar.constants import MOON_RADIUS_M, NS
-from lunar.frames import (
-    continuous_quaternions,
-    mcmf_from_spherical,
-    quaternion_from_matrix,
-    spherical_from_mcmf,
-)
+from lunar.frames import continuous_quaternions, mcmf_from_spherical, quaternion_from_matrix, spherical_from_mcmf
 from lunar.timescales import format_utc
 from tmtc.errors import MissingLibrary
 
@@ -116,9 +111,7 @@ def _tracks(inputs: PassInputs, poses: Poses) -> Layer:
 
 def _footprints(camera: PinholeCamera, poses: Poses) -> Layer:
     border = _border_px(camera)
-    points = ground_point_sphere(
-        camera, poses.camera_from_mcmf[:, None], poses.position_mcmf_m[:, None], border[None]
-    )
+    points = ground_point_sphere(camera, poses.camera_from_mcmf[:, None], poses.position_mcmf_m[:, None], border[None])
     features = []
     for k, ring in enumerate(points):
         on_ground = np.isfinite(ring).all(axis=1)
@@ -138,9 +131,7 @@ def _border_px(camera: PinholeCamera) -> FloatArray:
     """Return points (n, 2) along the outer edges of the image."""
     corners = camera.corners_px()
     steps = np.arange(EDGE_POINTS)[:, None] / EDGE_POINTS
-    return np.concatenate(
-        [a + (b - a) * steps for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
-    )
+    return np.concatenate([a + (b - a) * steps for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
 
 
 def _detections(inputs: PassInputs, poses: Poses) -> Layer:
@@ -150,9 +141,7 @@ def _detections(inputs: PassInputs, poses: Poses) -> Layer:
     for k, row in enumerate(poses.row.tolist()):
         first, last = int(samples.offsets[row]), int(samples.offsets[row + 1])
         uv = np.column_stack([samples.u_px[first:last], samples.v_px[first:last]])
-        ground = ground_point_sphere(
-            inputs.viewing.camera, poses.camera_from_mcmf[k], poses.position_mcmf_m[k], uv
-        )
+        ground = ground_point_sphere(inputs.viewing.camera, poses.camera_from_mcmf[k], poses.position_mcmf_m[k], uv)
         places = degrees_of(ground)
         for item in np.flatnonzero(np.isfinite(places).all(axis=1)).tolist():
             number = first + item
@@ -209,10 +198,7 @@ def _craters(inputs: PassInputs, poses: Poses, footprints: Layer) -> Layer:
     reach = np.nanmax(np.where(np.isfinite(chord), chord, np.nan), axis=1, initial=0.0)
     radius_m = 2.0 * MOON_RADIUS_M * np.arcsin(np.minimum(reach / 2.0, 1.0))
     latitude, longitude, _ = spherical_from_mcmf(poses.position_mcmf_m)
-    near = [
-        catalogue.near(float(a), float(b), float(r))
-        for a, b, r in zip(latitude, longitude, radius_m, strict=True)
-    ]
+    near = [catalogue.near(float(a), float(b), float(r)) for a, b, r in zip(latitude, longitude, radius_m, strict=True)]
     features = []
     for k in np.unique(np.concatenate(near)).tolist():
         east = (np.degrees(catalogue.longitude_rad[k]) + 180.0) % 360.0 - 180.0
@@ -255,9 +241,7 @@ def cut_ring(places: Ring) -> tuple[Ring, ...]:
         ring = np.concatenate([ring, [[ring[-1, 0], pole], [ring[0, 0], pole]]])
     else:
         ring = ring[:-1]
-    worlds = np.arange(
-        np.floor((ring[:, 0].min() + 180.0) / 360.0), np.floor((ring[:, 0].max() + 180.0) / 360.0) + 1
-    )
+    worlds = np.arange(np.floor((ring[:, 0].min() + 180.0) / 360.0), np.floor((ring[:, 0].max() + 180.0) / 360.0) + 1)
     parts = []
     for world in worlds.tolist():
         part = _clipped(ring, 360.0 * world - 180.0, 1.0)
@@ -434,9 +418,7 @@ def format_czml(inputs: PassInputs, poses: Poses, layers: tuple[Layer, ...], nam
         _track(
             one.estimator,
             one.utc_ns[known],
-            mcmf_from_spherical(np.radians(one.latitude_deg), np.radians(one.longitude_deg), one.altitude_m)[
-                known
-            ],
+            mcmf_from_spherical(np.radians(one.latitude_deg), np.radians(one.longitude_deg), one.altitude_m)[known],
         )
         for one in inputs.navigation
         if np.count_nonzero(known := np.isfinite(one.altitude_m)) > 1

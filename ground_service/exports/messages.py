@@ -15,15 +15,7 @@ from lunar.frames import mcmf_from_spherical
 from lunar.messages.aem import AttitudeSegment, format_aem
 from lunar.messages.oem import format_oem
 from lunar.messages.oem_xml import format_oem_xml
-from lunar.messages.spice import (
-    ClockLine,
-    ck_octets,
-    format_fk,
-    format_ik,
-    format_sclk,
-    spacecraft_id,
-    spk_kernel,
-)
+from lunar.messages.spice import ClockLine, ck_octets, format_fk, format_ik, format_sclk, spacecraft_id, spk_kernel
 from lunar.timescales import LEAP_DATES, TICKS_PER_SECOND, tdb_s_from_utc_ns, utc_ns_from_ticks
 
 
@@ -93,9 +85,7 @@ def states_names(inputs: PassInputs) -> list[str]:
 
 def no_such_states(inputs: PassInputs, states: str) -> EvaluationError:
     """Return the error of a request for states that the pass does not have."""
-    return EvaluationError(
-        f"states: expected {' or '.join(states_names(inputs)) or 'none'}, found {states!r}"
-    )
+    return EvaluationError(f"states: expected {' or '.join(states_names(inputs)) or 'none'}, found {states!r}")
 
 
 def _reference_positions(inputs: PassInputs, utc_ns: IntArray, mcmf_from_icrf: FloatArray) -> FloatArray:
@@ -117,9 +107,7 @@ def _estimated_positions(inputs: PassInputs, utc_ns: IntArray, states: str) -> F
     position = np.full((len(utc_ns), 3), np.nan)
     rows = place[same]
     position[same] = mcmf_from_spherical(
-        np.radians(samples.latitude_deg[rows]),
-        np.radians(samples.longitude_deg[rows]),
-        samples.altitude_m[rows],
+        np.radians(samples.latitude_deg[rows]), np.radians(samples.longitude_deg[rows]), samples.altitude_m[rows]
     )
     return position
 
@@ -213,9 +201,7 @@ def attitude_octets(inputs: PassInputs, spacecraft: SpacecraftNames, kind: str, 
     if not len(utc_ns):
         raise EvaluationError(f"pass {inputs.pass_id}: expected attitudes of its frames, found none")
     if kind == "ck":
-        ticks = np.array(
-            [ticks_of_utc_ns(int(one), spacecraft.correlations) for one in utc_ns], dtype=np.int64
-        )
+        ticks = np.array([ticks_of_utc_ns(int(one), spacecraft.correlations) for one in utc_ns], dtype=np.int64)
         step = float(np.median(np.diff(ticks))) if len(ticks) > 1 else float(TICKS_PER_SECOND)
         return ck_octets(ticks, q_wxyz, spacecraft_id(spacecraft.number), gap_ticks=int(GAP_STEPS * step))
     segment = AttitudeSegment(utc_ns, q_wxyz, object_name=spacecraft.name, object_id=spacecraft.name)
@@ -243,9 +229,7 @@ def text_kernel(inputs: PassInputs, spacecraft: SpacecraftNames, kind: str) -> s
         return format_fk(number, spacecraft.name)
     if kind == "ik":
         return format_ik(inputs.viewing.camera, number, spacecraft.name)
-    ticks = [
-        ticks_of_utc_ns(one, spacecraft.correlations) for one in (inputs.start_utc_ns, inputs.stop_utc_ns)
-    ]
+    ticks = [ticks_of_utc_ns(one, spacecraft.correlations) for one in (inputs.start_utc_ns, inputs.stop_utc_ns)]
     return format_sclk(clock_lines(spacecraft.correlations, np.array(ticks, dtype=np.int64)), number)
 
 

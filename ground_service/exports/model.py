@@ -52,17 +52,8 @@ _ALL = (
     Format("sclk", "tsc", "SPICE SCLK: on-board clock with the time correlations"),
     Format("fk", "tf", "SPICE FK: names and camera frame"),
     Format("ik", "ti", "SPICE IK: field of view of the camera"),
-    Format(
-        "geojson", "geojson", "tracks, footprints, detections, landmarks and craters as GeoJSON", states=True
-    ),
-    Format(
-        "gpkg",
-        "gpkg",
-        "the same as GeoPackage, a layer each, for QGIS and GDAL",
-        "pyogrio",
-        "geo",
-        states=True,
-    ),
+    Format("geojson", "geojson", "tracks, footprints, detections, landmarks and craters as GeoJSON", states=True),
+    Format("gpkg", "gpkg", "the same as GeoPackage, a layer each, for QGIS and GDAL", "pyogrio", "geo", states=True),
     Format("czml", "czml", "tracks, attitude, footprints and points over time for Cesium", states=True),
     Format("parquet", "zip", "decoded packets: one Parquet file for each packet type", "pyarrow", "parquet"),
     Format("netcdf", "nc", "all tables as groups of one netCDF-4 file", "xarray", "netcdf"),
@@ -109,7 +100,5 @@ class ExportFormatInfo(Entity):
     description: str
     ending: str = Field(examples=["geojson"], description="Ending of the file; zip: several files")
     states: bool = Field(description="The request chooses the states")
-    extra: str = Field(
-        description="Extra of the installation that the format needs; empty: none", examples=["geo"]
-    )
+    extra: str = Field(description="Extra of the installation that the format needs; empty: none", examples=["geo"])
     available: bool = Field(description="The library of the extra is installed")

@@ -17,9 +17,7 @@ exports = operations("exports")
 @exports.post(
     "/exports",
     response_class=Response,
-    responses={
-        200: {"content": {MEDIA: {}}, "description": "The file; formats of several files are a zip archive"}
-    },
+    responses={200: {"content": {MEDIA: {}}, "description": "The file; formats of several files are a zip archive"}},
 )
 def export_pass(ground: GroundOf, _: Viewer, request: ExportRequest) -> Response:
     """Return a pass in a format of other tools."""
@@ -27,10 +25,7 @@ def export_pass(ground: GroundOf, _: Viewer, request: ExportRequest) -> Response
     return StreamingResponse(
         found.blocks(),
         media_type=MEDIA,
-        headers={
-            "Content-Disposition": f'attachment; filename="{found.name}"',
-            "Content-Length": str(found.size),
-        },
+        headers={"Content-Disposition": f'attachment; filename="{found.name}"', "Content-Length": str(found.size)},
     )
 
 

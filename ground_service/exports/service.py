@@ -125,12 +125,8 @@ def _files(ground: Ground, request: ExportRequest, chosen: Format) -> Iterator[t
     """Yield name and content of each file of a format; EvaluationError without any."""
     if chosen.name == "parquet":
         with ground.database.reading() as connection:
-            packets = packets_by_name(
-                connection, pass_span(connection, store.get_pass(connection, request.pass_id))
-            )
-            yield from _some(
-                parquet_files(packets, {"pass": str(request.pass_id)}), request.pass_id, "packets"
-            )
+            packets = packets_by_name(connection, pass_span(connection, store.get_pass(connection, request.pass_id)))
+            yield from _some(parquet_files(packets, {"pass": str(request.pass_id)}), request.pass_id, "packets")
     elif chosen.name == "images":
         with ground.database.reading() as connection:
             store.get_pass(connection, request.pass_id)
@@ -207,9 +203,7 @@ def _zipped(ground: Ground, files: Iterable[tuple[str, bytes]]) -> IO[bytes]:
     with ExitStack() as unfinished:
         try:
             stream = unfinished.enter_context(
-                tempfile.SpooledTemporaryFile(
-                    SPOOLED_OCTETS, dir=str(folder), prefix=unfinished_prefix(INCOMING)
-                )
+                tempfile.SpooledTemporaryFile(SPOOLED_OCTETS, dir=str(folder), prefix=unfinished_prefix(INCOMING))
             )
             with zipfile.ZipFile(stream, "w") as archive:
                 for name, octets in files:

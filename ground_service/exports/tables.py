@@ -85,9 +85,7 @@ def _states(inputs: PassInputs) -> Table:
         Column("estimator", _joined(names), "", "name of the estimator"),
         Column("frame_number", _joined([one.frame_number for one in parts]), "", "number of the frame"),
         Column("latitude_deg", _joined([one.latitude_deg for one in parts]), "deg", "mean-Earth latitude"),
-        Column(
-            "longitude_deg", _joined([one.longitude_deg for one in parts]), "deg", "mean-Earth east longitude"
-        ),
+        Column("longitude_deg", _joined([one.longitude_deg for one in parts]), "deg", "mean-Earth east longitude"),
         Column("altitude_m", _joined([one.altitude_m for one in parts]), "m", "altitude above 1737.4 km"),
     ]
     for k, (axis, word) in enumerate(_AXES):
@@ -96,12 +94,7 @@ def _states(inputs: PassInputs) -> Table:
     columns += [
         Column("nis", _joined([one.nis for one in parts]), "", "normalised innovation squared"),
         Column("matched", _joined([one.matched for one in parts]), "", "craters matched"),
-        Column(
-            "outcome",
-            _joined([_texts(one.outcome) for one in parts]),
-            "",
-            "what the estimator made of the frame",
-        ),
+        Column("outcome", _joined([_texts(one.outcome) for one in parts]), "", "what the estimator made of the frame"),
     ]
     return Table("states", "States of the on-board estimators", tuple(columns))
 
@@ -139,12 +132,7 @@ def _residuals(navigation: Sequence[NavigationSeries]) -> Table:
     columns.append(Column("error_3d_m", distance, "m", "distance of solution and reference"))
     nees = [none if one.nees is None else one.nees for one, none in zip(parts, unknown, strict=True)]
     columns.append(
-        Column(
-            "nees",
-            _joined(nees),
-            "",
-            "normalised estimation error squared of the position, 3 degrees of freedom",
-        )
+        Column("nees", _joined(nees), "", "normalised estimation error squared of the position, 3 degrees of freedom")
     )
     return Table("residuals", "Errors of the navigation solutions against the reference", tuple(columns))
 
@@ -173,9 +161,7 @@ def _detections(inputs: PassInputs) -> Table:
         Column("v_px", samples.v_px, "px", "row; the centre of the first pixel is 0"),
         Column("diameter_px", samples.diameter_px, "px", "apparent diameter"),
         Column("score", samples.score, "", "score of the detector"),
-        Column(
-            "size_class", samples.size_class, "", "0: 5-10 km, 1: 10-15 km, 2: 15-30 km, 3: 3-5 km, -1: none"
-        ),
+        Column("size_class", samples.size_class, "", "0: 5-10 km, 1: 10-15 km, 2: 15-30 km, 3: 3-5 km, -1: none"),
         Column("crater_id", identified_craters(inputs), "", "crater that the payload identified, -1: none"),
     )
     return Table("detections", "Detections of the payload", columns)
@@ -189,9 +175,7 @@ def identified_craters(inputs: PassInputs) -> IntArray:
         return craters
     frame = np.minimum(np.searchsorted(samples.utc_ns, found.utc_ns), len(samples) - 1)
     row = samples.offsets[frame] + found.detection
-    good = (
-        (samples.utc_ns[frame] == found.utc_ns) & (found.detection >= 0) & (row < samples.offsets[frame + 1])
-    )
+    good = (samples.utc_ns[frame] == found.utc_ns) & (found.detection >= 0) & (row < samples.offsets[frame + 1])
     craters[row[good]] = found.crater_id[good]
     return craters
 
@@ -201,12 +185,7 @@ def _identifications(inputs: PassInputs) -> Table:
     none = np.zeros(0, dtype=np.int64)
     columns = (
         _utc(none if found is None else found.utc_ns),
-        Column(
-            "detection",
-            none if found is None else found.detection,
-            "",
-            "place in the detections of the frame",
-        ),
+        Column("detection", none if found is None else found.detection, "", "place in the detections of the frame"),
         Column("crater_id", none if found is None else found.crater_id, "", "crater of the catalogue"),
     )
     return Table("identifications", "Craters that the payload identified", columns)
@@ -218,12 +197,7 @@ def _landmarks(inputs: PassInputs) -> Table:
     columns = [
         Column("landmark_id", whole if found is None else found.landmark_id, "", "number of the landmark"),
         Column("latitude_deg", real if found is None else found.latitude_deg, "deg", "mean-Earth latitude"),
-        Column(
-            "longitude_deg",
-            real if found is None else found.longitude_deg,
-            "deg",
-            "mean-Earth east longitude",
-        ),
+        Column("longitude_deg", real if found is None else found.longitude_deg, "deg", "mean-Earth east longitude"),
         Column("height_m", real if found is None else found.height_m, "m", "height above 1737.4 km"),
         Column("diameter_m", real if found is None else found.diameter_m, "m", "diameter"),
     ]
@@ -259,9 +233,7 @@ def _reference(inputs: PassInputs) -> Table:
         position, velocity = inputs.reference.at(utc_ns)
         if inputs.orientation is not None:
             track = ground_track(inputs.reference, inputs.orientation, utc_ns)
-            place = np.stack(
-                [np.degrees(track.latitude_rad), np.degrees(track.longitude_rad), track.altitude_m]
-            )
+            place = np.stack([np.degrees(track.latitude_rad), np.degrees(track.longitude_rad), track.altitude_m])
     columns = [
         _utc(utc_ns),
         Column("latitude_deg", place[0], "deg", "mean-Earth latitude"),
@@ -338,14 +310,8 @@ def _csv_metadata(table: Table) -> dict[str, Any]:
     columns = []
     for column in table.columns:
         entry = {"name": column.name, "titles": column.name, "dc:description": column.description}
-        columns.append(
-            entry | {"datatype": _datatype(column)} | ({"linna:unit": column.unit} if column.unit else {})
-        )
-    return {
-        "url": f"{table.name}.csv",
-        "dc:description": table.description,
-        "tableSchema": {"columns": columns},
-    }
+        columns.append(entry | {"datatype": _datatype(column)} | ({"linna:unit": column.unit} if column.unit else {}))
+    return {"url": f"{table.name}.csv", "dc:description": table.description, "tableSchema": {"columns": columns}}
 
 
 def _datatype(column: Column) -> str:

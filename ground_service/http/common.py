@@ -65,11 +65,7 @@ SpacecraftId = Annotated[int, Path(ge=0, le=1023)]
 Key = Annotated[str, Path(pattern=r"^[0-9a-f]{32}$")]
 IdempotencyKey = Annotated[
     str | None,
-    Header(
-        alias=IDEMPOTENCY_HEADER,
-        max_length=128,
-        description="The same key again gives the same job, not another",
-    ),
+    Header(alias=IDEMPOTENCY_HEADER, max_length=128, description="The same key again gives the same job, not another"),
 ]
 OnceKey = Annotated[
     str | None,
@@ -118,9 +114,5 @@ def upload_body(content: str) -> dict[str, Any]:
     another type.
     """
     schema = {"type": "string", "format": "binary"}
-    body = {
-        "description": content,
-        "required": True,
-        "content": {"application/octet-stream": {"schema": schema}},
-    }
+    body = {"description": content, "required": True, "content": {"application/octet-stream": {"schema": schema}}}
     return {"requestBody": body}

@@ -52,9 +52,7 @@ class BodyLimit:
         limit = self._upload_limit if upload else JSON_LIMIT_OCTETS
         announced = Headers(scope=scope).get("content-length", "")
         if announced and (not announced.isdigit() or int(announced) > limit):
-            response = problem(
-                413, "too large", f"body: expected at most {limit} octets, found {announced[:20]}"
-            )
+            response = problem(413, "too large", f"body: expected at most {limit} octets, found {announced[:20]}")
             await response(scope, receive, send)
             return
         taken = 0
@@ -258,13 +256,7 @@ def _host_and_port(text: str) -> tuple[str, int | None] | None:
     """Return name and port of a Host header; None if it is invalid."""
     try:
         parts = urlsplit(f"//{text}")
-        if (
-            parts.hostname is None
-            or parts.username is not None
-            or parts.path
-            or parts.query
-            or parts.fragment
-        ):
+        if parts.hostname is None or parts.username is not None or parts.path or parts.query or parts.fragment:
             return None
         return _plain(parts.hostname), parts.port
     except ValueError:

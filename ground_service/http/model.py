@@ -18,9 +18,7 @@ Item = TypeVar("Item")
 TIME_COLUMN = "_utc_ns"
 """Ending of database columns with times; the fields of entities have the name without it."""
 
-InstanceName = Annotated[
-    str, Field(min_length=1, max_length=96, pattern=r"^[A-Za-z0-9._@-]+$", examples=["flight"])
-]
+InstanceName = Annotated[str, Field(min_length=1, max_length=96, pattern=r"^[A-Za-z0-9._@-]+$", examples=["flight"])]
 SpacecraftNumber = Annotated[int, Field(ge=0, le=1023, examples=[76])]
 
 
@@ -140,9 +138,7 @@ class UtcTime(str):
         )
 
     @classmethod
-    def __get_pydantic_json_schema__(
-        cls, _schema: CoreSchema, _handler: GetJsonSchemaHandler
-    ) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(cls, _schema: CoreSchema, _handler: GetJsonSchemaHandler) -> dict[str, Any]:
         return {"type": "string", "format": "date-time", "examples": [f"{EXAMPLE_TIME[:-1]}.000000Z"]}
 
 
@@ -193,7 +189,5 @@ def _read(value: Any) -> UtcTime:
     raise ValueError(f"expected a time such as {EXAMPLE_TIME}, found {type(value).__name__}")
 
 
-RequestTime = Annotated[
-    UtcTime, BeforeValidator(_given), Field(examples=[EXAMPLE_TIME], description="UTC, RFC 3339")
-]
+RequestTime = Annotated[UtcTime, BeforeValidator(_given), Field(examples=[EXAMPLE_TIME], description="UTC, RFC 3339")]
 """A time in a request: text only, within the range of the on-board clock."""

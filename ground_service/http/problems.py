@@ -103,17 +103,9 @@ PUBLIC_TEXTS: tuple[tuple[type[Exception], str], ...] = (
 """Public text of internal errors, without paths and addresses."""
 
 
-def problem(
-    status: int, title: str, detail: str, request: Request | None = None, **extra: Any
-) -> JSONResponse:
+def problem(status: int, title: str, detail: str, request: Request | None = None, **extra: Any) -> JSONResponse:
     """A problem document."""
-    body: dict[str, Any] = {
-        "type": "about:blank",
-        "title": title,
-        "status": status,
-        "detail": detail,
-        **extra,
-    }
+    body: dict[str, Any] = {"type": "about:blank", "title": title, "status": status, "detail": detail, **extra}
     if request is not None:
         body["instance"] = request.url.path
     headers = {"WWW-Authenticate": "Bearer"} if status == 401 else None

@@ -39,9 +39,7 @@ class PlainText:
             query = unquote(query_of(scope).replace("+", " "))
             where = "path" if _CONTROL.search(scope["path"]) else "query" if _CONTROL.search(query) else None
             if where is not None:
-                response = problem(
-                    422, "invalid request", f"{where}: expected no control characters, found some"
-                )
+                response = problem(422, "invalid request", f"{where}: expected no control characters, found some")
                 await refuse(response, scope, receive, send)
                 return
         await self._app(scope, receive, send)
@@ -213,9 +211,7 @@ def parse_json(octets: bytes) -> Any:
     json.JSONDecodeError, UnicodeDecodeError, RecursionError
         If the text is not JSON, or nested too deeply.
     """
-    value = json.loads(
-        octets.decode("utf-8"), parse_constant=_constant, parse_float=_finite, object_pairs_hook=_once
-    )
+    value = json.loads(octets.decode("utf-8"), parse_constant=_constant, parse_float=_finite, object_pairs_hook=_once)
     if _SUSPECT.search(octets):
         _check_texts(value)
     return value

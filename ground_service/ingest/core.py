@@ -168,8 +168,7 @@ def implausible_times(
         agreed = known & (np.abs(ticks - received) <= LONGEST_STEP)
         if agreed.any():  # otherwise the clock of the station is wrong
             doubts = {
-                int(k): f"{span_words(int(ticks[k] - received[k]))} after its reception"
-                for k in np.flatnonzero(ahead)
+                int(k): f"{span_words(int(ticks[k] - received[k]))} after its reception" for k in np.flatnonzero(ahead)
             }
     reached = newest
     for stretch in np.split(order, np.flatnonzero(np.diff(times) > LONGEST_STEP) + 1):
@@ -344,21 +343,14 @@ def join(
     def among(
         known: dict[tuple[Channel, int], list[Fragment]], one: Fragment, counts: Mapping[int, int]
     ) -> list[Fragment]:
-        there = {
-            other: octets for count, octets in counts.items() for other in known.get((one.channel, count), ())
-        }
+        there = {other: octets for count, octets in counts.items() for other in known.get((one.channel, count), ())}
         return [other for other, octets in there.items() if other not in used and fits(other, octets)]
 
     packets = []
     for one in fragments:
         if not one.begins or one in used:
             continue
-        found = complete(
-            one,
-            partial(among, lasts),
-            partial(among, firsts),
-            form_of(one.channel[0]),
-        )
+        found = complete(one, partial(among, lasts), partial(among, firsts), form_of(one.channel[0]))
         if found is not None:
             used.update(found[0])
             packets.append((one.channel[0], found[1]))

@@ -13,13 +13,7 @@ from ground_service.clock import independent_now_ns
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf
 from ground_service.ingest import store
-from ground_service.ingest.core import (
-    LONGEST_STEP,
-    UNSET_TICKS,
-    fits_between,
-    implausible_times,
-    span_words,
-)
+from ground_service.ingest.core import LONGEST_STEP, UNSET_TICKS, fits_between, implausible_times, span_words
 from ground_service.ingest.model import ImplausibleFilter, ImplausiblePacket
 from ground_service.store import repository
 from ground_service.store.event_kinds import TelemetryWithdrawn, TimesDoubted, publish
@@ -99,11 +93,7 @@ def _image_doubts(batch: PacketBatch) -> dict[int, str]:
         late = image > packet + LONGEST_STEP
         unset = (image > 0) & (image < UNSET_TICKS) & (packet > 2 * UNSET_TICKS)
         for k in np.flatnonzero((late | unset) & (packet != NO_TICKS)).tolist():
-            words = (
-                f"{span_words(int(image[k] - packet[k]))} after it"
-                if late[k]
-                else "from a clock that was not set"
-            )
+            words = f"{span_words(int(image[k] - packet[k]))} after it" if late[k] else "from a clock that was not set"
             doubts[int(columns["packet"][k])] = f"the time of its image is {words}"
     return doubts
 
@@ -118,9 +108,7 @@ def withdraw_doubted(
     known = [one for one in (telemetry.newest_ticks(connection, vehicle), newest_declared) if one is not None]
     newest = max(known, default=None)
     timed = ticks[ticks != NO_TICKS]
-    if not timed.size or (
-        newest is not None and timed.max() <= newest + LONGEST_STEP and timed.min() > UNSET_TICKS
-    ):
+    if not timed.size or (newest is not None and timed.max() <= newest + LONGEST_STEP and timed.min() > UNSET_TICKS):
         return np.zeros(0, dtype=np.int64)
     if newest is not None and not _is_firm(connection, vehicle):
         newest = None
@@ -203,9 +191,7 @@ def list_implausible(connection: Connection, asked: ImplausibleFilter) -> PageOf
     query = select(*columns, _VEHICLES.c.ccsds_id.label("spacecraft_id"), _VEHICLES.c.instance)
     query = query.join(_VEHICLES, _VEHICLES.c.id == _DOUBTED.c.vehicle_id)
     rows, total = repository.page(connection, query, asked, _DOUBTED.c.id.desc())
-    return asked.page(
-        (ImplausiblePacket.of(row, time=utc_ns_from_ticks(row["ticks"])) for row in rows), total
-    )
+    return asked.page((ImplausiblePacket.of(row, time=utc_ns_from_ticks(row["ticks"])) for row in rows), total)
 
 
 def needs_review(connection: Connection, vehicle: int, first_ticks: int | None) -> bool:
@@ -259,9 +245,7 @@ def withdraw_packets(connection: Connection, vehicle: int, ids: list[int]) -> No
 
 
 def _put_back(connection: Connection, vehicle: int) -> None:
-    rows = connection.execute(
-        select(_DOUBTED).where(_DOUBTED.c.vehicle_id == vehicle).order_by(_DOUBTED.c.ticks)
-    )
+    rows = connection.execute(select(_DOUBTED).where(_DOUBTED.c.vehicle_id == vehicle).order_by(_DOUBTED.c.ticks))
     found = rows.mappings().all()
     if not found:
         return

@@ -345,11 +345,7 @@ class ChannelReader:
                 filled += len(octets)
         buffer = b"".join(bytes(part) for part in parts)
         ranges_used = np.array(segments, dtype=np.int64).reshape(-1, 2)
-        cut = cut_packets(
-            buffer,
-            segments=ranges_used,
-            form=self.form_of(spacecraft_id).in_frames,
-        )
+        cut = cut_packets(buffer, segments=ranges_used, form=self.form_of(spacecraft_id).in_frames)
         self.packets += int(np.count_nonzero(cut.crc_ok))
         self.crc_errors += cut.crc_errors
         self.octets_unused += _not_in_packets(ranges_used, cut)
@@ -404,27 +400,17 @@ class ChannelReader:
                 yield joint, [(0, len(joint))], filled[low + begins[:1]]
             elif lead := (b"" if kept is None else kept.octets) + head:
                 opened = (before, at[0]) if kept is None else (kept.count, kept.first)
-                self._leave(
-                    Fragment(channel, False, True, opened[0], UNKNOWN, opened[1], at[1], lead, self.stream)
-                )
+                self._leave(Fragment(channel, False, True, opened[0], UNKNOWN, opened[1], at[1], lead, self.stream))
             tail = buffer[end : high * zone].tobytes()
             ranges.append((begin, end if block.settings.proves_frames else high * zone))
             if tail:
-                self._open[channel] = Fragment(
-                    channel, True, False, UNKNOWN, after, at[0], at[1], tail, self.stream
-                )
+                self._open[channel] = Fragment(channel, True, False, UNKNOWN, after, at[0], at[1], tail, self.stream)
                 if not block.settings.proves_frames:  # its octets are also searched and counted
                     self.octets_unused -= len(tail)
         yield buffer, ranges, filled
 
     def _continue(
-        self,
-        channel: Channel,
-        kept: Fragment | None,
-        before: int,
-        after: int,
-        at: tuple[int, int],
-        octets: bytes,
+        self, channel: Channel, kept: Fragment | None, before: int, after: int, at: tuple[int, int], octets: bytes
     ) -> None:
         """Keep the octets of frames in which no packet begins."""
         if kept is not None:
@@ -432,13 +418,9 @@ class ChannelReader:
         if len(octets) > PACKET_MAX_LENGTH:
             self.octets_unused += len(octets)
             return
-        begins, count, first = (
-            (False, before, at[0]) if kept is None else (kept.begins, kept.count, kept.first)
-        )
+        begins, count, first = (False, before, at[0]) if kept is None else (kept.begins, kept.count, kept.first)
         if octets:
-            self._open[channel] = Fragment(
-                channel, begins, False, count, after, first, at[1], octets, self.stream
-            )
+            self._open[channel] = Fragment(channel, begins, False, count, after, first, at[1], octets, self.stream)
 
 
 def packets_end(buffer: OctetArray | bytes, start: int, stop: int) -> int:
@@ -559,9 +541,7 @@ class PacketReader:
         used = np.concatenate([prefixed, cut.idle + at])
         self.found.octets_used += self.section.of_piece(used[:, 0], used[:, 1])
         new = (starts >= self._new[0]) & (stops <= self._new[1])
-        mine = PacketCut(
-            cut.offsets[new], cut.lengths[new], cut.crc_ok[new], cut.skipped, cut.idle, cut.consumed
-        )
+        mine = PacketCut(cut.offsets[new], cut.lengths[new], cut.crc_ok[new], cut.skipped, cut.idle, cut.consumed)
         self.end = int(stops[new].max(initial=self.end))
         self.found.packets += int(np.count_nonzero(mine.crc_ok))
         self.found.crc_errors += mine.crc_errors

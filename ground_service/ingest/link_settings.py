@@ -150,8 +150,5 @@ def _station(link: Link, station: str) -> StationLink | None:
 
 def _record(station: StationLink) -> RecordFormat:
     return RecordFormat(
-        station.header_octets or 0,
-        station.trailer_octets or 0,
-        station.time_code,
-        station.time_offset or 0,
+        station.header_octets or 0, station.trailer_octets or 0, station.time_code, station.time_offset or 0
     )

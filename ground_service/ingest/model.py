@@ -62,17 +62,13 @@ class ControlWords(Entity):
     """Telecommand channel as its command link control words show it, see `tmtc.link.clcw.UplinkSeen`."""
 
     virtual_channel: int = Field(ge=0, le=63, examples=[0])
-    frames: int = Field(
-        description="Frames of the reception that carry a word of the channel", examples=[120]
-    )
+    frames: int = Field(description="Frames of the reception that carry a word of the channel", examples=[120])
     changes: int = Field(description="Number of changes of the word in the reception")
     frames_lockout: int
     frames_wait: int
     frames_retransmit: int
     frames_no_rf: int
-    report_value: int = Field(
-        ge=0, le=255, description="Number of the sequence-controlled frame that is expected next"
-    )
+    report_value: int = Field(ge=0, le=255, description="Number of the sequence-controlled frame that is expected next")
     farm_b_counter: int = Field(ge=0, le=3, description="Expedited frames accepted, modulo 4", examples=[3])
     lockout: bool = Field(description="Flags are those of the newest word")
     wait: bool
@@ -119,9 +115,7 @@ class IngestResult(Entity):
     last_ticks: int | None = None
     vehicle_ids: tuple[int, ...] = Field(default=(), description="Vehicles whose packets the file contains")
     reception: ReceivedLink | None = Field(default=None, description="null: bare packets")
-    remark: str = Field(
-        default="", description="How the octets contradict the declared link; empty: they fit"
-    )
+    remark: str = Field(default="", description="How the octets contradict the declared link; empty: they fit")
     uplink: tuple[ReceivedControlWords, ...] = ()
 
 
@@ -156,9 +150,7 @@ class Ingest(Entity):
     """One ingest of one file."""
 
     id: int = Field(examples=[1])
-    state: str = Field(
-        examples=["done"], description="queued, running, done, failed, withdrawing or withdrawn"
-    )
+    state: str = Field(examples=["done"], description="queued, running, done, failed, withdrawing or withdrawn")
     sha256: str
     received: UtcTime
     finished: UtcTime | None

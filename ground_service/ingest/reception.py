@@ -30,12 +30,7 @@ from ground_service.ingest.store import Stored
 from ground_service.missions.definitions import PacketDefinitions
 from ground_service.store.files import FileArchive, mapped_octets, read_blocks, recorded_name
 from ground_service.store.vehicles import vehicle_id
-from ground_service.telemetry.decoding import (
-    catch_up,
-    decode_declared,
-    definitions_of_spacecraft,
-    note_dictionary,
-)
+from ground_service.telemetry.decoding import catch_up, decode_declared, definitions_of_spacecraft, note_dictionary
 from ground_service.telemetry.packets import PacketBatch, batch_of_cut, time_receptions
 from lunar.arrays import OctetArray
 from tmtc.arrays import as_octets
@@ -139,9 +134,7 @@ def run_around(connection: Connection, files: FileArchive, piece: Piece, reach: 
     )
 
 
-def _sections(
-    run: Run, links: Sequence[tuple[int, int, LinkSettings | None]], reach: int
-) -> Iterator[Section]:
+def _sections(run: Run, links: Sequence[tuple[int, int, LinkSettings | None]], reach: int) -> Iterator[Section]:
     """Yield the sections of a run that are read now, with the octets around them."""
     position, stream = run.piece.position - run.first, run.piece.stream
     for start, stop, settings in links:
@@ -159,9 +152,7 @@ class Reading:
     `judged`: which packets have an implausible time is known already.
     """
 
-    def __init__(
-        self, ground: Ground, piece: Piece, progress: Progress | None = None, *, judged: bool = False
-    ) -> None:
+    def __init__(self, ground: Ground, piece: Piece, progress: Progress | None = None, *, judged: bool = False) -> None:
         self.ground, self.piece, self.progress, self.judged = ground, piece, progress, judged
         with ground.database.reading() as connection:
             self.known = known_before(connection, piece)
@@ -293,12 +284,7 @@ class Reading:
         elif piece.spacecraft_id is None:
             raise InvalidInput("downlink of bare packets", "", "the id of their spacecraft", "none given")
         else:
-            reader = PacketReader(
-                section,
-                self.found,
-                self.expected.form,
-                spacecraft_id=piece.spacecraft_id,
-            )
+            reader = PacketReader(section, self.found, self.expected.form, spacecraft_id=piece.spacecraft_id)
         # earlier pieces were read without the octets that are new between them
         edges = [0, *(edge for one in run.new for edge in one), run.octets]
         known = [
@@ -324,9 +310,7 @@ class Reading:
         """Return the packets that the mission description of a spacecraft declares."""
         if spacecraft not in self.definitions:
             with self.ground.database.reading() as connection:
-                self.definitions[spacecraft], _ = definitions_of_spacecraft(
-                    connection, spacecraft, self.piece.scope
-                )
+                self.definitions[spacecraft], _ = definitions_of_spacecraft(connection, spacecraft, self.piece.scope)
         return self.definitions[spacecraft]
 
     def _refuse(self) -> NoReturn:
@@ -419,9 +403,7 @@ class Reading:
             stored += self._store(connection, batch_of_cut(b"".join(octets), cut, DICTIONARY, spacecraft))
         return stored
 
-    def _count(
-        self, connection: Connection, stored: Stored, *, joined: int = 0, is_last: bool = False
-    ) -> None:
+    def _count(self, connection: Connection, stored: Stored, *, joined: int = 0, is_last: bool = False) -> None:
         """Add to the totals of the ingest; finish it if it is the last time."""
         key = self.piece.ingest_id
         added = {"packets_stored": stored.new, "packets_joined": joined, "samples_stored": stored.samples}
@@ -502,11 +484,7 @@ class Reading:
         """Return how the octets contradict the declared link; empty if they fit."""
         settings = [one.settings for one in self.sections if one.settings is not None]
         good, frames = self.found.frames_good, self.found.frames
-        if (
-            not (frames or self.is_framed)
-            or not all(one.proves_frames for one in settings)
-            or 2 * good > frames
-        ):
+        if not (frames or self.is_framed) or not all(one.proves_frames for one in settings) or 2 * good > frames:
             return ""
         declared = ", ".join(f"{name}={value}" for name, value in settings[0].describe().items())
         source = self.expected.source_of(settings[0])

@@ -12,15 +12,7 @@ from sqlalchemy import Connection, and_, bindparam, delete, func, insert, select
 from sqlalchemy.dialects import postgresql, sqlite
 
 from ground_service.ingest.core import UNKNOWN, Fragment, fits
-from ground_service.store.repository import (
-    FRAGMENTS,
-    INGESTS,
-    MISSIONS,
-    PACKET_DECODINGS,
-    PASSES,
-    PIECES,
-    VEHICLES,
-)
+from ground_service.store.repository import FRAGMENTS, INGESTS, MISSIONS, PACKET_DECODINGS, PASSES, PIECES, VEHICLES
 from ground_service.store.vehicles import hold
 
 DIGEST_OCTETS = 16
@@ -109,11 +101,7 @@ def neighbours(connection: Connection, piece: Piece, reach: int) -> Neighbours:
     query = (
         select(*(PIECES.c[name] for name in columns), INGESTS.c.state)
         .join(INGESTS, INGESTS.c.id == PIECES.c.ingest_id)
-        .where(
-            PIECES.c.scope == piece.scope,
-            PIECES.c.stream == piece.stream,
-            PIECES.c.ingest_id < piece.ingest_id,
-        )
+        .where(PIECES.c.scope == piece.scope, PIECES.c.stream == piece.stream, PIECES.c.ingest_id < piece.ingest_id)
     )
     start, stop = piece.position, piece.position + piece.octets
     before: list[Part] = []
@@ -298,20 +286,13 @@ def _surroundings_query() -> Any:
             func.sum(PASSES.c.id * PASSES.c.mission_id).label("their_missions"),
         )
         .join(vehicles, vehicles.c.id == PASSES.c.vehicle_id)
-        .where(
-            vehicles.c.instance == scope,
-            PASSES.c.archive_digest.is_not(None),
-            PASSES.c.mission_id.is_not(None),
-        )
+        .where(vehicles.c.instance == scope, PASSES.c.archive_digest.is_not(None), PASSES.c.mission_id.is_not(None))
     )
     counts = [one.subquery() for one in (missions, archived)]
     vehicle = and_(VEHICLES.c.ccsds_id == bindparam("spacecraft_id"), VEHICLES.c.instance == scope)
     decodings = select(PACKET_DECODINGS.c.vehicle_id).where(PACKET_DECODINGS.c.vehicle_id == VEHICLES.c.id)
     return select(
-        *(column for one in counts for column in one.c),
-        decodings.exists(),
-        VEHICLES.c.id,
-        VEHICLES.c.decoded_version,
+        *(column for one in counts for column in one.c), decodings.exists(), VEHICLES.c.id, VEHICLES.c.decoded_version
     ).select_from(counts[0].join(counts[1], true()).join(VEHICLES, vehicle, isouter=True))
 
 

@@ -6,15 +6,7 @@ from fastapi import Query, Response
 
 from ground_service.access.security import Operator, UploadOf, Viewer, add_list, idempotent_id
 from ground_service.errors import InvalidInput
-from ground_service.http.common import (
-    API_PREFIX,
-    GroundOf,
-    IdempotencyKey,
-    Instance,
-    Name,
-    RowId,
-    upload_body,
-)
+from ground_service.http.common import API_PREFIX, GroundOf, IdempotencyKey, Instance, Name, RowId, upload_body
 from ground_service.http.requests import operations, problems
 from ground_service.ingest import doubt_store, service, store
 from ground_service.ingest.model import Ingest, IngestAccepted, Withdrawal

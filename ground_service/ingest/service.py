@@ -131,9 +131,7 @@ def enter_ingest(
             known = find_job(connection, job_id)
             if known is not None:
                 return _known_ingest(connection, known, stored, arguments), job_id
-        ingest_id = _add(
-            connection, stored, name, "queued", spacecraft_id, instance, place, station, link
-        ).ingest_id
+        ingest_id = _add(connection, stored, name, "queued", spacecraft_id, instance, place, station, link).ingest_id
         return ingest_id, add_job(connection, "ingest", {"ingest_id": ingest_id, **arguments}, job_id=job_id)
 
 
@@ -164,9 +162,7 @@ def _add(
         connection, stored.sha256, state=state, dictionary_version=DICTIONARY.version, now_utc_ns=now
     )
     stream, position = ("", 0) if place is None else (place.stream, place.offset)
-    piece = Piece(
-        ingest_id, instance, spacecraft_id, stored.sha256, stored.octets, stream, position, station, link
-    )
+    piece = Piece(ingest_id, instance, spacecraft_id, stored.sha256, stored.octets, stream, position, station, link)
     add_piece(connection, piece)
     return piece
 
@@ -193,9 +189,7 @@ def run_ingest(
     return _ingest(ground, piece, progress, judged=judged)
 
 
-def _ingest(
-    ground: Ground, piece: Piece, progress: Progress | None = None, *, judged: bool = False
-) -> IngestResult:
+def _ingest(ground: Ground, piece: Piece, progress: Progress | None = None, *, judged: bool = False) -> IngestResult:
     with ground.database.listeners.held():  # one call for the whole file, not one for each batch
         try:
             reading = Reading(ground, piece, progress, judged=judged)
@@ -232,9 +226,7 @@ def withdraw_ingest(ground: Ground, ingest_id: int, *, reason: str, actor: str) 
         found = store.get_ingest(connection, ingest_id)
         if not store.change_ingest(connection, ingest_id, "done", "withdrawing"):
             raise StateConflict("ingest", ingest_id, "done", found.state)
-        audit(
-            connection, actor, "withdraw ingest", str(ingest_id), {"reason": reason, "sha256": found.sha256}
-        )
+        audit(connection, actor, "withdraw ingest", str(ingest_id), {"reason": reason, "sha256": found.sha256})
         return add_job(connection, "withdrawal", {"ingest_id": ingest_id})
 
 
@@ -294,7 +286,5 @@ def undecoded_vehicles(ground: Ground, spacecraft_id: int) -> list[int]:
         return [
             one.id
             for one in mine
-            if not parameters.is_decoded(
-                connection, one.id, definitions_in_force(connection, one.id)[0].digest
-            )
+            if not parameters.is_decoded(connection, one.id, definitions_in_force(connection, one.id)[0].digest)
         ]

@@ -75,9 +75,7 @@ class Batch(Protocol):
 
 
 _KEEP_VEHICLE = (
-    select(VEHICLES.c.id)
-    .where(VEHICLES.c.id == bindparam("vehicle_id"))
-    .with_for_update(read=True, key_share=True)
+    select(VEHICLES.c.id).where(VEHICLES.c.id == bindparam("vehicle_id")).with_for_update(read=True, key_share=True)
 )
 
 _INSERT_POSTGRESQL = """
@@ -165,11 +163,7 @@ def note_receptions(
     changed = 0
     for (ticks, sequence_count), utc_ns in sorted(received.items()):
         statement: Any = dialect.insert(_RECEPTIONS).values(
-            vehicle_id=vehicle_id,
-            ticks=ticks,
-            sequence_count=sequence_count,
-            station=station,
-            earth_utc_ns=utc_ns,
+            vehicle_id=vehicle_id, ticks=ticks, sequence_count=sequence_count, station=station, earth_utc_ns=utc_ns
         )
         earlier = statement.excluded.earth_utc_ns
         statement = statement.on_conflict_do_update(
@@ -190,9 +184,7 @@ def _new_packets(connection: Connection, vehicle_id: int, batch: Batch) -> IntAr
     stored: set[bytes] = set()
     few = connection.dialect.name == "postgresql" and len(batch.octets) <= FEW_PACKETS
     for apid, first, last in () if few else _time_ranges(batch.apid, batch.ticks):
-        found = connection.execute(
-            _IN_RANGE, {"vehicle_id": vehicle_id, "apid": apid, "first": first, "last": last}
-        )
+        found = connection.execute(_IN_RANGE, {"vehicle_id": vehicle_id, "apid": apid, "first": first, "last": last})
         stored.update(found.scalars())
     fresh = []
     seen = stored
@@ -239,15 +231,11 @@ def _insert_packets(connection: Connection, vehicle_id: int, batch: Batch, new: 
         return np.array([ids.get(digest, 0) for digest in columns["digest"]], dtype=np.int64)
     highest = connection.execute(select(func.max(_PACKETS.c.id))).scalar() or 0
     found = np.arange(highest + 1, highest + 1 + len(chosen), dtype=np.int64)
-    insert_columns(
-        connection, _PACKETS, {"id": found, "vehicle_id": np.full(len(chosen), vehicle_id), **columns}
-    )
+    insert_columns(connection, _PACKETS, {"id": found, "vehicle_id": np.full(len(chosen), vehicle_id), **columns})
     return found
 
 
-def add_ingest(
-    connection: Connection, sha256: str, *, state: str, dictionary_version: int, now_utc_ns: int
-) -> int:
+def add_ingest(connection: Connection, sha256: str, *, state: str, dictionary_version: int, now_utc_ns: int) -> int:
     """Add an ingest of a file; return its id."""
     return int(
         repository.add(
@@ -288,9 +276,7 @@ def start_ingest(connection: Connection, ingest_id: int) -> None:
 
 def fail_ingest(connection: Connection, ingest_id: int, error: str, now_utc_ns: int) -> None:
     """Record why an ingest failed."""
-    repository.change(
-        connection, _INGESTS, ingest_id, state="failed", error=error, finished_utc_ns=now_utc_ns
-    )
+    repository.change(connection, _INGESTS, ingest_id, state="failed", error=error, finished_utc_ns=now_utc_ns)
 
 
 def finish_ingest(connection: Connection, result: IngestResult, now_utc_ns: int) -> None:
@@ -367,11 +353,9 @@ def _may_have_packets(vehicle: int, start_ticks: int, stop_ticks: int) -> tuple[
     """Return the conditions of ingests that are done and may have packets, or octets of them, in a time."""
     timeless = ("packets", "packets_joined", "crc_errors", "frames_bad", "octets_skipped", "octets_pending")
     return (
-        or_(*(_INGESTS.c.accounting[name].as_integer() > 0 for name in timeless))
-        & _INGESTS.c.last_ticks.is_(None)
+        or_(*(_INGESTS.c.accounting[name].as_integer() > 0 for name in timeless)) & _INGESTS.c.last_ticks.is_(None)
         | (_INGESTS.c.last_ticks >= start_ticks) & (_INGESTS.c.first_ticks <= stop_ticks),
-        (_INGESTS.c.vehicle_id == vehicle)
-        | _INGESTS.c.accounting["vehicle_ids"][1].as_integer().is_not(None),
+        (_INGESTS.c.vehicle_id == vehicle) | _INGESTS.c.accounting["vehicle_ids"][1].as_integer().is_not(None),
         _INGESTS.c.state == "done",
     )
 
@@ -412,9 +396,7 @@ def change_ingest(connection: Connection, ingest_id: int, state: str, new: str) 
 
 def ingests_of_vehicles(connection: Connection, vehicles: Sequence[int], but: int) -> list[int]:
     """Return the ingests, except one, that may have packets of these vehicles, oldest first."""
-    mine = _INGESTS.c.vehicle_id.in_(vehicles) | _INGESTS.c.accounting["vehicle_ids"][1].as_integer().is_not(
-        None
-    )
+    mine = _INGESTS.c.vehicle_id.in_(vehicles) | _INGESTS.c.accounting["vehicle_ids"][1].as_integer().is_not(None)
     query = select(_INGESTS.c.id).where(mine, _INGESTS.c.state == "done", _INGESTS.c.id != but)
     return [int(key) for key in connection.execute(query.order_by(_INGESTS.c.id)).scalars()]
 

@@ -120,16 +120,7 @@ def requeue(connection: Connection, job_id: str, attempt: int) -> None:
         Another process has started a new attempt.
     """
     where = {"attempts": attempt}
-    move(
-        connection,
-        JOB,
-        job_id,
-        "queued",
-        expected=("running",),
-        where=where,
-        attempts=attempt - 1,
-        progress=0.0,
-    )
+    move(connection, JOB, job_id, "queued", expected=("running",), where=where, attempts=attempt - 1, progress=0.0)
 
 
 def repeat_job(connection: Connection, job_id: str) -> None:
@@ -163,13 +154,7 @@ def repeat_failed(connection: Connection, now_utc_ns: int) -> None:
         and_(JOBS.c.attempts == k, JOBS.c.finished_utc_ns <= now_utc_ns - wait_ns)
         for k, wait_ns in enumerate(REPEAT_NS, 1)
     )
-    move_all(
-        connection,
-        JOB,
-        (JOBS.c.kind.in_(REPEATED), JOBS.c.state == "failed", or_(*due)),
-        "queued",
-        progress=0.0,
-    )
+    move_all(connection, JOB, (JOBS.c.kind.in_(REPEATED), JOBS.c.state == "failed", or_(*due)), "queued", progress=0.0)
 
 
 def end_attempt(
@@ -243,9 +228,7 @@ def enter_job(ground: Ground, kind: str, arguments: Mapping[str, Any], *, job_id
     return ground.write(add_job, kind, arguments, job_id=job_id)
 
 
-def add_job(
-    connection: Connection, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None
-) -> str:
+def add_job(connection: Connection, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
     """Add a job as `enter_job` does, within the caller's transaction.
 
     Raises
@@ -268,11 +251,7 @@ def add_job(
 
 
 def enter_jobs(
-    ground: Ground,
-    first: Mapping[str, Mapping[str, Any]],
-    kind: str,
-    arguments: Mapping[str, Any],
-    job_id: str,
+    ground: Ground, first: Mapping[str, Mapping[str, Any]], kind: str, arguments: Mapping[str, Any], job_id: str
 ) -> list[str]:
     """Add a job and the replays that it needs first in one transaction; return the ids to start, in order.
 

@@ -41,9 +41,7 @@ class Channel(Section):
     email: Annotated[tuple[Annotated[str, Field(pattern=r"^[^@\s]+@[^@\s]+$")], ...], Array] | None = None
     smtp: Annotated[str, Field(pattern=r"^[^\s:/]+:[0-9]{1,5}$")] = "localhost:25"
     sender: Annotated[str, Field(pattern=r"^[^@\s]+@[^@\s]+$")] = "linna@localhost"
-    signing_secret: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$", max_length=64)] | None = (
-        None
-    )
+    signing_secret: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9._-]*$", max_length=64)] | None = None
 
     @property
     def server(self) -> tuple[str, int]:
@@ -95,9 +93,7 @@ def without_rules(table: Mapping[str, Any], source: str) -> dict[str, Any]:
     automation = dict(table.get("automation", {}))
     rules, channels = automation.pop("rules", None), automation.pop("channels", None)
     if rules:
-        log.warning(
-            "%s: %d rules of an earlier version have no effect, see docs/automation.md", source, len(rules)
-        )
+        log.warning("%s: %d rules of an earlier version have no effect, see docs/automation.md", source, len(rules))
     elif rules is not None:
         automation.setdefault("evaluate", False)
     return {**table, "automation": automation, **({"notify": channels} if channels else {})}

@@ -71,9 +71,7 @@ def catalogue_of(ground: Ground, mission: Mission) -> CraterCatalogue:
             )
         return replace(read_catalogue(path), source=stated.source or f"catalogue {stated.sha256[:16]}")
     if stated.source is None:
-        raise InvalidInput(
-            mission.name, "catalogue", "the source or SHA-256 of a crater catalogue", "neither"
-        )
+        raise InvalidInput(mission.name, "catalogue", "the source or SHA-256 of a crater catalogue", "neither")
     found = _public(ground.data, stated.source)
     if found is None:
         raise InvalidInput(

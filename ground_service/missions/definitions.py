@@ -87,19 +87,13 @@ def definition_faults(mission: Mission, source: str) -> list[InvalidInput]:
     if mission.approval.windows == "automatic" and mission.critical_in_windows:
         expected = "approval.one_person_for with the telecommands of a window that is approved automatically"
         needed = ", ".join(mission.critical_in_windows)
-        faults.append(
-            InvalidInput(source, "approval.windows", expected, f"a second person needed for {needed}")
-        )
+        faults.append(InvalidInput(source, "approval.windows", expected, f"a second person needed for {needed}"))
     sources, unpacked = mission.packets or (), 0
     for index, one in enumerate(sources):
         try:
-            unpacked += sum(
-                len(_document(entry, DOCUMENTS_LIMIT_OCTETS)) for entry in one.xtce or ()
-            )  # one at a time
+            unpacked += sum(len(_document(entry, DOCUMENTS_LIMIT_OCTETS)) for entry in one.xtce or ())  # one at a time
             if unpacked > DOCUMENTS_LIMIT_OCTETS:
-                raise DefinitionError(
-                    f"expected {DOCUMENTS_LIMIT_OCTETS >> 20} MiB of documents in all, found more"
-                )
+                raise DefinitionError(f"expected {DOCUMENTS_LIMIT_OCTETS >> 20} MiB of documents in all, found more")
             _decoder(one)
         except DefinitionError as error:
             faults.append(InvalidInput(source, f"packets.{index}.xtce", "XTCE that is supported", str(error)))
@@ -142,9 +136,7 @@ def minimal_description(xtce: Path, spacecraft_id: int) -> str:
         raise InvalidInput(str(xtce), "", "XTCE that is supported", str(error)) from None
     apids = sorted({apid for root in decoder.roots for apid in packet_apids(root)[0] if apid < IDLE_APID})
     if not apids:
-        raise InvalidInput(
-            str(xtce), "Comparison", "a container that compares its APID with a number", "none"
-        )
+        raise InvalidInput(str(xtce), "Comparison", "a container that compares its APID with a number", "none")
     packets = {"name": xtce.stem[:64], "apids": apids, "packet_checksum": "none", "xtce": [document]}
     return format_toml({"name": xtce.stem, "spacecraft": {"id": spacecraft_id}, "packets": [packets]})
 
@@ -211,9 +203,7 @@ def _document(entry: str, limit_octets: int = MAX_OCTETS) -> str | bytes:
     except (binascii.Error, ValueError, zlib.error):
         raise DefinitionError("embedded document: expected gzip in base64, found other text") from None
     if not unpacking.eof or len(octets) > limit_octets:
-        raise DefinitionError(
-            f"embedded document: expected at most {limit_octets} whole octets, found others"
-        )
+        raise DefinitionError(f"embedded document: expected at most {limit_octets} whole octets, found others")
     return octets
 
 

@@ -13,15 +13,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from ground_service.missions.model import (
-    Camera,
-    DictionarySection,
-    Evidence,
-    Frames,
-    Mission,
-    Spacecraft,
-    World,
-)
+from ground_service.missions.model import Camera, DictionarySection, Evidence, Frames, Mission, Spacecraft, World
 from ground_service.missions.section import Section
 from lunar.camera import PinholeCamera
 from lunar.datafolder import DataFolder
@@ -98,9 +90,7 @@ def assumed_camera(camera: Camera) -> str:
     values = [f"{name} ({value})" for name, (stated, value) in assumed.items() if stated is None]
     if not values:
         return ""
-    return (
-        f"the mission description does not state sizes of the camera, which are assumed: {', '.join(values)}"
-    )
+    return f"the mission description does not state sizes of the camera, which are assumed: {', '.join(values)}"
 
 
 def _reason(what: str, declared: str | None, key: str) -> str:
@@ -160,18 +150,14 @@ def mission_of_manifest(manifest: Mapping[str, Any]) -> Mission:
     """Return the mission description that a manifest declares."""
     sources = manifest.get("data_sources")
     named = [str(one) for one in sources] if isinstance(sources, list | tuple) else []
-    orientations = [
-        one.removeprefix(ORIENTATION_PREFIX) for one in named if one.startswith(ORIENTATION_PREFIX)
-    ]
+    orientations = [one.removeprefix(ORIENTATION_PREFIX) for one in named if one.startswith(ORIENTATION_PREFIX)]
     gravity, camera = _table(manifest, "gravity"), _table(manifest, "camera")
     dictionary = _table(manifest, "dictionary")
     name = str(manifest.get("scenario") or manifest.get("pass_name") or "not stated")[:200]
     return Mission(
         name=name,
         spacecraft=_section(Spacecraft, id=manifest.get("spacecraft_id")),
-        dictionary=_section(
-            DictionarySection, version=dictionary.get("version"), hash=dictionary.get("hash")
-        ),
+        dictionary=_section(DictionarySection, version=dictionary.get("version"), hash=dictionary.get("hash")),
         frames=_section(
             Frames,
             orientation=orientations[0] if len(orientations) == 1 else None,
@@ -189,9 +175,7 @@ def mission_of_manifest(manifest: Mapping[str, Any]) -> Mission:
             frame_interval_s=manifest.get("cadence_s"),
         ),
         evidence=_section(
-            Evidence,
-            world=_world(str(manifest.get("terrain")), manifest.get("seed")),
-            seed=manifest.get("seed"),
+            Evidence, world=_world(str(manifest.get("terrain")), manifest.get("seed")), seed=manifest.get("seed")
         ),
     )
 
@@ -202,9 +186,7 @@ def _world(terrain: str, seed: object) -> World | None:
         return "real-terrain"
     if terrain.startswith("photograph "):
         return "photographs"
-    made = terrain == f"procedural Moon, seed {seed}" or terrain.endswith(
-        f" on a procedural base, seed {seed}"
-    )
+    made = terrain == f"procedural Moon, seed {seed}" or terrain.endswith(f" on a procedural base, seed {seed}")
     return "procedural" if made else None
 
 

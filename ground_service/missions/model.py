@@ -21,14 +21,7 @@ from ground_service.missions.section import Array, Section
 from ground_service.toml import faults, read_table
 from lunar.boxes import Box, Region
 from lunar.errors import TimeFormatError
-from lunar.plausible import (
-    CAMERA_FIELD_DEG,
-    CAMERA_PIXELS,
-    EXPOSURE_S,
-    MAP_SHIFT_M,
-    REFERENCE_SIGMA_M,
-    Limit,
-)
+from lunar.plausible import CAMERA_FIELD_DEG, CAMERA_PIXELS, EXPOSURE_S, MAP_SHIFT_M, REFERENCE_SIGMA_M, Limit
 from lunar.timescales import parse_utc
 from tmtc.dictionary.effects import EFFECTS, FUNCTION, Effect
 from tmtc.dictionary.payload import DICTIONARY
@@ -160,9 +153,7 @@ class StationLink(FrameSettings):
         if self.time_code is not None and self.time_offset is not None:
             end = self.time_offset + (6 if self.time_code == "cds" else 8)
             if end > (self.header_octets or 0):
-                raise ValueError(
-                    f"a header of at least {end} octets for its time, found {self.header_octets or 0}"
-                )
+                raise ValueError(f"a header of at least {end} octets for its time, found {self.header_octets or 0}")
         return self
 
 
@@ -354,9 +345,7 @@ class Evidence(Section):
         if self.trained_on is None:
             return None
         return tuple(
-            Region(
-                tuple(Box(*one) for one in part.boxes), tuple(Box(*one) for one in part.avoid), part.buffer_km
-            )
+            Region(tuple(Box(*one) for one in part.boxes), tuple(Box(*one) for one in part.avoid), part.buffer_km)
             for part in self.trained_on
         )
 
@@ -573,9 +562,7 @@ class StationConnection(Section):
             if value is None:
                 continue
             host, _, port = value.rpartition(":")
-            if self.kind == "tcp" and not (
-                host and port.isascii() and port.isdigit() and 0 < int(port) < 65536
-            ):
+            if self.kind == "tcp" and not (host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
                 raise ValueError(f"{key} as HOST:PORT, found {value[:80]!r}")
             if self.kind == "file" and not value.startswith("/"):
                 raise ValueError(f"{key} as the absolute path of a folder, found {value[:80]!r}")
@@ -636,9 +623,7 @@ class PacketTime(Section):
         if self.code == "cds" and self.whole_octets not in (2, 3):
             raise ValueError(f"2 or 3 octets of days in a CDS code, found {self.whole_octets}")
         if self.code == "cds" and self.fraction_octets not in (0, 2, 4):
-            raise ValueError(
-                f"0, 2 or 4 octets below the millisecond in a CDS code, found {self.fraction_octets}"
-            )
+            raise ValueError(f"0, 2 or 4 octets below the millisecond in a CDS code, found {self.fraction_octets}")
         if self.epoch.endswith(EPOCH_TAI) and (self.code == "cds" or self.clock == "unix"):
             raise ValueError("an epoch in UTC for a CDS code or a Unix clock, found one in TAI")
         _epoch(self.epoch)
@@ -666,9 +651,7 @@ class PacketSource(Section):
     def _texts(self) -> PacketSource:
         for text in self.xtce or ():
             if not text.lstrip().startswith(("<", XTCE_COMPRESSED)):
-                raise ValueError(
-                    f"texts of XTCE documents, or files that `linna mission` reads, found {text[:80]!r}"
-                )
+                raise ValueError(f"texts of XTCE documents, or files that `linna mission` reads, found {text[:80]!r}")
         for key in ("container", "leading_size"):
             if getattr(self, key) is not None and not self.xtce:
                 raise ValueError(f"xtce documents with a {key}, found none")
@@ -722,13 +705,9 @@ class Mission(Section):
         for source in self.packets or ():
             for apid in source.apids:
                 if apid in owner:
-                    raise ValueError(
-                        f"each APID in one entry of packets, found {apid} in {owner[apid]!r} and again"
-                    )
+                    raise ValueError(f"each APID in one entry of packets, found {apid} in {owner[apid]!r} and again")
                 if apid in DICTIONARY_APIDS:
-                    raise ValueError(
-                        f"APIDs that the packet dictionary does not use, found {apid} in {source.name!r}"
-                    )
+                    raise ValueError(f"APIDs that the packet dictionary does not use, found {apid} in {source.name!r}")
                 owner[apid] = source.name
         names = [source.name for source in self.packets or ()]
         if len(set(names)) < len(names):

@@ -54,9 +54,7 @@ def withdraw_catalogue(
     return Response(status_code=204)
 
 
-@missions.post(
-    "/catalogues", status_code=201, openapi_extra=upload_body("Crater catalogue: CSV, plain or gzip")
-)
+@missions.post("/catalogues", status_code=201, openapi_extra=upload_body("Crater catalogue: CSV, plain or gzip"))
 async def add_catalogue(
     upload: UploadOf, ground: GroundOf, caller: Operator, name: Name = "catalogue.csv"
 ) -> HeldCatalogue:

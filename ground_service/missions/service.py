@@ -88,9 +88,7 @@ def _changes(before: list[str], after: list[str]) -> tuple[str, ...]:
     tail = next((k for k in range(rest) if before[-1 - k] != after[-1 - k]), rest)
     removed, added = len(before) - head - tail, len(after) - head - tail
     if removed * added > COMPARED_LIMIT:
-        return (
-            f"@@ {removed} lines from line {head + 1} on are replaced by {added}: too many to compare @@",
-        )
+        return (f"@@ {removed} lines from line {head + 1} on are replaced by {added}: too many to compare @@",)
     return tuple(difflib.unified_diff(before, after, lineterm="", n=1))[2:]
 
 
@@ -120,12 +118,7 @@ def _require_own(mission: Mission, source: str, caller: Caller) -> None:
 
 
 def add_mission(
-    ground: Ground,
-    octets: bytes,
-    *,
-    source: str = "mission.toml",
-    actor: str = "local",
-    caller: Caller = LOCAL_CALLER,
+    ground: Ground, octets: bytes, *, source: str = "mission.toml", actor: str = "local", caller: Caller = LOCAL_CALLER
 ) -> MissionDetail:
     """Add a mission description as a revision; the same content gives the same revision.
 
@@ -157,10 +150,7 @@ def _check_link_names(connection: Connection, mission: Mission, source: str) -> 
         taken = mine.intersection(one.name for one in other.links or ())
         if spacecraft != mission.spacecraft.id and taken:
             raise InvalidInput(
-                source,
-                "links",
-                "names that no other spacecraft uses",
-                f"{min(taken)!r} of spacecraft {spacecraft}",
+                source, "links", "names that no other spacecraft uses", f"{min(taken)!r} of spacecraft {spacecraft}"
             )
 
 
@@ -211,9 +201,6 @@ def without_tokens(found: MissionDetail) -> MissionDetail:
         text = text.replace(address, shown[address])
     if any(one.webhook in shown for one in parse_mission(text, stored=True).notify.values()):
         text = ""  # an address is written with escapes
-    public = {
-        name: one.model_copy(update={"webhook": shown.get(one.webhook or "")})
-        for name, one in channels.items()
-    }
+    public = {name: one.model_copy(update={"webhook": shown.get(one.webhook or "")}) for name, one in channels.items()}
     document = found.document.model_copy(update={"notify": public})
     return found.model_copy(update={"document": document, "text": text})

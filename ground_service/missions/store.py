@@ -129,11 +129,7 @@ def _archived(connection: Connection, instance: str) -> dict[int, int]:
     query = (
         select(vehicles.c.ccsds_id, passes.c.mission_id)
         .join(vehicles, vehicles.c.id == passes.c.vehicle_id)
-        .where(
-            vehicles.c.instance == instance,
-            passes.c.archive_digest.is_not(None),
-            passes.c.mission_id.is_not(None),
-        )
+        .where(vehicles.c.instance == instance, passes.c.archive_digest.is_not(None), passes.c.mission_id.is_not(None))
         .order_by(passes.c.id)
     )
     return {int(spacecraft): int(key) for spacecraft, key in connection.execute(query)}

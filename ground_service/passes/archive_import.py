@@ -23,12 +23,7 @@ from ground_service.errors import InvalidInput, NotFound, storage_error
 from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_stored
 from ground_service.missions import store as missions
-from ground_service.missions.ephemerides.service import (
-    attitude_file,
-    check_attitudes,
-    insert_ephemeris,
-    load_attitudes,
-)
+from ground_service.missions.ephemerides.service import attitude_file, check_attitudes, insert_ephemeris, load_attitudes
 from ground_service.missions.frames import mission_of_manifest
 from ground_service.missions.model import Mission
 from ground_service.missions.service import enter, read_mission
@@ -112,24 +107,11 @@ def import_archive(ground: Ground, folder: Path) -> int:
     stored[MANIFEST_FILE] = ground.files.put_file(folder / MANIFEST_FILE)
     images = {number: ground.files.put_file(folder / name) for number, name in _chosen_frames(names)}
     pass_id = _register(
-        ground,
-        folder,
-        manifest,
-        digest,
-        start_utc_ns,
-        stop_utc_ns,
-        stored,
-        images,
-        (mission, text),
-        reference,
+        ground, folder, manifest, digest, start_utc_ns, stop_utc_ns, stored, images, (mission, text), reference
     )
     if receptions is not None:
         enter_receptions(
-            ground,
-            int(manifest["spacecraft_id"]),
-            instance_of(manifest, digest),
-            receptions,
-            actor="archive",
+            ground, int(manifest["spacecraft_id"]), instance_of(manifest, digest), receptions, actor="archive"
         )
     if "downlink.cadu" in stored:
         ingest_stored(
@@ -158,9 +140,7 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
     """The manifest of a pass archive, checked for what must be in it, and the SHA-256 that names the archive."""
     path = folder / "manifest.json"
     if not folder.is_dir():
-        raise InvalidInput(
-            str(folder), "", "a pass archive folder", "a file" if folder.exists() else "nothing there"
-        )
+        raise InvalidInput(str(folder), "", "a pass archive folder", "a file" if folder.exists() else "nothing there")
     try:
         octets = path.read_bytes()
     except FileNotFoundError:
@@ -176,10 +156,7 @@ def read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
             raise InvalidInput(str(path), key, expected, repr(manifest.get(key))[:80])
     if manifest["schema_version"] > SCHEMA_VERSION:
         raise InvalidInput(
-            str(path),
-            "schema_version",
-            f"{SCHEMA_VERSION} or less",
-            f"{manifest['schema_version']} of a newer version",
+            str(path), "schema_version", f"{SCHEMA_VERSION} or less", f"{manifest['schema_version']} of a newer version"
         )
     for place, (least, most) in _NUMBERS.items():
         section, _, key = place.rpartition(".")
@@ -211,9 +188,7 @@ def checked_files(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
                 str(folder / "manifest.json"), f"files.{name}", "an object with sha256", repr(entry)[:80]
             )
         if Path(name).is_absolute() or not path.resolve().is_relative_to(root):
-            raise InvalidInput(
-                str(folder / "manifest.json"), f"files.{name}", "a path inside the archive", name
-            )
+            raise InvalidInput(str(folder / "manifest.json"), f"files.{name}", "a path inside the archive", name)
         if not path.is_file():
             raise InvalidInput(str(folder), name, "a file of the archive", "nothing there")
         found = _sha256(path)
@@ -226,9 +201,7 @@ def checked_files(folder: Path, manifest: Mapping[str, Any]) -> list[str]:
             )
         size = path.stat().st_size
         if entry.get("bytes", size) != size:
-            raise InvalidInput(
-                str(path), "", f"{str(entry['bytes'])[:20]} octets as in the manifest", str(size)
-            )
+            raise InvalidInput(str(path), "", f"{str(entry['bytes'])[:20]} octets as in the manifest", str(size))
         names.append(name)
     return names
 
@@ -443,9 +416,7 @@ def _unpack(archive: zipfile.ZipFile, folder: Path, packed_octets: int, name: st
                 while block := source.read(BLOCK_OCTETS):
                     taken += len(block)
                     if taken > limit:
-                        raise InvalidInput(
-                            name, entry.filename[:80], f"at most {limit} octets when unpacked", "more"
-                        )
+                        raise InvalidInput(name, entry.filename[:80], f"at most {limit} octets when unpacked", "more")
                     sink.write(block)
         except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
             raise InvalidInput(name, entry.filename[:80], "a whole file", str(error)[:120]) from None
@@ -519,9 +490,7 @@ DELAY_NS = DAY_NS
 THUMBNAIL = {name: code for code, name in DICTIONARY.labels("large_data_last", "table").items()}["thumbnail"]
 
 
-def list_images(
-    ground: Ground, spacecraft_id: int, instance: str, start_utc_ns: int, stop_utc_ns: int
-) -> list[Image]:
+def list_images(ground: Ground, spacecraft_id: int, instance: str, start_utc_ns: int, stop_utc_ns: int) -> list[Image]:
     """Return the images of a spacecraft in an interval, in time order; of more than `IMAGES_LIMIT` the newest.
 
     Raises
@@ -650,9 +619,7 @@ def _archived(connection: Connection, vehicle: int, start_utc_ns: int, stop_utc_
         rows = sample_store.samples(connection, span, "detections", ("frame_number", "ticks"))
         ticks = dict(zip(rows["frame_number"], rows["ticks"], strict=True))
         numbers = [number for number in store.frame_files(connection, record.id) if number in ticks]
-        for number, time_ns in zip(
-            numbers, span.utc_ns([ticks[number] for number in numbers]).tolist(), strict=True
-        ):
+        for number, time_ns in zip(numbers, span.utc_ns([ticks[number] for number in numbers]).tolist(), strict=True):
             address = f"/api/v1/passes/{record.id}/images/{number}"
             yield Image.of(
                 {},
@@ -666,12 +633,7 @@ def _archived(connection: Connection, vehicle: int, start_utc_ns: int, stop_utc_
 
 
 def _downlinked(
-    connection: Connection,
-    vehicle: int,
-    spacecraft_id: int,
-    instance: str,
-    start_utc_ns: int,
-    stop_utc_ns: int,
+    connection: Connection, vehicle: int, spacecraft_id: int, instance: str, start_utc_ns: int, stop_utc_ns: int
 ) -> Iterator[Image]:
     span = vehicle_span(connection, vehicle, start_utc_ns, stop_utc_ns + DELAY_NS)
     rows = sample_store.samples(connection, span, "detections", ("frame_number", "ticks"))

@@ -40,11 +40,7 @@ def downsample(utc_ns: IntArray, values: FloatArray, max_points: int) -> Buckets
         return Buckets(whole, whole, whole, none, none, none, none.astype(np.bool_))
     step = np.diff(utc_ns)
     usual = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
-    gap = (
-        np.concatenate(([False], step > GAP_STEPS * usual))
-        if usual
-        else np.zeros(len(utc_ns), dtype=np.bool_)
-    )
+    gap = np.concatenate(([False], step > GAP_STEPS * usual)) if usual else np.zeros(len(utc_ns), dtype=np.bool_)
     if len(utc_ns) <= max_points:
         one = np.ones(len(utc_ns), dtype=np.int64)
         return Buckets(utc_ns, utc_ns, one, values, values, values, gap)
@@ -100,10 +96,7 @@ def aggregate(utc_ns: IntArray, values: FloatArray) -> Aggregates:
 def join(pieces: Sequence[Aggregates]) -> Aggregates:
     """Stretches one after another."""
     columns = zip(
-        *(
-            (one.first_utc_ns, one.last_utc_ns, one.rows, one.count, one.total, one.low, one.high)
-            for one in pieces
-        ),
+        *((one.first_utc_ns, one.last_utc_ns, one.rows, one.count, one.total, one.low, one.high) for one in pieces),
         strict=True,
     )
     return Aggregates(*(np.concatenate(column) for column in columns))

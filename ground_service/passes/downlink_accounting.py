@@ -86,10 +86,7 @@ class RawAccount:
 
 
 def read_raw(
-    octets: Octets,
-    spacecraft_id: int | None,
-    sections: Sequence[LinkSection] = (),
-    form: PacketForm = CHECKED,
+    octets: Octets, spacecraft_id: int | None, sections: Sequence[LinkSection] = (), form: PacketForm = CHECKED
 ) -> RawFile:
     """Return the content of a raw file for one spacecraft.
 
@@ -213,9 +210,7 @@ def _frame_of(found: DownlinkDecode, places: IntArray) -> IntArray:
     if not used.size:
         return np.full(len(places), -1, dtype=np.int64)
     rows = used[_before(table.buffer_offset[used], places)]
-    inside = (places >= table.buffer_offset[rows]) & (
-        places < table.buffer_offset[rows] + table.buffer_octets[rows]
-    )
+    inside = (places >= table.buffer_offset[rows]) & (places < table.buffer_offset[rows] + table.buffer_octets[rows])
     return np.where(inside, rows, -1)
 
 

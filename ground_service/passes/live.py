@@ -12,13 +12,7 @@ from ground_service.http.model import UtcTime
 from ground_service.missions.store import mission_of_vehicle
 from ground_service.missions.timekeeping.core import TimeCorrelation, utc_ns_of_ticks
 from ground_service.missions.timekeeping.store import load_correlations
-from ground_service.passes.model import (
-    LiveParameter,
-    LiveValue,
-    NewestPacket,
-    ParameterInfo,
-    SpacecraftInstance,
-)
+from ground_service.passes.model import LiveParameter, LiveValue, NewestPacket, ParameterInfo, SpacecraftInstance
 from ground_service.passes.parameters import DeclaredParameter, declared_reading
 from ground_service.store.vehicles import FLOWN, Vehicle, find_vehicle, get_vehicle, used_vehicles
 from ground_service.telemetry import store as telemetry
@@ -27,12 +21,7 @@ from tmtc.dictionary.fields import Field
 from tmtc.dictionary.payload import DICTIONARY, STRUCTURES
 from tmtc.dictionary.schema import DecodedPacket, limit_states
 
-LIVE_PACKETS = (
-    *(one.name for one in STRUCTURES.values()),
-    "navigation_state",
-    "frame_outcome",
-    "detections",
-)
+LIVE_PACKETS = (*(one.name for one in STRUCTURES.values()), "navigation_state", "frame_outcome", "detections")
 """Packets whose newest values are shown; the others report single occurrences."""
 
 Correlations = Sequence[TimeCorrelation]
@@ -47,9 +36,7 @@ def list_spacecraft(ground: Ground) -> list[SpacecraftInstance]:
             SpacecraftInstance(
                 spacecraft_id=one.ccsds_id,
                 instance=one.instance,
-                name=None
-                if (mission := mission_of_vehicle(connection, one.id)) is None
-                else mission.spacecraft.name,
+                name=None if (mission := mission_of_vehicle(connection, one.id)) is None else mission.spacecraft.name,
             )
             for one in used_vehicles(connection)
         ]
@@ -61,11 +48,7 @@ def live_parameters(ground: Ground, spacecraft_id: int, instance: str) -> list[L
     with ground.database.reading() as connection:
         vehicle = find_vehicle(connection, spacecraft_id, instance)
         newest, reading = _newest(connection, vehicle), declared_reading(connection, vehicle.id)
-    declared = (
-        {}
-        if reading is None
-        else {(one.container, one.name): one.info for one in reading.parameters.values()}
-    )
+    declared = {} if reading is None else {(one.container, one.name): one.info for one in reading.parameters.values()}
     return [
         _described(packet, value, declared.get((packet.packet, value.name)))
         for packet in newest
@@ -93,9 +76,7 @@ def _newest(connection: Connection, vehicle: Vehicle) -> list[NewestPacket]:
     return [one.model_copy(update={"age_s": (now - one.time.utc_ns) / 1e9}) for one in found]
 
 
-def _newest_declared(
-    connection: Connection, vehicle: Vehicle, correlations: Correlations
-) -> Iterator[NewestPacket]:
+def _newest_declared(connection: Connection, vehicle: Vehicle, correlations: Correlations) -> Iterator[NewestPacket]:
     """Yield the newest packets that the mission description defines, in the time of their clock."""
     reading = declared_reading(connection, vehicle.id)
     containers: dict[int, list[DeclaredParameter]] = {}

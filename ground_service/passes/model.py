@@ -8,15 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from ground_service.http.model import (
-    Entity,
-    InstanceName,
-    Paging,
-    RequestModel,
-    RequestTime,
-    SpacecraftNumber,
-    UtcTime,
-)
+from ground_service.http.model import Entity, InstanceName, Paging, RequestModel, RequestTime, SpacecraftNumber, UtcTime
 from ground_service.store.vehicles import FLOWN
 from ground_service.toml import LINE_PATTERN_JSON
 
@@ -88,9 +80,7 @@ class ApidCompleteness(Entity):
     name: str = Field(examples=["detections"])
     packets: int
     lost: int = Field(description="Missing between received packets, by sequence count")
-    lost_at_edges: int | None = Field(
-        description="Missing before the first and after the last packet, by the plan"
-    )
+    lost_at_edges: int | None = Field(description="Missing before the first and after the last packet, by the plan")
     duplicates: int | None = Field(description="Received again with the same octets; null: not computed")
     conflicts: int
     crc_errors: int | None = Field(description="Received with a wrong checksum; null: not computed")
@@ -243,20 +233,14 @@ ExportFormat = Literal["json", "csv", "parquet"]
 class ParameterInfo(Entity):
     """Parameter with a series."""
 
-    name: str = Field(
-        description="Name in addresses; with the packet where several packets have the parameter"
-    )
+    name: str = Field(description="Name in addresses; with the packet where several packets have the parameter")
     packet: str = Field(description="Packet, or XTCE container", examples=["housekeeping"])
     source: str = Field(description="`dictionary`, or the name of the packets in the mission description")
     description: str
     unit: str
     labels: dict[str, str] = Field(description="Names of codes")
-    warning: tuple[float | None, float | None] | None = Field(
-        description="Least and greatest value without warning"
-    )
-    alarm: tuple[float | None, float | None] | None = Field(
-        description="Least and greatest value without alarm"
-    )
+    warning: tuple[float | None, float | None] | None = Field(description="Least and greatest value without warning")
+    alarm: tuple[float | None, float | None] | None = Field(description="Least and greatest value without alarm")
 
 
 class SpacecraftInstance(Entity):
@@ -264,9 +248,7 @@ class SpacecraftInstance(Entity):
 
     spacecraft_id: int = Field(examples=[76])
     instance: str = Field(examples=["flight"])
-    name: str | None = Field(
-        description="Name in the mission description; null: not stated", examples=["SelenITA"]
-    )
+    name: str | None = Field(description="Name in the mission description; null: not stated", examples=["SelenITA"])
 
 
 class LiveValue(Entity):
@@ -297,9 +279,7 @@ class LiveParameter(LiveValue):
     unit: str = Field(examples=["degC"])
     limits: str = Field(description="Warning limits, else alarm limits; empty: none", examples=["-20 to 60"])
     time: UtcTime = Field(description="Spacecraft time of the packet")
-    age_s: float = Field(
-        description="Time since then by the clock of the service or the newest packet", examples=[4.2]
-    )
+    age_s: float = Field(description="Time since then by the clock of the service or the newest packet", examples=[4.2])
 
 
 class PacketInfo(Entity):
@@ -323,9 +303,7 @@ class PassParameters(Entity):
 class PassFilter(Paging):
     """Passes to list."""
 
-    search: str | None = Field(
-        default=None, min_length=1, max_length=200, description="Part of the name, in any case"
-    )
+    search: str | None = Field(default=None, min_length=1, max_length=200, description="Part of the name, in any case")
     spacecraft_id: SpacecraftNumber | None = None
     instance: InstanceName | None = None
     verdict: Literal["met", "not met", "unknown", "none"] | None = Field(
@@ -339,8 +317,6 @@ class EventFilter(Paging):
     spacecraft_id: SpacecraftNumber
     instance: InstanceName = FLOWN
     severity: list[EventSeverity] | None = Field(default=None, description="Default: any severity")
-    name: str | None = Field(
-        default=None, min_length=1, max_length=100, description="Part of the name of the event"
-    )
+    name: str | None = Field(default=None, min_length=1, max_length=100, description="Part of the name of the event")
     start: RequestTime | None = None
     stop: RequestTime | None = None

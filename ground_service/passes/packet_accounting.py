@@ -148,10 +148,7 @@ def _runs(pieces: list[Received]) -> list[_Run]:
         if start < one.octets or not runs[-1]:
             runs[-1].append((one, _Part(one.sha256, start, one.octets)))
             reached = one.position + one.octets
-    return [
-        _Run(run[0][0].station, tuple(part for _, part in run), _sections([one for one, _ in run]))
-        for run in runs
-    ]
+    return [_Run(run[0][0].station, tuple(part for _, part in run), _sections([one for one, _ in run])) for run in runs]
 
 
 def _sections(pieces: list[Received]) -> tuple[LinkSection, ...]:
@@ -270,13 +267,7 @@ def _frames_at_edges(planned: object, images: _Images, in_gaps: int) -> int | No
     It follows from the frame counter at start and end of the observation; without both, from the plan.
     """
     start, stop = images.first_made, images.after_last_made
-    if (
-        images.count
-        and start is not None
-        and stop is not None
-        and start <= images.first
-        and images.last < stop
-    ):
+    if images.count and start is not None and stop is not None and start <= images.first and images.last < stop:
         return images.first - start + stop - 1 - images.last
     if not isinstance(planned, int) or isinstance(planned, bool):
         return None

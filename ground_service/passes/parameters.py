@@ -214,17 +214,13 @@ def declared_parameters(definitions: PacketDefinitions) -> dict[str, DeclaredPar
     for one in found:
         counts[one.name] = counts.get(one.name, 0) + 1
     named = (
-        replace(
-            one, name=(one.name if counts[one.name] == 1 else f"{one.container}.{one.name}").replace("/", ".")
-        )
+        replace(one, name=(one.name if counts[one.name] == 1 else f"{one.container}.{one.name}").replace("/", "."))
         for one in found
     )
     return {one.name: one for one in named}
 
 
-def series_source(
-    connection: Connection, span: PassSpan, parameter: str
-) -> tuple[SampleSource, PassSpan, str, str]:
+def series_source(connection: Connection, span: PassSpan, parameter: str) -> tuple[SampleSource, PassSpan, str, str]:
     """Return the source of the series of a parameter, its span, the name of its value there, and its unit."""
     if parameter in PARAMETERS:
         unit = DICTIONARY.packet(OWN_PACKET).field(parameter).unit

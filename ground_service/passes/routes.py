@@ -145,17 +145,13 @@ def get_states(
 
 
 @passes.get("/passes/{pass_id}/events")
-def list_events(
-    ground: GroundOf, _: Viewer, request: Request, pass_id: PassId, asked: PagingOf
-) -> PageOf[Event]:
+def list_events(ground: GroundOf, _: Viewer, request: Request, pass_id: PassId, asked: PagingOf) -> PageOf[Event]:
     """List the event reports of a pass, in time order."""
     return linked(request, service.list_events(ground, pass_id, asked))
 
 
 @passes.get("/passes/{pass_id}/craters")
-def list_craters(
-    ground: GroundOf, _: Viewer, request: Request, pass_id: PassId, asked: PagingOf
-) -> PageOf[Crater]:
+def list_craters(ground: GroundOf, _: Viewer, request: Request, pass_id: PassId, asked: PagingOf) -> PageOf[Crater]:
     """List the craters of the catalogue of a pass, the largest first."""
     return linked(request, service.craters(ground, pass_id, asked))
 
@@ -212,13 +208,7 @@ def get_trend(
 ) -> Response:
     """Return the series of a housekeeping parameter of a spacecraft over an interval; by default over all."""
     found = service.trend_series(
-        ground,
-        spacecraft_id,
-        instance,
-        parameter,
-        max_points,
-        start_utc_ns=ns_of(start),
-        stop_utc_ns=ns_of(stop),
+        ground, spacecraft_id, instance, parameter, max_points, start_utc_ns=ns_of(start), stop_utc_ns=ns_of(stop)
     )
     return JSONResponse(series_document(found))
 
@@ -237,9 +227,7 @@ def list_spacecraft_parameters(
     return PageOf.all_of(parameters.spacecraft_parameters(ground, spacecraft_id, instance))
 
 
-PNG: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"application/octet-stream": {}}, "description": "PNG image"}
-}
+PNG: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}, "description": "PNG image"}}
 
 
 @passes.get("/spacecraft/{spacecraft_id}/images")
@@ -252,9 +240,7 @@ def list_images(
     instance: Instance = FLOWN,
 ) -> PageOf[Image]:
     """List the images of an interval: downlinked thumbnails, and frames of pass archives; at most 2000."""
-    return PageOf.all_of(
-        archive_import.list_images(ground, spacecraft_id, instance, start.utc_ns, stop.utc_ns)
-    )
+    return PageOf.all_of(archive_import.list_images(ground, spacecraft_id, instance, start.utc_ns, stop.utc_ns))
 
 
 @passes.get("/spacecraft/{spacecraft_id}/thumbnails/{ticks}", response_class=Response, responses=PNG)
@@ -264,9 +250,7 @@ def get_thumbnail(
     spacecraft_id: SpacecraftId,
     ticks: Annotated[int, Path(ge=0, lt=1 << 48, description="On-board time of the frame, 2^-16 s")],
     instance: Instance = FLOWN,
-    detections: Annotated[
-        bool, Query(description="Enlarge it and draw the detections of the payload")
-    ] = False,
+    detections: Annotated[bool, Query(description="Enlarge it and draw the detections of the payload")] = False,
 ) -> Response:
     """Return a downlinked thumbnail as PNG."""
     octets = archive_import.thumbnail_image(ground, spacecraft_id, instance, ticks, detections=detections)
@@ -301,8 +285,6 @@ def list_live_parameters(
 
 
 @passes.get("/spacecraft/{spacecraft_id}/trends")
-def list_trends(
-    ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN
-) -> list[Trend]:
+def list_trends(ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN) -> list[Trend]:
     """List statistics, slope and limit state of the housekeeping parameters over 30 days of on-board time."""
     return service.spacecraft_trends(ground, spacecraft_id, instance)

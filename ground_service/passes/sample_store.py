@@ -32,9 +32,7 @@ def samples(connection: Connection, span: PassSpan, kind: str, names: Sequence[s
     return telemetry.samples(connection, kind, span.where, names)
 
 
-def sample_arrays(
-    connection: Connection, span: PassSpan, kind: str, names: Sequence[str]
-) -> dict[str, NDArray[Any]]:
+def sample_arrays(connection: Connection, span: PassSpan, kind: str, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     """As `samples`, as arrays: whole numbers as int64, all else as float64 with NaN for NULL."""
     return telemetry.sample_arrays(connection, kind, span.where, names)
 
@@ -85,8 +83,7 @@ def detection_samples(connection: Connection, span: PassSpan) -> DetectionSample
 def _first_reports(rows: Mapping[str, list[Any]]) -> list[int]:
     """Numbers of the rows to count, in time order: of those on one image the first by content."""
     order = sorted(
-        range(len(rows["ticks"])),
-        key=lambda i: (rows["ticks"][i], rows["frame_number"][i], bytes(rows["items"][i])),
+        range(len(rows["ticks"])), key=lambda i: (rows["ticks"][i], rows["frame_number"][i], bytes(rows["items"][i]))
     )
     return [
         i
@@ -156,9 +153,7 @@ def event_page(
     content, whatever the order in which they came.
     """
     table = repository.SAMPLES["events"]
-    query = select(*(table.c[column] for column in _EVENT_COLUMNS)).where(
-        repository.within(table, span.where)
-    )
+    query = select(*(table.c[column] for column in _EVENT_COLUMNS)).where(repository.within(table, span.where))
     if severities:
         codes = [code for code, one in _SEVERITIES.items() if one in severities]
         query = query.where(table.c.severity.in_(codes))
@@ -166,18 +161,14 @@ def event_page(
         part = name.strip().lower().replace(" ", "_")
         labels = DICTIONARY.labels("event_info", "event_id")
         query = query.where(table.c.event_id.in_([code for code, label in labels.items() if part in label]))
-    order = [
-        table.c[column] for column in ("ticks", "event_id", "frame_number", "value_1", "value_2", "packet_id")
-    ]
+    order = [table.c[column] for column in ("ticks", "event_id", "frame_number", "value_1", "value_2", "packet_id")]
     sorting = (column.desc() if newest_first else column for column in order)
     rows, total = repository.page(connection, query, asked, *sorting, others=["severity"])
     found = [tuple(row.values()) for row in rows]
     return _pass_events(found, span, _telecommands(connection, span.vehicle, found)), total
 
 
-def _telecommands(
-    connection: Connection, vehicle: int, rows: Sequence[tuple[Any, ...]]
-) -> Callable[[int, float], str]:
+def _telecommands(connection: Connection, vehicle: int, rows: Sequence[tuple[Any, ...]]) -> Callable[[int, float], str]:
     """Return a function that writes a telecommand that an event of these rows names, by ticks and first four octets.
 
     Sequence counts return after 16384 telecommands: the last one that was sent before the event counts.
@@ -207,15 +198,11 @@ def _pass_events(
         return format_utc(int(utc_ns_of_ticks(np.array([ticks], dtype=np.int64), span.correlations)[0][0]), 0)
 
     def detail(ticks: int, event_id: int, frame: int, *values: float | None) -> str:
-        text = event_text(
-            labels.get(event_id, ""), *values, time=time, telecommand=partial(telecommand, ticks)
-        )
+        text = event_text(labels.get(event_id, ""), *values, time=time, telecommand=partial(telecommand, ticks))
         return f"frame {frame}: {text}" if text else f"frame {frame}"
 
     labels = DICTIONARY.labels("event_info", "event_id")
-    utc_ns, correlation_ids = utc_ns_of_ticks(
-        np.array([row[0] for row in rows], dtype=np.int64), span.correlations
-    )
+    utc_ns, correlation_ids = utc_ns_of_ticks(np.array([row[0] for row in rows], dtype=np.int64), span.correlations)
     return [
         PassEvent(
             utc_ns=int(utc),
@@ -224,7 +211,5 @@ def _pass_events(
             detail=detail(ticks, event_id, *values),
             correlation_id=int(correlation),
         )
-        for (ticks, severity, event_id, *values), utc, correlation in zip(
-            rows, utc_ns, correlation_ids, strict=True
-        )
+        for (ticks, severity, event_id, *values), utc, correlation in zip(rows, utc_ns, correlation_ids, strict=True)
     ]

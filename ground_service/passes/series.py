@@ -16,14 +16,7 @@ from sqlalchemy import Connection, Engine
 
 from ground_service.ground import Ground
 from ground_service.missions.timekeeping.core import IDEAL_CLOCK, utc_ns_of_ticks
-from ground_service.passes.core import (
-    Aggregates,
-    Buckets,
-    aggregate,
-    downsample,
-    downsample_aggregates,
-    join,
-)
+from ground_service.passes.core import Aggregates, Buckets, aggregate, downsample, downsample_aggregates, join
 from ground_service.passes.span import LAST_TICKS, PassSpan
 from ground_service.passes.store import decoding_state
 from ground_service.store.event_kinds import CorrelationChanged, TelemetryReceived
@@ -37,15 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
-__all__ = [
-    "PARAMETERS",
-    "STATE_VALUES",
-    "SampleSource",
-    "Series",
-    "SeriesReading",
-    "kind_samples",
-    "series_document",
-]
+__all__ = ["PARAMETERS", "STATE_VALUES", "SampleSource", "Series", "SeriesReading", "kind_samples", "series_document"]
 
 FEW_ROWS = 50_000
 """Up to this many samples are read one by one, which is exact to the sample and quick enough."""
@@ -146,18 +131,12 @@ class SeriesReading:
         width = rollups.width_ticks(level)
         start, stop = self.span.start_ticks, self.span.stop_ticks
         first, last = -(-start // width), (stop + 1) // width - 1
-        rows = rollups.rollup_rows(
-            self.connection, *self._key(), level, first, last, self.source.places[name]
-        )
+        rows = rollups.rollup_rows(self.connection, *self._key(), level, first, last, self.source.places[name])
         begin, used = utc_ns_of_ticks(rows[0], self.span.correlations)
         end, _ = utc_ns_of_ticks(rows[1], self.span.correlations)
         count, total, low, high = rows[3].T
         middle = Aggregates(begin, end, rows[2], count.astype(np.int64), total, low, high)
-        pieces = [
-            self._edge(name, start, first * width - 1),
-            middle,
-            self._edge(name, (last + 1) * width, stop),
-        ]
+        pieces = [self._edge(name, start, first * width - 1), middle, self._edge(name, (last + 1) * width, stop)]
         return join(pieces), int(used[-1]) if len(used) else IDEAL_CLOCK
 
     def _edge(self, name: str, start: int, stop: int) -> Aggregates:

@@ -31,21 +31,8 @@ from ground_service.passes.model import (
 from ground_service.passes.packet_accounting import packet_accounting
 from ground_service.passes.parameters import series_source, state_unit
 from ground_service.passes.sample_store import detection_frames, detection_samples
-from ground_service.passes.series import (
-    PARAMETERS,
-    STATE_VALUES,
-    Cache,
-    Series,
-    SeriesReading,
-    kind_samples,
-)
-from ground_service.passes.span import (
-    LAST_TICKS,
-    REACH_NS,
-    PassSpan,
-    pass_span,
-    vehicle_span,
-)
+from ground_service.passes.series import PARAMETERS, STATE_VALUES, Cache, Series, SeriesReading, kind_samples
+from ground_service.passes.span import LAST_TICKS, REACH_NS, PassSpan, pass_span, vehicle_span
 from ground_service.store.files import StoredFile, register_file
 from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
 from ground_service.telemetry import rollups
@@ -147,9 +134,7 @@ def spacecraft_events(ground: Ground, asked: EventFilter) -> PageOf[SpacecraftEv
     with ground.database.reading() as connection:
         vehicle = find_vehicle(connection, asked.spacecraft_id, asked.instance).id
         span = vehicle_span(connection, vehicle, ns_of(asked.start), ns_of(asked.stop))
-        found, total = sample_store.event_page(
-            connection, span, asked, severities=asked.severity, name=asked.name
-        )
+        found, total = sample_store.event_page(connection, span, asked, severities=asked.severity, name=asked.name)
         spans = {
             one.id: pass_span(connection, one)
             for one in store.passes_of_vehicle(connection, vehicle, reported=False)
@@ -159,13 +144,10 @@ def spacecraft_events(ground: Ground, asked: EventFilter) -> PageOf[SpacecraftEv
     def pass_at(utc_ns: int) -> int | None:
         """Return the newest of the passes that a time belongs to."""
         ticks = ticks_of_utc_ns(utc_ns, span.correlations)
-        return max(
-            (key for key, one in spans.items() if one.start_ticks <= ticks <= one.stop_ticks), default=None
-        )
+        return max((key for key, one in spans.items() if one.start_ticks <= ticks <= one.stop_ticks), default=None)
 
     return asked.page(
-        (SpacecraftEvent.of(asdict(one), time=one.utc_ns, pass_id=pass_at(one.utc_ns)) for one in found),
-        total,
+        (SpacecraftEvent.of(asdict(one), time=one.utc_ns, pass_id=pass_at(one.utc_ns)) for one in found), total
     )
 
 
@@ -216,12 +198,7 @@ def craters(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Crater]:
     order = np.lexsort((catalogue.ids, -catalogue.diameter_m))
     chosen = order[asked.offset : asked.offset + asked.limit]
     east = (np.degrees(catalogue.longitude_rad[chosen]) + 180.0) % 360.0 - 180.0
-    columns = (
-        catalogue.ids[chosen],
-        np.degrees(catalogue.latitude_rad[chosen]),
-        east,
-        catalogue.diameter_m[chosen],
-    )
+    columns = (catalogue.ids[chosen], np.degrees(catalogue.latitude_rad[chosen]), east, catalogue.diameter_m[chosen])
     names = ("id", "latitude_deg", "longitude_deg", "diameter_m")
     rows = zip(*(column.tolist() for column in columns), strict=True)
     return asked.page((Crater(**dict(zip(names, row, strict=True))) for row in rows), len(catalogue))
@@ -309,9 +286,7 @@ def vehicle_trends(ground: Ground, vehicle: int) -> list[Trend]:
 
 def _trends(connection: Connection, vehicle: int) -> list[Trend]:
     version = readable_version(connection, vehicle)
-    _, _, last = rollups.rolled_extent(
-        connection, rollups.KINDS["housekeeping"][0], vehicle, version, 0, 0, LAST_TICKS
-    )
+    _, _, last = rollups.rolled_extent(connection, rollups.KINDS["housekeeping"][0], vehicle, version, 0, 0, LAST_TICKS)
     if last == 0:
         return []
     first = max(last - (TREND_DAYS * 86_400 << 16), 0)

@@ -78,9 +78,7 @@ def observations(events: Iterable[tuple[int, int, int]]) -> list[Observation]:
                 found.append(Observation(going.start, ticks - 1, going.planned))
             going = Observation(ticks, None, planned)
         else:
-            found.append(
-                Observation(None, ticks) if going is None else Observation(going.start, ticks, going.planned)
-            )
+            found.append(Observation(None, ticks) if going is None else Observation(going.start, ticks, going.planned))
             going = None
     return found if going is None else [*found, going]
 
@@ -117,14 +115,10 @@ def observation_events(connection: Connection, span: PassSpan) -> list[tuple[int
     """Return on-board time, event and planned end of the reports of start and end of observations in an interval."""
     found = telemetry.samples(connection, "events", span.where, ("ticks", "event_id", "value_1"))
     rows = zip(found["ticks"], found["event_id"], found["value_1"], strict=True)
-    return [
-        (ticks, event, int(planned or 0)) for ticks, event, planned in rows if event in (STARTED, STOPPED)
-    ]
+    return [(ticks, event, int(planned or 0)) for ticks, event, planned in rows if event in (STARTED, STOPPED)]
 
 
-def vehicle_span(
-    connection: Connection, vehicle: int, start_utc_ns: int | None, stop_utc_ns: int | None
-) -> PassSpan:
+def vehicle_span(connection: Connection, vehicle: int, start_utc_ns: int | None, stop_utc_ns: int | None) -> PassSpan:
     """Return an interval of a vehicle's on-board time; None: without an end."""
     correlations = load_correlations(connection, vehicle)
     return PassSpan(

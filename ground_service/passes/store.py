@@ -173,9 +173,7 @@ def frame_files(connection: Connection, pass_id: int) -> dict[int, str]:
     return {int(number): sha256 for number, sha256 in rows}
 
 
-def passes_with_images(
-    connection: Connection, vehicle: int, start_utc_ns: int, stop_utc_ns: int
-) -> list[PassRecord]:
+def passes_with_images(connection: Connection, vehicle: int, start_utc_ns: int, stop_utc_ns: int) -> list[PassRecord]:
     """Return the passes of a vehicle with archived images that overlap an interval, oldest first."""
     query = select(_PASSES).where(
         _PASSES.c.vehicle_id == vehicle,
@@ -201,9 +199,7 @@ def approved_windows(
     return [(key, start, stop) for key, start, stop in connection.execute(query)]
 
 
-def received_frames(
-    connection: Connection, vehicle: int, version: int, start_ticks: int, stop_ticks: int
-) -> int:
+def received_frames(connection: Connection, vehicle: int, version: int, start_ticks: int, stop_ticks: int) -> int:
     """Return the number of images of an interval in the science packet with the most of them."""
     tables = [repository.SAMPLES[kind] for kind in ("detections", "navigation_states", "frame_outcomes")]
     queries = [

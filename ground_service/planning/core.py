@@ -223,9 +223,7 @@ class Planner:
         maximum_ns = round(constraints.maximum_duration_s * NS)
         return [part for span in found for part in _cut(*span, maximum_ns, self.gap_ns)]
 
-    def exclusion(
-        self, constraints: Constraints, start_utc_ns: int, stop_utc_ns: int, *, step_s: float = 30.0
-    ) -> str:
+    def exclusion(self, constraints: Constraints, start_utc_ns: int, stop_utc_ns: int, *, step_s: float = 30.0) -> str:
         """Return the smallest set of constraints that no span of the minimum duration fulfils, and what would help."""
         epochs = np.arange(start_utc_ns, stop_utc_ns + 1, round(step_s * NS), dtype=np.int64)
         excess = self._excess(self.conditions(epochs), constraints, everywhere=True)
@@ -264,9 +262,7 @@ class Planner:
         horizon = min(until_utc_ns, stop_utc_ns + round(CONTACT_HORIZON_S) * NS)
         contacts = predict_contacts(self.ephemeris, self.resources.stations, start_utc_ns, horizon)
         battery = self._battery(since_utc_ns, stop_utc_ns, 30.0)
-        return self._candidate(
-            Constraints(), start_utc_ns, stop_utc_ns, cadence_s, contacts, battery, commitments
-        )
+        return self._candidate(Constraints(), start_utc_ns, stop_utc_ns, cadence_s, contacts, battery, commitments)
 
     def conditions(self, utc_ns: IntArray) -> Conditions:
         """Return the conditions below the spacecraft at epochs (n,)."""
@@ -381,10 +377,7 @@ class Planner:
         )
 
     def _refusal(self, candidate: Candidate, constraints: Constraints) -> str | None:
-        if (
-            constraints.minimum_battery is not None
-            and candidate.battery_minimum < constraints.minimum_battery
-        ):
+        if constraints.minimum_battery is not None and candidate.battery_minimum < constraints.minimum_battery:
             return BATTERY
         if candidate.storage_peak_octets > self.resources.storage_octets:
             return STORAGE
@@ -424,10 +417,7 @@ def data_octets(frames: int, detections_per_frame: float, estimators: int) -> in
 
 
 def storage_peak(
-    commitments: Sequence[Option],
-    contacts: Sequence[PredictedContact],
-    downlink_bit_s: float,
-    mine: Option,
+    commitments: Sequence[Option], contacts: Sequence[PredictedContact], downlink_bit_s: float, mine: Option
 ) -> tuple[int, int | None]:
     """Most octets ever stored on board, and when those of `mine` are down (None: not within the contacts).
 
@@ -523,9 +513,7 @@ def explain_exclusion(excess: Sequence[Excess], needed: int, step_s: float) -> s
             continue
         nearest = float(spans(one.value).max(axis=1)[free].min())
         helps.append(
-            f"{one.name} relaxed by {nearest:.3g} {one.unit}"
-            if math.isfinite(nearest)
-            else f"without {one.name}"
+            f"{one.name} relaxed by {nearest:.3g} {one.unit}" if math.isfinite(nearest) else f"without {one.name}"
         )
     longest = max(map(len, _hold(excess, n).tobytes().split(b"\0")))
     if longest > 1:

@@ -62,8 +62,7 @@ def rehearsed(ground: Ground, octets: bytes) -> DryRun:
     if not mine:
         return DryRun(faults=(NO_EPHEMERIS,))
     asked = [
-        one.terms.model_dump(mode="json", exclude_none=True)
-        | {"name": one.name, "spacecraft_id": spacecraft.id}
+        one.terms.model_dump(mode="json", exclude_none=True) | {"name": one.name, "spacecraft_id": spacecraft.id}
         for one in listed
         if one.spacecraft_id == spacecraft.id and one.state == "active"
     ]
@@ -105,9 +104,7 @@ def _posted(ground: Ground, mission: Path) -> tuple[list[int], int]:
     folder = mission.parent
     for name in (REFERENCE, REQUEST):
         if not (folder / name).is_file():
-            raise InvalidInput(
-                str(folder / name), "", "a file in the folder of the mission description", "none"
-            )
+            raise InvalidInput(str(folder / name), "", "a file in the folder of the mission description", "none")
     if (folder / CATALOGUE).is_file():
         add_catalogue(ground, ground.files.put_file(folder / CATALOGUE), CATALOGUE, actor=OPERATOR)
     add_mission(ground, read_mission_file(mission), source=str(mission), actor=OPERATOR)

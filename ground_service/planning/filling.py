@@ -141,10 +141,7 @@ def curves(grid: ResourceGrid, chosen: Sequence[Option]) -> ResourceCurves:
 
 
 def take_in_order(
-    grid: ResourceGrid,
-    options: Sequence[Option],
-    committed: Sequence[Option],
-    quota: Mapping[int, int] | None = None,
+    grid: ResourceGrid, options: Sequence[Option], committed: Sequence[Option], quota: Mapping[int, int] | None = None
 ) -> tuple[list[Option], dict[Option, str]]:
     """Take each option, in the given order, that the resources permit; return them and the reasons of the others.
 
@@ -183,9 +180,7 @@ def choose(
     options = sorted(options, key=astuple)  # equal values keep an order of their own, not that of the call
     orders = (
         options,
-        sorted(
-            options, key=lambda one: (-one.value / (one.stop_utc_ns - one.start_utc_ns), one.start_utc_ns)
-        ),
+        sorted(options, key=lambda one: (-one.value / (one.stop_utc_ns - one.start_utc_ns), one.start_utc_ns)),
         sorted(options, key=lambda one: (-one.value, one.start_utc_ns)),
     )
     plans = [take_in_order(grid, order, committed, quota)[0] for order in orders]
@@ -212,11 +207,7 @@ def _improved(
             if out not in plan:
                 continue
             rest = [one for one in plan if one is not out]
-            near = [
-                one
-                for one in options
-                if one not in plan and abs(one.start_utc_ns - out.start_utc_ns) <= NEAR_NS
-            ]
+            near = [one for one in options if one not in plan and abs(one.start_utc_ns - out.start_utc_ns) <= NEAR_NS]
             added, _ = take_in_order(grid, near, [*committed, *rest], _left(quota, rest))
             if _value(added) > out.value:
                 plan = [*rest, *added]

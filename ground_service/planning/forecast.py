@@ -57,13 +57,9 @@ def get_forecast(
     with ground.database.reading() as connection:
         service.require_described(connection, spacecraft_id)
         mission = service.mission_of(connection, spacecraft_id)
-        windows = store.windows_between(
-            connection, spacecraft_id, instance, start_utc_ns - HISTORY_NS, stop_utc_ns
-        )
+        windows = store.windows_between(connection, spacecraft_id, instance, start_utc_ns - HISTORY_NS, stop_utc_ns)
         try:
-            reference = service.ephemerides_for(
-                connection, ephemeris_id, start_utc_ns, stop_utc_ns, spacecraft_id
-            )[0]
+            reference = service.ephemerides_for(connection, ephemeris_id, start_utc_ns, stop_utc_ns, spacecraft_id)[0]
         except NotFound:
             if ephemeris_id is not None:
                 raise
@@ -124,9 +120,7 @@ def _forecast(
     middles = first + np.arange(before + count, dtype=np.int64) * step_ns + step_ns // 2
     grid = service.resource_grid(planner, mission, first, before + count, empty.step_s)
     options = {
-        one.id: Option(one.start.utc_ns, one.stop.utc_ns, one.data_octets)
-        for one in windows
-        if one.stop.utc_ns > first
+        one.id: Option(one.start.utc_ns, one.stop.utc_ns, one.data_octets) for one in windows if one.stop.utc_ns > first
     }
     found = curves(grid, list(options.values()))
     at = planner.conditions(middles[before:])
@@ -198,13 +192,7 @@ def crater_density(ground: Ground, spacecraft_id: int) -> CraterDensity:
     """Return the crater density of the catalogue of the mission description in force."""
     mission = ground.read(service.mission_of, spacecraft_id)
     low, high = DENSITY_DIAMETER_KM
-    found = CraterDensity(
-        source=None,
-        reason=None,
-        cell_deg=CELL_DEG,
-        diameter_km=Span(min=low, max=high),
-        rows=[],
-    )
+    found = CraterDensity(source=None, reason=None, cell_deg=CELL_DEG, diameter_km=Span(min=low, max=high), rows=[])
     try:
         catalogue = catalogue_of(ground, mission)
     except InvalidInput as error:

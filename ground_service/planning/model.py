@@ -8,15 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
-from ground_service.http.model import (
-    Entity,
-    InstanceName,
-    Paging,
-    RequestModel,
-    RequestTime,
-    SpacecraftNumber,
-    UtcTime,
-)
+from ground_service.http.model import Entity, InstanceName, Paging, RequestModel, RequestTime, SpacecraftNumber, UtcTime
 from ground_service.planning import core
 from ground_service.planning.core import Constraints
 from ground_service.toml import LINE_PATTERN_JSON
@@ -28,15 +20,7 @@ Time = Annotated[RequestTime, AfterValidator(lambda time: UtcTime(time.utc_ns //
 """Time of a plan, in whole microseconds, so that an exported plan states it exactly."""
 
 WindowState = Literal[
-    "draft",
-    "approved",
-    "uplinked",
-    "cancelling",
-    "executing",
-    "executed",
-    "downlinked",
-    "processed",
-    "failed",
+    "draft", "approved", "uplinked", "cancelling", "executing", "executed", "downlinked", "processed", "failed"
 ]
 Decision = Literal["draft", "approved", "failed"]
 
@@ -215,8 +199,7 @@ class SearchResult(Entity):
     contacts: list[Contact]
     rejected: list[RejectedSpan] = Field(description="Spans that were left out, in order of time")
     reason: str | None = Field(
-        default=None,
-        description="Without a span: the constraints that exclude all, and the nearest relaxation",
+        default=None, description="Without a span: the constraints that exclude all, and the nearest relaxation"
     )
 
 
@@ -419,13 +402,9 @@ class RequestTerms(RequestModel):
     windows: int = Field(ge=1, le=1000, description="Windows in each period", examples=[10])
     period_days: Finite = Field(default=7.0, ge=0.1, le=366.0)
     horizon_days: Finite = Field(default=3.0, ge=0.1, le=31.0, description="Days ahead that are planned")
-    start: Time | None = Field(
-        default=None, description="Begin of the first period; default: when it was added"
-    )
+    start: Time | None = Field(default=None, description="Begin of the first period; default: when it was added")
     stop: Time | None = Field(default=None, description="No windows from this time on")
-    priority: int = Field(
-        default=0, ge=-1000, le=1000, description="Requests with a higher number come first"
-    )
+    priority: int = Field(default=0, ge=-1000, le=1000, description="Requests with a higher number come first")
     regions: list[Region] | None = Field(default=None, min_length=1, max_length=50)
     sun_elevation_deg: Limits | None = Field(
         default=None,
@@ -512,6 +491,5 @@ class RequestPlan(Entity):
     basis: str = Field(description="Hash of what the plan depends on, except time")
     candidates: list[PlannedCandidate]
     replaced: list[dict[str, Any]] = Field(
-        description="Failed windows of the request",
-        examples=[[{"window_id": 7, "reason": "a telecommand failed"}]],
+        description="Failed windows of the request", examples=[[{"window_id": 7, "reason": "a telecommand failed"}]]
     )

@@ -15,12 +15,7 @@ from lunar.ephemeris import Ephemeris
 from lunar.errors import EphemerisCoverageError
 from lunar.frames import IauOrientation, Orientation
 from lunar.timescales import format_utc, tdb_s_from_utc_ns
-from tmtc.dictionary.tables import (
-    InitialState,
-    pack_anchor_table,
-    pack_initial_state,
-    pack_orientation_table,
-)
+from tmtc.dictionary.tables import InitialState, pack_anchor_table, pack_initial_state, pack_orientation_table
 from tmtc.packets.large_data import split
 
 LEAD_NS = 60 * NS
@@ -68,9 +63,7 @@ def prepare_window(
     activities: list[Activity] = [(start_utc_ns - LEAD_NS, "perform_function", _mode(1.0))]
     state = None
     if uploads.tables:
-        needed = (
-            f"window from {format_utc(start_utc_ns, 0)}: its tables need a reference ephemeris that covers it"
-        )
+        needed = f"window from {format_utc(start_utc_ns, 0)}: its tables need a reference ephemeris that covers it"
         if reference is None:
             raise Conflict(f"{needed}, found none")
         try:
@@ -81,11 +74,7 @@ def prepare_window(
         at_utc_ns = start_utc_ns - LEAD_NS + 10 * NS
         for k, (name, octets) in enumerate(tables):
             for command, values in split(
-                octets,
-                transaction=(transaction + k) % 65_536,
-                table=name,
-                part_length=PART_OCTETS,
-                link="uplink",
+                octets, transaction=(transaction + k) % 65_536, table=name, part_length=PART_OCTETS, link="uplink"
             ):
                 items = values["items"]
                 assert isinstance(items, dict)
@@ -116,9 +105,7 @@ def experiment_state(orbit: Ephemeris, error_m: float, utc_ns: int, spacecraft_i
 
 def experiment_accuracy(uploads: Uploads, error_m: float, state: StartState) -> Uploads:
     """Return uploads that declare the accuracy of a start state of the experiment."""
-    return uploads.model_copy(
-        update={"sigma_position_m": error_m, "sigma_velocity_m_s": error_m * _mean_motion(state)}
-    )
+    return uploads.model_copy(update={"sigma_position_m": error_m, "sigma_velocity_m_s": error_m * _mean_motion(state)})
 
 
 def _mean_motion(state: StartState) -> float:
@@ -145,9 +132,7 @@ def _tables(
         tdb_s = np.asarray(tdb_s_from_utc_ns(times), dtype=np.float64)
         mcmf_from_icrf = onboard.mcmf_from_icrf(tdb_s)
         pa_from_mcmf = onboard.pa_from_icrf(float(tdb_s[0])) @ mcmf_from_icrf[0].T
-        made.append(
-            ("orientation", pack_orientation_table(_ticks(times, ticks_of), mcmf_from_icrf, pa_from_mcmf))
-        )
+        made.append(("orientation", pack_orientation_table(_ticks(times, ticks_of), mcmf_from_icrf, pa_from_mcmf)))
     if "anchor_ephemeris" in uploads.tables:
         first, last = start_utc_ns - MARGIN_NS, stop_utc_ns + MARGIN_NS
         times = np.arange(first, last, ANCHOR_STEP_NS, dtype=np.int64)

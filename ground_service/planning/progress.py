@@ -111,8 +111,7 @@ def _evidence(connection: Connection, window: WindowRecord) -> WindowEvidence:
     return WindowEvidence(
         decision=window.decision,
         replaced=store.is_replaced(connection, window),
-        predecessor_failed=predecessor is not None
-        and store.get_window(connection, predecessor).state == "failed",
+        predecessor_failed=predecessor is not None and store.get_window(connection, predecessor).state == "failed",
         command_states=tuple(view.state for view in commands),
         deletion_states=tuple(view.state for view in commands if view.record.name == DELETE),
         failure=next(failed, ""),

@@ -8,14 +8,7 @@ from ground_service.access.idempotency import added_once
 from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.contacts.commanding import service as commanding
 from ground_service.contacts.commanding.model import Telecommand
-from ground_service.http.common import (
-    API_PREFIX,
-    IF_MATCH_HEADER,
-    GroundOf,
-    Instance,
-    OnceKey,
-    PassId,
-)
+from ground_service.http.common import API_PREFIX, IF_MATCH_HEADER, GroundOf, Instance, OnceKey, PassId
 from ground_service.http.model import PageOf, RequestTime
 from ground_service.http.problems import PreconditionFailed
 from ground_service.http.requests import operations, problems
@@ -73,11 +66,7 @@ add_list(planning, "/windows", store.list_windows)
 
 @planning.post("/windows", status_code=201, responses=problems(404))
 def add_window(
-    response: Response,
-    ground: GroundOf,
-    caller: Operator,
-    window: WindowIn,
-    idempotency_key: OnceKey = None,
+    response: Response, ground: GroundOf, caller: Operator, window: WindowIn, idempotency_key: OnceKey = None
 ) -> Window:
     """Add a window as a draft; 409 lists the conflicts with committed windows and resources."""
 
@@ -118,13 +107,9 @@ def change_window(
 
 
 @planning.delete("/windows/{window_id}", status_code=204, responses=problems(409))
-def delete_window(
-    ground: GroundOf, caller: Operator, window_id: PassId, if_match: IfMatch = None
-) -> Response:
+def delete_window(ground: GroundOf, caller: Operator, window_id: PassId, if_match: IfMatch = None) -> Response:
     """Delete a window from the plan."""
-    service.delete_window(
-        ground, window_id, actor=caller.name, expected=lambda found: _expect(found, if_match)
-    )
+    service.delete_window(ground, window_id, actor=caller.name, expected=lambda found: _expect(found, if_match))
     return Response(status_code=204)
 
 
@@ -147,9 +132,7 @@ def get_forecast(
     _: Viewer,
     spacecraft_id: Annotated[int, Query(ge=0, le=1023, examples=[76])],
     start: Annotated[RequestTime, Query(examples=["2029-08-07T00:00:00Z"])],
-    stop: Annotated[
-        RequestTime, Query(examples=["2029-08-08T00:00:00Z"], description="At most 8 days later")
-    ],
+    stop: Annotated[RequestTime, Query(examples=["2029-08-08T00:00:00Z"], description="At most 8 days later")],
     instance: Instance = "flight",
     ephemeris_id: Annotated[int | None, Query(ge=1, le=2**31 - 1)] = None,
 ) -> PlanForecast:
@@ -194,11 +177,7 @@ add_list(requests, "/requests", store.list_requests)
 
 @requests.post("/requests", status_code=201)
 def add_request(
-    response: Response,
-    ground: GroundOf,
-    caller: Operator,
-    request: StandingRequestIn,
-    idempotency_key: OnceKey = None,
+    response: Response, ground: GroundOf, caller: Operator, request: StandingRequestIn, idempotency_key: OnceKey = None
 ) -> StandingRequest:
     """Add a standing request; the planner fills the coming days from then on."""
 

@@ -86,15 +86,7 @@ DAYLIGHT_RAD = (0.0, math.pi / 2.0)
 _DECIDABLE = {
     "draft": ("approved", "uplinked", "failed"),
     "approved": ("draft",),
-    "failed": (
-        "draft",
-        "approved",
-        "uplinked",
-        "executing",
-        "executed",
-        "downlinked",
-        "processed",
-    ),
+    "failed": ("draft", "approved", "uplinked", "executing", "executed", "downlinked", "processed"),
 }
 """States in which a window can be decided, by decision."""
 
@@ -138,12 +130,7 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     planner = planner_of(ground, reference, mission, catalogue, mare)
     found = [
         replace(planner, ephemeris=_part(planner.ephemeris, first, last)).search(
-            constraints,
-            max(first, start),
-            last,
-            given.cadence_s,
-            step_s=given.step_s,
-            commitments=commitments,
+            constraints, max(first, start), last, given.cadence_s, step_s=given.step_s, commitments=commitments
         )
         for first, last in spans
         if last > start
@@ -199,9 +186,7 @@ def insert_window(ground: Ground, connection: Connection, entry: WindowEntry, *,
     lock_spacecraft(connection, vehicle)
     assessed = _assessed(ground, connection, vehicle, 0, entry, "draft")
     mission_id = missions.in_force(connection, vehicle)
-    key = store.add_window(
-        connection, vehicle, assessed, mission_id=mission_id, actor=actor, now_utc_ns=utc_now_ns()
-    )
+    key = store.add_window(connection, vehicle, assessed, mission_id=mission_id, actor=actor, now_utc_ns=utc_now_ns())
     _note(connection, actor, "enter", key, "draft", {"name": entry.name})
     return store.get_window(connection, key)
 
@@ -251,9 +236,7 @@ def change_window(
         wanted = decision or window.decision
         values: dict[str, Any] = {}
         if changes or decision == "approved":
-            values = store.columns_of(
-                _assessed(ground, connection, window.vehicle_id, window_id, entry, wanted)
-            )
+            values = store.columns_of(_assessed(ground, connection, window.vehicle_id, window_id, entry, wanted))
         if decision in ("draft", "failed"):
             commands.withdraw_window(connection, window_id, actor=actor, now_utc_ns=utc_now_ns())
         if (
@@ -315,11 +298,7 @@ def _delete_on_board(connection: Connection, window: WindowRecord, actor: str) -
 
 
 def delete_window(
-    ground: Ground,
-    window_id: int,
-    *,
-    actor: str,
-    expected: Callable[[Window], None] | None = None,
+    ground: Ground, window_id: int, *, actor: str, expected: Callable[[Window], None] | None = None
 ) -> None:
     """Delete a window from the plan, unless its telecommands were sent.
 
@@ -380,13 +359,7 @@ def uplink_window(ground: Ground, window_id: int, *, actor: str) -> list[int]:
             store.note_uploads(connection, window_id, uploads)
         ids = [
             commanding.add_released(
-                connection,
-                window.vehicle_id,
-                ENABLE,
-                {},
-                actor=actor,
-                window_id=window_id,
-                approval=approval,
+                connection, window.vehicle_id, ENABLE, {}, actor=actor, window_id=window_id, approval=approval
             )
         ]
         for utc_ns, command, arguments in activities:
@@ -462,9 +435,7 @@ def _preparation(
     if mission is None or mission.uploads is None:
         return [], None
     start, stop = window.start.utc_ns, window.stop.utc_ns
-    found = service.covering_ephemerides(
-        connection, start - MARGIN_NS, stop + MARGIN_NS, window.spacecraft_id
-    )
+    found = service.covering_ephemerides(connection, start - MARGIN_NS, stop + MARGIN_NS, window.spacecraft_id)
     whole = [
         one
         for one in found
@@ -522,9 +493,7 @@ def _assessed(
     mission = mission_of(connection, entry.spacecraft_id)
     conflicts = _span_conflicts(connection, vehicle, window_id, entry, mission)
     if entry.start_utc_ns <= (now := mission_now_ns()):
-        expected = (
-            f"expected a start after the mission time {UtcTime(now)}, found {UtcTime(entry.start_utc_ns)}"
-        )
+        expected = f"expected a start after the mission time {UtcTime(now)}, found {UtcTime(entry.start_utc_ns)}"
         conflicts.append(PlanConflict("past", None, expected))
     commitments = store.commitments(connection, entry.spacecraft_id, entry.instance, without=window_id)
     prediction = _prediction(ground, connection, entry, mission, commitments)
@@ -560,9 +529,7 @@ def _assessed(
     if peak > resources.storage_octets:
         conflicts.append(
             PlanConflict(
-                "storage",
-                None,
-                f"{peak} octets would be stored on board, expected at most {resources.storage_octets}",
+                "storage", None, f"{peak} octets would be stored on board, expected at most {resources.storage_octets}"
             )
         )
     if conflicts:
@@ -574,11 +541,7 @@ def _assessed(
 
 
 def planner_of(
-    ground: Ground,
-    reference: Ephemeris,
-    mission: Mission,
-    catalogue: CraterCatalogue | None = None,
-    mare: Any = None,
+    ground: Ground, reference: Ephemeris, mission: Mission, catalogue: CraterCatalogue | None = None, mare: Any = None
 ) -> Planner:
     """Return a planner with camera and orientation of the mission; defaults replace what it does not state."""
     orientation = declared_frames(mission.frames, ground.data).orientation or ground.orientation
@@ -618,14 +581,10 @@ def mission_of(connection: Connection, spacecraft_id: int | None) -> Mission:
 def resources_of(mission: Mission) -> Resources:
     """Return the resources that a mission description states, with defaults for the others."""
     stated, default = mission.resources, asdict(Resources())
-    rates = [
-        one.downlink_bps for one in (mission.link.stations or {}).values() if one.downlink_bps is not None
-    ]
+    rates = [one.downlink_bps for one in (mission.link.stations or {}).values() if one.downlink_bps is not None]
     given: dict[str, Any] = {
         "storage_octets": None if stated.storage_mib is None else round(stated.storage_mib * (1 << 20)),
-        "downlink_bit_s": min(rates, default=None)
-        if stated.downlink_kbit_s is None
-        else stated.downlink_kbit_s * 1e3,
+        "downlink_bit_s": min(rates, default=None) if stated.downlink_kbit_s is None else stated.downlink_kbit_s * 1e3,
         "stations": stations_of(mission.link) or Resources().stations,
     }
     given = stated.model_dump(include=set(default)) | given
@@ -668,19 +627,13 @@ def resource_grid(planner: Planner, mission: Mission, start: int, count: int, st
 
 
 def _prediction(
-    ground: Ground,
-    connection: Connection,
-    entry: WindowEntry,
-    mission: Mission,
-    commitments: Sequence[Option],
+    ground: Ground, connection: Connection, entry: WindowEntry, mission: Mission, commitments: Sequence[Option]
 ) -> Candidate | None:
     """Predict the window if a reference ephemeris covers it."""
     candidates = (
         [service.get_ephemeris(connection, entry.ephemeris_id)]
         if entry.ephemeris_id is not None
-        else service.covering_ephemerides(
-            connection, entry.start_utc_ns, entry.stop_utc_ns, entry.spacecraft_id
-        )
+        else service.covering_ephemerides(connection, entry.start_utc_ns, entry.stop_utc_ns, entry.spacecraft_id)
     )
     for one in candidates:
         start, stop = one.start.utc_ns, one.stop.utc_ns
@@ -732,11 +685,7 @@ def _span_conflicts(
 
 
 def ephemerides_for(
-    connection: Connection,
-    ephemeris_id: int | None,
-    start: int | None,
-    stop: int | None,
-    spacecraft_id: int | None,
+    connection: Connection, ephemeris_id: int | None, start: int | None, stop: int | None, spacecraft_id: int | None
 ) -> list[Ephemeris]:
     """Return the ephemerides that cover a span, the best first: all of it, then by precedence and coverage."""
     if ephemeris_id is not None:
@@ -753,9 +702,7 @@ def ephemerides_for(
         return min(one.stop.utc_ns, last) - max(one.start.utc_ns, first)
 
     whole = last - first if start is not None and stop is not None else 2**63
-    return sorted(
-        found, key=lambda one: (covered(one) >= whole, one.precedence, covered(one), one.id), reverse=True
-    )
+    return sorted(found, key=lambda one: (covered(one) >= whole, one.precedence, covered(one), one.id), reverse=True)
 
 
 def _part(ephemeris: States, start: int, stop: int) -> States:
@@ -798,10 +745,7 @@ def _check_span(start: int, stop: int, step_s: float, reference: Ephemeris) -> N
         )
     if start < reference.start.utc_ns or stop > reference.stop.utc_ns:
         raise InvalidInput(
-            "search",
-            "start, stop",
-            f"a span that ephemeris {reference.id} ({reference.name}) covers",
-            "another",
+            "search", "start, stop", f"a span that ephemeris {reference.id} ({reference.name}) covers", "another"
         )
 
 
@@ -845,8 +789,6 @@ def _locked_window(connection: Connection, window_id: int) -> WindowRecord:
     return store.get_record(connection, window_id)
 
 
-def _note(
-    connection: Connection, actor: str, action: str, window_id: int, state: str, detail: dict[str, Any]
-) -> None:
+def _note(connection: Connection, actor: str, action: str, window_id: int, state: str, detail: dict[str, Any]) -> None:
     audit(connection, actor, f"{action} window", str(window_id), detail)
     publish(connection, WindowChanged(id=window_id, state=state))

@@ -90,9 +90,7 @@ def add_request(ground: Ground, given: StandingRequestIn, *, actor: str) -> Stan
         return store.get_request(connection, key)
 
 
-def change_request(
-    ground: Ground, request_id: int, change: StandingRequestChange, *, actor: str
-) -> StandingRequest:
+def change_request(ground: Ground, request_id: int, change: StandingRequestChange, *, actor: str) -> StandingRequest:
     """Pause or resume a standing request, or replace its terms; planned windows stay.
 
     Raises
@@ -184,9 +182,7 @@ def planned_with(ground: Ground, ephemeris_id: int) -> list[int]:
             return vehicles
         numbers = {one: get_vehicle(connection, one).ccsds_id for one in vehicles}
         return [
-            one
-            for one, number in numbers.items()
-            if planning.mission_of(connection, number).spacecraft.is_object(name)
+            one for one, number in numbers.items() if planning.mission_of(connection, number).spacecraft.is_object(name)
         ]
 
 
@@ -199,8 +195,7 @@ def _advance(ground: Ground, now: int, vehicle_id: int | None) -> tuple[int, int
             if one.request_id is not None and one.start.utc_ns > now
         ]
         automatic = {
-            one.spacecraft_id: planning.mission_of(connection, one.spacecraft_id).approval.windows
-            == "automatic"
+            one.spacecraft_id: planning.mission_of(connection, one.spacecraft_id).approval.windows == "automatic"
             for one in soon
         }
     approved = released = 0
@@ -295,9 +290,7 @@ def _quota(situation: _Situation, start: int, end: int) -> dict[int, int]:
     request = situation.request
     if end <= start:
         return {}
-    quota = dict.fromkeys(
-        range(_period(request, start), _period(request, end - 1) + 1), request.terms.windows
-    )
+    quota = dict.fromkeys(range(_period(request, start), _period(request, end - 1) + 1), request.terms.windows)
     for one in situation.mine:
         period = _period(request, one.start.utc_ns)
         if one.state != "failed" and period in quota:
@@ -477,10 +470,7 @@ def _stored(
         store.set_plan(connection, plan)
         if ids:
             lost = tuple(one.id for one in failed)
-            publish(
-                connection,
-                PlanChanged(request_id=request.id, windows_added=tuple(ids), windows_failed=lost),
-            )
+            publish(connection, PlanChanged(request_id=request.id, windows_added=tuple(ids), windows_failed=lost))
     return len(ids)
 
 

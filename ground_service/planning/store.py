@@ -166,9 +166,7 @@ def neighbours(connection: Connection, vehicle: int, entry: WindowEntry, gap_ns:
     return [PlannedSpan(*row) for row in connection.execute(query)]
 
 
-def commitments(
-    connection: Connection, spacecraft_id: int | None, instance: str, *, without: int = 0
-) -> list[Option]:
+def commitments(connection: Connection, spacecraft_id: int | None, instance: str, *, without: int = 0) -> list[Option]:
     """Return the windows of a spacecraft, except one, whose data are or will be on board."""
     query = (
         select(WINDOWS.c.start_utc_ns, WINDOWS.c.stop_utc_ns, WINDOWS.c.data_octets)
@@ -247,9 +245,7 @@ def _one(connection: Connection, window_id: int, kind: type[AnyWindow]) -> AnyWi
     return found[0]
 
 
-def _windows(
-    connection: Connection, rows: Sequence[Mapping[Any, Any]], kind: type[AnyWindow]
-) -> list[AnyWindow]:
+def _windows(connection: Connection, rows: Sequence[Mapping[Any, Any]], kind: type[AnyWindow]) -> list[AnyWindow]:
     telecommands = ids_of_windows(connection, [row["id"] for row in rows])
     return [kind.of(row, telecommands=telecommands[row["id"]]) for row in rows]
 
@@ -324,8 +320,7 @@ def active_requests(connection: Connection, vehicle_id: int | None = None) -> li
     if vehicle_id is not None:
         query = query.where(_REQUESTS.c.vehicle_id == vehicle_id)
     return [
-        int(key)
-        for key in connection.execute(query.order_by(_REQUESTS.c.priority.desc(), _REQUESTS.c.id)).scalars()
+        int(key) for key in connection.execute(query.order_by(_REQUESTS.c.priority.desc(), _REQUESTS.c.id)).scalars()
     ]
 
 
@@ -350,9 +345,7 @@ def claim_plan(connection: Connection, found: RequestRecord) -> bool:
     """Count a plan of a request unless another process has planned it, or it was changed, since it was read."""
     statement = (
         update(_REQUESTS)
-        .where(
-            _REQUESTS.c.id == found.id, _REQUESTS.c.plans == found.plans, _REQUESTS.c.version == found.version
-        )
+        .where(_REQUESTS.c.id == found.id, _REQUESTS.c.plans == found.plans, _REQUESTS.c.version == found.version)
         .values(plans=found.plans + 1)
     )
     return connection.execute(statement).rowcount == 1
@@ -398,9 +391,7 @@ def planned_vehicles(connection: Connection) -> list[int]:
     return sorted({*connection.execute(active).scalars(), *windows})
 
 
-def unfinished_windows(
-    connection: Connection, until_utc_ns: int, vehicle_id: int | None = None
-) -> list[WindowRecord]:
+def unfinished_windows(connection: Connection, until_utc_ns: int, vehicle_id: int | None = None) -> list[WindowRecord]:
     """Return the drafts, and the approved windows without an uplink, that begin before a time.
 
     Those of a vehicle; None: of all.
@@ -415,11 +406,7 @@ def unfinished_windows(
 
 def _request(connection: Connection, row: repository.Row) -> StandingRequest:
     vehicle = get_vehicle(connection, row["vehicle_id"])
-    counts = (
-        select(_WINDOWS.c.state, func.count())
-        .where(_WINDOWS.c.request_id == row["id"])
-        .group_by(_WINDOWS.c.state)
-    )
+    counts = select(_WINDOWS.c.state, func.count()).where(_WINDOWS.c.request_id == row["id"]).group_by(_WINDOWS.c.state)
     windows = {str(state): int(number) for state, number in connection.execute(counts)}
     planned = row["planned_utc_ns"]
     return StandingRequest.of(

@@ -98,10 +98,7 @@ def _cancelled(evidence: WindowEvidence) -> tuple[str, str | None]:
     if evidence.received_after and evidence.ended and not evidence.awaited:
         return "failed", "it was cancelled, telemetry from after its end shows no observation"
     refused = evidence.deletion_states.count("failed")
-    return (
-        "cancelling",
-        f"{refused} of its activities could not be deleted: {evidence.failure}" if refused else None,
-    )
+    return ("cancelling", f"{refused} of its activities could not be deleted: {evidence.failure}" if refused else None)
 
 
 def _flown(evidence: WindowEvidence) -> tuple[str, str | None] | None:
@@ -121,9 +118,7 @@ def _awaiting(evidence: WindowEvidence) -> tuple[str, str | None]:
         return "failed", f"a telecommand of it failed: {evidence.failure or 'no reason is known'}"
     if evidence.predecessor_failed:
         return "failed", "its predecessor failed"
-    sent = bool(evidence.command_states) and not {"queued", "released", "carried"} & set(
-        evidence.command_states
-    )
+    sent = bool(evidence.command_states) and not {"queued", "released", "carried"} & set(evidence.command_states)
     if sent and evidence.received_after and evidence.ended and not evidence.awaited:
         return "failed", "telemetry from after its end shows no observation"
     return ("uplinked" if sent else "approved"), None
@@ -161,9 +156,7 @@ def span_conflicts(
         if predecessor.stop_utc_ns > window.start_utc_ns or predecessor.id == window.id:
             found.append(
                 PlanConflict(
-                    "predecessor",
-                    predecessor.id,
-                    f"window {predecessor.id} does not end before this one starts",
+                    "predecessor", predecessor.id, f"window {predecessor.id} does not end before this one starts"
                 )
             )
         if predecessor.state == "failed":

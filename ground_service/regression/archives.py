@@ -27,20 +27,8 @@ from ground_service.ground import Ground
 from ground_service.http.model import UtcTime
 from ground_service.passes.archive_import import checked_files, read_manifest, unpacked
 from ground_service.regression import store
-from ground_service.regression.model import (
-    COMPLETE,
-    TELEMETRY_ONLY,
-    TO_RENDER,
-    ArchiveRecord,
-    KeptArchive,
-)
-from ground_service.store.files import (
-    FileArchive,
-    StoredFile,
-    remove_leftovers,
-    replace_durably,
-    unfinished_prefix,
-)
+from ground_service.regression.model import COMPLETE, TELEMETRY_ONLY, TO_RENDER, ArchiveRecord, KeptArchive
+from ground_service.store.files import FileArchive, StoredFile, remove_leftovers, replace_durably, unfinished_prefix
 from ground_service.store.vehicles import hold
 from ground_service.toml import read_json, read_table
 
@@ -135,23 +123,13 @@ def check_archive(folder: Path) -> PassArchive:
     """
     manifest, digest = read_manifest(folder)
     names = set(checked_files(folder, manifest))
-    for name in (
-        INPUTS,
-        "payload/parameters.toml",
-        "payload/dictionary.json",
-        "reference.oem",
-        "catalogue.csv",
-    ):
+    for name in (INPUTS, "payload/parameters.toml", "payload/dictionary.json", "reference.oem", "catalogue.csv"):
         if name not in names:
-            raise InvalidInput(
-                str(folder), name, "a file of an archive that can be flown again", "nothing there"
-            )
+            raise InvalidInput(str(folder), name, "a file of an archive that can be flown again", "nothing there")
     rows = frame_inputs(folder)
     lacking = _lacking(rows, names)
     if DETECTIONS in names and not lacking:
-        raise InvalidInput(
-            str(folder), DETECTIONS, "received detections only where frames are missing", "all frames"
-        )
+        raise InvalidInput(str(folder), DETECTIONS, "received detections only where frames are missing", "all frames")
     _check_images(folder, manifest, [row for row in rows if row["image"] in names])
     state, reason = COMPLETE, ""
     if lacking:
@@ -259,9 +237,7 @@ def keep_archive(ground: Ground, path: Path, *, pinned: bool = False) -> PassArc
     return archive
 
 
-def store_archive(
-    ground: Ground, archive: PassArchive, *, pinned: bool = False, pass_id: int | None = None
-) -> None:
+def store_archive(ground: Ground, archive: PassArchive, *, pinned: bool = False, pass_id: int | None = None) -> None:
     """Keep a checked archive; with `pass_id` it replaces the archives that were made of this pass before."""
     files = store_of(ground)
     stored = _stored(files, archive)
@@ -338,9 +314,7 @@ def check_out(ground: Ground, digest: str, folder: Path, *, images: bool = True)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / MANIFEST).write_bytes(files.get(record.manifest_sha256))
         names = {
-            name: entry
-            for name, entry in archive.manifest["files"].items()
-            if images or not name.startswith("frames/")
+            name: entry for name, entry in archive.manifest["files"].items() if images or not name.startswith("frames/")
         }
         for name, entry in names.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)

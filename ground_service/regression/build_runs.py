@@ -11,12 +11,7 @@ from ground_service.errors import InvalidInput
 from ground_service.regression.archives import write_flight_view
 from ground_service.regression.builds import Build
 from ground_service.regression.model import OK
-from ground_service.regression.runner import (
-    DOWNLINKS,
-    PERFORMANCE,
-    RunRequest,
-    run_confined,
-)
+from ground_service.regression.runner import DOWNLINKS, PERFORMANCE, RunRequest, run_confined
 from ground_service.regression.sandbox import SandboxRefused, tail
 from ground_service.toml import read_json
 
@@ -71,9 +66,7 @@ class BuildRun:
 
     def summary(self) -> dict[str, Any]:
         """The run as figures for a script, and as a line for a person."""
-        figures = {
-            key: value for key, value in asdict(self).items() if key not in ("downlink", "performance")
-        }
+        figures = {key: value for key, value in asdict(self).items() if key not in ("downlink", "performance")}
         message = f"{self.build} {OUTCOMES[self.outcome]}" + (f": {self.detail}" if self.detail else "")
         return {
             **figures,
@@ -170,9 +163,7 @@ def read_performance(path: Path) -> dict[str, Any] | None:
     """Return the costs that a build reports of itself; None if they are not finite times of the contract's form."""
     try:
         with path.open("rb") as stream:
-            given = read_json(
-                stream.read(PERFORMANCE_LIMIT_OCTETS + 1), PERFORMANCE, PERFORMANCE_LIMIT_OCTETS
-            )
+            given = read_json(stream.read(PERFORMANCE_LIMIT_OCTETS + 1), PERFORMANCE, PERFORMANCE_LIMIT_OCTETS)
         stages = {str(name): [float(value) for value in values] for name, values in given["stages"].items()}
         times = [one for values in stages.values() for one in values]
         return {"stages": stages} if all(0.0 <= one < math.inf for one in times) else None

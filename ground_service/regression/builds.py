@@ -177,10 +177,7 @@ class Build:
         folder.mkdir(parents=True)
         if not self.folder_needed:
             return
-        for name, source in (
-            (BUILD_FILE, self.file),
-            *((name, self.folder / name) for name, _ in self.files),
-        ):
+        for name, source in ((BUILD_FILE, self.file), *((name, self.folder / name) for name, _ in self.files)):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(source, folder / name)
 
@@ -414,10 +411,7 @@ def registered_build(ground: Ground, digest: str) -> Build:
     build = load_build(folder)
     if build.digest != whole:
         raise InvalidInput(
-            f"build {whole[:12]}",
-            "",
-            "the files and flight code it was registered with",
-            f"{build.digest[:12]}",
+            f"build {whole[:12]}", "", "the files and flight code it was registered with", f"{build.digest[:12]}"
         )
     return build
 

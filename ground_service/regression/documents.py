@@ -19,25 +19,11 @@ from ground_service.ground import Ground
 from ground_service.missions.model import weakest_evidence
 from ground_service.regression import store
 from ground_service.regression.archives import store_of
-from ground_service.regression.gates.core import (
-    EXACT_METRICS,
-    FAIL,
-    IDENTICAL,
-    INCONCLUSIVE,
-    INFORMS,
-    NOT_JUDGED,
-    PASS,
-)
+from ground_service.regression.gates.core import EXACT_METRICS, FAIL, IDENTICAL, INCONCLUSIVE, INFORMS, NOT_JUDGED, PASS
 from ground_service.regression.gates.metrics import LATENCY, RUN, START, first_difference, metrics_of
 from ground_service.regression.gates.samples import cell_places_deg
 from ground_service.regression.model import UNUSABLE_STATES, Verdict
-from ground_service.regression.outcome import (
-    JUDGED,
-    JUDGED_STATES,
-    PassVerdict,
-    RegressionOutcome,
-    pass_figures,
-)
+from ground_service.regression.outcome import JUDGED, JUDGED_STATES, PassVerdict, RegressionOutcome, pass_figures
 from ground_service.regression.replay_samples import PassContext, ReadDownlink
 from lunar.timescales import format_utc
 from reports.values import (
@@ -397,9 +383,7 @@ def changed_craters(judged: Sequence[PassVerdict]) -> ChangedCraters:
     return ChangedCraters(latitude, longitude, changes, false_latitude, false_longitude)
 
 
-def _side(
-    context: PassContext, read: ReadDownlink, frame: int, crater: int, image: Any, label: str
-) -> GalleryFrame:
+def _side(context: PassContext, read: ReadDownlink, frame: int, crater: int, image: Any, label: str) -> GalleryFrame:
     """Return what a build found in a frame, cut out around a crater."""
     all_frames, utc = read.detections, context.frame_utc_ns[frame : frame + 1]
     chosen = np.flatnonzero(all_frames.frame_number == frame)
@@ -454,20 +438,12 @@ def _build(build: Any) -> dict[str, Any]:
 def _gate(gate: Gate) -> dict[str, Any]:
     row = asdict(gate)
     bounds = [row.pop("change_low"), row.pop("change_high")]
-    texts = {
-        "pass": row.pop("pass_id") or None,
-        "reason": gate.reason or None,
-    }
+    texts = {"pass": row.pop("pass_id") or None, "reason": gate.reason or None}
     return {**row, **texts, "passed": gate.passed, "change_bounds": bounds}
 
 
 def _pass(one: PassVerdict) -> dict[str, Any]:
-    found: dict[str, Any] = {
-        "name": one.name,
-        "archive": one.digest,
-        "state": one.state,
-        "detail": one.detail,
-    }
+    found: dict[str, Any] = {"name": one.name, "archive": one.digest, "state": one.state, "detail": one.detail}
     costs = {"outcome", "detail", "cpu_s", "wall_s", "peak_rss_mib", "printed"}
     for label, replay, read in (
         ("baseline", one.baseline, one.baseline_read),
@@ -493,10 +469,7 @@ def _regression_pass(one: PassVerdict) -> RegressionPass:
 def _headline(outcome: RegressionOutcome) -> tuple[HeadlineFigure, ...]:
     return tuple(
         HeadlineFigure(
-            NAMES[gate.name].capitalize(),
-            gate.candidate,
-            gate.unit,
-            f"baseline {gate.baseline:.3g} {gate.unit}",
+            NAMES[gate.name].capitalize(), gate.candidate, gate.unit, f"baseline {gate.baseline:.3g} {gate.unit}"
         )
         for gate in outcome.gates
         if gate.name in NAMES and not gate.pass_id

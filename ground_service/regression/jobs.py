@@ -55,9 +55,7 @@ def run_placebo(
             frames = (one.baseline_read.frames, one.candidate_read.frames)
             noise += pass_noise(*frames, policy.policy, condition_of(one.context))
     remark = f"placebo: the baseline against itself with other noise in the images, seed {seed}"
-    return replace(
-        outcome, baseline=build, candidate=build, noise=tuple(noise), remarks=(*outcome.remarks, remark)
-    )
+    return replace(outcome, baseline=build, candidate=build, noise=tuple(noise), remarks=(*outcome.remarks, remark))
 
 
 log = logging.getLogger(__name__)
@@ -156,9 +154,7 @@ def analysis_job(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> d
     return baseline_figures(_outcome(ground, arguments, job_id, load_policy()))
 
 
-def _outcome(
-    ground: Ground, arguments: Mapping[str, Any], job_id: str, policy: PolicyFile
-) -> RegressionOutcome:
+def _outcome(ground: Ground, arguments: Mapping[str, Any], job_id: str, policy: PolicyFile) -> RegressionOutcome:
     def progress(items: Any, total: int) -> Iterator[Any]:
         for number, item in enumerate(items, start=1):
             yield item
@@ -167,9 +163,7 @@ def _outcome(
             ground.write(set_progress, job_id, share)
 
     archives = list(arguments["archives"])
-    candidate, baseline = (
-        registered_build(ground, str(arguments[side])) for side in ("candidate", "baseline")
-    )
+    candidate, baseline = (registered_build(ground, str(arguments[side])) for side in ("candidate", "baseline"))
     options: dict[str, Any] = {"workers": arguments.get("workers"), "progress": progress}
     if seed := arguments.get("placebo"):
         return run_placebo(ground, archives, baseline, policy, int(seed), **options)

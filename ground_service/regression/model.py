@@ -104,9 +104,7 @@ class Pruned(Entity):
 class Comparison(RequestModel):
     """Builds to compare, and the archives to replay."""
 
-    candidate: str = Field(
-        pattern=r"^(current|[0-9a-f]{8,64})$", description="Identity of a build, or current"
-    )
+    candidate: str = Field(pattern=r"^(current|[0-9a-f]{8,64})$", description="Identity of a build, or current")
     baseline: str = Field(default="current", pattern=r"^(current|[0-9a-f]{8,64})$")
     archives: list[Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]] = Field(
         default_factory=list,
@@ -117,10 +115,7 @@ class Comparison(RequestModel):
         default_factory=list, max_length=1000, description="Passes whose archives are replayed"
     )
     workers: int | None = Field(
-        default=None,
-        ge=1,
-        le=256,
-        description="Simultaneous replays in one job; default: a job for each replay",
+        default=None, ge=1, le=256, description="Simultaneous replays in one job; default: a job for each replay"
     )
 
 
@@ -148,9 +143,7 @@ class Noise(Entity):
 
     metric: str
     condition: str = Field(default="", description="Terrain and altitude of the pass")
-    loss: float | None = Field(
-        default=None, description="On the scale of the test: a difference or a log ratio"
-    )
+    loss: float | None = Field(default=None, description="On the scale of the test: a difference or a log ratio")
     square: float | None = Field(default=None, description="Square of the loss over its standard error")
     p_value: float
     level: float
@@ -165,9 +158,7 @@ class Calibration(Entity):
     rejected: int
     level: float = Field(description="Share that may be rejected")
     spread: float | None = Field(description="Root mean square of the losses")
-    mean_square: float | None = Field(
-        description="Of the losses over their standard errors; 1 if these are right"
-    )
+    mean_square: float | None = Field(description="Of the losses over their standard errors; 1 if these are right")
     calibrated: bool
 
     @property
@@ -212,8 +203,7 @@ class JudgedGate(Entity):
     name: str = Field(examples=["detector.recall"])
     pass_id: str | None = Field(alias="pass", description="null: the whole suite")
     outcome: str = Field(
-        description="pass, fail, inconclusive, not judged, or informs: a metric that never decides",
-        examples=["pass"],
+        description="pass, fail, inconclusive, not judged, or informs: a metric that never decides", examples=["pass"]
     )
     passed: bool
     baseline: float | None
@@ -338,11 +328,7 @@ class Regression(Entity):
         gates.sort(key=lambda one: one.outcome != "fail")
         return [
             *(one.text for one in gates),
-            *(
-                f"{one.name}: {one.detail or one.state}"
-                for one in self.result.passes
-                if one.state != "judged"
-            ),
+            *(f"{one.name}: {one.detail or one.state}" for one in self.result.passes if one.state != "judged"),
         ][:REASONS_LIMIT]
 
     def summary(self) -> RegressionSummary:

@@ -73,9 +73,7 @@ class RegressionOutcome:
     def frames_judged(self) -> int:
         """Number of frames processed by both builds."""
         return sum(
-            len(one.baseline_read.frames)
-            for one in self.passes
-            if one.state in JUDGED_STATES and one.baseline_read
+            len(one.baseline_read.frames) for one in self.passes if one.state in JUDGED_STATES and one.baseline_read
         )
 
     @property
@@ -90,9 +88,7 @@ def pass_figures(frames: PassFrames) -> dict[str, Any]:
     return {
         "outcome_shares": outcome_shares(frames),
         "stages_ms": {
-            name: float(np.nanmedian(values))
-            for name, values in frames.latency_ms.items()
-            if np.isfinite(values).any()
+            name: float(np.nanmedian(values)) for name, values in frames.latency_ms.items() if np.isfinite(values).any()
         },
         "memory_mib": frames.memory_mib,
         "undecodable": frames.undecodable,

@@ -161,10 +161,7 @@ def _received(ground: Ground, connection: Connection, record: PassRecord, folder
         "start_state": record.manifest.get("start_state"),
         "data_sources": list(record.manifest.get("data_sources", ())),
         "files": {
-            path.name: {
-                "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
-                "bytes": path.stat().st_size,
-            }
+            path.name: {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size}
             for path in sorted(folder.iterdir())
         },
     }

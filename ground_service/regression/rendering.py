@@ -77,9 +77,7 @@ class RenderingFailed(GroundError):
     """The renderer ended without a result and without a refusal; another attempt may succeed."""
 
     def __init__(self, name: str, found: str) -> None:
-        super().__init__(
-            f"rendering of {name}: expected all frames, or a refusal with its reason, found {found}"
-        )
+        super().__init__(f"rendering of {name}: expected all frames, or a refusal with its reason, found {found}")
 
 
 def settle_archive(ground: Ground, digest: str, *, again: bool = False) -> KeptArchive:
@@ -140,13 +138,7 @@ def _render(ground: Ground, archive: PassArchive, out: Path) -> str:
         folder.mkdir()
     try:
         report = run_confined(
-            RENDERING,
-            work,
-            written,
-            printed,
-            runner=ground.runner,
-            private=(ground.home,),
-            data=ground.data.root,
+            RENDERING, work, written, printed, runner=ground.runner, private=(ground.home,), data=ground.data.root
         )
     except SandboxRefused as error:
         raise RenderingFailed(archive.name, str(error)) from None
@@ -156,9 +148,7 @@ def _render(ground: Ground, archive: PassArchive, out: Path) -> str:
         return ""
     refusal = _refusal(report["exit_status"], tail(printed))
     if not refusal or refusal.startswith(LACKING):
-        raise RenderingFailed(
-            archive.name, refusal or report["cause"] or f"exit status {report['exit_status']}"
-        )
+        raise RenderingFailed(archive.name, refusal or report["cause"] or f"exit status {report['exit_status']}")
     return f"the frames cannot be rendered: {_shortened(_ARCHIVE.sub('archive', refusal))}"
 
 
@@ -217,9 +207,7 @@ def recorded_detections(archive: PassArchive) -> list[dict[str, Any]]:
     try:
         decoded = decode((archive.folder / name).read_bytes(), dictionary=dictionary)
     except TmtcError as error:
-        raise InvalidInput(
-            archive.name, name, "telemetry of the dictionary of its archive", str(error)
-        ) from None
+        raise InvalidInput(archive.name, name, "telemetry of the dictionary of its archive", str(error)) from None
     table = decoded.tables(dictionary).get("detections")
     if table is None or len(table) == 0:
         return []
@@ -233,9 +221,7 @@ def recorded_detections(archive: PassArchive) -> list[dict[str, Any]]:
                 "ticks": int(ticks[packet]),
                 "quality": int(table.columns["image_quality"][packet]),
                 **{
-                    key: _numbers(
-                        table.items[key][items] if key in table.items else np.full(len(items), np.nan)
-                    )
+                    key: _numbers(table.items[key][items] if key in table.items else np.full(len(items), np.nan))
                     for key in ("u_px", "v_px", "diameter_px", "score", "sigma_px")
                 },
             }

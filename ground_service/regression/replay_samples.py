@@ -15,12 +15,7 @@ from ground_service.evaluation.alignment import reference_states
 from ground_service.evaluation.extras import sun_angles
 from ground_service.evaluation.inputs import evidence_of_frames, orientation_of
 from ground_service.evaluation.recall import Viewing
-from ground_service.missions.ephemerides.service import (
-    ATTITUDE_FILES,
-    attitude_file,
-    load_attitudes,
-    no_attitudes,
-)
+from ground_service.missions.ephemerides.service import ATTITUDE_FILES, attitude_file, load_attitudes, no_attitudes
 from ground_service.missions.frames import camera_of
 from ground_service.missions.model import Camera, Evidence, Mission
 from ground_service.passes.archive_import import archived_mission
@@ -109,9 +104,7 @@ def pass_context(archive: PassArchive, data: DataFolder) -> PassContext:
         camera=camera,
         orientation=orientation,
         viewing=_viewing(folder, mission.camera, camera, ticks, utc_ns),
-        evidence=evidence_of_frames(
-            mission.evidence, camera, reference_states(reference, orientation, utc_ns)
-        ),
+        evidence=evidence_of_frames(mission.evidence, camera, reference_states(reference, orientation, utc_ns)),
         mission=mission.revision,
         flown=_flown_parameters(folder, mission),
         step_ticks=np.array([row["ticks"] for row in frame_inputs(folder, steps=True)], dtype=np.int64),
@@ -126,9 +119,7 @@ def _flown_parameters(folder: Path, mission: Mission) -> dict[str, Any]:
     return own | flat(read_table(path.read_bytes(), str(path), "parameters (TOML)"))
 
 
-def _viewing(
-    folder: Path, declared: Camera, camera: PinholeCamera, ticks: IntArray, utc_ns: IntArray
-) -> Viewing:
+def _viewing(folder: Path, declared: Camera, camera: PinholeCamera, ticks: IntArray, utc_ns: IntArray) -> Viewing:
     """Return the pointing of the camera for the frames of an archive."""
     present = [name for name in ATTITUDE_FILES if (folder / name).is_file()]
     name = attitude_file(present, str(folder))
@@ -190,9 +181,7 @@ def read_downlink(
             frames,
             latency_ms=latency_ms,
             cpu_s=cpu_s,
-            undecodable=decoded.unknown
-            + decoded.crc_errors
-            + _meaningless(decoded, tables, context.dictionary),
+            undecodable=decoded.unknown + decoded.crc_errors + _meaningless(decoded, tables, context.dictionary),
             memory_mib=memory_mib,
             digests=_digests(decoded, ticks, context.frame_ticks),
             times=_time_tags(decoded, tables, ticks, context),
@@ -214,10 +203,7 @@ def condition_of(context: PassContext) -> str:
     if context.manifest.get("light", "real") == "real":
         limits.append((float(np.nanmedian(sun_angles(track).elevation_deg)), LOW_SUN_DEG, "degrees of Sun"))
     return ", ".join(
-        [
-            kind,
-            *(f"{'below' if value < limit else 'above'} {limit:g} {unit}" for value, limit, unit in limits),
-        ]
+        [kind, *(f"{'below' if value < limit else 'above'} {limit:g} {unit}" for value, limit, unit in limits)]
     )
 
 
@@ -236,9 +222,7 @@ def _digests(decoded: DownlinkDecode, ticks: IntArray, frame_ticks: IntArray) ->
     return tuple(one.digest() for one in hashes)
 
 
-def _time_tags(
-    decoded: DownlinkDecode, tables: Mapping[str, Table], ticks: IntArray, context: PassContext
-) -> TimeTags:
+def _time_tags(decoded: DownlinkDecode, tables: Mapping[str, Table], ticks: IntArray, context: PassContext) -> TimeTags:
     unknown: dict[str, int] = {}
     delays: dict[str, NDArray[np.float64]] = {}
     steps = np.unique(np.concatenate((context.step_ticks, context.frame_ticks)))

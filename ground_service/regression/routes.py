@@ -9,24 +9,13 @@ from ground_service.access.security import Operator, UploadOf, Viewer, add_list,
 from ground_service.access.service import Caller
 from ground_service.errors import Forbidden
 from ground_service.ground import Ground
-from ground_service.http.common import (
-    API_PREFIX,
-    GroundOf,
-    IdempotencyKey,
-    Key,
-    PassId,
-    upload_body,
-)
+from ground_service.http.common import API_PREFIX, GroundOf, IdempotencyKey, Key, PassId, upload_body
 from ground_service.http.requests import operations, problems
 from ground_service.jobs.model import Job
 from ground_service.jobs.service import DispatcherOf, enter_jobs, get_job
 from ground_service.regression import archives as archive_service
 from ground_service.regression import service, store
-from ground_service.regression.builds import (
-    CURRENT,
-    load_build,
-    register_build,
-)
+from ground_service.regression.builds import CURRENT, load_build, register_build
 from ground_service.regression.documents import regression_junit
 from ground_service.regression.gates.policy import read_policy
 from ground_service.regression.jobs import compared, missing_replays
@@ -76,9 +65,7 @@ def list_kept_archives(ground: GroundOf, _: Viewer) -> list[KeptArchive]:
     return archive_service.kept_archives(ground)
 
 
-@regressions.post(
-    "/regression-archives", status_code=201, openapi_extra=upload_body("Zip file of a pass archive")
-)
+@regressions.post("/regression-archives", status_code=201, openapi_extra=upload_body("Zip file of a pass archive"))
 async def keep_archive(upload: UploadOf, ground: GroundOf, _: Operator, pinned: bool = False) -> KeptArchive:
     """Keep a zipped pass archive for replays, after checking every hash in it."""
     stored = await upload.stored()
@@ -114,9 +101,7 @@ def change_kept_archive(ground: GroundOf, _: Operator, digest: Digest, given: Ar
 def delete_kept_archives(
     ground: GroundOf,
     caller: Operator,
-    unused_days: Annotated[
-        float, Query(ge=0.0, le=36_500.0, description="Remove archives unused for this time")
-    ],
+    unused_days: Annotated[float, Query(ge=0.0, le=36_500.0, description="Remove archives unused for this time")],
 ) -> Pruned:
     """Delete kept archives that are not pinned and were not used for a time."""
     unused_for_ns = round(unused_days * 86_400e9)
@@ -200,8 +185,6 @@ def _register(ground: Ground, stored: StoredFile, caller: Caller) -> Build:
     with archive_service.opened_archive(stored.path) as folder:
         build = load_build(folder)
         if build.command and not caller.may("admin"):
-            raise Forbidden(
-                f"{caller.name}: expected the role admin to register a program, found {caller.role}"
-            )
+            raise Forbidden(f"{caller.name}: expected the role admin to register a program, found {caller.role}")
         register_build(ground, build, actor=caller.name)
     return ground.read(store.get_build, build.digest)

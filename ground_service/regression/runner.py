@@ -128,12 +128,7 @@ def _run_in_sandbox(
     variables = {**ENVIRONMENT, "NUMBA_CACHE_DIR": "/kernels"}
     if request.reads_data and data is not None:
         folders["data"], variables["LINNA_DATA"] = data, "/data"
-    places = {
-        "{python}": sys.executable,
-        "{archive}": "/archive",
-        "{out}": host.OUT,
-        "{folder}": "/build",
-    }
+    places = {"{python}": sys.executable, "{archive}": "/archive", "{out}": host.OUT, "{folder}": "/build"}
     run = Run(
         tuple(_placed(word, places) for word in request.words),
         variables,
@@ -143,19 +138,13 @@ def _run_in_sandbox(
         printed.absolute(),
         (
             *host.program_view(),
-            *(
-                host.Part("bind", str(path.absolute()), f"/{name}")
-                for name, path in folders.items()
-                if path.is_dir()
-            ),
+            *(host.Part("bind", str(path.absolute()), f"/{name}") for name, path in folders.items() if path.is_dir()),
         ),
     )
     return host.execute(run)
 
 
-def _run_by_runner(
-    exchange: Path, request: RunRequest, staged: Path, written: Path, printed: Path
-) -> dict[str, Any]:
+def _run_by_runner(exchange: Path, request: RunRequest, staged: Path, written: Path, printed: Path) -> dict[str, Any]:
     identity = uuid.uuid4().hex
     try:
         for name in ("jobs", "running", "results"):
@@ -200,11 +189,7 @@ ENVIRONMENT = {
 
 
 def serve_exchange(
-    exchange: Path,
-    *,
-    jobs: int | None = None,
-    stopping: threading.Event | None = None,
-    data: Path | None = None,
+    exchange: Path, *, jobs: int | None = None, stopping: threading.Event | None = None, data: Path | None = None
 ) -> int:
     """Run the jobs of an exchange folder one by one, until `jobs` of them are done or `stopping` is set.
 

@@ -214,11 +214,7 @@ def execute(run: Run) -> dict[str, Any]:
     capabilities = ["--cap-add", "CAP_SETUID", "--cap-add", "CAP_SETGID", "--cap-add", "CAP_SETPCAP"]
     with contextlib.ExitStack() as opened:
         try:
-            texts = (
-                seccomp_filter(),
-                f"build:x:{uid}:{uid}::{HOME}:/bin/sh\n".encode(),
-                f"build:x:{uid}:\n".encode(),
-            )
+            texts = (seccomp_filter(), f"build:x:{uid}:{uid}::{HOME}:/bin/sh\n".encode(), f"build:x:{uid}:\n".encode())
             files = [opened.enter_context(_file_in_memory(text)) for text in texts]
             process = subprocess.Popen(
                 [
@@ -331,9 +327,7 @@ class _Supervisor:
         if self.messages != b"ready\n":
             self.drain()
             said = self.tail.decode(errors="replace").strip().splitlines() or ["not set up in time"]
-            raise SandboxRefused(
-                "bubblewrap: " + said[-1].removeprefix("bwrap: ").partition(". See")[0][:200]
-            )
+            raise SandboxRefused("bubblewrap: " + said[-1].removeprefix("bwrap: ").partition(". See")[0][:200])
         try:
             child = descendants(self.process.pid)[0]
             self.init = os.pidfd_open(child)
@@ -429,10 +423,7 @@ class _Supervisor:
                 continue
             state = os.fstat(source)
             if stat.S_ISREG(state.st_mode) and state.st_size <= self.run.limits["file_mib"] << 20:
-                with (
-                    open(source, "rb", closefd=False) as stream,
-                    (self.run.deliver / name).open("xb") as copy,
-                ):
+                with open(source, "rb", closefd=False) as stream, (self.run.deliver / name).open("xb") as copy:
                     shutil.copyfileobj(stream, copy)
             os.close(source)
 

@@ -49,13 +49,7 @@ from ground_service.regression.model import (
     KeptReplay,
     Regression,
 )
-from ground_service.regression.outcome import (
-    JUDGED,
-    TELEMETRY_JUDGED,
-    PassVerdict,
-    RegressionOutcome,
-    pass_figures,
-)
+from ground_service.regression.outcome import JUDGED, TELEMETRY_JUDGED, PassVerdict, RegressionOutcome, pass_figures
 from ground_service.regression.pass_archives import NO_INPUTS
 from ground_service.regression.rendering import LIVE_BEGINNING, settle_archive
 from ground_service.regression.replay_samples import (
@@ -234,16 +228,11 @@ def is_done(replay: KeptReplay | None) -> bool:
 
 
 def judge_regression(
-    ground: Ground,
-    kept: Sequence[PassArchive | PassVerdict],
-    candidate: Build,
-    baseline: Build,
-    policy: PolicyFile,
+    ground: Ground, kept: Sequence[PassArchive | PassVerdict], candidate: Build, baseline: Build, policy: PolicyFile
 ) -> RegressionOutcome:
     """The gates over replays that were done."""
     passes = tuple(
-        one if isinstance(one, PassVerdict) else _pass_verdict(ground, one, candidate, baseline)
-        for one in kept
+        one if isinstance(one, PassVerdict) else _pass_verdict(ground, one, candidate, baseline) for one in kept
     )
     judged = [one for one in passes if one.baseline_read is not None and one.candidate_read is not None]
     flown = [one.context.flown for one in judged if one.context]
@@ -265,9 +254,7 @@ def judge_regression(
             f"no latency is compared on {apart} of {len(judged)} passes: the builds were not replayed at the same time"
         )
     whole = {name for name, one in zip(names, judged, strict=True) if one.state == JUDGED}
-    doubts = {
-        one.metric: one.text for one in calibrations_of(ground) if not (one.calibrated or one.condition)
-    }
+    doubts = {one.metric: one.text for one in calibrations_of(ground) if not (one.calibrated or one.condition)}
     gates = [
         replace(gate, reason="; ".join(filter(None, (gate.reason, doubts.get(gate.name)))))
         for gate in judge(before, after, policy.policy, imaged=whole)
@@ -303,10 +290,7 @@ def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id
     with ground.database.writing() as connection:
         register_file(connection, html, "report", f"regression {identity}", now)
         regression = Regression(
-            id=identity,
-            verdict=outcome.verdict,
-            created=UtcTime(now),
-            result=verdict_document(outcome),
+            id=identity, verdict=outcome.verdict, created=UtcTime(now), result=verdict_document(outcome)
         )
         flown = {one.context.mission for one in outcome.passes if one.context is not None}
         added = store.add_regression(connection, regression, missions=sorted(flown), html_sha256=html.sha256)
@@ -375,9 +359,7 @@ def _pass_verdict(ground: Ground, archive: PassArchive, candidate: Build, baseli
         return PassVerdict(archive.name, archive.digest, "unusable", "it was not flown", old, new)
     for replay, build, state in ((new, candidate, "candidate failed"), (old, baseline, "baseline failed")):
         if replay.outcome != OK:
-            message = f"{build.name} {OUTCOMES[replay.outcome]}" + (
-                f": {replay.detail}" if replay.detail else ""
-            )
+            message = f"{build.name} {OUTCOMES[replay.outcome]}" + (f": {replay.detail}" if replay.detail else "")
             return PassVerdict(archive.name, archive.digest, state, message, old, new)
     try:
         context = _context(ground, archive.digest)
@@ -385,17 +367,13 @@ def _pass_verdict(ground: Ground, archive: PassArchive, candidate: Build, baseli
     except (GroundError, LunarError) as error:
         return PassVerdict(archive.name, archive.digest, "unusable", str(error), old, new)
     state = JUDGED if archive.state == COMPLETE else TELEMETRY_JUDGED
-    return PassVerdict(
-        archive.name, archive.digest, state, archive.reason, old, new, context, read[0], read[1]
-    )
+    return PassVerdict(archive.name, archive.digest, state, archive.reason, old, new, context, read[0], read[1])
 
 
 def _read(ground: Ground, context: PassContext, replay: KeptReplay) -> ReadDownlink:
     files = store_of(ground)
     assert replay.downlink_sha256 is not None
-    performance = (
-        read_performance(files.path(replay.performance_sha256)) if replay.performance_sha256 else None
-    )
+    performance = read_performance(files.path(replay.performance_sha256)) if replay.performance_sha256 else None
     octets = files.get(replay.downlink_sha256)
     return read_downlink(context, octets, performance, replay.peak_rss_mib, replay.cpu_s)
 
@@ -412,8 +390,7 @@ def _other_camera(build: Build, archive: PassArchive) -> str:
 def _unique_names(passes: Sequence[PassVerdict]) -> list[str]:
     names = [one.name for one in passes]
     return [
-        name if names.count(name) == 1 else f"{name} {one.digest[:8]}"
-        for name, one in zip(names, passes, strict=True)
+        name if names.count(name) == 1 else f"{name} {one.digest[:8]}" for name, one in zip(names, passes, strict=True)
     ]
 
 
@@ -430,18 +407,11 @@ def baseline_figures(outcome: RegressionOutcome) -> dict[str, Any]:
             "build": {"name": outcome.baseline.name, "digest": outcome.baseline.digest},
             "suite": _figures([frames for _, frames in judged]) if judged else {},
             "passes": [
-                {
-                    "name": name,
-                    "frames": len(frames),
-                    "figures": _figures([frames]),
-                    **pass_figures(frames),
-                }
+                {"name": name, "frames": len(frames), "figures": _figures([frames]), **pass_figures(frames)}
                 for name, frames in judged
             ],
             "not_flown": [
-                {"name": one.name, "detail": one.detail}
-                for one in outcome.passes
-                if one.baseline_read is None
+                {"name": one.name, "detail": one.detail} for one in outcome.passes if one.baseline_read is None
             ],
         }
     )

@@ -71,9 +71,7 @@ def keep_archive(connection: Connection, archive: ArchiveRecord) -> None:
     """Add a kept archive; adding it again notes its use, pins it if requested, and adds its pass."""
     values = archive.model_dump(exclude={"kept_since", "pinned"})
     now, pinned = archive.kept_since.utc_ns, int(archive.pinned)
-    added = repository.add_new(
-        connection, ARCHIVES, **values, pinned=pinned, used_utc_ns=now, created_utc_ns=now
-    )
+    added = repository.add_new(connection, ARCHIVES, **values, pinned=pinned, used_utc_ns=now, created_utc_ns=now)
     if not added:
         changed: dict[str, int] = {"pinned": 1} if pinned else {}
         if archive.pass_id is not None:
@@ -86,9 +84,7 @@ def restock_archive(
 ) -> bool:
     """Replace the files of a kept archive, and remove its replays; return False if it has changed meanwhile."""
     expected = {"manifest_sha256": archive.manifest_sha256}
-    changed = change_if(
-        connection, ARCHIVES, archive.digest, expected, manifest_sha256=manifest_sha256, **values
-    )
+    changed = change_if(connection, ARCHIVES, archive.digest, expected, manifest_sha256=manifest_sha256, **values)
     if changed:
         connection.execute(delete(REPLAYS).where(REPLAYS.c.archive_digest == archive.digest))
     return changed
@@ -101,9 +97,7 @@ def archives_of_pass(connection: Connection, pass_id: int) -> list[ArchiveRecord
 
 def remove_replaced(connection: Connection, pass_id: int, digest: str) -> list[ArchiveRecord]:
     """Delete the archives that were made of a pass, except one and those that are pinned; return them."""
-    query = delete(ARCHIVES).where(
-        ARCHIVES.c.pass_id == pass_id, ARCHIVES.c.digest != digest, ARCHIVES.c.pinned == 0
-    )
+    query = delete(ARCHIVES).where(ARCHIVES.c.pass_id == pass_id, ARCHIVES.c.digest != digest, ARCHIVES.c.pinned == 0)
     return [_archive(row) for row in connection.execute(query.returning(*ARCHIVES.c)).mappings()]
 
 
@@ -153,9 +147,7 @@ def remove_unused(connection: Connection, used_before_utc_ns: int) -> list[Archi
     return [_archive(row) for row in connection.execute(query.returning(*ARCHIVES.c)).mappings()]
 
 
-def remove_above(
-    connection: Connection, limit_octets: int, conditions: Mapping[str, str]
-) -> list[ArchiveRecord]:
+def remove_above(connection: Connection, limit_octets: int, conditions: Mapping[str, str]) -> list[ArchiveRecord]:
     """Delete archives that are not pinned down to a total size; return them.
 
     Those without frames go first, because they say nothing about a detector; then the longest unused of the condition
@@ -170,22 +162,14 @@ def remove_above(
         free = [digest for digest, row in left.items() if not row.pinned]
         if not free:
             break
-        chosen.append(
-            min(free, key=lambda one: (left[one].state != TELEMETRY_ONLY, -counts[conditions.get(one)]))
-        )
+        chosen.append(min(free, key=lambda one: (left[one].state != TELEMETRY_ONLY, -counts[conditions.get(one)])))
         del left[chosen[-1]]
     removal = delete(ARCHIVES).where(ARCHIVES.c.pinned == 0, ARCHIVES.c.digest.in_(chosen))
     return [_archive(row) for row in connection.execute(removal.returning(*ARCHIVES.c)).mappings()]
 
 
 def keep_replay(
-    connection: Connection,
-    archive: str,
-    build: str,
-    replay: KeptReplay,
-    now_utc_ns: int,
-    *,
-    manifest_sha256: str,
+    connection: Connection, archive: str, build: str, replay: KeptReplay, now_utc_ns: int, *, manifest_sha256: str
 ) -> bool:
     """Store a replay of a build over an archive; an unsuccessful one does not replace a successful one.
 
@@ -235,9 +219,7 @@ def replay_id(archive: str, build: str) -> str:
     return hashlib.sha256(f"{archive} {build}".encode()).hexdigest()
 
 
-def add_regression(
-    connection: Connection, regression: Regression, *, missions: list[str], html_sha256: str
-) -> bool:
+def add_regression(connection: Connection, regression: Regression, *, missions: list[str], html_sha256: str) -> bool:
     """Add a regression; return False if its id exists, because a stored verdict is not replaced."""
     verdict = regression.result
     added = repository.add_new(
@@ -261,9 +243,7 @@ def get_regression(connection: Connection, regression_id: str) -> Regression:
 
 def placebo_noise(connection: Connection, policy_version: str) -> list[Noise]:
     """Return the noise of the newest placebos that this version of a policy judged."""
-    query = select(REGRESSIONS.c.result).where(
-        REGRESSIONS.c.baseline_digest == REGRESSIONS.c.candidate_digest
-    )
+    query = select(REGRESSIONS.c.result).where(REGRESSIONS.c.baseline_digest == REGRESSIONS.c.candidate_digest)
     newest = query.order_by(REGRESSIONS.c.created_utc_ns.desc(), REGRESSIONS.c.id).limit(PLACEBOS)
     return [
         Noise.model_validate(row)

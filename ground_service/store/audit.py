@@ -62,15 +62,7 @@ class BrokenEntry:
 
 def entry_sha256(previous_sha256: str, number: int, note: Note) -> str:
     """Return the hash (hex) of an entry: SHA-256 of its canonical JSON with the hash of the previous entry."""
-    content = [
-        previous_sha256,
-        number,
-        note.utc_ns,
-        note.actor,
-        note.action,
-        note.target,
-        plain_detail(note.detail),
-    ]
+    content = [previous_sha256, number, note.utc_ns, note.actor, note.action, note.target, plain_detail(note.detail)]
     return hashlib.sha256(
         json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
     ).hexdigest()
@@ -155,9 +147,7 @@ def count_entries(connection: Connection) -> int:
 def broken_entries(connection: Connection) -> Iterator[BrokenEntry]:
     """Yield the faults of the chain, from its first entry to its head."""
     number, previous = 0, GENESIS
-    rows = connection.execution_options(yield_per=BLOCK_ROWS).execute(
-        select(_ENTRIES).order_by(_ENTRIES.c.id)
-    )
+    rows = connection.execution_options(yield_per=BLOCK_ROWS).execute(select(_ENTRIES).order_by(_ENTRIES.c.id))
     for row in rows.mappings():
         found = int(row["id"])
         if found != number + 1:
@@ -170,9 +160,7 @@ def broken_entries(connection: Connection) -> Iterator[BrokenEntry]:
             yield BrokenEntry(found, "expected content that matches its hash, found changed content")
         number, previous = found, str(row["sha256"])
     head = read_head(connection)
-    others = connection.execute(
-        select(func.count()).select_from(_HEAD).where(_HEAD.c.id != HEAD_ID)
-    ).scalar_one()
+    others = connection.execute(select(func.count()).select_from(_HEAD).where(_HEAD.c.id != HEAD_ID)).scalar_one()
     if others:
         yield BrokenEntry(0, f"expected one head of the chain, found {others} more")
     if head is None:

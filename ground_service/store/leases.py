@@ -20,14 +20,7 @@ _CLOCKS_NS = 60_000_000_000
 
 
 def renew_or_take(
-    connection: Connection,
-    table: Table,
-    name: str,
-    owner: str,
-    *,
-    now_utc_ns: int,
-    until_utc_ns: int,
-    **taken: Any,
+    connection: Connection, table: Table, name: str, owner: str, *, now_utc_ns: int, until_utc_ns: int, **taken: Any
 ) -> bool:
     """Renew the lease of `owner`, or take one that is free or has ended; return whether `owner` has it now.
 
@@ -43,9 +36,7 @@ def renew_or_take(
     renewal = update(table).where(rows.name == name, rows.owner == owner).values(lease_utc_ns=until_utc_ns)
     ahead = rows.lease_utc_ns > until_utc_ns + _CLOCKS_NS
     free = or_(rows.owner.is_(None), rows.lease_utc_ns < now_utc_ns, ahead)
-    taking = (
-        update(table).where(rows.name == name, free).values(owner=owner, lease_utc_ns=until_utc_ns, **taken)
-    )
+    taking = update(table).where(rows.name == name, free).values(owner=owner, lease_utc_ns=until_utc_ns, **taken)
     return connection.execute(renewal).rowcount == 1 or connection.execute(taking).rowcount == 1
 
 

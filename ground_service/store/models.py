@@ -238,11 +238,7 @@ def image_samples(name: str, *columns: Column[Any]) -> Table:
     return samples(name, column("packet_ticks", BigInteger), column("frame_number", BigInteger), *columns)
 
 
-DETECTIONS = image_samples(
-    "detections",
-    *columns(SmallInteger, "image_quality", "count"),
-    column("items", LargeBinary),
-)
+DETECTIONS = image_samples("detections", *columns(SmallInteger, "image_quality", "count"), column("items", LargeBinary))
 """Detections of one image; `items` packed as `store.codec.DETECTION_ITEM`."""
 
 NAVIGATION_STATES = image_samples(
@@ -274,11 +270,7 @@ EVENTS = samples(
 )
 """An event report; `ticks` is the packet's time, `severity` 1 (info) to 4 (high)."""
 
-TIME_REPORTS = samples(
-    "time_reports",
-    column("reported_ticks", BigInteger),
-    column("rate_exponent", SmallInteger),
-)
+TIME_REPORTS = samples("time_reports", column("reported_ticks", BigInteger), column("rate_exponent", SmallInteger))
 """A time report; `ticks` is the packet's time."""
 
 VERIFICATIONS = samples(
@@ -290,22 +282,14 @@ VERIFICATIONS = samples(
 )
 """A telecommand verification report (service 1); `ticks` is the packet's time."""
 
-FILTER_STATES = image_samples(
-    "filter_states",
-    column("values", LargeBinary),
-    optional("innovation_degrees", Integer),
-)
+FILTER_STATES = image_samples("filter_states", column("values", LargeBinary), optional("innovation_degrees", Integer))
 """Estimate of the navigation filter with its covariance.
 
 `values` holds the state and its covariance as `store.codec.pack_filter_states` packs them; `innovation_degrees`
 are those of the NIS of the frame, None if the packet does not contain it (dictionary version 2).
 """
 
-IDENTIFICATIONS = image_samples(
-    "identifications",
-    column("count", SmallInteger),
-    column("items", LargeBinary),
-)
+IDENTIFICATIONS = image_samples("identifications", column("count", SmallInteger), column("items", LargeBinary))
 """Catalogued crater with which each used detection of an image was identified.
 
 `items` packs pairs of detection (uint16) and crater (uint32), little-endian.
@@ -568,19 +552,12 @@ AUDIT = table(
 """Action of a user; entries are only appended, numbered from 1 without gaps (see `store.audit`)."""
 
 AUDIT_HEAD = table(
-    "audit_head",
-    key("id", Integer, autoincrement=False),
-    column("number", BigInteger),
-    column("sha256", String(64)),
+    "audit_head", key("id", Integer, autoincrement=False), column("number", BigInteger), column("sha256", String(64))
 )
 """Number and hash of the newest audit entry: one row, locked while entries are appended."""
 
 EVENT_LOG = table(
-    "event_log",
-    key("id", BigKey),
-    column("utc_ns", BigInteger),
-    column("kind", String(32)),
-    column("payload", JSON),
+    "event_log", key("id", BigKey), column("utc_ns", BigInteger), column("kind", String(32)), column("payload", JSON)
 )
 """Event of the log; `id` is its number, from 1 without gaps."""
 
@@ -627,11 +604,7 @@ ALARM_POSITIONS = table(
 )
 """Last packet of a vehicle that has been examined for alarms."""
 
-EVENT_POSITIONS = table(
-    "event_positions",
-    key("consumer", String(32)),
-    column("number", BigInteger),
-)
+EVENT_POSITIONS = table("event_positions", key("consumer", String(32)), column("number", BigInteger))
 """Number of the last event that a consumer has handled."""
 
 ANSWERS = table(
@@ -703,12 +676,7 @@ LINKS = table(
 reception, `considered_utc_ns` the mission time up to which predicted contacts were compared with receptions.
 """
 
-LEASES = table(
-    "leases",
-    key("name", String(64)),
-    optional("owner", String(96)),
-    column("lease_utc_ns", BigInteger),
-)
+LEASES = table("leases", key("name", String(64)), optional("owner", String(96)), column("lease_utc_ns", BigInteger))
 """Right of one process among many to do recurring work, until `lease_utc_ns` by the clock of the database."""
 
 CONTACTS = table(
@@ -741,9 +709,7 @@ TRANSMISSIONS = table(
 """Octets of telecommands for one link; `transmitted_utc_ns` (mission time) is NULL until they are on the wire."""
 
 COMMAND_COUNTERS = table(
-    "command_counters",
-    key("vehicle_id", ForeignKey("vehicles.id")),
-    column("telecommands", BigInteger),
+    "command_counters", key("vehicle_id", ForeignKey("vehicles.id")), column("telecommands", BigInteger)
 )
 """Number of telecommand sequence counts assigned for a vehicle; locked during commanding."""
 

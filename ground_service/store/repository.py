@@ -145,9 +145,7 @@ def page(
         query = query.where(owner.in_(spacecraft))
     for name, value in asked.filters().items():
         if name in columns and name not in others:
-            query = query.where(
-                columns[name].in_(value) if isinstance(value, list) else columns[name] == value
-            )
+            query = query.where(columns[name].in_(value) if isinstance(value, list) else columns[name] == value)
     total = connection.execute(select(func.count()).select_from(query.subquery())).scalar_one()
     rows = connection.execute(query.order_by(*order).limit(asked.limit).offset(asked.offset)).mappings()
     return [dict(row) for row in rows], int(total)
@@ -240,9 +238,7 @@ def insert_columns(
         if count <= FEW_ROWS:
             arrays = ", ".join(f"%b::{kind}[]" for kind in kinds)
             with driver.cursor() as cursor:
-                cursor.execute(
-                    f'INSERT INTO "{table.name}" ({names}) SELECT * FROM unnest({arrays}){conflict}', values
-                )
+                cursor.execute(f'INSERT INTO "{table.name}" ({names}) SELECT * FROM unnest({arrays}){conflict}', values)
             return count
         with (
             driver.cursor() as cursor,
@@ -254,8 +250,7 @@ def insert_columns(
     else:
         marks = ", ".join("?" * len(values))
         connection.exec_driver_sql(
-            f'INSERT INTO "{table.name}" ({names}) VALUES ({marks}){conflict}',
-            list(zip(*values, strict=True)),
+            f'INSERT INTO "{table.name}" ({names}) VALUES ({marks}){conflict}', list(zip(*values, strict=True))
         )
     return count
 

@@ -90,8 +90,7 @@ def _grant(database: Database, role: str, statements_of: Callable[[str, list[str
         query = text("SELECT 1 FROM pg_roles WHERE rolname = :name")
         if connection.execute(query, {"name": role}).scalar() is None:
             raise DatabaseUnavailable(
-                database.label,
-                f"expected the role {role}, found none; CREATE ROLE {quoted(role)} LOGIN PASSWORD ...",
+                database.label, f"expected the role {role}, found none; CREATE ROLE {quoted(role)} LOGIN PASSWORD ..."
             )
         tables = connection.scalars(text("SELECT tablename FROM pg_tables WHERE schemaname = 'public'"))
         for statement in statements_of(role, list(tables)):

@@ -43,9 +43,7 @@ def copied_tables() -> list[Table]:
 def row_blocks(connection: Connection, table: Table) -> Iterator[list[Row]]:
     """Yield all rows of a table in the order of its key, which is the same in both databases."""
     key = [
-        collate(column, "C")
-        if connection.dialect.name == "postgresql" and isinstance(column.type, String)
-        else column
+        collate(column, "C") if connection.dialect.name == "postgresql" and isinstance(column.type, String) else column
         for column in table.primary_key.columns
     ]
     rows = connection.execution_options(yield_per=BLOCK_ROWS).execute(select(table).order_by(*key))
@@ -109,9 +107,7 @@ def insert_rows(connection: Connection, table: Table, blocks: Iterable[list[Row]
         connection.execute(insert(table), block)
         count += len(block)
     for row in later:
-        connection.execute(
-            table.update().where(table.c.id == row["id"]).values(predecessor_id=row["predecessor_id"])
-        )
+        connection.execute(table.update().where(table.c.id == row["id"]).values(predecessor_id=row["predecessor_id"]))
     return count
 
 
@@ -124,14 +120,11 @@ def advance_sequences(connection: Connection) -> None:
         if len(keys) != 1 or not issubclass(keys[0].type.python_type, int):
             continue
         name = connection.execute(
-            text("SELECT pg_get_serial_sequence(:table, :column)"),
-            {"table": f'"{table.name}"', "column": keys[0].name},
+            text("SELECT pg_get_serial_sequence(:table, :column)"), {"table": f'"{table.name}"', "column": keys[0].name}
         ).scalar()
         if name is not None:
             connection.execute(
-                text(
-                    f'SELECT setval(:name, (SELECT COALESCE(MAX({keys[0].name}), 0) + 1 FROM "{table.name}"), false)'
-                ),
+                text(f'SELECT setval(:name, (SELECT COALESCE(MAX({keys[0].name}), 0) + 1 FROM "{table.name}"), false)'),
                 {"name": name},
             )
 

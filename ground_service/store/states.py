@@ -116,13 +116,9 @@ def move_all(
     return [dict(row) for row in rows]
 
 
-def change_if(
-    connection: Connection, table: Table, key: Any, found: Mapping[str, Any], **values: Any
-) -> bool:
+def change_if(connection: Connection, table: Table, key: Any, found: Mapping[str, Any], **values: Any) -> bool:
     """Change columns of a row if it still has the expected values; return whether it was changed."""
     column = next(iter(table.primary_key.columns))
-    unchanged = (
-        table.c[name].is_(None) if value is None else table.c[name] == value for name, value in found.items()
-    )
+    unchanged = (table.c[name].is_(None) if value is None else table.c[name] == value for name, value in found.items())
     changed = connection.execute(update(table).where(column == key, *unchanged).values(**values))
     return changed.rowcount == 1

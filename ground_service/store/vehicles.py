@@ -114,9 +114,7 @@ def vehicle_id(connection: Connection, ccsds_id: int, instance: str) -> int:
 def spacecraft_of_missions(connection: Connection, names: Collection[str]) -> frozenset[int]:
     """Return the spacecraft whose mission description in force has one of these names."""
     table = repository.MISSIONS.c
-    query = select(table.ccsds_id, table.name).where(
-        table.ccsds_id.is_not(None), table.entered_by != ARCHIVE_ACTOR
-    )
+    query = select(table.ccsds_id, table.name).where(table.ccsds_id.is_not(None), table.entered_by != ARCHIVE_ACTOR)
     rows = connection.execute(query.order_by(table.created_utc_ns, table.id))
     newest = {int(number): name for number, name in rows}
     return frozenset(number for number, name in newest.items() if name in names)
@@ -137,11 +135,7 @@ def decoded_version(connection: Connection, vehicle: int, newest: int) -> int:
 
 def lock_spacecraft(connection: Connection, vehicle: int) -> int:
     """Lock the operations of a vehicle until the transaction ends; return the number of assigned sequence counts."""
-    query = (
-        select(COMMAND_COUNTERS.c.telecommands)
-        .where(COMMAND_COUNTERS.c.vehicle_id == vehicle)
-        .with_for_update()
-    )
+    query = select(COMMAND_COUNTERS.c.telecommands).where(COMMAND_COUNTERS.c.vehicle_id == vehicle).with_for_update()
     given = connection.execute(query).scalar()
     if given is None:
         add_new(connection, COMMAND_COUNTERS, vehicle_id=vehicle, telecommands=0)

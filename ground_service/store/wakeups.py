@@ -57,9 +57,7 @@ class Waker:
                 log.info("live feed: the broker is available again")
         except (redis.RedisError, OSError) as error:
             if not self._away_until_s:
-                log.warning(
-                    "live feed: the broker is unavailable (%s); other processes poll the event log", error
-                )
+                log.warning("live feed: the broker is unavailable (%s); other processes poll the event log", error)
             self._away_until_s = time.monotonic() + RETRY_S
 
 
@@ -70,9 +68,7 @@ async def listen(url: str, wake: Callable[[], None]) -> None:
 
     available = True
     while True:
-        client = redis.asyncio.from_url(
-            url, socket_connect_timeout=TIMEOUT_S, health_check_interval=HEALTH_CHECK_S
-        )
+        client = redis.asyncio.from_url(url, socket_connect_timeout=TIMEOUT_S, health_check_interval=HEALTH_CHECK_S)
         try:
             async with client.pubsub(ignore_subscribe_messages=True) as subscribed:
                 await subscribed.subscribe(CHANNEL)

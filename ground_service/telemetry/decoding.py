@@ -30,13 +30,7 @@ from ground_service.telemetry.packets import batch_of_cut
 from ground_service.telemetry.values import Decoding, StoredPackets, last_packet
 from lunar.arrays import FloatArray, IntArray
 from lunar.constants import NS
-from lunar.timescales import (
-    ONBOARD_EPOCH_TAI_NS,
-    TICKS_PER_SECOND,
-    parse_utc,
-    tai_ns_from_utc_ns,
-    ticks_from_utc_ns,
-)
+from lunar.timescales import ONBOARD_EPOCH_TAI_NS, TICKS_PER_SECOND, parse_utc, tai_ns_from_utc_ns, ticks_from_utc_ns
 from tmtc.arrays import Octets
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Dictionary
@@ -82,9 +76,7 @@ def definitions_in_force(connection: Connection, vehicle: int) -> tuple[PacketDe
     return definitions_of_spacecraft(connection, found.ccsds_id, found.instance)
 
 
-def definitions_of_spacecraft(
-    connection: Connection, spacecraft: int, instance: str
-) -> tuple[PacketDefinitions, int]:
+def definitions_of_spacecraft(connection: Connection, spacecraft: int, instance: str) -> tuple[PacketDefinitions, int]:
     """As `definitions_in_force`, by spacecraft id and instance."""
     mission_id = missions.packets_in_force(connection, spacecraft, instance)
     if mission_id is None:
@@ -105,9 +97,7 @@ def _next_block(connection: Connection, vehicle: int, judge: Judge | None = None
         earlier = _readable_definitions(connection, vehicle)
         new = definitions.form.unchecked - earlier.form.unchecked
         progress = parameters.begin(connection, vehicle, definition, read_again=bool(new))
-    packets = parameters.packets_after(
-        connection, vehicle, progress.decoded_to, definitions.apids, BLOCK_PACKETS
-    )
+    packets = parameters.packets_after(connection, vehicle, progress.decoded_to, definitions.apids, BLOCK_PACKETS)
     if not packets.ids:
         end = replace(progress, decoded_to=parameters.last_packet(connection, vehicle), complete=True)
         if end != progress:
@@ -147,9 +137,7 @@ def _with_counts(progress: Decoding, decoded_to: int, counts: dict[int, dict[str
     return replace(progress, decoded_to=decoded_to, counts=merged)
 
 
-def decoded_values(
-    definitions: PacketDefinitions, packets: StoredPackets
-) -> tuple[Samples, dict[int, dict[str, int]]]:
+def decoded_values(definitions: PacketDefinitions, packets: StoredPackets) -> tuple[Samples, dict[int, dict[str, int]]]:
     """Return the values of packets, and the number of packets by APID and outcome of decoding."""
     apids = np.array(packets.apids, dtype=np.int64)
     ids = np.array(packets.ids, dtype=np.int64)

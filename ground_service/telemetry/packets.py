@@ -137,9 +137,7 @@ def _joined(pieces: list[Columns]) -> Columns:
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
-def packet_ticks(
-    buffer: Octets, cut: PacketCut, good: IntArray, secondary_header: NDArray[np.bool_]
-) -> IntArray:
+def packet_ticks(buffer: Octets, cut: PacketCut, good: IntArray, secondary_header: NDArray[np.bool_]) -> IntArray:
     """Return the on-board time (n,) of PUS-C packets with CUC 4+2 time (agency epoch); `NO_TICKS` for all others."""
     ticks = np.full(len(good), NO_TICKS, dtype=np.int64)
     long_enough = np.flatnonzero(secondary_header & (cut.lengths[good] >= _TIMED_HEADER.itemsize))
@@ -173,10 +171,7 @@ def _navigation(table: Table, place: IntArray) -> Columns:
     velocity, sigma = columns["velocity_icrf_m_s"], columns["sigma_rtn_m"]
     return {
         **_frame_columns(table, place),
-        **{
-            name: columns[name]
-            for name in ("estimator", "outcome", "latitude_deg", "longitude_deg", "altitude_m")
-        },
+        **{name: columns[name] for name in ("estimator", "outcome", "latitude_deg", "longitude_deg", "altitude_m")},
         **{f"velocity_{axis}_m_s": velocity[:, i] for i, axis in enumerate("xyz")},
         **{f"sigma_{axis}_m": sigma[:, i] for i, axis in enumerate("rtn")},
         "nis": columns["nis"],

@@ -86,11 +86,7 @@ def add_to_rollups(
 
 
 def add_values(
-    connection: Connection,
-    vehicle_id: int,
-    version: int,
-    code: int,
-    samples: Mapping[int, tuple[IntArray, FloatArray]],
+    connection: Connection, vehicle_id: int, version: int, code: int, samples: Mapping[int, tuple[IntArray, FloatArray]]
 ) -> None:
     """Add on-board times (n,) and values (n, v) of each part of a kind, as `add_to_rollups` does."""
     hold(connection, f"rollups {vehicle_id}")
@@ -140,9 +136,7 @@ def forget_values(connection: Connection, vehicle_id: int, version: int, codes: 
     """Remove the roll-ups of some kinds in one version."""
     connection.execute(
         delete(_TABLE).where(
-            _TABLE.c.vehicle_id == vehicle_id,
-            _TABLE.c.dictionary_version == version,
-            _TABLE.c.kind.in_(codes),
+            _TABLE.c.vehicle_id == vehicle_id, _TABLE.c.dictionary_version == version, _TABLE.c.kind.in_(codes)
         )
     )
 
@@ -164,8 +158,7 @@ def rollup_rows(
     rows = connection.execute(
         select(_TABLE.c.first_ticks, _TABLE.c.last_ticks, _TABLE.c.rows, wanted)
         .where(
-            *_of(vehicle_id, dictionary_version, code, part, level),
-            _TABLE.c.bucket.between(first_bucket, last_bucket),
+            *_of(vehicle_id, dictionary_version, code, part, level), _TABLE.c.bucket.between(first_bucket, last_bucket)
         )
         .order_by(_TABLE.c.bucket)
     ).all()
@@ -190,9 +183,7 @@ def rolled_extent(
     width = width_ticks(LEVELS - 1)
     row = connection.execute(
         select(
-            func.coalesce(func.sum(_TABLE.c.rows), 0),
-            func.min(_TABLE.c.first_ticks),
-            func.max(_TABLE.c.last_ticks),
+            func.coalesce(func.sum(_TABLE.c.rows), 0), func.min(_TABLE.c.first_ticks), func.max(_TABLE.c.last_ticks)
         ).where(
             *_of(vehicle_id, dictionary_version, code, part, LEVELS - 1),
             _TABLE.c.bucket.between(start_ticks // width, stop_ticks // width),
@@ -280,10 +271,7 @@ def _buckets_query(count: int) -> Any:
     """Return the query for `count` buckets by their whole key, each of which both databases find by the index."""
     common = [_TABLE.c[name] == bindparam(name) for name in _KEY[:3]]
     each = [
-        and_(
-            *common,
-            *(_TABLE.c[name] == bindparam(f"{name}_{number}") for name in ("part", "level", "bucket")),
-        )
+        and_(*common, *(_TABLE.c[name] == bindparam(f"{name}_{number}") for name in ("part", "level", "bucket")))
         for number in range(count)
     ]
     return select(_TABLE.c.part, _TABLE.c.level, *_BUCKET).where(or_(*each))
@@ -330,9 +318,7 @@ def _store(connection: Connection, found: Sequence[tuple[Mapping[str, int], _Lev
             "first_ticks": np.concatenate([level[1] for _, level in merged]),
             "last_ticks": np.concatenate([level[2] for _, level in merged]),
             "rows": np.concatenate([level[3] for _, level in merged]),
-            "statistics": [
-                one.tobytes() for _, level in merged for one in np.ascontiguousarray(level[4], dtype="<f8")
-            ],
+            "statistics": [one.tobytes() for _, level in merged for one in np.ascontiguousarray(level[4], dtype="<f8")],
         },
         replace=is_small,
     )

@@ -66,14 +66,5 @@ def no_detections() -> DetectionSamples:
     """Detections of no frame at all."""
     none, whole = np.zeros(0), np.zeros(0, dtype=np.int64)
     return DetectionSamples(
-        whole,
-        whole,
-        np.zeros(0, dtype=np.bool_),
-        (),
-        np.zeros(1, dtype=np.int64),
-        none,
-        none,
-        none,
-        none,
-        whole,
+        whole, whole, np.zeros(0, dtype=np.bool_), (), np.zeros(1, dtype=np.int64), none, none, none, none, whole
     )

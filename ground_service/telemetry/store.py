@@ -46,9 +46,7 @@ def _apids(connection: Connection, vehicle: int) -> list[int]:
     """Return the APIDs of the stored packets of a vehicle, each found by one step in the index."""
     found: list[int] = []
     least = select(func.min(PACKETS.c.apid)).where(PACKETS.c.vehicle_id == vehicle)
-    while (
-        apid := connection.execute(least.where(PACKETS.c.apid > (found or [-1])[-1])).scalar()
-    ) is not None:
+    while (apid := connection.execute(least.where(PACKETS.c.apid > (found or [-1])[-1])).scalar()) is not None:
         found.append(int(apid))
     return found
 
@@ -101,9 +99,7 @@ def packets_before(connection: Connection, vehicle: int, ticks: int, first: int 
     return [int(key) for key in connection.execute(query).scalars()]
 
 
-def packet_octets(
-    connection: Connection, vehicle: int, apid: int, start_ticks: int, stop_ticks: int
-) -> bytes:
+def packet_octets(connection: Connection, vehicle: int, apid: int, start_ticks: int, stop_ticks: int) -> bytes:
     """The stored packets of one APID between two on-board times (both included), end to end in order of time."""
     query = (
         select(PACKETS.c.octets)
@@ -219,9 +215,7 @@ def pack_filter_states(state: NDArray[np.float64], covariance: NDArray[np.float6
     return [row.tobytes() for row in packed]
 
 
-def unpack_filter_states(
-    columns: Sequence[bytes], size: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def unpack_filter_states(columns: Sequence[bytes], size: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return states (n, size) and covariances (n, size, size) from packed octet strings."""
     rows, places = np.tril_indices(size)
     values = np.frombuffer(b"".join(columns), dtype="<f8").reshape(len(columns), size + len(rows))

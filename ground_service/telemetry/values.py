@@ -71,9 +71,7 @@ def readable_decoding(connection: Connection, vehicle: int) -> Decoding | None:
 def begin(connection: Connection, vehicle: int, definition: int, *, read_again: bool) -> Decoding:
     """Begin decoding with a definition; `read_again`: also read the raw files that came before it was stated."""
     ingests, missions = repository.INGESTS, repository.MISSIONS
-    stated = select(missions.c.created_utc_ns).where(
-        missions.c.id == mission_of_definition(connection, definition)
-    )
+    stated = select(missions.c.created_utc_ns).where(missions.c.id == mission_of_definition(connection, definition))
     last = select(func.max(ingests.c.id)).where(ingests.c.received_utc_ns < stated.scalar_subquery())
     repository.add(
         connection,
@@ -156,11 +154,7 @@ def packets_after(
     """Return the next packets of these APIDs, in the order of their ids."""
     query = (
         select(_PACKETS.c.id, _PACKETS.c.apid, _PACKETS.c.octets)
-        .where(
-            _PACKETS.c.vehicle_id == vehicle,
-            _PACKETS.c.id > packet_id,
-            _PACKETS.c.apid.in_(sorted(apids)),
-        )
+        .where(_PACKETS.c.vehicle_id == vehicle, _PACKETS.c.id > packet_id, _PACKETS.c.apid.in_(sorted(apids)))
         .order_by(_PACKETS.c.id)
         .limit(limit)
     )
@@ -174,10 +168,7 @@ def last_packet(connection: Connection, vehicle: int) -> int:
 
 
 def store_values(
-    connection: Connection,
-    vehicle: int,
-    definition: int,
-    samples: Mapping[int, tuple[IntArray, IntArray, FloatArray]],
+    connection: Connection, vehicle: int, definition: int, samples: Mapping[int, tuple[IntArray, IntArray, FloatArray]]
 ) -> int:
     """Store times (n,), packet ids (n,) and values (n, v) by container number; return the number of samples."""
     timed: dict[int, tuple[IntArray, FloatArray]] = {}
@@ -216,9 +207,7 @@ def read_values(
 ) -> tuple[IntArray, FloatArray]:
     """Return times (n,) and values (n, v) of some places of a container between two times (both included)."""
     size = VALUE.itemsize
-    wanted = [
-        func.substr(_SAMPLES.c["values"], index * size + 1, size, type_=LargeBinary) for index in indices
-    ]
+    wanted = [func.substr(_SAMPLES.c["values"], index * size + 1, size, type_=LargeBinary) for index in indices]
     query = (
         select(_SAMPLES.c.ticks, *wanted)
         .where(*_between(vehicle, definition, container, start_ticks, stop_ticks))
@@ -264,13 +253,7 @@ def count_values(
 
 
 def packets_of_container(
-    connection: Connection,
-    vehicle: int,
-    definition: int,
-    container: int,
-    start_ticks: int,
-    stop_ticks: int,
-    limit: int,
+    connection: Connection, vehicle: int, definition: int, container: int, start_ticks: int, stop_ticks: int, limit: int
 ) -> tuple[IntArray, StoredPackets]:
     """Return times (n,) and packets of a container between two times, in order of time."""
     query = (
@@ -284,9 +267,7 @@ def packets_of_container(
     return np.array([row[0] for row in rows], dtype=np.int64), _stored([row[1:] for row in rows])
 
 
-def _between(
-    vehicle: int, definition: int, container: int, start_ticks: int, stop_ticks: int
-) -> tuple[Any, ...]:
+def _between(vehicle: int, definition: int, container: int, start_ticks: int, stop_ticks: int) -> tuple[Any, ...]:
     return (
         _SAMPLES.c.vehicle_id == vehicle,
         _SAMPLES.c.definition_id == definition,
@@ -300,6 +281,4 @@ def _decoding(row: repository.Row) -> Decoding:
 
 
 def _stored(rows: Sequence[Any]) -> StoredPackets:
-    return StoredPackets(
-        [int(row[0]) for row in rows], [int(row[1]) for row in rows], [bytes(row[2]) for row in rows]
-    )
+    return StoredPackets([int(row[0]) for row in rows], [int(row[1]) for row in rows], [bytes(row[2]) for row in rows])

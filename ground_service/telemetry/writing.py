@@ -67,9 +67,7 @@ def forget_samples(connection: Connection, vehicle: int, dictionary_version: int
     """Remove what a dictionary version has decoded from the packets of a vehicle."""
     for table in TABLES.values():
         connection.execute(
-            delete(table).where(
-                table.c.vehicle_id == vehicle, table.c.dictionary_version == dictionary_version
-            )
+            delete(table).where(table.c.vehicle_id == vehicle, table.c.dictionary_version == dictionary_version)
         )
     forget_rollups(connection, vehicle, dictionary_version)
 

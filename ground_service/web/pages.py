@@ -135,9 +135,7 @@ def page_response(body: str, policy: str = POLICY) -> Response:
 
 for _page in PAGES:
     if _page is not DISPLAYS:
-        pages.add_api_route(
-            _page.path, _page_answer(_page), methods=["GET", "HEAD"], name=f"page {_page.name}"
-        )
+        pages.add_api_route(_page.path, _page_answer(_page), methods=["GET", "HEAD"], name=f"page {_page.name}")
 
 
 @pages.get("/static/{path:path}")
@@ -186,9 +184,7 @@ def moon_map(request: Request) -> Response:
     albedo = request.app.state.ground.data.albedo
     if albedo is None:
         raise NotFound("data product", "albedo map")
-    return Response(
-        basemap_jpeg(albedo), media_type="image/jpeg", headers={"Cache-Control": "private, max-age=86400"}
-    )
+    return Response(basemap_jpeg(albedo), media_type="image/jpeg", headers={"Cache-Control": "private, max-age=86400"})
 
 
 @cache
@@ -211,9 +207,7 @@ def _version() -> str:
 
 
 @lru_cache(maxsize=2 * len(PAGES) + 1)
-def rendered(
-    page: Page, template: str = "", openmct: str = "", schemas: str = "{}", *, provider: bool = False
-) -> str:
+def rendered(page: Page, template: str = "", openmct: str = "", schemas: str = "{}", *, provider: bool = False) -> str:
     """Return the HTML of a page.
 
     Parameters
@@ -267,11 +261,7 @@ def _schemas(page: Page, routes: Iterable[Route]) -> str:
 
 def sign_in_page(*, next_page: str = "/", refusal: str = "") -> str:
     """Return the HTML of the answer to a sign-in: opens the next page, or states why it was refused."""
-    return (
-        _environment()
-        .get_template("sign_in.html")
-        .render(next_page=next_page, refusal=refusal, version=_version())
-    )
+    return _environment().get_template("sign_in.html").render(next_page=next_page, refusal=refusal, version=_version())
 
 
 def help_page(title: str, body: str) -> str:
@@ -494,8 +484,6 @@ def installation(folder: Path) -> Installation | None:
         for file in sorted((folder / "dist").rglob("*"))
         if file.suffix in MEDIA and file.is_file()
     }
-    packed = {
-        path: gzip.compress(body, 6, mtime=0) for path, body in plain.items() if path.endswith(_COMPRESSED)
-    }
+    packed = {path: gzip.compress(body, 6, mtime=0) for path, body in plain.items() if path.endswith(_COMPRESSED)}
     smaller = {path: body for path, body in packed.items() if len(body) < len(plain[path])}
     return Installation(str(version), plain, smaller)

@@ -53,9 +53,7 @@ async def _watched(session: Session) -> None:
         async with asyncio.timeout(CONNECT_TIMEOUT_S):
             reader, writer = await asyncio.open_connection(*address, limit=LINE_LIMIT_OCTETS)
     except (OSError, TimeoutError):
-        await _refuse(
-            socket, f"no payload answers at {address[0]}:{address[1]}; start it with linna emulate --live"
-        )
+        await _refuse(socket, f"no payload answers at {address[0]}:{address[1]}; start it with linna emulate --live")
         return
     writer.write(b"watch\n")
     await socket.send_json({"kind": "connected"})
@@ -105,9 +103,7 @@ async def _show(socket: WebSocket, waiting: deque[str], arrived: asyncio.Event) 
             await socket.send_text(waiting.popleft())
 
 
-async def _steer(
-    session: Session, writer: asyncio.StreamWriter, waiting: deque[str], arrived: asyncio.Event
-) -> None:
+async def _steer(session: Session, writer: asyncio.StreamWriter, waiting: deque[str], arrived: asyncio.Event) -> None:
     while True:
         words = (await session.socket.receive_text()).strip()
         if not session.caller.may("operator"):

@@ -44,12 +44,7 @@ async def begin_sign_in(request: Request, next: Words = "/") -> Response:
     response = RedirectResponse(place, status_code=303)
     response.headers["Cache-Control"] = "no-store"
     response.set_cookie(
-        _cookie(request),
-        begun.cookie(),
-        max_age=SIGN_IN_S,
-        httponly=True,
-        samesite="lax",
-        secure=_safe(request),
+        _cookie(request), begun.cookie(), max_age=SIGN_IN_S, httponly=True, samesite="lax", secure=_safe(request)
     )
     return response
 
@@ -65,9 +60,7 @@ async def complete_sign_in(
         if error or not code:
             raise SignInRefused("answer of the provider", "a code", repr(error)[:80] if error else "none")
         who = await provider.complete(begun, code, _own(request, CALLBACK), iss)
-        secret, _ = await to_thread.run_sync(
-            start_provider_session, request.app.state.ground, who, begun.state
-        )
+        secret, _ = await to_thread.run_sync(start_provider_session, request.app.state.ground, who, begun.state)
     except (SignInRefused, ProviderUnavailable) as refusal:
         return _without_cookie(request, _refused(refusal))
     response = page_response(sign_in_page(next_page=begun.next_page))
@@ -91,9 +84,7 @@ async def sign_in_ended(request: Request, next: Words = "/") -> Response:
 
 
 @sign_in.post("/sign-in/provider-sign-out", status_code=200)
-async def sign_out_by_provider(
-    request: Request, logout_token: Annotated[str, Form(max_length=16384)]
-) -> Response:
+async def sign_out_by_provider(request: Request, logout_token: Annotated[str, Form(max_length=16384)]) -> Response:
     """End the sessions that the provider names (OpenID Connect Back-Channel Logout 1.0)."""
     provider = _provider(request)
     try:

@@ -275,9 +275,7 @@ class Sockets:
 
     async def _offer_values(self, items: list[LoggedEvent]) -> None:
         vehicles = {
-            TelemetryReceived.of(item).vehicle_id
-            for item in items
-            if item.kind == TelemetryReceived.event_kind
+            TelemetryReceived.of(item).vehicle_id for item in items if item.kind == TelemetryReceived.event_kind
         }
         if not vehicles or all(session.values is None for session in self._readers):
             return
@@ -383,12 +381,7 @@ def token_of(socket: WebSocket) -> str | None:
 
 def text_of(item: LoggedEvent) -> str:
     """Return the message of an event."""
-    message = {
-        "sequence": item.number,
-        "time": time_text(item.utc_ns),
-        "kind": item.kind,
-        "payload": item.payload,
-    }
+    message = {"sequence": item.number, "time": time_text(item.utc_ns), "kind": item.kind, "payload": item.payload}
     return json.dumps(message, separators=(",", ":"), ensure_ascii=False)
 
 

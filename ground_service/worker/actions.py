@@ -212,8 +212,7 @@ def _monthly_report_of(vehicle: int) -> Step:
 
 def _landmarks_of(pass_id: int) -> Step:
     return Step(
-        f"landmarks of pass {pass_id}",
-        lambda ground: update_landmarks(ground, pass_id).model_dump(mode="json"),
+        f"landmarks of pass {pass_id}", lambda ground: update_landmarks(ground, pass_id).model_dump(mode="json")
     )
 
 

@@ -185,13 +185,7 @@ def run_worker(settings: Settings, concurrency: int = 1) -> None:
     def configure(**_: Any) -> None:
         logging.config.dictConfig(logging_config(settings.log_format))
 
-    words = [
-        "worker",
-        "--loglevel=INFO",
-        f"--concurrency={concurrency}",
-        "--without-gossip",
-        "--without-mingle",
-    ]
+    words = ["worker", "--loglevel=INFO", f"--concurrency={concurrency}", "--without-gossip", "--without-mingle"]
     with present(ground, settings, "worker"):
         ground.close()  # its processes are forked without connections
         make_app(settings).worker_main(words)

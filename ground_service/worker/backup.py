@@ -167,9 +167,7 @@ def _check_rows(folder: Path, connection: Connection, manifest: dict[str, Any]) 
         raise InvalidInput(str(folder / DATABASE), name, "the rows that were saved", "no such table")
     for name, table in digests.items():
         if manifest["rows"].get(name) != table.rows:
-            raise InvalidInput(
-                str(folder / DATABASE), name, f"{manifest['rows'].get(name)} rows", str(table.rows)
-            )
+            raise InvalidInput(str(folder / DATABASE), name, f"{manifest['rows'].get(name)} rows", str(table.rows))
         if manifest["tables"].get(name) != table.sha256:
             raise InvalidInput(str(folder / DATABASE), name, "the rows that were saved", "changed rows")
     if _list_sha256(file_names(connection)) != manifest["files_sha256"]:
@@ -179,9 +177,7 @@ def _check_rows(folder: Path, connection: Connection, manifest: dict[str, Any]) 
         raise InvalidInput(str(folder / MANIFEST), "audit_head", "the head of the audit chain", "another")
     broken = next(audit.broken_entries(connection), None)
     if broken is not None:
-        raise InvalidInput(
-            str(folder / DATABASE), f"audit {broken.number}", "a complete chain", broken.reason
-        )
+        raise InvalidInput(str(folder / DATABASE), f"audit {broken.number}", "a complete chain", broken.reason)
 
 
 def _list_sha256(names: list[str]) -> str:

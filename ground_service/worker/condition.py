@@ -97,21 +97,9 @@ STORE_ID = "store-id"
 DIGITS = 8
 OWN = frozenset(
     {
-        *(
-            "home",
-            "database_url",
-            "migration_database_url",
-            "backup_role",
-            "allow_database_owner",
-            "broker_url",
-        ),
+        *("home", "database_url", "migration_database_url", "backup_role", "allow_database_owner", "broker_url"),
         *("host", "port", "openmct", "live_console", "links", "backups", "log_format", "traces", "data"),
-        *(
-            "allowed_hosts",
-            "trusted_proxies",
-            "sockets",
-            "sockets_per_user",
-        ),
+        *("allowed_hosts", "trusted_proxies", "sockets", "sockets_per_user"),
         *("drain_s", "objects_secret_key", "objects_cache_gib", "runner_exchange"),
     }
 )

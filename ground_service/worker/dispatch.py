@@ -67,9 +67,7 @@ class ThreadDispatcher(Dispatcher):
             wait_s = min(2.0 * self._held.get(job_id, (0.0, FIRST_WAIT_S / 2.0))[1], LONGEST_WAIT_S)
             self._held[job_id] = (time.monotonic() + wait_s, wait_s)
             log.warning("job %s did not finish: %s", job_id, error)
-        except (
-            Exception
-        ):  # outermost loop of the thread: the job could not be ended and is started again later
+        except Exception:  # outermost loop of the thread: the job could not be ended and is started again later
             log.exception("job %s did not finish", job_id)
         finally:
             with self._lock:

@@ -75,9 +75,7 @@ def _processes(ground: Ground, settings: Settings) -> Result:
         faults.append(f"expected one version, found {', '.join(sorted(versions)) or 'other ones'}")
     wanted = ["api", *(["worker"] if settings.resolved_broker_url() is not None else [])]
     faults += [
-        f"expected a running {kind}, found none"
-        for kind in wanted
-        if all(one.kind != kind for one in processes)
+        f"expected a running {kind}, found none" for kind in wanted if all(one.kind != kind for one in processes)
     ]
     if any(one.statement is not None and one.statement.runner == "no" for one in processes):
         faults.append("expected a runner of payload builds that responds, found none")
@@ -91,9 +89,7 @@ def _clocks(ground: Ground, _settings: Settings) -> Result:
         here = (utc_now_ns() - leases.database_now_ns(connection)) // 1_000_000
     clocks = {"here": here}
     clocks |= {
-        str(one): one.statement.clock_ms
-        for one in running_processes(ground.database)
-        if one.statement is not None
+        str(one): one.statement.clock_ms for one in running_processes(ground.database) if one.statement is not None
     }
     faults = [
         f"{name}: expected within {CLOCK_LIMIT_MS} ms of the database, found {ms} ms"
@@ -104,9 +100,7 @@ def _clocks(ground: Ground, _settings: Settings) -> Result:
 
 
 def _scheduler(ground: Ground, _settings: Settings) -> Result:
-    return (
-        [] if has_scheduler(ground) else ["expected a process that does the recurring work, found none"]
-    ), "one"
+    return ([] if has_scheduler(ground) else ["expected a process that does the recurring work, found none"]), "one"
 
 
 def _broker(_ground: Ground, settings: Settings) -> Result:

@@ -85,9 +85,7 @@ def _after_telemetry(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
         with _ground.database.reading() as connection:
             yield from (
                 ("re-evaluate", pass_id)
-                for pass_id in _reported_passes(
-                    connection, event.vehicle_id, event.first_ticks, event.last_ticks
-                )
+                for pass_id in _reported_passes(connection, event.vehicle_id, event.first_ticks, event.last_ticks)
             )
 
 
@@ -174,9 +172,7 @@ def _note_finding(ground: Ground, number: int, _event: int) -> None:
         note_finding(ground, times.vehicle_id, "implausible_time", times.packets)
     else:
         clock = ClockDoubted.of(logged)
-        note_finding(
-            ground, clock.vehicle_id, f"station_clock {clock.station}"[:64], value=clock.difference_s
-        )
+        note_finding(ground, clock.vehicle_id, f"station_clock {clock.station}"[:64], value=clock.difference_s)
 
 
 def _alarms_again(ground: Ground, vehicle: int, _event: int) -> None:
@@ -207,9 +203,7 @@ def _reevaluate(ground: Ground, pass_id: int, event: int) -> str | None:
 
 def _decode(ground: Ground, vehicle: int, event: int) -> str:
     """Add the job that decodes the packets of a vehicle with a new mission description."""
-    return ground.write(
-        add_job, "redecode", {"vehicle_id": vehicle}, job_id=_job_id("decode", vehicle, event)
-    )
+    return ground.write(add_job, "redecode", {"vehicle_id": vehicle}, job_id=_job_id("decode", vehicle, event))
 
 
 def _add_job_of_event(kind: str) -> Callable[[Ground, int, int], str]:
@@ -354,9 +348,7 @@ def _reported_passes(connection: Connection, vehicle: int, first_ticks: int, las
     return [
         one.id
         for one in passes_of_vehicle(connection, vehicle, reported=True)
-        if overlaps(
-            vehicle_span(connection, vehicle, one.start_utc_ns - REACH_NS, one.stop_utc_ns + REACH_NS)
-        )
+        if overlaps(vehicle_span(connection, vehicle, one.start_utc_ns - REACH_NS, one.stop_utc_ns + REACH_NS))
         and overlaps(pass_span(connection, one))
     ]
 

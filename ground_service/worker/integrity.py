@@ -167,10 +167,7 @@ def rows(connection: Connection, table: Table) -> Rows:
     )
     # The digest is the last part of a key: an index gives the order of the others.
     for _, together in groupby(found, key=lambda row: row[: size - 1]):
-        keyed = (
-            ((*row[: size - 1], b"" if row[size - 1] is None else row[size - 1]), row[size:])
-            for row in together
-        )
+        keyed = (((*row[: size - 1], b"" if row[size - 1] is None else row[size - 1]), row[size:]) for row in together)
         yield from sorted(keyed, key=lambda one: one[0])
 
 
@@ -454,9 +451,7 @@ def _compare_rows(table: Table, stored: Rows, derived: Rows, excuse: Excuse, fou
             elif here is None:
                 found.damage(table.name, _words(key), "expected this row, found none")
             elif there is None:
-                found.damage(
-                    table.name, _words(key), "expected no such row, found one that the raw data do not give"
-                )
+                found.damage(table.name, _words(key), "expected no such row, found one that the raw data do not give")
             else:
                 found.damage(table.name, _words(key), "expected the values of its packets, found others")
         mine = next(stored, None) if here is not None else mine

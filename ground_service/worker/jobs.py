@@ -11,13 +11,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from ground_service.clock import utc_now_ns
-from ground_service.errors import (
-    PASSING,
-    GroundError,
-    StateConflict,
-    public_text,
-    storage_error,
-)
+from ground_service.errors import PASSING, GroundError, StateConflict, public_text, storage_error
 from ground_service.evaluation.service import make_report, reevaluate
 from ground_service.ground import Ground
 from ground_service.ingest.service import apply_definition, derive_without, run_ingest
@@ -212,12 +206,7 @@ _doing_lock = threading.Lock()
 
 
 def _finish(
-    ground: Ground,
-    job_id: str,
-    attempt: int,
-    *,
-    result: Mapping[str, Any] | None = None,
-    error: str | None = None,
+    ground: Ground, job_id: str, attempt: int, *, result: Mapping[str, Any] | None = None, error: str | None = None
 ) -> Job:
     """End the attempt of a job, unless another process has started a new attempt meanwhile."""
     with ground.database.writing() as connection:
@@ -225,9 +214,7 @@ def _finish(
         try:
             service.end_attempt(connection, job_id, attempt, finished, result=result, error=error)
         except StateConflict as conflict:
-            log.warning(
-                "job %s: attempt %d ended after another one had started: %s", job_id, attempt, conflict
-            )
+            log.warning("job %s: attempt %d ended after another one had started: %s", job_id, attempt, conflict)
             return service.get_job(connection, job_id)
         job = service.get_job(connection, job_id)
         publish(connection, JobChanged(id=job_id, kind=job.kind, state=job.state, result=job.result))

@@ -7,14 +7,7 @@ import time
 from pathlib import Path
 
 from fastapi import APIRouter, Request, Response
-from prometheus_client import (
-    CONTENT_TYPE_LATEST,
-    CollectorRegistry,
-    Counter,
-    Gauge,
-    Histogram,
-    generate_latest,
-)
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -59,16 +52,12 @@ class Metrics:
         self._jobs = Gauge("linna_jobs", "Jobs by state", ("kind", "state"), registry=self._registry)
         self._ingests = Gauge("linna_ingests", "Ingests by state", ("state",), registry=self._registry)
         self._passes = Gauge("linna_passes", "Passes", registry=self._registry)
-        self._queue_age = self._gauge(
-            "linna_queue_age_seconds", "Age of the oldest job that waits; 0: none waits"
-        )
+        self._queue_age = self._gauge("linna_queue_age_seconds", "Age of the oldest job that waits; 0: none waits")
         self._lag = self._gauge("linna_ingest_lag_seconds", "Age of the oldest unfinished ingest; 0: none")
         self._free = self._gauge("linna_disk_free_bytes", "Free space of the archive's file system")
         self._size = self._gauge("linna_disk_size_bytes", "Size of the archive's file system")
         self._scheduler = self._gauge("linna_scheduler", "Processes that do the recurring work: 1 or 0")
-        self._backed_up = self._gauge(
-            "linna_backup_configured", "Whether LINNA_BACKUPS names a folder: 1 or 0"
-        )
+        self._backed_up = self._gauge("linna_backup_configured", "Whether LINNA_BACKUPS names a folder: 1 or 0")
         self._backup = self._gauge("linna_backup_age_seconds", "Age of the newest backup", ("folder",))
         self._correlation = self._gauge(
             "linna_time_correlation_age_seconds",
@@ -80,9 +69,7 @@ class Metrics:
         self._broker = self._gauge("linna_broker_up", "Whether the broker answers: 1 or 0", ("kind",))
         self._runner = self._gauge("linna_runner_up", "Whether a worker sees a runner: 1 or 0", ("kind",))
         self._processes = self._gauge("linna_processes", "Running processes of the deployment", ("kind",))
-        self._disagreements = self._gauge(
-            "linna_disagreements", "Settings and folders in which processes differ"
-        )
+        self._disagreements = self._gauge("linna_disagreements", "Settings and folders in which processes differ")
 
     def _gauge(self, name: str, text: str, labels: tuple[str, ...] = ()) -> Gauge:
         return Gauge(name, text, labels, registry=self._registry)

@@ -58,15 +58,11 @@ def permitted_address(host: str, port: int, networks: Sequence[Network]) -> str:
         mapped = getattr(address, "ipv4_mapped", None)
         plain = address if mapped is None else mapped
         if (not plain.is_global or plain.is_multicast) and not any(plain in one for one in networks):
-            raise NotDelivered(
-                f"{host}: expected a public address or one of LINNA_NOTIFY_NETWORKS, found {text}"
-            )
+            raise NotDelivered(f"{host}: expected a public address or one of LINNA_NOTIFY_NETWORKS, found {text}")
     return texts[0]
 
 
-def post(
-    url: str, body: bytes, headers: Mapping[str, str], networks: Sequence[Network], deadline_s: float
-) -> int:
+def post(url: str, body: bytes, headers: Mapping[str, str], networks: Sequence[Network], deadline_s: float) -> int:
     """Post a body and return the status; redirects are not followed, and the body of the answer is not read.
 
     Raises

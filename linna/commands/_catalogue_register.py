@@ -19,11 +19,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         nargs="?",
     )
     option(
-        parser,
-        "--terrain F",
-        Path,
-        "height rasters in any projection (default: those of the data folder)",
-        nargs="+",
+        parser, "--terrain F", Path, "height rasters in any projection (default: those of the data folder)", nargs="+"
     )
     option(
         parser,

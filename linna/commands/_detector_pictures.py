@@ -33,19 +33,11 @@ def add_evaluation(evaluate: argparse.ArgumentParser, tested: Any) -> None:
     of_set = evaluate.add_argument_group("with --coco")
     option(of_set, "--category NAME", str, "category of craters (default: those whose name says crater)", "")
     _add_search(of_set)
-    option(
-        of_set, "--pixel-m", ABOVE_ZERO, "ground covered by a pixel; gives classes in km", default=math.nan
-    )
+    option(of_set, "--pixel-m", ABOVE_ZERO, "ground covered by a pixel; gives classes in km", default=math.nan)
     option(of_set, "--altitude-km", ABOVE_ZERO, "above the ground, with --fov-deg, instead", default=math.nan)
     option(of_set, "--fov-deg", FIELD_OF_VIEW, "", 120.0)
     option(of_set, "--range-px LOW HIGH", float, "diameters that are scored (default: 8 150)", (8.0, 150.0))
-    option(
-        of_set,
-        "--level",
-        ("2", "3s", "3", "4", "5"),
-        "evidence level of the images (default: 5, photographs)",
-        "5",
-    )
+    option(of_set, "--level", ("2", "3s", "3", "4", "5"), "evidence level of the images (default: 5, photographs)", "5")
 
 
 def evaluate_set(arguments: argparse.Namespace) -> int:
@@ -53,11 +45,7 @@ def evaluate_set(arguments: argparse.Namespace) -> int:
     from linna.errors import UsageError
     from linna.output import emit, progress
     from payload_emulator.training.evaluate.evaluate import open_for_evaluation
-    from payload_emulator.training.evaluate.pictures import (
-        PictureSetOptions,
-        evaluate_pictures,
-        format_picture_figures,
-    )
+    from payload_emulator.training.evaluate.pictures import PictureSetOptions, evaluate_pictures, format_picture_figures
 
     for name in ("report", "run", "source", "paper_classes"):
         if getattr(arguments, name):
@@ -132,9 +120,7 @@ def _detect(arguments: argparse.Namespace) -> int:
 
     if arguments.picture and len(arguments.images) > 1:
         raise UsageError(f"--picture: expected one image, found {len(arguments.images)}")
-    detector = OnnxDetector(
-        model_octets(arguments.model), DetectorParameters(score_threshold=arguments.threshold)
-    )
+    detector = OnnxDetector(model_octets(arguments.model), DetectorParameters(score_threshold=arguments.threshold))
     sun = None if arguments.sun_azimuth_deg is None else sun_at_azimuth(arguments.sun_azimuth_deg)
     images: list[dict[str, Any]] = []
     for path in arguments.images:

@@ -27,17 +27,9 @@ def add_service_options(parser: argparse.ArgumentParser) -> None:
 def add_operator_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose the local service or a server."""
     add_service_options(parser)
-    option(
-        parser, "--server URL", str, "work on this server (default: $LINNA_SERVER, otherwise this machine)"
-    )
+    option(parser, "--server URL", str, "work on this server (default: $LINNA_SERVER, otherwise this machine)")
     option(parser, "--token T", str, "token for the server (default: $LINNA_TOKEN)")
-    option(
-        parser,
-        "--as NAME",
-        str,
-        "actor in the audit log, without a server (default: the login name)",
-        dest="actor",
-    )
+    option(parser, "--as NAME", str, "actor in the audit log, without a server (default: the login name)", dest="actor")
 
 
 def ground_client(arguments: argparse.Namespace, *, background: bool = False) -> Client:

@@ -28,30 +28,18 @@ def configure_interpolate(commands: Any) -> None:
     """Add `interpolate` to the subparsers of `linna orbit`."""
     interpolate = commands.add_parser("interpolate", help="states of an ephemeris at given UTC epochs")
     option(interpolate, "ephemeris F", Path, "ephemeris file (OEM, STK .e, Horizons CSV)")
-    option(
-        interpolate, "--epochs FILE", str, "UTC epochs, one a line (- reads standard input)", required=True
-    )
+    option(interpolate, "--epochs FILE", str, "UTC epochs, one a line (- reads standard input)", required=True)
     finish(interpolate, run_interpolate)
 
 
 def configure_convert(commands: Any) -> None:
     """Add `convert` to the subparsers of `linna orbit`."""
     convert = commands.add_parser("convert", help="an ephemeris as OEM, SPK, STK .e, CSV or TUM")
-    option(
-        convert,
-        "ephemeris F",
-        Path,
-        "OEM (text or XML), STK .e, Horizons CSV (all also as .gz or .zip), or SPK",
-    )
+    option(convert, "ephemeris F", Path, "OEM (text or XML), STK .e, Horizons CSV (all also as .gz or .zip), or SPK")
     option(convert, "--out FILE", Path, "ending in .oem, .xml, .bsp, .e, .csv or .tum", required=True)
     option(convert, "--spice-id N", int, "SPICE number of the spacecraft in an SPK, such as -85")
     option(convert, "--step S", ABOVE_ZERO, "seconds between states (default: the states of the file)")
-    option(
-        convert,
-        "--type N",
-        ("3", "13"),
-        "type of an SPK: 3 (polynomials) or 13 (states); default: 3 if exact",
-    )
+    option(convert, "--type N", ("3", "13"), "type of an SPK: 3 (polynomials) or 13 (states); default: 3 if exact")
     finish(convert, run_convert)
 
 
@@ -78,10 +66,7 @@ def run_compare(arguments: argparse.Namespace) -> int:
     }
     rows = [
         f"{name:<4} radial {radial:.6g} m, transverse {transverse:.6g} m, normal {normal:.6g} m"
-        for name, (radial, transverse, normal) in (
-            ("mean", difference.mean_rtn_m),
-            ("rms", difference.rms_rtn_m),
-        )
+        for name, (radial, transverse, normal) in (("mean", difference.mean_rtn_m), ("rms", difference.rms_rtn_m))
     ]
     text = (
         f"A: {figures['a']}; B: {figures['b']}\n"

@@ -92,22 +92,12 @@ class Command:
             if name in NOT_ASKED or name in self.preset:
                 continue
             is_first = (
-                first
-                and one.default is one.empty
-                and one.kind is not one.KEYWORD_ONLY
-                and name != "spacecraft_id"
+                first and one.default is one.empty and one.kind is not one.KEYWORD_ONLY and name != "spacecraft_id"
             )
             first = first and not is_first
             stated = self.options.get(name, "")
             option = Option(stated) if isinstance(stated, str) else stated
-            _add(
-                parser,
-                name,
-                eval(one.annotation, scope),
-                one.default,
-                option,
-                is_first or name in self.positional,
-            )
+            _add(parser, name, eval(one.annotation, scope), one.default, option, is_first or name in self.positional)
         if self.limit is not None and signature.return_annotation.startswith("Listing["):
             _add(parser, "limit", int, self.limit, Option(), False)
         add_operator_options(parser)
@@ -171,9 +161,7 @@ def add_commands(parser: argparse.ArgumentParser, commands: Commands) -> None:
         actions.add_parser(name, help=one.help).fill(one.configure)
 
 
-def _add(
-    parser: argparse.ArgumentParser, name: str, kind: Any, default: Any, option: Option, positional: bool
-) -> None:
+def _add(parser: argparse.ArgumentParser, name: str, kind: Any, default: Any, option: Option, positional: bool) -> None:
     """Add an argument of a type: choices of a literal, repeated values of a sequence, a switch for a truth value."""
     required = default is inspect.Parameter.empty
     inner = [one for one in get_args(kind) if one is not types.NoneType]

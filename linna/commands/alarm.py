@@ -32,10 +32,7 @@ COMMANDS = {
         _line,
         "alarms",
         "no alarms",
-        options={
-            "state": "only alarms in this state; can be repeated",
-            "severity": "only alarms of this severity",
-        },
+        options={"state": "only alarms in this state; can be repeated", "severity": "only alarms of this severity"},
     ),
     "show": Command("get_alarm", "show an alarm with its history", _lines),
     "acknowledge": Command("acknowledge_alarm", "acknowledge an alarm", _lines, options=COMMENT),

@@ -18,9 +18,7 @@ FIGURES = (
 
 def configure(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    study = commands.add_parser(
-        "fov-study", help="probability of craters in the footprint over the field of view"
-    )
+    study = commands.add_parser("fov-study", help="probability of craters in the footprint over the field of view")
     option(study, "--ephemeris F", Path, "ephemeris file (OEM, STK .e, Horizons CSV)", required=True)
     option(study, "--catalogue F", str, CATALOGUE_HELP)
     option(study, "--seed", int, "seed of a synthetic catalogue", 1)
@@ -73,7 +71,5 @@ def run_fov_study(arguments: argparse.Namespace) -> int:
         row = "  ".join(f"{study.probability_at_least[n][k]:7.4f}" for n in counts)
         lines.append(f"{fov_deg:5g}  {row}")
     chosen = "none" if np.isnan(study.selected_fov_deg) else f"{study.selected_fov_deg:g} deg"
-    lines.append(
-        f"smallest with P(>={study.needed}) > {study.threshold:g}: {chosen}; {covered}; {study.source}"
-    )
+    lines.append(f"smallest with P(>={study.needed}) > {study.threshold:g}: {chosen}; {covered}; {study.source}")
     return emit(arguments, figures, text="\n".join(lines))

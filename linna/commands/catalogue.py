@@ -22,9 +22,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(stats, "--seed", int, "seed of a synthetic catalogue", 1)
     finish(stats, run_stats)
     _configure_curate(
-        commands.add_parser(
-            "curate", help="make the on-board anchoring catalogue from a crater list and terrain"
-        )
+        commands.add_parser("curate", help="make the on-board anchoring catalogue from a crater list and terrain")
     )
     from linna.commands._catalogue_register import configure as configure_register
 
@@ -42,9 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     ).configure(adding)
     from linna.commands._catalogue_landmarks import configure as configure_landmarks
 
-    configure_landmarks(
-        commands.add_parser("landmarks", help="compare the map made by the payload with a catalogue")
-    )
+    configure_landmarks(commands.add_parser("landmarks", help="compare the map made by the payload with a catalogue"))
 
 
 def _configure_curate(curate: argparse.ArgumentParser) -> None:

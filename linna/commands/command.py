@@ -17,18 +17,7 @@ if TYPE_CHECKING:
     from ground_service.contacts.commanding.model import Handover, Telecommand, UplinkChannel, UplinkState
     from linna.parser import LinnaParser
 
-SHOWN = {
-    "id",
-    "name",
-    "arguments",
-    "text",
-    "state",
-    "critical",
-    "timed_out",
-    "requested_by",
-    "decided_by",
-    "remark",
-}
+SHOWN = {"id", "name", "arguments", "text", "state", "critical", "timed_out", "requested_by", "decided_by", "remark"}
 
 
 def _enter(
@@ -41,9 +30,7 @@ def _enter(
     timeout_s: int = 600,
 ) -> Telecommand:
     values = dict(map(_argument, arguments))
-    return service.enter_telecommand(
-        name, spacecraft_id, arguments=values, instance=instance, timeout_s=timeout_s
-    )
+    return service.enter_telecommand(name, spacecraft_id, arguments=values, instance=instance, timeout_s=timeout_s)
 
 
 def _argument(text: str) -> tuple[str, object]:
@@ -72,9 +59,7 @@ def _uplink(arguments: argparse.Namespace) -> int:
     out.parent.mkdir(parents=True, exist_ok=True)
     # The file comes first: telecommands count as sent from the moment they are taken.
     with out.open("wb") as file, ground_client(arguments) as service:
-        taken = service.take_uplink(
-            arguments.spacecraft_id, instance=arguments.instance, format=arguments.format
-        )
+        taken = service.take_uplink(arguments.spacecraft_id, instance=arguments.instance, format=arguments.format)
         file.write(taken.octets)
     figures = {"file": str(out), "octets": len(taken.octets), "telecommands": list(taken.telecommands)}
     text = f"{out}: {len(taken.telecommands)} telecommands, {len(taken.octets)} octets"
@@ -136,43 +121,25 @@ COMMANDS: Commands = {
         "get_telecommand", "show a telecommand, its verification, and why it failed", _text, figures=_figures
     ),
     "release": Command("release_telecommand", "release a queued telecommand", _text, figures=_figures),
-    "reject": Command(
-        "reject_telecommand", "remove a queued telecommand from the queue", _text, figures=_figures
-    ),
+    "reject": Command("reject_telecommand", "remove a queued telecommand from the queue", _text, figures=_figures),
     "hold": Command(
         "hold_spacecraft",
         "stop release and transmission of telecommands of a spacecraft at once",
-        lambda one: (
-            f"spacecraft {one.spacecraft_id} ({one.instance}): on hold by {one.held_by} since {one.held}"
-        ),
+        lambda one: f"spacecraft {one.spacecraft_id} ({one.instance}): on hold by {one.held_by} since {one.held}",
         options={"reason": "why, for the other operators"},
     ),
-    "resume": Command(
-        "resume_spacecraft",
-        "end the hold of a spacecraft",
-        _handover,
-    ),
+    "resume": Command("resume_spacecraft", "end the hold of a spacecraft", _handover),
     "note": Command(
-        "change_handover",
-        "write the note for the next shift",
-        _handover,
-        options={"note": "replaces the one before"},
+        "change_handover", "write the note for the next shift", _handover, options={"note": "replaces the one before"}
     ),
     "handovers": Command(
-        "list_handovers",
-        "list notes of the last shift and holds",
-        _handover,
-        "handovers",
-        "no notes, no holds",
+        "list_handovers", "list notes of the last shift and holds", _handover, "handovers", "no notes, no holds"
     ),
     "uplink": CustomCommand(
-        "take the released telecommands and write them to a file; they count as sent from then on",
-        _configure_uplink,
+        "take the released telecommands and write them to a file; they count as sent from then on", _configure_uplink
     ),
     "receiver": Command(
-        "get_uplink_state",
-        "show the state of the telecommand receiver according to the newest telemetry",
-        _receiver,
+        "get_uplink_state", "show the state of the telecommand receiver according to the newest telemetry", _receiver
     ),
 }
 

@@ -18,16 +18,12 @@ BLOCK = 10_000
 """Number of receptions in one request."""
 
 
-def _list(
-    service: Client, *, spacecraft_id: int, instance: str = "flight", all: bool = False
-) -> list[Correlation]:
+def _list(service: Client, *, spacecraft_id: int, instance: str = "flight", all: bool = False) -> list[Correlation]:
     rows = service.list_correlations(spacecraft_id, instance=instance)
     return rows if all else sorted((row for row in rows if row.in_force), key=lambda row: row.start_ticks)
 
 
-def _receptions(
-    service: Client, file: Path, *, spacecraft_id: int, instance: str = "flight"
-) -> list[Correlation]:
+def _receptions(service: Client, file: Path, *, spacecraft_id: int, instance: str = "flight") -> list[Correlation]:
     from ground_service.missions.timekeeping.recorrelation import read_receptions
     from lunar.timescales import format_utc
 
@@ -45,9 +41,7 @@ def _receptions(
         rows = service.add_receptions(spacecraft_id, given[start : start + BLOCK], instance=instance)
     reports = service.list_time_reports(spacecraft_id, instance=instance)
     for remark in sorted({one.remark for one in reports} - {""}):
-        log(
-            f"linna: warning: {remark}: {sum(one.remark == remark for one in reports)} time reports do not count"
-        )
+        log(f"linna: warning: {remark}: {sum(one.remark == remark for one in reports)} time reports do not count")
     return rows
 
 
@@ -113,9 +107,7 @@ COMMANDS = {
         _receptions,
         "enter reception times of time reports (CSV)",
         *SEGMENTS,
-        options={
-            "file": Option("columns packet_ticks, sequence_count, received_utc; optional: station", "file")
-        },
+        options={"file": Option("columns packet_ticks, sequence_count, received_utc; optional: station", "file")},
     ),
 }
 

@@ -60,9 +60,7 @@ def _fetch(arguments: argparse.Namespace) -> int:
             known = ", ".join(product.name for product in PRODUCTS)
             raise UsageError(f"data fetch: expected one of {known}, found {name!r}")
         if not product.files:
-            raise UsageError(
-                f"data fetch: {name}: expected a product with an address, found none: {product.note}"
-            )
+            raise UsageError(f"data fetch: {name}: expected a product with an address, found none: {product.note}")
     files = [file for product in products if product for file in product.files if arguments.only in file.path]
     if not files:
         raise UsageError(f"data fetch: expected files with {arguments.only!r} in their name, found none")
@@ -82,10 +80,7 @@ def _verify(arguments: argparse.Namespace) -> int:
 
     root = _root(arguments)
     checked = verify(root)
-    counts = {
-        status: sum(c.status == status for c in checked)
-        for status in ("whole", "damaged", "missing", "unknown")
-    }
+    counts = {status: sum(c.status == status for c in checked) for status in ("whole", "damaged", "missing", "unknown")}
     for c in checked:
         if c.status != "whole":
             log(f"{root / c.path}: {c.status} ({c.against})")

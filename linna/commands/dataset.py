@@ -23,14 +23,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(build, "--bits", int, "of the PNG files", None, choices=(8, 16))
     option(build, "--renderer NAME", str, "fast (default), raymarch or cycles", None)
     finish(build, _build)
-    check = verbs.add_parser(
-        "check", help="find missing and damaged files; frames and craters compared with the paper"
-    )
+    check = verbs.add_parser("check", help="find missing and damaged files; frames and craters compared with the paper")
     option(check, "folder DIR", Path)
     finish(check, _check)
-    stats = verbs.add_parser(
-        "stats", help="frames by split, crater instances by class, compared with the paper"
-    )
+    stats = verbs.add_parser("stats", help="frames by split, crater instances by class, compared with the paper")
     option(stats, "folder DIR", Path)
     finish(stats, _stats)
 

@@ -18,15 +18,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(metavar="ACTION", required=True)
     upgrade = actions.add_parser("upgrade", help="upgrade the schema to this version")
     upgrade.set_defaults(handler=run_upgrade)
-    granting = actions.add_parser(
-        "grant", help="grant a database role the least privileges that the service needs"
-    )
+    granting = actions.add_parser("grant", help="grant a database role the least privileges that the service needs")
     option(granting, "--role NAME", str, "default: the user of $LINNA_DATABASE_URL")
     option(
-        granting,
-        "--backup",
-        bool,
-        "grant only the right to read, for backups; --role defaults to $LINNA_BACKUP_ROLE",
+        granting, "--backup", bool, "grant only the right to read, for backups; --role defaults to $LINNA_BACKUP_ROLE"
     )
     option(granting, "--print", bool, "print the SQL statements and do not run them")
     granting.set_defaults(handler=run_grant)
@@ -35,18 +30,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     saving = actions.add_parser("backup", help="write the whole service into a new folder, while it runs")
     option(saving, "--out DIR", Path, required=True)
     saving.set_defaults(handler=run_backup)
-    restoring = actions.add_parser(
-        "restore", help="fill an empty service from a backup, of SQLite or PostgreSQL"
-    )
+    restoring = actions.add_parser("restore", help="fill an empty service from a backup, of SQLite or PostgreSQL")
     option(restoring, "folder", Path)
     restoring.set_defaults(handler=run_restore)
     tidying = actions.add_parser("tidy", help="delete old feed messages and old finished jobs")
-    option(
-        tidying,
-        "--days",
-        int,
-        "delete what is older than this number of days (default: $LINNA_RETENTION_DAYS)",
-    )
+    option(tidying, "--days", int, "delete what is older than this number of days (default: $LINNA_RETENTION_DAYS)")
     tidying.set_defaults(handler=run_tidy)
     decoding = actions.add_parser("redecode", help="decode the archive again with this version's dictionary")
     decoding.set_defaults(handler=run_redecode)
@@ -93,18 +81,14 @@ def run_grant(arguments: argparse.Namespace) -> int:
         grant(database, role)
     finally:
         database.engine.dispose()
-    return emit(
-        arguments, {"role": role, "database": database.label}, text=f"{database.label}: granted to {role}"
-    )
+    return emit(arguments, {"role": role, "database": database.label}, text=f"{database.label}: granted to {role}")
 
 
 def _service_role(settings: Settings) -> str | None:
     """Return the database role of the service; None if it is also the role of migrations."""
     from sqlalchemy import make_url
 
-    service, owner = (
-        make_url(url) for url in (settings.resolved_database_url(), settings.resolved_migration_url())
-    )
+    service, owner = (make_url(url) for url in (settings.resolved_database_url(), settings.resolved_migration_url()))
     if settings.migration_database_url is None or service.username == owner.username:
         return None
     return service.username
@@ -149,9 +133,7 @@ def run_tidy(arguments: argparse.Namespace) -> int:
     days = arguments.days if arguments.days is not None else settings_of(arguments).retention_days
     with open_service(arguments) as ground:
         removed = tidy(ground, max(days, 0))
-    return emit(
-        arguments, {"removed": removed}, text=", ".join(f"{count} {name}" for name, count in removed.items())
-    )
+    return emit(arguments, {"removed": removed}, text=", ".join(f"{count} {name}" for name, count in removed.items()))
 
 
 def run_redecode(arguments: argparse.Namespace) -> int:

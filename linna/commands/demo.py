@@ -30,11 +30,7 @@ KERNELS = (
 
 def configure(parser: argparse.ArgumentParser) -> None:
     option(
-        parser,
-        "--out DIR",
-        Path,
-        "folder for the pass archive, the ground database and the report",
-        Path("linna-demo"),
+        parser, "--out DIR", Path, "folder for the pass archive, the ground database and the report", Path("linna-demo")
     )
     option(parser, "--scenario", str, "scenario file or name (default: selenita; live: live-demo)")
     option(parser, "--seed", int, "another seed than the scenario's")
@@ -60,9 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         from studies.mission_run.living import living_demo
 
         stopping = event_of_signals()
-        living_demo(
-            scenario, data, arguments.out, arguments.rate, arguments.port, log, stopping, watched_rims
-        )
+        living_demo(scenario, data, arguments.out, arguments.rate, arguments.port, log, stopping, watched_rims)
         return 0
     archive = arguments.out / "pass"
     log("emulating the payload ...")
@@ -90,9 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
         "data": emulated["data"],
     }
     return emit(
-        arguments,
-        figures,
-        text=describe(figures) + "\n\nnext steps:\n" + "\n".join(next_steps(arguments, figures)),
+        arguments, figures, text=describe(figures) + "\n\nnext steps:\n" + "\n".join(next_steps(arguments, figures))
     )
 
 
@@ -111,14 +103,8 @@ def next_steps(arguments: argparse.Namespace, figures: dict[str, Any]) -> list[s
             "--approve",
             "plan an observation window",
         ),
-        (
-            f"plan uplink 1 --home {home} --out {arguments.out / 'window.cltu'}",
-            "send its telecommands to a file",
-        ),
-        (
-            f"report {figures['pass_id']} --home {home} --out {arguments.out / 'report'}",
-            "report as HTML, PDF, JSON",
-        ),
+        (f"plan uplink 1 --home {home} --out {arguments.out / 'window.cltu'}", "send its telecommands to a file"),
+        (f"report {figures['pass_id']} --home {home} --out {arguments.out / 'report'}", "report as HTML, PDF, JSON"),
     )
     return [f"  # {purpose}\n  {linna} {command}" for command, purpose in steps]
 

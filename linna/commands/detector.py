@@ -6,12 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from linna.commands._detector_common import (
-    add_model,
-    model_octets,
-    need_torch,
-    restart_for_training,
-)
+from linna.commands._detector_common import add_model, model_octets, need_torch, restart_for_training
 from linna.output import finish
 from linna.parser import option
 
@@ -41,10 +36,7 @@ def _add_train(verbs: Any) -> None:
     option(train, "--landmarks F.csv", Path, "uncatalogued landmarks as further labels", None)
     option(train, "--start-from FILE", Path, "first weights: a checkpoint or an ONNX network", None)
     option(
-        train,
-        "--normalise-first",
-        bool,
-        "the paper's order: channels of an RGB data set are normalised, then averaged",
+        train, "--normalise-first", bool, "the paper's order: channels of an RGB data set are normalised, then averaged"
     )
     option(
         train,
@@ -66,10 +58,7 @@ def _add_export(verbs: Any) -> None:
     option(export, "--revision", str, "source revision for the model's metadata", "")
     option(export, "--paper-classes", bool, "keep the heatmaps of the paper's three classes")
     option(
-        export,
-        "--classes-only",
-        bool,
-        "the paper's detector: class heatmaps and offsets, no sizes; flies as a build",
+        export, "--classes-only", bool, "the paper's detector: class heatmaps and offsets, no sizes; flies as a build"
     )
     option(
         export,
@@ -85,8 +74,7 @@ def _add_export(verbs: Any) -> None:
 
 def _add_calibrate(verbs: Any) -> None:
     calibrate = verbs.add_parser(
-        "calibrate",
-        help="fit the standard deviations of centres on validation frames, and store them",
+        "calibrate", help="fit the standard deviations of centres on validation frames, and store them"
     )
     add_model(calibrate)
     option(calibrate, "--dataset DIR", Path, nargs="+", required=True)
@@ -152,12 +140,7 @@ def _train(arguments: argparse.Namespace) -> int:
     datasets = [Dataset(folder) for folder in arguments.datasets]
     landmarks = None if arguments.landmarks is None else load_landmarks(arguments.landmarks)
     figures = train(
-        datasets,
-        arguments.out,
-        parameters,
-        start_from=arguments.start_from,
-        landmarks=landmarks,
-        report=log,
+        datasets, arguments.out, parameters, start_from=arguments.start_from, landmarks=landmarks, report=log
     )
     return emit(arguments, figures)
 
@@ -249,9 +232,7 @@ def _info(arguments: argparse.Namespace) -> int:
 
     octets = model_octets(arguments.model)
     detector = OnnxDetector(octets)
-    metadata = {
-        key: json.loads(text) if text[:1] in ("{", "[") else text for key, text in detector.metadata.items()
-    }
+    metadata = {key: json.loads(text) if text[:1] in ("{", "[") else text for key, text in detector.metadata.items()}
     figures = {"sha256": detector.sha256, "model_bytes": len(octets), **metadata}
     shipped = describe_networks()
     lines = [f"{key}: {value}" for key, value in figures.items()] + [

@@ -37,13 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         Path,
         "table of `linna catalogue curate`, uploaded in place of the terrain's craters",
     )
-    option(
-        parser,
-        "--frames",
-        ("none", "some", "all"),
-        "images kept in the archive (default: eight of them)",
-        "some",
-    )
+    option(parser, "--frames", ("none", "some", "all"), "images kept in the archive (default: eight of them)", "some")
     option(
         parser,
         "--images DIR",
@@ -78,9 +72,7 @@ def _add_live(parser: argparse.ArgumentParser) -> None:
     add("--days", type=ABOVE_ZERO, metavar="D", help="end after so many days (default: never)")
     add("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
     add("--port", type=int, default=10015, help="telemetry of the first station (default: %(default)s)")
-    add(
-        "--tc-port", type=int, default=10025, help="its telecommands, CLTUs or packets (default: %(default)s)"
-    )
+    add("--tc-port", type=int, default=10025, help="its telecommands, CLTUs or packets (default: %(default)s)")
     add(
         "--station-port",
         action="append",
@@ -89,25 +81,11 @@ def _add_live(parser: argparse.ArgumentParser) -> None:
         help="ports of a station (default: those after the ports of the station before)",
     )
     words = "run|pause|step|state|watch|save|until UTC|rate X|quit"
-    add(
-        "--console-port",
-        type=int,
-        default=10035,
-        help=f"JSON lines out, {words} in (default: %(default)s)",
-    )
+    add("--console-port", type=int, default=10035, help=f"JSON lines out, {words} in (default: %(default)s)")
     add("--mission-port", type=int, default=10045, help="mission description (default: %(default)s)")
     add("--craters", type=Path, metavar="FILE", help="craters on board from launch; made if there is no file")
-    add(
-        "--operations",
-        type=Path,
-        metavar="FILE",
-        help="TOML in place of the automation and approval of the mission",
-    )
-    add(
-        "--hold-contacts",
-        action="store_true",
-        help="stop time at the start and the end of contacts until run",
-    )
+    add("--operations", type=Path, metavar="FILE", help="TOML in place of the automation and approval of the mission")
+    add("--hold-contacts", action="store_true", help="stop time at the start and the end of contacts until run")
     add("--keep-unacknowledged", action="store_true", help="stations keep telemetry until it is acknowledged")
     add("--end-with-console", action="store_true", help="end when the last connection of the console ends")
     add(
@@ -150,9 +128,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         raise UsageError("emulate: expected --out DIR or --live, found neither")
     kept = {"none": 0, "some": 8, "all": None}[arguments.frames]
-    external = (
-        None if arguments.images is None else load_external(arguments.images, scenario, arguments.evidence)
-    )
+    external = None if arguments.images is None else load_external(arguments.images, scenario, arguments.evidence)
     summary = emulate(
         scenario,
         data_folder(),

@@ -51,11 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     with ground_client(arguments) as service, tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "export.zip" if unpacked else out
         service.export_pass(
-            arguments.pass_id,
-            arguments.format,
-            target,
-            states=arguments.states,
-            version=arguments.version,
+            arguments.pass_id, arguments.format, target, states=arguments.states, version=arguments.version
         )
         files = _unpack(target, out) if unpacked else [out]
     figures = {

@@ -26,15 +26,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         str,
         "name of the recording of which the files are consecutive pieces (default: each file is a recording)",
     )
-    option(
-        parser,
-        "--offset N",
-        number(int, least=0),
-        "offset of the first file in the recording, octets (default: 0)",
-    )
-    option(
-        parser, "--station NAME", str, "station that received the files, as in the mission description", ""
-    )
+    option(parser, "--offset N", number(int, least=0), "offset of the first file in the recording, octets (default: 0)")
+    option(parser, "--station NAME", str, "station that received the files, as in the mission description", "")
     option(
         parser,
         "--link SETTINGS",

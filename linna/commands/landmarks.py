@@ -27,11 +27,7 @@ def _export(
     out: Path,
     spacecraft_id: int | None = None,
 ) -> dict[str, Any]:
-    from ground_service.evaluation.landmarks.service import (
-        extended_catalogue,
-        extended_table,
-        format_labels,
-    )
+    from ground_service.evaluation.landmarks.service import extended_catalogue, extended_table, format_labels
     from lunar.catalogue import format_catalogue, load_catalogue
     from tmtc.dictionary.tables import pack_catalogue_table, unpack_catalogue_table
 
@@ -55,11 +51,7 @@ def _table(service: Client, pass_id: int, *, out: Path) -> dict[str, Any]:
 
     service.get_onboard_table(pass_id, out)
     octets = out.read_bytes()
-    return {
-        "file": str(out),
-        "craters": len(unpack_catalogue_table(octets)),
-        "hash": f"{table_hash(octets):08x}",
-    }
+    return {"file": str(out), "craters": len(unpack_catalogue_table(octets)), "hash": f"{table_hash(octets):08x}"}
 
 
 def _upload(

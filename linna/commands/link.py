@@ -20,15 +20,7 @@ if TYPE_CHECKING:
 
 INCONCLUSIVE = 3
 SHOWN = 6
-_DECLARED = (
-    "frame_length",
-    "coding",
-    "randomiser",
-    "interleave",
-    "rs_errors",
-    "dual_basis",
-    "frame_checksum",
-)
+_DECLARED = ("frame_length", "coding", "randomiser", "interleave", "rs_errors", "dual_basis", "frame_checksum")
 _CODE_ONLY = ("interleave", "rs_errors", "dual_basis")
 
 
@@ -96,9 +88,7 @@ def _differences(settings: Mapping[str, Any], declared: Mapping[str, Any]) -> li
     return lines
 
 
-def _lines(
-    proposal: LinkProposal, packets: int, form: PacketForm | None, differences: list[str]
-) -> list[str]:
+def _lines(proposal: LinkProposal, packets: int, form: PacketForm | None, differences: list[str]) -> list[str]:
     lines = [f"markers {proposal.markers}"]
     common = list(proposal.distances.items())[:SHOWN]
     if common:
@@ -161,9 +151,7 @@ def operate(arguments: argparse.Namespace) -> int:
         names = frozenset(arguments.names)
         unknown = sorted(names.difference(declared_links(ground)))
         if unknown:
-            raise UsageError(
-                f"{unknown[0]}: expected a link of a mission description, found none of this name"
-            )
+            raise UsageError(f"{unknown[0]}: expected a link of a mission description, found none of this name")
         supervisor = LinkSupervisor(ground, names or None)
         supervisor.start()
         log(f"links: {', '.join(sorted(names)) or 'all'}")
@@ -176,9 +164,7 @@ def operate(arguments: argparse.Namespace) -> int:
 def _line(link: LinkStatus) -> str:
     reason = f": {link.reason}" if link.reason else ""
     waiting = f", {link.unsent} telecommands wait" if link.unsent else ""
-    return (
-        f"{link.name} ({link.station or 'no station'}): {link.state}{reason}; {link.octets} octets{waiting}"
-    )
+    return f"{link.name} ({link.station or 'no station'}): {link.state}{reason}; {link.octets} octets{waiting}"
 
 
 def _contacts(found: Contacts) -> str:

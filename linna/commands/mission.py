@@ -76,9 +76,7 @@ def write(arguments: argparse.Namespace) -> int:
         window_s = 60.0 * arguments.window_min
         log("computing the orbit, measuring the rims of the craters around the windows ...")
         folder = data_folder()
-        text = write_flight(
-            scenario, folder, arguments.out, arguments.windows, window_s, watched=watched_rims
-        )
+        text = write_flight(scenario, folder, arguments.out, arguments.windows, window_s, watched=watched_rims)
     else:
         text = scenario_mission_text(scenario, data_folder())
     mission, _ = read_mission(text.encode(), str(arguments.out))
@@ -92,13 +90,7 @@ def check(arguments: argparse.Namespace) -> int:
 
     mission, faults = check_mission_file(arguments.file)
     if mission is None:
-        figures: dict[str, Any] = {
-            "mission": None,
-            "revision": None,
-            "unknown": [],
-            "remarks": [],
-            "faults": faults,
-        }
+        figures: dict[str, Any] = {"mission": None, "revision": None, "unknown": [], "remarks": [], "faults": faults}
         emit(arguments, figures, text="\n".join(faults))
         return 2
     figures = {**_figures(mission), "faults": []}
@@ -116,8 +108,7 @@ def check(arguments: argparse.Namespace) -> int:
             ],
         }
         lines += [
-            f"window {one['start']} to {one['stop']}: {one['telecommands']} telecommands"
-            for one in figures["windows"]
+            f"window {one['start']} to {one['stop']}: {one['telecommands']} telecommands" for one in figures["windows"]
         ]
         lines += flown.faults
     emit(arguments, figures, text="\n".join(lines))
@@ -138,10 +129,7 @@ def _figures(mission: Any) -> dict[str, Any]:
 
 def _described(figures: Mapping[str, Any]) -> str:
     unknown = figures["unknown"]
-    lines = [
-        f"mission {figures['mission']}, revision {figures['revision'][:16]}",
-        *figures["stated"].splitlines(),
-    ]
+    lines = [f"mission {figures['mission']}, revision {figures['revision'][:16]}", *figures.get("stated", "").splitlines()]
     if unknown:
         lines.append(f"not stated ({len(unknown)}): {', '.join(unknown)}")
     return "\n".join([*lines, *figures.get("remarks", ())])
@@ -213,15 +201,11 @@ def went_well(figures: Mapping[str, Any]) -> bool:
 COMMANDS: Commands = {
     "write": CustomCommand("write the mission description of a scenario", _configure_write),
     "check": CustomCommand("check a mission description; print one line for each fault", _configure_check),
-    "add": Command(
-        "add_mission", "add a mission description as a revision", lambda made: _described(as_json(made))
-    ),
+    "add": Command("add_mission", "add a mission description as a revision", lambda made: _described(as_json(made))),
     "list": Command(
         "list_missions",
         "list the revisions, newest first",
-        lambda one: (
-            f"{one.revision[:16]}  {str(one.entered)[:19]}Z  {one.mission}  ({len(one.unknown)} not stated)"
-        ),
+        lambda one: f"{one.revision[:16]}  {str(one.entered)[:19]}Z  {one.mission}  ({len(one.unknown)} not stated)",
         "missions",
         "no mission descriptions",
     ),

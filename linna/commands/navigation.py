@@ -48,13 +48,8 @@ def run_survey(arguments: argparse.Namespace) -> int:
         scenario = survey_scenario(base, region, arguments.windows, seed)
         sessions.append(
             survey_session(
-                scenario,
-                data_folder(),
-                arguments.out,
-                lambda rows, total: progress(rows, total, "frames", "frame"),
+                scenario, data_folder(), arguments.out, lambda rows, total: progress(rows, total, "frames", "frame")
             )
         )
     figures = summary(sessions)
-    return emit(
-        arguments, {"seeds": list(range(first, first + arguments.seeds)), **figures}, format_survey(figures)
-    )
+    return emit(arguments, {"seeds": list(range(first, first + arguments.seeds)), **figures}, format_survey(figures))

@@ -50,9 +50,7 @@ def run_propagate(arguments: argparse.Namespace) -> int:
     ephemeris, states = sample(orbit, arguments.step)
     save(out, format_oem(ephemeris).encode())
     wall_s = time.perf_counter() - started
-    log(
-        f"propagated in {propagated - started:.2f} s, sampled and written in {wall_s - (propagated - started):.2f} s"
-    )
+    log(f"propagated in {propagated - started:.2f} s, sampled and written in {wall_s - (propagated - started):.2f} s")
     figures = _figures(orbit, states, wall_s)
     figures["data"] = list(data.names()) or ["built-in gravity and IAU orientation only"]
     figures["out"] = str(out)
@@ -162,20 +160,14 @@ def run_visibility(arguments: argparse.Namespace) -> int:
 
     stations = tuple(_station(text) for text in arguments.station)
     if len({one.name for one in stations}) < len(stations):
-        raise UsageError(
-            f"--station: expected names of their own, found {', '.join(one.name for one in stations)}"
-        )
+        raise UsageError(f"--station: expected names of their own, found {', '.join(one.name for one in stations)}")
     orientation = default_orientation(data_folder())
     ephemeris = load_orbit(arguments.ephemeris)
     found = visibility_spans(ephemeris, orientation, stations, arguments.step)
 
     def listed(spans: tuple[tuple[int, int], ...]) -> list[dict[str, Any]]:
         return [
-            {
-                "start": format_utc(start),
-                "stop": format_utc(stop),
-                "duration_s": round((stop - start) / 1e9, 3),
-            }
+            {"start": format_utc(start), "stop": format_utc(stop), "duration_s": round((stop - start) / 1e9, 3)}
             for start, stop in spans
         ]
 
@@ -225,6 +217,4 @@ def _station(text: str) -> Any:
         )
     height_m = values[2] if len(values) > 2 else 0.0
     elevation_deg = values[3] if len(values) > 3 else 10.0
-    return GroundStation(
-        name, math.radians(values[0]), math.radians(values[1]), height_m, math.radians(elevation_deg)
-    )
+    return GroundStation(name, math.radians(values[0]), math.radians(values[1]), height_m, math.radians(elevation_deg))

@@ -75,10 +75,7 @@ COMMANDS = {
         "passes",
         "no passes: telemetry alone makes none; a pass is a flown window, an imported archive, or a defined interval",
         _listed,
-        options={
-            "search": "part of the name",
-            "verdict": "verdict of the newest report; none: without a report",
-        },
+        options={"search": "part of the name", "verdict": "verdict of the newest report; none: without a report"},
     ),
     "show": Command("evaluate_pass", "evaluate a pass and show its metrics", describe),
 }

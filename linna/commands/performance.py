@@ -42,15 +42,11 @@ def performance_lines(found: Performance) -> str:
         judged = rule.met + rule.not_met
         status = f"met on {rule.met} of {judged} judged passes" if judged else "not judged"
         remark = f"; {rule.remark}" if rule.remark else ""
-        lines.append(
-            f"  {rule.name}, last {found.window_days:g} days: {status}, unknown on {rule.unknown}{remark}"
-        )
+        lines.append(f"  {rule.name}, last {found.window_days:g} days: {status}, unknown on {rule.unknown}{remark}")
     return "\n".join(lines)
 
 
-def _report(
-    service: Client, *, spacecraft_id: int, instance: str = "flight", month: str, out: Path
-) -> dict[str, Any]:
+def _report(service: Client, *, spacecraft_id: int, instance: str = "flight", month: str, out: Path) -> dict[str, Any]:
     made = service.add_monthly_report(spacecraft_id, month, instance=instance)
     for kind in ("html", "pdf", "json"):
         service.get_monthly_report(made.id, out / f"report.{kind}", format=kind)

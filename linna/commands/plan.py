@@ -92,9 +92,7 @@ def _uplink(service: Client, window_id: int, *, out: Path | None = None) -> dict
         octets = service.take_uplink(window.spacecraft_id, instance=window.instance).octets
         if not octets:
             states = ", ".join(sorted({one.state for one in released})) or "none"
-            raise UsageError(
-                f"window {window_id}: nothing to send: its telecommands are {states}; no file is written"
-            )
+            raise UsageError(f"window {window_id}: nothing to send: its telecommands are {states}; no file is written")
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_bytes(octets)
     return {"window_id": window_id, "telecommands": [as_json(one) for one in released]}
@@ -157,9 +155,7 @@ def _window(window: Window) -> str:
 
 
 def _released(made: dict[str, Any]) -> str:
-    return "\n".join(
-        f"telecommand {one['id']} ({one['name']}): {one['state']}" for one in made["telecommands"]
-    )
+    return "\n".join(f"telecommand {one['id']} ({one['name']}): {one['state']}" for one in made["telecommands"])
 
 
 def _request(one: StandingRequest) -> str:
@@ -205,15 +201,11 @@ REQUESTS: Commands = {
         "no standing requests",
         limit=None,
     ),
-    "plan": Command(
-        "get_request_plan", "show the candidates of the last plan with the reasons", _request_plan
-    ),
+    "plan": Command("get_request_plan", "show the candidates of the last plan with the reasons", _request_plan),
     "pause": Command(
         "change_request", "plan no further windows", _request_state, preset={"change": {"state": "paused"}}
     ),
-    "resume": Command(
-        "change_request", "plan windows again", _request_state, preset={"change": {"state": "active"}}
-    ),
+    "resume": Command("change_request", "plan windows again", _request_state, preset={"change": {"state": "active"}}),
     "delete": Command(
         _delete_request,
         "delete a standing request; its windows stay",
@@ -249,26 +241,16 @@ COMMANDS: Commands = {
         _add,
         "enter a window as a draft",
         _window,
-        options={
-            "after": Option("window that must precede this one", "ID"),
-            "approve": "approve the window as well",
-        },
+        options={"after": Option("window that must precede this one", "ID"), "approve": "approve the window as well"},
     ),
-    "list": Command(
-        "list_windows", "list planned windows, newest first", _window, "windows", "no windows", limit=100
-    ),
+    "list": Command("list_windows", "list planned windows, newest first", _window, "windows", "no windows", limit=100),
     "show": Command("get_window", "show a window", _window),
     "approve": Command("change_window", "approve a draft", _window, preset={"change": {"state": "approved"}}),
     "draft": Command(
-        "change_window",
-        "return a window to the state draft",
-        _window,
-        preset={"change": {"state": "draft"}},
+        "change_window", "return a window to the state draft", _window, preset={"change": {"state": "draft"}}
     ),
     "fail": Command(_fail, "mark a window as failed", _window),
-    "delete": Command(
-        _delete, "remove a window from the plan", lambda made: f"window {made['deleted']}: deleted"
-    ),
+    "delete": Command(_delete, "remove a window from the plan", lambda made: f"window {made['deleted']}: deleted"),
     "uplink": Command(
         _uplink,
         "release the time-tagged telecommands of a window",

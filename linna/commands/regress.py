@@ -36,9 +36,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(run, "--build BUILD", str, "candidate: build file, 'current' or identity", required=True)
     option(run, "--baseline BUILD", str, "baseline", "current")
     option(run, "--policy FILE", Path, "policy of the gates: a file, or a shipped one by name", Path("ci"))
-    option(
-        run, "--repeat-baseline", bool, "replay kept baselines again, so that processor times are compared"
-    )
+    option(run, "--repeat-baseline", bool, "replay kept baselines again, so that processor times are compared")
     option(run, "--junit FILE", Path, "write JUnit XML")
     option(run, "--report FILE", Path, "write the report as HTML")
     _finish(run, _run)
@@ -49,8 +47,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(baseline, "--build BUILD", str, "build", "current")
     _finish(baseline, _baseline)
     placebo = commands.add_parser(
-        "placebo",
-        help="compare a build with itself, with other noise in the images: do gates reject equal builds?",
+        "placebo", help="compare a build with itself, with other noise in the images: do gates reject equal builds?"
     )
     _archives(placebo)
     option(placebo, "--build BUILD", str, "build", "current")
@@ -60,9 +57,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     suite = commands.add_parser(
         "suite", help="show what the passes of the regression suite can detect, or write their archives"
     )
-    option(
-        suite, "scenario", str, "names of shipped passes, or scenario files (default: all shipped)", nargs="*"
-    )
+    option(suite, "scenario", str, "names of shipped passes, or scenario files (default: all shipped)", nargs="*")
     option(suite, "--out DIR", Path, "folder for the archives; without it nothing is written")
     option(suite, "--frames N", int, "frames of each pass (default: the scenario's)")
     option(suite, "--seeds K", int, "passes of each scenario", 1)
@@ -85,9 +80,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(build, "action", ("register", "list"))
     option(build, "file", str, "build file", nargs="?")
     _finish(build, _build)
-    sandbox = commands.add_parser(
-        "sandbox", help="show which sandbox isolates builds here, or why builds are refused"
-    )
+    sandbox = commands.add_parser("sandbox", help="show which sandbox isolates builds here, or why builds are refused")
     finish(sandbox, _sandbox)
 
 
@@ -102,14 +95,7 @@ def _archives(parser: argparse.ArgumentParser) -> None:
         action="extend",
     )
     option(
-        parser,
-        "--pass ID",
-        int,
-        "passes whose archives are replayed",
-        [],
-        dest="passes",
-        nargs="+",
-        action="extend",
+        parser, "--pass ID", int, "passes whose archives are replayed", [], dest="passes", nargs="+", action="extend"
     )
     option(parser, "--workers N", int, "simultaneous replays (default: one for each core)")
 
@@ -155,11 +141,7 @@ def _sandbox(arguments: argparse.Namespace) -> int:
     text = f"builds are isolated by: {isolation}"
     if exchange is not None:
         text = f"builds run in the runner at {exchange}"
-        refusal = (
-            ""
-            if alive(exchange)
-            else f"runner exchange {exchange}: expected a runner, found none that responds"
-        )
+        refusal = "" if alive(exchange) else f"runner exchange {exchange}: expected a runner, found none that responds"
     figures = {
         "confined": not refusal,
         "isolation": isolation,
@@ -217,23 +199,17 @@ def _suite(arguments: argparse.Namespace) -> int:
         lines.append(power_text(found))
         return emit(arguments, {"passes": rows, "detectable": found}, text="\n".join(lines))
     written = write_suite(
-        scenarios,
-        data_folder(),
-        arguments.out,
-        progress=lambda items, total: progress(items, total, "frames", "frame"),
+        scenarios, data_folder(), arguments.out, progress=lambda items, total: progress(items, total, "frames", "frame")
     )
     keys = ("scenario", "frames", "altitude_km")
     passes = [{"archive": str(one.folder)} | {key: getattr(one, key) for key in keys} for one in written]
     lines = [
-        f"{one.folder}: {one.frames} frames, {one.altitude_km[0]:.0f} to {one.altitude_km[1]:.0f} km"
-        for one in written
+        f"{one.folder}: {one.frames} frames, {one.altitude_km[0]:.0f} to {one.altitude_km[1]:.0f} km" for one in written
     ]
     return emit(arguments, {"passes": passes}, text="\n".join(lines))
 
 
-def _comparison(
-    service: Client, arguments: argparse.Namespace, candidate: str, baseline: str
-) -> dict[str, Any]:
+def _comparison(service: Client, arguments: argparse.Namespace, candidate: str, baseline: str) -> dict[str, Any]:
     """Return a request to compare two builds over archives, which are uploaded if needed."""
     from linna.errors import UsageError
 
@@ -284,9 +260,7 @@ def _kept(service: Client, given: list[str]) -> list[str]:
 def _known(service: Client) -> dict[str, str]:
     """Return the identities of the kept archives by identity, by its beginning as it is listed, and by pass."""
     kept = list(service.list_kept_archives())
-    return {
-        key: one.digest for one in kept for key in (one.digest, one.digest[:LISTED], str(one.pass_id or ""))
-    }
+    return {key: one.digest for one in kept for key in (one.digest, one.digest[:LISTED], str(one.pass_id or ""))}
 
 
 def _upload(service: Client, path: Path, known: Container[str]) -> str:
@@ -353,9 +327,7 @@ def _archive(arguments: argparse.Namespace) -> int:
         for one in kept
     ]
     rows = [one.model_dump(mode="json", include=shown) for one in kept]
-    return emit(
-        arguments, {"archives": rows, "removed": removed}, text="\n".join(lines) or "no archive is kept"
-    )
+    return emit(arguments, {"archives": rows, "removed": removed}, text="\n".join(lines) or "no archive is kept")
 
 
 def _is_pass(target: str) -> bool:

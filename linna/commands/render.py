@@ -55,11 +55,7 @@ def _run_frame(arguments: argparse.Namespace) -> int:
     from payload_emulator.training.evaluate.sheets import draw_labels, save_png
 
     frame = render_frame(
-        _scenario(arguments),
-        data_folder(),
-        parse_utc(arguments.epoch[0]),
-        arguments.renderer,
-        blender_python(),
+        _scenario(arguments), data_folder(), parse_utc(arguments.epoch[0]), arguments.renderer, blender_python()
     )
     save_png(draw_labels(frame.image, frame.labels) if arguments.draw_labels else frame.image, arguments.out)
     figures: dict[str, Any] = {
@@ -95,8 +91,7 @@ def _run_sheet(arguments: argparse.Namespace) -> int:
         for view in progress(views, len(views), "render", "frames")
     ]
     pictures = [
-        draw_labels(frame.image, frame.labels) if arguments.draw_labels else eight_bits(frame.image)
-        for frame in frames
+        draw_labels(frame.image, frame.labels) if arguments.draw_labels else eight_bits(frame.image) for frame in frames
     ]
     captions = [_caption(world, view) for view in views]
     save_png(contact_sheet(pictures, captions, min(SHEET_COLUMNS, len(pictures))), arguments.out)
@@ -117,10 +112,7 @@ def _scenario(arguments: argparse.Namespace) -> Any:
     from payload_emulator.session.scenario import load_scenario
 
     scenario = load_scenario(arguments.scenario)
-    replaced = {
-        "terrain": {"source": arguments.terrain},
-        "light": {"photometry": arguments.photometry},
-    }
+    replaced = {"terrain": {"source": arguments.terrain}, "light": {"photometry": arguments.photometry}}
     sections = {
         name: dataclasses.replace(
             getattr(scenario, name), **{key: value for key, value in keys.items() if value is not None}

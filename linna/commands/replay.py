@@ -14,16 +14,9 @@ from linna.parser import option
 
 def configure(parser: argparse.ArgumentParser) -> None:
     option(parser, "archive", Path, "pass archive: a folder or a zip file", nargs="?")
-    option(
-        parser, "--build", str, "build file (TOML), or 'current': this flight code and its network", "current"
-    )
+    option(parser, "--build", str, "build file (TOML), or 'current': this flight code and its network", "current")
     option(parser, "--out DIR", Path, "output folder for downlink and summary")
-    option(
-        parser,
-        "--check-build BUILD",
-        Path,
-        "only check a build file, and its parameters against this flight code",
-    )
+    option(parser, "--check-build BUILD", Path, "only check a build file, and its parameters against this flight code")
     option(
         parser,
         "--complete",
@@ -58,12 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _fly(arguments: argparse.Namespace, archive: Path) -> int:
     if arguments.complete:
         return _complete(arguments, archive)
-    from payload_emulator.session.archive.replay import (
-        FlightBuild,
-        load_flight_build,
-        names_command,
-        replay_archive,
-    )
+    from payload_emulator.session.archive.replay import FlightBuild, load_flight_build, names_command, replay_archive
 
     current = arguments.build == "current"
     if not current and names_command(Path(arguments.build)):
@@ -107,9 +95,7 @@ def _complete(arguments: argparse.Namespace, archive: Path) -> int:
     manifest = complete_archive(archive, arguments.out, data_folder(), progress=_bar)
     frames = sum(name.startswith("frames/") for name in manifest["files"])
     return emit(
-        arguments,
-        {"archive": str(arguments.out), "frames": frames},
-        text=f"{frames} frames, archive: {arguments.out}",
+        arguments, {"archive": str(arguments.out), "frames": frames}, text=f"{frames} frames, archive: {arguments.out}"
     )
 
 

@@ -40,13 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
         dispatcher = dispatcher_for(ground, settings)
         follow_up = follow_in_process(ground, dispatcher.start)
         try:
-            scheduler = Scheduler(
-                ground,
-                dispatcher,
-                follow_up.drain,
-                settings.kept,
-                plan_hourly=settings.plan_hourly,
-            )
+            scheduler = Scheduler(ground, dispatcher, follow_up.drain, settings.kept, plan_hourly=settings.plan_hourly)
             with present(ground, settings, "scheduler"), mission_clock(ground):
                 scheduler.run(stopping, first_s=0.0)
         finally:

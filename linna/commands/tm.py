@@ -27,9 +27,7 @@ _PAUSE_S = 0.03
 def configure(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    decode = commands.add_parser(
-        "decode", help="packets of a downlink (CADUs or bare packets) as JSON, CSV or Parquet"
-    )
+    decode = commands.add_parser("decode", help="packets of a downlink (CADUs or bare packets) as JSON, CSV or Parquet")
     option(decode, "file FILE", Path)
     option(decode, "--format", ("json", "csv", "parquet"), "", "json")
     option(decode, "--out F", Path, "write there (default: standard output)")
@@ -55,9 +53,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(xtce, "--unrolled", bool, "without arrays, for decoders that do not support them")
     finish(xtce, run_xtce)
 
-    yamcs = commands.add_parser(
-        "yamcs", help="configuration of a Yamcs instance for our frames and telecommands"
-    )
+    yamcs = commands.add_parser("yamcs", help="configuration of a Yamcs instance for our frames and telecommands")
     option(yamcs, "--out DIR", Path, "folder in which Yamcs is started", required=True)
     option(yamcs, "--frame-port N", int, "UDP port of Yamcs for frames", 10016)
     option(yamcs, "--station HOST:PORT", str, "TCP port of the station for telecommands", "127.0.0.1:10025")
@@ -66,9 +62,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(yamcs, "--no-frame-checksum", bool, "frames carry no frame error control")
     finish(yamcs, run_yamcs)
 
-    frames = commands.add_parser(
-        "frames", help="send plain frames of a downlink as UDP datagrams, as Yamcs takes them"
-    )
+    frames = commands.add_parser("frames", help="send plain frames of a downlink as UDP datagrams, as Yamcs takes them")
     option(frames, "source SOURCE", str, "file of CADUs, or HOST:PORT of a station")
     option(frames, "--to HOST:PORT", str, "", "127.0.0.1:10016")
     _add_link_options(frames)
@@ -116,9 +110,7 @@ def _decode_foreign(arguments: argparse.Namespace) -> int:
     return _write(arguments, octets, len(records), figures, text)
 
 
-def _write(
-    arguments: argparse.Namespace, octets: bytes, count: int, figures: dict[str, object], text: str
-) -> int:
+def _write(arguments: argparse.Namespace, octets: bytes, count: int, figures: dict[str, object], text: str) -> int:
     if arguments.out is None:
         sys.stdout.buffer.write(octets)
         return 0
@@ -150,9 +142,7 @@ def _read_foreign(arguments: argparse.Namespace) -> tuple[DownlinkDecode, XtceDe
     decoder = Decoder(definition, arguments.container)
     decoded = _read(arguments, Dictionary(version=0, telemetry=()))
     checksum = 0 if arguments.no_error_control else 2
-    found = decoder.decode(
-        decoded.buffer, decoded.cut, decoded.headers, whole_stream=True, checksum_octets=checksum
-    )
+    found = decoder.decode(decoded.buffer, decoded.cut, decoded.headers, whole_stream=True, checksum_octets=checksum)
     known = (found.verdict == DECODED) | (found.verdict == JOINED)
     unknown = int((decoded.cut.crc_ok & ~known).sum())
     return replace(decoded, unknown=unknown), found, definition
@@ -183,9 +173,7 @@ def run_yamcs(arguments: argparse.Namespace) -> int:
     from tmtc.xtce.yamcs import yamcs_files
 
     checksum, station = not arguments.no_frame_checksum, _address("--station", arguments.station)
-    files = yamcs_files(
-        arguments.spacecraft_id, arguments.frame_length, checksum, arguments.frame_port, station
-    )
+    files = yamcs_files(arguments.spacecraft_id, arguments.frame_length, checksum, arguments.frame_port, station)
     for name, text in files.items():
         path = arguments.out / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -205,11 +193,7 @@ def run_frames(arguments: argparse.Namespace) -> int:
     settings = _link_settings(arguments) or LinkSettings()
     path = Path(arguments.source)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        pieces = (
-            _file_pieces(path)
-            if path.is_file()
-            else _received(_address("SOURCE (no file)", arguments.source))
-        )
+        pieces = _file_pieces(path) if path.is_file() else _received(_address("SOURCE (no file)", arguments.source))
         for frame in plain_frames(pieces, settings):
             sender.sendto(frame, target)
             count += 1
@@ -281,9 +265,7 @@ def _add_definition_options(parser: argparse.ArgumentParser) -> None:
         "what a size before a text counts (default: octets in documents of Yamcs and F Prime, else bits)",
     )
     option(group, "--no-error-control", bool, "packets do not end with a checksum (CRC-16)")
-    option(
-        group, "--prefix-octets N", int, "octets before each packet of a file without frames (default: tried)"
-    )
+    option(group, "--prefix-octets N", int, "octets before each packet of a file without frames (default: tried)")
 
 
 def _add_link_options(parser: argparse.ArgumentParser) -> None:
@@ -328,9 +310,7 @@ def _read(arguments: argparse.Namespace, dictionary: Dictionary | None = None) -
     except UnknownCoding as error:
         raise UsageError(f"{arguments.file}: expected {error.expected}, found {error.found}") from error
     if not decoded.packets and not decoded.frame_count:
-        raise UsageError(
-            f"{arguments.file}: expected CADUs or space packets, found none in its {len(octets)} octets"
-        )
+        raise UsageError(f"{arguments.file}: expected CADUs or space packets, found none in its {len(octets)} octets")
     return decoded
 
 

@@ -23,18 +23,11 @@ def _say_unknown(service: Client, missions: Sequence[str] | None) -> None:
     """Warn of missions that no description has: the user sees nothing of them."""
     known = {one.mission for one in service.list_missions()} if missions else set()
     for name in sorted({*(missions or ())} - known):
-        log(
-            f"linna: warning: no spacecraft has the mission {name!r}; known: {', '.join(sorted(known)) or 'none'}"
-        )
+        log(f"linna: warning: no spacecraft has the mission {name!r}; known: {', '.join(sorted(known)) or 'none'}")
 
 
 def _add(
-    service: Client,
-    name: str,
-    role: Role,
-    *,
-    missions: Sequence[str] | None = None,
-    days: float | None = None,
+    service: Client, name: str, role: Role, *, missions: Sequence[str] | None = None, days: float | None = None
 ) -> dict[str, Any]:
     _say_unknown(service, missions)
     made = service.add_user(name, role, missions=missions, days_valid=days)
@@ -42,12 +35,7 @@ def _add(
 
 
 def _renew(
-    service: Client,
-    name: str,
-    *,
-    keep: bool = False,
-    missions: Sequence[str] | None = None,
-    days: float | None = None,
+    service: Client, name: str, *, keep: bool = False, missions: Sequence[str] | None = None, days: float | None = None
 ) -> dict[str, Any]:
     _say_unknown(service, missions)
     made = service.add_token(name, missions=missions, days_valid=days, revoke_others=not keep)
@@ -113,10 +101,7 @@ DAYS = {
 }
 COMMANDS: Commands = {
     "add": Command(
-        _add,
-        "add a user and print the token, which cannot be printed again",
-        lambda made: made["token"],
-        options=DAYS,
+        _add, "add a user and print the token, which cannot be printed again", lambda made: made["token"], options=DAYS
     ),
     "token": Command(
         _renew,
@@ -124,9 +109,7 @@ COMMANDS: Commands = {
         lambda made: made["token"],
         options=DAYS | {"keep": "keep earlier tokens valid"},
     ),
-    "ensure": CustomCommand(
-        "create the user if needed, with a token from the environment", _configure_ensure
-    ),
+    "ensure": CustomCommand("create the user if needed, with a token from the environment", _configure_ensure),
     "disable": Command(
         "change_user",
         "disable a user and all tokens of the user",
@@ -134,10 +117,7 @@ COMMANDS: Commands = {
         preset={"state": "disabled", "role": None, "missions": None},
     ),
     "enable": Command(
-        "change_user",
-        "enable a disabled user",
-        _changed,
-        preset={"state": "active", "role": None, "missions": None},
+        "change_user", "enable a disabled user", _changed, preset={"state": "active", "role": None, "missions": None}
     ),
     "missions": Command(
         _limit,

@@ -171,9 +171,7 @@ def _read_segment(reader: Lines) -> AttitudeSegment:
     )
 
 
-def _useable(
-    reader: Lines, meta: dict[str, str], where: dict[str, int], system: str, utc_ns: IntArray
-) -> BoolArray:
+def _useable(reader: Lines, meta: dict[str, str], where: dict[str, int], system: str, utc_ns: IntArray) -> BoolArray:
     """Return which attitudes (n,) are in the useable interval; they span START_TIME to STOP_TIME, to 1 ms."""
     start, stop, first, last = (
         reader.epoch(meta[key], system, where[key]) if key in meta else None

@@ -18,31 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray, IntArray
-from lunar.ephemeris import (
-    INTERPOLATIONS,
-    Covariance,
-    Ephemeris,
-    EphemerisSegment,
-    read_text,
-)
+from lunar.ephemeris import INTERPOLATIONS, Covariance, Ephemeris, EphemerisSegment, read_text
 from lunar.errors import DataFileError, UnknownFrameError, UnknownTimeSystemError
 from lunar.frames import ICRF_NAMES, J2000_NAMES, icrf_from_j2000
-from lunar.messages.kvn import (
-    Lines,
-    comment_lines,
-    epoch_texts,
-    is_number,
-    numbered_lines,
-    utc_epoch_text,
-)
-from lunar.timescales import (
-    TIME_SYSTEMS,
-    format_tai,
-    format_utc,
-    tai_ns_from_utc_ns,
-    to_tai_ns,
-    utc_ns_from_tai_ns,
-)
+from lunar.messages.kvn import Lines, comment_lines, epoch_texts, is_number, numbered_lines, utc_epoch_text
+from lunar.timescales import TIME_SYSTEMS, format_tai, format_utc, tai_ns_from_utc_ns, to_tai_ns, utc_ns_from_tai_ns
 
 VERSIONS = ("1.0", "2.0", "3.0")
 CENTRES = ("MOON",)
@@ -53,15 +33,7 @@ BLOCK_ROWS = 10_000
 _CAST_ROWS = 256
 """Texts that numpy turns into epochs at a time: it refuses a text among more than 500 by a segmentation fault."""
 
-_MANDATORY = (
-    "OBJECT_NAME",
-    "OBJECT_ID",
-    "CENTER_NAME",
-    "REF_FRAME",
-    "TIME_SYSTEM",
-    "START_TIME",
-    "STOP_TIME",
-)
+_MANDATORY = ("OBJECT_NAME", "OBJECT_ID", "CENTER_NAME", "REF_FRAME", "TIME_SYSTEM", "START_TIME", "STOP_TIME")
 _META_KEYS = (
     *_MANDATORY,
     "REF_FRAME_EPOCH",
@@ -101,9 +73,7 @@ def parse_oem_lines(reader: Lines) -> Ephemeris:
     comments, header = reader.header("OEM", VERSIONS)
     for key in ("CREATION_DATE", "ORIGINATOR"):
         if key not in header:
-            raise reader.error(
-                f"{key} in the header", "the end of the file" if reader.peek() is None else "none"
-            )
+            raise reader.error(f"{key} in the header", "the end of the file" if reader.peek() is None else "none")
     segments: list[EphemerisSegment] = []
     while reader.peek() is not None:
         segments.append(_read_segment(reader, STATES_LIMIT - sum(len(one.utc_ns) for one in segments)))
@@ -117,9 +87,7 @@ def parse_oem_lines(reader: Lines) -> Ephemeris:
     return Ephemeris(tuple(segments), header["ORIGINATOR"], tuple(comments))
 
 
-def format_oem(
-    ephemeris: Ephemeris, *, time_system: str | None = None, creation_utc_ns: int | None = None
-) -> str:
+def format_oem(ephemeris: Ephemeris, *, time_system: str | None = None, creation_utc_ns: int | None = None) -> str:
     """Return OEM 2.0 text; positions to 1 um, velocities to 1 nm/s, epochs exact to the nanosecond.
 
     ``time_system`` overrides the segments' own.  CREATION_DATE is the first epoch of the ephemeris unless
@@ -128,11 +96,7 @@ def format_oem(
     created = ephemeris.start_utc_ns if creation_utc_ns is None else creation_utc_ns
     lines = ["CCSDS_OEM_VERS = 2.0"]
     lines += comment_lines(ephemeris.comments)
-    lines += [
-        f"CREATION_DATE = {format_utc(created).rstrip('Z')}",
-        f"ORIGINATOR = {ephemeris.originator}",
-        "",
-    ]
+    lines += [f"CREATION_DATE = {format_utc(created).rstrip('Z')}", f"ORIGINATOR = {ephemeris.originator}", ""]
     for segment in ephemeris.segments:
         lines += _segment_lines(segment, time_system or segment.time_system)
     return "\n".join(lines) + "\n"
@@ -155,9 +119,7 @@ def _read_segment(reader: Lines, left: int) -> EphemerisSegment:
         raise reader.error("CENTER_NAME = MOON", repr(meta["CENTER_NAME"]), where["CENTER_NAME"])
     method = meta.get("INTERPOLATION", "HERMITE").upper()
     if method not in INTERPOLATIONS:
-        raise reader.error(
-            f"an INTERPOLATION out of {', '.join(INTERPOLATIONS)}", repr(method), where["INTERPOLATION"]
-        )
+        raise reader.error(f"an INTERPOLATION out of {', '.join(INTERPOLATIONS)}", repr(method), where["INTERPOLATION"])
     degree = _degree(reader, meta, where, method)
     useable: dict[str, int] = {
         key: reader.epoch(meta[key], system, where[key])
@@ -255,13 +217,10 @@ def _epochs(reader: Lines, texts: NDArray[np.bytes_], at: list[int], system: str
         texts = np.strings.rstrip(texts, b"Z")
     if texts[0][4:5] == b"-" and texts[0][7:8] == b"-":
         with suppress(ValueError):
-            parts = [
-                texts[k : k + _CAST_ROWS].astype("datetime64[ns]") for k in range(0, len(texts), _CAST_ROWS)
-            ]
+            parts = [texts[k : k + _CAST_ROWS].astype("datetime64[ns]") for k in range(0, len(texts), _CAST_ROWS)]
             return np.asarray(to_tai_ns(np.concatenate(parts).astype(np.int64), system))
     return np.array(
-        [reader.tai(text.decode("latin-1"), system, line) for text, line in zip(texts, at, strict=True)],
-        dtype=np.int64,
+        [reader.tai(text.decode("latin-1"), system, line) for text, line in zip(texts, at, strict=True)], dtype=np.int64
     )
 
 
@@ -270,9 +229,7 @@ def _check_epochs(reader: Lines, tai_ns: IntArray, times: dict[str, int], at: In
     if late.size:
         k = int(late[0])
         raise reader.error(
-            f"an epoch after {format_tai(int(tai_ns[k]), 6)}",
-            format_tai(int(tai_ns[k + 1]), 6),
-            int(at[k + 1]),
+            f"an epoch after {format_tai(int(tai_ns[k]), 6)}", format_tai(int(tai_ns[k + 1]), 6), int(at[k + 1])
         )
     start_ns, stop_ns, grace_ns = times["START_TIME"], times["STOP_TIME"], 10**6  # Both may be rounded.
     outside = np.flatnonzero((tai_ns < start_ns - grace_ns) | (tai_ns > stop_ns + grace_ns))

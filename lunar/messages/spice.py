@@ -232,9 +232,7 @@ def _fitted(
 
     def at(places: FloatArray) -> FloatArray:
         offset_ns = np.rint((half_s * NS * (1.0 - rate))[:, None] * places).astype(np.int64)
-        values = np.concatenate(
-            state(np.clip(tai_ns_from_et(middle)[:, None] + offset_ns, *span_tai_ns)), axis=2
-        )
+        values = np.concatenate(state(np.clip(tai_ns_from_et(middle)[:, None] + offset_ns, *span_tai_ns)), axis=2)
         return values.transpose(0, 2, 1)
 
     nodes, others = chebyshev.chebpts1(terms), np.linspace(-1.0, 1.0, 2 * terms + 1)
@@ -266,8 +264,7 @@ def moon_kernel(start_utc_ns: int, stop_utc_ns: int) -> bytes:
     def write(spice: Any, path: str) -> None:
         handle = spice.spkopn(path, "LINNA", _COMMENT_CHARACTERS)
         spice.dafac(
-            handle,
-            ["The Moon about the barycentre, within 20 km (ERFA); load DE440 (NAIF) after it for better."],
+            handle, ["The Moon about the barycentre, within 20 km (ERFA); load DE440 (NAIF) after it for better."]
         )
         head = (handle, MOON, 0, FRAME, first, last, "MOON TO 20 KM")
         spice.spkw02(*head, record_s, records, _MOON_TERMS - 1, coefficients, first)
@@ -276,9 +273,7 @@ def moon_kernel(start_utc_ns: int, stop_utc_ns: int) -> bytes:
     return _written(write)
 
 
-def ck_octets(
-    ticks: IntArray, q_wxyz: FloatArray, spacecraft: int, *, gap_ticks: int = 10 * TICKS_PER_SECOND
-) -> bytes:
+def ck_octets(ticks: IntArray, q_wxyz: FloatArray, spacecraft: int, *, gap_ticks: int = 10 * TICKS_PER_SECOND) -> bytes:
     """Return a CK (type 3) of the camera: attitudes are interpolated between images at most ``gap_ticks`` apart.
 
     Angular rates are those of the turns to the images before and after, and 0 for an image alone.
@@ -492,9 +487,7 @@ def load_spk(path: Path | str, target: int | None = None, step_s: float = READ_S
             arcs = _spk_arcs(spice, handle, chosen)
             states = sum((arc.stop_s - arc.start_s) / step_s + 2 for arc in arcs)
             if not states <= STATES_LIMIT:
-                raise DataFileError(
-                    path, "", f"at most {STATES_LIMIT} states of {step_s:g} s", f"{states:.0f}"
-                )
+                raise DataFileError(path, "", f"at most {STATES_LIMIT} states of {step_s:g} s", f"{states:.0f}")
             segments = [_spk_segment(spice, handle, f"{path}: body {chosen}", arc, step_s) for arc in arcs]
         except spice.utils.exceptions.SpiceyError as error:
             raise DataFileError(path, f"body {chosen}", "states about the Moon", _reason(error)) from None
@@ -552,9 +545,7 @@ def _spk_arcs(spice: Any, handle: int, body: int) -> list[_Arc]:
 def _spk_segment(spice: Any, handle: int, place: str, arc: _Arc, step_s: float) -> EphemerisSegment:
     count = max(math.ceil((arc.stop_s - arc.start_s) / step_s), 1) + 1
     # A float64 of seconds is good to 0.1 us.
-    tai_ns = (
-        np.rint(tai_ns_from_et(np.linspace(arc.start_s, arc.stop_s, count)) / 1000).astype(np.int64) * 1000
-    )
+    tai_ns = np.rint(tai_ns_from_et(np.linspace(arc.start_s, arc.stop_s, count)) / 1000).astype(np.int64) * 1000
     states = []
     for et in et_from_tai_ns(tai_ns).tolist():
         state = spice.spkpvn(handle, arc.descriptor, et)[1]
@@ -564,12 +555,7 @@ def _spk_segment(spice: Any, handle: int, place: str, arc: _Arc, step_s: float) 
         states.append(state)
     values, name = 1e3 * np.array(states), place.rpartition(" ")[2]
     return EphemerisSegment(
-        utc_ns_from_tai_ns(tai_ns),
-        values[:, :3],
-        values[:, 3:],
-        object_name=name,
-        object_id=name,
-        tai_ns=tai_ns,
+        utc_ns_from_tai_ns(tai_ns), values[:, :3], values[:, 3:], object_name=name, object_id=name, tai_ns=tai_ns
     )
 
 

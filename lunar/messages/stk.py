@@ -17,22 +17,14 @@ import numpy as np
 from lunar.arrays import FloatArray, IntArray
 from lunar.constants import NS
 from lunar.ephemeris import Ephemeris, EphemerisSegment, parse_numbers, resampled
-from lunar.errors import (
-    DataFileError,
-    EphemerisError,
-    TimeFormatError,
-    UnknownFrameError,
-    UnknownTimeSystemError,
-)
+from lunar.errors import DataFileError, EphemerisError, TimeFormatError, UnknownFrameError, UnknownTimeSystemError
 from lunar.frames import ICRF_NAMES, J2000_NAMES, icrf_from_j2000
 from lunar.timescales import format_tai, parse_tai, utc_ns_from_tai_ns
 
 _STATE_WIDTH = {"EPHEMERISTIMEPOSVEL": 7, "EPHEMERISTIMEPOSVELACC": 10}
 _UNITS_M = {"METERS": 1.0, "KILOMETERS": 1000.0, "METER": 1.0, "KILOMETER": 1000.0}
 _MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
-_EPOCH = re.compile(
-    r"(\d{1,2})\s+([A-Za-z]{3})[a-z]*\s+(\d{4})\s+(\d{1,2}:\d{2}:\d{2}(?:\.\d*)?)\Z", re.ASCII
-)
+_EPOCH = re.compile(r"(\d{1,2})\s+([A-Za-z]{3})[a-z]*\s+(\d{4})\s+(\d{1,2}:\d{2}:\d{2}(?:\.\d*)?)\Z", re.ASCII)
 _IGNORED = (
     "NUMBEROFEPHEMERISPOINTS",
     "SCENARIOEPOCH",
@@ -64,9 +56,7 @@ def parse_stk(text: str, source: str = "STK text") -> Ephemeris:
     comments = tuple(line[1:].strip() for _, line in lines if line.startswith("#"))
     lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
     if not lines or not lines[0][1].lower().startswith("stk.v."):
-        raise DataFileError(
-            source, "line 1", "stk.v.<version>", repr(lines[0][1][:40]) if lines else "nothing"
-        )
+        raise DataFileError(source, "line 1", "stk.v.<version>", repr(lines[0][1][:40]) if lines else "nothing")
     if len(lines) < 2 or lines[1][1].upper() != "BEGIN EPHEMERIS":
         found = repr(lines[1][1][:40]) if len(lines) > 1 else "the end of the file"
         raise DataFileError(source, f"line {lines[min(1, len(lines) - 1)][0]}", "BEGIN Ephemeris", found)
@@ -96,9 +86,7 @@ def parse_stk(text: str, source: str = "STK text") -> Ephemeris:
     scale_m, turn = _units_and_axes(source, header)
     rows, first_line, at = _rows(source, lines, at, width)
     if not any(line.upper() == "END EPHEMERIS" for _, line in lines[at:]):
-        raise DataFileError(
-            source, f"line {lines[-1][0]}", "END Ephemeris", "the end of the file: it is cut short"
-        )
+        raise DataFileError(source, f"line {lines[-1][0]}", "END Ephemeris", "the end of the file: it is cut short")
     if "NUMBEROFEPHEMERISPOINTS" in header:
         value, number = header["NUMBEROFEPHEMERISPOINTS"]
         if value != str(len(rows)):
@@ -134,9 +122,7 @@ def format_stk(ephemeris: Ephemeris) -> str:
     segments = resampled(ephemeris).segments
     for earlier, later in pairwise(segments):
         if later.tai_ns[0] != earlier.tai_ns[-1]:
-            raise EphemerisError(
-                "an STK .e file: expected segments that follow each other, found a gap between two"
-            )
+            raise EphemerisError("an STK .e file: expected segments that follow each other, found a gap between two")
     start_tai_ns = int(segments[0].tai_ns[0])
     method = segments[0].interpolation.capitalize() if segments[0].interpolation != "LINEAR" else "Lagrange"
     samples = segments[0].degree // 2 if method == "Hermite" else segments[0].degree
@@ -183,9 +169,7 @@ def _rows(source: str, lines: list[tuple[int, str]], at: int, width: int) -> tup
         raise DataFileError(source, f"line {lines[first][0]}", "states of numbers", "others")
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if bad.size:
-        raise DataFileError(
-            source, f"line {lines[first + int(bad[0])][0]}", "finite numbers", "NaN or infinity"
-        )
+        raise DataFileError(source, f"line {lines[first + int(bad[0])][0]}", "finite numbers", "NaN or infinity")
     return rows, first, at
 
 
@@ -221,9 +205,7 @@ def _units_and_axes(source: str, header: dict[str, tuple[str, int]]) -> tuple[fl
     body, number = header.get("CENTRALBODY", ("Earth", 0))
     if body.upper() != "MOON":
         place = f"line {number}" if number else "header"
-        raise DataFileError(
-            source, place, "CentralBody Moon", repr(body) if number else "none, which means Earth"
-        )
+        raise DataFileError(source, place, "CentralBody Moon", repr(body) if number else "none, which means Earth")
     axes, number = header.get("COORDINATESYSTEM", ("Fixed", 0))
     if axes.upper() in ICRF_NAMES:
         turn = np.eye(3)
@@ -262,9 +244,7 @@ def _parts(
     steps = np.diff(tai_ns)
     if np.any(steps < 0):
         k = int(np.flatnonzero(steps < 0)[0]) + 1
-        raise DataFileError(
-            source, f"line {lines[first + k][0]}", "a time after the one before", "an earlier one"
-        )
+        raise DataFileError(source, f"line {lines[first + k][0]}", "a time after the one before", "an earlier one")
     starts = [0, *(np.flatnonzero(steps == 0) + 1).tolist(), len(tai_ns)]
     parts = []
     for begin, end in pairwise(starts):

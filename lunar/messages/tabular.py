@@ -33,8 +33,7 @@ def format_csv(ephemeris: Ephemeris, orientation: Orientation) -> str:
     row = "%s,%.9f,%.9f,%.9f,%.12f,%.12f,%.12f,%.8f,%.8f,%.6f"
     values = np.concatenate([states, places], axis=1).tolist()
     lines = [
-        row % (format_tai(t, 3 if t % 10**6 == 0 else 9), *v)
-        for t, v in zip(tai_ns.tolist(), values, strict=True)
+        row % (format_tai(t, 3 if t % 10**6 == 0 else 9), *v) for t, v in zip(tai_ns.tolist(), values, strict=True)
     ]
     return "\n".join([",".join(CSV_COLUMNS), *lines, ""])
 

@@ -127,11 +127,7 @@ class Payload:
         self._sent_octets = 0
 
     def step(
-        self,
-        image: NDArray[Any] | None,
-        attitude: FloatArray,
-        clock_ticks: int,
-        telecommand_octets: bytes,
+        self, image: NDArray[Any] | None, attitude: FloatArray, clock_ticks: int, telecommand_octets: bytes
     ) -> list[bytes]:
         """Return the space packets that go down after one frame, or one turn without a frame.
 
@@ -488,15 +484,10 @@ class Payload:
         takes = machine.board.downlink_octets()
         sends_all = machine.mode in (PayloadMode.observing, PayloadMode.downlinking)
         kinds = StoreClass if sends_all else _SMALL_CLASSES
-        if (
-            machine.time_exponent >= 0
-            and takes
-            and self._sent_octets >= _FRAME_OCTETS << machine.time_exponent
-        ):
+        if machine.time_exponent >= 0 and takes and self._sent_octets >= _FRAME_OCTETS << machine.time_exponent:
             self._sent_octets = 0
             machine.telemetry.send(
-                "time_report",
-                {"reported_ticks": machine.telemetry.ticks, "rate_exponent": machine.time_exponent},
+                "time_report", {"reported_ticks": machine.telemetry.ticks, "rate_exponent": machine.time_exponent}
             )
         packets = machine.store.take(takes, kinds)
         self._sent_octets += sum(map(len, packets))

@@ -376,11 +376,7 @@ class Scenario:
         return ", ".join(listed)
 
     def with_choices(
-        self,
-        *,
-        modes: Sequence[str] | None = None,
-        seed: int | None = None,
-        anchoring_catalogue: Path | None = None,
+        self, *, modes: Sequence[str] | None = None, seed: int | None = None, anchoring_catalogue: Path | None = None
     ) -> Scenario:
         """Return the same scenario with other estimators, seed or table of craters; None keeps what it has."""
         navigation = self.navigation
@@ -394,11 +390,7 @@ class Scenario:
 def shipped_file(path: Path) -> Path:
     """Return the file of a shipped scenario for its bare name; other paths as they are."""
     shipped = SHIPPED / f"{path.name}.toml"
-    return (
-        shipped
-        if not path.is_file() and path.name == str(path) and not path.suffix and shipped.is_file()
-        else path
-    )
+    return shipped if not path.is_file() and path.name == str(path) and not path.suffix and shipped.is_file() else path
 
 
 def load_scenario(path: Path | str) -> Scenario:
@@ -477,12 +469,8 @@ def _read(table: object, source: str) -> Scenario:
         return read_table(Scenario, table)
     except TableFault as fault:
         if not fault.known:
-            raise ScenarioError(
-                f"{source}: {fault.place} must be {fault.expected}, found {fault.found}"
-            ) from None
-        hint = (
-            f"did you mean '{fault.nearest}'?" if fault.nearest else f"known keys: {', '.join(fault.known)}"
-        )
+            raise ScenarioError(f"{source}: {fault.place} must be {fault.expected}, found {fault.found}") from None
+        hint = f"did you mean '{fault.nearest}'?" if fault.nearest else f"known keys: {', '.join(fault.known)}"
         raise ScenarioError(f"{source}: unknown key '{fault.place}'; {hint}") from None
 
 
@@ -504,11 +492,7 @@ def _check_cartesian(orbit: OrbitSection, require: Require) -> None:
         require(len(values) == 3, f"orbit.{key}", "three numbers", values)
     default = OrbitSection()
     for key in _ELEMENT_KEYS:
-        require(
-            getattr(orbit, key) == getattr(default, key),
-            f"orbit.{key}",
-            "absent where orbit.position_km is given",
-        )
+        require(getattr(orbit, key) == getattr(default, key), f"orbit.{key}", "absent where orbit.position_km is given")
     require(not orbit.oem, "orbit.oem", "absent where orbit.position_km is given")
     require(
         math.hypot(*orbit.position_km) > _MOON_RADIUS_KM,
@@ -611,11 +595,7 @@ def _check_limits(scenario: Scenario, require: Require) -> None:
 
 def _check_orbit(scenario: Scenario, require: Require) -> None:
     orbit, window = scenario.orbit, scenario.window
-    texts = {
-        "orbit.epoch": orbit.epoch,
-        "window.start": window.start,
-        "clock.reference": scenario.clock.reference,
-    }
+    texts = {"orbit.epoch": orbit.epoch, "window.start": window.start, "clock.reference": scenario.clock.reference}
     for key, text in texts.items():
         try:
             good = bool(UTC_NS.holds(parse_utc(text))) if text or key == "orbit.epoch" else True
@@ -674,16 +654,8 @@ _UNUSED: tuple[tuple[str, str, Callable[[Scenario], bool]], ...] = (
         lambda s: not s.disturbances.kidnap_distance_km,
     ),
     ("disturbances outage_at_s", "without outage_duration_s", lambda s: not s.disturbances.outage_duration_s),
-    (
-        "disturbances burn_at_s burn_declared",
-        "without burn_delta_v_m_s",
-        lambda s: not s.disturbances.burn_delta_v_m_s,
-    ),
-    (
-        "link burst_end burst_frame_loss burst_bit_error_rate",
-        "without burst_start",
-        lambda s: not s.link.burst_start,
-    ),
+    ("disturbances burn_at_s burn_declared", "without burn_delta_v_m_s", lambda s: not s.disturbances.burn_delta_v_m_s),
+    ("link burst_end burst_frame_loss burst_bit_error_rate", "without burst_start", lambda s: not s.link.burst_start),
     ("link playback outages missed", "without link.stations", lambda s: not s.link.stations),
 )
 """Keys that have no effect (section, then keys), in which case, and whether a scenario is one."""
@@ -698,18 +670,12 @@ def _check_unused(scenario: Scenario, source: str) -> None:
             found = getattr(getattr(scenario, section), name)
             if found != getattr(getattr(default, section), name):
                 key = f"{section}.{name}"
-                raise ScenarioError(
-                    f"{source}: {key} has no effect {words}: expected it left out, found {found!r}"
-                )
+                raise ScenarioError(f"{source}: {key} has no effect {words}: expected it left out, found {found!r}")
 
 
 def _check_window(scenario: Scenario, require: Require) -> None:
     window = scenario.window
-    require(
-        0.0 < window.latitude_limit_deg <= 90.0,
-        "window.latitude_limit_deg",
-        "over 0 and up to 90",
-    )
+    require(0.0 < window.latitude_limit_deg <= 90.0, "window.latitude_limit_deg", "over 0 and up to 90")
     lowest_deg, highest_deg = window.latitude_band_deg
     require(
         lowest_deg < highest_deg,
@@ -723,9 +689,7 @@ def _check_window(scenario: Scenario, require: Require) -> None:
         "over window.longitude_min_deg by up to 360",
     )
     require(
-        window.search != "none" or window.duration_s > 0.0,
-        "window.duration_s",
-        "positive when window.search is 'none'",
+        window.search != "none" or window.duration_s > 0.0, "window.duration_s", "positive when window.search is 'none'"
     )
 
 
@@ -783,9 +747,7 @@ def _check_light(scenario: Scenario, require: Require) -> None:
         "no more than light.elevation_max_deg",
     )
     require(
-        light.azimuth_min_deg <= light.azimuth_max_deg,
-        "light.azimuth_min_deg",
-        "no more than light.azimuth_max_deg",
+        light.azimuth_min_deg <= light.azimuth_max_deg, "light.azimuth_min_deg", "no more than light.azimuth_max_deg"
     )
 
 

@@ -64,12 +64,7 @@ class TableFault(ValueError):
 
 
 def read_table(
-    kind: type[Record],
-    table: object,
-    path: str = "",
-    *,
-    present: Record | None = None,
-    bounds: Bounds | None = None,
+    kind: type[Record], table: object, path: str = "", *, present: Record | None = None, bounds: Bounds | None = None
 ) -> Record:
     """Return a dataclass with the values of a table.
 
@@ -128,9 +123,7 @@ def _annotation(hint: Any, name: str, bounds: Bounds | None) -> Any:
 def _of_length(count: int) -> Callable[[object], object]:
     def check(value: object) -> object:
         if isinstance(value, list) and len(value) != count:
-            raise PydanticCustomError(
-                "expected", "{expected}", {"expected": f"{count} values", "found": len(value)}
-            )
+            raise PydanticCustomError("expected", "{expected}", {"expected": f"{count} values", "found": len(value)})
         return value
 
     return check
@@ -139,9 +132,7 @@ def _of_length(count: int) -> Callable[[object], object]:
 def _member_of(kind: type[IntEnum]) -> Callable[[object], object]:
     def check(value: object) -> object:
         if value not in kind.__members__:
-            raise PydanticCustomError(
-                "expected", "{expected}", {"expected": f"one of {', '.join(kind.__members__)}"}
-            )
+            raise PydanticCustomError("expected", "{expected}", {"expected": f"one of {', '.join(kind.__members__)}"})
         return kind[str(value)]
 
     return check
@@ -205,9 +196,7 @@ def _fault(kind: type, error: ValidationError, path: str) -> TableFault:
     if first["type"] == "extra_forbidden":
         name = str(first["loc"][-1])
         known = [item.name for item in dataclasses.fields(here)]
-        return TableFault(
-            f"{place}.{name}" if place else name, f"one of {', '.join(known)}", "an unknown key", known
-        )
+        return TableFault(f"{place}.{name}" if place else name, f"one of {', '.join(known)}", "an unknown key", known)
     if first["type"] == "literal_error":
         choices = get_args(get_type_hints(here)[str(first["loc"][-1])])
         return TableFault(place, f"one of {', '.join(map(repr, choices))}", found)

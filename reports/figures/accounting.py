@@ -25,9 +25,7 @@ def draw_frame_steps(canvas: Canvas, steps: Sequence[tuple[str, int]]) -> None:
     for side in ("left", "bottom"):
         axes.spines[side].set_visible(False)
     for place, (_, count) in zip(places, steps, strict=True):
-        axes.text(
-            1.10, place, count_text(count), transform=axes.get_yaxis_transform(), ha="right", va="center"
-        )
+        axes.text(1.10, place, count_text(count), transform=axes.get_yaxis_transform(), ha="right", va="center")
         axes.text(
             1.225, place, percent_text(count, whole), transform=axes.get_yaxis_transform(), ha="right",
             va="center", color=color("muted"),
@@ -35,11 +33,7 @@ def draw_frame_steps(canvas: Canvas, steps: Sequence[tuple[str, int]]) -> None:
 
 
 def draw_completeness(
-    canvas: Canvas,
-    series: CompletenessSeries,
-    time: TimeScale,
-    arcs: Sequence[TimeSpan],
-    gaps: Sequence[TimeSpan],
+    canvas: Canvas, series: CompletenessSeries, time: TimeScale, arcs: Sequence[TimeSpan], gaps: Sequence[TimeSpan]
 ) -> None:
     """Share of expected packets received over the pass; gaps in the colour of a fault."""
     axes = canvas.axes(0.72, 0.50, canvas.width_in - 0.87, canvas.height_in - 0.78)
@@ -55,12 +49,7 @@ def draw_completeness(
     for mask, tint in ((whole, "blue"), (~whole & np.isfinite(share), "vermillion")):
         if mask.any():
             axes.bar(
-                edges[:-1][mask],
-                share[mask],
-                np.diff(edges)[mask] * 0.9,
-                align="edge",
-                color=color(tint),
-                linewidth=0,
+                edges[:-1][mask], share[mask], np.diff(edges)[mask] * 0.9, align="edge", color=color(tint), linewidth=0
             )
     for gap in gaps:
         left, right = float(time.x(gap.start_utc_ns)), float(time.x(gap.stop_utc_ns))

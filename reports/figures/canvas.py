@@ -145,9 +145,7 @@ def time_axis(axes: Axes, time: TimeScale, *, labelled: bool = True, most: int =
 
 def arcs_differ(time: TimeScale, arcs: Iterable[TimeSpan]) -> bool:
     """True where imaging arcs cover some but not all of a span."""
-    covered = sum(
-        max(0, min(a.stop_utc_ns, time.stop_utc_ns) - max(a.start_utc_ns, time.start_utc_ns)) for a in arcs
-    )
+    covered = sum(max(0, min(a.stop_utc_ns, time.stop_utc_ns) - max(a.start_utc_ns, time.start_utc_ns)) for a in arcs)
     return 0.0 < covered / 1e9 < 0.985 * time.length_s
 
 

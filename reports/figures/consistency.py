@@ -81,9 +81,7 @@ def draw_consistency(
         axes.plot(*thinned(x, running_mean(scaled, window), 400), color=tint, linewidth=1.6)
         bottom, top = quantiles(scaled, (0.005, 0.995))
         axes.set_ylim(min(max(bottom, 1e-3), 0.1) * 0.8, max(top * 1.3, 10.0))
-        ticks = [
-            t for t in (0.01, 0.1, 1.0, 10.0, 100.0, 1000.0) if axes.get_ylim()[0] <= t <= axes.get_ylim()[1]
-        ]
+        ticks = [t for t in (0.01, 0.1, 1.0, 10.0, 100.0, 1000.0) if axes.get_ylim()[0] <= t <= axes.get_ylim()[1]]
         axes.set_yticks(ticks, [f"{t:g}" for t in ticks])
         axes.set_yticks([], minor=True)
         count, mean, within = per_degree(value[keep], dof[keep])
@@ -173,11 +171,7 @@ def draw_dependence(
         for k, one in enumerate(series):
             error = error_3d_m(one.error_rtn_m)
             for j, kind in enumerate(terrain):
-                chosen = (
-                    error[np.array([t == kind for t in one.terrain], dtype=np.bool_)]
-                    if one.terrain
-                    else error[:0]
-                )
+                chosen = error[np.array([t == kind for t in one.terrain], dtype=np.bool_)] if one.terrain else error[:0]
                 p50, p95 = quantiles(chosen, (0.5, 0.95))
                 if np.isfinite(p50):
                     place = j + (k - (len(series) - 1) / 2) * 0.16
@@ -189,11 +183,6 @@ def draw_dependence(
     for k, one in enumerate(series):
         left = _LEFT + 1.5 * k
         canvas.text(
-            left,
-            canvas.height_in - 0.16,
-            "●",
-            color=styles[one.name][0],
-            fontsize="medium",
-            va="center_baseline",
+            left, canvas.height_in - 0.16, "●", color=styles[one.name][0], fontsize="medium", va="center_baseline"
         )
         canvas.text(left + 0.18, canvas.height_in - 0.16, one.name, fontsize="small", va="center_baseline")

@@ -29,11 +29,7 @@ def draw_class_scores(canvas: Canvas, scores: Sequence[ClassScore]) -> None:
     parts = (
         ("precision", [s.precision for s in scores], [_published(s, "precision") for s in scores]),
         ("recall", [s.recall for s in scores], [_published(s, "recall") for s in scores]),
-        (
-            "localisation, px",
-            [s.localisation_px for s in scores],
-            [_published(s, "localisation_px") for s in scores],
-        ),
+        ("localisation, px", [s.localisation_px for s in scores], [_published(s, "localisation_px") for s in scores]),
     )
     for i, (name, ours, theirs) in enumerate(parts):
         axes = canvas.axes(left + i * (width + gap), bottom, width, height)
@@ -85,12 +81,7 @@ def draw_bins(canvas: Canvas, parts: Sequence[tuple[str, Sequence[BinScore]]]) -
         high = np.array([b.high for b in bins], dtype=np.float64)
         count = np.array([b.expected for b in bins], dtype=np.float64)
         axes.bar(
-            low,
-            count / max(count.max(), 1.0),
-            (high - low) * 0.96,
-            align="edge",
-            color=color("grid"),
-            linewidth=0,
+            low, count / max(count.max(), 1.0), (high - low) * 0.96, align="edge", color=color("grid"), linewidth=0
         )
         centre = (low + high) / 2
         lines: tuple[tuple[str, FloatArray, str, str], ...] = (
@@ -236,9 +227,7 @@ def _nice(value: float) -> float:
     return float(next(m * decade for m in (1.0, 2.0, 5.0, 10.0) if m * decade >= value * 0.999))
 
 
-def draw_curves(
-    canvas: Canvas, curves: Sequence[PrecisionRecallCurve], calibration: Sequence[CalibrationBin]
-) -> None:
+def draw_curves(canvas: Canvas, curves: Sequence[PrecisionRecallCurve], calibration: Sequence[CalibrationBin]) -> None:
     """Precision against recall for each class, and the share of true detections against their score."""
     size = canvas.height_in - 0.85
     left = 0.72

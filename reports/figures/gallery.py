@@ -42,12 +42,7 @@ def draw_gallery(canvas: Canvas, frames: Sequence[GalleryFrame], columns: int) -
             title += f" · {utc_text(frame.utc_ns, date=False)}"
         canvas.text(left, top - 0.15, title, va="center_baseline", fontsize="small", weight="bold")
         canvas.text(
-            left,
-            top - 0.33,
-            _fitted(frame.caption, size),
-            va="center_baseline",
-            fontsize="small",
-            color=color("muted"),
+            left, top - 0.33, _fitted(frame.caption, size), va="center_baseline", fontsize="small", color=color("muted")
         )
         draw_frame(canvas, sheet, left, top - head - size, size, frame)
 
@@ -66,9 +61,7 @@ def gallery_height_in(count: int, columns: int, width_in: float) -> float:
     return rows * (size + head) + (rows - 1) * gap
 
 
-def draw_frame(
-    canvas: Canvas, sheet: Axes, left: float, bottom: float, size: float, frame: GalleryFrame
-) -> None:
+def draw_frame(canvas: Canvas, sheet: Axes, left: float, bottom: float, size: float, frame: GalleryFrame) -> None:
     """One frame with its marks, ``size`` inches wide, at a place of a sheet whose data units are inches."""
     from matplotlib.patches import Rectangle
 
@@ -96,9 +89,7 @@ def draw_frame(
                     y(frame.catalogue_v_px[chosen]),
                     frame.catalogue_diameter_px[chosen] / 2 * inches,
                 )
-                (line,) = sheet.plot(
-                    *circles, color=tint_of(int(size_class)), linestyle=dashes[lost], linewidth=1.3
-                )
+                (line,) = sheet.plot(*circles, color=tint_of(int(size_class)), linestyle=dashes[lost], linewidth=1.3)
                 line.set_clip_path(border)
     scored = np.isin(frame.detection_class, SCORED_CLASSES)
     found = ~false | scored

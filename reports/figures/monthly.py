@@ -21,9 +21,7 @@ def series(report: MonthlyReportValue) -> dict[str, FloatArray]:
     return {name: one for name, one in found.items() if name != "map_offset_m" or np.isfinite(one).any()}
 
 
-def draw_trend(
-    canvas: Canvas, report: MonthlyReportValue, metrics: Mapping[str, tuple[str, str, float, int]]
-) -> None:
+def draw_trend(canvas: Canvas, report: MonthlyReportValue, metrics: Mapping[str, tuple[str, str, float, int]]) -> None:
     """Draw one panel for each metric; vertical lines are changes of its level."""
     starts = np.array([one.start_utc_ns for one in report.passes], dtype=np.int64)
     room = max(int(starts.max() - starts.min()) // 40, 1_800_000_000_000)

@@ -8,15 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from reports.arrays import FloatArray
-from reports.figures.canvas import (
-    Canvas,
-    TimeScale,
-    end_labels,
-    log_length_axis,
-    shade_arcs,
-    thinned,
-    time_axis,
-)
+from reports.figures.canvas import Canvas, TimeScale, end_labels, log_length_axis, shade_arcs, thinned, time_axis
 from reports.figures.theme import REFERENCE, TRIGGERS, LineStyle, Styles, color
 from reports.statistics import containment, cumulative, error_3d_m, inside, north_east_error_m, reference_at
 from reports.text import length_text
@@ -116,11 +108,7 @@ def _name_lines(
 
 
 def draw_error_over_time(
-    canvas: Canvas,
-    series: Sequence[NavigationSeries],
-    styles: Styles,
-    time: TimeScale,
-    arcs: Sequence[TimeSpan],
+    canvas: Canvas, series: Sequence[NavigationSeries], styles: Styles, time: TimeScale, arcs: Sequence[TimeSpan]
 ) -> None:
     """3-D position error of every solution on one logarithmic axis."""
     height = canvas.height_in - _BOTTOM - _TOP
@@ -138,9 +126,7 @@ def draw_error_over_time(
     _name_lines(canvas, axes, height, entries, styles)
 
 
-def draw_rtn(
-    canvas: Canvas, one: NavigationSeries, styles: Styles, time: TimeScale, arcs: Sequence[TimeSpan]
-) -> None:
+def draw_rtn(canvas: Canvas, one: NavigationSeries, styles: Styles, time: TimeScale, arcs: Sequence[TimeSpan]) -> None:
     """Radial, along-track and cross-track error of one solution, with its own three-sigma bounds where it has them."""
     gap = 0.16
     height = (canvas.height_in - _BOTTOM - _TOP - 2 * gap) / 3
@@ -166,9 +152,7 @@ def draw_rtn(
         draw_lines(axes, x, error / factor, (tint, "-"))
         axes.set_ylim(-limit / factor, limit / factor)
         axes.set_ylabel(unit)
-        lines = (
-            [f"rms {length_text(float(np.sqrt(np.nanmean(error**2))))}"] if np.isfinite(error).any() else []
-        )
+        lines = [f"rms {length_text(float(np.sqrt(np.nanmean(error**2))))}"] if np.isfinite(error).any() else []
         if np.isfinite(held):
             lines.append(f"{100 * held:.1f} % within ±3σ")
         beyond = int(np.sum(np.abs(error) > limit))
@@ -219,9 +203,7 @@ def draw_ground_error(
     errors = [(s, north_east_error_m(s, track), time.inside(s.utc_ns)) for s in series]
     resets = resets_of(series, time)
     for i, name in enumerate(("latitude", "longitude")):
-        axes = canvas.axes(
-            _LEFT, _BOTTOM + (1 - i) * (height + gap), canvas.width_in - _LEFT - _RIGHT, height
-        )
+        axes = canvas.axes(_LEFT, _BOTTOM + (1 - i) * (height + gap), canvas.width_in - _LEFT - _RIGHT, height)
         time_axis(axes, time, labelled=i == 1)
         shade_arcs(axes, time, arcs)
         shown = [e[i][keep] for _, e, keep in errors]

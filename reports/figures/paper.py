@@ -117,9 +117,7 @@ def _state_lines(canvas: Canvas, left: float, top: float, session: PaperSession,
         k = int(np.argmin(np.abs(one.utc_ns - frame.utc_ns)))
         error = float(error_3d_m(one.error_rtn_m[k : k + 1])[0])
         place = _place(float(one.latitude_deg[k]), float(one.longitude_deg[k]), float(one.altitude_m[k]))
-        lines.append(
-            (one.name, f"{place}; error {length_text(error)}; {one.outcome[k] if one.outcome else ''}")
-        )
+        lines.append((one.name, f"{place}; error {length_text(error)}; {one.outcome[k] if one.outcome else ''}"))
     for row, (name, text) in enumerate(lines):
         canvas.text(left, top - 0.22 * row, name, fontsize="small", weight="bold")
         canvas.text(left + 0.85, top - 0.22 * row, text, fontsize="small")

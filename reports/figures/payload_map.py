@@ -15,9 +15,7 @@ def draw_payload_map(canvas: Canvas, mapped: PayloadMap) -> None:
     size = canvas.height_in - 0.85
     distance = np.hypot(mapped.offset_m[:, 0], mapped.offset_m[:, 1])
     claimed = float(np.sqrt(np.mean(mapped.sigma_m**2)))
-    limit = 1.1 * max(
-        min(float(distance.max()), _SHOWN_OF_MEDIAN * float(np.median(distance))), 2.0 * claimed
-    )
+    limit = 1.1 * max(min(float(distance.max()), _SHOWN_OF_MEDIAN * float(np.median(distance))), 2.0 * claimed)
     axes = canvas.axes(0.85, 0.5, size, size)
     axes.set_aspect("equal")
     axes.set_xlim(-limit, limit)
@@ -34,9 +32,7 @@ def draw_payload_map(canvas: Canvas, mapped: PayloadMap) -> None:
         linestyle="none",
     )
     angle = np.linspace(0.0, 2.0 * np.pi, 121)
-    axes.plot(
-        2.0 * claimed * np.cos(angle), 2.0 * claimed * np.sin(angle), color=color("vermillion"), linewidth=1.6
-    )
+    axes.plot(2.0 * claimed * np.cos(angle), 2.0 * claimed * np.sin(angle), color=color("vermillion"), linewidth=1.6)
     axes.set_xlabel("east, m")
     axes.set_ylabel("north, m")
     axes.set_title("landmark minus catalogue")

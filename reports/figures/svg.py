@@ -35,9 +35,7 @@ def draw_svg(key: str, width_in: float, height_in: float, draw: Callable[[Canvas
         photos: list[Photo] = []
         draw(Canvas(figure, width_in, height_in, photos=photos))
         buffer = io.StringIO()
-        figure.savefig(
-            buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None}
-        )
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     return _for_page(buffer.getvalue(), key, label, photos)
 
 

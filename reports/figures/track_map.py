@@ -82,10 +82,7 @@ def draw_strips(
         ticks = np.arange(np.ceil((middle - half) / step), np.floor((middle + half) / step) + 1) * step
         axes.set_xticks(list(ticks), [f"{t % 360:g}°" for t in ticks])
         step = _degree_step(tall, 8)
-        ticks = (
-            np.arange(np.ceil((low + high - tall) / 2 / step), np.floor((low + high + tall) / 2 / step) + 1)
-            * step
-        )
+        ticks = np.arange(np.ceil((low + high - tall) / 2 / step), np.floor((low + high + tall) / 2 / step) + 1) * step
         axes.set_yticks(list(ticks), [latitude_label(t) for t in ticks])
         if craters is not None:
             _craters(axes, craters, middle)
@@ -120,12 +117,7 @@ def _craters(axes: Axes, craters: CraterMap, middle: float) -> None:
     west, east = axes.get_xlim()
     south, north = axes.get_ylim()
     longitude = _unwrapped(craters.longitude_deg, middle)
-    near = (
-        (longitude > west)
-        & (longitude < east)
-        & (craters.latitude_deg > south)
-        & (craters.latitude_deg < north)
-    )
+    near = (longitude > west) & (longitude < east) & (craters.latitude_deg > south) & (craters.latitude_deg < north)
     found = _found(craters)
     angle = np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)
     for mask, role in ((near & ~found, "orange"), (near & found, "blue")):
@@ -149,9 +141,7 @@ def _line(axes: Axes, track: TrackSeries, keep: BoolArray, tint: str, width: flo
     longitude = np.where(keep, track.longitude_deg % 360.0, np.nan)
     latitude = np.where(keep, track.latitude_deg, np.nan)
     step = np.diff(track.utc_ns, prepend=track.utc_ns[:1])
-    silent = (
-        step > _SILENT_STEPS * float(np.median(step[1:])) if len(step) > 1 else np.zeros(len(step), np.bool_)
-    )
+    silent = step > _SILENT_STEPS * float(np.median(step[1:])) if len(step) > 1 else np.zeros(len(step), np.bool_)
     # No line over the edge of the map, and none through places that nobody sampled.
     jump = (np.abs(np.diff(longitude, prepend=longitude[:1])) > 180.0) | silent
     axes.plot(
@@ -174,26 +164,13 @@ def draw_underlay(canvas: Canvas, axes: Axes, terrain: TerrainMap | None, middle
     left, right = terrain.west_deg + turn, terrain.east_deg + turn
     first = int(np.clip(np.floor((west - left) / (right - left) * columns), 0, columns))
     last = int(np.clip(np.ceil((east - left) / (right - left) * columns), 0, columns))
-    top = int(
-        np.clip(
-            np.floor((terrain.north_deg - north) / (terrain.north_deg - terrain.south_deg) * rows), 0, rows
-        )
-    )
-    base = int(
-        np.clip(
-            np.ceil((terrain.north_deg - south) / (terrain.north_deg - terrain.south_deg) * rows), 0, rows
-        )
-    )
+    top = int(np.clip(np.floor((terrain.north_deg - north) / (terrain.north_deg - terrain.south_deg) * rows), 0, rows))
+    base = int(np.clip(np.ceil((terrain.north_deg - south) / (terrain.north_deg - terrain.south_deg) * rows), 0, rows))
     if last <= first or base <= top:
         return
     step = (right - left) / columns
     down = (terrain.north_deg - terrain.south_deg) / rows
-    box = (
-        left + first * step,
-        left + last * step,
-        terrain.north_deg - base * down,
-        terrain.north_deg - top * down,
-    )
+    box = (left + first * step, left + last * step, terrain.north_deg - base * down, terrain.north_deg - top * down)
     canvas.photo(axes, terrain.image[top:base, first:last], box, 0.5)
 
 

@@ -20,9 +20,7 @@ def draw_training(canvas: Canvas, curves: Sequence[TrainingCurve]) -> None:
     height = (canvas.height_in - 0.5 - 0.75 * (rows - 1) - 0.28) / rows
     for i, curve in enumerate(curves):
         row, column = divmod(i, columns)
-        axes = canvas.axes(
-            left + column * (width + gap), 0.5 + (rows - 1 - row) * (height + 0.75), width, height
-        )
+        axes = canvas.axes(left + column * (width + gap), 0.5 + (rows - 1 - row) * (height + 0.75), width, height)
         axes.plot(curve.epoch, curve.values, color=color("blue"), linewidth=1.3)
         axes.set_title(curve.name, fontsize="small")
         axes.set_xlabel(curve.axis)

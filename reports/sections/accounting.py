@@ -8,15 +8,7 @@ import numpy as np
 from reports.document import Block, Column, Heading, Paragraph, Picture, Properties, Table
 from reports.figures import accounting
 from reports.sections.common import PassView, arc_words
-from reports.text import (
-    NOT_A_VALUE,
-    computed_text,
-    count_text,
-    duration_text,
-    percent_text,
-    rate_text,
-    utc_text,
-)
+from reports.text import NOT_A_VALUE, computed_text, count_text, duration_text, percent_text, rate_text, utc_text
 from reports.values import (
     ApidAccounting,
     CompletenessSeries,
@@ -130,20 +122,11 @@ def _downlink_properties(packets: PacketAccounting) -> Properties:
             ),
             ("Packets lost in gaps", count_text(packets.lost)),
             ("Packets lost at the edges", computed_text(packets.lost_at_edges, "not known without a plan")),
-            (
-                "Duplicates, conflicts",
-                f"{computed_text(packets.duplicates)}, {count_text(packets.conflicts)}",
-            ),
+            ("Duplicates, conflicts", f"{computed_text(packets.duplicates)}, {count_text(packets.conflicts)}"),
             ("Packets with CRC errors", computed_text(packets.crc_errors)),
-            (
-                "Transfer frames, of these bad",
-                f"{computed_text(packets.frames)}, {computed_text(packets.frames_bad)}",
-            ),
+            ("Transfer frames, of these bad", f"{computed_text(packets.frames)}, {computed_text(packets.frames_bad)}"),
             ("Symbols corrected", computed_text(packets.symbols_corrected)),
-            (
-                "Octets, of these skipped",
-                f"{computed_text(packets.octets)}, {computed_text(packets.octets_skipped)}",
-            ),
+            ("Octets, of these skipped", f"{computed_text(packets.octets)}, {computed_text(packets.octets_skipped)}"),
         )
     )
 
@@ -207,12 +190,7 @@ def _packets_by_apid(by_apid: Mapping[int, ApidAccounting]) -> Table:
 def _gaps(gaps: Sequence[TimeSpan]) -> Table:
     return Table(
         "Gaps in what was received.",
-        (
-            Column("from", numeric=False),
-            Column("to", numeric=False),
-            Column("length"),
-            Column("of", numeric=False),
-        ),
+        (Column("from", numeric=False), Column("to", numeric=False), Column("length"), Column("of", numeric=False)),
         tuple(
             (
                 utc_text(g.start_utc_ns),

@@ -140,11 +140,7 @@ def _residuals(residuals: ResidualSeries) -> Picture:
     mean, _ = detector.octant_bias(residuals)
     whole = float(np.hypot(np.nanmean(residuals.du_px), np.nanmean(residuals.dv_px)))
     worst = float(np.nanmax(np.hypot(mean[:, 0], mean[:, 1]))) if np.isfinite(mean).any() else math.nan
-    text = (
-        f", and {significant_text(worst, 2)} px in the worst octant of Sun azimuth"
-        if math.isfinite(worst)
-        else ""
-    )
+    text = f", and {significant_text(worst, 2)} px in the worst octant of Sun azimuth" if math.isfinite(worst) else ""
     return Picture(
         "residuals",
         "Mean signed distance between detected and expected centres. Over all it is "
@@ -170,9 +166,7 @@ def detector_section(view: PassView) -> list[Block]:
     blocks: list[Block] = [Heading("The detector")]
     score = view.report.detector
     found = detector_blocks(score) if score is not None else []
-    return (
-        [*blocks, *found] if found else [*blocks, view.absent("detector", "Recall, precision, localisation")]
-    )
+    return [*blocks, *found] if found else [*blocks, view.absent("detector", "Recall, precision, localisation")]
 
 
 def _sentence(text: str) -> str:
@@ -201,17 +195,13 @@ def galleries(view: PassView) -> list[Block]:
     blocks: list[Block] = [Heading("Detections over the images")]
     if report.gallery:
         blocks.append(
-            gallery_picture(
-                "gallery", report.gallery[:9], 3, "Frames of the pass (form of the paper's Fig. 6)."
-            )
+            gallery_picture("gallery", report.gallery[:9], 3, "Frames of the pass (form of the paper's Fig. 6).")
         )
     else:
         blocks.append(view.absent("gallery", "Gallery of detections"))
     if report.worst_frames:
         worst = report.worst_frames[:9]
-        blocks.append(
-            gallery_picture("worst", worst, 3, "Frames with the lowest recall, of all frames of the pass.")
-        )
+        blocks.append(gallery_picture("worst", worst, 3, "Frames with the lowest recall, of all frames of the pass."))
     if report.gallery and "worst_frames" in report.not_available:
         blocks.append(view.absent("worst_frames", "Frames with the lowest recall"))
     return blocks

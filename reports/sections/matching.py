@@ -46,9 +46,7 @@ def matching(view: PassView) -> list[Block]:
             "detector gave the matcher too little to work with.",
             "Outcome of each frame over time, one row for each estimator.",
             0.58 + 0.52 * len(series),
-            partial(
-                outcomes.draw_outcome_course, series=series, time=view.time, arcs=view.report.imaging_arcs
-            ),
+            partial(outcomes.draw_outcome_course, series=series, time=view.time, arcs=view.report.imaging_arcs),
         )
     )
     return blocks
@@ -70,9 +68,7 @@ def outcome_table(series: Sequence[NavigationSeries]) -> Table:
             possible = outcome in FIX_OUTCOMES if _is_filter(series[i]) else outcome not in FIX_OUTCOMES
             cells += [count_text(n), percent_text(n, totals[i])] if possible or n else ["", ""]
         rows.append(tuple(cells))
-    rows.append(
-        (Cell("All", strong=True), *(c for n in totals for c in (Cell(count_text(n), strong=True), "")))
-    )
+    rows.append((Cell("All", strong=True), *(c for n in totals for c in (Cell(count_text(n), strong=True), ""))))
     return Table("Outcomes of all frames.", tuple(columns), tuple(rows), note=_fix_note(series))
 
 

@@ -107,9 +107,7 @@ def _arc_table(view: PassView) -> Table:
             ]
             rows.append(
                 (
-                    Cell(
-                        one.name if first else "", swatch=role_of(view.styles[one.name][0]) if first else ""
-                    ),
+                    Cell(one.name if first else "", swatch=role_of(view.styles[one.name][0]) if first else ""),
                     name,
                     count_text(int(finite.sum())),
                     number_text(p50, 0),

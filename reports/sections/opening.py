@@ -69,9 +69,7 @@ def provenance_and_data(report: ReportCommon) -> list[Block]:
             )
         )
     if report.provenance:
-        blocks.append(
-            Properties(tuple((k, hash_text(v) if is_hash(v) else v) for k, v in report.provenance.items()))
-        )
+        blocks.append(Properties(tuple((k, hash_text(v) if is_hash(v) else v) for k, v in report.provenance.items())))
     else:
         blocks.append(absent(report, "provenance", "Build, hashes, seed", "none was archived"))
     blocks.append(Heading("Data sources", 3))

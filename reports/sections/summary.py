@@ -115,9 +115,7 @@ def _statistics_table(view: PassView) -> Table:
         tuple(rows),
         note="Drift is the horizontal error gathered since the last reset, at the instant before the next, over the "
         "path since that reset; the median over resets. A dash means that there is no such value."
-        + "".join(
-            f" Not applicable: {one.not_applicable}." for one in view.report.navigation if one.not_applicable
-        ),
+        + "".join(f" Not applicable: {one.not_applicable}." for one in view.report.navigation if one.not_applicable),
     )
 
 

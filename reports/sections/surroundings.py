@@ -24,11 +24,7 @@ def ground_track(view: PassView) -> list[Block]:
     chosen = _middle_arc(view)
     several = len(arcs) > 1
     under = f" over {report.terrain.source}" if report.terrain is not None and report.terrain.source else ""
-    imaging = (
-        "Vermillion: imaging; thin: sampled between imaging arcs"
-        if arcs
-        else "Vermillion: the track of the pass"
-    )
+    imaging = "Vermillion: imaging; thin: sampled between imaging arcs" if arcs else "Vermillion: the track of the pass"
     blocks.append(
         Picture(
             "globe",
@@ -37,11 +33,7 @@ def ground_track(view: PassView) -> list[Block]:
             "Map of the Moon with the ground track.",
             4.6 if several else 3.2,
             partial(
-                track_map.draw_globe,
-                track=track,
-                arcs=arcs,
-                terrain=report.terrain,
-                span=chosen if several else None,
+                track_map.draw_globe, track=track, arcs=arcs, terrain=report.terrain, span=chosen if several else None
             ),
         )
     )
@@ -98,10 +90,7 @@ def housekeeping_and_events(view: PassView) -> list[Block]:
                 "Housekeeping parameters: " + ", ".join(p.name for p in parameters),
                 housekeeping.housekeeping_height_in(len(parameters)),
                 partial(
-                    housekeeping.draw_housekeeping,
-                    parameters=parameters,
-                    time=view.time,
-                    arcs=report.imaging_arcs,
+                    housekeeping.draw_housekeeping, parameters=parameters, time=view.time, arcs=report.imaging_arcs
                 ),
             )
         )

@@ -114,7 +114,7 @@ def test_a_mission_description_is_checked_by_a_dry_run(tmp_path, capsys):
     capsys.readouterr()
     assert cli.run(["mission", "check", str(path), "--flight", "--json"]) == 2
     [fault] = json.loads(capsys.readouterr().out)["faults"]
-    assert fault.endswith("reference.oem: expected a file beside the mission description, found none")
+    assert fault.endswith("reference.oem: expected a file in the folder of the mission description, found none")
 
 
 def test_a_number_outside_its_limits_is_refused():

@@ -36,7 +36,9 @@ def test_compare_tells_the_difference_of_an_oem_and_an_stk_file(oem_path, tmp_pa
     assert figures["rms_rtn_m"] == pytest.approx([10.0, 0.0, 0.0], abs=1e-5)
     assert figures["mean_rtn_m"] == pytest.approx([10.0, 0.0, 0.0], abs=1e-5)
     text = typed(f"orbit compare {oem_path} {other} --step 3600")
-    assert text.startswith("49 epochs from 2029-08-07T00:00:00.000Z")
+    assert text.startswith(
+        "A: SELENITA, epochs in UTC; B: SELENITA, epochs in UTC\n49 epochs from 2029-08-07T00:00:00.000Z"
+    )
     assert "mean radial 10 m, transverse" in text and "rms  radial 10 m, transverse" in text
 
 

@@ -43,7 +43,7 @@ def server(tmp_path):
 def test_a_pass_archive_is_imported_and_reported_over_the_wire(typed, server, synthetic_archive, tmp_path):
     with open_ground(tmp_path / "here") as ground:
         import_archive(ground, synthetic_archive)
-    here = typed(f"pass show {1} --home {tmp_path}/here --json")
+    here = typed(f"pass show 1 --home {tmp_path}/here --json")
     assert typed(f"ingest {synthetic_archive} --json {server}")["ingested"][0]["pass_id"] == 1
     assert typed(f"pass show 1 --json {server}") == here
     made = typed(f"report 1 --out {tmp_path}/out --json {server}")

@@ -1,7 +1,9 @@
 """`linna render`: a frame, sheets, renderers side by side, and what it refuses."""
 
+import numpy as np
 import pytest
 
+from lunar.constants import GM_MOON_M3_S2
 from tests.lazy import Lazy
 
 cv2 = Lazy("cv2")
@@ -98,8 +100,11 @@ def test_what_cannot_be_rendered_is_one_line(scenario, tmp_path, monkeypatch, ty
 
 def test_an_ephemeris_below_the_terrain_and_epochs_outside_it_are_one_line(scenario, tmp_path, typed):
     oem = tmp_path / "low.oem"
+    angle = np.sqrt(GM_MOON_M3_S2 / 1.73e6**3) * 60.0 * np.arange(30)
+    c, s, speed = np.cos(angle), np.sin(angle), np.sqrt(GM_MOON_M3_S2 / 1.73e6) / 1e3
     states = "\n".join(
-        f"2029-08-07T00:{minute:02d}:00.000 1730.0 {0.1 * minute:.1f} 0.0 0.0 0.0016 0.0" for minute in range(30)
+        f"2029-08-07T00:{k:02d}:00.000 {1730.0 * c[k]} {1730.0 * s[k]} 0.0 {-speed * s[k]} {speed * c[k]} 0.0"
+        for k in range(30)
     )
     oem.write_text(
         "CCSDS_OEM_VERS = 2.0\nCREATION_DATE = 2029-01-01T00:00:00\nORIGINATOR = T\nMETA_START\nOBJECT_NAME = A\n"

@@ -67,10 +67,7 @@ def arguments_by_number(name: str, arguments: Mapping[str, Any]) -> dict[str, An
         if type(value) in (int, float) and -1e300 < value < 1e300 and not parameter.accepts(value):
             kind = "a whole number of" if parameter.whole else "a number of"
             raise ValueRefused(
-                name,
-                parameter.name,
-                value,
-                f"{kind} {parameter.minimum:g} to {parameter.maximum:g} {parameter.unit}",
+                name, parameter.name, value, f"{kind} {parameter.minimum:g} to {parameter.maximum:g} {parameter.unit}"
             )
     return given
 

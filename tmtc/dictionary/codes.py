@@ -56,13 +56,7 @@ TABLES: Labels = (
     (8, "orientation"), (9, "initial_state"), (10, "burns"),
 )  # fmt: skip
 
-STORE_CLASSES: Labels = (
-    (0, "critical"),
-    (1, "housekeeping"),
-    (2, "navigation"),
-    (3, "detections"),
-    (4, "bulk"),
-)
+STORE_CLASSES: Labels = ((0, "critical"), (1, "housekeeping"), (2, "navigation"), (3, "detections"), (4, "bulk"))
 # What report definitions of service 3 can be made of: the on-board data pool.
 QUANTITIES: Labels = (
     (1, "mode"), (2, "boot_count"), (3, "frames_processed"), (4, "frames_bad"), (5, "detections_total"),

@@ -37,9 +37,7 @@ def parse_dictionary(text: str, source: str = "dictionary") -> Dictionary:
             tuple(_definition(item) for item in content["telecommands"]),
         )
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise MalformedPacket(
-            f"{source}: expected a packet dictionary, found something else ({error})"
-        ) from None
+        raise MalformedPacket(f"{source}: expected a packet dictionary, found something else ({error})") from None
     if dictionary.hash != content.get("hash"):
         raise MalformedPacket(
             f"{source}: expected a dictionary with hash {str(content.get('hash'))[:16]}…, "

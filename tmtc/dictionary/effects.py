@@ -90,9 +90,7 @@ EFFECTS: Mapping[str, CommandEffect] = {
 _FUNCTION_NAMES = dict(FUNCTIONS)
 
 
-def effect_of(
-    dictionary: Dictionary, name: str, arguments: Mapping[str, Any], octets: bytes
-) -> CommandEffect:
+def effect_of(dictionary: Dictionary, name: str, arguments: Mapping[str, Any], octets: bytes) -> CommandEffect:
     """Return the effect of a telecommand; an unknown telecommand counts as the most severe.
 
     Parameters

@@ -55,10 +55,7 @@ def filter_estimates(tables: Mapping[str, Table]) -> FilterEstimates:
         none = np.zeros(0, dtype=np.int64)
         states = np.zeros((0, STATES)), np.zeros((0, STATES, STATES))
         return FilterEstimates(none, none, none, none, *states, none)
-    columns = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in FilterEstimates.__dataclass_fields__
-    )
+    columns = (np.concatenate([getattr(part, name) for part in parts]) for name in FilterEstimates.__dataclass_fields__)
     return FilterEstimates(*columns)
 
 

@@ -5,15 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 
-from tmtc.dictionary.codes import (
-    EVENTS,
-    FAILURES,
-    IMAGE_QUALITIES,
-    MODES,
-    RESET_TRIGGERS,
-    TABLES,
-    Labels,
-)
+from tmtc.dictionary.codes import EVENTS, FAILURES, IMAGE_QUALITIES, MODES, RESET_TRIGGERS, TABLES, Labels
 from tmtc.packets.cuc import TICKS_PER_SECOND
 
 _EPOCH = datetime(2000, 1, 1)
@@ -107,19 +99,13 @@ EVENT_TEXTS: Mapping[str, EventText] = {
     "event_reporting_changed": _of("{0} {1}", ("event", _EVENT), ("0 disabled, 1 enabled", _SWITCH)),
     "thumbnail_stored": _of("frame {0}, {1}", ("frame", _number()), ("octets", _number("octets"))),
     "image_streak": _of(
-        "{1} frames, last quality: {0}",
-        ("image quality (0: end of the streak)", _QUALITY),
-        ("frames", _number()),
+        "{1} frames, last quality: {0}", ("image quality (0: end of the streak)", _QUALITY), ("frames", _number())
     ),
     "camera_fault": _of(
-        "{0} frames without image, camera switched {1} times",
-        ("frames", _number()),
-        ("power cycles", _number()),
+        "{0} frames without image, camera switched {1} times", ("frames", _number()), ("power cycles", _number())
     ),
     "camera_recovered": _of(
-        "after {0} frames without image and {1} power cycles",
-        ("frames", _number()),
-        ("power cycles", _number()),
+        "after {0} frames without image and {1} power cycles", ("frames", _number()), ("power cycles", _number())
     ),
     "frame_skipped": _of("in mode {0}", ("mode", _MODE)),
     "detector_timeout": _of("{0}, limit {1}", ("duration, s", _number("s")), ("limit, s", _number("s"))),
@@ -129,9 +115,7 @@ EVENT_TEXTS: Mapping[str, EventText] = {
         "{0} craters matched, sigma {1}", ("craters matched", _number()), ("largest sigma, m", _number("m"))
     ),
     "filter_divergence": _of("sigma {0}", ("largest sigma, m", _number("m"))),
-    "fix_refused": _of(
-        "{0} candidates, {1} expected", ("candidate pairs", _number()), ("expected craters", _number())
-    ),
+    "fix_refused": _of("{0} candidates, {1} expected", ("candidate pairs", _number()), ("expected craters", _number())),
     "attitude_degraded": _of(
         "noise {0} per axis, declared {1}",
         ("estimated noise per axis, deg", _number("deg")),
@@ -194,8 +178,6 @@ def event_text(
         _time: lambda value: _time(value, time),
     }
     written = (
-        own.get(write, write)(value)
-        for write, value in zip(text.formats, known, strict=False)
-        if value is not None
+        own.get(write, write)(value) for write, value in zip(text.formats, known, strict=False) if value is not None
     )
     return text.text.format(*written)

@@ -104,15 +104,11 @@ Frames without the field (flag `0`, as older recordings have them) are read as w
 def format_icd(dictionary: Dictionary = DICTIONARY) -> str:
     """The document, in Markdown."""
     lines = [_INTRODUCTION.format(version=dictionary.version, hash=dictionary.hash)]
-    for title, definitions in (
-        ("Telemetry", dictionary.telemetry),
-        ("Telecommands", dictionary.telecommands),
-    ):
+    for title, definitions in (("Telemetry", dictionary.telemetry), ("Telecommands", dictionary.telecommands)):
         lines.append(f"## {title}\n")
         lines.append("| packet | APID | service | subtype | octets | |\n|---|---|---|---|---|---|")
         lines += [
-            f"| [{d.name}](#{d.name}) | 0x{d.apid:03X} | {d.service} | {d.subtype} | {_length(d)} "
-            f"| {d.description} |"
+            f"| [{d.name}](#{d.name}) | 0x{d.apid:03X} | {d.service} | {d.subtype} | {_length(d)} | {d.description} |"
             for d in definitions
         ]
         lines.append("")
@@ -141,9 +137,7 @@ def _packet(d: PacketDefinition) -> list[str]:
             lines.append(_field(str(octet), f))
             octet += f.octets
     if d.group:
-        lines.append(
-            f"\nThen, as often as `{d.group.count}` says, {d.item_length} octets of `{d.group.name}`:\n"
-        )
+        lines.append(f"\nThen, as often as `{d.group.count}` says, {d.item_length} octets of `{d.group.name}`:\n")
         lines.append(_TABLE_HEAD)
         octet = 0
         for f in d.group.fields:

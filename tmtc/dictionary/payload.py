@@ -178,25 +178,16 @@ _REPORTS = (
 
 
 def _command(
-    name: str,
-    service: int,
-    subtype: int,
-    text: str,
-    fields: tuple[Field, ...] = (),
-    group: Group | None = None,
+    name: str, service: int, subtype: int, text: str, fields: tuple[Field, ...] = (), group: Group | None = None
 ) -> PacketDefinition:
-    return PacketDefinition(
-        name, APID_COMMAND, service, subtype, text, fields, group, packet_type=TYPE_TELECOMMAND
-    )
+    return PacketDefinition(name, APID_COMMAND, service, subtype, text, fields, group, packet_type=TYPE_TELECOMMAND)
 
 
 structure = Field("structure_id", "u16", "Housekeeping structure", minimum=1, maximum=31)
 event = Field("event_id", "u16", "Event", labels=EVENTS)
 parameter = Field("parameter_id", "u16", "Number of the parameter")
 _QUANTITY = Field("quantity", "u16", "Quantity of the data pool", labels=QUANTITIES)
-_STRUCTURE = Field(
-    "structure_id", "u16", "Housekeeping structure, defined by telecommand", minimum=16, maximum=31
-)
+_STRUCTURE = Field("structure_id", "u16", "Housekeeping structure, defined by telecommand", minimum=16, maximum=31)
 
 _TELECOMMANDS = (
     _command("enable_housekeeping", 3, 5, "Send the structure periodically", (structure,)),
@@ -485,12 +476,5 @@ STRUCTURES: dict[int, PacketDefinition] = {
 }
 """Housekeeping structures that every build sends, by number; the data pool has their fields."""
 
-DRAWN = (
-    "temperature_c",
-    "bus_voltage_v",
-    "power_w",
-    "memory_used_kib",
-    "queue_depth",
-    "storage_used_permille",
-)
+DRAWN = ("temperature_c", "bus_voltage_v", "power_w", "memory_used_kib", "queue_depth", "storage_used_permille")
 """Parameters of these structures that reports draw over time."""

@@ -231,9 +231,7 @@ class Dictionary:
         definition = compiled.definition
         if definition.packet_type != TYPE_TELEMETRY:
             raise UnknownPacket(f"expected a telemetry packet, found telecommand {name!r}")
-        header = TmSecondaryHeader(
-            definition.service, definition.subtype, int(ticks), message_counter, destination
-        )
+        header = TmSecondaryHeader(definition.service, definition.subtype, int(ticks), message_counter, destination)
         return compiled.packet(pack_tm_header(header), values, sequence_count)
 
     def pack_command(
@@ -408,10 +406,7 @@ class _Compiled:
         head = definition.packet_type << 12 | 1 << 11 | definition.apid
         body = header + self.data(values)
         packet = pack_packet(
-            definition.apid,
-            body + b"\0\0",
-            sequence_count=sequence_count,
-            packet_type=definition.packet_type,
+            definition.apid, body + b"\0\0", sequence_count=sequence_count, packet_type=definition.packet_type
         )
         assert int.from_bytes(packet[:2], "big") == head
         return append_crc(packet[:-CRC_LENGTH])
@@ -429,9 +424,7 @@ class _Compiled:
         for f in definition.fields:
             if group and f.name == group.count:
                 if values.get(f.name, count) != count:
-                    raise ValueRefused(
-                        definition.name, f.name, values[f.name], f"{count}, the number of items"
-                    )
+                    raise ValueRefused(definition.name, f.name, values[f.name], f"{count}, the number of items")
                 if count > f.raw_limits[1]:
                     raise ValueRefused(definition.name, group.name, count, f"at most {f.raw_limits[1]} items")
                 numbers.append(count)
@@ -457,9 +450,7 @@ class _Compiled:
         definition, group = self.definition, self.definition.group
         found = len(octets)
         if found < definition.base_length:
-            raise MalformedPacket(
-                f"{definition.name}: expected {definition.base_length} octets or more, found {found}"
-            )
+            raise MalformedPacket(f"{definition.name}: expected {definition.base_length} octets or more, found {found}")
         numbers = iter(self.struct.unpack_from(octets, definition.data_start))
         raw: dict[str, Any] = {}
         values: dict[str, Any] = {}
@@ -537,9 +528,7 @@ class _Compiled:
                     raise ValueRefused(definition.name, group.name, item, f"mappings of {', '.join(names)}")
             columns = {name: [item[name] for item in value] for name in names}
         else:
-            raise ValueRefused(
-                definition.name, group.name, value, "a sequence of mappings or a mapping of arrays"
-            )
+            raise ValueRefused(definition.name, group.name, value, "a sequence of mappings or a mapping of arrays")
         if columns.keys() != set(names):
             raise ValueRefused(definition.name, group.name, sorted(columns), f"columns {', '.join(names)}")
         arrays = {f.name: _encode_column(definition.name, f, columns[f.name]) for f in group.fields}
@@ -578,9 +567,7 @@ class _Columns(Mapping[str, RecordArray]):
 
 def _columns(fields: tuple[Field, ...], records: RecordArray) -> tuple[_Columns, _Columns]:
     """(raw, engineering) columns of big-endian `records`."""
-    raw = _Columns(
-        fields, lambda f: np.ascontiguousarray(records[f.name], np.dtype(f.dtype).newbyteorder("="))
-    )
+    raw = _Columns(fields, lambda f: np.ascontiguousarray(records[f.name], np.dtype(f.dtype).newbyteorder("=")))
     return raw, _Columns(fields, lambda f: _decode_column(f, raw[f.name]))
 
 

@@ -240,9 +240,7 @@ def unpack_anchor_table(octets: bytes) -> AnchorTable:
     count = _count(content, 32, b"AE")
     times = np.frombuffer(content, dtype=">i8", count=count, offset=4)
     position = np.frombuffer(content, dtype=">f8", count=3 * count, offset=4 + 8 * count)
-    return AnchorTable(
-        _increasing(times, "anchor ephemeris"), _finite(position, "anchor ephemeris").reshape(count, 3)
-    )
+    return AnchorTable(_increasing(times, "anchor ephemeris"), _finite(position, "anchor ephemeris").reshape(count, 3))
 
 
 def pack_catalogue_table(table: CatalogueTable) -> bytes:
@@ -283,9 +281,7 @@ def pack_gravity_table(table: GravityTable) -> bytes:
     lower = np.tril_indices(degree + 1)
     name = table.name.encode("ascii", "replace")[:32]
     head = struct.pack(">32sddH", name, table.gm_m3_s2, table.radius_m, degree)
-    return _wrap(
-        b"GR", head + table.c_bar[lower].astype(">f8").tobytes() + table.s_bar[lower].astype(">f8").tobytes()
-    )
+    return _wrap(b"GR", head + table.c_bar[lower].astype(">f8").tobytes() + table.s_bar[lower].astype(">f8").tobytes())
 
 
 def unpack_gravity_table(octets: bytes) -> GravityTable:
@@ -337,9 +333,7 @@ def unpack_orientation_table(octets: bytes) -> OrientationTable:
 def pack_initial_state(state: InitialState) -> bytes:
     """Return the state that starts the filter as octets."""
     values = (*map(float, state.position_icrf_m), *map(float, state.velocity_icrf_m_s))
-    return _wrap(
-        b"IS", struct.pack(">q8d", state.ticks, *values, state.sigma_position_m, state.sigma_velocity_m_s)
-    )
+    return _wrap(b"IS", struct.pack(">q8d", state.ticks, *values, state.sigma_position_m, state.sigma_velocity_m_s))
 
 
 def unpack_initial_state(octets: bytes) -> InitialState:

@@ -41,9 +41,7 @@ def find_markers(
             if bit >= stop:
                 break
             here = (word >> np.uint64(8 - shift)) & np.uint64(0xFFFFFFFF)
-            wrong = np.int64(distance[0, here >> np.uint64(16)]) + np.int64(
-                distance[1, here & np.uint64(0xFFFF)]
-            )
+            wrong = np.int64(distance[0, here >> np.uint64(16)]) + np.int64(distance[1, here & np.uint64(0xFFFF)])
             if wrong <= tolerance or wrong >= 32 - tolerance:
                 found[count] = bit
                 count += 1

@@ -76,11 +76,7 @@ class CaduSync:
     def take(self, rows: IntArray) -> CaduSync:
         """Return the CADUs of these rows."""
         return CaduSync(
-            self.start_bits[rows],
-            self.inverted[rows],
-            self.marker_errors[rows],
-            self.truncated[:0],
-            self.period,
+            self.start_bits[rows], self.inverted[rows], self.marker_errors[rows], self.truncated[:0], self.period
         )
 
 
@@ -196,9 +192,7 @@ class _Synchroniser:
         damaged = np.flatnonzero(wrong > self.tolerance)
         sound = np.flatnonzero(wrong <= self.tolerance)
         turns = np.diff(inverted[sound])
-        alone = sound[1:-1][
-            turns[1:] & turns[:-1]
-        ]  # nearly all bits of a marker are wrong, or really inverted
+        alone = sound[1:-1][turns[1:] & turns[:-1]]  # nearly all bits of a marker are wrong, or really inverted
         alone = alone[self._are_valid(starts[alone], ~inverted[alone])]
         damaged, sound = np.union1d(damaged, alone), np.setdiff1d(sound, alone)
         if damaged.size and sound.size:
@@ -209,9 +203,7 @@ class _Synchroniser:
             if doubtful.size and self.verify is not None:
                 valid = self._are_valid(starts[damaged[doubtful]], polarity[doubtful])
                 polarity[doubtful[~valid]] ^= True
-            wrong[damaged] = np.where(
-                inverted[damaged] == polarity, wrong[damaged], MARKER_BITS - wrong[damaged]
-            )
+            wrong[damaged] = np.where(inverted[damaged] == polarity, wrong[damaged], MARKER_BITS - wrong[damaged])
             inverted[damaged] = polarity
         # a frame that lost bits reaches into the next one
         whole = np.append(np.diff(starts) >= 8 * self.period, True)[: starts.size]

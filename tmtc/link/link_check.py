@@ -131,9 +131,7 @@ def propose_link(stream: OctetArray, count_packets: CountPackets, survey: Marker
         return LinkProposal(None, (), survey.markers, distances, False)
     best = found[0]
     rivals = [
-        one
-        for one in found[1:]
-        if one.packets >= best.packets > 0 and one.headers_regular >= best.headers_regular
+        one for one in found[1:] if one.packets >= best.packets > 0 and one.headers_regular >= best.headers_regular
     ]
     return LinkProposal(best.settings, tuple(found), survey.markers, distances, bool(rivals))
 
@@ -145,9 +143,7 @@ def _lengths(octets: int, distances: dict[int, int]) -> Iterator[list[int]]:
         yield [octets] if _SHORTEST_CADU <= octets <= longest else []
         return
     total = sum(distances.values())
-    usual = [d for d, n in distances.items() if n >= max(total / 50, 2) and _SHORTEST_CADU <= d <= longest][
-        :4
-    ]
+    usual = [d for d, n in distances.items() if n >= max(total / 50, 2) and _SHORTEST_CADU <= d <= longest][:4]
     yield usual or [d for d in list(distances)[:1] if _SHORTEST_CADU <= d <= longest]
     # a header or gap between CADUs: lengths up to the distance that only few pairs of markers are below
     ordered = sorted(distances)
@@ -175,17 +171,13 @@ def _examine(
     if not whole.size:
         return []
     rows = whole[np.unique(np.linspace(0, whole.size - 1, min(whole.size, SAMPLE)).astype(np.int64))]
-    sync = cadu.CaduSync(
-        starts[rows], inverted[rows], np.zeros(rows.size, dtype=np.int64), starts[:0], length
-    )
+    sync = cadu.CaduSync(starts[rows], inverted[rows], np.zeros(rows.size, dtype=np.int64), starts[:0], length)
     blocks = cadu.cadu_octets(stream, sync)[:, cadu.ASM_LENGTH :]
     plain = {name: randomise(blocks, name) for name in RANDOMISERS}
     coded, uncoded = _candidates(length - cadu.ASM_LENGTH)
     if not proved:
         without = [
-            replace(c, checksum=False)
-            for c in uncoded
-            if are_regular(plain[c.randomiser]).mean() >= LEAST_REGULAR
+            replace(c, checksum=False) for c in uncoded if are_regular(plain[c.randomiser]).mean() >= LEAST_REGULAR
         ]
         weighed = [_weigh(stream, sync, plain[c.randomiser], c, count_packets) for c in without]
         return [one for one in weighed if one.packets >= LEAST_PROOFS and one.filled >= LEAST_FILLED]
@@ -207,11 +199,7 @@ def _examine(
 
 
 def _weigh(
-    stream: OctetArray,
-    sync: cadu.CaduSync,
-    blocks: OctetArray,
-    candidate: LinkSettings,
-    count_packets: CountPackets,
+    stream: OctetArray, sync: cadu.CaduSync, blocks: OctetArray, candidate: LinkSettings, count_packets: CountPackets
 ) -> LinkEvidence:
     """Return the evidence for one candidate, with frame error control if most frames have it."""
     code = candidate.code
@@ -255,9 +243,7 @@ def are_regular(frames: OctetArray) -> BoolArray:
     return regular
 
 
-def _best(
-    shares: list[tuple[float, LinkSettings, Any]],
-) -> list[LinkSettings]:
+def _best(shares: list[tuple[float, LinkSettings, Any]]) -> list[LinkSettings]:
     """Return the candidates with at least half of the greatest share and enough valid frames."""
     greatest = max((share for share, _, _ in shares), default=0.0)
     if greatest <= LEAST_SHARE:

@@ -199,9 +199,7 @@ class _Trial:
         marked = np.flatnonzero(self.markers)
         runs = np.split(marked, np.flatnonzero(np.diff(self.choice[marked] < 0)) + 1)
         open_runs = [
-            run
-            for run in runs
-            if run.size and self.choice[run[0]] < 0 and self.markers[run].sum() >= LEAST_MARKERS
+            run for run in runs if run.size and self.choice[run[0]] < 0 and self.markers[run].sum() >= LEAST_MARKERS
         ]
         open_runs.sort(key=len, reverse=True)
         for run in open_runs:

@@ -40,9 +40,7 @@ class ReedSolomon:
         if self.errors not in (8, 16):
             raise LinkFormatError(f"Reed-Solomon: expected 8 or 16 corrected errors, found {self.errors}")
         if self.interleave not in INTERLEAVES:
-            raise LinkFormatError(
-                f"Reed-Solomon: expected interleave 1, 2, 3, 4, 5 or 8, found {self.interleave}"
-            )
+            raise LinkFormatError(f"Reed-Solomon: expected interleave 1, 2, 3, 4, 5 or 8, found {self.interleave}")
         if not 0 <= self.virtual_fill < CODEWORD - 2 * self.errors:
             raise LinkFormatError(
                 f"Reed-Solomon: expected 0..{CODEWORD - 2 * self.errors - 1} symbols of virtual fill, "
@@ -99,9 +97,7 @@ def code_for(
 def encode(frames: OctetArray, code: ReedSolomon) -> OctetArray:
     """Codeblocks (n, block_length) of frames (n, frame_length)."""
     if frames.ndim != 2 or frames.shape[1] != code.frame_length:
-        raise LinkFormatError(
-            f"Reed-Solomon: expected frames of {code.frame_length} octets, found {frames.shape}"
-        )
+        raise LinkFormatError(f"Reed-Solomon: expected frames of {code.frame_length} octets, found {frames.shape}")
     blocks = np.empty((frames.shape[0], code.block_length), dtype=np.uint8)
     blocks[:, : code.frame_length] = frames
     data = frames.reshape(-1, code.symbols, code.interleave)
@@ -113,9 +109,7 @@ def encode(frames: OctetArray, code: ReedSolomon) -> OctetArray:
 def decode(blocks: OctetArray, code: ReedSolomon) -> RsDecode:
     """Frames and corrected symbols of codeblocks (n, block_length)."""
     if blocks.ndim != 2 or blocks.shape[1] != code.block_length:
-        raise LinkFormatError(
-            f"Reed-Solomon: expected codeblocks of {code.block_length} octets, found {blocks.shape}"
-        )
+        raise LinkFormatError(f"Reed-Solomon: expected codeblocks of {code.block_length} octets, found {blocks.shape}")
     corrected = np.zeros((blocks.shape[0], code.interleave), dtype=np.int16)
     wrong_bits = np.zeros(blocks.shape[0], dtype=np.int64)
     frames = blocks[:, : code.frame_length]
@@ -196,9 +190,7 @@ def generator(errors: int) -> tuple[int, ...]:
     polynomial = [1]
     for j in range(128 - errors, 128 + errors):
         root = int(exponent[11 * j % 255])
-        polynomial = [
-            a ^ int(times[root, b]) for a, b in zip([*polynomial, 0], [0, *polynomial], strict=True)
-        ]
+        polynomial = [a ^ int(times[root, b]) for a, b in zip([*polynomial, 0], [0, *polynomial], strict=True)]
     return tuple(polynomial)
 
 

@@ -63,9 +63,7 @@ class LinkSettings:
                 raise LinkFormatError(f"link: expected {', '.join(_ALLOWED)}, found {name[:40]!r}")
             if isinstance(allowed, dict):
                 if value not in allowed:
-                    raise LinkFormatError(
-                        f"link: {name}: expected {', '.join(allowed)}, found {value[:40]!r}"
-                    )
+                    raise LinkFormatError(f"link: {name}: expected {', '.join(allowed)}, found {value[:40]!r}")
                 values[name] = allowed[value]
             elif not (value.isascii() and value.isdigit()):
                 raise LinkFormatError(f"link: {name}: expected a number, found {value[:40]!r}")

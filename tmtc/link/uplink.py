@@ -129,9 +129,7 @@ class UplinkEncoder:
     def encode(self, packets: Iterable[bytes]) -> bytes:
         """CLTUs that carry `packets`, each packet in a segment of its own or in several when it is long."""
         return b"".join(
-            encode_cltu(frame, randomised=self.randomised)
-            for packet in packets
-            for frame in self.frames(packet)
+            encode_cltu(frame, randomised=self.randomised) for packet in packets for frame in self.frames(packet)
         )
 
     def frames(self, packet: bytes) -> list[bytes]:
@@ -145,9 +143,7 @@ class UplinkEncoder:
             segment = bytes((flags << 6 | self.map_id,)) + piece
             number = 0 if self.bypass else self.sequence_number
             frames.append(
-                pack_tc_frame(
-                    TcFrame(self.spacecraft_id, self.virtual_channel, number, segment, bypass=self.bypass)
-                )
+                pack_tc_frame(TcFrame(self.spacecraft_id, self.virtual_channel, number, segment, bypass=self.bypass))
             )
             if not self.bypass:
                 self.sequence_number = (self.sequence_number + 1) & 0xFF
@@ -239,9 +235,7 @@ class UplinkDecoder:
             # should the start be a false one, the true one may follow at once
             at = start + len(CLTU_START)
             if not information:
-                faults.append(
-                    "CLTU: expected a code block behind the start sequence, found none that can be repaired"
-                )
+                faults.append("CLTU: expected a code block behind the start sequence, found none that can be repaired")
                 continue
             try:
                 frame = unpack_tc_frame(_randomise(information) if self.randomised else information)

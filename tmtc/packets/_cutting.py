@@ -63,9 +63,7 @@ def powers_of_octets() -> RecordArray:
 
 @njit(nogil=True, inline="always")
 def _after(crc: int, buffer: RecordArray, i: int, last: int, tables: RecordArray) -> int:
-    change = _U(
-        tables[last, buffer[i] ^ (crc >> _U(8))] ^ tables[last - _U(1), buffer[i + _U(1)] ^ (crc & _U(255))]
-    )
+    change = _U(tables[last, buffer[i] ^ (crc >> _U(8))] ^ tables[last - _U(1), buffer[i + _U(1)] ^ (crc & _U(255))])
     for k in range(2, last + _U(1)):
         change ^= tables[last - _U(k), buffer[i + _U(k)]]
     return change
@@ -310,9 +308,7 @@ def search_unchecked(
     for q in range(first, stop):
         if (buffer[q] >> 4) == packet_type and proves(buffer, q, stop, packet_type, prefix, last, False):
             end = q + header_at(buffer, q, stop, packet_type)
-            if is_idle(buffer, q) or (
-                not _is_unchecked(buffer, q, unchecked) and _crc(buffer, q, end, tables) == 0
-            ):
+            if is_idle(buffer, q) or (not _is_unchecked(buffer, q, unchecked) and _crc(buffer, q, end, tables) == 0):
                 return q
             if not _is_unchecked(buffer, q, unchecked):
                 continue
@@ -401,9 +397,7 @@ def walk(
                 break
             if _crc(buffer, p, p + length, tables) != 0:
                 leads = _is_unknown(buffer, p, unchecked)
-                if not leads or not follows(
-                    buffer, p + length, stop, packet_type, unchecked, tables, open_end
-                ):
+                if not leads or not follows(buffer, p + length, stop, packet_type, unchecked, tables, open_end):
                     break
         rows[count, 0] = GOOD
         rows[count, 1] = p

@@ -40,10 +40,7 @@ def split(
         name = "last" if k == count - 1 else "first" if k == 0 else "middle"
         piece = np.frombuffer(octets[k * part_length : (k + 1) * part_length], dtype=np.uint8)
         parts.append(
-            (
-                f"{link}_{name}",
-                {"transaction": transaction, "part": k + 1, "table": table, "items": {"octet": piece}},
-            )
+            (f"{link}_{name}", {"transaction": transaction, "part": k + 1, "table": table, "items": {"octet": piece}})
         )
     return parts
 
@@ -76,9 +73,7 @@ class LargeDataReceiver:
             self._last[transaction] = number
         last = self._last.get(transaction)
         if last is not None and len(parts) >= last and all(k in parts for k in range(1, last + 1)):
-            whole = LargeData(
-                transaction, self._tables[transaction], b"".join(parts[k] for k in range(1, last + 1))
-            )
+            whole = LargeData(transaction, self._tables[transaction], b"".join(parts[k] for k in range(1, last + 1)))
             self.abort(transaction)
             return whole
         while len(self._parts) > 1 and self._kept > self.most_octets:

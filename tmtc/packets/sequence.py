@@ -141,11 +141,7 @@ def _begins_again(
         if not begins and later[k] and count <= highest and count <= counts[k - 1]:
             conflicts = copies = 0
             stop = k
-            while (
-                stop < len(counts)
-                and counts[stop] <= highest
-                and (stop == k or counts[stop] > counts[stop - 1])
-            ):
+            while stop < len(counts) and counts[stop] <= highest and (stop == k or counts[stop] > counts[stop - 1]):
                 if (earlier := seen.get(counts[stop])) is not None:
                     is_copy = same(earlier, stop)
                     copies, conflicts = copies + is_copy, conflicts + (not is_copy)

@@ -42,12 +42,7 @@ class PrimaryHeader:
 
 
 def pack_packet(
-    apid: int,
-    data: bytes,
-    *,
-    sequence_count: int,
-    packet_type: int = TYPE_TELEMETRY,
-    secondary_header: bool = True,
+    apid: int, data: bytes, *, sequence_count: int, packet_type: int = TYPE_TELEMETRY, secondary_header: bool = True
 ) -> bytes:
     """A space packet with `data` as its data field (secondary header and error control included)."""
     if not 0 <= apid < APID_LIMIT:

@@ -73,9 +73,7 @@ class PacketCut:
     def packets(self, buffer: Octets) -> Iterator[bytes]:
         """The octets of every packet whose checksum holds."""
         view = as_octets(buffer).data
-        for start, length, good in zip(
-            self.offsets.tolist(), self.lengths.tolist(), self.crc_ok.tolist(), strict=True
-        ):
+        for start, length, good in zip(self.offsets.tolist(), self.lengths.tolist(), self.crc_ok.tolist(), strict=True):
             if good:
                 yield view[start : start + length].tobytes()
 
@@ -170,9 +168,7 @@ def cut_packets(
         Whether a packet is expected at the beginning of each segment, for packets that are found by their headers.
     """
     if form.by_headers and not final:
-        raise ValueRefused(
-            "packet stream", "final", final, "true for packets that are found by their headers"
-        )
+        raise ValueRefused("packet stream", "final", final, "true for packets that are found by their headers")
     octets = as_octets(buffer).view()
     octets.flags.writeable = False  # one compiled variant for bytes and arrays alike
     if segments is None:
@@ -314,9 +310,7 @@ class _Cutter(_Rows):
         state = (self.prefix, self.known, self.tables, self.powers)
         length = self.length_at(p, stop)
         e = p + length
-        trusted = length and (
-            self.is_idle(p) or self.kernels.is_pus(self.octets, p, length, self.packet_type)
-        )
+        trusted = length and (self.is_idle(p) or self.kernels.is_pus(self.octets, p, length, self.packet_type))
         if trusted and (e == stop or self.is_packet_at(e, stop)):
             # the header is one and a packet follows where it says, so the damage is inside [p, e), whatever else may
             # be found in there, unless the length is wrong and right packets fill the end of that range
@@ -378,9 +372,7 @@ class _HeaderCutter(_Rows):
             p = self.skip(start, *key)
         while p < stop:
             before = self.count
-            p, self.count = kernels.walk_unchecked(
-                self.octets, p, *place, *self.checks, self.rows, self.count
-            )
+            p, self.count = kernels.walk_unchecked(self.octets, p, *place, *self.checks, self.rows, self.count)
             if self.grow():
                 continue
             if p < stop and (self.count == before or self.is_begun(p, *key)):

@@ -121,10 +121,6 @@ def concatenated(columns: list[Column]) -> Column:
         return ArrayColumn(counts, concatenated([c.elements for c in arrays]))
     if isinstance(first, RecordColumn):
         records = cast(list[RecordColumn], columns)
-        return RecordColumn(
-            {name: concatenated([c.members[name] for c in records]) for name in first.members}
-        )
+        return RecordColumn({name: concatenated([c.members[name] for c in records]) for name in first.members})
     optional = cast(list[OptionalColumn], columns)
-    return OptionalColumn(
-        np.concatenate([c.present for c in optional]), concatenated([c.column for c in optional])
-    )
+    return OptionalColumn(np.concatenate([c.present for c in optional]), concatenated([c.column for c in optional]))

@@ -32,14 +32,7 @@ from tmtc.packets.space_packets import (
     SEQUENCE_COUNT_LIMIT,
 )
 from tmtc.packets.stream import PacketCut, PrimaryHeaders
-from tmtc.xtce.columns import (
-    ArrayColumn,
-    Column,
-    OptionalColumn,
-    RecordColumn,
-    ValueColumn,
-    concatenated,
-)
+from tmtc.xtce.columns import ArrayColumn, Column, OptionalColumn, RecordColumn, ValueColumn, concatenated
 from tmtc.xtce.definition import (
     AggregateType,
     AllOf,
@@ -151,9 +144,7 @@ def choose_roots(definition: Definition, names: Sequence[str] = ()) -> tuple[Con
     for name in names:
         if name not in definition.containers:
             known = ", ".join(sorted(definition.containers)[:12])
-            raise DefinitionError(
-                f"{definition.name}: expected the name of a container ({known}), found {name!r}"
-            )
+            raise DefinitionError(f"{definition.name}: expected the name of a container ({known}), found {name!r}")
     roots = tuple(definition.containers[name] for name in names) or tuple(definition.roots.values())
     open_roots = [root.name for root in roots if not any(conditions for _, conditions in tree(root))]
     if len(open_roots) > 1:
@@ -182,9 +173,7 @@ class Decoder:
         self.definition = definition
         self.roots = choose_roots(definition, (roots,) if isinstance(roots, str) else roots or ())
         self._steps: dict[str, list[_Step]] = {}
-        self._conditional = [
-            {one.name for one, conditions in tree(root) if conditions} for root in self.roots
-        ]
+        self._conditional = [{one.name for one, conditions in tree(root) if conditions} for root in self.roots]
         self._reads_segments = any(_asks_for(root, 16, 2) for root in self.roots)
         self._reads_header_flag = any(_asks_for(root, 4, 1) for root in self.roots)
 
@@ -240,9 +229,7 @@ class Decoder:
             found.append(self._decode(root, its, mine))
         return _merged(found, self._conditional)
 
-    def _decode(
-        self, root: Container, sources: Sequence[_Source], verdict: npt.NDArray[np.int8]
-    ) -> XtceDecode:
+    def _decode(self, root: Container, sources: Sequence[_Source], verdict: npt.NDArray[np.int8]) -> XtceDecode:
         """Decode packets that begin with a container; their verdicts are set."""
         pieces: dict[str, list[XtceTable]] = {}
         unknown: dict[str, list[IntArray]] = {}
@@ -259,9 +246,7 @@ class Decoder:
                     pieces.setdefault(table.name, []).append(table)
         tables = {name: _joined(found) for name, found in sorted(pieces.items())}
         noted = {name: np.concatenate(parts) for name, parts in sorted(unknown.items())}
-        return XtceDecode(
-            tables, verdict, {name: one[verdict[one] == DECODED] for name, one in noted.items()}
-        )
+        return XtceDecode(tables, verdict, {name: one[verdict[one] == DECODED] for name, one in noted.items()})
 
     def _tables(self, root: Container, run: _Run, packets: _Rows) -> Iterator[XtceTable]:
         pending = [(root, packets)]
@@ -295,11 +280,7 @@ class Decoder:
 
 
 def _join_segments(
-    octets: OctetArray,
-    cut: PacketCut,
-    headers: PrimaryHeaders,
-    verdict: npt.NDArray[np.int8],
-    checksum_octets: int,
+    octets: OctetArray, cut: PacketCut, headers: PrimaryHeaders, verdict: npt.NDArray[np.int8], checksum_octets: int
 ) -> _Source:
     """Join the parts of segmented packets whose counts follow one another; `packets` are the first parts.
 

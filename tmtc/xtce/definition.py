@@ -296,9 +296,7 @@ def header_field(root: Container, bit: int, bits: int) -> Reference | None:
     return found.get((bit, bits))
 
 
-def _place_entries(
-    entries: tuple[Entry, ...], start: int, found: dict[tuple[int, int], Reference]
-) -> int | None:
+def _place_entries(entries: tuple[Entry, ...], start: int, found: dict[tuple[int, int], Reference]) -> int | None:
     """Add values of fixed place by (bit, width); return the place behind them, None if it is not fixed."""
     at: int | None = start
     for entry in entries:

@@ -193,9 +193,7 @@ def _parameter_type(types: ET.Element, name: str, f: Field, what: str = "Paramet
         element = ET.SubElement(types, f"Float{what}Type", {"name": name, "sizeInBits": size})
     else:
         signed = "true" if f.type[0] == "i" else "false"
-        element = ET.SubElement(
-            types, f"Integer{what}Type", {"name": name, "sizeInBits": str(bits), "signed": signed}
-        )
+        element = ET.SubElement(types, f"Integer{what}Type", {"name": name, "sizeInBits": str(bits), "signed": signed})
     _units(element, f)
     _encoding(element, f)
     if f.minimum is not None or f.maximum is not None:
@@ -211,9 +209,7 @@ def _parameter_type(types: ET.Element, name: str, f: Field, what: str = "Paramet
         for tag, limits in (("WarningRange", f.warning), ("CriticalRange", f.alarm)):
             if limits:
                 ET.SubElement(
-                    ranges,
-                    tag,
-                    {"minInclusive": _number(limits[0], f), "maxInclusive": _number(limits[1], f)},
+                    ranges, tag, {"minInclusive": _number(limits[0], f), "maxInclusive": _number(limits[1], f)}
                 )
 
 
@@ -230,9 +226,7 @@ def _units(element: ET.Element, f: Field) -> None:
 def _encoding(element: ET.Element, f: Field) -> None:
     bits = f.type[1:]
     if f.is_float:
-        encoding = ET.SubElement(
-            element, "FloatDataEncoding", {"sizeInBits": bits, "encoding": "IEEE754_1985"}
-        )
+        encoding = ET.SubElement(element, "FloatDataEncoding", {"sizeInBits": bits, "encoding": "IEEE754_1985"})
     else:
         kind = "unsigned" if f.type[0] == "u" else "twosComplement"
         encoding = ET.SubElement(element, "IntegerDataEncoding", {"sizeInBits": bits, "encoding": kind})
@@ -243,16 +237,12 @@ def _encoding(element: ET.Element, f: Field) -> None:
 
 
 def _unsigned_type(types: ET.Element, name: str, bits: int) -> None:
-    element = ET.SubElement(
-        types, "IntegerParameterType", {"name": name, "sizeInBits": str(bits), "signed": "false"}
-    )
+    element = ET.SubElement(types, "IntegerParameterType", {"name": name, "sizeInBits": str(bits), "signed": "false"})
     ET.SubElement(element, "UnitSet")
     ET.SubElement(element, "IntegerDataEncoding", {"sizeInBits": str(bits), "encoding": "unsigned"})
 
 
-def _binary_type(
-    types: ET.Element, name: str, count: str, what: str = "Parameter", item_octets: int = 1
-) -> None:
+def _binary_type(types: ET.Element, name: str, count: str, what: str = "Parameter", item_octets: int = 1) -> None:
     """Octets of as many items as the parameter or argument `count` says."""
     element = ET.SubElement(types, f"Binary{what}Type", {"name": name})
     ET.SubElement(element, "UnitSet")
@@ -265,9 +255,7 @@ def _binary_type(
 
 def _parameter(parameters: ET.Element, name: str, type_name: str, description: str) -> None:
     ET.SubElement(
-        parameters,
-        "Parameter",
-        {"name": name, "parameterTypeRef": type_name, "shortDescription": description},
+        parameters, "Parameter", {"name": name, "parameterTypeRef": type_name, "shortDescription": description}
     )
 
 
@@ -285,20 +273,13 @@ def _entries(container: ET.Element, names: list[str]) -> None:
 
 
 def _inherit(container: ET.Element, base: str, conditions: list[tuple[str, str, int]]) -> None:
-    criteria = ET.SubElement(
-        ET.SubElement(container, "BaseContainer", {"containerRef": base}), "RestrictionCriteria"
-    )
+    criteria = ET.SubElement(ET.SubElement(container, "BaseContainer", {"containerRef": base}), "RestrictionCriteria")
     parent = criteria if len(conditions) == 1 else ET.SubElement(criteria, "ComparisonList")
     for name, operator, value in conditions:
         ET.SubElement(
             parent,
             "Comparison",
-            {
-                "parameterRef": name,
-                "comparisonOperator": operator,
-                "value": str(value),
-                "useCalibratedValue": "false",
-            },
+            {"parameterRef": name, "comparisonOperator": operator, "value": str(value), "useCalibratedValue": "false"},
         )
 
 
@@ -322,9 +303,7 @@ def _commands(root: ET.Element, dictionary: Dictionary) -> None:
                 f = replace(f, labels=tuple((one.number, one.name) for one in PARAMETERS))
             _parameter_type(types, type_name, f, "Argument")
             ET.SubElement(
-                arguments,
-                "Argument",
-                {"name": f.name, "argumentTypeRef": type_name, "shortDescription": f.description},
+                arguments, "Argument", {"name": f.name, "argumentTypeRef": type_name, "shortDescription": f.description}
             )
             names.append(f.name)
         if d.group is not None:
@@ -340,9 +319,7 @@ def _commands(root: ET.Element, dictionary: Dictionary) -> None:
         head = d.key >> 16
         header = f"{head:04X}C0000000{0x2F:02X}{d.service:02X}{d.subtype:02X}0000"
         ET.SubElement(
-            entries,
-            "FixedValueEntry",
-            {"name": "header", "binaryValue": header, "sizeInBits": str(len(header) * 4)},
+            entries, "FixedValueEntry", {"name": "header", "binaryValue": header, "sizeInBits": str(len(header) * 4)}
         )
         for name in names:
             ET.SubElement(entries, "ArgumentRefEntry", {"argumentRef": name})

@@ -170,15 +170,7 @@ class _System:
 
 def _system(node: Node, parent: _System | None) -> _System:
     node.only(
-        (
-            *_DESCRIPTION,
-            "Header",
-            "TelemetryMetaData",
-            "CommandMetaData",
-            "ServiceSet",
-            "Service",
-            "SpaceSystem",
-        ),
+        (*_DESCRIPTION, "Header", "TelemetryMetaData", "CommandMetaData", "ServiceSet", "Service", "SpaceSystem"),
         (*_NAMED, "operationalStatus", "ID"),
     )
     name = node.attribute("name")
@@ -290,14 +282,7 @@ class _Importer:
         """The container of an element, with those that continue it."""
         system, node = self.owner[key]
         node.only(
-            (
-                *_DESCRIPTION,
-                "DefaultRateInStream",
-                "RateInStreamSet",
-                "BinaryEncoding",
-                "EntryList",
-                "BaseContainer",
-            ),
+            (*_DESCRIPTION, "DefaultRateInStream", "RateInStreamSet", "BinaryEncoding", "EntryList", "BaseContainer"),
             (*_NAMED, "abstract", "idlePattern", "sizeInBits"),
         )
         base = node.child("BaseContainer")
@@ -318,9 +303,7 @@ class _Importer:
             return self.parts[key]
         system, node = self.owner[key]
         if node in self.open:
-            raise node.error(
-                "containers that do not contain themselves", f"{node.attributes['name']!r} in itself"
-            )
+            raise node.error("containers that do not contain themselves", f"{node.attributes['name']!r} in itself")
         _expect(node, len(self.open) < MAX_TYPE_DEPTH, f"containers at most {MAX_TYPE_DEPTH} deep", "deeper")
         self.open.append(node)
         found, size = [], 0
@@ -414,9 +397,7 @@ class _Importer:
         what = {"types": "parameter type", "parameters": "parameter", "containers": "container"}[kind]
         raise node.error(f"the name of a {what}", repr(reference))
 
-    def _descend(
-        self, start: _System | None, steps: list[str], kind: str, name: str
-    ) -> tuple[_System, Node] | None:
+    def _descend(self, start: _System | None, steps: list[str], kind: str, name: str) -> tuple[_System, Node] | None:
         for step in steps:
             if start is None:
                 return None
@@ -479,9 +460,7 @@ class _Importer:
             column = self.names[system.path, node.attributes["name"]]
             owner, type_node = self.find("types", node.attribute("parameterTypeRef"), system, node)
             data_type = self.type(owner, type_node)
-            self.parameters[path] = Parameter(
-                column, path, data_type, node.attributes.get("shortDescription", "")
-            )
+            self.parameters[path] = Parameter(column, path, data_type, node.attributes.get("shortDescription", ""))
         return self.parameters[path]
 
     # types
@@ -491,9 +470,7 @@ class _Importer:
         key = id(node)
         if key not in self.types:
             if node in self.open:
-                raise node.error(
-                    "types that do not contain themselves", f"{node.attributes['name']!r} in itself"
-                )
+                raise node.error("types that do not contain themselves", f"{node.attributes['name']!r} in itself")
             _expect(node, len(self.open) < MAX_TYPE_DEPTH, f"types at most {MAX_TYPE_DEPTH} deep", "deeper")
             self.open.append(node)
             if node.tag == "ArrayParameterType":
@@ -582,9 +559,7 @@ class _Importer:
                 break
         if encoding is None:
             raise node.error("a data encoding", "none")
-        labels = next(
-            (listed for _, one in chain if (listed := one.child("EnumerationList")) is not None), None
-        )
+        labels = next((listed for _, one in chain if (listed := one.child("EnumerationList")) is not None), None)
         units = next((u for _, one in chain if (u := one.child("UnitSet")) is not None), None)
         time = node.child("ReferenceTime")
         reference = None if time is None else time.child("Epoch")
@@ -625,15 +600,11 @@ class _Importer:
             form = node.attributes.get("encoding", "unsigned")
             _expect(node, form in _INTEGER_FORMS, f"encoding {', '.join(_INTEGER_FORMS)}", form)
             little = _is_little(node, bits)
-            _expect(
-                node, not little or bits % 8 == 0, "whole octets where the least comes first", f"{bits} bits"
-            )
+            _expect(node, not little or bits % 8 == 0, "whole octets where the least comes first", f"{bits} bits")
             return IntegerEncoding(bits, _INTEGER_FORMS[form], little, calibration)
         bits = _integer(node, "sizeInBits", 32)
         form = node.attributes.get("encoding", "IEEE754_1985")
-        form = {"IEEE-754": "IEEE754", "MIL-1750A": "MILSTD_1750A"}.get(
-            form, form
-        )  # so spelt in older documents
+        form = {"IEEE-754": "IEEE754", "MIL-1750A": "MILSTD_1750A"}.get(form, form)  # so spelt in older documents
         if form in ("IEEE754", "IEEE754_1985"):
             _expect(node, bits in (16, 32, 64), "sizeInBits 16, 32 or 64", f"{bits}")
             return FloatEncoding(bits, "IEEE754", _is_little(node, bits), calibration)
@@ -652,12 +623,7 @@ class _Importer:
         text = algorithm.child("AlgorithmText")
         tagged = None if text is None else _TAGGED_OCTETS.fullmatch(text.text)
         tag_bits = 0 if tagged is None else int(tagged[1])
-        _expect(
-            algorithm,
-            1 <= tag_bits <= 32,
-            "elements that are supported here",
-            f"{algorithm.tag}, which is not",
-        )
+        _expect(algorithm, 1 <= tag_bits <= 32, "elements that are supported here", f"{algorithm.tag}, which is not")
         return BinaryEncoding(Size(), tag_bits)
 
     def string(self, node: Node, system: _System) -> StringEncoding:
@@ -685,9 +651,7 @@ class _Importer:
                 value.only(("FixedValue",))
                 size = Size(fixed=_fixed(value.required("FixedValue"), 1))
         else:
-            holder.only(
-                ("DynamicValue", "DiscreteLookupList", "TerminationChar", "LeadingSize"), ("maxSizeInBits",)
-            )
+            holder.only(("DynamicValue", "DiscreteLookupList", "TerminationChar", "LeadingSize"), ("maxSizeInBits",))
             most = min(_integer(holder, "maxSizeInBits", MAX_BITS), MAX_BITS)
             dynamic = holder.child("DynamicValue")
             name_of = dynamic.required("ParameterInstanceRef") if dynamic is not None else None
@@ -748,12 +712,7 @@ class _Importer:
         for one in value.children:
             _expect(one, one.tag == "DiscreteLookup", "a DiscreteLookup", one.tag)
             number = _integer(one, "value", None)
-            _expect(
-                one,
-                least is None or least <= number <= MAX_BITS,
-                f"a value of {least} to {MAX_BITS}",
-                f"{number}",
-            )
+            _expect(one, least is None or least <= number <= MAX_BITS, f"a value of {least} to {MAX_BITS}", f"{number}")
             lookup.append((self.condition(one, system, ("value",)), number))
         _expect(value, bool(lookup), "a DiscreteLookup", "none")
         return Size(lookup=tuple(lookup))
@@ -841,15 +800,12 @@ class _Importer:
                 parameter = Parameter(parameter.name, parameter.path, array, parameter.description)
         return parameter, self.values[id(type_node)]
 
-    def entry(
-        self, node: Node, item: Parameter | Container, system: _System, attributes: tuple[str, ...]
-    ) -> Entry:
+    def entry(self, node: Node, item: Parameter | Container, system: _System, attributes: tuple[str, ...]) -> Entry:
         """The entry: where it begins and whether it is there."""
         extra = ("DimensionList",) if node.tag == "ArrayParameterRefEntry" else ()
         children = ("LocationInContainerInBits", "RepeatEntry", "IncludeCondition", "TimeAssociation")
         node.only(
-            (*_DESCRIPTION, *children, *extra),
-            (*attributes, "shortDescription", "lastEntryForThisArrayInstance"),
+            (*_DESCRIPTION, *children, *extra), (*attributes, "shortDescription", "lastEntryForThisArrayInstance")
         )
         location, condition = node.child("LocationInContainerInBits"), node.child("IncludeCondition")
         offset: int | Size = 0
@@ -861,9 +817,7 @@ class _Importer:
             from_start = where == "containerStart"
             place = self.size(location, system, 0 if from_start else None, attributes=("referenceLocation",))
             offset = place if place.fixed is None else place.fixed
-        return Entry(
-            item, offset, from_start, None if condition is None else self.condition(condition, system)
-        )
+        return Entry(item, offset, from_start, None if condition is None else self.condition(condition, system))
 
 
 def _column_names(elements: list[tuple[str, str]]) -> dict[tuple[str, str], str]:
@@ -896,8 +850,7 @@ def _check_entries(entries: tuple[Entry, ...], names: dict[str, bool], place: st
             twice = sorted(_names_of(entry.item) & names.keys())
             if twice:
                 raise DefinitionError(
-                    f"{place}: expected a parameter once where it is under a condition, "
-                    f"found {twice[0]!r} again"
+                    f"{place}: expected a parameter once where it is under a condition, found {twice[0]!r} again"
                 )
         if isinstance(entry.item, Container):
             _check_entries(entry.item.entries, names, place)
@@ -915,9 +868,7 @@ def _names_of(item: Parameter | Container) -> set[str]:
 def _check_known(wanted: set[str], names: Mapping[str, bool], place: str) -> None:
     missing = sorted(name for name in wanted if not names.get(name))
     if missing:
-        raise DefinitionError(
-            f"{place}: expected references to parameters that stand before, found {missing[0]!r}"
-        )
+        raise DefinitionError(f"{place}: expected references to parameters that stand before, found {missing[0]!r}")
 
 
 def _operator(node: Node, text: str) -> Operator:
@@ -946,9 +897,7 @@ def _compared(node: Node, left: Reference, data_type: ScalarType, operator_text:
     if isinstance(encoding, StringEncoding):
         return Comparison(left, operator, text)
     if isinstance(encoding, BinaryEncoding):
-        raise node.error(
-            "a comparison of a number, a text or a name", f"one of the octets {left.parameter!r}"
-        )
+        raise node.error("a comparison of a number, a text or a name", f"one of the octets {left.parameter!r}")
     calibrated = left.calibrated and encoding.calibration != Calibration()
     try:
         if isinstance(encoding, IntegerEncoding) and not calibrated:
@@ -978,9 +927,7 @@ def _calibrator(node: Node, extrapolate: bool) -> Calibrator:
         _expect(inner, len(set(exponents)) == len(exponents), "each exponent once", str(exponents))
         return Polynomial(tuple(terms))
     inner.only(("SplinePoint", "AncillaryDataSet"), (*_NAMED, "order", "extrapolate"))
-    points = sorted(
-        {(_number(p, "raw", None), _number(p, "calibrated", None)) for p in inner.all("SplinePoint")}
-    )
+    points = sorted({(_number(p, "raw", None), _number(p, "calibrated", None)) for p in inner.all("SplinePoint")})
     order = _integer(inner, "order", 1)
     _expect(inner, order in (0, 1), "order 0 or 1", f"{order}")
     for point in inner.all("SplinePoint"):
@@ -1004,9 +951,7 @@ def _labels(node: Node, listed: Node | None, encoding: Encoding) -> tuple[tuple[
         one.only((), ("value", "maxValue", "label", "shortDescription"))
         first = _integer(one, "value", None)
         last = _integer(one, "maxValue", first)
-        _expect(
-            one, least <= first <= last <= greatest, f"codes of {least} to {greatest}", f"{first} to {last}"
-        )
+        _expect(one, least <= first <= last <= greatest, f"codes of {least} to {greatest}", f"{first} to {last}")
         labels.append((first, last, one.attribute("label")))
     _expect(listed, bool(labels), "an Enumeration", "none")
     labels.sort(key=lambda label: label[0])

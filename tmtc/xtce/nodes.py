@@ -74,9 +74,7 @@ class Node:
         """An error at this element."""
         name = self.attributes.get("name")
         what = self.tag if name is None else f"{self.tag} {name!r}"
-        return DefinitionError(
-            f"{self.document}, line {self.line}, {what}: expected {expected}, found {found}"
-        )
+        return DefinitionError(f"{self.document}, line {self.line}, {what}: expected {expected}, found {found}")
 
 
 def parse_xml(text: str | bytes, document: str) -> Node:
@@ -113,8 +111,7 @@ class _Builder:
             self.parser.Parse(octets, True)
         except expat.ExpatError as error:
             raise DefinitionError(
-                f"{self.document}, line {error.lineno}: expected well-formed XML, found "
-                f"{expat.ErrorString(error.code)}"
+                f"{self.document}, line {error.lineno}: expected well-formed XML, found {expat.ErrorString(error.code)}"
             ) from None
         except (LookupError, ValueError) as error:  # encodings that Python does not know or cannot map
             raise DefinitionError(
@@ -128,9 +125,7 @@ class _Builder:
         line = self.parser.CurrentLineNumber
         self.elements += 1
         if self.elements > MAX_ELEMENTS:
-            raise DefinitionError(
-                f"{self.document}, line {line}: expected at most {MAX_ELEMENTS} elements, found more"
-            )
+            raise DefinitionError(f"{self.document}, line {line}: expected at most {MAX_ELEMENTS} elements, found more")
         if len(self.stack) >= MAX_DEPTH:
             raise DefinitionError(
                 f"{self.document}, line {line}, {tag}: expected elements at most {MAX_DEPTH} deep, found deeper"

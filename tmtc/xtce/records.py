@@ -17,8 +17,7 @@ def xtce_records(found: XtceDecode, *, raw: bool = False) -> list[Record]:
     numbered: list[tuple[int, Record]] = []
     for name, table in found.tables.items():
         columns = {
-            f"{key}_" if key == _CONTAINER else key: column.to_list(raw)
-            for key, column in table.columns.items()
+            f"{key}_" if key == _CONTAINER else key: column.to_list(raw) for key, column in table.columns.items()
         }
         rows = zip(*columns.values(), strict=True) if columns else ((),) * len(table)
         for index, values in zip(table.packet_index.tolist(), rows, strict=True):

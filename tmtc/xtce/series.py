@@ -11,15 +11,7 @@ import numpy as np
 from tmtc.arrays import FloatArray
 from tmtc.xtce.columns import Column, OptionalColumn, RecordColumn, ValueColumn
 from tmtc.xtce.decode import XtceTable
-from tmtc.xtce.definition import (
-    AggregateType,
-    ArrayType,
-    BinaryEncoding,
-    Container,
-    Entry,
-    ScalarType,
-    StringEncoding,
-)
+from tmtc.xtce.definition import AggregateType, ArrayType, BinaryEncoding, Container, Entry, ScalarType, StringEncoding
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +64,7 @@ def _of_type(
     if isinstance(data_type, AggregateType):
         for name, member in data_type.members:
             yield from _of_type(parameter, (*members, name), member, text)
-    elif isinstance(data_type, ScalarType) and not isinstance(
-        data_type.encoding, (StringEncoding, BinaryEncoding)
-    ):
+    elif isinstance(data_type, ScalarType) and not isinstance(data_type.encoding, (StringEncoding, BinaryEncoding)):
         yield SeriesValue(parameter, members, data_type, text)
 
 

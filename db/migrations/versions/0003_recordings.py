@@ -47,13 +47,9 @@ def upgrade() -> None:
         sa.Column("fit", sa.Integer(), nullable=False),
         sa.Column("digest", sa.LargeBinary(length=16), nullable=False),
         sa.Column("octets", sa.LargeBinary(), nullable=False),
-        sa.ForeignKeyConstraint(
-            ["vehicle_id"], ["vehicles.id"], name=op.f("fk_fragments_vehicle_id_vehicles")
-        ),
+        sa.ForeignKeyConstraint(["vehicle_id"], ["vehicles.id"], name=op.f("fk_fragments_vehicle_id_vehicles")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_fragments")),
-        sa.UniqueConstraint(
-            "vehicle_id", "channel", "digest", name=op.f("uq_fragments_vehicle_id_channel_digest")
-        ),
+        sa.UniqueConstraint("vehicle_id", "channel", "digest", name=op.f("uq_fragments_vehicle_id_channel_digest")),
     )
     op.create_index("ix_fragments_first", "fragments", ["vehicle_id", "channel", "count", "fit"])
     op.create_index("ix_fragments_last", "fragments", ["vehicle_id", "channel", "next_count", "fit"])
@@ -99,9 +95,7 @@ def _keep_fragments() -> None:
 def _list_waiting() -> None:
     """State the octets that wait in the accounting of their ingests, and log the pieces without a position."""
     bind = op.get_bind()
-    ingests = sa.table(
-        "ingests", sa.column("id"), sa.column("file_sha256"), sa.column("accounting", sa.JSON())
-    )
+    ingests = sa.table("ingests", sa.column("id"), sa.column("file_sha256"), sa.column("accounting", sa.JSON()))
     pieces = sa.table("pieces", sa.column("ingest_id"), sa.column("stream"))
     query = (
         sa.select(EDGES.c.file_sha256, EDGES.c.domain, sa.func.sum(EDGES.c.length))
@@ -113,9 +107,7 @@ def _list_waiting() -> None:
         waiting[sha256] = min(int(octets), waiting.get(sha256, int(octets)))
     found = sa.select(ingests, pieces.c.stream).join(pieces, pieces.c.ingest_id == ingests.c.id)
     for row in bind.execute(found.order_by(ingests.c.id)).mappings().all():
-        accounting = (
-            row["accounting"] if isinstance(row["accounting"], dict) else json.loads(row["accounting"])
-        )
+        accounting = row["accounting"] if isinstance(row["accounting"], dict) else json.loads(row["accounting"])
         octets = waiting.get(row["file_sha256"], 0)
         if "octets_pending" in accounting and accounting["octets_pending"] != octets:
             changed = {**accounting, "octets_pending": octets}

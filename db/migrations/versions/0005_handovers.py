@@ -24,8 +24,6 @@ def upgrade() -> None:
         sa.Column("held_by", sa.String(length=64), nullable=True),
         sa.Column("held_utc_ns", sa.BigInteger(), nullable=True),
         sa.Column("hold_reason", sa.Text(), nullable=False),
-        sa.ForeignKeyConstraint(
-            ["vehicle_id"], ["vehicles.id"], name=op.f("fk_handovers_vehicle_id_vehicles")
-        ),
+        sa.ForeignKeyConstraint(["vehicle_id"], ["vehicles.id"], name=op.f("fk_handovers_vehicle_id_vehicles")),
         sa.PrimaryKeyConstraint("vehicle_id", name=op.f("pk_handovers")),
     )

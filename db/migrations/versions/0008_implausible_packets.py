@@ -30,9 +30,7 @@ def upgrade() -> None:
         sa.ForeignKeyConstraint(
             ["vehicle_id"], ["vehicles.id"], name=op.f("fk_implausible_packets_vehicle_id_vehicles")
         ),
-        sa.ForeignKeyConstraint(
-            ["ingest_id"], ["ingests.id"], name=op.f("fk_implausible_packets_ingest_id_ingests")
-        ),
+        sa.ForeignKeyConstraint(["ingest_id"], ["ingests.id"], name=op.f("fk_implausible_packets_ingest_id_ingests")),
         sa.PrimaryKeyConstraint("id", name=op.f("pk_implausible_packets")),
         sa.UniqueConstraint("vehicle_id", "digest", name=op.f("uq_implausible_packets_vehicle_id_digest")),
     )

@@ -22,8 +22,7 @@ class CommandEntry(RequestModel):
 
     name: str = Field(max_length=64, examples=["perform_function"])
     arguments: dict[str, Any] = Field(
-        default_factory=dict,
-        examples=[{"function_id": "start_observation", "argument_1": 0, "argument_2": 15}],
+        default_factory=dict, examples=[{"function_id": "start_observation", "argument_1": 0, "argument_2": 15}]
     )
     spacecraft_id: SpacecraftNumber
     instance: InstanceName = "flight"
@@ -51,9 +50,7 @@ class Telecommand(Entity):
     id: int
     name: str
     arguments: dict[str, Any]
-    text: str = Field(
-        description="The arguments with names and units", examples=["duration 900 s, cadence 15 s"]
-    )
+    text: str = Field(description="The arguments with names and units", examples=["duration 900 s, cadence 15 s"])
     spacecraft_id: int
     instance: str
     state: str = Field(
@@ -189,9 +186,7 @@ class Handover(Entity):
     note: str = ""
     noted_by: str | None = None
     noted: UtcTime | None = None
-    held_by: str | None = Field(
-        default=None, description="Who stopped release and transmission; null: nobody"
-    )
+    held_by: str | None = Field(default=None, description="Who stopped release and transmission; null: nobody")
     held: UtcTime | None = Field(default=None, description="Since when")
     hold_reason: str = ""
 

@@ -17,13 +17,7 @@ from ground_service.contacts.commanding.model import (
     Telecommand,
     UplinkState,
 )
-from ground_service.http.common import (
-    GroundOf,
-    Instance,
-    OnceKey,
-    RowId,
-    SpacecraftId,
-)
+from ground_service.http.common import GroundOf, Instance, OnceKey, RowId, SpacecraftId
 from ground_service.http.requests import operations, problems
 from ground_service.store.vehicles import FLOWN
 
@@ -68,9 +62,7 @@ def release_telecommand(ground: GroundOf, caller: Operator, command_id: RowId) -
 
 
 @telecommands.post("/telecommands/{command_id}/reject", responses=problems(409))
-def reject_telecommand(
-    ground: GroundOf, caller: Operator, command_id: RowId, given: Rejection
-) -> Telecommand:
+def reject_telecommand(ground: GroundOf, caller: Operator, command_id: RowId, given: Rejection) -> Telecommand:
     """Reject a queued telecommand."""
     commanding.reject_command(ground, command_id, actor=caller.name, reason=given.reason)
     return commanding.get_command(ground, command_id).telecommand
@@ -89,11 +81,7 @@ add_list(telecommands, "/handovers", store.list_handovers)
 
 @telecommands.put("/spacecraft/{spacecraft_id}/handover")
 def change_handover(
-    ground: GroundOf,
-    caller: Operator,
-    spacecraft_id: SpacecraftId,
-    given: HandoverNote,
-    instance: Instance = FLOWN,
+    ground: GroundOf, caller: Operator, spacecraft_id: SpacecraftId, given: HandoverNote, instance: Instance = FLOWN
 ) -> Handover:
     """Change the note for the next shift."""
     return commanding.change_handover(ground, spacecraft_id, instance, given.note, actor=caller.name)
@@ -101,11 +89,7 @@ def change_handover(
 
 @telecommands.post("/spacecraft/{spacecraft_id}/hold", responses=problems(409))
 def hold_spacecraft(
-    ground: GroundOf,
-    caller: Operator,
-    spacecraft_id: SpacecraftId,
-    given: Rejection,
-    instance: Instance = FLOWN,
+    ground: GroundOf, caller: Operator, spacecraft_id: SpacecraftId, given: Rejection, instance: Instance = FLOWN
 ) -> Handover:
     """Suppress release and transmission of telecommands of a spacecraft at once, automatic ones included."""
     return commanding.hold_spacecraft(ground, spacecraft_id, instance, reason=given.reason, actor=caller.name)

@@ -214,9 +214,7 @@ def take_released(
     return stream, ids
 
 
-def hold_spacecraft(
-    ground: Ground, spacecraft_id: int, instance: str, *, reason: str, actor: str
-) -> Handover:
+def hold_spacecraft(ground: Ground, spacecraft_id: int, instance: str, *, reason: str, actor: str) -> Handover:
     """Stop the release and the transmission of all telecommands of a spacecraft until `resume_spacecraft`.
 
     A transmission that a station has begun is not recalled.
@@ -241,9 +239,7 @@ def resume_spacecraft(ground: Ground, spacecraft_id: int, instance: str, *, acto
     return _change_hold(ground, spacecraft_id, instance, actor=actor, reason=None)
 
 
-def _change_hold(
-    ground: Ground, spacecraft_id: int, instance: str, *, actor: str, reason: str | None
-) -> Handover:
+def _change_hold(ground: Ground, spacecraft_id: int, instance: str, *, actor: str, reason: str | None) -> Handover:
     with ground.database.writing() as connection:
         vehicle = find_vehicle(connection, spacecraft_id, instance).id
         lock_spacecraft(connection, vehicle)  # what is being released or taken now comes before the hold
@@ -432,8 +428,6 @@ def _require_approval(
     )
 
 
-def _note(
-    connection: Connection, actor: str, action: str, command_id: int, state: str, detail: dict[str, Any]
-) -> None:
+def _note(connection: Connection, actor: str, action: str, command_id: int, state: str, detail: dict[str, Any]) -> None:
     audit(connection, actor, f"{action} telecommand", str(command_id), detail)
     publish(connection, CommandStateChanged(id=command_id, state=state))

@@ -4,18 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
-from sqlalchemy import (
-    BigInteger,
-    ColumnElement,
-    Connection,
-    ScalarSelect,
-    and_,
-    cast,
-    func,
-    or_,
-    select,
-    update,
-)
+from sqlalchemy import BigInteger, ColumnElement, Connection, ScalarSelect, and_, cast, func, or_, select, update
 from sqlalchemy.sql import Select
 
 from ground_service.contacts.commanding.core import CommandFate, SentCommand, VerificationReport, fate_of
@@ -86,9 +75,7 @@ def add_command(
     )
 
 
-def release(
-    connection: Connection, command_id: int, issued: CommandOctets, *, actor: str, now_utc_ns: int
-) -> None:
+def release(connection: Connection, command_id: int, issued: CommandOctets, *, actor: str, now_utc_ns: int) -> None:
     """Move a queued telecommand to released.
 
     Raises
@@ -133,9 +120,7 @@ def note_handover(connection: Connection, vehicle: int, note: str, *, actor: str
     repository.change(connection, HANDOVERS, vehicle, note=note, noted_by=actor, noted_utc_ns=now_utc_ns)
 
 
-def set_hold(
-    connection: Connection, vehicle: int, held_by: str | None, reason: str, *, now_utc_ns: int
-) -> bool:
+def set_hold(connection: Connection, vehicle: int, held_by: str | None, reason: str, *, now_utc_ns: int) -> bool:
     """Hold a vehicle, or end its hold if `held_by` is None; return whether this has changed anything."""
     repository.add_new(connection, HANDOVERS, vehicle_id=vehicle, note="", hold_reason="")
     before = HANDOVERS.c.held_by.is_not(None) if held_by is None else HANDOVERS.c.held_by.is_(None)
@@ -161,9 +146,7 @@ def set_carrier(connection: Connection, command_id: int, carrier_id: int) -> Non
     repository.change(connection, TELECOMMANDS, command_id, carrier_id=carrier_id)
 
 
-def send_released(
-    connection: Connection, vehicle: int, now_utc_ns: int, mission_utc_ns: int
-) -> list[CommandRecord]:
+def send_released(connection: Connection, vehicle: int, now_utc_ns: int, mission_utc_ns: int) -> list[CommandRecord]:
     """Move the released telecommands of a vehicle, and those that they carry, to sent.
 
     Those whose time for transmission has passed at `mission_utc_ns` stay released.
@@ -201,9 +184,7 @@ def count_released(connection: Connection, ccsds_id: int, instance: str, mission
 
 def limit_sending(connection: Connection, ids: Sequence[int], before_utc_ns: int) -> None:
     """Enter the mission time from which telecommands are no longer sent."""
-    connection.execute(
-        update(TELECOMMANDS).where(TELECOMMANDS.c.id.in_(ids)).values(send_before_utc_ns=before_utc_ns)
-    )
+    connection.execute(update(TELECOMMANDS).where(TELECOMMANDS.c.id.in_(ids)).values(send_before_utc_ns=before_utc_ns))
 
 
 def note_timeout(connection: Connection, command_id: int, now_utc_ns: int) -> bool:
@@ -222,9 +203,7 @@ def get_view(connection: Connection, command_id: int, now_utc_ns: int) -> Comman
     return _views(connection, [get_record(connection, command_id)], now_utc_ns)[0]
 
 
-def list_views(
-    connection: Connection, asked: TelecommandFilter, now_utc_ns: int
-) -> tuple[list[CommandView], int]:
+def list_views(connection: Connection, asked: TelecommandFilter, now_utc_ns: int) -> tuple[list[CommandView], int]:
     """Return a page of the telecommands, newest first, and their number."""
     rows, total = repository.newest(connection, TELECOMMANDS, asked)
     return _views(connection, [CommandRecord.of(row) for row in rows], now_utc_ns), total
@@ -232,9 +211,7 @@ def list_views(
 
 def views_of_window(connection: Connection, window_id: int, now_utc_ns: int) -> list[CommandView]:
     """Return the telecommands of a window that were not rejected."""
-    query = select(TELECOMMANDS).where(
-        TELECOMMANDS.c.window_id == window_id, TELECOMMANDS.c.state != "rejected"
-    )
+    query = select(TELECOMMANDS).where(TELECOMMANDS.c.window_id == window_id, TELECOMMANDS.c.state != "rejected")
     return _selected(connection, query, now_utc_ns)
 
 
@@ -264,9 +241,7 @@ def ids_of_windows(connection: Connection, windows: Sequence[int]) -> dict[int, 
 def carriers_of_window(connection: Connection, window_id: int) -> list[int]:
     """Return the ids of the telecommands that uplink a window, without rejected and carried ones."""
     query = select(TELECOMMANDS.c.id).where(
-        TELECOMMANDS.c.window_id == window_id,
-        TELECOMMANDS.c.carrier_id.is_(None),
-        TELECOMMANDS.c.state != "rejected",
+        TELECOMMANDS.c.window_id == window_id, TELECOMMANDS.c.carrier_id.is_(None), TELECOMMANDS.c.state != "rejected"
     )
     return [int(key) for key in connection.execute(query.order_by(TELECOMMANDS.c.id)).scalars()]
 
@@ -274,9 +249,7 @@ def carriers_of_window(connection: Connection, window_id: int) -> list[int]:
 def activities_on_board(connection: Connection, window_id: int) -> list[int]:
     """Return the request ids of the activities of a window that were sent, in order of release."""
     query = select(TELECOMMANDS.c.request_id).where(
-        TELECOMMANDS.c.window_id == window_id,
-        TELECOMMANDS.c.carrier_id.is_not(None),
-        TELECOMMANDS.c.state == "sent",
+        TELECOMMANDS.c.window_id == window_id, TELECOMMANDS.c.carrier_id.is_not(None), TELECOMMANDS.c.state == "sent"
     )
     return [int(request) for request in connection.execute(query.order_by(TELECOMMANDS.c.id)).scalars()]
 
@@ -287,9 +260,7 @@ def sent_for_pass(connection: Connection, pass_id: int) -> bytes:
     Parameters that were changed by telecommand before are in force in the pass: those packets come first.
     """
     windows = repository.WINDOWS
-    window = connection.execute(
-        select(windows.c.id, windows.c.vehicle_id).where(windows.c.pass_id == pass_id)
-    )
+    window = connection.execute(select(windows.c.id, windows.c.vehicle_id).where(windows.c.pass_id == pass_id))
     found = window.first()
     if found is None:
         return b""
@@ -297,9 +268,7 @@ def sent_for_pass(connection: Connection, pass_id: int) -> bytes:
         TELECOMMANDS.c.window_id == found.id,
         and_(TELECOMMANDS.c.window_id.is_(None), TELECOMMANDS.c.name == "set_parameter"),
     )
-    rows = connection.execute(
-        _sent_octets(found.vehicle_id, concerned, TELECOMMANDS.c.carrier_id.is_(None))
-    ).all()
+    rows = connection.execute(_sent_octets(found.vehicle_id, concerned, TELECOMMANDS.c.carrier_id.is_(None))).all()
     last = max((number for number, row in enumerate(rows) if row.window_id is not None), default=-1)
     return b"".join(row.octets for row in rows[: last + 1])
 
@@ -340,9 +309,7 @@ def withdraw_window(connection: Connection, window_id: int, *, actor: str, now_u
 
 def unlink_window(connection: Connection, window_id: int) -> None:
     """Remove the reference to a window from its telecommands."""
-    connection.execute(
-        update(TELECOMMANDS).where(TELECOMMANDS.c.window_id == window_id).values(window_id=None)
-    )
+    connection.execute(update(TELECOMMANDS).where(TELECOMMANDS.c.window_id == window_id).values(window_id=None))
 
 
 def newest_channels(connection: Connection, spacecraft_id: int, instance: str) -> list[UplinkChannel]:
@@ -399,9 +366,7 @@ def _views(connection: Connection, records: Sequence[CommandRecord], now_utc_ns:
         vehicle = get_vehicle(connection, key)
         mine = [record for record in records if record.vehicle_id == key]
         fates = _fates(connection, key, mine, now_utc_ns)
-        views |= {
-            one.id: CommandView(one, vehicle.ccsds_id, vehicle.instance, fates.get(one.id)) for one in mine
-        }
+        views |= {one.id: CommandView(one, vehicle.ccsds_id, vehicle.instance, fates.get(one.id)) for one in mine}
     return [views[record.id] for record in records]
 
 

@@ -62,9 +62,7 @@ def predict_contacts(
     return tuple(sorted(found, key=lambda one: (one.start_utc_ns, one.station)))
 
 
-def _visible_spans(
-    ephemeris: Ephemeris, station: GroundStation, start_utc_ns: int, stop_utc_ns: int
-) -> list[Span]:
+def _visible_spans(ephemeris: Ephemeris, station: GroundStation, start_utc_ns: int, stop_utc_ns: int) -> list[Span]:
     """Return the spans between two times in which a station sees the spacecraft, in order of time."""
     spans: list[Span] = []
     for block in range(start_utc_ns // BLOCK_NS, -(-stop_utc_ns // BLOCK_NS)):
@@ -86,9 +84,7 @@ def _spans_of_block(ephemeris: Ephemeris, station: GroundStation, block: int) ->
     last = min((block + 1) * BLOCK_NS, ephemeris.stop_utc_ns)
     if last <= first:
         return ()
-    return tuple(
-        find_windows(lambda epochs: link(ephemeris, epochs, station).visible, first, last, STEP_S, EDGE_S)
-    )
+    return tuple(find_windows(lambda epochs: link(ephemeris, epochs, station).visible, first, last, STEP_S, EDGE_S))
 
 
 def without(span: Span, closed: Sequence[Span]) -> list[Span]:
@@ -104,9 +100,7 @@ def without(span: Span, closed: Sequence[Span]) -> list[Span]:
     return parts
 
 
-def contact_at(
-    contacts: Sequence[PredictedContact], utc_ns: int, margin_ns: int = 0
-) -> PredictedContact | None:
+def contact_at(contacts: Sequence[PredictedContact], utc_ns: int, margin_ns: int = 0) -> PredictedContact | None:
     """Return the contact that contains a time, the margin before and after included; None without any."""
     for one in contacts:
         if one.start_utc_ns - margin_ns <= utc_ns <= one.stop_utc_ns + margin_ns:

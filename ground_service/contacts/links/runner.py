@@ -506,9 +506,7 @@ class LinkRunner:
         if other is None:
             self._refused_until_s = time.monotonic() + REFUSED_S
             return False
-        log.info(
-            "link %s: telecommands %s given to link %s", self._name, list(transmission.telecommands), other
-        )
+        log.info("link %s: telecommands %s given to link %s", self._name, list(transmission.telecommands), other)
         return True
 
     def _transmit(self, up: Connector, transmission: TransmissionRow) -> bool:

@@ -157,9 +157,7 @@ def list_contacts(
             unpredicted[name] = reason
         mine = [row for row in rows if row.link == name]
         contacts += [
-            _predicted(one, contact)
-            for contact in predicted
-            if not any(_belongs(row, contact) for row in mine)
+            _predicted(one, contact) for contact in predicted if not any(_belongs(row, contact) for row in mine)
         ]
     contacts.sort(key=lambda one: (one.start.utc_ns, one.link))
     return Contacts(contacts=contacts, unpredicted=unpredicted)
@@ -206,9 +204,7 @@ def release(ground: Ground, name: str, owner: str) -> None:
 def change_state(ground: Ground, name: str, owner: str, state: str, reason: str | None) -> bool:
     """Change the state of a link; return whether `owner` still has it."""
     with ground.database.writing() as connection:
-        changed = store.change_link(
-            connection, name, owner, state=state, reason=reason, changed_utc_ns=utc_now_ns()
-        )
+        changed = store.change_link(connection, name, owner, state=state, reason=reason, changed_utc_ns=utc_now_ns())
         if changed:
             publish(connection, LinkChanged(link=name, state=state, reason=reason))
         return changed
@@ -219,9 +215,7 @@ def owners(ground: Ground) -> dict[str, str | None]:
     now = utc_now_ns()
     with ground.database.reading() as connection:
         rows = {name: store.find_link(connection, name) for name in _declared(connection)}
-    return {
-        name: row.owner if row is not None and row.lease_utc_ns >= now else None for name, row in rows.items()
-    }
+    return {name: row.owner if row is not None and row.lease_utc_ns >= now else None for name, row in rows.items()}
 
 
 def last_reception_ns(ground: Ground, name: str) -> int | None:
@@ -301,12 +295,7 @@ def end_contact(ground: Ground, contact_id: int, name: str, stop_utc_ns: int) ->
 
 
 def note_reception(
-    ground: Ground,
-    name: str,
-    contact_id: int | None,
-    octets: int,
-    heard_utc_ns: int | None,
-    offset_ns: int | None,
+    ground: Ground, name: str, contact_id: int | None, octets: int, heard_utc_ns: int | None, offset_ns: int | None
 ) -> None:
     """Count ingested octets of a link; `offset_ns` is that of the station's clock, None if unknown."""
     with ground.database.writing() as connection:
@@ -330,8 +319,7 @@ def note_missed(ground: Ground, declared: DeclaredLink, owner: str, now_utc_ns: 
     over = [
         one
         for one in predicted
-        if one.stop_utc_ns + MARGIN_NS <= now_utc_ns
-        and one.stop_utc_ns - one.start_utc_ns >= MISSED_SHORTEST_NS
+        if one.stop_utc_ns + MARGIN_NS <= now_utc_ns and one.stop_utc_ns - one.start_utc_ns >= MISSED_SHORTEST_NS
     ]
     # A contact that may still go on is looked at again from its start.
     going_on = [one.start_utc_ns for one in predicted if one.stop_utc_ns + MARGIN_NS > now_utc_ns]
@@ -342,9 +330,7 @@ def note_missed(ground: Ground, declared: DeclaredLink, owner: str, now_utc_ns: 
         rows = store.contacts_between(connection, since - 3 * MARGIN_NS, now_utc_ns)
         mine = [row for row in rows if row.link == name]
         elsewhere = _of_other_links(connection, declared, rows)
-        missed = [
-            one for one in over if not any(_belongs(row, one) for row in mine) and _is_unheard(one, elsewhere)
-        ]
+        missed = [one for one in over if not any(_belongs(row, one) for row in mine) and _is_unheard(one, elsewhere)]
         vehicle = vehicle_id(connection, declared.spacecraft_id, declared.link.instance) if missed else 0
         for one in missed:
             _add_missed(connection, declared, vehicle, one, why)
@@ -451,13 +437,7 @@ def repeat_unconfirmed(ground: Ground, declared: DeclaredLink, contact: ContactR
                 if not store.repeat_transmission(connection, one.id, name, seen=seen):
                     continue
                 repeated += 1
-                audit(
-                    connection,
-                    ACTOR,
-                    "repeat transmission",
-                    str(one.id),
-                    {"telecommands": list(one.telecommands)},
-                )
+                audit(connection, ACTOR, "repeat transmission", str(one.id), {"telecommands": list(one.telecommands)})
     return repeated
 
 
@@ -555,9 +535,7 @@ def _predicted(declared: DeclaredLink, contact: PredictedContact) -> LinkContact
     )
 
 
-def _of_other_links(
-    connection: Connection, declared: DeclaredLink, rows: Sequence[ContactRow]
-) -> list[core.Span]:
+def _of_other_links(connection: Connection, declared: DeclaredLink, rows: Sequence[ContactRow]) -> list[core.Span]:
     """Return the spans, with margins, of the contacts over the other links of a spacecraft."""
     names = {
         name
@@ -566,10 +544,7 @@ def _of_other_links(
         and name != declared.link.name
     }
     return [
-        (
-            row.start_utc_ns - MARGIN_NS,
-            MARGIN_NS + (mission_now_ns() if row.stop_utc_ns is None else row.stop_utc_ns),
-        )
+        (row.start_utc_ns - MARGIN_NS, MARGIN_NS + (mission_now_ns() if row.stop_utc_ns is None else row.stop_utc_ns))
         for row in rows
         if row.link in names and row.state != "missed"
     ]

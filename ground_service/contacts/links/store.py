@@ -120,13 +120,7 @@ def acquire(
 def release(connection: Connection, name: str, owner: str, wall_utc_ns: int) -> None:
     """Give a link back, so that another process need not wait for the end of the lease."""
     mine = (_LINKS.c.name == name, _LINKS.c.owner == owner)
-    values = {
-        "owner": None,
-        "lease_utc_ns": 0,
-        "state": "waiting",
-        "reason": None,
-        "changed_utc_ns": wall_utc_ns,
-    }
+    values = {"owner": None, "lease_utc_ns": 0, "state": "waiting", "reason": None, "changed_utc_ns": wall_utc_ns}
     connection.execute(update(_LINKS).where(*mine).values(**values))
 
 
@@ -142,9 +136,7 @@ def add_octets(connection: Connection, name: str, octets: int) -> None:
     connection.execute(statement)
 
 
-def note_reception(
-    connection: Connection, name: str, heard_utc_ns: int | None, offset_ns: int | None
-) -> None:
+def note_reception(connection: Connection, name: str, heard_utc_ns: int | None, offset_ns: int | None) -> None:
     """Record when something was received over a link, and the offset of the station's clock; None changes nothing."""
     given = {"heard_utc_ns": heard_utc_ns, "clock_offset_ns": offset_ns}
     values = {key: value for key, value in given.items() if value is not None}
@@ -172,14 +164,10 @@ def add_contact(connection: Connection, **columns: Any) -> int:
 
 def end_contact(connection: Connection, contact_id: int, stop_utc_ns: int) -> bool:
     """End a contact if it is open; return whether this call ended it."""
-    return change_if(
-        connection, _CONTACTS, contact_id, {"state": "open"}, state="ended", stop_utc_ns=stop_utc_ns
-    )
+    return change_if(connection, _CONTACTS, contact_id, {"state": "open"}, state="ended", stop_utc_ns=stop_utc_ns)
 
 
-def count_in_contact(
-    connection: Connection, contact_id: int, *, octets: int = 0, telecommands: int = 0
-) -> None:
+def count_in_contact(connection: Connection, contact_id: int, *, octets: int = 0, telecommands: int = 0) -> None:
     """Count octets received and telecommands sent in a contact."""
     connection.execute(
         update(_CONTACTS)
@@ -221,9 +209,7 @@ def add_transmission(connection: Connection, **columns: Any) -> int:
 
 def pending_transmissions(connection: Connection, link: str) -> list[TransmissionRow]:
     """Return the transmissions of a link that may not be on the wire, in order."""
-    query = select(_TRANSMISSIONS).where(
-        _TRANSMISSIONS.c.link == link, _TRANSMISSIONS.c.transmitted_utc_ns.is_(None)
-    )
+    query = select(_TRANSMISSIONS).where(_TRANSMISSIONS.c.link == link, _TRANSMISSIONS.c.transmitted_utc_ns.is_(None))
     return [_transmission(row) for row in connection.execute(query.order_by(_TRANSMISSIONS.c.id)).mappings()]
 
 
@@ -263,9 +249,7 @@ def hand_over(connection: Connection, transmission_id: int, link: str, other: st
     return change_if(connection, _TRANSMISSIONS, transmission_id, found, link=other)
 
 
-def note_transmitted(
-    connection: Connection, transmission_id: int, contact_id: int | None, utc_ns: int
-) -> None:
+def note_transmitted(connection: Connection, transmission_id: int, contact_id: int | None, utc_ns: int) -> None:
     """Record that the octets of a transmission are on the wire."""
     connection.execute(
         update(_TRANSMISSIONS)
@@ -275,6 +259,4 @@ def note_transmitted(
 
 
 def _transmission(row: RowMapping) -> TransmissionRow:
-    return TransmissionRow(
-        **{**row, "octets": bytes(row["octets"]), "telecommands": tuple(row["telecommands"])}
-    )
+    return TransmissionRow(**{**row, "octets": bytes(row["octets"]), "telecommands": tuple(row["telecommands"])})

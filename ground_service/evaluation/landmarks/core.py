@@ -167,10 +167,7 @@ def is_listed(place: Place, catalogue: CraterCatalogue) -> bool:
     near = catalogue.near(place.latitude_rad, place.longitude_rad, REACH * place.diameter_m)
     columns = (catalogue.latitude_rad[near], catalogue.longitude_rad[near], catalogue.diameter_m[near])
     return any(
-        same_place(
-            place,
-            replace(place, latitude_rad=lat, longitude_rad=lon, diameter_m=size, sigma_m=(0.0, 0.0, 0.0)),
-        )
+        same_place(place, replace(place, latitude_rad=lat, longitude_rad=lon, diameter_m=size, sigma_m=(0.0, 0.0, 0.0)))
         for lat, lon, size in zip(*(one.tolist() for one in columns), strict=True)
     )
 
@@ -222,11 +219,7 @@ def combined(places: Sequence[Place]) -> Place:
 
 def is_persistent(passes: int, sightings: int, looks: int) -> bool:
     """Return whether a landmark was seen often enough to be proposed."""
-    return (
-        passes >= PASSES_NEEDED
-        and sightings >= SIGHTINGS_NEEDED
-        and sightings >= SHARE_NEEDED * max(looks, 1)
-    )
+    return passes >= PASSES_NEEDED and sightings >= SIGHTINGS_NEEDED and sightings >= SHARE_NEEDED * max(looks, 1)
 
 
 def _explained(detections: DetectionSamples, expected: ExpectedCraters, matches: Matches) -> BoolArray:
@@ -238,8 +231,7 @@ def _explained(detections: DetectionSamples, expected: ExpectedCraters, matches:
         if d.stop == d.start or c.stop == c.start:
             continue
         apart = np.hypot(
-            detections.u_px[d, None] - expected.u_px[None, c],
-            detections.v_px[d, None] - expected.v_px[None, c],
+            detections.u_px[d, None] - expected.u_px[None, c], detections.v_px[d, None] - expected.v_px[None, c]
         )
         with np.errstate(divide="ignore", invalid="ignore"):
             alike = np.abs(np.log2(detections.diameter_px[d, None] / expected.diameter_px[None, c])) < 1.0
@@ -249,11 +241,7 @@ def _explained(detections: DetectionSamples, expected: ExpectedCraters, matches:
 
 
 def _ground_points(
-    detections: DetectionSamples,
-    frames: Frames,
-    owner: IntArray,
-    rows: IntArray,
-    catalogue: CraterCatalogue,
+    detections: DetectionSamples, frames: Frames, owner: IntArray, rows: IntArray, catalogue: CraterCatalogue
 ) -> tuple[FloatArray, FloatArray]:
     """Return the points (n, 3) of detections on spheres of the local height, and their depths (n,)."""
     points, depth = np.full((len(rows), 3), np.nan), np.full(len(rows), np.nan)
@@ -264,9 +252,7 @@ def _ground_points(
         point = position + ray * intersect_sphere(position, ray)
         if not np.isfinite(point).all():
             continue
-        point = position + ray * intersect_sphere(
-            position, ray, MOON_RADIUS_M + _local_height_m(catalogue, point)
-        )
+        point = position + ray * intersect_sphere(position, ray, MOON_RADIUS_M + _local_height_m(catalogue, point))
         points[k], depth[k] = point, (rotation @ (point - position))[2]
     return points, depth
 

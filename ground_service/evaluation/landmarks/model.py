@@ -38,9 +38,7 @@ class PassSightings(Entity):
     score: float
     frame_width_px: int = Field(description="Size of the frames that the detections refer to")
     frame_height_px: int
-    controls: int = Field(
-        description="Catalogued craters that calibrate the pass; below 5 it is not calibrated"
-    )
+    controls: int = Field(description="Catalogued craters that calibrate the pass; below 5 it is not calibrated")
     sightings: list[Sighting]
 
 
@@ -80,9 +78,7 @@ class LandmarkDetail(Landmark):
 class LandmarkDecision(RequestModel):
     """Reason for accepting or rejecting a landmark."""
 
-    reason: str = Field(
-        default="", max_length=500, pattern=LINE_PATTERN_JSON, examples=["crater in all images"]
-    )
+    reason: str = Field(default="", max_length=500, pattern=LINE_PATTERN_JSON, examples=["crater in all images"])
 
 
 class LandmarkUpdate(Entity):
@@ -96,9 +92,7 @@ class LandmarkUpdate(Entity):
         description="Further places: craters that the catalogue of the pass lacks and the full list has"
     )
     controls: int = Field(description="Catalogued craters that calibrate the pass")
-    offset_east_m: float | None = Field(
-        description="Offset of these craters that was removed; null: none was"
-    )
+    offset_east_m: float | None = Field(description="Offset of these craters that was removed; null: none was")
     offset_north_m: float | None
     added: int
     proposed: int = Field(description="Landmarks that wait for a decision now")

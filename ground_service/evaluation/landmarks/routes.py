@@ -4,11 +4,7 @@ from fastapi import Response
 
 from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.evaluation.landmarks import service
-from ground_service.evaluation.landmarks.model import (
-    LandmarkDecision,
-    LandmarkDetail,
-    LandmarkUpdate,
-)
+from ground_service.evaluation.landmarks.model import LandmarkDecision, LandmarkDetail, LandmarkUpdate
 from ground_service.http.common import GroundOf, PassId, RowId
 from ground_service.http.requests import operations, problems
 
@@ -29,9 +25,7 @@ def accept_landmark(
     ground: GroundOf, caller: Operator, landmark_id: RowId, decision: LandmarkDecision = LandmarkDecision()
 ) -> LandmarkDetail:
     """Accept a proposed landmark as a crater of the next anchoring catalogue."""
-    return service.decide_landmark(
-        ground, landmark_id, accept=True, reason=decision.reason, actor=caller.name
-    )
+    return service.decide_landmark(ground, landmark_id, accept=True, reason=decision.reason, actor=caller.name)
 
 
 @landmarks.post("/landmarks/{landmark_id}/reject", responses=problems(404, 409))
@@ -39,9 +33,7 @@ def reject_landmark(
     ground: GroundOf, caller: Operator, landmark_id: RowId, decision: LandmarkDecision = LandmarkDecision()
 ) -> LandmarkDetail:
     """Reject a proposed landmark."""
-    return service.decide_landmark(
-        ground, landmark_id, accept=False, reason=decision.reason, actor=caller.name
-    )
+    return service.decide_landmark(ground, landmark_id, accept=False, reason=decision.reason, actor=caller.name)
 
 
 @landmarks.post("/passes/{pass_id}/landmarks", responses=problems(404, 409))

@@ -148,9 +148,7 @@ def set_decision(
 
 def count_proposed(connection: Connection, spacecraft_id: int) -> int:
     """Return the number of landmarks that wait for a decision."""
-    query = select(func.count()).where(
-        _LANDMARKS.c.spacecraft_id == spacecraft_id, _LANDMARKS.c.state == "proposed"
-    )
+    query = select(func.count()).where(_LANDMARKS.c.spacecraft_id == spacecraft_id, _LANDMARKS.c.state == "proposed")
     return int(connection.execute(query).scalar_one())
 
 
@@ -206,9 +204,7 @@ def get_landmark(ground: Ground, landmark_id: int) -> LandmarkDetail:
     return landmark.model_copy(update={"evidence": [_with_images(ground, one) for one in landmark.evidence]})
 
 
-def decide_landmark(
-    ground: Ground, landmark_id: int, *, accept: bool, reason: str, actor: str
-) -> LandmarkDetail:
+def decide_landmark(ground: Ground, landmark_id: int, *, accept: bool, reason: str, actor: str) -> LandmarkDetail:
     """Accept or reject a proposed landmark, or change the decision.
 
     Raises
@@ -226,10 +222,7 @@ def decide_landmark(
         audit(connection, actor, f"{verb} landmark", str(landmark_id), {"reason": reason})
         decided = select_landmark(connection, landmark_id)
         proposed = count_proposed(connection, decided.spacecraft_id)
-        publish(
-            connection,
-            LandmarkChanged(spacecraft_id=decided.spacecraft_id, pass_id=None, proposed=proposed),
-        )
+        publish(connection, LandmarkChanged(spacecraft_id=decided.spacecraft_id, pass_id=None, proposed=proposed))
     return get_landmark(ground, landmark_id)
 
 
@@ -277,9 +270,7 @@ def _places(inputs: PassInputs) -> tuple[PassPlaces, Frames]:
     }
     missing = [name for name, value in needed.items() if value is None]
     if missing or inputs.catalogue is None:
-        raise EvaluationError(
-            f"landmarks of pass {inputs.pass_id}: expected {', '.join(missing)}, found none"
-        )
+        raise EvaluationError(f"landmarks of pass {inputs.pass_id}: expected {', '.join(missing)}, found none")
     detections, viewing = inputs.detections, inputs.viewing
     track = reference_states(inputs.reference, inputs.orientation, detections.utc_ns)
     rotation = viewing.camera_from_mcmf(detections.utc_ns, track.position_mcmf_m, track.mcmf_from_icrf)
@@ -326,9 +317,7 @@ def _entered(
     return len(left)
 
 
-def _changed(
-    connection: Connection, landmark: LandmarkDetail, evidence: Sequence[PassSightings], now: int
-) -> None:
+def _changed(connection: Connection, landmark: LandmarkDetail, evidence: Sequence[PassSightings], now: int) -> None:
     seen = [one for one in evidence if one.sightings]
     figures = _figures(evidence) if seen else {}
     state: str = landmark.state
@@ -387,9 +376,7 @@ def _unseen(place: Place, looks: int) -> Place:
     )  # fmt: skip
 
 
-def _evidence(
-    pass_id: int, place: Place, controls: int, frames: Frames, detections: DetectionSamples
-) -> PassSightings:
+def _evidence(pass_id: int, place: Place, controls: int, frames: Frames, detections: DetectionSamples) -> PassSightings:
     owner = np.searchsorted(detections.offsets, place.rows, side="right") - 1
     sightings = [
         Sighting(
@@ -424,9 +411,7 @@ def _with_images(ground: Ground, evidence: PassSightings) -> PassSightings:
     images = list_images(ground, vehicle.ccsds_id, vehicle.instance, record.start_utc_ns, record.stop_utc_ns)
     address = {one.frame_number: one.address for one in images if one.source == "thumbnail"}
     address |= {one.frame_number: one.address for one in images if one.source == "archive"}
-    sightings = [
-        one.model_copy(update={"image": address.get(one.frame_number)}) for one in evidence.sightings
-    ]
+    sightings = [one.model_copy(update={"image": address.get(one.frame_number)}) for one in evidence.sightings]
     return evidence.model_copy(update={"sightings": sightings})
 
 

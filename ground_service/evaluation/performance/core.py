@@ -190,9 +190,7 @@ def wilson(successes: int, trials: int) -> Share:
     return Share(share, max((middle - reach) / scale, 0.0), min((middle + reach) / scale, 1.0))
 
 
-def rolling_counts(
-    times_ns: Sequence[int], statuses: Sequence[str], window_ns: int
-) -> list[Mapping[str, int]]:
+def rolling_counts(times_ns: Sequence[int], statuses: Sequence[str], window_ns: int) -> list[Mapping[str, int]]:
     """Return the numbers of passes by status within the window that ends at each pass.
 
     Parameters

@@ -26,8 +26,7 @@ def get_performance(
     _: Viewer,
     spacecraft_id: Spacecraft,
     instance: Annotated[
-        InstanceName | None,
-        Query(description="Default: the flown one if it has passes, otherwise all imported passes"),
+        InstanceName | None, Query(description="Default: the flown one if it has passes, otherwise all imported passes")
     ] = None,
     start: RequestTime | None = None,
     stop: RequestTime | None = None,

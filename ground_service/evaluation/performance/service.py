@@ -49,14 +49,7 @@ from ground_service.store.files import register_file
 from ground_service.store.vehicles import FLOWN, get_vehicle
 from lunar.timescales import format_utc, parse_utc
 from reports.statistics import sigma_remark
-from reports.values import (
-    HeadlineFigure,
-    LevelChange,
-    MeanByGroup,
-    MonthlyReportValue,
-    MonthPass,
-    RequirementOverTime,
-)
+from reports.values import HeadlineFigure, LevelChange, MeanByGroup, MonthlyReportValue, MonthPass, RequirementOverTime
 
 _PASSES, _VEHICLES = repository.PASSES, repository.VEHICLES
 _MONTHLY = repository.MONTHLY_REPORTS
@@ -66,11 +59,7 @@ PASSES_LIMIT = 5000
 
 
 def reported_passes(
-    connection: Connection,
-    spacecraft_id: int,
-    instance: str | None,
-    start_utc_ns: int | None,
-    stop_utc_ns: int | None,
+    connection: Connection, spacecraft_id: int, instance: str | None, start_utc_ns: int | None, stop_utc_ns: int | None
 ) -> tuple[list[tuple[PassRecord, StoredReport]], int]:
     """Return the passes of a spacecraft that begin in a span and have a report, with the newest one, by time.
 
@@ -152,8 +141,7 @@ def monthly_value(found: Performance, month: str) -> MonthlyReportValue:
         evidence_level=levels[0] if len(levels) == 1 else "",
         headline=_headline(found),
         passes=tuple(
-            _value(MonthPass, one, start_utc_ns=one.start.utc_ns, estimator=one.estimator or "")
-            for one in found.passes
+            _value(MonthPass, one, start_utc_ns=one.start.utc_ns, estimator=one.estimator or "") for one in found.passes
         ),
         groups=tuple(_value(MeanByGroup, one) for one in found.groups),
         changes=tuple(_value(LevelChange, one, utc_ns=one.time.utc_ns) for one in found.changes),
@@ -179,10 +167,7 @@ def _verdict(found: Performance) -> tuple[str, str]:
     elif judged and not unknown and not missing:
         verdict, level = f"requirements met in every pass: {len(judged)} of {len(judged)} judged", "met"
     else:
-        verdict, level = (
-            f"requirements judged: {len(judged)} of {len(found.requirements)}, none missed",
-            "unknown",
-        )
+        verdict, level = (f"requirements judged: {len(judged)} of {len(found.requirements)}, none missed", "unknown")
     if unknown:
         worst = max(unknown, key=lambda one: one.unknown)
         verdict += f"; {worst.name} not judged on {worst.unknown} of {worst.passes} passes"
@@ -389,9 +374,7 @@ def _requirements(found: Sequence[Reported], window_ns: int) -> list[RollingRequ
                 low=_known(share.low),
                 high=_known(share.high),
                 lowest_share=min(shares, default=None),
-                remark=_consistency_remark(
-                    key, [row[key].value for row in rows[-sum(last.values()) :] if key in row]
-                ),
+                remark=_consistency_remark(key, [row[key].value for row in rows[-sum(last.values()) :] if key in row]),
             )
         )
     return requirements
@@ -413,9 +396,7 @@ def _consistency_remark(key: str, values: Sequence[float | None]) -> str:
     return f"mean {level.mean:.2f} of {len(known)} passes: {wrong}" if wrong else ""
 
 
-def make_monthly_report(
-    ground: Ground, spacecraft_id: int, month: str, *, instance: str = FLOWN
-) -> MonthlyReport:
+def make_monthly_report(ground: Ground, spacecraft_id: int, month: str, *, instance: str = FLOWN) -> MonthlyReport:
     """Make the report of a month (YYYY-MM, UTC) of a spacecraft in one instance, and return it.
 
     The same content is stored once.
@@ -428,10 +409,7 @@ def make_monthly_report(
     found = _month(ground, spacecraft_id, instance, month)
     if not found.passes:
         raise InvalidInput(
-            f"monthly report of spacecraft {spacecraft_id} ({instance})",
-            month,
-            "passes with a report",
-            "none",
+            f"monthly report of spacecraft {spacecraft_id} ({instance})", month, "passes with a report", "none"
         )
     return _keep_monthly_report(ground, found, instance, month)
 

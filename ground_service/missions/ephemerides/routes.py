@@ -16,11 +16,7 @@ UPLOAD_PATHS = (f"{API_PREFIX}/ephemerides",)
 ephemerides = operations("ephemerides")
 
 
-@ephemerides.post(
-    "/ephemerides",
-    status_code=201,
-    openapi_extra=upload_body(EPHEMERIS_FILE),
-)
+@ephemerides.post("/ephemerides", status_code=201, openapi_extra=upload_body(EPHEMERIS_FILE))
 async def add_ephemeris(
     upload: UploadOf,
     ground: GroundOf,
@@ -32,9 +28,7 @@ async def add_ephemeris(
     stored = await upload.stored()
 
     def add() -> Ephemeris:
-        return service.add_ephemeris(
-            ground, stored, name=name, precedence=precedence, actor=caller.name, caller=caller
-        )
+        return service.add_ephemeris(ground, stored, name=name, precedence=precedence, actor=caller.name, caller=caller)
 
     return await upload.run(add)
 

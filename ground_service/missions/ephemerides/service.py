@@ -88,9 +88,7 @@ def covering_ephemerides(
     )
     mission = mission_in_force(connection, spacecraft_id)
     rows = connection.execute(query).mappings()
-    return [
-        _ephemeris(row) for row in rows if mission is None or mission.spacecraft.is_object(row["object_name"])
-    ]
+    return [_ephemeris(row) for row in rows if mission is None or mission.spacecraft.is_object(row["object_name"])]
 
 
 def mark_withdrawn(connection: Connection, ephemeris_id: int) -> Ephemeris:
@@ -141,15 +139,11 @@ def add_ephemeris(
         known = find_ephemeris(connection, sha256=stored.sha256, precedence=precedence, name=name)
         if known is not None:
             return known
-        added = insert_ephemeris(
-            connection, stored, ephemeris, name=name, precedence=precedence, now_utc_ns=now
-        )
+        added = insert_ephemeris(connection, stored, ephemeris, name=name, precedence=precedence, now_utc_ns=now)
         audit(connection, actor, "add ephemeris", name, {"id": added.id, "sha256": stored.sha256})
         publish(
             connection,
-            EphemerisAdded(
-                id=added.id, start_utc_ns=ephemeris.start_utc_ns, stop_utc_ns=ephemeris.stop_utc_ns
-            ),
+            EphemerisAdded(id=added.id, start_utc_ns=ephemeris.start_utc_ns, stop_utc_ns=ephemeris.stop_utc_ns),
         )
         return added
 
@@ -165,21 +159,14 @@ def _check_object(connection: Connection, name: str, caller: Caller) -> None:
         raise InvalidInput("ephemeris", "OBJECT_NAME", expected, name)
 
 
-def withdraw_ephemeris(
-    ground: Ground, ephemeris_id: int, *, actor: str, caller: Caller = LOCAL_CALLER
-) -> None:
+def withdraw_ephemeris(ground: Ground, ephemeris_id: int, *, actor: str, caller: Caller = LOCAL_CALLER) -> None:
     """Withdraw a reference ephemeris: plans and reports no longer use it; the audit log and its file are kept."""
     with ground.database.writing() as connection:
         if caller.spacecraft is not None:
             _check_object(connection, get_ephemeris(connection, ephemeris_id).object_name, caller)
         found = mark_withdrawn(connection, ephemeris_id)
-        audit(
-            connection, actor, "withdraw ephemeris", found.name, {"id": ephemeris_id, "sha256": found.sha256}
-        )
-        publish(
-            connection,
-            EphemerisAdded(id=found.id, start_utc_ns=found.start.utc_ns, stop_utc_ns=found.stop.utc_ns),
-        )
+        audit(connection, actor, "withdraw ephemeris", found.name, {"id": ephemeris_id, "sha256": found.sha256})
+        publish(connection, EphemerisAdded(id=found.id, start_utc_ns=found.start.utc_ns, stop_utc_ns=found.stop.utc_ns))
 
 
 def open_ephemeris(ground: Ground, reference: Ephemeris) -> States:
@@ -269,9 +256,7 @@ def load_attitudes(path: Path, source: str = "attitude.csv") -> AttitudeTable:
             time, quaternion = -1, []
         length = float(np.linalg.norm(quaternion)) if len(quaternion) == 4 else float("nan")
         if not 0 <= time < 1 << 48 or not abs(length - 1.0) <= UNIT_TOLERANCE:
-            raise InvalidInput(
-                source, f"line {number}", "on-board ticks and a unit quaternion", repr(line[:80])
-            )
+            raise InvalidInput(source, f"line {number}", "on-board ticks and a unit quaternion", repr(line[:80]))
         if time in ticks[-1:]:
             raise InvalidInput(source, f"line {number}", "one attitude of an image", f"{time} again")
         ticks.append(time)

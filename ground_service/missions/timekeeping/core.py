@@ -138,9 +138,7 @@ def fit_correlation(ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntA
     ticks = np.asarray(ticks, dtype=np.int64)
     if len(ticks) == 0:
         raise EvaluationError("time correlation: expected at least one time report, found none")
-    sent_tai = np.asarray(tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - np.asarray(
-        light_time_ns
-    )
+    sent_tai = np.asarray(tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - np.asarray(light_time_ns)
     middle = int(np.argsort(ticks, kind="stable")[len(ticks) // 2])
     nominal = (ticks - ticks[middle]) * _NS_NUMERATOR // _NS_DENOMINATOR
     # Small numbers from here on: what the clock is off by, against the middle point.
@@ -306,9 +304,7 @@ def _is_whole(difference_ns: float) -> bool:
     return whole in WHOLE_SECONDS and abs(abs(difference_ns) - whole * 1e9) <= STATION_DIFFERENCE_NS
 
 
-def clock_runs(
-    ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray, boot: IntArray
-) -> list[IntArray]:
+def clock_runs(ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray, boot: IntArray) -> list[IntArray]:
     """Indices of the time reports (n,) of each run of the clock, in the order in which they were sent.
 
     A run ends with a boot, and where the clock was set: where it is off by more than `JUMP_NS` from where its drift

@@ -34,13 +34,7 @@ from ground_service.missions.timekeeping.core import (
     utc_ns_of_ticks,
 )
 from ground_service.missions.timekeeping.model import RECEPTIONS_LIMIT, Correlation, TimeReport
-from ground_service.store.event_kinds import (
-    ClockDoubted,
-    CorrelationChanged,
-    ReceptionsEntered,
-    publish,
-    publish_once,
-)
+from ground_service.store.event_kinds import ClockDoubted, CorrelationChanged, ReceptionsEntered, publish, publish_once
 from ground_service.store.vehicles import find_vehicle, get_vehicle, lock_vehicle, vehicle_id
 from lunar.arrays import BoolArray, IntArray
 from lunar.constants import SPEED_OF_LIGHT_M_S
@@ -58,14 +52,7 @@ AUTOMATIC = "time reports, light time"
 _BLOCK_NS = 86_400 * 10**9
 """Receptions whose light times are kept together."""
 
-_LINE = (
-    "start_ticks",
-    "stop_ticks",
-    "reference_ticks",
-    "reference_utc_ns",
-    "drift_ppb",
-    "points",
-)
+_LINE = ("start_ticks", "stop_ticks", "reference_ticks", "reference_utc_ns", "drift_ppb", "points")
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,9 +98,7 @@ def received_reports(given: Sequence[Mapping[str, Any]]) -> list[ReceivedReport]
                 "time report", place, "packet_ticks, sequence_count and received", str(error)[:120]
             ) from None
         if not (0 <= ticks < 1 << 48 and 0 <= count < 1 << 14):
-            raise InvalidInput(
-                "time report", place, "48 bits of ticks, 14 bits of count", f"{ticks}, {count}"
-            )
+            raise InvalidInput("time report", place, "48 bits of ticks, 14 bits of count", f"{ticks}, {count}")
         station = str(one.get("station") or "")
         if station and station.lower() not in known:
             expected = ", ".join(sorted(known.values()))
@@ -197,9 +182,7 @@ def recorrelate(ground: Ground, vehicle: int, *, over_manual: bool = False) -> b
             return False
         fits, doubts = fit_runs(time_reports(ground, connection, vehicle))
         for doubt in doubts:
-            doubted = ClockDoubted(
-                vehicle_id=vehicle, station=doubt.station, difference_s=round(doubt.difference_s, 3)
-            )
+            doubted = ClockDoubted(vehicle_id=vehicle, station=doubt.station, difference_s=round(doubt.difference_s, 3))
             publish_once(connection, doubted)
         lines = {_line(one.boot_count, one) for one in old}
         if lines == {_line(*fit) for fit in fits} and len(old) == len(fits):
@@ -216,9 +199,7 @@ def fit_runs(reports: TimeReports) -> tuple[list[tuple[int, CorrelationFit]], li
     """
     kept, doubts = _doubts(reports)
     rows = np.flatnonzero(kept)
-    runs = clock_runs(
-        reports.ticks[rows], reports.earth_utc_ns[rows], reports.light_time_ns[rows], reports.boot[rows]
-    )
+    runs = clock_runs(reports.ticks[rows], reports.earth_utc_ns[rows], reports.light_time_ns[rows], reports.boot[rows])
     fits = []
     for run in (rows[found] for found in runs if len(found)):
         fit = fit_correlation(reports.ticks[run], reports.earth_utc_ns[run], reports.light_time_ns[run])
@@ -232,9 +213,7 @@ def fit_runs(reports: TimeReports) -> tuple[list[tuple[int, CorrelationFit]], li
 
 
 def _doubts(reports: TimeReports) -> tuple[BoolArray, dict[int, StationDoubt]]:
-    return doubted_stations(
-        reports.ticks, reports.earth_utc_ns, reports.light_time_ns, reports.boot, reports.station
-    )
+    return doubted_stations(reports.ticks, reports.earth_utc_ns, reports.light_time_ns, reports.boot, reports.station)
 
 
 def residuals(ground: Ground, vehicle: int) -> list[TimeReport]:
@@ -334,9 +313,7 @@ def _references(connection: Connection, vehicle: int, earth_utc_ns: IntArray) ->
 
 
 @functools.lru_cache(maxsize=1024)
-def _light_times_s(
-    path: Path, station: GroundStation | None, earth_utc_ns: tuple[int, ...]
-) -> tuple[float, ...]:
+def _light_times_s(path: Path, station: GroundStation | None, earth_utc_ns: tuple[int, ...]) -> tuple[float, ...]:
     """Return the light times at receptions of a block by an ephemeris file, whose name is its SHA-256.
 
     Every correlation needs those of all receptions. They are kept, so that the files need not be.
@@ -414,9 +391,7 @@ def correlate_again(ground: Ground, spacecraft_id: int, instance: str, *, actor:
     return ground.read(store.correlations_in_force, vehicle)
 
 
-def withdraw_correlations(
-    ground: Ground, spacecraft_id: int, instance: str, *, actor: str
-) -> list[Correlation]:
+def withdraw_correlations(ground: Ground, spacecraft_id: int, instance: str, *, actor: str) -> list[Correlation]:
     """Withdraw the correlations in force that a person entered, and correlate again; the correlations then in force.
 
     The withdrawn ones stay on record.

@@ -30,16 +30,11 @@ def list_correlations(
 
 @timekeeping.post("/spacecraft/{spacecraft_id}/correlations", status_code=201)
 def add_correlations(
-    ground: GroundOf,
-    caller: Operator,
-    spacecraft_id: SpacecraftId,
-    given: TimePoints,
-    instance: Instance = FLOWN,
+    ground: GroundOf, caller: Operator, spacecraft_id: SpacecraftId, given: TimePoints, instance: Instance = FLOWN
 ) -> PageOf[Correlation]:
     """Add time reports and correlate on-board time with UTC from them; the correlations then in force."""
     points = [
-        TimePoint(one.ticks, one.received.utc_ns, round(one.light_time_s * 1e9), one.boot_count)
-        for one in given.points
+        TimePoint(one.ticks, one.received.utc_ns, round(one.light_time_s * 1e9), one.boot_count) for one in given.points
     ]
     return PageOf.all_of(correlate_spacecraft(ground, spacecraft_id, instance, points, actor=caller.name))
 
@@ -69,11 +64,7 @@ def run_correlation(
 
 @timekeeping.post("/spacecraft/{spacecraft_id}/receptions", status_code=201)
 def add_receptions(
-    ground: GroundOf,
-    caller: Operator,
-    spacecraft_id: SpacecraftId,
-    given: Receptions,
-    instance: Instance = FLOWN,
+    ground: GroundOf, caller: Operator, spacecraft_id: SpacecraftId, given: Receptions, instance: Instance = FLOWN
 ) -> PageOf[Correlation]:
     """Add Earth reception times of time reports; the correlations then in force."""
     reports = received_reports([vars(one) for one in given.receptions])

@@ -41,12 +41,7 @@ def correlations_on_record(connection: Connection, vehicle: int) -> list[Correla
 
 
 def replace_correlations(
-    connection: Connection,
-    vehicle: int,
-    fits: Iterable[tuple[int, CorrelationFit]],
-    *,
-    method: str,
-    now_utc_ns: int,
+    connection: Connection, vehicle: int, fits: Iterable[tuple[int, CorrelationFit]], *, method: str, now_utc_ns: int
 ) -> None:
     """Supersede the correlations in force by the fits (boot, line) of a method."""
     connection.execute(update(_CORRELATIONS).where(*_in_force(vehicle)).values(superseded=1))
@@ -73,13 +68,7 @@ def receptions(connection: Connection, vehicle: int) -> dict[ReceptionKey, int]:
 def add_receptions(connection: Connection, vehicle: int, new: Mapping[ReceptionKey, int]) -> None:
     """Add the reception times of time reports that have none."""
     rows = [
-        {
-            "vehicle_id": vehicle,
-            "ticks": ticks,
-            "sequence_count": count,
-            "station": station,
-            "earth_utc_ns": time,
-        }
+        {"vehicle_id": vehicle, "ticks": ticks, "sequence_count": count, "station": station, "earth_utc_ns": time}
         for (ticks, count, station), time in new.items()
     ]
     if rows:
@@ -109,9 +98,7 @@ def has_receptions(connection: Connection, vehicle: int) -> bool:
 
 def vehicles_with_receptions(connection: Connection, start_utc_ns: int, stop_utc_ns: int) -> list[int]:
     """Return the vehicles with time reports received in an interval of time."""
-    query = select(_RECEPTIONS.c.vehicle_id).where(
-        _RECEPTIONS.c.earth_utc_ns.between(start_utc_ns, stop_utc_ns)
-    )
+    query = select(_RECEPTIONS.c.vehicle_id).where(_RECEPTIONS.c.earth_utc_ns.between(start_utc_ns, stop_utc_ns))
     return [int(vehicle) for vehicle in connection.execute(query.distinct()).scalars()]
 
 
@@ -162,9 +149,7 @@ def boot_starts(connection: Connection, vehicle: int) -> IntArray:
 def ephemerides_of_passes(connection: Connection, vehicle: int) -> set[int]:
     """Return the ids of the reference ephemerides of the passes of a vehicle."""
     passes = repository.PASSES
-    query = select(passes.c.ephemeris_id).where(
-        passes.c.vehicle_id == vehicle, passes.c.ephemeris_id.is_not(None)
-    )
+    query = select(passes.c.ephemeris_id).where(passes.c.vehicle_id == vehicle, passes.c.ephemeris_id.is_not(None))
     return {int(key) for key in connection.execute(query).scalars()}
 
 

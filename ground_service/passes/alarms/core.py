@@ -130,9 +130,7 @@ def _conditions(tables: Mapping[str, Table]) -> Iterator[Condition]:
             broken = np.flatnonzero(states)
             if broken.size:
                 last = broken[np.argmax(table.ticks[broken])]
-                yield _condition(
-                    "parameter", field.name, int(states.max()), table.ticks[broken], float(values[last])
-                )
+                yield _condition("parameter", field.name, int(states.max()), table.ticks[broken], float(values[last]))
 
 
 def _limited(packet: PacketDefinition) -> tuple[Field, ...]:

@@ -4,15 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from ground_service.http.model import (
-    Entity,
-    InstanceName,
-    Paging,
-    RequestModel,
-    RequestTime,
-    SpacecraftNumber,
-    UtcTime,
-)
+from ground_service.http.model import Entity, InstanceName, Paging, RequestModel, RequestTime, SpacecraftNumber, UtcTime
 
 AlarmState = Literal["raised", "acknowledged", "cleared", "shelved"]
 Severity = Literal["warning", "alarm"]

@@ -23,13 +23,7 @@ from ground_service.missions.timekeeping.core import ticks_of_utc_ns, utc_ns_of_
 from ground_service.missions.timekeeping.store import load_correlations
 from ground_service.passes.alarms import core
 from ground_service.passes.alarms.core import Condition
-from ground_service.passes.alarms.model import (
-    SHELVED_DAYS_LIMIT,
-    Alarm,
-    AlarmChange,
-    AlarmDetail,
-    AlarmFilter,
-)
+from ground_service.passes.alarms.model import SHELVED_DAYS_LIMIT, Alarm, AlarmChange, AlarmDetail, AlarmFilter
 from ground_service.store import models, states
 from ground_service.store.event_kinds import AlarmChanged, publish
 from ground_service.store.repository import VEHICLES, Row, add_new, page
@@ -47,9 +41,7 @@ _POSITIONS = models.ALARM_POSITIONS
 OPEN = 1
 """Value of the column `open` of an alarm that is not cleared, NULL for others: one open alarm for each cause."""
 
-ALARM = StateMachine(
-    "alarm", _ALARMS, {"raised": ("acknowledged", "cleared"), "acknowledged": ("raised", "cleared")}
-)
+ALARM = StateMachine("alarm", _ALARMS, {"raised": ("acknowledged", "cleared"), "acknowledged": ("raised", "cleared")})
 
 SEVERITY_CODES = {"warning": 1, "alarm": 2}
 
@@ -87,9 +79,7 @@ def position(connection: Connection, vehicle: int) -> int:
 
 def advance(connection: Connection, vehicle: int, packet_id: int) -> None:
     """Store the id of the last packet that has been examined; the caller holds the lock of the vehicle."""
-    done = connection.execute(
-        update(_POSITIONS).where(_POSITIONS.c.vehicle_id == vehicle).values(packet_id=packet_id)
-    )
+    done = connection.execute(update(_POSITIONS).where(_POSITIONS.c.vehicle_id == vehicle).values(packet_id=packet_id))
     if done.rowcount == 0:
         connection.execute(insert(_POSITIONS).values(vehicle_id=vehicle, packet_id=packet_id))
 
@@ -186,9 +176,7 @@ def note_change(
 ) -> None:
     """Add a change to the alarm_history of an alarm."""
     connection.execute(
-        insert(_CHANGES).values(
-            alarm_id=alarm_id, utc_ns=now_utc_ns, actor=actor, change=change, comment=comment
-        )
+        insert(_CHANGES).values(alarm_id=alarm_id, utc_ns=now_utc_ns, actor=actor, change=change, comment=comment)
     )
 
 
@@ -203,9 +191,7 @@ def alarm_history(connection: Connection, alarm_id: int) -> list[AlarmChange]:
     """Return the changes of an alarm, oldest first."""
     query = select(_CHANGES).where(_CHANGES.c.alarm_id == alarm_id).order_by(_CHANGES.c.id)
     return [
-        AlarmChange(
-            time=UtcTime(row["utc_ns"]), actor=row["actor"], change=row["change"], comment=row["comment"]
-        )
+        AlarmChange(time=UtcTime(row["utc_ns"]), actor=row["actor"], change=row["change"], comment=row["comment"])
         for row in connection.execute(query).mappings()
     ]
 
@@ -317,19 +303,11 @@ def acknowledge_alarm(ground: Ground, alarm_id: int, comment: str, *, actor: str
         note_change(connection, alarm_id, now, actor, "acknowledged", comment)
         if state == "cleared":
             note_change(connection, alarm_id, now, TELEMETRY, "cleared", "the condition had ended")
-        audit(
-            connection,
-            actor,
-            "acknowledge alarm",
-            f"alarm {alarm_id}",
-            {"name": row.name, "comment": comment},
-        )
+        audit(connection, actor, "acknowledge alarm", f"alarm {alarm_id}", {"name": row.name, "comment": comment})
         return get_alarm(connection, alarm_id)
 
 
-def shelve_alarm(
-    ground: Ground, alarm_id: int, until_utc_ns: int, comment: str, *, actor: str
-) -> AlarmDetail:
+def shelve_alarm(ground: Ground, alarm_id: int, until_utc_ns: int, comment: str, *, actor: str) -> AlarmDetail:
     """Suppress an open alarm until a mission time, or end its suppression with one in the past.
 
     Raises
@@ -345,10 +323,7 @@ def shelve_alarm(
     if until_utc_ns > now + SHELVED_DAYS_LIMIT * DAY_NS:
         found = format_utc(until_utc_ns)
         raise InvalidInput(
-            "alarm",
-            "until",
-            f"a time within {SHELVED_DAYS_LIMIT} days of the mission time {format_utc(now)}",
-            found,
+            "alarm", "until", f"a time within {SHELVED_DAYS_LIMIT} days of the mission time {format_utc(now)}", found
         )
     ends = until_utc_ns <= now
     with ground.database.writing() as connection:
@@ -358,9 +333,7 @@ def shelve_alarm(
         change = "unshelved" if ends else "shelved"
         note_change(connection, alarm_id, utc_now_ns(), actor, change, comment)
         detail = {"name": row.name, "until": format_utc(until_utc_ns), "comment": comment}
-        audit(
-            connection, actor, "shelve alarm" if not ends else "unshelve alarm", f"alarm {alarm_id}", detail
-        )
+        audit(connection, actor, "shelve alarm" if not ends else "unshelve alarm", f"alarm {alarm_id}", detail)
         _publish(connection, row, change)
         return get_alarm(connection, alarm_id)
 
@@ -406,12 +379,7 @@ def examine_again(ground: Ground, vehicle: int) -> None:
 
 
 def _update(
-    connection: Connection,
-    vehicle: int,
-    found: tuple[Condition, ...],
-    broken: Set[str],
-    *,
-    is_operations: bool = False,
+    connection: Connection, vehicle: int, found: tuple[Condition, ...], broken: Set[str], *, is_operations: bool = False
 ) -> None:
     """Apply new conditions to the alarms of a vehicle, which the caller has locked; those in `broken` continue."""
     now = utc_now_ns()
@@ -462,24 +430,14 @@ def _move(connection: Connection, row: AlarmRow, state: str, now: int, **values:
 
 def _publish(connection: Connection, row: AlarmRow, state: str) -> None:
     event = AlarmChanged(
-        id=row.id,
-        vehicle_id=row.vehicle_id,
-        name=row.name,
-        severity=core.SEVERITIES[row.severity],
-        state=state,
+        id=row.id, vehicle_id=row.vehicle_id, name=row.name, severity=core.SEVERITIES[row.severity], state=state
     )
     publish(connection, event)
 
 
 def _condition(row: AlarmRow) -> Condition:
     return Condition(
-        cast("core.Source", row.source),
-        row.name,
-        row.severity,
-        row.first_ticks,
-        row.last_ticks,
-        row.count,
-        row.value,
+        cast("core.Source", row.source), row.name, row.severity, row.first_ticks, row.last_ticks, row.count, row.value
     )
 
 

@@ -11,14 +11,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from ground_service.regression.gates.core import (
-    EXACT_METRICS,
-    FAIL,
-    NOT_JUDGED,
-    PASS_SPREAD,
-    GatePolicy,
-    verdict_of,
-)
+from ground_service.regression.gates.core import EXACT_METRICS, FAIL, NOT_JUDGED, PASS_SPREAD, GatePolicy, verdict_of
 from ground_service.regression.gates.metrics import metrics_of
 from ground_service.regression.gates.samples import PassFrames
 from ground_service.regression.gates.statistics import (

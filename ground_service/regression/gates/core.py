@@ -177,9 +177,7 @@ def judge(
     metrics = {one.name: one for one in metrics_of([*before.values(), *after.values()])}
     tests = _local_tests(before, after, pictured, policy, metrics)
     level = policy.fail_level / (2.0 if tests else 1.0)
-    gates = [
-        _exact_gate(before, after, rule, pictured, metrics) for rule in policy.rules if rule.weight == 0.0
-    ]
+    gates = [_exact_gate(before, after, rule, pictured, metrics) for rule in policy.rules if rule.weight == 0.0]
     for rule in policy.rules:
         if rule.weight > 0.0:
             chosen = pictured if rule.metric.startswith(NEEDS_FRAMES) else names
@@ -243,9 +241,7 @@ def _cost_gate(
     known = np.isfinite(old + new)
     if not known.any():
         reason = "it was not measured for both builds"
-        return Gate(
-            metric.name, NOT_JUDGED, math.nan, math.nan, rule.margin, math.nan, metric.unit, reason=reason
-        )
+        return Gate(metric.name, NOT_JUDGED, math.nan, math.nan, rule.margin, math.nan, metric.unit, reason=reason)
     if metric.name == MEMORY:
         margin, then, now = rule.margin, old[known].max(), new[known].max()
     else:
@@ -326,26 +322,13 @@ def _primary(
     gate = _decided("", change, metric, rule, frames, level, window=frames < WINDOW_FRAMES)
     if same and math.isfinite(change.baseline):
         return replace(
-            gate,
-            outcome=PASS,
-            change_low=0.0,
-            change_high=0.0,
-            resolution=0.0,
-            reason=IDENTICAL,
-            frames_needed=None,
+            gate, outcome=PASS, change_low=0.0, change_high=0.0, resolution=0.0, reason=IDENTICAL, frames_needed=None
         )
     return gate
 
 
 def _decided(
-    place: str,
-    change: Change,
-    metric: Metric,
-    rule: GateRule,
-    frames: int,
-    level: float,
-    *,
-    window: bool,
+    place: str, change: Change, metric: Metric, rule: GateRule, frames: int, level: float, *, window: bool
 ) -> Gate:
     """Return the claim of one gate."""
     materiality, margin = rule.sizes(window)
@@ -369,9 +352,7 @@ def _decided(
         error, freedom = PASS_SPREAD / math.sqrt(change.units), math.inf
     if freedom < 1.0:
         return replace(gate, reason=f"{change.units} {metric.evidence} have no spread")
-    reach, ahead, power = (
-        student_quantile(at, min(freedom, 1e9)) for at in (1.0 - level, PASS_CONFIDENCE, POWER)
-    )
+    reach, ahead, power = (student_quantile(at, min(freedom, 1e9)) for at in (1.0 - level, PASS_CONFIDENCE, POWER))
     few = metric.evidence in ("tracks", "ground cells") and change.units < FEWEST_TRACKS
     claim = max(materiality, margin) if few else materiality
     low, high = loss - ahead * error, loss + ahead * error

@@ -75,14 +75,10 @@ def metrics_of(passes: Sequence[PassFrames]) -> tuple[Metric, ...]:
         found += [
             Metric(f"{place}.p50", "m", False, True, _of(name, lambda e: quantile(e.error_m, 0.5))),
             Metric(f"{place}.p95", "m", False, True, _of(name, lambda e: quantile(e.error_m, 0.95))),
-            Metric(
-                f"{place}.bad_outcomes", "", False, False, _of(name, lambda e: _mean(e.share(*BAD_OUTCOMES)))
-            ),
+            Metric(f"{place}.bad_outcomes", "", False, False, _of(name, lambda e: _mean(e.share(*BAD_OUTCOMES)))),
         ]
         if any(
-            np.isfinite(one.estimators[name].squared_normalised_error).any()
-            for one in passes
-            if name in one.estimators
+            np.isfinite(one.estimators[name].squared_normalised_error).any() for one in passes if name in one.estimators
         ):
             found += [
                 _ratio(f"{place}.fixes", "", True, _fixes(name), f"blocks of {BLOCK_FRAMES} frames"),
@@ -93,9 +89,7 @@ def metrics_of(passes: Sequence[PassFrames]) -> tuple[Metric, ...]:
                     True,
                     _of(name, lambda e: _mean(e.squared_normalised_error)),
                 ),
-                Metric(
-                    f"{place}.sigma_p95", "m", False, True, _of(name, lambda e: quantile(e.sigma_m, 0.95))
-                ),
+                Metric(f"{place}.sigma_p95", "m", False, True, _of(name, lambda e: quantile(e.sigma_m, 0.95))),
             ]
     return tuple(found)
 
@@ -193,9 +187,7 @@ class Count:
 def counts(before: PassFrames, after: PassFrames) -> dict[str, Count]:
     """Return the faults of each kind on one pass."""
     return {
-        UNDECODABLE: Count(
-            before.undecodable, after.undecodable, f"{after.undecodable} packets cannot be decoded"
-        ),
+        UNDECODABLE: Count(before.undecodable, after.undecodable, f"{after.undecodable} packets cannot be decoded"),
         TIMES: _times(before.times, after.times),
         FRAMES: _frames(before, after),
         WRONG_FIXES: _wrong_fixes(before, after),
@@ -205,9 +197,7 @@ def counts(before: PassFrames, after: PassFrames) -> dict[str, Count]:
 def identical(before: Mapping[str, PassFrames], after: Mapping[str, PassFrames]) -> bool:
     """Return whether both builds sent the same packets, octet by octet, on every pass."""
     return all(
-        bool(one.digests)
-        and one.digests == after[name].digests
-        and one.undecodable == after[name].undecodable
+        bool(one.digests) and one.digests == after[name].digests and one.undecodable == after[name].undecodable
         for name, one in before.items()
     )
 
@@ -223,9 +213,7 @@ def _times(before: TimeTags, after: TimeTags) -> Count:
     for name, unknown in after.unknown_images.items():
         if unknown > before.unknown_images.get(name, 0):
             faulty += unknown
-            parts.append(
-                f"{unknown} of {after.packets[name]} {name} packets name a time at which no image was taken"
-            )
+            parts.append(f"{unknown} of {after.packets[name]} {name} packets name a time at which no image was taken")
     late, packets, worst = 0, 0, 0.0
     usual = [delays for delays in before.delays_s.values() if len(delays)]
     for name, delays in after.delays_s.items():

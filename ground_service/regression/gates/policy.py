@@ -101,18 +101,13 @@ def read_policy(octets: bytes, source: str) -> PolicyFile:
             raise InvalidInput(source, f"gate.{i}.weight", expected, f"{item.weight:g}")
         if item.weight and not item.materiality < item.margin:
             raise InvalidInput(
-                source,
-                f"gate.{i}.margin",
-                f"more than the materiality {item.materiality:g}",
-                f"{item.margin:g}",
+                source, f"gate.{i}.margin", f"more than the materiality {item.materiality:g}", f"{item.margin:g}"
             )
     weights = sum(item.weight for item in read.gate)
     if not 0.0 < weights <= 1.0 + 1e-9:
         raise InvalidInput(source, "gate", "weights above 0 that sum to at most 1", f"{weights:g}")
     named = {item.metric for item in read.gate}
-    always = (
-        GateRule(name, 0.0, reason=ALWAYS) for name in (UNDECODABLE, TIMES, FRAMES) if name not in named
-    )
+    always = (GateRule(name, 0.0, reason=ALWAYS) for name in (UNDECODABLE, TIMES, FRAMES) if name not in named)
     policy = GatePolicy(
         version=read.version,
         fail_level=read.fail.level,

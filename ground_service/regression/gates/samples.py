@@ -114,9 +114,7 @@ class EstimatorFrames:
 
     def share(self, *outcomes: str) -> FloatArray:
         """1 for frames of these outcomes, 0 for others, NaN for frames without any."""
-        return np.array(
-            [np.nan if not name else float(name in outcomes) for name in self.outcome], dtype=np.float64
-        )
+        return np.array([np.nan if not name else float(name in outcomes) for name in self.outcome], dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -246,9 +244,7 @@ def pass_frames(
             dv,
         ),
         detections=DetectionRows(
-            shown_frame,
-            _cells(track.position_mcmf_m[shown_frame], lines),
-            matches.crater_of_detection[shown] >= 0,
+            shown_frame, _cells(track.position_mcmf_m[shown_frame], lines), matches.crater_of_detection[shown] >= 0
         ),
     )
 

@@ -45,13 +45,7 @@ from payload_emulator.flight.navigation.filter.attitude_monitor import (
 from payload_emulator.flight.navigation.filter.dynamics import OrbitModel, process_noise
 from payload_emulator.flight.navigation.filter.filter import FilterState, KalmanFilter
 from payload_emulator.flight.navigation.filter.map_offset import OffsetSize, first_size, learned
-from payload_emulator.flight.navigation.landmark_map import (
-    FIRST_LANDMARK_ID,
-    Landmark,
-    MapState,
-    View,
-    unclaimed,
-)
+from payload_emulator.flight.navigation.landmark_map import FIRST_LANDMARK_ID, Landmark, MapState, View, unclaimed
 from payload_emulator.flight.navigation.outcomes import Outcome
 from payload_emulator.flight.navigation.search.acquisition import SEARCHABLE_DETECTIONS
 from payload_emulator.flight.navigation.search.lost_in_space import PlaceIndex, place_index
@@ -65,14 +59,7 @@ from payload_emulator.flight.navigation.sighting import (
     turned_by,
 )
 from payload_emulator.flight.vision.detections import Detections
-from tmtc.dictionary.tables import (
-    BurnTable,
-    CatalogueTable,
-    GravityTable,
-    InitialState,
-    OrientationTable,
-    no_burns,
-)
+from tmtc.dictionary.tables import BurnTable, CatalogueTable, GravityTable, InitialState, OrientationTable, no_burns
 from tmtc.packets.cuc import TICKS_PER_SECOND
 
 _NAN = float("nan")
@@ -295,9 +282,7 @@ def start(
     return setup, AnchoredState(estimate, landmarks, MapState(), initial_state.ticks, offset=offset)
 
 
-def step(
-    state: AnchoredState, observation: Observation, setup: AnchoredSetup
-) -> tuple[AnchoredState, AnchoredReport]:
+def step(state: AnchoredState, observation: Observation, setup: AnchoredSetup) -> tuple[AnchoredState, AnchoredReport]:
     """Return the state after one frame and the report of its decisions.
 
     Outside the orientation table neither dynamics nor catalogue can be used: the state then stays as it is. An estimate
@@ -308,14 +293,10 @@ def step(
     parameters = _with_errors(setup.parameters, state.attitude.sigma_rad(declared_rad), state.offset)
     setup = replace(setup, parameters=parameters)
     mcmf_from_icrf = setup.model.mcmf_from_icrf(observation.ticks)
-    prior = predicted(
-        state.estimate, observation.ticks, setup.model, setup.burns, parameters.errors, setup.method
-    )
+    prior = predicted(state.estimate, observation.ticks, setup.model, setup.burns, parameters.errors, setup.method)
     if prior is not None and not is_usable(prior, parameters.limits):
         state = replace(state, estimate=setup.initial, fixed_ticks=None, trusted=())
-        prior = predicted(
-            setup.initial, observation.ticks, setup.model, setup.burns, parameters.errors, setup.method
-        )
+        prior = predicted(setup.initial, observation.ticks, setup.model, setup.burns, parameters.errors, setup.method)
     if prior is None or mcmf_from_icrf is None or not is_usable(prior, parameters.limits):
         return state, _report(state, setup, Outcome.refused, None, _Decisions())
     state, decided = _entered(state, prior, observation, setup)
@@ -362,9 +343,7 @@ def is_lost(state: AnchoredState, parameters: AnchoredParameters) -> bool:
     return not state.estimate.finite or state.estimate.position_sigma_m > parameters.divergence_limit_m
 
 
-def _with_errors(
-    parameters: AnchoredParameters, attitude_rad: float, offset: OffsetSize | None
-) -> AnchoredParameters:
+def _with_errors(parameters: AnchoredParameters, attitude_rad: float, offset: OffsetSize | None) -> AnchoredParameters:
     """Return the parameters with the noise of the attitude and the offset of the catalogue that are in use."""
     errors = replace(parameters.errors, attitude_noise_rad=attitude_rad)
     if offset is not None and parameters.offset is not None:
@@ -417,9 +396,7 @@ def search_around(state: AnchoredState, pose: Pose, found: Detections, setup: An
     sigma_m = prior.position_sigma_m
     if sigma_m > tracking_limit_m(prior, parameters):
         expected = len(in_view(landmarks, pose, camera, 0.0))
-        fix = recovery.search_by_votes(
-            prior, pose, found, landmarks, camera, parameters, sigma_m, method=setup.method
-        )
+        fix = recovery.search_by_votes(prior, pose, found, landmarks, camera, parameters, sigma_m, method=setup.method)
         # A search that found no safe place is a fix refused, and counts the detections it was tried with.
         tried = len(found) if len(found) >= SEARCHABLE_DETECTIONS else 0
         return Search(prior, fix, tried if fix is None else fix.identification.candidates, expected)
@@ -440,12 +417,7 @@ def search_around(state: AnchoredState, pose: Pose, found: Detections, setup: An
 
 
 def rotation_evidence(
-    state: AnchoredState,
-    search: Search,
-    disagrees: bool,
-    pose: Pose,
-    found: Detections,
-    setup: AnchoredSetup,
+    state: AnchoredState, search: Search, disagrees: bool, pose: Pose, found: Detections, setup: AnchoredSetup
 ) -> RotationEvidence | None:
     """Return what a frame says about a rotation of the camera; None without enough craters.
 
@@ -489,17 +461,13 @@ def with_judged_attitude(
         return replace(state, attitude=judged, trusted=() if judged.degraded else trusted)
     estimate = state.estimate
     if trusted:
-        carried = predicted(
-            trusted[0], estimate.ticks, setup.model, setup.burns, parameters.errors, setup.method
-        )
+        carried = predicted(trusted[0], estimate.ticks, setup.model, setup.burns, parameters.errors, setup.method)
         if carried is not None and is_usable(carried, parameters.limits):
             estimate = carried
     if len(trusted) <= len(before.window) and len(trusted) < parameters.monitor.window_frames:
         height_m = max(altitude_above_sphere_m(estimate), parameters.limits.lowest_altitude_m)
         shift_m = judged.noise_rad * height_m
-        estimate = kalman.widened(
-            estimate.only_craters(_NO_CRATERS), shift_m, recovery.ORBITAL_RATE_RAD_S * shift_m
-        )
+        estimate = kalman.widened(estimate.only_craters(_NO_CRATERS), shift_m, recovery.ORBITAL_RATE_RAD_S * shift_m)
     return replace(state, estimate=estimate, attitude=judged, trusted=())
 
 
@@ -513,22 +481,12 @@ def recovered(
     unseen_s = math.inf
     if state.fixed_ticks is not None:
         unseen_s = (prior.ticks - state.fixed_ticks) / TICKS_PER_SECOND
-    fix = recovery.search_widely(
-        prior, pose, found, state.landmarks, camera, parameters, unseen_s, setup.method
-    )
+    fix = recovery.search_widely(prior, pose, found, state.landmarks, camera, parameters, unseen_s, setup.method)
     if fix is None and recovery.is_lost_search_due(state.disagreements, parameters):
         places = place_index(state.landmarks) if state.places is None else state.places
         state = replace(state, places=places)
         fix = recovery.search_everywhere(
-            prior,
-            pose,
-            found,
-            state.landmarks,
-            camera,
-            parameters,
-            setup.markov_sigma_m_s2,
-            places,
-            setup.method,
+            prior, pose, found, state.landmarks, camera, parameters, setup.markov_sigma_m_s2, places, setup.method
         )
     return state, fix
 
@@ -582,11 +540,7 @@ def map_frame(
 
 
 def _report(
-    state: AnchoredState,
-    setup: AnchoredSetup,
-    outcome: Outcome,
-    mcmf_from_icrf: FloatArray | None,
-    decided: _Decisions,
+    state: AnchoredState, setup: AnchoredSetup, outcome: Outcome, mcmf_from_icrf: FloatArray | None, decided: _Decisions
 ) -> AnchoredReport:
     """Return the report of a frame; latitude, longitude and altitude are NaN without the Moon's orientation."""
     mean, fix = state.estimate.mean, decided.fix

@@ -204,11 +204,7 @@ def is_plausible(prior: FilterState, posterior: FilterState, limits: AnchoredLim
     """Return whether the prediction's uncertainty allows a correction, and whether it leads to a usable estimate."""
     change = float(np.linalg.norm(posterior.mean[kalman.POSITION] - prior.mean[kalman.POSITION]))
     positive = bool(np.all(np.diag(posterior.covariance) >= 0.0))
-    return (
-        is_usable(posterior, limits)
-        and positive
-        and change < limits.correction_sigmas * prior.position_sigma_m
-    )
+    return is_usable(posterior, limits) and positive and change < limits.correction_sigmas * prior.position_sigma_m
 
 
 def frame_limit(degrees: int, sigmas: float) -> float:

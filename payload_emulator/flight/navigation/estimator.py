@@ -13,12 +13,7 @@ import numpy as np
 from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
 from payload_emulator.flight.navigation import anchored
-from payload_emulator.flight.navigation.anchored import (
-    AnchoredReport,
-    AnchoredSetup,
-    AnchoredState,
-    Observation,
-)
+from payload_emulator.flight.navigation.anchored import AnchoredReport, AnchoredSetup, AnchoredState, Observation
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.filter import KalmanFilter
@@ -113,14 +108,10 @@ class Estimator(Protocol):
     tables: ClassVar[tuple[str, ...]]
     outcomes: ClassVar[tuple[Outcome, ...]]
 
-    def start(
-        self, tables: Mapping[str, Any], parameters: NavigationParameters, before: Any | None
-    ) -> Any | None:
+    def start(self, tables: Mapping[str, Any], parameters: NavigationParameters, before: Any | None) -> Any | None:
         """Return the first state, with what a state `before` learned of the same tables; None without a table."""
 
-    def step(
-        self, state: Any | None, frame: Frame, parameters: NavigationParameters
-    ) -> tuple[Any | None, Report]:
+    def step(self, state: Any | None, frame: Frame, parameters: NavigationParameters) -> tuple[Any | None, Report]:
         """Return the state after a frame and the report of it."""
 
     def widen(self, state: Any, position_m: float, velocity_m_s: float) -> Any:

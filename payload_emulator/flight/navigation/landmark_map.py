@@ -178,11 +178,7 @@ def observe(
     """
     spread = float(np.sqrt(np.trace(view.covariance_m2) / 3.0))
     usable = (
-        free
-        & np.isfinite(found.u_px)
-        & np.isfinite(found.v_px)
-        & (found.diameter_px > 0.0)
-        & np.isfinite(variance_px2)
+        free & np.isfinite(found.u_px) & np.isfinite(found.v_px) & (found.diameter_px > 0.0) & np.isfinite(variance_px2)
     )
     state, ready = _closed(state, view.ticks, camera, parameters)
     if not (np.isfinite(spread) and spread < parameters.position_limit_m):
@@ -318,9 +314,7 @@ def _joined(
     return tuple(grown), joined
 
 
-def _longer(
-    track: Track, view: View, uv: FloatArray, variance_px2: float, diameter_m: float, kept: int
-) -> Track:
+def _longer(track: Track, view: View, uv: FloatArray, variance_px2: float, diameter_m: float, kept: int) -> Track:
     """Return the track with one more sighting; only the newest sightings up to a limit are kept."""
     count = len(track.views)
     return replace(
@@ -408,13 +402,7 @@ def _landmark(track: Track, identity: int, camera: PinholeCamera) -> Landmark | 
         + np.eye(3) * (reach * middle.attitude_sigma_rad) ** 2
     )
     return Landmark(
-        identity,
-        track.position_mcmf_m,
-        covariance,
-        track.diameter_m,
-        len(track.views),
-        1,
-        track.views[-1].ticks,
+        identity, track.position_mcmf_m, covariance, track.diameter_m, len(track.views), 1, track.views[-1].ticks
     )
 
 
@@ -435,10 +423,7 @@ def _added(state: MapState, new: Landmark, parameters: MappingParameters) -> tup
         del landmarks[poorest]
         places = np.delete(places, poorest, axis=0)
     grown = MapState(
-        (*landmarks, new),
-        np.concatenate([places, new.position_mcmf_m[None]]),
-        state.tracks,
-        state.next_identity + 1,
+        (*landmarks, new), np.concatenate([places, new.position_mcmf_m[None]]), state.tracks, state.next_identity + 1
     )
     return grown, new
 
@@ -472,9 +457,7 @@ def intersected(first: Landmark, second: Landmark) -> Landmark:
             best = float(np.trace(covariance)), covariance, covariance @ information
     assert best is not None
     total = first.sightings + second.sightings
-    log_diameter = (
-        first.sightings * np.log(first.diameter_m) + second.sightings * np.log(second.diameter_m)
-    ) / total
+    log_diameter = (first.sightings * np.log(first.diameter_m) + second.sightings * np.log(second.diameter_m)) / total
     return Landmark(
         first.identity,
         best[2],
@@ -528,9 +511,6 @@ def unclaimed(found: Detections, sighting: Sighting, used: IntArray) -> BoolArra
         uv = np.stack([found.u_px, found.v_px], axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             away = np.linalg.norm(uv[:, None] - sighting.uv_px[None], axis=2)
-            alike = (
-                np.abs(np.log(found.diameter_px[:, None] / sighting.diameter_px[None]))
-                < _CLAIMED_LOG_DIAMETER
-            )
+            alike = np.abs(np.log(found.diameter_px[:, None] / sighting.diameter_px[None])) < _CLAIMED_LOG_DIAMETER
         free &= ~np.any((away < _CLAIMED_PX) & alike, axis=1)
     return free

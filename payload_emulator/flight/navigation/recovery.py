@@ -8,12 +8,7 @@ import numpy as np
 from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
-from payload_emulator.flight.navigation.correction import (
-    Fix,
-    altitude_above_sphere_m,
-    correct,
-    detection_variance_px2,
-)
+from payload_emulator.flight.navigation.correction import Fix, altitude_above_sphere_m, correct, detection_variance_px2
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.filter import FilterState, KalmanFilter
 from payload_emulator.flight.navigation.search.acquisition import acquire
@@ -31,9 +26,7 @@ ORBITAL_RATE_RAD_S = 1e-3
 rate times the position error."""
 
 
-def disagreements(
-    count: int, fix: Fix | None, expected: int, detections: int, parameters: AnchoredParameters
-) -> int:
+def disagreements(count: int, fix: Fix | None, expected: int, detections: int, parameters: AnchoredParameters) -> int:
     """Return the number of consecutive frames in which map and image disagree, after one more frame.
 
     Parameters

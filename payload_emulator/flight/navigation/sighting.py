@@ -75,12 +75,7 @@ def landmark_map(table: CatalogueTable) -> LandmarkMap:
     axes = enu_from_mcmf(latitude, table.longitude_rad[order])
     radius = MOON_RADIUS_M + table.rim_height_m[order]
     return LandmarkMap(
-        table.ids[order],
-        latitude,
-        radius[:, None] * axes[:, 2],
-        axes,
-        table.diameter_m[order],
-        table.sigma_m[order],
+        table.ids[order], latitude, radius[:, None] * axes[:, 2], axes, table.diameter_m[order], table.sigma_m[order]
     )
 
 
@@ -161,9 +156,7 @@ def inside_image(sighting: Sighting, camera: PinholeCamera, margin_px: float = 0
     """Return which craters lie in the image, or up to a margin outside it; False for NaN."""
     u, v = sighting.uv_px[:, 0] - camera.centre_px[0], sighting.uv_px[:, 1] - camera.centre_px[1]
     with np.errstate(invalid="ignore"):
-        inside = (np.abs(u) < camera.width_px / 2 + margin_px) & (
-            np.abs(v) < camera.height_px / 2 + margin_px
-        )
+        inside = (np.abs(u) < camera.width_px / 2 + margin_px) & (np.abs(v) < camera.height_px / 2 + margin_px)
     return np.asarray(inside, dtype=np.bool_)
 
 
@@ -185,11 +178,7 @@ def _reach_rad(radius_m: float, pose: Pose, camera: PinholeCamera, margin_px: fl
 
 
 def look(
-    landmarks: LandmarkMap,
-    index: IntArray,
-    pose: Pose,
-    camera: PinholeCamera,
-    shift_enu_m: FloatArray | None = None,
+    landmarks: LandmarkMap, index: IntArray, pose: Pose, camera: PinholeCamera, shift_enu_m: FloatArray | None = None
 ) -> Sighting:
     """Return the given craters as a pose sees them; NaN behind the camera.
 

@@ -32,10 +32,7 @@ def send_structure(machine: Machine, number: int) -> None:
 def send_large_data(machine: Machine, table: str, octets: bytes) -> None:
     """Send octets in parts, under a separate transaction number."""
     parts = split(
-        octets,
-        transaction=machine.transaction,
-        table=table,
-        part_length=int(machine.parameters["large_data_part"]),
+        octets, transaction=machine.transaction, table=table, part_length=int(machine.parameters["large_data_part"])
     )
     for name, values in parts:
         machine.telemetry.send(name, values)

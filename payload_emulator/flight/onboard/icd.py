@@ -12,10 +12,7 @@ _PORTS = {
     "ADCS and OBDH": (("uptime_ticks",), "attitude and time; see also the arguments of a step"),
     "TM/TC": (("downlink_octets",), "telemetry out, telecommands in; see also the arguments of a step"),
     "Processor": (("enter", "memory_octets", "load", "request_reset"), "the board that runs the software"),
-    "Non-volatile memory": (
-        ("read_table", "write_table"),
-        "in addition to the attributes `store` and `settings`",
-    ),
+    "Non-volatile memory": (("read_table", "write_table"), "in addition to the attributes `store` and `settings`"),
 }
 
 _STEP = """\

@@ -18,14 +18,7 @@ from tmtc.dictionary.tables import (
 )
 
 # Numbers of tables, as in the dictionary's table of tables.
-TABLE_NUMBERS = {
-    "anchor_ephemeris": 1,
-    "catalogue": 2,
-    "gravity": 3,
-    "orientation": 8,
-    "initial_state": 9,
-    "burns": 10,
-}
+TABLE_NUMBERS = {"anchor_ephemeris": 1, "catalogue": 2, "gravity": 3, "orientation": 8, "initial_state": 9, "burns": 10}
 MODEL_NUMBER = 5
 UNPACKERS: dict[str, Callable[[bytes], object]] = {
     "anchor_ephemeris": unpack_anchor_table,

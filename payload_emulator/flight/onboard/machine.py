@@ -8,12 +8,7 @@ from typing import Any
 
 from payload_emulator.flight.onboard.commanding import CommandHistory
 from payload_emulator.flight.onboard.fdir import Monitors
-from payload_emulator.flight.onboard.housekeeping import (
-    STATE,
-    Housekeeping,
-    StageTimer,
-    Structure,
-)
+from payload_emulator.flight.onboard.housekeeping import STATE, Housekeeping, StageTimer, Structure
 from payload_emulator.flight.onboard.loads import MODEL_NUMBER, FlightParameters, FlightTables
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.onboard.observer import Observer

@@ -65,11 +65,7 @@ class Observer:
     """
 
     def __init__(
-        self,
-        detector: Detector,
-        parameters: FlightParameters,
-        telemetry: Telemetry,
-        timer: StageTimer,
+        self, detector: Detector, parameters: FlightParameters, telemetry: Telemetry, timer: StageTimer
     ) -> None:
         self.detector = detector
         self.last_quality = ImageQuality.OK
@@ -117,12 +113,7 @@ class Observer:
                 self._states[mode] = ESTIMATORS[mode].widen(state, position_m, velocity_m_s)
 
     def frame(
-        self,
-        image: NDArray[Any],
-        attitude: FloatArray,
-        score_floor: float,
-        timeout_s: float,
-        quiet: bool,
+        self, image: NDArray[Any], attitude: FloatArray, score_floor: float, timeout_s: float, quiet: bool
     ) -> None:
         """Detect craters in one frame, run every estimator on them, report both.
 
@@ -206,9 +197,7 @@ class Observer:
         self._telemetry.event("info", "table_loaded", number, identity)
         return table
 
-    def _detect(
-        self, image: NDArray[Any], sun: FloatArray | None, timeout_s: float
-    ) -> tuple[ImageQuality, Detections]:
+    def _detect(self, image: NDArray[Any], sun: FloatArray | None, timeout_s: float) -> tuple[ImageQuality, Detections]:
         """Run the detector; what fails or comes too late is an event and no detection."""
         started_ns = self._timer.enter(Stage.detector)
         self.detector_failed = False

@@ -296,8 +296,7 @@ def _request_parameter(machine: Machine, values: Values) -> int:
     parameter = find_parameter(int(values["parameter_id"]))
     assert parameter is not None
     machine.telemetry.send(
-        "parameter_report",
-        {"parameter_id": parameter.number, "value": machine.parameters[parameter.name]},
+        "parameter_report", {"parameter_id": parameter.number, "value": machine.parameters[parameter.name]}
     )
     return 0
 
@@ -393,9 +392,7 @@ _FUNCTION_HANDLERS: dict[str, Callable[[Machine, float, float], int | None]] = {
     "check_tables": lambda machine, *_: failure("table_corrupt") if machine.memory.damaged() else 0,
     "synchronise_clock": _synchronise_clock,
     "abort_uplink": lambda machine, table, _: machine.uplink.abort(int(table)),
-    "widen_estimate": lambda machine, position_m, velocity_m_s: machine.observer.widen(
-        position_m, velocity_m_s
-    ),
+    "widen_estimate": lambda machine, position_m, velocity_m_s: machine.observer.widen(position_m, velocity_m_s),
     # The own count of the command, whatever it is, has become the newest when it was accepted.
     "resynchronise_commands": lambda *_: 0,
     "downlink_thumbnail": _thumbnail,

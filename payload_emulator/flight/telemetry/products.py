@@ -27,9 +27,7 @@ def thumbnail_octets(image: NDArray[Any], factor: int, frame_number: int, ticks:
     full = float(np.iinfo(image.dtype).max) if image.dtype.kind in "ui" else 1.0
     rows, columns = (size // factor for size in gray.shape)
     squares = gray[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor)
-    levels = (
-        np.nan_to_num(squares.mean(axis=(1, 3)) * (255.0 / full)) if squares.size else squares[:, 0, :, 0]
-    )
+    levels = np.nan_to_num(squares.mean(axis=(1, 3)) * (255.0 / full)) if squares.size else squares[:, 0, :, 0]
     return pack_thumbnail(Thumbnail(frame_number, ticks, np.clip(np.rint(levels), 0, 255).astype(np.uint8)))
 
 
@@ -46,7 +44,5 @@ def image_report(image: NDArray[Any], attitude: FloatArray) -> dict[str, int]:
 
 def map_octets(sightings: Mapping[int, int]) -> bytes:
     """Return the octets of the landmark map: how many frames used each crater."""
-    rows = np.array(
-        [(crater, min(count, 0xFFFF)) for crater, count in sorted(sightings.items())], dtype=_LANDMARK
-    )
+    rows = np.array([(crater, min(count, 0xFFFF)) for crater, count in sorted(sightings.items())], dtype=_LANDMARK)
     return rows.tobytes()

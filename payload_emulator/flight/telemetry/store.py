@@ -219,9 +219,7 @@ class PacketStore:
             (record.serial, ring, record)
             for ring in self._rings
             for record in ring.records
-            if not (record.waiting or record.again)
-            and start_ticks <= record.ticks < stop_ticks
-            and record.alive
+            if not (record.waiting or record.again) and start_ticks <= record.ticks < stop_ticks and record.alive
         ]
         wanted.sort(key=lambda item: item[0])
         for _, ring, record in wanted:
@@ -290,9 +288,7 @@ class PacketStore:
 
     def levels(self) -> tuple[tuple[int, int], ...]:
         """Packets waiting and use in 1/1000 of each class."""
-        return tuple(
-            (ring.unsent, round(1000 * ring.octets / max(ring.memory.size, 1))) for ring in self._rings
-        )
+        return tuple((ring.unsent, round(1000 * ring.octets / max(ring.memory.size, 1))) for ring in self._rings)
 
     def _read(self, ring: _Ring, record: _Record) -> bytes | None:
         """The packet of a record; None, the record dropped and counted, where it is damaged."""

@@ -89,9 +89,7 @@ def no_detections() -> Detections:
 class Detector(Protocol):
     """Anything that finds craters in a camera frame."""
 
-    def examine(
-        self, image: NDArray[Any], sun_in_camera: FloatArray | None = None
-    ) -> tuple[ImageQuality, Detections]:
+    def examine(self, image: NDArray[Any], sun_in_camera: FloatArray | None = None) -> tuple[ImageQuality, Detections]:
         """Return the verdict on an image (H, W) or (H, W, 3) and its craters; none unless the verdict is OK.
 
         The Sun vector, camera frame, helps and may be absent.

@@ -35,20 +35,9 @@ from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray, IntArray
 from payload_emulator.errors import ModelError
-from payload_emulator.flight.vision.calibration import (
-    SigmaModel,
-    load_calibration,
-    sigma_features,
-    with_sigma,
-)
+from payload_emulator.flight.vision.calibration import SigmaModel, load_calibration, sigma_features, with_sigma
 from payload_emulator.flight.vision.detections import Detections, no_detections
-from payload_emulator.flight.vision.preprocess import (
-    ImageQuality,
-    Preparation,
-    prepare_image,
-    sun_up_turns,
-    turn_back,
-)
+from payload_emulator.flight.vision.preprocess import ImageQuality, Preparation, prepare_image, sun_up_turns, turn_back
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -114,18 +103,14 @@ class OnnxDetector:
     def __post_init__(self) -> None:
         self.sha256 = hashlib.sha256(self.model_octets).hexdigest()
         if self.expected_sha256 and self.expected_sha256.lower() != self.sha256:
-            raise ModelError(
-                f"detector network: expected SHA-256 {self.expected_sha256.lower()}, found {self.sha256}"
-            )
+            raise ModelError(f"detector network: expected SHA-256 {self.expected_sha256.lower()}, found {self.sha256}")
         self._session = _open_session(self.model_octets, self.threads)
         self.stride_px = INPUT_SIZE_PX // int(self._session.get_outputs()[0].shape[-1])
         self.metadata = dict(self._session.get_modelmeta().custom_metadata_map)
         self.preparation = Preparation(self.metadata.get("preparation", Preparation.gray_first))
         self.class_medians_m = _class_medians(self._session, self.metadata)
         chosen = self.parameters.score_threshold
-        self.score_threshold = (
-            float(self.metadata.get("score_threshold", "0.4")) if chosen is None else chosen
-        )
+        self.score_threshold = float(self.metadata.get("score_threshold", "0.4")) if chosen is None else chosen
         self.parallax_per_px = float(self.metadata.get("parallax_per_px", "0.0"))
         self.calibration = load_calibration(self.metadata, self.model_octets)
 
@@ -193,18 +178,14 @@ class OnnxDetector:
         least = self.score_threshold if score_threshold is None else score_threshold
         rows, columns = gray.shape
         found = [
-            self._search_tile(gray, top, left, least)
-            for top in _tile_starts(rows)
-            for left in _tile_starts(columns)
+            self._search_tile(gray, top, left, least) for top in _tile_starts(rows) for left in _tile_starts(columns)
         ]
         every = found[0] if len(found) == 1 else join(found)
         order = np.argsort(-every.score, kind="stable")
         kept = drop_duplicates(every.select(order), self.parameters)
         return kept.select(np.arange(min(len(kept), self.parameters.max_detections * len(found))))
 
-    def _search_tile(
-        self, gray: NDArray[np.float32], top: int, left: int, score_threshold: float
-    ) -> Detections:
+    def _search_tile(self, gray: NDArray[np.float32], top: int, left: int, score_threshold: float) -> Detections:
         tile = gray[top : top + INPUT_SIZE_PX, left : left + INPUT_SIZE_PX]
         rows, columns = tile.shape
         if tile.shape != (INPUT_SIZE_PX, INPUT_SIZE_PX):
@@ -215,19 +196,14 @@ class OnnxDetector:
         if self.class_medians_m is None:
             found = decode(heatmap[0, 0], geometry[0], score_threshold, self.stride_px)
         else:
-            found = decode_classes(
-                heatmap[0], geometry[0], self.class_medians_m, score_threshold, self.stride_px
-            )
+            found = decode_classes(heatmap[0], geometry[0], self.class_medians_m, score_threshold, self.stride_px)
         inside = (found.u_px < columns) & (found.v_px < rows)
         found = found.select(inside)
         return replace(found, u_px=found.u_px + left, v_px=found.v_px + top)
 
 
 def decode(
-    heatmap: NDArray[np.float32],
-    geometry: NDArray[np.float32],
-    score_threshold: float,
-    stride_px: int = STRIDE_PX,
+    heatmap: NDArray[np.float32], geometry: NDArray[np.float32], score_threshold: float, stride_px: int = STRIDE_PX
 ) -> Detections:
     """Detections of one image from heatmap (h, w) and geometry (2, 4 or 5, h, w): see the head of this module.
 
@@ -339,9 +315,7 @@ def _tile_starts(length: int) -> list[int]:
     return [int(start) for start in np.rint(np.linspace(0, length - INPUT_SIZE_PX, count))]
 
 
-MANY_DETECTIONS = (
-    512  # from here on, comparing each with each other takes longer than a search for neighbours
-)
+MANY_DETECTIONS = 512  # from here on, comparing each with each other takes longer than a search for neighbours
 
 
 def drop_duplicates(found: Detections, parameters: DetectorParameters) -> Detections:
@@ -406,14 +380,7 @@ def _open_session(model_octets: bytes, threads: int) -> onnxruntime.InferenceSes
     import onnxruntime
     from onnxruntime.capi import onnxruntime_pybind11_state as library
 
-    kinds = (
-        "Fail",
-        "InvalidArgument",
-        "InvalidGraph",
-        "InvalidProtobuf",
-        "NotImplemented",
-        "RuntimeException",
-    )
+    kinds = ("Fail", "InvalidArgument", "InvalidGraph", "InvalidProtobuf", "NotImplemented", "RuntimeException")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1

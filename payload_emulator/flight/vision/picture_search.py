@@ -160,9 +160,7 @@ def _enlarge_rows(plane: NDArray[np.float32]) -> NDArray[np.float32]:
 def _squares(gray: NDArray[np.float32]) -> list[NDArray[np.float32]]:
     """One to four squares of half the network's input, spread over a plane; the whole of a smaller one."""
     starts = [
-        [0]
-        if length <= _EVIDENCE_SQUARE_PX
-        else sorted({int(q * (length - _EVIDENCE_SQUARE_PX)) for q in spread})
+        [0] if length <= _EVIDENCE_SQUARE_PX else sorted({int(q * (length - _EVIDENCE_SQUARE_PX)) for q in spread})
         for length in gray.shape
         for spread in [(0.0, 1.0) if length <= 2 * _EVIDENCE_SQUARE_PX else (0.25, 0.75)]
     ]
@@ -183,9 +181,7 @@ def _walls(plane: NDArray[np.float32], found: Detections) -> tuple[NDArray[np.co
             continue
         top, left = (int(max(0, np.ceil(x - _OUTSIDE[1] * radius))) for x in (v, u))
         values = plane[top : int(v + _OUTSIDE[1] * radius) + 1, left : int(u + _OUTSIDE[1] * radius) + 1]
-        place = np.add.outer(
-            1j * (np.arange(values.shape[0]) + top - v), np.arange(values.shape[1]) + left - u
-        )
+        place = np.add.outer(1j * (np.arange(values.shape[0]) + top - v), np.arange(values.shape[1]) + left - u)
         share = np.abs(place) / radius
         inside, outside = share <= _INSIDE, (share > _OUTSIDE[0]) & (share <= _OUTSIDE[1])
         if np.count_nonzero(inside) < 2 or np.count_nonzero(outside) < 2:

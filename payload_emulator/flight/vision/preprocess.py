@@ -14,9 +14,7 @@ from lunar.arrays import FloatArray, OctetArray
 
 # Fractions of full scale. A frame on the night side holds read noise and an offset of at most a few counts of 255.
 _DARK_LEVEL = 0.04
-_DARK_SHARE = (
-    0.002  # fewer lit pixels than this (about a 23 px square of 512 x 512) hold no crater worth a match
-)
+_DARK_SHARE = 0.002  # fewer lit pixels than this (about a 23 px square of 512 x 512) hold no crater worth a match
 _SATURATED_LEVEL = 0.996
 _SATURATED_SHARE = 0.6  # the rest of the frame would still hold fewer craters than a fix needs
 _UNIFORM_DEVIATION = 0.004  # of the square root of full scale: one count of 8 bits at mid scale
@@ -48,9 +46,7 @@ class PreparedImage:
     quality: ImageQuality
 
 
-def prepare_image(
-    image: NDArray[np.generic], preparation: Preparation = Preparation.gray_first
-) -> PreparedImage:
+def prepare_image(image: NDArray[np.generic], preparation: Preparation = Preparation.gray_first) -> PreparedImage:
     """Normalised gray plane of a frame of (H, W) or (H, W, 1|3|4), unsigned integer or float in 0..1.
 
     The square root of the mean of the colour channels is taken (shot noise becomes even, shadows open), then mean and
@@ -84,9 +80,7 @@ def quality_reason(image: NDArray[np.generic], quality: ImageQuality) -> str:
     gray = _square_root_gray(image) if image.size and image.dtype.kind in "uf" else None
     if gray is None:
         bad = np.count_nonzero(~np.isfinite(image)) if image.dtype.kind == "f" else image.size
-        return (
-            f"{bad} of {image.size} pixels hold no number" if bad else f"shape {image.shape} of {image.dtype}"
-        )
+        return f"{bad} of {image.size} pixels hold no number" if bad else f"shape {image.shape} of {image.dtype}"
     if quality is ImageQuality.UNIFORM:
         return f"deviation {gray.std(dtype=np.float64):.4f} of full scale, expected over {_UNIFORM_DEVIATION}"
     level = _DARK_LEVEL if quality is ImageQuality.DARK else _SATURATED_LEVEL
@@ -167,9 +161,7 @@ def _prepare_bytes(image: NDArray[np.generic]) -> PreparedImage:
     root = np.sqrt(level)
     mean = float(share @ root)
     deviation = float(np.sqrt(max(float(share @ (root - mean) ** 2), 0.0)))
-    quality = _verdict(
-        float(share[level > _SATURATED_LEVEL].sum()), float(share[level > _DARK_LEVEL].sum()), deviation
-    )
+    quality = _verdict(float(share[level > _SATURATED_LEVEL].sum()), float(share[level > _DARK_LEVEL].sum()), deviation)
     if quality is not ImageQuality.OK:
         return PreparedImage(np.zeros(total.shape, np.float32), quality)
     table = np.clip((root - mean) / max(deviation, 1e-6), -_CLIP, _CLIP).astype(np.float32)

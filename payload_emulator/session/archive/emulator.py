@@ -36,26 +36,12 @@ from payload_emulator.session.archive.recording import (
 )
 from payload_emulator.session.archive.scoring import judge_session, score_navigation
 from payload_emulator.session.scenario import Scenario, format_scenario
-from payload_emulator.session.spacecraft.loading import (
-    LoadedPayload,
-    check_payload_files,
-    load_scenario_payload,
-)
-from payload_emulator.session.spacecraft.loop import (
-    PLAYBACK_CHANNEL,
-    Spacecraft,
-    StepResult,
-    new_spacecraft,
-)
+from payload_emulator.session.spacecraft.loading import LoadedPayload, check_payload_files, load_scenario_payload
+from payload_emulator.session.spacecraft.loop import PLAYBACK_CHANNEL, Spacecraft, StepResult, new_spacecraft
 from payload_emulator.session.spacecraft.schedule import fly_scenario, timeline
 from payload_emulator.session.world.camera import expose, require_renderable, true_sun_direction
 from payload_emulator.session.world.external import ExternalFrames
-from payload_emulator.session.world.world import (
-    World,
-    build_world,
-    clock_ticks,
-    sample_truth,
-)
+from payload_emulator.session.world.world import World, build_world, clock_ticks, sample_truth
 from payload_emulator.sim.board.link import (
     LIGHT_S,
     Reception,
@@ -203,12 +189,7 @@ class Sender:
 
 
 def _emulate_into(
-    world: World,
-    data: DataFolder,
-    folder: Path,
-    frames_kept: int | None,
-    progress: Progress | None,
-    started: float,
+    world: World, data: DataFolder, folder: Path, frames_kept: int | None, progress: Progress | None, started: float
 ) -> dict[str, Any]:
     scenario = world.scenario
     loaded, reference, catalogue = load_scenario_payload(world, data)
@@ -216,9 +197,7 @@ def _emulate_into(
     warnings += [] if world.external is None else sun_warnings(world, loaded.detector)
     total = int(world.frame_utc_ns.size)
     kept = (
-        set(range(total))
-        if frames_kept is None
-        else set(np.linspace(0, total - 1, frames_kept + 2, dtype=int)[1:-1])
+        set(range(total)) if frames_kept is None else set(np.linspace(0, total - 1, frames_kept + 2, dtype=int)[1:-1])
     )
     spacecraft = new_spacecraft(world, loaded)
     sender = Sender(world, LinkSettings(coding=scenario.link.coding))
@@ -250,9 +229,7 @@ def _emulate_into(
     (folder / "downlink.cadu").write_bytes(reception.octets)
     save_receptions(folder, sender.transmitter.dumps)
     emitted = np.array([utc_ns for _, utc_ns in sender.time_reports], dtype=np.int64)
-    save_time_receptions(
-        folder, [packet for packet, _ in sender.time_reports], emitted, world.truth.states(emitted)[0]
-    )
+    save_time_receptions(folder, [packet for packet, _ in sender.time_reports], emitted, world.truth.states(emitted)[0])
     wall_s = time.monotonic() - started
     summary = _summary(world, loaded, spacecraft, packets, reception, len(kept), wall_s)
     judged = judge_session(world, loaded, catalogue, attitudes, b"".join(packets))
@@ -361,6 +338,5 @@ def _require_replaceable(out: Path) -> None:
     """Refuse to overwrite anything that is not a pass archive of an earlier run."""
     if out.exists() and not (out.is_dir() and (not any(out.iterdir()) or (out / "manifest.json").is_file())):
         raise ScenarioError(
-            f"{out}: expected a new folder or an earlier pass archive, found something else; "
-            "choose another --out"
+            f"{out}: expected a new folder or an earlier pass archive, found something else; choose another --out"
         )

@@ -28,13 +28,7 @@ from payload_emulator.flight.navigation.filter.map_offset import OffsetRule
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.session.archive.recording import RecordedStep
 from payload_emulator.session.live.station_ports import RECORD_HEADER
-from payload_emulator.session.scenario import (
-    SHIPPED,
-    SPACECRAFT_ID,
-    RequirementsSection,
-    Scenario,
-    format_scenario,
-)
+from payload_emulator.session.scenario import SHIPPED, SPACECRAFT_ID, RequirementsSection, Scenario, format_scenario
 from payload_emulator.session.spacecraft.loading import detector_parameters, filter_field, network_octets
 from payload_emulator.session.spacecraft.loop import PLAYBACK_CHANNEL
 from payload_emulator.session.typed_toml import toml_text
@@ -192,9 +186,7 @@ def _latitude_limit_deg(world: World) -> float | None:
     camera = world.scenario.camera
     if camera.images == "reduced" or world.external is not None:
         return None
-    highest_m = _ALTITUDE_MARGIN * float(
-        spherical_from_mcmf(world.truth.positions_mcmf(_track_utc_ns(world)))[2].max()
-    )
+    highest_m = _ALTITUDE_MARGIN * float(spherical_from_mcmf(world.truth.positions_mcmf(_track_utc_ns(world)))[2].max())
     # Central angle of a corner of the image at nadir; without ground there, that of the limb.
     off_nadir = math.atan(
         math.hypot(1.0, camera.height_px / camera.width_px) * math.tan(math.radians(camera.fov_deg / 2.0))
@@ -207,9 +199,7 @@ def _latitude_limit_deg(world: World) -> float | None:
 
 def _track_utc_ns(world: World) -> IntArray:
     """Return times of the flight so far (n,), one a minute."""
-    return np.arange(
-        world.truth.start_utc_ns, world.truth.stop_utc_ns, round(_TRACK_STEP_S * NS), dtype=np.int64
-    )
+    return np.arange(world.truth.start_utc_ns, world.truth.stop_utc_ns, round(_TRACK_STEP_S * NS), dtype=np.int64)
 
 
 def _registration(world: World) -> dict[str, float | int]:
@@ -301,11 +291,7 @@ def _section(title: str, values: Mapping[str, Value]) -> list[str]:
 
 def _station(name: str, link: LinkSection) -> dict[str, Value]:
     """Return place, rates and outages of a station of the scenario, and its records."""
-    records: dict[str, Value] = {
-        "header_octets": RECORD_HEADER.size,
-        "time_code": "unix_ns",
-        "time_offset": 0,
-    }
+    records: dict[str, Value] = {"header_octets": RECORD_HEADER.size, "time_code": "unix_ns", "time_offset": 0}
     if name not in link.stations:
         return records
     latitude_deg, longitude_deg, height_m = STATIONS[name]

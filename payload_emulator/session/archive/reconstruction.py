@@ -36,14 +36,7 @@ from payload_emulator.session.archive.recording import (
 from payload_emulator.session.scenario import Scenario, parse_scenario
 from payload_emulator.session.spacecraft.loading import LoadedPayload, launch_payload
 from payload_emulator.session.world.camera import Exposure, expose
-from payload_emulator.session.world.world import (
-    CHUNK_S,
-    World,
-    extended_flight,
-    first_utc_ns,
-    frame_utc_ns,
-    open_world,
-)
+from payload_emulator.session.world.world import CHUNK_S, World, extended_flight, first_utc_ns, frame_utc_ns, open_world
 from payload_emulator.sim.board.faults import parse_fault
 from tmtc.dictionary.onboard_parameters import find_parameter
 from tmtc.dictionary.payload import DICTIONARY
@@ -74,9 +67,7 @@ class ImageReport:
     values: Mapping[str, int]
 
 
-def reconstruct(
-    archive: Path, out: Path, data: DataFolder, progress: Progress | None = None
-) -> dict[str, Any]:
+def reconstruct(archive: Path, out: Path, data: DataFolder, progress: Progress | None = None) -> dict[str, Any]:
     """Write a copy of the archive of a live pass with its images and the inputs of the payload; return its manifest.
 
     Raises
@@ -87,9 +78,7 @@ def reconstruct(
     manifest = json.loads((archive / "manifest.json").read_text())
     scenario = parse_scenario(str(manifest["scenario_toml"]), source=f"declared world of {archive}")
     if scenario.camera.images == "reduced":
-        raise RecordError(
-            f"{archive}: expected a world with rendered images, found camera.images = 'reduced'"
-        )
+        raise RecordError(f"{archive}: expected a world with rendered images, found camera.images = 'reduced'")
     received = _received(archive)
     telemetry = received.tables(DICTIONARY)
     reports = image_reports(telemetry.get("image_report"))
@@ -128,8 +117,7 @@ def image_reports(table: Table | None) -> list[ImageReport]:
     if table is not None:
         for i, ticks in enumerate(np.asarray(table.columns["image_ticks"], dtype=np.int64).tolist()):
             values = {
-                name: int(table.columns[name][i])
-                for name in ("width_px", "height_px", "image_crc", "inputs_crc")
+                name: int(table.columns[name][i]) for name in ("width_px", "height_px", "image_crc", "inputs_crc")
             }
             found.setdefault(ticks, ImageReport(ticks, values))
     return [found[ticks] for ticks in sorted(found)]
@@ -236,9 +224,7 @@ def _received(archive: Path) -> DownlinkDecode:
     try:
         return decode(octets, dictionary=DICTIONARY)
     except TmtcError as error:
-        raise RecordError(
-            f"{archive / DOWNLINK}: expected packets of the dictionary, found {error}"
-        ) from None
+        raise RecordError(f"{archive / DOWNLINK}: expected packets of the dictionary, found {error}") from None
 
 
 def _octets(archive: Path, name: str, what: str) -> bytes:

@@ -23,11 +23,7 @@ from numpy.typing import NDArray
 from lunar.arrays import FloatArray, IntArray
 from payload_emulator.errors import RecordError
 from payload_emulator.flight.payload import FlightTables
-from payload_emulator.session.spacecraft.parameter_file import (
-    BuildParameters,
-    format_parameters,
-    parse_parameters,
-)
+from payload_emulator.session.spacecraft.parameter_file import BuildParameters, format_parameters, parse_parameters
 from tmtc.dictionary.definitions import format_dictionary
 from tmtc.dictionary.payload import DICTIONARY
 
@@ -171,11 +167,7 @@ def frame_path(number: int) -> str:
 
 def missing_frames(folder: Path, inputs: Sequence[RecordedStep]) -> list[int]:
     """Return the frames that had an image which is not in the archive."""
-    return [
-        item.number
-        for item in inputs
-        if item.image_sha256 and not (folder / frame_path(item.number)).is_file()
-    ]
+    return [item.number for item in inputs if item.image_sha256 and not (folder / frame_path(item.number)).is_file()]
 
 
 def save_image(folder: Path, number: int, image: Image) -> None:

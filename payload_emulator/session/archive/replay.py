@@ -132,12 +132,7 @@ def names_command(path: Path) -> bool:
 
 
 def replay_archive(
-    archive: Path,
-    build: FlightBuild,
-    out: Path,
-    *,
-    data: DataFolder | None = None,
-    progress: Progress | None = None,
+    archive: Path, build: FlightBuild, out: Path, *, data: DataFolder | None = None, progress: Progress | None = None
 ) -> dict[str, Any]:
     """Fly an archived pass again and write `downlink.cadu`, `performance.json` and `summary.json` into `out`.
 
@@ -170,9 +165,7 @@ def replay_archive(
     flown = replay(record, images, _with_network(build, manifest), progress=progress, recorded=recorded)
     wall_s = time.monotonic() - started
     out.mkdir(parents=True, exist_ok=True)
-    octets = encode_cadus(
-        flown.packets, spacecraft_id=int(manifest["spacecraft_id"]), coding=_coding(manifest)
-    )
+    octets = encode_cadus(flown.packets, spacecraft_id=int(manifest["spacecraft_id"]), coding=_coding(manifest))
     (out / "downlink.cadu").write_bytes(octets)
     _write_json(
         out / "performance.json",
@@ -250,9 +243,7 @@ def replay(
         step_s = cpu_clock() - began
         if item.number < 0:
             continue
-        rows.append(
-            (detector.network_s, detector.examine_s - detector.network_s, step_s - detector.examine_s)
-        )
+        rows.append((detector.network_s, detector.examine_s - detector.network_s, step_s - detector.examine_s))
     stages = 1e3 * np.array(rows, dtype=np.float64).reshape(-1, len(STAGES))
     return Replay(packets, payload.summary(), {name: stages[:, i] for i, name in enumerate(STAGES)})
 
@@ -303,9 +294,7 @@ def _declared_world(scenario: Scenario, data: DataFolder, declared: Collection[s
     """Return the world of a scenario with the declared data products; `RecordError` without them."""
     from payload_emulator.session.world.world import REGISTRATION, build_world
 
-    lacking = needed = [
-        name for name in declared if ", seed " not in name and not name.startswith(REGISTRATION)
-    ]
+    lacking = needed = [name for name in declared if ", seed " not in name and not name.startswith(REGISTRATION)]
     for folder in (data, DataFolder(None)):
         try:
             world = build_world(scenario, folder)
@@ -338,15 +327,11 @@ def load_detections(archive: Path) -> dict[int, Recorded] | None:
             detections = Detections(u_px, v_px, diameter_px, score, sigma_px)
             found[int(row["ticks"])] = ImageQuality(row["quality"]), detections
     except (ValueError, KeyError, TypeError) as error:
-        raise RecordError(
-            f"{path}: expected the detections of each image, found something else ({error})"
-        ) from None
+        raise RecordError(f"{path}: expected the detections of each image, found something else ({error})") from None
     return found
 
 
-def complete_archive(
-    archive: Path, out: Path, data: DataFolder, progress: Progress | None = None
-) -> dict[str, Any]:
+def complete_archive(archive: Path, out: Path, data: DataFolder, progress: Progress | None = None) -> dict[str, Any]:
     """Write a copy of an archive that holds all its frames; the new manifest comes back.
 
     The archive of a live pass that declares its world gets the inputs of the payload as well, see `reconstruction`.
@@ -417,9 +402,7 @@ class _TimedDetector:
         timed = self
 
         class Onnx(OnnxDetector):
-            def run_network(
-                self, tile: NDArray[np.float32]
-            ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+            def run_network(self, tile: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
                 began = timed.clock()
                 maps = OnnxDetector.run_network(self, tile)
                 timed.network_s += timed.clock() - began
@@ -432,9 +415,7 @@ class _TimedDetector:
     def reset(self) -> None:
         self.examine_s = self.network_s = 0.0
 
-    def examine(
-        self, image: NDArray[Any], sun_in_camera: FloatArray | None = None
-    ) -> tuple[ImageQuality, Detections]:
+    def examine(self, image: NDArray[Any], sun_in_camera: FloatArray | None = None) -> tuple[ImageQuality, Detections]:
         if self.recorded is not None:
             return self.recorded.get(self.image_ticks, (ImageQuality.INVALID, no_detections()))
         began = self.clock()

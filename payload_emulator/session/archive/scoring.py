@@ -128,11 +128,7 @@ class JudgedSession:
 
 
 def judge_session(
-    world: World,
-    loaded: LoadedPayload,
-    catalogue: CraterCatalogue,
-    camera_from_mcmf: FloatArray,
-    octets: bytes,
+    world: World, loaded: LoadedPayload, catalogue: CraterCatalogue, camera_from_mcmf: FloatArray, octets: bytes
 ) -> JudgedSession | None:
     """Return a session judged by the truth; None where the anchored estimator did not run.
 
@@ -174,9 +170,7 @@ def score_navigation(world: World, judged: JudgedSession | None) -> dict[str, An
             "imaging_from_start": _statistics(errors.position_m[imaging[errors.frame]]),
             "end_of_coast": _statistics(coast[np.isfinite(coast)]),
             "propagate_only": _statistics(errors.only_error_m[settled]),
-            "velocity_p95_m_s": _percentile(
-                np.linalg.norm(errors.state_error_rtn[settled, 3:], axis=1), 95.0
-            ),
+            "velocity_p95_m_s": _percentile(np.linalg.norm(errors.state_error_rtn[settled, 3:], axis=1), 95.0),
             "bias_rtn_m": _means(errors.state_error_rtn[settled, :3]),
             "median_rtn_m": _absolute_percentiles(errors.state_error_rtn[settled, :3], 50.0),
             "p95_rtn_m": _absolute_percentiles(errors.state_error_rtn[settled, :3], 95.0),
@@ -217,11 +211,7 @@ def _outcomes(tables: dict[str, Table], frame_ticks: IntArray) -> tuple[IntArray
 
 
 def _errors(
-    world: World,
-    loaded: LoadedPayload,
-    estimates: FilterEstimates,
-    frame_ticks: IntArray,
-    imaging: BoolArray,
+    world: World, loaded: LoadedPayload, estimates: FilterEstimates, frame_ticks: IntArray, imaging: BoolArray
 ) -> FlownErrors:
     which, frame = _first_of_each(estimates.image_ticks, frame_ticks)
     own, covariance = estimates.state[which], estimates.covariance[which]
@@ -322,9 +312,7 @@ def _judged_pairs(
     rim = catalogue.position_mcmf_m
     used = tables.get("identifications")
     used_row = (
-        {}
-        if used is None
-        else dict(zip(*_first_of_each(used.columns["image_ticks"], frame_ticks)[::-1], strict=True))
+        {} if used is None else dict(zip(*_first_of_each(used.columns["image_ticks"], frame_ticks)[::-1], strict=True))
     )
     order = np.argsort(catalogue.ids)
     latitude, longitude, altitude = spherical_from_mcmf(position)

@@ -23,9 +23,7 @@ class SuitePass:
     altitude_km: tuple[float, float]
 
 
-def suite_scenarios(
-    given: Sequence[str] = (), *, frames: int | None = None, seeds: int = 1
-) -> list[Scenario]:
+def suite_scenarios(given: Sequence[str] = (), *, frames: int | None = None, seeds: int = 1) -> list[Scenario]:
     """Load the scenarios of a suite: those shipped, or those given, each with a number of seeds.
 
     Parameters

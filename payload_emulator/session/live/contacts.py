@@ -103,9 +103,7 @@ class Contacts:
     _last_step_ns: int = 0
 
     def __post_init__(self) -> None:
-        self._transmitter = Transmitter(
-            self.scenario.spacecraft_id, LinkSettings(coding=self.scenario.link.coding)
-        )
+        self._transmitter = Transmitter(self.scenario.spacecraft_id, LinkSettings(coding=self.scenario.link.coding))
 
     @property
     def is_limited(self) -> bool:

@@ -47,12 +47,7 @@ _POLL_S = 0.05
 # Two steps at one reading of the on-board clock would look like a clock that stands still.
 _LEAST_STEP_NS = 20_000_000
 _ARCS_KEPT = 2
-_EXACT = {
-    "utc_ns": "utc_ns",
-    "spacecraft": "spacecraft",
-    "_last_image_ns": "_last_image_ns",
-    "_operator": "_operator",
-}
+_EXACT = {"utc_ns": "utc_ns", "spacecraft": "spacecraft", "_last_image_ns": "_last_image_ns", "_operator": "_operator"}
 """Attributes of a session in an exact state, with those of contacts, console and flight, by their names there."""
 
 
@@ -138,9 +133,7 @@ class LiveSession:
         if self.state_file is not None:
             self._continue_from(self.state_file)
         if self.has_operator:
-            self._slots.extend(
-                one for one in timeline(world) if not self._is_continued or one.utc_ns > self.utc_ns
-            )
+            self._slots.extend(one for one in timeline(world) if not self._is_continued or one.utc_ns > self.utc_ns)
             if not self._is_continued:
                 self.utc_ns = self._slots[0].utc_ns
         if not self.contacts.is_limited and not self._is_continued:

@@ -35,9 +35,7 @@ _HEADER = re.compile(rb"LINNA spacecraft state, version (\d{1,9}), SHA-256 ([0-9
 _EXPECTED = "the state of a spacecraft process (linna emulate --live --state)"
 _PACKAGES = ("payload_emulator", "lunar", "tmtc")
 _PLAIN = (type(None), bool, int, float, str)
-_SEQUENCES: dict[str, type] = {
-    one.__name__: one for one in (list, tuple, set, frozenset, dict, Counter, OrderedDict)
-}
+_SEQUENCES: dict[str, type] = {one.__name__: one for one in (list, tuple, set, frozenset, dict, Counter, OrderedDict)}
 _PLAIN_NEW: object = object.__new__
 _MAPPINGS = (dict, Counter, OrderedDict)
 _UNSET = object()
@@ -200,9 +198,7 @@ class _Writer:
         """Return the attributes of an instance of a class whose slots are known."""
         name, slots = self._classes[type(value)]
         found = [(slot, getattr(value, slot, _UNSET)) for slot in (*slots, *getattr(value, "__dict__", ()))]
-        nodes = (
-            [slot, one if type(one) in _PLAIN else self.node(one)] for slot, one in found if one is not _UNSET
-        )
+        nodes = ([slot, one if type(one) in _PLAIN else self.node(one)] for slot, one in found if one is not _UNSET)
         return ["object", name, *nodes]
 
     def _numbers_of(self, value: Any) -> list[Any]:

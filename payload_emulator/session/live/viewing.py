@@ -61,9 +61,7 @@ def step_message(
         for estimate in estimates.values():
             if "altitude_m" in estimate:
                 place = mcmf_from_spherical(
-                    np.radians(estimate["latitude_deg"]),
-                    np.radians(estimate["longitude_deg"]),
-                    estimate["altitude_m"],
+                    np.radians(estimate["latitude_deg"]), np.radians(estimate["longitude_deg"]), estimate["altitude_m"]
                 )
                 estimate["error_m"] = float(np.linalg.norm(place - position))
         message["estimates"] = estimates
@@ -84,12 +82,7 @@ def _add_packets(message: dict[str, Any], packets: Sequence[bytes]) -> dict[str,
             event = labels(name, "event_id").get(values["event_id"], "")
             numbers = [values["value_1"], values["value_2"]]
             message["events"].append(
-                {
-                    "severity": name[6:],
-                    "event": event,
-                    "values": numbers,
-                    "text": event_text(event, *numbers),
-                }
+                {"severity": name[6:], "event": event, "values": numbers, "text": event_text(event, *numbers)}
             )
         elif name.startswith("verification_"):
             message["verifications"].append({"stage": name[13:], **values})
@@ -141,9 +134,7 @@ def _on_sphere(world: World, exposure: Exposure) -> list[dict[str, float]]:
 def _largest(world: World, index: IntArray, columns: dict[str, FloatArray]) -> list[dict[str, float]]:
     shown = np.argsort(-columns["diameter_px"], kind="stable")[:_SHOWN_CRATERS].tolist()
     ids = world.terrain.catalogue.ids[index]
-    return [
-        {"id": int(ids[k]), **{name: float(column[k]) for name, column in columns.items()}} for k in shown
-    ]
+    return [{"id": int(ids[k]), **{name: float(column[k]) for name, column in columns.items()}} for k in shown]
 
 
 def _jpeg(image: Any) -> str:

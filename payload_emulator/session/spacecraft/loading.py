@@ -33,11 +33,7 @@ from payload_emulator.flight.ports import Board
 from payload_emulator.flight.vision.detections import Detector
 from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
 from payload_emulator.session.scenario import Scenario
-from payload_emulator.session.spacecraft.parameter_file import (
-    BuildParameters,
-    format_parameters,
-    parse_parameters,
-)
+from payload_emulator.session.spacecraft.parameter_file import BuildParameters, format_parameters, parse_parameters
 from payload_emulator.session.world.regions import displaced, observed_craters
 from payload_emulator.session.world.world import (
     World,
@@ -219,9 +215,7 @@ def _loaded(
 ) -> LoadedPayload:
     """Return the payload of a build with tables, described for the archive."""
     parameters, detector, field = build.parameters.flight, build.detector, build.field
-    payload = Payload(
-        detector, parameters, tables, model_hash=detector.model_hash, model_octets=len(build.model)
-    )
+    payload = Payload(detector, parameters, tables, model_hash=detector.model_hash, model_octets=len(build.model))
     return LoadedPayload(
         payload,
         build.parameters,
@@ -233,23 +227,15 @@ def _loaded(
             "parameters_sha256": parameters.sha256,
         },
         start_state=start_state,
-        table_hashes={
-            item.name: hashlib.sha256(getattr(tables, item.name)).hexdigest() for item in fields(tables)
-        },
-        gravity={
-            "filter": field.name,
-            "filter_degree": field.degree,
-            "filter_orientation": orientation.name,
-        },
+        table_hashes={item.name: hashlib.sha256(getattr(tables, item.name)).hexdigest() for item in fields(tables)},
+        gravity={"filter": field.name, "filter_degree": field.degree, "filter_orientation": orientation.name},
         model=build.model,
         detector=detector,
     )
 
 
 def _gravity_octets(field: GravityField) -> bytes:
-    return pack_gravity_table(
-        GravityTable(field.name, field.gm_m3_s2, field.radius_m, field.c_bar, field.s_bar)
-    )
+    return pack_gravity_table(GravityTable(field.name, field.gm_m3_s2, field.radius_m, field.c_bar, field.s_bar))
 
 
 def _attitude_errors(scenario: Scenario) -> CommonErrors:
@@ -322,9 +308,7 @@ def onboard_catalogue(scenario: Scenario, catalogue: CraterCatalogue) -> Catalog
     if not made:
         height_m -= SEEN_BELOW_RIM_M
     centre_sigma_m = np.maximum(horizontal_m, _SMALLEST_SIGMA_M)
-    height_sigma_m = np.hypot(
-        _SMALLEST_SIGMA_M if made else _HEIGHT_SIGMA_M, navigation.catalogue_height_error_m
-    )
+    height_sigma_m = np.hypot(_SMALLEST_SIGMA_M if made else _HEIGHT_SIGMA_M, navigation.catalogue_height_error_m)
     return CatalogueTable(
         chosen.ids,
         chosen.latitude_rad + north_m / MOON_RADIUS_M,
@@ -395,9 +379,7 @@ def _anchor_table(reference: Ephemeris, orientation: Orientation) -> bytes:
     times = np.arange(reference.start_utc_ns, reference.stop_utc_ns + 1, _ANCHOR_STEP_NS, dtype=np.int64)
     position, _ = reference.at(times)
     rotation = orientation.mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(times), dtype=np.float64))
-    return pack_anchor_table(
-        np.asarray(ticks_from_utc_ns(times)), np.einsum("nij,nj->ni", rotation, position)
-    )
+    return pack_anchor_table(np.asarray(ticks_from_utc_ns(times)), np.einsum("nij,nj->ni", rotation, position))
 
 
 def detector_parameters(scenario: Scenario) -> DetectorParameters:

@@ -115,9 +115,7 @@ class BreakableDetector:
     throws: bool = False
     hangs: bool = False
 
-    def examine(
-        self, image: NDArray[Any], sun_in_camera: FloatArray | None = None
-    ) -> tuple[ImageQuality, Detections]:
+    def examine(self, image: NDArray[Any], sun_in_camera: FloatArray | None = None) -> tuple[ImageQuality, Detections]:
         if self.hangs:
             self.hangs = False
             raise ProcessorHang

@@ -60,10 +60,7 @@ def format_parameters(parameters: BuildParameters) -> str:
 
 
 def parse_parameters(
-    text: str,
-    flown: BuildParameters = BuildParameters(),
-    source: str = "parameters",
-    dropped: list[str] | None = None,
+    text: str, flown: BuildParameters = BuildParameters(), source: str = "parameters", dropped: list[str] | None = None
 ) -> BuildParameters:
     """Return `flown` with the values of a TOML text.
 
@@ -104,9 +101,7 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _read(
-    flown: BuildParameters, table: dict[str, Any], source: str, dropped: list[str] | None
-) -> BuildParameters:
+def _read(flown: BuildParameters, table: dict[str, Any], source: str, dropped: list[str] | None) -> BuildParameters:
     """Return parameters with the values of a table."""
     try:
         kept = table if dropped is None else _known(flown, table, "", dropped)

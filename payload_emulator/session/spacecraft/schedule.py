@@ -91,9 +91,7 @@ class Operator:
 
     def command(self, name: str, **values: object) -> bytes:
         """Return the next telecommand packet."""
-        packet = DICTIONARY.pack_command(
-            name, values, sequence_count=self.sequence_count, source=_PLANNING_SOURCE
-        )
+        packet = DICTIONARY.pack_command(name, values, sequence_count=self.sequence_count, source=_PLANNING_SOURCE)
         self.sequence_count = (self.sequence_count + 1) % (1 << 14)
         return packet
 

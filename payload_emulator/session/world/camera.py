@@ -209,9 +209,7 @@ def _exposed(world: World, scene: _Scene) -> Exposure:
         image = take_picture(scene.radiance, scenario.sensor, rng)
     assert image is not None
     attitude = scenario.attitude
-    bias = np.radians(attitude.knowledge_bias_deg) * np.random.default_rng(
-        (scenario.seed, 2**32)
-    ).standard_normal(3)
+    bias = np.radians(attitude.knowledge_bias_deg) * np.random.default_rng((scenario.seed, 2**32)).standard_normal(3)
     noise = np.radians(attitude.knowledge_noise_deg) * rng.standard_normal(3)
     known = perturbed(scene.camera_from_icrf, bias + noise)
     sun_in_camera = known @ scene.camera_from_icrf.T @ scene.camera_from_mcmf @ scene.sun_mcmf
@@ -238,9 +236,7 @@ def _seen(
     return render(world.terrain, camera, position_mcmf_m, camera_from_mcmf, sun_mcmf, law).radiance, None
 
 
-def true_sun_direction(
-    world: World, position_mcmf_m: FloatArray, utc_ns: int, rng: np.random.Generator
-) -> FloatArray:
+def true_sun_direction(world: World, position_mcmf_m: FloatArray, utc_ns: int, rng: np.random.Generator) -> FloatArray:
     """Direction to the Sun in MCMF, unit (3,): drawn near the spacecraft as in the paper, or from the ephemeris."""
     light = world.scenario.light
     if light.mode == "paper":
@@ -279,9 +275,7 @@ class CatalogueDetector:
         sigma = np.full(sizes.size, _REDUCED_DETECTOR.stated_sigma_px)
         self._next = Detections(places[:, 0], places[:, 1], sizes, np.full(sizes.size, 0.9), sigma)
 
-    def examine(
-        self, image: NDArray[Any], sun_in_camera: FloatArray | None = None
-    ) -> tuple[ImageQuality, Detections]:
+    def examine(self, image: NDArray[Any], sun_in_camera: FloatArray | None = None) -> tuple[ImageQuality, Detections]:
         found, self._next = self._next, no_detections()
         if not image.size:
             return ImageQuality.INVALID, no_detections()
@@ -292,9 +286,7 @@ class CatalogueDetector:
         return ImageQuality.OK, found
 
 
-def craters_in_view(
-    world: World, exposure: Exposure, smallest_px: float
-) -> tuple[IntArray, FloatArray, FloatArray]:
+def craters_in_view(world: World, exposure: Exposure, smallest_px: float) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return the craters in an image: index, place (n, 2) and diameter (n,) in pixels; unknown heights are 0."""
     position = world.truth.positions_mcmf(exposure.utc_ns)[0]
     latitude, longitude, altitude = (float(value) for value in spherical_from_mcmf(position))

@@ -216,10 +216,7 @@ def external_scenario(scenario: Scenario, frames: ExternalFrames) -> Scenario:
         scenario,
         orbit=replace(scenario.orbit, oem=str(frames.ephemeris)),
         window=replace(
-            scenario.window,
-            search="none",
-            start=format_utc(int(frames.utc_ns[0])),
-            duration_s=duration_s + 1.0,
+            scenario.window, search="none", start=format_utc(int(frames.utc_ns[0])), duration_s=duration_s + 1.0
         ),
         light=replace(scenario.light, mode="real"),
         attitude=replace(scenario.attitude, pointing_error_deg=0.0),
@@ -233,9 +230,7 @@ def _table(folder: Path) -> tuple[IntArray, tuple[Path, ...]]:
         with path.open(encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError(
-            f"{path}: expected a table with columns file and utc, found none ({error})"
-        ) from None
+        raise ScenarioError(f"{path}: expected a table with columns file and utc, found none ({error})") from None
     times: list[int] = []
     files: list[Path] = []
     for line, row in enumerate(rows, start=2):
@@ -252,9 +247,7 @@ def _table(folder: Path) -> tuple[IntArray, tuple[Path, ...]]:
             raise ScenarioError(f"{path}, line {line}: expected the image {folder / name}, found none")
         if folder / name in files:
             first = files.index(folder / name) + 2
-            raise ScenarioError(
-                f"{path}, lines {first} and {line}: expected an image of its own, found {name} twice"
-            )
+            raise ScenarioError(f"{path}, lines {first} and {line}: expected an image of its own, found {name} twice")
         files.append(folder / name)
     if not files:
         raise ScenarioError(f"{path}: expected at least one frame, found none")
@@ -273,15 +266,9 @@ def _attitudes(folder: Path) -> tuple[IntArray, FloatArray, tuple[str, ...]]:
         if one.frame_a not in _INERTIAL:
             raise ScenarioError(f"{path}: expected REF_FRAME_A {' or '.join(_INERTIAL)}, found {one.frame_a}")
         if not one.frame_b.upper().startswith(CAMERA_NAMES):
-            raise ScenarioError(
-                f"{path}: expected REF_FRAME_B INSTRUMENT_1 (the camera), found {one.frame_b}"
-            )
+            raise ScenarioError(f"{path}: expected REF_FRAME_B INSTRUMENT_1 (the camera), found {one.frame_b}")
     scales = tuple(dict.fromkeys(one.time_system for one in segments))
-    return (
-        np.concatenate([one.utc_ns for one in segments]),
-        np.concatenate([one.q_wxyz for one in segments]),
-        scales,
-    )
+    return (np.concatenate([one.utc_ns for one in segments]), np.concatenate([one.q_wxyz for one in segments]), scales)
 
 
 def _only(folder: Path, pattern: str, what: str) -> Path:
@@ -298,6 +285,4 @@ def _between(first: FloatArray, second: FloatArray, share: float) -> FloatArray:
     angle = float(np.arccos(np.clip(abs(cosine), 0.0, 1.0)))
     if angle < 1e-9:
         return first
-    return np.asarray(
-        (np.sin((1.0 - share) * angle) * first + np.sin(share * angle) * second) / np.sin(angle)
-    )
+    return np.asarray((np.sin((1.0 - share) * angle) * first + np.sin(share * angle) * second) / np.sin(angle))

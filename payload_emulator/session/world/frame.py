@@ -68,11 +68,7 @@ class View:
 
 
 def render_frame(
-    scenario: Scenario,
-    data: DataFolder,
-    utc_ns: int,
-    renderer_name: str = "fast",
-    blender_python: str = sys.executable,
+    scenario: Scenario, data: DataFolder, utc_ns: int, renderer_name: str = "fast", blender_python: str = sys.executable
 ) -> Frame:
     """Return the image that the scenario's camera takes at an epoch, whatever the scenario's windows are.
 
@@ -156,12 +152,7 @@ def view_at(world: World, utc_ns: int) -> View:
     return View(utc_ns, position, world.camera_from_mcmf(position), sun)
 
 
-def take_frame(
-    world: World,
-    view: View,
-    renderer_name: str = "fast",
-    blender_python: str = sys.executable,
-) -> Frame:
+def take_frame(world: World, view: View, renderer_name: str = "fast", blender_python: str = sys.executable) -> Frame:
     """Take the frame of a view: rendered, exposed, labelled."""
     pose = (world.terrain, world.true_camera, view.position_mcmf_m, view.camera_from_mcmf, view.sun_mcmf)
     law, filmic_png = Photometry(world.scenario.light.photometry), b""

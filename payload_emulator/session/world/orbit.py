@@ -154,9 +154,7 @@ def propagate_from(
     return ScenarioOrbit(trajectory, maneuvers, model, epoch_utc_ns)
 
 
-def sample(
-    orbit: ScenarioOrbit, step_s: float, object_name: str = "SELENITA"
-) -> tuple[Ephemeris, FloatArray]:
+def sample(orbit: ScenarioOrbit, step_s: float, object_name: str = "SELENITA") -> tuple[Ephemeris, FloatArray]:
     """Return the ephemeris on a regular grid, a segment with states at its ends between burns; its states (n, 6)."""
     last_s = float(orbit.trajectory.elapsed_s[-1])
     steps = int(np.floor(last_s / step_s + 1e-9))

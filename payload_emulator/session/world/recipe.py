@@ -109,15 +109,12 @@ class Recipe:
 def _source_dict(source: dict[str, Any]) -> dict[str, Any]:
     """Return a source's values; of an ephemeris only the name, as its folder says nothing about the frames."""
     source = _without_defaults(
-        source,
-        {"sharpen": True, "footprint": "inside", "label_minimum_px": 5.0, "views": 1, "view_step_km": 24.5},
+        source, {"sharpen": True, "footprint": "inside", "label_minimum_px": 5.0, "views": 1, "view_step_km": 24.5}
     )
     if source["ephemeris"]:
         return source | {"ephemeris": Path(source["ephemeris"]).name}
     return {
-        key: value
-        for key, value in source.items()
-        if key not in ("ephemeris", "step_s", "days", "latitude_limit_deg")
+        key: value for key, value in source.items() if key not in ("ephemeris", "step_s", "days", "latitude_limit_deg")
     }
 
 
@@ -161,9 +158,7 @@ def load_recipe(path: Path) -> Recipe:
         raise DatasetError(f"{path}: dataset: expected a table, found {table!r}")
     sources = table.get("source", [])
     if not isinstance(sources, list) or not sources:
-        raise DatasetError(
-            f"{path}: dataset.source: expected at least one [[dataset.source]] table, found none"
-        )
+        raise DatasetError(f"{path}: dataset.source: expected at least one [[dataset.source]] table, found none")
     settings = {key: value for key, value in table.items() if key != "source"}
     for key in ("name", "seed"):
         if key not in settings:
@@ -194,9 +189,7 @@ def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
             raise DatasetError(f"{path}: {where}: {key}: expected a value, found none")
     splits = (*SPLITS, PAPER_SPLIT) if values.get("ephemeris") else SPLITS
     if values["split"] not in splits:
-        raise DatasetError(
-            f"{path}: {where}: split: expected one of {', '.join(splits)}, found {values['split']!r}"
-        )
+        raise DatasetError(f"{path}: {where}: split: expected one of {', '.join(splits)}, found {values['split']!r}")
     if "sharpen" in values and values["terrain"] != "real":
         raise DatasetError(
             f"{path}: {where}: sharpen: expected true or false on real terrain, found {values['sharpen']!r} "
@@ -207,9 +200,7 @@ def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
             values[key] = [_box(path, f"{where}: {key}", item) for item in values[key]]
     source = _read(path, where, Source, values)
     if not 1 <= source.views <= 20 or (source.views > 1 and source.ephemeris):
-        raise DatasetError(
-            f"{path}: {where}: views: expected 1 to 20, and 1 along an ephemeris, found {source.views}"
-        )
+        raise DatasetError(f"{path}: {where}: views: expected 1 to 20, and 1 along an ephemeris, found {source.views}")
     if not source.ephemeris:
         return source
     in_folder = path.parent / source.ephemeris
@@ -221,8 +212,6 @@ def _source(path: Path, number: int, table: Mapping[str, Any]) -> Source:
 
 def _box(path: Path, where: str, item: object) -> dict[str, float]:
     """Return the table of a box from its list of limits."""
-    if not (
-        isinstance(item, list) and len(item) == 4 and all(isinstance(value, (int, float)) for value in item)
-    ):
+    if not (isinstance(item, list) and len(item) == 4 and all(isinstance(value, (int, float)) for value in item)):
         raise DatasetError(f"{path}: {where}: expected [west, east, south, north] in degrees, found {item!r}")
     return dict(zip((limit.name for limit in fields(Box)), item, strict=True))

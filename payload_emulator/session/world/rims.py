@@ -32,9 +32,7 @@ def sources_of(scenario: Scenario, data: DataFolder) -> str:
     return repr((scenario.terrain, scenario.seed, stated))
 
 
-def rims_of(
-    scenario: Scenario, terrain: Terrain, craters: IntArray, watched: Watched = iter
-) -> CraterCatalogue:
+def rims_of(scenario: Scenario, terrain: Terrain, craters: IntArray, watched: Watched = iter) -> CraterCatalogue:
     """Return the craters of useful size with the heights of their rims: on the sphere, or measured on the ground.
 
     `watched` yields the parts of a long measurement and shows its progress.

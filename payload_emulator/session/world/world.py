@@ -25,27 +25,14 @@ from lunar.maneuvers import Maneuver
 from lunar.messages.ephemeris_files import load_orbit
 from lunar.plausible import HEIGHT_M
 from lunar.propagation import ForceModel
-from lunar.timescales import (
-    format_utc,
-    parse_utc,
-    tdb_s_from_utc_ns,
-    ticks_from_utc_ns,
-    utc_ns_from_tdb_s,
-)
+from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns, utc_ns_from_tdb_s
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import ReferenceSection, Scenario, WindowSection
 from payload_emulator.session.world.external import ExternalFrames, external_scenario
 from payload_emulator.session.world.orbit import force_model, propagate_from, propagate_to_impact
 from payload_emulator.session.world.rims import rims_of, sources_of
 from payload_emulator.sim.orbit.disturbances import TrueBurn, changed, executed, turned_state
-from payload_emulator.sim.orbit.truth import (
-    Crossing,
-    Truth,
-    find_crossings,
-    frame_times,
-    require_above_ground,
-    spliced,
-)
+from payload_emulator.sim.orbit.truth import Crossing, Truth, find_crossings, frame_times, require_above_ground, spliced
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.raster import RasterTerrain
 from payload_emulator.sim.terrain.registering import fitted
@@ -116,9 +103,7 @@ class World:
     def camera_from_mcmf(self, position_mcmf_m: FloatArray) -> FloatArray:
         """Rotation (3, 3) to the camera as it is meant to point from a position (3,)."""
         section = self.scenario.camera
-        return pointed_camera_from_mcmf(
-            position_mcmf_m, np.radians(section.tilt_deg), np.radians(section.yaw_deg)
-        )
+        return pointed_camera_from_mcmf(position_mcmf_m, np.radians(section.tilt_deg), np.radians(section.yaw_deg))
 
 
 _parsed_utc = functools.lru_cache(maxsize=16)(parse_utc)
@@ -158,9 +143,7 @@ def build_world(scenario: Scenario, data: DataFolder, external: ExternalFrames |
     return World(scenario, truth, terrain, model, burns, frame_utc_ns, names, ends=ends)
 
 
-def _external_world(
-    scenario: Scenario, external: ExternalFrames, terrain: Terrain, model: ForceModel
-) -> World:
+def _external_world(scenario: Scenario, external: ExternalFrames, terrain: Terrain, model: ForceModel) -> World:
     """Return the world of external frames."""
     ephemeris = load_orbit(external.ephemeris)
     truth = _truth_of_ephemeris(ephemeris, model.orientation)
@@ -197,9 +180,7 @@ def open_world(scenario: Scenario, data: DataFolder, *, is_declared: bool = Fals
     section = scenario.disturbances
     if scenario.orbit.oem or section.kidnap_distance_km > 0.0 or section.burn_delta_v_m_s != 0.0:
         found = "orbit.oem" if scenario.orbit.oem else "a kidnap or a burn in [disturbances]"
-        raise ScenarioError(
-            f"scenario {scenario.name}: expected an orbit to propagate without end, found {found}"
-        )
+        raise ScenarioError(f"scenario {scenario.name}: expected an orbit to propagate without end, found {found}")
     world = build_world(scenario, data)
     truth, burns, _ = _propagate(scenario, world.model, CHUNK_S / 86_400.0)
     reference = scenario.epoch_utc_ns if is_declared else world.clock_utc_ns
@@ -355,9 +336,7 @@ def _fly_to_windows(
         return truth, (), _windows(scenario, truth, terrain, max(not_before, truth.start_utc_ns)), ""
     reach_days = min(_SEARCH_CHUNK_DAYS, window.search_days)
     if window.search == "none":
-        reach_days = (
-            (not_before - scenario.epoch_utc_ns) / NS / 86_400.0 + window.duration_s / 86_400.0 + 0.01
-        )
+        reach_days = (not_before - scenario.epoch_utc_ns) / NS / 86_400.0 + window.duration_s / 86_400.0 + 0.01
     while True:
         truth, burns, impact = _propagate(scenario, model, reach_days)
         ends = "" if impact is None else str(impact)
@@ -402,9 +381,7 @@ def _band_rad(scenario: Scenario) -> tuple[float, float]:
     return float(np.radians(low_deg)), float(np.radians(high_deg))
 
 
-def _windows(
-    scenario: Scenario, truth: Truth, terrain: Terrain, not_before_utc_ns: int
-) -> list[tuple[int, int]]:
+def _windows(scenario: Scenario, truth: Truth, terrain: Terrain, not_before_utc_ns: int) -> list[tuple[int, int]]:
     window = scenario.window
     if window.search == "none":
         stop_utc_ns = not_before_utc_ns + round(window.duration_s * NS)

@@ -76,9 +76,7 @@ def parse_outage(text: str) -> Outage:
         The text has another form, or names no known station.
     """
     words = text.split()
-    fault = (
-        f"link.outages: expected STATION START STOP (UTC) with one of {', '.join(STATIONS)}, found {text!r}"
-    )
+    fault = f"link.outages: expected STATION START STOP (UTC) with one of {', '.join(STATIONS)}, found {text!r}"
     if len(words) != 3 or words[0] not in STATIONS:
         raise ScenarioError(fault)
     try:
@@ -110,9 +108,7 @@ def parse_clock_error(text: str) -> tuple[str, int]:
     return name, error_ns
 
 
-def plan_contacts(
-    ephemeris: Ephemeris, section: Geometry, start_utc_ns: int, stop_utc_ns: int
-) -> list[StationContact]:
+def plan_contacts(ephemeris: Ephemeris, section: Geometry, start_utc_ns: int, stop_utc_ns: int) -> list[StationContact]:
     """Return the contacts between two instants in order of time, one station at a time."""
     outages = [parse_outage(text) for text in (*section.outages, *section.missed)]
     seen: list[tuple[int, int, GroundStation]] = []

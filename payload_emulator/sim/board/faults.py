@@ -84,11 +84,7 @@ def parse_fault(text: str) -> Fault:
         ) from None
     kind = FAULT_KINDS.get(match["kind"])
     if kind is None:
-        raise ScenarioError(
-            f"fault {text!r}: expected one of {', '.join(FAULT_KINDS)}, found {match['kind']!r}"
-        )
+        raise ScenarioError(f"fault {text!r}: expected one of {', '.join(FAULT_KINDS)}, found {match['kind']!r}")
     if kind.lasts and lasts_s <= 0.0:
-        raise ScenarioError(
-            f"fault {text!r}: expected how long it lasts ('for SECONDS'), found no time above 0"
-        )
+        raise ScenarioError(f"fault {text!r}: expected how long it lasts ('for SECONDS'), found no time above 0")
     return Fault(kind.name, at_s, lasts_s, kind.size if size is None else size)

@@ -101,9 +101,7 @@ class Receiver:
     def take(self, packets: bytes) -> bytes:
         """Telecommand packets of a station, sent as it sends them and received here."""
         return b"".join(
-            self.decoder.decode(
-                self.station.encode(cut_packets(packets, packet_type=1).packets(packets))
-            ).packets
+            self.decoder.decode(self.station.encode(cut_packets(packets, packet_type=1).packets(packets))).packets
         )
 
     @property
@@ -158,15 +156,7 @@ class Transmitter:
         zone = self._zone(clcw is not None)
         stop = np.cumsum(lengths)
         self.dumps.append(
-            Dump(
-                octets,
-                virtual_channel,
-                utc_ns,
-                tuple(packets),
-                (stop - lengths) // zone,
-                (stop - 1) // zone,
-                light_s,
-            )
+            Dump(octets, virtual_channel, utc_ns, tuple(packets), (stop - lengths) // zone, (stop - 1) // zone, light_s)
         )
         assert int(self.dumps[-1].last[-1]) < frames
         return octets
@@ -283,11 +273,7 @@ def station(name: str, minimum_elevation_deg: float = 10.0) -> GroundStation:
         raise ScenarioError(f"link.stations: expected names of {', '.join(STATIONS)}, found {name!r}")
     latitude_deg, longitude_deg, height_m = STATIONS[name]
     return GroundStation(
-        name,
-        np.radians(latitude_deg),
-        np.radians(longitude_deg),
-        height_m,
-        np.radians(minimum_elevation_deg),
+        name, np.radians(latitude_deg), np.radians(longitude_deg), height_m, np.radians(minimum_elevation_deg)
     )
 
 
@@ -317,9 +303,7 @@ def light_to_earth_s(position_icrf_m: FloatArray, utc_ns: IntArray) -> FloatArra
     return np.asarray(np.linalg.norm(position_icrf_m - earth, axis=1) / SPEED_OF_LIGHT_M_S)
 
 
-def _bursts(
-    frames: int, section: LinkSection, bursting: bool, rng: np.random.Generator
-) -> tuple[BoolArray, bool]:
+def _bursts(frames: int, section: LinkSection, bursting: bool, rng: np.random.Generator) -> tuple[BoolArray, bool]:
     """Return whether each frame falls into a burst, and whether one goes on behind the last."""
     states = np.zeros(frames, dtype=np.bool_)
     for k, draw in enumerate(rng.random(frames).tolist()):
@@ -329,11 +313,7 @@ def _bursts(
 
 
 def _with_errors(
-    frames: OctetArray,
-    lost: BoolArray,
-    bit_error_rate: FloatArray,
-    settings: LinkSettings,
-    rng: np.random.Generator,
+    frames: OctetArray, lost: BoolArray, bit_error_rate: FloatArray, settings: LinkSettings, rng: np.random.Generator
 ) -> tuple[OctetArray, BoolArray, int, int]:
     """(frames that came, which of them cannot be repaired, symbols to repair in the others, wrong bits)."""
     came = frames[~lost].copy()

@@ -43,9 +43,7 @@ def turned_state(state: FloatArray, distance_m: float, heading_rad: float) -> Fl
     return np.concatenate([turn @ state[:3], turn @ state[3:]])
 
 
-def changed(
-    truth: Truth, utc_ns: int, change: Callable[[FloatArray], FloatArray], model: ForceModel
-) -> Truth:
+def changed(truth: Truth, utc_ns: int, change: Callable[[FloatArray], FloatArray], model: ForceModel) -> Truth:
     """The flight whose state (6,), ICRF, is changed at an instant and flown on from there without further burns."""
     at_s = float(tdb_s_from_utc_ns(utc_ns))
     state = change(truth.state_icrf(np.array([at_s]))[0])

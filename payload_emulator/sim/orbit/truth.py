@@ -14,12 +14,7 @@ from numpy.typing import ArrayLike
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.constants import MOON_RADIUS_M
-from lunar.frames import (
-    Orientation,
-    matrix_from_quaternion,
-    quaternion_from_matrix,
-    spherical_from_mcmf,
-)
+from lunar.frames import Orientation, matrix_from_quaternion, quaternion_from_matrix, spherical_from_mcmf
 from lunar.timescales import format_utc, tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError
 
@@ -102,9 +97,7 @@ class Spliced:
 
 
 def spliced(
-    before: Callable[[FloatArray], FloatArray],
-    joint_tdb_s: float,
-    after: Callable[[FloatArray], FloatArray],
+    before: Callable[[FloatArray], FloatArray], joint_tdb_s: float, after: Callable[[FloatArray], FloatArray]
 ) -> Spliced:
     """Return a trajectory that follows one function up to a joint and another one after it."""
     if isinstance(before, Spliced):
@@ -113,11 +106,7 @@ def spliced(
 
 
 def frame_times(
-    truth: Truth,
-    start_utc_ns: int,
-    stop_utc_ns: int,
-    interval_ns: int,
-    latitude_band_rad: tuple[float, float],
+    truth: Truth, start_utc_ns: int, stop_utc_ns: int, interval_ns: int, latitude_band_rad: tuple[float, float]
 ) -> IntArray:
     """UTC instants of the frames between two instants: one each interval, where the sub-satellite latitude allows."""
     times = np.arange(start_utc_ns, stop_utc_ns, interval_ns, dtype=np.int64)

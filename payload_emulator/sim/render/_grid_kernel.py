@@ -63,10 +63,7 @@ class Tiles(NamedTuple):
     shift: int
 
 
-@njit(
-    ahead="f4[:, ::1], Nodes(*4 * [f4[:, ::1]]), Tiles(f4[:, :, ::1], i4[:, ::1], i8), Grid(f8, f8, f8)",
-    **FAST,
-)
+@njit(ahead="f4[:, ::1], Nodes(*4 * [f4[:, ::1]]), Tiles(f4[:, :, ::1], i4[:, ::1], i8), Grid(f8, f8, f8)", **FAST)
 def fill_grid(heights: Float32Array, nodes: Nodes, tiles: Tiles, grid: Grid) -> None:
     """Fill ``heights`` with z of the ground in the tangent frame.
 
@@ -124,9 +121,7 @@ def _place_row(
 
 
 @njit(**FAST)
-def _read_row(
-    work: Float32Array, places: Int32Array, pool: Float32Array, table: Int32Array, columns: int
-) -> None:
+def _read_row(work: Float32Array, places: Int32Array, pool: Float32Array, table: Int32Array, columns: int) -> None:
     """Put the heights of the terrain at the places of a grid row into the buffer, bilinear."""
     flat = pool.ravel()
     tile_size = np.uint64(pool.shape[1] * pool.shape[2])

@@ -337,9 +337,7 @@ def _look_up_row(
 
 
 @njit(**INLINED)
-def _interpolate(
-    values: Float32Array, m: np.uint64, next_row: np.uint64, fi: np.float32, fj: np.float32
-) -> np.float32:
+def _interpolate(values: Float32Array, m: np.uint64, next_row: np.uint64, fi: np.float32, fj: np.float32) -> np.float32:
     """Return the value at fractions of row and column from place ``m`` of a grid stored as one line, bilinear."""
     next_one = np.uint64(1)
     top = values[m] + fj * (values[m + next_one] - values[m])
@@ -358,9 +356,7 @@ def _weights(fi: np.float32, fj: np.float32) -> tuple[np.float32, np.float32, np
 
 
 @njit(**INLINED)
-def _albedo_at(
-    albedo: NDArray[Any], slot: np.uint64, r: np.float32, c: np.float32, mask: np.uint64
-) -> np.float32:
+def _albedo_at(albedo: NDArray[Any], slot: np.uint64, r: np.float32, c: np.float32, mask: np.uint64) -> np.float32:
     """Return the albedo of a tile at row ``r`` and column ``c``, bilinear."""
     next_one = np.uint64(1)
     p = np.uint64(r)

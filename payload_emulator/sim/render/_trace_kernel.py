@@ -181,8 +181,7 @@ def find_hit(
 
 
 @njit(
-    ahead="f4[:, ::1], f4[:, ::1], f8, f8, Grid(f8, f8, f8), Viewpoint(f8, f8[:, ::1], f8, f8, f8), f4[:, ::1]",
-    **FAST,
+    ahead="f4[:, ::1], f4[:, ::1], f8, f8, Grid(f8, f8, f8), Viewpoint(f8, f8[:, ::1], f8, f8, f8), f4[:, ::1]", **FAST
 )
 def trace_pixels(
     heights: Float32Array,
@@ -256,12 +255,8 @@ def _nadir_pixel(viewpoint: Viewpoint, high: int, wide: int) -> tuple[int, int]:
     nadir_u = wide // 2
     nadir_v = high // 2
     if down > 0.05:
-        nadir_u = min(
-            max(int(viewpoint.centre_u_px - viewpoint.focal_px * rotation[2, 0] / down), 0), wide - 1
-        )
-        nadir_v = min(
-            max(int(viewpoint.centre_v_px - viewpoint.focal_px * rotation[2, 1] / down), 0), high - 1
-        )
+        nadir_u = min(max(int(viewpoint.centre_u_px - viewpoint.focal_px * rotation[2, 0] / down), 0), wide - 1)
+        nadir_v = min(max(int(viewpoint.centre_v_px - viewpoint.focal_px * rotation[2, 1] / down), 0), high - 1)
     return nadir_u, nadir_v
 
 
@@ -458,9 +453,7 @@ def trace_shifted(
             di = (rotation[0, 0] * right + rotation[0, 1] * below + rotation[0, 2]) * inverse
             dj = (rotation[1, 0] * right + rotation[1, 1] * below + rotation[1, 2]) * inverse
             dz = rotation[2, 0] * right + rotation[2, 1] * below + rotation[2, 2]
-            depth_along[v, u] = _search(
-                heights, peaks, i0, j0, viewpoint.altitude_m, di, dj, dz, 0.0, top, low
-            )
+            depth_along[v, u] = _search(heights, peaks, i0, j0, viewpoint.altitude_m, di, dj, dz, 0.0, top, low)
 
 
 @njit(**FAST)

@@ -101,9 +101,7 @@ def render_scene(scene: CyclesScene, settings: CyclesSettings, python: str = sys
     """
     with tempfile.TemporaryDirectory(prefix="linna-cycles-") as name:
         folder = Path(name)
-        scene_file, exr, png, cost = (
-            folder / file for file in ("scene.npz", "out.exr", "picture.png", "cost.json")
-        )
+        scene_file, exr, png, cost = (folder / file for file in ("scene.npz", "out.exr", "picture.png", "cost.json"))
         scene.save(scene_file, settings)
         # -P: the worker's own folder must not hide Blender's modules of the same names.
         _run([python, "-P", str(WORKER), str(scene_file), str(exr), str(png), str(cost)], python)
@@ -134,9 +132,7 @@ def rendering_of_passes(planes: dict[str, Image], scene: CyclesScene) -> Renderi
     direct = _plane(planes, "Diffuse Direct.R", "DiffDir.R")
     lit = np.where(ground & (cosine > GRAZING), np.clip(direct / np.maximum(cosine, GRAZING), 0.0, 1.0), 0.0)
     viewpoint = scene.camera_to_world[:3, 3]
-    offset = [
-        _plane(planes, f"Position.{axis}") - np.float32(e) for axis, e in zip("XYZ", viewpoint, strict=True)
-    ]
+    offset = [_plane(planes, f"Position.{axis}") - np.float32(e) for axis, e in zip("XYZ", viewpoint, strict=True)]
     range_m = 1e3 * np.sqrt(sum(plane.astype(np.float64) ** 2 for plane in offset))
     return Rendering(
         np.where(ground, _plane(planes, "Combined.R"), np.float32(0.0)).astype(np.float32),
@@ -184,14 +180,10 @@ def read_exr(path: Path) -> dict[str, npt.NDArray[np.float32]]:
         attributes, place = _attributes(octets, path)
         names = _channels(attributes["channels"], path)
         if attributes["compression"][0] != UNCOMPRESSED:
-            raise RendererError(
-                f"{path}: expected an uncompressed EXR, found method {attributes['compression'][0]}"
-            )
+            raise RendererError(f"{path}: expected an uncompressed EXR, found method {attributes['compression'][0]}")
         left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"])
     except (KeyError, IndexError, struct.error, ValueError) as error:
-        raise RendererError(
-            f"{path}: expected the header of an EXR file, found it damaged ({error})"
-        ) from None
+        raise RendererError(f"{path}: expected the header of an EXR file, found it damaged ({error})") from None
     wide, high = right - left + 1, bottom - top + 1
     line = np.dtype([("number", "<i4"), ("size", "<i4"), ("values", "<f4", (len(names), wide))])
     start = place + 8 * high
@@ -210,9 +202,7 @@ def _attributes(octets: bytes, path: Path) -> tuple[dict[str, bytes], int]:
     """Values of the header's attributes by name, and where the header ends."""
     magic, version = struct.unpack_from("<ii", octets)
     if magic != MAGIC or version & ~LONG_NAMES != 2:
-        raise RendererError(
-            f"{path}: expected a single-part EXR of version 2, found octets {octets[:8].hex()}"
-        )
+        raise RendererError(f"{path}: expected a single-part EXR of version 2, found octets {octets[:8].hex()}")
     attributes = {}
     place = 8
     while octets[place] != 0:

@@ -20,14 +20,7 @@ from payload_emulator.errors import RendererError, TerrainError
 from payload_emulator.sim.render.light import SUN_ANGULAR_RADIUS_RAD
 from payload_emulator.sim.render.photometry import Photometry
 from payload_emulator.sim.render.raymarch import height_above_ground_m, rays_window
-from payload_emulator.sim.terrain.tiles import (
-    ALBEDO_SHIFT,
-    MEAN_ALBEDO,
-    TILE_PIXELS,
-    TILE_SHIFT,
-    Terrain,
-    TerrainPatch,
-)
+from payload_emulator.sim.terrain.tiles import ALBEDO_SHIFT, MEAN_ALBEDO, TILE_PIXELS, TILE_SHIFT, Terrain, TerrainPatch
 
 Image = npt.NDArray[np.float32]
 

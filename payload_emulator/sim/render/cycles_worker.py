@@ -140,9 +140,7 @@ def _regolith(bpy: Any, scene_values: Any) -> Any:
     surface = nodes["Principled BSDF"]
     surface.inputs["Roughness"].default_value = float(scene_values["set_roughness"])
     surface.inputs["IOR"].default_value = float(scene_values["specular_ior"])
-    links.new(
-        _texture(bpy, nodes, "albedo", scene_values["albedo"]).outputs["Color"], surface.inputs["Base Color"]
-    )
+    links.new(_texture(bpy, nodes, "albedo", scene_values["albedo"]).outputs["Color"], surface.inputs["Base Color"])
     relief = nodes.new("ShaderNodeDisplacement")
     relief.space = "OBJECT"
     relief.inputs["Midlevel"].default_value = 0.5

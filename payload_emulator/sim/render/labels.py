@@ -68,9 +68,7 @@ class Labels:
         return self.index.size
 
 
-def view_radius_m(
-    camera: PinholeCamera, position_mcmf_m: npt.ArrayLike, camera_from_mcmf: npt.ArrayLike
-) -> float:
+def view_radius_m(camera: PinholeCamera, position_mcmf_m: npt.ArrayLike, camera_from_mcmf: npt.ArrayLike) -> float:
     """Ground distance from below the camera to the farthest ground in the picture, with room for relief of 5 km."""
     position = np.asarray(position_mcmf_m, dtype=np.float64)
     distance = float(np.linalg.norm(position))
@@ -108,9 +106,7 @@ def label_frame(
     local = catalogue.select(near)
     up = mcmf_from_spherical(local.latitude_rad, local.longitude_rad, 0.0) / MOON_RADIUS_M
     # A crater can only be in the picture if it is at one of the heights that ground has.
-    margin = (
-        0.5 * local.diameter_m / max(float(np.linalg.norm(position)) - MOON_RADIUS_M, 1.0e3) * camera.focal_px
-    )
+    margin = 0.5 * local.diameter_m / max(float(np.linalg.norm(position)) - MOON_RADIUS_M, 1.0e3) * camera.focal_px
     possible = np.zeros(near.size, dtype=bool)
     for height in (-4_000.0, 0.0, 4_000.0):
         uv = project_mcmf(camera, rotation, position, up * (MOON_RADIUS_M + height))
@@ -145,9 +141,7 @@ def project_craters(
     latitude, longitude, _ = spherical_from_mcmf(position)
     radius = view_radius_m(camera, position, rotation)
     largest = float(catalogue.diameter_m.max()) if len(catalogue) else 0.0
-    near = np.asarray(
-        catalogue.near(float(latitude), float(longitude), radius + 0.5 * largest), dtype=np.int64
-    )
+    near = np.asarray(catalogue.near(float(latitude), float(longitude), radius + 0.5 * largest), dtype=np.int64)
     near = near[catalogue.diameter_m[near] >= minimum_diameter_m]
     chosen = catalogue.select(near)
     centre, rim = _rim_points(chosen)
@@ -182,22 +176,17 @@ def project_craters(
         visible_fraction=within.mean(axis=1) if near.size else np.empty(0),
         lit_fraction=np.full(near.size, np.nan) if lit is None else _lit_fraction(rim_uv, centre_uv, lit),
         sight_fraction=(
-            np.full(near.size, np.nan)
-            if range_m is None
-            else _sight_fraction(rim_uv, within, distance, range_m)
+            np.full(near.size, np.nan) if range_m is None else _sight_fraction(rim_uv, within, distance, range_m)
         ),
     )
 
 
-def _rim_points(
-    catalogue: CraterCatalogue, tilt_m: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray]:
+def _rim_points(catalogue: CraterCatalogue, tilt_m: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
     """Centres (n, 3) and rims (n, 24, 3) in MCMF at rim height, on planes tilted by (n, 2) toward north and east."""
     height = np.nan_to_num(catalogue.rim_height_m, nan=0.0)
     latitude, longitude = catalogue.latitude_rad, catalogue.longitude_rad
     up = np.stack(
-        [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)],
-        axis=-1,
+        [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], axis=-1
     )
     east = np.stack([-np.sin(longitude), np.cos(longitude), np.zeros_like(longitude)], axis=-1)
     north = np.cross(up, east)

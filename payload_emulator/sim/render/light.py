@@ -16,9 +16,7 @@ def sun_direction_mcmf(
 ) -> FloatArray:
     """Unit vector (3,) to a Sun of this elevation and azimuth (from north, clockwise) at a place."""
     horizontal = math.cos(elevation_rad)
-    enu = np.array(
-        [horizontal * math.sin(azimuth_rad), horizontal * math.cos(azimuth_rad), math.sin(elevation_rad)]
-    )
+    enu = np.array([horizontal * math.sin(azimuth_rad), horizontal * math.cos(azimuth_rad), math.sin(elevation_rad)])
     return np.asarray(enu_from_mcmf(latitude_rad, longitude_rad).T @ enu)
 
 

@@ -63,9 +63,7 @@ class Photometry:
             h_one = 3.0 / (1.0 + 2.0 * math.sqrt(1.0 - w))
             normal = 0.5 * ((1.0 + HAPKE_SURGE) * 1.68 + h_one * h_one - 1.0)
             return np.asarray(
-                np.stack(
-                    [((1.0 + surge) * single - 1.0) / normal, np.zeros_like(g), np.full_like(g, 1.0 / normal)]
-                ),
+                np.stack([((1.0 + surge) * single - 1.0) / normal, np.zeros_like(g), np.full_like(g, 1.0 / normal)]),
                 dtype=np.float32,
             )
         phase = np.ones_like(g) if self.law == "matt" else np.exp(-self.phase_slope_per_rad * g)
@@ -75,9 +73,7 @@ class Photometry:
             degrees = np.degrees(g)
             # McEwen (1996, LPSC 27, 841): partition between Lommel-Seeliger and Lambert for the Moon.
             weight = np.clip(1.0 - 0.019 * degrees + 0.242e-3 * degrees**2 - 1.46e-6 * degrees**3, 0.0, 1.0)
-        return np.asarray(
-            np.stack([2.0 * weight * phase, (1.0 - weight) * phase, np.zeros_like(g)]), dtype=np.float32
-        )
+        return np.asarray(np.stack([2.0 * weight * phase, (1.0 - weight) * phase, np.zeros_like(g)]), dtype=np.float32)
 
     def over_lambert(self, mu0: Cosines, mu: Cosines, cos_phase: Cosines) -> Cosines:
         """Reflectance of this law over that of a matt Lambert surface of the same albedo, per place.

@@ -117,10 +117,7 @@ def _ground(patch: TerrainPatch) -> Ground:
 
 
 def rays_window(
-    camera: PinholeCamera,
-    position: FloatArray,
-    rotation: FloatArray,
-    sun: FloatArray,
+    camera: PinholeCamera, position: FloatArray, rotation: FloatArray, sun: FloatArray
 ) -> tuple[FloatArray, FloatArray, float]:
     """Places over all ground that any ray, toward the ground or on to the Sun, can pass, and their spacing."""
     edge = np.linspace(-0.5, 1.0, 9)

@@ -150,9 +150,7 @@ def photographed(
     )
     latitude, longitude, _ = spherical_from_mcmf(ground)
     brightness = terrain.brightness(latitude, longitude, sample_m)
-    return Rendering(
-        np.nan_to_num(brightness) * np.float32(PHOTOGRAPH_RADIANCE), rendering.lit, rendering.range_m
-    )
+    return Rendering(np.nan_to_num(brightness) * np.float32(PHOTOGRAPH_RADIANCE), rendering.lit, rendering.range_m)
 
 
 def _render_grid(
@@ -183,11 +181,7 @@ def _render_grid(
         lit,
     )
     shape = (camera.height_px, camera.width_px)
-    radiance, mask, range_m = (
-        np.empty(shape, np.float32),
-        np.empty(shape, np.float32),
-        np.empty(shape, np.float32),
-    )
+    radiance, mask, range_m = (np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32))
     place = Grid(grid.x0_m, grid.y0_m, grid.texel_m)
     viewpoint = Viewpoint(
         view.altitude_m,
@@ -243,10 +237,7 @@ def tangent_view(
     away = -toward / length
     frame = np.stack([away, np.cross(up, away), up])
     return View(
-        frame,
-        distance - MOON_RADIUS_M,
-        frame @ np.asarray(camera_from_mcmf, dtype=np.float64).T,
-        math.asin(sine),
+        frame, distance - MOON_RADIUS_M, frame @ np.asarray(camera_from_mcmf, dtype=np.float64).T, math.asin(sine)
     )
 
 
@@ -258,9 +249,7 @@ def places_of_tangent(
     with np.errstate(invalid="ignore"):
         z = np.sqrt(radius**2 - x_m**2 - y_m**2)
     point = np.stack(np.broadcast_arrays(x_m, y_m, z), axis=-1) @ view.tangent_from_mcmf
-    return np.arctan2(point[..., 2], np.hypot(point[..., 0], point[..., 1])), np.arctan2(
-        point[..., 1], point[..., 0]
-    )
+    return np.arctan2(point[..., 2], np.hypot(point[..., 0], point[..., 1])), np.arctan2(point[..., 1], point[..., 0])
 
 
 def _below(position_mcmf_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -291,9 +280,7 @@ def _penumbra(elevation_rad: float) -> float:
     return 0.5 * (high - math.tan(min(elevation_rad, 1.5) - SUN_ANGULAR_RADIUS_RAD))
 
 
-def _fit_grid(
-    terrain: Terrain, camera: PinholeCamera, view: View, level: int
-) -> tuple[TangentGrid, TangentGrid]:
+def _fit_grid(terrain: Terrain, camera: PinholeCamera, view: View, level: int) -> tuple[TangentGrid, TangentGrid]:
     """The rectangle that holds the ground in the picture as far as its border shows, and one that holds it surely."""
     low, high = -500.0, 500.0
     rays = _border_rays(camera, view)
@@ -421,9 +408,7 @@ def _sunward_grid(grid: TangentGrid, view: View) -> TangentGrid | None:
     return TangentGrid(grid.x0_m - grid.texel_m - (rows - 1) * texel, grid.y0_m - texel, texel, rows, columns)
 
 
-def _incoming_shadow(
-    grid: TangentGrid, sunward: TangentGrid, view: View, patch: TerrainPatch
-) -> tuple[Image, Image]:
+def _incoming_shadow(grid: TangentGrid, sunward: TangentGrid, view: View, patch: TerrainPatch) -> tuple[Image, Image]:
     """Height of the shadow that falls on the grid's first row from ground nearer the Sun, and how far its caster is."""
     from payload_emulator.sim.render._grid_kernel import sweep_shadows
 

@@ -119,18 +119,14 @@ def shape_craters(
     )
 
 
-def draw_power_law(
-    rng: np.random.Generator, count: int, low_m: float, high_m: float, exponent: float
-) -> FloatArray:
+def draw_power_law(rng: np.random.Generator, count: int, low_m: float, high_m: float, exponent: float) -> FloatArray:
     """Diameters (count,) between two limits with cumulative numbers falling as ``D ** -exponent``."""
     share = rng.random(count)
     low, high = low_m**-exponent, high_m**-exponent
     return np.asarray((low + share * (high - low)) ** (-1.0 / exponent))
 
 
-def draw_depth_ratio(
-    rng: np.random.Generator, count: int, quantiles: tuple[tuple[float, float], ...]
-) -> FloatArray:
+def draw_depth_ratio(rng: np.random.Generator, count: int, quantiles: tuple[tuple[float, float], ...]) -> FloatArray:
     """Depth over diameter (count,) by a table of (share, value)."""
     table = np.array(quantiles)
     return np.asarray(np.interp(rng.random(count), table[:, 0], table[:, 1]))
@@ -140,13 +136,7 @@ class SmallCraters:
     """Craters below the catalogue's limit, drawn cell by cell of one degree from the seed alone."""
 
     def __init__(
-        self,
-        seed: int,
-        low_m: float,
-        high_m: float,
-        per_km2: float,
-        exponent: float,
-        density: FloatArray | None = None,
+        self, seed: int, low_m: float, high_m: float, per_km2: float, exponent: float, density: FloatArray | None = None
     ) -> None:
         """``per_km2`` counts craters above ``low_m``; ``density`` (180, 360) scales it per cell, north first."""
         self.seed = seed
@@ -179,9 +169,7 @@ class SmallCraters:
         found = self._cells.get((row, column))
         if found is not None:
             return found
-        rng = np.random.Generator(
-            np.random.Philox(key=[self.seed & 0xFFFF_FFFF_FFFF_FFFF, row * 360 + column])
-        )
+        rng = np.random.Generator(np.random.Philox(key=[self.seed & 0xFFFF_FFFF_FFFF_FFFF, row * 360 + column]))
         count = int(rng.poisson(self._mean[row, column]))
         top, bottom = math.radians(90.0 - row), math.radians(89.0 - row)
         latitude = np.arcsin(rng.uniform(math.sin(bottom), math.sin(top), count))

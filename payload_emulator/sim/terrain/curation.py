@@ -172,10 +172,7 @@ class _Fit:
 
 
 def curate(
-    catalogue: CraterCatalogue,
-    heights: Heights,
-    region: Region = Region(),
-    rules: CurationRules = CurationRules(),
+    catalogue: CraterCatalogue, heights: Heights, region: Region = Region(), rules: CurationRules = CurationRules()
 ) -> Curation:
     """Return the anchoring catalogue of a region.
 
@@ -282,9 +279,7 @@ def _require_depths(craters: CraterCatalogue, fit: _Fit) -> None:
             )
 
 
-def _blocks(
-    craters: CraterCatalogue, heights: Heights
-) -> Iterator[tuple[IntArray, tuple[FloatArray, float, float]]]:
+def _blocks(craters: CraterCatalogue, heights: Heights) -> Iterator[tuple[IntArray, tuple[FloatArray, float, float]]]:
     """Yield rows of craters that lie in one block, with the heights about them."""
     latitude = np.degrees(craters.latitude_rad)
     longitude = np.mod(np.degrees(craters.longitude_rad), 360.0)
@@ -305,9 +300,7 @@ def _blocks(
             yield rows.astype(np.int64), window
 
 
-def _fitted(
-    craters: CraterCatalogue, ppd: float, window: FloatArray, top_deg: float, left_deg: float
-) -> FloatArray:
+def _fitted(craters: CraterCatalogue, ppd: float, window: FloatArray, top_deg: float, left_deg: float) -> FloatArray:
     """Return east, north, radius, rim height, depth, scatter, share of azimuths, sigma of the rim height, (8, n)."""
     count = len(craters)
     latitude, longitude = np.degrees(craters.latitude_rad), np.degrees(craters.longitude_rad)
@@ -463,11 +456,7 @@ class RasterHeights:
         values = np.asarray(layer.read(top, left, rows, columns), dtype=np.float64)
         if np.isfinite(values).any():
             values = _smoothed(values, SMOOTHING_PIXELS)
-        return (
-            values,
-            90.0 - (top + 0.5 + layer.north_offset) / ppd,
-            (left + 0.5 + layer.west_offset) / ppd,
-        )
+        return (values, 90.0 - (top + 0.5 + layer.north_offset) / ppd, (left + 0.5 + layer.west_offset) / ppd)
 
 
 def _smoothed(values: FloatArray, sigma: float) -> FloatArray:
@@ -478,7 +467,5 @@ def _smoothed(values: FloatArray, sigma: float) -> FloatArray:
     for axis in (0, 1):
         padded = np.pad(values, [(reach, reach) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
         size = values.shape[axis]
-        values = sum(
-            weight * np.take(padded, range(k, k + size), axis=axis) for k, weight in enumerate(kernel)
-        )
+        values = sum(weight * np.take(padded, range(k, k + size), axis=axis) for k, weight in enumerate(kernel))
     return np.asarray(values)

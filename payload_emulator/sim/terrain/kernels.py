@@ -112,12 +112,7 @@ def _component(h: np.uint32, shift: int) -> np.float32:
 
 @njit(ahead="f4[:, ::1], *4 * [f8], f4[:, ::1]", **FAST)
 def resample_cubic(
-    source: Float32Array,
-    first_row: float,
-    row_step: float,
-    first_column: float,
-    column_step: float,
-    out: Float32Array,
+    source: Float32Array, first_row: float, row_step: float, first_column: float, column_step: float, out: Float32Array
 ) -> None:
     """Fill ``out`` with ``source`` at rows ``first_row + i * row_step`` (and likewise columns), Catmull-Rom.
 
@@ -135,9 +130,7 @@ def resample_cubic(
         w2 = np.float32(0.5) * t * (t * (np.float32(4.0) - np.float32(3.0) * t) + np.float32(1.0))
         w3 = np.float32(0.5) * t * t * (t - np.float32(1.0))
         for j in range(width):
-            line[j] = (
-                w0 * source[k - 1, j] + w1 * source[k, j] + w2 * source[k + 1, j] + w3 * source[k + 2, j]
-            )
+            line[j] = w0 * source[k - 1, j] + w1 * source[k, j] + w2 * source[k + 1, j] + w3 * source[k + 2, j]
         for j in range(columns):
             c = first_column + j * column_step
             m = int(c)

@@ -56,9 +56,7 @@ def open_terrain(
         )
     if kind == "catalogue":
         if catalogue_path is None:
-            raise TerrainError(
-                f"terrain: expected a crater catalogue in {data.root or 'a data folder'}, found none"
-            )
+            raise TerrainError(f"terrain: expected a crater catalogue in {data.root or 'a data folder'}, found none")
         from lunar.catalogue import load_catalogue
         from payload_emulator.sim.terrain.procedural import ProceduralTerrain
 
@@ -73,17 +71,10 @@ def open_terrain(
     from payload_emulator.sim.terrain.raster import RasterTerrain
 
     assert catalogue_path is not None
-    chosen: dict[str, Any] = {
-        "name": data.own_heights or "LROC WAC GLD100",
-        **_moved(registration_north_east_m),
-    }
+    chosen: dict[str, Any] = {"name": data.own_heights or "LROC WAC GLD100", **_moved(registration_north_east_m)}
     if data.dem_sldem:
         # The smoothing is GLD100's; nothing is known against SLDEM2015 as it stands.
-        chosen |= {
-            "name": "SLDEM2015",
-            "smoothing_pixels": 0.0,
-            "effective_resolution_m": SLDEM_RESOLUTION_M,
-        }
+        chosen |= {"name": "SLDEM2015", "smoothing_pixels": 0.0, "effective_resolution_m": SLDEM_RESOLUTION_M}
     albedo = data.albedo_tiles or ((data.albedo,) if data.albedo else ())
     terrain = RasterTerrain(
         tiles,

@@ -30,11 +30,7 @@ class PhotographTerrain(RasterTerrain):
     """Height rasters and photographs of one ground, both shifted by the registration of the heights."""
 
     def __init__(
-        self,
-        paths: Sequence[Path | str],
-        photographs: Sequence[Path | str],
-        catalogue: CraterCatalogue,
-        **options: Any,
+        self, paths: Sequence[Path | str], photographs: Sequence[Path | str], catalogue: CraterCatalogue, **options: Any
     ) -> None:
         if not photographs:
             raise TerrainError("photographic terrain: expected at least one photograph, found none")
@@ -68,17 +64,13 @@ class PhotographTerrain(RasterTerrain):
                 out[lacking] = _sampled(layer, latitude[lacking], longitude[lacking], sample_m)
         return np.asarray(out / np.float32(self._full_scale))
 
-    def _on_raster(
-        self, latitude_rad: FloatArray, longitude_rad: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def _on_raster(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Places as the rasters are georeferenced, of places on the ground of this world."""
         latitude = latitude_rad - math.radians(self._shift_north_deg)
         return latitude, longitude_rad - self._shift_east_m / MOON_RADIUS_M / np.cos(latitude)
 
 
-def _sampled(
-    layer: RasterLayer, latitude_rad: FloatArray, longitude_rad: FloatArray, sample_m: float
-) -> Brightness:
+def _sampled(layer: RasterLayer, latitude_rad: FloatArray, longitude_rad: FloatArray, sample_m: float) -> Brightness:
     """Values of a layer at places (n,), cubic, after a mean over what one sample covers."""
     from scipy import ndimage
 

@@ -20,12 +20,7 @@ from payload_emulator.sim.terrain.craters import (
     fresh_depth_ratio,
     shape_craters,
 )
-from payload_emulator.sim.terrain.tiles import (
-    MEAN_ALBEDO,
-    Heights,
-    Terrain,
-    coarse_nodes,
-)
+from payload_emulator.sim.terrain.tiles import MEAN_ALBEDO, Heights, Terrain, coarse_nodes
 
 COARSE_STEP = 8
 """Long waves are computed at every eighth pixel and resampled."""
@@ -74,11 +69,7 @@ class ProceduralTerrain(Terrain):
     """The whole Moon from a seed, on 256 pixels per degree (118 m)."""
 
     def __init__(
-        self,
-        seed: int,
-        pixels_per_degree: int = 256,
-        cache_tiles: int = 192,
-        catalogue: CraterCatalogue | None = None,
+        self, seed: int, pixels_per_degree: int = 256, cache_tiles: int = 192, catalogue: CraterCatalogue | None = None
     ) -> None:
         """``catalogue`` takes the place of the synthetic one: its craters are stamped where and as large as it says.
 
@@ -121,9 +112,7 @@ class ProceduralTerrain(Terrain):
 
     def covers(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike) -> BoolArray:
         """Return whether the source itself holds each place: everywhere but within six degrees of the poles."""
-        latitude, _ = np.broadcast_arrays(
-            np.asarray(latitude_rad, dtype=np.float64), np.asarray(longitude_rad)
-        )
+        latitude, _ = np.broadcast_arrays(np.asarray(latitude_rad, dtype=np.float64), np.asarray(longitude_rad))
         return np.asarray(np.abs(latitude) < math.radians(83.0))
 
     def make_heights(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> Heights:
@@ -138,12 +127,7 @@ class ProceduralTerrain(Terrain):
         waves = [(km, rms, salt) for (km, rms), salt in zip(WAVES_KM, self._salts, strict=False)]
         long = [wave for wave in waves if wave[0] > COARSE_WAVE_PIXELS * pixel_km]
         short = [wave for wave in waves[len(long) :] if wave[0] > SHORTEST_WAVE_PIXELS * pixel_km]
-        angles = (
-            np.cos(node_latitude),
-            np.sin(node_latitude),
-            np.cos(node_longitude),
-            np.sin(node_longitude),
-        )
+        angles = (np.cos(node_latitude), np.sin(node_latitude), np.cos(node_longitude), np.sin(node_longitude))
         for wavelength, rms, salt in long:
             gain = even if wavelength > 300.0 else roughness
             kernels.add_noise(coarse, *angles, MOON_RADIUS_M / 1000.0 / wavelength, rms, salt, gain)
@@ -154,13 +138,9 @@ class ProceduralTerrain(Terrain):
         angles = (np.cos(latitude_rad), np.sin(latitude_rad), np.cos(longitude_rad), np.sin(longitude_rad))
         for wavelength, rms, salt in short:
             kernels.add_noise(out, *angles, MOON_RADIUS_M / 1000.0 / wavelength, rms, salt, gain)
-        stamp(
-            out, latitude_rad, longitude_rad, self._craters_about(latitude_rad, longitude_rad), self._profiles
-        )
+        stamp(out, latitude_rad, longitude_rad, self._craters_about(latitude_rad, longitude_rad), self._profiles)
         small = self.small_craters(latitude_rad, longitude_rad)
-        stamp(
-            out, latitude_rad, longitude_rad, small.above(SMALLEST_CRATER_PIXELS * 0.5 * step), self._profiles
-        )
+        stamp(out, latitude_rad, longitude_rad, small.above(SMALLEST_CRATER_PIXELS * 0.5 * step), self._profiles)
         return out
 
     def make_albedo(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> Heights:
@@ -177,9 +157,7 @@ class ProceduralTerrain(Terrain):
         # Rows beyond a pole are not used (see POLE_LIMIT_RAD); the clip only keeps the index in the map.
         top = math.floor(rows[0]) - 2
         height = math.ceil(rows[-1]) + 4 - top
-        source = self._plains[np.clip(np.arange(top, top + height), 0, 360)][
-            :, np.arange(left, left + width) % 720
-        ]
+        source = self._plains[np.clip(np.arange(top, top + height), 0, 360)][:, np.arange(left, left + width) % 720]
         out = np.empty((rows.size, columns.size), np.float32)
         kernels.resample_cubic(
             np.ascontiguousarray(source, dtype=np.float32),
@@ -203,11 +181,7 @@ class ProceduralTerrain(Terrain):
 
 
 def stamp(
-    out: Heights,
-    latitude: FloatArray,
-    longitude: FloatArray,
-    shapes: CraterShapes,
-    profiles: npt.NDArray[np.float32],
+    out: Heights, latitude: FloatArray, longitude: FloatArray, shapes: CraterShapes, profiles: npt.NDArray[np.float32]
 ) -> None:
     """Add craters to a tile of heights in place."""
     kernels.stamp_craters(
@@ -224,9 +198,7 @@ def stamp(
     )
 
 
-def mottled_albedo(
-    base: FloatArray, latitude: FloatArray, longitude: FloatArray, salts: list[int]
-) -> Heights:
+def mottled_albedo(base: FloatArray, latitude: FloatArray, longitude: FloatArray, salts: list[int]) -> Heights:
     """Normal albedo: a smooth map relative to the mean, with seeded mottling of 3 to 60 km."""
     angles = (np.cos(latitude), np.sin(latitude), np.cos(longitude), np.sin(longitude))
     mottle = np.zeros(base.shape, np.float32)
@@ -245,9 +217,7 @@ def _plains_map(salts: list[int]) -> npt.NDArray[np.float32]:
     field = np.zeros((361, 720), np.float32)
     even = np.ones_like(field)
     angles = (np.cos(latitude), np.sin(latitude), np.cos(longitude), np.sin(longitude))
-    for wavelength, rms, salt in zip(
-        (2600.0, 1200.0, 500.0, 200.0), (1.0, 0.7, 0.35, 0.15), salts, strict=False
-    ):
+    for wavelength, rms, salt in zip((2600.0, 1200.0, 500.0, 200.0), (1.0, 0.7, 0.35, 0.15), salts, strict=False):
         kernels.add_noise(field, *angles, MOON_RADIUS_M / 1000.0 / wavelength, rms, salt, even)
     weights = np.repeat(np.cos(latitude)[:, None], 720, axis=1).ravel()
     order = np.argsort(field, axis=None)

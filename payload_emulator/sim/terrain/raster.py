@@ -18,18 +18,9 @@ from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain import kernels
 from payload_emulator.sim.terrain.albedo import open_albedo
 from payload_emulator.sim.terrain.craters import SmallCraters, crater_profiles
-from payload_emulator.sim.terrain.procedural import (
-    SHORTEST_WAVE_PIXELS,
-    SMALLEST_CRATER_PIXELS,
-    mottled_albedo,
-    stamp,
-)
+from payload_emulator.sim.terrain.procedural import SHORTEST_WAVE_PIXELS, SMALLEST_CRATER_PIXELS, mottled_albedo, stamp
 from payload_emulator.sim.terrain.rasters import ChunkCache, RasterLayer, open_layers
-from payload_emulator.sim.terrain.tiles import (
-    Heights,
-    Terrain,
-    coarse_nodes,
-)
+from payload_emulator.sim.terrain.tiles import Heights, Terrain, coarse_nodes
 
 SMOOTHING_PIXELS = 1.0
 """GLD100 is quantised to 1 m, which shows as a weave under a low Sun; one pixel of smoothing removes it."""
@@ -136,9 +127,7 @@ class RasterTerrain(Terrain):
             if wavelength > shortest:
                 kernels.add_noise(out, *angles, MOON_RADIUS_M / 1000.0 / wavelength, rms, salt, gain)
         small = self.small_craters(latitude_rad, longitude_rad)
-        stamp(
-            out, latitude_rad, longitude_rad, small.above(SMALLEST_CRATER_PIXELS * 0.5 * step), self._profiles
-        )
+        stamp(out, latitude_rad, longitude_rad, small.above(SMALLEST_CRATER_PIXELS * 0.5 * step), self._profiles)
         return out
 
     def make_albedo(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> Heights:
@@ -171,9 +160,7 @@ class RasterTerrain(Terrain):
             )
         return result
 
-    def _from_layer(
-        self, layer: RasterLayer, latitude: FloatArray, longitude: FloatArray
-    ) -> tuple[Heights, Heights]:
+    def _from_layer(self, layer: RasterLayer, latitude: FloatArray, longitude: FloatArray) -> tuple[Heights, Heights]:
         """Smoothed heights of one layer and how much they count: 1 inside, falling to 0 at the edge of its data."""
         ppd = layer.pixels_per_degree
         middle = 0.5 * float(latitude[0] + latitude[-1])
@@ -230,12 +217,7 @@ class RasterTerrain(Terrain):
         # Cell (k, l) of the blur is centred half a step after node k + 1.
         out = np.empty((latitude.size, longitude.size), np.float32)
         kernels.resample_cubic(
-            np.ascontiguousarray(gain, dtype=np.float32),
-            top - 1.5,
-            1.0 / stride,
-            left - 1.5,
-            1.0 / stride,
-            out,
+            np.ascontiguousarray(gain, dtype=np.float32), top - 1.5, 1.0 / stride, left - 1.5, 1.0 / stride, out
         )
         return out
 

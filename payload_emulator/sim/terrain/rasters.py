@@ -139,12 +139,8 @@ class RasterFile:
         if self.warp is None or not inside.any():
             return np.asarray(inside)
         x, y = _applied(self.warp.transform, east[inside], row[inside] - self.row)
-        column_px, row_px = _applied(
-            self.warp.pixel_from_crs, *_transformed(self.warp.sphere, self.warp.crs, x, y)
-        )
-        inside[inside] = (
-            (row_px >= 0) & (row_px <= self.shape[0]) & (column_px >= 0) & (column_px <= self.shape[1])
-        )
+        column_px, row_px = _applied(self.warp.pixel_from_crs, *_transformed(self.warp.sphere, self.warp.crs, x, y))
+        inside[inside] = (row_px >= 0) & (row_px <= self.shape[0]) & (column_px >= 0) & (column_px <= self.shape[1])
         return np.asarray(inside)
 
 
@@ -216,9 +212,7 @@ class RasterLayer:
                     rows_px = np.arange(top, bottom, dtype=np.float64) - north
                     columns_px = np.arange(left, right, dtype=np.float64) - east
                     part = self._part(number, rows_px, columns_px)
-                    place = out[
-                        top - first_row : bottom - first_row, left - first_column : right - first_column
-                    ]
+                    place = out[top - first_row : bottom - first_row, left - first_column : right - first_column]
                     np.copyto(place, part, where=~np.isnan(part))
         return out
 
@@ -318,9 +312,7 @@ class RasterLayer:
         means = values[: rows * step, : columns * step].reshape(rows, step, columns, step).mean(axis=(1, 3))
         latitude = 90.0 - (file.row + corner[0] + (np.arange(rows) + 0.5) * step) / ppd
         longitude = (file.column + corner[1] + (np.arange(columns) + 0.5) * step) / ppd
-        row = np.rint((90.0 - latitude) * coarse.pixels_per_degree - 0.5 - coarse.north_offset).astype(
-            np.int64
-        )
+        row = np.rint((90.0 - latitude) * coarse.pixels_per_degree - 0.5 - coarse.north_offset).astype(np.int64)
         column = np.rint(longitude * coarse.pixels_per_degree - 0.5 - coarse.west_offset).astype(np.int64)
         window = coarse.read(row[0], column[0], row[-1] + 1 - row[0], column[-1] + 1 - column[0])
         relief = window[np.ix_(row - row[0], column - column[0])]
@@ -437,9 +429,7 @@ def _require_relief(file: RasterFile, reading: Reading, values: Heights, pixel_m
     )
 
 
-def _require_slopes(
-    file: RasterFile, reading: Reading, values: Heights, pixel_m: float, narrow: float
-) -> None:
+def _require_slopes(file: RasterFile, reading: Reading, values: Heights, pixel_m: float, narrow: float) -> None:
     """Refuse heights without a unit that are steeper than ground of the Moon is; columns are ``narrow`` pixels wide."""
     if reading.unit or pixel_m < SLOPE_BASE_M or min(values.shape) < 2 or narrow < _NARROW:
         return
@@ -496,12 +486,8 @@ def _stated(path: Path, source: Any, heights: bool) -> Reading:
             f"{path}: expected longitudes to the east, found {' '.join(found.group().split())!r}: GDAL reads them as "
             "longitudes to the east; project the image again with longitudes to the east"
         )
-    if (found := re.search(r"MAP_PROJECTION_ROTATION\s*=\s*([-0-9.eE+]+)", label)) and float(
-        found.group(1)
-    ) % 360.0:
-        raise TerrainError(
-            f"{path}: expected MAP_PROJECTION_ROTATION = 0, which GDAL takes, found {found.group(1)}"
-        )
+    if (found := re.search(r"MAP_PROJECTION_ROTATION\s*=\s*([-0-9.eE+]+)", label)) and float(found.group(1)) % 360.0:
+        raise TerrainError(f"{path}: expected MAP_PROJECTION_ROTATION = 0, which GDAL takes, found {found.group(1)}")
     nodata, kind = source.nodata, np.dtype(source.dtypes[0])
     if not heights:
         return Reading(nodata=nodata)
@@ -517,9 +503,7 @@ def _stated(path: Path, source: Any, heights: bool) -> Reading:
     scale, offset = source.scales[0] or 1.0, source.offsets[0] or 0.0
     words = f"unit {unit or 'not stated'}, scale {scale:g}, zero {offset:.8g}, no data {nodata}"
     if unit and unit not in UNITS_M:
-        raise TerrainError(
-            f"{path}: expected heights in a unit of length ({', '.join(UNITS_M)}), found {unit!r}"
-        )
+        raise TerrainError(f"{path}: expected heights in a unit of length ({', '.join(UNITS_M)}), found {unit!r}")
     if nodata is None and kind.kind == "i":
         nodata = float(np.iinfo(kind).min)  # no height of the Moon in any unit
     factor = UNITS_M.get(unit, 1.0)
@@ -646,8 +630,7 @@ def _transformed(source: Any, target: Any, x: FloatArray, y: FloatArray) -> tupl
         if x.size == 1:
             return np.array([math.inf]), np.array([math.inf])
         halves = [
-            _transformed(source, target, *part)
-            for part in zip(np.array_split(x, 2), np.array_split(y, 2), strict=True)
+            _transformed(source, target, *part) for part in zip(np.array_split(x, 2), np.array_split(y, 2), strict=True)
         ]
         east, north = (np.concatenate(part) for part in zip(*halves, strict=True))
     return np.asarray(east), np.asarray(north)
@@ -656,7 +639,4 @@ def _transformed(source: Any, target: Any, x: FloatArray, y: FloatArray) -> tupl
 def _applied(transform: Any, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return coordinates (n,) under an affine transform."""
     with np.errstate(invalid="ignore"):
-        return (
-            transform.a * x + transform.b * y + transform.c,
-            transform.d * x + transform.e * y + transform.f,
-        )
+        return (transform.a * x + transform.b * y + transform.c, transform.d * x + transform.e * y + transform.f)

@@ -69,9 +69,7 @@ def register(
             f"{catalogue}: expected clear rims of 4 to 16 km on {len(terrain)} rasters in the region, found none"
         )
     hashes = {path.name: file_sha256(path) for path in heights.files}
-    return replace(
-        fit_registration(rims), catalogue=file_sha256(catalogue), terrain=hashes, made_utc=made_utc
-    )
+    return replace(fit_registration(rims), catalogue=file_sha256(catalogue), terrain=hashes, made_utc=made_utc)
 
 
 def fitted(catalogue: CraterCatalogue, terrain: Sequence[Path]) -> Registration | None:

@@ -229,11 +229,7 @@ def clear_rims(
             & (np.hypot(east_m, north_m) <= _LARGEST_SHIFT * radius_m)
         )
     return Rims(
-        craters.latitude_rad[clear],
-        craters.longitude_rad[clear],
-        east_m[clear],
-        north_m[clear],
-        scatter_m[clear],
+        craters.latitude_rad[clear], craters.longitude_rad[clear], east_m[clear], north_m[clear], scatter_m[clear]
     )
 
 
@@ -247,14 +243,10 @@ def fit_registration(rims: Rims) -> Registration:
     row = np.degrees(rims.latitude_rad) / LATTICE_DEG
     column = np.mod(np.degrees(rims.longitude_rad), 360.0) / LATTICE_DEG
     turn = round(360.0 / LATTICE_DEG)
-    corners = [
-        np.stack([np.floor(row) + i, np.mod(np.floor(column) + j, turn)]) for i in (0, 1) for j in (0, 1)
-    ]
+    corners = [np.stack([np.floor(row) + i, np.mod(np.floor(column) + j, turn)]) for i in (0, 1) for j in (0, 1)]
     nodes = np.unique(np.concatenate(corners, axis=1).astype(np.int64), axis=1)
     nearest = np.stack([np.rint(row), np.mod(np.rint(column), turn)]).astype(np.int64)
-    count = np.array(
-        [np.count_nonzero(np.all(nearest == node[:, None], axis=0)) for node in nodes.T], np.int64
-    )
+    count = np.array([np.count_nonzero(np.all(nearest == node[:, None], axis=0)) for node in nodes.T], np.int64)
     places = _unit(np.radians(nodes[0] * LATTICE_DEG), np.radians(nodes[1] * LATTICE_DEG))
     cells, mean, variance = _cells(rims)
     prior = _alike(cells, cells) + np.diag(variance)
@@ -291,9 +283,7 @@ def _means(cell: IntArray, shift: FloatArray, sigma: FloatArray) -> tuple[FloatA
     weight = 1.0 / sigma**2
     for step in range(16):
         total = np.bincount(cell, weight)
-        mean = (
-            np.stack([np.bincount(cell, weight * shift[:, axis]) for axis in (0, 1)], axis=1) / total[:, None]
-        )
+        mean = np.stack([np.bincount(cell, weight * shift[:, axis]) for axis in (0, 1)], axis=1) / total[:, None]
         if step == 15:
             break
         square = np.sum((shift - mean[cell]) ** 2, axis=1) / sigma**2
@@ -304,9 +294,7 @@ def _means(cell: IntArray, shift: FloatArray, sigma: FloatArray) -> tuple[FloatA
 
 def _unit(latitude_rad: FloatArray, longitude_rad: FloatArray) -> FloatArray:
     level = np.cos(latitude_rad)
-    return np.stack(
-        [level * np.cos(longitude_rad), level * np.sin(longitude_rad), np.sin(latitude_rad)], axis=-1
-    )
+    return np.stack([level * np.cos(longitude_rad), level * np.sin(longitude_rad), np.sin(latitude_rad)], axis=-1)
 
 
 def _alike(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -358,9 +346,7 @@ def parse_registration(text: str, source: str) -> Registration:
     except json.JSONDecodeError as error:
         raise TerrainError(f"{source}: expected a registration (JSON), found {error}") from None
     if not isinstance(head, dict) or head.get("kind") != "registration":
-        raise TerrainError(
-            f"{source}: expected a registration made by linna catalogue register, found another file"
-        )
+        raise TerrainError(f"{source}: expected a registration made by linna catalogue register, found another file")
     for name, expected in (("version", VERSION), ("lattice_deg", LATTICE_DEG), ("columns", list(_COLUMNS))):
         if head.get(name) != expected:
             raise TerrainError(f"{source}: expected {name} {expected}, found {head.get(name)}; make it again")
@@ -372,19 +358,13 @@ def parse_registration(text: str, source: str) -> Registration:
             f"{source}: expected nodes of {len(_COLUMNS)} numbers and two hashes, found {error}"
         ) from None
     if not np.all(np.isfinite(rows)) or np.any(rows[:, 4] <= 0.0) or np.any(rows[:, 5] < 0.0):
-        raise TerrainError(
-            f"{source}: expected finite shifts, positive sigma_m and counts of rims, found others"
-        )
+        raise TerrainError(f"{source}: expected finite shifts, positive sigma_m and counts of rims, found others")
     places, shifts = rows[:, :2] / LATTICE_DEG, np.abs(rows[:, 2:4])
     is_lattice = np.all(np.abs(places - np.rint(places)) < 1e-6) and np.all(np.abs(rows[:, 0]) <= 90.0)
     if not is_lattice or len(np.unique(rows[:, :2], axis=0)) < len(rows):
-        raise TerrainError(
-            f"{source}: expected each node of the lattice of {LATTICE_DEG:g} deg once, found others"
-        )
+        raise TerrainError(f"{source}: expected each node of the lattice of {LATTICE_DEG:g} deg once, found others")
     if shifts.size and shifts.max() > MAP_SHIFT_M:
-        raise TerrainError(
-            f"{source}: expected shifts of at most {MAP_SHIFT_M:g} m, found {shifts.max():.6g} m"
-        )
+        raise TerrainError(f"{source}: expected shifts of at most {MAP_SHIFT_M:g} m, found {shifts.max():.6g} m")
     row, column = np.rint(rows[:, :2].T / LATTICE_DEG).astype(np.int64)
     return Registration(
         row,

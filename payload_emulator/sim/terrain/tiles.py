@@ -91,9 +91,7 @@ class TerrainPatch:
     low_m: float
     high_m: float
 
-    def coordinates(
-        self, latitude_rad: FloatArray, longitude_rad: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def coordinates(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixel coordinates (row, column) of places within the window; integers are pixel centres."""
         rows = (0.5 * math.pi - latitude_rad) * self.pixels_per_radian - 0.5 - self.first_row
         middle = (self.first_column + 0.5 * self.table.shape[1] * TILE_PIXELS) / self.pixels_per_radian
@@ -228,9 +226,7 @@ class Terrain(ABC):
                 "the view is too wide or too near a pole"
             )
         self._room = max(self._room, count)
-        keys = [
-            (level, top + row, (left + column) % tile_columns) for row, column in np.argwhere(wanted).tolist()
-        ]
+        keys = [(level, top + row, (left + column) % tile_columns) for row, column in np.argwhere(wanted).tolist()]
         for key in keys:
             if key in self._slots:
                 self._slots.move_to_end(key)
@@ -254,9 +250,7 @@ class Terrain(ABC):
         sizes = [math.pi * MOON_RADIUS_M / (rows * TILE_PIXELS) for rows in self._level_rows]
         return next((level for level, size in enumerate(sizes) if size >= 0.75 * sample_m), LEVELS - 1)
 
-    def height_m(
-        self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike, level: int = 0
-    ) -> FloatArray:
+    def height_m(self, latitude_rad: npt.ArrayLike, longitude_rad: npt.ArrayLike, level: int = 0) -> FloatArray:
         """Height above the map sphere (...) in metres, bilinear on the grid of a level; places may lie far apart."""
         from payload_emulator.sim.terrain import kernels
 
@@ -266,9 +260,7 @@ class Terrain(ABC):
         out = np.empty(latitude.size)
         flat_latitude, flat_longitude = latitude.ravel(), longitude.ravel()
         # Blocks of 4 x 4 tiles: few calls, and no window wider than the cache.
-        block_row = np.floor(
-            (0.5 * math.pi - flat_latitude) * self.pixels_per_radian / (4 * TILE_PIXELS << level)
-        )
+        block_row = np.floor((0.5 * math.pi - flat_latitude) * self.pixels_per_radian / (4 * TILE_PIXELS << level))
         block_column = np.floor(flat_longitude * self.pixels_per_radian / (4 * TILE_PIXELS << level))
         blocks, block = np.unique(block_row * 1.0e6 + block_column, return_inverse=True)
         for number in range(blocks.size):
@@ -311,9 +303,7 @@ class Terrain(ABC):
             return
         latitude = self.catalogue.latitude_rad[indices]
         indices = indices[np.abs(latitude) < POLE_LIMIT_RAD - 0.05]
-        order = np.lexsort(
-            (self.catalogue.longitude_rad[indices], np.round(self.catalogue.latitude_rad[indices], 1))
-        )
+        order = np.lexsort((self.catalogue.longitude_rad[indices], np.round(self.catalogue.latitude_rad[indices], 1)))
         parts = np.array_split(indices[order], max(1, indices.size // 256))
         # From west to east, so that each tile and each cell of small craters is made once.
         for part in sorted(parts, key=lambda one: self.catalogue.longitude_rad[one[:1]].tolist()):
@@ -325,9 +315,9 @@ class Terrain(ABC):
             azimuth = _azimuths(RIM_AZIMUTHS)
             tilt = 2.0 / RIM_AZIMUTHS * around @ np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
             rings = [
-                self.height_m(
-                    *_circle(latitude, longitude, fraction * radius, FLOOR_AZIMUTHS), MEASURE_LEVEL
-                ).mean(axis=1)
+                self.height_m(*_circle(latitude, longitude, fraction * radius, FLOOR_AZIMUTHS), MEASURE_LEVEL).mean(
+                    axis=1
+                )
                 for fraction in (0.1, 0.22, 0.34)
             ]
             # Rings stand for equal-width annuli of the inner 0.4 radius: weights are their areas.

@@ -29,13 +29,7 @@ from payload_emulator.session.world.recipe import Recipe, Source
 from payload_emulator.training.data import dataset as store
 from payload_emulator.training.data.finishing import write_index
 from payload_emulator.training.data.frames import describe, take_frame
-from payload_emulator.training.data.shots import (
-    Place,
-    draw_box,
-    draw_pose,
-    pose_at,
-    view_position_mcmf_m,
-)
+from payload_emulator.training.data.shots import Place, draw_box, draw_pose, pose_at, view_position_mcmf_m
 from payload_emulator.training.data.track import Track, lay_track
 
 _FOLDERS = ("images", "metadata", "shards")
@@ -84,12 +78,7 @@ def plan_shards(recipe: Recipe, frames: int, tracks: Mapping[str, Track] | None 
 
 
 def build(
-    recipe: Recipe,
-    folder: Path,
-    frames: int,
-    data: DataFolder,
-    workers: int = 1,
-    blender_python: str = sys.executable,
+    recipe: Recipe, folder: Path, frames: int, data: DataFolder, workers: int = 1, blender_python: str = sys.executable
 ) -> Iterator[tuple[int, int]]:
     """Make or finish a data set; yields (frames done, frames in all) after every shard.
 
@@ -123,8 +112,7 @@ def build(
                 done += shard.frames
                 yield done, total
             hashes = {
-                shard.name: hashlib.sha256(_shard_path(folder, shard).read_bytes()).hexdigest()
-                for shard in shards
+                shard.name: hashlib.sha256(_shard_path(folder, shard).read_bytes()).hexdigest() for shard in shards
             }
             write_index(folder, recipe, total, hashes, _data_names(recipe, data))
         except OSError as error:
@@ -157,18 +145,12 @@ def make_shard(
         first = shots[k - view] if view else None
 
         def pose_of(
-            generator: np.random.Generator,
-            k: int = k,
-            number: int = number,
-            view: int = view,
-            first: Any = first,
+            generator: np.random.Generator, k: int = k, number: int = number, view: int = view, first: Any = first
         ) -> Any:
             if place is not None and first is None:
                 return draw_pose(terrain, camera, source, place, generator)
             position = (
-                np.array(shard.position_mcmf_m[k])
-                if first is None
-                else view_position_mcmf_m(source, first.pose, view)
+                np.array(shard.position_mcmf_m[k]) if first is None else view_position_mcmf_m(source, first.pose, view)
             )
             return pose_at(terrain, camera, source, position, f"frame {number}", generator)
 
@@ -216,8 +198,7 @@ def _make(
     pool = ProcessPoolExecutor(min(workers, len(todo)), mp_context=context, initializer=_follow_parent)
     try:
         running: dict[Future[None], Sequence[Shard]] = {
-            pool.submit(_make_run, recipe, run, folder, data_root, blender_python): run
-            for run in _runs(todo, workers)
+            pool.submit(_make_run, recipe, run, folder, data_root, blender_python): run for run in _runs(todo, workers)
         }
         for finished in as_completed(running):
             finished.result()
@@ -235,9 +216,7 @@ def _runs(todo: Sequence[Shard], workers: int) -> Iterator[Sequence[Shard]]:
         yield from (shards[first : first + longest] for first in range(0, len(shards), longest))
 
 
-def _make_run(
-    recipe: Recipe, shards: Sequence[Shard], folder: Path, data_root: str, blender_python: str
-) -> None:
+def _make_run(recipe: Recipe, shards: Sequence[Shard], folder: Path, data_root: str, blender_python: str) -> None:
     for shard in shards:
         make_shard(recipe, shard, folder, data_root, blender_python)
 
@@ -262,9 +241,7 @@ def _wanted(recipe: Recipe, frames: int) -> list[tuple[Source, int]]:
     """Return the number of frames of each source."""
     total = sum(source.share for source in recipe.sources)
     if frames < len(recipe.sources) or total <= 0.0:
-        raise DatasetError(
-            f"data set: expected at least one frame per source ({len(recipe.sources)}), found {frames}"
-        )
+        raise DatasetError(f"data set: expected at least one frame per source ({len(recipe.sources)}), found {frames}")
     return [(source, max(1, round(frames * source.share / total))) for source in recipe.sources]
 
 

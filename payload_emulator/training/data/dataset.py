@@ -133,9 +133,7 @@ class Dataset:
         try:
             self.index: dict[str, Any] = json.loads(index.read_text(encoding="utf-8"))
         except FileNotFoundError:
-            found = (
-                "an unfinished one: build it again to go on" if (folder / "recipe.json").is_file() else "none"
-            )
+            found = "an unfinished one: build it again to go on" if (folder / "recipe.json").is_file() else "none"
             raise DatasetError(f"{folder}: expected a data set (dataset.json), found {found}") from None
         except (OSError, ValueError) as error:
             raise DatasetError(f"{index}: expected a JSON object, found: {error}") from error
@@ -177,9 +175,7 @@ class Dataset:
 
     def frames(self, split: str = "", source: str = "") -> list[Frame]:
         """Frames of a split and a source; every one where not named."""
-        return [
-            f for f in self._frames if (not split or f.split == split) and (not source or f.source == source)
-        ]
+        return [f for f in self._frames if (not split or f.split == split) and (not source or f.source == source)]
 
     def is_scored(self, frame: Frame, latitude_deg: FloatArray, longitude_deg: FloatArray) -> BoolArray:
         """Return whether places count in the scores of a frame: all, or only the middle in a box."""
@@ -231,9 +227,7 @@ def choose_tiers(
     span = FULL_WEIGHT_DEPTH_RATIO - LABEL_MINIMUM_DEPTH_RATIO
     grown = (craters["depth_ratio"] - LABEL_MINIMUM_DEPTH_RATIO) / span
     weight = np.clip(LABEL_LEAST_WEIGHT + (1.0 - LABEL_LEAST_WEIGHT) * grown, LABEL_LEAST_WEIGHT, 1.0)
-    return np.where(label, Tier.LABEL, Tier.IGNORE).astype(np.int8), np.nan_to_num(
-        weight, nan=LABEL_LEAST_WEIGHT
-    )
+    return np.where(label, Tier.LABEL, Tier.IGNORE).astype(np.int8), np.nan_to_num(weight, nan=LABEL_LEAST_WEIGHT)
 
 
 def frame_truth(dataset: Dataset, frame: Frame) -> FrameTruth:
@@ -257,11 +251,7 @@ def frame_truth(dataset: Dataset, frame: Frame) -> FrameTruth:
 
 
 def diameter_on_ground_m(
-    dataset: Dataset,
-    frame: Frame,
-    u_px: FloatArray,
-    v_px: FloatArray,
-    diameter_px: FloatArray,
+    dataset: Dataset, frame: Frame, u_px: FloatArray, v_px: FloatArray, diameter_px: FloatArray
 ) -> FloatArray:
     """Diameters that a payload knowing its altitude above the mean ground gives to detections of the frame."""
     camera = dataset.camera

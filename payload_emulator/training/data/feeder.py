@@ -134,9 +134,7 @@ def _vary_tone(
 @functools.cache
 def _noise() -> NDArray[np.float32]:
     """One large picture of unit noise; crops take a window of it, which is ten times quicker than drawing again."""
-    return np.random.Generator(np.random.PCG64(5)).standard_normal(
-        (_NOISE_SIZE, _NOISE_SIZE), dtype=np.float32
-    )
+    return np.random.Generator(np.random.PCG64(5)).standard_normal((_NOISE_SIZE, _NOISE_SIZE), dtype=np.float32)
 
 
 LEAST_CROP_DIAMETER_PX = 8.0
@@ -189,18 +187,13 @@ class Feeder:
     """Crops by number: crop k of a run is the same whatever thread asks for it."""
 
     def __init__(
-        self,
-        frames: Sequence[tuple[Dataset, Frame]],
-        images: list[OctetArray],
-        parameters: TrainParameters,
+        self, frames: Sequence[tuple[Dataset, Frame]], images: list[OctetArray], parameters: TrainParameters
     ) -> None:
         self.frames = frames
         self.images = images
         self.parameters = parameters
         least_px = LABEL_MINIMUM_DIAMETER_PX / parameters.enlarge
-        self.tiers = [
-            choose_tiers(f.craters, d.width_px, d.height_px, f.complete, least_px) for d, f in frames
-        ]
+        self.tiers = [choose_tiers(f.craters, d.width_px, d.height_px, f.complete, least_px) for d, f in frames]
 
     def batch(self, first: int, count: int) -> dict[str, NDArray[Any]]:
         """Arrays of `count` crops from crop number `first` on."""
@@ -234,9 +227,9 @@ class Feeder:
             & (crop.v_px < p.crop_px + margin)
         )
         inside = (crop.u_px > 1) & (crop.u_px < p.crop_px - 2) & (crop.v_px > 1) & (crop.v_px < p.crop_px - 2)
-        tier = np.where(
-            inside & (crop.diameter_px >= LEAST_CROP_DIAMETER_PX / p.enlarge), tiers, Tier.IGNORE
-        ).astype(np.int8)[near]
+        tier = np.where(inside & (crop.diameter_px >= LEAST_CROP_DIAMETER_PX / p.enlarge), tiers, Tier.IGNORE).astype(
+            np.int8
+        )[near]
         emphasis = np.clip(p.enlarge * crop.diameter_px / EVEN_DIAMETER_PX, LEAST_EMPHASIS, MOST_EMPHASIS)
         weights = weights * np.where(craters["id"] < 0, STAMPED_EMPHASIS, 1.0) * emphasis
         targets = make_targets(

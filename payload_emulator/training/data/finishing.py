@@ -32,9 +32,7 @@ RIM_VERTICES = 32
 """Number of vertices of a rim polygon, plus its extreme points: the area is at most 0.6 % too small."""
 
 
-def write_index(
-    folder: Path, recipe: Recipe, frames: int, shards: dict[str, str], data_names: Sequence[str]
-) -> None:
+def write_index(folder: Path, recipe: Recipe, frames: int, shards: dict[str, str], data_names: Sequence[str]) -> None:
     """Write the COCO files and, last, dataset.json with the hashes of them and of the shards."""
     files = _write_coco(folder, recipe, sorted(shards))
     index = {
@@ -85,9 +83,7 @@ class _CocoFile:
         self._digest = hashlib.sha256()
         self._images: list[tuple[int, float]] = []
         self._count = 0
-        categories = [
-            {"id": number + FIRST_ID, "name": name, "supercategory": "crater"} for number, name in CATEGORIES
-        ]
+        categories = [{"id": number + FIRST_ID, "name": name, "supercategory": "crater"} for number, name in CATEGORIES]
         head = {
             "info": {"description": recipe.name, "version": str(SCHEMA_VERSION)},
             "licenses": [],
@@ -152,13 +148,7 @@ def _annotations(frame: Frame, width_px: int, height_px: int) -> Iterator[dict[s
             "iscrowd": 0,
             "centre": [round(u, 3), round(v, 3)],
             "diameter": round(d, 3),
-            "ellipse": [
-                round(u, 3),
-                round(v, 3),
-                round(a, 3),
-                round(b, 3),
-                round(math.degrees(angle), 2),
-            ],
+            "ellipse": [round(u, 3), round(v, 3), round(a, 3), round(b, 3), round(math.degrees(angle), 2)],
             "visible": round(float(craters["visible"][k]), 3),
             "crater_id": int(craters["id"][k]),
             "depth_ratio": round(float(np.nan_to_num(craters["depth_ratio"][k])), 4),

@@ -64,12 +64,7 @@ def take_frame(
             sun = sun_mcmf
             elevation, azimuth = sun_angles(sun, pose.latitude_rad, pose.longitude_rad)
         rendering = render(
-            terrain,
-            camera,
-            pose.position_mcmf_m,
-            pose.camera_from_mcmf,
-            sun,
-            draw_photometry(source.vary, rng),
+            terrain, camera, pose.position_mcmf_m, pose.camera_from_mcmf, sun, draw_photometry(source.vary, rng)
         )
         image, coarse = _exposed(rendering.radiance, draw_sensor(source.vary, rng), recipe, rng)
         if prepare_image(coarse).quality is ImageQuality.OK:
@@ -93,12 +88,7 @@ def take_frame(
 
 
 def describe(
-    camera: PinholeCamera,
-    shot: Shot,
-    source: Source,
-    split: str,
-    terrain: Any,
-    utc_ns: int | None = None,
+    camera: PinholeCamera, shot: Shot, source: Source, split: str, terrain: Any, utc_ns: int | None = None
 ) -> dict[str, Any]:
     """Metadata of a frame for its JSON file; angles in degrees."""
     pose, row = shot.pose, shot.row
@@ -150,18 +140,14 @@ def _exposed(
     return (picture if in_colour else deep), (deep >> 8).astype(np.uint8)
 
 
-def _label(
-    terrain: Any, camera: PinholeCamera, pose: Pose, rendering: Any, least_px: float
-) -> dict[str, NDArray[Any]]:
+def _label(terrain: Any, camera: PinholeCamera, pose: Pose, rendering: Any, least_px: float) -> dict[str, NDArray[Any]]:
     """Catalogued craters in view with what scoring and training need to know of each."""
     from payload_emulator.sim.render.labels import label_frame
 
     position, rotation = pose.position_mcmf_m, pose.camera_from_mcmf
     # No crater of fewer metres has `least_px` even on the highest ground straight below; tilt is a few degrees at most.
     resolved_m = 0.95 * least_px * (pose.altitude_m - HEIGHT_M.high) / camera.focal_px
-    labels = label_frame(
-        terrain, camera, position, rotation, max(_LABEL_MINIMUM_M, resolved_m), rendering.lit
-    )
+    labels = label_frame(terrain, camera, position, rotation, max(_LABEL_MINIMUM_M, resolved_m), rendering.lit)
     measured = terrain.measured(labels.index)
     points = (measured.position_mcmf_m - position) @ rotation.T
     diameter_px = camera.focal_px * measured.diameter_m / points[:, 2]
@@ -219,9 +205,7 @@ def stamped_craters(
     rim_longitude = place_longitude[:, None] + arc * np.sin(azimuth) / np.cos(place_latitude)[:, None]
     level = terrain.level_for(altitude_m / camera.focal_px)
     height = terrain.height_m(rim_latitude, rim_longitude, level).mean(axis=1) if chosen.size else np.zeros(0)
-    points = (
-        np.asarray(mcmf_from_spherical(place_latitude, place_longitude, height)) - position
-    ) @ rotation.T
+    points = (np.asarray(mcmf_from_spherical(place_latitude, place_longitude, height)) - position) @ rotation.T
     uv = camera.project(points)
     diameter_px = camera.focal_px * diameter_m[chosen] / points[:, 2]
     keep = np.flatnonzero((diameter_px >= _STAMPED_MINIMUM_PX) & camera.contains(uv))

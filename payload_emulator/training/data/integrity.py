@@ -8,13 +8,7 @@ from typing import Any
 
 from payload_emulator.errors import DatasetError
 from payload_emulator.session.world.recipe import PAPER_SHARES, SPLITS
-from payload_emulator.training.data.dataset import (
-    Dataset,
-    ShardLabels,
-    count_instances,
-    load_shard,
-    read_gray,
-)
+from payload_emulator.training.data.dataset import Dataset, ShardLabels, count_instances, load_shard, read_gray
 from payload_emulator.training.data.finishing import index_digest
 from reports.published import FRAMES as PAPER_FRAMES
 from reports.published import LABELS as PAPER_INSTANCES
@@ -37,9 +31,7 @@ def check(folder: Path) -> list[str]:
         found = "an unfinished one" if (folder / "recipe.json").is_file() else "none"
         raise DatasetError(f"{folder}: expected a data set (dataset.json), found {found}") from None
     except (OSError, ValueError) as error:
-        return [
-            f"{folder / 'dataset.json'}: expected a JSON object, found: {error}; build again to replace it"
-        ]
+        return [f"{folder / 'dataset.json'}: expected a JSON object, found: {error}; build again to replace it"]
     return list(_problems(folder, index))
 
 
@@ -105,9 +97,7 @@ def _picture(path: Path, size: tuple[int, int]) -> Iterator[str]:
         yield str(error)
         return
     if image.shape != size:
-        yield (
-            f"{path}: expected {size[1]} x {size[0]} pixels, found {image.shape[1]} x {image.shape[0]} pixels"
-        )
+        yield (f"{path}: expected {size[1]} x {size[0]} pixels, found {image.shape[1]} x {image.shape[0]} pixels")
 
 
 def summarise(folder: Path) -> dict[str, Any]:
@@ -119,12 +109,9 @@ def summarise(folder: Path) -> dict[str, Any]:
         **_counts(len(frames), count_instances(frames, dataset.width_px, dataset.height_px)),
         "split": {split: len(found) for split, found in splits.items()},
         "instances_by_split": {
-            split: count_instances(found, dataset.width_px, dataset.height_px)
-            for split, found in splits.items()
+            split: count_instances(found, dataset.width_px, dataset.height_px) for split, found in splits.items()
         },
-        "sources": {
-            name: sum(f.source == name for f in frames) for name in sorted({f.source for f in frames})
-        },
+        "sources": {name: sum(f.source == name for f in frames) for name in sorted({f.source for f in frames})},
         "paper": _counts(PAPER_FRAMES, list(PAPER_INSTANCES.values())) | {"split_shares": list(PAPER_SHARES)},
         "labels_sha256": dataset.digest,
         "data": dataset.index["data"],

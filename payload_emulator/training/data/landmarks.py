@@ -64,8 +64,7 @@ def with_landmarks(dataset: Dataset, frame: Frame, landmarks: Landmarks) -> Fram
         "visible": np.ones(index.size),
     }
     craters: dict[str, NDArray[Any]] = {
-        key: np.concatenate([values, added[key].astype(values.dtype)])
-        for key, values in frame.craters.items()
+        key: np.concatenate([values, added[key].astype(values.dtype)]) for key, values in frame.craters.items()
     }
     return replace(frame, craters=craters)
 
@@ -83,9 +82,7 @@ def load_landmarks(path: Path) -> Landmarks:
             rows = list(csv.DictReader(stream))
         column = {name: np.array([float(row[name]) for row in rows]) for name in _COLUMNS}
     except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        raise DatasetError(
-            f"{path}: expected landmarks (CSV with {', '.join(_COLUMNS)}), found: {error}"
-        ) from error
+        raise DatasetError(f"{path}: expected landmarks (CSV with {', '.join(_COLUMNS)}), found: {error}") from error
     return Landmarks(
         np.radians(column["latitude_deg"]),
         np.radians(column["longitude_deg"]),

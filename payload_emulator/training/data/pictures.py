@@ -114,9 +114,7 @@ def _coco(path: Path) -> dict[str, Any] | None:
 
 def _pictures(path: Path, document: dict[str, Any], category: str) -> list[LabelledPicture]:
     images = _identified(document["images"], "an image", f"{path}, images")
-    _identified(
-        [item for item in document["annotations"] if "id" in item], "an annotation", f"{path}, annotations"
-    )
+    _identified([item for item in document["annotations"] if "id" in item], "an annotation", f"{path}, annotations")
     craters, names = _categories(path, document, category)
     labels: dict[Any, list[_Label]] = {number: [] for number in images}
     others: dict[Any, list[str]] = {number: [] for number in images}
@@ -223,9 +221,7 @@ def _picture(
     name = _value(item, "file_name", place)
     if not isinstance(name, str) or not name:
         raise DatasetError(f"{place}.file_name: expected the name of an image file, found {name!r}")
-    found = next(
-        (file for file in (path.parent / name, path.parent / "images" / name) if file.is_file()), None
-    )
+    found = next((file for file in (path.parent / name, path.parent / "images" / name) if file.is_file()), None)
     if found is None:
         raise DatasetError(f"{place}.file_name: expected an image file, found no {path.parent / name}")
     if found.suffix.lower() not in IMAGE_SUFFIXES:
@@ -280,24 +276,18 @@ def _label(item: Mapping[str, Any], place: str) -> _Label:
 def _box(value: Any, place: str) -> tuple[float, float, float, float]:
     x, y, width, height = _numbers(value, 4, f"{place}.bbox")
     if width <= 0.0 or height <= 0.0:
-        raise DatasetError(
-            f"{place}.bbox: expected [x, y, width, height] with a size above zero, found {value}"
-        )
+        raise DatasetError(f"{place}.bbox: expected [x, y, width, height] with a size above zero, found {value}")
     return x, y, width, height
 
 
-def _of_polygons(
-    polygons: list[Any], place: str
-) -> tuple[tuple[float, float, float, float], float, float, float]:
+def _of_polygons(polygons: list[Any], place: str) -> tuple[tuple[float, float, float, float], float, float, float]:
     """Box, centre and diameter of the circle of equal area of polygons, whose parts do not overlap."""
     area, moment = 0.0, np.zeros(2)
     corners = []
     for k, polygon in enumerate(polygons):
         where = f"{place}.segmentation[{k}]"
         if not isinstance(polygon, list) or len(polygon) < 6 or len(polygon) % 2:
-            raise DatasetError(
-                f"{where}: expected at least three pairs x, y in one list, found {polygon!s:.60}"
-            )
+            raise DatasetError(f"{where}: expected at least three pairs x, y in one list, found {polygon!s:.60}")
         points = np.array(_numbers(polygon, len(polygon), where)).reshape(-1, 2)
         start = points[0]
         x, y = (points - start).T  # about a corner, so that little is lost far from the origin
@@ -318,9 +308,7 @@ def _of_polygons(
 
 def _value(item: Mapping[str, Any], key: str, place: str) -> Any:
     if key not in item or isinstance(item[key], (list, dict)):
-        raise DatasetError(
-            f"{place}.{key}: expected a value, found {'none' if key not in item else 'a list'}"
-        )
+        raise DatasetError(f"{place}.{key}: expected a value, found {'none' if key not in item else 'a list'}")
     return item[key]
 
 

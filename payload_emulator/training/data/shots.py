@@ -46,9 +46,7 @@ class Pose:
     camera_from_mcmf: FloatArray
 
 
-def draw_pose(
-    terrain: Any, camera: PinholeCamera, source: Source, place: Place, rng: np.random.Generator
-) -> Pose:
+def draw_pose(terrain: Any, camera: PinholeCamera, source: Source, place: Place, rng: np.random.Generator) -> Pose:
     """A pose whose footprint lies where the source may look, on the terrain, well above the ground.
 
     Raises
@@ -109,9 +107,7 @@ def _pose_over(
     rotation = turn @ nadir_camera_from_mcmf(position)
     ground = footprint_edge(camera, rotation, position, edge)
     edge_latitude, edge_longitude, _ = spherical_from_mcmf(ground)
-    if source.footprint == "inside" and not allowed(
-        source, box, np.degrees(edge_latitude), np.degrees(edge_longitude)
-    ):
+    if source.footprint == "inside" and not allowed(source, box, np.degrees(edge_latitude), np.degrees(edge_longitude)):
         return None
     if not np.all(terrain.covers(edge_latitude, edge_longitude)):
         return None
@@ -198,9 +194,7 @@ def allowed(source: Source, box: Box, latitude_deg: FloatArray, longitude_deg: F
     """Return whether a footprint's edge lies in the box and clear of every box to avoid, buffer included."""
     if not inside_box(box, latitude_deg, longitude_deg, 0.0).all():
         return False
-    return not any(
-        inside_box(other, latitude_deg, longitude_deg, source.buffer_km).any() for other in source.avoid
-    )
+    return not any(inside_box(other, latitude_deg, longitude_deg, source.buffer_km).any() for other in source.avoid)
 
 
 def edge_pixels(camera: PinholeCamera) -> FloatArray:
@@ -217,8 +211,7 @@ def draw_box(source: Source, rng: np.random.Generator) -> Box:
     """One of the source's boxes, by area."""
     areas = np.array(
         [
-            (b.east_deg - b.west_deg)
-            * (math.sin(math.radians(b.north_deg)) - math.sin(math.radians(b.south_deg)))
+            (b.east_deg - b.west_deg) * (math.sin(math.radians(b.north_deg)) - math.sin(math.radians(b.south_deg)))
             for b in source.boxes
         ]
     )
@@ -232,9 +225,7 @@ def draw_sun(light: str, rng: np.random.Generator) -> tuple[float, float]:
     azimuth = math.radians(rng.uniform(-180.0, 180.0))
     if light == "low":
         return math.radians(rng.uniform(5.0, 15.0)), azimuth
-    limits = ((5.0, 15.0), (15.0, 35.0), (35.0, 60.0), (3.0, 5.0))[
-        int(rng.choice(4, p=(0.7, 0.17, 0.07, 0.06)))
-    ]
+    limits = ((5.0, 15.0), (15.0, 35.0), (35.0, 60.0), (3.0, 5.0))[int(rng.choice(4, p=(0.7, 0.17, 0.07, 0.06)))]
     return math.radians(rng.uniform(*limits)), azimuth
 
 
@@ -260,9 +251,7 @@ def draw_photometry(vary: bool, rng: np.random.Generator) -> Any:
         return Photometry()
     law = _LAWS[int(rng.choice(len(_LAWS), p=_LAW_SHARES))]
     return Photometry(
-        law=law,
-        phase_slope_per_rad=float(rng.uniform(0.2, 1.0)),
-        albedo_contrast=float(rng.uniform(0.0, 1.6)),
+        law=law, phase_slope_per_rad=float(rng.uniform(0.2, 1.0)), albedo_contrast=float(rng.uniform(0.0, 1.6))
     )
 
 

@@ -41,9 +41,7 @@ class Track:
         return hashlib.sha256(octets + self.order.tobytes()).hexdigest()
 
 
-def lay_track(
-    source: Source, camera: PinholeCamera, terrain: Any, data: DataFolder, wanted: int, seed: int
-) -> Track:
+def lay_track(source: Source, camera: PinholeCamera, terrain: Any, data: DataFolder, wanted: int, seed: int) -> Track:
     """The first `wanted` places of a source's ephemeris from which frames can be taken.
 
     Left out are places beyond the latitude limit, footprints that leave the terrain, and, where the source has boxes or

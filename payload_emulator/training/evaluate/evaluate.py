@@ -17,13 +17,7 @@ from payload_emulator.flight.vision.detector import (
     drop_duplicates,
 )
 from payload_emulator.flight.vision.preprocess import Preparation, prepare_image, sun_up_turns, turn_back
-from payload_emulator.training.data.dataset import (
-    Dataset,
-    Frame,
-    diameter_on_ground_m,
-    frame_truth,
-    ground_points,
-)
+from payload_emulator.training.data.dataset import Dataset, Frame, diameter_on_ground_m, frame_truth, ground_points
 from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate.metrics import Scene, Thresholds, score
 from payload_emulator.training.evaluate.scoring import FrameDetections
@@ -62,9 +56,7 @@ def detect_with_network(network: Any, dataset: Dataset, frame: Frame, device: st
     found = drop_duplicates(found.select(np.argsort(-found.score, kind="stable")), DetectorParameters())
     u_px, v_px = turn_back(found.u_px, found.v_px, turns, *gray.shape)
     return _on_ground(
-        dataset,
-        frame,
-        Detections(u_px, v_px, found.diameter_px, found.score, found.sigma_px, found.depth_ratio),
+        dataset, frame, Detections(u_px, v_px, found.diameter_px, found.score, found.sigma_px, found.depth_ratio)
     )
 
 
@@ -85,9 +77,7 @@ def detect_by_class(detector: OnnxDetector, dataset: Dataset, frame: Frame) -> F
     turns = sun_up_turns(frame.sun_camera)
     heatmap, geometry = detector.run_network(np.ascontiguousarray(np.rot90(prepared, turns))[None, None])
     if heatmap.shape[1] not in (3, 4):
-        raise ModelError(
-            f"detector network: expected the paper's three class heatmaps, found {heatmap.shape[1] - 1}"
-        )
+        raise ModelError(f"detector network: expected the paper's three class heatmaps, found {heatmap.shape[1] - 1}")
     heats = heatmap[0, -3:]
     parts = [decode(heat, geometry[0], SCORE_FLOOR, detector.stride_px) for heat in heats]
     column = {
@@ -103,9 +93,7 @@ def detect_by_class(detector: OnnxDetector, dataset: Dataset, frame: Frame) -> F
 
 def open_for_evaluation(model_octets: bytes) -> OnnxDetector:
     """The flight detector, kept down to `SCORE_FLOOR` so that curves can be drawn."""
-    return OnnxDetector(
-        model_octets, DetectorParameters(score_threshold=SCORE_FLOOR, max_detections=EVERY_DETECTION)
-    )
+    return OnnxDetector(model_octets, DetectorParameters(score_threshold=SCORE_FLOOR, max_detections=EVERY_DETECTION))
 
 
 def run(
@@ -175,11 +163,7 @@ def evaluate(
 
 
 def summary(
-    detector: OnnxDetector,
-    datasets: Sequence[Dataset],
-    scored: Scored,
-    split: str,
-    source: str = "",
+    detector: OnnxDetector, datasets: Sequence[Dataset], scored: Scored, split: str, source: str = ""
 ) -> dict[str, Any]:
     """Figures of scored frames with what they rest on."""
     frames = [f for _, f in scored.frames]
@@ -223,13 +207,9 @@ def format_figures(figures: dict[str, Any]) -> str:
     names = ("class 0 (5-10 km)", "class 1 (10-15 km)", "class 2 (15-30 km)")
     for name, row in zip(names, figures["per_class"], strict=True):
         paper = row["paper"]
-        lines.append(
-            _row(name, row) + f"   {paper['precision']:.2f} / {paper['recall']:.2f} / {paper['loc_px']:.2f}"
-        )
+        lines.append(_row(name, row) + f"   {paper['precision']:.2f} / {paper['recall']:.2f} / {paper['loc_px']:.2f}")
     lines.append(_row("5-30 km strict", figures["micro"]) + f"   F1 {_interval(figures['micro'])}")
-    lines.append(
-        _row("5-30 km ignore-aware", figures["ignore_aware"]) + f"   F1 {_interval(figures['ignore_aware'])}"
-    )
+    lines.append(_row("5-30 km ignore-aware", figures["ignore_aware"]) + f"   F1 {_interval(figures['ignore_aware'])}")
     lines.append(_row("3-30 km strict", figures["strict_3_to_30_km"]))
     lines.append(_row("3-30 km ignore-aware", figures["ignore_aware_3_to_30_km"]))
     lines.append(_row("5-30 km within 0.5 R", figures["micro_half_radius"]))
@@ -255,11 +235,7 @@ def format_figures(figures: dict[str, Any]) -> str:
 
 def _row(name: str, row: dict[str, float]) -> str:
     values = (row["precision"], row["recall"], row["f1"])
-    return (
-        f"{name:28}"
-        + "".join(f"{v:7.3f}" for v in values)
-        + f"{row['loc_px']:8.2f}{row['loc_median_px']:8.2f}"
-    )
+    return f"{name:28}" + "".join(f"{v:7.3f}" for v in values) + f"{row['loc_px']:8.2f}{row['loc_median_px']:8.2f}"
 
 
 def _bias_lines(figures: dict[str, Any]) -> list[str]:

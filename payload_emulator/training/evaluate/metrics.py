@@ -10,11 +10,7 @@ import numpy as np
 from lunar.arrays import BoolArray, FloatArray
 from payload_emulator.flight.vision.detections import DEGRADED_DEPTH_RATIO, FRESH_DEPTH_RATIO
 from payload_emulator.training.data.truth import FrameTruth
-from payload_emulator.training.evaluate.localisation import (
-    bias_by_octant,
-    bias_overall,
-    right,
-)
+from payload_emulator.training.evaluate.localisation import bias_by_octant, bias_overall, right
 from payload_emulator.training.evaluate.scoring import (
     DEGRADATION_EDGES,
     PAPER_TABLE_2,
@@ -56,10 +52,7 @@ class Thresholds:
 
 
 def score(
-    truths: Sequence[FrameTruth],
-    found: Sequence[FrameDetections],
-    thresholds: Thresholds,
-    scenes: Sequence[Scene],
+    truths: Sequence[FrameTruth], found: Sequence[FrameDetections], thresholds: Thresholds, scenes: Sequence[Scene]
 ) -> dict[str, Any]:
     """Every figure of detections against truths, as one mapping of plain values."""
     threshold = thresholds.on_board
@@ -83,17 +76,13 @@ def score(
         "average_precision_half_radius": {
             "strict": average_precision(strict_radius),
             "ignore_aware": average_precision(fair_radius),
-            "per_class": [
-                average_precision(tally(truths, found, classes=(k,), rule=RADIUS_RULE)) for k in range(3)
-            ],
+            "per_class": [average_precision(tally(truths, found, classes=(k,), rule=RADIUS_RULE)) for k in range(3)],
         },
         "balanced": _at(pair, thresholds.balanced),
         "navigation": _at(pair, thresholds.navigation),
         "recall_by_degradation": _recall_by(strict, strict.crater_depth_ratio, DEGRADATION_EDGES, threshold),
         "degradation_state": _state(fair, threshold),
-        "by_altitude_km": _by_frame(
-            pair, threshold, np.array([s.altitude_km for s in scenes]), _ALTITUDE_EDGES_KM
-        ),
+        "by_altitude_km": _by_frame(pair, threshold, np.array([s.altitude_km for s in scenes]), _ALTITUDE_EDGES_KM),
         "by_sun_elevation_deg": _by_frame(
             pair, threshold, np.array([s.sun_elevation_deg for s in scenes]), _ELEVATION_EDGES_DEG
         ),
@@ -103,9 +92,7 @@ def score(
             np.degrees(np.array([t.sun_azimuth_image_rad for t in truths])) % 360.0,
             tuple(45.0 * k for k in range(9)),
         ),
-        "by_terrain": _by_name(
-            pair, threshold, ["lowland" if s.ground_m < LOWLAND_M else "upland" for s in scenes]
-        ),
+        "by_terrain": _by_name(pair, threshold, ["lowland" if s.ground_m < LOWLAND_M else "upland" for s in scenes]),
         "by_source": _by_name(pair, threshold, [s.source for s in scenes]),
         "bias_px_by_sun_octant": octants,
         "bias_px": bias_overall(strict, threshold, truths, octants),
@@ -121,9 +108,7 @@ def score(
     }
 
 
-def _class(
-    truths: Sequence[FrameTruth], found: Sequence[FrameDetections], k: int, threshold: float
-) -> dict[str, Any]:
+def _class(truths: Sequence[FrameTruth], found: Sequence[FrameDetections], k: int, threshold: float) -> dict[str, Any]:
     strict = tally(truths, found, classes=(k,))
     fair = tally(truths, found, classes=(k,), ignore_aware=True)
     return {
@@ -174,9 +159,7 @@ def _by_name(pair: tuple[Tally, Tally], threshold: float, names: Sequence[str]) 
     ]
 
 
-def _recall_by(
-    tallied: Tally, values: FloatArray, edges: Sequence[float], threshold: float
-) -> list[dict[str, Any]]:
+def _recall_by(tallied: Tally, values: FloatArray, edges: Sequence[float], threshold: float) -> list[dict[str, Any]]:
     with np.errstate(invalid="ignore"):
         found = tallied.crater_score >= threshold
     rows = []
@@ -232,9 +215,7 @@ def _calibration(tallied: Tally, threshold: float, chosen: BoolArray | None = No
     }
 
 
-def _calibration_by_altitude(
-    tallied: Tally, threshold: float, scenes: Sequence[Scene]
-) -> list[dict[str, float]]:
+def _calibration_by_altitude(tallied: Tally, threshold: float, scenes: Sequence[Scene]) -> list[dict[str, float]]:
     altitude = np.array([s.altitude_km for s in scenes])
     rows = []
     for low, high in itertools.pairwise(_ALTITUDE_EDGES_KM):
@@ -264,11 +245,6 @@ def _curve(tallied: Tally) -> list[dict[str, float]]:
     for threshold in _CURVE_THRESHOLDS:
         figures = tallied.figures(threshold)
         rows.append(
-            {
-                "threshold": threshold,
-                "precision": figures.precision,
-                "recall": figures.recall,
-                "f1": figures.f1,
-            }
+            {"threshold": threshold, "precision": figures.precision, "recall": figures.recall, "f1": figures.f1}
         )
     return rows

@@ -210,9 +210,7 @@ def _between(values: FloatArray, limits: tuple[float, float]) -> BoolArray:
     return inside
 
 
-def _matched(
-    picture: LabelledPicture, found: Detections, criterion: Criterion, expected: BoolArray
-) -> IntArray:
+def _matched(picture: LabelledPicture, found: Detections, criterion: Criterion, expected: BoolArray) -> IntArray:
     """Label that each detection (best first) takes, -1 for none; an expected label before any other."""
     taken = np.full(len(found), -1, np.int64)
     free = ~picture.crowd

@@ -81,9 +81,7 @@ def _curves(run: Path) -> tuple[TrainingCurve, ...]:
     step = np.array([float(row["step"]) for row in rows])
     names = ("total", "heat", "offset", "diameter", "sigma", "f1", "precision", "recall", "loc_px")
     return tuple(
-        TrainingCurve(name, step, np.array([float(row[name]) for row in rows]), "step")
-        for name in names
-        if rows
+        TrainingCurve(name, step, np.array([float(row[name]) for row in rows]), "step") for name in names if rows
     )
 
 
@@ -105,9 +103,7 @@ def _picture(scored: Scored, k: int, threshold: float) -> GalleryFrame:
     dataset, frame = scored.frames[k]
     truth, found, scene = scored.truths[k], scored.found[k], scored.scenes[k]
     d = np.flatnonzero((found.score >= threshold) & (found.diameter_m >= 3_000.0))
-    inside = (
-        (truth.u_px >= 0) & (truth.u_px < truth.width_px) & (truth.v_px >= 0) & (truth.v_px < truth.height_px)
-    )
+    inside = (truth.u_px >= 0) & (truth.u_px < truth.width_px) & (truth.v_px >= 0) & (truth.v_px < truth.height_px)
     c = np.flatnonzero(inside & (truth.diameter_m >= 3_000.0) & (truth.diameter_px >= _GALLERY_LEAST_PX))
     hit = match(found.u_px[d], found.v_px[d], truth.u_px[c], truth.v_px[c], truth.diameter_px[c], MatchRule())
     matched = np.zeros(c.size, bool)

@@ -78,9 +78,7 @@ class MatchRule:
 
     def limits_px(self, diameter_px: FloatArray) -> FloatArray:
         """Return the largest distance (n,) from craters of some diameters (n,)."""
-        return (
-            np.full(diameter_px.shape, self.pixels) if self.radii == 0.0 else 0.5 * self.radii * diameter_px
-        )
+        return np.full(diameter_px.shape, self.pixels) if self.radii == 0.0 else 0.5 * self.radii * diameter_px
 
 
 def match(
@@ -139,9 +137,7 @@ class Tally:
         """The part of a tally that masks of its detections and craters choose."""
         return Tally(
             **{
-                item.name: getattr(self, item.name)[
-                    craters if item.name.startswith("crater_") else detections
-                ]
+                item.name: getattr(self, item.name)[craters if item.name.startswith("crater_") else detections]
                 for item in fields(self)
             }
         )
@@ -164,11 +160,7 @@ def make_figures(expected: int, found: int, false_alarms: int, errors_px: FloatA
     """Figures of counts; NaN where nothing was expected or claimed."""
     precision = found / (found + false_alarms) if found + false_alarms else float("nan")
     recall = found / expected if expected else float("nan")
-    f1 = (
-        2.0 * found / (2 * found + false_alarms + (expected - found))
-        if expected + false_alarms
-        else float("nan")
-    )
+    f1 = 2.0 * found / (2 * found + false_alarms + (expected - found)) if expected + false_alarms else float("nan")
     return Figures(
         expected,
         found,
@@ -216,12 +208,7 @@ def tally(
         if ignore_aware:
             other = np.flatnonzero(~wanted)
             near = match_any(
-                found.u_px[d],
-                found.v_px[d],
-                truth.u_px[other],
-                truth.v_px[other],
-                truth.diameter_px[other],
-                rule,
+                found.u_px[d], found.v_px[d], truth.u_px[other], truth.v_px[other], truth.diameter_px[other], rule
             )
             outcome[(outcome == 0) & near] = -1
         parts.append(detection_columns(number, truth, found, w, d, hit, outcome))
@@ -236,9 +223,7 @@ def joined(
     if not detections:
         empty: list[NDArray[Any]] = [np.zeros(0)] * len(fields(Tally))
         return Tally(*empty)
-    return Tally(
-        *(np.concatenate(column) for part in (detections, craters) for column in zip(*part, strict=True))
-    )
+    return Tally(*(np.concatenate(column) for part in (detections, craters) for column in zip(*part, strict=True)))
 
 
 def _in_frame(truth: FrameTruth) -> BoolArray:

@@ -132,9 +132,7 @@ def contact_sheet(pictures: Sequence[Rgb], captions: Sequence[str], columns: int
     cells = [_captioned(picture, caption) for picture, caption in zip(pictures, captions, strict=True)]
     high, wide = cells[0].shape[:2]
     rows = math.ceil(len(cells) / columns)
-    sheet = np.full(
-        (rows * (high + GAP_PX) + GAP_PX, columns * (wide + GAP_PX) + GAP_PX, 3), GROUND, np.uint8
-    )
+    sheet = np.full((rows * (high + GAP_PX) + GAP_PX, columns * (wide + GAP_PX) + GAP_PX, 3), GROUND, np.uint8)
     for number, cell in enumerate(cells):
         top = GAP_PX + number // columns * (high + GAP_PX)
         left = GAP_PX + number % columns * (wide + GAP_PX)
@@ -164,7 +162,5 @@ def _captioned(picture: Rgb, caption: str) -> Rgb:
 
     strip = np.full((CAPTION_PX, picture.shape[1], 3), GROUND, np.uint8)
     scale = 0.42 if picture.shape[1] >= 360 else 0.32
-    cv2.putText(
-        strip, caption, (4, CAPTION_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, scale, (INK,) * 3, 1, cv2.LINE_AA
-    )
+    cv2.putText(strip, caption, (4, CAPTION_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, scale, (INK,) * 3, 1, cv2.LINE_AA)
     return np.concatenate([picture, strip])

@@ -148,9 +148,7 @@ def without_parallax(found: FrameDetections, share_per_px: float, truth: FrameTr
     return replace(found, u_px=moved.u_px, v_px=moved.v_px)
 
 
-def geometry_shift(
-    tallied: Tally, threshold: float, cell_px: int = STRIDE_PX
-) -> tuple[float, float, float, float]:
+def geometry_shift(tallied: Tally, threshold: float, cell_px: int = STRIDE_PX) -> tuple[float, float, float, float]:
     """Return the shift of the network's geometry that centres errors in the Sun-up image and makes sigma one sigma."""
     right = (tallied.outcome == 1) & (tallied.score >= threshold)
     if np.count_nonzero(right) < _LEAST_PAIRS:
@@ -162,9 +160,7 @@ def geometry_shift(
     return (-bias_u / cell_px, -bias_v / cell_px, -log_ratio, float(np.log(np.quantile(ratio, 0.683))))
 
 
-def _shifted(
-    found: FrameDetections, shift: tuple[float, float, float, float], cell_px: int
-) -> FrameDetections:
+def _shifted(found: FrameDetections, shift: tuple[float, float, float, float], cell_px: int) -> FrameDetections:
     """Detections in a Sun-up image as the corrected network would give them."""
     factor = float(np.exp(shift[2]))
     return replace(

@@ -12,13 +12,7 @@ import numpy as np
 
 from lunar.catalogue import size_class
 from payload_emulator.errors import DatasetError, ModelError
-from payload_emulator.flight.vision.detector import (
-    GEOMETRY_NAME,
-    HEATMAP_NAME,
-    INPUT_NAME,
-    INPUT_SIZE_PX,
-    OnnxDetector,
-)
+from payload_emulator.flight.vision.detector import GEOMETRY_NAME, HEATMAP_NAME, INPUT_NAME, INPUT_SIZE_PX, OnnxDetector
 from payload_emulator.flight.vision.preprocess import Preparation
 from payload_emulator.training.data.dataset import Dataset, write_whole
 from payload_emulator.training.model.calibrate import Calibration, calibrate, paper_threshold
@@ -26,9 +20,7 @@ from payload_emulator.training.model.calibrate import Calibration, calibrate, pa
 PARITY_LIMIT = 2e-4
 """Greatest difference allowed between torch and ONNX Runtime: far under one count of a score in telemetry (1/255)."""
 
-INPUT_CONVENTION = (
-    "float32 (1, 1, 512, 512): square root of gray, zero mean, unit deviation, clipped at 4; Sun-up"
-)
+INPUT_CONVENTION = "float32 (1, 1, 512, 512): square root of gray, zero mean, unit deviation, clipped at 4; Sun-up"
 OUTPUT_CONVENTION = (
     "heatmap probability (1, 1 or 4, 128, 128): any crater, then the paper's classes in the paper's variant; geometry "
     "(1, 4 or 5, 128, 128): right, down in cells, ln(diameter / 16 px), ln(sigma / 1 px), ten times depth/diameter"
@@ -82,9 +74,7 @@ def export(
         stored = stored | {"config": network.config.to_dict()}
     paper_classes = paper_classes or classes_only
     if paper_classes and network.heat_channels == 1:
-        raise ModelError(
-            f"{checkpoint}: expected a network with the paper's class heatmaps, found one without"
-        )
+        raise ModelError(f"{checkpoint}: expected a network with the paper's class heatmaps, found one without")
     calibration = calibrate(network, datasets)
     heats = network.heat_channels if paper_classes else 1
     exported = ExportedCraterNet(network, calibration.geometry_shift, heats, classes_only=classes_only).eval()
@@ -100,9 +90,7 @@ def export(
         octets = _with_metadata(model, metadata)
     difference = parity(exported, octets)
     if difference > PARITY_LIMIT:
-        raise ModelError(
-            f"{out}: expected torch and ONNX to agree within {PARITY_LIMIT:g}, found {difference:.2g}"
-        )
+        raise ModelError(f"{out}: expected torch and ONNX to agree within {PARITY_LIMIT:g}, found {difference:.2g}")
     tested: dict[str, Any] = {}
     if test:
         tested = _test_figures(octets, datasets, paper_classes)
@@ -138,9 +126,7 @@ def class_medians_m(datasets: Sequence[Dataset]) -> list[float]:
     classes = size_class(diameter_m.astype(np.float64))
     counts = [int(np.count_nonzero(classes == k)) for k in range(3)]
     if min(counts) == 0:
-        raise DatasetError(
-            f"class medians: expected craters of three classes in training frames, found {counts}"
-        )
+        raise DatasetError(f"class medians: expected craters of three classes in training frames, found {counts}")
     return [round(float(np.median(diameter_m[classes == k])), 1) for k in range(3)]
 
 
@@ -255,10 +241,7 @@ def _metadata(
         "model_config": json.dumps(stored["config"]),
         "data": json.dumps(
             trained.get("datasets")
-            or [
-                {"name": d.index["name"], "labels_sha256": d.digest, "data": d.index["data"]}
-                for d in datasets
-            ]
+            or [{"name": d.index["name"], "labels_sha256": d.digest, "data": d.index["data"]} for d in datasets]
         ),
     }
 

@@ -38,12 +38,7 @@ from payload_emulator.training.evaluate.evaluate import (
     detect_with_model,
     refuse_other_camera,
 )
-from payload_emulator.training.evaluate.scoring import (
-    FrameDetections,
-    MatchRule,
-    match,
-    tally,
-)
+from payload_emulator.training.evaluate.scoring import FrameDetections, MatchRule, match, tally
 
 _KNOTS_PX = (10.0, 14.0, 20.0, 32.0, 48.0, 80.0)
 _SCORED_M = (3_000.0, 30_000.0)
@@ -132,9 +127,7 @@ def plain_model(model_octets: bytes) -> bytes:
 
 
 def fit_calibration(
-    model_octets: bytes,
-    datasets: Sequence[Dataset],
-    progress: Callable[[Sequence[Any]], Iterable[Any]] = iter,
+    model_octets: bytes, datasets: Sequence[Dataset], progress: Callable[[Sequence[Any]], Iterable[Any]] = iter
 ) -> tuple[bytes, dict[str, Any]]:
     """The model with its calibration, and what was fitted with its evidence.
 
@@ -146,9 +139,7 @@ def fit_calibration(
         The network gives classes and no sizes.
     """
     plain = plain_model(model_octets)
-    detector = OnnxDetector(
-        plain, DetectorParameters(score_threshold=SCORE_FLOOR, max_detections=EVERY_DETECTION)
-    )
+    detector = OnnxDetector(plain, DetectorParameters(score_threshold=SCORE_FLOOR, max_detections=EVERY_DETECTION))
     if detector.class_medians_m is not None:
         raise ModelError("detector network: expected one that gives sizes, found one that gives classes only")
     frames = _validation_frames(datasets)
@@ -337,9 +328,7 @@ def fit_sigma(pairs: Pairs) -> tuple[SigmaModel, dict[str, Any]]:
     scatter = (inner.error_px - mean[crater])[again] * np.sqrt(times / np.maximum(times - 1.0, 1.0))[crater][
         again, None
     ]
-    fresh, kept_again = _log_linear(
-        inner.features[again], 0.5 * (scatter**2).sum(axis=1), _FRESH_OUTLIER_SIGMAS
-    )
+    fresh, kept_again = _log_linear(inner.features[again], 0.5 * (scatter**2).sum(axis=1), _FRESH_OUTLIER_SIGMAS)
     fresh[0] += np.log(FRESH_FACTOR)
     low, high = np.percentile(inner.features, (1.0, 99.0), axis=0)
     model = SigmaModel(*(tuple(float(x) for x in part) for part in (fresh, total, low, high)))
@@ -404,10 +393,7 @@ def format_calibration_figures(document: dict[str, Any]) -> str:
     pulls = ", ".join(
         f"{name} {value:+.3f} ± {error:.3f}"
         for name, value, error in zip(
-            ("toward", "toward per 20 px", "across"),
-            sun["coefficients_px"],
-            sun["standard_errors_px"],
-            strict=True,
+            ("toward", "toward per 20 px", "across"), sun["coefficients_px"], sun["standard_errors_px"], strict=True
         )
     )
     lines = [

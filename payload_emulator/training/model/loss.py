@@ -57,9 +57,7 @@ def crater_loss(
     share[0] = 1.0
     centres = target_weight[:, 0].sum().clamp(min=1.0)
     positive = -(share * target_weight * (1.0 - probability) ** 2 * log_p).sum()
-    unlisted = (
-        incomplete[:, None, None, None] & (probability.detach() > weights.high_score) & (target_heat < 0.05)
-    )
+    unlisted = incomplete[:, None, None, None] & (probability.detach() > weights.high_score) & (target_heat < 0.05)
     negative_weight = negative_weight.masked_fill(unlisted, 0.0).masked_fill(target_weight > 0.0, 0.0)
     negative = -(share * negative_weight * (1.0 - target_heat) ** 4 * probability**2 * log_not_p).sum()
     heat = (positive + negative) / centres
@@ -75,11 +73,5 @@ def crater_loss(
     depth = torch.zeros_like(sigma)
     if geometry.shape[1] > 4:
         depth = (regressed * (geometry[:, 4] - target_geometry[:, 3]).abs()).sum() / mass
-    total = (
-        heat
-        + weights.offset * offset
-        + weights.diameter * diameter
-        + weights.sigma * sigma
-        + weights.depth * depth
-    )
+    total = heat + weights.offset * offset + weights.diameter * diameter + weights.sigma * sigma + weights.depth * depth
     return LossTerms(total, heat.detach(), offset.detach(), diameter.detach(), sigma.detach(), depth.detach())

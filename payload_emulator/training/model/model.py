@@ -154,9 +154,7 @@ class CraterNet(nn.Module):
             merged = nn.functional.interpolate(merged, scale_factor=2.0, mode="nearest")
             merged = self.smooth[level](self.lateral[level](features[level]) + merged)
         out = self.head(self.trunk(merged))
-        if (
-            out.requires_grad
-        ):  # a gradient of another memory layout makes the backward pass several times slower
+        if out.requires_grad:  # a gradient of another memory layout makes the backward pass several times slower
             out.register_hook(lambda gradient: gradient.contiguous(memory_format=torch.channels_last))
         return out
 
@@ -224,9 +222,7 @@ class _InvertedResidual(nn.Module):
         if expanded != channels:
             layers.append(_conv_norm(channels, expanded, 1, activation=_activation(swish)))
         layers.append(
-            _conv_norm(
-                expanded, expanded, kernel, stride=stride, groups=expanded, activation=_activation(swish)
-            )
+            _conv_norm(expanded, expanded, kernel, stride=stride, groups=expanded, activation=_activation(swish))
         )
         if squeeze:
             layers.append(_SqueezeExcite(expanded))
@@ -243,12 +239,7 @@ def _activation(swish: bool) -> nn.Module:
 
 
 def _conv_norm(
-    channels: int,
-    out: int,
-    kernel: int,
-    stride: int = 1,
-    groups: int = 1,
-    activation: nn.Module | None = None,
+    channels: int, out: int, kernel: int, stride: int = 1, groups: int = 1, activation: nn.Module | None = None
 ) -> nn.Sequential:
     layers: list[nn.Module] = [
         nn.Conv2d(channels, out, kernel, stride, kernel // 2, groups=groups, bias=False),

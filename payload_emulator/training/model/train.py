@@ -136,9 +136,7 @@ def _check_datasets(
         raise DatasetError("training: expected data sets of one camera, found several")
     in_colour = parameters.preparation is Preparation.normalise_first
     if in_colour and not all(d.index["recipe"].get("colour") == "rgb" for d in datasets):
-        raise DatasetError(
-            'training: expected data sets in colour (colour = "rgb") to normalise before averaging'
-        )
+        raise DatasetError('training: expected data sets in colour (colour = "rgb") to normalise before averaging')
 
 
 def _model_config(parameters: TrainParameters) -> ModelConfig:
@@ -276,9 +274,7 @@ _LOSSES = ("total", "heat", "offset", "diameter", "sigma", "depth")
 _SCORES = ("f1", "precision", "recall", "loc_px", "threshold")
 
 
-def _append_curve(
-    run: Path, step: int, minutes: float, losses: FloatArray, figures: dict[str, float]
-) -> None:
+def _append_curve(run: Path, step: int, minutes: float, losses: FloatArray, figures: dict[str, float]) -> None:
     """Add a line to curves.csv: losses since the last one, figures of the validation."""
     with (run / "curves.csv").open("a", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
@@ -357,14 +353,7 @@ class _Team:
                 STRIDE_PX // p.enlarge,
             )
             (terms.total * (size / count)).backward()
-            values = (
-                terms.total.detach(),
-                terms.heat,
-                terms.offset,
-                terms.diameter,
-                terms.sigma,
-                terms.depth,
-            )
+            values = (terms.total.detach(), terms.heat, terms.offset, terms.diameter, terms.sigma, terms.depth)
             sums += np.array([float(value) for value in values]) * (size / count)
         return sums
 
@@ -413,9 +402,7 @@ def _parameter_groups(network: Any, weight_decay: float) -> list[dict[str, Any]]
 def _learning_rate(state: _Progress, parameters: TrainParameters) -> float:
     """Linear warm-up, then a cosine to zero over the budget."""
     done = (
-        state.seconds / (60.0 * parameters.minutes)
-        if parameters.minutes > 0
-        else state.step / max(parameters.steps, 1)
+        state.seconds / (60.0 * parameters.minutes) if parameters.minutes > 0 else state.step / max(parameters.steps, 1)
     )
     warm = min(1.0, (state.step + 1) / max(parameters.warm_up_steps, 1))
     return parameters.learning_rate * warm * max(0.5 * (1.0 + math.cos(math.pi * min(done, 1.0))), 2e-3)
@@ -437,9 +424,7 @@ def _update_average(average: Any, network: Any, decay: float) -> None:
             held.copy_(value)
 
 
-def _validate(
-    network: Any, validation: list[tuple[Dataset, Frame]], limit: int, device: str
-) -> dict[str, float]:
+def _validate(network: Any, validation: list[tuple[Dataset, Frame]], limit: int, device: str) -> dict[str, float]:
     """Strict figures of 5-30 km craters at the threshold of the greatest F1, over evenly chosen frames."""
     from payload_emulator.training.data.dataset import frame_truth
     from payload_emulator.training.evaluate.evaluate import detect_with_network
@@ -454,9 +439,7 @@ def _validate(
 
 
 def _load_images(
-    frames: Sequence[tuple[Dataset, Frame]],
-    report: Callable[[str], None],
-    in_colour: bool,
+    frames: Sequence[tuple[Dataset, Frame]], report: Callable[[str], None], in_colour: bool
 ) -> list[OctetArray]:
     began = time.monotonic()
     images = [dataset.image(frame) if in_colour else dataset.gray(frame) for dataset, frame in frames]
@@ -480,9 +463,7 @@ def _write_run(
     document = {
         "parameters": asdict(parameters),
         "model": config,
-        "datasets": [
-            {"name": d.index["name"], "labels_sha256": d.digest, "data": d.index["data"]} for d in datasets
-        ],
+        "datasets": [{"name": d.index["name"], "labels_sha256": d.digest, "data": d.index["data"]} for d in datasets],
         "replicas": replicas,
         "device": device,
         "started_from": origin,

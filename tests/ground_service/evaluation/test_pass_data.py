@@ -21,15 +21,15 @@ from ground_service.missions.frames import camera_of, declared_frames
 from ground_service.missions.model import Camera, Frames, Mission
 from ground_service.missions.service import add_mission
 from ground_service.passes.archive_import import import_archive
-from lunar.camera import PinholeCamera
+from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.datafolder import DataFolder
-from lunar.frames import IauOrientation
+from lunar.frames import IauOrientation, continuous_quaternions, matrix_from_quaternion, quaternion_from_matrix
 from lunar.gravity import builtin_gravity
 from lunar.lens import BrownCamera
 from lunar.messages.aem import AttitudeSegment, format_aem
 from lunar.timescales import ticks_from_utc_ns
 from reports.render import to_json
-from tests.ground_service.conftest import define_pass_of, enter_files
+from tests.ground_service.conftest import circular_states, define_pass_of, enter_files
 from tests.ground_service.evaluation.still import TurnedOrientation
 
 MISSING_FILES = DataFolder(orientation_bpc=Path("no.bpc"), gravity=Path("no.gfc"), gravity_alternative=Path("no.cof"))
@@ -147,12 +147,18 @@ def test_the_attitude_of_an_archive_is_found_by_the_time_of_the_image(
     folder = tmp_path / "a"
     shutil.copytree(synthetic_pass.folder, folder)
     ticks = [int(ticks_from_utc_ns(int(synthetic_pass.utc_ns[k]))) for k in (5, 2)]
-    rows = "".join(f"{tick},{q}\n" for tick, q in zip(ticks, ("0,1,0,0", "1,0,0,0"), strict=True))
+    q_wxyz = quaternion_from_matrix(nadir_camera_from_mcmf(circular_states(synthetic_pass.utc_ns[[5, 2]])[0]))
+    rows = "".join(f"{tick},{','.join(map(repr, q))}\n" for tick, q in zip(ticks, q_wxyz.tolist(), strict=True))
     (folder / "attitude.csv").write_text(f"{HEADER}\n{rows}")
     enter_files(folder)
     viewing = load_pass_inputs(ground, import_archive(ground, folder)).viewing
     assert np.flatnonzero(viewing.known(synthetic_pass.utc_ns)).tolist() == [2, 5]
-    assert viewing.q_wxyz.tolist() == [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]
+    assert viewing.q_wxyz.tolist() == q_wxyz[::-1].tolist()
+
+
+def first_nadir(synthetic_pass: Any) -> np.ndarray:
+    """Rotation (3, 3) of a camera that looks down at the first image."""
+    return nadir_camera_from_mcmf(circular_states(synthetic_pass.utc_ns[:1])[0])[0]
 
 
 def with_attitude_message(synthetic_pass: Any, folder: Path, **fields: Any) -> AttitudeSegment:
@@ -161,7 +167,8 @@ def with_attitude_message(synthetic_pass: Any, folder: Path, **fields: Any) -> A
     utc_ns = synthetic_pass.utc_ns[0] + np.arange(0, 121, 10) * 10**9
     angle = np.radians(2.0) * np.arange(len(utc_ns))
     zero = np.zeros(len(utc_ns))
-    q_wxyz = np.column_stack([np.cos(angle / 2.0), zero, zero, np.sin(angle / 2.0)])
+    turns = matrix_from_quaternion(np.column_stack([np.cos(angle / 2.0), zero, zero, np.sin(angle / 2.0)]))
+    q_wxyz = continuous_quaternions(quaternion_from_matrix(turns @ first_nadir(synthetic_pass)))
     q_wxyz[3] *= -1.0  # the same attitude
     segment = AttitudeSegment(utc_ns, q_wxyz, **fields)
     (folder / "attitude.aem").write_text(format_aem((segment,)))
@@ -180,7 +187,8 @@ def test_an_attitude_message_is_interpolated_to_the_times_of_the_images(
     turn = np.broadcast_to(np.eye(3), (len(utc_ns), 3, 3))
     rotations = viewing.camera_from_mcmf(utc_ns, np.full((len(utc_ns), 3), 1.0e6), turn)
     # A quaternion turns vectors: by 2 degrees in 10 s.
-    angles = np.degrees(np.arctan2(rotations[:9, 1, 0], rotations[:9, 0, 0]))
+    rotations = rotations[:9] @ first_nadir(synthetic_pass).T
+    angles = np.degrees(np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]))
     np.testing.assert_allclose(angles, 3.0 * np.arange(9), atol=1e-9)
 
 

@@ -59,7 +59,7 @@ sigma_rtn_m = [10, 30, 15.5]
     ("line", "message"),
     [
         ("fow_deg = 90", "m.toml, camera.fow_deg: expected 'fov_deg', found unknown key 'fow_deg'"),
-        ("fov_deg = 190", "m.toml, camera.fov_deg: expected less than 180, found 190"),
+        ("fov_deg = 190", "m.toml, camera.fov_deg: expected less than or equal to 170, found 190"),
         ('fov_deg = "wide"', "m.toml, camera.fov_deg: expected a valid number"),
         ("fov_deg = nan", "m.toml, camera.fov_deg: expected a finite number, found nan"),
         ("fov_deg = true", "m.toml, camera.fov_deg: expected a valid number, found True"),

@@ -139,12 +139,7 @@ def _advance(step_matrix: FloatArray, matrix: FloatArray, both_sides: bool, work
 
 @njit(error_model="numpy")
 def _add_noise(
-    noise: FloatArray,
-    axes: FloatArray,
-    length_s: float,
-    decay: float,
-    white_psd: FloatArray,
-    markov_sigma: FloatArray,
+    noise: FloatArray, axes: FloatArray, length_s: float, decay: float, white_psd: FloatArray, markov_sigma: FloatArray
 ) -> None:
     """Add the process noise of a step: white acceleration integrated twice, and the renewed part of the Markov one."""
     for i in range(3):
@@ -160,8 +155,7 @@ def _add_noise(
 
 
 @njit(
-    error_model="numpy",
-    ahead="f8[::1], f8, i8, f8[:, ::1], *4 * [f8[::1]], f8[:, ::1], f8[::1], f8, f8[::1], f8[::1]",
+    error_model="numpy", ahead="f8[::1], f8, i8, f8[:, ::1], *4 * [f8[::1]], f8[:, ::1], f8[::1], f8, f8[::1], f8[::1]"
 )
 def propagate_arc(
     start: FloatArray,

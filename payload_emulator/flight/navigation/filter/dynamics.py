@@ -11,12 +11,7 @@ import numpy as np
 from lunar.arrays import FloatArray
 from lunar.constants import GM_EARTH_M3_S2, GM_SUN_M3_S2, MOON_RADIUS_M
 from lunar.gravity import GravityField, packed, packed_gradient
-from lunar.gravity_omission import (
-    FAR_SIDE_COSINE,
-    MEASURED_ALTITUDES_M,
-    REFERENCE_ALTITUDE_M,
-    field_noise,
-)
+from lunar.gravity_omission import FAR_SIDE_COSINE, MEASURED_ALTITUDES_M, REFERENCE_ALTITUDE_M, field_noise
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns, utc_ns_from_ticks
 from tmtc.dictionary.tables import BurnTable, GravityTable, OrientationTable
@@ -99,9 +94,7 @@ class OrbitModel:
         Process noise.
     """
 
-    def __init__(
-        self, gravity: GravityTable, orientation: OrientationTable, degree: int, noise: ProcessNoise
-    ) -> None:
+    def __init__(self, gravity: GravityTable, orientation: OrientationTable, degree: int, noise: ProcessNoise) -> None:
         from lunar._gravity_kernel import scratch_size
 
         used = min(degree, gravity.c_bar.shape[0] - 1)
@@ -152,9 +145,7 @@ class OrbitModel:
             noise = transition @ noise @ transition.T + added
         return Prediction(state, total, noise)
 
-    def _white_psd(
-        self, position_mcmf_m: FloatArray, velocity_mcmf_m_s: FloatArray
-    ) -> tuple[float, float, float]:
+    def _white_psd(self, position_mcmf_m: FloatArray, velocity_mcmf_m_s: FloatArray) -> tuple[float, float, float]:
         """Return the spectral density of white acceleration at a place, for an inertial velocity."""
         noise, radius_m = self._noise, float(np.linalg.norm(position_mcmf_m))
         psd, height_m = noise.white_psd_m2_s3, noise.scale_height_m
@@ -162,11 +153,7 @@ class OrbitModel:
             normal = np.cross(position_mcmf_m, velocity_mcmf_m_s)
             cosine = abs(float(normal[2])) / max(float(np.linalg.norm(normal)), _TINY)
             far, oblique = noise.far_side_psd_m2_s3, noise.far_side_oblique_psd_m2_s3
-            psd = (
-                far[0] + cosine * oblique[0],
-                far[1] + cosine * oblique[1],
-                far[2] + cosine * oblique[2],
-            )
+            psd = (far[0] + cosine * oblique[0], far[1] + cosine * oblique[1], far[2] + cosine * oblique[2])
             height_m = noise.far_side_scale_height_m
         if height_m is None:
             return psd
@@ -176,21 +163,14 @@ class OrbitModel:
         return factor * psd[0], factor * psd[1], factor * psd[2]
 
 
-def flown(
-    model: OrbitModel, state: FloatArray, from_ticks: int, to_ticks: int, burns: BurnTable
-) -> FloatArray | None:
+def flown(model: OrbitModel, state: FloatArray, from_ticks: int, to_ticks: int, burns: BurnTable) -> FloatArray | None:
     """Return the state (9,) carried forwards over the planned burns on the way; None outside the orientation table."""
     reached = coasted(model, state, np.zeros((9, 9)), from_ticks, to_ticks, burns)
     return None if reached is None else reached[0]
 
 
 def coasted(
-    model: OrbitModel,
-    state: FloatArray,
-    covariance: FloatArray,
-    from_ticks: int,
-    to_ticks: int,
-    burns: BurnTable,
+    model: OrbitModel, state: FloatArray, covariance: FloatArray, from_ticks: int, to_ticks: int, burns: BurnTable
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return state (9,) and covariance (9, 9) as `flown` does, with the noise of the motion and of the burns."""
     low, high = np.searchsorted(burns.ticks, [from_ticks, to_ticks], side="right")
@@ -221,6 +201,4 @@ def _turn(start: FloatArray, stop: FloatArray) -> FloatArray:
     The turn over a minute is 1.6e-4 rad: the antisymmetric part is the vector to 1e-12 rad.
     """
     change = stop @ start.T
-    return 0.5 * np.array(
-        [change[1, 2] - change[2, 1], change[2, 0] - change[0, 2], change[0, 1] - change[1, 0]]
-    )
+    return 0.5 * np.array([change[1, 2] - change[2, 1], change[2, 0] - change[0, 2], change[0, 1] - change[1, 0]])

@@ -377,11 +377,7 @@ def update(
     for step in range(iterations):
         current = replace(prior, mean=mean)
         sighting = look(
-            landmarks,
-            index,
-            pose_of(current, camera_from_icrf, mcmf_from_icrf),
-            camera,
-            current.shifts(index),
+            landmarks, index, pose_of(current, camera_from_icrf, mcmf_from_icrf), camera, current.shifts(index)
         )
         design = design_matrix(sighting, current).reshape(count, mean.size)
         crossed = design @ prior.covariance
@@ -393,9 +389,7 @@ def update(
             turning = design[:, turn : turn + 3]
             solved = np.linalg.solve(spread, np.column_stack([innovation, turning]))
             nis = float(innovation @ solved[:, 0])
-            rotation = RotationEvidence(
-                turning.T @ solved[:, 0], turning.T @ solved[:, 1:], errors.attitude_noise_rad
-            )
+            rotation = RotationEvidence(turning.T @ solved[:, 0], turning.T @ solved[:, 1:], errors.attitude_noise_rad)
             spread_of_sum = spread.reshape(index.size, 2, index.size, 2).sum(axis=(0, 2))
             mean_innovation = innovation.reshape(-1, 2).sum(axis=0) / np.sqrt(np.diag(spread_of_sum))
         gain: FloatArray = np.asarray(np.linalg.solve(spread, crossed).T, dtype=np.float64)
@@ -461,9 +455,7 @@ def _contradiction(spread: FloatArray, innovation: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("ka,kab,kb->k", pull, np.linalg.inv(blocks), pull), dtype=np.float64)
 
 
-def corrected_covariance(
-    covariance: FloatArray, design: FloatArray, gain: FloatArray, noise: FloatArray
-) -> FloatArray:
+def corrected_covariance(covariance: FloatArray, design: FloatArray, gain: FloatArray, noise: FloatArray) -> FloatArray:
     """Return the covariance after a measurement in Joseph form, (1 - K H) P (1 - K H)' + K R K', symmetric.
 
     The form is valid for any gain, not only the optimal one, so rounding of the gain does not invalidate it.

@@ -107,11 +107,7 @@ def match_frames(
 
 
 def _candidate_pairs(
-    earlier: GroundFeatures,
-    later: GroundFeatures,
-    scale: float,
-    direction: int,
-    parameters: MatcherParameters,
+    earlier: GroundFeatures, later: GroundFeatures, scale: float, direction: int, parameters: MatcherParameters
 ) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
     """Return shift east, shift north and both indices of every same-class pair inside the bounds."""
     east = earlier.east_m[:, None] - later.east_m[None, :]

@@ -30,12 +30,7 @@ from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.catalogue import size_class
 from lunar.constants import MOON_RADIUS_M
-from payload_emulator.flight.navigation.odometry.matcher import (
-    GroundFeatures,
-    Match,
-    MatcherParameters,
-    match_frames,
-)
+from payload_emulator.flight.navigation.odometry.matcher import GroundFeatures, Match, MatcherParameters, match_frames
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.vision.detections import Detections
 from tmtc.dictionary.tables import AnchorTable
@@ -159,9 +154,7 @@ def step(
         return _reset(state, ticks, features, anchor, trigger)
     state = replace(state, altitude_reads=state.altitude_reads + 1)
     interval_s = (ticks - state.ticks) / TICKS_PER_SECOND
-    match = match_frames(
-        state.features.ground, features.ground, interval_s, state.direction, parameters.matcher
-    )
+    match = match_frames(state.features.ground, features.ground, interval_s, state.direction, parameters.matcher)
     motion = None
     if len(match):
         if mode is Mode.paper:
@@ -187,9 +180,7 @@ def step(
     )
 
 
-def frame_features(
-    detections: Detections, altitude_m: float, camera: PinholeCamera, mode: Mode
-) -> FrameFeatures:
+def frame_features(detections: Detections, altitude_m: float, camera: PinholeCamera, mode: Mode) -> FrameFeatures:
     """Return the detections placed on the ground: on the tangent plane (`paper`) or on the sphere
     (`spherical`).
 
@@ -207,14 +198,10 @@ def frame_features(
         else detections.size_class
     )
     size_class = np.where(np.isfinite(east) & np.isfinite(north), size_class, -1)
-    return FrameFeatures(
-        detections.u_px, detections.v_px, GroundFeatures(east, north, size_class), altitude_m
-    )
+    return FrameFeatures(detections.u_px, detections.v_px, GroundFeatures(east, north, size_class), altitude_m)
 
 
-def depth_on_sphere(
-    u_px: FloatArray, v_px: FloatArray, altitude_m: float, camera: PinholeCamera
-) -> FloatArray:
+def depth_on_sphere(u_px: FloatArray, v_px: FloatArray, altitude_m: float, camera: PinholeCamera) -> FloatArray:
     """Return the depth along the boresight of the ground behind pixels, nadir camera, NaN beyond the limb."""
     x, y = _tangents(u_px, v_px, camera)
     return _depth(x * x + y * y, altitude_m)
@@ -273,9 +260,7 @@ def solve_spherical(
     north = float(np.mean(shift[0].north_m[match.earlier] - shift[1].north_m[match.later]))
     east = float(np.mean(shift[0].east_m[match.earlier] - shift[1].east_m[match.later]))
     cosine = max(np.cos(latitude_rad), _POLE_COSINE)
-    unknowns = np.array(
-        [latitude_rad + north / MOON_RADIUS_M, east / (MOON_RADIUS_M * cosine), later.altitude_m]
-    )
+    unknowns = np.array([latitude_rad + north / MOON_RADIUS_M, east / (MOON_RADIUS_M * cosine), later.altitude_m])
     steps = np.array([_DERIVATIVE_STEP_RAD, _DERIVATIVE_STEP_RAD / cosine, _DERIVATIVE_STEP_M])
     columns = 2 if locked else 3
     for _ in range(_GAUSS_NEWTON_STEPS):
@@ -320,11 +305,7 @@ def _reset_trigger(
 
 
 def _reset(
-    state: OdometryState | None,
-    ticks: int,
-    features: FrameFeatures,
-    anchor: AnchorTable,
-    trigger: ResetTrigger,
+    state: OdometryState | None, ticks: int, features: FrameFeatures, anchor: AnchorTable, trigger: ResetTrigger
 ) -> tuple[OdometryState | None, OdometryReport]:
     """Return the state put onto the anchor ephemeris."""
     sample = anchor.at(ticks)
@@ -389,9 +370,7 @@ def _tangents(u_px: FloatArray, v_px: FloatArray, camera: PinholeCamera) -> tupl
     return (u_px - cx) / camera.focal_px, (v_px - cy) / camera.focal_px
 
 
-def _sphere_places(
-    x: FloatArray, y: FloatArray, altitude_m: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _sphere_places(x: FloatArray, y: FloatArray, altitude_m: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return arcs east and north of the sub-satellite point, and depth along the boresight, on the sphere."""
     radius = MOON_RADIUS_M + altitude_m
     depth = _depth(x * x + y * y, altitude_m)

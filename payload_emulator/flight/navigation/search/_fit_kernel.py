@@ -131,9 +131,7 @@ def fit_place(
         if step == _ROUNDS - 1:
             evidence = log_evidence(nearest, seen, found, image, gates.log_diameter_sigma)
             break
-        right = _normal_equations(
-            normal, place, theta, rotation, seen, found, nearest, attitude_sigma, image.focal_px
-        )
+        right = _normal_equations(normal, place, theta, rotation, seen, found, nearest, attitude_sigma, image.focal_px)
         change = _solved(normal, right)
         for a in range(3):
             place[a] += enu[0, a] * change[0] + enu[1, a] * change[1] + enu[2, a] * change[2]
@@ -249,9 +247,7 @@ def _turned(camera_from_enu: FloatArray, theta: FloatArray) -> FloatArray:
     for a in range(3):
         b, c = (a + 1) % 3, (a + 2) % 3
         for k in range(3):
-            rotation[a, k] = (
-                camera_from_enu[a, k] + theta[c] * camera_from_enu[b, k] - theta[b] * camera_from_enu[c, k]
-            )
+            rotation[a, k] = camera_from_enu[a, k] + theta[c] * camera_from_enu[b, k] - theta[b] * camera_from_enu[c, k]
     return rotation
 
 
@@ -352,12 +348,7 @@ def _normal_equations(
 
 @njit
 def _derivatives(
-    row: FloatArray,
-    offset: FloatArray,
-    rotation: FloatArray,
-    distance_m: float,
-    tangent: float,
-    focal_px: float,
+    row: FloatArray, offset: FloatArray, rotation: FloatArray, distance_m: float, tangent: float, focal_px: float
 ) -> None:
     """Fill the derivatives (2, 6) of a crater's pixel by place and rotation.
 

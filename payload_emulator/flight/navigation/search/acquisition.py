@@ -175,9 +175,7 @@ class _Votes:
         position = pose.mcmf_from_icrf @ pose.position_icrf_m
         radius = float(np.linalg.norm(position))
         up = position / radius
-        altitude = float(
-            np.clip(radius - MOON_RADIUS_M, parameters.minimum_altitude_m, parameters.maximum_altitude_m)
-        )
+        altitude = float(np.clip(radius - MOON_RADIUS_M, parameters.minimum_altitude_m, parameters.maximum_altitude_m))
         reach = parameters.prior_sigmas * sigma_m
         low = max(altitude - reach, parameters.minimum_altitude_m)
         high = min(altitude + reach, parameters.maximum_altitude_m)
@@ -227,18 +225,14 @@ class _Votes:
             x = np.floor((camera @ self.east) / self.cell_m).astype(np.int64) + size // 2
             y = np.floor((camera @ self.north) / self.cell_m).astype(np.int64) + size // 2
             inside = (x >= 0) & (x < size) & (y >= 0) & (y < size) & (root > 0.0)
-            inside &= (
-                np.abs(self.log_depth - np.log(altitude) - self.sag) < parameters.log_diameter_gate + self.sag
-            )
+            inside &= np.abs(self.log_depth - np.log(altitude) - self.sag) < parameters.log_diameter_gate + self.sag
             cells = np.unique((x[inside] * size + y[inside]) * 4096 + self.detection[inside]) // 4096
             grid = np.bincount(cells, minlength=size * size).reshape(size, size).astype(np.float64)
             wide = np.pad(grid, 1)
             blocks = wide[:-1, :-1] + wide[1:, :-1] + wide[:-1, 1:] + wide[1:, 1:]
             for flat in np.argpartition(blocks.reshape(-1), -3)[-3:]:
                 i, j = divmod(int(flat), blocks.shape[1])
-                found.append(
-                    (float(blocks[i, j]), float(i - size // 2), float(j - size // 2), float(altitude))
-                )
+                found.append((float(blocks[i, j]), float(i - size // 2), float(j - size // 2), float(altitude)))
         found.sort(key=lambda item: -item[0])
         return [
             (self.centre * (MOON_RADIUS_M + altitude) + (self.east * i + self.north * j) * self.cell_m)

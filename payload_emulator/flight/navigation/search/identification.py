@@ -112,14 +112,7 @@ def identify(
     """
     place_px2 = np.einsum("jajb->jab", prior_px2) if place_px2 is None else place_px2
     detection, sighted, offset, spread, chance, harm = _candidates(
-        found,
-        sighting,
-        prior_px2,
-        crater_noise_px2,
-        detection_variance_px2,
-        image_area_px2,
-        parameters,
-        place_px2,
+        found, sighting, prior_px2, crater_noise_px2, detection_variance_px2, image_area_px2, parameters, place_px2
     )
     count = int(detection.size)
     if not count:
@@ -128,9 +121,7 @@ def identify(
     chosen, tight_chance = _consensus(
         detection, sighted, offset, spread, prior_px2, chance, parameters.hypothesis_limit
     )
-    chosen = _consistent(
-        chosen, sighted, offset, prior_px2, crater_noise_px2, detection_variance_px2[detection]
-    )
+    chosen = _consistent(chosen, sighted, offset, prior_px2, crater_noise_px2, detection_variance_px2[detection])
     limit = parameters.false_set_limit / max(1, len(found) - 2) ** 2
     needed = max(
         minimum_members(float(chance.sum()), tight_chance, limit),
@@ -271,7 +262,6 @@ def _distance(offset: FloatArray, spread: FloatArray, determinant: FloatArray) -
     """Return squared Mahalanobis distances of offsets (..., 2) under covariances (..., 2, 2)."""
     a, b = offset[..., 0], offset[..., 1]
     return np.asarray(
-        (spread[..., 1, 1] * a * a - 2.0 * spread[..., 0, 1] * a * b + spread[..., 0, 0] * b * b)
-        / determinant,
+        (spread[..., 1, 1] * a * a - 2.0 * spread[..., 0, 1] * a * b + spread[..., 0, 0] * b * b) / determinant,
         dtype=np.float64,
     )

@@ -141,13 +141,7 @@ class PlaceIndex:
     def octets(self) -> int:
         """Return the size of what is kept in addition to the map."""
         bins = (self.tile_start, self.bin_start, self.bin_height, self.height_m)
-        craters = (
-            self.log_diameter,
-            self.latitude_rad,
-            self.tangent,
-            self.longitude_rad,
-            self.size_quantiles,
-        )
+        craters = (self.log_diameter, self.latitude_rad, self.tangent, self.longitude_rad, self.size_quantiles)
         return int(sum(array.nbytes for array in (*bins, *craters)))
 
     def __len__(self) -> int:
@@ -192,9 +186,7 @@ def place_index(landmarks: LandmarkMap) -> PlaceIndex:
     heights, height = np.unique(
         np.floor((radius - MOON_RADIUS_M) / _HEIGHT_BIN_M).astype(np.int64), return_inverse=True
     )
-    row, column = (
-        np.floor(part / _TILE_RAD).astype(np.int64) for part in (landmarks.latitude_rad, longitude)
-    )
+    row, column = (np.floor(part / _TILE_RAD).astype(np.int64) for part in (landmarks.latitude_rad, longitude))
     tile = row * _TILE_FACTOR + column
     order = np.lexsort((log_diameter, height, tile))
     bins, first = np.unique(np.stack([tile[order], height[order]]), axis=1, return_index=True)
@@ -273,11 +265,7 @@ def find_place(
 
 
 def _voted(
-    uv: FloatArray,
-    diameter_px: FloatArray,
-    index: PlaceIndex,
-    camera: PinholeCamera,
-    parameters: LostParameters,
+    uv: FloatArray, diameter_px: FloatArray, index: PlaceIndex, camera: PinholeCamera, parameters: LostParameters
 ) -> FloatArray:
     """Return the best places of the vote (MCMF), shape (n, 3), best first."""
     from payload_emulator.flight.navigation.search._vote_kernel import Blocks, Directions, SortedCraters, vote
@@ -330,9 +318,7 @@ def _voted(
     latitude = south + (row + 1.0) * edge
     longitude = west + (column + 1.0) * edge / np.cos(latitude)
     flat = distance_m * np.cos(latitude)
-    return np.stack(
-        [flat * np.cos(longitude), flat * np.sin(longitude), distance_m * np.sin(latitude)], axis=1
-    )
+    return np.stack([flat * np.cos(longitude), flat * np.sin(longitude), distance_m * np.sin(latitude)], axis=1)
 
 
 def _grid(index: PlaceIndex, cell_rad: float) -> tuple[int, int]:
@@ -360,11 +346,7 @@ def _work_space(cells: int) -> NDArray[np.uint16]:
 
 
 def _affordable(
-    log_size: FloatArray,
-    altitudes_m: FloatArray,
-    cells_rad: FloatArray,
-    index: PlaceIndex,
-    parameters: LostParameters,
+    log_size: FloatArray, altitudes_m: FloatArray, cells_rad: FloatArray, index: PlaceIndex, parameters: LostParameters
 ) -> int:
     """Return how many detections, from the first on, may vote within the bound of work.
 
@@ -382,8 +364,7 @@ def _affordable(
     size = log_size[:, None] + np.log(altitudes_m)
     level = np.linspace(0.0, len(index), index.size_quantiles.size)
     below, above = (
-        np.interp(size + sign * parameters.log_diameter_gate, index.size_quantiles, level)
-        for sign in (-1.0, 1.0)
+        np.interp(size + sign * parameters.log_diameter_gate, index.size_quantiles, level) for sign in (-1.0, 1.0)
     )
     votes = above - below
     votes[votes * 4.0 * cells_rad**2 > CHANCE_LIMIT * index.extent[4]] = 0.0
@@ -399,13 +380,7 @@ def _fitted(
     parameters: LostParameters,
 ) -> list[Place]:
     """Return places (MCMF), shape (n, 3), fitted to the detections they explain; those without three are left out."""
-    from payload_emulator.flight.navigation.search._fit_kernel import (
-        Craters,
-        DetectedCraters,
-        Gates,
-        Image,
-        fit_place,
-    )
+    from payload_emulator.flight.navigation.search._fit_kernel import Craters, DetectedCraters, Gates, Image, fit_place
 
     landmarks = index.landmarks
     half_px = 0.5 * np.array([camera.width_px, camera.height_px], dtype=np.float64)
@@ -454,11 +429,7 @@ def _fitted(
 
 
 def _log_share(
-    altitude_m: float,
-    attitude_rad: FloatArray,
-    normal: FloatArray,
-    index: PlaceIndex,
-    parameters: LostParameters,
+    altitude_m: float, attitude_rad: FloatArray, normal: FloatArray, index: PlaceIndex, parameters: LostParameters
 ) -> float:
     """Return the logarithm of the share of all possible poses that agrees with the detections as well as a fit.
 
@@ -468,9 +439,7 @@ def _log_share(
     sigma = parameters.attitude_sigma_rad
     span = math.log(parameters.maximum_altitude_m / parameters.minimum_altitude_m)
     of_place = -math.log(float(index.extent[4]) * MOON_RADIUS_M**2 * altitude_m * span)
-    of_attitude = (
-        -1.5 * math.log(2.0 * math.pi * sigma**2) - 0.5 * float(attitude_rad @ attitude_rad) / sigma**2
-    )
+    of_attitude = -1.5 * math.log(2.0 * math.pi * sigma**2) - 0.5 * float(attitude_rad @ attitude_rad) / sigma**2
     volume = 3.0 * math.log(2.0 * math.pi) - 0.5 * float(np.linalg.slogdet(normal)[1])
     return of_place + of_attitude + volume
 
