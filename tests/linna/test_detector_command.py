@@ -114,17 +114,17 @@ def test_a_labelled_set_of_anyone_is_evaluated(tmp_path, write_image, typed):
     assert "evidence level 5" in text and "two scales" in text
 
 
-@pytest.mark.parametrize(
-    ("extra", "words"),
-    [
-        ("--report r.html", "--report: expected together with --dataset"),
-        ("--paper-classes", "--paper-classes: expected together with --dataset"),
-        ("--pixel-m 0", "--pixel-m: expected a number above 0, found '0'"),
-        ("--fov-deg 0", "--fov-deg: expected a number above 0 and below 180"),
-        ("--range-px 9 8", "--range-px: expected two diameters in rising order, found 9 8"),
-        ("", "expected a COCO file"),
-    ],
-)
+UNFIT = """
+--report r.html -> --report: expected together with --dataset
+--paper-classes -> --paper-classes: expected together with --dataset
+--pixel-m 0 -> --pixel-m: expected a number above 0, found '0'
+--fov-deg 0 -> --fov-deg: expected a number above 0 and below 180
+--range-px 9 8 -> --range-px: expected two diameters in rising order, found 9 8
+ -> expected a COCO file
+"""
+
+
+@pytest.mark.parametrize(("extra", "words"), [line.split(" -> ") for line in UNFIT.splitlines()[1:]])
 def test_what_does_not_fit_a_labelled_set_is_refused(tmp_path, typed, extra, words):
     assert words in typed(f"detector evaluate --coco {tmp_path} {extra}", 2)
 

@@ -7,7 +7,6 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -44,11 +43,21 @@ SCENARIO = commanded_scenario(
 SHORT = 'outages = ["madrid 2029-08-07T04:00:00Z 2029-08-07T23:00:00Z"]\n'
 """Ends the first contact, which begins at 03:27:55, after half an hour."""
 
-Act = Callable[["Ground", dict[str, Any]], None]
-
 
 def scenario(further=""):
     return parse_scenario(SCENARIO + further)
+
+
+def first(send, say=""):
+    """Let the ground send telecommands, and a word to the console, when its first contact starts."""
+
+    def act(ground, contact):
+        if contact["state"] == "started" and ground.count == 0:
+            ground.send(*send(ground))
+            if say:
+                ground.say(say)
+
+    return act
 
 
 class Ground:
@@ -59,7 +68,6 @@ class Ground:
         self.contacts = []
         self.records = b""
         self.count = 0
-        self.saved = []
         self._lock = threading.Lock()
         self._telemetry = self._connect("telemetry madrid")
         self._telecommand = self._connect("telecommand madrid")
@@ -70,8 +78,7 @@ class Ground:
             thread.start()
 
     def _connect(self, name):
-        connection = socket.create_connection(("127.0.0.1", self.session.ports[name]), timeout=900.0)
-        return connection
+        return socket.create_connection(("127.0.0.1", self.session.ports[name]), timeout=900.0)
 
     def _receive(self):
         while octets := self._telemetry.recv(65_536):
@@ -83,8 +90,6 @@ class Ground:
             if message["kind"] == "contact":
                 self.contacts.append(message)
                 self.act(self, message)
-            if message["kind"] == "saved":
-                self.saved.append(message["saved"])
             if message["kind"] in ("contact", "finished"):
                 self._console.sendall(b"run\n")
 
@@ -115,9 +120,9 @@ class Ground:
             connection.close()
 
 
-def opened(scenario, craters=None, **options):
+def opened(scenario, **options):
     """Return a session of a launched spacecraft."""
-    return LiveSession(*launch(scenario, DataFolder(None), craters), **options)
+    return LiveSession(*launch(scenario, DataFolder(None)), **options)
 
 
 @contextlib.contextmanager
@@ -170,16 +175,13 @@ Flight = tuple[LiveSession, Ground, list[tuple[int, str, dict[str, Any]]]]
 def flight():
     """Sixteen hours with time reports and one window: the Moon is above the station for twelve of them."""
 
-    def act(ground, contact):
-        if contact["state"] == "started" and ground.count == 0:
-            ground.send(
-                ground.command("set_time_report_rate", rate_exponent=0),
-                ground.at(WINDOW + 100 * NS, ground.command("test_connection")),
-                ground.at(WINDOW, ground.function("start_observation", 600.0, 15.0)),
-                ground.at(WINDOW + 605 * NS, ground.function("set_mode", 3.0)),
-            )
+    def commands(ground):
+        yield ground.command("set_time_report_rate", rate_exponent=0)
+        yield ground.at(WINDOW + 100 * NS, ground.command("test_connection"))
+        yield ground.at(WINDOW, ground.function("start_observation", 600.0, 15.0))
+        yield ground.at(WINDOW + 605 * NS, ground.function("set_mode", 3.0))
 
-    session, ground = flown(scenario(), 16.0, act)
+    session, ground = flown(scenario(), 16.0, first(commands))
     return session, ground, packets_of(ground.records)
 
 
@@ -245,37 +247,27 @@ def test_telecommands_without_a_contact_of_their_station_are_lost():
 
 def test_the_uplink_carries_no_more_than_its_rate():
     """At 8 bit/s a contact of half an hour takes a part of 2000 telecommands; the others are lost."""
-    sent = []
-
-    def act(ground, contact):
-        if contact["state"] == "started" and not sent:
-            packets = [ground.command("test_connection") for _ in range(2_000)]
-            sent.append(sum(map(len, packets)))
-            ground.send(*packets)
-
     slow = parse_scenario(SCENARIO.replace("uplink_bps = 64000.0", "uplink_bps = 8.0") + SHORT)
+    act = first(lambda ground: [ground.command("test_connection") for _ in range(2_000)])
     session, ground = flown(slow, 4.5, act)
-    first = [parse_utc(one["utc"]) for one in ground.contacts[:2]]
-    seconds = (first[1] - first[0]) / NS
-    packet = sent[0] // 2_000
+    start, stop = (parse_utc(one["utc"]) for one in ground.contacts[:2])
+    seconds, packet = (stop - start) / NS, len(ground.command("test_connection"))
     assert session.account.telecommands == pytest.approx(seconds / packet, abs=2)
-    assert session.account.telecommand_octets_lost == pytest.approx(sent[0] - seconds, abs=2 * packet)
+    assert session.account.telecommand_octets_lost == pytest.approx(2_000 * packet - seconds, abs=2 * packet)
 
 
 def test_an_exact_state_gives_the_same_flight_as_without_an_interruption(tmp_path):
     """The state is written between the uplink of a window and the window; it has the schedule of the payload."""
     snapshot = tmp_path / "exact"
 
-    def act(ground, contact):
-        if contact["state"] == "started" and ground.count == 0:
-            ground.send(
-                ground.command("set_time_report_rate", rate_exponent=0),
-                ground.at(EPOCH + 5 * HOUR_NS, ground.function("start_observation", 600.0, 15.0)),
-            )
+    def commands(ground):
+        yield ground.command("set_time_report_rate", rate_exponent=0)
+        yield ground.at(EPOCH + 5 * HOUR_NS, ground.function("start_observation", 600.0, 15.0))
 
+    act = first(commands)
     whole, received = flown(scenario(SHORT), 29.0, act)
-    first, before = flown(scenario(SHORT), 4.5, act, state_file=snapshot)
-    assert first.account.frames == 0
+    begun, before = flown(scenario(SHORT), 4.5, act, state_file=snapshot)
+    assert begun.account.frames == 0
     second, after = flown(scenario(SHORT), 29.0, state_file=snapshot)
     assert second.spacecraft.resets == []
     assert second.account == whole.account and whole.account.frames == 40
@@ -286,14 +278,10 @@ def test_an_exact_state_in_a_contact_keeps_what_is_still_on_the_uplink(tmp_path)
     """At 16 bit/s most of 60 telecommands reach the spacecraft after the state was written."""
     slow = parse_scenario(SCENARIO.replace("uplink_bps = 64000.0", "uplink_bps = 16.0") + SHORT)
 
-    def act(ground, contact):
-        if contact["state"] == "started" and ground.count == 0:
-            ground.send(*(ground.command("test_connection") for _ in range(60)))
-            ground.say("save")
-
+    act = first(lambda ground: [ground.command("test_connection") for _ in range(60)], "save")
     whole, received = flown(slow, 5.0, act)
-    first, _ = flown(slow, 3.5, act, state_file=tmp_path / "exact")
-    assert first.account.telecommands < 60 == whole.account.telecommands
+    begun, _ = flown(slow, 3.5, act, state_file=tmp_path / "exact")
+    assert begun.account.telecommands < 60 == whole.account.telecommands
     second, after = flown(slow, 5.0, state_file=tmp_path / "exact")
     assert second.account == whole.account
     assert received.records.endswith(after.records) and len(after.records) > 0
@@ -324,13 +312,11 @@ def test_a_console_that_connects_after_the_end_is_informed(tmp_path):
 def test_images_that_the_payload_refuses_to_look_at_are_no_frames():
     """In safe mode the start of the observation is refused, and the image that was made for it is not counted."""
 
-    def act(ground, contact):
-        if contact["state"] == "started" and ground.count == 0:
-            start = ground.function("start_observation", 60.0, 15.0)
-            safe = ground.at(EPOCH + 5 * HOUR_NS - 60 * NS, ground.function("set_mode", 0.0))
-            ground.send(safe, ground.at(EPOCH + 5 * HOUR_NS, start))
+    def commands(ground):
+        yield ground.at(EPOCH + 5 * HOUR_NS - 60 * NS, ground.function("set_mode", 0.0))
+        yield ground.at(EPOCH + 5 * HOUR_NS, ground.function("start_observation", 60.0, 15.0))
 
-    session, _ = flown(scenario(SHORT), 6.0, act)
+    session, _ = flown(scenario(SHORT), 6.0, first(commands))
     payload = session.spacecraft.payload
     assert session.account.frames == payload.frames == 0
 
@@ -354,9 +340,9 @@ def test_records_that_are_not_acknowledged_come_again_on_the_next_connection():
                     got += connection.recv(65_536)
             return got
 
-        with socket.create_connection(("127.0.0.1", station.telemetry.port)) as first:
-            assert len(served(first, 3 * length)) == 3 * length
-            first.send(struct.pack(">Q", length))
+        with socket.create_connection(("127.0.0.1", station.telemetry.port)) as early:
+            assert len(served(early, 3 * length)) == 3 * length
+            early.send(struct.pack(">Q", length))
         for _ in range(20):
             session._serve(selector, 0.02)
         with socket.create_connection(("127.0.0.1", station.telemetry.port)) as second:
@@ -379,16 +365,10 @@ def test_the_mission_description_names_stations_and_links():
     assert written.approval is not None and written.uploads is not None
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--live", "--rate", "-1"], "--rate: expected a number from 0, found '-1'"),
-        (["--live", "--days", "-1"], "--days: expected a number above 0, found '-1'"),
-    ],
-)
-def test_impossible_options_are_refused_in_one_line(words, message, capsys):
-    assert cli.run(["emulate", "low-over-mare", *words]) == 2
-    assert message in capsys.readouterr().err
+@pytest.mark.parametrize(("option", "limit"), [("--rate", "from"), ("--days", "above")])
+def test_impossible_options_are_refused_in_one_line(option, limit, capsys):
+    assert cli.run(["emulate", "low-over-mare", "--live", option, "-1"]) == 2
+    assert f"{option}: expected a number {limit} 0, found '-1'" in capsys.readouterr().err
 
 
 def test_a_scenario_with_an_ephemeris_or_a_kidnap_is_refused():

@@ -50,18 +50,21 @@ EPOCH = parse_utc("2029-08-07T01:40:00Z")
 
 @pytest.fixture(scope="module")
 def flown():
-    data = NO_DATA
-    world = build_world(parse_scenario(SCENARIO), data)
-    return world, load_scenario_payload(world, data)[0]
+    world = build_world(parse_scenario(SCENARIO), NO_DATA)
+    return world, load_scenario_payload(world, NO_DATA)[0]
+
+
+def connected(port):
+    return socket.create_connection(("127.0.0.1", port), timeout=900.0)
 
 
 class Watcher:
     """A client of the live payload."""
 
     def __init__(self, live):
-        self.telemetry = socket.create_connection(("127.0.0.1", live.ports["telemetry earth"]), timeout=900.0)
-        self.telecommands = socket.create_connection(("127.0.0.1", live.ports["telecommand earth"]), timeout=900.0)
-        self.console = socket.create_connection(("127.0.0.1", live.ports["console"]), timeout=900.0)
+        self.telemetry = connected(live.ports["telemetry earth"])
+        self.telecommands = connected(live.ports["telecommand earth"])
+        self.console = connected(live.ports["console"])
         self.lines = self.console.makefile("r")
         self.say("watch")
 
@@ -254,7 +257,7 @@ def test_hundreds_of_short_half_open_and_reset_connections_do_not_stop_the_paylo
     held = []
     for k in range(300):
         for name in ("telemetry earth", "telecommand earth", "console"):
-            connection = socket.create_connection(("127.0.0.1", live.ports[name]), timeout=900.0)
+            connection = connected(live.ports[name])
             if name == "console":
                 # The answer to an unknown word meets a connection that is gone already.
                 connection.sendall(b"unknown\n" * 3 + b"half a wo")
@@ -302,7 +305,7 @@ def test_a_reader_that_does_not_read_is_disconnected_and_delays_nobody():
     received = []
     server = Server("telemetry", 0, "127.0.0.1", lambda number, octets: received.append((number, octets)))
     selector = served(server)
-    slow, quick = (socket.create_connection(("127.0.0.1", server.port), timeout=900.0) for _ in range(2))
+    slow, quick = (connected(server.port) for _ in range(2))
     while len(server.clients) < 2:
         turn(selector)
     chunk, octets = bytes(range(256)) * 1024, b""
@@ -335,7 +338,7 @@ def test_words_of_a_client_that_left_without_reading_are_received(leave):
     received = []
     server = Server("console", 0, "127.0.0.1", lambda number, octets: received.append(octets))
     selector = served(server)
-    client = socket.create_connection(("127.0.0.1", server.port), timeout=900.0)
+    client = connected(server.port)
     while not server.clients:
         turn(selector)
     server.send(b"snapshot that nobody reads\n")
@@ -355,7 +358,7 @@ def test_words_of_a_client_that_left_without_reading_are_received(leave):
 def test_no_more_connections_are_held_than_the_limit():
     server = Server("telemetry", 0, "127.0.0.1", lambda number, octets: None)
     selector = served(server)
-    clients = [socket.create_connection(("127.0.0.1", server.port), timeout=900.0) for _ in range(CLIENT_LIMIT + 3)]
+    clients = [connected(server.port) for _ in range(CLIENT_LIMIT + 3)]
     while server._accepted < CLIENT_LIMIT:
         turn(selector)
     for _ in range(3):

@@ -1,6 +1,7 @@
 """Anchored navigation over many simulated frames: accuracy, honesty, recovery, and what it does with bad input."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -33,8 +34,13 @@ PARAMETERS = AnchoredParameters(
 )
 
 
-def test_from_five_kilometres_off_the_orbit_is_held_to_a_hundred_metres_without_truth(navigation_case):
-    case = navigation_case(120, start_position_m=5_000.0, start_velocity_m_s=5.0, parameters=PARAMETERS)
+@pytest.fixture
+def case_of(navigation_case):
+    return partial(navigation_case, parameters=PARAMETERS)
+
+
+def test_from_five_kilometres_off_the_orbit_is_held_to_a_hundred_metres_without_truth(case_of):
+    case = case_of(120, start_position_m=5_000.0, start_velocity_m_s=5.0)
     result = consistency([fly(case, seed) for seed in (1, 2)])
     # The single-frame bound for 18 craters, 1.5 px and this catalogue is 120 m (3-D); the orbit averages over frames.
     assert result.median_m <= 100.0
@@ -63,10 +69,9 @@ def test_each_way_of_not_knowing_its_errors_is_named(fault, words):
     assert len(judged.reasons) == 1 and words in judged.reasons[0]
 
 
-def test_errors_of_a_run_differ_for_each_seed(navigation_case):
-    case = navigation_case(
+def test_errors_of_a_run_differ_for_each_seed(case_of):
+    case = case_of(
         30, start_position_m=100.0, start_velocity_m_s=0.1, detector=SimulatedDetector(scale_sigma=0.02),
-        parameters=PARAMETERS,
     )  # fmt: skip
     # Two per cent of 23 km of altitude are 460 m: the radial errors of runs scatter by that, and not without it.
     radial = [fly(case, seed).error_rtn_m[-1, 0] for seed in range(6)]
@@ -75,19 +80,19 @@ def test_errors_of_a_run_differ_for_each_seed(navigation_case):
     assert np.std(exact) < 80.0
 
 
-def test_a_common_pixel_bias_hides_from_the_innovations_and_shows_in_the_errors(navigation_case):
-    biased = navigation_case(150, detector=SimulatedDetector(bias_px=(1.0, 0.0)), parameters=PARAMETERS)
+def test_a_common_pixel_bias_hides_from_the_innovations_and_shows_in_the_errors(case_of):
+    biased = case_of(150, detector=SimulatedDetector(bias_px=(1.0, 0.0)))
     result = consistency([fly(biased, 3)])
     assert result.nis_per_degree <= 1.15
     assert result.anees > 10.0
 
 
-def test_an_attitude_of_a_degree_neither_diverges_nor_lies(navigation_case):
+def test_an_attitude_of_a_degree_neither_diverges_nor_lies(case_of):
     # A wide field of view sees its own attitude: with known errors of the sensor (single frame, 20 craters, 30 km) the
     # place is worse by 1.8 without any attitude; a filter has 93 m (median) at 1 degree.
     noise = float(np.radians(1.0))
     parameters = replace(PARAMETERS, errors=replace(PARAMETERS.errors, attitude_noise_rad=noise))
-    case = navigation_case(100, attitude_noise_rad=noise, attitude_bias_rad=0.0, parameters=parameters)
+    case = case_of(100, attitude_noise_rad=noise, attitude_bias_rad=0.0, parameters=parameters)
     runs = [fly(case, seed) for seed in (21, 22, 23, 24)]
     result = consistency(runs)
     assert result.median_m <= 130.0
@@ -100,33 +105,33 @@ def test_an_attitude_of_a_degree_neither_diverges_nor_lies(navigation_case):
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(one, marks=pytest.mark.campaign) for one in (2, 3))])
-def test_a_jump_of_five_kilometres_that_nobody_told_of_is_noticed_and_mended(navigation_case, seed):
-    case = navigation_case(80, kidnap=Kidnap(50, 5_000.0, announced=False), parameters=PARAMETERS)
+def test_a_jump_of_five_kilometres_that_nobody_told_of_is_noticed_and_mended(case_of, seed):
+    case = case_of(80, kidnap=Kidnap(50, 5_000.0, announced=False))
     run = fly(case, seed)
     assert run.error_m[49] < 300.0
     assert run.error_m[50] > 4_000.0
     assert np.all(run.error_m[58:] < 500.0)
 
 
-def test_a_told_jump_of_tens_of_kilometres_is_mended_within_four_frames(navigation_case):
-    case = navigation_case(40, kidnap=Kidnap(25, 50_000.0, announced=True), parameters=PARAMETERS)
+def test_a_told_jump_of_tens_of_kilometres_is_mended_within_four_frames(case_of):
+    case = case_of(40, kidnap=Kidnap(25, 50_000.0, announced=True))
     run = fly(case, 4)
     assert np.all(run.error_m[29:] < 500.0)
 
 
-def test_after_hours_without_a_camera_the_first_frames_bring_the_orbit_back(navigation_case):
+def test_after_hours_without_a_camera_the_first_frames_bring_the_orbit_back(case_of):
     imaging = np.ones(760, dtype=bool)
     imaging[20:740] = False
-    case = navigation_case(760, imaging=imaging, parameters=PARAMETERS)
+    case = case_of(760, imaging=imaging)
     run = fly(case, 5)
     assert np.all(run.outcome[20:740] == Outcome.no_image)
     assert np.all(run.error_m[743:] < 500.0)
 
 
-def test_a_wrong_catalogue_is_refused_and_the_orbit_coasted(navigation_case):
-    case = navigation_case(
+def test_a_wrong_catalogue_is_refused_and_the_orbit_coasted(case_of):
+    case = case_of(
         40, start_position_m=100.0, start_velocity_m_s=0.1,
-        catalogue_errors=CatalogueErrors(centre_of_diameter=0.03, wrong_share=1.0), parameters=PARAMETERS,
+        catalogue_errors=CatalogueErrors(centre_of_diameter=0.03, wrong_share=1.0),
     )  # fmt: skip
     run = fly(case, 6)
     # A lone chance neighbour inside its gate may be taken for a crater now and then: it moves nothing by much.
@@ -134,12 +139,10 @@ def test_a_wrong_catalogue_is_refused_and_the_orbit_coasted(navigation_case):
     assert np.all(run.error_m < 500.0)
 
 
-def test_false_detections_alone_give_no_fix(navigation_case):
+def test_false_detections_alone_give_no_fix(case_of):
     blind = SimulatedDetector(recall=(0.0, 0.0, 0.0, 0.0), precision=0.06)
     for sigma, frames in ((100.0, 60), (10_000.0, 6)):
-        case = navigation_case(
-            frames, detector=blind, start_position_m=sigma, start_velocity_m_s=0.1, parameters=PARAMETERS
-        )
+        case = case_of(frames, detector=blind, start_position_m=sigma, start_velocity_m_s=0.1)
         run = fly(case, 7)
         assert np.count_nonzero(run.fixed) <= 2
         assert set(run.outcome.tolist()) <= {Outcome.fixed, Outcome.coasted, Outcome.refused}
@@ -147,8 +150,8 @@ def test_false_detections_alone_give_no_fix(navigation_case):
     assert Outcome.refused in run.outcome.tolist()
 
 
-def test_the_same_seed_gives_the_same_run_on_any_number_of_processes(navigation_case):
-    case = navigation_case(12, parameters=PARAMETERS)
+def test_the_same_seed_gives_the_same_run_on_any_number_of_processes(case_of):
+    case = case_of(12)
     alone, together = fly_many(case, [1, 2], workers=1), fly_many(case, [1, 2], workers=2)
     for one, other in zip(alone, together, strict=True):
         np.testing.assert_array_equal(one.error_rtn_m, other.error_rtn_m)

@@ -123,12 +123,10 @@ def test_a_damaged_file_is_refused_with_its_name(tmp_path):
     assert found is not None and np.array_equal(found["one"], np.arange(40))
     assert [one.name for one in tmp_path.iterdir()] == ["exact"]
     begin = whole.index(b"\n") + 1
-    for length in (0, 1, 20, begin - 1, begin, begin + 1, begin + 60, len(whole) - 1):
-        path.write_bytes(whole[:length])
-        with pytest.raises(RecordError, match=r"exact: expected the state of a spacecraft process .*, found"):
-            load_state(path, "a", {})
-    for place in (3, begin + 2, begin + 100, len(whole) - 2):
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+    cut = (whole[:length] for length in (0, 1, 20, begin - 1, begin, begin + 1, begin + 60, len(whole) - 1))
+    places = (3, begin + 2, begin + 100, len(whole) - 2)
+    for octets in (*cut, *(whole[:k] + bytes([whole[k] ^ 4]) + whole[k + 1 :] for k in places)):
+        path.write_bytes(octets)
         with pytest.raises(RecordError, match=r"exact: expected the state of a spacecraft process .*, found"):
             load_state(path, "a", {})
 
@@ -152,29 +150,36 @@ def sealed(root):
     return f"LINNA spacecraft state, version {VERSION}, SHA-256 {sha256(body).hexdigest()}\n".encode() + body
 
 
-@pytest.mark.parametrize(
-    "node",
-    [
-        7, None, ["list", 1], ["ref", 9], ["dict", ["one"]], ["dict", ["one", ["known", "x"]]], ["unknown"], [],
-        ["dict", ["one", ["object", "subprocess:Popen"]]], ["dict", ["one", ["module", "subprocess"]]],
-        ["dict", ["one", ["object", "payload_emulator.session.live.state:Path"]]],
-        ["dict", ["one", ["object", "payload_emulator.session.live.state:pack_state"]]],
-        ["dict", ["one", ["object", "payload_emulator.session.live.state:json.JSONDecoder"]]],
-        ["dict", ["one", ["object", "payload_emulator.session.none:Any"]]],
-        ["dict", ["one", ["object", "payload_emulator.flight.onboard.modes:PayloadMode"]]],
-        ["dict", ["one", ["enum", "tmtc.link.uplink:Farm", 1]]],
-        ["dict", ["one", ["trajectory", ["dict"]]]],
-        ["dict", ["one", ["array", "O", [1], "C", 0]]],
-        ["dict", ["one", ["view", ["array", "|u1", [8], "C", 0], 0, [1], [8], "O"]]],
-        ["dict", ["one", ["view", ["array", "|u1", [8], "C", 0], 4, [1], [8], "<i8"]]],
-        ["dict", ["one", ["bytes", 1]]],
-        ["dict", ["one", ["object", "tmtc.link.uplink:Farm", ["unknown", 1]]]],
-    ],
-    ids=json.dumps,
-)  # fmt: skip
+NODES = """
+7
+null
+["list", 1]
+["ref", 9]
+["dict", ["one"]]
+["dict", ["one", ["known", "x"]]]
+["unknown"]
+[]
+["dict", ["one", ["object", "subprocess:Popen"]]]
+["dict", ["one", ["module", "subprocess"]]]
+["dict", ["one", ["object", "payload_emulator.session.live.state:Path"]]]
+["dict", ["one", ["object", "payload_emulator.session.live.state:pack_state"]]]
+["dict", ["one", ["object", "payload_emulator.session.live.state:json.JSONDecoder"]]]
+["dict", ["one", ["object", "payload_emulator.session.none:Any"]]]
+["dict", ["one", ["object", "payload_emulator.flight.onboard.modes:PayloadMode"]]]
+["dict", ["one", ["enum", "tmtc.link.uplink:Farm", 1]]]
+["dict", ["one", ["trajectory", ["dict"]]]]
+["dict", ["one", ["array", "O", [1], "C", 0]]]
+["dict", ["one", ["view", ["array", "|u1", [8], "C", 0], 0, [1], [8], "O"]]]
+["dict", ["one", ["view", ["array", "|u1", [8], "C", 0], 4, [1], [8], "<i8"]]]
+["dict", ["one", ["bytes", 1]]]
+["dict", ["one", ["object", "tmtc.link.uplink:Farm", ["unknown", 1]]]]
+"""
+
+
+@pytest.mark.parametrize("node", NODES.strip().splitlines())
 def test_another_document_with_a_fitting_checksum_is_refused_and_calls_nothing(node):
     with pytest.raises(RecordError, match="found damage"):
-        unpack_state(sealed(["a", node, [8]]), "a", {})
+        unpack_state(sealed(["a", json.loads(node), [8]]), "a", {})
 
 
 def test_a_document_names_octets_by_their_numbers_and_equal_ones_are_written_once():

@@ -1,5 +1,6 @@
 """Tables read into frozen values: what is converted, what is refused and in which words."""
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -63,29 +64,31 @@ def test_what_a_table_does_not_name_stays_as_it_was():
     assert before.inner.length_m == 9.0
 
 
+WRONG = """
+name = 3 | name | a text | 3
+count = 1.0 | count | a whole number | 1.0
+count = true | count | a whole number | True
+share = "much" | share | a number | 'much'
+share = true | share | a number | True
+share = inf | share | finite | inf
+on = 1 | on | true or false | 1
+mode = "swift" | mode | one of 'slow', 'fast' | 'swift'
+colours = "red" | colours | a list | 'red'
+colours = ["red", "green"] | colours[1] | one of red, blue | 'green'
+inner = 3.0 | inner | a table | 3.0
+inner = {limits = [1.0]} | inner.limits | 2 values | 1
+inner = {limits = [1.0, "x"]} | inner.limits[1] | a number | 'x'
+items = [{}, {length_m = "x"}] | items[1].length_m | a number | 'x'
+rest = {length_m = "x"} | rest.length_m | a number | 'x'
+"""
+
+
 @pytest.mark.parametrize(
-    ("table", "place", "expected", "found"),
-    [
-        ({"name": 3}, "name", "a text", "3"),
-        ({"name": "a", "count": 1.0}, "count", "a whole number", "1.0"),
-        ({"name": "a", "count": True}, "count", "a whole number", "True"),
-        ({"name": "a", "share": "much"}, "share", "a number", "'much'"),
-        ({"name": "a", "share": True}, "share", "a number", "True"),
-        ({"name": "a", "share": float("inf")}, "share", "finite", "inf"),
-        ({"name": "a", "on": 1}, "on", "true or false", "1"),
-        ({"name": "a", "mode": "swift"}, "mode", "one of 'slow', 'fast'", "'swift'"),
-        ({"name": "a", "colours": "red"}, "colours", "a list", "'red'"),
-        ({"name": "a", "colours": ["red", "green"]}, "colours[1]", "one of red, blue", "'green'"),
-        ({"name": "a", "inner": 3.0}, "inner", "a table", "3.0"),
-        ({"name": "a", "inner": {"limits": [1.0]}}, "inner.limits", "2 values", "1"),
-        ({"name": "a", "inner": {"limits": [1.0, "x"]}}, "inner.limits[1]", "a number", "'x'"),
-        ({"name": "a", "items": [{}, {"length_m": "x"}]}, "items[1].length_m", "a number", "'x'"),
-        ({"name": "a", "rest": {"length_m": "x"}}, "rest.length_m", "a number", "'x'"),
-    ],
+    ("table", "place", "expected", "found"), [line.split(" | ") for line in WRONG.strip().splitlines()]
 )
 def test_a_wrong_value_is_told_by_place_expectation_and_finding(table, place, expected, found):
     with pytest.raises(TableFault) as fault:
-        read_table(Outer, table, "top")
+        read_table(Outer, {"name": "a"} | tomllib.loads(table), "top")
     assert (fault.value.place, fault.value.expected, fault.value.found) == (f"top.{place}", expected, found)
     assert fault.value.known == () and fault.value.nearest is None
 
@@ -122,8 +125,6 @@ def test_bounds_hold_for_numbers_by_their_name_also_in_lists():
 
 
 def test_values_are_written_as_toml_that_reads_the_same():
-    import tomllib
-
     values = {"a": True, "b": 'two "quoted"\nlines \\ here', "c": (1.5, 2.0), "d": 3}
     text = "\n".join(f"{key} = {toml_text(value)}" for key, value in values.items())
     assert tomllib.loads(text) == {**values, "c": [1.5, 2.0]}

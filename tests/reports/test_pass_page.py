@@ -25,6 +25,14 @@ def page(whole_page):
     return Page(whole_page)
 
 
+def shown(report, **changes):
+    return Page(render_html(replace(report, **changes)))
+
+
+def of_pass(title="T", pass_id="p", **values):
+    return shown(PassReport(title, pass_id, **values))
+
+
 def _series(n, **more):
     """A navigation series of n samples at ten seconds, every value finite unless replaced."""
     return NavigationSeries(
@@ -91,46 +99,41 @@ def test_the_ledger_lists_the_reads_that_reset_an_estimator_only(whole_pass):
         AnchorRead("paper", whole_pass.truth_ledger[0].utc_ns, trigger, 700 + number)
         for number, trigger in enumerate(("none", "safety_timeout", "none"))
     )
-    text = Page(render_html(replace(whole_pass, truth_ledger=reads))).text
+    text = shown(whole_pass, truth_ledger=reads).text
     resets = text[text.index("Reads that reset an estimator.") : text.index("Every read is in the JSON form")]
     assert "701 safety timeout" in resets
     assert "700" not in resets and "702" not in resets
 
 
 def test_a_title_with_markup_is_text(whole_pass):
-    text = render_html(
-        PassReport(
-            title='<script>alert("x")</script> $\\alpha$ 月',
-            pass_id='";} body{display:none}</style>',
-            navigation=(_series(3, name="<b>&</b> $x^2$ 月"),),
-        )
-    )
-    page = Page(text)
+    title, series = '<script>alert("x")</script> $\\alpha$ 月', _series(3, name="<b>&</b> $x^2$ 月")
+    page = of_pass(title, '";} body{display:none}</style>', navigation=(series,))
     assert page.left_open == []
     assert "script" not in page.tags and "b" in page.tags
-    assert '<script>alert("x")</script> $\\alpha$ 月' in page.text
+    assert title in page.text
 
 
 def test_an_empty_pass_says_what_is_missing_and_why():
-    page = Page(render_html(PassReport(title="Nothing", pass_id="p0")))
+    page = of_pass()
     assert page.left_open == []
-    for what, why in (
-        ("Verdict", "there is no verdict"),
-        ("Navigation", "no navigation telemetry was received"),
-        ("Frame accounting", "the frames of the pass were not counted"),
-        ("Packet accounting", "the pass has no packet accounting"),
-        ("Matcher outcomes", "no estimator reported matching outcomes"),
-        ("Altitude against the reference", "no reference ephemeris covers the pass"),
-        ("Ground track", "no reference ephemeris covers the pass"),
-        ("Gallery of detections", "the pass has no images on the ground"),
-        ("Housekeeping", "no housekeeping packet was received"),
-        ("Configuration", "none was archived with the pass"),
-    ):
-        assert f"{what} not available: {why}" in page.text
+    missing = """
+Verdict not available: there is no verdict
+Navigation not available: no navigation telemetry was received
+Frame accounting not available: the frames of the pass were not counted
+Packet accounting not available: the pass has no packet accounting
+Matcher outcomes not available: no estimator reported matching outcomes
+Altitude against the reference not available: no reference ephemeris covers the pass
+Ground track not available: no reference ephemeris covers the pass
+Gallery of detections not available: the pass has no images on the ground
+Housekeeping not available: no housekeeping packet was received
+Configuration not available: none was archived with the pass
+"""
+    for line in missing.strip().splitlines():
+        assert line in page.text
 
 
 def test_without_imaging_arcs_errors_are_those_of_the_whole_pass():
-    words = Page(render_html(PassReport("No arcs", "p7", navigation=(_series(30),)))).text
+    words = of_pass(navigation=(_series(30),)).text
     table = words[words.index("The same errors by direction in the reference orbit.") :]
     assert "whole" in table and "imaging arcs and between them" not in words
 
@@ -156,10 +159,7 @@ def test_only_false_alarms_of_the_scored_classes_are_marked_as_false(whole_pass)
 
 
 def test_a_reason_given_with_the_value_replaces_the_usual_one():
-    report = PassReport(
-        title="No images", pass_id="p1", not_available={"gallery": "images were not asked for in this window"}
-    )
-    text = Page(render_html(report)).text
+    text = of_pass(not_available={"gallery": "images were not asked for in this window"}).text
     assert "Gallery of detections not available: images were not asked for in this window" in text
     assert "gallery: images were not asked for in this window" in text
 
@@ -167,14 +167,13 @@ def test_a_reason_given_with_the_value_replaces_the_usual_one():
 def test_a_pass_without_a_reference_shows_what_the_estimators_said():
     nothing = np.full((40, 3), np.nan)
     one = _series(40, error_rtn_m=nothing, outcome=("fixed",) * 30 + ("coasted",) * 10)
-    text = Page(render_html(PassReport(title="No reference", pass_id="p2", navigation=(one,)))).text
+    text = of_pass(navigation=(one,)).text
     assert "Position error not available: no reference ephemeris covers the pass" in text
     assert "Fixed on the catalogue" in text and "75.0 %" in text
 
 
 def test_a_pass_without_frames_says_so_and_shows_the_rest(whole_pass):
-    report = replace(whole_pass, accounting=None, gallery=(), worst_frames=(), detector=None, craters=None)
-    page = Page(render_html(report))
+    page = shown(whole_pass, accounting=None, gallery=(), worst_frames=(), detector=None, craters=None)
     assert page.left_open == []
     assert "Frame accounting not available: the frames of the pass were not counted" in page.text
     assert "Recall, precision, localisation not available" in page.text
@@ -183,7 +182,7 @@ def test_a_pass_without_frames_says_so_and_shows_the_rest(whole_pass):
 
 
 def test_a_pass_without_navigation_says_so_and_shows_the_rest(whole_pass):
-    page = Page(render_html(replace(whole_pass, navigation=(), truth_ledger=())))
+    page = shown(whole_pass, navigation=(), truth_ledger=())
     assert page.left_open == []
     assert "Navigation not available: no navigation telemetry was received" in page.text
     assert "Detection by size class" in page.text and "Filter consistency" not in page.text
@@ -192,15 +191,16 @@ def test_a_pass_without_navigation_says_so_and_shows_the_rest(whole_pass):
 def test_a_pass_of_one_frame_is_reported():
     report = example.pass_report(hours=15.0 / 3600.0, gallery=1, worst=0)
     assert len(report.navigation[0].utc_ns) == 1
-    page = Page(render_html(report))
+    page = shown(report)
     assert page.left_open == []
     assert "Of 1 expected" in page.text
 
 
 @pytest.mark.parametrize("changes", [(), (("link.coding", "rs", None),)])
 def test_settings_are_compared_with_those_of_the_previous_pass(changes):
-    report = PassReport("Compared", "p8", comparison=SettingsComparison("W-1", changes))
-    _, _, text = Page(render_html(report)).text.rpartition("those of the previous pass, W-1. ")
+    _, _, text = of_pass(comparison=SettingsComparison("W-1", changes)).text.rpartition(
+        "those of the previous pass, W-1. "
+    )
     row = "setting previous pass this pass link.coding rs not stated "
     assert text.startswith(row if changes else "LINNA · Pass report")
 
@@ -212,7 +212,7 @@ def test_series_of_nothing_but_nan_are_dashes_not_numbers():
     one = _series(n, **numbers, **vectors, nis_dof=np.zeros(n, np.int64))
     track = TrackSeries(one.utc_ns, np.linspace(-5, 5, n), np.full(n, 10.0), np.full(n, np.nan))
     headline = (HeadlineFigure("Error", float("nan"), "m"), HeadlineFigure("Recall", None))
-    text = Page(render_html(PassReport("NaN", "p3", navigation=(one,), reference=track, headline=headline))).text
+    text = of_pass("NaN", navigation=(one,), reference=track, headline=headline).text
     assert text.count("not available") >= 4
     absent = "Position error not available: no downlinked state has both values and a reference"
     assert text.count(absent) == 2
@@ -223,29 +223,23 @@ def test_series_of_nothing_but_nan_are_dashes_not_numbers():
 def test_single_wild_values_do_not_break_a_page():
     n = 60
     error = np.full((n, 3), 12.0)
-    error[7] = 1e12
-    error[9] = np.inf
-    error[11] = 0.0
+    error[[7, 9, 11]] = [[1e12], [np.inf], [0.0]]
     one = _series(n, error_rtn_m=error, sigma_rtn_m=np.full((n, 3), 1e-9))
-    assert Page(render_html(PassReport("Wild", "p4", navigation=(one,)))).left_open == []
+    assert of_pass(navigation=(one,)).left_open == []
 
 
 def test_half_a_downlink_shows_the_share_that_came():
-    report = replace(example.pass_report(gallery=0, worst=0), accounting=FrameAccounting(expected=148, processed=74))
-    text = Page(render_html(report)).text
+    text = of_pass(accounting=FrameAccounting(expected=148, processed=74)).text
     assert "Of 148 expected, 74 (50.0 %) are processed." in text
 
 
 def test_arrays_of_different_lengths_are_refused_with_place_expected_and_found():
     with pytest.raises(InconsistentReport) as caught:
-        render_html(PassReport("Bad", "p5", navigation=(_series(4, altitude_m=np.zeros(3)),)))
+        of_pass(navigation=(_series(4, altitude_m=np.zeros(3)),))
     message = str(caught.value)
     assert "'anchored', altitude_m" in message and "(4,)" in message and "(3,)" in message
-
-
-def test_too_few_outcome_labels_are_refused():
     with pytest.raises(InconsistentReport, match="4 labels"):
-        render_html(PassReport("Bad", "p6", navigation=(_series(4, outcome=("fixed",)),)))
+        of_pass(navigation=(_series(4, outcome=("fixed",)),))
 
 
 def test_a_value_that_is_no_report_is_refused_by_name():

@@ -35,24 +35,18 @@ from tests.reports import example
 from tests.reports.page import Page
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (51.23, "51.2"), (0.70444, "0.704"), (0.0996, "0.0996"), (0.9996, "1.00"), (148.4, "148"),
-        (59_012.0, "59\u202f000"), (9, "9"), (12_345, "12\u202f345"), (-3.14159, "−3.14"), (0.0, "0"),
-        (math.nan, "–"), (None, "–"), ("words", "words"), (1e-9, "1.00e−09"),
-    ],
-)  # fmt: skip
-def test_three_significant_digits(value, text):
-    assert significant_text(value) == text
+def texts(write, *values):
+    return "; ".join(map(write, values))
 
 
-@pytest.mark.parametrize(
-    ("metres", "text"),
-    [(84.0, "84.0 m"), (999.4, "999 m"), (1_310.0, "1.31 km"), (58_960.0, "59.0 km"), (math.nan, "–")],
-)
-def test_lengths_carry_the_unit_that_fits(metres, text):
-    assert length_text(metres) == text
+def test_three_significant_digits():
+    found = texts(significant_text, 51.23, 0.70444, 0.0996, 0.9996, 148.4, 59_012.0, 9, 12_345, -3.14159, 0.0)
+    assert found == "51.2; 0.704; 0.0996; 1.00; 148; 59\u202f000; 9; 12\u202f345; −3.14; 0"
+    assert texts(significant_text, math.nan, None, "words", 1e-9) == "–; –; words; 1.00e−09"
+
+
+def test_lengths_carry_the_unit_that_fits():
+    assert texts(length_text, 84.0, 999.4, 1_310.0, 58_960.0, math.nan) == "84.0 m; 999 m; 1.31 km; 59.0 km; –"
 
 
 def test_shares_of_nothing_are_no_number():
@@ -73,11 +67,8 @@ def test_times_are_cut_to_the_second_and_named():
     assert utc_text(None) == "–"
 
 
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(42.0, "42 s"), (2_220.0, "37.0 min"), (86_400.0, "24.0 h"), (864_000.0, "10.0 d")]
-)
-def test_durations_fit_their_size(seconds, text):
-    assert duration_text(seconds) == text
+def test_durations_fit_their_size():
+    assert texts(duration_text, 42.0, 2_220.0, 86_400.0, 864_000.0) == "42 s; 37.0 min; 24.0 h; 10.0 d"
 
 
 @pytest.mark.parametrize(
@@ -100,16 +91,13 @@ def test_a_level_on_terrain_seen_in_training_keeps_its_mark_and_words():
     assert evidence_text("2") == "level 2 of 5, procedural Moon" and evidence_text("") == "evidence not stated"
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(1.1e-5, "< 0.001"), (-1.1e-5, "> −0.001"), (1.23e-3, "0.00123"), (0.0, "0"), (28.14, "28.1"), (0, "0")],
-)
-def test_what_is_next_to_nothing_is_said_so_on_the_first_page(value, text):
-    assert headline_text(value) == text
+def test_what_is_next_to_nothing_is_said_so_on_the_first_page():
+    found = texts(headline_text, 1.1e-5, -1.1e-5, 1.23e-3, 0.0, 28.14, 0)
+    assert found == "< 0.001; > −0.001; 0.00123; 0; 28.1; 0"
 
 
 def test_a_rate_of_zero_has_no_power_of_ten():
-    assert [rate_text(rate) for rate in (None, 0.0, 2.5e-5)] == [NOT_A_VALUE, "0", "2.5e-05"]
+    assert texts(rate_text, None, 0.0, 2.5e-5) == f"{NOT_A_VALUE}; 0; 2.5e-05"
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,22 @@ import pytest
 from payload_emulator.session.world.recipe import Recipe, Source
 from payload_emulator.training.data import dataset as store
 from payload_emulator.training.data.finishing import write_index
+from payload_emulator.training.data.truth import FrameTruth
+from payload_emulator.training.evaluate.scoring import FrameDetections
 
 SIZE = 512
+
+
+def truth_of(u, v, diameter=30.0, ratio=0.1, azimuth=0.0, number=0, diameter_m=7e3):
+    u, v = np.array(u, float), np.array(v, float)
+    columns = (np.broadcast_to(one, u.shape).astype(float) for one in (diameter, diameter_m, ratio))
+    return FrameTruth(u, v, *columns, np.arange(u.size) + 100 * number, 512, 512, azimuth, number)
+
+
+def found_at(u, v, diameter=30.0, diameter_m=7e3, scores=0.9, sigma=1.0, *further, **more):
+    """Detections; a number stands for an array of it."""
+    u, columns = np.array(u, float), (v, diameter, diameter_m, scores, sigma, *further)
+    return FrameDetections(u, *(np.broadcast_to(one, u.shape).astype(float) for one in columns), **more)
 
 
 def draw_blobs(rng, u, v, diameter, pits=()):
