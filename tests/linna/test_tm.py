@@ -67,10 +67,9 @@ def test_decode_writes_json_to_a_file_or_to_standard_output(downlink, tmp_path, 
 
 
 def test_decode_writes_csv_and_parquet(downlink, tmp_path, typed):
-    out = tmp_path / "packets.csv"
+    out = tmp_path / "packets"
     typed(f"tm decode {downlink} --format csv --out {out}")
     assert [row["event_id"] for row in csv.DictReader(out.read_text().splitlines())] == ["anchor_read"] * 100
-    out = tmp_path / "packets.parquet"
     typed(f"tm decode {downlink} --format parquet --out {out}")
     assert out.read_bytes()[:4] == b"PAR1"
 

@@ -112,19 +112,22 @@ def test_errors_come_in_bursts_of_the_length_that_is_asked_for():
 def test_the_receiver_reports_what_it_accepted_and_whether_it_hears_anybody():
     receiver = Receiver(76)
     ping = DICTIONARY.pack_command("test_connection", {}, sequence_count=1)
-    assert unpack_clcw(receiver.clcw) == Clcw(0, 0)
+
+    def state():
+        return unpack_clcw(receiver.clcw)
+
+    assert state() == Clcw(0, 0)
     assert receiver.take(ping * 3) == ping * 3
-    assert unpack_clcw(receiver.clcw) == Clcw(0, 0, farm_b_counter=3)
+    assert state() == Clcw(0, 0, farm_b_counter=3)
     # A sequence-controlled frame that does not follow is not accepted, and one far off locks the receiver.
     assert receiver.decoder.decode(UplinkEncoder(76, bypass=False, sequence_number=1).encode([ping])).packets == ()
-    assert unpack_clcw(receiver.clcw).retransmit
+    assert state().retransmit
     receiver.decoder.decode(UplinkEncoder(76, bypass=False, sequence_number=99).encode([ping]))
-    assert unpack_clcw(receiver.clcw).lockout
+    assert state().lockout
     receiver.bit_lock = False
-    assert unpack_clcw(receiver.clcw).no_bit_lock and not unpack_clcw(receiver.clcw).no_rf_available
+    assert state().no_bit_lock and not state().no_rf_available
     receiver.carrier = False
-    state = unpack_clcw(receiver.clcw)
-    assert state.no_rf_available and state.no_bit_lock and state.farm_b_counter == 3
+    assert state() == replace(state(), no_rf_available=True, no_bit_lock=True, farm_b_counter=3)
 
 
 def circling(hours=4.0):

@@ -77,18 +77,15 @@ def test_a_split_without_frames_is_refused(detector, blob_dataset):
         run(detector, [blob_dataset], "test", "none")
 
 
-def test_frames_of_another_camera_are_refused(detector, make_blob_dataset, tmp_path):
+def test_frames_of_another_camera_or_field_of_view_are_refused(detector, make_blob_dataset, tmp_path, monkeypatch):
     other = make_blob_dataset(tmp_path / "set", {"test": 1})
+    monkeypatch.setitem(detector.metadata, "camera_fov_deg", "90")
+    with pytest.raises(DatasetError, match=r"90 degrees\), found 512 x 512 pixels, 120 degrees"):
+        run(detector, [other], "test")
+    monkeypatch.undo()
     other.index["camera"]["width_px"] = 640
     with pytest.raises(DatasetError, match=r"expected frames of the detector's camera \(512 x 512"):
         run(detector, [other], "test")
-
-
-def test_frames_of_another_field_of_view_are_refused(blob_dataset):
-    detector = open_for_evaluation(load_shipped_model())
-    detector.metadata["camera_fov_deg"] = "90"
-    with pytest.raises(DatasetError, match=r"90 degrees\), found 512 x 512 pixels, 120 degrees"):
-        run(detector, [blob_dataset], "test")
 
 
 def test_the_papers_variant_needs_the_papers_heatmaps(detector, blob_dataset):

@@ -62,9 +62,9 @@ def test_a_crop_of_a_colour_frame_is_that_of_its_gray_where_channels_agree():
     np.testing.assert_allclose(crops[0].image, crops[1].image, atol=1e-5)
 
 
-def one_frame(folder, split):
+def one_frame(folder, split, colour="rgb"):
     source = Source("world", split, "procedural", 1.0, (41,), altitude_km=(40.0, 45.0))
-    list(build(Recipe("colour", 7, (source,), frames_per_shard=1, colour="rgb"), folder, 1, find_data(None)))
+    list(build(Recipe("colour", 7, (source,), frames_per_shard=1, colour=colour), folder, 1, find_data(None)))
     return Dataset(folder)
 
 
@@ -80,9 +80,7 @@ def test_a_data_set_in_colour_keeps_the_channels(coloured, tmp_path):
     assert np.any(image[..., 0] != image[..., 2])
     np.testing.assert_array_equal(coloured.gray(frame), gray_levels(image))
     # The same frame without colours holds the mean of the channels.
-    source = Source("world", "train", "procedural", 1.0, (41,), altitude_km=(40.0, 45.0))
-    list(build(Recipe("colour", 7, (source,), frames_per_shard=1), tmp_path / "gray", 1, find_data(None)))
-    plain = Dataset(tmp_path / "gray")
+    plain = one_frame(tmp_path / "gray", "train", "gray")
     np.testing.assert_array_equal(plain.image(plain.frames()[0]), coloured.gray(frame))
 
 
