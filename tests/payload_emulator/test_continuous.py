@@ -120,9 +120,9 @@ class Ground:
             connection.close()
 
 
-def opened(scenario, **options):
+def opened(scenario, craters=None, **options):
     """Return a session of a launched spacecraft."""
-    return LiveSession(*launch(scenario, DataFolder(None)), **options)
+    return LiveSession(*launch(scenario, DataFolder(None), craters), **options)
 
 
 @contextlib.contextmanager

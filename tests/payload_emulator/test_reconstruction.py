@@ -17,7 +17,7 @@ from payload_emulator.session.live.station_ports import RECORD_HEADER
 from payload_emulator.session.scenario import format_scenario, parse_scenario
 from payload_emulator.session.spacecraft.loading import launch_payload
 from payload_emulator.session.world.world import clock_ticks, first_utc_ns, open_world
-from tests.payload_emulator.test_continuous import CADU, EPOCH, HOUR_NS, NS, flown, scenario
+from tests.payload_emulator.test_continuous import CADU, EPOCH, HOUR_NS, NS, first, flown, scenario
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode
 from tmtc.link.settings import LinkSettings
@@ -49,22 +49,17 @@ def received(folder, described):
     """Fly a window and write what the ground has of it: packets, telecommands, catalogue, declared world."""
     sent = []
 
-    def act(ground, contact):
-        if contact["state"] == "started" and ground.count == 0:
-            sent.extend(
-                (
-                    ground.at(WINDOW, ground.function("start_observation", FRAMES * 15.0, 15.0)),
-                    ground.at(WINDOW + 90 * NS, ground.function("set_mode", 3.0)),
-                )
-            )
-            ground.send(*sent)
+    def commands(ground):
+        sent.append(ground.at(WINDOW, ground.function("start_observation", FRAMES * 15.0, 15.0)))
+        sent.append(ground.at(WINDOW + 90 * NS, ground.function("set_mode", 3.0)))
+        return sent
 
     terrain = open_world(described, DataFolder(None)).terrain
     folder.mkdir()
     listed = terrain.catalogue.diameter_m
     some = np.flatnonzero((listed > 5e3) & (listed < 8e3))[:40]
     save_catalogue(terrain.measured(some), folder / CATALOGUE)
-    session, ground = flown(described, 6.5, act, craters=folder / CATALOGUE)
+    session, ground = flown(described, 6.5, first(commands), craters=folder / CATALOGUE)
     assert session.account.frames == FRAMES
     (folder / "downlink.packets").write_bytes(packets_of(ground.records))
     (folder / "telecommands.packets").write_bytes(b"".join(sent))
@@ -115,9 +110,9 @@ def test_the_first_time_of_a_tick_is_the_same_from_everywhere():
     moon = open_world(world(), DataFolder(None))
     for seconds in (0.0, 1.0, 3333.333, 2_592_000.25):
         ticks = clock_ticks(moon, EPOCH + round(seconds * NS))
-        first = first_utc_ns(moon, ticks)
-        assert clock_ticks(moon, first) == ticks and clock_ticks(moon, first - 1) == ticks - 1
-        assert abs(first - EPOCH - seconds * NS) < 16_000
+        start = first_utc_ns(moon, ticks)
+        assert clock_ticks(moon, start) == ticks and clock_ticks(moon, start - 1) == ticks - 1
+        assert abs(start - EPOCH - seconds * NS) < 16_000
 
 
 def in_world(old, new):
