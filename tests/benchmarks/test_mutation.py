@@ -5,9 +5,7 @@ rows with peers, what is missing on the machine, and rows that contradict the ex
 
 import json
 import math
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +19,7 @@ from payload_emulator.sim.render.renderer import Rendering
 
 
 @pytest.mark.parametrize("name", sorted(mutation.GROUPS))
-def test_a_group_names_modules_and_tests_that_exist(name: str) -> None:
+def test_a_group_names_modules_and_tests_that_exist(name):
     group = mutation.GROUPS[name]
     assert group.modules and group.tests
     assert [path for path in group.modules + group.tests if not (mutation.ROOT / path).exists()] == []
@@ -37,7 +35,7 @@ def test_a_group_names_modules_and_tests_that_exist(name: str) -> None:
         '-    raise Refused("a", b, "not so", "c")\n+    raise Refused("a", b, "NOT SO", "c")',
     ],
 )
-def test_element_types_and_wording_are_left_out(difference: str) -> None:
+def test_element_types_and_wording_are_left_out(difference):
     assert mutation.reason_left_out(difference) is not None
 
 
@@ -53,12 +51,12 @@ def test_element_types_and_wording_are_left_out(difference: str) -> None:
         "-    order = np.argsort(a, kind=b)\n+    order = np.argsort(a)",
     ],
 )
-def test_what_decides_is_tested(difference: str) -> None:
+def test_what_decides_is_tested(difference):
     assert mutation.reason_left_out(difference) is None
 
 
 @pytest.fixture
-def state(monkeypatch: pytest.MonkeyPatch) -> Any:
+def state(monkeypatch):
     """What mutmut records, without mutmut."""
     recorded = SimpleNamespace(_stats=set(), duration_by_test={"a": 1.0})
     monkeypatch.setattr(mutation_plugin, "_state", lambda: recorded)
@@ -66,7 +64,7 @@ def state(monkeypatch: pytest.MonkeyPatch) -> Any:
     return recorded
 
 
-def set_up(state: Any, name: str, scope: str, calls: set[str]) -> None:
+def set_up(state, name, scope, calls):
     """Run the hook around a fixture that makes these calls."""
     hook = mutation_plugin.pytest_fixture_setup(SimpleNamespace(argname=name, scope=scope))
     next(hook)
@@ -75,7 +73,7 @@ def set_up(state: Any, name: str, scope: str, calls: set[str]) -> None:
         hook.send(None)
 
 
-def test_what_a_shared_fixture_calls_is_credited_to_every_test_that_uses_it(state: Any) -> None:
+def test_what_a_shared_fixture_calls_is_credited_to_every_test_that_uses_it(state):
     state._stats.add("own")
     set_up(state, "shared", "module", {"inner"})
     set_up(state, "alone", "function", {"other"})
@@ -88,17 +86,15 @@ def test_what_a_shared_fixture_calls_is_credited_to_every_test_that_uses_it(stat
     assert state._stats == set()
 
 
-def test_the_time_of_a_test_holds_that_of_its_fixtures(state: Any) -> None:
+def test_the_time_of_a_test_holds_that_of_its_fixtures(state):
     for when, total in (("call", 1.0), ("setup", 3.5)):
         mutation_plugin.pytest_runtest_makereport(SimpleNamespace(nodeid="a"), SimpleNamespace(when=when, duration=2.5))
         assert state.duration_by_test == {"a": total}
 
 
-def test_the_fastest_files_are_run_first_and_their_tests_stay_in_order(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_fastest_files_are_run_first_and_their_tests_stay_in_order(tmp_path, monkeypatch):
     names = ["slow.py::b", "slow.py::a", "quick.py::b", "unknown.py::x", "quick.py::a"]
-    items: Any = [SimpleNamespace(nodeid=name) for name in names]
+    items = [SimpleNamespace(nodeid=name) for name in names]
     path = tmp_path / "statistics.json"
     monkeypatch.setattr(mutation_plugin, "_STATISTICS", path)
     mutation_plugin.pytest_collection_modifyitems(items)
@@ -145,29 +141,29 @@ VALUES = np.tile([-1.0, 1.0], 5)
 
 
 @pytest.mark.parametrize(("confidence", "factor"), [(0.95, 2.911), (0.90, 2.568)])
-def test_the_bound_of_ten_values_has_the_published_factor(confidence: float, factor: float) -> None:
+def test_the_bound_of_ten_values_has_the_published_factor(confidence, factor):
     values = list(3.0 + 2.0 * VALUES / np.std(VALUES, ddof=1))
     assert tolerance_bound(values, True, 0.95, confidence) == pytest.approx(3.0 + 2.0 * factor, abs=2e-3)
     assert tolerance_bound(values, False, 0.95, confidence) == pytest.approx(3.0 - 2.0 * factor, abs=2e-3)
 
 
-def test_one_pass_gives_no_bound() -> None:
+def test_one_pass_gives_no_bound():
     assert np.isnan(tolerance_bound([1.0], True, 0.95, 0.9))
 
 
 @pytest.mark.parametrize(("unit", "ratio"), [("packets/s", 2.0), ("s", 0.5), ("packets", 2.0), ("MiB", 0.5)])
-def test_a_ratio_above_one_is_better_than_the_peer(unit: str, ratio: float) -> None:
+def test_a_ratio_above_one_is_better_than_the_peer(unit, ratio):
     assert Row("job", 10.0, unit, "peer", 5.0).ratio == ratio
     assert Row("job", 10.0, unit).ratio is None
 
 
-def test_a_line_names_the_peer_and_the_contradiction() -> None:
+def test_a_line_names_the_peer_and_the_contradiction():
     text = line(Row("job", 10.0, "s", "other program", 5.0, "values differ"))
     assert "0.50 x" in text and "other program: 5" in text and text.endswith("DIFFERENT: values differ")
     assert "no peer" in line(Row("job", 10.0, "s")) and "DIFFERENT" not in line(Row("job", 10.0, "s"))
 
 
-def test_a_missing_program_is_named() -> None:
+def test_a_missing_program_is_named():
     with pytest.raises(NotMeasured, match=r"^Thing is not installed$"):
         needs("Thing", "no-such-program-1", "no-such-program-2")
     assert needs("a shell", "no-such-program-1", "sh").endswith("sh")
@@ -181,9 +177,7 @@ def test_a_missing_program_is_named() -> None:
         ([Row("job", 1.0, "s")], "did not finish in 300 s", 1),
     ],
 )  # fmt: skip
-def test_the_status_tells_contradictions_from_missing_programs(
-    rows: list[Row], fault: str, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_status_tells_contradictions_from_missing_programs(rows, fault, status, monkeypatch, capsys):
     monkeypatch.setattr(_rows, "run", lambda names: iter([(names[0], rows, fault)]))
     assert report(["tmtc"], as_json=True) == status
     found = json.loads(capsys.readouterr().out)
@@ -192,12 +186,12 @@ def test_the_status_tells_contradictions_from_missing_programs(
     assert fault in capsys.readouterr().out
 
 
-def test_an_unknown_name_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_name_is_refused_in_one_line(capsys):
     assert main(["year"]) == 2
     assert capsys.readouterr().err.startswith("benchmarks: expected tmtc, ")
 
 
-def test_every_benchmark_of_the_list_yields_rows_in_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_benchmark_of_the_list_yields_rows_in_a_process_of_its_own(monkeypatch):
     import importlib
 
     assert all(callable(importlib.import_module(f"benchmarks.{name}").rows) for name in NAMES)

@@ -1,8 +1,6 @@
 """Rooms, floors and arrows of packages; the table of the benchmarks."""
 
-from collections.abc import Iterator, Sequence
 from graphlib import CycleError
-from pathlib import Path
 
 import pytest
 
@@ -18,20 +16,18 @@ MODULES = {
 }  # fmt: skip
 
 
-def test_rooms_floors_and_arrows_are_those_of_the_imports() -> None:
+def test_rooms_floors_and_arrows_are_those_of_the_imports():
     """attic → hall → cellar, and attic → cellar inside a function; 7 of 12 lines import."""
     assert measure("house", MODULES) == Rooms(3, 3, 3, 6, 12, 7 / 12)
 
 
-def test_a_circle_of_imports_between_rooms_is_refused() -> None:
+def test_a_circle_of_imports_between_rooms_is_refused():
     with pytest.raises(CycleError, match="cycle"):
         measure("house", MODULES | {"house.cellar": "from house import attic\n"})
 
 
-def test_a_benchmark_states_its_ratio_to_the_build_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def run(names: Sequence[str], root: Path = _rows.ROOT) -> Iterator[tuple[str, list[_rows.Row], str]]:
+def test_a_benchmark_states_its_ratio_to_the_build_before(tmp_path, monkeypatch, capsys):
+    def run(names, root=_rows.ROOT):
         now = root == _rows.ROOT
         rows = [_rows.Row("rate", 30.0 if now else 20.0, "packets/s"), _rows.Row("time", 2.0 if now else 3.0, "ms")]
         yield names[0], [*rows, _rows.Row("new", 1.0, "ms")] if now else rows, ""

@@ -4,14 +4,12 @@ scripts rely keep their names.
 """
 
 import hashlib
-import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from linna.cli import GROUPS, run
+from linna.cli import GROUPS
 from linna.help import example
 from linna.parser import command_parser
 from lunar.catalogue import make_catalogue, save_catalogue
@@ -26,7 +24,7 @@ from tmtc.packets.space_packets import pack_packet
 METRES_PER_DEG = math.radians(1.0) * 1_737_400.0
 
 
-def landmarks_packet(latitude: list[float], identity: int = 3_000_000_000) -> bytes:
+def landmarks_packet(latitude, identity=3_000_000_000):
     one = np.ones(len(latitude))
     items = {
         "landmark_id": identity + np.arange(len(latitude)), "latitude_deg": np.array(latitude),
@@ -38,32 +36,30 @@ def landmarks_packet(latitude: list[float], identity: int = 3_000_000_000) -> by
     return DICTIONARY.pack("landmarks", values, ticks=0, sequence_count=0)
 
 
-def test_a_downlinked_map_is_compared_with_a_catalogue(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_downlinked_map_is_compared_with_a_catalogue(tmp_path, typed):
     path, downlink = tmp_path / "list.csv", tmp_path / "map.bin"
     listed = make_catalogue(np.radians([10.0]), np.radians([300.0]), [6_000.0], source="one", rim_height_m=[50.0])
     save_catalogue(listed, path)
     # 0.01 degrees are 303 m on the ground; the other landmark is far from any crater.
     downlink.write_bytes(landmarks_packet([10.01, 20.0]))
-    assert run(["catalogue", "landmarks", str(downlink), "--catalogue", str(path), "--json"]) == 0
-    figures = json.loads(capsys.readouterr().out)
+    figures = typed(f"catalogue landmarks {downlink} --catalogue {path} --json")
     assert (figures["landmarks"], figures["in_catalogue"], figures["new"]) == (2, 1, 1)
     assert figures["median_horizontal_m"] == pytest.approx(303.2, abs=1.0)
 
 
-def test_a_downlink_without_a_map_has_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_downlink_without_a_map_has_none(tmp_path, typed):
     path, downlink = tmp_path / "list.csv", tmp_path / "other.bin"
     save_catalogue(make_catalogue([0.1], [0.2], [6_000.0], source="one"), path)
     time_report = {"reported_ticks": 1, "rate_exponent": 0}
     downlink.write_bytes(DICTIONARY.pack("time_report", time_report, ticks=0, sequence_count=0))
-    assert run(["catalogue", "landmarks", str(downlink), "--catalogue", str(path), "--json"]) == 0
-    figures = json.loads(capsys.readouterr().out)
+    figures = typed(f"catalogue landmarks {downlink} --catalogue {path} --json")
     assert (figures["landmarks"], figures["median_horizontal_m"]) == (0, None)
 
 
-def test_a_list_is_registered_to_terrain(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_list_is_registered_to_terrain(tmp_path, typed):
     latitude, longitude = (part.ravel() for part in np.meshgrid(np.arange(1.5, 9, 1.5), np.arange(301.5, 309, 1.5)))
 
-    def bowls(lat: np.ndarray, lon: np.ndarray) -> np.ndarray:
+    def bowls(lat, lon):
         height = np.zeros(np.broadcast_shapes(lat.shape, lon.shape))
         for north, east in zip(latitude, longitude, strict=True):
             level = np.cos(np.radians(north))
@@ -78,9 +74,7 @@ def test_a_list_is_registered_to_terrain(tmp_path: Path, capsys: pytest.CaptureF
     )
     path, out = tmp_path / "list.csv", tmp_path / "made" / "registration.json"
     save_catalogue(listed, path)
-    words = ["catalogue", "register", str(path), "--terrain", str(raster), "--out", str(out), "--json"]
-    assert run(words) == 0
-    figures = json.loads(capsys.readouterr().out)
+    figures = typed(f"catalogue register {path} --terrain {raster} --out {out} --json")
     assert (figures["rims"], figures["out"]) == (25, str(out))
     made = parse_registration(out.read_text(), "made")
     shift, sigma = made.at(np.radians([5.0]), np.radians([305.0]))
@@ -92,37 +86,27 @@ def test_a_list_is_registered_to_terrain(tmp_path: Path, capsys: pytest.CaptureF
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["catalogue", "register"], "CATALOGUE: expected a crater list"),
-        (["catalogue", "register", "none.csv"], "--terrain: expected height rasters"),
-        (["catalogue", "curate", "none.csv", "--out", "x", "--region", "5"], "--region"),
-        (["catalogue", "curate", "none.csv", "--out", "x", "--min-diameter", "40"], "--min-diameter"),
+        ("register", "CATALOGUE: expected a crater list"),
+        ("register none.csv", "--terrain: expected height rasters"),
+        ("curate none.csv --out x --region 5", "--region"),
+        ("curate none.csv --out x --min-diameter 40", "--min-diameter"),
     ],
 )
-def test_bad_input_is_one_line_that_names_it(
-    arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bad_input_is_one_line_that_names_it(arguments, expected, typed, monkeypatch):
     monkeypatch.delenv("LINNA_DATA", raising=False)
-    assert run(arguments) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert expected in error
+    assert expected in typed(f"catalogue {arguments}", 2)
 
 
 @pytest.fixture
-def recording(tmp_path: Path) -> Path:
+def recording(tmp_path):
     path = tmp_path / "station.cadu"
     path.write_bytes(encode_cadus(make_packets(120), spacecraft_id=76))
     return path
 
 
-def figures(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict]:
-    status = run(["link", "check", *arguments, "--json"])
-    return status, json.loads(capsys.readouterr().out)
-
-
-def test_settings_come_with_their_evidence(recording, capsys):
-    status, found = figures(capsys, str(recording))
-    assert status == 0 and not found["ambiguous"]
+def test_settings_come_with_their_evidence(recording, typed):
+    found = typed(f"link check {recording} --json")
+    assert not found["ambiguous"]
     assert found["settings"]["frame_length"] == 1115 and found["settings"]["randomiser"] == "legacy"
     best = found["evidence"][0]
     assert best["codewords_clean"] == best["checksums_hold"] == best["headers_regular"] == 1.0
@@ -130,41 +114,37 @@ def test_settings_come_with_their_evidence(recording, capsys):
 
 
 @pytest.mark.parametrize(("randomiser", "status"), [("legacy", 0), ("long", 1)])
-def test_a_mission_description_is_compared(recording, capsys, tmp_path, randomiser, status):
+def test_a_mission_description_is_compared(recording, typed, tmp_path, randomiser, status):
     mission = tmp_path / "mission.toml"
     mission.write_text(f'name = "test"\n[link]\nframe_length = 1115\nrandomiser = "{randomiser}"\n')
-    code, found = figures(capsys, str(recording), "--mission", str(mission))
-    assert code == status
+    found = typed(f"link check {recording} --mission {mission} --json", status)
     expected = ["randomiser: the mission states long, the recording has legacy"] if status else []
     assert found["contradicts_mission"] == expected
 
 
-def test_frames_that_nothing_proves_are_inconclusive(capsys, tmp_path):
+def test_frames_that_nothing_proves_are_inconclusive(typed, tmp_path):
     noise = np.random.default_rng(3).integers(0, 256, (30, 700), dtype=np.uint8)
     noise[:, :4] = np.frombuffer(ASM, dtype=np.uint8)
     path = tmp_path / "noise.cadu"
     path.write_bytes(noise.tobytes())
-    status, found = figures(capsys, str(path))
-    assert status == 3 and found["settings"] is None and found["distances"]["700"] == 29
+    found = typed(f"link check {path} --json", 3)
+    assert found["settings"] is None and found["distances"]["700"] == 29
 
 
-def test_packets_without_frames_are_told_and_noise_is_refused(capsys, tmp_path):
+def test_packets_without_frames_are_told_and_noise_is_refused(typed, tmp_path):
     path = tmp_path / "packets.bin"
     path.write_bytes(b"".join(make_packets(20)))
-    status, found = figures(capsys, str(path))
-    assert status == 0 and found["packets_without_frames"] == 42
+    assert typed(f"link check {path} --json")["packets_without_frames"] == 42
     path.write_bytes(np.random.default_rng(1).integers(0, 256, 5000, dtype=np.uint8).tobytes())
-    assert run(["link", "check", str(path)]) == 2
-    assert "expected CADUs or space packets, found none in its 5000 octets" in capsys.readouterr().err
+    assert "expected CADUs or space packets, found none in its 5000 octets" in typed(f"link check {path}", 2)
 
 
 @pytest.mark.parametrize("prefix", [0, 3])
-def test_the_form_of_packets_without_checksum_is_proposed(capsys, tmp_path, prefix):
+def test_the_form_of_packets_without_checksum_is_proposed(typed, tmp_path, prefix):
     packets = [bytes(prefix) + pack_packet(0x200, bytes(range(60)), sequence_count=k) for k in range(30)]
     path = tmp_path / "foreign.bin"
     path.write_bytes(b"".join(packets))
-    assert run(["link", "check", str(path)]) == 0
-    shown = capsys.readouterr().out
+    shown = typed(f"link check {path}")
     assert "30 space packets without checksum" in shown and 'packet_checksum = "none"' in shown
     assert (f"packet_prefix_octets = {prefix}" in shown) == (prefix > 0)
 
@@ -217,10 +197,10 @@ link check F --mission M
 
 
 @pytest.mark.parametrize("line", RELIED_ON.strip().splitlines())
-def test_a_documented_command_is_understood(line: str) -> None:
+def test_a_documented_command_is_understood(line):
     words = line.split()
     command_parser(GROUPS, words[0]).parse_args(words)
 
 
-def test_the_example_of_a_telecommand_is_one_of_the_dictionary() -> None:
+def test_the_example_of_a_telecommand_is_one_of_the_dictionary():
     assert example("linna command enter").split()[3] in {one.name for one in DICTIONARY.telecommands}

@@ -29,9 +29,8 @@ def write_image(tmp_path):
     return write
 
 
-def test_info_tells_the_hash_and_the_thresholds(capsys):
-    assert run(["detector", "info", "--json"]) == 0
-    figures = json.loads(capsys.readouterr().out)
+def test_info_tells_the_hash_and_the_thresholds(typed):
+    figures = typed("detector info --json")
     assert len(figures["sha256"]) == 64
     assert 0.1 <= float(figures["score_threshold"]) <= float(figures["navigation_threshold"])
     assert figures["shipped"]["craters"]["sha256"] == figures["sha256"]
@@ -47,10 +46,9 @@ def test_info_tells_the_hash_and_the_thresholds(capsys):
         ("d.png", speckled((64, 48))),
     ],
 )  # fmt: skip
-def test_detect_takes_any_size_and_depth(write_image, capsys, name, image):
+def test_detect_takes_any_size_and_depth(write_image, typed, name, image):
     path = write_image(name, image)
-    assert run(["detector", "detect", str(path), "--altitude-km", "30", "--threshold", "0.05", "--json"]) == 0
-    (item,) = json.loads(capsys.readouterr().out)["images"]
+    (item,) = typed(f"detector detect {path} --altitude-km 30 --threshold 0.05 --json")["images"]
     assert item["file"] == str(path)
     assert item["quality"] == "ok"
     for detection in item["detections"]:
@@ -59,18 +57,16 @@ def test_detect_takes_any_size_and_depth(write_image, capsys, name, image):
         assert -1 <= detection["class"] <= 3
 
 
-def test_twelve_bits_in_a_file_of_sixteen_are_no_dark_picture(write_image, capsys):
+def test_twelve_bits_in_a_file_of_sixteen_are_no_dark_picture(write_image, typed):
     image = speckled().astype(np.uint16) * 16
-    assert run(["detector", "detect", str(write_image("raw.tiff", image)), "--json"]) == 0
-    (item,) = json.loads(capsys.readouterr().out)["images"]
+    (item,) = typed(f"detector detect {write_image('raw.tiff', image)} --json")["images"]
     assert item["quality"] == "ok"
 
 
-def test_a_picture_that_is_not_searched_is_a_verdict_with_its_reason(write_image, capsys):
+def test_a_picture_that_is_not_searched_is_a_verdict_with_its_reason(write_image, typed):
     image = np.full((512, 512), 0.5, np.float32)
     image[3, 4] = np.nan
-    assert run(["detector", "detect", str(write_image("nan.tiff", image)), "--json"]) == 1
-    (item,) = json.loads(capsys.readouterr().out)["images"]
+    (item,) = typed(f"detector detect {write_image('nan.tiff', image)} --json", 1)["images"]
     assert item["quality"] == "uniform" and item["detections"] == []
     assert item["reason"].startswith("deviation 0.00")
     assert item["pixels"] == "1 without data (black) of 262144 pixels"
@@ -108,114 +104,90 @@ def write_labelled(tmp_path, write_image):
     (tmp_path / "labels.json").write_text(json.dumps(document))
 
 
-def test_a_labelled_set_of_anyone_is_evaluated(tmp_path, write_image, capsys):
+def test_a_labelled_set_of_anyone_is_evaluated(tmp_path, write_image, typed):
     write_labelled(tmp_path, write_image)
-    assert run(["detector", "evaluate", "--coco", str(tmp_path), "--pixel-m", "200", "--json"]) == 0
-    figures = json.loads(capsys.readouterr().out)
+    figures = typed(f"detector evaluate --coco {tmp_path} --pixel-m 200 --json")
     assert figures["rung"] == 5 and figures["images"] == 1 and figures["craters"] == 4
     assert set(figures["micro"]) >= {"precision", "recall", "f1", "loc_px", "f1_interval_95"}
     assert figures["per_class"][0]["expected"] == 4
-    assert run(["detector", "evaluate", "--coco", str(tmp_path), "--two-scales"]) == 0
-    text = capsys.readouterr().out
+    text = typed(f"detector evaluate --coco {tmp_path} --two-scales")
     assert "evidence level 5" in text and "two scales" in text
 
 
+UNFIT = """
+--report r.html -> --report: expected together with --dataset
+--paper-classes -> --paper-classes: expected together with --dataset
+--pixel-m 0 -> --pixel-m: expected a number above 0, found '0'
+--fov-deg 0 -> --fov-deg: expected a number above 0 and below 180
+--range-px 9 8 -> --range-px: expected two diameters in rising order, found 9 8
+ -> expected a COCO file
+"""
+
+
+@pytest.mark.parametrize(("extra", "words"), [line.split(" -> ") for line in UNFIT.splitlines()[1:]])
+def test_what_does_not_fit_a_labelled_set_is_refused(tmp_path, typed, extra, words):
+    assert words in typed(f"detector evaluate --coco {tmp_path} {extra}", 2)
+
+
+def test_options_of_labelled_sets_are_refused_with_data_sets(tmp_path, typed):
+    assert "--two-scales: expected together with --coco" in typed(
+        f"detector evaluate --dataset {tmp_path} --two-scales", 2
+    )
+
+
 @pytest.mark.parametrize(
     ("extra", "words"),
     [
-        (["--report", "r.html"], "--report: expected together with --dataset"),
-        (["--paper-classes"], "--paper-classes: expected together with --dataset"),
-        (["--pixel-m", "0"], "--pixel-m: expected a number above 0, found '0'"),
-        (["--fov-deg", "0"], "--fov-deg: expected a number above 0 and below 180"),
-        (["--range-px", "9", "8"], "--range-px: expected two diameters in rising order, found 9 8"),
-        ([], "expected a COCO file"),
+        ("--altitude-km -3", "--altitude-km: expected a number above 0, found '-3'"),
+        ("--fov-deg 180", "--fov-deg: expected a number above 0 and below 180, found '180'"),
     ],
 )
-def test_what_does_not_fit_a_labelled_set_is_refused(tmp_path, capsys, extra, words):
-    assert run(["detector", "evaluate", "--coco", str(tmp_path), *extra]) == 2
-    error = capsys.readouterr().err
-    assert words in error and error.count("\n") == 1
+def test_a_camera_that_cannot_be_is_refused(write_image, typed, extra, words):
+    assert words in typed(f"detector detect {write_image('a.png', speckled())} {extra}", 2)
 
 
-def test_options_of_labelled_sets_are_refused_with_data_sets(tmp_path, capsys):
-    assert run(["detector", "evaluate", "--dataset", str(tmp_path), "--two-scales"]) == 2
-    assert "--two-scales: expected together with --coco" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("extra", "words"),
-    [
-        (["--altitude-km", "-3"], "--altitude-km: expected a number above 0, found '-3'"),
-        (["--fov-deg", "180"], "--fov-deg: expected a number above 0 and below 180, found '180'"),
-    ],
-)
-def test_a_camera_that_cannot_be_is_refused(write_image, capsys, extra, words):
-    assert run(["detector", "detect", str(write_image("a.png", speckled())), *extra]) == 2
-    assert words in capsys.readouterr().err
-
-
-def test_a_black_picture_is_a_verdict_not_an_error(write_image, capsys):
-    assert run(["detector", "detect", str(write_image("black.png", np.zeros((512, 512), np.uint8))), "--json"]) == 1
-    (item,) = json.loads(capsys.readouterr().out)["images"]
+def test_a_black_picture_is_a_verdict_not_an_error(write_image, typed):
+    (item,) = typed(f"detector detect {write_image('black.png', np.zeros((512, 512), np.uint8))} --json", 1)["images"]
     assert item["quality"] == "dark" and item["detections"] == []
     assert item["reason"] == "0.00% of the pixels over 4.0% of full scale, expected over 0.2%"
 
 
-def test_what_is_no_image_is_refused_in_one_line(tmp_path, capsys):
+def test_what_is_no_image_is_refused_in_one_line(tmp_path, typed):
     path = tmp_path / "x.png"
     path.write_text("no image")
-    assert run(["detector", "detect", str(path)]) == 2
-    error = capsys.readouterr().err
-    assert str(path) in error and error.count("\n") == 1
+    assert str(path) in typed(f"detector detect {path}", 2)
 
 
-def test_what_is_no_model_is_refused_in_one_line(write_image, tmp_path, capsys):
+def test_what_is_no_model_is_refused_in_one_line(write_image, tmp_path, typed):
     (tmp_path / "m.onnx").write_bytes(b"no model")
     image = write_image("a.png", speckled())
-    assert run(["detector", "detect", str(image), "--model", str(tmp_path / "m.onnx")]) == 2
-    error = capsys.readouterr().err
-    assert "expected an ONNX model" in error and error.count("\n") == 1
+    assert "expected an ONNX model" in typed(f"detector detect {image} --model {tmp_path}/m.onnx", 2)
+    assert "none.onnx" in typed(f"detector info --model {tmp_path}/none.onnx", 2)
 
 
-def test_a_missing_model_file_is_named(tmp_path, capsys):
-    assert run(["detector", "info", "--model", str(tmp_path / "none.onnx")]) == 2
-    assert "none.onnx" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    "command",
+    ["dataset stats", "dataset check", "detector evaluate --dataset", "detector calibrate --out m.onnx --dataset"],
+)
+def test_a_folder_without_a_data_set_is_refused_and_no_file_left(command, tmp_path, typed, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "expected a data set" in typed(f"{command} {tmp_path}", 2)
+    assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("verb", [["dataset", "stats"], ["dataset", "check"]])
-def test_a_folder_without_a_data_set_is_refused(verb, tmp_path, capsys):
-    assert run([*verb, str(tmp_path)]) == 2
-    assert "expected a data set" in capsys.readouterr().err
-
-
-def test_evaluating_on_no_data_set_is_refused(tmp_path, capsys):
-    assert run(["detector", "evaluate", "--dataset", str(tmp_path)]) == 2
-    assert "expected a data set" in capsys.readouterr().err
-
-
-def test_a_calibration_without_a_data_set_leaves_no_file(capsys, tmp_path):
-    out = tmp_path / "m.onnx"
-    assert run(["detector", "calibrate", "--dataset", str(tmp_path), "--out", str(out)]) == 2
-    assert "expected a data set" in capsys.readouterr().err
-    assert not out.exists()
-
-
-def test_detect_lists_the_craters_and_draws_them(write_image, capsys, tmp_path):
+def test_detect_lists_the_craters_and_draws_them(write_image, typed, tmp_path):
     import cv2
 
     path, picture = write_image("a.png", speckled()), tmp_path / "found.png"
-    assert run(["detector", "detect", str(path), "--threshold", "0.05", "--picture", str(picture)]) == 0
-    heading, _, *rows = capsys.readouterr().out.splitlines()
+    heading, _, *rows = typed(f"detector detect {path} --threshold 0.05 --picture {picture}").splitlines()
     diameters = [float(row.split()[2]) for row in rows]
     assert heading == f"{path}: ok, {len(rows)} craters" and diameters == sorted(diameters, reverse=True)
     drawn = cv2.imread(str(picture))
     assert (drawn[..., 0] != drawn[..., 2]).sum() > 10 * len(rows) > 0
-    assert run(["detector", "detect", str(path), str(path), "--picture", str(picture)]) == 2
-    assert "expected one image, found 2" in capsys.readouterr().err
+    assert "expected one image, found 2" in typed(f"detector detect {path} {path} --picture {picture}", 2)
 
 
-def test_bench_reports_latency_memory_and_size(capsys):
-    assert run(["detector", "bench", "--frames", "5", "--json"]) == 0
-    figures = json.loads(capsys.readouterr().out)
+def test_bench_reports_latency_memory_and_size(typed):
+    figures = typed("detector bench --frames 5 --json")
     assert {"median_ms", "p99_ms", "peak_rss_mb", "model_bytes"} <= set(figures)
     assert figures["model_bytes"] <= 6_000_000

@@ -1,12 +1,10 @@
 """The commands on ephemerides as users run them."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from linna import cli
 from lunar.catalogue import PAPER_CLASS_COUNTS
 from lunar.constants import NS
 from lunar.ephemeris import Ephemeris
@@ -29,29 +27,15 @@ def oem_path(tmp_path):
     return path
 
 
-def run_json(capsys, *arguments):
-    assert cli.run([*map(str, arguments), "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
-
-
-def error_line(capsys, *arguments):
-    assert cli.run([*map(str, arguments)]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    (line,) = [line for line in captured.err.strip().splitlines() if ": error: " in line]
-    return line
-
-
-def test_compare_tells_the_difference_of_an_oem_and_an_stk_file(oem_path, tmp_path, capsys):
+def test_compare_tells_the_difference_of_an_oem_and_an_stk_file(oem_path, tmp_path, typed):
     other = tmp_path / "orbit.e"
     other.write_text(format_stk(polar_orbit(48.0, radius_m=1_768_190.0)))
-    figures = run_json(capsys, "orbit", "compare", oem_path, other)
+    figures = typed(f"orbit compare {oem_path} {other} --json")
     assert figures["samples"] == 48 * 60 + 1
     assert figures["max_m"] == pytest.approx(10.0, abs=1e-5)
     assert figures["rms_rtn_m"] == pytest.approx([10.0, 0.0, 0.0], abs=1e-5)
     assert figures["mean_rtn_m"] == pytest.approx([10.0, 0.0, 0.0], abs=1e-5)
-    assert cli.run(["orbit", "compare", str(oem_path), str(other), "--step", "3600"]) == 0
-    text = capsys.readouterr().out
+    text = typed(f"orbit compare {oem_path} {other} --step 3600")
     assert text.startswith(
         "A: SELENITA, epochs in UTC; B: SELENITA, epochs in UTC\n49 epochs from 2029-08-07T00:00:00.000Z"
     )
@@ -59,65 +43,65 @@ def test_compare_tells_the_difference_of_an_oem_and_an_stk_file(oem_path, tmp_pa
 
 
 @pytest.mark.parametrize("ending", [".oem", ".xml", ".e", ".csv", ".tum"])
-def test_an_ephemeris_converts_to_every_format(oem_path, tmp_path, capsys, ending):
+def test_an_ephemeris_converts_to_every_format(oem_path, tmp_path, typed, ending):
     out = tmp_path / f"converted{ending}"
-    assert run_json(capsys, "orbit", "convert", oem_path, "--out", out)["states"] == 2881
+    assert typed(f"orbit convert {oem_path} --out {out} --json")["states"] == 2881
     if ending in (".oem", ".xml", ".e"):
-        assert run_json(capsys, "orbit", "compare", oem_path, out)["max_m"] < 1e-5
+        assert typed(f"orbit compare {oem_path} {out} --json")["max_m"] < 1e-5
     else:
         assert len(out.read_text().splitlines()) == 2881 + (ending == ".csv")
     assert [path.name for path in tmp_path.glob("*.part")] == []
 
 
-def test_an_ephemeris_goes_through_spice_and_back(oem_path, tmp_path, capsys):
+def test_an_ephemeris_goes_through_spice_and_back(oem_path, tmp_path, typed):
     kernel, back = tmp_path / "orbit.bsp", tmp_path / "back.oem"
-    made = run_json(capsys, "orbit", "convert", oem_path, "--out", kernel, "--spice-id", "-85")
+    made = typed(f"orbit convert {oem_path} --out {kernel} --spice-id -85 --json")
     assert made["spk_type"] == 3 and made["error_m"] < 1e-4
-    older = run_json(capsys, "orbit", "convert", oem_path, "--out", kernel, "--spice-id", "-85", "--type", "13")
+    older = typed(f"orbit convert {oem_path} --out {kernel} --spice-id -85 --type 13 --json")
     assert (older["spk_type"], older["states"], older["error_m"]) == (13, 2881, None)
-    run_json(capsys, "orbit", "convert", kernel, "--out", back, "--spice-id", "-85", "--step", "30")
+    typed(f"orbit convert {kernel} --out {back} --spice-id -85 --step 30 --json")
     # A float64 of seconds is good to 0.2 mm at orbital speed.
-    assert run_json(capsys, "orbit", "compare", oem_path, back)["max_m"] < 1e-3
+    assert typed(f"orbit compare {oem_path} {back} --json")["max_m"] < 1e-3
 
 
 @pytest.mark.parametrize(("ending", "count"), [(".oem", 242), (".csv", 223), (".tum", 223), (".e", 223)])
-def test_a_conversion_prints_as_many_states_as_it_writes(tmp_path, capsys, ending, count):
+def test_a_conversion_prints_as_many_states_as_it_writes(tmp_path, typed, ending, count):
     """Two arcs of 121 states share an epoch; 20 states of the second are beyond its useable interval."""
     first = polar_orbit(2.0).segments[0]
     stop = int(first.utc_ns[-1])
     later = replace(first, utc_ns=first.utc_ns + 7200 * NS, useable_stop_utc_ns=stop + 6030 * NS, tai_ns=None)
     path, out = tmp_path / "two.oem", tmp_path / f"out{ending}"
     save_oem(Ephemeris((first, later)), path)
-    assert run_json(capsys, "orbit", "convert", path, "--out", out)["states"] == count
+    assert typed(f"orbit convert {path} --out {out} --json")["states"] == count
     rows = [line for line in out.read_text().splitlines() if line[0:1].isdigit() and len(line) > 60]
     assert len(rows) == count
 
 
-def test_figures_of_states_that_gravity_does_not_move_are_refused(tmp_path, capsys):
+def test_figures_of_states_that_gravity_does_not_move_are_refused(tmp_path, typed):
     (one,) = polar_orbit(2.0).segments
     save_oem(Ephemeris((replace(one, velocity_m_s=0.9 * one.velocity_m_s),)), tmp_path / "slow.oem")
-    line = error_line(capsys, "orbit", "visibility", tmp_path / "slow.oem")
+    line = typed(f"orbit visibility {tmp_path}/slow.oem", 2)
     assert "expected an acceleration of" in line and "% off" in line
 
 
-def test_a_kernel_without_the_number_of_the_spacecraft_is_one_line(oem_path, tmp_path, capsys):
-    line = error_line(capsys, "orbit", "convert", oem_path, "--out", tmp_path / "orbit.bsp")
+def test_a_kernel_without_the_number_of_the_spacecraft_is_one_line(oem_path, tmp_path, typed):
+    line = typed(f"orbit convert {oem_path} --out {tmp_path}/orbit.bsp", 2)
     assert "--spice-id: expected the SPICE number of the spacecraft, such as -85, found none" in line
 
 
-def test_a_conversion_to_an_unknown_format_is_one_line(oem_path, tmp_path, capsys):
-    line = error_line(capsys, "orbit", "convert", oem_path, "--out", tmp_path / "orbit.json")
+def test_a_conversion_to_an_unknown_format_is_one_line(oem_path, tmp_path, typed):
+    line = typed(f"orbit convert {oem_path} --out {tmp_path}/orbit.json", 2)
     assert "expected a name ending in .oem, .xml, .bsp, .e, .csv, .tum, found 'orbit.json'" in line
 
 
-def test_a_file_cut_short_is_one_line(oem_path, tmp_path, capsys):
+def test_a_file_cut_short_is_one_line(oem_path, tmp_path, typed):
     cut = tmp_path / "cut.oem"
     cut.write_text(oem_path.read_text()[:2000])
-    assert "cut.oem: line" in error_line(capsys, "orbit", "compare", cut, oem_path)
+    assert "cut.oem: line" in typed(f"orbit compare {cut} {oem_path}", 2)
 
 
-def test_visibility_lists_eclipses_and_the_contacts_of_a_station(oem_path, capsys):
-    figures = run_json(capsys, "orbit", "visibility", oem_path, "--station", "Madrid=40.43,-4.25,830")
+def test_visibility_lists_eclipses_and_the_contacts_of_a_station(oem_path, typed):
+    figures = typed(f"orbit visibility {oem_path} --station Madrid=40.43,-4.25,830 --json")
     assert len(figures["eclipses"]) in (25, 26, 27)  # a revolution of 111 min, 48 h
     assert figures["contacts"]["Madrid"]
     assert 1.1 < figures["light_time_s"]["min"] < figures["light_time_s"]["max"] < 1.4  # s
@@ -126,48 +110,45 @@ def test_visibility_lists_eclipses_and_the_contacts_of_a_station(oem_path, capsy
 
 
 @pytest.mark.parametrize("station", ["Madrid", "Madrid=here", "Madrid=400,0", "=1,2", "Madrid=1"])
-def test_a_station_that_cannot_be_read_is_one_line(oem_path, capsys, station):
-    assert "expected NAME=LATITUDE,LONGITUDE" in error_line(
-        capsys, "orbit", "visibility", oem_path, "--station", station
-    )
+def test_a_station_that_cannot_be_read_is_one_line(oem_path, typed, station):
+    assert "expected NAME=LATITUDE,LONGITUDE" in typed(f"orbit visibility {oem_path} --station {station}", 2)
 
 
-def test_interpolate_gives_states_at_the_epochs_of_a_file(oem_path, tmp_path, capsys):
+def test_interpolate_gives_states_at_the_epochs_of_a_file(oem_path, tmp_path, typed):
     epochs = tmp_path / "epochs.txt"
     epochs.write_text("# two epochs\n2029-08-07T00:00:00Z\n\n2029-08-07T12:34:56.789123Z  # odd\n")
-    figures = run_json(capsys, "orbit", "interpolate", oem_path, "--epochs", epochs)
+    figures = typed(f"orbit interpolate {oem_path} --epochs {epochs} --json")
     first, second = figures["states"]
     assert set(first) == {*("epoch", "position_km", "velocity_km_s", "latitude_deg", "longitude_deg", "altitude_km")}
     assert second["epoch"] == "2029-08-07T12:34:56.789123000Z"
     assert np.linalg.norm(second["position_km"]) == pytest.approx(1768.18, abs=1e-6)
     assert first["altitude_km"] == pytest.approx(30.78, abs=1e-6)
     assert abs(first["latitude_deg"]) < 0.1
-    assert cli.run(["orbit", "interpolate", str(oem_path), "--epochs", str(epochs)]) == 0
-    assert len(capsys.readouterr().out.splitlines()) == 3
+    assert len(typed(f"orbit interpolate {oem_path} --epochs {epochs}").splitlines()) == 3
 
 
-def test_interpolate_names_the_epoch_that_is_not_covered_and_the_line_that_is_no_epoch(oem_path, tmp_path, capsys):
+def test_interpolate_names_the_epoch_that_is_not_covered_and_the_line_that_is_no_epoch(oem_path, tmp_path, typed):
     epochs = tmp_path / "epochs.txt"
     epochs.write_text("2029-09-07T00:00:00Z\n")
-    line = error_line(capsys, "orbit", "interpolate", oem_path, "--epochs", epochs)
+    line = typed(f"orbit interpolate {oem_path} --epochs {epochs}", 2)
     assert "found 2029-09-07T00:00:00.000Z; nothing is extrapolated" in line
     epochs.write_text("2029-08-07T00:00:00Z\nnoon\n")
-    line = error_line(capsys, "orbit", "interpolate", oem_path, "--epochs", epochs)
+    line = typed(f"orbit interpolate {oem_path} --epochs {epochs}", 2)
     assert "epochs.txt: line 2: expected a UTC epoch" in line and line.endswith("found 'noon'")
 
 
-def test_catalogue_stats_counts_the_classes_of_the_papers_density(capsys):
-    figures = run_json(capsys, "catalogue", "stats", "paper-density")
+def test_catalogue_stats_counts_the_classes_of_the_papers_density(typed):
+    figures = typed("catalogue stats paper-density --json")
     assert figures["class_counts"] == list(PAPER_CLASS_COUNTS)
     assert figures["total"] == sum(PAPER_CLASS_COUNTS)
     assert figures["source"].startswith("synthetic")
 
 
-def test_the_fov_study_gives_the_probabilities_and_the_smallest_field_of_view(oem_path, capsys):
-    words = ("camera", "fov-study", "--ephemeris", oem_path, "--catalogue", "paper-density")
-    figures = run_json(capsys, *words)
+def test_the_fov_study_gives_the_probabilities_and_the_smallest_field_of_view(oem_path, typed):
+    study = f"camera fov-study --ephemeris {oem_path} --catalogue paper-density"
+    figures = typed(f"{study} --json")
     assert figures["fov_deg"] == list(range(10, 161, 10))
     assert set(figures["probability_at_least"]) == {"1", "3", "5"}
     enough = [p > 0.9 for p in figures["probability_at_least"]["3"]]
     assert figures["selected_fov_deg"] == figures["fov_deg"][enough.index(True)]
-    assert "--needed: expected" in error_line(capsys, *words, "--needed", "0")
+    assert "--needed: expected" in typed(f"{study} --needed 0", 2)

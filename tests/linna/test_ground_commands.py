@@ -3,10 +3,7 @@
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -24,12 +21,12 @@ NS = 1_000_000_000
 
 
 @pytest.fixture(scope="module")
-def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def reference(tmp_path_factory):
     return save_circle(tmp_path_factory.mktemp("oem") / "reference.oem")
 
 
 @pytest.fixture
-def downlink(tmp_path: Path) -> Path:
+def downlink(tmp_path):
     ticks = int(ticks_from_utc_ns(START + 60 * NS))
     path = tmp_path / "downlink.cadu"
     path.write_bytes(encode_cadus([event_packet(ticks + k, k) for k in range(5)], spacecraft_id=76))
@@ -37,35 +34,26 @@ def downlink(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[list[str]]:
+def server(tmp_path):
     """A served service with one operator: the options that name it."""
     with served(Settings(home=tmp_path / "served")) as (url, token):
-        yield ["--server", url, "--token", token]
+        yield f"--server {url} --token {token}"
 
 
-def asked(capsys: pytest.CaptureFixture[str], *words: Any, status: int = 0) -> Any:
-    code = run([*map(str, words), "--json"])
-    printed = capsys.readouterr()
-    assert code == status, printed.err
-    return json.loads(printed.out) if status == 0 else printed.err
-
-
-def test_a_pass_archive_is_imported_and_reported_over_the_wire(
-    capsys: pytest.CaptureFixture[str], server: list[str], synthetic_archive: Path, tmp_path: Path
-) -> None:
+def test_a_pass_archive_is_imported_and_reported_over_the_wire(typed, server, synthetic_archive, tmp_path):
     with open_ground(tmp_path / "here") as ground:
         import_archive(ground, synthetic_archive)
-    here = asked(capsys, "pass", "show", 1, "--home", tmp_path / "here")
-    assert asked(capsys, "ingest", synthetic_archive, *server)["ingested"][0]["pass_id"] == 1
-    assert asked(capsys, "pass", "show", 1, *server) == here
-    made = asked(capsys, "report", 1, "--out", tmp_path / "out", *server)
+    here = typed(f"pass show 1 --home {tmp_path}/here --json")
+    assert typed(f"ingest {synthetic_archive} --json {server}")["ingested"][0]["pass_id"] == 1
+    assert typed(f"pass show 1 --json {server}") == here
+    made = typed(f"report 1 --out {tmp_path}/out --json {server}")
     for kind, start in (("html", b"<!"), ("json", b"{"), ("pdf", b"%PDF")):
         assert (tmp_path / "out" / f"report.{kind}").read_bytes().startswith(start)
     assert made["packets"] == here["packets"]
 
 
 @pytest.fixture
-def synthetic_archive(tmp_path: Path, downlink: Path, reference: Path) -> Path:
+def synthetic_archive(tmp_path, downlink, reference):
     """The smallest pass archive there is."""
     folder = tmp_path / "archive"
     folder.mkdir()
@@ -78,18 +66,16 @@ def synthetic_archive(tmp_path: Path, downlink: Path, reference: Path) -> Path:
     return folder
 
 
-def test_a_wrong_token_and_a_wrong_server_are_told_in_one_line(
-    capsys: pytest.CaptureFixture[str], server: list[str]
-) -> None:
-    wrong = asked(capsys, "pass", "list", *server[:3], "x", status=2)
+def test_a_wrong_token_and_a_wrong_server_are_told_in_one_line(typed, server):
+    wrong = typed(f"pass list --json {server}x", 2)
     assert wrong.strip() == "linna: error: token: expected one that 'linna user add' gave out, found another"
-    gone = asked(capsys, "pass", "list", "--server", "http://127.0.0.1:1", status=2)
+    gone = typed("pass list --server http://127.0.0.1:1 --json", 2)
     assert gone.startswith("linna: error: http://127.0.0.1:1: cannot be reached")
-    odd = asked(capsys, "pass", "list", "--server", "ftp://x", status=2)
+    odd = typed("pass list --server ftp://x --json", 2)
     assert "expected a URL such as" in odd
 
 
-def test_a_failed_job_is_reported_in_one_line_that_names_the_file(tmp_path: Path) -> None:
+def test_a_failed_job_is_reported_in_one_line_that_names_the_file(tmp_path):
     archive = tmp_path / "archive"
     archive.mkdir()
     (archive / "manifest.json").write_text("{}")
@@ -101,9 +87,7 @@ def test_a_failed_job_is_reported_in_one_line_that_names_the_file(tmp_path: Path
     assert line.startswith(f"linna: error: {archive}: manifest.json, schema_version: expected int, found None (help: ")
 
 
-def test_an_unusable_file_does_not_keep_the_others_from_being_ingested(
-    capsys: pytest.CaptureFixture[str], downlink: Path, tmp_path: Path
-) -> None:
+def test_an_unusable_file_does_not_keep_the_others_from_being_ingested(capsys, downlink, tmp_path):
     noise = tmp_path / "noise.cadu"
     noise.write_bytes(bytes(range(256)) * 80)
     home = ["--home", tmp_path / "home"]
@@ -115,8 +99,8 @@ def test_an_unusable_file_does_not_keep_the_others_from_being_ingested(
     assert first["packets"] == last["packets"] > 0 and last["packets_new"] == 0
 
 
-def test_a_user_of_an_unknown_mission_is_warned_of(capsys: pytest.CaptureFixture[str]) -> None:
-    service: Any = SimpleNamespace(
+def test_a_user_of_an_unknown_mission_is_warned_of(capsys):
+    service = SimpleNamespace(
         list_missions=lambda: [SimpleNamespace(mission="selenita")],
         add_user=lambda *_, **__: SimpleNamespace(token="T"),
     )

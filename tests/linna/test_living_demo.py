@@ -1,7 +1,6 @@
 """`linna demo --live`: the parts start, documents are posted, and all end with the command or with a part."""
 
 import sys
-from pathlib import Path
 from threading import Event
 from unittest.mock import MagicMock
 
@@ -17,17 +16,15 @@ from studies.mission_run import living
 from tests.serving import wait_for
 
 
-def test_a_part_that_ends_is_named_after_the_documents_were_posted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_part_that_ends_is_named_after_the_documents_were_posted(tmp_path, monkeypatch):
     folder, client, said = tmp_path / "demo", MagicMock(), []
     client.__enter__.return_value = client
 
-    def written(*_: object) -> str:
+    def written(*_):
         (folder / "request.json").write_text('{"windows": 12}')
         return ""
 
-    def parts(folder: Path, *_: object) -> dict[str, Part]:
+    def parts(folder, *_):
         program = [sys.executable, "-c", "import time; time.sleep(0.5)"]
         return {"spacecraft": Part(program, folder / "spacecraft.log", lambda: True)}
 
@@ -51,14 +48,14 @@ def test_a_part_that_ends_is_named_after_the_documents_were_posted(
         living.living_demo(*other)
 
 
-def test_a_spacecraft_that_goes_on_has_its_state_and_ports_and_the_terrain_of_the_demo(tmp_path: Path) -> None:
+def test_a_spacecraft_that_goes_on_has_its_state_and_ports_and_the_terrain_of_the_demo(tmp_path):
     command = living._parts(tmp_path, 60.0, 8042, {"madrid": (1, 2)})["spacecraft"]._command
     assert {"--state", "--journal", "madrid:1:2"} <= {*command}
     assert load_scenario("live-demo").terrain == load_scenario("selenita").terrain
 
 
 @pytest.mark.campaign
-def test_a_living_demo_plans_and_commands_until_it_is_ended(tmp_path: Path) -> None:
+def test_a_living_demo_plans_and_commands_until_it_is_ended(tmp_path):
     port, log = free_port(), tmp_path / "log"
     words = ["demo", "--live", "--out", tmp_path / "demo", "--port", port, "--rate", 240]
     environment = bare_environment()

@@ -3,12 +3,10 @@
 import csv
 import importlib.util
 import json
-from pathlib import Path
-from typing import Any
 
 import pytest
 
-from linna import cli
+from linna.cli import run
 from lunar.datafolder import find_data
 from studies import paper_steps
 from studies.paper_steps import Effort, StepFolder
@@ -19,9 +17,9 @@ SMALL = Effort(
 
 
 @pytest.fixture(scope="module")
-def document(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], list[str]]:
+def document(tmp_path_factory):
     out = tmp_path_factory.mktemp("paper") / "paper"
-    lines: list[str] = []
+    lines = []
     with pytest.MonkeyPatch.context() as patch:
         find_spec = importlib.util.find_spec
         patch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "torch" else find_spec(name, *a))
@@ -29,13 +27,14 @@ def document(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
         patch.setattr("linna.commands.paper.log", lines.append)
         patch.delenv("LINNA_DATA", raising=False)
         patch.setenv("XDG_DATA_HOME", str(out.parent))
-        assert cli.run(["paper", "--quick", "--out", str(out)]) == 0
+        words = ["paper", "--quick", "--out", str(out)]
+        assert run(words) == 0
         first = len(lines)
-        assert cli.run(["paper", "--quick", "--out", str(out)]) == 0
+        assert run(words) == 0
     return out, json.loads((out / "paper.json").read_text()), lines[first:]
 
 
-def test_the_document_has_the_figures_tables_and_differences(document: tuple[Path, dict[str, Any], list[str]]) -> None:
+def test_the_document_has_the_figures_tables_and_differences(document):
     out, index, _ = document
     rows = list(csv.DictReader((out / "paper.csv").read_text().splitlines()))
     assert [row["quantity"] for row in rows] == [one["quantity"] for one in index["values"]]
@@ -49,28 +48,26 @@ def test_the_document_has_the_figures_tables_and_differences(document: tuple[Pat
     assert "5" in images["paper"] and "0.1 h" in images["here"] and "32.5 h" in images["reason"]
 
 
-def test_a_second_run_repeats_no_step(document: tuple[Path, dict[str, Any], list[str]]) -> None:
+def test_a_second_run_repeats_no_step(document):
     announced, *steps = document[2]
     assert announced.startswith("this takes") and steps
     assert all(line.endswith(": already done") for line in steps)
 
 
-def test_without_torch_the_document_says_what_it_lacks(document: tuple[Path, dict[str, Any], list[str]]) -> None:
+def test_without_torch_the_document_says_what_it_lacks(document):
     assert "torch" in document[1]["not_available"]["sessions"]
     assert not [figure for figure in document[1]["figures"] if figure["key"].startswith("own-")]
 
 
-def test_without_data_every_level_is_that_of_the_procedural_moon(
-    document: tuple[Path, dict[str, Any], list[str]],
-) -> None:
+def test_without_data_every_level_is_that_of_the_procedural_moon(document):
     levels = {figure["key"]: figure["level"] for figure in document[1]["figures"]}
     assert all(level.startswith(("level 1", "level 2")) for level in levels.values()), levels
 
 
-def test_a_step_is_done_again_when_what_it_is_made_from_changes(tmp_path: Path) -> None:
-    calls: list[int] = []
+def test_a_step_is_done_again_when_what_it_is_made_from_changes(tmp_path):
+    calls = []
 
-    def make() -> int:
+    def make():
         calls.append(len(calls))
         return len(calls)
 
@@ -82,9 +79,8 @@ def test_a_step_is_done_again_when_what_it_is_made_from_changes(tmp_path: Path) 
     ] == [1, 1, 2]
 
 
-def test_hours_out_of_range_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["paper", "--out", str(tmp_path / "p"), "--hours", "0"]) == 2
-    assert capsys.readouterr().err == (
-        "linna paper: error: argument --hours: expected a number from 0.5 and up to 240, found '0'\n"
+def test_hours_out_of_range_are_refused(tmp_path, typed):
+    assert typed(f"paper --out {tmp_path}/p --hours 0", 2) == (
+        "linna paper: error: argument --hours: expected a number from 0.5 and up to 240, found '0'"
     )
     assert not (tmp_path / "p").exists()

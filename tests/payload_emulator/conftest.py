@@ -1,8 +1,5 @@
 """A small world for navigation: a rough gravity field, craters of the paper's density, the paper's orbit."""
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -17,7 +14,7 @@ TRUTH_DEGREE = 60
 
 
 @pytest.fixture(scope="session")
-def navigation_case() -> Callable[..., NavigationCase]:
+def navigation_case():
     """Return a maker of cases; every argument of `NavigationCase` can be replaced."""
     gravity, craters = rough_gravity(TRUTH_DEGREE), crater_world()
     position, velocity = icrf_state_from_elements(
@@ -26,8 +23,8 @@ def navigation_case() -> Callable[..., NavigationCase]:
         gravity.gm_m3_s2,
     )
 
-    def make(frames: int = 120, **changes: Any) -> NavigationCase:
-        values: dict[str, Any] = {
+    def make(frames=120, **changes):
+        values = {
             "epoch_utc_ns": EPOCH, "position_icrf_m": position, "velocity_icrf_m_s": velocity,
             "frame_utc_ns": EPOCH + np.arange(frames) * 15 * 10**9, "imaging": np.ones(frames, dtype=bool),
             "gravity": gravity, "gravity_degree": TRUTH_DEGREE, "orientation": IauOrientation(),

@@ -2,15 +2,14 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lunar.catalogue import CraterCatalogue, load_catalogue, make_catalogue
+from lunar.catalogue import load_catalogue, make_catalogue
 from lunar.datafolder import find_data
 from payload_emulator.errors import TerrainError
-from payload_emulator.sim.terrain.curation import Curation, CurationRules, RasterHeights, Region, curate
+from payload_emulator.sim.terrain.curation import CurationRules, RasterHeights, Region, curate
 from tmtc.dictionary.tables import pack_catalogue_table, unpack_catalogue_table
 
 RADIUS_M = 1_737_400.0
@@ -24,7 +23,7 @@ LIST_ERROR_M = 120.0
 class Field:
     """Bowls with raised rims on a slope, at places the raster says, on pixels of 128 per degree."""
 
-    def __init__(self, ppd: float = 128.0, tilt: float = 0.01) -> None:
+    def __init__(self, ppd=128.0, tilt=0.01):
         rng = np.random.default_rng(4)
         # One crater per cell of half a degree: none touches another.
         cells = np.arange(0.5, SIZE_DEG, 0.62)
@@ -36,10 +35,10 @@ class Field:
         self.rim = 0.2 * self.depth
         self.pixels_per_degree, self.tilt = ppd, tilt
 
-    def base(self, latitude: np.ndarray, longitude: np.ndarray) -> np.ndarray:
+    def base(self, latitude, longitude):
         return 800.0 + self.tilt * METRES_PER_DEG * (latitude - SOUTH)
 
-    def window(self, south: float, north: float, west: float, east: float) -> tuple[np.ndarray, float, float]:
+    def window(self, south, north, west, east):
         ppd = self.pixels_per_degree
         top, left = math.ceil(north * ppd) / ppd, math.floor(west * ppd) / ppd
         rows, columns = round((top - south) * ppd) + 1, round((east - left) * ppd) + 1
@@ -57,7 +56,7 @@ class Field:
         outside = (latitude < SOUTH) | (latitude > SOUTH + SIZE_DEG)
         return np.where(outside, np.nan, height), top, left
 
-    def listed(self, error_m: float = LIST_ERROR_M) -> CraterCatalogue:
+    def listed(self, error_m=LIST_ERROR_M):
         """The list that goes with the raster: shifted as a whole, each centre and diameter a little wrong."""
         rng = np.random.default_rng(9)
         east, north = error_m * rng.standard_normal((2, self.latitude.size))
@@ -68,16 +67,16 @@ class Field:
 
 
 @pytest.fixture(scope="module")
-def field() -> Field:
+def field():
     return Field()
 
 
 @pytest.fixture(scope="module")
-def curation(field: Field) -> Curation:
+def curation(field):
     return curate(field.listed(), field)
 
 
-def errors_m(field: Field, curation: Curation) -> np.ndarray:
+def errors_m(field, curation):
     """Kept centres beside the raster's own, east and north."""
     table = curation.table
     rows = table.ids
@@ -86,7 +85,7 @@ def errors_m(field: Field, curation: Curation) -> np.ndarray:
     return np.stack([east * np.cos(table.latitude_rad), north], axis=1)
 
 
-def test_the_shift_of_the_list_is_found_with_its_uncertainty(curation: Curation) -> None:
+def test_the_shift_of_the_list_is_found_with_its_uncertainty(curation):
     # The list's own errors average out as 120 m / sqrt(n), n about 60 rims that tell.
     error = np.subtract(curation.offset_m, OFFSET_M)
     assert np.all(np.abs(error) < 3.0 * LIST_ERROR_M / math.sqrt(60.0))
@@ -95,16 +94,12 @@ def test_the_shift_of_the_list_is_found_with_its_uncertainty(curation: Curation)
     assert 50 <= curation.registration.rims.sum() <= 90
 
 
-def test_centres_lie_where_the_raster_shows_the_rims(field: Field, curation: Curation) -> None:
-    # Registration, 35 m and 60 m in this list, is no part of the table; half a pixel would be 118 m.
-    assert np.all(np.abs(errors_m(field, curation).mean(axis=0)) < 10.0)
-
-
-def test_centres_sizes_and_rim_heights_are_refitted(field: Field, curation: Curation) -> None:
-    error = errors_m(field, curation)
-    left = error
+def test_centres_sizes_and_rim_heights_are_refitted(field, curation):
     # A pixel is 237 m; 48 azimuths put the rim to a tenth of it, where the list is 120 m off.
-    assert np.sqrt(np.mean(left**2)) < 30.0
+    error = errors_m(field, curation)
+    assert np.sqrt(np.mean(error**2)) < 30.0
+    # Registration, 35 m and 60 m in this list, is no part of the table; half a pixel would be 118 m.
+    assert np.all(np.abs(error.mean(axis=0)) < 10.0)
     rows = curation.table.ids
     assert np.median(np.abs(np.log(curation.table.diameter_m / field.diameter[rows]))) < 0.03
     rim = field.base(field.latitude[rows], field.longitude[rows]) + field.rim[rows]
@@ -112,7 +107,7 @@ def test_centres_sizes_and_rim_heights_are_refitted(field: Field, curation: Cura
     assert np.abs(np.median(curation.table.rim_height_m - rim)) < 25.0
 
 
-def test_every_crater_is_kept_or_dropped_for_one_reason_and_the_shallow_ones_are_dropped(field: Field) -> None:
+def test_every_crater_is_kept_or_dropped_for_one_reason_and_the_shallow_ones_are_dropped(field):
     listed = field.listed()
     curation = curate(listed, field)
     assert len(curation.table) + sum(curation.dropped.values()) == len(listed)
@@ -121,7 +116,7 @@ def test_every_crater_is_kept_or_dropped_for_one_reason_and_the_shallow_ones_are
     assert curation.dropped["shallow"] >= len(shallow)
 
 
-def test_a_crater_without_terrain_is_dropped_and_a_map_without_any_is_refused(field: Field) -> None:
+def test_a_crater_without_terrain_is_dropped_and_a_map_without_any_is_refused(field):
     listed = field.listed()
     moved = replace(listed, latitude_rad=listed.latitude_rad + np.radians(20.0))
     with pytest.raises(TerrainError, match="expected heights under some of"):
@@ -130,7 +125,7 @@ def test_a_crater_without_terrain_is_dropped_and_a_map_without_any_is_refused(fi
     assert curate(half, field).dropped["no_terrain"] > 0
 
 
-def test_of_two_craters_on_top_of_each_other_the_deeper_stays(field: Field) -> None:
+def test_of_two_craters_on_top_of_each_other_the_deeper_stays(field):
     listed = field.listed(error_m=0.0)
     twice = listed.select(np.r_[np.arange(len(listed)), [0]])
     twice = replace(twice, ids=np.arange(len(twice)))
@@ -138,27 +133,27 @@ def test_of_two_craters_on_top_of_each_other_the_deeper_stays(field: Field) -> N
     assert curation.dropped["confusable"] == 1
 
 
-def test_a_coarse_raster_is_corrected_for_low_rims_and_says_so(curation: Curation) -> None:
+def test_a_coarse_raster_is_corrected_for_low_rims_and_says_so(curation):
     coarse = Field(ppd=32.0)
     # One halving below 64 px/deg.
     assert curate(coarse.listed(), coarse).height_correction_m == pytest.approx(20.0)
     assert curation.height_correction_m == 0.0
 
 
-def test_a_region_over_the_zero_meridian_holds_both_sides() -> None:
+def test_a_region_over_the_zero_meridian_holds_both_sides():
     region = Region(350.0, 370.0, -10.0, 10.0)
     inside = region.holds(np.zeros(4), np.radians([355.0, 5.0, 15.0, -5.0]))
     assert inside.tolist() == [True, True, False, True]
 
 
-def test_the_table_survives_upload_and_its_sigmas_are_never_below_the_floor(curation: Curation) -> None:
+def test_the_table_survives_upload_and_its_sigmas_are_never_below_the_floor(curation):
     table = unpack_catalogue_table(pack_catalogue_table(curation.table))
     assert len(table) == len(curation.table)
     assert np.all(table.sigma_m[:, :2] >= CurationRules().centre_sigma_m)
 
 
 @pytest.mark.real_data
-def test_on_gld100_the_list_and_the_terrain_agree_to_half_a_pixel(data_path: Path) -> None:
+def test_on_gld100_the_list_and_the_terrain_agree_to_half_a_pixel(data_path):
     data = find_data(data_path)
     tiles = [path for path in data.dem_tiles if "128ppd" in path.name]
     heights = RasterHeights(tiles)

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -76,11 +75,11 @@ def flown(tmp_path_factory):
     return folder
 
 
-def inputs(folder: Path):
+def inputs(folder):
     return [json.loads(line) for line in (folder / "payload" / "inputs.jsonl").read_text().splitlines()]
 
 
-def copied(flown: Path, to: Path) -> Path:
+def copied(flown, to):
     shutil.copytree(flown / "given", to)
     return to
 

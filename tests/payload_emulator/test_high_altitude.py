@@ -1,7 +1,5 @@
 """Navigation from 150 km with simulated detections: from the first frame, with an initial error of 2 km."""
 
-from pathlib import Path
-
 from lunar.datafolder import DataFolder
 from payload_emulator.session.archive.emulator import emulate
 from payload_emulator.session.scenario import parse_scenario
@@ -41,7 +39,7 @@ catalogue_min_diameter_km = 5.0
 """
 
 
-def test_every_frame_is_fixed_and_the_error_is_below_a_pixel(tmp_path: Path) -> None:
+def test_every_frame_is_fixed_and_the_error_is_below_a_pixel(tmp_path):
     summary = emulate(parse_scenario(SCENARIO), DataFolder(), tmp_path / "pass")
     assert summary["altitude_km"]["min"] > 140.0
     assert summary["outcomes"]["fixed"] == summary["frames"] == 8

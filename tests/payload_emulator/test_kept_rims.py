@@ -2,12 +2,10 @@
 
 import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import DataFolder
 from payload_emulator.session.scenario import Scenario
@@ -15,21 +13,20 @@ from payload_emulator.session.world import rims
 from payload_emulator.session.world.rims import rims_of, sources_of
 from payload_emulator.sim.terrain import tiles
 from payload_emulator.sim.terrain.procedural import ProceduralTerrain
-from payload_emulator.sim.terrain.tiles import Heights
 
 SCENARIO = Scenario(name="rims", seed=5)
 ALL = np.arange(6)
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     opened().measured(ALL[:1])  # compiled code comes from its own folder
     # Ground lies beside the folder of compiled code, which builds under test read.
     monkeypatch.setattr("kernels.cache_folder", lambda: tmp_path / "code")
     return tmp_path / "code-ground"
 
 
-def opened(sources: str = "one", shift_rad: float = 0.0) -> ProceduralTerrain:
+def opened(sources="one", shift_rad=0.0):
     """Return a terrain with six craters in a row."""
     places = np.linspace(0.1, 0.11, 6)
     craters = make_catalogue(places + shift_rad, places, 4e3 + 2e6 * (places - 0.1), source="a row")
@@ -38,13 +35,13 @@ def opened(sources: str = "one", shift_rad: float = 0.0) -> ProceduralTerrain:
     return terrain
 
 
-def makes_ground(terrain: ProceduralTerrain, craters: IntArray = ALL) -> bool:
+def makes_ground(terrain, craters=ALL):
     """Return whether the rims of these craters are measured."""
     rims_of(SCENARIO, terrain, craters)
     return bool(terrain._slots)
 
 
-def test_rims_are_measured_once_and_again_for_other_ground(folder: Path) -> None:
+def test_rims_are_measured_once_and_again_for_other_ground(folder):
     first, second = opened(), opened()
     found = rims_of(SCENARIO, first, ALL)
     assert not makes_ground(second)
@@ -66,14 +63,14 @@ def test_rims_are_measured_once_and_again_for_other_ground(folder: Path) -> None
     assert makes_ground(opened())
 
 
-def test_tiles_are_made_once_and_again_for_other_ground(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tiles_are_made_once_and_again_for_other_ground(folder, monkeypatch):
     made, make = list[ProceduralTerrain](), ProceduralTerrain.make_heights
 
-    def counted(terrain: ProceduralTerrain, *places: FloatArray) -> Heights:
+    def counted(terrain, *places):
         made.append(terrain)
         return make(terrain, *places)
 
-    def tile(terrain: ProceduralTerrain, latitude_rad: float = 0.1) -> Heights:
+    def tile(terrain, latitude_rad=0.1):
         patch = terrain.patch(latitude_rad, 0.1)
         return patch.heights[patch.table[0, 0]]
 
@@ -102,7 +99,7 @@ def test_tiles_are_made_once_and_again_for_other_ground(folder: Path, monkeypatc
     assert sorted(file.name[:5] for file in folder.iterdir()) == ["rims-", "tile-"]
 
 
-def test_sources_change_with_the_seed_the_section_and_each_file_of_a_raster(tmp_path: Path) -> None:
+def test_sources_change_with_the_seed_the_section_and_each_file_of_a_raster(tmp_path):
     raster, label = tmp_path / "heights.IMG", tmp_path / "heights.LBL"
     for file in (raster, label):
         file.write_bytes(b"heights")
@@ -117,11 +114,11 @@ def test_sources_change_with_the_seed_the_section_and_each_file_of_a_raster(tmp_
     assert len(set(texts)) == len(texts)
 
 
-def test_a_long_measurement_is_watched_in_parts_and_a_kept_one_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_measurement_is_watched_in_parts_and_a_kept_one_is_not(monkeypatch):
     monkeypatch.setattr(rims, "PART", 4)
-    seen: list[list[int]] = []
+    seen = []
 
-    def watched(parts: list[IntArray]) -> list[IntArray]:
+    def watched(parts):
         seen.extend(part.tolist() for part in parts)
         return parts
 

@@ -6,17 +6,15 @@ import selectors
 import socket
 import struct
 import threading
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from lunar.camera import project_mcmf
-from lunar.datafolder import DataFolder, find_data
+from lunar.datafolder import find_data
 from lunar.frames import mcmf_from_spherical
 from lunar.timescales import parse_utc
 from payload_emulator.errors import LinkError
@@ -31,11 +29,11 @@ from payload_emulator.session.live.station_ports import (
 )
 from payload_emulator.session.live.viewing import step_message
 from payload_emulator.session.scenario import FaultsSection, parse_scenario
-from payload_emulator.session.spacecraft.loading import LoadedPayload, load_scenario_payload
+from payload_emulator.session.spacecraft.loading import load_scenario_payload
 from payload_emulator.session.spacecraft.loop import StepInput, StepResult, new_spacecraft
 from payload_emulator.session.spacecraft.schedule import Operator, fly_scenario
 from payload_emulator.session.world.camera import Exposure, expose
-from payload_emulator.session.world.world import World, build_world
+from payload_emulator.session.world.world import build_world
 from payload_emulator.sim.board.faults import FAULT_KINDS
 from payload_emulator.sim.board.link import Receiver
 from studies.harness.parts import free_port, listens
@@ -51,26 +49,29 @@ EPOCH = parse_utc("2029-08-07T01:40:00Z")
 
 
 @pytest.fixture(scope="module")
-def flown() -> tuple[World, LoadedPayload]:
-    data: DataFolder = NO_DATA
-    world = build_world(parse_scenario(SCENARIO), data)
-    return world, load_scenario_payload(world, data)[0]
+def flown():
+    world = build_world(parse_scenario(SCENARIO), NO_DATA)
+    return world, load_scenario_payload(world, NO_DATA)[0]
+
+
+def connected(port):
+    return socket.create_connection(("127.0.0.1", port), timeout=900.0)
 
 
 class Watcher:
     """A client of the live payload."""
 
-    def __init__(self, live: LiveSession) -> None:
-        self.telemetry = socket.create_connection(("127.0.0.1", live.ports["telemetry earth"]), timeout=900.0)
-        self.telecommands = socket.create_connection(("127.0.0.1", live.ports["telecommand earth"]), timeout=900.0)
-        self.console = socket.create_connection(("127.0.0.1", live.ports["console"]), timeout=900.0)
+    def __init__(self, live):
+        self.telemetry = connected(live.ports["telemetry earth"])
+        self.telecommands = connected(live.ports["telecommand earth"])
+        self.console = connected(live.ports["console"])
         self.lines = self.console.makefile("r")
         self.say("watch")
 
-    def say(self, word: str) -> None:
+    def say(self, word):
         self.console.sendall(word.encode() + b"\n")
 
-    def until(self, wanted: Any) -> list[dict[str, Any]]:
+    def until(self, wanted):
         """Messages up to the first that is wanted."""
         found = []
         for line in self.lines:
@@ -79,7 +80,7 @@ class Watcher:
                 return found
         raise AssertionError("the console ended")
 
-    def rest_of_telemetry(self) -> bytes:
+    def rest_of_telemetry(self):
         octets = b""
         while part := self.telemetry.recv(65_536):
             octets += part
@@ -87,14 +88,14 @@ class Watcher:
         starts = range(RECORD_HEADER.size, len(octets), length)
         return b"".join(octets[start : start + LinkSettings().cadu_length] for start in starts)
 
-    def close(self) -> None:
+    def close(self):
         self.lines.close()
         for connection in (self.telemetry, self.telecommands, self.console):
             connection.close()
 
 
 @contextmanager
-def watched(world: World, loaded: LoadedPayload) -> Iterator[tuple[LiveSession, Watcher]]:
+def watched(world, loaded):
     """Fly a payload live, paused at the start, with a client."""
     live = LiveSession(world, loaded, has_operator=True, paused=True)
     thread = threading.Thread(target=live.run, daemon=True)
@@ -110,23 +111,23 @@ def watched(world: World, loaded: LoadedPayload) -> Iterator[tuple[LiveSession, 
 
 
 @pytest.fixture
-def running(flown: tuple[World, LoadedPayload]) -> Iterator[tuple[LiveSession, Watcher]]:
+def running(flown):
     with watched(*flown) as both:
         yield both
 
 
-def ping(count: int) -> bytes:
+def ping(count):
     return DICTIONARY.pack_command("test_connection", {}, sequence_count=count)
 
 
-def seen_from(world: World, utc_ns: int, packets: list[bytes]) -> StepResult:
+def seen_from(world, utc_ns, packets):
     """A step with a nadir image that is not rendered."""
     position = world.truth.positions_mcmf(utc_ns)[0]
     exposure = Exposure(utc_ns, np.zeros((0, 0), np.uint8), np.zeros(9), 0, world.camera_from_mcmf(position))
     return StepResult(StepInput(utc_ns, 0, 1.0, True, 0), exposure, packets, b"")
 
 
-def test_rings_of_the_catalogue_lie_on_the_rims_of_the_rendered_ground() -> None:
+def test_rings_of_the_catalogue_lie_on_the_rims_of_the_rendered_ground():
     world = build_world(parse_scenario(SCENARIO.replace('"reduced"', '"rendered"')), NO_DATA)
     with watched(world, load_scenario_payload(world, NO_DATA)[0]) as (_, watcher):
         watcher.say("run")
@@ -145,7 +146,7 @@ def test_rings_of_the_catalogue_lie_on_the_rims_of_the_rendered_ground() -> None
     assert all(one["minor_px"] <= one["diameter_px"] <= one["major_px"] for one in rings)
 
 
-def test_detections_that_the_payload_identified_have_their_craters(flown: tuple[World, LoadedPayload]) -> None:
+def test_detections_that_the_payload_identified_have_their_craters(flown):
     world, loaded = flown
     frame = {"frame_number": 0, "image_ticks": 0}
     found = {"u_px": 1.0, "v_px": 2.0, "diameter_px": 9.0, "score": 0.5, "size_class": 0, "sigma_px": 0.5}
@@ -161,7 +162,7 @@ def test_detections_that_the_payload_identified_have_their_craters(flown: tuple[
     assert message["terrain"] == {"name": world.terrain.name, "real": False}
 
 
-def test_a_session_of_watching_stepping_and_commanding(running: tuple[LiveSession, Watcher]) -> None:
+def test_a_session_of_watching_stepping_and_commanding(running):
     _, watcher = running
     watcher.say("step")
     watcher.say("step")
@@ -197,7 +198,7 @@ def test_a_session_of_watching_stepping_and_commanding(running: tuple[LiveSessio
     assert uplink.frames == decoded.frame_count and not uplink.no_rf_available and uplink.changes > 0
 
 
-def test_the_scenario_runs_through_and_the_machine_goes_on(running: tuple[LiveSession, Watcher]) -> None:
+def test_the_scenario_runs_through_and_the_machine_goes_on(running):
     live, watcher = running
     watcher.say("run")
     messages = watcher.until(
@@ -212,7 +213,7 @@ def test_the_scenario_runs_through_and_the_machine_goes_on(running: tuple[LiveSe
     watcher.until(lambda message: message.get("rate") == 5.0)
 
 
-def test_the_operator_answers_to_telemetry_of_two_light_times_ago(flown: tuple[World, LoadedPayload]) -> None:
+def test_the_operator_answers_to_telemetry_of_two_light_times_ago(flown):
     second = 1_000_000_000
     modes = [PayloadMode(1 + (k // 3) % 3) for k in range(12)]
     for step_s, behind in ((10, 0), (1, 2)):
@@ -225,7 +226,7 @@ def test_the_operator_answers_to_telemetry_of_two_light_times_ago(flown: tuple[W
         assert seen[behind:] == modes[: len(modes) - behind]
 
 
-def test_a_port_in_use_is_named_and_nothing_stays_open(flown: tuple[World, LoadedPayload]) -> None:
+def test_a_port_in_use_is_named_and_nothing_stays_open(flown):
     world, loaded = flown
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
@@ -233,11 +234,11 @@ def test_a_port_in_use_is_named_and_nothing_stays_open(flown: tuple[World, Loade
             LiveSession(world, loaded, has_operator=True, station_ports={"earth": (0, port)})
 
 
-def test_who_reaches_the_console_reaches_the_mission_description(flown: tuple[World, LoadedPayload]) -> None:
+def test_who_reaches_the_console_reaches_the_mission_description(flown):
     port = free_port()
     answers = []
 
-    def text(world: World, used: dict[str, tuple[int, int]]) -> str:
+    def text(world, used):
         answers.append(listens(port))
         return "text"
 
@@ -245,20 +246,18 @@ def test_who_reaches_the_console_reaches_the_mission_description(flown: tuple[Wo
     assert answers == [False]
 
 
-def reset(connection: socket.socket) -> None:
+def reset(connection):
     """Close a connection with RST instead of FIN."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
     connection.close()
 
 
-def test_hundreds_of_short_half_open_and_reset_connections_do_not_stop_the_payload(
-    running: tuple[LiveSession, Watcher],
-) -> None:
+def test_hundreds_of_short_half_open_and_reset_connections_do_not_stop_the_payload(running):
     live, watcher = running
     held = []
     for k in range(300):
         for name in ("telemetry earth", "telecommand earth", "console"):
-            connection = socket.create_connection(("127.0.0.1", live.ports[name]), timeout=900.0)
+            connection = connected(live.ports[name])
             if name == "console":
                 # The answer to an unknown word meets a connection that is gone already.
                 connection.sendall(b"unknown\n" * 3 + b"half a wo")
@@ -290,23 +289,23 @@ def test_hundreds_of_short_half_open_and_reset_connections_do_not_stop_the_paylo
     )
 
 
-def served(server: Server) -> selectors.BaseSelector:
+def served(server):
     selector = selectors.DefaultSelector()
     server.attach(selector)
     return selector
 
 
-def turn(selector: selectors.BaseSelector) -> None:
+def turn(selector):
     for key, events in selector.select(0.01):
         server, client = key.data
         server.serve(client, events)
 
 
-def test_a_reader_that_does_not_read_is_disconnected_and_delays_nobody() -> None:
-    received: list[tuple[int, bytes]] = []
+def test_a_reader_that_does_not_read_is_disconnected_and_delays_nobody():
+    received = []
     server = Server("telemetry", 0, "127.0.0.1", lambda number, octets: received.append((number, octets)))
     selector = served(server)
-    slow, quick = (socket.create_connection(("127.0.0.1", server.port), timeout=900.0) for _ in range(2))
+    slow, quick = (connected(server.port) for _ in range(2))
     while len(server.clients) < 2:
         turn(selector)
     chunk, octets = bytes(range(256)) * 1024, b""
@@ -335,11 +334,11 @@ def test_a_reader_that_does_not_read_is_disconnected_and_delays_nobody() -> None
 
 
 @pytest.mark.parametrize("leave", [socket.socket.close, reset], ids=["closed", "reset"])
-def test_words_of_a_client_that_left_without_reading_are_received(leave: Callable[[socket.socket], None]) -> None:
-    received: list[bytes] = []
+def test_words_of_a_client_that_left_without_reading_are_received(leave):
+    received = []
     server = Server("console", 0, "127.0.0.1", lambda number, octets: received.append(octets))
     selector = served(server)
-    client = socket.create_connection(("127.0.0.1", server.port), timeout=900.0)
+    client = connected(server.port)
     while not server.clients:
         turn(selector)
     server.send(b"snapshot that nobody reads\n")
@@ -356,10 +355,10 @@ def test_words_of_a_client_that_left_without_reading_are_received(leave: Callabl
     selector.close()
 
 
-def test_no_more_connections_are_held_than_the_limit() -> None:
+def test_no_more_connections_are_held_than_the_limit():
     server = Server("telemetry", 0, "127.0.0.1", lambda number, octets: None)
     selector = served(server)
-    clients = [socket.create_connection(("127.0.0.1", server.port), timeout=900.0) for _ in range(CLIENT_LIMIT + 3)]
+    clients = [connected(server.port) for _ in range(CLIENT_LIMIT + 3)]
     while server._accepted < CLIENT_LIMIT:
         turn(selector)
     for _ in range(3):
@@ -372,7 +371,7 @@ def test_no_more_connections_are_held_than_the_limit() -> None:
         client.close()
 
 
-def test_telecommands_come_out_of_any_noise_whole_or_not_at_all() -> None:
+def test_telecommands_come_out_of_any_noise_whole_or_not_at_all():
     rng = np.random.default_rng(6)
     for trial in range(200):
         telecommands = [ping(k) for k in range(4)]
@@ -391,14 +390,14 @@ def test_telecommands_come_out_of_any_noise_whole_or_not_at_all() -> None:
         assert buffer.dropped >= sum(map(len, noise))
 
 
-def test_a_flood_of_octets_is_not_kept() -> None:
+def test_a_flood_of_octets_is_not_kept():
     buffer = TelecommandBuffer(Receiver(0x4C))
     for _ in range(40):
         assert buffer.take(b"\xeb\x90" + b"\x00" * 65_536) == []
     assert buffer.dropped > 1 << 20
 
 
-def test_a_processor_that_hangs_is_reset_and_the_payload_goes_on(flown: tuple[World, LoadedPayload]) -> None:
+def test_a_processor_that_hangs_is_reset_and_the_payload_goes_on(flown):
     world, loaded = flown
     scenario = replace(world.scenario, faults=FaultsSection(("processor_hang at 60",)))
     flights = []
@@ -416,6 +415,6 @@ def test_a_processor_that_hangs_is_reset_and_the_payload_goes_on(flown: tuple[Wo
     assert flights[1] == flights[0]  # the same seed gives the same flight
 
 
-def test_every_kind_of_fault_is_documented() -> None:
+def test_every_kind_of_fault_is_documented():
     page = (Path(__file__).resolve().parents[2] / "docs" / "payload.md").read_text()
     assert all(f"`{kind}`" in page for kind in FAULT_KINDS)

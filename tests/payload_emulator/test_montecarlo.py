@@ -1,8 +1,7 @@
 """Anchored navigation over many simulated frames: accuracy, honesty, recovery, and what it does with bad input."""
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from functools import partial
 
 import numpy as np
 import pytest
@@ -35,8 +34,13 @@ PARAMETERS = AnchoredParameters(
 )
 
 
-def test_from_five_kilometres_off_the_orbit_is_held_to_a_hundred_metres_without_truth(navigation_case: Any) -> None:
-    case = navigation_case(120, start_position_m=5_000.0, start_velocity_m_s=5.0, parameters=PARAMETERS)
+@pytest.fixture
+def case_of(navigation_case):
+    return partial(navigation_case, parameters=PARAMETERS)
+
+
+def test_from_five_kilometres_off_the_orbit_is_held_to_a_hundred_metres_without_truth(case_of):
+    case = case_of(120, start_position_m=5_000.0, start_velocity_m_s=5.0)
     result = consistency([fly(case, seed) for seed in (1, 2)])
     # The single-frame bound for 18 craters, 1.5 px and this catalogue is 120 m (3-D); the orbit averages over frames.
     assert result.median_m <= 100.0
@@ -58,17 +62,16 @@ GOOD = Consistency(6.1, 1.0, (0.95, 0.96, 0.94), 0.01, 40.0, 80.0, 120.0, 0.99, 
         ({"contained_95": (0.95, 0.80, 0.95)}, "share inside 1.96 sigma"),
     ],
 )
-def test_each_way_of_not_knowing_its_errors_is_named(fault: dict[str, Any], words: str) -> None:
+def test_each_way_of_not_knowing_its_errors_is_named(fault, words):
     assert verdict(GOOD, 50).consistent
     judged = verdict(replace(GOOD, **fault), 50)
     assert not judged.consistent
     assert len(judged.reasons) == 1 and words in judged.reasons[0]
 
 
-def test_errors_of_a_run_differ_for_each_seed(navigation_case: Any) -> None:
-    case = navigation_case(
+def test_errors_of_a_run_differ_for_each_seed(case_of):
+    case = case_of(
         30, start_position_m=100.0, start_velocity_m_s=0.1, detector=SimulatedDetector(scale_sigma=0.02),
-        parameters=PARAMETERS,
     )  # fmt: skip
     # Two per cent of 23 km of altitude are 460 m: the radial errors of runs scatter by that, and not without it.
     radial = [fly(case, seed).error_rtn_m[-1, 0] for seed in range(6)]
@@ -77,19 +80,19 @@ def test_errors_of_a_run_differ_for_each_seed(navigation_case: Any) -> None:
     assert np.std(exact) < 80.0
 
 
-def test_a_common_pixel_bias_hides_from_the_innovations_and_shows_in_the_errors(navigation_case: Any) -> None:
-    biased = navigation_case(150, detector=SimulatedDetector(bias_px=(1.0, 0.0)), parameters=PARAMETERS)
+def test_a_common_pixel_bias_hides_from_the_innovations_and_shows_in_the_errors(case_of):
+    biased = case_of(150, detector=SimulatedDetector(bias_px=(1.0, 0.0)))
     result = consistency([fly(biased, 3)])
     assert result.nis_per_degree <= 1.15
     assert result.anees > 10.0
 
 
-def test_an_attitude_of_a_degree_neither_diverges_nor_lies(navigation_case: Any) -> None:
+def test_an_attitude_of_a_degree_neither_diverges_nor_lies(case_of):
     # A wide field of view sees its own attitude: with known errors of the sensor (single frame, 20 craters, 30 km) the
     # place is worse by 1.8 without any attitude; a filter has 93 m (median) at 1 degree.
     noise = float(np.radians(1.0))
     parameters = replace(PARAMETERS, errors=replace(PARAMETERS.errors, attitude_noise_rad=noise))
-    case = navigation_case(100, attitude_noise_rad=noise, attitude_bias_rad=0.0, parameters=parameters)
+    case = case_of(100, attitude_noise_rad=noise, attitude_bias_rad=0.0, parameters=parameters)
     runs = [fly(case, seed) for seed in (21, 22, 23, 24)]
     result = consistency(runs)
     assert result.median_m <= 130.0
@@ -102,33 +105,33 @@ def test_an_attitude_of_a_degree_neither_diverges_nor_lies(navigation_case: Any)
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(one, marks=pytest.mark.campaign) for one in (2, 3))])
-def test_a_jump_of_five_kilometres_that_nobody_told_of_is_noticed_and_mended(navigation_case: Any, seed: int) -> None:
-    case = navigation_case(80, kidnap=Kidnap(50, 5_000.0, announced=False), parameters=PARAMETERS)
+def test_a_jump_of_five_kilometres_that_nobody_told_of_is_noticed_and_mended(case_of, seed):
+    case = case_of(80, kidnap=Kidnap(50, 5_000.0, announced=False))
     run = fly(case, seed)
     assert run.error_m[49] < 300.0
     assert run.error_m[50] > 4_000.0
     assert np.all(run.error_m[58:] < 500.0)
 
 
-def test_a_told_jump_of_tens_of_kilometres_is_mended_within_four_frames(navigation_case: Any) -> None:
-    case = navigation_case(40, kidnap=Kidnap(25, 50_000.0, announced=True), parameters=PARAMETERS)
+def test_a_told_jump_of_tens_of_kilometres_is_mended_within_four_frames(case_of):
+    case = case_of(40, kidnap=Kidnap(25, 50_000.0, announced=True))
     run = fly(case, 4)
     assert np.all(run.error_m[29:] < 500.0)
 
 
-def test_after_hours_without_a_camera_the_first_frames_bring_the_orbit_back(navigation_case: Any) -> None:
+def test_after_hours_without_a_camera_the_first_frames_bring_the_orbit_back(case_of):
     imaging = np.ones(760, dtype=bool)
     imaging[20:740] = False
-    case = navigation_case(760, imaging=imaging, parameters=PARAMETERS)
+    case = case_of(760, imaging=imaging)
     run = fly(case, 5)
     assert np.all(run.outcome[20:740] == Outcome.no_image)
     assert np.all(run.error_m[743:] < 500.0)
 
 
-def test_a_wrong_catalogue_is_refused_and_the_orbit_coasted(navigation_case: Any) -> None:
-    case = navigation_case(
+def test_a_wrong_catalogue_is_refused_and_the_orbit_coasted(case_of):
+    case = case_of(
         40, start_position_m=100.0, start_velocity_m_s=0.1,
-        catalogue_errors=CatalogueErrors(centre_of_diameter=0.03, wrong_share=1.0), parameters=PARAMETERS,
+        catalogue_errors=CatalogueErrors(centre_of_diameter=0.03, wrong_share=1.0),
     )  # fmt: skip
     run = fly(case, 6)
     # A lone chance neighbour inside its gate may be taken for a crater now and then: it moves nothing by much.
@@ -136,12 +139,10 @@ def test_a_wrong_catalogue_is_refused_and_the_orbit_coasted(navigation_case: Any
     assert np.all(run.error_m < 500.0)
 
 
-def test_false_detections_alone_give_no_fix(navigation_case: Any) -> None:
+def test_false_detections_alone_give_no_fix(case_of):
     blind = SimulatedDetector(recall=(0.0, 0.0, 0.0, 0.0), precision=0.06)
     for sigma, frames in ((100.0, 60), (10_000.0, 6)):
-        case = navigation_case(
-            frames, detector=blind, start_position_m=sigma, start_velocity_m_s=0.1, parameters=PARAMETERS
-        )
+        case = case_of(frames, detector=blind, start_position_m=sigma, start_velocity_m_s=0.1)
         run = fly(case, 7)
         assert np.count_nonzero(run.fixed) <= 2
         assert set(run.outcome.tolist()) <= {Outcome.fixed, Outcome.coasted, Outcome.refused}
@@ -149,8 +150,8 @@ def test_false_detections_alone_give_no_fix(navigation_case: Any) -> None:
     assert Outcome.refused in run.outcome.tolist()
 
 
-def test_the_same_seed_gives_the_same_run_on_any_number_of_processes(navigation_case: Any) -> None:
-    case = navigation_case(12, parameters=PARAMETERS)
+def test_the_same_seed_gives_the_same_run_on_any_number_of_processes(case_of):
+    case = case_of(12)
     alone, together = fly_many(case, [1, 2], workers=1), fly_many(case, [1, 2], workers=2)
     for one, other in zip(alone, together, strict=True):
         np.testing.assert_array_equal(one.error_rtn_m, other.error_rtn_m)
@@ -160,7 +161,7 @@ SHIPPED_RUNS, SHIPPED_HOURS = 4, 0.5
 
 
 @pytest.fixture(scope="module")
-def shipped() -> Any:
+def shipped():
     """The standard case with everything as shipped: bias states, catalogue offset, scale, persistence, noise."""
     case = standard_case(DataFolder(), "tuning", SHIPPED_HOURS)
     assert case.parameters == replace(
@@ -169,12 +170,12 @@ def shipped() -> Any:
     return case
 
 
-def shipped_consistency(case: Any) -> Consistency:
+def shipped_consistency(case):
     return consistency([fly(case, seed) for seed in range(31, 31 + SHIPPED_RUNS)], settle_frames=40)
 
 
 @pytest.mark.parametrize("distorted", [False, True])
-def test_the_shipped_filter_knows_its_errors(shipped: Any, distorted: bool) -> None:
+def test_the_shipped_filter_knows_its_errors(shipped, distorted):
     case = shipped
     if distorted:
         drawn = CatalogueErrors(regional_sigma_m=(60.0, 60.0, 10.0), regional_rad=np.radians(10.0))
@@ -189,9 +190,7 @@ def test_the_shipped_filter_knows_its_errors(shipped: Any, distorted: bool) -> N
 
 
 @pytest.mark.parametrize("believed", [1.0, 0.05])
-def test_craters_that_the_payload_mapped_are_met_again_and_their_errors_known(
-    monkeypatch: pytest.MonkeyPatch, believed: float
-) -> None:
+def test_craters_that_the_payload_mapped_are_met_again_and_their_errors_known(monkeypatch, believed):
     rows = landmark_map.map_rows
     monkeypatch.setattr(
         landmark_map, "map_rows", lambda made: replace(rows(made), sigma_m=believed * rows(made).sigma_m)
@@ -204,7 +203,7 @@ def test_craters_that_the_payload_mapped_are_met_again_and_their_errors_known(
     assert (result.anees <= chdtri(6, 0.025)) == (believed == 1.0)
 
 
-def test_a_regional_shift_has_its_size_and_is_alike_over_its_angle() -> None:
+def test_a_regional_shift_has_its_size_and_is_alike_over_its_angle():
     rng = np.random.default_rng(5)
     # Pairs of places 30 degrees apart on the equator, and 2 degrees.
     longitude = np.radians(np.array([0.0, 2.0, 30.0]))
@@ -218,7 +217,7 @@ def test_a_regional_shift_has_its_size_and_is_alike_over_its_angle() -> None:
 
 
 @pytest.mark.parametrize("named", [False, True])
-def test_a_scenario_distorts_the_map_that_is_uploaded_by_the_stated_amount(tmp_path: Path, named: bool) -> None:
+def test_a_scenario_distorts_the_map_that_is_uploaded_by_the_stated_amount(tmp_path, named):
     scenario, craters = load_scenario("selenita"), crater_world()
     plain = loading._catalogue_octets(scenario, craters)
     if named:
@@ -239,7 +238,7 @@ def test_a_scenario_distorts_the_map_that_is_uploaded_by_the_stated_amount(tmp_p
     np.testing.assert_array_equal(one.sigma_m[first], other.sigma_m[second])
 
 
-def test_slow_errors_wander_with_the_memory_they_are_given() -> None:
+def test_slow_errors_wander_with_the_memory_they_are_given():
     elapsed_s = np.full(40_000, 15.0)
     rng = np.random.default_rng(0)
     values = montecarlo._wandering(np.zeros(2), 0.5, 150.0, elapsed_s, rng)[200:]
@@ -250,7 +249,7 @@ def test_slow_errors_wander_with_the_memory_they_are_given() -> None:
     np.testing.assert_array_equal(still, np.broadcast_to([0.3, -0.2], still.shape))
 
 
-def test_an_acceleration_that_lasts_moves_the_truth_as_it_should(shipped: Any) -> None:
+def test_an_acceleration_that_lasts_moves_the_truth_as_it_should(shipped):
     """A nearly constant push across the plane over ten minutes."""
     still = replace(shipped, lasting_m_s2=(0.0, 0.0, 0.0))
     pushed = replace(shipped, lasting_m_s2=(0.0, 0.0, 1e-4), lasting_correlation_s=1e9)
@@ -266,13 +265,13 @@ def test_an_acceleration_that_lasts_moves_the_truth_as_it_should(shipped: Any) -
     assert normal @ (there[k, :3] - here[k, :3]) == pytest.approx(expected, rel=0.12)
 
 
-def test_every_error_that_the_filter_allows_for_is_drawn(shipped: Any) -> None:
+def test_every_error_that_the_filter_allows_for_is_drawn(shipped):
     noise = shipped.parameters.noise
     assert shipped.lasting_m_s2 == noise.markov_sigma_m_s2 == (2e-6, 2e-6, 2e-6)
     assert shipped.lasting_correlation_s == noise.correlation_s
 
 
-def test_tracks_differ_and_draw_their_nodes_where_they_say() -> None:
+def test_tracks_differ_and_draw_their_nodes_where_they_say():
     axis = np.array([0.0, 0.0, 1.0])
     inclinations, altitudes = {}, {}
     for track in TRACKS:

@@ -21,7 +21,7 @@ k1 = -0.02
 RIM_M = 5_000.0
 
 
-def test_rings_lie_where_rims_on_high_ground_are_seen_by_a_tilted_distorted_camera() -> None:
+def test_rings_lie_where_rims_on_high_ground_are_seen_by_a_tilted_distorted_camera():
     world = build_world(parse_scenario(SCENARIO), DataFolder())
     utc_ns = int(world.frame_utc_ns[0])
     position = world.truth.positions_mcmf(utc_ns)[0]
@@ -38,7 +38,7 @@ def test_rings_lie_where_rims_on_high_ground_are_seen_by_a_tilted_distorted_came
     )
     focal_px = 256.0 / np.tan(np.radians(60.0))
 
-    def pixels(height_m: float) -> np.ndarray:
+    def pixels(height_m):
         seen = ((1_737_400.0 + height_m) * unit - position) @ rotation.T
         plane = seen[:, :2] / seen[:, 2:]
         return 255.5 + focal_px * plane * (1.0 - 0.02 * np.sum(plane**2, axis=1, keepdims=True))

@@ -2,10 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,10 +14,10 @@ from payload_emulator.flight.payload import FlightParameters
 from payload_emulator.session.archive.reconstruction import CATALOGUE, reconstruct
 from payload_emulator.session.archive.replay import FlightBuild, complete_archive, replay_archive
 from payload_emulator.session.live.station_ports import RECORD_HEADER
-from payload_emulator.session.scenario import Scenario, format_scenario, parse_scenario
+from payload_emulator.session.scenario import format_scenario, parse_scenario
 from payload_emulator.session.spacecraft.loading import launch_payload
 from payload_emulator.session.world.world import clock_ticks, first_utc_ns, open_world
-from tests.payload_emulator.test_continuous import CADU, EPOCH, HOUR_NS, NS, Ground, flown, scenario
+from tests.payload_emulator.test_continuous import CADU, EPOCH, HOUR_NS, NS, first, flown, scenario
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode
 from tmtc.link.settings import LinkSettings
@@ -34,40 +31,35 @@ OUTAGE = 'outages = ["madrid 2029-08-07T04:00:00Z 2029-08-07T06:00:00Z"]\n'
 """The window is uplinked before it and received after it."""
 
 
-def world(further: str = "") -> Scenario:
+def world(further=""):
     """The scenario of the continuous session with rendered images; the clock jumps between the second and the third."""
     text = format_scenario(scenario(OUTAGE)).replace('images = "reduced"', 'images = "rendered"')
     text = text.replace("events = []", f'events = ["clock_jump at {JUMP_S} size 1.0"]')
     return parse_scenario(text + further)
 
 
-def packets_of(records: bytes) -> bytes:
+def packets_of(records):
     step = RECORD_HEADER.size + CADU
     cadus = b"".join(records[at + RECORD_HEADER.size : at + step] for at in range(0, len(records), step))
     result = decode(cadus, settings=LinkSettings())
     return b"".join(result.cut.packets(result.buffer))
 
 
-def received(folder: Path, described: Scenario) -> Path:
+def received(folder, described):
     """Fly a window and write what the ground has of it: packets, telecommands, catalogue, declared world."""
-    sent: list[bytes] = []
+    sent = []
 
-    def act(ground: Ground, contact: dict[str, Any]) -> None:
-        if contact["state"] == "started" and ground.count == 0:
-            sent.extend(
-                (
-                    ground.at(WINDOW, ground.function("start_observation", FRAMES * 15.0, 15.0)),
-                    ground.at(WINDOW + 90 * NS, ground.function("set_mode", 3.0)),
-                )
-            )
-            ground.send(*sent)
+    def commands(ground):
+        sent.append(ground.at(WINDOW, ground.function("start_observation", FRAMES * 15.0, 15.0)))
+        sent.append(ground.at(WINDOW + 90 * NS, ground.function("set_mode", 3.0)))
+        return sent
 
     terrain = open_world(described, DataFolder(None)).terrain
     folder.mkdir()
     listed = terrain.catalogue.diameter_m
     some = np.flatnonzero((listed > 5e3) & (listed < 8e3))[:40]
     save_catalogue(terrain.measured(some), folder / CATALOGUE)
-    session, ground = flown(described, 6.5, act, craters=folder / CATALOGUE)
+    session, ground = flown(described, 6.5, first(commands), craters=folder / CATALOGUE)
     assert session.account.frames == FRAMES
     (folder / "downlink.packets").write_bytes(packets_of(ground.records))
     (folder / "telecommands.packets").write_bytes(b"".join(sent))
@@ -79,17 +71,17 @@ def received(folder: Path, described: Scenario) -> Path:
 
 
 @pytest.fixture(scope="module")
-def live(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def live(tmp_path_factory):
     return received(tmp_path_factory.mktemp("reconstruction") / "pass", world())
 
 
 @pytest.fixture
-def copy(live: Path, tmp_path: Path) -> Path:
+def copy(live, tmp_path):
     shutil.copytree(live, tmp_path / "copy")
     return tmp_path / "copy"
 
 
-def of_kind(name: str, octets: bytes) -> list[dict[str, Any]]:
+def of_kind(name, octets):
     """Values of the packets of one kind in the order of the images, without the number of the frame since boot."""
     found = []
     decoded = decode(octets)
@@ -101,7 +93,7 @@ def of_kind(name: str, octets: bytes) -> list[dict[str, Any]]:
     return found
 
 
-def test_the_flown_build_says_of_the_images_made_again_what_it_said_in_flight(live: Path, tmp_path: Path) -> None:
+def test_the_flown_build_says_of_the_images_made_again_what_it_said_in_flight(live, tmp_path):
     """The detector looked at the same pixels: its reports have the same octets, and so have those of the images."""
     whole = tmp_path / "whole"
     manifest = complete_archive(live, whole, DataFolder(None))
@@ -114,17 +106,17 @@ def test_the_flown_build_says_of_the_images_made_again_what_it_said_in_flight(li
     assert any(one["items"]["u_px"] for one in of_kind("detections", before))
 
 
-def test_the_first_time_of_a_tick_is_the_same_from_everywhere() -> None:
+def test_the_first_time_of_a_tick_is_the_same_from_everywhere():
     moon = open_world(world(), DataFolder(None))
     for seconds in (0.0, 1.0, 3333.333, 2_592_000.25):
         ticks = clock_ticks(moon, EPOCH + round(seconds * NS))
-        first = first_utc_ns(moon, ticks)
-        assert clock_ticks(moon, first) == ticks and clock_ticks(moon, first - 1) == ticks - 1
-        assert abs(first - EPOCH - seconds * NS) < 16_000
+        start = first_utc_ns(moon, ticks)
+        assert clock_ticks(moon, start) == ticks and clock_ticks(moon, start - 1) == ticks - 1
+        assert abs(start - EPOCH - seconds * NS) < 16_000
 
 
-def in_world(old: str, new: str) -> Callable[[Path], None]:
-    def changed(folder: Path) -> None:
+def in_world(old, new):
+    def changed(folder):
         manifest = json.loads((folder / "manifest.json").read_text())
         assert old in manifest["scenario_toml"]
         manifest["scenario_toml"] = manifest["scenario_toml"].replace(old, new)
@@ -133,13 +125,13 @@ def in_world(old: str, new: str) -> Callable[[Path], None]:
     return changed
 
 
-def without_reports(folder: Path) -> None:
+def without_reports(folder):
     decoded = decode((folder / "downlink.packets").read_bytes())
     kept = [one for one in decoded.cut.packets(decoded.buffer) if DICTIONARY.unpack(one)[0] != "image_report"]
     (folder / "downlink.packets").write_bytes(b"".join(kept))
 
 
-def with_another_catalogue(folder: Path) -> None:
+def with_another_catalogue(folder):
     lines = (folder / CATALOGUE).read_text().splitlines(keepends=True)
     (folder / CATALOGUE).write_text("".join(lines[:20]))
 
@@ -157,15 +149,13 @@ def with_another_catalogue(folder: Path) -> None:
         (lambda folder: (folder / "telecommands.packets").unlink(), "expected telecommands that were sent"),
     ],
 )  # fmt: skip
-def test_what_telemetry_does_not_confirm_is_refused(
-    change: Callable[[Path], None], said: str, copy: Path, tmp_path: Path
-) -> None:
+def test_what_telemetry_does_not_confirm_is_refused(change, said, copy, tmp_path):
     change(copy)
     with pytest.raises(PayloadError, match=said):
         reconstruct(copy, tmp_path / "out", DataFolder(None))
 
 
-def test_only_a_payload_as_launched_reports_images(tmp_path: Path) -> None:
+def test_only_a_payload_as_launched_reports_images(tmp_path):
     described = world()
     opened = open_world(described, DataFolder(None))
     launched = launch_payload(described, opened.camera, DataFolder(None)).parameters.flight

@@ -30,7 +30,7 @@ source = "procedural"
 """)
 
 
-def test_frames_keep_to_the_band_of_the_window() -> None:
+def test_frames_keep_to_the_band_of_the_window():
     world = build_world(SCENARIO, DataFolder())
     latitude, _, _ = spherical_from_mcmf(world.truth.positions_mcmf(world.frame_utc_ns))
     # A frame each 15 s moves the ground point by 0.8 degrees.
@@ -38,7 +38,7 @@ def test_frames_keep_to_the_band_of_the_window() -> None:
     assert np.degrees(latitude.min()) >= -20.0 and np.degrees(latitude.max()) <= 50.0
 
 
-def test_a_search_without_a_window_names_the_latitudes_that_lack_terrain(monkeypatch) -> None:
+def test_a_search_without_a_window_names_the_latitudes_that_lack_terrain(monkeypatch):
     opened = world_module.open_terrain
 
     class Patchy:
@@ -58,7 +58,7 @@ def test_a_search_without_a_window_names_the_latitudes_that_lack_terrain(monkeyp
     assert build_world(south, DataFolder()).frame_utc_ns.size > 20
 
 
-def test_a_search_in_longitudes_that_no_track_crosses_says_so() -> None:
+def test_a_search_in_longitudes_that_no_track_crosses_says_so():
     narrow = replace(SCENARIO.window, longitude_min_deg=10.0, longitude_max_deg=11.0)
     with pytest.raises(ScenarioError, match=r"keeps its swath within longitudes 10\.0 to 11\.0 deg"):
         build_world(replace(SCENARIO, window=narrow), DataFolder())
@@ -86,7 +86,7 @@ source = "procedural"
 """
 
 
-def test_a_window_before_the_impact_of_the_orbit_is_found_and_the_impact_is_named() -> None:
+def test_a_window_before_the_impact_of_the_orbit_is_found_and_the_impact_is_named():
     world = build_world(parse_scenario(FALLING), DataFolder())
     assert format_utc(int(world.frame_utc_ns[0]), 0) == "2029-08-07T01:05:00Z"
     assert world.ends.startswith("the orbit hits the Moon at 2029-08-11T15:5")
@@ -120,7 +120,7 @@ duration_s = 600
 """
 
 
-def test_a_flight_over_a_pole_is_refused_before_it_starts_by_its_first_frame_that_sees_too_far(tmp_path) -> None:
+def test_a_flight_over_a_pole_is_refused_before_it_starts_by_its_first_frame_that_sees_too_far(tmp_path):
     message = r"expected ground within 84 deg of latitude .* found 8\d\.\d+ deg needed by frame \d of 40 at 2029"
     with pytest.raises(ScenarioError, match=message):
         checked_world(parse_scenario(POLAR), DataFolder())

@@ -3,12 +3,9 @@
 import json
 import shutil
 import subprocess
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 _WAIT_S = 120.0
@@ -17,15 +14,15 @@ _WAIT_S = 120.0
 class Tab:
     """One page in the browser, with everything it has logged and requested since it was opened."""
 
-    def __init__(self, socket: ClientConnection) -> None:
+    def __init__(self, socket):
         self._socket = socket
         self._number = 0
-        self.requests: list[str] = []
-        self.complaints: list[str] = []
+        self.requests = []
+        self.complaints = []
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
 
-    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+    def call(self, method, **parameters):
         """The result of one protocol command."""
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
@@ -33,35 +30,35 @@ class Tab:
             message = self._receive()
             if message.get("id") == self._number:
                 assert "error" not in message, message
-                result: dict[str, Any] = message["result"]
+                result = message["result"]
                 return result
 
-    def open(self, path: Path) -> None:
+    def open(self, path):
         """Go to a file and wait until it is loaded."""
         self.call("Page.navigate", url=path.as_uri())
         while self._receive().get("method") != "Page.loadEventFired":
             pass
 
-    def size(self, width: int, height: int) -> None:
+    def size(self, width, height):
         """Set the size of the window."""
         self.call(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False,
         )  # fmt: skip
 
-    def theme(self, scheme: str, media: str = "screen") -> None:
+    def theme(self, scheme, media="screen"):
         """Prefer light or dark, on a screen or on paper."""
         self.call(
             "Emulation.setEmulatedMedia", media=media, features=[{"name": "prefers-color-scheme", "value": scheme}]
         )
 
-    def value(self, expression: str) -> Any:
+    def value(self, expression):
         """Value of a JavaScript expression in the page."""
         result = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
-    def _receive(self) -> dict[str, Any]:
-        message: dict[str, Any] = json.loads(self._socket.recv(timeout=_WAIT_S))
+    def _receive(self):
+        message = json.loads(self._socket.recv(timeout=_WAIT_S))
         method, about = message.get("method"), message.get("params", {})
         if method == "Network.requestWillBeSent":
             self.requests.append(about["request"]["url"])
@@ -75,7 +72,7 @@ class Tab:
 
 
 @contextmanager
-def tab(profile: Path) -> Iterator[Tab]:
+def tab(profile):
     """A browser of its own with one empty page, gone afterwards."""
     assert CHROMIUM is not None
     process = subprocess.Popen(

@@ -3,17 +3,16 @@
 import pytest
 
 from reports.render import render_html
-from reports.values import PassReport
 from tests.reports import example
 
 
 @pytest.fixture(scope="session")
-def whole_pass() -> PassReport:
+def whole_pass():
     """A pass with everything that a report can show."""
     return example.pass_report(gallery=3, worst=5)
 
 
 @pytest.fixture(scope="session")
-def whole_page(whole_pass: PassReport) -> str:
+def whole_page(whole_pass):
     """Its page."""
     return render_html(whole_pass)

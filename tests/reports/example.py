@@ -5,8 +5,6 @@ that walk from a reset at the start of each arc, a catalogue filter that coasts 
 a single-frame fix.
 """
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -56,26 +54,26 @@ PERIOD_S = 111.20 * 60.0
 FOCAL_PX = 147.80
 
 
-def _unit_track(elapsed_s: Array) -> tuple[Array, Array]:
+def _unit_track(elapsed_s):
     """Unit position and direction of motion, (n, 3) each."""
     angle = np.radians(-62.0) + 2.0 * np.pi * elapsed_s[:, None] / PERIOD_S
     node, north = np.array([0.44, -0.90, 0.0]), np.array([0.03, 0.01, 1.0])
     return np.cos(angle) * node + np.sin(angle) * north, np.cos(angle) * north - np.sin(angle) * node
 
 
-def _altitude_m(elapsed_s: Array) -> Array:
+def _altitude_m(elapsed_s):
     angle = 2.0 * np.pi * elapsed_s / PERIOD_S
     return np.asarray(30_700.0 - 9_800.0 * np.cos(angle - 0.6) + 1_900.0 * np.sin(3.1 * angle))
 
 
-def _geodetic(position_m: Array) -> tuple[Array, Array, Array]:
+def _geodetic(position_m):
     radius = np.linalg.norm(position_m, axis=-1)
     latitude = np.degrees(np.arcsin(position_m[:, 2] / radius))
     longitude = np.degrees(np.arctan2(position_m[:, 1], position_m[:, 0])) % 360.0
     return latitude, longitude, radius - RADIUS_M
 
 
-def _quantiles(error_rtn_m: Array, drift_percent: float, path_m: float) -> NavigationStatistics:
+def _quantiles(error_rtn_m, drift_percent, path_m):
     length = np.linalg.norm(error_rtn_m, axis=1)
     length = length[np.isfinite(length)]
     if not len(length):
@@ -84,9 +82,7 @@ def _quantiles(error_rtn_m: Array, drift_percent: float, path_m: float) -> Navig
     return NavigationStatistics(p50, p68, p95, p99, float(length.max()), drift_percent, float(length[-1]), path_m)
 
 
-def _series(
-    name: str, kind: str, utc_ns: NDArray[np.int64], elapsed_s: Array, error_rtn_m: Array, **more: object
-) -> NavigationSeries:
+def _series(name, kind, utc_ns, elapsed_s, error_rtn_m, **more):
     unit, along = _unit_track(elapsed_s)
     cross = np.cross(unit, along)
     radius = RADIUS_M + _altitude_m(elapsed_s)
@@ -96,9 +92,7 @@ def _series(
     return NavigationSeries(name, kind, utc_ns, latitude, longitude, altitude, error_rtn_m, **more)
 
 
-def _odometry(
-    rng: np.random.Generator, imaging: NDArray[np.bool_], drift_m: tuple[float, float, float]
-) -> dict[str, Any]:
+def _odometry(rng, imaging, drift_m):
     """Errors that walk from the start of each arc, with outcomes, reset triggers and errors before a reset."""
     n = len(imaging)
     starts = imaging & ~np.append(False, imaging[:-1])
@@ -120,7 +114,7 @@ def _odometry(
     }
 
 
-def _filter(rng: np.random.Generator, imaging: NDArray[np.bool_], cadence_s: float) -> dict[str, Any]:
+def _filter(rng, imaging, cadence_s):
     """Errors of a filter whose uncertainty grows with the time since its last fix."""
     n = len(imaging)
     pairs = rng.poisson(5.5, n) * imaging
@@ -138,7 +132,7 @@ def _filter(rng: np.random.Generator, imaging: NDArray[np.bool_], cadence_s: flo
     }  # fmt: skip
 
 
-def crater_image(seed: int) -> tuple[NDArray[np.uint8], tuple[Array, Array, Array]]:
+def crater_image(seed):
     """A gray frame of 512 by 512 pixels with shaded bowls, and their centres and diameters in pixels."""
     rng = np.random.default_rng(seed)
     gray = rng.normal(118.0, 5.0, (512, 512))
@@ -150,11 +144,11 @@ def crater_image(seed: int) -> tuple[NDArray[np.uint8], tuple[Array, Array, Arra
     return np.clip(gray, 0, 255).astype(np.uint8), (u, v, diameter.astype(np.float64))
 
 
-def size_class(diameter_px: Array) -> NDArray[np.int64]:
+def size_class(diameter_px):
     return np.array([3, 0, 1, 2])[np.digitize(diameter_px * 30.0 / FOCAL_PX, (5.0, 10.0, 15.0))]
 
 
-def gallery_frame(seed: int, frame_number: int = 1, utc_ns: int | None = None) -> GalleryFrame:
+def gallery_frame(seed, frame_number=1, utc_ns=None):
     image, (u, v, diameter) = crater_image(seed)
     rng = np.random.default_rng(seed + 1)
     seen = rng.random(len(u)) < 0.72
@@ -171,7 +165,7 @@ def gallery_frame(seed: int, frame_number: int = 1, utc_ns: int | None = None) -
     )  # fmt: skip
 
 
-def detector_score(seed: int = 3) -> DetectorScore:
+def detector_score(seed=3):
     rng = np.random.default_rng(seed)
     n = 2_400
     azimuth = rng.uniform(-45.0, 45.0, n) % 360.0
@@ -200,9 +194,7 @@ def detector_score(seed: int = 3) -> DetectorScore:
     )
 
 
-def pass_report(
-    seed: int = 7, *, hours: float = 37.1 / 60.0, cadence_s: float = 15.0, gallery: int = 6, worst: int = 10
-) -> PassReport:
+def pass_report(seed=7, *, hours=37.1 / 60.0, cadence_s=15.0, gallery=6, worst=10):
     """A complete pass report; with ``hours=24`` a whole day of windows between 60 degrees south and north."""
     rng = np.random.default_rng(seed)
     n = max(1, round(hours * 3600.0 / cadence_s))
@@ -233,13 +225,13 @@ def pass_report(
     snapshot[anchored["matched"] == 0] = np.nan
     lengths = np.array([100e3, 200e3, 500e3, 1e6, 2e6])
 
-    def sweep(base: float, slope: float) -> tuple[DriftSample, ...]:
+    def sweep(base, slope):
         return tuple(
             DriftSample(float(m), base * (m / 1e6) ** slope, 2.1 * base * (m / 1e6) ** slope, int(4e7 / m))
             for m in lengths
         )
 
-    def flown(name: str, kind: str, error_rtn_m: Array, drift_percent: float, **more: object) -> NavigationSeries:
+    def flown(name, kind, error_rtn_m, drift_percent, **more):
         statistics = _quantiles(error_rtn_m, drift_percent, path)
         return _series(name, kind, utc_ns, elapsed, error_rtn_m, statistics=statistics, **more)
 
@@ -358,17 +350,17 @@ def pass_report(
     )  # fmt: skip
 
 
-def _regression_pass(i: int, rng: np.random.Generator) -> RegressionPass:
+def _regression_pass(i, rng):
     recall, precision, median = (tuple(one.tolist()) for one in rng.normal((0.68, 0.84, 40.0), 0.04, (2, 3)).T)
     return RegressionPass(f"W-{i:04d}", 148, i if i % 3 else None, recall, precision, median)
 
 
-def _changed_track(i: int) -> ChangedTrack:
+def _changed_track(i):
     sides = (gallery_frame(i, i, 0), gallery_frame(i + 9, i, 0))
     return ChangedTrack(f"W-{i:04d}", -12.5, 301.25, 7.5, 4, 3, 0, *sides)
 
 
-def regression_report(seed: int = 12, count: int = 24) -> RegressionReport:
+def regression_report(seed=12, count=24):
     """A candidate that is better on the whole and worse in a few passes."""
     rng = np.random.default_rng(seed)
     return RegressionReport(
@@ -399,7 +391,7 @@ def regression_report(seed: int = 12, count: int = 24) -> RegressionReport:
     )
 
 
-def detector_report(seed: int = 13) -> DetectorReport:
+def detector_report(seed=13):
     """A detector with everything that can be said of it."""
     epoch = np.arange(1.0, 41.0)
     kinds = (

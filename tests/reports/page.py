@@ -9,21 +9,21 @@ class Page(HTMLParser):
 
     VOID = frozenset({"meta", "link", "br", "hr", "img", "input"})
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
-        self.ids: list[str] = []
-        self.references: set[str] = set()
-        self.addresses: list[str] = []
-        self.styles: list[str] = []
-        self.tags: list[str] = []
-        self._open: list[str] = []
-        self._words: list[str] = []
+        self.ids = []
+        self.references = set()
+        self.addresses = []
+        self.styles = []
+        self.tags = []
+        self._open = []
+        self._words = []
         self.feed(text)
         self.close()
         self.left_open = list(self._open)
         self.text = re.sub(r"\s+", " ", " ".join(self._words))
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
         for name, value in attrs:
             value = value or ""
@@ -40,18 +40,18 @@ class Page(HTMLParser):
         if tag not in self.VOID:
             self._open.append(tag)
 
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_startendtag(self, tag, attrs):
         self.handle_starttag(tag, attrs)
         if tag not in self.VOID:
             self._open.pop()
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         if self._open and self._open[-1] == tag:
             self._open.pop()
         else:
             self._open.append(f"/{tag}")
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         if self._open and self._open[-1] == "style":
             self.styles.append(data)
         else:

@@ -3,7 +3,6 @@
 import json
 import re
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
@@ -16,22 +15,22 @@ from tests.reports.page import Page
 KINDS = ("regression", "detector")
 
 
-def _report(kind: str) -> Any:
+def _report(kind):
     return getattr(example, f"{kind}_report")()
 
 
 @pytest.fixture(scope="module", params=KINDS)
-def kind(request: pytest.FixtureRequest) -> str:
+def kind(request):
     return str(request.param)
 
 
 @pytest.fixture(scope="module")
-def text(kind: str) -> str:
+def text(kind):
     return render_html(_report(kind))
 
 
 @pytest.mark.parametrize("kind", ("pass", *KINDS), indirect=True)
-def test_the_page_is_whole_self_contained_and_repeatable(kind: str, text: str) -> None:
+def test_the_page_is_whole_self_contained_and_repeatable(kind, text):
     page = Page(text)
     assert page.left_open == []
     assert len(page.ids) == len(set(page.ids)) and page.references <= set(page.ids)
@@ -41,14 +40,14 @@ def test_the_page_is_whole_self_contained_and_repeatable(kind: str, text: str) -
     assert heads and not [head for head in heads if re.search(r"<th[^>]*></th>", head)]
 
 
-def test_the_verdict_and_the_figures_come_first(kind: str, text: str) -> None:
+def test_the_verdict_and_the_figures_come_first(kind, text):
     report, words = _report(kind), Page(text).text
     assert report.verdict in words
     assert f"Verdict: {report.verdict_level}" in words
     assert all(figure.label in words for figure in report.headline)
 
 
-def test_the_pdf_repeats_and_the_json_names_its_kind(kind: str) -> None:
+def test_the_pdf_repeats_and_the_json_names_its_kind(kind):
     report = _report(kind)
     assert render_pages(report)[1] == render_pages(_report(kind))[1]
     assert json.loads(to_json(report))["kind"] == type(report).__name__
@@ -62,27 +61,27 @@ def test_the_pdf_repeats_and_the_json_names_its_kind(kind: str) -> None:
         DetectorReport("Empty", "m1", score=DetectorScore()),
     ],
 )
-def test_a_report_of_nothing_says_what_is_missing(empty: Any) -> None:
+def test_a_report_of_nothing_says_what_is_missing(empty):
     page = Page(render_html(empty))
     assert page.left_open == []
     assert page.text.count("not available: ") >= 4
     assert render_pages(empty)[1].startswith(b"%PDF-")
 
 
-def test_failed_gates_stand_first() -> None:
+def test_failed_gates_stand_first():
     words = Page(render_html(example.regression_report())).text
     table = words[words.index("Gates, failed gates first.") :]
     assert table.index("recall, class 0") < table.index("median error, anchored")
     assert "gates 1 failed, 0 inconclusive, 2 passed" in words
 
 
-def test_the_bias_of_every_octant_met_is_in_the_table() -> None:
+def test_the_bias_of_every_octant_met_is_in_the_table():
     words = Page(render_html(example.detector_report())).text
     table = words[words.index("Mean residual by octant of Sun azimuth") :]
     assert "0–45°" in table and "315–360°" in table and "180–225°" not in table
 
 
-def test_strict_and_ignore_aware_scores_stand_side_by_side() -> None:
+def test_strict_and_ignore_aware_scores_stand_side_by_side():
     words = Page(render_html(example.detector_report())).text
     table = words[words.index("By type of terrain") :]
     assert "precision, ignore-aware" in table and "recall, ignore-aware" in table
@@ -90,7 +89,7 @@ def test_strict_and_ignore_aware_scores_stand_side_by_side() -> None:
     assert lowland.index("0.870") < lowland.index("0.930") < lowland.index("0.610")
 
 
-def test_predicted_uncertainty_stands_beside_what_it_should_be() -> None:
+def test_predicted_uncertainty_stands_beside_what_it_should_be():
     words = Page(render_html(example.detector_report())).text
     table = words[words.index("Predicted uncertainty") :]
     for figure in ("14–20 km up", "1.33", "0.655", "0.941", "0.683"):
@@ -101,7 +100,7 @@ def test_predicted_uncertainty_stands_beside_what_it_should_be() -> None:
     ("level", "role"),
     [("met", "green"), ("not met", "vermillion"), ("unknown", "orange"), ("fail", "vermillion"), ("", "")],
 )
-def test_a_verdict_is_named_by_its_level_and_has_its_colour(level: str, role: str) -> None:
+def test_a_verdict_is_named_by_its_level_and_has_its_colour(level, role):
     text = render_html(replace(example.regression_report(), verdict_level=level))
     heading = f"Verdict: {level}" if level else "Verdict"
     assert f'<div class="verdict {role}"><p class="word">{heading}</p>' in text
@@ -109,6 +108,6 @@ def test_a_verdict_is_named_by_its_level_and_has_its_colour(level: str, role: st
         assert f".verdict.{role} .word{{color:" in text
 
 
-def test_accuracies_without_an_evidence_level_are_marked() -> None:
+def test_accuracies_without_an_evidence_level_are_marked():
     figures = (HeadlineFigure("Frames", 3),)
     assert "No evidence level was stated" in Page(render_html(DetectorReport("M", "m", headline=figures))).text

@@ -2,14 +2,12 @@
 
 import base64
 import dataclasses
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from reports.render import render_html
 from tests.reports import example
-from tests.reports.browser import CHROMIUM, Tab, tab
+from tests.reports.browser import CHROMIUM, tab
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")]
 
@@ -35,26 +33,26 @@ _CONTRAST = """
 
 
 @pytest.fixture(scope="module")
-def path(whole_page: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def path(whole_page, tmp_path_factory):
     file = tmp_path_factory.mktemp("page") / "report.html"
     file.write_text(whole_page, encoding="utf-8")
     return file
 
 
 @pytest.fixture(scope="module")
-def browser(path: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+def browser(path, tmp_path_factory):
     with tab(tmp_path_factory.mktemp("profile")) as page:
         page.size(1280, 900)
         page.open(path)
         yield page
 
 
-def test_the_page_loads_without_a_word_on_the_console_and_without_a_request(browser: Tab, path: Path) -> None:
+def test_the_page_loads_without_a_word_on_the_console_and_without_a_request(browser, path):
     assert browser.complaints == []
     assert [r for r in browser.requests if not r.startswith("data:")] == [path.as_uri()]
 
 
-def test_every_figure_is_drawn(browser: Tab) -> None:
+def test_every_figure_is_drawn(browser):
     sizes = browser.value("[...document.querySelectorAll('figure svg')].map(s => s.getBoundingClientRect().height)")
     assert len(sizes) > 15
     assert min(sizes) > 60
@@ -62,14 +60,14 @@ def test_every_figure_is_drawn(browser: Tab) -> None:
 
 
 @pytest.mark.parametrize("width", [1280, 1000, 800])
-def test_nothing_runs_out_of_the_window(browser: Tab, width: int) -> None:
+def test_nothing_runs_out_of_the_window(browser, width):
     browser.size(width, 900)
     assert browser.value("document.documentElement.scrollWidth") <= width
     browser.size(1280, 900)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_and_figures_are_legible_in_both_themes(browser: Tab, scheme: str) -> None:
+def test_text_and_figures_are_legible_in_both_themes(browser, scheme):
     browser.theme(scheme)
     # 4.5 is WCAG AA for text; labels in the colour of their line are held to the 3 of graphics.
     weak = browser.value(_CONTRAST.replace("LIMIT", "3.0"))
@@ -78,7 +76,7 @@ def test_text_and_figures_are_legible_in_both_themes(browser: Tab, scheme: str) 
     browser.theme("light")
 
 
-def test_dark_and_light_differ_in_ground_and_ink(browser: Tab) -> None:
+def test_dark_and_light_differ_in_ground_and_ink(browser):
     colours = []
     for scheme in ("light", "dark"):
         browser.theme(scheme)
@@ -87,7 +85,7 @@ def test_dark_and_light_differ_in_ground_and_ink(browser: Tab) -> None:
     assert colours == ["rgb(254, 254, 254)", "rgb(20, 24, 30)"]
 
 
-def test_the_contents_lead_to_the_sections(browser: Tab) -> None:
+def test_the_contents_lead_to_the_sections(browser):
     broken = browser.value(
         "[...document.querySelectorAll('.contents a')].filter(a => !document.querySelector(a.hash)).length"
     )
@@ -97,12 +95,12 @@ def test_the_contents_lead_to_the_sections(browser: Tab) -> None:
     )
 
 
-def test_figures_have_words_for_those_who_cannot_see_them(browser: Tab) -> None:
+def test_figures_have_words_for_those_who_cannot_see_them(browser):
     assert browser.value("[...document.querySelectorAll('figure svg')].every(s => s.getAttribute('aria-label'))")
     assert browser.value("[...document.querySelectorAll('table')].every(t => t.caption && t.tHead)")
 
 
-def test_on_paper_no_figure_is_taller_than_a_page_and_paper_is_white(browser: Tab) -> None:
+def test_on_paper_no_figure_is_taller_than_a_page_and_paper_is_white(browser):
     browser.theme("dark", media="print")
     # A4 less the margins of the sheet is 265 mm or 1001 CSS pixels high, 178 mm or 673 wide.
     browser.size(673, 1001)
@@ -115,7 +113,7 @@ def test_on_paper_no_figure_is_taller_than_a_page_and_paper_is_white(browser: Ta
 
 
 @pytest.mark.parametrize("kind", ["regression", "detector"])
-def test_the_other_reports_are_as_silent_and_as_legible(browser: Tab, kind: str, path: Path) -> None:
+def test_the_other_reports_are_as_silent_and_as_legible(browser, kind, path):
     other = path.with_name(f"{kind}.html")
     other.write_text(render_html(getattr(example, f"{kind}_report")()), encoding="utf-8")
     browser.requests.clear()
@@ -160,7 +158,7 @@ _GEOMETRY = """
 
 
 @pytest.mark.parametrize("kind", ["pass", "regression", "detector"])
-def test_nothing_is_cut_and_every_number_can_be_read(browser: Tab, kind: str, path: Path) -> None:
+def test_nothing_is_cut_and_every_number_can_be_read(browser, kind, path):
     """At 1,280 px every table is whole; at 390 px tables and figures scroll in their frames, the page does not."""
     other = path.with_name(f"{kind}-geometry.html")
     other.write_text(render_html(getattr(example, f"{kind}_report")()), encoding="utf-8")
@@ -179,7 +177,7 @@ def test_nothing_is_cut_and_every_number_can_be_read(browser: Tab, kind: str, pa
     browser.open(path)
 
 
-def test_long_names_of_solutions_cut_no_column(browser: Tab, path: Path) -> None:
+def test_long_names_of_solutions_cut_no_column(browser, path):
     report = example.pass_report()
     renamed = tuple(
         dataclasses.replace(one, name=f"{one.name}, propagate-only with a perfect start") for one in report.navigation
@@ -192,7 +190,7 @@ def test_long_names_of_solutions_cut_no_column(browser: Tab, path: Path) -> None
     browser.open(path)
 
 
-def test_it_prints_to_a4(browser: Tab) -> None:
+def test_it_prints_to_a4(browser):
     pdf = base64.b64decode(browser.call("Page.printToPDF", preferCSSPageSize=True)["data"])
     assert pdf.startswith(b"%PDF-")
     # 594.96 by 841.92 points are A4 in whole CSS pixels.

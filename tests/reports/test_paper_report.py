@@ -1,7 +1,6 @@
 """The document on the paper's figures: the paper's values next to ours, evidence levels, reasons for gaps."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ UTC_NS = 1_880_964_840_000_000_000 + np.arange(4) * 15_000_000_000
 TRACK = TrackSeries(UTC_NS, np.linspace(0.0, 2.4, 4), np.full(4, 80.0), np.full(4, 30e3))
 
 
-def series(name: str, radial_m: float, outcome: str) -> NavigationSeries:
+def series(name, radial_m, outcome):
     error = np.zeros((4, 3))
     error[:, 0] = radial_m
     return NavigationSeries(
@@ -28,7 +27,7 @@ def series(name: str, radial_m: float, outcome: str) -> NavigationSeries:
     )  # fmt: skip
 
 
-def report(**changes: Any) -> PaperReport:
+def report(**changes):
     scores = tuple(ClassScore(k, "", 10, 5, 5, 0.5, 0.25 + k / 10, 1.5) for k in range(3))
     made = PaperReport(
         title="The figures of the LINNA paper",
@@ -50,15 +49,15 @@ def report(**changes: Any) -> PaperReport:
     return dataclasses.replace(made, **changes)
 
 
-def table(of: PaperReport, words: str) -> Table:
+def table(of, words):
     return next(b for b in paper_document(of).blocks if isinstance(b, Table) and words in b.caption)
 
 
-def rows(of: Table) -> list[list[str]]:
+def rows(of):
     return [[cell.text if isinstance(cell, Cell) else cell for cell in row] for row in of.rows]
 
 
-def test_table_one_has_the_altitudes_of_the_paper_and_ours() -> None:
+def test_table_one_has_the_altitudes_of_the_paper_and_ours():
     found = rows(table(report(), "Table I:"))
     assert ["Eccentricity", "0.006908", "0.006908"] in found
     found = rows(table(report(), "Altitudes over"))
@@ -66,14 +65,14 @@ def test_table_one_has_the_altitudes_of_the_paper_and_ours() -> None:
     assert found[-1][1:] == [count_text(5196), count_text(3834), count_text(-1362)]
 
 
-def test_table_two_has_the_scores_of_the_paper_and_ours() -> None:
+def test_table_two_has_the_scores_of_the_paper_and_ours():
     found = rows(table(report(), "Table II"))
     assert [row[1:] for row in found[6:]] == [
         ["0.813", "0.500", "−0.313"], ["0.466", "0.450", "−0.0159"], ["4.75", "1.50", "−3.25"],
     ]  # fmt: skip
 
 
-def test_outcomes_and_errors_are_counted_by_estimator() -> None:
+def test_outcomes_and_errors_are_counted_by_estimator():
     assert ["Multi-pair match", "2", percent_text(2, 4)] in rows(table(report(), "Outcomes of all frames"))
     errors = rows(table(report(), "Position error of each estimator"))
     assert [row[0] for row in errors] == ["paper", "spherical"]
@@ -81,13 +80,13 @@ def test_outcomes_and_errors_are_counted_by_estimator() -> None:
     assert errors[0][5] == "5"
 
 
-def test_every_figure_and_table_with_an_accuracy_states_its_evidence_level() -> None:
+def test_every_figure_and_table_with_an_accuracy_states_its_evidence_level():
     for figure in paper_index(report())["figures"]:
         assert figure["level"].startswith("level "), figure["caption"]
     assert "level 2 of 5" in table(report(), "Position error").caption
 
 
-def test_the_index_has_figures_tables_and_differences() -> None:
+def test_the_index_has_figures_tables_and_differences():
     index = paper_index(report())
     assert {"own-outcomes", "own-ground", "own-altitude", "classes"} <= {f["key"] for f in index["figures"]}
     assert index["differences"] == [{"subject": "Images", "paper": "5,196", "here": "4", "reason": "A test has few."}]
@@ -100,7 +99,7 @@ def test_the_index_has_figures_tables_and_differences() -> None:
     assert [t["number"] for t in index["tables"]] == list(range(1, len(index["tables"]) + 1))
 
 
-def test_what_was_not_made_is_absent_with_its_reason() -> None:
+def test_what_was_not_made_is_absent_with_its_reason():
     blocks = paper_document(report(region=None, not_available={"region": "no terrain"})).blocks
     found = [b for b in blocks if isinstance(b, Absent) and "Fig. 3" in b.what]
     assert [b.why for b in found] == ["no terrain"]
@@ -110,13 +109,13 @@ def test_what_was_not_made_is_absent_with_its_reason() -> None:
 
 
 @pytest.mark.slow
-def test_the_document_is_a_page_and_a_pdf_and_the_same_every_time() -> None:
+def test_the_document_is_a_page_and_a_pdf_and_the_same_every_time():
     html, pdf = render_pages(report())
     assert pdf.startswith(b"%PDF") and "form of the paper" in html.lower()
     assert render_pages(report()) == (html, pdf)
 
 
-def test_a_figure_is_a_png_and_a_table_of_what_it_plots() -> None:
+def test_a_figure_is_a_png_and_a_table_of_what_it_plots():
     found = {picture.key: picture_files(picture) for picture in paper_figures(report())}
     assert all(octets.startswith(b"\x89PNG") for octets, _ in found.values())
     outcomes = found["own-outcomes"][1].splitlines()

@@ -7,7 +7,6 @@ import sys
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 from pypdf import PdfReader
@@ -18,31 +17,30 @@ from reports.drawings import KeptDrawings, drawing_hash
 from reports.pass_report import pass_document
 from reports.pdf_pages import _typeset, pdf_pages
 from reports.render import render_html, render_pages
-from reports.values import PassReport
 from tests.reports import example
 
 _POINTS = 72.0
 
 
 @pytest.fixture(scope="module")
-def small() -> PassReport:
+def small():
     return example.pass_report(hours=0.2, gallery=1, worst=0)
 
 
 @pytest.fixture(scope="module")
-def octets(small: PassReport) -> bytes:
+def octets(small):
     return render_pages(small)[1]
 
 
-def pages_of(octets: bytes) -> list[str]:
+def pages_of(octets):
     return [page.extract_text().replace("\u200b", "") for page in PdfReader(io.BytesIO(octets)).pages]
 
 
-def document(*blocks: object) -> Document:
+def document(*blocks):
     return Document("Test", "Title", "t", (), blocks)
 
 
-def test_it_is_a_pdf_of_numbered_a4_pages(octets: bytes) -> None:
+def test_it_is_a_pdf_of_numbered_a4_pages(octets):
     reader = PdfReader(io.BytesIO(octets))
     assert len(reader.pages) > 2
     for number, page in enumerate(reader.pages, 1):
@@ -51,12 +49,12 @@ def test_it_is_a_pdf_of_numbered_a4_pages(octets: bytes) -> None:
         assert f"{number} / {len(reader.pages)}" in page.extract_text()
 
 
-def test_no_date_and_no_machine_is_in_it(octets: bytes) -> None:
+def test_no_date_and_no_machine_is_in_it(octets):
     assert b"CreationDate" not in octets and b"ModDate" not in octets
     assert PdfReader(io.BytesIO(octets)).metadata["/Title"].startswith("Pass report: ")
 
 
-def test_all_figures_and_tables_of_the_page_are_in_it(small: PassReport, octets: bytes) -> None:
+def test_all_figures_and_tables_of_the_page_are_in_it(small, octets):
     page, text = render_html(small), "\n".join(pages_of(octets))
     for kind in ("Figure", "Table"):
         count = page.count(f"<b>{kind} ")
@@ -64,11 +62,11 @@ def test_all_figures_and_tables_of_the_page_are_in_it(small: PassReport, octets:
         assert all(f"{kind} {number}." in text for number in range(1, count + 1))
 
 
-def test_text_stays_inside_the_margins(whole_pass: PassReport) -> None:
+def test_text_stays_inside_the_margins(whole_pass):
     for page in PdfReader(io.BytesIO(render_pages(whole_pass)[1])).pages:
-        places: list[tuple[float, float]] = []
+        places = []
 
-        def note(text: str, cm: list[float], tm: list[float], *_: object, places: list = places) -> None:
+        def note(text, cm, tm, *_, places=places):
             if text.strip():
                 x, y = tm[4:6]
                 places.append((x * cm[0] + y * cm[2] + cm[4], x * cm[1] + y * cm[3] + cm[5]))
@@ -80,7 +78,7 @@ def test_text_stays_inside_the_margins(whole_pass: PassReport) -> None:
             assert 0.2 * _POINTS <= y <= 841.9 - 0.5 * _POINTS
 
 
-def test_a_long_table_repeats_its_head_and_loses_no_row() -> None:
+def test_a_long_table_repeats_its_head_and_loses_no_row():
     rows = tuple((str(i), f"row-{i}.") for i in range(200))
     table = Table("Long.", (Column("n"), Column("what", numeric=False)), rows)
     pages = pages_of(pdf_pages(document(Heading("Section"), table)))
@@ -89,13 +87,13 @@ def test_a_long_table_repeats_its_head_and_loses_no_row() -> None:
     assert all(f"row-{i}." in "".join(pages) for i in range(200))
 
 
-def test_two_figures_of_little_more_than_half_a_page_share_a_page() -> None:
+def test_two_figures_of_little_more_than_half_a_page_share_a_page():
     first, second = (Picture(key, key, key, 6.8, lambda canvas: None) for key in ("first", "second"))
     (page,) = pages_of(pdf_pages(document(Heading("Section"), first, second)))
     assert "first" in page and "second" in page
 
 
-def test_a_wide_table_is_set_in_smaller_type() -> None:
+def test_a_wide_table_is_set_in_smaller_type():
     """Twenty numeric columns do not overlap: each number starts right of the previous one."""
     columns = tuple(Column(f"c{i}") for i in range(20))
     row = tuple(f"{12_345 + i}" for i in range(20))
@@ -106,14 +104,14 @@ def test_a_wide_table_is_set_in_smaller_type() -> None:
     assert all(a < b for a, b in pairwise(places))
 
 
-def test_a_long_word_is_broken_inside_the_width() -> None:
+def test_a_long_word_is_broken_inside_the_width():
     pages = pages_of(pdf_pages(document(Paragraph("x" * 400), Properties((("path", "/" + "long" * 80),)))))
     lines = [line for line in pages[0].splitlines() if "xxxx" in line or "longlong" in line]
     assert len(lines) > 6
     assert sum(line.count("x") for line in lines) == 400
 
 
-def test_awkward_text_is_printed_and_not_interpreted() -> None:
+def test_awkward_text_is_printed_and_not_interpreted():
     text = "\n".join(
         pages_of(
             pdf_pages(
@@ -136,7 +134,7 @@ def test_awkward_text_is_printed_and_not_interpreted() -> None:
     assert "file: in full in the HTML and JSON forms" in text and "a = 1" not in text
 
 
-def test_the_process_of_a_report_does_not_keep_what_typesetting_computes() -> None:
+def test_the_process_of_a_report_does_not_keep_what_typesetting_computes():
     program = (
         "import sys; from reports.document import Document, Paragraph; from reports.pdf_pages import pdf_pages\n"
         "octets = pdf_pages(Document('Test', 'Title', 't', (), (Paragraph('x'),)))\n"
@@ -146,20 +144,18 @@ def test_the_process_of_a_report_does_not_keep_what_typesetting_computes() -> No
     assert done.stdout == "b'%PDF-' False\n"
 
 
-def test_a_fault_of_typesetting_is_one_line(tmp_path: Path) -> None:
+def test_a_fault_of_typesetting_is_one_line(tmp_path):
     (tmp_path / "main.typ").write_text("#unknown-function()")
     with pytest.raises(RuntimeError, match=r"^PDF of a report: expected a document, found: .*unknown") as raised:
         _typeset(tmp_path)
     assert "\n" not in str(raised.value)
 
 
-def test_a_kept_figure_is_shown_again_unless_it_is_damaged_or_of_another_version(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_kept_figure_is_shown_again_unless_it_is_damaged_or_of_another_version(tmp_path, monkeypatch, caplog):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
     picture, drawn = Picture("one", "one", "one", 1.0, partial(len)), 0
 
-    def draw(*_: object) -> str:
+    def draw(*_):
         nonlocal drawn
         drawn += 1
         return "<svg/>"
@@ -183,8 +179,8 @@ def test_a_kept_figure_is_shown_again_unless_it_is_damaged_or_of_another_version
     ]
 
 
-def test_late_telemetry_changes_only_the_figures_that_show_it(small: PassReport) -> None:
-    def hashes(report: PassReport) -> dict[str, str]:
+def test_late_telemetry_changes_only_the_figures_that_show_it(small):
+    def hashes(report):
         return {one.key: drawing_hash(one) for one in pass_document(report).blocks if isinstance(one, Picture)}
 
     before = hashes(example.pass_report(hours=0.2, gallery=1, worst=0))

@@ -25,19 +25,19 @@ from reports.values import NavigationSeries, NavigationStatistics, TimeSpan, Tra
 
 @pytest.mark.parametrize("dof", [1, 2, 3, 12, 60, 400])
 @pytest.mark.parametrize("probability", [0.025, 0.5, 0.975])
-def test_chi_squared_quantiles_are_those_of_scipy(dof: int, probability: float) -> None:
+def test_chi_squared_quantiles_are_those_of_scipy(dof, probability):
     from scipy import stats
 
     expected = float(stats.chi2.ppf(probability, dof))
     assert float(chi2_quantile(probability, dof)) == pytest.approx(expected, rel=1e-9)
 
 
-def test_quantiles_pass_over_nan_and_say_nan_where_there_is_nothing() -> None:
+def test_quantiles_pass_over_nan_and_say_nan_where_there_is_nothing():
     assert quantiles(np.array([np.nan, 3.0, 1.0, 2.0]), (0.5,)) == (2.0,)
     assert np.isnan(quantiles(np.array([np.nan]), (0.5,))[0])
 
 
-def test_the_reference_between_samples_lies_on_the_great_circle_across_the_zero_meridian() -> None:
+def test_the_reference_between_samples_lies_on_the_great_circle_across_the_zero_meridian():
     track = TrackSeries(
         np.array([0, 10_000_000_000]), np.zeros(2), np.array([359.8, 0.2]), np.array([30_000.0, 31_000.0])
     )
@@ -48,7 +48,7 @@ def test_the_reference_between_samples_lies_on_the_great_circle_across_the_zero_
     assert np.isnan(latitude[1]) and np.isnan(altitude[1])
 
 
-def test_ground_error_is_metres_north_and_east() -> None:
+def test_ground_error_is_metres_north_and_east():
     # A degree of the 1737.4 km sphere is 2 pi 1737.4 / 360 = 30.3234 km; of longitude at 60 degrees, half of it.
     track = TrackSeries(np.array([0, 1]), np.full(2, 60.0), np.full(2, 359.5), np.full(2, 3e4))
     one = NavigationSeries(
@@ -59,7 +59,7 @@ def test_ground_error_is_metres_north_and_east() -> None:
     assert east[0] == pytest.approx(15_161.7, abs=1.0)
 
 
-def test_statistics_given_are_kept_and_the_others_found() -> None:
+def test_statistics_given_are_kept_and_the_others_found():
     error = np.zeros((5, 3))
     error[:, 1] = [1.0, 2.0, 3.0, 4.0, np.nan]
     one = NavigationSeries(
@@ -71,16 +71,16 @@ def test_statistics_given_are_kept_and_the_others_found() -> None:
     assert np.isnan(found.drift_percent)
 
 
-def test_containment_counts_only_samples_with_a_sigma() -> None:
+def test_containment_counts_only_samples_with_a_sigma():
     assert containment(np.array([1.0, 9.0, np.nan]), np.array([1.0, 1.0, 1.0])) == 0.5
     assert np.isnan(containment(np.array([1.0]), np.array([np.nan])))
 
 
-def test_spans_hold_their_start_and_not_their_end() -> None:
+def test_spans_hold_their_start_and_not_their_end():
     assert inside(np.array([9, 10, 19, 20]), [TimeSpan(10, 20)]).tolist() == [False, True, True, False]
 
 
-def test_a_thinned_line_keeps_its_extremes_and_its_gaps() -> None:
+def test_a_thinned_line_keeps_its_extremes_and_its_gaps():
     x = np.arange(50_000.0)
     y = np.sin(x / 300.0)
     y[20_000:20_200] = np.nan
@@ -93,55 +93,55 @@ def test_a_thinned_line_keeps_its_extremes_and_its_gaps() -> None:
     assert np.all(np.diff(few_x) > 0)
 
 
-def test_short_lines_are_not_thinned() -> None:
+def test_short_lines_are_not_thinned():
     x = np.arange(10.0)
     assert thinned(x, x)[0] is x
 
 
-def test_cumulative_shares_end_at_one() -> None:
+def test_cumulative_shares_end_at_one():
     value, share = cumulative(np.random.default_rng(1).normal(size=5_000), 50)
     assert len(value) <= 50 and share[-1] == 1.0
     assert np.all(np.diff(value) >= 0) and np.all(np.diff(share) > 0)
 
 
-def test_bins_without_enough_samples_are_left_out() -> None:
+def test_bins_without_enough_samples_are_left_out():
     found = binned(np.array([0.5] * 6 + [1.5] * 2), np.arange(8.0), np.array([0.0, 1.0, 2.0]))
     assert found.centre.tolist() == [0.5]
     assert found.median[0] == 2.5 and found.count.tolist() == [6]
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (14.2, 48.6), (5.0, 5.0), (-3.0, 1e5)])
-def test_bin_edges_hold_all_values(low: float, high: float) -> None:
+def test_bin_edges_hold_all_values(low, high):
     edges = round_edges(np.array([low, high, np.nan]))
     assert edges[0] <= low and edges[-1] > high
     assert len(edges) <= 11
 
 
-def test_running_mean_bridges_gaps_and_keeps_its_length() -> None:
+def test_running_mean_bridges_gaps_and_keeps_its_length():
     smooth = running_mean(np.array([1.0, np.nan, 3.0, np.nan, np.nan, np.nan]), 3)
     assert len(smooth) == 6
     assert smooth[1] == 2.0 and np.isnan(smooth[5])
     assert len(running_mean(np.zeros(2), 9)) == 2
 
 
-def test_runs_of_labels() -> None:
+def test_runs_of_labels():
     assert runs(("a", "a", "b", "a")) == [(0, 2, "a"), (2, 3, "b"), (3, 4, "a")]
     assert runs(()) == []
 
 
-def test_time_ticks_are_round_and_inside() -> None:
+def test_time_ticks_are_round_and_inside():
     start = 1_880_964_840_000_000_000  # 2029-08-09T10:14:00Z
     places, labels = TimeScale(start, start + 2_220_000_000_000).ticks()
     assert labels == ["10:15", "10:20", "10:25", "10:30", "10:35", "10:40", "10:45", "10:50"]
     assert places[0] == 60.0
 
 
-def test_the_label_of_an_axis_over_midnight_names_both_days() -> None:
+def test_the_label_of_an_axis_over_midnight_names_both_days():
     start = 1_880_964_840_000_000_000
     assert TimeScale(start, start + 86_400_000_000_000).label() == "UTC, 9–10 August 2029"
 
 
-def test_only_long_spans_are_zoomed() -> None:
+def test_only_long_spans_are_zoomed():
     start = 1_880_964_840_000_000_000
     assert zoom_span(TimeScale(start, start + 2_220_000_000_000), ()) is None
     day = TimeScale(start, start + 86_400_000_000_000)
@@ -151,7 +151,7 @@ def test_only_long_spans_are_zoomed() -> None:
     assert zoom.length_s == 3_600.0
 
 
-def test_a_zoom_shows_the_reset_nearest_the_middle_and_what_led_to_it() -> None:
+def test_a_zoom_shows_the_reset_nearest_the_middle_and_what_led_to_it():
     start = 1_880_964_840_000_000_000
     day = TimeScale(start, start + 86_400_000_000_000)
     arc = TimeSpan(start + 43_000_000_000_000, start + 45_000_000_000_000)
@@ -166,7 +166,7 @@ def test_a_zoom_shows_the_reset_nearest_the_middle_and_what_led_to_it() -> None:
     assert zoom is not None and zoom.start_utc_ns < late < zoom.stop_utc_ns == day.stop_utc_ns
 
 
-def test_a_mean_per_degree_is_the_ratio_of_sums_and_not_the_mean_of_ratios() -> None:
+def test_a_mean_per_degree_is_the_ratio_of_sums_and_not_the_mean_of_ratios():
     values, degrees = np.array([6.0, 8.0, np.nan, 5.0]), np.array([2, 16, 2, 0])
     count, mean, within = per_degree(values, degrees)
     assert (count, mean) == (2, pytest.approx(14.0 / 18.0))  # the mean of 6 / 2 and 8 / 16 is 1.75

@@ -5,19 +5,19 @@ import os
 import pytest
 
 from benchmarks.campaigns.hostile.attack_kinds import KINDS
-from benchmarks.campaigns.hostile_build import ProfileResult, campaign, went_well
+from benchmarks.campaigns.hostile_build import campaign, went_well
 
 root_only = pytest.mark.skipif(os.geteuid() != 0, reason="the profile can be taken by root only")
 
 
-def held(result: ProfileResult) -> bool:
+def held(result):
     for finding in result.successes:
         print(f"{finding.kind}, {finding.name}: {finding.seen}")
     return went_well(result)
 
 
 @pytest.mark.parametrize("kinds", [("explore", "daemon"), pytest.param(KINDS, marks=pytest.mark.campaign)])
-def test_a_hostile_build_achieves_nothing_as_the_user_of_the_tests(kinds: tuple[str, ...]) -> None:
+def test_a_hostile_build_achieves_nothing_as_the_user_of_the_tests(kinds):
     result = campaign("user", kinds)
     assert held(result)
     assert result.attempts > 150 and "private root" in result.isolation
@@ -25,12 +25,12 @@ def test_a_hostile_build_achieves_nothing_as_the_user_of_the_tests(kinds: tuple[
 
 @root_only
 @pytest.mark.campaign
-def test_a_hostile_build_achieves_nothing_with_the_profile_of_the_image() -> None:
+def test_a_hostile_build_achieves_nothing_with_the_profile_of_the_image():
     assert held(campaign("image", ("explore", "daemon")))
 
 
 @root_only
-def test_a_hostile_build_is_refused_where_the_engine_refuses_namespaces() -> None:
+def test_a_hostile_build_is_refused_where_the_engine_refuses_namespaces():
     result = campaign("no unshare", ("leave files",))
     assert held(result) and result.refusals == 1
     assert "bubblewrap: No permissions to create new namespace" in result.refusal
@@ -39,6 +39,6 @@ def test_a_hostile_build_is_refused_where_the_engine_refuses_namespaces() -> Non
 
 @root_only
 @pytest.mark.parametrize("kinds", [("explore", "daemon"), pytest.param(KINDS, marks=pytest.mark.campaign)])
-def test_a_hostile_build_achieves_nothing_in_the_runner(kinds: tuple[str, ...]) -> None:
+def test_a_hostile_build_achieves_nothing_in_the_runner(kinds):
     result = campaign("no unshare, runner", kinds)
     assert held(result) and result.isolation.startswith("runner, bubblewrap")

@@ -4,8 +4,6 @@ import json
 import random
 import sys
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -16,16 +14,14 @@ from benchmarks.campaigns.kill import holds, main, the_pass, totals
 SHORT = "--laptop --packets 400 --pieces 4 --reports 0 --pause 0.3 --json"
 
 
-def campaign(monkeypatch: Any, capsys: pytest.CaptureFixture[str], words: str) -> tuple[int, Any]:
+def campaign(monkeypatch, capsys, words):
     monkeypatch.setattr(sys, "argv", ["kill", *words.split()])
     code = main()
     return code, json.loads(capsys.readouterr().out)
 
 
 @pytest.mark.campaign
-def test_nothing_is_lost_or_doubled_by_kills_and_a_campaign_goes_on_where_it_ended(
-    monkeypatch: Any, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_nothing_is_lost_or_doubled_by_kills_and_a_campaign_goes_on_where_it_ended(monkeypatch, capsys, tmp_path):
     state = tmp_path / "state.json"
     code, figures = campaign(monkeypatch, capsys, f"{SHORT} --kills 3 --state {state}")
     assert code == 0, figures
@@ -36,7 +32,7 @@ def test_nothing_is_lost_or_doubled_by_kills_and_a_campaign_goes_on_where_it_end
     assert campaign(monkeypatch, capsys, f"{SHORT} --kills 3 --state {state}") == (0, figures)
 
 
-def test_a_lost_packet_or_an_unfinished_job_fails_the_campaign() -> None:
+def test_a_lost_packet_or_an_unfinished_job_fails_the_campaign():
     run = {
         "kills": {"api": 2}, "jobs": {"done": 3}, "ingests": {"done": 2}, "uploads": 2, "attempts": 4, "lost": 0,
         "doubled": 0, "seconds": 5, "archive_identical": True, "telecommands": 3, "handed_out": 1,
@@ -54,7 +50,7 @@ def test_a_lost_packet_or_an_unfinished_job_fails_the_campaign() -> None:
         assert not holds(totals([run, {**run, **injury}]))
 
 
-ROWS: list[dict[str, Any]] = [
+ROWS = [
     {"id": 1, "state": "sent", "sequence_count": 0, "octets": b"one", "decided_by": "ann"},
     {"id": 2, "state": "rejected", "sequence_count": None, "octets": None, "decided_by": "bob"},
     {"id": 3, "state": "released", "sequence_count": 1, "octets": b"three", "decided_by": "bob"},
@@ -68,7 +64,7 @@ LINES = [
 ]  # fmt: skip
 
 
-def what_clients_were_told() -> Ledger:
+def what_clients_were_told():
     return Ledger(
         entered=[Entered(11, 1, "ann"), Entered(12, 2, "ann"), Entered(13, 3, "ann")],
         decisions=[
@@ -81,11 +77,11 @@ def what_clients_were_told() -> Ledger:
     )
 
 
-def test_an_archive_that_holds_what_clients_were_told_has_no_faults() -> None:
+def test_an_archive_that_holds_what_clients_were_told_has_no_faults():
     assert judge(what_clients_were_told(), ROWS, LINES).total() == 0
 
 
-def changed(number: int, **values: Any) -> list[dict[str, Any]]:
+def changed(number, **values):
     return [{**row, **values} if row["id"] == number else row for row in ROWS]
 
 
@@ -100,11 +96,11 @@ def changed(number: int, **values: Any) -> list[dict[str, Any]]:
         ("audit_wrong", changed(4, state="rejected", decided_by="bob")),
     ],
 )  # fmt: skip
-def test_each_difference_of_a_row_is_a_fault(fault: str, rows: list[dict[str, Any]]) -> None:
+def test_each_difference_of_a_row_is_a_fault(fault, rows):
     assert judge(what_clients_were_told(), rows, LINES)[fault] > 0
 
 
-def test_a_second_hand_out_and_a_changed_answer_are_faults() -> None:
+def test_a_second_hand_out_and_a_changed_answer_are_faults():
     told = what_clients_were_told()
     told.hand_outs.append(HandOut("ann", (1,), b"one"))
     assert judge(told, ROWS, LINES)["double_hand_outs"] == 1
@@ -117,7 +113,7 @@ def test_a_second_hand_out_and_a_changed_answer_are_faults() -> None:
     assert judge(told, sent, [*LINES, AuditLine("send", 3, "ann")]).total() == 0
 
 
-def test_every_change_has_one_audit_entry_of_its_actor() -> None:
+def test_every_change_has_one_audit_entry_of_its_actor():
     told = what_clients_were_told()
     for number in range(len(LINES)):
         missing = [line for k, line in enumerate(LINES) if k != number]
@@ -128,7 +124,7 @@ def test_every_change_has_one_audit_entry_of_its_actor() -> None:
     assert judge(told, ROWS, [*LINES, AuditLine("release", 4, "ann")])["audit_wrong"] == 1
 
 
-def test_pieces_are_cut_at_any_octet_and_make_up_the_stream() -> None:
+def test_pieces_are_cut_at_any_octet_and_make_up_the_stream():
     stream = bytes(random.Random(1).randbytes(5000))
     pieces = cut_pieces(stream, 40, random.Random(2), "round")
     in_order = sorted(pieces, key=lambda piece: piece.offset)
@@ -136,12 +132,10 @@ def test_pieces_are_cut_at_any_octet_and_make_up_the_stream() -> None:
     assert all(stream[one.offset :].startswith(one.octets) for one in pieces)
 
 
-def test_a_pass_whose_definition_was_cut_off_is_looked_for_before_it_is_asked_for_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    asked: list[str] = []
+def test_a_pass_whose_definition_was_cut_off_is_looked_for_before_it_is_asked_for_again(monkeypatch):
+    asked = []
 
-    def ask(_self: Session, method: str, _path: str, _body: bytes | None = None, key: str = "") -> Answer:
+    def ask(_self, method, _path, _body=None, key=""):
         asked.append(f"{method} {key}".strip())
         if method == "GET":
             return Answer(200, b'{"items": []}', {})

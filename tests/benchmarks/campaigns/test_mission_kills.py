@@ -30,12 +30,12 @@ KILLED = (
 )  # fmt: skip
 
 
-def hold_telecommands_until_the_spacecraft_was_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+def hold_telecommands_until_the_spacecraft_was_killed(monkeypatch):
     """Let the ground wait for the stations of a spacecraft that is killed meanwhile."""
     was_restarted = threading.Event()
     restart, unsent = KillableSpacecraft.restart, links.unsent
 
-    def note_restart(spacecraft: KillableSpacecraft) -> None:
+    def note_restart(spacecraft):
         restart(spacecraft)
         was_restarted.set()
 
@@ -44,7 +44,7 @@ def hold_telecommands_until_the_spacecraft_was_killed(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.campaign
-def test_kills_do_not_change_the_figures_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kills_do_not_change_the_figures_of_a_run(tmp_path, monkeypatch):
     monkeypatch.delenv("LINNA_DATA", raising=False)
     scenario, data = parse_scenario(SCENARIO), DataFolder(None)
     terms = RunTerms(days=0.25, windows_per_day=4, window_s=600.0)
@@ -69,15 +69,13 @@ def test_kills_do_not_change_the_figures_of_a_run(tmp_path: Path, monkeypatch: p
     assert not Path((folder / "postgres-folder").read_text()).exists()
 
 
-def test_a_kill_waits_for_the_process_that_it_kills_and_for_no_later_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kill_waits_for_the_process_that_it_kills_and_for_no_later_one(tmp_path, monkeypatch):
     """The run starts the spacecraft again as soon as it notices the kill."""
     part = sleeper(tmp_path)
     part.start()
     first = part.pid
 
-    def kill_and_start(pid: int) -> None:
+    def kill_and_start(pid):
         kill_family(pid)
         part.start()
 
@@ -88,15 +86,15 @@ def test_a_kill_waits_for_the_process_that_it_kills_and_for_no_later_one(
     part.end()
 
 
-def test_a_spacecraft_is_started_again_after_the_kill_has_ended() -> None:
-    done: list[str] = []
+def test_a_spacecraft_is_started_again_after_the_kill_has_ended():
+    done = []
     killing, started = threading.Event(), threading.Event()
 
     class SlowPart:
-        def start(self) -> None:
+        def start(self):
             done.append("start")
 
-        def kill(self) -> None:
+        def kill(self):
             killing.set()
             started.wait(0.5)  # a restart that does not wait comes now
             done.append("killed")
@@ -116,7 +114,7 @@ def test_a_spacecraft_is_started_again_after_the_kill_has_ended() -> None:
     assert done == ["killed", "start"] and not spacecraft.was_killed
 
 
-def test_kills_are_planned_by_their_seed_for_every_part_in_every_phase() -> None:
+def test_kills_are_planned_by_their_seed_for_every_part_in_every_phase():
     parts = ["api", "database", "spacecraft"]
     found = plan_kills(7, parts, 0, 30 * HOUR_NS, 30)
     assert found == plan_kills(7, parts, 0, 30 * HOUR_NS, 30) != plan_kills(8, parts, 0, 30 * HOUR_NS, 30)
@@ -127,15 +125,15 @@ def test_kills_are_planned_by_their_seed_for_every_part_in_every_phase() -> None
     assert plan_kills(7, parts, 0, HOUR_NS, 0) == ()
 
 
-def sleeper(folder: Path) -> Part:
+def sleeper(folder):
     return Part([sys.executable, "-c", "import time; time.sleep(600)"], folder / "log", lambda: True)
 
 
-def made_keeper(parts: dict[str, Part], planned: tuple[PlannedKill, ...], folder: Path) -> Keeper:
+def made_keeper(parts, planned, folder):
     return Keeper(parts, planned, lambda: None, lambda: None, folder / "kills.json", lambda line: None)
 
 
-def test_a_part_is_killed_at_its_stop_once_and_a_part_that_ends_is_started_again(tmp_path: Path) -> None:
+def test_a_part_is_killed_at_its_stop_once_and_a_part_that_ends_is_started_again(tmp_path):
     part = sleeper(tmp_path)
     planned = (PlannedKill(5, "ended", "api", 0.0, 0.0), PlannedKill(5, "started", "api", 0.0, 0.0))
     keeper = made_keeper({"api": part}, planned, tmp_path)
@@ -168,7 +166,7 @@ def test_a_part_is_killed_at_its_stop_once_and_a_part_that_ends_is_started_again
         part.end()
 
 
-def test_a_part_that_ends_while_the_spacecraft_is_down_is_started_again(tmp_path: Path) -> None:
+def test_a_part_that_ends_while_the_spacecraft_is_down_is_started_again(tmp_path):
     part = sleeper(tmp_path)
     keeper = made_keeper({"worker": part}, (PlannedKill(5, "ended", "spacecraft", 0.0, 0.0),), tmp_path)
     part.start()
@@ -189,7 +187,7 @@ def test_a_part_that_ends_while_the_spacecraft_is_down_is_started_again(tmp_path
         part.end()
 
 
-def test_a_part_that_does_not_start_ends_the_run_with_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_part_that_does_not_start_ends_the_run_with_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr("studies.harness.parts.START_S", 0.5)
     part = Part([sys.executable, "-c", "raise SystemExit('no home')"], tmp_path / "log", lambda: False)
     keeper = made_keeper({"api": part}, (), tmp_path)
@@ -201,7 +199,7 @@ def test_a_part_that_does_not_start_ends_the_run_with_one_line(tmp_path: Path, m
             keeper.check()
 
 
-def test_a_part_that_ends_at_once_is_given_up_after_its_attempts(tmp_path: Path) -> None:
+def test_a_part_that_ends_at_once_is_given_up_after_its_attempts(tmp_path):
     log = tmp_path / "log"
     part = Part([sys.executable, "-c", "print('no home')"], log, lambda: False, attempts=2)
     with pytest.raises(GroundError, match=r"found: no home \| no home$"):
@@ -209,7 +207,7 @@ def test_a_part_that_ends_at_once_is_given_up_after_its_attempts(tmp_path: Path)
     assert log.read_text() == "no home\n" * 2
 
 
-def test_processes_that_a_killed_run_has_left_are_ended_and_no_others(tmp_path: Path) -> None:
+def test_processes_that_a_killed_run_has_left_are_ended_and_no_others(tmp_path):
     left, other = sleeper(tmp_path), sleeper(tmp_path)
     left.start()
     other.start()
@@ -227,7 +225,7 @@ def test_processes_that_a_killed_run_has_left_are_ended_and_no_others(tmp_path: 
         other.end()
 
 
-def test_a_database_server_continues_with_its_files(tmp_path: Path) -> None:
+def test_a_database_server_continues_with_its_files(tmp_path):
     first = PostgresServer(tmp_path)
     url = first.prepare_service()
     assert "//service@" in url

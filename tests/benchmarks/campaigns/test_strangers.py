@@ -9,26 +9,26 @@ from ground_service.settings import Settings
 
 
 @pytest.mark.campaign
-def test_an_operator_comes_from_an_empty_folder_to_a_report_by_http() -> None:
+def test_an_operator_comes_from_an_empty_folder_to_a_report_by_http():
     assert operator_http.main() == 0
 
 
 @pytest.mark.campaign
-def test_an_operator_spends_an_hour_with_the_pages() -> None:
+def test_an_operator_spends_an_hour_with_the_pages():
     assert operator_pages.main() == 0
 
 
 @pytest.mark.campaign
-def test_an_engineer_judges_builds_by_command_line() -> None:
+def test_an_engineer_judges_builds_by_command_line():
     assert engineer.main() == 0
 
 
 @pytest.mark.campaign
-def test_no_request_costs_more_than_the_rule_allows() -> None:
+def test_no_request_costs_more_than_the_rule_allows():
     assert costs.main([]) == 0
 
 
-def test_a_wrong_turn_that_harms_or_misleads_fails_the_hour(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_turn_that_harms_or_misleads_fails_the_hour(capsys):
     for kind, status in (("A", 1), ("B", 1), ("C", 0)):
         diary = Diary("an hour")
         assert diary.expect(kind, "what holds", True) and not diary.expect(kind, "what does not", False, 7)
@@ -36,13 +36,13 @@ def test_a_wrong_turn_that_harms_or_misleads_fails_the_hour(capsys: pytest.Captu
         assert f'["{kind}: what does not; found 7"]' in capsys.readouterr().out
 
 
-def test_commands_and_files_are_those_of_the_page(tmp_path) -> None:
+def test_commands_and_files_are_those_of_the_page(tmp_path):
     lines = list(commands_of("tutorials/own-build.md", tmp_path))
     assert 'linna regress suite || [[ ",0,1," == *",$?,"* ]]' in lines
     assert (tmp_path / "parameters.toml").read_text() == "detector.score_threshold = 0.8\n"
 
 
-def test_every_operation_has_a_request_and_every_request_an_operation(tmp_path) -> None:
+def test_every_operation_has_a_request_and_every_request_an_operation(tmp_path):
     paths = create_app(Settings(home=tmp_path)).openapi()["paths"]
     found = {one["operationId"]: (path, one) for path, methods in paths.items() for one in methods.values()}
     special = {one[0] for one in costs.cases()}
@@ -59,9 +59,7 @@ def test_every_operation_has_a_request_and_every_request_an_operation(tmp_path) 
         (422, 1.0, 1.0, True),
     ],
 )  # fmt: skip
-def test_a_request_is_judged_by_memory_processor_time_and_status(
-    status: int, memory_mib: float, processor_s: float, kept: bool
-) -> None:
+def test_a_request_is_judged_by_memory_processor_time_and_status(status, memory_mib, processor_s, kept):
     cost = costs.Cost("get_status", "", status, memory_mib, 0.0, processor_s)
     assert (cost.fault == "") is kept
     assert cost.cells().startswith(f"| `get_status` |  | {status} | {memory_mib:.0f} | 0 |")

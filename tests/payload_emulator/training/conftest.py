@@ -1,19 +1,30 @@
 """Crude data sets for the tests: bright-and-dark blobs on a plain, drawn without any renderer."""
 
-from collections.abc import Sequence
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from payload_emulator.session.world.recipe import Recipe, Source
 from payload_emulator.training.data import dataset as store
 from payload_emulator.training.data.finishing import write_index
+from payload_emulator.training.data.truth import FrameTruth
+from payload_emulator.training.evaluate.scoring import FrameDetections
 
 SIZE = 512
 
 
-def draw_blobs(rng: np.random.Generator, u, v, diameter, pits=()) -> np.ndarray:
+def truth_of(u, v, diameter=30.0, ratio=0.1, azimuth=0.0, number=0, diameter_m=7e3):
+    u, v = np.array(u, float), np.array(v, float)
+    columns = (np.broadcast_to(one, u.shape).astype(float) for one in (diameter, diameter_m, ratio))
+    return FrameTruth(u, v, *columns, np.arange(u.size) + 100 * number, 512, 512, azimuth, number)
+
+
+def found_at(u, v, diameter=30.0, diameter_m=7e3, scores=0.9, sigma=1.0, *further, **more):
+    """Detections; a number stands for an array of it."""
+    u, columns = np.array(u, float), (v, diameter, diameter_m, scores, sigma, *further)
+    return FrameDetections(u, *(np.broadcast_to(one, u.shape).astype(float) for one in columns), **more)
+
+
+def draw_blobs(rng, u, v, diameter, pits=()):
     """Gray image (512, 512) of blobs like craters (lit below: Sun at the top) and pits, dark spots of 40 px."""
     row, column = np.mgrid[0:SIZE, 0:SIZE].astype(np.float64)
     image = 110.0 + 4.0 * rng.standard_normal((SIZE, SIZE))
@@ -25,9 +36,7 @@ def draw_blobs(rng: np.random.Generator, u, v, diameter, pits=()) -> np.ndarray:
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def write_blob_dataset(
-    folder: Path, frames_per_split: dict[str, int], seed: int = 3, pits: Sequence[tuple[float, float]] = ()
-) -> store.Dataset:
+def write_blob_dataset(folder, frames_per_split, seed=3, pits=()):
     """A data set of blobs in the project's own format, 30 km up over a plain; pits have no labels."""
     sources = tuple(Source(name, name, "procedural", 1.0) for name in frames_per_split)
     recipe = Recipe("blobs", seed, sources)
@@ -83,7 +92,7 @@ def write_blob_dataset(
 
 
 @pytest.fixture(scope="session")
-def blob_dataset(tmp_path_factory) -> store.Dataset:
+def blob_dataset(tmp_path_factory):
     return write_blob_dataset(tmp_path_factory.mktemp("blobs") / "set", {"train": 24, "val": 6, "test": 4})
 
 

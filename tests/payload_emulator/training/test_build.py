@@ -54,36 +54,43 @@ altitude_km = [14.0, 16.0]
 """
 
 
+def made(folder, *more, **changes):
+    """Return the steps of a build of the recipe, changed."""
+    return build(dataclasses.replace(RECIPE, **changes), folder, 3, find_data(None), *more)
+
+
+def empty_set(folder):
+    for name in ("images", "metadata", "shards"):
+        (folder / name).mkdir(parents=True)
+    return folder
+
+
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     folder = tmp_path_factory.mktemp("built") / "set"
-    steps = list(build(RECIPE, folder, 3, find_data(None)))
-    return folder, steps
+    list(made(folder))
+    return folder
 
 
 def test_a_shard_does_not_depend_on_what_was_made_before(built, tmp_path):
-    folder, _ = built
-    for name in ("images", "metadata", "shards"):
-        (tmp_path / name).mkdir()
+    empty_set(tmp_path)
     for shard in reversed(plan_shards(RECIPE, 3)[-2:]):
         make_shard(RECIPE, shard, tmp_path, "")
         for path in (f"images/{shard.frame_numbers[0]:06d}.png", f"shards/{shard.name}.npz"):
-            assert (tmp_path / path).read_bytes() == (folder / path).read_bytes(), path
+            assert (tmp_path / path).read_bytes() == (built / path).read_bytes(), path
 
 
 def test_a_finished_data_set_is_not_made_again(built, monkeypatch):
-    folder, _ = built
 
     def refuse(*arguments):
         raise AssertionError("a finished shard was rendered again")
 
     monkeypatch.setattr("payload_emulator.training.data.build.make_shard", refuse)
-    assert list(build(RECIPE, folder, 3, find_data(None))) == [(4, 4)]
+    assert list(made(built)) == [(4, 4)]
 
 
 def test_a_build_killed_at_work_goes_on_to_the_same_bytes(built, tmp_path):
     """SIGKILL, so that nothing can tidy up."""
-    folder, _ = built
     recipe = tmp_path / "tiny.toml"
     recipe.write_text(TOML)
     assert load_recipe(recipe).digest == RECIPE.digest
@@ -102,14 +109,14 @@ def test_a_build_killed_at_work_goes_on_to_the_same_bytes(built, tmp_path):
     assert 1 <= done < 4
     list(build(load_recipe(recipe), target, 3, find_data(None)))
     assert check(target) == []
-    ours, theirs = ({p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()} for f in (folder, target))
+    ours, theirs = ({p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()} for f in (built, target))
     assert ours == theirs
 
 
 def test_a_full_disk_loses_nothing_that_was_finished(tmp_path):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     folder = tmp_path / "set"
-    steps = build(RECIPE, folder, 3, find_data(None))
+    steps = made(folder)
     next(steps), next(steps)
     try:
         # A picture has more than a hundred thousand octets.
@@ -119,28 +126,26 @@ def test_a_full_disk_loses_nothing_that_was_finished(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert [path.name for path in folder.rglob(".*")] == []
-    assert next(build(RECIPE, folder, 3, find_data(None))) == (1, 4)
+    assert next(made(folder)) == (1, 4)
 
 
 def test_a_dead_worker_is_said_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr("payload_emulator.training.data.build._follow_parent", functools.partial(os._exit, 9))
     with pytest.raises(DatasetError, match=r"a worker process died .*; 0 of 4 frames are kept"):
-        list(build(RECIPE, tmp_path / "set", 3, find_data(None), workers=2))
+        list(made(tmp_path / "set", 2))
 
 
 def test_two_builds_do_not_write_to_one_folder(tmp_path):
-    steps = build(RECIPE, tmp_path / "set", 3, find_data(None))
+    steps = made(tmp_path / "set")
     assert next(steps) == (0, 4)
     with pytest.raises(DatasetError, match="found a build in progress"):
-        next(build(RECIPE, tmp_path / "set", 3, find_data(None)))
+        next(made(tmp_path / "set"))
     steps.close()
-    assert next(build(RECIPE, tmp_path / "set", 3, find_data(None))) == (0, 4)
+    assert next(made(tmp_path / "set")) == (0, 4)
 
 
 def test_neighbouring_shards_go_to_one_worker():
-    recipe = dataclasses.replace(RECIPE, frames_per_shard=1)
-    shards = plan_shards(recipe, 80)
-    runs = list(_runs(shards, 2))
+    runs = list(_runs(plan_shards(RECIPE, 80), 2))
     assert [shard.number for run in runs for shard in run] == list(range(80))
     assert max(map(len, runs)) == 8
     assert all(len({(s.source.name, s.seed) for s in run}) == 1 for run in runs)
@@ -149,22 +154,19 @@ def test_neighbouring_shards_go_to_one_worker():
 def test_sixteen_bits_show_what_eight_do(built, tmp_path):
     import cv2
 
-    folder, _ = built
-    for name in ("images", "metadata", "shards"):
-        (tmp_path / name).mkdir()
+    empty_set(tmp_path)
     shard = plan_shards(RECIPE, 3)[-1]
     make_shard(dataclasses.replace(RECIPE, bits=16), shard, tmp_path, "")
     name = f"images/{shard.frame_numbers[0]:06d}.png"
     deep = cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED)
-    plain = cv2.imread(str(folder / name), cv2.IMREAD_UNCHANGED)
+    plain = cv2.imread(str(built / name), cv2.IMREAD_UNCHANGED)
     assert deep.dtype == np.uint16 and np.unique(deep).size > 2000
     # One step of eight bits.
     assert np.abs(deep / 257.0 - plain).max() < 1.5
 
 
 def test_metadata_tell_pose_corners_and_sun(built):
-    folder, _ = built
-    document = json.loads((folder / "metadata" / "000003.json").read_text())
+    document = json.loads((built / "metadata" / "000003.json").read_text())
     for key in ("latitude_deg", "longitude_deg", "altitude_km", "tilt_deg", "azimuth_deg", "corners_deg"):
         assert key in document
     rotation = np.array(document["camera_from_mcmf"])
@@ -173,8 +175,7 @@ def test_metadata_tell_pose_corners_and_sun(built):
 
 
 def test_ellipses_of_coco_lie_in_their_boxes(built):
-    folder, _ = built
-    annotations = json.loads((folder / "coco_train.json").read_text())["annotations"]
+    annotations = json.loads((built / "coco_train.json").read_text())["annotations"]
     assert len(annotations) >= 15
     whole = 0
     for a in annotations:
@@ -184,12 +185,7 @@ def test_ellipses_of_coco_lie_in_their_boxes(built):
         y = v + half_major * np.cos(around) * np.sin(angle) + half_minor * np.sin(around) * np.cos(angle) + 0.5
         assert half_major >= half_minor > 0.0 and 0.0 < a["visible"] <= 1.0
         left, top, width, height = a["bbox"]
-        assert (
-            left >= 0.0
-            and top >= 0.0
-            and left + width <= RECIPE.width_px + 0.01
-            and top + height <= RECIPE.width_px + 0.01
-        )
+        assert min(left, top) >= 0.0 and max(left + width, top + height) <= RECIPE.width_px + 0.01
         if min(x.min(), y.min()) < 0.0 or max(x.max(), y.max()) > RECIPE.width_px:
             continue
         whole += 1
@@ -200,15 +196,14 @@ def test_ellipses_of_coco_lie_in_their_boxes(built):
 
 
 def test_another_data_set_in_the_folder_is_refused(built):
-    folder, _ = built
     with pytest.raises(DatasetError, match="expected an empty folder or the same data set"):
-        list(build(dataclasses.replace(RECIPE, seed=8), folder, 3, find_data(None)))
+        list(made(built, seed=8))
 
 
 def test_other_files_in_the_folder_are_left_alone(tmp_path):
     (tmp_path / "letter.txt").write_text("mine")
     with pytest.raises(DatasetError, match="found other files"):
-        list(build(RECIPE, tmp_path, 3, find_data(None)))
+        list(made(tmp_path))
     assert (tmp_path / "letter.txt").read_text() == "mine"
 
 
@@ -220,8 +215,7 @@ def test_real_terrain_without_data_is_refused(tmp_path):
 
 def test_labels_of_fresh_craters_sit_on_dark_and_bright_walls(built):
     """Along the Sun's direction the wall toward the Sun is the darker: the label's centre parts them."""
-    folder, _ = built
-    dataset = store.Dataset(folder)
+    dataset = store.Dataset(built)
     contrast = []
     for frame in dataset.frames():
         image = dataset.image(frame).astype(float)
@@ -240,8 +234,7 @@ def test_labels_of_fresh_craters_sit_on_dark_and_bright_walls(built):
 @pytest.mark.real_data
 def test_training_frames_keep_sixty_kilometres_from_every_held_out_box(tmp_path, data_path):
     recipe = load_recipe(ROOT / "scenarios" / "detector-dataset.toml")
-    for name in ("images", "metadata", "shards"):
-        (tmp_path / name).mkdir()
+    empty_set(tmp_path)
     shard = plan_shards(recipe, 400)[0]
     shard = dataclasses.replace(shard, frame_numbers=shard.frame_numbers[:2])
     make_shard(recipe, shard, tmp_path, str(data_path))
@@ -262,9 +255,7 @@ def test_the_renderers_of_a_recipe_get_the_same_scenes_and_an_unknown_one_is_ref
     shard = plan_shards(RECIPE, 3)[-1]
     frames = {}
     for name in ("fast", "raymarch"):
-        folder = tmp_path / name
-        for part in ("images", "metadata", "shards"):
-            (folder / part).mkdir(parents=True)
+        folder = empty_set(tmp_path / name)
         make_shard(dataclasses.replace(RECIPE, renderer=name), shard, folder, "")
         frames[name] = store.load_shard(folder / "shards" / f"{shard.name}.npz")
     fast, slow = frames["fast"], frames["raymarch"]
@@ -272,10 +263,9 @@ def test_the_renderers_of_a_recipe_get_the_same_scenes_and_an_unknown_one_is_ref
     np.testing.assert_array_equal(fast.sun_camera, slow.sun_camera)
     assert fast.image_sha256 != slow.image_sha256
     with pytest.raises(ScenarioError, match="expected one of fast, raymarch, cycles, found 'pov'"):
-        list(build(dataclasses.replace(RECIPE, renderer="pov"), tmp_path / "x", 3, find_data(None)))
+        list(made(tmp_path / "x", renderer="pov"))
 
 
 def test_a_build_by_cycles_without_blender_says_what_is_missing(tmp_path):
-    recipe = dataclasses.replace(RECIPE, renderer="cycles")
     with pytest.raises(RendererError, match="expected a Python interpreter with Blender"):
-        list(build(recipe, tmp_path / "x", 3, find_data(None), 1, str(tmp_path / "none")))
+        list(made(tmp_path / "x", 1, str(tmp_path / "none"), renderer="cycles"))

@@ -38,25 +38,17 @@ def copy(blob_dataset, tmp_path):
 
 
 def test_frames_come_back_by_split(blob_dataset):
-    assert {split: len(blob_dataset.frames(split)) for split in ("train", "val", "test")} == {
-        "train": 24,
-        "val": 6,
-        "test": 4,
-    }
+    assert [len(blob_dataset.frames(split)) for split in ("train", "val", "test")] == [24, 6, 4]
     frame = blob_dataset.frames("val")[0]
     assert blob_dataset.image(frame).shape == (512, 512)
     assert frame.craters["u_px"].shape == frame.craters["id"].shape
-
-
-def test_a_whole_data_set_has_no_problems(blob_dataset):
     assert check(blob_dataset.folder) == []
 
 
 def test_every_missing_or_damaged_file_is_named(copy):
-    (copy / "images" / "000003.png").unlink()
-    (copy / "images" / "000004.png").write_bytes(b"\x89PNG broken")
-    (copy / "metadata" / "000005.json").unlink()
-    (copy / "coco_val.json").unlink()
+    (copy / "images/000004.png").write_bytes(b"\x89PNG broken")
+    for name in ("images/000003.png", "metadata/000005.json", "coco_val.json"):
+        (copy / name).unlink()
     coco = copy / "coco_train.json"
     coco.write_bytes(coco.read_bytes().replace(b"2", b"3", 1))
     problems = "\n".join(check(copy))
@@ -66,8 +58,8 @@ def test_every_missing_or_damaged_file_is_named(copy):
 
 @pytest.mark.parametrize("missing", [True, False])
 def test_a_lost_shard_does_not_hide_the_rest(copy, missing):
-    (copy / "images" / "000025.png").unlink()
-    path = copy / "shards" / "00000.npz"
+    (copy / "images/000025.png").unlink()
+    path = copy / "shards/00000.npz"
     if missing:
         path.unlink()
     else:
@@ -77,12 +69,16 @@ def test_a_lost_shard_does_not_hide_the_rest(copy, missing):
     assert any("000025.png" in problem for problem in problems)
 
 
-def test_a_changed_index_is_found(copy):
+def test_a_changed_index_is_found_and_one_of_another_schema_refused(copy):
     path = copy / "dataset.json"
     index = json.loads(path.read_text())
     index["camera"]["fov_deg"] = 119.0
     path.write_text(json.dumps(index))
     assert any("dataset.json" in problem for problem in check(copy))
+    index["schema_version"] = 99
+    path.write_text(json.dumps(index))
+    with pytest.raises(DatasetError, match="schema_version: expected 1, found 99"):
+        store.Dataset(copy)
     path.write_text("{")
     assert any("dataset.json: expected a JSON object" in problem for problem in check(copy))
 
@@ -150,23 +146,15 @@ def test_nothing_half_written_stays_when_the_disk_is_full(tmp_path, monkeypatch)
 
 
 def test_changed_labels_are_found_by_their_hash(copy):
-    path = copy / "shards" / "00000.npz"
+    path = copy / "shards/00000.npz"
     labels = store.load_shard(path)
     labels.craters["u_px"][0] += 1.0
     store.write_shard(copy, "00000", labels)
     assert any("SHA-256" in problem for problem in check(copy))
 
 
-def test_a_data_set_of_another_schema_is_refused(copy):
-    index = json.loads((copy / "dataset.json").read_text())
-    index["schema_version"] = 99
-    (copy / "dataset.json").write_text(json.dumps(index))
-    with pytest.raises(DatasetError, match="schema_version: expected 1, found 99"):
-        store.Dataset(copy)
-
-
 def test_a_damaged_shard_is_refused(copy):
-    (copy / "shards" / "00001.npz").write_bytes(b"PK damaged")
+    (copy / "shards/00001.npz").write_bytes(b"PK damaged")
     with pytest.raises(DatasetError, match=r"00001\.npz"):
         store.Dataset(copy)
 
@@ -181,16 +169,15 @@ def test_coco_has_the_fields_that_its_readers_need(blob_dataset, split):
     coco = json.loads((blob_dataset.folder / f"coco_{split}.json").read_text())
     assert set(coco) == {"info", "licenses", "images", "annotations", "categories"}
     images = {image["id"]: image for image in coco["images"]}
-    categories = {category["id"] for category in coco["categories"]}
     numbers = [frame.number for frame in blob_dataset.frames(split)]
     assert [images[number + 1]["file_name"] for number in numbers] == [f"images/{n:06d}.png" for n in numbers]
-    assert min(images) >= 1 and min(categories) == 1
+    assert min(images) >= 1 and len(images) == len(numbers)
     assert all((i["width"], i["height"]) == (512, 512) for i in images.values())
     assert [a["id"] for a in coco["annotations"]] == list(range(1, len(coco["annotations"]) + 1))
     names = {c["id"]: c["name"] for c in coco["categories"]}
     assert names == {1: "5-10 km", 2: "10-15 km", 3: "15-30 km", 4: "3-5 km"}
     for a in coco["annotations"]:
-        assert a["image_id"] in images and a["category_id"] in categories and a["iscrowd"] == 0
+        assert a["image_id"] in images and a["iscrowd"] == 0
         x, y, w, h = a["bbox"]
         assert min(x, y) >= 0.0 and w > 0.0 and h > 0.0 and max(far_corner(a)) <= 512.0 + 0.01  # rounded
         (ring,) = a["segmentation"]
@@ -230,8 +217,6 @@ def test_nothing_is_left_of_a_crater_outside_of_the_image():
 
 def test_coco_boxes_surround_their_centres(blob_dataset):
     coco = json.loads((blob_dataset.folder / "coco_train.json").read_text())
-    assert len(coco["images"]) == 24
-    assert {c["id"] for c in coco["categories"]} == {1, 2, 3, 4}
     whole = [a for a in coco["annotations"] if min(a["bbox"][:2]) > 0.0 and max(far_corner(a)) < 512.0]
     assert len(whole) > 100
     for a in whole:
@@ -262,10 +247,9 @@ def craters(**changes):
 @pytest.mark.parametrize(
     ("change", "tier"),
     [
-        ({}, Tier.LABEL), ({"depth_ratio": 0.01}, Tier.IGNORE), ({"depth_ratio": np.nan}, Tier.IGNORE),
-        ({"diameter_px": 6.0}, Tier.IGNORE), ({"diameter_m": 2200.0}, Tier.IGNORE),
-        ({"diameter_m": 1200.0, "id": -4}, Tier.LABEL), ({"lit": 0.0}, Tier.IGNORE), ({"hidden": 1}, Tier.IGNORE),
-        ({"u_px": -5.0}, Tier.IGNORE),
+        ({}, Tier.LABEL), ({"diameter_m": 1200.0, "id": -4}, Tier.LABEL),
+        *(({name: value}, Tier.IGNORE) for name, value in (("depth_ratio", 0.01), ("depth_ratio", np.nan),
+            ("diameter_px", 6.0), ("diameter_m", 2200.0), ("lit", 0.0), ("hidden", 1), ("u_px", -5.0))),
     ],
 )  # fmt: skip
 def test_what_can_be_seen_is_a_label_and_the_rest_is_ignored(change, tier):
@@ -275,9 +259,8 @@ def test_what_can_be_seen_is_a_label_and_the_rest_is_ignored(change, tier):
 
 
 def test_deeper_craters_weigh_more():
-    _, shallow = store.choose_tiers(craters(depth_ratio=0.03), 512, 512, False)
-    _, deep = store.choose_tiers(craters(depth_ratio=0.1), 512, 512, False)
-    assert shallow[0] < deep[0] == 1.0
+    (_, [shallow]), (_, [deep]) = (store.choose_tiers(craters(depth_ratio=d), 512, 512, False) for d in (0.03, 0.1))
+    assert shallow < deep == 1.0
 
 
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # of pycocotools itself
@@ -357,18 +340,19 @@ def test_one_seed_gives_one_crop():
         image, np.array([0.0, -1.0, 0.0]), np.array([100.0]), np.array([100.0]), np.array([20.0]), np.array([True]),
         256, AugmentParameters(),
     )  # fmt: skip
-    first = make_crop(*arguments, np.random.default_rng(9))
-    second = make_crop(*arguments, np.random.default_rng(9))
+    first, second = (make_crop(*arguments, np.random.default_rng(9)) for _ in range(2))
     assert np.array_equal(first.image, second.image)
     assert np.array_equal(first.u_px, second.u_px)
 
 
-def perfect_maps(u, v, diameter):
-    n = len(u)
-    t = make_targets(
-        512, 512, np.array(u, float), np.array(v, float), np.array(diameter, float),
-        np.full(n, Tier.LABEL, np.int8), np.ones(n),
-    )  # fmt: skip
+def targets(u, v, diameter, tiers=Tier.LABEL, weight=1.0, *classes):
+    u, v, diameter = (np.array(one, float) for one in (u, v, diameter))
+    tiers, weight = np.broadcast_to(np.int8(tiers), u.shape), np.broadcast_to(weight, u.shape)
+    return make_targets(512, 512, u, v, diameter, tiers, weight, *classes)
+
+
+def perfect_maps(*places):
+    t = targets(*places)
     geometry = np.concatenate([t.geometry, np.zeros((1, 128, 128), np.float32)])
     return t, geometry
 
@@ -388,30 +372,20 @@ def test_decoding_the_targets_returns_the_craters():
 
 
 def test_an_ignored_crater_takes_the_loss_away_around_it_and_adds_no_heat():
-    t = make_targets(
-        512, 512, np.array([200.0]), np.array([100.0]), np.array([60.0]), np.array([Tier.IGNORE], np.int8),
-        np.ones(1),
-    )  # fmt: skip
+    t = targets([200], [100], [60], Tier.IGNORE)
     assert t.heat.max() == 0.0 and t.weight.max() == 0.0 and t.regressed.max() == 0.0
     assert t.negative[0, 25, 50] == 0.0
     assert t.negative[0, 25, 80] == 1.0
 
 
 def test_a_label_beside_an_ignored_crater_keeps_its_own_weight():
-    t = make_targets(
-        512, 512, np.array([200.0, 206.0]), np.array([100.0, 100.0]), np.array([60.0, 40.0]),
-        np.array([Tier.IGNORE, Tier.LABEL], np.int8), np.array([1.0, 0.7]),
-    )  # fmt: skip
+    t = targets([200, 206], [100, 100], [60, 40], [Tier.IGNORE, Tier.LABEL], [1.0, 0.7])
     assert t.weight.max() == pytest.approx(0.7)
 
 
 def test_class_heatmaps_follow_the_common_one():
-    t = make_targets(
-        512, 512, np.array([100.0, 300.0]), np.array([100.0, 300.0]), np.array([40.0, 60.0]),
-        np.full(2, Tier.LABEL, np.int8), np.ones(2), np.array([0, 3], np.int8),
-    )  # fmt: skip
-    assert t.heat.shape[0] == 4
-    assert t.heat[1].max() == 1.0 and t.heat[2].max() == 0.0 and t.heat[3].max() == 0.0
+    t = targets([100, 300], [100, 300], [40, 60], Tier.LABEL, 1.0, np.array([0, 3], np.int8))
+    assert [one.max() for one in t.heat[1:]] == [1.0, 0.0, 0.0]
     assert (t.heat[0] == 1.0).sum() == 2
 
 
@@ -447,14 +421,10 @@ share = 1.0
 """
 
 
-def test_an_unknown_key_is_refused_with_the_nearest_known_one(tmp_path):
-    with pytest.raises(DatasetError, match=r"unknown key 'sead' \(did you mean 'seed'\?\)"):
-        load_recipe(write(tmp_path, GOOD.replace("seed = 1", "seed = 1\nsead = 2")))
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
+        ("seed = 1", "seed = 1\nsead = 2", r"unknown key 'sead' \(did you mean 'seed'\?\)"),
         ('split = "train"', 'split = "trane"', "expected one of train, val, test"),
         ('terrain = "procedural"', 'terrain = "mars"', "expected one of 'procedural', 'real'"),
         ("share = 1.0", "share = 1.0\nboxes = [[1, 2, 3]]", "west, east, south, north"),
@@ -468,11 +438,8 @@ def test_a_wrong_recipe_is_refused_in_one_line_that_says_where(tmp_path, old, ne
     assert "recipe.toml" in str(caught.value)
 
 
-def test_a_plain_scenario_gives_the_procedural_recipe_of_its_seed(tmp_path):
+def test_a_plain_scenario_gives_the_procedural_recipe_of_its_seed_and_its_splits_share_no_world(tmp_path):
     assert load_recipe(write(tmp_path, "seed = 5\n")).digest == procedural_recipe(5).digest
-
-
-def test_procedural_splits_share_no_world():
     seeds = [seed for source in procedural_recipe().sources for seed in source.seeds]
     assert len(seeds) == len(set(seeds))
 
@@ -496,10 +463,9 @@ def test_a_footprint_within_the_buffer_of_a_forbidden_box_is_refused():
     source = Source("x", "train", "real", 1.0, avoid=(Box(285.0, 300.0, -60.0, 60.0),), buffer_km=60.0)
     world = Box(180.0, 330.0, -60.0, 60.0)
     # One degree of longitude is 30.3 km at the equator and half of that at 60 degrees.
-    assert not allowed(source, world, np.array([0.0]), np.array([284.0]))
-    assert not allowed(source, world, np.array([0.0]), np.array([283.1]))
-    assert allowed(source, world, np.array([0.0]), np.array([282.9]))
-    assert not allowed(source, world, np.array([58.0]), np.array([281.5]))
+    places = ((0.0, 284.0), (0.0, 283.1), (0.0, 282.9), (58.0, 281.5))
+    found = [bool(allowed(source, world, np.array([north]), np.array([east]))) for north, east in places]
+    assert found == [False, False, True, False]
 
 
 def test_boxes_join_over_the_zero_meridian():
@@ -511,27 +477,20 @@ def test_boxes_join_over_the_zero_meridian():
 def test_shards_hold_every_frame_once_and_each_source_its_share():
     recipe = procedural_recipe()
     shards = plan_shards(recipe, 300)
-    numbers = [n for s in shards for n in s.frame_numbers]
-    assert numbers == list(range(300))
-    train = sum(s.frames for s in shards if s.source.split == "train")
-    assert train == 240
+    assert [n for s in shards for n in s.frame_numbers] == list(range(300))
+    assert sum(s.frames for s in shards if s.source.split == "train") == 240
 
 
 def test_real_terrain_may_be_taken_without_what_is_stamped_on_it(tmp_path):
-    path = tmp_path / "r.toml"
-    text = '[dataset]\nname = "a"\nseed = 1\n[[dataset.source]]\nname = "x"\nsplit = "train"\nshare = 1.0\n'
-    path.write_text(text + 'terrain = "real"\n')
-    sharpened = load_recipe(path)
-    path.write_text(text + 'terrain = "real"\nsharpen = false\n')
-    plain = load_recipe(path)
+    real = GOOD.replace("procedural", "real")
+    sharpened, plain = (load_recipe(write(tmp_path, real + more)) for more in ("", "sharpen = false\n"))
     assert sharpened.sources[0].sharpen and not plain.sources[0].sharpen
     # What is as it always was keeps the identity that data sets carry.
     assert "sharpen" not in sharpened.to_dict()["sources"][0]
     assert plain.digest != sharpened.digest
-    for terrain, value in (("procedural", "false"), ("real", "3")):
-        path.write_text(f'{text}terrain = "{terrain}"\nsharpen = {value}\n')
+    for text in (f"{GOOD}sharpen = false\n", f"{real}sharpen = 3\n"):
         with pytest.raises(DatasetError, match="sharpen: expected true or false"):
-            load_recipe(path)
+            load_recipe(write(tmp_path, text))
 
 
 torch = Lazy("torch")
@@ -542,7 +501,7 @@ restoring = Lazy("payload_emulator.training.model.restore")
 class Crops:
     """Stands in for the feeder: seeded images of another brightness than unit deviation."""
 
-    def batch(self, first: int, count: int) -> dict[str, np.ndarray]:
+    def batch(self, first, count):
         rng = np.random.default_rng(first)
         return {"image": 1.7 * rng.standard_normal((count, 1, 64, 64)).astype(np.float32) + 0.4}
 
@@ -560,7 +519,7 @@ def outputs(network, image):
     return torch.sigmoid(heat).numpy(), geometry.numpy()
 
 
-def test_the_restored_network_gives_what_the_exported_one_gives(shipped) -> None:
+def test_the_restored_network_gives_what_the_exported_one_gives(shipped):
     network, document = restoring.network_from_onnx(shipped)
     image = np.random.default_rng(1).standard_normal((1, 1, 512, 512)).astype(np.float32)
     heat, geometry = outputs(network, image)
@@ -571,7 +530,7 @@ def test_the_restored_network_gives_what_the_exported_one_gives(shipped) -> None
     assert document["progress"]["step"] == 5095  # in the metadata of the shipped network
 
 
-def test_counted_statistics_leave_outputs_and_make_training_mode_agree(shipped) -> None:
+def test_counted_statistics_leave_outputs_and_make_training_mode_agree(shipped):
     network, _ = restoring.network_from_onnx(shipped)
     average, _ = restoring.network_from_onnx(shipped)
     image = Crops().batch(1, 16)["image"]
@@ -588,15 +547,14 @@ def test_counted_statistics_leave_outputs_and_make_training_mode_agree(shipped) 
     np.testing.assert_allclose(first.running_var.numpy(), seen.var((0, 2, 3), unbiased=False).numpy(), rtol=1e-3)
 
 
-def test_what_is_no_exported_network_is_refused(tmp_path) -> None:
-    with pytest.raises(ModelError, match="expected an exported network, found no file"):
-        restoring.network_from_onnx(tmp_path / "none.onnx")
+def test_what_is_no_exported_network_is_refused(tmp_path):
     (tmp_path / "text.onnx").write_text("no model")
-    with pytest.raises(ModelError, match="expected an exported network"):
-        restoring.network_from_onnx(tmp_path / "text.onnx")
+    for name, found in (("none", ", found no file"), ("text", "")):
+        with pytest.raises(ModelError, match="expected an exported network" + found):
+            restoring.network_from_onnx(tmp_path / f"{name}.onnx")
 
 
-def test_an_enlarging_network_gives_maps_of_half_the_stride_and_flies() -> None:
+def test_an_enlarging_network_gives_maps_of_half_the_stride_and_flies():
     network = networks.CraterNet(networks.ModelConfig(16, depth=True, enlarge=2)).eval()
     assert network.config.cell_px == 2
     import onnx
@@ -613,15 +571,14 @@ def test_an_enlarging_network_gives_maps_of_half_the_stride_and_flies() -> None:
         networks.ModelConfig(enlarge=3)
 
 
-def test_older_networks_name_the_only_backbone_and_stride() -> None:
+def test_older_networks_name_the_only_backbone_and_stride():
     assert networks.parse_config({"enlarge": 2, "backbone": "small", "stride_px": 4}) == networks.ModelConfig(enlarge=2)
-    with pytest.raises(ModelError, match="expected backbone small, found 'large'"):
-        networks.parse_config({"backbone": "large"})
-    with pytest.raises(ModelError, match="expected stride_px 4, found 2"):
-        networks.parse_config({"stride_px": 2})
+    for name, known, other in (("backbone", "small", "large"), ("stride_px", 4, 2)):
+        with pytest.raises(ModelError, match=f"expected {name} {known}, found {other!r}"):
+            networks.parse_config({name: other})
 
 
-def test_a_peak_of_a_fine_map_lies_in_the_middle_of_its_cell() -> None:
+def test_a_peak_of_a_fine_map_lies_in_the_middle_of_its_cell():
     heat = np.zeros((256, 256), np.float32)
     heat[10, 20] = 0.9
     found = decode(heat, np.zeros((5, 256, 256), np.float32), 0.5, 2)
@@ -629,7 +586,7 @@ def test_a_peak_of_a_fine_map_lies_in_the_middle_of_its_cell() -> None:
     assert (found.u_px[0], found.v_px[0]) == (pytest.approx(40.5), pytest.approx(20.5))
 
 
-def test_an_enlarging_copy_sees_the_enlarged_image_and_tells_pixels_of_the_image(shipped) -> None:
+def test_an_enlarging_copy_sees_the_enlarged_image_and_tells_pixels_of_the_image(shipped):
     network, _ = restoring.network_from_onnx(shipped)
     image = np.random.default_rng(5).standard_normal((1, 1, 128, 128)).astype(np.float32)
     large = torch.nn.functional.interpolate(
@@ -638,6 +595,5 @@ def test_an_enlarging_copy_sees_the_enlarged_image_and_tells_pixels_of_the_image
     heat, geometry = outputs(restoring.enlarging(network, 2), image)
     expected_heat, expected = outputs(network, large)
     np.testing.assert_allclose(heat, expected_heat, atol=1e-5)
-    np.testing.assert_allclose(geometry[:, 2], expected[:, 2] - np.log(2.0), atol=1e-4)
-    np.testing.assert_allclose(geometry[:, 3], expected[:, 3] - np.log(2.0), atol=1e-4)
-    np.testing.assert_allclose(geometry[:, :2], expected[:, :2], atol=1e-4)
+    expected[:, 2:4] -= np.log(2.0)
+    np.testing.assert_allclose(geometry[:, :4], expected[:, :4], atol=1e-4)

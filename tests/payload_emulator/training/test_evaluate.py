@@ -17,7 +17,6 @@ from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.training.data.feeder import TrainParameters
 from payload_emulator.training.data.landmarks import load_landmarks, with_landmarks
-from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate.evaluate import (
     detect_by_class,
     evaluate,
@@ -30,12 +29,13 @@ from payload_emulator.training.evaluate.evaluate import (
 from payload_emulator.training.evaluate.localisation import bias_by_octant, bias_overall
 from payload_emulator.training.evaluate.metrics import Scene, Thresholds, score
 from payload_emulator.training.evaluate.report import detector_report
-from payload_emulator.training.evaluate.scoring import FrameDetections, average_precision, tally
+from payload_emulator.training.evaluate.scoring import average_precision, tally
 from payload_emulator.training.model.calibrate import fit_parallax, paper_threshold, without_parallax
 from payload_emulator.training.model.export import PARITY_LIMIT, export
 from payload_emulator.training.model.train import train
 from reports.json_form import to_json
 from reports.render import render_html
+from tests.payload_emulator.training.conftest import found_at, truth_of
 
 
 @pytest.fixture(scope="module")
@@ -77,18 +77,15 @@ def test_a_split_without_frames_is_refused(detector, blob_dataset):
         run(detector, [blob_dataset], "test", "none")
 
 
-def test_frames_of_another_camera_are_refused(detector, make_blob_dataset, tmp_path):
+def test_frames_of_another_camera_or_field_of_view_are_refused(detector, make_blob_dataset, tmp_path, monkeypatch):
     other = make_blob_dataset(tmp_path / "set", {"test": 1})
+    monkeypatch.setitem(detector.metadata, "camera_fov_deg", "90")
+    with pytest.raises(DatasetError, match=r"90 degrees\), found 512 x 512 pixels, 120 degrees"):
+        run(detector, [other], "test")
+    monkeypatch.undo()
     other.index["camera"]["width_px"] = 640
     with pytest.raises(DatasetError, match=r"expected frames of the detector's camera \(512 x 512"):
         run(detector, [other], "test")
-
-
-def test_frames_of_another_field_of_view_are_refused(blob_dataset):
-    detector = open_for_evaluation(load_shipped_model())
-    detector.metadata["camera_fov_deg"] = "90"
-    with pytest.raises(DatasetError, match=r"90 degrees\), found 512 x 512 pixels, 120 degrees"):
-        run(detector, [blob_dataset], "test")
 
 
 def test_the_papers_variant_needs_the_papers_heatmaps(detector, blob_dataset):
@@ -192,13 +189,7 @@ def test_a_file_that_holds_no_landmarks_is_refused(tmp_path):
 def shifted_scene(azimuth_deg, shift, number=0):
     """Craters on a grid under a Sun at an image azimuth, every detection off by the same shift (right, down)."""
     u, v = (part.ravel() for part in np.meshgrid(np.arange(60.0, 460.0, 80.0), np.arange(60.0, 460.0, 80.0)))
-    size = np.full(u.size, 30.0)
-    truth = FrameTruth(
-        u, v, size, np.full(u.size, 7_000.0), np.full(u.size, 0.1), np.arange(u.size) + 100 * number, 512, 512,
-        np.radians(azimuth_deg), number,
-    )  # fmt: skip
-    found = FrameDetections(u + shift[0], v + shift[1], size, truth.diameter_m, np.full(u.size, 0.9), np.ones(u.size))
-    return truth, found
+    return truth_of(u, v, azimuth=np.radians(azimuth_deg), number=number), found_at(u + shift[0], v + shift[1])
 
 
 def bias_of(*scenes):
@@ -254,21 +245,16 @@ def frames(count=12, share=SHARE, depth_said=True, noise=0.0, seed=0):
         place = np.arange(40.0, 480.0, 80.0)
         u, v = (part.ravel()[:n] for part in np.meshgrid(place, place))
         diameter, ratio = rng.uniform(12, 60, n), rng.uniform(0.06, 0.2, n)
-        truth = FrameTruth(u, v, diameter, np.full(n, 7e3), ratio, np.arange(n), 512, 512, 0.0, 0)
         inward = 1.0 / (1.0 + share * ratio * diameter)
-        found = FrameDetections(
-            255.5 + (u - 255.5) * inward + rng.normal(0, noise + 1e-12, n),
-            255.5 + (v - 255.5) * inward + rng.normal(0, noise + 1e-12, n), diameter, np.full(n, 7e3),
-            np.full(n, 0.9), np.ones(n), ratio if depth_said else None,
-        )  # fmt: skip
-        pairs.append((truth, found))
+        shown = (255.5 + (at - 255.5) * inward + rng.normal(0, noise + 1e-12, n) for at in (u, v))
+        said = (ratio,) if depth_said else ()
+        pairs.append((truth_of(u, v, diameter, ratio), found_at(*shown, diameter, 7e3, 0.9, 1.0, *said)))
     return pairs
 
 
 def test_the_share_put_in_is_the_share_found():
     share, error = fit_parallax(frames())
-    assert share == pytest.approx(SHARE, rel=1e-6)
-    assert error < 1e-9
+    assert share == pytest.approx(SHARE, rel=1e-6) and error < 1e-9
 
 
 def test_the_standard_error_covers_the_scatter_of_the_fit():
@@ -288,10 +274,11 @@ def test_detections_come_back_onto_the_rims():
 def test_a_network_that_tells_no_depth_is_corrected_on_the_whole():
     share, _ = fit_parallax(frames(depth_said=False))
     truth, found = frames(1, depth_said=False)[0]
-    before = np.hypot(found.u_px - truth.u_px, found.v_px - truth.v_px)
-    fixed = without_parallax(found, share, truth)
-    after = np.hypot(fixed.u_px - truth.u_px, fixed.v_px - truth.v_px)
-    assert after.mean() < 0.5 * before.mean()
+    before, after = (
+        np.hypot(one.u_px - truth.u_px, one.v_px - truth.v_px).mean()
+        for one in (found, without_parallax(found, share, truth))
+    )
+    assert after < 0.5 * before
 
 
 def test_too_few_craters_give_no_correction():
@@ -301,58 +288,42 @@ def test_too_few_craters_give_no_correction():
 
 def test_the_papers_threshold_is_chosen_over_its_classes_together():
     # One crater of class 0 found at 0.7, a false detection of class 1 at 0.5: anything in between is best.
-    one = np.array([100.0])
-    truth = FrameTruth(one, one, np.array([30.0]), np.array([7e3]), np.array([0.1]), np.array([1]), 512, 512, 0.0, 0)
-    found = FrameDetections(
-        np.array([100.0, 300.0]), np.array([100.0, 300.0]), np.full(2, 30.0), np.array([7e3, 12e3]),
-        np.array([0.7, 0.5]), np.ones(2), size_class=np.array([0, 1], np.int8),
-    )  # fmt: skip
-    assert 0.5 < paper_threshold([truth], [found]) <= 0.7
+    places, classes = [100, 300], np.array([0, 1], np.int8)
+    found = found_at(places, places, 30.0, [7e3, 12e3], [0.7, 0.5], size_class=classes)
+    assert 0.5 < paper_threshold([truth_of([100], [100])], [found]) <= 0.7
 
 
 THRESHOLDS = Thresholds(0.5, 0.3, 0.7)
 
 
-def scene(u, v, *, shift=(0.0, 0.0), scale=0.0, sigma=1.0, said=0.15, depth=0.15, azimuth=0.0, found=None):
-    """Craters at (u, v) and detections of all (or of a mask), moved by a shift and a scale about the middle."""
+def scene(u, v, *, shift=(0.0, 0.0), sigma=1.0, said=0.15, depth=0.15, azimuth=0.0, found=True):
+    """Craters at (u, v) and detections of all (or of a mask), moved by a shift."""
     u, v = np.array(u, float), np.array(v, float)
-    n = u.size
-    truth = FrameTruth(
-        u, v, np.full(n, 30.0), np.full(n, 7_000.0), np.full(n, depth), np.arange(n), 512, 512, azimuth, 0
-    )
-    keep = np.ones(n, bool) if found is None else np.array(found)
-    detections = FrameDetections(
-        (u + shift[0] + scale * (u - 255.5))[keep], (v + shift[1] + scale * (v - 255.5))[keep],
-        np.full(keep.sum(), 30.0), np.full(keep.sum(), 7_000.0), np.full(keep.sum(), 0.8),
-        np.full(keep.sum(), sigma), np.full(keep.sum(), said),
-    )  # fmt: skip
-    return truth, detections
+    keep = np.broadcast_to(found, u.shape)
+    shown = ((at + moved)[keep] for at, moved in zip((u, v), shift, strict=True))
+    return truth_of(u, v, 30.0, depth, azimuth), found_at(*shown, 30.0, 7e3, 0.8, sigma, said)
 
 
 def figures_of(parts, scenes):
     return score([t for t, _ in parts], [d for _, d in parts], THRESHOLDS, scenes)
 
 
-GRID = np.meshgrid(np.arange(40.0, 500.0, 60.0), np.arange(40.0, 500.0, 60.0))
+GRID = np.reshape(np.meshgrid(np.arange(40.0, 500.0, 60.0), np.arange(40.0, 500.0, 60.0)), (2, -1))
 LOW = Scene(16.0, 5.0, -2_000.0, "mare")
 HIGH = Scene(42.0, 12.0, 500.0, "hills")
 
 
 def test_groups_hold_their_own_frames_and_no_others():
-    everything = scene(GRID[0].ravel(), GRID[1].ravel())
-    nothing = scene(GRID[0].ravel(), GRID[1].ravel(), found=np.zeros(64, bool))
-    figures = figures_of([everything, nothing], [LOW, HIGH])
+    figures = figures_of([scene(*GRID), scene(*GRID, found=False)], [LOW, HIGH])
     assert [row["strict"]["recall"] for row in figures["by_altitude_km"]] == [1.0, 0.0]
     assert {row["name"]: row["strict"]["recall"] for row in figures["by_terrain"]} == {"lowland": 1.0, "upland": 0.0}
     assert {row["name"]: row["ignore_aware"]["recall"] for row in figures["by_source"]} == {"mare": 1.0, "hills": 0.0}
-    assert [(row["low"], row["strict"]["recall"]) for row in figures["by_sun_elevation_deg"]] == [
-        (3.0, 1.0),
-        (12.0, 0.0),
-    ]
+    sun = [(row["low"], row["strict"]["recall"]) for row in figures["by_sun_elevation_deg"]]
+    assert sun == [(3.0, 1.0), (12.0, 0.0)]
 
 
 def test_a_common_shift_is_the_bias_of_its_sun_octant():
-    part = scene(GRID[0].ravel(), GRID[1].ravel(), shift=(0.4, -0.2), azimuth=np.radians(100.0))
+    part = scene(*GRID, shift=(0.4, -0.2), azimuth=np.radians(100.0))
     figures = figures_of([part], [LOW])
     biased = [row for row in figures["bias_px_by_sun_octant"] if row["pairs"]]
     assert [row["octant"] for row in biased] == [2]
@@ -389,7 +360,7 @@ def test_thresholds_of_three_purposes_are_scored_side_by_side():
 
 
 def test_no_detections_at_all_give_nan_and_zero_rather_than_an_error():
-    figures = figures_of([scene([100], [100], found=[False])], [LOW])
+    figures = figures_of([scene([100], [100], found=False)], [LOW])
     assert figures["micro"]["recall"] == 0.0
     assert figures["sigma_calibration"]["pairs"] == 0
 
@@ -397,8 +368,5 @@ def test_no_detections_at_all_give_nan_and_zero_rather_than_an_error():
 def test_average_precision_of_a_ranking_done_by_hand():
     # Ranked right, wrong, right over 2 craters: areas 0.5 * 1 + 0.5 * 2/3.
     truth, _ = scene([100, 200], [100, 200])
-    found = FrameDetections(
-        np.array([100.0, 400.0, 200.0]), np.array([100.0, 400.0, 200.0]), np.full(3, 30.0), np.full(3, 7_000.0),
-        np.array([0.9, 0.8, 0.7]), np.ones(3),
-    )  # fmt: skip
+    found = found_at([100, 400, 200], [100, 400, 200], scores=[0.9, 0.8, 0.7])
     assert average_precision(tally([truth], [found])) == pytest.approx(0.5 + 0.5 * 2 / 3)

@@ -7,8 +7,6 @@ from payload_emulator.errors import DatasetError
 from payload_emulator.flight.models import load_shipped_model
 from payload_emulator.flight.vision.calibration import CALIBRATION_KEY
 from payload_emulator.flight.vision.detector import OnnxDetector
-from payload_emulator.training.data.truth import FrameTruth
-from payload_emulator.training.evaluate.scoring import FrameDetections
 from payload_emulator.training.model.fit_calibration import (
     FRESH_FACTOR,
     Pairs,
@@ -20,6 +18,7 @@ from payload_emulator.training.model.fit_calibration import (
     plain_model,
     sun_directions,
 )
+from tests.payload_emulator.training.conftest import found_at, truth_of
 
 
 def scored_frames(count=150, seed=1):
@@ -32,14 +31,8 @@ def scored_frames(count=150, seed=1):
         score = np.sort(rng.uniform(0.1, 0.9, u.size))[::-1]
         odds = np.exp(2.0 * np.log(score / (1.0 - score)) + 1.0 - np.log(diameter / 20.0))
         right = rng.uniform(size=u.size) < odds / (1.0 + odds)
-        size_m = np.full(u.size, 8e3)
-        found.append(FrameDetections(u, v, diameter, size_m, score, np.ones(u.size)))
-        n = int(right.sum())
-        truths.append(
-            FrameTruth(
-                u[right], v[right], diameter[right], size_m[:n], np.full(n, 0.1), np.arange(n), 512, 512, 0.0, 0,
-            )
-        )  # fmt: skip
+        found.append(found_at(u, v, diameter, 8e3, score))
+        truths.append(truth_of(u[right], v[right], diameter[right], diameter_m=8e3))
     return truths, found
 
 

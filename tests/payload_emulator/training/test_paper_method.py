@@ -2,8 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -25,14 +23,14 @@ from payload_emulator.training.model.train import train
 MEDIANS_M = np.array([6.5e3, 12e3, 18e3])
 
 
-def colour_frame(seed: int = 0) -> np.ndarray:
+def colour_frame(seed=0):
     rng = np.random.default_rng(seed)
     base = 90.0 + 50.0 * np.sin(np.arange(512) / 11.0)[:, None] * np.cos(np.arange(512) / 8.0)[None, :]
     gains = np.array([1.2, 0.9, 0.5])
     return np.clip(base[..., None] * gains + rng.normal(0.0, 3.0, (512, 512, 3)), 0, 255).astype(np.uint8)
 
 
-def test_each_channel_is_normalised_before_the_average() -> None:
+def test_each_channel_is_normalised_before_the_average():
     image = colour_frame()
     paper = prepare_image(image, Preparation.normalise_first).gray
     expected = np.zeros((512, 512))
@@ -45,14 +43,14 @@ def test_each_channel_is_normalised_before_the_average() -> None:
     np.testing.assert_array_equal(prepare_image(gray, Preparation.normalise_first).gray, prepare_image(gray).gray)
 
 
-def test_a_gain_of_one_channel_makes_no_difference_in_the_papers_order() -> None:
+def test_a_gain_of_one_channel_makes_no_difference_in_the_papers_order():
     image = colour_frame().astype(np.float32) / 255.0
     dimmed = image * np.array([1.0, 1.0, 0.5], np.float32)
     paper = [prepare_image(one, Preparation.normalise_first).gray for one in (image, dimmed)]
     np.testing.assert_allclose(paper[0], paper[1], atol=1e-3)
 
 
-def test_a_crop_of_a_colour_frame_is_that_of_its_gray_where_channels_agree() -> None:
+def test_a_crop_of_a_colour_frame_is_that_of_its_gray_where_channels_agree():
     gray = colour_frame()[..., 0]
     crops = []
     for picture in (gray, np.repeat(gray[..., None], 3, axis=2)):
@@ -64,31 +62,29 @@ def test_a_crop_of_a_colour_frame_is_that_of_its_gray_where_channels_agree() -> 
     np.testing.assert_allclose(crops[0].image, crops[1].image, atol=1e-5)
 
 
-def one_frame(folder: Path, split: Literal["train", "val"]) -> Dataset:
+def one_frame(folder, split, colour="rgb"):
     source = Source("world", split, "procedural", 1.0, (41,), altitude_km=(40.0, 45.0))
-    list(build(Recipe("colour", 7, (source,), frames_per_shard=1, colour="rgb"), folder, 1, find_data(None)))
+    list(build(Recipe("colour", 7, (source,), frames_per_shard=1, colour=colour), folder, 1, find_data(None)))
     return Dataset(folder)
 
 
 @pytest.fixture(scope="module")
-def coloured(tmp_path_factory) -> Dataset:
+def coloured(tmp_path_factory):
     return one_frame(tmp_path_factory.mktemp("colour") / "set", "train")
 
 
-def test_a_data_set_in_colour_keeps_the_channels(coloured: Dataset, tmp_path) -> None:
+def test_a_data_set_in_colour_keeps_the_channels(coloured, tmp_path):
     frame = coloured.frames()[0]
     image = coloured.image(frame)
     assert image.shape == (512, 512, 3) and image.dtype == np.uint8
     assert np.any(image[..., 0] != image[..., 2])
     np.testing.assert_array_equal(coloured.gray(frame), gray_levels(image))
     # The same frame without colours holds the mean of the channels.
-    source = Source("world", "train", "procedural", 1.0, (41,), altitude_km=(40.0, 45.0))
-    list(build(Recipe("colour", 7, (source,), frames_per_shard=1), tmp_path / "gray", 1, find_data(None)))
-    plain = Dataset(tmp_path / "gray")
+    plain = one_frame(tmp_path / "gray", "train", "gray")
     np.testing.assert_array_equal(plain.image(plain.frames()[0]), coloured.gray(frame))
 
 
-def test_an_unknown_colour_is_refused(tmp_path) -> None:
+def test_an_unknown_colour_is_refused(tmp_path):
     path = tmp_path / "r.toml"
     path.write_text(
         '[dataset]\nname = "x"\nseed = 1\ncolour = "sepia"\n[[dataset.source]]\nname = "a"\nsplit = "train"\n'
@@ -99,7 +95,7 @@ def test_an_unknown_colour_is_refused(tmp_path) -> None:
 
 
 @pytest.fixture(scope="module")
-def classes_only(coloured: Dataset, tmp_path_factory) -> bytes:
+def classes_only(coloured, tmp_path_factory):
     run = tmp_path_factory.mktemp("classes")
     parameters = TrainParameters(
         minutes=0.0, steps=1, batch=2, crop_px=96, replicas=1, detail_blocks=0,
@@ -110,7 +106,7 @@ def classes_only(coloured: Dataset, tmp_path_factory) -> bytes:
     return (run / "m.onnx").read_bytes()
 
 
-def test_the_exported_network_gives_classes_offsets_and_no_sizes(classes_only, coloured: Dataset) -> None:
+def test_the_exported_network_gives_classes_offsets_and_no_sizes(classes_only, coloured):
     detector = OnnxDetector(classes_only)
     heat, offsets = detector.run_network(np.zeros((1, 1, 512, 512), np.float32))
     assert heat.shape == (1, 3, 128, 128) and offsets.shape == (1, 2, 128, 128)
@@ -127,7 +123,7 @@ def test_the_exported_network_gives_classes_offsets_and_no_sizes(classes_only, c
     np.testing.assert_array_equal(found.diameter_m, detector.class_medians_m[found.size_class])
 
 
-def test_a_network_of_classes_without_medians_is_refused(classes_only) -> None:
+def test_a_network_of_classes_without_medians_is_refused(classes_only):
     import onnx
 
     model = onnx.load_from_string(classes_only)
@@ -138,7 +134,7 @@ def test_a_network_of_classes_without_medians_is_refused(classes_only) -> None:
         OnnxDetector(model.SerializeToString())
 
 
-def test_of_two_classes_at_one_place_the_better_counts() -> None:
+def test_of_two_classes_at_one_place_the_better_counts():
     heat = np.zeros((3, 128, 128), np.float32)
     heat[0, 40, 50], heat[1, 40, 51], heat[2, 90, 10] = 0.6, 0.8, 0.5
     found = decode_classes(heat, np.zeros((2, 128, 128), np.float32), MEDIANS_M, 0.4)
@@ -146,7 +142,7 @@ def test_of_two_classes_at_one_place_the_better_counts() -> None:
     assert found.size_class.tolist() == [1, 2] and found.score.tolist() == pytest.approx([0.8, 0.5])
 
 
-def test_odometry_takes_the_class_of_a_classified_detection_and_its_prior_gives_the_size() -> None:
+def test_odometry_takes_the_class_of_a_classified_detection_and_its_prior_gives_the_size():
     heat = np.zeros((3, 128, 128), np.float32)
     heat[2, 64, 64] = 0.9
     found = decode_classes(heat, np.zeros((2, 128, 128), np.float32), MEDIANS_M, 0.4)

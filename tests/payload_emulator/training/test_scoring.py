@@ -5,9 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate.scoring import (
-    FrameDetections,
     MatchRule,
     best_threshold,
     match,
@@ -15,24 +13,15 @@ from payload_emulator.training.evaluate.scoring import (
     threshold_for_precision,
     with_interval,
 )
+from tests.payload_emulator.training.conftest import found_at, truth_of
 
 
-def truth(u, v, diameter_px=30.0, diameter_m=7_000.0, depth_ratio=0.15, block=0):
-    n = len(u)
-    return FrameTruth(
-        np.array(u, float), np.array(v, float), np.full(n, diameter_px),
-        np.broadcast_to(diameter_m, n).astype(float), np.broadcast_to(depth_ratio, n).astype(float), np.arange(n),
-        512, 512, 0.0, block,
-    )  # fmt: skip
+def truth(u, v, depth_ratio=0.15, **more):
+    return truth_of(u, v, ratio=depth_ratio, **more)
 
 
-def found(u, v, score, diameter_m=7_000.0):
-    n = len(u)
-    order = np.argsort(-np.array(score, float), kind="stable")
-    return FrameDetections(
-        np.array(u, float)[order], np.array(v, float)[order], np.full(n, 30.0),
-        np.broadcast_to(diameter_m, n).astype(float)[order], np.array(score, float)[order], np.ones(n),
-    )  # fmt: skip
+def found(u, v, score, diameter_m=7e3):
+    return found_at(u, v, 30.0, diameter_m, score)
 
 
 def test_two_detections_of_one_crater_are_one_right_and_one_false():
@@ -58,12 +47,10 @@ def test_precision_recall_and_f1_of_a_case_counted_by_hand():
 
 
 def test_the_pixel_rule_ends_at_ten_pixels_and_the_radius_rule_at_half_a_radius():
-    frame = truth([100], [100], diameter_px=30.0)
-    assert tally([frame], [found([110], [100], [0.9])]).figures(0.5).detected_true == 1
-    assert tally([frame], [found([110.1], [100], [0.9])]).figures(0.5).detected_true == 0
-    rule = MatchRule(radii=0.5)
-    assert tally([frame], [found([107.4], [100], [0.9])], rule=rule).figures(0.5).detected_true == 1
-    assert tally([frame], [found([107.6], [100], [0.9])], rule=rule).figures(0.5).detected_true == 0
+    frame = truth([100], [100])
+    for u, right, rule in ((110, 1, {}), (110.1, 0, {}), (107.4, 1, {"radii": 0.5}), (107.6, 0, {"radii": 0.5})):
+        tallied = tally([frame], [found([u], [100], [0.9])], rule=MatchRule(**rule))
+        assert tallied.figures(0.5).detected_true == right
 
 
 def test_a_ghost_counts_when_strict_and_is_left_out_when_ignore_aware():
@@ -78,8 +65,8 @@ def test_a_ghost_counts_when_strict_and_is_left_out_when_ignore_aware():
 def test_a_detection_on_nothing_is_false_by_both_rules():
     frame = truth([100], [100])
     detections = found([100, 300], [100, 300], [0.9, 0.8])
-    assert tally([frame], [detections]).figures(0.5).false_alarms == 1
-    assert tally([frame], [detections], ignore_aware=True).figures(0.5).false_alarms == 1
+    for aware in (False, True):
+        assert tally([frame], [detections], ignore_aware=aware).figures(0.5).false_alarms == 1
 
 
 def test_a_detection_of_the_wrong_class_is_false_and_its_crater_missed():
@@ -104,7 +91,7 @@ def test_the_best_threshold_separates_right_from_wrong():
 
 
 def test_the_bootstrap_interval_holds_the_figure_and_narrows_to_it_when_blocks_agree():
-    frames = [truth([100, 200], [100, 200], block=k) for k in range(8)]
+    frames = [truth([100, 200], [100, 200], number=k) for k in range(8)]
     detections = [found([100], [100], [0.9])] * 8
     assert with_interval(tally(frames, detections), 0.5)["f1_interval_95"] == pytest.approx([2 / 3, 2 / 3])
 
@@ -131,7 +118,7 @@ def test_a_precision_that_rests_on_a_handful_of_detections_decides_nothing():
     place = np.linspace(5.0, 505.0, 20)
     u, v = (part.ravel()[:n] for part in np.meshgrid(place, place))
     score = np.linspace(0.94, 0.30, n)
-    craters = truth(u[2:], v[2:], diameter_px=10.0)
+    craters = truth(u[2:], v[2:], diameter=10.0)
     tallied = tally([craters], [found(u, v, score)], rule=MatchRule(pixels=3.0))
     assert tallied.figures(0.93).precision < 0.9
     assert threshold_for_precision(tallied, 0.9) < 0.31

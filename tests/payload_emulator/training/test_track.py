@@ -31,7 +31,7 @@ class Everywhere:
 
     name = "flat"
 
-    def __init__(self, height_m: float = 0.0) -> None:
+    def __init__(self, height_m=0.0):
         self.height = height_m
 
     def covers(self, latitude_rad, longitude_rad):
@@ -65,14 +65,18 @@ def source(path, **changes):
     return dataclasses.replace(plain, **changes)
 
 
+def laid(along, count, seed=1):
+    return lay_track(along, CAMERA, Everywhere(), find_data(None), count, seed)
+
+
 def test_every_position_within_sixty_degrees_is_taken_and_no_other(polar_orbit):
-    track = lay_track(source(polar_orbit), CAMERA, Everywhere(), find_data(None), 140, 1)
+    track = laid(source(polar_orbit), 140)
     latitude, _, altitude = spherical_from_mcmf(track.position_mcmf_m)
     assert np.abs(np.degrees(latitude)).max() <= 60.0
     assert np.allclose(altitude, 30_000.0, atol=5.0)
     # Two thirds of a polar revolution of 110 minutes at two frames a minute: 147.
     with pytest.raises(DatasetError, match=r"expected 200 places .* found 14\d of 2\d\d"):
-        lay_track(source(polar_orbit), CAMERA, Everywhere(), find_data(None), 200, 1)
+        laid(source(polar_orbit), 200)
     steps = np.diff(track.utc_ns) / 1e9
     assert set(np.round(steps[steps < 60.0], 6)) == {30.0}
     # Once over each pole a third of half a revolution is left out.
@@ -80,15 +84,15 @@ def test_every_position_within_sixty_degrees_is_taken_and_no_other(polar_orbit):
 
 
 def test_places_follow_the_ephemeris_and_not_its_step(polar_orbit):
-    fine = lay_track(source(polar_orbit, step_s=15.0), CAMERA, Everywhere(), find_data(None), 40, 1)
-    coarse = lay_track(source(polar_orbit), CAMERA, Everywhere(), find_data(None), 20, 1)
+    fine = laid(source(polar_orbit, step_s=15.0), 40)
+    coarse = laid(source(polar_orbit), 20)
     np.testing.assert_array_equal(fine.utc_ns[::2], coarse.utc_ns)
     np.testing.assert_allclose(fine.position_mcmf_m[::2], coarse.position_mcmf_m, atol=1e-3)
 
 
 def test_boxes_and_buffers_hold_along_an_orbit_too(polar_orbit):
     north = source(polar_orbit, boxes=(Box(0.0, 360.0, 10.0, 60.0),), avoid=(Box(0.0, 360.0, 40.0, 50.0),))
-    track = lay_track(north, CAMERA, Everywhere(), find_data(None), 20, 1)
+    track = laid(north, 20)
     latitude = np.degrees(spherical_from_mcmf(track.position_mcmf_m)[0])
     # A footprint from 30 km reaches 1.76 degrees to each side at its edge, 2.5 in its corners; the buffer is 60 km.
     assert latitude.min() > 10.0 + 1.7
@@ -108,7 +112,7 @@ def test_the_papers_split_keeps_one_arc_for_testing():
 
 def test_an_ephemeris_below_the_ground_is_refused_with_the_place(polar_orbit):
     along = source(polar_orbit)
-    position = lay_track(along, CAMERA, Everywhere(), find_data(None), 1, 1).position_mcmf_m[0]
+    position = laid(along, 1).position_mcmf_m[0]
     rng = np.random.default_rng(1)
     assert pose_at(Everywhere(), CAMERA, along, position, "frame 3", rng).ground_m == 0.0
     with pytest.raises(DatasetError, match=r"frame 3: expected a place above the ground at .* found the camera at"):
@@ -148,7 +152,7 @@ def test_the_shipped_recipe_of_the_papers_data_set_flies_the_shipped_orbit():
     (along,) = recipe.sources
     assert (along.split, along.light, along.step_s, along.days) == ("80/15/5", "paper", 30.0, 30.0)
     day = dataclasses.replace(along, days=0.1, step_s=60.0)
-    track = lay_track(day, CAMERA, Everywhere(), find_data(None), 60, recipe.seed)
+    track = laid(day, 60, recipe.seed)
     altitude_km = spherical_from_mcmf(track.position_mcmf_m)[2] / 1e3
     # The paper's orbit flies between 14.0 and 48.6 km.
     assert altitude_km.min() > 13.0 and altitude_km.max() < 50.0
@@ -174,5 +178,5 @@ def test_places_are_ordered_so_that_neighbours_on_the_ground_follow_each_other()
 
 
 def test_the_order_of_making_is_part_of_the_digest(polar_orbit):
-    track = lay_track(source(polar_orbit), CAMERA, Everywhere(), find_data(None), 40, 7)
+    track = laid(source(polar_orbit), 40, 7)
     assert dataclasses.replace(track, order=track.order[::-1]).digest != track.digest

@@ -143,20 +143,16 @@ class _Hostile:
 
 
 def test_a_damaged_checkpoint_is_refused_and_a_hostile_one_runs_nothing(blob_dataset, tmp_path):
-    (tmp_path / "checkpoint.pt").write_bytes(b"damaged")
-    with pytest.raises(ModelError, match="expected a checkpoint"):
-        load_network(tmp_path / "checkpoint.pt")
-    torch.save({"config": _Hostile(tmp_path / "mark")}, tmp_path / "checkpoint.pt")
-    with pytest.raises(ModelError, match="expected a checkpoint"):
-        load_network(tmp_path / "checkpoint.pt")
+    path = tmp_path / "checkpoint.pt"
+    parts = {"config": {}, "network": {}, "average": {}, "progress": {}}
+    hostile = {"config": _Hostile(tmp_path / "mark")}
+    for other in (b"damaged", {}, parts, parts | {"config": {"none": 1}}, hostile):
+        path.write_bytes(other) if other == b"damaged" else torch.save(other, path)
+        with pytest.raises(ModelError, match="expected a checkpoint"):
+            load_network(path)
     with pytest.raises(ModelError, match="expected a checkpoint"):
         train([blob_dataset], tmp_path, SHORT)
     assert not (tmp_path / "mark").exists()
-    parts = {"config": {}, "network": {}, "average": {}, "progress": {}}
-    for other in ({}, parts, parts | {"config": {"none": 1}}):
-        torch.save(other, tmp_path / "checkpoint.pt")
-        with pytest.raises(ModelError, match="expected a checkpoint"):
-            load_network(tmp_path / "checkpoint.pt")
 
 
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol", "ignore:TypedStorage is deprecated")
