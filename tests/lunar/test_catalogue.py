@@ -143,7 +143,7 @@ def test_completing_fills_the_empty_tiles_up_to_the_papers_counts():
 
 
 @pytest.mark.parametrize(
-    ("text", "place"),
+    "text, place",
     [
         ("", "line 1: expected the column names"),
         ("a,b\n1,2\n", "line 1: expected the columns of a crater catalogue"),
@@ -217,7 +217,7 @@ OWN = """id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text, message",
     [
         (OWN, "lines 2 and 3, column id: expected an id of its own for each crater .* found 1 twice"),
         (OWN.replace("\n1,-36", "\n1.7,-36"), "line 3, column id: expected a whole number, found 1.7"),

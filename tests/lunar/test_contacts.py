@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from lunar.constants import MOON_RADIUS_M, NS, SPEED_OF_LIGHT_M_S
 from lunar.contacts import visibility_spans
@@ -65,7 +66,7 @@ def test_eclipses_last_as_long_as_the_shadow_is_wide(found):
     durations = lasting_s(whole(found.eclipse, found))
     assert len(durations) >= REVOLUTIONS - 1
     # The Sun has moved by 0.3 deg at the end, edges are found to a second each.
-    np.testing.assert_allclose(durations, expected, atol=8.0)  # s
+    assert_allclose(durations, expected, atol=8.0)  # s
 
 
 def test_the_earth_is_hidden_as_long_as_the_limb_is_wide(found):
@@ -73,11 +74,11 @@ def test_the_earth_is_hidden_as_long_as_the_limb_is_wide(found):
     durations = lasting_s(whole(found.occultation, found))
     assert len(durations) >= REVOLUTIONS - 1
     # The Earth stands at 215 Moon radii, not at infinity, and has moved by 4 deg at the end: 1 % of 2,800 s.
-    np.testing.assert_allclose(durations, expected, atol=60.0)  # s
+    assert_allclose(durations, expected, atol=60.0)  # s
 
 
 def test_half_of_every_revolution_is_over_the_night_side(found):
-    np.testing.assert_allclose(lasting_s(whole(found.night, found)), PERIOD_S / 2.0, atol=8.0)  # s
+    assert_allclose(lasting_s(whole(found.night, found)), PERIOD_S / 2.0, atol=8.0)  # s
 
 
 def test_stations_on_opposite_sides_of_the_earth_share_the_time_that_the_limb_leaves(found):

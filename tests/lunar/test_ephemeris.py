@@ -175,7 +175,7 @@ def test_a_leap_second_inside_a_segment_does_no_harm():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change, message",
     [
         (lambda t, p, v: (t[::-1], p, v), "expected an epoch after"),
         (lambda t, p, v: (np.r_[t[:1], t[:-1]], p, v), "expected an epoch after"),
@@ -267,7 +267,7 @@ def test_states_that_gravity_moves_are_accepted_also_with_an_orbit_determination
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change, message",
     [
         (
             scaled(1e3, 1e3),

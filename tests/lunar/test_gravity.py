@@ -66,7 +66,7 @@ def at(latitude_deg: float, longitude_deg: float, altitude_km: float = 30.0) -> 
 
 
 @pytest.mark.parametrize("place", [at(37.0, -101.0), at(-89.2, 12.0), at(1e-3, 200.0, 14.0)])
-def test_degree_100_agrees_with_an_evaluation_in_fifty_digits(place: np.ndarray) -> None:
+def test_degree_100_agrees_with_an_evaluation_in_fifty_digits(place):
     field = kaula_field(100)
     expected = exact_acceleration(field, place, 100)
     # 5,000 terms of a double each: a few units in the last place of the sum.
@@ -74,14 +74,14 @@ def test_degree_100_agrees_with_an_evaluation_in_fifty_digits(place: np.ndarray)
 
 
 @pytest.mark.parametrize("degree", [*range(13), 20, 31, 32, 33])
-def test_every_degree_agrees_with_the_definition_whatever_the_number_of_blocks(degree: int) -> None:
+def test_every_degree_agrees_with_the_definition_whatever_the_number_of_blocks(degree):
     field = kaula_field(33)
     place = at(-21.0, 77.0, 100.0)
     expected = exact_acceleration(field, place, degree)
     assert np.linalg.norm(acceleration(field, place, degree) - expected) <= 3e-15 * np.linalg.norm(expected)
 
 
-def test_nothing_happens_at_the_poles() -> None:
+def test_nothing_happens_at_the_poles():
     field = kaula_field(60)
     pole = np.array([0.0, 0.0, -1.768e6])
     beside = acceleration(field, pole + np.array([1e-3, 0.0, 0.0]))
@@ -90,13 +90,13 @@ def test_nothing_happens_at_the_poles() -> None:
     assert np.all(np.isfinite(gradient(field, pole, 20)))
 
 
-def test_a_sphere_pulls_as_a_point_mass() -> None:
+def test_a_sphere_pulls_as_a_point_mass():
     place = at(12.0, 34.0, 1000.0)
     expected = -4.9028e12 * place / np.linalg.norm(place) ** 3
     assert np.allclose(acceleration(kaula_field(5), place, 0), expected, rtol=1e-15)
 
 
-def test_oblateness_pulls_as_in_the_closed_form() -> None:
+def test_oblateness_pulls_as_in_the_closed_form():
     """Vallado, Fundamentals of Astrodynamics (2013), equations 8-19 and following: acceleration by J2."""
     j2, radius, gm = 2.0e-4, 1.738e6, 4.9e12
     c = np.zeros((3, 3))
@@ -111,7 +111,7 @@ def test_oblateness_pulls_as_in_the_closed_form() -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 8, 40])
-def test_the_gradient_is_the_change_of_the_acceleration(degree: int) -> None:
+def test_the_gradient_is_the_change_of_the_acceleration(degree):
     field = kaula_field(40)
     place, step = at(-63.0, 140.0), 10.0
     expected = np.stack(
@@ -128,7 +128,7 @@ def test_the_gradient_is_the_change_of_the_acceleration(degree: int) -> None:
     assert abs(np.trace(found)) < 1e-20
 
 
-def test_shapes_are_kept_for_none_one_and_many_positions() -> None:
+def test_shapes_are_kept_for_none_one_and_many_positions():
     field = kaula_field(4)
     assert acceleration(field, np.empty((0, 3))).shape == (0, 3)
     assert acceleration(field, at(0, 0)).shape == (3,)
@@ -138,7 +138,7 @@ def test_shapes_are_kept_for_none_one_and_many_positions() -> None:
     assert gradient(field, places).shape == (2, 2, 3, 3)
 
 
-def test_the_other_vector_width_gives_the_same_sums(tmp_path: Path) -> None:
+def test_the_other_vector_width_gives_the_same_sums(tmp_path):
     """Machines differ in the width of their vectors; here the one this machine does not use by itself."""
     text = Path(kernel.__file__).read_text(encoding="utf-8")
     marker = 'LANES = 8 if get_host_cpu_features().get("avx512f") else 4'
@@ -159,7 +159,7 @@ def test_the_other_vector_width_gives_the_same_sums(tmp_path: Path) -> None:
     assert np.allclose(found, acceleration(field, places), rtol=1e-14)
 
 
-def test_truncation_asks_for_a_degree_the_field_has() -> None:
+def test_truncation_asks_for_a_degree_the_field_has():
     field = kaula_field(5)
     assert field.truncated(3).degree == 3
     assert field.truncated(5) is field
@@ -169,7 +169,7 @@ def test_truncation_asks_for_a_degree_the_field_has() -> None:
     assert packed(field, 3) is packed(field, 3)
 
 
-def test_the_built_in_field_says_what_it_is() -> None:
+def test_the_built_in_field_says_what_it_is():
     field = builtin_gravity()
     assert field.degree == 12 and "GRGM1200L" in field.name
     assert field.c_bar[0, 0] == 1.0 and np.all(field.s_bar[:, 0] == 0.0)
@@ -180,7 +180,7 @@ def test_the_built_in_field_says_what_it_is() -> None:
 
 
 @pytest.mark.real_data
-def test_the_built_in_field_agrees_with_other_fields(data_path: Path) -> None:
+def test_the_built_in_field_agrees_with_other_fields(data_path):
     builtin = builtin_gravity()
     for name, tolerance in (("GRGM660PRIM_to150.gfc", 1e-8), ("LP165P.cof", 5e-7)):
         other = load_gravity(data_path / "gravity" / name, max_degree=12)
@@ -190,7 +190,7 @@ def test_the_built_in_field_agrees_with_other_fields(data_path: Path) -> None:
 
 
 @pytest.mark.real_data
-def test_published_files_are_read_to_their_last_line(data_path: Path) -> None:
+def test_published_files_are_read_to_their_last_line(data_path):
     grail = load_gravity(data_path / "gravity" / "GRGM660PRIM_to150.gfc")
     assert (grail.name, grail.degree, grail.gm_m3_s2, grail.radius_m) == (
         *("GRGM660PRIM", 150),
@@ -246,7 +246,7 @@ SHTOOLS_KM = "1.738E+03, 4.9E+03, 2.66E-06, 2, 2\n" + SHADR.partition("\n")[2]
 @pytest.mark.parametrize(
     "text", [ICGEM, COF, SHADR, SHTOOLS, SHTOOLS_KM], ids=["icgem", "cof", "shadr", "pyshtools", "pyshtools in km"]
 )
-def test_the_formats_hold_the_same_field(text: str, tmp_path: Path) -> None:
+def test_the_formats_hold_the_same_field(text, tmp_path):
     path = tmp_path / "tiny"
     path.write_text(text)
     field = load_gravity(path)
@@ -257,7 +257,7 @@ def test_the_formats_hold_the_same_field(text: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "where", "expected"),
+    "text, where, expected",
     [
         (ICGEM.replace("gfc 2 2 3.4e-05 -1.0e-10\n", ""), "degree 2, order 2", "all coefficients to degree 2"),
         (ICGEM.replace("gfc 2 1", "gfc 1 2"), "line 10", "order <= degree <= 2"),
@@ -283,9 +283,7 @@ def test_the_formats_hold_the_same_field(text: str, tmp_path: Path) -> None:
         ("", "", "an ICGEM, GMAT .cof, PDS SHADR or pyshtools gravity field"),
     ],
 )
-def test_a_bad_file_is_named_with_the_place_and_what_was_expected(
-    text: str, where: str, expected: str, tmp_path: Path
-) -> None:
+def test_a_bad_file_is_named_with_the_place_and_what_was_expected(text, where, expected, tmp_path):
     path = tmp_path / "bad.field"
     path.write_text(text)
     with pytest.raises(DataFileError) as caught:
@@ -294,6 +292,6 @@ def test_a_bad_file_is_named_with_the_place_and_what_was_expected(
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
+def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(DataFileError, match=r"nowhere\.gfc: expected a gravity field file"):
         load_gravity(tmp_path / "nowhere.gfc")

@@ -1,10 +1,10 @@
 """What a cut gravity field lacks, as a filter's process noise."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.special import eval_legendre
 
 from lunar import gravity_omission as noise_model
@@ -90,7 +90,7 @@ def zonal_field(degree: int, coefficient: float) -> GravityField:
     return GravityField("zonal", GM, RADIUS, c_bar, s_bar)
 
 
-def test_the_same_field_lacks_nothing() -> None:
+def test_the_same_field_lacks_nothing():
     field = zonal_field(12, 1e-5)
     found = measured_omission(field, field, revolutions=2)
     assert not np.any(found.psd_m2_s3)
@@ -98,7 +98,7 @@ def test_the_same_field_lacks_nothing() -> None:
 
 
 @pytest.mark.parametrize("degree", [20, 80])
-def test_only_slow_waves_count(degree: int) -> None:
+def test_only_slow_waves_count(degree):
     """A zonal term of degree n goes as P_n(sin latitude): how much of that lies below 31 waves a circle."""
     found = measured_omission(zonal_field(degree, 1e-6), zonal_field(0, 1.0), revolutions=40)
     angle = np.arange(4_096) / 4_096 * 2.0 * np.pi
@@ -109,7 +109,7 @@ def test_only_slow_waves_count(degree: int) -> None:
     assert slow == pytest.approx(expected, rel=0.1)
 
 
-def test_density_of_a_zonal_term_against_its_closed_form() -> None:
+def test_density_of_a_zonal_term_against_its_closed_form():
     """Radially -(n+1) GM/r^2 (R/r)^n c sqrt(2n+1) P_n(sin lat): for n = 2 its mean square by hand."""
     c = 1e-5
     found = measured_omission(zonal_field(2, c), zonal_field(0, 1.0), revolutions=60)
@@ -118,8 +118,8 @@ def test_density_of_a_zonal_term_against_its_closed_form() -> None:
     assert found.rms_m_s2[0] == pytest.approx(expected, rel=0.01)
 
 
-@pytest.mark.parametrize(("name", "degree"), [("GRGM", 20), ("GRGM", 100), ("LP165P", 100)])
-def test_noise_by_altitude_has_the_mean_over_the_orbit_that_the_table_gives(name: str, degree: int) -> None:
+@pytest.mark.parametrize("name, degree", [("GRGM", 20), ("GRGM", 100), ("LP165P", 100)])
+def test_noise_by_altitude_has_the_mean_over_the_orbit_that_the_table_gives(name, degree):
     """Averaged over the paper's orbit (30.8 km, +-12.2 km), by adding it up; the far side is one field's alone."""
     noise, near, far = field_noise(name, degree), *field_psd_m2_s3(name, degree)
     altitude_m = (
@@ -131,15 +131,15 @@ def test_noise_by_altitude_has_the_mean_over_the_orbit_that_the_table_gives(name
     ):
         factor = np.exp((REFERENCE_ALTITUDE_M - altitude_m) / height_m).mean()
         # Two exponentials stand as one where a field has errors of its own.
-        np.testing.assert_allclose(np.array(psd) * factor, mean, rtol=1e-3 if name == "GRGM" else 0.05)
+        assert_allclose(np.array(psd) * factor, mean, rtol=1e-3 if name == "GRGM" else 0.05)
     level = np.subtract(field_psd_m2_s3(name, degree, 0.0)[1], far)
     factor = np.exp((REFERENCE_ALTITUDE_M - altitude_m) / noise.far_scale_height_m).mean()
-    np.testing.assert_allclose(np.array(noise.far_oblique_psd_m2_s3) * factor, level, rtol=0.05)
+    assert_allclose(np.array(noise.far_oblique_psd_m2_s3) * factor, level, rtol=0.05)
     assert (noise.near_psd_m2_s3 == noise.far_psd_m2_s3) is (name == "GRGM")
 
 
 @pytest.mark.real_data
-def test_what_a_cut_omits_falls_with_altitude_as_the_filter_holds(data_path: Path) -> None:
+def test_what_a_cut_omits_falls_with_altitude_as_the_filter_holds(data_path):
     named = find_data(data_path).gravity
     assert named is not None
     truth = load_gravity(named).truncated(150)
@@ -163,7 +163,7 @@ def test_what_a_cut_omits_falls_with_altitude_as_the_filter_holds(data_path: Pat
 
 
 @pytest.mark.real_data
-def test_the_table_of_the_filter_is_what_is_measured(data_path: Path) -> None:
+def test_the_table_of_the_filter_is_what_is_measured(data_path):
     named = find_data(data_path).gravity
     assert named is not None
     truth = load_gravity(named)
@@ -174,9 +174,7 @@ def test_the_table_of_the_filter_is_what_is_measured(data_path: Path) -> None:
 
 @pytest.mark.real_data
 @pytest.mark.parametrize("inclination_deg", [89.0, 60.0])
-def test_errors_of_an_older_field_over_the_far_side_grow_with_the_obliqueness_of_the_track(
-    data_path: Path, inclination_deg: float
-) -> None:
+def test_errors_of_an_older_field_over_the_far_side_grow_with_the_obliqueness_of_the_track(data_path, inclination_deg):
     products = find_data(data_path)
     assert products.gravity is not None and products.gravity_alternative is not None
     truth, other = load_gravity(products.gravity), load_gravity(products.gravity_alternative)
@@ -185,5 +183,5 @@ def test_errors_of_an_older_field_over_the_far_side_grow_with_the_obliqueness_of
     _, held = field_psd_m2_s3(other.name, 100, inclination)
     # Sixty revolutions know it to a fifth, and over the altitudes of this orbit it is a quarter more than at 30 km. The
     # transverse part, a tenth of the others, is held to a factor of two.
-    np.testing.assert_allclose(found.far_psd_m2_s3[[0, 2]], np.array(held)[[0, 2]], rtol=0.4)
+    assert_allclose(found.far_psd_m2_s3[[0, 2]], np.array(held)[[0, 2]], rtol=0.4)
     assert 0.5 < held[1] / found.far_psd_m2_s3[1] < 2.0

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from lunar import _dynamics_kernel
 from lunar.comparison import compare
@@ -47,7 +48,7 @@ def kepler_place(elements: Elements, gm: float, elapsed_s: float) -> np.ndarray:
     return state_from_elements(moved, gm)[0]
 
 
-def test_elements_come_back_from_the_state_they_give() -> None:
+def test_elements_come_back_from_the_state_they_give():
     gm = builtin_gravity().gm_m3_s2
     back = elements_from_state(*state_from_elements(TABLE_I, gm), gm)
     assert back.semi_major_axis_m == pytest.approx(TABLE_I.semi_major_axis_m, abs=1e-5)  # m
@@ -55,7 +56,7 @@ def test_elements_come_back_from_the_state_they_give() -> None:
         assert getattr(back, name) == pytest.approx(getattr(TABLE_I, name), abs=1e-11), name
 
 
-def test_a_point_mass_gives_the_orbit_of_kepler() -> None:
+def test_a_point_mass_gives_the_orbit_of_kepler():
     gm = builtin_gravity().gm_m3_s2
     trajectory = propagate(EPOCH_S, *state_from_elements(TABLE_I, gm), 86_400.0, KEPLER)
     for elapsed_s in (0.0, 1_234.5, 40_000.0, 86_400.0):
@@ -65,14 +66,14 @@ def test_a_point_mass_gives_the_orbit_of_kepler() -> None:
         assert error_m < 0.01, elapsed_s  # m, over 13 revolutions
 
 
-def test_methods_of_different_families_agree_over_a_day() -> None:
+def test_methods_of_different_families_agree_over_a_day():
     start = (EPOCH_S, *state_from_elements(TABLE_I, builtin_gravity().gm_m3_s2), 86_400.0, FULL)
     adaptive = propagate(*start).state_after(86_400.0)[:3]
     equal_steps, _, _ = propagate_with_stm(*start, stm_degree=2)
     assert np.linalg.norm(adaptive - equal_steps) < 0.05  # m
 
 
-def test_an_orbit_into_the_ground_stops_with_the_place_of_impact() -> None:
+def test_an_orbit_into_the_ground_stops_with_the_place_of_impact():
     gm = builtin_gravity().gm_m3_s2
     falling = Elements(MOON_RADIUS_M - 10_000.0, 0.03, math.radians(89.0), 0.0, 0.0, math.pi)
     with pytest.raises(ImpactError) as end:
@@ -88,7 +89,7 @@ def test_an_orbit_into_the_ground_stops_with_the_place_of_impact() -> None:
     assert "\n" not in str(end.value)
 
 
-def test_burns_bring_the_orbit_back_to_the_rule() -> None:
+def test_burns_bring_the_orbit_back_to_the_rule():
     gm = builtin_gravity().gm_m3_s2
     rule = ManeuverRule(15e3, 1_768_180.0, 0.006)
     trajectory, burns = propagate_with_maneuvers(EPOCH_S, *state_from_elements(TABLE_I, gm), 12 * 86_400.0, FULL, rule)
@@ -102,7 +103,7 @@ def test_burns_bring_the_orbit_back_to_the_rule() -> None:
     assert after.eccentricity == pytest.approx(rule.eccentricity, abs=2e-4)
 
 
-def test_earth_and_sun_stand_where_the_eclipse_of_2018_had_them() -> None:
+def test_earth_and_sun_stand_where_the_eclipse_of_2018_had_them():
     """Total lunar eclipse of 27 July 2018, greatest at 20:21:44 UTC, gamma 0.1168 (F. Espenak, NASA): the Moon's centre
     passes 0.1168 Earth radii from the axis of the shadow. Light time and aberration move the axis by up to 40 km.
     """
@@ -135,7 +136,7 @@ def acceleration(model: ForceModel, position_m: np.ndarray) -> np.ndarray:
     return np.array(_dynamics_kernel.force_acceleration(0.0, *position_m, gravity, force, table, *work))
 
 
-def test_sunlight_pushes_away_from_the_sun_with_the_pressure_of_its_flux() -> None:
+def test_sunlight_pushes_away_from_the_sun_with_the_pressure_of_its_flux():
     place = 1_768_180.0 * sunward()
     push = pushed(place)
     distance_au = np.linalg.norm(sun_position_icrf_m(EPOCH_S) - place) / 149_597_870_700.0
@@ -145,7 +146,7 @@ def test_sunlight_pushes_away_from_the_sun_with_the_pressure_of_its_flux() -> No
     assert push @ sunward() == pytest.approx(-expected, rel=1e-6)
 
 
-def test_sunlight_ends_in_the_moons_shadow_and_is_halved_on_its_edge() -> None:
+def test_sunlight_ends_in_the_moons_shadow_and_is_halved_on_its_edge():
     across = np.cross(sunward(), [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across)
     lit = np.linalg.norm(pushed(1_768_180.0 * sunward()))
@@ -157,7 +158,7 @@ def test_sunlight_ends_in_the_moons_shadow_and_is_halved_on_its_edge() -> None:
     assert np.linalg.norm(pushed(edge)) == pytest.approx(0.5 * lit, rel=0.02)
 
 
-def test_sunlight_moves_a_low_orbit_by_what_its_push_does_in_ten_minutes() -> None:
+def test_sunlight_moves_a_low_orbit_by_what_its_push_does_in_ten_minutes():
     place = 1_768_180.0 * sunward()
     across = np.cross(sunward(), [0.0, 0.0, 1.0])
     speed = math.sqrt(builtin_gravity().gm_m3_s2 / 1_768_180.0)
@@ -174,13 +175,13 @@ def test_sunlight_moves_a_low_orbit_by_what_its_push_does_in_ten_minutes() -> No
 
 
 @pytest.mark.parametrize("duration_s", [900.0, -900.0])
-def test_the_transition_matrix_is_the_change_of_the_end_with_the_start(duration_s: float) -> None:
+def test_the_transition_matrix_is_the_change_of_the_end_with_the_start(duration_s):
     start = np.concatenate(state_from_elements(TABLE_I, builtin_gravity().gm_m3_s2))
     position, velocity, matrix = propagate_with_stm(
         EPOCH_S, start[:3], start[3:], duration_s, FULL, stm_degree=FULL.gravity.degree
     )
     end = propagate(EPOCH_S, start[:3], start[3:], duration_s, FULL).state_after(duration_s)
-    np.testing.assert_allclose(np.concatenate([position, velocity]), end, atol=2e-3)  # m, m/s
+    assert_allclose(np.concatenate([position, velocity]), end, atol=2e-3)  # m, m/s
     steps = np.array([10.0] * 3 + [0.01] * 3)
     for column, step in enumerate(steps):
         ends = []
@@ -189,8 +190,8 @@ def test_the_transition_matrix_is_the_change_of_the_end_with_the_start(duration_
             moved[column] += sign * step
             ends.append(propagate(EPOCH_S, moved[:3], moved[3:], duration_s, FULL).state_after(duration_s))
         slope = (ends[0] - ends[1]) / (2.0 * step)
-        np.testing.assert_allclose(matrix[:3, column], slope[:3], atol=2e-4 * np.abs(slope[:3]).max())
-        np.testing.assert_allclose(matrix[3:, column], slope[3:], atol=2e-4 * np.abs(slope[3:]).max())
+        assert_allclose(matrix[:3, column], slope[:3], atol=2e-4 * np.abs(slope[:3]).max())
+        assert_allclose(matrix[3:, column], slope[3:], atol=2e-4 * np.abs(slope[3:]).max())
 
 
 REFERENCE = json.loads((Path(__file__).parents[1] / "references" / "lunar" / "third_bodies_de421.json").read_text())
@@ -204,7 +205,7 @@ def tide(gm: float, body_m: np.ndarray, orbiter_m: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("body", ["earth", "sun"])
-def test_pulls_on_a_low_orbit_are_those_of_de421(body: str) -> None:
+def test_pulls_on_a_low_orbit_are_those_of_de421(body):
     position, gm = {"earth": (earth_position_icrf_m, GM_EARTH_M3_S2), "sun": (sun_position_icrf_m, GM_SUN_M3_S2)}[body]
     rng = np.random.default_rng(1)
     for epoch in REFERENCE["epochs"]:
@@ -219,12 +220,12 @@ def test_pulls_on_a_low_orbit_are_those_of_de421(body: str) -> None:
         assert np.linalg.norm(ours_m - theirs_m) < {"earth": 5e3, "sun": 15e3}[body], epoch["jd_tdb"]
 
 
-def test_whole_arrays_of_epochs_keep_their_shape() -> None:
+def test_whole_arrays_of_epochs_keep_their_shape():
     times = np.linspace(0.0, 1e9, 6).reshape(2, 3)
     for position in (earth_position_icrf_m, sun_position_icrf_m):
         many = position(times)
         assert many.shape == (2, 3, 3)
-        np.testing.assert_allclose(many[1, 2], position(times[1, 2]), atol=1e-3)  # m
+        assert_allclose(many[1, 2], position(times[1, 2]), atol=1e-3)  # m
 
 
 ELAPSED_S = np.arange(200) * 30.0

@@ -27,7 +27,7 @@ from tests.lunar.orbits import POLAR, START, circle, times
 
 
 @pytest.mark.parametrize(
-    ("landing_utc", "latitude_deg", "longitude_deg", "sun_angle_deg"),
+    "landing_utc, latitude_deg, longitude_deg, sun_angle_deg",
     [
         # Orloff 2000, Apollo by the Numbers (NASA SP-2000-4029): touchdown and Sun angle.
         # Places: Davies and Colvin 2000.
@@ -50,7 +50,7 @@ def test_the_sun_stood_where_the_apollo_crews_found_it(landing_utc, latitude_deg
 
 
 @pytest.mark.parametrize(
-    ("utc", "expected"),
+    "utc, expected",
     [
         # NASA eclipse catalogue, 27 July 2018, UT: P1 17:14:49, U2 19:30:15, greatest 20:21:44, U3 21:13:12,
         # P4 23:28:37.

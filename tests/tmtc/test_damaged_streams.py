@@ -98,7 +98,7 @@ def test_gaps_of_any_length_between_frames_cost_nothing():
     check(np.concatenate(parts), sent())
 
 
-@pytest.mark.parametrize(("rate", "seed"), [(2e-2, 0), (3e-2, 1)])
+@pytest.mark.parametrize("rate, seed", [(2e-2, 0), (3e-2, 1)])
 def test_frames_that_no_code_can_repair_are_never_good(rate, seed):
     rows = with_bit_errors(cadus()[:60], rate, seed)
     with pytest.raises(LinkFormatError, match="no valid frame"):

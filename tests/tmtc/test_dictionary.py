@@ -17,6 +17,7 @@ import pytest
 from ccsdspy import FixedLength, PacketArray, PacketField, VariableLength
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 import payload_emulator.flight
 from tmtc.dictionary.arguments import FUNCTION_ARGUMENTS, argument_text, arguments_by_number
@@ -139,7 +140,7 @@ def test_ccsdspy_reads_the_repeated_items_to_the_same_raw_values():
         dtype = np.dtype([(n, d) for n, d in zip(item, (">u2", ">u2", ">u2", "u1", "i1", "u1"), strict=True)])
         records = np.asarray(theirs["items"][row], dtype=np.uint8).reshape(-1).view(dtype)
         for name in item:
-            np.testing.assert_array_equal(table.items_raw[name][mine], records[name])
+            assert_array_equal(table.items_raw[name][mine], records[name])
 
 
 def detections(count: int, rng: np.random.Generator) -> dict:
@@ -171,7 +172,7 @@ def test_unknown_sigma_is_nan_and_large_sigma_saturates_below_the_code_for_unkno
     values = detections(3, np.random.default_rng(0))
     values["items"]["sigma_px"] = np.array([np.nan, 100.0, 0.5])
     _, back = DICTIONARY.unpack(pack("detections", values))
-    np.testing.assert_array_equal(back["items"]["sigma_px"], [np.nan, 254 / 64, 0.5])
+    assert_array_equal(back["items"]["sigma_px"], [np.nan, 254 / 64, 0.5])
 
 
 @settings(max_examples=60, deadline=None)
@@ -181,8 +182,8 @@ def test_quantised_columns_come_back_within_half_a_step(seed, count):
     _, back = DICTIONARY.unpack(pack("detections", values))
     steps = {"u_px": 1 / 64, "v_px": 1 / 64, "diameter_px": 1 / 64, "score": 1 / 255, "sigma_px": 1 / 64}
     for name, step in steps.items():
-        np.testing.assert_allclose(back["items"][name], values["items"][name], atol=step / 2 + 1e-12, rtol=0)
-    np.testing.assert_array_equal(back["items"]["size_class"], values["items"]["size_class"])
+        assert_allclose(back["items"][name], values["items"][name], atol=step / 2 + 1e-12, rtol=0)
+    assert_array_equal(back["items"]["size_class"], values["items"]["size_class"])
     # and what came back packs to the same octets
     assert pack("detections", back) == pack("detections", values)
 
@@ -232,13 +233,13 @@ def test_every_packet_of_the_dictionary_comes_back_equal_scalar_and_vectorised(d
     assert table.ticks.tolist() == [header["ticks"]] * 2
     assert table.sequence_count.tolist() == [header["sequence_count"]] * 2
     for f in definition.fields:
-        np.testing.assert_array_equal(
+        assert_array_equal(
             table.columns[f.name][1], np.asarray(decoded.values[f.name]).astype(table.columns[f.name].dtype)
         )
     if definition.group:
         for f in definition.group.fields:
             mine = table.items[f.name][table.item_owner == 1]
-            np.testing.assert_array_equal(mine, decoded.values[definition.group.name][f.name])
+            assert_array_equal(mine, decoded.values[definition.group.name][f.name])
 
 
 @settings(max_examples=60, deadline=None)
@@ -253,7 +254,7 @@ def test_every_telecommand_of_the_dictionary_comes_back_equal(data):
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "message"),
+    "name, change, message",
     [
         ("housekeeping", {"mode": 9}, r"housekeeping\.mode: expected one of 0 \(safe\).*found 9"),
         ("housekeeping", {"mode": "asleep"}, "found 'asleep'"),
@@ -381,24 +382,24 @@ def test_limits_tell_warning_from_alarm():
     assert limit_states(DICTIONARY.packet("housekeeping").field("mode"), [3]).tolist() == [WITHIN_LIMITS]
 
 
-def test_a_dictionary_survives_being_written_down() -> None:
+def test_a_dictionary_survives_being_written_down():
     again = parse_dictionary(format_dictionary(DICTIONARY))
     assert (again.version, again.hash) == (DICTIONARY.version, DICTIONARY.hash)
     assert (again.telemetry, again.telecommands) == (DICTIONARY.telemetry, DICTIONARY.telecommands)
 
 
-def test_a_packet_of_today_is_read_with_the_dictionary_of_the_archive() -> None:
+def test_a_packet_of_today_is_read_with_the_dictionary_of_the_archive():
     packet = DICTIONARY.pack("connection_report", {}, ticks=7, sequence_count=1)
     assert parse_dictionary(format_dictionary(DICTIONARY)).unpack(packet)[0] == "connection_report"
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"version": 1, "telemetry": [{}], "telecommands": []}'])
-def test_something_else_is_refused(text: str) -> None:
+def test_something_else_is_refused(text):
     with pytest.raises(MalformedPacket, match="expected a packet dictionary"):
         parse_dictionary(text, "old.json")
 
 
-def test_a_changed_definition_is_refused() -> None:
+def test_a_changed_definition_is_refused():
     content = json.loads(format_dictionary(DICTIONARY))
     content["telemetry"][0]["fields"][0]["type"] = "u32"
     with pytest.raises(MalformedPacket, match="expected a dictionary with hash"):
@@ -421,31 +422,31 @@ def carried(octets: bytes) -> dict[str, Any]:
     return {"release_ticks": 1, "items": [{"octet": octet} for octet in octets]}
 
 
-def test_every_telecommand_and_every_function_has_an_effect_with_a_reason_and_nothing_else_has() -> None:
+def test_every_telecommand_and_every_function_has_an_effect_with_a_reason_and_nothing_else_has():
     names = {one.name for one in DICTIONARY.telecommands} - {FUNCTION, CARRIER}
     functions = {f"{FUNCTION}/{name}" for _, name in FUNCTIONS}
     assert set(EFFECTS) == names | functions
     assert all(one.reason and one.subject == subject for subject, one in EFFECTS.items())
 
 
-def test_a_parameter_and_the_table_that_holds_it_have_the_same_effect() -> None:
+def test_a_parameter_and_the_table_that_holds_it_have_the_same_effect():
     part = {"transaction": 1, "part": 1, "table": "parameters", "items": [{"octet": 0}]}
     assert effect("set_parameter", parameter_id=1, value=1.0) == effect("uplink_first", **part)
     assert effect("set_parameter", parameter_id=1, value=1.0) is Effect.CHANGES_STATE
 
 
 @pytest.mark.parametrize(
-    ("name", "code", "expected"),
+    "name, code, expected",
     [
         ("set_mode", 1, Effect.CHANGES_STATE), ("start_observation", 2, Effect.ROUTINE),
         ("reboot", 7, Effect.DESTROYS_DATA), ("synchronise_clock", 9, Effect.CHANGES_STATE),
     ],
 )  # fmt: skip
-def test_a_function_has_its_effect_by_name_and_by_code(name: str, code: int, expected: Effect) -> None:
+def test_a_function_has_its_effect_by_name_and_by_code(name, code, expected):
     assert effect(FUNCTION, **function(name)) is effect(FUNCTION, **function(code)) is expected
 
 
-def test_an_activity_has_the_effect_of_what_it_carries_however_deep() -> None:
+def test_an_activity_has_the_effect_of_what_it_carries_however_deep():
     for inner, expected in (
         (function("start_observation"), Effect.ROUTINE),
         (function("reboot"), Effect.DESTROYS_DATA),
@@ -455,7 +456,7 @@ def test_an_activity_has_the_effect_of_what_it_carries_however_deep() -> None:
         assert effect(CARRIER, **carried(packed(CARRIER, once))) is expected
 
 
-def test_what_carries_no_telecommand_and_what_is_not_known_counts_as_the_gravest() -> None:
+def test_what_carries_no_telecommand_and_what_is_not_known_counts_as_the_gravest():
     assert effect(CARRIER, **carried(b"\x00" * 12)) is Effect.DESTROYS_DATA
     for name, arguments in ((FUNCTION, {"function_id": 999}), ("new_command", {})):
         assert effect_of(DICTIONARY, name, arguments, b"").effect is Effect.DESTROYS_DATA
@@ -464,7 +465,7 @@ def test_what_carries_no_telecommand_and_what_is_not_known_counts_as_the_gravest
 FLIGHT = Path(next(iter(payload_emulator.flight.__path__)))
 
 
-def test_values_of_events_are_read_as_names() -> None:
+def test_values_of_events_are_read_as_names():
     assert event_text("mode_changed", 1.0, 2.0) == "from standby to observing"
     assert event_text("table_loaded", 3.0, float(0xDF7F5779)) == "gravity, hash df7f5779"
     assert event_text("camera_fault", 82.0, 3.0) == "82 frames without image, camera switched 3 times"
@@ -476,17 +477,17 @@ def test_values_of_events_are_read_as_names() -> None:
 
 
 @pytest.mark.parametrize("value", [None, math.nan])
-def test_unknown_values_are_not_invented(value: float | None) -> None:
+def test_unknown_values_are_not_invented(value):
     assert event_text("mode_changed", 1.0, value) == "1"
     assert event_text("no_such_event", 4.0, 0.5) == "4, 0.5"
     assert event_text("attitude_missing", 0.0, 0.0) == ""
 
 
-def test_unknown_codes_remain_numbers() -> None:
+def test_unknown_codes_remain_numbers():
     assert event_text("mode_changed", 9.0, 2.0) == "from 9 to observing"
 
 
-def test_every_event_of_the_flight_software_is_described_with_its_values() -> None:
+def test_every_event_of_the_flight_software_is_described_with_its_values():
     """The number of values in the code of the flight software is that of the description."""
     found = {}
     for path in FLIGHT.rglob("*.py"):
@@ -500,14 +501,14 @@ def test_every_event_of_the_flight_software_is_described_with_its_values() -> No
     assert {name: len(EVENT_TEXTS[name].values) if name in EVENT_TEXTS else 0 for name in found} == found
 
 
-def test_the_interface_document_states_the_values() -> None:
+def test_the_interface_document_states_the_values():
     assert "| mode_changed | mode before | mode after |" in format_icd()
 
 
 OBSERVATION = {"function_id": "start_observation", "argument_1": 2227.5, "argument_2": 15.0}
 
 
-def test_the_numbers_of_a_function_have_its_names_and_units() -> None:
+def test_the_numbers_of_a_function_have_its_names_and_units():
     assert (
         argument_text("perform_function", OBSERVATION) == "function start observation, duration 2227.5 s, cadence 15 s"
     )
@@ -519,7 +520,7 @@ def test_the_numbers_of_a_function_have_its_names_and_units() -> None:
     assert set(FUNCTION_ARGUMENTS) <= {name for _, name in FUNCTIONS}
 
 
-def test_names_are_entered_in_place_of_numbers() -> None:
+def test_names_are_entered_in_place_of_numbers():
     given = {"function_id": "start_observation", "duration_s": 2227.5, "cadence_s": 15}
     assert arguments_by_number("perform_function", given) == OBSERVATION
     assert arguments_by_number("perform_function", OBSERVATION) == OBSERVATION
@@ -533,7 +534,7 @@ def test_names_are_entered_in_place_of_numbers() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "given", "expected"),
+    "name, given, expected",
     [
         ("perform_function", {"function_id": "start_observation", "duration_s": -1.0}, "start_observation.duration_s"),
         ("perform_function", {"function_id": "set_mode", "mode": "asleep"}, r"0 \(safe\)"),
@@ -541,14 +542,12 @@ def test_names_are_entered_in_place_of_numbers() -> None:
         ("set_parameter", {"parameter_id": 5, "value": 1.5}, "a whole number of 1 to 1000"),
     ],
 )  # fmt: skip
-def test_a_value_outside_its_range_is_refused_with_the_range(
-    name: str, given: dict[str, object], expected: str
-) -> None:
+def test_a_value_outside_its_range_is_refused_with_the_range(name, given, expected):
     with pytest.raises(ValueRefused, match=expected):
         arguments_by_number(name, given)
 
 
-def test_a_carried_telecommand_is_written_out_with_its_time() -> None:
+def test_a_carried_telecommand_is_written_out_with_its_time():
     octets = DICTIONARY.pack_command("perform_function", OBSERVATION, sequence_count=3)
     carrying = {"release_ticks": 65_536, "items": [{"octet": octet} for octet in octets]}
     assert argument_text("insert_activity", carrying, lambda ticks: f"{ticks / 65_536:g} s") == (
@@ -557,7 +556,7 @@ def test_a_carried_telecommand_is_written_out_with_its_time() -> None:
     assert argument_text("insert_activity", {**carrying, "items": [{"octet": 1}]}).startswith("1 octets at 2000-01-01")
 
 
-def test_every_telecommand_has_a_text_for_its_least_values() -> None:
+def test_every_telecommand_has_a_text_for_its_least_values():
     for definition in DICTIONARY.telecommands:
         counted = definition.group.count if definition.group else None
         values: dict[str, object] = {
@@ -602,18 +601,18 @@ def estimates_of(octets: bytes) -> Any:
 
 
 @pytest.mark.parametrize("name, degrees", [("filter_state", -1), ("filter_estimate", 22)])
-def test_state_and_covariance_come_back_within_single_precision(name: str, degrees: int) -> None:
+def test_state_and_covariance_come_back_within_single_precision(name, degrees):
     octets = b"".join(packet(name, row, 100 + row) for row in (0, 1))
     found = estimates_of(octets)
     assert found.image_ticks.tolist() == [100, 101] and found.packet_ticks.tolist() == [109, 110]
     assert found.frame_number.tolist() == [5, 6] and found.packet_index.tolist() == [0, 1]
     assert found.innovation_degrees.tolist() == [degrees, degrees]
-    np.testing.assert_array_equal(found.state[:, :6], STATES[:, :6])
-    np.testing.assert_allclose(found.state[:, 6:], STATES[:, 6:], rtol=1e-7)
-    np.testing.assert_allclose(found.covariance, COVARIANCES, rtol=1.2e-7)
+    assert_array_equal(found.state[:, :6], STATES[:, :6])
+    assert_allclose(found.state[:, 6:], STATES[:, 6:], rtol=1e-7)
+    assert_allclose(found.covariance, COVARIANCES, rtol=1.2e-7)
 
 
-def test_a_stream_may_hold_packets_of_both_versions_and_other_ones() -> None:
+def test_a_stream_may_hold_packets_of_both_versions_and_other_ones():
     other = DICTIONARY.pack("connection_report", {}, ticks=1, sequence_count=1)
     octets = packet("filter_estimate", 0, 7) + other + packet("filter_state", 1, 8)
     found = estimates_of(octets)
@@ -621,7 +620,7 @@ def test_a_stream_may_hold_packets_of_both_versions_and_other_ones() -> None:
     assert len(estimates_of(other)) == 0 and estimates_of(other).covariance.shape == (0, 9, 9)
 
 
-def test_single_precision_keeps_the_normalised_error_and_half_precision_does_not() -> None:
+def test_single_precision_keeps_the_normalised_error_and_half_precision_does_not():
     """The choice of the interface, on a covariance of a fix: position 20 to 40 m, velocity 2 to 5 cm/s, correlated."""
     sigma = np.array([22.0, 43.0, 33.0, 0.03, 0.02, 0.05])
     correlation = np.eye(6)
@@ -659,13 +658,13 @@ def test_enumerations_of_one_name_are_the_same_everywhere():
 
 
 @pytest.mark.parametrize("shape", [(3, 5), (1, 1), (0, 0)])
-def test_a_thumbnail_reads_back(shape: tuple[int, int]) -> None:
+def test_a_thumbnail_reads_back(shape):
     levels = np.arange(shape[0] * shape[1], dtype=np.uint8).reshape(shape)
     octets = pack_thumbnail(Thumbnail(7, 2**40 + 1, levels))
     assert octets[:16] == struct.pack(">IQHH", 7, 2**40 + 1, *shape)
     found = unpack_thumbnail(octets)
     assert (found.frame_number, found.ticks) == (7, 2**40 + 1)
-    np.testing.assert_array_equal(found.levels, levels)
+    assert_array_equal(found.levels, levels)
 
 
 @pytest.mark.parametrize(
@@ -675,6 +674,6 @@ def test_a_thumbnail_reads_back(shape: tuple[int, int]) -> None:
         HEADER.pack(1, 2, 3, 4) + zlib.compress(bytes(13)), HEADER.pack(1, 2, 3, 4) + zlib.compress(bytes(12))[:-5],
     ],
 )  # fmt: skip
-def test_what_is_no_thumbnail_is_refused(octets: bytes) -> None:
+def test_what_is_no_thumbnail_is_refused(octets):
     with pytest.raises(ValueRefused, match="thumbnail"):
         unpack_thumbnail(octets)

@@ -97,7 +97,7 @@ def test_parquet_without_rows_keeps_its_columns():
     assert read_parquet(parquet_octets({"n": [], "t": []})).column_names == ["n", "t"]
 
 
-def test_parquet_without_its_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
+def test_parquet_without_its_library_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingLibrary, match=r"expected the library pyarrow, found none; install linna\[parquet\]"):
         parquet_octets({"n": [1]})

@@ -84,7 +84,7 @@ def test_the_checksum_has_the_published_check_value():
 
 
 @pytest.mark.parametrize(
-    ("data", "checksum"),
+    "data, checksum",
     # ECSS-E-ST-70-41C annex B.1.5 (verification of compliance)
     [("0000", 0x1D0F), ("000000", 0xCC9C), ("ABCDEF01", 0x04A2), ("1456F89A0001", 0x7FD5)],
 )
@@ -105,7 +105,7 @@ def test_a_wrong_checksum_is_told_with_both_values():
 
 
 @pytest.mark.parametrize(
-    ("name", "start"),
+    "name, start",
     [
         # CCSDS 131.0-B-3 section 9.4.2: first 40 bits of the 255-bit sequence; more octets from its register
         ("legacy", "FF480EC09A0D70BC8E2C"),
@@ -119,7 +119,7 @@ def test_sequences_begin_as_the_standards_print_them(name, start):
     assert sequence(name, len(start) // 2).tobytes().hex().upper() == start
 
 
-@pytest.mark.parametrize(("name", "bits"), [("legacy", 255), ("long", 131_071), ("telecommand", 255)])
+@pytest.mark.parametrize("name, bits", [("legacy", 255), ("long", 131_071), ("telecommand", 255)])
 def test_sequences_repeat_after_their_full_period_and_not_before(name, bits):
     stream = np.unpackbits(sequence(name, (2 * bits + 7) // 8 + 1))
     assert np.array_equal(stream[:bits], stream[bits : 2 * bits])
@@ -149,7 +149,7 @@ def words(*clcws: Clcw | int) -> np.ndarray:
     )
 
 
-def test_a_stretch_is_summed_up_and_its_newest_word_is_shown() -> None:
+def test_a_stretch_is_summed_up_and_its_newest_word_is_shown():
     locked = Clcw(0, 7, lockout=True, retransmit=True, farm_b_counter=2)
     (seen,) = uplink_seen(words(Clcw(0, 7), Clcw(0, 7), locked, locked, Clcw(0, 8, farm_b_counter=3)))
     assert (seen.frames, seen.changes) == (5, 2)
@@ -157,7 +157,7 @@ def test_a_stretch_is_summed_up_and_its_newest_word_is_shown() -> None:
     assert (seen.report_value, seen.farm_b_counter, seen.lockout) == (8, 3, False)
 
 
-def test_channels_are_kept_apart_and_what_is_no_control_word_is_passed_over() -> None:
+def test_channels_are_kept_apart_and_what_is_no_control_word_is_passed_over():
     seen = uplink_seen(words(Clcw(3, 1), 0, Clcw(0, 9), TYPE_TWO_REPORT, Clcw(3, 2), Clcw(0, 9)))
     assert [(one.virtual_channel, one.frames, one.changes, one.report_value) for one in seen] == [
         (0, 2, 0, 9),
@@ -166,7 +166,7 @@ def test_channels_are_kept_apart_and_what_is_no_control_word_is_passed_over() ->
     assert uplink_seen(words(0, TYPE_TWO_REPORT)) == () == uplink_seen(words())
 
 
-def test_overlapping_stretches_add_up_to_the_whole() -> None:
+def test_overlapping_stretches_add_up_to_the_whole():
     rng = np.random.default_rng(5)
     for _ in range(50):
         stream = words(*(Clcw(0, int(n), lockout=bool(n == 1)) for n in rng.integers(0, 3, 60)))

@@ -70,7 +70,7 @@ def test_virtual_fill_is_leading_zeros_that_are_not_sent():
 
 
 @pytest.mark.parametrize(
-    ("frame_length", "interleave", "block_length"),
+    "frame_length, interleave, block_length",
     [(1115, 5, 1275), (892, 4, 1020), (223, 1, 255), (446, 2, 510), (1784, 8, 2040), (1000, 5, 1160)],
 )
 def test_the_code_is_found_from_the_frame_length(frame_length, interleave, block_length):

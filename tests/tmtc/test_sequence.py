@@ -142,7 +142,7 @@ def test_a_count_that_falls_to_less_than_64_by_more_than_64_is_a_restart():
 
 
 @pytest.mark.parametrize(
-    ("counts", "restarts", "conflicts", "missing"),
+    "counts, restarts, conflicts, missing",
     [
         ([*range(25), *range(3, 30)], 1, 0, 0),  # the last five before and the first three after it are lost
         ([*range(25), *range(30), *range(2, 20)], 2, 0, 0),

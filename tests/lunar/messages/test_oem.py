@@ -232,7 +232,7 @@ def replaced(old, new):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text, message",
     [
         ("", "line 1: expected CCSDS_OEM_VERS = 1.0, 2.0 or 3.0, found nothing"),
         (replaced("VERS = 1.0", "VERS = 4.0"), "line 1: expected an OEM version out of 1.0, 2.0, 3.0, found '4.0'"),

@@ -107,7 +107,7 @@ def replaced(old, new):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text, message",
     [
         ("", "line 1: expected stk.v.<version>, found nothing"),
         (replaced("BEGIN Ephemeris", "BEGIN Attitude"), "line 5: expected BEGIN Ephemeris, found 'BEGIN Attitude'"),

@@ -155,7 +155,7 @@ def test_other_signs_are_read():
 
 # The examples of MIL-STD-1750A for 32 and 48 bits, and the least positive step of 48 bits at exponent 0 by hand
 @pytest.mark.parametrize(
-    ("octets", "value"),
+    "octets, value",
     [
         ("7FFFFF7F", 0.9999998807907104 * 2.0**127), ("4000007F", 0.5 * 2.0**127), ("50000004", 0.625 * 2.0**4),
         ("40000001", 0.5 * 2.0**1), ("40000000", 0.5), ("400000FF", 0.5 * 2.0**-1), ("40000080", 0.5 * 2.0**-128),
@@ -526,7 +526,7 @@ def test_an_entry_may_stand_at_a_place_that_the_packet_states():
     assert values(text, packets) == {"n": [1, 2], "a": [2, 4], "b": [4, 7]}
 
 
-@pytest.mark.parametrize(("width", "kind"), [(8, "fixed"), (8, "text")])
+@pytest.mark.parametrize("width, kind", [(8, "fixed"), (8, "text")])
 def test_repetitions_stand_apart_by_their_offset(width, kind):
     repeat = (
         '<ParameterRefEntry parameterRef="a"><RepeatEntry><Count><DynamicValue><ParameterInstanceRef parameterRef="n"/>'
@@ -627,7 +627,7 @@ def test_an_array_cut_off_is_too_short_and_a_negative_count_malformed(count):
 
 
 @pytest.mark.parametrize(
-    ("slope", "verdict"), [(-8, "malformed"), (0.5, "malformed"), (1e300, "too_short"), (8, "decoded")]
+    "slope, verdict", [(-8, "malformed"), (0.5, "malformed"), (1e300, "too_short"), (8, "decoded")]
 )
 def test_sizes_that_are_none_condemn_the_packet_alone(slope, verdict):
     types = integer("N", 64) + (

@@ -66,7 +66,7 @@ def test_documents_are_bounded_in_depth_number_and_size(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    "text, words",
     [
         ("", "well-formed"),
         ("<SpaceSystem", "well-formed"),
@@ -90,7 +90,7 @@ def test_octets_of_other_encodings_are_read():
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    "text, words",
     [
         (document(U8, {"a": "u9"}, PLAIN), "Parameter 'a': expected the name of a parameter type, found 'u9'"),
         (document(U8, {}, PLAIN), "expected the name of a parameter, found 'a'"),
@@ -118,7 +118,7 @@ def test_a_size_that_stands_behind_what_it_measures_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    "text, words",
     [
         (document(U8, {"a": "u8"}, container("P", ["a"], "P")), "found itself"),
         (document(U8, {"a": "u8"}, container("P", ["a"], "Q") + container("Q", [], "P")), "found itself"),
@@ -174,7 +174,7 @@ def test_long_chains_of_inheritance_are_read_and_endless_ones_refused():
 
 
 @pytest.mark.parametrize(
-    ("types", "words"),
+    "types, words",
     [
         (integer("t", 65), "sizeInBits of 1 to 64, found 65"),
         (integer("t", 0), "sizeInBits of 1 to 64, found 0"),
@@ -244,7 +244,7 @@ def test_types_beyond_the_subset_or_their_bounds_are_refused_by_name(types, word
 
 
 @pytest.mark.parametrize(
-    ("entry", "words"),
+    "entry, words",
     [
         ('<StreamSegmentEntry streamRef="x"/>', "StreamSegmentEntry"),
         ('<ParameterSegmentRefEntry parameterRef="a" sizeInBits="4"/>', "ParameterSegmentRefEntry"),
@@ -283,7 +283,7 @@ MODES = (
 
 
 @pytest.mark.parametrize(
-    ("criteria", "words"),
+    "criteria, words",
     [
         (comparison("a", "one"), "a number, found 'one'"),
         (comparison("a", "1.5"), "a number, found '1.5'"),
@@ -328,7 +328,7 @@ def test_conditions_are_joined_and_compared_as_written():
 
 
 @pytest.mark.parametrize(
-    ("operator", "expected"),
+    "operator, expected",
     [("==", [3]), ("!=", [1, 2, 4]), ("<", [1, 2]), ("<=", [1, 2, 3]), (">", [4]), (">=", [3, 4]), ("geq", [3, 4])],
 )
 @pytest.mark.parametrize(
@@ -343,7 +343,7 @@ def test_comparisons_mean_what_they_say(operator, expected, types):
     assert values == expected
 
 
-@pytest.mark.parametrize(("operator", "expected"), [("==", [1]), ("!=", [0, 2])])
+@pytest.mark.parametrize("operator, expected", [("==", [1]), ("!=", [0, 2])])
 def test_names_of_codes_are_compared(operator, expected):
     text = document(MODES, {"a": "m"}, PLAIN + container("Q", [], "P", comparison("a", "ON", operator)))
     found = Decoder(parse_xtce(text)).decode(*whole([b"\0", b"\1", b"\2"]))
