@@ -59,7 +59,7 @@ def test_the_form_with_arrays_is_imported_to_equal_values_of_every_packet(defini
     counts = [0, 1, 2, 40, 255] if definition.group else [0, 0, 0]
     packets = [random_packet(definition, count, rng) for count in counts]
     cut = whole_packets(np.array([len(packet) for packet in packets]))
-    found = Decoder(imported, "CCSDSPacket").decode(b"".join(packets), cut)
+    found = Decoder(imported).decode(b"".join(packets), cut)
     assert found.counts()["decoded"] == len(packets)
     (table,) = found.tables.values()
     assert table.name == definition.name
