@@ -5,9 +5,9 @@ import math
 import sys
 from pathlib import Path
 
-import mpmath
 import numpy as np
 import pytest
+from mpmath import atan2, cos, mp, mpf, sin, sqrt
 
 from lunar import _gravity_kernel as kernel
 from lunar.errors import DataFileError, OrbitError
@@ -28,36 +28,30 @@ def kaula_field(degree: int, seed: int = 1) -> GravityField:
 
 def exact_acceleration(field: GravityField, position: np.ndarray, degree: int) -> np.ndarray:
     """The gradient of the potential by central differences of its definition, with 50 digits."""
-    mpmath.mp.dps = 50
+    mp.dps = 50
 
-    def potential(x: mpmath.mpf, y: mpmath.mpf, z: mpmath.mpf) -> mpmath.mpf:
-        r = mpmath.sqrt(x * x + y * y + z * z)
-        u, c = z / r, mpmath.sqrt(x * x + y * y) / r
-        longitude = mpmath.atan2(y, x)
-        total, sectorial = mpmath.mpf(0), mpmath.mpf(1)
+    def potential(x: mpf, y: mpf, z: mpf) -> mpf:
+        r = sqrt(x * x + y * y + z * z)
+        u, c = z / r, sqrt(x * x + y * y) / r
+        longitude = atan2(y, x)
+        total, sectorial = mpf(0), mpf(1)
         for m in range(degree + 1):
             if m:
-                sectorial *= c * mpmath.sqrt(mpmath.mpf((2 * m + 1) * (2 if m == 1 else 1)) / (2 * m))
-            before, now = mpmath.mpf(0), sectorial
-            cos, sin = mpmath.cos(m * longitude), mpmath.sin(m * longitude)
+                sectorial *= c * sqrt(mpf((2 * m + 1) * (2 if m == 1 else 1)) / (2 * m))
+            before, now = mpf(0), sectorial
+            east, north = cos(m * longitude), sin(m * longitude)
             for n in range(m, degree + 1):
                 if n > m:
-                    a = mpmath.sqrt(mpmath.mpf((2 * n - 1) * (2 * n + 1)) / ((n - m) * (n + m)))
-                    b = mpmath.mpf((2 * n + 1) * (n + m - 1) * (n - m - 1)) / ((n - m) * (n + m) * (2 * n - 3))
-                    before, now = now, a * u * now - mpmath.sqrt(b) * before
-                weight = mpmath.mpf(float(field.c_bar[n, m])) * cos + mpmath.mpf(float(field.s_bar[n, m])) * sin
-                total += (mpmath.mpf(field.radius_m) / r) ** n * now * weight
-        return mpmath.mpf(field.gm_m3_s2) / r * total
+                    a = sqrt(mpf((2 * n - 1) * (2 * n + 1)) / ((n - m) * (n + m)))
+                    b = mpf((2 * n + 1) * (n + m - 1) * (n - m - 1)) / ((n - m) * (n + m) * (2 * n - 3))
+                    before, now = now, a * u * now - sqrt(b) * before
+                weight = mpf(float(field.c_bar[n, m])) * east + mpf(float(field.s_bar[n, m])) * north
+                total += (mpf(field.radius_m) / r) ** n * now * weight
+        return mpf(field.gm_m3_s2) / r * total
 
-    start = [mpmath.mpf(float(value)) for value in position]
-    step = mpmath.mpf(10) ** -12
-    result = []
-    for axis in range(3):
-        up, down = list(start), list(start)
-        up[axis] += step
-        down[axis] -= step
-        result.append(float((potential(*up) - potential(*down)) / (2 * step)))
-    return np.array(result)
+    start = np.array([mpf(float(value)) for value in position])
+    steps = mpf(10) ** -12 * np.eye(3, dtype=int)
+    return np.array([float((potential(*(start + d)) - potential(*(start - d))) / (2 * d.sum())) for d in steps])
 
 
 def at(latitude_deg: float, longitude_deg: float, altitude_km: float = 30.0) -> np.ndarray:
@@ -256,36 +250,49 @@ def test_the_formats_hold_the_same_field(text, tmp_path):
     assert field.s_bar.tolist() == [[0.0] * 3, [0.0] * 3, [0.0, 2e-9, -1e-10]]
 
 
-@pytest.mark.parametrize(
-    "text, where, expected",
-    [
-        (ICGEM.replace("gfc 2 2 3.4e-05 -1.0e-10\n", ""), "degree 2, order 2", "all coefficients to degree 2"),
-        (ICGEM.replace("gfc 2 1", "gfc 1 2"), "line 10", "order <= degree <= 2"),
-        (ICGEM.replace("gfc 2 1", "gfc 2 0"), "line 10", "every coefficient once"),
-        (ICGEM.replace("fully_normalized", "unnormalized"), "header, norm", "fully_normalized"),
-        (ICGEM.replace("3.4e-05", "3.4e-0x"), "line 11", "degree, order and two coefficients"),
-        (ICGEM.replace("3.4e-05", "nan"), "line 11", "finite coefficients"),
-        (ICGEM.replace("max_degree 2\n", ""), "header, max_degree", "a number"),
-        (ICGEM.replace("0.49D+13", "0.49"), "header", "Moon's GM of 4.9028e+12 m3/s2"),
-        (ICGEM.replace("0.49D+13", "3.986004415E+14"), "header", "radius of 1.7374e+06 m"),
-        (ICGEM.replace("1.738E+06", "1.738E+03"), "header", "radius of 1.7374e+06 m"),
-        (SHADR.replace("1.738E+03", "3.396E+03"), "header", "radius of 1.7374e+06 m"),
-        (SHTOOLS.replace("1.738", "3.396"), "header", "radius of 1.7374e+06 m"),
-        (SHTOOLS.replace("-9.0e-05", "-2.032e-04"), "degree 2, order 0", "normalised flattening"),
-        (SHTOOLS.replace("2, 2, 3.4e-05, -1.0e-10\n", ""), "degree 2, order 2", "all coefficients to degree 2"),
-        (ICGEM.replace("-9.0D-05", "-9.0"), "degree 2, order 0", "normalised flattening"),
-        (COF.replace("END\n", ""), "end of file", "END"),
-        (COF.replace("1.00000000000000e+00\n", "0.00000000000000e+00\n"), "line 3", "normalised coefficients"),
-        (COF.replace("RECOEF    2  2", "RECOEF    3  2"), "line 6", "order <= degree <= 2"),
-        (SHADR.replace("2, 2, 1,", "2, 2, 0,"), "line 1, normalisation state", "fully normalised"),
-        (SHADR[:-30], "line 4", "degree, order and two coefficients"),
-        ("hello\n", "", "an ICGEM, GMAT .cof, PDS SHADR or pyshtools gravity field"),
-        ("", "", "an ICGEM, GMAT .cof, PDS SHADR or pyshtools gravity field"),
-    ],
-)
-def test_a_bad_file_is_named_with_the_place_and_what_was_expected(text, where, expected, tmp_path):
+# What is replaced | by what | where | what was expected; ¶ is the end of a line. Each is tried on the format before it.
+FAULTS = {
+    ICGEM: """
+gfc 2 2 3.4e-05 -1.0e-10¶ |  | degree 2, order 2 | all coefficients to degree 2
+gfc 2 1 | gfc 1 2 | line 10 | order <= degree <= 2
+gfc 2 1 | gfc 2 0 | line 10 | every coefficient once
+fully_normalized | unnormalized | header, norm | fully_normalized
+3.4e-05 | 3.4e-0x | line 11 | degree, order and two coefficients
+3.4e-05 | nan | line 11 | finite coefficients
+max_degree 2¶ |  | header, max_degree | a number
+0.49D+13 | 0.49 | header | Moon's GM of 4.9028e+12 m3/s2
+0.49D+13 | 3.986004415E+14 | header | radius of 1.7374e+06 m
+1.738E+06 | 1.738E+03 | header | radius of 1.7374e+06 m
+-9.0D-05 | -9.0 | degree 2, order 0 | normalised flattening
+""",
+    SHADR: """
+1.738E+03 | 3.396E+03 | header | radius of 1.7374e+06 m
+2, 2, 1, | 2, 2, 0, | line 1, normalisation state | fully normalised
+    2,    2, 3.4E-05,-1.0E-10, 0.0, 0.0¶ |     2,    2, | line 4 | degree, order and two coefficients
+""",
+    SHTOOLS: """
+1.738 | 3.396 | header | radius of 1.7374e+06 m
+-9.0e-05 | -2.032e-04 | degree 2, order 0 | normalised flattening
+2, 2, 3.4e-05, -1.0e-10¶ |  | degree 2, order 2 | all coefficients to degree 2
+""",
+    COF: """
+END¶ |  | end of file | END
+1.00000000000000e+00¶ | 0.00000000000000e+00¶ | line 3 | normalised coefficients
+RECOEF    2  2 | RECOEF    3  2 | line 6 | order <= degree <= 2
+""",
+    "hello\n": """
+hello | hullo |  | an ICGEM, GMAT .cof, PDS SHADR or pyshtools gravity field
+hello¶ |  |  | an ICGEM, GMAT .cof, PDS SHADR or pyshtools gravity field
+""",
+}
+
+
+@pytest.mark.parametrize("text, row", [(text, row) for text in FAULTS for row in FAULTS[text].strip("\n").splitlines()])
+def test_a_bad_file_is_named_with_the_place_and_what_was_expected(text, row, tmp_path):
+    old, new, where, expected = row.replace("¶", "\n").split(" | ")
+    assert old in text
     path = tmp_path / "bad.field"
-    path.write_text(text)
+    path.write_text(text.replace(old, new))
     with pytest.raises(DataFileError) as caught:
         load_gravity(path)
     assert where in caught.value.where and expected in caught.value.expected

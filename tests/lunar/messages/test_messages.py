@@ -3,6 +3,7 @@
 import gzip
 import io
 import zipfile
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,22 +26,23 @@ from lunar.timescales import from_tai_ns, parse_tai, parse_utc
 START = parse_utc("2029-08-07T00:00:00")
 
 
+def rows_of(table):
+    """Rows of a table of texts with columns between bars."""
+    return [row.split(" | ") for row in table.strip().splitlines()]
+
+
 def ephemeris() -> Ephemeris:
     rng = np.random.default_rng(1)
     matrix = rng.normal(size=(6, 6))
-    first = EphemerisSegment(
-        START + np.arange(5) * 60 * NS,
-        rng.normal(size=(5, 3)) * 1e6,
-        rng.normal(size=(5, 3)) * 1e3,
-        comments=("before the burn & after <start>",),
-        covariances=(
-            Covariance(START, "RTN", matrix @ matrix.T),
-            Covariance(START + 60 * NS, "RTN", 2.0 * matrix @ matrix.T),
-        ),
-    )
-    second = EphemerisSegment(
-        START + np.arange(4, 9) * 60 * NS + 123_456_789, rng.normal(size=(5, 3)) * 1e6,
-        rng.normal(size=(5, 3)) * 1e3, time_system="TDB", interpolation="LAGRANGE", degree=5,
+    covariances = [Covariance(START + k * 60 * NS, "RTN", (k + 1) * matrix @ matrix.T) for k in (0, 1)]
+
+    def segment(first: int, shift_ns: int = 0, **fields: Any) -> EphemerisSegment:
+        position, velocity = rng.normal(size=(5, 3)) * 1e6, rng.normal(size=(5, 3)) * 1e3
+        return EphemerisSegment(START + np.arange(first, first + 5) * 60 * NS + shift_ns, position, velocity, **fields)
+
+    first = segment(0, comments=("before the burn & after <start>",), covariances=tuple(covariances))
+    second = segment(
+        4, 123_456_789, time_system="TDB", interpolation="LAGRANGE", degree=5,
         useable_start_utc_ns=START + 300 * NS,
     )  # fmt: skip
     return Ephemeris((first, second), "TEST", ("two arcs",))
@@ -53,9 +55,17 @@ def assert_same(found: Ephemeris, expected: Ephemeris) -> None:
         assert np.abs(one.utc_ns - other.utc_ns).max() <= 1
         assert_allclose(one.position_m, other.position_m, rtol=0, atol=1e-6)
         assert_allclose(one.velocity_m_s, other.velocity_m_s, rtol=0, atol=1e-9)
-        for name in ("centre", "frame", "object_name", "object_id", "time_system", "interpolation", "degree"):
+        for name in [
+            "centre",
+            "frame",
+            "object_name",
+            "object_id",
+            "time_system",
+            "interpolation",
+            "degree",
+            "comments",
+        ]:
             assert getattr(one, name) == getattr(other, name), name
-        assert one.comments == other.comments
         for mine, theirs in zip(one.covariances, other.covariances, strict=True):
             assert (mine.utc_ns, mine.frame) == (theirs.utc_ns, theirs.frame)
             assert_allclose(mine.matrix, theirs.matrix, rtol=1e-12)
@@ -105,19 +115,15 @@ def test_a_wrapped_message_with_a_name_space_is_read():
 def test_elements_are_in_the_order_of_the_standard():
     tree = etree.fromstring(format_oem_xml(ephemeris()).encode())
     assert (tree.tag, tree.get("id"), tree.get("version")) == ("oem", "CCSDS_OEM_VERS", "2.0")
-    assert [one.tag for one in tree] == ["header", "body"]
-    segment = tree.find("body/segment")
-    assert [one.tag for one in segment] == ["metadata", "data"]
-    assert [one.tag for one in segment.find("metadata") if one.tag != "COMMENT"] == [
-        "OBJECT_NAME", "OBJECT_ID", "CENTER_NAME", "REF_FRAME", "TIME_SYSTEM", "START_TIME", "STOP_TIME",
-        "INTERPOLATION", "INTERPOLATION_DEGREE",
-    ]  # fmt: skip
-    assert [one.tag for one in segment.find("data/stateVector")] == [
-        "EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT",
-    ]  # fmt: skip
-    assert [one.tag for one in segment.find("data/covarianceMatrix")][:6] == [
-        "EPOCH", "COV_REF_FRAME", "CX_X", "CY_X", "CY_Y", "CZ_X",
-    ]  # fmt: skip
+    for path, tags in (
+        (".", "header body"), ("body/segment", "metadata data"),
+        ("body/segment/data/stateVector", "EPOCH X Y Z X_DOT Y_DOT Z_DOT"),
+        ("body/segment/metadata", "OBJECT_NAME OBJECT_ID CENTER_NAME REF_FRAME TIME_SYSTEM START_TIME STOP_TIME "
+         "INTERPOLATION INTERPOLATION_DEGREE"),
+        ("body/segment/data/covarianceMatrix", "EPOCH COV_REF_FRAME CX_X CY_X CY_Y CZ_X"),
+    ):  # fmt: skip
+        found = " ".join(one.tag for one in tree.find(path) if one.tag != "COMMENT")
+        assert found.startswith(tags) if "CX_X" in tags else found == tags
 
 
 LAUGHS = """<?xml version="1.0"?>
@@ -125,22 +131,26 @@ LAUGHS = """<?xml version="1.0"?>
 <oem id="CCSDS_OEM_VERS" version="2.0"><header><ORIGINATOR>&b;</ORIGINATOR></header></oem>"""
 
 
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        (lambda text: LAUGHS, r"line 2: expected XML without a document type, found <!DOCTYPE oem>"),
-        (lambda text: text[:700], r"line \d+: expected well-formed XML, found"),
-        (lambda text: text.replace('units="km"', 'units="m"', 1), r"line \d+: expected units='km' of X, found 'm'"),
-        (lambda text: text.replace("<ORIGINATOR>TEST</ORIGINATOR>", ""), "expected ORIGINATOR in the header"),
-        (lambda text: text.replace('version="2.0"', 'version="9"'), r"line 2: expected an OEM version .*found '9'"),
-        (lambda text: text.replace("<Z_DOT", "<Z_TOD").replace("/Z_DOT", "/Z_TOD"), "expected <Z_DOT> with one value"),
-        (lambda text: "<a>" * 20 + "</a>" * 20, "expected"),
-    ],
-)  # fmt: skip
-def test_faults_of_xml_are_named_with_their_line(change, message):
-    text = change(format_oem_xml(ephemeris()))
-    with pytest.raises(DataFileError, match=message):
-        parse_oem_xml(text.encode(), "orbit.xml")
+XML_FAULTS = r"""
+units="km" | units="m" | line \d+: expected units='km' of X, found 'm'
+<ORIGINATOR>TEST</ORIGINATOR> |  | expected ORIGINATOR in the header
+version="2.0" | version="9" | line 2: expected an OEM version .*found '9'
+Z_DOT | Z_TOD | expected <Z_DOT> with one value
+"""
+
+
+def test_faults_of_xml_are_named_with_their_line():
+    whole = format_oem_xml(ephemeris())
+    for text, message in (
+        *((whole.replace(old, new), message) for old, new, message in rows_of(XML_FAULTS)),
+        (LAUGHS, r"line 2: expected XML without a document type, found <!DOCTYPE oem>"),
+        (whole[:700], r"line \d+: expected well-formed XML, found"), ("<a>" * 20 + "</a>" * 20, "expected"),
+        ('<?xml version="1.0" encoding="foo"?><oem/>', "expected XML in UTF-8"),
+        ('<?xml version="1.0" encoding="big5"?><oem/>', "expected XML in UTF-8"),
+    ):  # fmt: skip
+        assert text != whole
+        with pytest.raises(DataFileError, match=message):
+            parse_oem_xml(text.encode(), "orbit.xml")
 
 
 def test_an_error_in_a_state_names_the_line_of_the_xml():
@@ -203,13 +213,6 @@ def test_many_gzip_members_take_linear_time(tmp_path):
     assert read_expanded(path, "text") == b""
 
 
-@pytest.mark.parametrize("encoding", ["foo", "big5"])
-def test_encodings_of_xml_that_are_not_supported_are_named(encoding):
-    text = f'<?xml version="1.0" encoding="{encoding}"?><oem/>'
-    with pytest.raises(DataFileError, match="expected XML in UTF-8"):
-        parse_oem_xml(text.encode(), "orbit.xml")
-
-
 @pytest.mark.parametrize("year", ["9999", "1500"])
 def test_years_outside_64_bits_of_nanoseconds_are_refused(year):
     with pytest.raises(TimeFormatError):
@@ -230,13 +233,8 @@ def attitudes(count: int = 6) -> AttitudeSegment:
 
 def standard_matrix(q1: float, q2: float, q3: float, qc: float) -> np.ndarray:
     """The direction cosine matrix from frame A to frame B of the annex of CCSDS 504.0-B."""
-    return np.array(
-        [
-            [q1**2 - q2**2 - q3**2 + qc**2, 2 * (q1 * q2 + q3 * qc), 2 * (q1 * q3 - q2 * qc)],
-            [2 * (q1 * q2 - q3 * qc), -(q1**2) + q2**2 - q3**2 + qc**2, 2 * (q2 * q3 + q1 * qc)],
-            [2 * (q1 * q3 + q2 * qc), 2 * (q2 * q3 - q1 * qc), -(q1**2) - q2**2 + q3**2 + qc**2],
-        ]
-    )
+    vector, cross = np.array([q1, q2, q3]), np.array([[0, -q3, q2], [q3, 0, -q1], [-q2, q1, 0]])
+    return (qc**2 - vector @ vector) * np.eye(3) + 2 * (np.outer(vector, vector) - qc * cross)
 
 
 def test_quaternions_of_an_aem_are_those_of_the_standard():
@@ -307,21 +305,21 @@ def test_a_quaternion_in_xml_without_its_scalar_is_named_with_its_line():
         parse_aem(AEM_XML.replace("<QC>0.6</QC>", ""))
 
 
-@pytest.mark.parametrize(
-    "old, new, message",
-    [
-        ("CCSDS_AEM_VERS = 2.0", "CCSDS_OEM_VERS = 2.0", "line 1: expected CCSDS_AEM_VERS"),
-        ("CCSDS_AEM_VERS = 2.0", "CCSDS_AEM_VERS = 7.0", "expected an AEM version out of 1.0, 2.0, found '7.0'"),
-        ("ATTITUDE_TYPE = QUATERNION", "ATTITUDE_TYPE = EULER_ANGLE", "expected ATTITUDE_TYPE = QUATERNION"),
-        ("DATA_STOP", "", "expected more lines, found the end of the file"),
-        ("REF_FRAME_B = INSTRUMENT_1\n", "", "expected REF_FRAME_B before META_STOP, found none"),
-        ("T00:00:15.000 ", "T00:00:15.000 7 ", "line 20: expected an epoch and a quaternion of 4 numbers"),
-        ("T00:00:30.000 ", "T00:00:15.000 ", "line 21: expected an epoch after 2029-08-07T00:00:15"),
-        ("T00:00:15.000 ", "T00:00:15.000 9", "line 20: expected a quaternion of unit length"),
-    ],
-)
+AEM_FAULTS = """
+CCSDS_AEM_VERS = 2.0 | CCSDS_OEM_VERS = 2.0 | line 1: expected CCSDS_AEM_VERS
+CCSDS_AEM_VERS = 2.0 | CCSDS_AEM_VERS = 7.0 | expected an AEM version out of 1.0, 2.0, found '7.0'
+ATTITUDE_TYPE = QUATERNION | ATTITUDE_TYPE = EULER_ANGLE | expected ATTITUDE_TYPE = QUATERNION
+DATA_STOP |  | expected more lines, found the end of the file
+REF_FRAME_B = INSTRUMENT_1¶ |  | expected REF_FRAME_B before META_STOP, found none
+T00:00:15.000  | T00:00:15.000 7  | line 20: expected an epoch and a quaternion of 4 numbers
+T00:00:30.000  | T00:00:15.000  | line 21: expected an epoch after 2029-08-07T00:00:15
+T00:00:15.000  | T00:00:15.000 9 | line 20: expected a quaternion of unit length
+"""
+
+
+@pytest.mark.parametrize("old, new, message", rows_of(AEM_FAULTS))
 def test_faults_of_an_aem_are_named_with_their_line(old, new, message):
-    text = format_aem((attitudes(),))
+    text, old = format_aem((attitudes(),)), old.replace("¶", "\n")
     assert old in text
     with pytest.raises(DataFileError, match=message):
         parse_aem(text.replace(old, new))
@@ -367,25 +365,25 @@ def test_a_horizons_table_is_read(tmp_path):
     assert_allclose(segment.velocity_m_s[1], [110.0, 1500.0, 210.0])
 
 
-@pytest.mark.parametrize(
-    "old, new, error, message",
-    [
-        ("Moon (301) ", "Earth (399) ", DataFileError, r"Center body name: expected Moon \(301\), found Earth \(399\)"),
-        ("KM-S", "AU-D", DataFileError, "line 8: expected Output units of KM-S, M-S, KM-D, found 'AU-D'"),
-        (": ICRF", ": Ecliptic of J2000.0", UnknownFrameError, "line 10: expected a reference frame out of ICRF"),
-        ("$$EOE", "", DataFileError, r"expected a table between \$\$SOE and \$\$EOE, found 1 of the marks"),
-        ("00:01:00", "00:00:00", DataFileError, "line 16: expected an epoch after 2029-08-06T23:58:50"),
-        ("9.0E+01", "nan", DataFileError, "line 16: expected finite numbers"),
-        ("9.0E+01", "ninety", DataFileError, "line 16: expected a date like .* and six numbers"),
-        (" VZ,", " LT,", DataFileError, "columns: expected a column VZ, found none"),
-        ("Calendar Date (TDB)", "Date", DataFileError, r"columns: expected columns with Calendar Date \(TDB\)"),
-    ],
-)
-def test_faults_of_a_horizons_table_are_named(tmp_path, old, new, error, message):
+HORIZONS_FAULTS = r"""
+Moon (301)  | Earth (399)  | Center body name: expected Moon \(301\), found Earth \(399\)
+KM-S | AU-D | line 8: expected Output units of KM-S, M-S, KM-D, found 'AU-D'
+: ICRF | : Ecliptic of J2000.0 | line 10: expected a reference frame out of ICRF
+$$EOE |  | expected a table between \$\$SOE and \$\$EOE, found 1 of the marks
+00:01:00 | 00:00:00 | line 16: expected an epoch after 2029-08-06T23:58:50
+9.0E+01 | nan | line 16: expected finite numbers
+9.0E+01 | ninety | line 16: expected a date like .* and six numbers
+ VZ, |  LT, | columns: expected a column VZ, found none
+Calendar Date (TDB) | Date | columns: expected columns with Calendar Date \(TDB\)
+"""
+
+
+@pytest.mark.parametrize("old, new, message", rows_of(HORIZONS_FAULTS))
+def test_faults_of_a_horizons_table_are_named(tmp_path, old, new, message):
     path = tmp_path / "lro.csv"
     assert old in HORIZONS
     path.write_text(HORIZONS.replace(old, new))
-    with pytest.raises(error, match=message):
+    with pytest.raises(UnknownFrameError if "frame" in message else DataFileError, match=message):
         load_ephemeris(path)
 
 
