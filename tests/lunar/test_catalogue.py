@@ -64,9 +64,7 @@ def test_the_index_holds_over_the_meridian_and_at_the_poles(place_deg):
 
 def test_an_empty_catalogue_answers_with_nothing():
     empty = CATALOGUE.select(np.zeros(0, dtype=bool))
-    assert len(empty) == 0
-    assert empty.near(0.0, 0.0, 1e6).shape == (0,)
-    assert empty.position_mcmf_m.shape == (0, 3)
+    assert (len(empty), empty.near(0.0, 0.0, 1e6).shape, empty.position_mcmf_m.shape) == (0, (0,), (0, 3))
     assert class_counts(empty).tolist() == [0, 0, 0]
     assert len(CATALOGUE.select([])) == 0
 
@@ -142,26 +140,26 @@ def test_completing_fills_the_empty_tiles_up_to_the_papers_counts():
         completed_to_paper(paper_density_catalogue(1), 1)
 
 
-@pytest.mark.parametrize(
-    "text, place",
-    [
-        ("", "line 1: expected the column names"),
-        ("a,b\n1,2\n", "line 1: expected the columns of a crater catalogue"),
-        ("lat,lon,diam\n1,2\n", "line 2: expected 3 values, found 2"),
-        ("lat,lon,diam\n1,2,3\n1,2,x\n", "line 3, column diam: expected a number, found 'x'"),
-        ("lat,lon,diam\n91,2,3\n", "line 2: expected a latitude"),
-        ("lat,lon,diam\n1,2,-3\n", "line 2: expected a diameter of 1 to 2600000 m, found -3000"),
-        ("lat,lon,diam\n1,2,8200\n", "line 2: expected a diameter of 1 to 2600000 m, found 8200000"),
-        ("lat,lon,diam\n1,nan,3\n", "line 2: expected a longitude"),
-    ],
-)
-def test_a_faulty_file_is_refused_with_file_line_and_what_was_found(tmp_path, text, place):
+FAULTS = """
+ | line 1: expected the column names
+a,b/1,2 | line 1: expected the columns of a crater catalogue
+lat,lon,diam/1,2 | line 2: expected 3 values, found 2
+lat,lon,diam/1,2,3/1,2,x | line 3, column diam: expected a number, found 'x'
+lat,lon,diam/91,2,3 | line 2: expected a latitude
+lat,lon,diam/1,2,-3 | line 2: expected a diameter of 1 to 2600000 m, found -3000
+lat,lon,diam/1,2,8200 | line 2: expected a diameter of 1 to 2600000 m, found 8200000
+lat,lon,diam/1,nan,3 | line 2: expected a longitude
+"""
+
+
+@pytest.mark.parametrize("row", FAULTS.strip("\n").splitlines())
+def test_a_faulty_file_is_refused_with_file_line_and_what_was_found(tmp_path, row):
+    text, place = row.split(" | ")
     path = tmp_path / "faulty.csv"
-    path.write_text(text)
+    path.write_text(text.replace("/", "\n"))
     with pytest.raises(DataFileError) as caught:
         load_catalogue(path)
-    assert str(caught.value).startswith(f"{path}: {place}")
-    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(f"{path}: {place}") and "\n" not in str(caught.value)
 
 
 def test_a_missing_file_a_folder_and_a_cut_gzip_are_refused(tmp_path):
@@ -177,18 +175,19 @@ def test_a_file_is_read_by_blocks_and_a_fault_has_its_line(tmp_path, monkeypatch
     rows = [f"{k},{k % 60}.25,{k}.5,{5000 + k},{quote}1{quote},,1" for k in range(200)]
     head = "id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete"
     path = tmp_path / "c.csv"
-    path.write_text("\n".join([head, *rows]) + "\n")
+    text = "\n".join([head, *rows])
+    path.write_text(text + "\n")
     whole = load_catalogue(path)
     monkeypatch.setattr(catalogue, "BLOCK_OCTETS", 300)
     found = load_catalogue(path)
     assert len(found) == 200
     for name in ("ids", "latitude_rad", "longitude_rad", "diameter_m", "rim_height_m", "complete"):
         np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
-    path.write_text("\n".join([head, *rows]).replace(",5150,", ",x,"))
+    path.write_text(text.replace(",5150,", ",x,"))
     with pytest.raises(DataFileError, match="line 152, column diameter_m"):
         load_catalogue(path)
     monkeypatch.setattr(catalogue, "ROWS_LIMIT", 199)
-    path.write_text("\n".join([head, *rows]))
+    path.write_text(text)
     with pytest.raises(DataFileError, match="at most 199 craters"):
         load_catalogue(path)
 
@@ -216,18 +215,15 @@ OWN = """id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete
 """
 
 
-@pytest.mark.parametrize(
-    "text, message",
-    [
-        (OWN, "lines 2 and 3, column id: expected an id of its own for each crater .* found 1 twice"),
-        (OWN.replace("\n1,-36", "\n1.7,-36"), "line 3, column id: expected a whole number, found 1.7"),
-        (OWN.replace("\n1,-36", "\n3,-36").replace(",112.0,", ",1737512.0,"), "line 2: expected a rim height"),
-        (OWN.replace("\n1,-36", "\n3,-36").replace(",1060.0,1", ",1060.0,yes"), "line 2, column complete"),
-    ],
-)
-def test_two_craters_of_one_id_and_impossible_values_are_refused(tmp_path, text, message):
+@pytest.mark.parametrize("identity, old, new, message", [
+    ("1", "", "", "lines 2 and 3, column id: expected an id of its own for each crater .* found 1 twice"),
+    ("1.7", "", "", "line 3, column id: expected a whole number, found 1.7"),
+    ("3", ",112.0,", ",1737512.0,", "line 2: expected a rim height"),
+    ("3", ",1060.0,1", ",1060.0,yes", "line 2, column complete"),
+])  # fmt: skip
+def test_two_craters_of_one_id_and_impossible_values_are_refused(tmp_path, identity, old, new, message):
     path = tmp_path / "own.csv"
-    path.write_text(text)
+    path.write_text(OWN.replace("\n1,-36", f"\n{identity},-36").replace(old or "?", new))
     with pytest.raises(DataFileError, match=message):
         load_catalogue(path)
 
@@ -258,12 +254,11 @@ def test_a_column_in_another_unit_is_refused(tmp_path, column, factor):
         return load_catalogue(path)
 
     assert len(written(table)) == 60
+    changed = [column]
     if factor == math.pi / 180.0:
         if column not in ("latitude_deg", "longitude_deg"):
             return
-        # Angles come in one unit.
-        changes = {name: table[name] * factor for name in ("latitude_deg", "longitude_deg")}
-    else:
-        changes = {column: table[column] * factor}
+        changed = ["latitude_deg", "longitude_deg"]  # angles come in one unit
+    changes = {name: table[name] * factor for name in changed}
     with pytest.raises(DataFileError, match="expected"):
         written(table | changes)

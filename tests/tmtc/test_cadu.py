@@ -5,11 +5,17 @@ from tmtc.link.cadu import ASM, cadu_octets, synchronise
 from tmtc.link.marker_survey import survey_markers
 
 PERIOD = 128
+PLACES = list(range(0, 20 * PERIOD, PERIOD))
+MARKER = np.frombuffer(ASM, dtype=np.uint8)
+
+
+def noise_of(shape: int | tuple[int, int], seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
 
 def stream_of(count: int, seed: int = 0) -> np.ndarray:
-    blocks = np.random.default_rng(seed).integers(0, 256, (count, PERIOD), dtype=np.uint8)
-    blocks[:, :4] = np.frombuffer(ASM, dtype=np.uint8)
+    blocks = noise_of((count, PERIOD), seed)
+    blocks[:, :4] = MARKER
     return blocks.reshape(-1)
 
 
@@ -37,8 +43,8 @@ def test_a_stream_may_begin_and_end_anywhere():
 
 def test_nothing_and_noise_have_no_cadus():
     assert starts(np.empty(0, dtype=np.uint8)) == []
-    assert find_period(np.random.default_rng(1).integers(0, 256, 100_000, dtype=np.uint8)) == 0
-    assert starts(np.random.default_rng(1).integers(0, 256, 100_000, dtype=np.uint8)) == []
+    noise = noise_of(100_000, 1)
+    assert (find_period(noise), starts(noise)) == (0, [])
 
 
 @pytest.mark.parametrize("which", [slice(10, 11), slice(1, None, 2)])
@@ -50,7 +56,7 @@ def test_damaged_markers_are_passed_over_while_in_lock_and_turn_no_frame(wrong_b
     bits[:, :wrong_bits] ^= 1
     markers[:] = np.packbits(bits, axis=1)
     sync = synchronise(stream, PERIOD, verify=lambda sync: (sync.offsets % PERIOD == 0) & ~sync.inverted)
-    assert sync.offsets.tolist() == list(range(0, 20 * PERIOD, PERIOD))
+    assert sync.offsets.tolist() == PLACES
     assert (sync.marker_errors[which] == wrong_bits).all() and not sync.inverted.any()
 
 
@@ -69,26 +75,21 @@ def test_inserted_octets_are_skipped():
 
 def test_a_marker_inside_a_frame_does_not_catch_the_lock():
     stream = stream_of(20)
-    stream[5 * PERIOD + 40 : 5 * PERIOD + 44] = np.frombuffer(ASM, dtype=np.uint8)
-    assert starts(stream) == list(range(0, 20 * PERIOD, PERIOD))
+    stream[5 * PERIOD + 40 : 5 * PERIOD + 44] = MARKER
+    assert starts(stream) == PLACES
     # not even in search: the check one period later fails
     assert starts(stream[5 * PERIOD + 10 :]) == [PERIOD * k - 10 for k in range(1, 15)]
 
 
 def test_a_long_outage_is_bridged():
-    noise = np.random.default_rng(9).integers(0, 256, 100_001, dtype=np.uint8)
+    noise = noise_of(100_001, 9)
     stream = np.concatenate((stream_of(5), noise, stream_of(5, seed=2)))
     after = 5 * PERIOD + noise.size
     assert starts(stream) == [PERIOD * k + gap for gap in (0, after) for k in range(5)]
 
 
 def test_a_single_cadu_is_a_stream():
-    stream = stream_of(1)
-    assert starts(stream) == [0]
-
-
-def bits_of(stream: np.ndarray) -> np.ndarray:
-    return np.unpackbits(stream)
+    assert starts(stream_of(1)) == [0]
 
 
 def sync_of_bits(bits: np.ndarray, **options):
@@ -99,14 +100,14 @@ def sync_of_bits(bits: np.ndarray, **options):
 @pytest.mark.parametrize("slip", range(1, 8))
 def test_a_stream_that_begins_within_an_octet_is_found_and_aligned(slip):
     stream = stream_of(12)
-    octets, sync = sync_of_bits(bits_of(stream)[slip:])
+    octets, sync = sync_of_bits(np.unpackbits(stream)[slip:])
     assert sync.start_bits.tolist() == [8 * PERIOD * k - slip for k in range(1, 12)]
     assert cadu_octets(octets, sync).tolist() == stream.reshape(-1, PERIOD)[1:].tolist()
 
 
 def test_a_bit_slip_costs_one_frame_and_the_rest_is_read_shifted():
     stream = stream_of(20)
-    octets, sync = sync_of_bits(np.delete(bits_of(stream), 8 * (7 * PERIOD + 60)))
+    octets, sync = sync_of_bits(np.delete(np.unpackbits(stream), 8 * (7 * PERIOD + 60)))
     rows = [k for k in range(20) if k != 7]
     assert sync.start_bits.tolist() == [8 * PERIOD * k - (k > 7) for k in rows]
     assert sync.truncated.tolist() == [PERIOD * 7]
@@ -143,12 +144,12 @@ def test_gaps_of_any_length_between_cadus_are_passed_over():
 
 def test_markers_of_a_weak_stretch_are_bridged_by_the_fly_wheel():
     stream = stream_of(30).reshape(-1, PERIOD)
-    stream[10:16, :4] = np.random.default_rng(3).integers(0, 256, (6, 4), dtype=np.uint8)
+    stream[10:16, :4] = noise_of((6, 4), 3)
     assert starts(stream.reshape(-1)) == list(range(0, 30 * PERIOD, PERIOD))
 
 
 def test_a_frame_with_a_worn_marker_and_no_neighbours_is_accepted_only_when_it_proves_itself():
-    noise = np.random.default_rng(5).integers(0, 256, 4 * PERIOD, dtype=np.uint8)
+    noise = noise_of(4 * PERIOD, 5)
     frame = stream_of(1)
     frame[0] ^= 0b00000111
     stream = np.concatenate((noise, frame, noise))
@@ -157,14 +158,14 @@ def test_a_frame_with_a_worn_marker_and_no_neighbours_is_accepted_only_when_it_p
 
 
 def test_the_period_is_told_from_the_whole_stream_however_long_the_noise_before_it():
-    noise = np.random.default_rng(7).integers(0, 256, 5_000_000, dtype=np.uint8)
+    noise = noise_of(5_000_000, 7)
     assert find_period(np.concatenate((noise, stream_of(40)))) == PERIOD
 
 
 def header_with_a_likeness(wrong_bits: int, *, inverted: bool) -> np.ndarray:
     """A record header of 8 octets with a marker of `wrong_bits` wrong bits that begins within an octet."""
     bits = np.zeros(64, dtype=np.uint8)
-    likeness = np.unpackbits(np.frombuffer(ASM, dtype=np.uint8)) ^ np.uint8(inverted)
+    likeness = np.unpackbits(MARKER) ^ np.uint8(inverted)
     likeness[-wrong_bits:] ^= 1
     bits[21:53] = likeness
     return np.packbits(bits)
@@ -184,7 +185,7 @@ def test_likenesses_of_a_marker_in_the_headers_of_records_do_not_catch_the_lock(
 
 
 def test_a_valid_frame_is_preferred_to_an_undamaged_likeness_that_others_follow():
-    header = np.concatenate((np.frombuffer(ASM, dtype=np.uint8), np.zeros(4, dtype=np.uint8)))
+    header = np.concatenate((MARKER, np.zeros(4, dtype=np.uint8)))
     frames = stream_of(12).reshape(-1, PERIOD)
     frames[:, 3] ^= 0b00000101
     stream = np.hstack((np.tile(header, (12, 1)), frames)).reshape(-1)
@@ -195,7 +196,7 @@ def test_a_valid_frame_is_preferred_to_an_undamaged_likeness_that_others_follow(
 
 def test_a_likeness_in_the_last_frame_does_not_cost_the_frame():
     stream = stream_of(3)
-    likeness = np.frombuffer(ASM, dtype=np.uint8).copy()
+    likeness = MARKER.copy()
     likeness[3] ^= 0b00000111
     stream[2 * PERIOD + 60 : 2 * PERIOD + 64] = likeness
     # the stream goes on for most of a frame, whose marker and the rest are damaged

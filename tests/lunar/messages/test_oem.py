@@ -183,10 +183,9 @@ def test_the_independent_reader_reads_what_we_write_and_interpolates_to_the_same
     for seconds in (100, 731, 1400):
         state = theirs(Time(format_utc(START + seconds * NS).rstrip("Z"), scale="utc"))
         # The writer's micrometre, and two interpolators' ways of dealing with rounding.
-        for found, ours, atol in zip(
-            (state.position, state.velocity), ephemeris.at(START + seconds * NS), (1e-4, 1e-6)
-        ):
-            assert np.allclose(1e3 * np.array(found), ours, atol=atol, rtol=0)
+        position, velocity = ephemeris.at(START + seconds * NS)
+        assert np.allclose(1e3 * np.array(state.position), position, atol=1e-4, rtol=0)
+        assert np.allclose(1e3 * np.array(state.velocity), velocity, atol=1e-6, rtol=0)
 
 
 @pytest.mark.filterwarnings("ignore:.*dubious year:erfa.ErfaWarning")
