@@ -14,7 +14,7 @@ from lunar.errors import DataFileError, OrbitError
 from lunar.gravity import GravityField, acceleration, builtin_gravity, gradient, load_gravity, packed
 
 
-def kaula_field(degree: int, seed: int = 1) -> GravityField:
+def kaula_field(degree, seed=1):
     """A made-up field of the Moon's roughness (Kaula's rule, 2.5e-4 / n^2), central term 1."""
     rng = np.random.default_rng(seed)
     n = np.arange(degree + 1.0)[:, None]
@@ -26,11 +26,11 @@ def kaula_field(degree: int, seed: int = 1) -> GravityField:
     return GravityField("made up", 4.9028e12, 1.738e6, c, s)
 
 
-def exact_acceleration(field: GravityField, position: np.ndarray, degree: int) -> np.ndarray:
+def exact_acceleration(field, position, degree):
     """The gradient of the potential by central differences of its definition, with 50 digits."""
     mp.dps = 50
 
-    def potential(x: mpf, y: mpf, z: mpf) -> mpf:
+    def potential(x, y, z):
         r = sqrt(x * x + y * y + z * z)
         u, c = z / r, sqrt(x * x + y * y) / r
         longitude = atan2(y, x)
@@ -54,7 +54,7 @@ def exact_acceleration(field: GravityField, position: np.ndarray, degree: int) -
     return np.array([float((potential(*(start + d)) - potential(*(start - d))) / (2 * d.sum())) for d in steps])
 
 
-def at(latitude_deg: float, longitude_deg: float, altitude_km: float = 30.0) -> np.ndarray:
+def at(latitude_deg, longitude_deg, altitude_km=30.0):
     r, lat, lon = 1.7374e6 + 1e3 * altitude_km, math.radians(latitude_deg), math.radians(longitude_deg)
     return r * np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
 

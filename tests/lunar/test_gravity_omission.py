@@ -34,9 +34,7 @@ class Omission:
     rms_m_s2: FloatArray
 
 
-def measured_omission(
-    truth: GravityField, flown: GravityField, revolutions: int = 16, seed: int = 1, inclination_rad: float = 0.5 * np.pi
-) -> Omission:
+def measured_omission(truth, flown, revolutions=16, seed=1, inclination_rad=0.5 * np.pi):
     """Measure the errors of `flown` relative to `truth`, over revolutions with random nodes and perilunes."""
     rng = np.random.default_rng(seed)
     period_s = float(2.0 * np.pi * np.sqrt(SEMI_MAJOR_M**3 / truth.gm_m3_s2))
@@ -56,9 +54,7 @@ def measured_omission(
     return Omission(slow, pieces[piece_beyond == 1.0].mean(axis=0), rms)
 
 
-def revolution(
-    inclination_rad: float, node_rad: float, perilune_rad: float, period_s: float
-) -> tuple[FloatArray, FloatArray]:
+def revolution(inclination_rad, node_rad, perilune_rad, period_s):
     """Return positions (n, 3) in Moon-fixed axes over a revolution, and the axes R, T, N there (n, 3, 3)."""
     # Even steps of the argument of latitude: at this eccentricity within 1 % of even steps of time.
     angle = np.arange(SAMPLES) / SAMPLES * 2.0 * np.pi
@@ -74,7 +70,7 @@ def revolution(
     return radius[:, None] * radial, rtn
 
 
-def field_psd_m2_s3(name: str, degree: int, inclination_rad: float = 0.5 * np.pi) -> tuple[FloatArray, FloatArray]:
+def field_psd_m2_s3(name, degree, inclination_rad=0.5 * np.pi):
     """Spectral densities of what a field by its name, cut at a degree, lacks or has wrong: near side and far side."""
     model, omitted = noise_model, np.array(omission_psd_m2_s3(degree))
     if name == "GRGM":
@@ -84,7 +80,7 @@ def field_psd_m2_s3(name: str, degree: int, inclination_rad: float = 0.5 * np.pi
     return near, model._FAR_SIDE_OMISSION * omitted + model._FAR_SIDE_M2_S3 + oblique
 
 
-def zonal_field(degree: int, coefficient: float) -> GravityField:
+def zonal_field(degree, coefficient):
     c_bar, s_bar = np.zeros((degree + 1, degree + 1)), np.zeros((degree + 1, degree + 1))
     c_bar[0, 0], c_bar[degree, 0] = 1.0, coefficient
     return GravityField("zonal", GM, RADIUS, c_bar, s_bar)

@@ -33,7 +33,7 @@ KEPLER = ForceModel(builtin_gravity(), IauOrientation(), 0, earth=False, sun=Fal
 FULL = ForceModel(builtin_gravity(), IauOrientation())
 
 
-def kepler_place(elements: Elements, gm: float, elapsed_s: float) -> np.ndarray:
+def kepler_place(elements, gm, elapsed_s):
     """Two-body position by Kepler's equation, solved by Newton's method."""
     e = elements.eccentricity
     start = 2.0 * math.atan(math.sqrt((1 - e) / (1 + e)) * math.tan(elements.true_anomaly_rad / 2.0))
@@ -114,22 +114,22 @@ DARK = ForceModel(builtin_gravity(), IauOrientation(), 0)
 SUNLIT = replace(DARK, solar_pressure=SolarPressure(0.02, 1.4))
 
 
-def sunward() -> np.ndarray:
+def sunward():
     sun = sun_position_icrf_m(EPOCH_S)
     return sun / np.linalg.norm(sun)
 
 
-def across_the_light() -> np.ndarray:
+def across_the_light():
     across = np.cross(sunward(), [0.0, 0.0, 1.0])
     return across / np.linalg.norm(across)
 
 
-def pushed(position_m: np.ndarray) -> np.ndarray:
+def pushed(position_m):
     """What sunlight adds to the acceleration at a place, m/s^2."""
     return acceleration(SUNLIT, position_m) - acceleration(DARK, position_m)
 
 
-def acceleration(model: ForceModel, position_m: np.ndarray) -> np.ndarray:
+def acceleration(model, position_m):
     """Acceleration of a whole model at the epoch, ICRF, m/s^2."""
     gravity, force, table, scratch = force_arrays(model, EPOCH_S, 0.0, 0.0)
     work = np.empty(scratch), np.empty(_dynamics_kernel.COLUMNS)
@@ -190,7 +190,7 @@ def test_the_transition_matrix_is_the_change_of_the_end_with_the_start(duration_
 REFERENCE = json.loads((Path(__file__).parents[1] / "references" / "lunar" / "third_bodies_de421.json").read_text())
 
 
-def tide(gm: float, body_m: np.ndarray, orbiter_m: np.ndarray) -> np.ndarray:
+def tide(gm, body_m, orbiter_m):
     """Pull on the orbiter less the pull on the Moon, m/s^2."""
     away = body_m - orbiter_m
     return gm * (away / np.linalg.norm(away) ** 3 - body_m / np.linalg.norm(body_m) ** 3)

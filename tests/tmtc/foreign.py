@@ -4,11 +4,8 @@ What is in a packet is written here with Python integers and `struct` alone, so 
 the code under test.
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
-from typing import SupportsInt
 
 import numpy as np
 from spacepackets.ccsds import PacketType, SpacePacketHeader
@@ -16,7 +13,7 @@ from spacepackets.ccsds import PacketType, SpacePacketHeader
 NAMESPACE = "http://www.omg.org/spec/XTCE/20180204"
 
 
-def document(types: str, parameters: dict[str, str], containers: str, name: str = "BUS", more: str = "") -> str:
+def document(types, parameters, containers, name="BUS", more=""):
     """An XTCE document of types, parameters (name: type) and containers."""
     listed = "".join(f'<Parameter name="{key}" parameterTypeRef="{kind}"/>' for key, kind in parameters.items())
     return (
@@ -26,7 +23,7 @@ def document(types: str, parameters: dict[str, str], containers: str, name: str 
     )
 
 
-def integer(name: str, bits: int, encoding: str = "unsigned", inner: str = "", order: str = "") -> str:
+def integer(name, bits, encoding="unsigned", inner="", order=""):
     byte_order = f' byteOrder="{order}"' if order else ""
     return (
         f'<IntegerParameterType name="{name}" signed="{str(encoding != "unsigned").lower()}"><UnitSet/>'
@@ -35,7 +32,7 @@ def integer(name: str, bits: int, encoding: str = "unsigned", inner: str = "", o
     )
 
 
-def floating(name: str, bits: int, encoding: str = "IEEE754", order: str = "") -> str:
+def floating(name, bits, encoding="IEEE754", order=""):
     byte_order = f' byteOrder="{order}"' if order else ""
     return (
         f'<FloatParameterType name="{name}"><UnitSet/>'
@@ -43,7 +40,7 @@ def floating(name: str, bits: int, encoding: str = "IEEE754", order: str = "") -
     )
 
 
-def calibrated(name: str, bits: int, encoding: str, calibrator: str) -> str:
+def calibrated(name, bits, encoding, calibrator):
     return (
         f'<FloatParameterType name="{name}"><UnitSet><Unit>V</Unit></UnitSet>'
         f'<IntegerDataEncoding sizeInBits="{bits}" encoding="{encoding}">{calibrator}</IntegerDataEncoding>'
@@ -51,21 +48,21 @@ def calibrated(name: str, bits: int, encoding: str, calibrator: str) -> str:
     )
 
 
-def polynomial(*coefficients: float) -> str:
+def polynomial(*coefficients: float):
     terms = "".join(f'<Term coefficient="{c!r}" exponent="{k}"/>' for k, c in enumerate(coefficients))
     return f"<PolynomialCalibrator>{terms}</PolynomialCalibrator>"
 
 
-def default(calibrator: str) -> str:
+def default(calibrator):
     return f"<DefaultCalibrator>{calibrator}</DefaultCalibrator>"
 
 
-def spline(points: list[tuple[float, float]], order: int, extrapolate: bool) -> str:
+def spline(points, order, extrapolate):
     listed = "".join(f'<SplinePoint raw="{a}" calibrated="{b}"/>' for a, b in points)
     return f'<SplineCalibrator order="{order}" extrapolate="{str(extrapolate).lower()}">{listed}</SplineCalibrator>'
 
 
-def comparison(parameter: str, value: object, operator: str = "==", calibrated: bool = True) -> str:
+def comparison(parameter, value, operator="==", calibrated=True):
     operator = operator.replace("<", "&lt;").replace(">", "&gt;")
     return (
         f'<Comparison parameterRef="{parameter}" value="{value}" comparisonOperator="{operator}" '
@@ -73,7 +70,7 @@ def comparison(parameter: str, value: object, operator: str = "==", calibrated: 
     )
 
 
-def container(name: str, entries: list[str], base: str = "", criteria: str = "", *, abstract: bool = False) -> str:
+def container(name, entries, base="", criteria="", *, abstract=False):
     listed = "".join(
         entry if entry.startswith("<") else f'<ParameterRefEntry parameterRef="{entry}"/>' for entry in entries
     )
@@ -87,17 +84,17 @@ def container(name: str, entries: list[str], base: str = "", criteria: str = "",
     )
 
 
-def layout(types: str, *more: str, **parameters: str) -> str:
+def layout(types, *more: str, **parameters: str):
     """A document of one container P with all its parameters, and containers that continue it."""
     return document(types, parameters, container("P", list(parameters)) + "".join(more))
 
 
-def child(criteria: str, name: str = "Q", base: str = "P") -> str:
+def child(criteria, name="Q", base="P"):
     """A container that adds nothing but a condition."""
     return container(name, [], base, criteria)
 
 
-def both(*comparisons: str) -> str:
+def both(*comparisons: str):
     return f"<ComparisonList>{''.join(comparisons)}</ComparisonList>"
 
 
@@ -109,7 +106,7 @@ HEADER_PARAMETERS = {name: f"U{bits}" for name, bits in HEADER.items()}
 HEADER_CONTAINER = container("CCSDSPacket", list(HEADER), abstract=True)
 
 
-def bus_like(parameters: dict[str, str], *containers: str, types: str = "") -> str:
+def bus_like(parameters, *containers: str, types=""):
     """A document of packets with the primary header."""
     return document(HEADER_TYPES + types, {**HEADER_PARAMETERS, **parameters}, HEADER_CONTAINER + "".join(containers))
 
@@ -120,7 +117,7 @@ _LINEAR = [(0.0, -40.0), (64.0, 0.0), (128.0, 35.5), (255.0, 125.0)]
 _STEPS = [(0.0, 1.0), (100.0, 2.5), (255.0, 4.0)]
 
 
-def enumerated(name: str, bits: int, labels: dict[int, str], encoding: str = "unsigned") -> str:
+def enumerated(name, bits, labels, encoding="unsigned"):
     listed = "".join(f'<Enumeration value="{code}" label="{label}"/>' for code, label in labels.items())
     return (
         f'<EnumeratedParameterType name="{name}"><UnitSet/>'
@@ -129,14 +126,14 @@ def enumerated(name: str, bits: int, labels: dict[int, str], encoding: str = "un
     )
 
 
-def text_type(size: str, charset: str = "UTF-8", name: str = "T") -> str:
+def text_type(size, charset="UTF-8", name="T"):
     return (
         f'<StringParameterType name="{name}"><UnitSet/>'
         f'<StringDataEncoding encoding="{charset}">{size}</StringDataEncoding></StringParameterType>'
     )
 
 
-def binary(size: object, after: str = "", name: str = "B") -> str:
+def binary(size, after="", name="B"):
     """Octets of a fixed number of bits, or of a size that is written out."""
     written = f"<FixedValue>{size}</FixedValue>" if isinstance(size, int) else size
     return (
@@ -145,11 +142,11 @@ def binary(size: object, after: str = "", name: str = "B") -> str:
     )
 
 
-def fixed_size(bits: int, inside: str = "") -> str:
+def fixed_size(bits, inside=""):
     return f"<SizeInBits><Fixed><FixedValue>{bits}</FixedValue></Fixed>{inside}</SizeInBits>"
 
 
-def dynamic(parameter: str, **adjustment: float) -> str:
+def dynamic(parameter, **adjustment: float):
     attributes = "".join(f' {key}="{value}"' for key, value in adjustment.items())
     adjusted = f"<LinearAdjustment{attributes}/>" if adjustment else ""
     return f'<DynamicValue><ParameterInstanceRef parameterRef="{parameter}"/>{adjusted}</DynamicValue>'
@@ -214,7 +211,7 @@ _PARAMETERS = {
 APID_HOUSEKEEPING, APID_EVENT, APID_DUMP, APID_BARE = 0x064, 0x065, 0x066, 0x3E7
 
 
-def _either(*conditions: tuple[str, str, object]) -> str:
+def _either(*conditions: tuple[str, str, object]):
     listed = "".join(
         f'<Condition><ParameterInstanceRef parameterRef="{p}" useCalibratedValue="false"/>'
         f"<ComparisonOperator>{o}</ComparisonOperator><Value>{v}</Value></Condition>"
@@ -249,23 +246,23 @@ class Bits:
     number: int = 0
     count: int = 0
 
-    def add(self, value: SupportsInt, bits: int) -> Bits:
+    def add(self, value, bits):
         value = int(value)
         assert -(1 << bits) <= value < 1 << bits
         self.number = self.number << bits | value & ((1 << bits) - 1)
         self.count += bits
         return self
 
-    def octets(self, data: bytes) -> Bits:
+    def octets(self, data):
         return self.add(int.from_bytes(data, "big"), 8 * len(data))
 
-    def packed(self) -> bytes:
+    def packed(self):
         """The octets, the last filled with zeros."""
         self.add(0, -self.count % 8)
         return self.number.to_bytes(self.count // 8, "big")
 
 
-def space_packet(apid: int, data: bytes, count: int, secondary: bool = True) -> bytes:
+def space_packet(apid, data, count, secondary=True):
     """A packet with the header that `spacepackets` makes."""
     header = SpacePacketHeader(
         packet_type=PacketType.TM, apid=apid, seq_count=count & 0x3FFF, data_len=len(data) - 1,
@@ -274,12 +271,12 @@ def space_packet(apid: int, data: bytes, count: int, secondary: bool = True) -> 
     return bytes(header.pack()) + data
 
 
-def housekeeping(rng: np.random.Generator, count: int) -> bytes:
+def housekeeping(rng, count):
     """A housekeeping packet of 124 octets with random values, whole ranges included."""
     mode, trend = rng.choice(list(_MODES)), rng.integers(-1, 2)
     bits = Bits()
 
-    def draw(rows: str) -> None:
+    def draw(rows):
         for row in rows.split(","):
             width, low, high = map(int, row.split())
             bits.add(rng.integers(low, high), width)
@@ -302,7 +299,7 @@ def housekeeping(rng: np.random.Generator, count: int) -> bytes:
     return space_packet(APID_HOUSEKEEPING, bits.packed(), count)
 
 
-def event(rng: np.random.Generator, count: int) -> bytes:
+def event(rng, count):
     """An event packet with a text of up to 40 characters, and a value behind it if it is urgent."""
     text = "".join(rng.choice(list("abcµ° Z"), rng.integers(40))).encode()
     reason = rng.integers(256)
@@ -310,19 +307,19 @@ def event(rng: np.random.Generator, count: int) -> bytes:
     return space_packet(APID_EVENT, data + (struct.pack(">f", rng.normal()) if reason >= 200 else b""), count)
 
 
-def dump(rng: np.random.Generator, count: int) -> bytes:
+def dump(rng, count):
     """A dump of up to 300 octets behind a CUC time of 4 and 3 octets."""
     data = rng.bytes(7) + rng.bytes(rng.integers(2, 302)) + struct.pack(">f", rng.normal())
     return space_packet(APID_DUMP, data, count)
 
 
-def bare(rng: np.random.Generator, count: int) -> bytes:
+def bare(rng, count):
     """A packet without secondary header."""
     data = struct.pack(">f", rng.normal())
     return space_packet(APID_BARE + int(rng.integers(2)), data, count, secondary=False)
 
 
-def capture(packets: int, seed: int) -> list[bytes]:
+def capture(packets, seed):
     """Packets of all kinds, mixed; every APID counts for itself."""
     rng = np.random.default_rng(seed)
     makers = (housekeeping, event, dump, bare)

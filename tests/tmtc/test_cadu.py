@@ -9,11 +9,11 @@ PLACES = list(range(0, 20 * PERIOD, PERIOD))
 MARKER = np.frombuffer(ASM, dtype=np.uint8)
 
 
-def noise_of(shape: int | tuple[int, int], seed: int = 0) -> np.ndarray:
+def noise_of(shape, seed=0):
     return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
 
-def stream_of(count: int, seed: int = 0) -> np.ndarray:
+def stream_of(count, seed=0):
     blocks = noise_of((count, PERIOD), seed)
     blocks[:, :4] = MARKER
     return blocks.reshape(-1)
@@ -23,7 +23,7 @@ def find_period(stream):
     return next(iter(survey_markers(stream).distances), 0)
 
 
-def starts(stream: np.ndarray, **options) -> list[int]:
+def starts(stream, **options):
     return synchronise(stream, PERIOD, **options).offsets.tolist()
 
 
@@ -92,7 +92,7 @@ def test_a_single_cadu_is_a_stream():
     assert starts(stream_of(1)) == [0]
 
 
-def sync_of_bits(bits: np.ndarray, **options):
+def sync_of_bits(bits, **options):
     octets = np.packbits(bits)
     return octets, synchronise(octets, PERIOD, **options)
 
@@ -162,7 +162,7 @@ def test_the_period_is_told_from_the_whole_stream_however_long_the_noise_before_
     assert find_period(np.concatenate((noise, stream_of(40)))) == PERIOD
 
 
-def header_with_a_likeness(wrong_bits: int, *, inverted: bool) -> np.ndarray:
+def header_with_a_likeness(wrong_bits, *, inverted):
     """A record header of 8 octets with a marker of `wrong_bits` wrong bits that begins within an octet."""
     bits = np.zeros(64, dtype=np.uint8)
     likeness = np.unpackbits(MARKER) ^ np.uint8(inverted)

@@ -12,7 +12,6 @@ from tests.tmtc.test_downlink import make_packets
 from tmtc.downlink import (
     FRAME_GOOD,
     FRAME_UNCHECKED,
-    DownlinkDecode,
     DownlinkEncoder,
     LinkSettings,
     decode,
@@ -28,24 +27,24 @@ ZONE = 1115 - 6 - 2
 
 
 @functools.cache
-def sent() -> list[bytes]:
+def sent():
     return make_packets(1500, seed=5)
 
 
 @functools.cache
-def cadus() -> np.ndarray:
+def cadus():
     """Return the undamaged stream, one CADU per row."""
     octets = encode_cadus(sent(), spacecraft_id=76)
     return np.frombuffer(octets, dtype=np.uint8).reshape(-1, SETTINGS.cadu_length)
 
 
-def with_bit_errors(rows: np.ndarray, rate: float, seed: int) -> np.ndarray:
+def with_bit_errors(rows, rate, seed):
     bits = np.unpackbits(rows.reshape(-1))
     wrong = np.random.default_rng(seed).random(bits.size) < rate
     return np.packbits(bits ^ wrong).reshape(rows.shape)
 
 
-def packets_within(received: set[int]) -> list[bytes]:
+def packets_within(received):
     """Return the packets whose frames were all received."""
     at, whole = 0, []
     for packet in sent():
@@ -56,7 +55,7 @@ def packets_within(received: set[int]) -> list[bytes]:
     return whole
 
 
-def check(stream: np.ndarray, expected: list[bytes], **options) -> DownlinkDecode:
+def check(stream, expected, **options):
     octets = stream.tobytes()
     decoded = decode(octets, **options)
     assert set(decoded.cut.packets(decoded.buffer)) == set(expected)
@@ -187,6 +186,6 @@ def test_foreign_packets_are_not_ordered_by_a_time_they_do_not_carry():
     assert (decoded.sequence.gaps, decoded.sequence.missing) == (0, 0)
 
 
-def _with_room(packets: list[bytes]) -> list[bytes]:
+def _with_room(packets):
     """The packets with two octets more in the length field, for a checksum to be appended."""
     return [p[:4] + (int.from_bytes(p[4:6], "big") + 2).to_bytes(2, "big") + p[6:] for p in packets]

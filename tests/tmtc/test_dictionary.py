@@ -53,15 +53,15 @@ HOUSEKEEPING = {f.name: 1 for f in DICTIONARY.packet("housekeeping").fields} | {
 }  # fmt: skip
 
 
-def pack(name: str, values: dict) -> bytes:
+def pack(name, values):
     return DICTIONARY.pack(name, values, ticks=5 << 16, sequence_count=1)
 
 
-def tables_of(octets: bytes) -> Any:
+def tables_of(octets):
     return DICTIONARY.unpack_many(octets, cut_packets(octets))
 
 
-def layout(text: str) -> list[PacketField]:
+def layout(text):
     """Fields of ccsdspy: name:octets, and name:octets*times of arrays (* alone: what is left)."""
     fields = []
     for entry in ("head:1*14 " + text + " crc:2").split():
@@ -131,7 +131,7 @@ def test_ccsdspy_reads_the_repeated_items_to_the_same_raw_values():
             assert_array_equal(table.items_raw[name][mine], records[name])
 
 
-def detections(count: int, rng: np.random.Generator) -> dict:
+def detections(count, rng):
     items = {name: rng.uniform(0, 1023, count) for name in ("u_px", "v_px", "diameter_px")} | {
         "score": rng.uniform(0, 1, count), "size_class": rng.integers(-1, 4, count),
         "sigma_px": np.where(rng.uniform(size=count) < 0.2, np.nan, rng.uniform(0, 3.9, count)),
@@ -171,7 +171,7 @@ def test_quantised_columns_come_back_within_half_a_step(seed, count):
     assert pack("detections", back) == pack("detections", values)
 
 
-def raw_values(f: Field) -> st.SearchStrategy:
+def raw_values(f):
     if f.is_float:
         one = st.floats(width=int(f.type[1:]), allow_nan=True)
     elif f.labels:
@@ -188,7 +188,7 @@ def raw_values(f: Field) -> st.SearchStrategy:
     return one if f.size == 1 else st.lists(one, min_size=f.size, max_size=f.size)
 
 
-def packets_of(definition: PacketDefinition) -> st.SearchStrategy:
+def packets_of(definition):
     fields = {
         f.name: raw_values(f) for f in definition.fields if not (definition.group and f.name == definition.group.count)
     }
@@ -366,19 +366,19 @@ def test_a_changed_definition_is_refused():
         parse_dictionary(json.dumps(content))
 
 
-def effect(name: str, **arguments: Any) -> Effect:
+def effect(name, **arguments: Any):
     return effect_of(DICTIONARY, name, arguments, packed(name, arguments)).effect
 
 
-def packed(name: str, arguments: dict[str, Any]) -> bytes:
+def packed(name, arguments):
     return DICTIONARY.pack_command(name, arguments, sequence_count=0)
 
 
-def function(name: Any) -> dict[str, Any]:
+def function(name):
     return {"function_id": name, "argument_1": 0.0, "argument_2": 0.0}
 
 
-def carried(octets: bytes) -> dict[str, Any]:
+def carried(octets):
     return {"release_ticks": 1, "items": [{"octet": octet} for octet in octets]}
 
 
@@ -525,7 +525,7 @@ _ROOTS = RNG.standard_normal((2, 9, 9)) * np.repeat([40.0, 0.05, 1e-6], 3)[:, No
 COVARIANCES = _ROOTS @ np.swapaxes(_ROOTS, 1, 2)
 
 
-def packet(name: str, row: int, ticks: int) -> bytes:
+def packet(name, row, ticks):
     covariance = COVARIANCES[row]
     # Element by element, so that the order of the triangle is that of the interface and not of a library.
     if name == "filter_state":
@@ -540,7 +540,7 @@ def packet(name: str, row: int, ticks: int) -> bytes:
     return DICTIONARY.pack(name, values, ticks=ticks + 9, sequence_count=row)
 
 
-def estimates_of(octets: bytes) -> Any:
+def estimates_of(octets):
     return filter_estimates(DICTIONARY.unpack_many(octets, cut_packets(octets)))
 
 

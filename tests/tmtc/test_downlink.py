@@ -14,7 +14,6 @@ from tmtc.downlink import (
     FRAME_BAD_CHECKSUM,
     FRAME_FOREIGN,
     FRAME_UNCORRECTABLE,
-    DownlinkDecode,
     DownlinkEncoder,
     LinkSettings,
     decode,
@@ -34,12 +33,12 @@ WITHDRAWN = bytes.fromhex(
 )
 
 
-def make_packets(count: int, seed: int = 0, boot: int = 1, start_s: int = 0) -> list[bytes]:
+def make_packets(count, seed=0, boot=1, start_s=0):
     rng = np.random.default_rng(seed)
     sequencer = PacketSequencer()
     packets = []
 
-    def add(name: str, apid: int, **values: Any) -> None:
+    def add(name, apid, **values: Any):
         packets.append(DICTIONARY.pack(name, values, ticks=ticks, sequence_count=sequencer.next(apid)))
 
     for k in range(count):
@@ -57,28 +56,28 @@ def make_packets(count: int, seed: int = 0, boot: int = 1, start_s: int = 0) -> 
     return packets
 
 
-def stranger_of(apid: int, octets: int) -> bytes:
+def stranger_of(apid, octets):
     """A packet of an APID that no dictionary has."""
     return append_crc(pack_packet(apid, bytes(octets + 2), sequence_count=0)[:-2])
 
 
 @functools.cache
-def sent() -> list[bytes]:
+def sent():
     return make_packets(200)
 
 
-def read(octets: bytes, **options: Any) -> DownlinkDecode:
+def read(octets, **options: Any):
     """Decode, and see that all octets are accounted for."""
     decoded = decode(octets, **options)
     assert sum(decoded.octets.values()) == len(octets) and min(decoded.octets.values()) >= 0
     return decoded
 
 
-def packets_of(decoded: DownlinkDecode) -> list[bytes]:
+def packets_of(decoded):
     return list(decoded.cut.packets(decoded.buffer))
 
 
-def cadus(spacecraft_id: int = 76, **options: Any) -> bytes:
+def cadus(spacecraft_id=76, **options: Any):
     return encode_cadus(sent(), spacecraft_id=spacecraft_id, **options)
 
 

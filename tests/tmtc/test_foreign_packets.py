@@ -13,16 +13,16 @@ from spacepackets.ccsds import CdsShortTimestamp, PacketId, PacketType
 from spacepackets.ccsds.spacepacket import parse_space_packets
 
 from tests.tmtc.foreign import bus_like, capture, comparison, container, floating, integer, space_packet
-from tmtc.downlink import DownlinkDecode, decode, encode_cadus
+from tmtc.downlink import decode, encode_cadus
 from tmtc.errors import ValueRefused
 from tmtc.packets.crc import append_crc
 from tmtc.packets.space_packets import idle_packet
-from tmtc.packets.stream import UNCHECKED, PacketCut, PacketForm, cut_packets, find_prefix
+from tmtc.packets.stream import UNCHECKED, PacketForm, cut_packets, find_prefix
 from tmtc.xtce.decode import Decoder
 from tmtc.xtce.importing import parse_xtce
 
 
-def ephemeris(count: int) -> bytes:
+def ephemeris(count):
     """An attitude and ephemeris packet as of a weather satellite: 71 octets, CDS time, no error control."""
     rng = np.random.default_rng(count)
     time = struct.pack(">HIH", 23109, count * 1000, 0)
@@ -30,7 +30,7 @@ def ephemeris(count: int) -> bytes:
     return space_packet(11, time + body + rng.normal(size=4).astype(">f4").tobytes() + b"\x00" * 8, count)
 
 
-def cut(octets: bytes) -> PacketCut:
+def cut(octets):
     found = cut_packets(octets, form=UNCHECKED)
     rows = [(s, s + n) for s, n in zip(found.offsets.tolist(), found.lengths.tolist(), strict=True)]
     rows += [tuple(r) for r in found.skipped.tolist()] + [tuple(r) for r in found.idle.tolist()]
@@ -39,13 +39,13 @@ def cut(octets: bytes) -> PacketCut:
     return found
 
 
-def columns_of(text: str, octets: bytes) -> dict[str, list]:
+def columns_of(text, octets):
     """Values of the packets of a stream of one kind."""
     (table,) = Decoder(parse_xtce(text)).decode(octets, cut(octets)).tables.values()
     return {name: column.to_list() for name, column in table.columns.items()}
 
 
-def packets_of(octets: bytes) -> list[bytes]:
+def packets_of(octets):
     return list(cut(octets).packets(octets))
 
 
@@ -236,7 +236,7 @@ def test_pieces_of_a_stream_are_refused_without_error_control():
 # in transfer frames
 
 
-def check(decoded: DownlinkDecode, packets: list[bytes]) -> None:
+def check(decoded, packets):
     assert list(decoded.cut.packets(decoded.buffer)) == packets
     assert decoded.sequence.gaps == decoded.sequence.missing == 0
 

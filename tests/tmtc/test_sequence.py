@@ -6,11 +6,11 @@ from hypothesis import strategies as st
 from tmtc.packets.sequence import CONFLICT, DUPLICATE, FIRST, account
 
 
-def never_same(a: int, b: int) -> bool:
+def never_same(a, b):
     return False
 
 
-def always_same(a: int, b: int) -> bool:
+def always_same(a, b):
     return True
 
 

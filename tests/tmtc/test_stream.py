@@ -12,7 +12,7 @@ from tests.tmtc.test_downlink import make_packets
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.packets.crc import append_crc, crc16
 from tmtc.packets.space_packets import idle_packet, pack_packet
-from tmtc.packets.stream import PacketCut, cut_packets
+from tmtc.packets.stream import cut_packets
 
 PACKETS = make_packets(480)[:1000]
 WHOLE = b"".join(PACKETS)
@@ -21,7 +21,7 @@ SWALLOWED = len(PACKETS[501]) + len(PACKETS[502])
 """Octets of exactly two packets."""
 
 
-def cut_to(octets: bytes, expected: list[bytes], **options: Any) -> PacketCut:
+def cut_to(octets, expected, **options: Any):
     """Cut octets into the packets that are expected, and see that all octets are accounted for."""
     cut = cut_packets(octets, **options)
     assert list(cut.packets(octets)) == expected
@@ -29,11 +29,11 @@ def cut_to(octets: bytes, expected: list[bytes], **options: Any) -> PacketCut:
     return cut
 
 
-def inserted(octets: bytes) -> bytes:
+def inserted(octets):
     return WHOLE[:AT_500] + octets + WHOLE[AT_500:]
 
 
-def assert_every_octet_is_accounted_for(octets: bytes, cut: PacketCut) -> None:
+def assert_every_octet_is_accounted_for(octets, cut):
     ranges = np.concatenate((np.stack((cut.offsets, cut.offsets + cut.lengths), axis=1), cut.skipped, cut.idle))
     ranges = ranges[np.argsort(ranges[:, 0], kind="stable")]
     edges = ranges.reshape(-1)
@@ -191,7 +191,7 @@ INJURIES = st.one_of(
 )
 
 
-def injure(octets: bytes, injuries: list) -> tuple[bytes, np.ndarray]:
+def injure(octets, injuries):
     """The octets after the injuries, and marks (n + 1,): 1 octet k was hit, 2 something was put in before it."""
     before: dict[int, bytes] = {}
     values: list[int | None] = list(octets)

@@ -31,12 +31,12 @@ def rows_of(table):
     return [row.split(" | ") for row in table.strip().splitlines()]
 
 
-def ephemeris() -> Ephemeris:
+def ephemeris():
     rng = np.random.default_rng(1)
     matrix = rng.normal(size=(6, 6))
     covariances = [Covariance(START + k * 60 * NS, "RTN", (k + 1) * matrix @ matrix.T) for k in (0, 1)]
 
-    def segment(first: int, shift_ns: int = 0, **fields: Any) -> EphemerisSegment:
+    def segment(first, shift_ns=0, **fields: Any):
         position, velocity = rng.normal(size=(5, 3)) * 1e6, rng.normal(size=(5, 3)) * 1e3
         return EphemerisSegment(START + np.arange(first, first + 5) * 60 * NS + shift_ns, position, velocity, **fields)
 
@@ -48,7 +48,7 @@ def ephemeris() -> Ephemeris:
     return Ephemeris((first, second), "TEST", ("two arcs",))
 
 
-def assert_same(found: Ephemeris, expected: Ephemeris) -> None:
+def assert_same(found, expected):
     assert (found.originator, found.comments) == (expected.originator, expected.comments)
     assert len(found.segments) == len(expected.segments)
     for one, other in zip(found.segments, expected.segments, strict=True):
@@ -164,7 +164,7 @@ def test_an_error_in_a_state_names_the_line_of_the_xml():
 # Compressed files
 
 
-def zipped(*contents: bytes) -> bytes:
+def zipped(*contents: bytes):
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for number, content in enumerate(contents):
@@ -222,7 +222,7 @@ def test_years_outside_64_bits_of_nanoseconds_are_refused(year):
 # AEM
 
 
-def attitudes(count: int = 6) -> AttitudeSegment:
+def attitudes(count=6):
     q = np.random.default_rng(4).normal(size=(count, 4))
     return AttitudeSegment(
         START + np.arange(count) * 15 * NS,
@@ -231,7 +231,7 @@ def attitudes(count: int = 6) -> AttitudeSegment:
     )
 
 
-def standard_matrix(q1: float, q2: float, q3: float, qc: float) -> np.ndarray:
+def standard_matrix(q1, q2, q3, qc):
     """The direction cosine matrix from frame A to frame B of the annex of CCSDS 504.0-B."""
     vector, cross = np.array([q1, q2, q3]), np.array([[0, -q3, q2], [q3, 0, -q1], [-q2, q1, 0]])
     return (qc**2 - vector @ vector) * np.eye(3) + 2 * (np.outer(vector, vector) - qc * cross)

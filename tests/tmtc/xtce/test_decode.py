@@ -1,7 +1,5 @@
 """Packets of other missions decoded through their XTCE, against an independent interpreter and constructed values."""
 
-from __future__ import annotations
-
 import math
 import struct
 import warnings
@@ -35,11 +33,11 @@ from tests.tmtc.foreign import (
 from tmtc.errors import DefinitionError
 from tmtc.packets.stream import PacketCut, primary_headers
 from tmtc.xtce.columns import ArrayColumn, OptionalColumn, ValueColumn
-from tmtc.xtce.decode import VERDICTS, Decoder, XtceDecode
+from tmtc.xtce.decode import VERDICTS, Decoder
 from tmtc.xtce.importing import parse_xtce
 
 
-def whole(packets: list[bytes]) -> tuple[bytes, PacketCut]:
+def whole(packets):
     """Packets one after another, and a cut that says where they stand."""
     lengths = np.array([len(p) for p in packets], dtype=np.int64)
     offsets = np.cumsum(lengths) - lengths
@@ -48,21 +46,21 @@ def whole(packets: list[bytes]) -> tuple[bytes, PacketCut]:
     return b"".join(packets), PacketCut(offsets, lengths, ok, none, none, int(lengths.sum()))
 
 
-def decoded(definition: str, packets: list[bytes], root: str | None = None) -> XtceDecode:
+def decoded(definition, packets, root=None):
     return Decoder(parse_xtce(definition), root).decode(*whole(packets))
 
 
-def verdicts(definition: str, packets: list[bytes]) -> list[str]:
+def verdicts(definition, packets):
     return [VERDICTS[v] for v in decoded(definition, packets).verdict.tolist()]
 
 
-def values(definition: str, packets: list[bytes], name: str = "P") -> dict[str, list]:
+def values(definition, packets, name="P"):
     """Values of packets of one container."""
     columns = decoded(definition, packets).tables[name].columns
     return {name: column.to_list() for name, column in columns.items()}
 
 
-def one(data: bytes, types: str, **parameters: str) -> dict[str, list]:
+def one(data, types, **parameters: str):
     """Values of one packet of a container without header."""
     text = layout(types, **parameters)
     assert verdicts(text, [data]) == ["decoded"]
@@ -72,7 +70,7 @@ def one(data: bytes, types: str, **parameters: str) -> dict[str, list]:
 # against an interpreter of another project
 
 
-def rows_of(found: XtceDecode, count: int) -> list[dict[str, tuple]]:
+def rows_of(found, count):
     """(value, raw) by parameter, for every packet."""
     rows: list[dict[str, tuple]] = [{} for _ in range(count)]
     for table in found.tables.values():
@@ -83,7 +81,7 @@ def rows_of(found: XtceDecode, count: int) -> list[dict[str, tuple]]:
     return rows
 
 
-def same(a, b) -> bool:
+def same(a, b):
     return a == b or (isinstance(a, float) and isinstance(b, float) and math.isnan(a) and math.isnan(b))
 
 
@@ -173,7 +171,7 @@ def test_a_value_outside_its_spline_is_unknown_and_keeps_its_raw_value_unless_ex
     )
     packets = [bytes((k,)) for k in (9, 10, 19, 20, 25, 40, 41)]
 
-    def read(types: str) -> list[float]:
+    def read(types):
         return values(layout(types, A="T"), packets)["A"]
 
     assert read(steps) == pytest.approx([math.nan, 1.0, 1.0, 3.0, 3.0, 5.0, math.nan], nan_ok=True)
@@ -214,12 +212,12 @@ def test_a_code_without_a_name_stays_a_number_and_ranges_of_codes_share_one():
 YAMCS_SIZE = dynamic("_yamcs_ignore")
 
 
-def variable(octets: int, end: str) -> str:
+def variable(octets, end):
     """A text of up to some octets that says itself where it ends, as Yamcs writes it."""
     return text_type(f'<Variable maxSizeInBits="{8 * octets}">{YAMCS_SIZE}{end}</Variable>')
 
 
-def tagged(bits: int) -> str:
+def tagged(bits):
     return variable(100, f'<LeadingSize sizeInBitsOfSizeTag="{bits}"/>')
 
 
@@ -304,14 +302,14 @@ def test_a_size_may_be_looked_up():
 # arrays and aggregates
 
 
-def array_type(name: str, element: str, ending: str) -> str:
+def array_type(name, element, ending):
     return (
         f'<ArrayParameterType name="{name}" arrayTypeRef="{element}"><DimensionList>{ending}</DimensionList>'
         "</ArrayParameterType>"
     )
 
 
-def dimension(parameter: str = "", intercept: int = -1, last: int = 0, first: int = 0) -> str:
+def dimension(parameter="", intercept=-1, last=0, first=0):
     ending = dynamic(parameter, intercept=intercept) if parameter else f"<FixedValue>{last}</FixedValue>"
     return (
         f"<Dimension><StartingIndex><FixedValue>{first}</FixedValue></StartingIndex>"
@@ -319,7 +317,7 @@ def dimension(parameter: str = "", intercept: int = -1, last: int = 0, first: in
     )
 
 
-def aggregate(name: str, members: dict[str, str]) -> str:
+def aggregate(name, members):
     listed = "".join(f'<Member name="{key}" typeRef="{kind}"/>' for key, kind in members.items())
     return f'<AggregateParameterType name="{name}"><MemberList>{listed}</MemberList></AggregateParameterType>'
 
@@ -405,7 +403,7 @@ def test_no_packet_with_an_element_gives_empty_arrays():
 # layouts
 
 
-def location(parameter: str, reference: str, place: object) -> str:
+def location(parameter, reference, place):
     place = place if isinstance(place, str) else f"<FixedValue>{place}</FixedValue>"
     return (
         f'<ParameterRefEntry parameterRef="{parameter}"><LocationInContainerInBits referenceLocation="{reference}">'
@@ -430,7 +428,7 @@ def test_entries_may_stand_at_places_counted_from_the_start_or_from_the_entry_be
 
 
 def test_entries_under_a_condition_are_there_or_not():
-    def under(parameter: str, *condition: object) -> str:
+    def under(parameter, *condition: object):
         inside = f"<IncludeCondition>{comparison(*condition)}</IncludeCondition>"
         return f'<ParameterRefEntry parameterRef="{parameter}">{inside}</ParameterRefEntry>'
 
@@ -605,7 +603,7 @@ def test_chunks_of_packets_are_joined(monkeypatch):
     assert small == rows_of(decoded(foreign.BUS, packets), 100)
 
 
-def of_apid(name: str, apid: int, entries: list[str], *, abstract: bool = True) -> str:
+def of_apid(name, apid, entries, *, abstract=True):
     """A first container of its own and one that continues it for packets of an APID, as OpenC3 writes them."""
     first = container(f"{name}_Base", [*HEADER, *entries], abstract=abstract)
     return first + container(name, [], f"{name}_Base", comparison("PKT_APID", apid))
@@ -642,7 +640,7 @@ def test_columns_of_numbers_are_arrays():
     assert list(HEADER) == list(HEADER_PARAMETERS)
 
 
-def parts(apid: int, first_count: int, *pieces: bytes, flags: tuple[int, ...] = ()) -> list[bytes]:
+def parts(apid, first_count, *pieces: bytes, flags=()):
     """Parts of a segmented packet: the first alone has a secondary header."""
     chosen = flags or (1, *[0] * (len(pieces) - 2), 2)
     return [
@@ -652,7 +650,7 @@ def parts(apid: int, first_count: int, *pieces: bytes, flags: tuple[int, ...] = 
     ]
 
 
-def stream_of(packets: list[bytes], checksum_octets: int = 0) -> tuple[list[tuple[int, int, int]], list[str]]:
+def stream_of(packets, checksum_octets=0):
     """(index, a, b) of decoded packets of a stream, and the verdict of each packet."""
     body = container("P", ["a", "b"], "CCSDSPacket", comparison("VERSION", 0))
     text = bus_like({"a": "U16", "b": "U32"}, body)
@@ -682,7 +680,7 @@ def test_each_part_has_its_checksum():
 
 
 def test_parts_that_make_no_packet_are_counted_and_not_decoded():
-    def all_of_them_alone(packets: list[bytes]) -> bool:
+    def all_of_them_alone(packets):
         return stream_of(packets) == ([], ["segments_not_joined"] * len(packets))
 
     three = parts(5, 0, b"\x00\x01", b"\x00\x00", b"\x00\x02")

@@ -12,7 +12,6 @@ from space_packet_parser.xtce.validation import validate_xtce
 from tmtc.dictionary.fields import Field
 from tmtc.dictionary.onboard_parameters import PARAMETERS
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.dictionary.schema import PacketDefinition
 from tmtc.packets.crc import CRC_LENGTH
 from tmtc.packets.stream import whole_packets
 from tmtc.xtce.decode import Decoder
@@ -93,7 +92,7 @@ def test_the_form_with_arrays_is_imported_to_equal_values_of_every_packet(defini
                 assert_imported(pair, ours.values["items"][f.name][k], ours.raw["items"][f.name][k], f)
 
 
-def assert_imported(pair, value, raw, f: Field) -> None:
+def assert_imported(pair, value, raw, f):
     if f.labels:
         assert pair == (f.label(raw), raw)
     elif f.missing is not None and raw == f.missing:
@@ -104,7 +103,7 @@ def assert_imported(pair, value, raw, f: Field) -> None:
         assert pair == (value, raw)
 
 
-def random_value(f: Field, rng: np.random.Generator):
+def random_value(f, rng):
     if f.size > 1:
         return [random_value(Field(f.name, f.type, ""), rng) for _ in range(f.size)]
     if f.labels:
@@ -121,7 +120,7 @@ def random_value(f: Field, rng: np.random.Generator):
     return raw * f.scale + f.offset if f.is_calibrated else raw
 
 
-def random_packet(definition: PacketDefinition, count: int, rng: np.random.Generator) -> bytes:
+def random_packet(definition, count, rng):
     group = definition.group
     values = {f.name: random_value(f, rng) for f in definition.fields if not (group and f.name == group.count)}
     if group:
@@ -163,7 +162,7 @@ def test_an_independent_decoder_reads_every_packet_to_equal_values(definition, d
                     assert_equal(theirs[name], ours.values["items"][f.name][k], ours.raw["items"][f.name][k], f)
 
 
-def assert_equal(theirs, value, raw, f: Field) -> None:
+def assert_equal(theirs, value, raw, f):
     if f.labels:
         assert (str(theirs), theirs.raw_value) == (f.label(raw), raw)
     elif f.is_float and math.isnan(value):
@@ -203,6 +202,6 @@ def test_telecommands_are_as_long_as_the_dictionary_expects_once_the_sender_appe
             assert listed == {one.name: str(one.number) for one in PARAMETERS}
 
 
-def first_value(f: Field):
+def first_value(f):
     """Return a value that the field accepts."""
     return f.labels[0][0] if f.labels else max(f.minimum or 0, 0)

@@ -1,7 +1,5 @@
 """XTCE documents that are damaged, hostile or beyond the subset: one line each, and nothing guessed."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest
@@ -35,11 +33,11 @@ PLAIN = container("P", ["a"])
 MODES = enumerated("m", 8, {1: "ON"})
 
 
-def plain(*more: str) -> str:
+def plain(*more: str):
     return layout(U8, *more, a="u8")
 
 
-def refused(text: str | bytes) -> str:
+def refused(text):
     with pytest.raises(DefinitionError) as caught:
         parse_xtce({"bus.xml": text})
     message = str(caught.value)
@@ -48,11 +46,11 @@ def refused(text: str | bytes) -> str:
     return message
 
 
-def of_type(types: str) -> str:
+def of_type(types):
     return layout(types, a="t")
 
 
-def chosen(text: str, *packets: bytes) -> list[int]:
+def chosen(text, *packets: bytes):
     """Places of the packets of Q."""
     return decoded(text, packets).tables["Q"].packet_index.tolist()
 
@@ -173,7 +171,7 @@ def test_types_that_multiply_are_refused_without_being_written_out():
 
 
 def test_long_chains_of_inheritance_are_read_and_endless_ones_refused():
-    def chain(count: int) -> str:
+    def chain(count):
         links = "".join(container(f"C{k}", ["a"], f"C{k - 1}") for k in range(1, count))
         return document(U8, {"a": "u8"}, container("C0", ["a"]) + links)
 
@@ -293,10 +291,10 @@ def test_conditions_beyond_the_subset_are_refused_by_name(row):
 
 
 def test_conditions_are_joined_and_compared_as_written():
-    def side(parameter: str) -> str:
+    def side(parameter):
         return f'<ParameterInstanceRef parameterRef="{parameter}" useCalibratedValue="false"/>'
 
-    def condition(left: str, operator: str, right: str) -> str:
+    def condition(left, operator, right):
         other = side(right) if right.isalpha() else f"<Value>{right}</Value>"
         operator = operator.replace("<", "&lt;")
         return f"<Condition>{side(left)}<ComparisonOperator>{operator}</ComparisonOperator>{other}</Condition>"
@@ -366,7 +364,7 @@ def test_a_document_of_yamcs_pymdb_is_read_to_the_values_of_yamcs():
     size = "<BinaryEncoding><SizeInBits><FixedValue>16</FixedValue></SizeInBits></BinaryEncoding><EntryList>"
     part = '<ContainerRefEntry containerRef="part"/>'
 
-    def criteria(member: str, value: str) -> str:
+    def criteria(member, value):
         return (
             f'<BooleanExpression><Condition><ParameterInstanceRef parameterRef="{member}"/>'
             f"<ComparisonOperator>==</ComparisonOperator><Value>{value}</Value></Condition></BooleanExpression>"
@@ -386,7 +384,7 @@ def test_a_document_of_yamcs_pymdb_is_read_to_the_values_of_yamcs():
 
 
 def test_entries_are_repeated_as_arrays():
-    def repeated(entry: str, count: str) -> str:
+    def repeated(entry, count):
         return entry.replace("/>", f"><RepeatEntry><Count>{count}</Count></RepeatEntry></{entry[1:].split()[0]}>")
 
     entries = [
