@@ -61,20 +61,16 @@ def whole(spans, found):
     return [span for span in spans if span[0] > found.start_utc_ns and span[1] < found.stop_utc_ns]
 
 
-def test_eclipses_last_as_long_as_the_shadow_is_wide(found):
-    expected = behind_s(sun_position_icrf_m(tdb_s_from_utc_ns(START)))
-    durations = lasting_s(whole(found.eclipse, found))
-    assert len(durations) >= REVOLUTIONS - 1
+@pytest.mark.parametrize("name, target, atol", [
     # The Sun has moved by 0.3 deg at the end, edges are found to a second each.
-    assert_allclose(durations, expected, atol=8.0)  # s
-
-
-def test_the_earth_is_hidden_as_long_as_the_limb_is_wide(found):
-    expected = behind_s(earth_position_icrf_m(tdb_s_from_utc_ns(START)))
-    durations = lasting_s(whole(found.occultation, found))
-    assert len(durations) >= REVOLUTIONS - 1
+    ("eclipse", sun_position_icrf_m, 8.0),
     # The Earth stands at 215 Moon radii, not at infinity, and has moved by 4 deg at the end: 1 % of 2,800 s.
-    assert_allclose(durations, expected, atol=60.0)  # s
+    ("occultation", earth_position_icrf_m, 60.0),
+])  # fmt: skip
+def test_eclipses_and_occultations_last_as_long_as_the_shadow_is_wide(found, name, target, atol):
+    durations = lasting_s(whole(getattr(found, name), found))
+    assert len(durations) >= REVOLUTIONS - 1
+    assert_allclose(durations, behind_s(target(tdb_s_from_utc_ns(START))), atol=atol)  # s
 
 
 def test_half_of_every_revolution_is_over_the_night_side(found):

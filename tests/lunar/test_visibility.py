@@ -15,6 +15,9 @@ from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from lunar.visibility import (
     GroundStation,
+    _disc_overlap,
+    _itrf_from_icrf,
+    _zenith,
     find_windows,
     limb_clearance_m,
     link,
@@ -80,8 +83,6 @@ def test_the_covered_share_of_a_disc_is_that_of_a_fine_grid(apart, near_radius, 
     # Far body at unit distance 10, near body at 1, so angular radii are asin(R / d).
     to_far = np.array([10.0, 0.0, 0.0])
     to_near = np.array([math.cos(apart), math.sin(apart), 0.0])
-    from lunar.visibility import _disc_overlap
-
     share = _disc_overlap(to_far, 10.0 * math.sin(far_radius), to_near, math.sin(near_radius))
     x, y = np.meshgrid(*[np.linspace(-far_radius, far_radius, 400)] * 2)
     disc = x**2 + y**2 <= far_radius**2
@@ -152,8 +153,6 @@ def test_station_and_elevation_are_those_of_astropy():
         frame = ITRS(CartesianRepresentation(local), obstime=time, location=place)
         elevation = frame.transform_to(AltAz(obstime=time, location=place)).alt.to_value(u.rad)
     leg = direction - theirs
-    from lunar.visibility import _itrf_from_icrf, _zenith
-
     up = _zenith(GOLDSTONE) @ _itrf_from_icrf(utc_ns)
     # 1e-4 rad is what the Earth turns in 1.4 s.
     assert math.asin(leg @ up / np.linalg.norm(leg)) == pytest.approx(elevation, abs=1e-4)

@@ -81,9 +81,8 @@ def test_a_flipped_bit_in_a_body_is_one_checksum_error_and_nothing_else():
 
 @pytest.mark.parametrize("change", [9, -9, 1, 255, 5000, 40_000, SWALLOWED])
 def test_a_wrong_length_field_costs_the_one_packet(change):
-    octets = bytearray(WHOLE)
-    length = int.from_bytes(octets[AT_500 + 4 : AT_500 + 6], "big")
-    octets[AT_500 + 4 : AT_500 + 6] = ((length + change) % 65536).to_bytes(2, "big")
+    octets, field = bytearray(WHOLE), slice(AT_500 + 4, AT_500 + 6)
+    octets[field] = ((int.from_bytes(octets[field], "big") + change) % 65536).to_bytes(2, "big")
     cut = cut_to(octets, PACKETS[:500] + PACKETS[501:])
     assert cut.octets_skipped + cut.lengths[~cut.crc_ok].sum() == len(PACKETS[500])
 
@@ -261,14 +260,11 @@ def test_a_hundred_thousand_injured_streams_lose_no_whole_packet_and_invent_none
             if action == 0:
                 octets[at] ^= values[case][s]
                 touched.add(within)
-            elif action == 1:
-                octets[at:at] = bytes((values[case][s],)) * 3
-                shifts.append((at, 3))
-                if at > starts[within]:
-                    touched.add(within)
-            else:
-                del octets[at]
-                shifts.append((at, -1))
+                continue
+            new = bytes((values[case][s],)) * 3 if action == 1 else b""
+            octets[at : at + (action == 2)] = new
+            shifts.append((at, 3 if new else -1))
+            if not new or at > starts[within]:
                 touched.add(within)
         base = len(buffer)
         for k, start in enumerate(starts[:-1]):

@@ -57,23 +57,16 @@ def arc(first_s, last_s, step_s=60, **fields: object):
 
 
 def test_ephemeris_time_is_that_of_spice_also_within_a_leap_second(tmp_path):
-    texts = [
-        "2016-12-31T23:59:59.5",
-        "2017-01-01T00:00:00",
-        "2029-08-07T12:34:56.789012",
-        "2035-02-03T00:00:00",
-        "2016-12-31T23:59:59.75",
-        "2017-01-01T00:00:00.25",
-        "2016-12-31T23:59:60.25",
-    ]
+    texts = [f"2016-12-31T23:59:{second}" for second in (59.5, 59.75, 60.25)]
+    texts += ["2017-01-01T00:00:00.25", "2029-08-07T12:34:56.789012", "2035-02-03T00:00:00"]
     with kernels(tmp_path) as spice:
         expected = np.array([spice.str2et(text) for text in texts])
     tai_ns = np.array([parse_tai(text) for text in texts])
     # One unit of a float64 of 1e9 s is 0.12 us.
     near(et_from_tai_ns(tai_ns), expected, atol=3e-7)
     assert np.abs(tai_ns_from_et(expected) - tai_ns).max() <= 300
-    utc_ns = np.array([parse_utc(text) for text in texts[:-1]])
-    near(et_from_utc_ns(utc_ns), expected[:-1], atol=3e-7)
+    utc_ns = np.array([parse_utc(text) for text in texts if ":60" not in text])
+    near(et_from_utc_ns(utc_ns), np.delete(expected, 2), atol=3e-7)
 
 
 @pytest.mark.parametrize("data_type", [3, 13])

@@ -33,7 +33,11 @@ def decoder(document):
 
 
 def test_the_document_validates_against_the_schema_and_its_references_hold(document):
-    result = validate_xtce(document, level="all", print_results=False, allow_schema_download=False)
+    validate(document, "all")
+
+
+def validate(path, level):
+    result = validate_xtce(path, level=level, print_results=False, allow_schema_download=False)
     assert result.valid, result.errors
 
 
@@ -41,8 +45,7 @@ def test_the_form_with_arrays_validates_against_the_schema_and_is_short(tmp_path
     text = format_xtce()
     path = tmp_path / "arrays.xml"
     path.write_text(text, encoding="utf-8")
-    result = validate_xtce(path, level="schema", print_results=False, allow_schema_download=False)
-    assert result.valid, result.errors
+    validate(path, "schema")
     assert text.count("<SequenceContainer") == len(DICTIONARY.telemetry) + 2
     assert len(text) < 300_000
 
@@ -72,12 +75,8 @@ def test_the_form_with_arrays_is_imported_to_equal_values_of_every_packet(defini
         assert columns["TIME_COARSE"][row][0] << 16 | columns["TIME_FINE"][row][0] == ours.ticks
         assert columns["ERROR_CONTROL"][row][0] == int.from_bytes(octets[-2:], "big")
         for f in definition.fields:
-            for k in range(f.size):
-                index = None if f.size == 1 else k + 1
-                value, raw = ours.values[f.name], ours.raw[f.name]
-                if index is not None:
-                    value, raw = value[k], raw[k]
-                assert_imported(columns[parameter_name(definition.name, f.name, index)][row], value, raw, f)
+            for name, value, raw in named(definition, f, ours):
+                assert_imported(columns[name][row], value, raw, f)
         if definition.group is None:
             continue
         values, raws = columns[parameter_name(definition.name, definition.group.name)][row]
@@ -90,6 +89,14 @@ def test_the_form_with_arrays_is_imported_to_equal_values_of_every_packet(defini
             for k in range(counts[row]):
                 pair = (values[k], raws[k]) if len(fields) == 1 else (values[k][f.name], raws[k][f.name])
                 assert_imported(pair, ours.values["items"][f.name][k], ours.raw["items"][f.name][k], f)
+
+
+def named(definition, f, ours):
+    """Names of the parameters of a field, with their values and raw values."""
+    value, raw = ours.values[f.name], ours.raw[f.name]
+    if f.size == 1:
+        return [(parameter_name(definition.name, f.name), value, raw)]
+    return [(parameter_name(definition.name, f.name, k + 1), value[k], raw[k]) for k in range(f.size)]
 
 
 def assert_imported(pair, value, raw, f):
@@ -147,11 +154,8 @@ def test_an_independent_decoder_reads_every_packet_to_equal_values(definition, d
         assert (theirs["SERVICE"], theirs["SUBTYPE"]) == (ours.service, ours.subtype)
         assert theirs["TIME_COARSE"] << 16 | theirs["TIME_FINE"] == ours.ticks
         for f in definition.fields:
-            if f.size == 1:
-                assert_equal(theirs[parameter_name(definition.name, f.name)], ours.values[f.name], ours.raw[f.name], f)
-            for k in range(f.size if f.size > 1 else 0):
-                name = parameter_name(definition.name, f.name, k + 1)
-                assert_equal(theirs[name], ours.values[f.name][k], ours.raw[f.name][k], f)
+            for name, value, raw in named(definition, f, ours):
+                assert_equal(theirs[name], value, raw, f)
         if definition.group and [f.type for f in definition.group.fields] == ["u8"]:
             name = parameter_name(definition.name, "items")
             assert bytes(theirs[name]) == bytes(ours.values["items"]["octet"].astype(np.uint8))
