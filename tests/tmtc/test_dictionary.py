@@ -404,13 +404,9 @@ def test_a_function_has_its_effect_by_name_and_by_code():
 
 
 def test_an_activity_has_the_effect_of_what_it_carries_however_deep():
-    for inner, expected in (
-        (function("start_observation"), Effect.ROUTINE),
-        (function("reboot"), Effect.DESTROYS_DATA),
-    ):
-        once = carried(packed(FUNCTION, inner))
-        assert effect(CARRIER, **once) is expected
-        assert effect(CARRIER, **carried(packed(CARRIER, once))) is expected
+    for name, expected in (("start_observation", Effect.ROUTINE), ("reboot", Effect.DESTROYS_DATA)):
+        once = carried(packed(FUNCTION, function(name)))
+        assert effect(CARRIER, **once) is effect(CARRIER, **carried(packed(CARRIER, once))) is expected
 
 
 def test_what_carries_no_telecommand_and_what_is_not_known_counts_as_the_gravest():
@@ -477,18 +473,15 @@ def test_names_are_entered_in_place_of_numbers():
     assert argument_text("set_parameter", changed) == "parameter temperature high c, value 55 degC"
 
 
-@pytest.mark.parametrize(
-    "name, given, expected",
-    [
-        ("perform_function", {"function_id": "start_observation", "duration_s": -1.0}, "start_observation.duration_s"),
-        ("perform_function", {"function_id": "set_mode", "mode": "asleep"}, r"0 \(safe\)"),
-        ("set_parameter", {"parameter_id": "temperature_high_c", "value": 101}, "20 to 100 degC"),
-        ("set_parameter", {"parameter_id": 5, "value": 1.5}, "a whole number of 1 to 1000"),
-    ],
-)  # fmt: skip
-def test_a_value_outside_its_range_is_refused_with_the_range(name, given, expected):
+@pytest.mark.parametrize("name, values, expected", [
+    (FUNCTION, {"function_id": "start_observation", "duration_s": -1.0}, "start_observation.duration_s"),
+    (FUNCTION, {"function_id": "set_mode", "mode": "asleep"}, r"0 \(safe\)"),
+    ("set_parameter", {"parameter_id": "temperature_high_c", "value": 101}, "20 to 100 degC"),
+    ("set_parameter", {"parameter_id": 5, "value": 1.5}, "a whole number of 1 to 1000"),
+])  # fmt: skip
+def test_a_value_outside_its_range_is_refused_with_the_range(name, values, expected):
     with pytest.raises(ValueRefused, match=expected):
-        arguments_by_number(name, given)
+        arguments_by_number(name, values)
 
 
 def test_a_carried_telecommand_is_written_out_with_its_time():
