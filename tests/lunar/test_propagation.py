@@ -46,17 +46,18 @@ def kepler_place(elements, gm, elapsed_s):
 
 
 GM = builtin_gravity().gm_m3_s2
+INITIAL = state_from_elements(TABLE_I, GM)
 
 
 def test_elements_come_back_from_the_state_they_give():
-    back = elements_from_state(*state_from_elements(TABLE_I, GM), GM)
+    back = elements_from_state(*INITIAL, GM)
     assert back.semi_major_axis_m == pytest.approx(TABLE_I.semi_major_axis_m, abs=1e-5)  # m
     for name in ("eccentricity", "inclination_rad", "raan_rad", "argument_of_perilune_rad", "true_anomaly_rad"):
         assert getattr(back, name) == pytest.approx(getattr(TABLE_I, name), abs=1e-11), name
 
 
 def test_a_point_mass_gives_the_orbit_of_kepler():
-    trajectory = propagate(EPOCH_S, *state_from_elements(TABLE_I, GM), 86_400.0, KEPLER)
+    trajectory = propagate(EPOCH_S, *INITIAL, 86_400.0, KEPLER)
     for elapsed_s in (0.0, 1_234.5, 40_000.0, 86_400.0):
         error_m = np.linalg.norm(
             trajectory.state(np.array([EPOCH_S + elapsed_s]))[0, :3] - kepler_place(TABLE_I, GM, elapsed_s)
@@ -65,7 +66,7 @@ def test_a_point_mass_gives_the_orbit_of_kepler():
 
 
 def test_methods_of_different_families_agree_over_a_day():
-    start = (EPOCH_S, *state_from_elements(TABLE_I, GM), 86_400.0, FULL)
+    start = (EPOCH_S, *INITIAL, 86_400.0, FULL)
     adaptive = propagate(*start).state_after(86_400.0)[:3]
     equal_steps, _, _ = propagate_with_stm(*start, stm_degree=2)
     assert np.linalg.norm(adaptive - equal_steps) < 0.05  # m
@@ -88,7 +89,7 @@ def test_an_orbit_into_the_ground_stops_with_the_place_of_impact():
 
 def test_burns_bring_the_orbit_back_to_the_rule():
     rule = ManeuverRule(15e3, 1_768_180.0, 0.006)
-    trajectory, burns = propagate_with_maneuvers(EPOCH_S, *state_from_elements(TABLE_I, GM), 12 * 86_400.0, FULL, rule)
+    trajectory, burns = propagate_with_maneuvers(EPOCH_S, *INITIAL, 12 * 86_400.0, FULL, rule)
     times = np.arange(EPOCH_S, EPOCH_S + 12 * 86_400.0, 30.0)
     altitude_m = np.linalg.norm(trajectory.state(times)[:, :3], axis=1) - MOON_RADIUS_M
     assert burns, "the orbit of Table I sinks below 15 km within days"
@@ -171,7 +172,7 @@ def test_sunlight_moves_a_low_orbit_by_what_its_push_does_in_ten_minutes():
 
 @pytest.mark.parametrize("duration_s", [900.0, -900.0])
 def test_the_transition_matrix_is_the_change_of_the_end_with_the_start(duration_s):
-    start = np.concatenate(state_from_elements(TABLE_I, GM))
+    start = np.concatenate(INITIAL)
     position, velocity, matrix = propagate_with_stm(
         EPOCH_S, start[:3], start[3:], duration_s, FULL, stm_degree=FULL.gravity.degree
     )

@@ -5,7 +5,6 @@ the code under test.
 """
 
 import struct
-from dataclasses import dataclass
 
 import numpy as np
 from spacepackets.ccsds import PacketType, SpacePacketHeader
@@ -48,7 +47,7 @@ def calibrated(name, bits, encoding, calibrator):
     )
 
 
-def polynomial(*coefficients: float):
+def polynomial(*coefficients):
     terms = "".join(f'<Term coefficient="{c!r}" exponent="{k}"/>' for k, c in enumerate(coefficients))
     return f"<PolynomialCalibrator>{terms}</PolynomialCalibrator>"
 
@@ -84,7 +83,7 @@ def container(name, entries, base="", criteria="", *, abstract=False):
     )
 
 
-def layout(types, *more: str, **parameters: str):
+def layout(types, *more, **parameters):
     """A document of one container P with all its parameters, and containers that continue it."""
     return document(types, parameters, container("P", list(parameters)) + "".join(more))
 
@@ -94,7 +93,7 @@ def child(criteria, name="Q", base="P"):
     return container(name, [], base, criteria)
 
 
-def both(*comparisons: str):
+def both(*comparisons):
     return f"<ComparisonList>{''.join(comparisons)}</ComparisonList>"
 
 
@@ -106,7 +105,7 @@ HEADER_PARAMETERS = {name: f"U{bits}" for name, bits in HEADER.items()}
 HEADER_CONTAINER = container("CCSDSPacket", list(HEADER), abstract=True)
 
 
-def bus_like(parameters, *containers: str, types=""):
+def bus_like(parameters, *containers, types=""):
     """A document of packets with the primary header."""
     return document(HEADER_TYPES + types, {**HEADER_PARAMETERS, **parameters}, HEADER_CONTAINER + "".join(containers))
 
@@ -146,7 +145,7 @@ def fixed_size(bits, inside=""):
     return f"<SizeInBits><Fixed><FixedValue>{bits}</FixedValue></Fixed>{inside}</SizeInBits>"
 
 
-def dynamic(parameter, **adjustment: float):
+def dynamic(parameter, **adjustment):
     attributes = "".join(f' {key}="{value}"' for key, value in adjustment.items())
     adjusted = f"<LinearAdjustment{attributes}/>" if adjustment else ""
     return f'<DynamicValue><ParameterInstanceRef parameterRef="{parameter}"/>{adjusted}</DynamicValue>'
@@ -239,12 +238,11 @@ BUS = document(
 )  # fmt: skip
 
 
-@dataclass
 class Bits:
     """Bits written one value after another."""
 
-    number: int = 0
-    count: int = 0
+    number = 0
+    count = 0
 
     def add(self, value, bits):
         value = int(value)
@@ -323,7 +321,7 @@ def capture(packets, seed):
     """Packets of all kinds, mixed; every APID counts for itself."""
     rng = np.random.default_rng(seed)
     makers = (housekeeping, event, dump, bare)
-    counts: dict[bytes, int] = {}
+    counts = {}
     made = []
     for _ in range(packets):
         packet = makers[rng.integers(4)](rng, 0)

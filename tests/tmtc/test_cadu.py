@@ -27,6 +27,11 @@ def starts(stream, **options):
     return synchronise(stream, PERIOD, **options).offsets.tolist()
 
 
+def after_headers(count):
+    """Places of CADUs behind a header of 8 octets each."""
+    return [(PERIOD + 8) * k + 8 for k in range(count)]
+
+
 def test_the_marker_is_that_of_the_standard():
     assert bytes.fromhex("1ACFFC1D") == ASM
 
@@ -63,14 +68,13 @@ def test_damaged_markers_are_passed_over_while_in_lock_and_turn_no_frame(wrong_b
 def test_lost_octets_cost_the_frame_they_are_lost_from():
     stream = np.delete(stream_of(20), slice(7 * PERIOD + 60, 7 * PERIOD + 63))
     sync = synchronise(stream, PERIOD)
-    expected = [PERIOD * k for k in range(7)] + [PERIOD * k - 3 for k in range(8, 20)]
-    assert sync.offsets.tolist() == expected
+    assert sync.offsets.tolist() == PLACES[:7] + [at - 3 for at in PLACES[8:]]
     assert sync.truncated.tolist() == [7 * PERIOD]
 
 
 def test_inserted_octets_are_skipped():
     stream = np.insert(stream_of(20), 7 * PERIOD, np.zeros(5, dtype=np.uint8))
-    assert starts(stream) == [PERIOD * k for k in range(7)] + [PERIOD * k + 5 for k in range(7, 20)]
+    assert starts(stream) == PLACES[:7] + [at + 5 for at in PLACES[7:]]
 
 
 def test_a_marker_inside_a_frame_does_not_catch_the_lock():
@@ -126,8 +130,7 @@ def test_an_inverted_stretch_is_turned_upright():
 def test_a_header_before_each_cadu_is_passed_over():
     stream = stream_of(20).reshape(-1, PERIOD)
     recorded = np.hstack((np.zeros((20, 8), dtype=np.uint8), stream)).reshape(-1)
-    sync = synchronise(recorded, PERIOD)
-    assert sync.offsets.tolist() == [(PERIOD + 8) * k + 8 for k in range(20)]
+    assert starts(recorded) == after_headers(20)
 
 
 def test_gaps_of_any_length_between_cadus_are_passed_over():
@@ -177,7 +180,7 @@ def header_with_a_likeness(wrong_bits, *, inverted):
 def test_likenesses_of_a_marker_in_the_headers_of_records_do_not_catch_the_lock(count, inverted, is_checked):
     header = header_with_a_likeness(3, inverted=inverted)
     stream = np.hstack((np.tile(header, (count, 1)), stream_of(count).reshape(-1, PERIOD))).reshape(-1)
-    expected = [(PERIOD + 8) * k + 8 for k in range(count)]
+    expected = after_headers(count)
     verify = (lambda sync: np.isin(sync.start_bits, 8 * np.array(expected))) if is_checked else None
     sync = synchronise(stream, PERIOD, verify=verify, record_octets=8)
     assert sync.offsets.tolist() == expected
@@ -189,16 +192,13 @@ def test_a_valid_frame_is_preferred_to_an_undamaged_likeness_that_others_follow(
     frames = stream_of(12).reshape(-1, PERIOD)
     frames[:, 3] ^= 0b00000101
     stream = np.hstack((np.tile(header, (12, 1)), frames)).reshape(-1)
-    expected = [(PERIOD + 8) * k + 8 for k in range(12)]
-    sync = synchronise(stream, PERIOD, verify=lambda sync: np.isin(sync.offsets, expected), record_octets=header.size)
-    assert sync.offsets.tolist() == expected
+    expected = after_headers(12)
+    assert starts(stream, verify=lambda sync: np.isin(sync.offsets, expected), record_octets=8) == expected
 
 
 def test_a_likeness_in_the_last_frame_does_not_cost_the_frame():
     stream = stream_of(3)
-    likeness = MARKER.copy()
-    likeness[3] ^= 0b00000111
-    stream[2 * PERIOD + 60 : 2 * PERIOD + 64] = likeness
+    stream[2 * PERIOD + 60 : 2 * PERIOD + 64] = MARKER ^ np.uint8([0, 0, 0, 7])
     # the stream goes on for most of a frame, whose marker and the rest are damaged
     stream = np.concatenate((stream, np.zeros(PERIOD - 1, dtype=np.uint8)))
     valid = [0, PERIOD, 2 * PERIOD]

@@ -12,7 +12,6 @@ import re
 import struct
 import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -366,7 +365,7 @@ def test_a_changed_definition_is_refused():
         parse_dictionary(json.dumps(content))
 
 
-def effect(name, **arguments: Any):
+def effect(name, **arguments):
     return effect_of(DICTIONARY, name, arguments, packed(name, arguments)).effect
 
 
@@ -496,7 +495,7 @@ def test_a_carried_telecommand_is_written_out_with_its_time():
 def test_every_telecommand_has_a_text_for_its_least_values():
     for definition in DICTIONARY.telecommands:
         counted = definition.group.count if definition.group else None
-        values: dict[str, object] = {
+        values = {
             field.name: field.labels[0][0] if field.labels else int(field.minimum or 0)
             for field in definition.fields
             if field.name != counted
@@ -522,7 +521,7 @@ def packet(name, row, ticks):
     covariance = COVARIANCES[row]
     # Element by element, so that the order of the triangle is that of the interface and not of a library.
     if name == "filter_state":
-        extra: dict[str, Any] = {"covariance": [covariance[i, j] for i in range(9) for j in range(i + 1)]}
+        extra = {"covariance": [covariance[i, j] for i in range(9) for j in range(i + 1)]}
     else:
         triangle = [covariance[i, j] for i in range(9) for j in range(i, 9)]
         extra = {"covariance": triangle, "innovation_degrees": 22}

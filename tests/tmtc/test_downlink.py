@@ -1,7 +1,6 @@
 """The whole chain, packets to CADUs and back, under every setting and every injury."""
 
 import functools
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +37,7 @@ def make_packets(count, seed=0, boot=1, start_s=0):
     sequencer = PacketSequencer()
     packets = []
 
-    def add(name, apid, **values: Any):
+    def add(name, apid, **values):
         packets.append(DICTIONARY.pack(name, values, ticks=ticks, sequence_count=sequencer.next(apid)))
 
     for k in range(count):
@@ -66,7 +65,7 @@ def sent():
     return make_packets(200)
 
 
-def read(octets, **options: Any):
+def read(octets, **options):
     """Decode, and see that all octets are accounted for."""
     decoded = decode(octets, **options)
     assert sum(decoded.octets.values()) == len(octets) and min(decoded.octets.values()) >= 0
@@ -77,7 +76,7 @@ def packets_of(decoded):
     return list(decoded.cut.packets(decoded.buffer))
 
 
-def cadus(spacecraft_id=76, **options: Any):
+def cadus(spacecraft_id=76, **options):
     return encode_cadus(sent(), spacecraft_id=spacecraft_id, **options)
 
 

@@ -67,7 +67,7 @@ def test_symbol_k_of_a_codeblock_belongs_to_codeword_k_modulo_the_depth():
 def test_virtual_fill_is_leading_zeros_that_are_not_sent():
     short, full = ReedSolomon(interleave=1, virtual_fill=23), ReedSolomon(interleave=1)
     frames = frames_for(short)
-    padded = np.concatenate((np.zeros((3, 23), dtype=np.uint8), frames), axis=1)
+    padded = np.pad(frames, ((0, 0), (23, 0)))
     assert np.array_equal(encode(frames, short), encode(padded, full)[:, 23:])
 
 

@@ -1,7 +1,6 @@
 """Packets out of damaged octets: each injury of the known list, then whatever hypothesis thinks of."""
 
 from itertools import accumulate
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ SWALLOWED = len(PACKETS[501]) + len(PACKETS[502])
 """Octets of exactly two packets."""
 
 
-def cut_to(octets, expected, **options: Any):
+def cut_to(octets, expected, **options):
     """Cut octets into the packets that are expected, and see that all octets are accounted for."""
     cut = cut_packets(octets, **options)
     assert list(cut.packets(octets)) == expected
@@ -192,8 +191,8 @@ INJURIES = st.one_of(
 
 def injure(octets, injuries):
     """The octets after the injuries, and marks (n + 1,): 1 octet k was hit, 2 something was put in before it."""
-    before: dict[int, bytes] = {}
-    values: list[int | None] = list(octets)
+    before = {}
+    values = list(octets)
     marks = np.zeros(len(octets) + 1, dtype=np.uint8)
     for kind, position, what in injuries:
         at = position % len(octets)

@@ -3,7 +3,6 @@
 import gzip
 import io
 import zipfile
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +35,7 @@ def ephemeris():
     matrix = rng.normal(size=(6, 6))
     covariances = [Covariance(START + k * 60 * NS, "RTN", (k + 1) * matrix @ matrix.T) for k in (0, 1)]
 
-    def segment(first, shift_ns=0, **fields: Any):
+    def segment(first, shift_ns=0, **fields):
         position, velocity = rng.normal(size=(5, 3)) * 1e6, rng.normal(size=(5, 3)) * 1e3
         return EphemerisSegment(START + np.arange(first, first + 5) * 60 * NS + shift_ns, position, velocity, **fields)
 
@@ -164,7 +163,7 @@ def test_an_error_in_a_state_names_the_line_of_the_xml():
 # Compressed files
 
 
-def zipped(*contents: bytes):
+def zipped(*contents):
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for number, content in enumerate(contents):

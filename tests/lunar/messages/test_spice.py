@@ -43,16 +43,16 @@ def circular(seconds, turn=0.0):
     return radius * np.stack([cos, 0.6 * sin, 0.8 * sin], 1), radius * rate * np.stack([-sin, 0.6 * cos, 0.8 * cos], 1)
 
 
-def segment_of(seconds, turn=0.0, **fields: object):
+def segment_of(seconds, turn=0.0, **fields):
     return EphemerisSegment(START + seconds * NS, *circular(seconds.astype(float), turn), **fields)
 
 
-def written(path, *segments: EphemerisSegment, data_type=None):
+def written(path, *segments, data_type=None):
     path.write_bytes(spk_kernel(Ephemeris(segments), CRAFT, data_type).octets)
     return path
 
 
-def arc(first_s, last_s, step_s=60, **fields: object):
+def arc(first_s, last_s, step_s=60, **fields):
     return segment_of(np.arange(first_s, last_s + 1, step_s), **fields)
 
 
@@ -235,7 +235,7 @@ def test_field_of_view_is_that_of_the_camera(tmp_path):
 def test_without_spiceypy_one_line_names_the_extra(monkeypatch):
     usual = builtins.__import__
 
-    def without(name, *rest: object):
+    def without(name, *rest):
         if name == "spiceypy":
             raise ImportError(name)
         return usual(name, *rest)

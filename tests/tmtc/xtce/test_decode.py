@@ -60,7 +60,7 @@ def values(definition, packets, name="P"):
     return {name: column.to_list() for name, column in columns.items()}
 
 
-def one(data, types, **parameters: str):
+def one(data, types, **parameters):
     """Values of one packet of a container without header."""
     text = layout(types, **parameters)
     assert verdicts(text, [data]) == ["decoded"]
@@ -72,7 +72,7 @@ def one(data, types, **parameters: str):
 
 def rows_of(found, count):
     """(value, raw) by parameter, for every packet."""
-    rows: list[dict[str, tuple]] = [{} for _ in range(count)]
+    rows = [{} for _ in range(count)]
     for table in found.tables.values():
         for name, column in table.columns.items():
             pairs = zip(column.to_list(), column.to_list(raw=True), strict=True)
@@ -326,16 +326,10 @@ ARRAY_ENTRY = '<ArrayParameterRefEntry parameterRef="{}"/>'.format
 
 
 def test_arrays_of_aggregates_follow_their_count_as_in_the_pus_examples_of_yamcs():
-    types = (
-        integer("N", 8)
-        + integer("ID", 12)
-        + integer("S", 4, "twosComplement")
-        + aggregate("ELEMENT", {"id": "ID", "status": "S"})
-        + array_type("REPORT", "ELEMENT", dimension("count"))
-    )
-    text = document(
-        types, {"count": "N", "report": "REPORT", "end": "N"}, container("P", ["count", ARRAY_ENTRY("report"), "end"])
-    )
+    types = integer("N", 8) + integer("ID", 12) + integer("S", 4, "twosComplement")
+    types += aggregate("ELEMENT", {"id": "ID", "status": "S"}) + array_type("REPORT", "ELEMENT", dimension("count"))
+    body = container("P", ["count", ARRAY_ENTRY("report"), "end"])
+    text = document(types, {"count": "N", "report": "REPORT", "end": "N"}, body)
     expected = [[(k * 100 + i, i % 16 - 8) for i in range(n)] for k, n in enumerate((3, 0, 1, 40))]
     packets = []
     for items in expected:
@@ -428,7 +422,7 @@ def test_entries_may_stand_at_places_counted_from_the_start_or_from_the_entry_be
 
 
 def test_entries_under_a_condition_are_there_or_not():
-    def under(parameter, *condition: object):
+    def under(parameter, *condition):
         inside = f"<IncludeCondition>{comparison(*condition)}</IncludeCondition>"
         return f'<ParameterRefEntry parameterRef="{parameter}">{inside}</ParameterRefEntry>'
 
@@ -640,7 +634,7 @@ def test_columns_of_numbers_are_arrays():
     assert list(HEADER) == list(HEADER_PARAMETERS)
 
 
-def parts(apid, first_count, *pieces: bytes, flags=()):
+def parts(apid, first_count, *pieces, flags=()):
     """Parts of a segmented packet: the first alone has a secondary header."""
     chosen = flags or (1, *[0] * (len(pieces) - 2), 2)
     return [
@@ -658,7 +652,7 @@ def stream_of(packets, checksum_octets=0):
     found = Decoder(parse_xtce(text)).decode(
         octets, cut, primary_headers(octets, cut), whole_stream=True, checksum_octets=checksum_octets
     )
-    rows: list = []
+    rows = []
     if table := found.tables.get("P"):
         columns = (table.columns[name].to_list() for name in "ab")
         rows = list(zip(table.packet_index.tolist(), *columns, strict=True))

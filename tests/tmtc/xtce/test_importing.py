@@ -33,7 +33,7 @@ PLAIN = container("P", ["a"])
 MODES = enumerated("m", 8, {1: "ON"})
 
 
-def plain(*more: str):
+def plain(*more):
     return layout(U8, *more, a="u8")
 
 
@@ -50,7 +50,7 @@ def of_type(types):
     return layout(types, a="t")
 
 
-def chosen(text, *packets: bytes):
+def chosen(text, *packets):
     """Places of the packets of Q."""
     return decoded(text, packets).tables["Q"].packet_index.tolist()
 
