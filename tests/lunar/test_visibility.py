@@ -15,7 +15,6 @@ from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from lunar.visibility import (
     GroundStation,
-    _disc_overlap,
     _itrf_from_icrf,
     _zenith,
     find_windows,
@@ -83,6 +82,8 @@ def test_the_covered_share_of_a_disc_is_that_of_a_fine_grid(apart, near_radius, 
     # Far body at unit distance 10, near body at 1, so angular radii are asin(R / d).
     to_far = np.array([10.0, 0.0, 0.0])
     to_near = np.array([math.cos(apart), math.sin(apart), 0.0])
+    from lunar.visibility import _disc_overlap
+
     share = _disc_overlap(to_far, 10.0 * math.sin(far_radius), to_near, math.sin(near_radius))
     x, y = np.meshgrid(*[np.linspace(-far_radius, far_radius, 400)] * 2)
     disc = x**2 + y**2 <= far_radius**2
