@@ -1,9 +1,6 @@
 """SPICE with kernels loaded for one test, and a leap-second kernel of the project's own writing."""
 
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from types import ModuleType
 
 import spiceypy
 
@@ -23,7 +20,7 @@ DELTET/DELTA_AT  = ( 36, @2015-JUL-1
 
 
 @contextmanager
-def kernels(folder: Path, **octets: bytes | str) -> Iterator[ModuleType]:
+def kernels(folder, **octets: bytes | str):
     """Yield spiceypy with leap seconds and the given kernels (name = content) loaded."""
     spiceypy.kclear()
     try:

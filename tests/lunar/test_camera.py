@@ -57,9 +57,8 @@ def test_the_nadir_camera_looks_down_with_north_up_and_east_right(latitude, long
     assert np.allclose(rotation[2], -position / np.linalg.norm(position), atol=1e-12)
     east, north = enu_from_mcmf(latitude, longitude)[:2]
     ground = mcmf_from_spherical(latitude, longitude)
-    u, v = project_mcmf(CAMERA, rotation, position, ground + 1000.0 * np.stack([east, north])).T
-    assert u[0] > 255.6 and abs(v[0] - 255.5) < 1e-6
-    assert v[1] < 255.4 and abs(u[1] - 255.5) < 1e-6
+    right, up = project_mcmf(CAMERA, rotation, position, ground + 1000.0 * np.stack([east, north])) - 255.5
+    assert right[0] > 0.1 and up[1] < -0.1 and max(abs(right[1]), abs(up[0])) < 1e-6
 
 
 @given(latitudes, longitudes, altitudes_m, st.floats(-0.5, 511.5), st.floats(-0.5, 511.5), st.floats(-5000, 5000))
@@ -79,8 +78,7 @@ def test_points_behind_the_camera_and_rays_past_the_limb_are_nan():
     assert np.isnan(CAMERA.project([0.0, 0.0, -1.0])).all()
     position = mcmf_from_spherical(0.0, 0.0, 30e3)
     level = np.cross(position / np.linalg.norm(position), [0, 0, 1.0])
-    assert np.isnan(intersect_sphere(position, level))
-    assert np.isnan(intersect_sphere(position, position / np.linalg.norm(position)))
+    assert np.isnan(intersect_sphere(position, np.stack([level, position / np.linalg.norm(position)]))).all()
 
 
 @given(latitudes, longitudes, altitudes_m, st.floats(0.0, 1.2))
@@ -94,8 +92,8 @@ def test_the_range_to_the_sphere_is_that_of_the_cosine_rule(latitude, longitude,
 
 
 def test_from_inside_a_sphere_the_way_out_is_found():
-    assert intersect_sphere([0.0, 0.0, 500.0], [0.0, 0.0, 1.0], 1000.0) == pytest.approx(500.0)
-    assert intersect_sphere([0.0, 0.0, 500.0], [0.0, 0.0, -1.0], 1000.0) == pytest.approx(1500.0)
+    ways = intersect_sphere(np.array([0.0, 0.0, 500.0]), np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]), 1000.0)
+    assert ways == pytest.approx([500.0, 1500.0])
 
 
 def test_what_lies_behind_the_horizon_is_hidden_and_what_stands_high_is_seen_over_it():

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from lunar.constants import MOON_RADIUS_M, NS, SPEED_OF_LIGHT_M_S
 from lunar.contacts import visibility_spans
@@ -60,24 +61,20 @@ def whole(spans, found):
     return [span for span in spans if span[0] > found.start_utc_ns and span[1] < found.stop_utc_ns]
 
 
-def test_eclipses_last_as_long_as_the_shadow_is_wide(found):
-    expected = behind_s(sun_position_icrf_m(tdb_s_from_utc_ns(START)))
-    durations = lasting_s(whole(found.eclipse, found))
-    assert len(durations) >= REVOLUTIONS - 1
+@pytest.mark.parametrize("name, target, atol", [
     # The Sun has moved by 0.3 deg at the end, edges are found to a second each.
-    np.testing.assert_allclose(durations, expected, atol=8.0)  # s
-
-
-def test_the_earth_is_hidden_as_long_as_the_limb_is_wide(found):
-    expected = behind_s(earth_position_icrf_m(tdb_s_from_utc_ns(START)))
-    durations = lasting_s(whole(found.occultation, found))
-    assert len(durations) >= REVOLUTIONS - 1
+    ("eclipse", sun_position_icrf_m, 8.0),
     # The Earth stands at 215 Moon radii, not at infinity, and has moved by 4 deg at the end: 1 % of 2,800 s.
-    np.testing.assert_allclose(durations, expected, atol=60.0)  # s
+    ("occultation", earth_position_icrf_m, 60.0),
+])  # fmt: skip
+def test_eclipses_and_occultations_last_as_long_as_the_shadow_is_wide(found, name, target, atol):
+    durations = lasting_s(whole(getattr(found, name), found))
+    assert len(durations) >= REVOLUTIONS - 1
+    assert_allclose(durations, behind_s(target(tdb_s_from_utc_ns(START))), atol=atol)  # s
 
 
 def test_half_of_every_revolution_is_over_the_night_side(found):
-    np.testing.assert_allclose(lasting_s(whole(found.night, found)), PERIOD_S / 2.0, atol=8.0)  # s
+    assert_allclose(lasting_s(whole(found.night, found)), PERIOD_S / 2.0, atol=8.0)  # s
 
 
 def test_stations_on_opposite_sides_of_the_earth_share_the_time_that_the_limb_leaves(found):

@@ -1,5 +1,6 @@
 """Segments, coverage and interpolation, against SciPy, SPICE and orbits in closed form."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +29,7 @@ def at_s(ephemeris, elapsed_s):
     return ephemeris.at(START + np.rint(np.asarray(elapsed_s) * NS).astype(np.int64))
 
 
+EVEN_S = np.arange(20) * 30.0
 IRREGULAR_S = np.cumsum(np.random.default_rng(2).uniform(10.0, 60.0, 120)) - 10.0
 
 
@@ -81,11 +83,10 @@ def test_states_come_back_as_they_are_at_their_own_epochs(interpolation):
 
 
 def test_lagrange_interpolation_of_degree_seven_uses_eight_states():
-    ephemeris = arc(np.arange(100) * 30.0, interpolation="LAGRANGE", degree=7)
-    position, velocity = at_s(ephemeris, [1500.3])
+    found = at_s(arc(np.arange(100) * 30.0, interpolation="LAGRANGE", degree=7), [1500.3])
     # 30 s is 0.028 rad: (w h)^8 / 8! x the product of distances (70) x radius is 0.1 mm at most.
-    assert np.allclose(position, circle([1500.3])[0], atol=1e-3)
-    assert np.allclose(velocity, circle([1500.3])[1], atol=1e-5)
+    for mine, expected, atol in zip(found, circle([1500.3]), (1e-3, 1e-5), strict=True):
+        assert np.allclose(mine, expected, atol=atol)
 
 
 @given(st.lists(st.floats(0.0, 3000.0), min_size=1, max_size=40))
@@ -100,36 +101,33 @@ def test_any_order_and_repetition_of_epochs_gives_the_same_states(elapsed):
 
 @pytest.mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
 def test_leading_dimensions_are_kept(shape):
-    position, velocity = at_s(arc(np.arange(20) * 30.0), np.full(shape, 100.0))
+    position, velocity = at_s(arc(EVEN_S), np.full(shape, 100.0))
     assert position.shape == velocity.shape == (*shape, 3)
-    assert arc(np.arange(20) * 30.0).covers(np.full(shape, START)).shape == shape
+    assert arc(EVEN_S).covers(np.full(shape, START)).shape == shape
 
 
-@pytest.mark.parametrize("outside_s", [-1e-9, 570.000000001])
-def test_a_nanosecond_outside_is_refused(outside_s):
-    ephemeris = arc(np.arange(20) * 30.0)
-    epoch = START + round(outside_s * NS)
-    assert not ephemeris.covers(epoch)
-    with pytest.raises(EphemerisCoverageError, match="nothing is extrapolated"):
-        ephemeris.at(epoch)
+def test_a_nanosecond_outside_is_refused():
+    ephemeris = arc(EVEN_S)
+    for epoch in (START - 1, START + 570 * NS + 1):
+        assert not ephemeris.covers(epoch)
+        with pytest.raises(EphemerisCoverageError, match="nothing is extrapolated"):
+            ephemeris.at(epoch)
 
 
 def test_the_useable_interval_is_honoured_and_the_states_beyond_it_still_serve():
     low, high = START + 90 * NS, START + 480 * NS
-    whole = arc(np.arange(20) * 30.0)
-    ephemeris = arc(np.arange(20) * 30.0, useable_start_utc_ns=low, useable_stop_utc_ns=high)
+    whole = arc(EVEN_S)
+    ephemeris = arc(EVEN_S, useable_start_utc_ns=low, useable_stop_utc_ns=high)
     assert (ephemeris.start_utc_ns, ephemeris.stop_utc_ns) == (low, high)
     assert ephemeris.utc_ns[0] == low and ephemeris.utc_ns[-1] == high
     assert ephemeris.covers([low - 1, low, high, high + 1]).tolist() == [False, True, True, False]
     assert np.array_equal(ephemeris.at(low + NS)[0], whole.at(low + NS)[0])
 
 
-def two_arcs(second_start_s=600.0, kick_m_s=5.0):
+def two_arcs(second_start_s=600.0):
     first = arc(np.arange(0.0, 601.0, 30.0)).segments[0]
-    elapsed = np.arange(second_start_s, second_start_s + 601.0, 30.0)
-    position, velocity = circle(elapsed)
-    utc_ns = START + np.rint(elapsed * NS).astype(np.int64)
-    return Ephemeris((first, EphemerisSegment(utc_ns, position, velocity + kick_m_s)))
+    second = arc(np.arange(second_start_s, second_start_s + 601.0, 30.0)).segments[0]
+    return Ephemeris((first, replace(second, velocity_m_s=second.velocity_m_s + 5.0)))
 
 
 def test_nothing_is_interpolated_across_the_edge_of_a_segment():
@@ -174,21 +172,15 @@ def test_a_leap_second_inside_a_segment_does_no_harm():
     assert np.allclose(position, circle([-10.0, 15.0])[0], atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda t, p, v: (t[::-1], p, v), "expected an epoch after"),
-        (lambda t, p, v: (np.r_[t[:1], t[:-1]], p, v), "expected an epoch after"),
-        (lambda t, p, v: (t, p[:-1], v), "expected positions (20, 3), found (19, 3)"),
-        (lambda t, p, v: (t, p, v * np.nan), "state 0: expected finite velocities"),
-        (lambda t, p, v: (t[:0], p[:0], v[:0]), "at least one state"),
-    ],
-)
-def test_states_that_form_no_segment_are_refused(change, message):
-    states = change(START + np.arange(20) * 30 * NS, *circle(np.arange(20) * 30.0))
-    with pytest.raises(EphemerisError) as caught:
-        EphemerisSegment(*states)
-    assert message in str(caught.value)
+def test_states_that_form_no_segment_are_refused():
+    t, (p, v) = START + np.arange(20) * 30 * NS, circle(EVEN_S)
+    for states, message in (
+        ((t[::-1], p, v), "expected an epoch after"), ((np.r_[t[:1], t[:-1]], p, v), "expected an epoch after"),
+        ((t, p[:-1], v), "expected positions (20, 3), found (19, 3)"), ((t[:0], p[:0], v[:0]), "at least one state"),
+        ((t, p, v * np.nan), "state 0: expected finite velocities"),
+    ):  # fmt: skip
+        with pytest.raises(EphemerisError, match=re.escape(message)):
+            EphemerisSegment(*states)
 
 
 def test_overlapping_segments_and_no_segments_are_refused():
@@ -198,21 +190,16 @@ def test_overlapping_segments_and_no_segments_are_refused():
         Ephemeris(())
 
 
-@pytest.mark.parametrize("text", ["", "\n\n", "once upon a time\n", "# a comment\nmore\n"])
-def test_a_file_of_neither_format_is_refused(tmp_path, text):
-    path = tmp_path / "orbit.txt"
-    path.write_text(text)
-    with pytest.raises(
-        DataFileError, match=r"orbit\.txt: first line: expected CCSDS_OEM_VERS, stk\.v\., XML or a Horizons table"
-    ):
+def test_files_of_neither_format_missing_and_binary_ones_are_refused(tmp_path):
+    line = r"orbit: first line: expected CCSDS_OEM_VERS, stk\.v\., XML or a Horizons table"
+    kinds = "orbit.*expected a CCSDS OEM, STK .e or Horizons"
+    path = tmp_path / "orbit"
+    with pytest.raises(DataFileError, match=kinds):
         load_ephemeris(path)
-
-
-def test_missing_and_binary_files_are_refused(tmp_path):
-    (tmp_path / "binary").write_bytes(bytes(range(256)))
-    for name in ("binary", "missing"):
-        with pytest.raises(DataFileError, match=f"{name}.*expected a CCSDS OEM, STK .e or Horizons"):
-            load_ephemeris(tmp_path / name)
+    for octets in (b"", b"\n\n", b"once upon a time\n", b"# a comment\nmore\n", bytes(range(256))):
+        path.write_bytes(octets)
+        with pytest.raises(DataFileError, match=kinds if octets[:1] == b"\0" else line):
+            load_ephemeris(path)
 
 
 def test_states_in_other_axes_make_no_ephemeris():
@@ -266,24 +253,14 @@ def test_states_that_gravity_moves_are_accepted_also_with_an_orbit_determination
     check_gravity(with_states(polar_orbit(0.01, step_s=1.0), scaled(1.003, 1.003)))  # 36 s of 0.9 %: a mascon?
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            scaled(1e3, 1e3),
-            r"gravity 1\.76818e\+06 km from the centre of the Moon, found 423\.6 m/s2, 1\.59e\+07 % off",
-        ),
-        (scaled(1e-3, 1e-3), "gravity 1.76818 km from .*, found 0.0015"),
-        (scaled(1.0, 1e-3), r"expected an acceleration of 1\.6 m/s2 by gravity 1768.18 km .* found 9\.197 m/s2"),
-        (scaled(3.95, 4.5), "gravity 6984.31 km from .* another centre"),
-        (scaled(1.003, 1.003), r"found 1\.5\d+ m/s2, 0\.9\d\d % off"),
-        (fixed_to_the_moon, r"found 1\.5\d+ m/s2, 0\.\d+ % off; rotating axes"),
-    ],
-    ids=[
-        "metres for kilometres", "kilometres for metres", "velocity in km/s", "orbit about the Earth", "scale",
-        "axes",
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("change, message", [
+    (scaled(1e3, 1e3), r"gravity 1\.76818e\+06 km from the centre of the Moon, found 423\.6 m/s2, 1\.59e\+07 % off"),
+    (scaled(1e-3, 1e-3), "gravity 1.76818 km from .*, found 0.0015"),
+    (scaled(1.0, 1e-3), r"expected an acceleration of 1\.6 m/s2 by gravity 1768.18 km .* found 9\.197 m/s2"),
+    (scaled(3.95, 4.5), "gravity 6984.31 km from .* another centre"),
+    (scaled(1.003, 1.003), r"found 1\.5\d+ m/s2, 0\.9\d\d % off"),
+    (fixed_to_the_moon, r"found 1\.5\d+ m/s2, 0\.\d+ % off; rotating axes"),
+])  # fmt: skip
 def test_states_that_gravity_does_not_move_are_refused_with_the_numbers(change, message):
     with pytest.raises(UnmovedByGravity, match=message):
         check_gravity(with_states(polar_orbit(4.0), change))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import pdtrc
 
-from lunar.camera import PinholeCamera, above_horizon, nadir_camera_from_mcmf, project_mcmf
+from lunar.camera import PinholeCamera, above_horizon, intersect_sphere, nadir_camera_from_mcmf, project_mcmf
 from lunar.catalogue import make_catalogue, paper_density_catalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.errors import LunarError
@@ -45,8 +45,6 @@ def test_uniform_craters_follow_poisson_in_the_true_footprint():
     position = mcmf_from_spherical(0.0, 0.0, altitude_m)
     v, u = np.mgrid[0:200, 0:200]
     rays = camera.rays(np.stack([u, v], -1)) @ nadir_camera_from_mcmf(position)
-    from lunar.camera import intersect_sphere
-
     range_m = intersect_sphere(position, rays)
     normal = (position + range_m[..., None] * rays) / MOON_RADIUS_M
     solid = (rays @ -position / np.linalg.norm(position)) ** 3 / camera.focal_px**2

@@ -5,16 +5,16 @@ import math
 import sys
 from pathlib import Path
 
-import mpmath
 import numpy as np
 import pytest
+from mpmath import atan2, cos, mp, mpf, sin, sqrt
 
 from lunar import _gravity_kernel as kernel
 from lunar.errors import DataFileError, OrbitError
 from lunar.gravity import GravityField, acceleration, builtin_gravity, gradient, load_gravity, packed
 
 
-def kaula_field(degree: int, seed: int = 1) -> GravityField:
+def kaula_field(degree, seed=1):
     """A made-up field of the Moon's roughness (Kaula's rule, 2.5e-4 / n^2), central term 1."""
     rng = np.random.default_rng(seed)
     n = np.arange(degree + 1.0)[:, None]
@@ -26,47 +26,41 @@ def kaula_field(degree: int, seed: int = 1) -> GravityField:
     return GravityField("made up", 4.9028e12, 1.738e6, c, s)
 
 
-def exact_acceleration(field: GravityField, position: np.ndarray, degree: int) -> np.ndarray:
+def exact_acceleration(field, position, degree):
     """The gradient of the potential by central differences of its definition, with 50 digits."""
-    mpmath.mp.dps = 50
+    mp.dps = 50
 
-    def potential(x: mpmath.mpf, y: mpmath.mpf, z: mpmath.mpf) -> mpmath.mpf:
-        r = mpmath.sqrt(x * x + y * y + z * z)
-        u, c = z / r, mpmath.sqrt(x * x + y * y) / r
-        longitude = mpmath.atan2(y, x)
-        total, sectorial = mpmath.mpf(0), mpmath.mpf(1)
+    def potential(x, y, z):
+        r = sqrt(x * x + y * y + z * z)
+        u, c = z / r, sqrt(x * x + y * y) / r
+        longitude = atan2(y, x)
+        total, sectorial = mpf(0), mpf(1)
         for m in range(degree + 1):
             if m:
-                sectorial *= c * mpmath.sqrt(mpmath.mpf((2 * m + 1) * (2 if m == 1 else 1)) / (2 * m))
-            before, now = mpmath.mpf(0), sectorial
-            cos, sin = mpmath.cos(m * longitude), mpmath.sin(m * longitude)
+                sectorial *= c * sqrt(mpf((2 * m + 1) * (2 if m == 1 else 1)) / (2 * m))
+            before, now = mpf(0), sectorial
+            east, north = cos(m * longitude), sin(m * longitude)
             for n in range(m, degree + 1):
                 if n > m:
-                    a = mpmath.sqrt(mpmath.mpf((2 * n - 1) * (2 * n + 1)) / ((n - m) * (n + m)))
-                    b = mpmath.mpf((2 * n + 1) * (n + m - 1) * (n - m - 1)) / ((n - m) * (n + m) * (2 * n - 3))
-                    before, now = now, a * u * now - mpmath.sqrt(b) * before
-                weight = mpmath.mpf(float(field.c_bar[n, m])) * cos + mpmath.mpf(float(field.s_bar[n, m])) * sin
-                total += (mpmath.mpf(field.radius_m) / r) ** n * now * weight
-        return mpmath.mpf(field.gm_m3_s2) / r * total
+                    a = sqrt(mpf((2 * n - 1) * (2 * n + 1)) / ((n - m) * (n + m)))
+                    b = mpf((2 * n + 1) * (n + m - 1) * (n - m - 1)) / ((n - m) * (n + m) * (2 * n - 3))
+                    before, now = now, a * u * now - sqrt(b) * before
+                weight = mpf(float(field.c_bar[n, m])) * east + mpf(float(field.s_bar[n, m])) * north
+                total += (mpf(field.radius_m) / r) ** n * now * weight
+        return mpf(field.gm_m3_s2) / r * total
 
-    start = [mpmath.mpf(float(value)) for value in position]
-    step = mpmath.mpf(10) ** -12
-    result = []
-    for axis in range(3):
-        up, down = list(start), list(start)
-        up[axis] += step
-        down[axis] -= step
-        result.append(float((potential(*up) - potential(*down)) / (2 * step)))
-    return np.array(result)
+    start = np.array([mpf(float(value)) for value in position])
+    steps = mpf(10) ** -12 * np.eye(3, dtype=int)
+    return np.array([float((potential(*(start + d)) - potential(*(start - d))) / (2 * d.sum())) for d in steps])
 
 
-def at(latitude_deg: float, longitude_deg: float, altitude_km: float = 30.0) -> np.ndarray:
+def at(latitude_deg, longitude_deg, altitude_km=30.0):
     r, lat, lon = 1.7374e6 + 1e3 * altitude_km, math.radians(latitude_deg), math.radians(longitude_deg)
     return r * np.array([math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)])
 
 
 @pytest.mark.parametrize("place", [at(37.0, -101.0), at(-89.2, 12.0), at(1e-3, 200.0, 14.0)])
-def test_degree_100_agrees_with_an_evaluation_in_fifty_digits(place: np.ndarray) -> None:
+def test_degree_100_agrees_with_an_evaluation_in_fifty_digits(place):
     field = kaula_field(100)
     expected = exact_acceleration(field, place, 100)
     # 5,000 terms of a double each: a few units in the last place of the sum.
@@ -74,14 +68,14 @@ def test_degree_100_agrees_with_an_evaluation_in_fifty_digits(place: np.ndarray)
 
 
 @pytest.mark.parametrize("degree", [*range(13), 20, 31, 32, 33])
-def test_every_degree_agrees_with_the_definition_whatever_the_number_of_blocks(degree: int) -> None:
+def test_every_degree_agrees_with_the_definition_whatever_the_number_of_blocks(degree):
     field = kaula_field(33)
     place = at(-21.0, 77.0, 100.0)
     expected = exact_acceleration(field, place, degree)
     assert np.linalg.norm(acceleration(field, place, degree) - expected) <= 3e-15 * np.linalg.norm(expected)
 
 
-def test_nothing_happens_at_the_poles() -> None:
+def test_nothing_happens_at_the_poles():
     field = kaula_field(60)
     pole = np.array([0.0, 0.0, -1.768e6])
     beside = acceleration(field, pole + np.array([1e-3, 0.0, 0.0]))
@@ -90,13 +84,13 @@ def test_nothing_happens_at_the_poles() -> None:
     assert np.all(np.isfinite(gradient(field, pole, 20)))
 
 
-def test_a_sphere_pulls_as_a_point_mass() -> None:
+def test_a_sphere_pulls_as_a_point_mass():
     place = at(12.0, 34.0, 1000.0)
     expected = -4.9028e12 * place / np.linalg.norm(place) ** 3
     assert np.allclose(acceleration(kaula_field(5), place, 0), expected, rtol=1e-15)
 
 
-def test_oblateness_pulls_as_in_the_closed_form() -> None:
+def test_oblateness_pulls_as_in_the_closed_form():
     """Vallado, Fundamentals of Astrodynamics (2013), equations 8-19 and following: acceleration by J2."""
     j2, radius, gm = 2.0e-4, 1.738e6, 4.9e12
     c = np.zeros((3, 3))
@@ -111,7 +105,7 @@ def test_oblateness_pulls_as_in_the_closed_form() -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 8, 40])
-def test_the_gradient_is_the_change_of_the_acceleration(degree: int) -> None:
+def test_the_gradient_is_the_change_of_the_acceleration(degree):
     field = kaula_field(40)
     place, step = at(-63.0, 140.0), 10.0
     expected = np.stack(
@@ -128,7 +122,7 @@ def test_the_gradient_is_the_change_of_the_acceleration(degree: int) -> None:
     assert abs(np.trace(found)) < 1e-20
 
 
-def test_shapes_are_kept_for_none_one_and_many_positions() -> None:
+def test_shapes_are_kept_for_none_one_and_many_positions():
     field = kaula_field(4)
     assert acceleration(field, np.empty((0, 3))).shape == (0, 3)
     assert acceleration(field, at(0, 0)).shape == (3,)
@@ -138,7 +132,7 @@ def test_shapes_are_kept_for_none_one_and_many_positions() -> None:
     assert gradient(field, places).shape == (2, 2, 3, 3)
 
 
-def test_the_other_vector_width_gives_the_same_sums(tmp_path: Path) -> None:
+def test_the_other_vector_width_gives_the_same_sums(tmp_path):
     """Machines differ in the width of their vectors; here the one this machine does not use by itself."""
     text = Path(kernel.__file__).read_text(encoding="utf-8")
     marker = 'LANES = 8 if get_host_cpu_features().get("avx512f") else 4'
@@ -159,7 +153,7 @@ def test_the_other_vector_width_gives_the_same_sums(tmp_path: Path) -> None:
     assert np.allclose(found, acceleration(field, places), rtol=1e-14)
 
 
-def test_truncation_asks_for_a_degree_the_field_has() -> None:
+def test_truncation_asks_for_a_degree_the_field_has():
     field = kaula_field(5)
     assert field.truncated(3).degree == 3
     assert field.truncated(5) is field
@@ -169,7 +163,7 @@ def test_truncation_asks_for_a_degree_the_field_has() -> None:
     assert packed(field, 3) is packed(field, 3)
 
 
-def test_the_built_in_field_says_what_it_is() -> None:
+def test_the_built_in_field_says_what_it_is():
     field = builtin_gravity()
     assert field.degree == 12 and "GRGM1200L" in field.name
     assert field.c_bar[0, 0] == 1.0 and np.all(field.s_bar[:, 0] == 0.0)
@@ -180,7 +174,7 @@ def test_the_built_in_field_says_what_it_is() -> None:
 
 
 @pytest.mark.real_data
-def test_the_built_in_field_agrees_with_other_fields(data_path: Path) -> None:
+def test_the_built_in_field_agrees_with_other_fields(data_path):
     builtin = builtin_gravity()
     for name, tolerance in (("GRGM660PRIM_to150.gfc", 1e-8), ("LP165P.cof", 5e-7)):
         other = load_gravity(data_path / "gravity" / name, max_degree=12)
@@ -190,7 +184,7 @@ def test_the_built_in_field_agrees_with_other_fields(data_path: Path) -> None:
 
 
 @pytest.mark.real_data
-def test_published_files_are_read_to_their_last_line(data_path: Path) -> None:
+def test_published_files_are_read_to_their_last_line(data_path):
     grail = load_gravity(data_path / "gravity" / "GRGM660PRIM_to150.gfc")
     assert (grail.name, grail.degree, grail.gm_m3_s2, grail.radius_m) == (
         *("GRGM660PRIM", 150),
@@ -246,7 +240,7 @@ SHTOOLS_KM = "1.738E+03, 4.9E+03, 2.66E-06, 2, 2\n" + SHADR.partition("\n")[2]
 @pytest.mark.parametrize(
     "text", [ICGEM, COF, SHADR, SHTOOLS, SHTOOLS_KM], ids=["icgem", "cof", "shadr", "pyshtools", "pyshtools in km"]
 )
-def test_the_formats_hold_the_same_field(text: str, tmp_path: Path) -> None:
+def test_the_formats_hold_the_same_field(text, tmp_path):
     path = tmp_path / "tiny"
     path.write_text(text)
     field = load_gravity(path)
@@ -256,44 +250,55 @@ def test_the_formats_hold_the_same_field(text: str, tmp_path: Path) -> None:
     assert field.s_bar.tolist() == [[0.0] * 3, [0.0] * 3, [0.0, 2e-9, -1e-10]]
 
 
-@pytest.mark.parametrize(
-    ("text", "where", "expected"),
-    [
-        (ICGEM.replace("gfc 2 2 3.4e-05 -1.0e-10\n", ""), "degree 2, order 2", "all coefficients to degree 2"),
-        (ICGEM.replace("gfc 2 1", "gfc 1 2"), "line 10", "order <= degree <= 2"),
-        (ICGEM.replace("gfc 2 1", "gfc 2 0"), "line 10", "every coefficient once"),
-        (ICGEM.replace("fully_normalized", "unnormalized"), "header, norm", "fully_normalized"),
-        (ICGEM.replace("3.4e-05", "3.4e-0x"), "line 11", "degree, order and two coefficients"),
-        (ICGEM.replace("3.4e-05", "nan"), "line 11", "finite coefficients"),
-        (ICGEM.replace("max_degree 2\n", ""), "header, max_degree", "a number"),
-        (ICGEM.replace("0.49D+13", "0.49"), "header", "Moon's GM of 4.9028e+12 m3/s2"),
-        (ICGEM.replace("0.49D+13", "3.986004415E+14"), "header", "radius of 1.7374e+06 m"),
-        (ICGEM.replace("1.738E+06", "1.738E+03"), "header", "radius of 1.7374e+06 m"),
-        (SHADR.replace("1.738E+03", "3.396E+03"), "header", "radius of 1.7374e+06 m"),
-        (SHTOOLS.replace("1.738", "3.396"), "header", "radius of 1.7374e+06 m"),
-        (SHTOOLS.replace("-9.0e-05", "-2.032e-04"), "degree 2, order 0", "normalised flattening"),
-        (SHTOOLS.replace("2, 2, 3.4e-05, -1.0e-10\n", ""), "degree 2, order 2", "all coefficients to degree 2"),
-        (ICGEM.replace("-9.0D-05", "-9.0"), "degree 2, order 0", "normalised flattening"),
-        (COF.replace("END\n", ""), "end of file", "END"),
-        (COF.replace("1.00000000000000e+00\n", "0.00000000000000e+00\n"), "line 3", "normalised coefficients"),
-        (COF.replace("RECOEF    2  2", "RECOEF    3  2"), "line 6", "order <= degree <= 2"),
-        (SHADR.replace("2, 2, 1,", "2, 2, 0,"), "line 1, normalisation state", "fully normalised"),
-        (SHADR[:-30], "line 4", "degree, order and two coefficients"),
-        ("hello\n", "", "an ICGEM, GMAT .cof, PDS SHADR or pyshtools gravity field"),
-        ("", "", "an ICGEM, GMAT .cof, PDS SHADR or pyshtools gravity field"),
-    ],
-)
-def test_a_bad_file_is_named_with_the_place_and_what_was_expected(
-    text: str, where: str, expected: str, tmp_path: Path
-) -> None:
+# What is replaced | by what | where | what was expected; ¶ is the end of a line. Each is tried on the format before it.
+FAULTS = {
+    ICGEM: """
+gfc 2 2 3.4e-05 -1.0e-10¶ |  | degree 2, order 2 | all coefficients to degree 2
+gfc 2 1 | gfc 1 2 | line 10 | order <= degree <= 2
+gfc 2 1 | gfc 2 0 | line 10 | every coefficient once
+fully_normalized | unnormalized | header, norm | fully_normalized
+3.4e-05 | 3.4e-0x | line 11 | degree, order and two coefficients
+3.4e-05 | nan | line 11 | finite coefficients
+max_degree 2¶ |  | header, max_degree | a number
+0.49D+13 | 0.49 | header | Moon's GM of 4.9028e+12 m3/s2
+0.49D+13 | 3.986004415E+14 | header | radius of 1.7374e+06 m
+1.738E+06 | 1.738E+03 | header | radius of 1.7374e+06 m
+-9.0D-05 | -9.0 | degree 2, order 0 | normalised flattening
+""",
+    SHADR: """
+1.738E+03 | 3.396E+03 | header | radius of 1.7374e+06 m
+2, 2, 1, | 2, 2, 0, | line 1, normalisation state | fully normalised
+    2,    2, 3.4E-05,-1.0E-10, 0.0, 0.0¶ |     2,    2, | line 4 | degree, order and two coefficients
+""",
+    SHTOOLS: """
+1.738 | 3.396 | header | radius of 1.7374e+06 m
+-9.0e-05 | -2.032e-04 | degree 2, order 0 | normalised flattening
+2, 2, 3.4e-05, -1.0e-10¶ |  | degree 2, order 2 | all coefficients to degree 2
+""",
+    COF: """
+END¶ |  | end of file | END
+1.00000000000000e+00¶ | 0.00000000000000e+00¶ | line 3 | normalised coefficients
+RECOEF    2  2 | RECOEF    3  2 | line 6 | order <= degree <= 2
+""",
+    "hello\n": """
+hello | hullo |  | an ICGEM, GMAT .cof, PDS SHADR or pyshtools gravity field
+hello¶ |  |  | an ICGEM, GMAT .cof, PDS SHADR or pyshtools gravity field
+""",
+}
+
+
+@pytest.mark.parametrize("text, row", [(text, row) for text in FAULTS for row in FAULTS[text].strip("\n").splitlines()])
+def test_a_bad_file_is_named_with_the_place_and_what_was_expected(text, row, tmp_path):
+    old, new, where, expected = row.replace("¶", "\n").split(" | ")
+    assert old in text
     path = tmp_path / "bad.field"
-    path.write_text(text)
+    path.write_text(text.replace(old, new))
     with pytest.raises(DataFileError) as caught:
         load_gravity(path)
     assert where in caught.value.where and expected in caught.value.expected
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
+def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(DataFileError, match=r"nowhere\.gfc: expected a gravity field file"):
         load_gravity(tmp_path / "nowhere.gfc")

@@ -4,11 +4,7 @@ What is in a packet is written here with Python integers and `struct` alone, so 
 the code under test.
 """
 
-from __future__ import annotations
-
 import struct
-from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from spacepackets.ccsds import PacketType, SpacePacketHeader
@@ -16,7 +12,7 @@ from spacepackets.ccsds import PacketType, SpacePacketHeader
 NAMESPACE = "http://www.omg.org/spec/XTCE/20180204"
 
 
-def document(types: str, parameters: dict[str, str], containers: str, name: str = "BUS", more: str = "") -> str:
+def document(types, parameters, containers, name="BUS", more=""):
     """An XTCE document of types, parameters (name: type) and containers."""
     listed = "".join(f'<Parameter name="{key}" parameterTypeRef="{kind}"/>' for key, kind in parameters.items())
     return (
@@ -26,7 +22,7 @@ def document(types: str, parameters: dict[str, str], containers: str, name: str 
     )
 
 
-def integer(name: str, bits: int, encoding: str = "unsigned", inner: str = "", order: str = "") -> str:
+def integer(name, bits, encoding="unsigned", inner="", order=""):
     byte_order = f' byteOrder="{order}"' if order else ""
     return (
         f'<IntegerParameterType name="{name}" signed="{str(encoding != "unsigned").lower()}"><UnitSet/>'
@@ -35,7 +31,7 @@ def integer(name: str, bits: int, encoding: str = "unsigned", inner: str = "", o
     )
 
 
-def floating(name: str, bits: int, encoding: str = "IEEE754", order: str = "") -> str:
+def floating(name, bits, encoding="IEEE754", order=""):
     byte_order = f' byteOrder="{order}"' if order else ""
     return (
         f'<FloatParameterType name="{name}"><UnitSet/>'
@@ -43,7 +39,7 @@ def floating(name: str, bits: int, encoding: str = "IEEE754", order: str = "") -
     )
 
 
-def calibrated(name: str, bits: int, encoding: str, calibrator: str) -> str:
+def calibrated(name, bits, encoding, calibrator):
     return (
         f'<FloatParameterType name="{name}"><UnitSet><Unit>V</Unit></UnitSet>'
         f'<IntegerDataEncoding sizeInBits="{bits}" encoding="{encoding}">{calibrator}</IntegerDataEncoding>'
@@ -51,21 +47,21 @@ def calibrated(name: str, bits: int, encoding: str, calibrator: str) -> str:
     )
 
 
-def polynomial(*coefficients: float) -> str:
+def polynomial(*coefficients):
     terms = "".join(f'<Term coefficient="{c!r}" exponent="{k}"/>' for k, c in enumerate(coefficients))
     return f"<PolynomialCalibrator>{terms}</PolynomialCalibrator>"
 
 
-def default(calibrator: str) -> str:
+def default(calibrator):
     return f"<DefaultCalibrator>{calibrator}</DefaultCalibrator>"
 
 
-def spline(points: list[tuple[float, float]], order: int, extrapolate: bool) -> str:
+def spline(points, order, extrapolate):
     listed = "".join(f'<SplinePoint raw="{a}" calibrated="{b}"/>' for a, b in points)
     return f'<SplineCalibrator order="{order}" extrapolate="{str(extrapolate).lower()}">{listed}</SplineCalibrator>'
 
 
-def comparison(parameter: str, value: object, operator: str = "==", calibrated: bool = True) -> str:
+def comparison(parameter, value, operator="==", calibrated=True):
     operator = operator.replace("<", "&lt;").replace(">", "&gt;")
     return (
         f'<Comparison parameterRef="{parameter}" value="{value}" comparisonOperator="{operator}" '
@@ -73,7 +69,7 @@ def comparison(parameter: str, value: object, operator: str = "==", calibrated: 
     )
 
 
-def container(name: str, entries: list[str], base: str = "", criteria: str = "", *, abstract: bool = False) -> str:
+def container(name, entries, base="", criteria="", *, abstract=False):
     listed = "".join(
         entry if entry.startswith("<") else f'<ParameterRefEntry parameterRef="{entry}"/>' for entry in entries
     )
@@ -87,7 +83,17 @@ def container(name: str, entries: list[str], base: str = "", criteria: str = "",
     )
 
 
-def both(*comparisons: str) -> str:
+def layout(types, *more, **parameters):
+    """A document of one container P with all its parameters, and containers that continue it."""
+    return document(types, parameters, container("P", list(parameters)) + "".join(more))
+
+
+def child(criteria, name="Q", base="P"):
+    """A container that adds nothing but a condition."""
+    return container(name, [], base, criteria)
+
+
+def both(*comparisons):
     return f"<ComparisonList>{''.join(comparisons)}</ComparisonList>"
 
 
@@ -98,13 +104,19 @@ HEADER_TYPES = "".join(integer(f"U{bits}", bits) for bits in sorted(set(HEADER.v
 HEADER_PARAMETERS = {name: f"U{bits}" for name, bits in HEADER.items()}
 HEADER_CONTAINER = container("CCSDSPacket", list(HEADER), abstract=True)
 
+
+def bus_like(parameters, *containers, types=""):
+    """A document of packets with the primary header."""
+    return document(HEADER_TYPES + types, {**HEADER_PARAMETERS, **parameters}, HEADER_CONTAINER + "".join(containers))
+
+
 LITTLE = "leastSignificantByteFirst"
 _MODES = {0: "SAFE", 1: "NOMINAL", 7: "DETUMBLE"}
 _LINEAR = [(0.0, -40.0), (64.0, 0.0), (128.0, 35.5), (255.0, 125.0)]
 _STEPS = [(0.0, 1.0), (100.0, 2.5), (255.0, 4.0)]
 
 
-def _enumerated(name: str, bits: int, labels: dict[int, str], encoding: str = "unsigned") -> str:
+def enumerated(name, bits, labels, encoding="unsigned"):
     listed = "".join(f'<Enumeration value="{code}" label="{label}"/>' for code, label in labels.items())
     return (
         f'<EnumeratedParameterType name="{name}"><UnitSet/>'
@@ -113,22 +125,30 @@ def _enumerated(name: str, bits: int, labels: dict[int, str], encoding: str = "u
     )
 
 
-def _string(name: str, size: str, charset: str = "UTF-8") -> str:
+def text_type(size, charset="UTF-8", name="T"):
     return (
         f'<StringParameterType name="{name}"><UnitSet/>'
         f'<StringDataEncoding encoding="{charset}">{size}</StringDataEncoding></StringParameterType>'
     )
 
 
-def fixed_size(bits: int, inside: str = "") -> str:
+def binary(size, after="", name="B"):
+    """Octets of a fixed number of bits, or of a size that is written out."""
+    written = f"<FixedValue>{size}</FixedValue>" if isinstance(size, int) else size
+    return (
+        f'<BinaryParameterType name="{name}"><UnitSet/><BinaryDataEncoding><SizeInBits>{written}</SizeInBits>{after}'
+        "</BinaryDataEncoding></BinaryParameterType>"
+    )
+
+
+def fixed_size(bits, inside=""):
     return f"<SizeInBits><Fixed><FixedValue>{bits}</FixedValue></Fixed>{inside}</SizeInBits>"
 
 
-def _dynamic(parameter: str, slope: int, intercept: int = 0) -> str:
-    return (
-        f'<DynamicValue><ParameterInstanceRef parameterRef="{parameter}"/>'
-        f'<LinearAdjustment slope="{slope}" intercept="{intercept}"/></DynamicValue>'
-    )
+def dynamic(parameter, **adjustment):
+    attributes = "".join(f' {key}="{value}"' for key, value in adjustment.items())
+    adjusted = f"<LinearAdjustment{attributes}/>" if adjustment else ""
+    return f'<DynamicValue><ParameterInstanceRef parameterRef="{parameter}"/>{adjusted}</DynamicValue>'
 
 
 _TYPES = (
@@ -142,8 +162,8 @@ _TYPES = (
     + "".join(floating(f"F{bits}", bits) for bits in (16, 32, 64))
     + floating("F64LE", 64, order=LITTLE)
     + floating("MIL", 32, "MILSTD_1750A")
-    + _enumerated("MODE", 3, _MODES)
-    + _enumerated("TREND", 4, {-1: "FALLING", 0: "LEVEL", 1: "RISING"}, "twosComplement")
+    + enumerated("MODE", 3, _MODES)
+    + enumerated("TREND", 4, {-1: "FALLING", 0: "LEVEL", 1: "RISING"}, "twosComplement")
     + '<BooleanParameterType name="FLAG"><UnitSet/><IntegerDataEncoding sizeInBits="1"/></BooleanParameterType>'
     + calibrated("VOLT", 12, "unsigned", default(polynomial(-1.5, 0.25)))
     + calibrated("TEMP", 16, "twosComplement", default(polynomial(21.0, 0.5, -0.001953125)))
@@ -162,16 +182,13 @@ _TYPES = (
     + '<AbsoluteTimeParameterType name="CLOCK"><Encoding units="seconds" scale="0.0009765625" offset="10">'
     '<IntegerDataEncoding sizeInBits="32"/></Encoding><ReferenceTime><Epoch>TAI</Epoch></ReferenceTime>'
     "</AbsoluteTimeParameterType>"
-    + _string("NAME", fixed_size(64), "US-ASCII")
-    + _string("LABEL", fixed_size(96, "<TerminationChar>00</TerminationChar>"))
-    + _string("TAGGED", fixed_size(80, '<LeadingSize sizeInBitsOfSizeTag="8"/>'))
-    + _string("WIDE", fixed_size(64), "UTF-16BE")
-    + _string("TEXT", f'<Variable maxSizeInBits="2040">{_dynamic("TEXT_LENGTH", 8)}</Variable>')
-    + '<BinaryParameterType name="DUMP"><UnitSet/><BinaryDataEncoding><SizeInBits>'
-    + _dynamic("PKT_LEN", 8, -8 * 10)
-    + "</SizeInBits></BinaryDataEncoding></BinaryParameterType>"
-    + '<BinaryParameterType name="KEY"><UnitSet/><BinaryDataEncoding><SizeInBits><FixedValue>24</FixedValue>'
-    "</SizeInBits></BinaryDataEncoding></BinaryParameterType>"
+    + text_type(fixed_size(64), "US-ASCII", "NAME")
+    + text_type(fixed_size(96, "<TerminationChar>00</TerminationChar>"), name="LABEL")
+    + text_type(fixed_size(80, '<LeadingSize sizeInBitsOfSizeTag="8"/>'), name="TAGGED")
+    + text_type(fixed_size(64), "UTF-16BE", "WIDE")
+    + text_type(f'<Variable maxSizeInBits="2040">{dynamic("TEXT_LENGTH", slope=8)}</Variable>', name="TEXT")
+    + binary(dynamic("PKT_LEN", slope=8, intercept=-80), name="DUMP")
+    + binary(24, name="KEY")
 )
 
 # name: type, in the order of the packet; each housekeeping value stands under its own name
@@ -193,7 +210,7 @@ _PARAMETERS = {
 APID_HOUSEKEEPING, APID_EVENT, APID_DUMP, APID_BARE = 0x064, 0x065, 0x066, 0x3E7
 
 
-def _either(*conditions: tuple[str, str, object]) -> str:
+def _either(*conditions: tuple[str, str, object]):
     listed = "".join(
         f'<Condition><ParameterInstanceRef parameterRef="{p}" useCalibratedValue="false"/>'
         f"<ComparisonOperator>{o}</ComparisonOperator><Value>{v}</Value></Condition>"
@@ -221,29 +238,29 @@ BUS = document(
 )  # fmt: skip
 
 
-@dataclass
 class Bits:
     """Bits written one value after another."""
 
-    number: int = 0
-    count: int = 0
-    values: dict[str, Any] = field(default_factory=dict)
+    number = 0
+    count = 0
 
-    def add(self, value: int, bits: int) -> Bits:
+    def add(self, value, bits):
+        value = int(value)
         assert -(1 << bits) <= value < 1 << bits
         self.number = self.number << bits | value & ((1 << bits) - 1)
         self.count += bits
         return self
 
-    def octets(self, data: bytes) -> Bits:
-        return self.add(int.from_bytes(data, "big"), 8 * len(data)) if data else self
+    def octets(self, data):
+        return self.add(int.from_bytes(data, "big"), 8 * len(data))
 
-    def packed(self) -> bytes:
-        assert self.count % 8 == 0
+    def packed(self):
+        """The octets, the last filled with zeros."""
+        self.add(0, -self.count % 8)
         return self.number.to_bytes(self.count // 8, "big")
 
 
-def space_packet(apid: int, data: bytes, count: int, secondary: bool = True) -> bytes:
+def space_packet(apid, data, count, secondary=True):
     """A packet with the header that `spacepackets` makes."""
     header = SpacePacketHeader(
         packet_type=PacketType.TM, apid=apid, seq_count=count & 0x3FFF, data_len=len(data) - 1,
@@ -252,64 +269,62 @@ def space_packet(apid: int, data: bytes, count: int, secondary: bool = True) -> 
     return bytes(header.pack()) + data
 
 
-def housekeeping(rng: np.random.Generator, count: int) -> bytes:
+def housekeeping(rng, count):
     """A housekeeping packet of 124 octets with random values, whole ranges included."""
-    raw = {"MODE": int(rng.choice(list(_MODES))), "TREND": int(rng.integers(-1, 2))}
+    mode, trend = rng.choice(list(_MODES)), rng.integers(-1, 2)
     bits = Bits()
-    bits.add(int(rng.integers(20000, 30000)), 16).add(int(rng.integers(0, 86_400_000)), 32)
-    bits.add(int(rng.integers(0, 1000)), 16)
-    bits.add(raw["MODE"], 3).add(int(rng.integers(2)), 1).add(raw["TREND"], 4)
-    bits.add(int(rng.integers(4096)), 12).add(int(rng.integers(-2048, 2048)), 12)
-    bits.add(int(rng.integers(-64, 64)), 7).add(int(rng.integers(-(2**32), 2**32)), 33)
-    bits.add(int(rng.integers(0, 2**64, dtype=np.uint64)), 64)
-    bits.add(int(rng.integers(-(2**63), 2**63 - 1)), 64)
-    bits.add(int(rng.integers(-32768, 32768)), 16).add(int(rng.integers(255)), 8).add(int(rng.integers(255)), 8)
-    bits.add(int(rng.integers(65536)), 16)
-    bits.octets(struct.pack(">e", rng.normal())).octets(struct.pack(">f", rng.normal()))
-    bits.octets(struct.pack(">d", rng.normal() * 1e200))
-    bits.octets(struct.pack("<H", int(rng.integers(65536)))).octets(
-        struct.pack("<i", int(rng.integers(-(2**31), 2**31)))
-    )
-    bits.octets(rng.bytes(3)).octets(struct.pack("<d", rng.normal())).octets(rng.bytes(4)).octets(rng.bytes(4))
-    bits.add(int(rng.integers(2)), 1).add(int(rng.integers(2**63)), 63)
+
+    def draw(rows):
+        for row in rows.split(","):
+            width, low, high = map(int, row.split())
+            bits.add(rng.integers(low, high), width)
+
+    draw("16 20000 30000, 32 0 86400000, 16 0 1000")
+    bits.add(mode, 3).add(rng.integers(2), 1).add(trend, 4)
+    draw("12 0 4096, 12 -2048 2048, 7 -64 64, 33 -4294967296 4294967296")
+    bits.add(rng.integers(2**64, dtype=np.uint64), 64)
+    draw("64 -9223372036854775808 9223372036854775807, 16 -32768 32768, 8 0 255, 8 0 255, 16 0 65536")
+    bits.octets(struct.pack(">efd", rng.normal(), rng.normal(), rng.normal() * 1e200))
+    bits.octets(struct.pack("<Hi", rng.integers(65536), rng.integers(-(2**31), 2**31)))
+    bits.octets(rng.bytes(3)).octets(struct.pack("<d", rng.normal())).octets(rng.bytes(8))
+    draw("1 0 2, 63 0 9223372036854775808")
     bits.octets(bytes(rng.integers(32, 127, 8).tolist()))
-    label = "häuser"[: int(rng.integers(7))].encode()
+    label = "häuser"[: rng.integers(7)].encode()
     bits.octets(label + b"\0" + rng.bytes(11 - len(label)))
-    tagged = int(rng.integers(0, 10))
+    tagged = int(rng.integers(10))
     bits.add(8 * tagged, 8).octets(bytes(rng.integers(32, 127, tagged).tolist()) + bytes(9 - tagged))
     bits.octets("µA°C".encode("utf-16-be")).octets(rng.bytes(3))
-    bits.add(0, -bits.count % 8)
     return space_packet(APID_HOUSEKEEPING, bits.packed(), count)
 
 
-def event(rng: np.random.Generator, count: int) -> bytes:
+def event(rng, count):
     """An event packet with a text of up to 40 characters, and a value behind it if it is urgent."""
-    text = "".join(rng.choice(list("abcµ° Z"), int(rng.integers(40)))).encode()
-    reason = int(rng.integers(256))
+    text = "".join(rng.choice(list("abcµ° Z"), rng.integers(40))).encode()
+    reason = rng.integers(256)
     data = rng.bytes(8) + bytes((reason, len(text))) + text
     return space_packet(APID_EVENT, data + (struct.pack(">f", rng.normal()) if reason >= 200 else b""), count)
 
 
-def dump(rng: np.random.Generator, count: int) -> bytes:
+def dump(rng, count):
     """A dump of up to 300 octets behind a CUC time of 4 and 3 octets."""
-    data = rng.bytes(7) + rng.bytes(int(rng.integers(0, 300)) + 2) + struct.pack(">f", rng.normal())
+    data = rng.bytes(7) + rng.bytes(rng.integers(2, 302)) + struct.pack(">f", rng.normal())
     return space_packet(APID_DUMP, data, count)
 
 
-def bare(rng: np.random.Generator, count: int) -> bytes:
+def bare(rng, count):
     """A packet without secondary header."""
     data = struct.pack(">f", rng.normal())
     return space_packet(APID_BARE + int(rng.integers(2)), data, count, secondary=False)
 
 
-def capture(packets: int, seed: int) -> list[bytes]:
+def capture(packets, seed):
     """Packets of all kinds, mixed; every APID counts for itself."""
     rng = np.random.default_rng(seed)
     makers = (housekeeping, event, dump, bare)
-    counts: dict[bytes, int] = {}
+    counts = {}
     made = []
     for _ in range(packets):
-        packet = makers[int(rng.integers(4))](rng, 0)
+        packet = makers[rng.integers(4)](rng, 0)
         count = counts[packet[:2]] = counts.get(packet[:2], -1) + 1
         made.append(packet[:2] + struct.pack(">H", 0xC000 | count & 0x3FFF) + packet[4:])
     return made

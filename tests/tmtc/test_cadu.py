@@ -5,11 +5,17 @@ from tmtc.link.cadu import ASM, cadu_octets, synchronise
 from tmtc.link.marker_survey import survey_markers
 
 PERIOD = 128
+PLACES = list(range(0, 20 * PERIOD, PERIOD))
+MARKER = np.frombuffer(ASM, dtype=np.uint8)
 
 
-def stream_of(count: int, seed: int = 0) -> np.ndarray:
-    blocks = np.random.default_rng(seed).integers(0, 256, (count, PERIOD), dtype=np.uint8)
-    blocks[:, :4] = np.frombuffer(ASM, dtype=np.uint8)
+def noise_of(shape, seed=0):
+    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+
+
+def stream_of(count, seed=0):
+    blocks = noise_of((count, PERIOD), seed)
+    blocks[:, :4] = MARKER
     return blocks.reshape(-1)
 
 
@@ -17,8 +23,13 @@ def find_period(stream):
     return next(iter(survey_markers(stream).distances), 0)
 
 
-def starts(stream: np.ndarray, **options) -> list[int]:
+def starts(stream, **options):
     return synchronise(stream, PERIOD, **options).offsets.tolist()
+
+
+def after_headers(count):
+    """Places of CADUs behind a header of 8 octets each."""
+    return [(PERIOD + 8) * k + 8 for k in range(count)]
 
 
 def test_the_marker_is_that_of_the_standard():
@@ -37,8 +48,8 @@ def test_a_stream_may_begin_and_end_anywhere():
 
 def test_nothing_and_noise_have_no_cadus():
     assert starts(np.empty(0, dtype=np.uint8)) == []
-    assert find_period(np.random.default_rng(1).integers(0, 256, 100_000, dtype=np.uint8)) == 0
-    assert starts(np.random.default_rng(1).integers(0, 256, 100_000, dtype=np.uint8)) == []
+    noise = noise_of(100_000, 1)
+    assert (find_period(noise), starts(noise)) == (0, [])
 
 
 @pytest.mark.parametrize("which", [slice(10, 11), slice(1, None, 2)])
@@ -50,48 +61,42 @@ def test_damaged_markers_are_passed_over_while_in_lock_and_turn_no_frame(wrong_b
     bits[:, :wrong_bits] ^= 1
     markers[:] = np.packbits(bits, axis=1)
     sync = synchronise(stream, PERIOD, verify=lambda sync: (sync.offsets % PERIOD == 0) & ~sync.inverted)
-    assert sync.offsets.tolist() == list(range(0, 20 * PERIOD, PERIOD))
+    assert sync.offsets.tolist() == PLACES
     assert (sync.marker_errors[which] == wrong_bits).all() and not sync.inverted.any()
 
 
 def test_lost_octets_cost_the_frame_they_are_lost_from():
     stream = np.delete(stream_of(20), slice(7 * PERIOD + 60, 7 * PERIOD + 63))
     sync = synchronise(stream, PERIOD)
-    expected = [PERIOD * k for k in range(7)] + [PERIOD * k - 3 for k in range(8, 20)]
-    assert sync.offsets.tolist() == expected
+    assert sync.offsets.tolist() == PLACES[:7] + [at - 3 for at in PLACES[8:]]
     assert sync.truncated.tolist() == [7 * PERIOD]
 
 
 def test_inserted_octets_are_skipped():
     stream = np.insert(stream_of(20), 7 * PERIOD, np.zeros(5, dtype=np.uint8))
-    assert starts(stream) == [PERIOD * k for k in range(7)] + [PERIOD * k + 5 for k in range(7, 20)]
+    assert starts(stream) == PLACES[:7] + [at + 5 for at in PLACES[7:]]
 
 
 def test_a_marker_inside_a_frame_does_not_catch_the_lock():
     stream = stream_of(20)
-    stream[5 * PERIOD + 40 : 5 * PERIOD + 44] = np.frombuffer(ASM, dtype=np.uint8)
-    assert starts(stream) == list(range(0, 20 * PERIOD, PERIOD))
+    stream[5 * PERIOD + 40 : 5 * PERIOD + 44] = MARKER
+    assert starts(stream) == PLACES
     # not even in search: the check one period later fails
     assert starts(stream[5 * PERIOD + 10 :]) == [PERIOD * k - 10 for k in range(1, 15)]
 
 
 def test_a_long_outage_is_bridged():
-    noise = np.random.default_rng(9).integers(0, 256, 100_001, dtype=np.uint8)
+    noise = noise_of(100_001, 9)
     stream = np.concatenate((stream_of(5), noise, stream_of(5, seed=2)))
     after = 5 * PERIOD + noise.size
     assert starts(stream) == [PERIOD * k + gap for gap in (0, after) for k in range(5)]
 
 
 def test_a_single_cadu_is_a_stream():
-    stream = stream_of(1)
-    assert starts(stream) == [0]
+    assert starts(stream_of(1)) == [0]
 
 
-def bits_of(stream: np.ndarray) -> np.ndarray:
-    return np.unpackbits(stream)
-
-
-def sync_of_bits(bits: np.ndarray, **options):
+def sync_of_bits(bits, **options):
     octets = np.packbits(bits)
     return octets, synchronise(octets, PERIOD, **options)
 
@@ -99,14 +104,14 @@ def sync_of_bits(bits: np.ndarray, **options):
 @pytest.mark.parametrize("slip", range(1, 8))
 def test_a_stream_that_begins_within_an_octet_is_found_and_aligned(slip):
     stream = stream_of(12)
-    octets, sync = sync_of_bits(bits_of(stream)[slip:])
+    octets, sync = sync_of_bits(np.unpackbits(stream)[slip:])
     assert sync.start_bits.tolist() == [8 * PERIOD * k - slip for k in range(1, 12)]
     assert cadu_octets(octets, sync).tolist() == stream.reshape(-1, PERIOD)[1:].tolist()
 
 
 def test_a_bit_slip_costs_one_frame_and_the_rest_is_read_shifted():
     stream = stream_of(20)
-    octets, sync = sync_of_bits(np.delete(bits_of(stream), 8 * (7 * PERIOD + 60)))
+    octets, sync = sync_of_bits(np.delete(np.unpackbits(stream), 8 * (7 * PERIOD + 60)))
     rows = [k for k in range(20) if k != 7]
     assert sync.start_bits.tolist() == [8 * PERIOD * k - (k > 7) for k in rows]
     assert sync.truncated.tolist() == [PERIOD * 7]
@@ -125,8 +130,7 @@ def test_an_inverted_stretch_is_turned_upright():
 def test_a_header_before_each_cadu_is_passed_over():
     stream = stream_of(20).reshape(-1, PERIOD)
     recorded = np.hstack((np.zeros((20, 8), dtype=np.uint8), stream)).reshape(-1)
-    sync = synchronise(recorded, PERIOD)
-    assert sync.offsets.tolist() == [(PERIOD + 8) * k + 8 for k in range(20)]
+    assert starts(recorded) == after_headers(20)
 
 
 def test_gaps_of_any_length_between_cadus_are_passed_over():
@@ -143,12 +147,12 @@ def test_gaps_of_any_length_between_cadus_are_passed_over():
 
 def test_markers_of_a_weak_stretch_are_bridged_by_the_fly_wheel():
     stream = stream_of(30).reshape(-1, PERIOD)
-    stream[10:16, :4] = np.random.default_rng(3).integers(0, 256, (6, 4), dtype=np.uint8)
+    stream[10:16, :4] = noise_of((6, 4), 3)
     assert starts(stream.reshape(-1)) == list(range(0, 30 * PERIOD, PERIOD))
 
 
 def test_a_frame_with_a_worn_marker_and_no_neighbours_is_accepted_only_when_it_proves_itself():
-    noise = np.random.default_rng(5).integers(0, 256, 4 * PERIOD, dtype=np.uint8)
+    noise = noise_of(4 * PERIOD, 5)
     frame = stream_of(1)
     frame[0] ^= 0b00000111
     stream = np.concatenate((noise, frame, noise))
@@ -157,14 +161,14 @@ def test_a_frame_with_a_worn_marker_and_no_neighbours_is_accepted_only_when_it_p
 
 
 def test_the_period_is_told_from_the_whole_stream_however_long_the_noise_before_it():
-    noise = np.random.default_rng(7).integers(0, 256, 5_000_000, dtype=np.uint8)
+    noise = noise_of(5_000_000, 7)
     assert find_period(np.concatenate((noise, stream_of(40)))) == PERIOD
 
 
-def header_with_a_likeness(wrong_bits: int, *, inverted: bool) -> np.ndarray:
+def header_with_a_likeness(wrong_bits, *, inverted):
     """A record header of 8 octets with a marker of `wrong_bits` wrong bits that begins within an octet."""
     bits = np.zeros(64, dtype=np.uint8)
-    likeness = np.unpackbits(np.frombuffer(ASM, dtype=np.uint8)) ^ np.uint8(inverted)
+    likeness = np.unpackbits(MARKER) ^ np.uint8(inverted)
     likeness[-wrong_bits:] ^= 1
     bits[21:53] = likeness
     return np.packbits(bits)
@@ -176,7 +180,7 @@ def header_with_a_likeness(wrong_bits: int, *, inverted: bool) -> np.ndarray:
 def test_likenesses_of_a_marker_in_the_headers_of_records_do_not_catch_the_lock(count, inverted, is_checked):
     header = header_with_a_likeness(3, inverted=inverted)
     stream = np.hstack((np.tile(header, (count, 1)), stream_of(count).reshape(-1, PERIOD))).reshape(-1)
-    expected = [(PERIOD + 8) * k + 8 for k in range(count)]
+    expected = after_headers(count)
     verify = (lambda sync: np.isin(sync.start_bits, 8 * np.array(expected))) if is_checked else None
     sync = synchronise(stream, PERIOD, verify=verify, record_octets=8)
     assert sync.offsets.tolist() == expected
@@ -184,20 +188,17 @@ def test_likenesses_of_a_marker_in_the_headers_of_records_do_not_catch_the_lock(
 
 
 def test_a_valid_frame_is_preferred_to_an_undamaged_likeness_that_others_follow():
-    header = np.concatenate((np.frombuffer(ASM, dtype=np.uint8), np.zeros(4, dtype=np.uint8)))
+    header = np.concatenate((MARKER, np.zeros(4, dtype=np.uint8)))
     frames = stream_of(12).reshape(-1, PERIOD)
     frames[:, 3] ^= 0b00000101
     stream = np.hstack((np.tile(header, (12, 1)), frames)).reshape(-1)
-    expected = [(PERIOD + 8) * k + 8 for k in range(12)]
-    sync = synchronise(stream, PERIOD, verify=lambda sync: np.isin(sync.offsets, expected), record_octets=header.size)
-    assert sync.offsets.tolist() == expected
+    expected = after_headers(12)
+    assert starts(stream, verify=lambda sync: np.isin(sync.offsets, expected), record_octets=8) == expected
 
 
 def test_a_likeness_in_the_last_frame_does_not_cost_the_frame():
     stream = stream_of(3)
-    likeness = np.frombuffer(ASM, dtype=np.uint8).copy()
-    likeness[3] ^= 0b00000111
-    stream[2 * PERIOD + 60 : 2 * PERIOD + 64] = likeness
+    stream[2 * PERIOD + 60 : 2 * PERIOD + 64] = MARKER ^ np.uint8([0, 0, 0, 7])
     # the stream goes on for most of a frame, whose marker and the rest are damaged
     stream = np.concatenate((stream, np.zeros(PERIOD - 1, dtype=np.uint8)))
     valid = [0, PERIOD, 2 * PERIOD]

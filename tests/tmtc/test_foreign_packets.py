@@ -12,28 +12,17 @@ from hypothesis import strategies as st
 from spacepackets.ccsds import CdsShortTimestamp, PacketId, PacketType
 from spacepackets.ccsds.spacepacket import parse_space_packets
 
-from tests.tmtc.foreign import (
-    HEADER_CONTAINER,
-    HEADER_PARAMETERS,
-    HEADER_TYPES,
-    capture,
-    comparison,
-    container,
-    document,
-    floating,
-    integer,
-    space_packet,
-)
-from tmtc.downlink import DownlinkDecode, decode, encode_cadus
+from tests.tmtc.foreign import bus_like, capture, comparison, container, floating, integer, space_packet
+from tmtc.downlink import decode, encode_cadus
 from tmtc.errors import ValueRefused
 from tmtc.packets.crc import append_crc
 from tmtc.packets.space_packets import idle_packet
-from tmtc.packets.stream import UNCHECKED, PacketCut, PacketForm, cut_packets, find_prefix
+from tmtc.packets.stream import UNCHECKED, PacketForm, cut_packets, find_prefix
 from tmtc.xtce.decode import Decoder
 from tmtc.xtce.importing import parse_xtce
 
 
-def ephemeris(count: int) -> bytes:
+def ephemeris(count):
     """An attitude and ephemeris packet as of a weather satellite: 71 octets, CDS time, no error control."""
     rng = np.random.default_rng(count)
     time = struct.pack(">HIH", 23109, count * 1000, 0)
@@ -41,7 +30,7 @@ def ephemeris(count: int) -> bytes:
     return space_packet(11, time + body + rng.normal(size=4).astype(">f4").tobytes() + b"\x00" * 8, count)
 
 
-def cut(octets: bytes) -> PacketCut:
+def cut(octets):
     found = cut_packets(octets, form=UNCHECKED)
     rows = [(s, s + n) for s, n in zip(found.offsets.tolist(), found.lengths.tolist(), strict=True)]
     rows += [tuple(r) for r in found.skipped.tolist()] + [tuple(r) for r in found.idle.tolist()]
@@ -50,7 +39,13 @@ def cut(octets: bytes) -> PacketCut:
     return found
 
 
-def packets_of(octets: bytes) -> list[bytes]:
+def columns_of(text, octets):
+    """Values of the packets of a stream of one kind."""
+    (table,) = Decoder(parse_xtce(text)).decode(octets, cut(octets)).tables.values()
+    return {name: column.to_list() for name, column in table.columns.items()}
+
+
+def packets_of(octets):
     return list(cut(octets).packets(octets))
 
 
@@ -82,29 +77,17 @@ def test_ccsdspy_reads_the_same_columns():
     ccsdspy.log.setLevel(logging.ERROR)
     packets = [ephemeris(k) for k in range(500)]
     octets = b"".join(packets)
-    fields = [
-        *(
-            ccsdspy.PacketField(name=name, data_type="uint", bit_length=bits)
-            for name, bits in (("DAY", 16), ("MS", 32), ("US", 16), ("ID", 8), ("TIME", 64))
-        ),
-        *(ccsdspy.PacketField(name=f"P{k}", data_type="float", bit_length=32) for k in range(6)),
-        ccsdspy.PacketField(name="AGAIN", data_type="uint", bit_length=64),
-        *(ccsdspy.PacketField(name=f"Q{k}", data_type="float", bit_length=32) for k in range(4)),
-        ccsdspy.PacketField(name="REST", data_type="uint", bit_length=64),
-    ]  # fmt: skip
-    theirs = ccsdspy.FixedLength(fields).load(io.BytesIO(octets))
-    own = {
-        "DAY": "U16", "MS": "U32", "US": "U16", "ID": "U8", "TIME": "U64", **{f"P{k}": "F" for k in range(6)},
-    }  # fmt: skip
+    own = {"DAY": "U16", "MS": "U32", "US": "U16", "ID": "U8", "TIME": "U64", **{f"P{k}": "F" for k in range(6)}}
     own |= {"AGAIN": "U64", **{f"Q{k}": "F" for k in range(4)}, "REST": "U64"}
-    text = document(
-        HEADER_TYPES + integer("U64", 64) + floating("F", 32),
-        {**HEADER_PARAMETERS, **own},
-        HEADER_CONTAINER + container("ephemeris", list(own), "CCSDSPacket", comparison("PKT_APID", 11)),
-    )
-    ours = Decoder(parse_xtce(text)).decode(octets, cut(octets)).tables["ephemeris"].columns
-    for name in own:
-        assert np.array_equal(ours[name].to_list(), theirs[name]), name
+    fields = [
+        ccsdspy.PacketField(name, "float" if kind == "F" else "uint", 32 if kind == "F" else int(kind[1:]))
+        for name, kind in own.items()
+    ]
+    theirs = ccsdspy.FixedLength(fields).load(io.BytesIO(octets))
+    body = container("ephemeris", list(own), "CCSDSPacket", comparison("PKT_APID", 11))
+    text = bus_like(own, body, types=integer("U64", 64) + floating("F", 32))
+    ours = columns_of(text, octets)
+    assert all(np.array_equal(ours[name], theirs[name]) for name in own)
 
 
 # times of secondary headers
@@ -115,32 +98,23 @@ def test_ccsdspy_reads_the_same_columns():
 def test_cuc_times_of_every_width_are_read_through_a_definition(coarse, fine):
     rng = np.random.default_rng(coarse * 10 + fine)
     parameters = {"COARSE": "C", **({"FINE": "F"} if fine else {}), "N": "U8"}
-    types = HEADER_TYPES + integer("C", 8 * coarse) + (integer("F", 8 * fine) if fine else "")
-    text = document(
-        types, {**HEADER_PARAMETERS, **parameters}, HEADER_CONTAINER + container("P", list(parameters), "CCSDSPacket")
-    )
+    types = integer("C", 8 * coarse) + (integer("F", 8 * fine) if fine else "")
+    text = bus_like(parameters, container("P", list(parameters), "CCSDSPacket"), types=types)
     times = [(rng.bytes(coarse), rng.bytes(fine)) for _ in range(20)]
-    packets = [space_packet(5, c + f + b"\x2a", k) for k, (c, f) in enumerate(times)]
-    octets = b"".join(packets)
-    columns = Decoder(parse_xtce(text)).decode(octets, cut(octets)).tables["P"].columns
-    assert columns["COARSE"].to_list() == [int.from_bytes(c, "big") for c, _ in times]
-    assert columns["N"].to_list() == [42] * 20
+    octets = b"".join(space_packet(5, c + f + b"\x2a", k) for k, (c, f) in enumerate(times))
+    columns = columns_of(text, octets)
+    assert columns["COARSE"] == [int.from_bytes(c, "big") for c, _ in times]
+    assert columns["N"] == [42] * 20
     if fine:
-        assert columns["FINE"].to_list() == [int.from_bytes(f, "big") for _, f in times]
+        assert columns["FINE"] == [int.from_bytes(f, "big") for _, f in times]
 
 
 def test_a_cds_header_made_by_spacepackets_is_read():
-    cds = CdsShortTimestamp(ccsds_days=25000, ms_of_day=86_399_999)
-    data = bytes(cds.pack())
-    text = document(
-        HEADER_TYPES,
-        {**HEADER_PARAMETERS, "P_FIELD": "U8", "DAY": "U16", "MS": "U32"},
-        HEADER_CONTAINER + container("P", ["P_FIELD", "DAY", "MS"], "CCSDSPacket"),
-    )
+    data = bytes(CdsShortTimestamp(ccsds_days=25000, ms_of_day=86_399_999).pack())
+    own = {"P_FIELD": "U8", "DAY": "U16", "MS": "U32"}
     octets = b"".join(space_packet(5, data, k) for k in range(3))
-    columns = Decoder(parse_xtce(text)).decode(octets, cut(octets)).tables["P"].columns
-    assert columns["DAY"].to_list() == [25000] * 3 and columns["MS"].to_list() == [86_399_999] * 3
-    assert columns["P_FIELD"].to_list() == [0x40] * 3
+    columns = columns_of(bus_like(own, container("P", list(own), "CCSDSPacket")), octets)
+    assert {name: columns[name] for name in own} == {"P_FIELD": [0x40] * 3, "DAY": [25000] * 3, "MS": [86_399_999] * 3}
 
 
 # damage
@@ -262,7 +236,7 @@ def test_pieces_of_a_stream_are_refused_without_error_control():
 # in transfer frames
 
 
-def check(decoded: DownlinkDecode, packets: list[bytes]) -> None:
+def check(decoded, packets):
     assert list(decoded.cut.packets(decoded.buffer)) == packets
     assert decoded.sequence.gaps == decoded.sequence.missing == 0
 
@@ -281,7 +255,7 @@ def test_a_lost_frame_costs_the_packets_that_are_in_it():
     size = 1279
     decoded = decode(octets[: 5 * size] + octets[6 * size :], form=UNCHECKED)
     zone = 1115 - 6 - 2
-    ends = np.cumsum([len(p) for p in packets])
-    starts = ends - [len(p) for p in packets]
+    ends = np.cumsum([*map(len, packets)])
+    starts = [0, *ends[:-1]]
     kept = [p for p, a, b in zip(packets, starts, ends, strict=True) if b <= 5 * zone or a >= 6 * zone]
     assert list(decoded.cut.packets(decoded.buffer)) == kept and decoded.frames_lost == 1

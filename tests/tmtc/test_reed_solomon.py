@@ -18,8 +18,12 @@ from tmtc.link.reed_solomon import (
 )
 
 
-def frames_for(code: ReedSolomon, count: int = 3, seed: int = 0) -> np.ndarray:
+def frames_for(code, count=3, seed=0):
     return np.random.default_rng(seed).integers(0, 256, (count, code.frame_length), dtype=np.uint8)
+
+
+def independent(errors):
+    return reedsolo.RSCodec(nsym=2 * errors, nsize=255, fcr=128 - errors, prim=0x187, generator=173)
 
 
 def test_the_generator_polynomial_is_that_of_the_standard():
@@ -42,9 +46,7 @@ def test_the_dual_basis_table_is_that_of_the_standard():
 def test_conventional_codewords_are_those_of_an_independent_encoder(errors):
     code = ReedSolomon(errors=errors, interleave=1, dual_basis=False)
     frame = frames_for(code, 1)
-    theirs = reedsolo.RSCodec(nsym=2 * errors, nsize=255, fcr=128 - errors, prim=0x187, generator=173).encode(
-        frame.tobytes()
-    )
+    theirs = independent(errors).encode(frame.tobytes())
     assert encode(frame, code).tobytes() == bytes(theirs)
 
 
@@ -65,28 +67,25 @@ def test_symbol_k_of_a_codeblock_belongs_to_codeword_k_modulo_the_depth():
 def test_virtual_fill_is_leading_zeros_that_are_not_sent():
     short, full = ReedSolomon(interleave=1, virtual_fill=23), ReedSolomon(interleave=1)
     frames = frames_for(short)
-    padded = np.concatenate((np.zeros((3, 23), dtype=np.uint8), frames), axis=1)
+    padded = np.pad(frames, ((0, 0), (23, 0)))
     assert np.array_equal(encode(frames, short), encode(padded, full)[:, 23:])
 
 
-@pytest.mark.parametrize(
-    ("frame_length", "interleave", "block_length"),
-    [(1115, 5, 1275), (892, 4, 1020), (223, 1, 255), (446, 2, 510), (1784, 8, 2040), (1000, 5, 1160)],
-)
-def test_the_code_is_found_from_the_frame_length(frame_length, interleave, block_length):
+@pytest.mark.parametrize("row", ["1115 5 1275", "892 4 1020", "223 1 255", "446 2 510", "1784 8 2040", "1000 5 1160"])
+def test_the_code_is_found_from_the_frame_length(row):
+    frame_length, interleave, block_length = map(int, row.split())
     code = code_for(frame_length)
     assert (code.interleave, code.frame_length, code.block_length) == (interleave, frame_length, block_length)
 
 
 def test_frames_that_no_code_carries_are_refused():
-    with pytest.raises(LinkFormatError, match="found 1117"):
-        code_for(1117)
-    with pytest.raises(LinkFormatError, match="expected interleave 1, 2, 3, 4, 5 or 8, found 6"):
-        ReedSolomon(interleave=6)
-    with pytest.raises(LinkFormatError, match="8 or 16"):
-        ReedSolomon(errors=4)
-    with pytest.raises(LinkFormatError, match="expected frames of 1115 octets"):
-        encode(np.zeros((1, 10), dtype=np.uint8), ReedSolomon())
+    for refused, message in (
+        (lambda: code_for(1117), "found 1117"), (lambda: ReedSolomon(errors=4), "8 or 16"),
+        (lambda: ReedSolomon(interleave=6), "expected interleave 1, 2, 3, 4, 5 or 8, found 6"),
+        (lambda: encode(np.zeros((1, 10), dtype=np.uint8), ReedSolomon()), "expected frames of 1115 octets"),
+    ):  # fmt: skip
+        with pytest.raises(LinkFormatError, match=message):
+            refused()
 
 
 @pytest.mark.parametrize("code", [ReedSolomon(), ReedSolomon(8, 2, 5), ReedSolomon(16, 1, 40, False)], ids=str)
@@ -126,7 +125,7 @@ def test_errors_found_in_the_virtual_fill_mean_that_too_many_others_were_there()
 
 @pytest.mark.parametrize("errors", [8, 16])
 def test_repair_agrees_with_an_independent_decoder_up_to_and_beyond_its_power(errors):
-    theirs = reedsolo.RSCodec(nsym=2 * errors, nsize=255, fcr=128 - errors, prim=0x187, generator=173)
+    theirs = independent(errors)
     code = ReedSolomon(errors=errors, interleave=1, dual_basis=False)
     rng = np.random.default_rng(errors)
     frames = frames_for(code, 60)

@@ -20,12 +20,19 @@ SWALLOWED = len(PACKETS[501]) + len(PACKETS[502])
 """Octets of exactly two packets."""
 
 
-def good_packets(octets: bytes) -> list[bytes]:
-    return list(cut_packets(octets).packets(octets))
+def cut_to(octets, expected, **options):
+    """Cut octets into the packets that are expected, and see that all octets are accounted for."""
+    cut = cut_packets(octets, **options)
+    assert list(cut.packets(octets)) == expected
+    assert_every_octet_is_accounted_for(octets, cut)
+    return cut
 
 
-def assert_every_octet_is_accounted_for(octets: bytes) -> None:
-    cut = cut_packets(octets)
+def inserted(octets):
+    return WHOLE[:AT_500] + octets + WHOLE[AT_500:]
+
+
+def assert_every_octet_is_accounted_for(octets, cut):
     ranges = np.concatenate((np.stack((cut.offsets, cut.offsets + cut.lengths), axis=1), cut.skipped, cut.idle))
     ranges = ranges[np.argsort(ranges[:, 0], kind="stable")]
     edges = ranges.reshape(-1)
@@ -35,8 +42,7 @@ def assert_every_octet_is_accounted_for(octets: bytes) -> None:
 
 
 def test_an_undamaged_stream_gives_all_its_packets_in_order():
-    cut = cut_packets(WHOLE)
-    assert good_packets(WHOLE) == PACKETS
+    cut = cut_to(WHOLE, PACKETS)
     assert (cut.crc_errors, cut.octets_skipped, cut.octets_idle) == (0, 0, 0)
 
 
@@ -49,9 +55,8 @@ def test_nothing_gives_nothing():
 
 
 def test_three_stray_octets_cost_no_packet():
-    octets = WHOLE[:AT_500] + b"\x01\x02\x03" + WHOLE[AT_500:]
-    cut = cut_packets(octets)
-    assert list(cut.packets(octets)) == PACKETS
+    octets = inserted(b"\x01\x02\x03")
+    cut = cut_to(octets, PACKETS)
     assert cut.skipped.tolist() == [[AT_500, AT_500 + 3]]
     assert cut.crc_errors == 0
 
@@ -60,42 +65,36 @@ def test_three_stray_octets_cost_no_packet():
     "stray", [b"\x08\xa1\xc0", b"\x00" * 40, b"\xff" * 40, WHOLE[3:17], b"\x07\xff\xc0\x00\x00\x09"]
 )
 def test_stray_octets_that_look_like_headers_cost_no_packet(stray):
-    octets = WHOLE[:AT_500] + stray + WHOLE[AT_500:]
-    cut = cut_packets(octets)
-    assert list(cut.packets(octets)) == PACKETS
+    octets = inserted(stray)
+    cut = cut_to(octets, PACKETS)
     assert cut.octets_skipped + cut.lengths[~cut.crc_ok].sum() + cut.octets_idle == len(stray)
 
 
 def test_a_flipped_bit_in_a_body_is_one_checksum_error_and_nothing_else():
     octets = bytearray(WHOLE)
     octets[AT_500 + 30] ^= 0x10
-    cut = cut_packets(octets)
-    assert list(cut.packets(octets)) == PACKETS[:500] + PACKETS[501:]
+    cut = cut_to(octets, PACKETS[:500] + PACKETS[501:])
     assert (cut.crc_errors, cut.octets_skipped) == (1, 0)
     assert cut.lengths[~cut.crc_ok].tolist() == [len(PACKETS[500])]
 
 
 @pytest.mark.parametrize("change", [9, -9, 1, 255, 5000, 40_000, SWALLOWED])
 def test_a_wrong_length_field_costs_the_one_packet(change):
-    octets = bytearray(WHOLE)
-    length = int.from_bytes(octets[AT_500 + 4 : AT_500 + 6], "big")
-    octets[AT_500 + 4 : AT_500 + 6] = ((length + change) % 65536).to_bytes(2, "big")
-    cut = cut_packets(octets)
-    assert list(cut.packets(octets)) == PACKETS[:500] + PACKETS[501:]
+    octets, field = bytearray(WHOLE), slice(AT_500 + 4, AT_500 + 6)
+    octets[field] = ((int.from_bytes(octets[field], "big") + change) % 65536).to_bytes(2, "big")
+    cut = cut_to(octets, PACKETS[:500] + PACKETS[501:])
     assert cut.octets_skipped + cut.lengths[~cut.crc_ok].sum() == len(PACKETS[500])
 
 
 def test_a_stream_that_ends_in_mid_packet_gives_all_that_are_whole():
     octets = WHOLE[: AT_500 + 11]
-    cut = cut_packets(octets)
-    assert list(cut.packets(octets)) == PACKETS[:500]
+    cut = cut_to(octets, PACKETS[:500])
     assert cut.skipped.tolist() == [[AT_500, AT_500 + 11]]
 
 
 def test_a_stream_that_is_joined_in_mid_packet_loses_only_that_one():
     octets = WHOLE[7:]
-    cut = cut_packets(octets)
-    assert list(cut.packets(octets)) == PACKETS[1:]
+    cut = cut_to(octets, PACKETS[1:])
     assert cut.octets_skipped == len(PACKETS[0]) - 7
 
 
@@ -105,8 +104,7 @@ def test_several_damaged_packets_in_a_row_are_told_apart():
     for packet in PACKETS[500:504]:
         octets[at + 20] ^= 1
         at += len(packet)
-    cut = cut_packets(octets)
-    assert list(cut.packets(octets)) == PACKETS[:500] + PACKETS[504:]
+    cut = cut_to(octets, PACKETS[:500] + PACKETS[504:])
     assert (cut.crc_errors, cut.octets_skipped) == (4, 0)
 
 
@@ -120,28 +118,26 @@ def test_a_damaged_packet_that_holds_a_whole_packet_does_not_give_birth_to_it():
     )
     damaged = bytearray(outer)
     damaged[-5] ^= 1
-    octets = WHOLE[:AT_500] + bytes(damaged) + WHOLE[AT_500:]
-    cut = cut_packets(octets)
-    assert list(cut.packets(octets)) == PACKETS
+    octets = inserted(bytes(damaged))
+    cut = cut_to(octets, PACKETS)
     assert cut.crc_errors == 1
 
 
 def test_idle_packets_are_counted_and_not_given():
-    octets = idle_packet(7) + WHOLE[:AT_500] + idle_packet(300) + WHOLE[AT_500:] + idle_packet(12)
-    cut = cut_packets(octets)
-    assert list(cut.packets(octets)) == PACKETS
+    octets = idle_packet(7) + inserted(idle_packet(300)) + idle_packet(12)
+    cut = cut_to(octets, PACKETS)
     assert (cut.octets_idle, cut.octets_skipped) == (319, 0)
 
 
 def test_an_idle_header_among_stray_octets_does_not_swallow_packets():
     # claims 65542 octets, far more than any damage: the packets "inside" it must come out
-    octets = WHOLE[:AT_500] + b"\x07\xff\xc0\x00\xff\xff" + WHOLE[AT_500:]
-    assert good_packets(octets) == PACKETS
+    octets = inserted(b"\x07\xff\xc0\x00\xff\xff")
+    cut_to(octets, PACKETS)
 
 
 def test_packets_of_the_other_type_are_not_packets():
     command = DICTIONARY.pack_command("test_connection", {}, sequence_count=1)
-    cut = cut_packets(WHOLE[:AT_500] + command + WHOLE[AT_500:])
+    cut = cut_packets(inserted(command))
     assert len(cut) == len(PACKETS) and cut.octets_skipped == len(command)
     assert cut_packets(command, packet_type=1).lengths.tolist() == [len(command)]
 
@@ -159,7 +155,7 @@ def test_octets_that_are_headers_all_along_do_not_hold_up_the_reader():
     octets = bytes.fromhex("000000000002AAAAAA") * 100_000
     cut = cut_packets(octets)
     assert not cut.crc_ok.any()
-    assert_every_octet_is_accounted_for(octets)
+    assert_every_octet_is_accounted_for(octets, cut)
 
 
 def test_packets_between_stretches_of_noise_are_found():
@@ -167,10 +163,7 @@ def test_packets_between_stretches_of_noise_are_found():
     parts = []
     for packet in PACKETS[:200]:
         parts += [rng.integers(0, 256, int(rng.integers(0, 3000)), dtype=np.uint8).tobytes(), packet]
-    octets = b"".join(parts)
-    found = good_packets(octets)
-    assert found == PACKETS[:200]
-    assert_every_octet_is_accounted_for(octets)
+    cut_to(b"".join(parts), PACKETS[:200])
 
 
 def test_segments_are_cut_each_for_itself():
@@ -178,28 +171,28 @@ def test_segments_are_cut_each_for_itself():
     half = len(PACKETS[500]) // 2
     octets = WHOLE[: AT_500 + half] + WHOLE[AT_500 + half :]
     segments = np.array([[0, AT_500 + half], [AT_500 + half, len(octets)]], dtype=np.int64)
-    cut = cut_packets(octets, segments=segments)
-    assert list(cut.packets(octets)) == PACKETS[:500] + PACKETS[501:]
+    cut = cut_to(octets, PACKETS[:500] + PACKETS[501:], segments=segments)
     assert cut.octets_skipped == len(PACKETS[500])
 
 
 def test_the_longest_packet_is_a_packet():
     packet = append_crc(pack_packet(5, bytes(65_536), sequence_count=0)[:-2])
     assert len(packet) == 65_542
-    assert good_packets(packet + packet) == [packet, packet]
+    cut_to(packet + packet, [packet, packet])
 
 
+AT = st.integers(0, 10**9)
 INJURIES = st.one_of(
-    st.tuples(st.just("flip"), st.integers(0, 10**9), st.integers(0, 7)),
-    st.tuples(st.just("insert"), st.integers(0, 10**9), st.binary(max_size=12)),
-    st.tuples(st.just("delete"), st.integers(0, 10**9), st.integers(1, 40)),
+    st.tuples(st.just("flip"), AT, st.integers(0, 7)),
+    st.tuples(st.just("insert"), AT, st.binary(max_size=12)),
+    st.tuples(st.just("delete"), AT, st.integers(1, 40)),
 )
 
 
-def injure(octets: bytes, injuries: list) -> tuple[bytes, np.ndarray]:
+def injure(octets, injuries):
     """The octets after the injuries, and marks (n + 1,): 1 octet k was hit, 2 something was put in before it."""
-    before: dict[int, bytes] = {}
-    values: list[int | None] = list(octets)
+    before = {}
+    values = list(octets)
     marks = np.zeros(len(octets) + 1, dtype=np.uint8)
     for kind, position, what in injuries:
         at = position % len(octets)
@@ -231,12 +224,13 @@ def test_whatever_happens_no_whole_packet_is_lost_and_none_is_invented(injuries)
         if not marks[at] & 1 and not marks[at + 1 : stop].any():
             safe.append(packet)
         at = stop
-    found = good_packets(octets)
+    cut = cut_packets(octets)
+    found = list(cut.packets(octets))
     # injuries may undo each other, so more than the untouched packets may be whole; never others than were sent
     remaining = iter(found)
     assert all(packet in remaining for packet in safe)
     assert set(found) <= set(packets)
-    assert_every_octet_is_accounted_for(octets)
+    assert_every_octet_is_accounted_for(octets, cut)
 
 
 def test_a_hundred_thousand_injured_streams_lose_no_whole_packet_and_invent_none():
@@ -265,14 +259,11 @@ def test_a_hundred_thousand_injured_streams_lose_no_whole_packet_and_invent_none
             if action == 0:
                 octets[at] ^= values[case][s]
                 touched.add(within)
-            elif action == 1:
-                octets[at:at] = bytes((values[case][s],)) * 3
-                shifts.append((at, 3))
-                if at > starts[within]:
-                    touched.add(within)
-            else:
-                del octets[at]
-                shifts.append((at, -1))
+                continue
+            new = bytes((values[case][s],)) * 3 if action == 1 else b""
+            octets[at : at + (action == 2)] = new
+            shifts.append((at, 3 if new else -1))
+            if not new or at > starts[within]:
                 touched.add(within)
         base = len(buffer)
         for k, start in enumerate(starts[:-1]):
@@ -294,6 +285,6 @@ def test_a_hundred_thousand_injured_streams_lose_no_whole_packet_and_invent_none
 @given(st.binary(max_size=400))
 def test_any_octets_at_all_are_accounted_for(octets):
     cut = cut_packets(octets)
-    assert_every_octet_is_accounted_for(octets)
+    assert_every_octet_is_accounted_for(octets, cut)
     for packet in cut.packets(octets):
         assert crc16(packet) == 0

@@ -23,6 +23,8 @@ from tmtc.packets.stream import cut_packets
 COMMANDS = [
     DICTIONARY.pack_command("set_parameter", {"parameter_id": k, "value": k / 3}, sequence_count=k) for k in range(6)
 ]
+FIRST = COMMANDS[:1]
+SENT = UplinkEncoder(76).encode(FIRST)
 LONG = DICTIONARY.pack_command(
     "uplink_first",
     {"transaction": 1, "part": 1, "table": "model", "items": {"octet": [k % 251 for k in range(5000)]}},
@@ -51,14 +53,12 @@ def test_a_frame_has_the_bits_that_the_standard_draws():
 
 def test_damaged_frames_are_refused_each_for_its_reason():
     frame = pack_tc_frame(TcFrame(76, 2, 5, b"\xc0\x01"))
-    with pytest.raises(ChecksumError):
-        unpack_tc_frame(frame[:-1] + bytes((frame[-1] ^ 1,)))
-    with pytest.raises(TruncatedPacket):
-        unpack_tc_frame(frame[:-1])
-    with pytest.raises(FrameError):
-        unpack_tc_frame(b"\xff" * 12)
-    with pytest.raises(FrameError, match="8 octets or more"):
-        unpack_tc_frame(bytes(12))
+    for octets, error, message in (
+        (frame[:-1] + bytes((frame[-1] ^ 1,)), ChecksumError, None), (frame[:-1], TruncatedPacket, None),
+        (b"\xff" * 12, FrameError, None), (bytes(12), FrameError, "8 octets or more"),
+    ):  # fmt: skip
+        with pytest.raises(error, match=message):
+            unpack_tc_frame(octets)
     with pytest.raises(ValueRefused, match=r"1\.\.1017"):
         pack_tc_frame(TcFrame(76, 2, 5, bytes(1018)))
     assert len(pack_tc_frame(TcFrame(76, 2, 5, bytes(1017)))) == 1024
@@ -74,12 +74,10 @@ def test_what_is_sent_comes_back_long_packets_too(randomised, bypass):
 
 
 def test_a_wrong_bit_in_each_code_block_is_repaired():
-    octets = bytearray(UplinkEncoder(76).encode(COMMANDS[:1]))
-    blocks = (len(octets) - 10) // 8
-    for k in range(blocks):
+    octets = bytearray(SENT)
+    for k in range((len(octets) - 10) // 8):
         octets[2 + 8 * k + k % 8] ^= 0x80 >> k % 7  # information and parity, never the filler bit
-    decoded = UplinkDecoder(76).decode(octets)
-    assert list(decoded.packets) == COMMANDS[:1]
+    assert list(UplinkDecoder(76).decode(octets).packets) == FIRST
 
 
 def test_two_wrong_bits_in_a_block_lose_that_command_and_no_other():
@@ -92,14 +90,14 @@ def test_two_wrong_bits_in_a_block_lose_that_command_and_no_other():
 
 
 def test_what_lies_between_cltus_is_skipped():
-    octets = b"\xeb\x90\xeb\x90" + b"\x55" * 9 + UplinkEncoder(76).encode(COMMANDS[:1]) + b"\xaa" * 20
+    octets = b"\xeb\x90\xeb\x90" + b"\x55" * 9 + SENT + b"\xaa" * 20
     decoded = UplinkDecoder(76).decode(octets)
-    assert list(decoded.packets) == COMMANDS[:1]
+    assert list(decoded.packets) == FIRST
     assert decoded.octets_skipped == 33
 
 
 def test_frames_for_another_spacecraft_are_not_used():
-    decoded = UplinkDecoder(77).decode(UplinkEncoder(76).encode(COMMANDS[:1]))
+    decoded = UplinkDecoder(77).decode(SENT)
     assert decoded.packets == ()
     assert decoded.faults == ("telecommand frame: expected spacecraft 77, found 76",)
 
@@ -107,7 +105,7 @@ def test_frames_for_another_spacecraft_are_not_used():
 def test_sequence_controlled_frames_are_used_once_and_in_order():
     frames = [UplinkEncoder(76, bypass=False, sequence_number=k).encode([c]) for k, c in enumerate(COMMANDS)]
     decoder = UplinkDecoder(76)
-    assert list(decoder.decode(frames[0] + frames[0]).packets) == COMMANDS[:1]
+    assert list(decoder.decode(frames[0] + frames[0]).packets) == FIRST
     assert decoder.decode(frames[2]).packets == ()
     farm = decoder.farms[0]
     assert farm.retransmit and farm.clcw.report_value == 1
@@ -118,18 +116,16 @@ def test_sequence_controlled_frames_are_used_once_and_in_order():
 def test_a_number_far_off_locks_the_receiver_until_it_is_unlocked():
     decoder = UplinkDecoder(76)
     encoder = UplinkEncoder(76, bypass=False, sequence_number=100)
-    assert decoder.decode(encoder.encode(COMMANDS[:1])).packets == ()
+    far = encoder.encode(FIRST)
+    assert decoder.decode(far).packets == ()
     assert decoder.farms[0].clcw.lockout
-    assert decoder.decode(UplinkEncoder(76, bypass=False).encode(COMMANDS[:1])).packets == ()
+    assert decoder.decode(UplinkEncoder(76, bypass=False).encode(FIRST)).packets == ()
     # expedited frames pass all the same
-    assert list(decoder.decode(UplinkEncoder(76).encode(COMMANDS[:1])).packets) == COMMANDS[:1]
+    assert list(decoder.decode(SENT).packets) == FIRST
     for command in (CONTROL_UNLOCK, CONTROL_SET_COUNT + b"\x64"):
         frame = pack_tc_frame(TcFrame(76, 0, 0, command, bypass=True, control=True))
         decoder.decode(encode_cltu(frame, randomised=True))
-    assert (
-        list(decoder.decode(UplinkEncoder(76, bypass=False, sequence_number=100).encode(COMMANDS[:1])).packets)
-        == COMMANDS[:1]
-    )
+    assert list(decoder.decode(far).packets) == FIRST
     assert decoder.farms[0].clcw.farm_b_counter == 3
 
 
@@ -147,7 +143,7 @@ def test_an_unfinished_packet_is_dropped_for_the_next():
     decoder = UplinkDecoder(76, randomised=False)
     stream = encode_cltu(frames[0]) + b"".join(encode_cltu(f) for f in UplinkEncoder(76).frames(COMMANDS[0]))
     decoded = decoder.decode(stream)
-    assert list(decoded.packets) == COMMANDS[:1]
+    assert list(decoded.packets) == FIRST
     assert decoded.faults == ("segment: expected a continuation, found the beginning of another packet",)
 
 

@@ -3,13 +3,13 @@
 import gzip
 import io
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
+from numpy.testing import assert_allclose, assert_array_equal
 
 from lunar.compressed import read_expanded
 from lunar.constants import NS
@@ -25,66 +25,75 @@ from lunar.timescales import from_tai_ns, parse_tai, parse_utc
 START = parse_utc("2029-08-07T00:00:00")
 
 
-def ephemeris() -> Ephemeris:
+def rows_of(table):
+    """Rows of a table of texts with columns between bars."""
+    return [row.split(" | ") for row in table.strip().splitlines()]
+
+
+def ephemeris():
     rng = np.random.default_rng(1)
     matrix = rng.normal(size=(6, 6))
-    first = EphemerisSegment(
-        START + np.arange(5) * 60 * NS,
-        rng.normal(size=(5, 3)) * 1e6,
-        rng.normal(size=(5, 3)) * 1e3,
-        comments=("before the burn & after <start>",),
-        covariances=(
-            Covariance(START, "RTN", matrix @ matrix.T),
-            Covariance(START + 60 * NS, "RTN", 2.0 * matrix @ matrix.T),
-        ),
-    )
-    second = EphemerisSegment(
-        START + np.arange(4, 9) * 60 * NS + 123_456_789, rng.normal(size=(5, 3)) * 1e6,
-        rng.normal(size=(5, 3)) * 1e3, time_system="TDB", interpolation="LAGRANGE", degree=5,
+    covariances = [Covariance(START + k * 60 * NS, "RTN", (k + 1) * matrix @ matrix.T) for k in (0, 1)]
+
+    def segment(first, shift_ns=0, **fields):
+        position, velocity = rng.normal(size=(5, 3)) * 1e6, rng.normal(size=(5, 3)) * 1e3
+        return EphemerisSegment(START + np.arange(first, first + 5) * 60 * NS + shift_ns, position, velocity, **fields)
+
+    first = segment(0, comments=("before the burn & after <start>",), covariances=tuple(covariances))
+    second = segment(
+        4, 123_456_789, time_system="TDB", interpolation="LAGRANGE", degree=5,
         useable_start_utc_ns=START + 300 * NS,
     )  # fmt: skip
     return Ephemeris((first, second), "TEST", ("two arcs",))
 
 
-def assert_same(found: Ephemeris, expected: Ephemeris) -> None:
+def assert_same(found, expected):
     assert (found.originator, found.comments) == (expected.originator, expected.comments)
     assert len(found.segments) == len(expected.segments)
     for one, other in zip(found.segments, expected.segments, strict=True):
         assert np.abs(one.utc_ns - other.utc_ns).max() <= 1
-        np.testing.assert_allclose(one.position_m, other.position_m, rtol=0, atol=1e-6)
-        np.testing.assert_allclose(one.velocity_m_s, other.velocity_m_s, rtol=0, atol=1e-9)
-        for name in ("centre", "frame", "object_name", "object_id", "time_system", "interpolation", "degree"):
+        assert_allclose(one.position_m, other.position_m, rtol=0, atol=1e-6)
+        assert_allclose(one.velocity_m_s, other.velocity_m_s, rtol=0, atol=1e-9)
+        for name in [
+            "centre",
+            "frame",
+            "object_name",
+            "object_id",
+            "time_system",
+            "interpolation",
+            "degree",
+            "comments",
+        ]:
             assert getattr(one, name) == getattr(other, name), name
-        assert one.comments == other.comments
         for mine, theirs in zip(one.covariances, other.covariances, strict=True):
             assert (mine.utc_ns, mine.frame) == (theirs.utc_ns, theirs.frame)
-            np.testing.assert_allclose(mine.matrix, theirs.matrix, rtol=1e-12)
+            assert_allclose(mine.matrix, theirs.matrix, rtol=1e-12)
 
 
 # OEM in XML
 
 
-def test_oem_in_xml_is_read_as_it_was_written() -> None:
+def test_oem_in_xml_is_read_as_it_was_written():
     assert_same(parse_oem_xml(format_oem_xml(ephemeris()).encode()), ephemeris())
 
 
 @pytest.mark.filterwarnings("ignore:ERFA function")
-def test_another_reader_gives_the_same_states_from_xml(tmp_path: Path) -> None:
+def test_another_reader_gives_the_same_states_from_xml(tmp_path):
     import oem as independent
 
     path = tmp_path / "orbit.xml"
     expected = ephemeris()
     path.write_text(format_oem_xml(Ephemeris(expected.segments[:1])))
     segment = next(iter(independent.OrbitEphemerisMessage.open(path)))
-    np.testing.assert_allclose([one.position for one in segment.states], expected.segments[0].position_m / 1e3)
-    np.testing.assert_allclose([one.velocity for one in segment.states], expected.segments[0].velocity_m_s / 1e3)
+    assert_allclose([one.position for one in segment.states], expected.segments[0].position_m / 1e3)
+    assert_allclose([one.velocity for one in segment.states], expected.segments[0].velocity_m_s / 1e3)
     covariances = list(segment.covariances)
     assert len(covariances) == 2
-    np.testing.assert_allclose(covariances[1].matrix, expected.segments[0].covariances[1].matrix / 1e6)
+    assert_allclose(covariances[1].matrix, expected.segments[0].covariances[1].matrix / 1e6)
 
 
 @pytest.mark.filterwarnings("ignore:ERFA function")
-def test_oem_of_another_writer_in_xml_is_read(tmp_path: Path) -> None:
+def test_oem_of_another_writer_in_xml_is_read(tmp_path):
     import oem as independent
 
     source, path = tmp_path / "orbit.oem", tmp_path / "orbit.xml"
@@ -92,32 +101,28 @@ def test_oem_of_another_writer_in_xml_is_read(tmp_path: Path) -> None:
     source.write_text(format_oem(expected))
     independent.OrbitEphemerisMessage.convert(source, path, "xml")
     found = load_ephemeris(path)
-    np.testing.assert_allclose(found.segments[0].position_m, expected.segments[0].position_m, atol=1e-3)
-    np.testing.assert_array_equal(found.segments[0].utc_ns, expected.segments[0].utc_ns)
+    assert_allclose(found.segments[0].position_m, expected.segments[0].position_m, atol=1e-3)
+    assert_array_equal(found.segments[0].utc_ns, expected.segments[0].utc_ns)
 
 
-def test_a_wrapped_message_with_a_name_space_is_read() -> None:
+def test_a_wrapped_message_with_a_name_space_is_read():
     plain = format_oem_xml(ephemeris()).partition("\n")[2]
     wrapped = f'<ndm:ndm xmlns:ndm="urn:ccsds:schema:ndmxml">{plain}</ndm:ndm>'
     assert_same(parse_oem_xml(wrapped.encode()), ephemeris())
 
 
-def test_elements_are_in_the_order_of_the_standard() -> None:
+def test_elements_are_in_the_order_of_the_standard():
     tree = etree.fromstring(format_oem_xml(ephemeris()).encode())
     assert (tree.tag, tree.get("id"), tree.get("version")) == ("oem", "CCSDS_OEM_VERS", "2.0")
-    assert [one.tag for one in tree] == ["header", "body"]
-    segment = tree.find("body/segment")
-    assert [one.tag for one in segment] == ["metadata", "data"]
-    assert [one.tag for one in segment.find("metadata") if one.tag != "COMMENT"] == [
-        "OBJECT_NAME", "OBJECT_ID", "CENTER_NAME", "REF_FRAME", "TIME_SYSTEM", "START_TIME", "STOP_TIME",
-        "INTERPOLATION", "INTERPOLATION_DEGREE",
-    ]  # fmt: skip
-    assert [one.tag for one in segment.find("data/stateVector")] == [
-        "EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT",
-    ]  # fmt: skip
-    assert [one.tag for one in segment.find("data/covarianceMatrix")][:6] == [
-        "EPOCH", "COV_REF_FRAME", "CX_X", "CY_X", "CY_Y", "CZ_X",
-    ]  # fmt: skip
+    for path, tags in (
+        (".", "header body"), ("body/segment", "metadata data"),
+        ("body/segment/data/stateVector", "EPOCH X Y Z X_DOT Y_DOT Z_DOT"),
+        ("body/segment/metadata", "OBJECT_NAME OBJECT_ID CENTER_NAME REF_FRAME TIME_SYSTEM START_TIME STOP_TIME "
+         "INTERPOLATION INTERPOLATION_DEGREE"),
+        ("body/segment/data/covarianceMatrix", "EPOCH COV_REF_FRAME CX_X CY_X CY_Y CZ_X"),
+    ):  # fmt: skip
+        found = " ".join(one.tag for one in tree.find(path) if one.tag != "COMMENT")
+        assert found.startswith(tags) if "CX_X" in tags else found == tags
 
 
 LAUGHS = """<?xml version="1.0"?>
@@ -125,25 +130,29 @@ LAUGHS = """<?xml version="1.0"?>
 <oem id="CCSDS_OEM_VERS" version="2.0"><header><ORIGINATOR>&b;</ORIGINATOR></header></oem>"""
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda text: LAUGHS, r"line 2: expected XML without a document type, found <!DOCTYPE oem>"),
-        (lambda text: text[:700], r"line \d+: expected well-formed XML, found"),
-        (lambda text: text.replace('units="km"', 'units="m"', 1), r"line \d+: expected units='km' of X, found 'm'"),
-        (lambda text: text.replace("<ORIGINATOR>TEST</ORIGINATOR>", ""), "expected ORIGINATOR in the header"),
-        (lambda text: text.replace('version="2.0"', 'version="9"'), r"line 2: expected an OEM version .*found '9'"),
-        (lambda text: text.replace("<Z_DOT", "<Z_TOD").replace("/Z_DOT", "/Z_TOD"), "expected <Z_DOT> with one value"),
-        (lambda text: "<a>" * 20 + "</a>" * 20, "expected"),
-    ],
-)  # fmt: skip
-def test_faults_of_xml_are_named_with_their_line(change, message) -> None:
-    text = change(format_oem_xml(ephemeris()))
-    with pytest.raises(DataFileError, match=message):
-        parse_oem_xml(text.encode(), "orbit.xml")
+XML_FAULTS = r"""
+units="km" | units="m" | line \d+: expected units='km' of X, found 'm'
+<ORIGINATOR>TEST</ORIGINATOR> |  | expected ORIGINATOR in the header
+version="2.0" | version="9" | line 2: expected an OEM version .*found '9'
+Z_DOT | Z_TOD | expected <Z_DOT> with one value
+"""
 
 
-def test_an_error_in_a_state_names_the_line_of_the_xml() -> None:
+def test_faults_of_xml_are_named_with_their_line():
+    whole = format_oem_xml(ephemeris())
+    for text, message in (
+        *((whole.replace(old, new), message) for old, new, message in rows_of(XML_FAULTS)),
+        (LAUGHS, r"line 2: expected XML without a document type, found <!DOCTYPE oem>"),
+        (whole[:700], r"line \d+: expected well-formed XML, found"), ("<a>" * 20 + "</a>" * 20, "expected"),
+        ('<?xml version="1.0" encoding="foo"?><oem/>', "expected XML in UTF-8"),
+        ('<?xml version="1.0" encoding="big5"?><oem/>', "expected XML in UTF-8"),
+    ):  # fmt: skip
+        assert text != whole
+        with pytest.raises(DataFileError, match=message):
+            parse_oem_xml(text.encode(), "orbit.xml")
+
+
+def test_an_error_in_a_state_names_the_line_of_the_xml():
     lines = format_oem_xml(ephemeris()).splitlines()
     where = next(k for k, line in enumerate(lines) if line.startswith("<stateVector>"))
     lines[where + 1] = lines[where + 1].replace("T00:01", "T00:61")
@@ -154,7 +163,7 @@ def test_an_error_in_a_state_names_the_line_of_the_xml() -> None:
 # Compressed files
 
 
-def zipped(*contents: bytes) -> bytes:
+def zipped(*contents):
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for number, content in enumerate(contents):
@@ -163,23 +172,21 @@ def zipped(*contents: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("compress", [gzip.compress, zipped])
-def test_compressed_oem_is_read(tmp_path: Path, compress) -> None:
+def test_compressed_oem_is_read(tmp_path, compress):
     path = tmp_path / "orbit"
     for text in (format_oem(ephemeris()), format_oem_xml(ephemeris())):
         path.write_bytes(compress(text.encode()))
-        np.testing.assert_allclose(
-            load_ephemeris(path).segments[0].position_m, ephemeris().segments[0].position_m, atol=1e-6
-        )
+        assert_allclose(load_ephemeris(path).segments[0].position_m, ephemeris().segments[0].position_m, atol=1e-6)
 
 
-def test_two_gzip_members_are_one_file(tmp_path: Path) -> None:
+def test_two_gzip_members_are_one_file(tmp_path):
     path = tmp_path / "two"
     path.write_bytes(gzip.compress(b"one ") + gzip.compress(b"two"))
     assert read_expanded(path, "text") == b"one two"
 
 
 @pytest.mark.parametrize(
-    ("octets", "message"),
+    "octets, message",
     [
         (gzip.compress(bytes(5 << 20)), "expected at most 1 MiB when expanded, found more"),
         (gzip.compress(bytes(900_000)) * 2, "expected at most 1 MiB when expanded, found more"),
@@ -192,28 +199,21 @@ def test_two_gzip_members_are_one_file(tmp_path: Path) -> None:
     # The octets contain the time, and would differ between the processes of a parallel run.
     ids=["large gzip", "two large members", "large zip", "cut gzip", "no gzip", "two files", "cut zip"],
 )
-def test_faults_of_compressed_files_are_named(tmp_path: Path, octets: bytes, message: str) -> None:
+def test_faults_of_compressed_files_are_named(tmp_path, octets, message):
     path = tmp_path / "orbit.gz"
     path.write_bytes(octets)
     with pytest.raises(DataFileError, match=rf"orbit\.gz: {message}"):
         read_expanded(path, "an ephemeris", 1 << 20)
 
 
-def test_many_gzip_members_take_linear_time(tmp_path: Path) -> None:
+def test_many_gzip_members_take_linear_time(tmp_path):
     path = tmp_path / "many.gz"
     path.write_bytes(gzip.compress(b"") * 200_000)  # 4 MB; minutes if each member copies the rest
     assert read_expanded(path, "text") == b""
 
 
-@pytest.mark.parametrize("encoding", ["foo", "big5"])
-def test_encodings_of_xml_that_are_not_supported_are_named(encoding: str) -> None:
-    text = f'<?xml version="1.0" encoding="{encoding}"?><oem/>'
-    with pytest.raises(DataFileError, match="expected XML in UTF-8"):
-        parse_oem_xml(text.encode(), "orbit.xml")
-
-
 @pytest.mark.parametrize("year", ["9999", "1500"])
-def test_years_outside_64_bits_of_nanoseconds_are_refused(year: str) -> None:
+def test_years_outside_64_bits_of_nanoseconds_are_refused(year):
     with pytest.raises(TimeFormatError):
         parse_utc(f"{year}-01-01T00:00:00Z")
 
@@ -221,7 +221,7 @@ def test_years_outside_64_bits_of_nanoseconds_are_refused(year: str) -> None:
 # AEM
 
 
-def attitudes(count: int = 6) -> AttitudeSegment:
+def attitudes(count=6):
     q = np.random.default_rng(4).normal(size=(count, 4))
     return AttitudeSegment(
         START + np.arange(count) * 15 * NS,
@@ -230,36 +230,31 @@ def attitudes(count: int = 6) -> AttitudeSegment:
     )
 
 
-def standard_matrix(q1: float, q2: float, q3: float, qc: float) -> np.ndarray:
+def standard_matrix(q1, q2, q3, qc):
     """The direction cosine matrix from frame A to frame B of the annex of CCSDS 504.0-B."""
-    return np.array(
-        [
-            [q1**2 - q2**2 - q3**2 + qc**2, 2 * (q1 * q2 + q3 * qc), 2 * (q1 * q3 - q2 * qc)],
-            [2 * (q1 * q2 - q3 * qc), -(q1**2) + q2**2 - q3**2 + qc**2, 2 * (q2 * q3 + q1 * qc)],
-            [2 * (q1 * q3 + q2 * qc), 2 * (q2 * q3 - q1 * qc), -(q1**2) - q2**2 + q3**2 + qc**2],
-        ]
-    )
+    vector, cross = np.array([q1, q2, q3]), np.array([[0, -q3, q2], [q3, 0, -q1], [-q2, q1, 0]])
+    return (qc**2 - vector @ vector) * np.eye(3) + 2 * (np.outer(vector, vector) - qc * cross)
 
 
-def test_quaternions_of_an_aem_are_those_of_the_standard() -> None:
+def test_quaternions_of_an_aem_are_those_of_the_standard():
     text = format_aem((attitudes(),))
     rows = text.partition("DATA_START\n")[2].partition("\nDATA_STOP")[0].splitlines()
     for row, q_wxyz in zip(rows, attitudes().q_wxyz, strict=True):
         numbers = [float(token) for token in row.split()[1:]]
-        np.testing.assert_allclose(standard_matrix(*numbers), matrix_from_quaternion(q_wxyz), atol=1e-11)
+        assert_allclose(standard_matrix(*numbers), matrix_from_quaternion(q_wxyz), atol=1e-11)
 
 
 @given(count=st.integers(1, 20), second=st.integers(0, 10**9))
-def test_an_aem_is_read_as_it_was_written(count: int, second: int) -> None:
+def test_an_aem_is_read_as_it_was_written(count, second):
     one = attitudes(count)
     one = AttitudeSegment(one.utc_ns + second, one.q_wxyz, object_name="A", object_id="2029-001A")
     (found,) = parse_aem(format_aem((one,)))
-    np.testing.assert_array_equal(found.utc_ns, one.utc_ns)
-    np.testing.assert_allclose(found.q_wxyz, one.q_wxyz, atol=1e-11)
+    assert_array_equal(found.utc_ns, one.utc_ns)
+    assert_allclose(found.q_wxyz, one.q_wxyz, atol=1e-11)
     assert (found.frame_a, found.frame_b, found.object_id) == ("ICRF", "INSTRUMENT_1", "2029-001A")
 
 
-def test_order_and_direction_of_quaternions_are_as_stated() -> None:
+def test_order_and_direction_of_quaternions_are_as_stated():
     text = format_aem((attitudes(),), "1.0")
     lines = []
     for line in text.splitlines():
@@ -269,10 +264,10 @@ def test_order_and_direction_of_quaternions_are_as_stated() -> None:
             line = f"{epoch} {w} {-float(a)} {-float(b)} {-float(c)}"
         lines.append(line.replace("LAST", "FIRST").replace("A2B", "B2A"))
     (found,) = parse_aem("\n".join(lines))
-    np.testing.assert_allclose(found.q_wxyz, attitudes().q_wxyz, atol=1e-11)
+    assert_allclose(found.q_wxyz, attitudes().q_wxyz, atol=1e-11)
 
 
-def test_an_aem_is_written_as_version_2_or_in_the_old_form_with_continuous_signs() -> None:
+def test_an_aem_is_written_as_version_2_or_in_the_old_form_with_continuous_signs():
     angle = np.linspace(0.0, 2.0 * np.pi, 6)
     q_wxyz = np.stack([np.cos(angle), np.sin(angle), 0 * angle, 0 * angle], axis=1)
     flipped = AttitudeSegment(attitudes().utc_ns, q_wxyz * np.array([1, -1, -1, 1, -1, 1])[:, None])
@@ -282,7 +277,7 @@ def test_an_aem_is_written_as_version_2_or_in_the_old_form_with_continuous_signs
     for keyword in ("ATTITUDE_DIR", "QUATERNION_TYPE"):
         assert keyword in texts["1.0"] and keyword not in texts["2.0"]
     for text in texts.values():
-        np.testing.assert_allclose(parse_aem(text)[0].q_wxyz, q_wxyz, atol=1e-11)
+        assert_allclose(parse_aem(text)[0].q_wxyz, q_wxyz, atol=1e-11)
 
 
 AEM_XML = """<?xml version="1.0" encoding="UTF-8"?>
@@ -298,38 +293,38 @@ AEM_XML = """<?xml version="1.0" encoding="UTF-8"?>
 </data></segment></body></aem>"""
 
 
-def test_an_aem_in_xml_is_read_by_the_names_of_its_elements() -> None:
+def test_an_aem_in_xml_is_read_by_the_names_of_its_elements():
     (segment,) = parse_aem(AEM_XML)
-    np.testing.assert_array_equal(segment.utc_ns, START + np.array([0, 15]) * NS)
-    np.testing.assert_allclose(segment.q_wxyz, [[0.6, 0, -0.8, 0], [0, 0, 0, -1.0]], atol=1e-15)
+    assert_array_equal(segment.utc_ns, START + np.array([0, 15]) * NS)
+    assert_allclose(segment.q_wxyz, [[0.6, 0, -0.8, 0], [0, 0, 0, -1.0]], atol=1e-15)
 
 
-def test_a_quaternion_in_xml_without_its_scalar_is_named_with_its_line() -> None:
+def test_a_quaternion_in_xml_without_its_scalar_is_named_with_its_line():
     with pytest.raises(DataFileError, match=r"line 8: expected <QC> with one value, found 'none'"):
         parse_aem(AEM_XML.replace("<QC>0.6</QC>", ""))
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("CCSDS_AEM_VERS = 2.0", "CCSDS_OEM_VERS = 2.0", "line 1: expected CCSDS_AEM_VERS"),
-        ("CCSDS_AEM_VERS = 2.0", "CCSDS_AEM_VERS = 7.0", "expected an AEM version out of 1.0, 2.0, found '7.0'"),
-        ("ATTITUDE_TYPE = QUATERNION", "ATTITUDE_TYPE = EULER_ANGLE", "expected ATTITUDE_TYPE = QUATERNION"),
-        ("DATA_STOP", "", "expected more lines, found the end of the file"),
-        ("REF_FRAME_B = INSTRUMENT_1\n", "", "expected REF_FRAME_B before META_STOP, found none"),
-        ("T00:00:15.000 ", "T00:00:15.000 7 ", "line 20: expected an epoch and a quaternion of 4 numbers"),
-        ("T00:00:30.000 ", "T00:00:15.000 ", "line 21: expected an epoch after 2029-08-07T00:00:15"),
-        ("T00:00:15.000 ", "T00:00:15.000 9", "line 20: expected a quaternion of unit length"),
-    ],
-)
-def test_faults_of_an_aem_are_named_with_their_line(old: str, new: str, message: str) -> None:
-    text = format_aem((attitudes(),))
+AEM_FAULTS = """
+CCSDS_AEM_VERS = 2.0 | CCSDS_OEM_VERS = 2.0 | line 1: expected CCSDS_AEM_VERS
+CCSDS_AEM_VERS = 2.0 | CCSDS_AEM_VERS = 7.0 | expected an AEM version out of 1.0, 2.0, found '7.0'
+ATTITUDE_TYPE = QUATERNION | ATTITUDE_TYPE = EULER_ANGLE | expected ATTITUDE_TYPE = QUATERNION
+DATA_STOP |  | expected more lines, found the end of the file
+REF_FRAME_B = INSTRUMENT_1¶ |  | expected REF_FRAME_B before META_STOP, found none
+T00:00:15.000  | T00:00:15.000 7  | line 20: expected an epoch and a quaternion of 4 numbers
+T00:00:30.000  | T00:00:15.000  | line 21: expected an epoch after 2029-08-07T00:00:15
+T00:00:15.000  | T00:00:15.000 9 | line 20: expected a quaternion of unit length
+"""
+
+
+@pytest.mark.parametrize("old, new, message", rows_of(AEM_FAULTS))
+def test_faults_of_an_aem_are_named_with_their_line(old, new, message):
+    text, old = format_aem((attitudes(),)), old.replace("¶", "\n")
     assert old in text
     with pytest.raises(DataFileError, match=message):
         parse_aem(text.replace(old, new))
 
 
-def test_an_empty_attitude_segment_is_refused() -> None:
+def test_an_empty_attitude_segment_is_refused():
     with pytest.raises(EphemerisError, match="expected at least one attitude, found none"):
         AttitudeSegment(np.zeros(0, dtype=np.int64), np.zeros((0, 4)))
 
@@ -357,7 +352,7 @@ $$EOE
 """
 
 
-def test_a_horizons_table_is_read(tmp_path: Path) -> None:
+def test_a_horizons_table_is_read(tmp_path):
     path = tmp_path / "lro.csv"
     path.write_text(HORIZONS)
     segment = load_ephemeris(path).segments[0]
@@ -365,35 +360,33 @@ def test_a_horizons_table_is_read(tmp_path: Path) -> None:
     # TDB is 69.184 s ahead of UTC, but for the 1.7 ms of its periodic part.
     offset = from_tai_ns(segment.tai_ns, "TDB") - (START + np.array([0, 60]) * NS)
     assert np.abs(offset).max() <= 1
-    np.testing.assert_allclose(segment.position_m[0], [1.768e6, 0.0, -15e3])
-    np.testing.assert_allclose(segment.velocity_m_s[1], [110.0, 1500.0, 210.0])
+    assert_allclose(segment.position_m[0], [1.768e6, 0.0, -15e3])
+    assert_allclose(segment.velocity_m_s[1], [110.0, 1500.0, 210.0])
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "error", "message"),
-    [
-        ("Moon (301) ", "Earth (399) ", DataFileError, r"Center body name: expected Moon \(301\), found Earth \(399\)"),
-        ("KM-S", "AU-D", DataFileError, "line 8: expected Output units of KM-S, M-S, KM-D, found 'AU-D'"),
-        (": ICRF", ": Ecliptic of J2000.0", UnknownFrameError, "line 10: expected a reference frame out of ICRF"),
-        ("$$EOE", "", DataFileError, r"expected a table between \$\$SOE and \$\$EOE, found 1 of the marks"),
-        ("00:01:00", "00:00:00", DataFileError, "line 16: expected an epoch after 2029-08-06T23:58:50"),
-        ("9.0E+01", "nan", DataFileError, "line 16: expected finite numbers"),
-        ("9.0E+01", "ninety", DataFileError, "line 16: expected a date like .* and six numbers"),
-        (" VZ,", " LT,", DataFileError, "columns: expected a column VZ, found none"),
-        ("Calendar Date (TDB)", "Date", DataFileError, r"columns: expected columns with Calendar Date \(TDB\)"),
-    ],
-)
-def test_faults_of_a_horizons_table_are_named(
-    tmp_path: Path, old: str, new: str, error: type[Exception], message: str
-) -> None:
+HORIZONS_FAULTS = r"""
+Moon (301)  | Earth (399)  | Center body name: expected Moon \(301\), found Earth \(399\)
+KM-S | AU-D | line 8: expected Output units of KM-S, M-S, KM-D, found 'AU-D'
+: ICRF | : Ecliptic of J2000.0 | line 10: expected a reference frame out of ICRF
+$$EOE |  | expected a table between \$\$SOE and \$\$EOE, found 1 of the marks
+00:01:00 | 00:00:00 | line 16: expected an epoch after 2029-08-06T23:58:50
+9.0E+01 | nan | line 16: expected finite numbers
+9.0E+01 | ninety | line 16: expected a date like .* and six numbers
+ VZ, |  LT, | columns: expected a column VZ, found none
+Calendar Date (TDB) | Date | columns: expected columns with Calendar Date \(TDB\)
+"""
+
+
+@pytest.mark.parametrize("old, new, message", rows_of(HORIZONS_FAULTS))
+def test_faults_of_a_horizons_table_are_named(tmp_path, old, new, message):
     path = tmp_path / "lro.csv"
     assert old in HORIZONS
     path.write_text(HORIZONS.replace(old, new))
-    with pytest.raises(error, match=message):
+    with pytest.raises(UnknownFrameError if "frame" in message else DataFileError, match=message):
         load_ephemeris(path)
 
 
-def test_a_horizons_table_with_steps_of_a_second_across_a_leap_second_is_read(tmp_path: Path) -> None:
+def test_a_horizons_table_with_steps_of_a_second_across_a_leap_second_is_read(tmp_path):
     head, _, _ = HORIZONS.partition("$$SOE\n")
     row = "2457754.5, A.D. 2017-Jan-01 00:01:{:02d}.0000, 1.8E+03, 0.0E+00, {}E+00, 0.0E+00, 0.0E+00, 1.6E+00,"
     path = tmp_path / "leap.csv"
@@ -404,14 +397,14 @@ def test_a_horizons_table_with_steps_of_a_second_across_a_leap_second_is_read(tm
     assert abs(segment.tai_ns[4] - parse_tai("2016-12-31T23:59:60.816")) < 2_000_000
 
 
-def test_an_attitude_within_a_leap_second_is_refused_with_that_reason() -> None:
+def test_an_attitude_within_a_leap_second_is_refused_with_that_reason():
     for system, clock in (("UTC", "2016-12-31T23:59:60.000"), ("TT", "2017-01-01T00:01:08.184")):
         text = format_aem((attitudes(1),)).replace("TIME_SYSTEM = UTC", f"TIME_SYSTEM = {system}")
         with pytest.raises(DataFileError, match=f"epoch outside of a leap second, .* found '{clock}' {system}"):
             parse_aem(text.replace("2029-08-07T00:00:00.000 ", f"{clock} "))
 
 
-def test_an_spk_is_referred_to_the_converter(tmp_path: Path) -> None:
+def test_an_spk_is_referred_to_the_converter(tmp_path):
     path = tmp_path / "orbit.bsp"
     path.write_bytes(b"DAF/SPK " + bytes(100))
     with pytest.raises(DataFileError, match="found a SPICE kernel; convert it with 'linna orbit convert'"):

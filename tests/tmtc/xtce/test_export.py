@@ -12,7 +12,6 @@ from space_packet_parser.xtce.validation import validate_xtce
 from tmtc.dictionary.fields import Field
 from tmtc.dictionary.onboard_parameters import PARAMETERS
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.dictionary.schema import PacketDefinition
 from tmtc.packets.crc import CRC_LENGTH
 from tmtc.packets.stream import whole_packets
 from tmtc.xtce.decode import Decoder
@@ -34,7 +33,11 @@ def decoder(document):
 
 
 def test_the_document_validates_against_the_schema_and_its_references_hold(document):
-    result = validate_xtce(document, level="all", print_results=False, allow_schema_download=False)
+    validate(document, "all")
+
+
+def validate(path, level):
+    result = validate_xtce(path, level=level, print_results=False, allow_schema_download=False)
     assert result.valid, result.errors
 
 
@@ -42,8 +45,7 @@ def test_the_form_with_arrays_validates_against_the_schema_and_is_short(tmp_path
     text = format_xtce()
     path = tmp_path / "arrays.xml"
     path.write_text(text, encoding="utf-8")
-    result = validate_xtce(path, level="schema", print_results=False, allow_schema_download=False)
-    assert result.valid, result.errors
+    validate(path, "schema")
     assert text.count("<SequenceContainer") == len(DICTIONARY.telemetry) + 2
     assert len(text) < 300_000
 
@@ -59,7 +61,7 @@ def test_the_form_with_arrays_is_imported_to_equal_values_of_every_packet(defini
     counts = [0, 1, 2, 40, 255] if definition.group else [0, 0, 0]
     packets = [random_packet(definition, count, rng) for count in counts]
     cut = whole_packets(np.array([len(packet) for packet in packets]))
-    found = Decoder(imported, "CCSDSPacket").decode(b"".join(packets), cut)
+    found = Decoder(imported).decode(b"".join(packets), cut)
     assert found.counts()["decoded"] == len(packets)
     (table,) = found.tables.values()
     assert table.name == definition.name
@@ -73,12 +75,8 @@ def test_the_form_with_arrays_is_imported_to_equal_values_of_every_packet(defini
         assert columns["TIME_COARSE"][row][0] << 16 | columns["TIME_FINE"][row][0] == ours.ticks
         assert columns["ERROR_CONTROL"][row][0] == int.from_bytes(octets[-2:], "big")
         for f in definition.fields:
-            for k in range(f.size):
-                index = None if f.size == 1 else k + 1
-                value, raw = ours.values[f.name], ours.raw[f.name]
-                if index is not None:
-                    value, raw = value[k], raw[k]
-                assert_imported(columns[parameter_name(definition.name, f.name, index)][row], value, raw, f)
+            for name, value, raw in named(definition, f, ours):
+                assert_imported(columns[name][row], value, raw, f)
         if definition.group is None:
             continue
         values, raws = columns[parameter_name(definition.name, definition.group.name)][row]
@@ -93,7 +91,15 @@ def test_the_form_with_arrays_is_imported_to_equal_values_of_every_packet(defini
                 assert_imported(pair, ours.values["items"][f.name][k], ours.raw["items"][f.name][k], f)
 
 
-def assert_imported(pair, value, raw, f: Field) -> None:
+def named(definition, f, ours):
+    """Names of the parameters of a field, with their values and raw values."""
+    value, raw = ours.values[f.name], ours.raw[f.name]
+    if f.size == 1:
+        return [(parameter_name(definition.name, f.name), value, raw)]
+    return [(parameter_name(definition.name, f.name, k + 1), value[k], raw[k]) for k in range(f.size)]
+
+
+def assert_imported(pair, value, raw, f):
     if f.labels:
         assert pair == (f.label(raw), raw)
     elif f.missing is not None and raw == f.missing:
@@ -104,7 +110,7 @@ def assert_imported(pair, value, raw, f: Field) -> None:
         assert pair == (value, raw)
 
 
-def random_value(f: Field, rng: np.random.Generator):
+def random_value(f, rng):
     if f.size > 1:
         return [random_value(Field(f.name, f.type, ""), rng) for _ in range(f.size)]
     if f.labels:
@@ -121,7 +127,7 @@ def random_value(f: Field, rng: np.random.Generator):
     return raw * f.scale + f.offset if f.is_calibrated else raw
 
 
-def random_packet(definition: PacketDefinition, count: int, rng: np.random.Generator) -> bytes:
+def random_packet(definition, count, rng):
     group = definition.group
     values = {f.name: random_value(f, rng) for f in definition.fields if not (group and f.name == group.count)}
     if group:
@@ -148,11 +154,8 @@ def test_an_independent_decoder_reads_every_packet_to_equal_values(definition, d
         assert (theirs["SERVICE"], theirs["SUBTYPE"]) == (ours.service, ours.subtype)
         assert theirs["TIME_COARSE"] << 16 | theirs["TIME_FINE"] == ours.ticks
         for f in definition.fields:
-            if f.size == 1:
-                assert_equal(theirs[parameter_name(definition.name, f.name)], ours.values[f.name], ours.raw[f.name], f)
-            for k in range(f.size if f.size > 1 else 0):
-                name = parameter_name(definition.name, f.name, k + 1)
-                assert_equal(theirs[name], ours.values[f.name][k], ours.raw[f.name][k], f)
+            for name, value, raw in named(definition, f, ours):
+                assert_equal(theirs[name], value, raw, f)
         if definition.group and [f.type for f in definition.group.fields] == ["u8"]:
             name = parameter_name(definition.name, "items")
             assert bytes(theirs[name]) == bytes(ours.values["items"]["octet"].astype(np.uint8))
@@ -163,7 +166,7 @@ def test_an_independent_decoder_reads_every_packet_to_equal_values(definition, d
                     assert_equal(theirs[name], ours.values["items"][f.name][k], ours.raw["items"][f.name][k], f)
 
 
-def assert_equal(theirs, value, raw, f: Field) -> None:
+def assert_equal(theirs, value, raw, f):
     if f.labels:
         assert (str(theirs), theirs.raw_value) == (f.label(raw), raw)
     elif f.is_float and math.isnan(value):
@@ -203,6 +206,6 @@ def test_telecommands_are_as_long_as_the_dictionary_expects_once_the_sender_appe
             assert listed == {one.name: str(one.number) for one in PARAMETERS}
 
 
-def first_value(f: Field):
+def first_value(f):
     """Return a value that the field accepts."""
     return f.labels[0][0] if f.labels else max(f.minimum or 0, 0)
