@@ -26,8 +26,7 @@ import httpx
 import numpy as np
 
 from benchmarks._ground_service import processor_s, resident_mib
-from benchmarks._servers import PostgresServer
-from benchmarks.campaigns._deployment import ManyApis
+from benchmarks._servers import Deployment, PostgresServer
 from benchmarks.ground import START, definition, mixed_downlink
 from ground_service.evaluation.service import make_report
 from ground_service.ground import open_ground
@@ -205,7 +204,7 @@ def measured(only: Sequence[str]) -> Iterator[Cost]:
     with tempfile.TemporaryDirectory(prefix="costs-") as name, PostgresServer(Path(name)) as server:
         folder, url = Path(name), server.url
         prepare_database(url, upgrade=True).engine.dispose()
-        with ManyApis(folder, url, count=1) as service:
+        with Deployment(folder, url=url) as service:
             base = f"http://127.0.0.1:{service.ports[0]}/api/v1/"
             with httpx.Client(base_url=base, timeout=900.0) as client:
                 client.post("missions", content=MISSION).raise_for_status()

