@@ -139,12 +139,20 @@ def _one(
     return Stream(name, (octets,), {SPACECRAFT: frozenset(packets)}, **more)
 
 
+def _readable(
+    name: str, rows: Rows, frames: int, settings: LinkSettings = LinkSettings(), seed: int = 0, **more: Any
+) -> Stream:
+    """Return the stream of rows, with the packets of the telemetry whose frames can be read."""
+    packets = telemetry(frames, seed, settings)
+    stream = more.pop("stream", rows)
+    return _one(name, stream, packets_of(can_be_read(rows, settings), packets, settings), **more)
+
+
 def weak_start(weak: int, frames: int = FRAMES, rate: float = WEAK) -> Stream:
     """Return a recording whose first frames have many bit errors."""
     rows = cadus(frames).copy()
     rows[:weak] = with_bit_errors(rows[:weak], rate, seed=weak)
-    found = packets_of(can_be_read(rows, LinkSettings()), telemetry(frames), LinkSettings())
-    return _one(f"first {weak} of {len(rows)} frames weak", rows, found)
+    return _readable(f"first {weak} of {len(rows)} frames weak", rows, frames)
 
 
 def weak_middle(weak: int, frames: int = FRAMES) -> Stream:
@@ -152,15 +160,13 @@ def weak_middle(weak: int, frames: int = FRAMES) -> Stream:
     rows = cadus(frames).copy()
     part = slice(len(rows) // 2, len(rows) // 2 + weak)
     rows[part] = with_bit_errors(rows[part], WEAK, seed=weak)
-    found = packets_of(can_be_read(rows, LinkSettings()), telemetry(frames), LinkSettings())
-    return _one(f"{weak} of {len(rows)} frames weak in the middle", rows, found)
+    return _readable(f"{weak} of {len(rows)} frames weak in the middle", rows, frames)
 
 
 def weak_everywhere(rate: float, seed: int) -> Stream:
     """Return a recording with one bit error rate."""
     rows = with_bit_errors(cadus(60), rate, seed)
-    found = packets_of(can_be_read(rows, LinkSettings()), telemetry(60), LinkSettings())
-    return _one(f"bit error rate {rate:.1e} throughout, seed {seed}", rows, found)
+    return _readable(f"bit error rate {rate:.1e} throughout, seed {seed}", rows, 60)
 
 
 def noise_before(octets: int) -> Stream:
@@ -175,8 +181,8 @@ def station_header(rate: float) -> Stream:
     """Return CADUs behind a station header of 8 octets: counter, and noise."""
     header = np.random.default_rng(8).integers(0, 256, (len(cadus()), 8), dtype=np.uint8)
     rows = with_bit_errors(cadus(), rate, seed=9)
-    found = packets_of(can_be_read(rows, LinkSettings()), telemetry(SHORT), LinkSettings())
-    return _one(f"station header of 8 octets, bit error rate {rate:.0e}", np.hstack((header, rows)), found)
+    name = f"station header of 8 octets, bit error rate {rate:.0e}"
+    return _readable(name, rows, SHORT, stream=np.hstack((header, rows)))
 
 
 def random_gaps() -> Stream:
@@ -251,7 +257,6 @@ def two_receivers(one_file: bool) -> Stream:
 
 def two_spacecraft() -> Stream:
     """Return frames of two spacecraft, interleaved."""
-    rows = np.empty((2 * SHORT, LinkSettings().cadu_length), dtype=np.uint8)
     mine, other = cadus(SHORT)[:SHORT], cadus(SHORT, 7, LinkSettings(), OTHER_SPACECRAFT)[:SHORT]
     rows = np.empty((2 * min(len(mine), len(other)), mine.shape[1]), dtype=np.uint8)
     rows[0::2], rows[1::2] = mine[: len(rows) // 2], other[: len(rows) // 2]
@@ -267,9 +272,8 @@ def uncoded_weak() -> Stream:
     """Return uncoded frames with checksums, of which some have bit errors."""
     settings = LinkSettings(coding="none")
     rows = with_bit_errors(cadus(SHORT, 2, settings), 2e-5, seed=3)
-    found = packets_of(can_be_read(rows, settings), telemetry(SHORT, 2, settings), settings)
-    declared = ('coding = "none"',)
-    return _one("uncoded with checksum, bit error rate 2e-5", rows, found, declared=declared)
+    name, declared = "uncoded with checksum, bit error rate 2e-5", ('coding = "none"',)
+    return _readable(name, rows, SHORT, settings, 2, declared=declared)
 
 
 def without_error_control() -> Stream:

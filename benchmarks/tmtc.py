@@ -10,15 +10,14 @@ import io
 import logging
 import struct
 import tempfile
-import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks._rows import Row
+from benchmarks._rows import Row, best_s
 from tmtc.dictionary.fields import Field
 from tmtc.dictionary.schema import Dictionary, Group, PacketDefinition
 from tmtc.downlink import LinkSettings, decode, encode_cadus
@@ -99,11 +98,11 @@ def rows() -> Iterator[Row]:
         ),
     }
     for kind, (octets, runs) in peers.items():
-        ours = n / _best(lambda octets=octets: _ours(octets))
+        ours = n / best_s(lambda octets=octets: _ours(octets))
         for peer, (run, count) in runs.items():
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                theirs = count / _best(lambda run=run, octets=octets, count=count: run(octets, count))
+                theirs = count / best_s(lambda run=run, octets=octets, count=count: run(octets, count))
             yield Row(kind, ours, "packets/s", peer, theirs, wrong)
     for what, figures in (("reed-solomon", _reed_solomon()), ("downlink", _downlink(variable))):
         for name, rate in figures.items():
@@ -223,9 +222,9 @@ def _reed_solomon() -> dict[str, float]:
     assert reed_solomon.clean(blocks, code).all()
     assert np.array_equal(reed_solomon.decode(dirty, code).frames, frames[:100])
     return {
-        "clean check": blocks.size / 1e6 / _best(lambda: reed_solomon.clean(blocks, code)),
-        "encode": frames.size / 1e6 / _best(lambda: reed_solomon.encode(frames, code)),
-        "repair of 16 errors a codeword": dirty.size / 1e6 / _best(lambda: reed_solomon.decode(dirty, code)),
+        "clean check": blocks.size / 1e6 / best_s(lambda: reed_solomon.clean(blocks, code)),
+        "encode": frames.size / 1e6 / best_s(lambda: reed_solomon.encode(frames, code)),
+        "repair of 16 errors a codeword": dirty.size / 1e6 / best_s(lambda: reed_solomon.decode(dirty, code)),
     }
 
 
@@ -239,21 +238,12 @@ def _downlink(octets: bytes) -> dict[str, float]:
     ):
         stream = encode_cadus(packets, spacecraft_id=76, coding=settings.coding)
         for how, given in (("settings known", settings), ("settings found out", None)):
-            seconds = _best(
+            seconds = best_s(
                 lambda stream=stream, given=given: decode(stream, settings=given, dictionary=DICTIONARY)
             )
             figures[f"{name}, {how}"] = len(stream) / 1e6 / seconds
         assert decode(stream).packets == len(packets)
     return figures
-
-
-def _best(run: Callable[[], Any], rounds: int = 5) -> float:
-    seconds = []
-    for _ in range(rounds):
-        started = time.process_time()
-        run()
-        seconds.append(time.process_time() - started)
-    return min(seconds)
 
 
 def _struct_of(definition: PacketDefinition) -> struct.Struct:

@@ -382,22 +382,11 @@ def prepare(ground: Ground, folder: Path) -> tuple[dict[str, str], tuple[str, st
             f'schema_version = 1\nname = "{name}"\ncommand = ["true", "{{archive}}", "{{out}}"]\n'
         )
         builds.append(register_build(ground, load_build(place)).digest)
-    now = utc_now_ns()
-    ground.write(
-        repository.add,
-        repository.REGRESSION_ARCHIVES,
-        digest="a" * 64,
-        name="race",
-        manifest_sha256="a" * 64,
-        frames=1,
-        frames_stored=1,
-        state="complete",
-        reason="",
-        octets=1,
-        pinned=1,
-        used_utc_ns=now,
-        created_utc_ns=now,
-    )
+    row = dict.fromkeys(("frames", "frames_stored", "octets", "pinned"), 1)
+    row |= dict.fromkeys(("used_utc_ns", "created_utc_ns"), utc_now_ns())
+    texts = dict.fromkeys(("digest", "manifest_sha256"), "a" * 64)
+    texts |= {"name": "race", "state": "complete", "reason": ""}
+    ground.write(repository.add, repository.REGRESSION_ARCHIVES, **row, **texts)
     return tokens, (builds[0], builds[1])
 
 

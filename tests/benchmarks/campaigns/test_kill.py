@@ -109,11 +109,11 @@ def test_a_second_hand_out_and_a_changed_answer_are_faults() -> None:
     told.hand_outs.append(HandOut("ann", (1,), b"one"))
     assert judge(told, ROWS, LINES)["double_hand_outs"] == 1
     told = what_clients_were_told()
-    told.count_changed()
+    told.count("changed_answers")
     assert judge(told, ROWS, LINES)["hand_outs_wrong"] == 1
     sent = changed(3, state="sent")
     told = what_clients_were_told()
-    told.count_unanswered()
+    told.count("unanswered_hand_outs")
     assert judge(told, sent, [*LINES, AuditLine("send", 3, "ann")]).total() == 0
 
 
@@ -141,7 +141,7 @@ def test_a_pass_whose_definition_was_cut_off_is_looked_for_before_it_is_asked_fo
 ) -> None:
     asked: list[str] = []
 
-    def ask(_self: Session, method: str, _path: str, _body: bytes | None = None, key: str = "") -> Answer:
+    def ask(_self: Session, method: str, _path: str, _body: bytes | None = None, key: str = "", *_: int) -> Answer:
         asked.append(f"{method} {key}".strip())
         if method == "GET":
             return Answer(200, b'{"items": []}', {})
