@@ -148,19 +148,12 @@ def _readable(
     return _one(name, stream, packets_of(can_be_read(rows, settings), packets, settings), **more)
 
 
-def weak_start(weak: int, frames: int = FRAMES, rate: float = WEAK) -> Stream:
-    """Return a recording whose first frames have many bit errors."""
+def weak_start(weak: int, frames: int = FRAMES, first: int = 0) -> Stream:
+    """Return a recording with many bit errors in its first frames, or in those from another one on."""
     rows = cadus(frames).copy()
-    rows[:weak] = with_bit_errors(rows[:weak], rate, seed=weak)
-    return _readable(f"first {weak} of {len(rows)} frames weak", rows, frames)
-
-
-def weak_middle(weak: int, frames: int = FRAMES) -> Stream:
-    """Return a recording with a weak section in its middle."""
-    rows = cadus(frames).copy()
-    part = slice(len(rows) // 2, len(rows) // 2 + weak)
-    rows[part] = with_bit_errors(rows[part], WEAK, seed=weak)
-    return _readable(f"{weak} of {len(rows)} frames weak in the middle", rows, frames)
+    rows[first : first + weak] = with_bit_errors(rows[first : first + weak], WEAK, seed=weak)
+    where = "in the middle" if first else "at its start"
+    return _readable(f"{weak} of {len(rows)} frames weak {where}", rows, frames)
 
 
 def weak_everywhere(rate: float, seed: int) -> Stream:
@@ -226,18 +219,6 @@ def settings_change() -> Stream:
     return _one("settings change twice", np.concatenate(parts), tuple(packets), declared=declared)
 
 
-def every_frame_twice() -> Stream:
-    """Return every frame twice in succession."""
-    return _one("every frame twice", np.repeat(cadus(), 2, axis=0), telemetry(SHORT))
-
-
-def odd_then_even() -> Stream:
-    """Return the odd frames followed by the even ones."""
-    return _one(
-        "odd frames, then even frames", np.concatenate((cadus()[1::2], cadus()[0::2])), telemetry(SHORT)
-    )
-
-
 def shuffled() -> Stream:
     """Return the frames in any order."""
     order = np.random.default_rng(4).permutation(len(cadus()))
@@ -292,7 +273,7 @@ STREAMS: dict[str, Callable[[], Stream]] = {
     "weak-100": lambda: weak_start(100),
     "weak-220": lambda: weak_start(220),
     "weak-400": lambda: weak_start(400),
-    "weak-middle": lambda: weak_middle(400),
+    "weak-middle": lambda: weak_start(400, first=FRAMES // 2),
     "weak-1e-2": lambda: weak_everywhere(1e-2, 0),
     "noise-77000": lambda: noise_before(77_000),
     "noise-79000": lambda: noise_before(79_000),
@@ -303,8 +284,10 @@ STREAMS: dict[str, Callable[[], Stream]] = {
     "slips": bit_slips,
     "inverted": inverted,
     "change": settings_change,
-    "twice": every_frame_twice,
-    "odd-even": odd_then_even,
+    "twice": lambda: _one("every frame twice", np.repeat(cadus(), 2, axis=0), telemetry(SHORT)),
+    "odd-even": lambda: _one(
+        "odd frames, then even frames", np.concatenate((cadus()[1::2], cadus()[0::2])), telemetry(SHORT)
+    ),
     "shuffled": shuffled,
     "receivers-one-file": lambda: two_receivers(one_file=True),
     "receivers-two-files": lambda: two_receivers(one_file=False),

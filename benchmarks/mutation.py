@@ -38,6 +38,9 @@ SOURCES = (
     "benchmarks",
 )
 UNTESTED = "not checked"
+LIMIT = 0.85
+"""Lowest score accepted."""
+
 _SHOW = """
 import json, sys
 from mutmut.mutation.diff_apply import get_diff_for_mutant
@@ -127,28 +130,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--sample", type=int, default=60, help="mutants of a group; 0: every one (default 60)"
     )
     parser.add_argument("--seed", type=int, default=1, help="seed of the sample (default 1)")
-    parser.add_argument("--limit", type=float, default=0.85, help="lowest score accepted (default 0.85)")
-    parser.add_argument("--children", type=int, default=1, help="mutants tested at once (default 1)")
     parser.add_argument("--json", type=Path, help="file for the figures and the survivors")
     options = parser.parse_args(arguments)
     results = {}
     for name in options.group or GROUPS:
-        results[name] = run_group(name, options.sample, options.seed, options.children)
+        results[name] = run_group(name, options.sample, options.seed)
         print(line_of(name, results[name]), flush=True)
         for survivor in results[name]["survivors"]:
             print(f"  survived: {survivor['name']}\n{survivor['difference']}", file=sys.stderr)
         if options.json is not None:
             options.json.write_text(json.dumps(results, indent=1) + "\n")
-    return int(any(result["score"] < options.limit for result in results.values()))
+    return int(any(result["score"] < LIMIT for result in results.values()))
 
 
-def run_group(name: str, sample: int, seed: int, children: int) -> dict[str, object]:
+def run_group(name: str, sample: int, seed: int) -> dict[str, object]:
     """Return the mutants, the killed ones, the score with its interval and the survivors of a group."""
     group = GROUPS[name]
     with tempfile.TemporaryDirectory(prefix="linna-mutation-") as folder:
         tree = Path(folder)
         _copy_tree(tree, group)
-        generated = _mutmut(tree, "run", "--max-children", str(children), "no such mutant")
+        generated = _mutmut(tree, "run", "--max-children", "1", "no such mutant")
         known = sorted(_states(tree))
         if not known:
             raise SystemExit(f"mutation: group {name}: no mutants were made:\n{generated[-2000:]}")
@@ -162,7 +163,7 @@ def run_group(name: str, sample: int, seed: int, children: int) -> dict[str, obj
             if len(chosen) >= wanted:
                 break
         chosen = chosen[:wanted]
-        said = _mutmut(tree, "run", "--max-children", str(children), *chosen)
+        said = _mutmut(tree, "run", "--max-children", "1", *chosen)
         found = _states(tree)
         states = {mutant: found.get(mutant, UNTESTED) for mutant in chosen}
         if UNTESTED in states.values():

@@ -22,6 +22,7 @@ from tmtc.dictionary.fields import Field
 from tmtc.dictionary.schema import Dictionary, Group, PacketDefinition
 from tmtc.downlink import LinkSettings, decode, encode_cadus
 from tmtc.link import reed_solomon
+from tmtc.packets.crc import append_crc
 from tmtc.packets.stream import cut_packets
 from tmtc.xtce.export import format_xtce
 
@@ -252,9 +253,5 @@ def _struct_of(definition: PacketDefinition) -> struct.Struct:
 
 
 def _with_checksums(packets: list[bytes]) -> bytes:
-    parts = []
-    for packet in packets:
-        length = len(packet) + 2 - 7
-        whole = packet[:4] + length.to_bytes(2, "big") + packet[6:]
-        parts += [whole, binascii.crc_hqx(whole, 0xFFFF).to_bytes(2, "big")]
-    return b"".join(parts)
+    whole = (packet[:4] + (len(packet) - 5).to_bytes(2, "big") + packet[6:] for packet in packets)
+    return b"".join(map(append_crc, whole))

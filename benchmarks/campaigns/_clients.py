@@ -1,17 +1,17 @@
 """Clients that upload pieces and add, decide and fetch telecommands while parts of the service are killed."""
 
-import http.client
+import contextlib
 import itertools
 import json
 import random
 import threading
 import time
-import urllib.error
-import urllib.request
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import httpx
 
 from benchmarks.campaigns._ledger import Decision, Entered, HandOut, Ledger, mark_of
 
@@ -26,19 +26,6 @@ TIMEOUT_S = 86_400
 
 RECENT = 12
 """Number of newest telecommands on which clients decide, so that they compete for the same ones."""
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """Response of the service, other than those for unavailable parts."""
-
-    status: int
-    body: bytes
-    headers: Mapping[str, str]
-
-    def json(self) -> Any:
-        """Return the body as JSON."""
-        return json.loads(self.body)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +49,9 @@ class Session:
     apis: tuple[str, ...]
     token: str
 
-    def ask(self, method: str, path: str, body: bytes | None = None, key: str = "", *expected: int) -> Answer:
+    def ask(
+        self, method: str, path: str, body: bytes | None = None, key: str = "", *expected: int
+    ) -> httpx.Response:
         """Repeat a request, with one process after another, until a response is not for an unavailable part.
 
         Raises
@@ -79,20 +68,14 @@ class Session:
             headers["Idempotency-Key"] = key
         until = time.monotonic() + TIMEOUT_S
         for api in itertools.cycle(random.sample(self.apis, len(self.apis))):
-            request = urllib.request.Request(f"{api}/api/v1{path}", data=body, method=method, headers=headers)
-            found = None
-            try:
-                with urllib.request.urlopen(request, timeout=60) as answer:
-                    found = Answer(answer.status, answer.read(), dict(answer.headers))
-            except urllib.error.HTTPError as error:
-                if error.code < 500:
-                    found = Answer(error.code, error.read(), dict(error.headers))
-            except (OSError, ValueError, http.client.HTTPException):  # the response was incomplete
-                pass
-            if found is not None:
-                if expected and found.status not in expected:
-                    raise SystemExit(f"{method} {path}: {found.status} {found.body[:300]!r}")
-                return found
+            with contextlib.suppress(httpx.HTTPError):
+                found = httpx.request(
+                    method, f"{api}/api/v1{path}", content=body, headers=headers, timeout=60
+                )
+                if found.status_code < 500:
+                    if expected and found.status_code not in expected:
+                        raise SystemExit(f"{method} {path}: {found.status_code} {found.content[:300]!r}")
+                    return found
             if time.monotonic() > until:
                 raise SystemExit(f"{method} {path}: no answer within {TIMEOUT_S:.0f} s")
             time.sleep(0.3)
@@ -161,7 +144,7 @@ class Client(threading.Thread):
         for attempt in range(20):
             body, key = json.dumps(given).encode(), f"enter {mark} {attempt}"
             answer = self._session.ask("POST", "/telecommands", body, key, 201, 409)
-            if answer.status == 201:
+            if answer.status_code == 201:
                 self._ledger.entered.append(Entered(mark, int(answer.json()["id"]), self.name))
                 return
             time.sleep(LOOK_AFTER_S)
@@ -180,7 +163,7 @@ class Client(threading.Thread):
         state = self._rng.choices(("released", "rejected"), (4, 1))[0]
         verb, body = ("release", b"") if state == "released" else ("reject", b'{"reason": "campaign"}')
         answer = self._session.ask("POST", f"/telecommands/{command}/{verb}", body, "", 200, 409)
-        if answer.status == 200:
+        if answer.status_code == 200:
             self._ledger.decisions.append(Decision(command, state, self.name))
         elif found := answer.json().get("state"):
             self._ledger.decisions.append(Decision(command, found))
@@ -190,13 +173,12 @@ class Client(threading.Thread):
         key = f"uplink {self._rng.getrandbits(64):x}"
         path = f"/uplink?spacecraft_id={self._spacecraft}&format=packets"
         answer = self._session.ask("POST", path, None, key, 200, 409)
-        if answer.status == 409:  # fetched by a process that was killed before its response
+        if answer.status_code == 409:  # fetched by a process that was killed before its response
             self._ledger.count("unanswered_hand_outs")
             return
-        named = {name.lower(): text for name, text in answer.headers.items()}.get("x-telecommands", "")
-        commands = tuple(int(one) for one in named.split(",") if one)
-        self._ledger.hand_outs.append(HandOut(self.name, commands, answer.body))
-        if self._rng.random() < 0.3 and self._session.ask("POST", path, None, key).body != answer.body:
+        commands = tuple(int(one) for one in answer.headers.get("x-telecommands", "").split(",") if one)
+        self._ledger.hand_outs.append(HandOut(self.name, commands, answer.content))
+        if self._rng.random() < 0.3 and self._session.ask("POST", path, None, key).content != answer.content:
             self._ledger.count("changed_answers")
 
     def _note_head(self) -> None:

@@ -406,15 +406,13 @@ def main(arguments=None):
     parser.add_argument("--row", action="append", help="only this row (repeatable)")
     parser.add_argument("--again", action="store_true", help="run rows that have results again")
     parser.add_argument("--write", action="store_true", help="write docs/results/compatibility.md")
-    parser.add_argument("--demo", type=Path, default=BUILD / "demo", help="folder of `linna demo` to use")
     options = parser.parse_args(arguments)
     samples = BUILD / "samples"
     if not (samples / "expected.json").is_file():
-        if not (options.demo / "ground").is_dir():
-            subprocess.run(
-                [sys.executable, "-m", "linna", "demo", "--out", str(options.demo)], check=True, cwd=ROOT
-            )
-        make_samples(samples, options.demo)
+        demo = BUILD / "demo"
+        if not (demo / "ground").is_dir():
+            subprocess.run([sys.executable, "-m", "linna", "demo", "--out", str(demo)], check=True, cwd=ROOT)
+        make_samples(samples, demo)
     wanted = [row for row in ROWS if not options.row or row.name in options.row]
     results = {row.name: result(row, samples, again=options.again) for row in wanted}
     for name, cells in results.items():

@@ -26,6 +26,7 @@ import numpy as np
 from sqlalchemy import select
 
 from benchmarks._servers import PostgresServer
+from benchmarks.campaigns.compatibility import compare
 from benchmarks.downlink import telemetry
 from ground_service.errors import DatabaseBusy, GroundError
 from ground_service.ground import Ground, open_ground
@@ -65,21 +66,9 @@ MISSIONS = (
 )
 NEW = ("packets_new", "samples")
 SUMS = ("crc_errors", "frames", "frames_bad", "symbols_corrected")
-RECEPTION_SUMS = (
-    "frames_good", "codewords", "codewords_lost", "wrong_bits", "checked_bits", "lock_losses", "frames_inverted",
-    "octets_frames", "octets_records",
-)  # fmt: skip
-
-OF_LOST_FRAMES = (
-    "frames",
-    "frames_bad",
-    "frames_inverted",
-    "lock_losses",
-    "octets_frames",
-    "codewords",
-    "codewords_lost",
-    "octets_other",
-)
+LOST = ("frames_inverted", "lock_losses", "octets_frames", "codewords", "codewords_lost")
+RECEPTION_SUMS = ("frames_good", "wrong_bits", "checked_bits", "octets_records", *LOST)
+OF_LOST_FRAMES = ("frames", "frames_bad", "octets_other", *LOST)
 """Counts that include frames which cannot be used: at the border of two pieces, those may be counted with both."""
 
 Rng = np.random.Generator
@@ -405,30 +394,16 @@ class Archive:
 
     def difference(self, case: Case) -> str:
         """Ingest a case and compare it with the whole recordings; empty if the archives are equal."""
-        instances = f"whole-{case.number}", f"pieces-{case.number}"
+        names = f"whole-{case.number}", f"pieces-{case.number}"
         try:
-            return self._difference(case, instances)
+            whole = list(zip(wholes(case), self.ingest(wholes(case), names[0]), strict=True))
+            results = list(zip(case.pieces, self.ingest(case.pieces, names[1]), strict=True))
+            expected, found = (contents(self.ground, case, one) for one in names)
         except (GroundError, TmtcError) as error:
             return f"refused: {error}"
-
-    def _difference(self, case: Case, instances: tuple[str, str]) -> str:
-        whole = list(zip(wholes(case), self.ingest(wholes(case), instances[0]), strict=True))
-        results = list(zip(case.pieces, self.ingest(case.pieces, instances[1]), strict=True))
-        expected, found = (contents(self.ground, case, one) for one in instances)
-        if expected["archive"] != found["archive"]:
-            return f"{found['packets']} of {expected['packets']} packets"
-        if expected["passes"] != found["passes"]:
-            return f"pass: {_differences(expected['passes'], found['passes'])}"
-        one, other = (sums(self.ground, case, ids) for ids in (whole, results))
-        return f"ingests: {_differences(one, other)}" if one != other else ""
-
-
-def _differences(expected: Any, found: Any, path: str = "") -> str:
-    if isinstance(expected, dict) and isinstance(found, dict):
-        keys = dict.fromkeys([*expected, *found])
-        parts = (_differences(expected.get(key), found.get(key), f"{path}{key} ") for key in keys)
-        return ", ".join(part for part in parts if part)
-    return "" if expected == found else f"{path}{found} instead of {expected}"
+        expected["ingests"], found["ingests"] = (sums(self.ground, case, ids) for ids in (whole, results))
+        text, is_equal = compare(expected, found)
+        return "" if is_equal else text
 
 
 _GROUND: list[Ground] = []

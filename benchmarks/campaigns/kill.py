@@ -174,7 +174,7 @@ def the_pass(session: Session, body: bytes) -> int:
     """Define a pass; where a kill leaves open whether it was done, look, and ask again under another key."""
     for attempt in range(20):
         answer = session.ask("POST", "/passes", body, f"pass {attempt}", 201, 409)
-        if answer.status == 201:
+        if answer.status_code == 201:
             return int(answer.json()["id"])
         known = session.get("/passes")["items"]
         if known:

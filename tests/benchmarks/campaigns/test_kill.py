@@ -7,9 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
-from benchmarks.campaigns._clients import Answer, Session, cut_pieces
+from benchmarks.campaigns._clients import Session, cut_pieces
 from benchmarks.campaigns._ledger import FAULTS, AuditLine, Decision, Entered, HandOut, Ledger, judge
 from benchmarks.campaigns.kill import holds, main, the_pass, totals
 
@@ -141,13 +142,15 @@ def test_a_pass_whose_definition_was_cut_off_is_looked_for_before_it_is_asked_fo
 ) -> None:
     asked: list[str] = []
 
-    def ask(_self: Session, method: str, _path: str, _body: bytes | None = None, key: str = "", *_: int) -> Answer:
+    def ask(
+        _self: Session, method: str, _path: str, _body: bytes | None = None, key: str = "", *_: int
+    ) -> httpx.Response:
         asked.append(f"{method} {key}".strip())
         if method == "GET":
-            return Answer(200, b'{"items": []}', {})
+            return httpx.Response(200, json={"items": []})
         if key == "pass 0":
-            return Answer(409, b"begun and its end is not known", {})
-        return Answer(201, b'{"id": 7}', {})
+            return httpx.Response(409)
+        return httpx.Response(201, json={"id": 7})
 
     monkeypatch.setattr(Session, "ask", ask)
     assert the_pass(Session(("http://nowhere",), "token"), b"{}") == 7
