@@ -1,7 +1,7 @@
 """`python -m benchmarks [NAME …] [--json] [--before COMMIT]`: benchmarks, each compared with its peers.
 
-Exit status 1: a benchmark did not finish, or a row contradicts the expectation. What takes longer than minutes (gate
-error rates, campaigns) has a command of its own and is not in this list. `python -m benchmarks rooms` prints the size
+Exit status 1: a benchmark did not finish, or a row contradicts the expectation. What takes longer than minutes
+(campaigns) has a command of its own and is not in this list. `python -m benchmarks rooms` prints the size
 and the import graph of each package.
 """
 

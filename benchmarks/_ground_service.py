@@ -15,7 +15,8 @@ from typing import Any
 import httpx
 import numpy as np
 
-from benchmarks.campaigns._deployment import Laptop
+from benchmarks._rows import Row
+from benchmarks._servers import Deployment
 from studies.harness.parts import Part
 
 READS = (
@@ -26,30 +27,23 @@ READS = (
 """Requests of the pages of operators, in turn."""
 
 
-def answers_under_load(
-    stream: bytes, definition: dict[str, Any], rate_per_s: float, seconds: float
-) -> dict[str, Any]:
+def answers_under_load(stream: bytes, definition: dict[str, Any], rate_per_s: float, seconds: float) -> Row:
     """Latencies of ordinary reads at a steady rate, from the moment each is due, and how many went wrong."""
-    with tempfile.TemporaryDirectory() as name:
-        service = Laptop(Path(name))
-        try:
-            base = f"{service.api}/api/v1"
-            with httpx.Client(base_url=base, timeout=300.0) as client:
-                job = client.post("/telemetry?spacecraft_id=76", content=stream).json()["job_id"]
-                wait_for_job(client, job)
-                client.post("/passes", json=definition).raise_for_status()
-            asyncio.run(_ask(base, rate_per_s, 3.0))  # warms what is compiled and cached
-            before = processor_s(service.parts["api"])
-            figures = asyncio.run(_ask(base, rate_per_s, seconds))
-            spent = processor_s(service.parts["api"]) - before
-            answers = max(figures["api_requests"], 1)
-            return figures | {"api_server_cpu_ms_an_answer": round(1e3 * spent / answers, 2)}
-        finally:
-            service.stop()
+    with tempfile.TemporaryDirectory() as name, Deployment(Path(name)) as service:
+        base = f"{service.apis[0]}/api/v1"
+        with httpx.Client(base_url=base, timeout=300.0) as client:
+            job = client.post("/telemetry?spacecraft_id=76", content=stream).json()["job_id"]
+            wait_for_job(client, job)
+            client.post("/passes", json=definition).raise_for_status()
+        asyncio.run(_ask(base, rate_per_s, 3.0))  # warms what is compiled and cached
+        times, errors = asyncio.run(_ask(base, rate_per_s, seconds))
+    half, most = map(float, np.percentile(times, (50, 95)))
+    wrong = f"errors {dict(errors)}" if errors else ""
+    return Row(f"API reads at {rate_per_s:.0f}/s, 95 %", most, "ms", "median", half, wrong)
 
 
-async def _ask(base: str, rate_per_s: float, seconds: float) -> dict[str, Any]:
-    times: dict[str, list[float]] = {path: [] for path in READS}
+async def _ask(base: str, rate_per_s: float, seconds: float) -> tuple[list[float], Counter[str]]:
+    times: list[float] = []
     errors: Counter[str] = Counter()
     async with httpx.AsyncClient(base_url=base, timeout=30.0) as client:
 
@@ -61,7 +55,7 @@ async def _ask(base: str, rate_per_s: float, seconds: float) -> dict[str, Any]:
                 return
             if status != 200:
                 errors[f"{status} {path}"] += 1
-            times[path].append(time.perf_counter() - due)
+            times.append(1e3 * (time.perf_counter() - due))
 
         begin = time.perf_counter()
         tasks = []
@@ -70,16 +64,7 @@ async def _ask(base: str, rate_per_s: float, seconds: float) -> dict[str, Any]:
             await asyncio.sleep(max(due - time.perf_counter(), 0.0))
             tasks.append(asyncio.create_task(one(path, due)))
         await asyncio.gather(*tasks)
-    every = np.array([value for values in times.values() for value in values]) * 1e3
-    return {
-        "api_requests": len(every),
-        "api_requests_per_s": rate_per_s,
-        "api_errors": dict(errors),
-        "api_p50_ms": round(float(np.percentile(every, 50)), 1),
-        "api_p95_ms": round(float(np.percentile(every, 95)), 1),
-        "api_p99_ms": round(float(np.percentile(every, 99)), 1),
-        "api_slowest": max(times, key=lambda path: float(np.median(times[path] or [0.0]))),
-    }
+    return times, errors
 
 
 def wait_for_job(client: httpx.Client, job: str) -> dict[str, Any]:
@@ -91,38 +76,32 @@ def wait_for_job(client: httpx.Client, job: str) -> dict[str, Any]:
         time.sleep(0.2)
 
 
-def memory_of_a_stream(different: bytes, megabytes: int) -> dict[str, Any]:
+def memory_of_a_stream(different: bytes, megabytes: int) -> Row:
     """Return the memory of the service while it takes and ingests a downlink of a size in one upload.
 
     Anonymous memory, sampled: pages of the mapped raw file belong to the page cache and can be dropped at any time. The
     stream is `different` again and again, so most of its packets are stored already when they come.
     """
-    with tempfile.TemporaryDirectory() as name:
-        service = Laptop(Path(name), LINNA_UPLOAD_LIMIT_MIB=str(megabytes + 1))
-        try:
-            idle = resident_mib(service.parts["api"], "RssAnon")
-            clock = time.perf_counter()
-            copies = max(round(megabytes * 1e6 / len(different)), 1)
+    limit = str(megabytes + 1)
+    with (
+        tempfile.TemporaryDirectory() as name,
+        Deployment(Path(name), LINNA_UPLOAD_LIMIT_MIB=limit) as service,
+    ):
+        idle = resident_mib(service.parts["api 1"], "RssAnon")
+        copies = max(round(megabytes * 1e6 / len(different)), 1)
 
-            def pieces() -> Iterator[bytes]:
-                for _ in range(copies):
-                    yield from (different[at : at + (1 << 20)] for at in range(0, len(different), 1 << 20))
+        def pieces() -> Iterator[bytes]:
+            for _ in range(copies):
+                yield from (different[at : at + (1 << 20)] for at in range(0, len(different), 1 << 20))
 
-            client = httpx.Client(base_url=f"{service.api}/api/v1", timeout=600.0)
-            with client, _peak_anonymous_mib(service.parts["api"]) as peak:
-                answer = client.post("/telemetry?spacecraft_id=76", content=pieces())
-                answer.raise_for_status()
-                row = wait_for_job(client, answer.json()["job_id"])
-            return {
-                "stream_megabytes": round(copies * len(different) / 1e6),
-                "stream_state": row["state"],
-                "stream_packets": (row["result"] or {}).get("packets"),
-                "stream_s": round(time.perf_counter() - clock, 1),
-                "idle_anonymous_mib": idle,
-                "stream_peak_anonymous_mib": max(peak),
-            }
-        finally:
-            service.stop()
+        client = httpx.Client(base_url=f"{service.apis[0]}/api/v1", timeout=600.0)
+        with client, _peak_anonymous_mib(service.parts["api 1"]) as peak:
+            answer = client.post("/telemetry?spacecraft_id=76", content=pieces())
+            answer.raise_for_status()
+            row = wait_for_job(client, answer.json()["job_id"])
+    wrong = "" if row["state"] == "done" and max(peak) < idle + 300 else f"{row['state']}, {max(peak)} MiB"
+    what = f"upload of {megabytes} MB: anonymous memory, peak"
+    return Row(what, max(peak), "MiB", "idle", idle, wrong)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tarfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -67,6 +67,16 @@ def needs(program: str, *names: str) -> str:
     if found is None:
         raise NotMeasured(f"{program} is not installed")
     return found
+
+
+def best_s(run: Callable[[], object], rounds: int = 5) -> float:
+    """Return the least processor time of some runs after one to warm up, or of a single run (0), in seconds."""
+    times = []
+    for _ in range(rounds + 1):
+        begin = time.process_time()
+        run()
+        times.append(time.process_time() - begin)
+    return min(times[1:] or times)
 
 
 @contextmanager

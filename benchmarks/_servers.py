@@ -1,4 +1,4 @@
-"""Servers of a distributed service on private ports of this machine: PostgreSQL and Redis."""
+"""The service on private ports of this machine: PostgreSQL, Redis, API processes and workers."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ import os
 import shutil
 import socket
 import subprocess
+import sys
 import tempfile
 import threading
 from collections.abc import Mapping
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 from sqlalchemy import text
@@ -17,7 +20,7 @@ from sqlalchemy import text
 from ground_service.errors import GroundError
 from ground_service.store.database import prepare_database
 from ground_service.store.roles import grant_service
-from studies.harness.parts import Part, free_port, kill_family, started_ticks
+from studies.harness.parts import Part, bare_environment, free_port, kill_family, listens, started_ticks
 
 SERVICE_ROLE = "service"
 
@@ -147,3 +150,57 @@ def _answers_ping(port: int) -> bool:
             return connection.recv(16).startswith(b"+PONG")
     except OSError:
         return False
+
+
+class Deployment:
+    """Processes of the service, `parts` by name, each of which can be killed and started again.
+
+    With workers: PostgreSQL, Redis, API processes and workers, with a database role that owns nothing. Without: API
+    processes alone, with Redis on the PostgreSQL database `url`, where jobs are added but not run, or on SQLite.
+    """
+
+    def __init__(
+        self, folder: Path, apis: int = 1, workers: int = 0, url: str | None = None, **settings: str
+    ) -> None:
+        self.home, self.url = folder / "home", url
+        self.ports = tuple(free_port() for _ in range(apis))
+        self.apis = tuple(f"http://127.0.0.1:{port}" for port in self.ports)
+        self.parts: dict[str, Part] = {}
+        self._ended = ExitStack()
+        given = {"LINNA_HOME": str(self.home)}
+        try:
+            if workers:
+                database = self._ended.enter_context(PostgresServer(folder))
+                self.parts["database"], self.url = database.part, database.prepare_service()
+            else:
+                given["LINNA_ALLOW_DATABASE_OWNER"] = "true"
+            if self.url:
+                broker = RedisServer(folder)
+                self.parts["broker"], self.broker_url = broker.part, broker.url
+                given |= {"LINNA_DATABASE_URL": self.url, "LINNA_BROKER_URL": broker.url}
+            environment = bare_environment(**given | settings)
+            commands = {f"api {k}": ["serve", "--port", str(port)] for k, port in enumerate(self.ports, 1)}
+            commands |= {f"worker {k}": ["worker"] for k in range(1, workers + 1)}
+            for name, words in commands.items():
+                ready = partial(listens, int(words[2])) if len(words) > 1 else lambda: True
+                command, log = (
+                    [sys.executable, "-m", "linna", *words],
+                    folder / f"{name.replace(' ', '')}.log",
+                )
+                self.parts[name] = Part(command, log, ready, env=environment)
+                self.parts[name].start()
+        except BaseException:
+            self.stop()
+            raise
+
+    def __enter__(self) -> Deployment:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """End all processes, and remove the files of the database server."""
+        for part in self.parts.values():
+            part.end()
+        self._ended.close()

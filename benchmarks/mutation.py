@@ -38,6 +38,9 @@ SOURCES = (
     "benchmarks",
 )
 UNTESTED = "not checked"
+LIMIT = 0.85
+"""Lowest score accepted."""
+
 _SHOW = """
 import json, sys
 from mutmut.mutation.diff_apply import get_diff_for_mutant
@@ -55,111 +58,51 @@ class Group:
     tests: tuple[str, ...]
 
 
-_FLIGHT = "payload_emulator/flight"
-_GROUND_TESTS = "tests/ground_service"
-_FLIGHT_TESTS = "tests/payload_emulator/flight"
+_TABLE = """\
+accounting|ground_service/ingest/core ground_service/passes/downlink_accounting tmtc/packets/sequence\
+|ground_service/ingest/test_sequence ground_service/passes/test_downlink_accounting tmtc/test_sequence
+verdicts|ground_service/evaluation/verdict ground_service/evaluation/alignment ground_service/evaluation/recall\
+|ground_service/evaluation/test_verdict ground_service/evaluation/test_pass_data
+evaluation|ground_service/evaluation/core ground_service/evaluation/alignment ground_service/evaluation/recall \
+ground_service/evaluation/smoother ground_service/evaluation/fixes\
+|ground_service/evaluation/test_pass_evaluation ground_service/evaluation/test_alignment \
+ground_service/evaluation/test_recall ground_service/evaluation/test_baseline ground_service/evaluation/test_fixes \
+ground_service/evaluation/test_golden_reports
+smoother|ground_service/evaluation/smoother\
+|ground_service/evaluation/test_smoother ground_service/exports/test_exports
+gates|ground_service/regression/gates/core ground_service/regression/gates/statistics\
+|ground_service/regression/test_regression_gates
+filter|payload_emulator/flight/navigation/filter/filter payload_emulator/flight/navigation/anchored \
+payload_emulator/flight/navigation/correction payload_emulator/flight/navigation/recovery \
+payload_emulator/flight/onboard/observer payload_emulator/flight/navigation/search/acquisition\
+|payload_emulator/flight/test_navigation_filter payload_emulator/flight/test_anchored \
+payload_emulator/flight/test_anchored_navigator payload_emulator/flight/test_observer \
+payload_emulator/flight/test_acquisition payload_emulator/flight/test_landmark_map
+authorisation|ground_service/access/service ground_service/access/security|ground_service/access
+commanding|ground_service/contacts/commanding/service ground_service/contacts/commanding/core \
+payload_emulator/flight/onboard/commanding\
+|ground_service/contacts/commanding/test_commanding payload_emulator/flight/test_commanding
+flight|payload_emulator/flight|payload_emulator/flight"""
+"""Groups: name, modules, and tests below `tests`; a folder stands for all that it contains."""
+
+
+def _files(name: str) -> list[str]:
+    """Return a module, or those of a folder that run mutated: mutmut renames functions, and numba compiles by name."""
+    if not (ROOT / name).is_dir():
+        return [f"{name}.py"]
+    found = sorted((ROOT / name).rglob("*.py"))
+    return [str(file.relative_to(ROOT)) for file in found if "njit" not in file.read_text(encoding="utf-8")]
+
 
 GROUPS = {
-    "accounting": Group(
-        (
-            "ground_service/ingest/core.py",
-            "ground_service/passes/downlink_accounting.py",
-            "tmtc/packets/sequence.py",
-        ),
-        (
-            f"{_GROUND_TESTS}/ingest/test_sequence.py",
-            f"{_GROUND_TESTS}/passes/test_downlink_accounting.py",
-            "tests/tmtc/test_sequence.py",
-        ),
-    ),
-    "verdicts": Group(
-        (
-            "ground_service/evaluation/verdict.py",
-            "ground_service/evaluation/alignment.py",
-            "ground_service/evaluation/recall.py",
-        ),
-        tuple(f"{_GROUND_TESTS}/evaluation/test_{name}.py" for name in ("verdict", "pass_data")),
-    ),
-    "evaluation": Group(
-        (
-            "ground_service/evaluation/core.py",
-            "ground_service/evaluation/alignment.py",
-            "ground_service/evaluation/alignment.py",
-            "ground_service/evaluation/recall.py",
-            "ground_service/evaluation/smoother.py",
-            "ground_service/evaluation/fixes.py",
-            "ground_service/evaluation/alignment.py",
-        ),
-        (
-            *(
-                f"{_GROUND_TESTS}/evaluation/test_{name}.py"
-                for name in (
-                    "pass_evaluation",
-                    "alignment",
-                    "recall",
-                    "baseline",
-                    "fixes",
-                )
-            ),
-            f"{_GROUND_TESTS}/evaluation/test_golden_reports.py",
-        ),
-    ),
-    "smoother": Group(
-        ("ground_service/evaluation/smoother.py",),
-        (f"{_GROUND_TESTS}/evaluation/test_smoother.py", f"{_GROUND_TESTS}/exports/test_exports.py"),
-    ),
-    "gates": Group(
-        ("ground_service/regression/gates/core.py", "ground_service/regression/gates/statistics.py"),
-        (f"{_GROUND_TESTS}/regression/test_regression_gates.py",),
-    ),
-    "filter": Group(
+    name: Group(
+        tuple(file for one in modules.split() for file in _files(one)),
         tuple(
-            f"{_FLIGHT}/{name}.py"
-            for name in (
-                "navigation/filter/filter",
-                "navigation/anchored",
-                "navigation/correction",
-                "navigation/recovery",
-                "onboard/observer",
-                "navigation/search/acquisition",
-            )
+            one if (ROOT / one).is_dir() else f"{one}.py"
+            for one in (f"tests/{test}" for test in tests.split())
         ),
-        tuple(
-            f"{_FLIGHT_TESTS}/test_{name}.py"
-            for name in (
-                "navigation_filter",
-                "anchored",
-                "anchored_navigator",
-                "observer",
-                "acquisition",
-                "landmark_map",
-            )
-        ),
-    ),
-    "flight": Group(
-        tuple(
-            str(file.relative_to(ROOT))
-            for file in sorted((ROOT / _FLIGHT).rglob("*.py"))
-            # Compiled code does not run mutated: mutmut renames functions, and numba compiles by name.
-            if "njit" not in file.read_text(encoding="utf-8")
-        ),
-        (_FLIGHT_TESTS,),
-    ),
-    "authorisation": Group(
-        ("ground_service/access/service.py", "ground_service/access/security.py"),
-        (f"{_GROUND_TESTS}/access",),
-    ),
-    "commanding": Group(
-        (
-            "ground_service/contacts/commanding/service.py",
-            "ground_service/contacts/commanding/core.py",
-            f"{_FLIGHT}/onboard/commanding.py",
-        ),
-        (
-            f"{_GROUND_TESTS}/contacts/commanding/test_commanding.py",
-            f"{_FLIGHT_TESTS}/test_commanding.py",
-        ),
-    ),
+    )
+    for name, modules, tests in (line.split("|") for line in _TABLE.splitlines())
 }
 
 _ELEMENT_TYPE = re.compile(r",? ?dtype=[\w.]+|\.astype\([\w.]+\)")
@@ -187,28 +130,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--sample", type=int, default=60, help="mutants of a group; 0: every one (default 60)"
     )
     parser.add_argument("--seed", type=int, default=1, help="seed of the sample (default 1)")
-    parser.add_argument("--limit", type=float, default=0.85, help="lowest score accepted (default 0.85)")
-    parser.add_argument("--children", type=int, default=1, help="mutants tested at once (default 1)")
     parser.add_argument("--json", type=Path, help="file for the figures and the survivors")
     options = parser.parse_args(arguments)
     results = {}
     for name in options.group or GROUPS:
-        results[name] = run_group(name, options.sample, options.seed, options.children)
+        results[name] = run_group(name, options.sample, options.seed)
         print(line_of(name, results[name]), flush=True)
         for survivor in results[name]["survivors"]:
             print(f"  survived: {survivor['name']}\n{survivor['difference']}", file=sys.stderr)
         if options.json is not None:
             options.json.write_text(json.dumps(results, indent=1) + "\n")
-    return int(any(result["score"] < options.limit for result in results.values()))
+    return int(any(result["score"] < LIMIT for result in results.values()))
 
 
-def run_group(name: str, sample: int, seed: int, children: int) -> dict[str, object]:
+def run_group(name: str, sample: int, seed: int) -> dict[str, object]:
     """Return the mutants, the killed ones, the score with its interval and the survivors of a group."""
     group = GROUPS[name]
     with tempfile.TemporaryDirectory(prefix="linna-mutation-") as folder:
         tree = Path(folder)
         _copy_tree(tree, group)
-        generated = _mutmut(tree, "run", "--max-children", str(children), "no such mutant")
+        generated = _mutmut(tree, "run", "--max-children", "1", "no such mutant")
         known = sorted(_states(tree))
         if not known:
             raise SystemExit(f"mutation: group {name}: no mutants were made:\n{generated[-2000:]}")
@@ -222,7 +163,7 @@ def run_group(name: str, sample: int, seed: int, children: int) -> dict[str, obj
             if len(chosen) >= wanted:
                 break
         chosen = chosen[:wanted]
-        said = _mutmut(tree, "run", "--max-children", str(children), *chosen)
+        said = _mutmut(tree, "run", "--max-children", "1", *chosen)
         found = _states(tree)
         states = {mutant: found.get(mutant, UNTESTED) for mutant in chosen}
         if UNTESTED in states.values():

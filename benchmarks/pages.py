@@ -1,4 +1,4 @@
-"""First paint and time to interactive of every page: python -m benchmarks.pages [--passes N] [--rows N].
+"""First paint and time to interactive of every page: python -m benchmarks pages.
 
 A service with passes of one spacecraft and rows of housekeeping is seeded and served, and every page is
 opened in Chromium with an empty cache, three times. A page is interactive when it has handled the last answer it asked
@@ -6,13 +6,9 @@ for and its main thread is idle; the middle of the three is printed, with the pr
 took, which a busy machine does not stretch.
 """
 
-import argparse
-import json
-import shutil
 import statistics
 import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,6 +30,7 @@ SPACECRAFT = 76
 START = parse_utc("2029-08-07T00:00:00Z")
 TICKS_A_SECOND = 65_536
 PASS_S = 7_200
+PASSES, ROWS = 200, 200_000
 _CHUNK = 500_000
 _TIMES = 3
 _QUIET_MS = 400
@@ -155,35 +152,13 @@ def _opened(chromium: Any, address: str) -> tuple[float, float, float]:
     return painted, at, 1e3 * metrics["TaskDuration"]
 
 
-def bench(passes: int, rows: int) -> dict[str, Any]:
-    """Milliseconds to interactive of every page, and what the database held."""
-    pages = [one.path for one in PAGES if "{" not in one.path] + ["/passes/1"]
-    folder = Path(tempfile.mkdtemp(prefix="linna-pages-"))
-    try:
-        clock = time.perf_counter()
-        seed(folder, passes, rows)
-        seeded = time.perf_counter() - clock
-        with served(folder) as url:
-            found = measure(url, [*pages, f"/telemetry?pass={passes}"])
-        return {"passes": passes, "rows": rows, "seed_s": round(seeded), "interactive_ms": found}
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
 def rows() -> Iterator[Row]:
     """Yield the time to interactive of each page; the peer is the limit of one second."""
     needs("Chromium", "chromium", "chromium-browser", "google-chrome")
-    for path, found in bench(200, 200_000)["interactive_ms"].items():
-        yield Row(f"{path}: interactive", found["clock"], "ms", "limit", 1000.0)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--passes", type=int, default=1_000)
-    parser.add_argument("--rows", type=int, default=10_000_000)
-    arguments = parser.parse_args()
-    print(json.dumps(bench(arguments.passes, arguments.rows), indent=2))
-
-
-if __name__ == "__main__":
-    main()
+    pages = [one.path for one in PAGES if "{" not in one.path] + ["/passes/1", f"/telemetry?pass={PASSES}"]
+    with tempfile.TemporaryDirectory(prefix="linna-pages-") as name:
+        seed(Path(name), PASSES, ROWS)
+        with served(Path(name)) as url:
+            found = measure(url, pages)
+    for path, one in found.items():
+        yield Row(f"{path}: interactive", one["clock"], "ms", "limit", 1000.0)

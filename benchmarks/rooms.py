@@ -7,20 +7,18 @@ share of lines in import statements. Exit status 2: the commit is unknown.
 
 import argparse
 import ast
-import io
-import subprocess
 import sys
-import tarfile
 from collections.abc import Iterator, Mapping
 from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import NamedTuple
 
+from benchmarks._rows import ROOT, NotMeasured, checkout
+
 PACKAGES = (
     "payload_emulator.session", "payload_emulator.flight.navigation", "tmtc", "ground_service",
     "payload_emulator", "studies", "linna", "lunar", "reports", "kernels",
 )  # fmt: skip
-_ROOT = Path(__file__).resolve().parents[1]
 
 
 class Rooms(NamedTuple):
@@ -67,18 +65,12 @@ def _targets(node: ast.Import | ast.ImportFrom, modules: Mapping[str, str]) -> I
         yield inner if inner in modules or isinstance(node, ast.Import) else str(node.module)
 
 
-def load_modules(commit: str) -> dict[str, str]:
-    """Return the texts of all Python modules by name, of a commit or ("") of the working tree."""
-    tops = sorted({name.partition(".")[0] for name in PACKAGES})
-    if commit:
-        command = ["git", "archive", commit, *tops]
-        octets = subprocess.run(command, cwd=_ROOT, check=True, capture_output=True).stdout
-        with tarfile.open(fileobj=io.BytesIO(octets)) as archive:
-            files = {one.name: archive.extractfile(one) for one in archive if one.name.endswith(".py")}
-            texts = {name: file.read().decode() for name, file in files.items() if file}
-    else:
-        paths = (path for top in tops for path in (_ROOT / top).rglob("*.py"))
-        texts = {str(path.relative_to(_ROOT)): path.read_text(encoding="utf-8") for path in paths}
+def load_modules(root: Path) -> dict[str, str]:
+    """Return the texts of all Python modules of a checkout by name."""
+    paths = (
+        path for top in {name.partition(".")[0] for name in PACKAGES} for path in (root / top).rglob("*.py")
+    )
+    texts = {str(path.relative_to(root)): path.read_text(encoding="utf-8") for path in paths}
     return {name[:-3].replace("/", ".").removesuffix(".__init__"): text for name, text in texts.items()}
 
 
@@ -88,14 +80,17 @@ def main(words: list[str]) -> int:
     parser.add_argument("--against", metavar="COMMIT")
     against = parser.parse_args(words).against
     try:
-        trees = {name: load_modules(name) for name in (against, "") if name is not None}
+        trees = {"": load_modules(ROOT)}
+        if against:
+            with checkout(against) as before:
+                trees = {against: load_modules(before), **trees}
         print(f"{'package':<46}" + "".join(f"{name:>8}" for name in Rooms._fields))
         for package in PACKAGES:
             for name, modules in trees.items():
                 *counts, imports = measure(package, modules)
                 label = f"{package} ({name})" if name else package
                 print(f"{label:<46}{''.join(f'{n:>8}' for n in counts)}{imports:>8.1%}")
-    except subprocess.CalledProcessError as error:
-        print(f"--against: expected a commit, found {error.stderr.decode().strip()}", file=sys.stderr)
+    except NotMeasured as error:
+        print(f"--against: {error}", file=sys.stderr)
         return 2
     return 0

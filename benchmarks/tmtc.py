@@ -1,4 +1,4 @@
-"""Benchmark of telemetry decoding (with checksums), compared with other libraries: python -m benchmarks.tmtc.
+"""Benchmark of telemetry decoding (with checksums), compared with other libraries: python -m benchmarks tmtc.
 
 Rates are by processor time of one thread, best of a few rounds: on a quiet machine that is the time that passes, and
 a busy one changes it little. Slow rivals decode fewer packets of the same kind. Every decoder's values are compared
@@ -7,23 +7,22 @@ with ours.
 
 import binascii
 import io
-import json
 import logging
 import struct
 import tempfile
-import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks._rows import Row
+from benchmarks._rows import Row, best_s
 from tmtc.dictionary.fields import Field
 from tmtc.dictionary.schema import Dictionary, Group, PacketDefinition
 from tmtc.downlink import LinkSettings, decode, encode_cadus
 from tmtc.link import reed_solomon
+from tmtc.packets.crc import append_crc
 from tmtc.packets.stream import cut_packets
 from tmtc.xtce.export import format_xtce
 
@@ -71,59 +70,44 @@ def variable_packets(count: int) -> bytes:
     return _with_checksums(parts)
 
 
-def bench(packets: int = PACKETS) -> dict[str, Any]:
-    """Packets and megabytes per second of ours and of the rivals."""
+def rows() -> Iterator[Row]:
+    """Yield rates of decoding compared with the peers; different values are an error."""
     import ccsdspy
 
     ccsdspy.log.setLevel(logging.ERROR)
-    fixed, variable = fixed_packets(packets), variable_packets(packets)
-    figures: dict[str, Any] = {"packets": packets, "clock": "processor time, best of rounds"}
-    ours = _ours(fixed), _ours(variable)  # also compiles
-    figures["fixed_62_octets"] = _rates(
-        fixed,
-        packets,
-        {
-            "linna, checksum": (lambda: _ours(fixed), packets),
-            "spacepackets cut + header + struct + fastcrc": (
-                lambda: _spacepackets_cut(fixed, packets // 10),
-                packets // 10,
-            ),
-            "ccsdspy FixedLength, no checksum": (lambda: _ccsdspy_fixed(fixed), packets),
-            "space_packet_parser XTCE, no checksum": (lambda: _xtce(fixed, packets // 400), packets // 400),
-            "struct loop + crc_hqx": (lambda: _struct_loop(fixed), packets),
-        },
+    n = PACKETS
+    fixed, variable = fixed_packets(n), variable_packets(n)
+    wrong = (
+        "" if _compare(fixed, variable, _ours(fixed), _ours(variable)) else "values of the decoders differ"
     )
-    figures["variable_mean_267_octets"] = _rates(
-        variable,
-        packets,
-        {
-            "linna, checksum": (lambda: _ours(variable), packets),
-            "ccsdspy VariableLength, no checksum": (
-                lambda: _ccsdspy_variable(variable, packets // 20),
-                packets // 20,
-            ),
-            "struct loop + frombuffer + crc_hqx": (lambda: _struct_loop_variable(variable), packets),
-        },
-    )
-    figures["values_equal"] = _compare(fixed, variable, *ours, packets)
-    figures["reed_solomon_mb_per_s"] = _reed_solomon()
-    figures["downlink_mb_per_s"] = _downlink(variable)
-    return figures
-
-
-def rows() -> Iterator[Row]:
-    """Yield rates of decoding compared with the fastest peers; different values are an error."""
-    figures = bench()
-    wrong = "" if figures["values_equal"] else "values of the decoders differ"
-    for kind in ("fixed_62_octets", "variable_mean_267_octets"):
-        rates = figures[kind]
-        ours = rates["linna, checksum"]["packets_per_s"]
-        for peer, rate in rates.items():
-            if peer != "linna, checksum":
-                yield Row(kind.replace("_", " "), ours, "packets/s", peer, rate["packets_per_s"], wrong)
-    for what in ("reed_solomon_mb_per_s", "downlink_mb_per_s"):
-        for name, rate in figures[what].items():
-            yield Row(f"{what.split('_mb')[0].replace('_', '-')}: {name}", rate, "MB/s")
+    peers: dict[str, Any] = {
+        "fixed 62 octets": (
+            fixed,
+            {
+                "spacepackets cut + header + struct + fastcrc": (_spacepackets_cut, n // 10),
+                "ccsdspy FixedLength, no checksum": (_ccsdspy_fixed, n),
+                "space_packet_parser XTCE, no checksum": (_xtce, n // 400),
+                "struct loop + crc_hqx": (_struct_loop, n),
+            },
+        ),
+        "variable mean 267 octets": (
+            variable,
+            {
+                "ccsdspy VariableLength, no checksum": (_ccsdspy_variable, n // 20),
+                "struct loop + frombuffer + crc_hqx": (_struct_loop_variable, n),
+            },
+        ),
+    }
+    for kind, (octets, runs) in peers.items():
+        ours = n / best_s(lambda octets=octets: _ours(octets))
+        for peer, (run, count) in runs.items():
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                theirs = count / best_s(lambda run=run, octets=octets, count=count: run(octets, count))
+            yield Row(kind, ours, "packets/s", peer, theirs, wrong)
+    for what, figures in (("reed-solomon", _reed_solomon()), ("downlink", _downlink(variable))):
+        for name, rate in figures.items():
+            yield Row(f"{what}: {name}", rate, "MB/s")
 
 
 def _ours(octets: bytes) -> Any:
@@ -149,7 +133,7 @@ def _spacepackets_cut(octets: bytes, count: int) -> list[tuple[Any, ...]]:
     return rows
 
 
-def _ccsdspy_fixed(octets: bytes) -> Any:
+def _ccsdspy_fixed(octets: bytes, _: int = 0) -> Any:
     import ccsdspy
 
     kinds = {"u": "uint", "i": "int", "f": "float"}
@@ -193,7 +177,7 @@ def _xtce(octets: bytes, count: int) -> list[Any]:
 _XTCE: Any = None
 
 
-def _struct_loop(octets: bytes) -> list[tuple[Any, ...]]:
+def _struct_loop(octets: bytes, _: int = 0) -> list[tuple[Any, ...]]:
     body, view, at, rows = _struct_of(FIXED), memoryview(octets), 0, []
     while at < len(octets):
         stop = at + 7 + (octets[at + 4] << 8 | octets[at + 5])
@@ -203,7 +187,7 @@ def _struct_loop(octets: bytes) -> list[tuple[Any, ...]]:
     return rows
 
 
-def _struct_loop_variable(octets: bytes) -> list[Any]:
+def _struct_loop_variable(octets: bytes, _: int = 0) -> list[Any]:
     view, at, rows = memoryview(octets), 0, []
     while at < len(octets):
         stop = at + 7 + (octets[at + 4] << 8 | octets[at + 5])
@@ -213,7 +197,7 @@ def _struct_loop_variable(octets: bytes) -> list[Any]:
     return rows
 
 
-def _compare(fixed: bytes, variable: bytes, ours_fixed: Any, ours_variable: Any, packets: int) -> bool:
+def _compare(fixed: bytes, variable: bytes, ours_fixed: Any, ours_variable: Any) -> bool:
     """Return whether all decoders read the same values."""
     columns = ours_fixed["fixed"].columns
     theirs = _ccsdspy_fixed(fixed)
@@ -224,7 +208,7 @@ def _compare(fixed: bytes, variable: bytes, ours_fixed: Any, ours_variable: Any,
     same &= row == tuple(parsed[f"fixed_{f.name}"] for f in FIXED.fields)
     records = ours_variable["variable"].items_raw["record"]
     same &= np.array_equal(records, np.concatenate(_struct_loop_variable(variable)))
-    some = _ccsdspy_variable(variable, packets // 20)["record"]
+    some = _ccsdspy_variable(variable, PACKETS // 20)["record"]
     expected = np.concatenate([np.asarray(r, dtype=np.uint64) for r in some])
     return bool(same and np.array_equal(records[: expected.size], expected))
 
@@ -239,9 +223,9 @@ def _reed_solomon() -> dict[str, float]:
     assert reed_solomon.clean(blocks, code).all()
     assert np.array_equal(reed_solomon.decode(dirty, code).frames, frames[:100])
     return {
-        "clean check": blocks.size / 1e6 / _best(lambda: reed_solomon.clean(blocks, code)),
-        "encode": frames.size / 1e6 / _best(lambda: reed_solomon.encode(frames, code)),
-        "repair of 16 errors a codeword": dirty.size / 1e6 / _best(lambda: reed_solomon.decode(dirty, code)),
+        "clean check": blocks.size / 1e6 / best_s(lambda: reed_solomon.clean(blocks, code)),
+        "encode": frames.size / 1e6 / best_s(lambda: reed_solomon.encode(frames, code)),
+        "repair of 16 errors a codeword": dirty.size / 1e6 / best_s(lambda: reed_solomon.decode(dirty, code)),
     }
 
 
@@ -255,36 +239,12 @@ def _downlink(octets: bytes) -> dict[str, float]:
     ):
         stream = encode_cadus(packets, spacecraft_id=76, coding=settings.coding)
         for how, given in (("settings known", settings), ("settings found out", None)):
-            seconds = _best(
+            seconds = best_s(
                 lambda stream=stream, given=given: decode(stream, settings=given, dictionary=DICTIONARY)
             )
             figures[f"{name}, {how}"] = len(stream) / 1e6 / seconds
         assert decode(stream).packets == len(packets)
     return figures
-
-
-def _rates(
-    octets: bytes, packets: int, runs: dict[str, tuple[Callable[[], Any], int]]
-) -> dict[str, dict[str, float]]:
-    rates = {}
-    for name, (run, count) in runs.items():
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            seconds = _best(run)
-        rates[name] = {
-            "packets_per_s": round(count / seconds),
-            "mb_per_s": round(len(octets) / packets * count / 1e6 / seconds, 1),
-        }
-    return rates
-
-
-def _best(run: Callable[[], Any], rounds: int = 5) -> float:
-    seconds = []
-    for _ in range(rounds):
-        started = time.process_time()
-        run()
-        seconds.append(time.process_time() - started)
-    return min(seconds)
 
 
 def _struct_of(definition: PacketDefinition) -> struct.Struct:
@@ -293,13 +253,5 @@ def _struct_of(definition: PacketDefinition) -> struct.Struct:
 
 
 def _with_checksums(packets: list[bytes]) -> bytes:
-    parts = []
-    for packet in packets:
-        length = len(packet) + 2 - 7
-        whole = packet[:4] + length.to_bytes(2, "big") + packet[6:]
-        parts += [whole, binascii.crc_hqx(whole, 0xFFFF).to_bytes(2, "big")]
-    return b"".join(parts)
-
-
-if __name__ == "__main__":
-    print(json.dumps({"tmtc": bench()}, indent=1))
+    whole = (packet[:4] + (len(packet) - 5).to_bytes(2, "big") + packet[6:] for packet in packets)
+    return b"".join(map(append_crc, whole))

@@ -1,17 +1,17 @@
 """Clients that upload pieces and add, decide and fetch telecommands while parts of the service are killed."""
 
-import http.client
+import contextlib
 import itertools
 import json
 import random
 import threading
 import time
-import urllib.error
-import urllib.request
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import httpx
 
 from benchmarks.campaigns._ledger import Decision, Entered, HandOut, Ledger, mark_of
 
@@ -26,19 +26,6 @@ TIMEOUT_S = 86_400
 
 RECENT = 12
 """Number of newest telecommands on which clients decide, so that they compete for the same ones."""
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """Response of the service, other than those for unavailable parts."""
-
-    status: int
-    body: bytes
-    headers: Mapping[str, str]
-
-    def json(self) -> Any:
-        """Return the body as JSON."""
-        return json.loads(self.body)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,13 +49,15 @@ class Session:
     apis: tuple[str, ...]
     token: str
 
-    def ask(self, method: str, path: str, body: bytes | None = None, key: str = "") -> Answer:
+    def ask(
+        self, method: str, path: str, body: bytes | None = None, key: str = "", *expected: int
+    ) -> httpx.Response:
         """Repeat a request, with one process after another, until a response is not for an unavailable part.
 
         Raises
         ------
         SystemExit
-            If there is no such response within `TIMEOUT_S`.
+            If there is no such response within `TIMEOUT_S`, or it has none of the `expected` statuses.
         """
         headers = {"Authorization": f"Bearer {self.token}"}
         if body is not None:
@@ -79,15 +68,14 @@ class Session:
             headers["Idempotency-Key"] = key
         until = time.monotonic() + TIMEOUT_S
         for api in itertools.cycle(random.sample(self.apis, len(self.apis))):
-            request = urllib.request.Request(f"{api}/api/v1{path}", data=body, method=method, headers=headers)
-            try:
-                with urllib.request.urlopen(request, timeout=60) as answer:
-                    return Answer(answer.status, answer.read(), dict(answer.headers))
-            except urllib.error.HTTPError as error:
-                if error.code < 500:
-                    return Answer(error.code, error.read(), dict(error.headers))
-            except (OSError, ValueError, http.client.HTTPException):  # the response was incomplete
-                pass
+            with contextlib.suppress(httpx.HTTPError):
+                found = httpx.request(
+                    method, f"{api}/api/v1{path}", content=body, headers=headers, timeout=60
+                )
+                if found.status_code < 500:
+                    if expected and found.status_code not in expected:
+                        raise SystemExit(f"{method} {path}: {found.status_code} {found.content[:300]!r}")
+                    return found
             if time.monotonic() > until:
                 raise SystemExit(f"{method} {path}: no answer within {TIMEOUT_S:.0f} s")
             time.sleep(0.3)
@@ -95,10 +83,7 @@ class Session:
 
     def get(self, path: str) -> Any:
         """Return the JSON of a path."""
-        answer = self.ask("GET", path)
-        if answer.status != 200:
-            raise SystemExit(f"GET {path}: {answer.status} {answer.body[:300]!r}")
-        return answer.json()
+        return self.ask("GET", path, None, "", 200).json()
 
 
 class Client(threading.Thread):
@@ -143,14 +128,12 @@ class Client(threading.Thread):
 
     def _upload(self, piece: Piece) -> None:
         path = f"/telemetry?spacecraft_id={self._spacecraft}&{piece.place}"
-        answer = self._session.ask("POST", path, piece.octets, piece.name)
-        if answer.status != 202:
-            raise SystemExit(f"POST {path}: {answer.status} {answer.body[:300]!r}")
+        answer = self._session.ask("POST", path, piece.octets, piece.name, 202)
         self._ledger.jobs.append(answer.json()["job_id"])
 
     def _enter(self) -> None:
         """Add a telecommand; after an unknown result check the list, and add it again under another key."""
-        mark = self._ledger.new_mark()
+        mark = self._ledger.count("marks")
         function = self._rng.choice(FUNCTIONS)
         given = {
             "name": "perform_function",
@@ -159,14 +142,11 @@ class Client(threading.Thread):
             "timeout_s": TIMEOUT_S,
         }
         for attempt in range(20):
-            answer = self._session.ask(
-                "POST", "/telecommands", json.dumps(given).encode(), f"enter {mark} {attempt}"
-            )
-            if answer.status == 201:
+            body, key = json.dumps(given).encode(), f"enter {mark} {attempt}"
+            answer = self._session.ask("POST", "/telecommands", body, key, 201, 409)
+            if answer.status_code == 201:
                 self._ledger.entered.append(Entered(mark, int(answer.json()["id"]), self.name))
                 return
-            if answer.status != 409:
-                raise SystemExit(f"POST /telecommands: {answer.status} {answer.body[:300]!r}")
             time.sleep(LOOK_AFTER_S)
             for row in self._session.get("/telecommands?limit=200")["items"]:
                 if mark_of(row) == mark:
@@ -182,11 +162,9 @@ class Client(threading.Thread):
         command = self._rng.choice(recent).command
         state = self._rng.choices(("released", "rejected"), (4, 1))[0]
         verb, body = ("release", b"") if state == "released" else ("reject", b'{"reason": "campaign"}')
-        answer = self._session.ask("POST", f"/telecommands/{command}/{verb}", body)
-        if answer.status == 200:
+        answer = self._session.ask("POST", f"/telecommands/{command}/{verb}", body, "", 200, 409)
+        if answer.status_code == 200:
             self._ledger.decisions.append(Decision(command, state, self.name))
-        elif answer.status != 409:
-            raise SystemExit(f"POST /telecommands/{command}/{verb}: {answer.status} {answer.body[:300]!r}")
         elif found := answer.json().get("state"):
             self._ledger.decisions.append(Decision(command, found))
 
@@ -194,17 +172,14 @@ class Client(threading.Thread):
         """Fetch the telecommands to be sent, sometimes twice under one key."""
         key = f"uplink {self._rng.getrandbits(64):x}"
         path = f"/uplink?spacecraft_id={self._spacecraft}&format=packets"
-        answer = self._session.ask("POST", path, key=key)
-        if answer.status == 409:  # fetched by a process that was killed before its response
-            self._ledger.count_unanswered()
+        answer = self._session.ask("POST", path, None, key, 200, 409)
+        if answer.status_code == 409:  # fetched by a process that was killed before its response
+            self._ledger.count("unanswered_hand_outs")
             return
-        if answer.status != 200:
-            raise SystemExit(f"POST {path}: {answer.status} {answer.body[:300]!r}")
-        named = {name.lower(): text for name, text in answer.headers.items()}.get("x-telecommands", "")
-        commands = tuple(int(one) for one in named.split(",") if one)
-        self._ledger.hand_outs.append(HandOut(self.name, commands, answer.body))
-        if self._rng.random() < 0.3 and self._session.ask("POST", path, key=key).body != answer.body:
-            self._ledger.count_changed()
+        commands = tuple(int(one) for one in answer.headers.get("x-telecommands", "").split(",") if one)
+        self._ledger.hand_outs.append(HandOut(self.name, commands, answer.content))
+        if self._rng.random() < 0.3 and self._session.ask("POST", path, None, key).content != answer.content:
+            self._ledger.count("changed_answers")
 
     def _note_head(self) -> None:
         head = self._session.get("/audit/head")

@@ -1,14 +1,13 @@
 """The distributed ground service of a mission run: separate processes on PostgreSQL and Redis.
 
-The run starts a database server and a broker of its own, unless it is given some, an API process, workers, a scheduler
-and a process for the links. Mission time comes from the file of the spacecraft, so that all processes have the same.
+The run starts a database server, a broker, an API process, workers, a scheduler and a process for the links. Mission
+time comes from the file of the spacecraft, so that all processes have the same.
 """
 
 import contextlib
 import signal
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -23,7 +22,6 @@ from ground_service.errors import Conflict, GroundError
 from ground_service.ground import Ground, open_ground
 from ground_service.settings import Settings
 from ground_service.store import leases
-from ground_service.store.database import prepare_database
 from ground_service.worker.app import worker_answers
 from ground_service.worker.scheduler import LEASE
 from lunar.datafolder import DataFolder
@@ -34,21 +32,10 @@ WORKERS = 2
 ANSWER_S = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class Servers:
-    """URLs of a database and a broker that the run uses; None: it starts its own."""
-
-    database_url: str | None = None
-    broker_url: str | None = None
-
-
-OWN_SERVERS = Servers()
-
-
 class DistributedGround(MissionGround):
     """The service as separate processes, `parts` by name."""
 
-    def __init__(self, folder: Path, data: DataFolder, clock_file: Path, servers: Servers) -> None:
+    def __init__(self, folder: Path, data: DataFolder, clock_file: Path) -> None:
         self.while_waiting: Callable[[], object] = lambda: None
         self.parts: dict[str, Part] = {}
         self.pids = PidFile(folder / "processes.json")
@@ -56,10 +43,10 @@ class DistributedGround(MissionGround):
         self._postgres: PostgresServer | None = None
         self._clients: list[Client] = []
         try:
-            settings = self._start_servers(folder, data, clock_file, servers)
+            settings = self._start_servers(folder, data, clock_file)
             set_mission_clock(ClockFile(clock_file).read)
             self.ground = open_ground(settings.home, data, database_url=settings.resolved_database_url())
-            self._start_service(folder, settings, servers)
+            self._start_service(folder, settings)
             self.note_processes()
         except BaseException:
             self.close()
@@ -86,18 +73,12 @@ class DistributedGround(MissionGround):
         if is_finished and self._postgres is not None:
             self._postgres.remove()
 
-    def _start_servers(self, folder: Path, data: DataFolder, clock_file: Path, servers: Servers) -> Settings:
-        url, broker = servers.database_url, servers.broker_url
-        if url is None:
-            self._postgres = PostgresServer(folder)
-            self.parts["database"] = self._postgres.part
-            url = self._postgres.prepare_service()
-        else:
-            prepare_database(url, upgrade=True).engine.dispose()
-        if broker is None:
-            redis = RedisServer(folder)
-            self.parts["broker"] = redis.part
-            broker = redis.url
+    def _start_servers(self, folder: Path, data: DataFolder, clock_file: Path) -> Settings:
+        self._postgres = PostgresServer(folder)
+        self.parts["database"] = self._postgres.part
+        url = self._postgres.prepare_service()
+        redis = RedisServer(folder)
+        self.parts["broker"], broker = redis.part, redis.url
         given = {
             "LINNA_HOME": str(folder / "ground"),
             "LINNA_DATABASE_URL": url,
@@ -105,14 +86,13 @@ class DistributedGround(MissionGround):
             "LINNA_CLOCK_FILE": str(clock_file.absolute()),
             "LINNA_LINKS": "false",
             "LINNA_PLAN_HOURLY": "false",
-            "LINNA_ALLOW_DATABASE_OWNER": "false" if servers.database_url is None else "true",
         }
         self._environment = environment_with_data(bare_environment(**given), data.root)
         return Settings(
             home=folder / "ground", database_url=SecretStr(url), broker_url=SecretStr(broker), data=data.root
         )
 
-    def _start_service(self, folder: Path, settings: Settings, servers: Servers) -> None:
+    def _start_service(self, folder: Path, settings: Settings) -> None:
         port = free_port()
         address = f"http://127.0.0.1:{port}"
         tokens = {name: _token(self.ground, name) for name in (USER, FLIGHT_DYNAMICS)}

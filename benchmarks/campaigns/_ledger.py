@@ -76,24 +76,14 @@ class Ledger:
     changed_answers: int = 0
     heads: list[tuple[int, str]] = field(default_factory=list)
     jobs: list[str] = field(default_factory=list)
-    _marks: int = 0
+    marks: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def new_mark(self) -> int:
-        """Return a unique number for the arguments of a telecommand."""
+    def count(self, name: str) -> int:
+        """Count in one of the numbers; return it. `marks` are unique numbers for the arguments of telecommands."""
         with self._lock:
-            self._marks += 1
-            return self._marks
-
-    def count_unanswered(self) -> None:
-        """Count a hand-out without a received response."""
-        with self._lock:
-            self.unanswered_hand_outs += 1
-
-    def count_changed(self) -> None:
-        """Count a key with two different responses."""
-        with self._lock:
-            self.changed_answers += 1
+            setattr(self, name, getattr(self, name) + 1)
+            return int(getattr(self, name))
 
 
 def mark_of(row: Mapping[str, Any]) -> int:

@@ -282,22 +282,12 @@ def prepare(name):
         return interpreter
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    install = [
-        str(interpreter),
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--disable-pip-version-check",
-        "-r",
-        str(pins),
-    ]
-    commands = [[sys.executable, "-m", "venv", "."], install]
+    install = '"$0" -m venv . && bin/python -m pip install --quiet --disable-pip-version-check -r "$1"'
     if name == "node":
         shutil.copy(pins, folder / "package.json")
-        commands = [["npm", "install", "--no-audit", "--no-fund", "--ignore-scripts", "--silent"]]
-    for command in commands:
-        subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True, timeout=LIMIT_S)
+        install = "npm install --no-audit --no-fund --ignore-scripts --silent"
+    command = ["sh", "-c", install, sys.executable, str(pins)]
+    subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True, timeout=LIMIT_S)
     shutil.copy(pins, folder / "pins")
     return interpreter
 
@@ -362,23 +352,14 @@ def _judge(entry, expected):
         text, good = compare(right, entry["values"], rotations=str(name).startswith("attitude"))
     why = entry.get("why", "")
     text = f"{text} ({why})" if why and not good else text
-    return {
-        "way": entry["way"],
-        "what": entry["what"],
-        "text": text.replace("|", "\\|"),
-        "good": good or bool(why),
-    }
+    return {**entry, "text": text.replace("|", "\\|"), "good": good or bool(why)}
 
 
 def result(row, samples, *, again):
     """Cells of a row; the program is not run again if nothing changed since it was."""
-    parts = [
-        NEIGHBOURS / row.script,
-        NEIGHBOURS / "_cells.py",
-        _pins(row.environment),
-        samples / "expected.json",
-    ]
-    digest = hashlib.sha256(b"".join(part.read_bytes() for part in parts)).hexdigest()
+    scripts = NEIGHBOURS / row.script, NEIGHBOURS / "_cells.py", _pins(row.environment)
+    parts = [part.read_bytes() for part in (*scripts, samples / "expected.json")]
+    digest = hashlib.sha256(b"".join(parts)).hexdigest()
     kept = BUILD / "results" / f"{row.function}.json"
     stored = json.loads(kept.read_text()) if kept.is_file() and not again else {}
     if stored.get("digest") != digest or any(
@@ -388,24 +369,25 @@ def result(row, samples, *, again):
         stored = {"digest": digest, "entries": run_row(row, samples, BUILD / "files" / row.function)}
         kept.parent.mkdir(parents=True, exist_ok=True)
         kept.write_text(json.dumps(stored))
-    expected = json.loads((samples / "expected.json").read_text())
-    return [_judge(entry, expected) for entry in stored["entries"]]
+    return [_judge(entry, json.loads(parts[-1])) for entry in stored["entries"]]
+
+
+HEAD = """\
+# Compatibility
+
+Each cell is the result of a run: the program read a file of ours, or we read a file of the program, and the
+values were compared. `python -m benchmarks.campaigns.compatibility --write` runs the programs, each in an
+environment of its own, and writes this page. `make campaigns` does the same.
+
+*Equal to n digits*: the largest difference is 10⁻ⁿ of the largest value of its column.
+
+| program | version | reads what we write | writes what we read |
+|---|---|---|---|"""
 
 
 def format_page(results):
     """The page with the table."""
-    lines = [
-        "# Compatibility",
-        "",
-        "Each cell is the result of a run: the program read a file of ours, or we read a file of the program, and the",
-        "values were compared. `python -m benchmarks.campaigns.compatibility --write` runs the programs, each in an",
-        "environment of its own, and writes this page. `make campaigns` does the same.",
-        "",
-        "*Equal to n digits*: the largest difference is 10⁻ⁿ of the largest value of its column.",
-        "",
-        "| program | version | reads what we write | writes what we read |",
-        "|---|---|---|---|",
-    ]
+    lines = [HEAD]
     for row in ROWS:
         if row.name in results:
             texts = [_cell(results[row.name], way) for way in WITHOUT]
@@ -424,15 +406,13 @@ def main(arguments=None):
     parser.add_argument("--row", action="append", help="only this row (repeatable)")
     parser.add_argument("--again", action="store_true", help="run rows that have results again")
     parser.add_argument("--write", action="store_true", help="write docs/results/compatibility.md")
-    parser.add_argument("--demo", type=Path, default=BUILD / "demo", help="folder of `linna demo` to use")
     options = parser.parse_args(arguments)
     samples = BUILD / "samples"
     if not (samples / "expected.json").is_file():
-        if not (options.demo / "ground").is_dir():
-            subprocess.run(
-                [sys.executable, "-m", "linna", "demo", "--out", str(options.demo)], check=True, cwd=ROOT
-            )
-        make_samples(samples, options.demo)
+        demo = BUILD / "demo"
+        if not (demo / "ground").is_dir():
+            subprocess.run([sys.executable, "-m", "linna", "demo", "--out", str(demo)], check=True, cwd=ROOT)
+        make_samples(samples, demo)
     wanted = [row for row in ROWS if not options.row or row.name in options.row]
     results = {row.name: result(row, samples, again=options.again) for row in wanted}
     for name, cells in results.items():

@@ -26,8 +26,7 @@ import httpx
 import numpy as np
 
 from benchmarks._ground_service import processor_s, resident_mib
-from benchmarks._servers import PostgresServer
-from benchmarks.campaigns._deployment import ManyApis
+from benchmarks._servers import Deployment, PostgresServer
 from benchmarks.ground import START, definition, mixed_downlink
 from ground_service.evaluation.service import make_report
 from ground_service.ground import open_ground
@@ -130,38 +129,67 @@ def cases() -> list[tuple[str, str, str, Any]]:
     listed = json.dumps(manifest).encode()
     formats = "oem oem-xml aem spk ck spice sclk fk ik geojson gpkg czml parquet netcdf csv tum images"
     kinds = [f"{kind}?format={one}" for kind in ("housekeeping", "detections") for one in ("json", "csv")]
-    return [
-        ("upload_archive", "256 MiB", "archives", lambda: iter([os.urandom(1 << 20)] * 256)),
-        ("upload_telemetry", "1 GiB", "telemetry?spacecraft_id=76", lambda: iter([os.urandom(1 << 20)] * 1024)),
-        ("add_ephemeris", "800,000 states", "ephemerides", lambda: circle(800_000, 2.0)),
-        ("add_ephemeris", "96 MiB in one line", "ephemerides", lambda: b"X" * (96 << 20)),
-        ("add_catalogue", f"{ROWS_LIMIT:,} rows", "catalogues", lambda: b"".join(catalogue(ROWS_LIMIT))),
-        ("add_mission", "1 MiB, 14,000 links", "missions", lambda: described),
-        ("check_mission", "1 MiB, 14,000 links", "missions/check", lambda: described),
-        ("check_mission", "a plan", "missions/check?plan=true", MISSION.encode),
-        ("define_pass", "", "passes", definition(PACKETS) | {"name": "again"}),
-        *(("export_pass", one, "exports", {"pass_id": 1, "format": one}) for one in formats.split()),
-        ("search_windows", "31 days", "windows/search", span),
-        ("search_windows", "with contacts", "windows/search", span | {"needs_contact": True, "minimum_battery": 0.3}),
-        ("search_windows", "with craters", "windows/search", span | {"craters_per_frame": 5.0}),
-        ("add_window", "10 h at 10 Hz", "windows", span | {"stop": at(0.4), "cadence_s": 0.1}),
-        ("change_window", "a draft", "windows/1", {"state": "approved"}),
-        ("add_request", "50 regions", "requests", {"name": "r", "spacecraft_id": 76, **terms}),
-        ("change_request", "50 regions", "requests/1", {"terms": terms}),
-        ("add_correlations", "9,000 points", "spacecraft/76/correlations", {"points": points}),
-        ("add_receptions", "9,000 times", "spacecraft/76/receptions", {"receptions": times}),
-        ("get_forecast", "8 days", f"plan/forecast?spacecraft_id=76&start={at(0)}&stop={at(8)}", None),
-        ("list_contacts", "31 days", f"contacts?since={at(0)}&until={at(31)}", None),
-        ("enter_telecommand", "60,000 arguments", "telecommands", command),
-        ("add_build", "256 MiB", "builds", lambda: zipped("build.toml", b"", model=bytes(256 << 20))),
-        ("keep_archive", "15,000 files", "regression-archives", lambda: zipped("manifest.json", listed)),
-        ("start_regression", "14,000 archives", "regressions", compared),
-        ("start_analysis", "14,000 archives", "analyses", compared),
-        *(("get_packets", f"10,000 {one}", f"passes/1/packets/{one}", None) for one in kinds),
-        ("list_newest_reports", "100 passes", "reports?" + "&".join(f"pass_id={k}" for k in range(1, 101)), None),
-        ("withdraw_ingest", "all packets", "ingests/1/withdraw", {"reason": "measured"}),
-    ]  # fmt: skip
+    window = span | {"stop": at(0.4), "cadence_s": 0.1}
+    bodies = {
+        "256 MiB": lambda: iter([os.urandom(1 << 20)] * 256),
+        "1 GiB": lambda: iter([os.urandom(1 << 20)] * 1024),
+        "states": lambda: circle(800_000, 2.0),
+        "line": lambda: b"X" * (96 << 20),
+        "craters": lambda: b"".join(catalogue(ROWS_LIMIT)),
+        "described": lambda: described,
+        "mission": MISSION.encode,
+        "pass": definition(PACKETS) | {"name": "again"},
+        "span": span,
+        "contacts": span | {"needs_contact": True, "minimum_battery": 0.3},
+        "dense": span | {"craters_per_frame": 5.0},
+        "window": window,
+        "approved": {"state": "approved"},
+        "request": {"name": "r", "spacecraft_id": 76, **terms},
+        "terms": {"terms": terms},
+        "points": {"points": points},
+        "times": {"receptions": times},
+        "command": command,
+        "build": lambda: zipped("build.toml", b"", model=bytes(256 << 20)),
+        "listed": lambda: zipped("manifest.json", listed),
+        "compared": compared,
+        "measured": {"reason": "measured"},
+    }
+    lines = CASES.format(rows=ROWS_LIMIT, start=at(0), later=at(8), end=at(31)).splitlines()
+    rows = [(*words, bodies.get(body)) for *words, body in (line.split("|") for line in lines)]
+    rows += [("export_pass", one, "exports", {"pass_id": 1, "format": one}) for one in formats.split()]
+    rows += [("get_packets", f"10,000 {one}", f"passes/1/packets/{one}", None) for one in kinds]
+    newest = "reports?" + "&".join(f"pass_id={k}" for k in range(1, 101))
+    return [*rows, ("list_newest_reports", "100 passes", newest, None)]
 
+
+CASES = """\
+upload_archive|256 MiB|archives|256 MiB
+upload_telemetry|1 GiB|telemetry?spacecraft_id=76|1 GiB
+add_ephemeris|800,000 states|ephemerides|states
+add_ephemeris|96 MiB in one line|ephemerides|line
+add_catalogue|{rows:,} rows|catalogues|craters
+add_mission|1 MiB, 14,000 links|missions|described
+check_mission|1 MiB, 14,000 links|missions/check|described
+check_mission|a plan|missions/check?plan=true|mission
+define_pass||passes|pass
+search_windows|31 days|windows/search|span
+search_windows|with contacts|windows/search|contacts
+search_windows|with craters|windows/search|dense
+add_window|10 h at 10 Hz|windows|window
+change_window|a draft|windows/1|approved
+add_request|50 regions|requests|request
+change_request|50 regions|requests/1|terms
+add_correlations|9,000 points|spacecraft/76/correlations|points
+add_receptions|9,000 times|spacecraft/76/receptions|times
+get_forecast|8 days|plan/forecast?spacecraft_id=76&start={start}&stop={later}|
+list_contacts|31 days|contacts?since={start}&until={end}|
+enter_telecommand|60,000 arguments|telecommands|command
+add_build|256 MiB|builds|build
+keep_archive|15,000 files|regression-archives|listed
+start_regression|14,000 archives|regressions|compared
+start_analysis|14,000 archives|analyses|compared
+withdraw_ingest|all packets|ingests/1/withdraw|measured"""
+"""Operation, what is largest, path, and name of the body."""
 
 VALUES: dict[str, Any] = {
     "spacecraft_id": 76, "estimator": "paper", "parameter": "temperature_c", "packet": "housekeeping",
@@ -205,7 +233,7 @@ def measured(only: Sequence[str]) -> Iterator[Cost]:
     with tempfile.TemporaryDirectory(prefix="costs-") as name, PostgresServer(Path(name)) as server:
         folder, url = Path(name), server.url
         prepare_database(url, upgrade=True).engine.dispose()
-        with ManyApis(folder, url, count=1) as service:
+        with Deployment(folder, url=url) as service:
             base = f"http://127.0.0.1:{service.ports[0]}/api/v1/"
             with httpx.Client(base_url=base, timeout=900.0) as client:
                 client.post("missions", content=MISSION).raise_for_status()

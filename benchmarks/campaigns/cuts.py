@@ -1,17 +1,16 @@
 """Campaign of recordings cut at random octets: every split, order and repetition must give the same archive.
 
-    python -m benchmarks.campaigns.cuts [--cases 500] [--kinds KIND...] [--postgresql] [--processes 3] [--json]
+    python -m benchmarks.campaigns.cuts [--cases 500] [--kinds KIND...] [--postgresql]
 
 Each case makes recordings of one kind from its number, cuts them at random octets, and ingests the pieces in order,
 reversed, shuffled, interleaved, or with repetitions and a second split, in an instance of its own. The packets, the
 values, the accounting of a pass over all of it (gaps, duplicates, octets, frames, receptions) and the sums over the
 ingests must equal those of the whole recordings. With PostgreSQL, several processes ingest the pieces of a case at the
-same time. `--packets-only` compares packets and values only. The exit status is 1 if an archive differs.
+same time. The exit status is 1 if an archive differs.
 """
 
 import argparse
 import itertools
-import json
 import multiprocessing
 import sys
 import tempfile
@@ -27,6 +26,7 @@ import numpy as np
 from sqlalchemy import select
 
 from benchmarks._servers import PostgresServer
+from benchmarks.campaigns.compatibility import compare
 from benchmarks.downlink import telemetry
 from ground_service.errors import DatabaseBusy, GroundError
 from ground_service.ground import Ground, open_ground
@@ -66,21 +66,9 @@ MISSIONS = (
 )
 NEW = ("packets_new", "samples")
 SUMS = ("crc_errors", "frames", "frames_bad", "symbols_corrected")
-RECEPTION_SUMS = (
-    "frames_good", "codewords", "codewords_lost", "wrong_bits", "checked_bits", "lock_losses", "frames_inverted",
-    "octets_frames", "octets_records",
-)  # fmt: skip
-
-OF_LOST_FRAMES = (
-    "frames",
-    "frames_bad",
-    "frames_inverted",
-    "lock_losses",
-    "octets_frames",
-    "codewords",
-    "codewords_lost",
-    "octets_other",
-)
+LOST = ("frames_inverted", "lock_losses", "octets_frames", "codewords", "codewords_lost")
+RECEPTION_SUMS = ("frames_good", "wrong_bits", "checked_bits", "octets_records", *LOST)
+OF_LOST_FRAMES = ("frames", "frames_bad", "octets_other", *LOST)
 """Counts that include frames which cannot be used: at the border of two pieces, those may be counted with both."""
 
 Rng = np.random.Generator
@@ -259,22 +247,22 @@ KINDS: dict[str, Callable[[Rng], list[Recording]]] = {
 # Splits
 
 
-def cuts_of(octets: int, rng: Rng, most: int) -> list[int]:
+def cuts_of(octets: int, rng: Rng) -> list[int]:
     """Random cuts: anywhere, close to each other, or a stretch of a few octets each."""
-    cuts = rng.integers(1, octets, int(rng.integers(1, most)))
+    cuts = rng.integers(1, octets, int(rng.integers(1, 9)))
     if rng.random() < 0.4:
         at = int(rng.integers(1, octets))
         cuts = np.concatenate((cuts, at + np.cumsum(rng.integers(1, 60, int(rng.integers(1, 6))))))
     return sorted({one for one in cuts.tolist() if 0 < one < octets})
 
 
-def split(recording: Recording, rng: Rng, most: int) -> list[Piece]:
+def split(recording: Recording, rng: Rng) -> list[Piece]:
     size = len(recording.octets)
-    edges = [0, *cuts_of(size, rng, most), size]
+    edges = [0, *cuts_of(size, rng), size]
     return [Piece(recording, start, stop) for start, stop in itertools.pairwise(edges)]
 
 
-def ordered(pieces: list[Piece], rng: Rng, order: str, most: int) -> list[Piece]:
+def ordered(pieces: list[Piece], rng: Rng, order: str) -> list[Piece]:
     """Return the pieces in one of the `ORDERS`."""
     if order == "reversed":
         return pieces[::-1]
@@ -284,9 +272,7 @@ def ordered(pieces: list[Piece], rng: Rng, order: str, most: int) -> list[Piece]
         pieces = [*pieces, *(pieces[i] for i in rng.integers(0, len(pieces), max(len(pieces) // 3, 1)))]
     if order == "cut twice":
         again = [
-            piece
-            for one in dict.fromkeys(piece.recording for piece in pieces)
-            for piece in split(one, rng, most)
+            piece for one in dict.fromkeys(piece.recording for piece in pieces) for piece in split(one, rng)
         ]
         pieces = [*pieces, *(again[i] for i in rng.permutation(len(again))[: len(again) // 2])]
     if order != "in order":
@@ -305,14 +291,14 @@ class Case:
     pieces: list[Piece]
 
 
-def case_of(number: int, kinds: Sequence[str] = tuple(KINDS), seed: int = 1, most: int = 9) -> Case:
+def case_of(number: int, kinds: Sequence[str] = tuple(KINDS)) -> Case:
     """Return a case; each kind meets each order."""
     kind = kinds[number % len(kinds)]
     order = ORDERS[number // len(kinds) % len(ORDERS)]
-    rng = np.random.default_rng((seed, number))
+    rng = np.random.default_rng((1, number))
     recordings = KINDS[kind](rng)
-    pieces = [piece for one in recordings for piece in split(one, rng, most)]
-    return Case(number, kind, order, recordings, ordered(pieces, rng, order, most))
+    pieces = [piece for one in recordings for piece in split(one, rng)]
+    return Case(number, kind, order, recordings, ordered(pieces, rng, order))
 
 
 # Archives
@@ -406,34 +392,18 @@ class Archive:
             return [ingest(self.ground, *one) for one in work]
         return list(self._pool.map(_ingest_here, work, chunksize=1))
 
-    def difference(self, case: Case, *, packets_only: bool = False) -> str:
+    def difference(self, case: Case) -> str:
         """Ingest a case and compare it with the whole recordings; empty if the archives are equal."""
-        instances = f"whole-{case.number}", f"pieces-{case.number}"
+        names = f"whole-{case.number}", f"pieces-{case.number}"
         try:
-            return self._difference(case, instances, packets_only)
+            whole = list(zip(wholes(case), self.ingest(wholes(case), names[0]), strict=True))
+            results = list(zip(case.pieces, self.ingest(case.pieces, names[1]), strict=True))
+            expected, found = (contents(self.ground, case, one) for one in names)
         except (GroundError, TmtcError) as error:
             return f"refused: {error}"
-
-    def _difference(self, case: Case, instances: tuple[str, str], packets_only: bool) -> str:
-        whole = list(zip(wholes(case), self.ingest(wholes(case), instances[0]), strict=True))
-        results = list(zip(case.pieces, self.ingest(case.pieces, instances[1]), strict=True))
-        expected, found = (contents(self.ground, case, one) for one in instances)
-        if expected["archive"] != found["archive"]:
-            return f"{found['packets']} of {expected['packets']} packets"
-        if packets_only:
-            return ""
-        if expected["passes"] != found["passes"]:
-            return f"pass: {_differences(expected['passes'], found['passes'])}"
-        one, other = (sums(self.ground, case, ids) for ids in (whole, results))
-        return f"ingests: {_differences(one, other)}" if one != other else ""
-
-
-def _differences(expected: Any, found: Any, path: str = "") -> str:
-    if isinstance(expected, dict) and isinstance(found, dict):
-        keys = dict.fromkeys([*expected, *found])
-        parts = (_differences(expected.get(key), found.get(key), f"{path}{key} ") for key in keys)
-        return ", ".join(part for part in parts if part)
-    return "" if expected == found else f"{path}{found} instead of {expected}"
+        expected["ingests"], found["ingests"] = (sums(self.ground, case, ids) for ids in (whole, results))
+        text, is_equal = compare(expected, found)
+        return "" if is_equal else text
 
 
 _GROUND: list[Ground] = []
@@ -459,55 +429,36 @@ def archive(folder: Path, url: str | None = None, processes: int = 3) -> Iterato
         yield Archive(stack.enter_context(open_ground(folder, database_url=url)), pool)
 
 
-def campaign(found: Archive, given: argparse.Namespace) -> int:
-    """Ingest all cases; return the exit status."""
-    equal: Counter[str] = Counter()
-    tried: Counter[str] = Counter()
-    different: dict[str, str] = {}
-    pieces, started = 0, time.monotonic()
-    for number in range(given.first, given.first + given.cases):
-        case = case_of(number, given.kinds, given.seed, given.pieces)
-        pieces += len(case.pieces)
-        difference = found.difference(case, packets_only=given.packets_only)
-        tried[case.kind] += 1
-        equal[case.kind] += not difference
-        if difference:
-            different[f"case {number} ({case.kind}, {case.order})"] = difference
-            print(f"case {number} ({case.kind}, {case.order}): {difference}", file=sys.stderr, flush=True)
-    figures = {
-        "cases": given.cases,
-        "pieces": pieces,
-        "equal": {name: f"{equal[name]} of {count}" for name, count in sorted(tried.items())},
-        "different": different,
-        "seconds": round(time.monotonic() - started),
-    }
-    if given.json:
-        print(json.dumps(figures, indent=2))
-    else:
-        for name, count in sorted(tried.items()):
-            print(f"{name:<20}{equal[name]:>6} of {count} equal")
-        print(f"all {equal.total()} of {tried.total()}, {pieces} pieces, {figures['seconds']} s")
-    return 0 if equal.total() == tried.total() else 1
-
-
 def main() -> int:
+    """Ingest all cases; return the exit status."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--cases", type=int, default=500)
-    parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS), metavar="KIND")
-    parser.add_argument("--pieces", type=int, default=9, help="largest number of random cuts of a recording")
-    parser.add_argument("--packets-only", action="store_true", help="compare packets and values only")
     parser.add_argument("--postgresql", action="store_true")
-    parser.add_argument("--processes", type=int, default=3, help="processes that ingest into PostgreSQL")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
+    equal: Counter[str] = Counter()
+    pieces, started = 0, time.monotonic()
+    cases = [case_of(number, given.kinds) for number in range(given.cases)]
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         url = stack.enter_context(PostgresServer(folder)).url if given.postgresql else None
-        return campaign(stack.enter_context(archive(folder / "home", url, given.processes)), given)
+        found = stack.enter_context(archive(folder / "home", url))
+        for case in cases:
+            pieces += len(case.pieces)
+            difference = found.difference(case)
+            equal[case.kind] += not difference
+            if difference:
+                print(
+                    f"case {case.number} ({case.kind}, {case.order}): {difference}",
+                    file=sys.stderr,
+                    flush=True,
+                )
+    for name, count in sorted(Counter(case.kind for case in cases).items()):
+        print(f"{name:<20}{equal[name]:>6} of {count} equal")
+    print(f"all {equal.total()} of {len(cases)}, {pieces} pieces, {round(time.monotonic() - started)} s")
+    return int(equal.total() != len(cases))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Campaign of a hostile payload build against the service, with every process profile of the service.
 
-    python -m benchmarks.campaigns.hostile_build [--profile NAME ...] [--json]
+    python -m benchmarks.campaigns.hostile_build [--profile NAME ...]
 
 The build knows every path, port and process of the service and tries to read its secrets, change its files, reach its
 network, leave its limits, outlive its time, and deliver outputs that are no files (`hostile/attack.py`). For every
@@ -18,6 +18,7 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 import selectors
 import shutil
 import socket
@@ -25,19 +26,28 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from benchmarks.campaigns.hostile.attack_kinds import EXPECTED, KINDS
 from benchmarks.campaigns.hostile.profiles import PROFILES, SERVICE_UID
+from studies.harness.parts import Part
 
 ATTACK = Path(__file__).parent / "hostile" / "attack.py"
 ROOT = Path(__file__).resolve().parents[2]
 SECRET = "hostile-campaign-secret"
 LEFTOVER = "hostile-campaign-leftover"
+FILES = """\
+home/.pgpass|db:5432:linna:linna:{secret}
+home/secret.txt|{secret}
+home/linna.toml|database_url = "postgresql://linna:{secret}@db/linna"
+home/linna.db|{secret}
+home/files/ab/raw|{secret}
+home/regression/reference.oem|{secret}
+home/regression/expected.json|{secret}
+home/regression/builds/other/inputs-of-another.jsonl|{secret}"""
 LIMITS = {
     "wall_s": 60,
     "cpu_s": 20,
@@ -48,6 +58,10 @@ LIMITS = {
     "processes": 32,
 }
 SHORT_S = 2
+MANIFEST = """{
+  "schema_version": 1, "pass_name": "small", "spacecraft_id": 76, "start_utc": "2029-08-07T01:40:00Z",
+  "stop_utc": "2029-08-07T01:44:00Z", "cadence_s": 15.0, "frames_expected": 0
+}"""
 SCENARIOS = ("root", "uid 10001", "image", "no unshare", "no unshare, runner")
 
 
@@ -144,16 +158,7 @@ class Service:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.home = folder / "home"
-        texts = {
-            "home/.pgpass": f"db:5432:linna:linna:{SECRET}",
-            "home/secret.txt": SECRET,
-            "home/linna.toml": f'database_url = "postgresql://linna:{SECRET}@db/linna"',
-            "home/linna.db": SECRET,
-            "home/files/ab/raw": SECRET,
-            "home/regression/reference.oem": SECRET,
-            "home/regression/expected.json": SECRET,
-            "home/regression/builds/other/inputs-of-another.jsonl": SECRET,
-        }
+        texts = dict(line.split("|") for line in FILES.format(secret=SECRET).splitlines())
         for name, text in texts.items():
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -230,29 +235,13 @@ def write_build(folder: Path, kind: str, service: Service, leftover: str, writab
 
 def write_archive(folder: Path) -> None:
     """Write the smallest pass archive that can be replayed."""
-    import hashlib
-
-    files = {
-        "payload/inputs.jsonl": "",
-        "payload/parameters.toml": "",
-        "reference.oem": SECRET,
-        "truth.oem": SECRET,
-    }
     listed = {}
-    for name, text in files.items():
+    for name in ("payload/inputs.jsonl", "payload/parameters.toml", "reference.oem", "truth.oem"):
+        text = SECRET if name.endswith("oem") else ""
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
         listed[name] = {"sha256": hashlib.sha256(text.encode()).hexdigest(), "bytes": len(text)}
-    manifest = {
-        "schema_version": 1,
-        "pass_name": "small",
-        "spacecraft_id": 76,
-        "start_utc": "2029-08-07T01:40:00Z",
-        "stop_utc": "2029-08-07T01:44:00Z",
-        "cadence_s": 15.0,
-        "frames_expected": 0,
-        "files": listed,
-    }
+    manifest = json.loads(MANIFEST) | {"files": listed}
     (folder / "manifest.json").write_text(json.dumps(manifest))
 
 
@@ -350,28 +339,28 @@ def _judged(profile: str, kind: str, run: Mapping[str, Any], place: Path) -> lis
     """Return the findings of a run, from its report and its outputs."""
     found: list[Finding] = []
     delivered = {path.name: path for path in place.iterdir()}
+
+    def add(name: str, seen: str, succeeded: bool = True) -> None:
+        found.append(Finding(profile, kind, name, succeeded, seen))
+
+    said = f"{run['outcome']} {run['detail']}"
+    if kind == "explore" and "downlink.packets" not in delivered:
+        add("the build", f"did not report: {said}")
+        return found
     if kind == "explore":
-        report = (
-            json.loads(delivered["downlink.packets"].read_text()) if "downlink.packets" in delivered else None
-        )
-        if report is None:
-            return [
-                Finding(profile, kind, "the build", True, f"did not report: {run['outcome']} {run['detail']}")
-            ]
-        found += [Finding(profile, kind, name, bool(won), str(seen)) for name, (won, seen) in report.items()]
+        for name, (won, seen) in json.loads(delivered["downlink.packets"].read_text()).items():
+            add(name, str(seen), bool(won))
     elif run["outcome"] not in EXPECTED[kind]:
-        found.append(Finding(profile, kind, "outcome", True, f"{run['outcome']}: {run['detail']}"))
+        add("outcome", said)
     for name, path in delivered.items():
         if name not in ("downlink.packets", "performance.json", "printed.txt"):
-            found.append(Finding(profile, kind, "delivered", True, name))
+            add("delivered", name)
         elif path.is_symlink() or not path.is_file():
-            found.append(Finding(profile, kind, "delivered", True, f"{name} is no file"))
-        elif path.stat().st_size > LIMITS["file_mib"] << 20 or (
-            name == "printed.txt" and path.stat().st_size > 1 << 17
-        ):
-            found.append(Finding(profile, kind, "delivered", True, f"{name}: {path.stat().st_size} octets"))
+            add("delivered", f"{name} is no file")
+        elif path.stat().st_size > (1 << 17 if name == "printed.txt" else LIMITS["file_mib"] << 20):
+            add("delivered", f"{name}: {path.stat().st_size} octets")
         elif kind != "explore" and SECRET.encode() in path.read_bytes():
-            found.append(Finding(profile, kind, "delivered", True, f"{name} holds the secret"))
+            add("delivered", f"{name} holds the secret")
     return found
 
 
@@ -380,21 +369,9 @@ def _left(leftover: str, folder: Path, out: Path) -> list[str]:
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
-            if (
-                leftover.encode() in (entry / "cmdline").read_bytes()
-                or b"attack.py" in (entry / "cmdline").read_bytes()
-            ):
+            if re.search(f"{leftover}|attack.py", (entry / "cmdline").read_text(errors="replace")):
                 found.append(f"process {entry.name} is alive")
-    for place in (
-        Path("/tmp"),
-        Path("/dev/shm"),
-        Path("/var/tmp"),
-        Path("/run"),
-        Path("/"),
-        folder,
-        out,
-        ROOT,
-    ):
+    for place in map(Path, ("/tmp", "/dev/shm", "/var/tmp", "/run", "/", folder, out, ROOT)):
         if (place / leftover).exists():
             found.append(f"{place / leftover} was left")
     for where, folders, names in os.walk(folder):  # tolerates folders that are removed meanwhile
@@ -403,25 +380,13 @@ def _left(leftover: str, folder: Path, out: Path) -> list[str]:
     return found
 
 
-@contextlib.contextmanager
-def _runner(exchange: Path, folder: Path) -> Iterator[None]:
+def _runner(exchange: Path, folder: Path) -> Part:
     command = [sys.executable, "-m", "linna", "runner", "--exchange", str(exchange)]
-    runner = subprocess.Popen(
+    words, environment = (
         _in_profile("runner", command, folder, exchange),
-        cwd=ROOT,
-        env=_environment({"LINNA_HOME": "/tmp"}),
-        stdout=subprocess.DEVNULL,
+        _environment({"LINNA_HOME": "/tmp"}),
     )
-    try:
-        until = time.monotonic() + 60.0
-        while not (exchange / "runner.json").exists():
-            if runner.poll() is not None or time.monotonic() > until:
-                raise SystemExit("the runner did not start")
-            time.sleep(0.1)
-        yield
-    finally:
-        runner.terminate()
-        runner.wait()
+    return Part(words, folder / "runner.log", (exchange / "runner.json").exists, 1, cwd=ROOT, env=environment)
 
 
 def _in_profile(name: str, command: list[str], folder: Path, exchange: Path | None = None) -> list[str]:
@@ -466,19 +431,15 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--profile", action="append", choices=(*SCENARIOS, "user"), help="default: all that can be taken"
     )
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     arguments = parser.parse_args(words)
     chosen = arguments.profile or (list(SCENARIOS) if os.geteuid() == 0 else ["user"])
     for name in chosen:
         print(f"[{name}] {PROFILES[name.partition(', ')[0]]}", file=sys.stderr)
     results = [campaign(name) for name in chosen]
-    if arguments.json:
-        print(json.dumps({"profiles": [asdict(one) for one in results]}))
-    else:
-        print(table(results))
-        for one in results:
-            for finding in one.successes:
-                print(f"SUCCEEDED [{finding.profile}] {finding.kind}, {finding.name}: {finding.seen}")
+    print(table(results))
+    for one in results:
+        for finding in one.successes:
+            print(f"SUCCEEDED [{finding.profile}] {finding.kind}, {finding.name}: {finding.seen}")
     return 0 if all(map(went_well, results)) else 1
 
 

@@ -1,6 +1,6 @@
 """Campaign of random kills of every part of the service during ingest, commanding and reports.
 
-    python -m benchmarks.campaigns.kill [--kills 300] [--state FILE [--seconds S]] [--laptop] [--json]
+    python -m benchmarks.campaigns.kill [--kills 300] [--state FILE] [--laptop] [--json]
 
 Starts PostgreSQL, Redis, two API processes and two workers on private ports. Four clients upload pieces of one
 downlink, cut at random octets, in random order, over and over, and meanwhile enter,
@@ -12,14 +12,12 @@ state, none shares a sequence count or was handed out twice, every change has on
 and `linna verify` finds no damage. Exit status 1 where that does not hold. `--laptop`: one API alone, with its jobs, on
 SQLite.
 
-The campaign goes in runs of `--kills-per-run`, each with its own servers and archive. With `--state` each run is
-added to a file when it is over, and a campaign goes on where that file ends; `--seconds` begins no run after that time
-and ends the kills of the one under way.
+The campaign goes in runs of 100 kills, each with its own servers and archive. With `--state` each run is added to a
+file when it is over, and a campaign goes on where that file ends.
 """
 
 import argparse
 import json
-import os
 import random
 import signal
 import sys
@@ -33,17 +31,16 @@ from typing import Any
 
 from sqlalchemy import select
 
+from benchmarks._servers import Deployment
 from benchmarks.campaigns._clients import TIMEOUT_S, Client, Piece, Session, broken_of, cut_pieces
-from benchmarks.campaigns._deployment import Deployment, Laptop
 from benchmarks.campaigns._ledger import FAULTS, AuditLine, Ledger, judge
-from benchmarks.ground import START, STEP_NS, mixed_downlink
+from benchmarks.ground import definition, mixed_downlink
 from ground_service.access.service import add_user
 from ground_service.ground import Ground, open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.store import audit, repository
 from ground_service.store.vehicles import vehicle_id
 from ground_service.worker.integrity import verify
-from lunar.timescales import format_utc
 from tests.ground_service.archive_hash import archive_hash
 
 SPACECRAFT = 76
@@ -60,20 +57,18 @@ Figures = dict[str, Any]
 class Harassment(threading.Thread):
     """Kills one part after another, at random, and starts it again."""
 
-    def __init__(
-        self, service: Deployment | Laptop, rng: random.Random, kills: int, pause_s: float, until: float
-    ) -> None:
+    def __init__(self, service: Deployment, rng: random.Random, kills: int, pause_s: float) -> None:
         super().__init__()
         self.killed: Counter[str] = Counter()
         self.broken: BaseException | None = None
         self.enough = threading.Event()
         self._service, self._rng, self._kills = service, rng, kills
-        self._pause_s, self._until = pause_s, until
+        self._pause_s = pause_s
         self._targets = list(service.parts)
 
     def run(self) -> None:
         try:
-            while self.killed.total() < self._kills and time.monotonic() < self._until:
+            while self.killed.total() < self._kills:
                 if self.enough.wait(self._rng.uniform(0.0, 2.0 * self._pause_s)):
                     return
                 name = self._rng.choice(self._targets)
@@ -117,18 +112,9 @@ def commands_of(ground: Ground, ledger: Ledger) -> tuple[int, Counter[str]]:
     return len(rows), faults
 
 
-def one_run(
-    kills: int,
-    seed: int,
-    *,
-    laptop: bool,
-    pause_s: float,
-    packets: int,
-    pieces: int,
-    reports: int,
-    until: float,
-) -> Figures:
+def one_run(kills: int, seed: int, given: argparse.Namespace) -> Figures:
     """Kills over one archive; the figures."""
+    packets = given.packets
     rng = random.Random(seed)
     started = time.monotonic()
     with tempfile.TemporaryDirectory() as name:
@@ -138,18 +124,16 @@ def one_run(
         with open_ground(folder / "reference") as ground:
             ingest_file(ground, folder / "whole.cadu")
             expected, there = contents(ground)
-        service = Laptop(folder) if laptop else Deployment(folder, APIS)
+        service = Deployment(folder) if given.laptop else Deployment(folder, APIS, 2)
         ledger = Ledger()
-        harassment = Harassment(service, rng, kills, pause_s, until)
+        harassment = Harassment(service, rng, kills, given.pause)
         try:
             with open_ground(service.home, database_url=service.url) as ground:
                 sessions = [
                     Session(service.apis, add_user(ground, f"client{k}", "operator")) for k in range(CLIENTS)
                 ]
             harassment.start()
-            work_meanwhile(
-                sessions, harassment, stream, pieces, random.Random(seed + 1), packets, reports, ledger
-            )
+            work_meanwhile(sessions, harassment, stream, random.Random(seed + 1), ledger, given)
             harassment.join()
             if harassment.broken:
                 raise harassment.broken
@@ -186,14 +170,12 @@ def one_run(
     }
 
 
-def the_pass(session: Session, definition: bytes) -> int:
+def the_pass(session: Session, body: bytes) -> int:
     """Define a pass; where a kill leaves open whether it was done, look, and ask again under another key."""
     for attempt in range(20):
-        answer = session.ask("POST", "/passes", definition, f"pass {attempt}")
-        if answer.status == 201:
+        answer = session.ask("POST", "/passes", body, f"pass {attempt}", 201, 409)
+        if answer.status_code == 201:
             return int(answer.json()["id"])
-        if answer.status != 409:
-            raise SystemExit(f"POST /passes: {answer.status} {answer.body[:300]!r}")
         known = session.get("/passes")["items"]
         if known:
             return int(known[0]["id"])
@@ -204,18 +186,16 @@ def work_meanwhile(
     sessions: Sequence[Session],
     harassment: Harassment,
     stream: bytes,
-    pieces: int,
     rng: random.Random,
-    packets: int,
-    reports: int,
     ledger: Ledger,
+    given: argparse.Namespace,
 ) -> None:
     """Upload the downlink with clients, repeatedly during the kills, with commands and reports in between.
 
     A round waits for the first job of the previous round, to limit the number of waiting jobs.
     """
     waiting: deque[Piece] = deque()
-    over = threading.Event()
+    over, pieces = threading.Event(), given.pieces
     clients = [
         Client(f"client{k}", session, SPACECRAFT, waiting, ledger, random.Random(rng.getrandbits(64)), over)
         for k, session in enumerate(sessions)
@@ -224,8 +204,9 @@ def work_meanwhile(
         waiting.extend(cut_pieces(stream, pieces, rng, "round 0"))
         for client in clients:
             client.start()
-        wait_for_room(waiting, over)
-        ask_for_reports(sessions[0], packets, reports, ledger)
+        while waiting and not over.wait(0.2):
+            pass
+        ask_for_reports(sessions[0], given.packets, given.reports, ledger)
         round_ = 0
         while harassment.is_alive() and not over.is_set():
             patient = time.monotonic() + ROUND_S
@@ -250,25 +231,11 @@ def work_meanwhile(
         raise broken
 
 
-def wait_for_room(waiting: deque[Piece], over: threading.Event) -> None:
-    """Wait until all pieces are accepted."""
-    while waiting and not over.wait(0.2):
-        pass
-
-
 def ask_for_reports(session: Session, packets: int, reports: int, ledger: Ledger) -> None:
     """Define a pass over the whole time and request reports of it."""
-    definition = {
-        "name": "all",
-        "start": format_utc(START),
-        "stop": format_utc(START + packets * STEP_NS // 4),
-        "spacecraft_id": SPACECRAFT,
-    }
-    pass_id = the_pass(session, json.dumps(definition).encode())
+    pass_id = the_pass(session, json.dumps(definition(packets)).encode())
     for k in range(reports):
-        answer = session.ask("POST", f"/passes/{pass_id}/reports", b"", f"report {k}")
-        if answer.status not in (200, 202):
-            raise SystemExit(f"POST /passes/{pass_id}/reports: {answer.status} {answer.body[:300]!r}")
+        answer = session.ask("POST", f"/passes/{pass_id}/reports", b"", f"report {k}", 200, 202)
         ledger.jobs.append(answer.json()["id"])
 
 
@@ -330,58 +297,27 @@ def table(figures: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def load_runs(path: Path | None) -> list[Figures]:
-    """The runs of a state file; none where there is no file yet."""
-    if path is None or not path.exists():
-        return []
-    runs = json.loads(path.read_text())["runs"]
-    assert isinstance(runs, list)
-    return runs
-
-
-def save_runs(path: Path, runs: Sequence[Figures]) -> None:
-    """Replace the state file at once."""
-    temporary = path.with_name(path.name + ".new")
-    temporary.write_text(json.dumps({"runs": runs}, indent=1))
-    os.replace(temporary, path)
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--kills", type=int, default=300)
-    parser.add_argument("--kills-per-run", type=int, default=100)
     parser.add_argument("--state", type=Path, help="file that runs are added to, to go on from")
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="kill no longer than that")
     parser.add_argument("--laptop", action="store_true", help="the API alone, on SQLite")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument(
-        "--pause", type=float, default=1.0, help="about how long everything runs between kills, s"
-    )
-    parser.add_argument("--packets", type=int, default=40_000)
-    parser.add_argument("--pieces", type=int, default=60)
-    parser.add_argument("--reports", type=int, default=6)
+    parser.add_argument("--pause", type=float, default=1.0, help="about how long all runs between kills, s")
+    for name, default in {"packets": 40_000, "pieces": 60, "reports": 6}.items():
+        parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was started is ended
-    until = time.monotonic() + given.seconds
-    runs = load_runs(given.state)
-    while (left := given.kills - totals(runs)["killed"]) > 0 and time.monotonic() < until:
-        one = one_run(
-            min(left, given.kills_per_run),
-            given.seed + len(runs),
-            laptop=given.laptop,
-            pause_s=given.pause,
-            packets=given.packets,
-            pieces=given.pieces,
-            reports=given.reports,
-            until=until,
-        )
-        runs.append(one)
-        if given.state is not None:
-            save_runs(given.state, runs)
-        print(f"run {len(runs)}: {json.dumps(one)}", file=sys.stderr, flush=True)
+    runs = json.loads(given.state.read_text()) if given.state and given.state.exists() else []
+    while (left := given.kills - totals(runs)["killed"]) > 0:
+        runs.append(one_run(min(left, 100), 1 + len(runs), given))
+        if given.state:
+            temporary = given.state.with_suffix(".new")
+            temporary.write_text(json.dumps(runs))
+            temporary.replace(given.state)
+        print(f"run {len(runs)}: {json.dumps(runs[-1])}", file=sys.stderr, flush=True)
     figures = totals(runs)
     print(json.dumps(figures, indent=2) if given.json else table(figures))
     return 0 if holds(figures) else 1

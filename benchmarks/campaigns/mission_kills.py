@@ -1,6 +1,6 @@
 """Campaign of a simulated mission on a distributed service whose processes are killed.
 
-    python -m benchmarks.campaigns.mission_kills selenita --days 3 --kill 7 [--kills N] [--json]
+    python -m benchmarks.campaigns.mission_kills selenita --days 3 --kill 7 [--kills N]
 
 The service runs as separate processes on PostgreSQL and Redis. Processes and the spacecraft are killed (SIGKILL) at
 random points of the seed and started again; a run that was stopped continues with the same command. The figures are
@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.campaigns._distributed import OWN_SERVERS, DistributedGround, Servers
+from benchmarks.campaigns._distributed import DistributedGround
 from benchmarks.campaigns._kills import SPACECRAFT, Keeper, plan_kills
 from linna.commands.mission import went_well
 from linna.data import data_folder
@@ -89,12 +89,8 @@ class KilledRun(MissionRun):
     keeps_archive = False
     _terms: KillTerms
 
-    def __init__(self, *given: Any, servers: Servers = OWN_SERVERS) -> None:
-        super().__init__(*given)
-        self._servers = servers
-
     def _open_ground(self) -> MissionGround:
-        return DistributedGround(self._folder, self._data, self._files.clock, self._servers)
+        return DistributedGround(self._folder, self._data, self._files.clock)
 
     def _operate(
         self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics
@@ -161,10 +157,9 @@ def run_killed(
     folder: Path,
     terms: KillTerms,
     say: Say,
-    servers: Servers = OWN_SERVERS,
 ) -> dict[str, Any]:
     """Run a mission with kills in a folder, or continue the run that is there; return the closing figures."""
-    return KilledRun(prepared(scenario, terms), data, folder, terms, say, servers=servers).run()
+    return KilledRun(prepared(scenario, terms), data, folder, terms, say).run()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -177,9 +172,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--kill", type=int, default=0, metavar="SEED")
     parser.add_argument("--kills", type=int, metavar="N", help="default: 4 a day")
     parser.add_argument("--folder", type=Path)
-    parser.add_argument("--database", metavar="URL", help="default: a PostgreSQL server of the run")
-    parser.add_argument("--broker", metavar="URL", help="default: a Redis server of the run")
-    parser.add_argument("--json", action="store_true")
     given = parser.parse_args(arguments)
     scenario = load_scenario(given.scenario)
     kills = max(round(4 * given.days), 1) if given.kills is None else given.kills
@@ -187,9 +179,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         given.days, 0.0, given.windows_per_day, 60.0 * given.window_min, kill_seed=given.kill, kills=kills
     )
     folder = given.folder or Path(f"run-{scenario.name}")
-    servers = Servers(given.database, given.broker)
-    figures = run_killed(scenario, data_folder(), folder, terms, log, servers)
-    print(json.dumps(figures) if given.json else json.dumps(figures["kills"], indent=2))
+    figures = run_killed(scenario, data_folder(), folder, terms, log)
+    print(json.dumps(figures["kills"], indent=2))
     return 0 if went_well(figures) else 1
 
 

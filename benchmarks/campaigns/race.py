@@ -1,6 +1,6 @@
 """Campaign of races for the state of telecommands, windows and jobs over HTTP.
 
-    python -m benchmarks.campaigns.race [--races 10000] [--seconds S] [--apis 2] [--seed 1] [--json]
+    python -m benchmarks.campaigns.race [--races 10000] [--seed 1]
 
 Starts PostgreSQL, Redis and two or more API processes on private ports. Every race sends several requests that
 contradict each other at the same time, to the processes in turn:
@@ -15,7 +15,7 @@ regress   four regressions with one idempotency key
 The campaign counts what must never happen: a telecommand released or handed out twice, two telecommands with one
 sequence count, a release and a rejection that both succeed, telecommands of a withdrawn window that are handed out,
 two jobs of one key, a lost request whose answer lacks the winning state, any server error. Exit status 1 if there
-was any. `--seconds` begins no race after that time.
+was any.
 """
 
 import argparse
@@ -27,17 +27,17 @@ import sys
 import tempfile
 import threading
 import time
-from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import func, select
 
-from benchmarks._servers import PostgresServer
-from benchmarks.campaigns._deployment import ManyApis
+from benchmarks._servers import Deployment, PostgresServer
 from ground_service.access.service import add_user
 from ground_service.clock import utc_now_ns
 from ground_service.contacts.commanding.service import enter_command, release_command
@@ -55,7 +55,7 @@ FIRST_SPACECRAFT, SPACECRAFT = 100, 8
 CRITICAL = ("perform_function", {"function_id": "reboot", "argument_1": 0.0, "argument_2": 0.0})
 ROUTINE: tuple[str, dict[str, Any]] = ("test_connection", {})
 WINDOWS_FROM_NS = 1_900_000_000 * NS
-FAULTS = (
+FAULTS = [
     "double_releases",
     "double_hand_outs",
     "shared_counts",
@@ -65,7 +65,7 @@ FAULTS = (
     "double_jobs",
     "unnamed_losers",
     "server_errors",
-)
+]
 
 Figures = dict[str, Any]
 
@@ -199,26 +199,13 @@ class Campaign:
         self.tally = Tally()
         self.windows = 0
 
-    def run(
-        self, races: int, progress: Callable[[int], None] = lambda _: None, seconds: float = float("inf")
-    ) -> Figures:
-        """Run races of all kinds in a seeded order for `seconds`; return the figures."""
+    def run(self, races: int) -> Figures:
+        """Run races of all kinds in a seeded order; return the figures."""
         kinds = [kind for kind, share in SHARES.items() for _ in range(max(1, round(races * share / 100)))]
         self.rng.shuffle(kinds)
-        races_of: dict[str, Callable[[int], None]] = {
-            "release": self._release,
-            "uplink": self._uplink,
-            "approve": self._approve,
-            "window": self._uplink_window,
-            "ingest": self._ingest,
-            "regress": self._regress,
-        }
         started = time.monotonic()
         for number, kind in enumerate(kinds, start=1):
-            if time.monotonic() - started > seconds:
-                break
-            races_of[kind](number)
-            progress(number)
+            getattr(self, f"_{kind}")(number)
         self._count_rows()
         tally = self.tally
         return {
@@ -293,17 +280,14 @@ class Campaign:
         )
         self.tally.fault("no_winner", "approve", f"window {window}", won.total() == 0)
         expected = "failed" if won["failed"] else "approved"
-        found = self._window(window)["state"]
+        found = self.ground.read(repository.get, repository.WINDOWS, window, "window")["state"]
         self.tally.fault("two_winners", "approve", f"window {window}: {won}, is {found}", found != expected)
 
     def _decision(self, path: str, state: str, k: int = 0) -> Request:
         body = json.dumps({"state": state, "reason": "race"}).encode()
         return Request(state, "PATCH", path, f"bob{k % 2}", body)
 
-    def _window(self, window: int) -> repository.Row:
-        return self.ground.read(repository.get, repository.WINDOWS, window, "window")
-
-    def _uplink_window(self, number: int) -> None:
+    def _window(self, number: int) -> None:
         spacecraft = FIRST_SPACECRAFT + SPACECRAFT + number % SPACECRAFT
         window = self._new_window(spacecraft)
         change_window(self.ground, window, actor="bob0", changes={}, decision="approved")
@@ -357,12 +341,7 @@ class Campaign:
 
     def _count_rows(self) -> None:
         """Count the rows of the database after all races."""
-        table, audit, ingests, jobs = (
-            repository.TELECOMMANDS,
-            repository.AUDIT,
-            repository.INGESTS,
-            repository.JOBS,
-        )
+        table, audit, jobs = repository.TELECOMMANDS, repository.AUDIT, repository.JOBS
         with self.ground.database.reading() as connection:
             counts = connection.execute(
                 select(table.c.vehicle_id, table.c.sequence_count, func.count())
@@ -374,7 +353,7 @@ class Campaign:
                 .where(audit.c.action.in_(("release telecommand", "send telecommand")))
                 .group_by(audit.c.action, audit.c.target)
             ).all()
-            stray = connection.execute(select(func.count()).select_from(ingests)).scalar_one()
+            stray = connection.execute(select(func.count()).select_from(repository.INGESTS)).scalar_one()
             kinds = connection.execute(select(jobs.c.kind, func.count()).group_by(jobs.c.kind))
             entered = {kind: int(number) for kind, number in kinds}
         for vehicle, count, times in counts:
@@ -386,12 +365,9 @@ class Campaign:
             self.tally.fault(names[action], "log", f"{action} {target}", times - 1)
         races = self.tally.races
         self.tally.fault("double_jobs", "ingest", f"{stray} ingests", stray - races["ingest"])
-        for kind, most in (
-            ("ingest", races["ingest"]),
-            ("regression", races["regress"]),
-            ("replay", 2 * races["regress"]),
-        ):
-            found = int(entered.get(kind, 0))
+        limits = {"ingest": races["ingest"], "regression": races["regress"], "replay": 2 * races["regress"]}
+        for kind, most in limits.items():
+            found = entered.get(kind, 0)
             self.tally.fault("double_jobs", kind, f"{found} jobs, expected at most {most}", found - most)
 
 
@@ -406,22 +382,11 @@ def prepare(ground: Ground, folder: Path) -> tuple[dict[str, str], tuple[str, st
             f'schema_version = 1\nname = "{name}"\ncommand = ["true", "{{archive}}", "{{out}}"]\n'
         )
         builds.append(register_build(ground, load_build(place)).digest)
-    now = utc_now_ns()
-    ground.write(
-        repository.add,
-        repository.REGRESSION_ARCHIVES,
-        digest="a" * 64,
-        name="race",
-        manifest_sha256="a" * 64,
-        frames=1,
-        frames_stored=1,
-        state="complete",
-        reason="",
-        octets=1,
-        pinned=1,
-        used_utc_ns=now,
-        created_utc_ns=now,
-    )
+    row = dict.fromkeys(("frames", "frames_stored", "octets", "pinned"), 1)
+    row |= dict.fromkeys(("used_utc_ns", "created_utc_ns"), utc_now_ns())
+    texts = dict.fromkeys(("digest", "manifest_sha256"), "a" * 64)
+    texts |= {"name": "race", "state": "complete", "reason": ""}
+    ground.write(repository.add, repository.REGRESSION_ARCHIVES, **row, **texts)
     return tokens, (builds[0], builds[1])
 
 
@@ -433,47 +398,25 @@ def holds(figures: Mapping[str, Any]) -> bool:
 def table(figures: Mapping[str, Any]) -> str:
     """Return the figures as text."""
     lines = [f"{'race':<10}{'races':>8}{'requests':>10}{'carried out':>13}{'refused':>9}"]
-    totals: defaultdict[str, int] = defaultdict(int)
-    for kind, row in figures["kinds"].items():
-        lines.append(
-            f"{kind:<10}{row['races']:>8}{row['requests']:>10}{row['won']:>13}{row['requests'] - row['won']:>9}"
-        )
-        for name in ("races", "requests", "won"):
-            totals[name] += row[name]
-    lines.append(
-        f"{'all':<10}{totals['races']:>8}{totals['requests']:>10}{totals['won']:>13}"
-        f"{totals['requests'] - totals['won']:>9}   in {figures['seconds']} s"
-    )
+    totals: Counter[str] = Counter()
+    for row in figures["kinds"].values():
+        totals.update({name: row[name] for name in ("races", "requests", "won")})
+    for kind, row in {**figures["kinds"], "all": totals}.items():
+        refused = row["requests"] - row["won"]
+        lines.append(f"{kind:<10}{row['races']:>8}{row['requests']:>10}{row['won']:>13}{refused:>9}")
+    lines[-1] += f"   in {figures['seconds']} s"
     lines += [f"{name.replace('_', ' '):<22}{figures[name]:>6}" for name in FAULTS]
     lines += [f"  {one}" for one in figures["examples"]]
     return "\n".join(lines)
 
 
-def run(
-    folder: Path,
-    url: str,
-    races: int,
-    apis: int,
-    seed: int,
-    *,
-    seconds: float = float("inf"),
-    quiet: bool = False,
-) -> Figures:
+def run(folder: Path, url: str, races: int, apis: int = 2, seed: int = 1) -> Figures:
     """Run the campaign with an empty database at `url`; return the figures."""
     prepare_database(url, upgrade=True).engine.dispose()
-
-    def progress(number: int) -> None:
-        if not quiet and number % 500 == 0:
-            print(f"{number} races", file=sys.stderr, flush=True)
-
     with open_ground(folder / "home", database_url=url) as ground:
         tokens, builds = prepare(ground, folder)
-        with ManyApis(folder, url, apis) as service:
-            racers = Racers(service.ports, tokens)
-            try:
-                return Campaign(ground, racers, builds, seed).run(races, progress, seconds)
-            finally:
-                racers.close()
+        with Deployment(folder, apis, url=url) as service, closing(Racers(service.ports, tokens)) as racers:
+            return Campaign(ground, racers, builds, seed).run(races)
 
 
 def main() -> int:
@@ -481,15 +424,12 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--races", type=int, default=10_000)
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="race no longer than that")
-    parser.add_argument("--apis", type=int, default=2, help="API processes")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that started processes are ended
     with tempfile.TemporaryDirectory() as name, PostgresServer(Path(name)) as database:
-        figures = run(Path(name), database.url, given.races, given.apis, given.seed, seconds=given.seconds)
-    print(json.dumps(figures, indent=2) if given.json else table(figures))
+        figures = run(Path(name), database.url, given.races, seed=given.seed)
+    print(table(figures))
     return 0 if holds(figures) else 1
 
 

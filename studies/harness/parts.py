@@ -94,6 +94,7 @@ class Part:
             time.sleep(0.5)
         if self._ended:
             return
+        self.kill()
         tail = self._log.read_text(errors="replace")[-500:].strip().replace("\n", " | ")
         raise GroundError(
             f"{' '.join(self._command[:4])}: expected it to start within {START_S:.0f} s, found: {tail}"

@@ -14,7 +14,6 @@ from benchmarks import _rows, mutation, mutation_plugin
 from benchmarks.__main__ import NAMES, main
 from benchmarks._rows import NotMeasured, Row, line, needs, report
 from benchmarks.render import compare_renderings, thinned
-from benchmarks.requirement_bounds import tolerance_bound
 from payload_emulator.sim.render.renderer import Rendering
 
 
@@ -135,20 +134,6 @@ def test_without_shadow_there_is_no_iou():
 def test_thinning_takes_the_pixels_that_the_march_takes():
     thin = thinned(rendering(4), 4)
     assert thin.lit.shape == (4, 4) and thin.lit[0].tolist() == [0.0, 1.0, 1.0, 1.0]
-
-
-VALUES = np.tile([-1.0, 1.0], 5)
-
-
-@pytest.mark.parametrize(("confidence", "factor"), [(0.95, 2.911), (0.90, 2.568)])
-def test_the_bound_of_ten_values_has_the_published_factor(confidence, factor):
-    values = list(3.0 + 2.0 * VALUES / np.std(VALUES, ddof=1))
-    assert tolerance_bound(values, True, 0.95, confidence) == pytest.approx(3.0 + 2.0 * factor, abs=2e-3)
-    assert tolerance_bound(values, False, 0.95, confidence) == pytest.approx(3.0 - 2.0 * factor, abs=2e-3)
-
-
-def test_one_pass_gives_no_bound():
-    assert np.isnan(tolerance_bound([1.0], True, 0.95, 0.9))
 
 
 @pytest.mark.parametrize(("unit", "ratio"), [("packets/s", 2.0), ("s", 0.5), ("packets", 2.0), ("MiB", 0.5)])

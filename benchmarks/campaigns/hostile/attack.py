@@ -33,23 +33,42 @@ NAMESPACE_FLAGS = {
 }
 FORKS = 600
 SYSTEM_CALLS = {
-    "x86_64": {"clone": 56, "clone3": 435, "setns": 308, "pivot_root": 155, "ptrace": 101, "bpf": 321,
-               "perf_event_open": 298, "userfaultfd": 323, "io_uring_setup": 425, "keyctl": 250, "memfd_create": 319,
-               "shmget": 29, "process_vm_readv": 310, "open_by_handle_at": 304, "fsopen": 430, "open_tree": 428,
-               "kexec_load": 246, "init_module": 175, "msgget": 68, "pidfd_open": 434, "pidfd_getfd": 438},
-    "aarch64": {"clone": 220, "clone3": 435, "setns": 268, "pivot_root": 41, "ptrace": 117, "bpf": 280,
-                "perf_event_open": 241, "userfaultfd": 282, "io_uring_setup": 425, "keyctl": 219, "memfd_create": 279,
-                "shmget": 194, "process_vm_readv": 270, "open_by_handle_at": 265, "fsopen": 430, "open_tree": 428,
-                "kexec_load": 104, "init_module": 105, "msgget": 186, "pidfd_open": 434, "pidfd_getfd": 438},
-}[os.uname().machine]  # fmt: skip
+    name: int(numbers[os.uname().machine == "aarch64"])
+    for name, *numbers in (
+        line.split()
+        for line in """\
+clone 56 220
+clone3 435 435
+setns 308 268
+pivot_root 155 41
+ptrace 101 117
+bpf 321 280
+perf_event_open 298 241
+userfaultfd 323 282
+io_uring_setup 425 425
+keyctl 250 219
+memfd_create 319 279
+shmget 29 194
+process_vm_readv 310 270
+open_by_handle_at 304 265
+fsopen 430 430
+open_tree 428 428
+kexec_load 246 104
+init_module 175 105
+msgget 68 186
+pidfd_open 434 434
+pidfd_getfd 438 438""".splitlines()
+    )
+}
+"""Numbers of system calls on x86_64 and aarch64."""
 
 RESULTS: dict = {}
 
 
-def attempt(name, action):
+def attempt(name, action, *given):
     """Record an attempt; it succeeds if the action returns a true value."""
     try:
-        seen = action()
+        seen = action(*given)
     except (OSError, ValueError, MemoryError, RuntimeError, subprocess.SubprocessError) as error:
         RESULTS[name] = [False, f"{type(error).__name__}: {error}"[:120]]
         return
@@ -58,18 +77,16 @@ def attempt(name, action):
 
 def call(name, *arguments):
     """Make a raw system call; raise an error for a negative result."""
-    result = LIBC.syscall(ctypes.c_long(SYSTEM_CALLS[name]), *arguments)
-    if result < 0:
-        code = ctypes.get_errno()
-        raise OSError(code, os.strerror(code))
-    return f"returned {result}"
+    return libc("syscall", ctypes.c_long(SYSTEM_CALLS[name]), *arguments)
 
 
 def libc(name, *arguments):
-    if getattr(LIBC, name)(*arguments) < 0:
+    """Call a function of the C library; raise an error for a negative result."""
+    result = getattr(LIBC, name)(*arguments)
+    if result < 0:
         code = ctypes.get_errno()
         raise OSError(code, os.strerror(code))
-    return f"{name} succeeded"
+    return f"{name} returned {result}"
 
 
 def secret_in(path):
@@ -87,12 +104,12 @@ def explore_secrets():
     )
     for process in {"1", "self", str(os.getppid()), *map(str, TARGETS["victims"]), *numbered("/proc")}:
         for part in ("environ", "cmdline", "mem", "maps", "root/etc/hostname", "cwd/secret.txt"):
-            attempt(f"/proc/{process}/{part}", lambda p=process, q=part: secret_in(f"/proc/{p}/{q}"))
+            attempt(f"/proc/{process}/{part}", secret_in, f"/proc/{process}/{part}")
     for path in TARGETS["secrets"]:
-        attempt(f"read {path}", lambda p=path: secret_in(p))
-        attempt(f"read through /proc/1/root {path}", lambda p=path: secret_in(f"/proc/1/root{p}"))
+        attempt(f"read {path}", secret_in, path)
+        attempt(f"read through /proc/1/root {path}", secret_in, f"/proc/1/root{path}")
     for path in ("/etc/shadow", "/dev/mem", "/dev/kmem", "/dev/kmsg", "/dev/vda", "/dev/sda", "/proc/kcore"):
-        attempt(f"read {path}", lambda p=path: first_octet(p))
+        attempt(f"read {path}", first_octet, path)
     attempt("descriptors left open", lambda: [f for f in os.listdir("/proc/self/fd") if int(f) > 3])
     attempt("files of the service anywhere", walk_for_targets)
 
@@ -127,7 +144,7 @@ def walk_for_targets():
 
 def explore_changes():
     for path in TARGETS["writable"]:
-        attempt(f"append to {path}", lambda p=path: append(p))
+        attempt(f"append to {path}", append, path)
         attempt(f"remove {path}", lambda p=path: os.unlink(p) or "removed")
     folders = [
         sys.prefix,
@@ -140,7 +157,7 @@ def explore_changes():
         str(HERE),
     ]
     for folder in folders:
-        attempt(f"write into {folder}", lambda p=folder: append(os.path.join(p, "hostile.pth")))
+        attempt(f"write into {folder}", append, os.path.join(folder, "hostile.pth"))
     attempt("make a device", lambda: os.mknod("/tmp/disk", 0o60666, os.makedev(254, 0)) or "made")
     for path in (
         "/proc/sys/kernel/core_pattern",
@@ -148,7 +165,7 @@ def explore_changes():
         "/sys/fs/cgroup/cgroup.procs",
         "/proc/1/oom_score_adj",
     ):
-        attempt(f"write {path}", lambda p=path: overwrite(p))
+        attempt(f"write {path}", overwrite, path)
 
 
 def overwrite(path):
@@ -168,21 +185,21 @@ def append(path):
 def explore_network():
     for port in TARGETS["ports"]:
         for family, host in ((socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1")):
-            attempt(f"connect to {host} port {port}", lambda f=family, h=host, p=port: connect(f, (h, p)))
+            attempt(f"connect to {host} port {port}", connect, family, (host, port))
     for path in TARGETS["sockets"]:
         name = path.replace("@", "\0", 1)
-        attempt(f"connect to unix socket {path}", lambda n=name: connect(socket.AF_UNIX, n))
-    attempt("connect to an address outside", lambda: connect(socket.AF_INET, ("192.0.2.1", 80)))
+        attempt(f"connect to unix socket {path}", connect, socket.AF_UNIX, name)
+    attempt("connect to an address outside", connect, socket.AF_INET, ("192.0.2.1", 80))
     attempt(
         "send UDP", lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b"x", ("127.0.0.1", 53))
     )
-    attempt("raw socket", lambda: socket.socket(socket.AF_INET, socket.SOCK_RAW, 1))
-    attempt("netlink", lambda: socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, 0))
+    attempt("raw socket", socket.socket, socket.AF_INET, socket.SOCK_RAW, 1)
+    attempt("netlink", socket.socket, socket.AF_NETLINK, socket.SOCK_RAW, 0)
     attempt(
         "socket to the host of the virtual machine",
         lambda: socket.socket(socket.AF_VSOCK, socket.SOCK_STREAM),
     )
-    attempt("packet socket", lambda: socket.socket(socket.AF_PACKET, socket.SOCK_RAW))
+    attempt("packet socket", socket.socket, socket.AF_PACKET, socket.SOCK_RAW)
 
 
 def connect(family, address):
@@ -197,23 +214,30 @@ def connect(family, address):
 
 def explore_kernel():
     for name, flag in NAMESPACE_FLAGS.items():
-        attempt(f"unshare {name}", lambda f=flag: libc("unshare", f))
-        attempt(f"clone into a new {name} namespace", lambda f=flag: cloned(f))
-    attempt("clone3", lambda: call("clone3", bytes(88), 88))
+        attempt(f"unshare {name}", libc, "unshare", flag)
+        attempt(f"clone into a new {name} namespace", cloned, flag)
+    attempt("clone3", call, "clone3", bytes(88), 88)
     for process in (1, *TARGETS["victims"]):
         for kind in ("net", "mnt", "user", "pid"):
-            attempt(f"setns {kind} of {process}", lambda p=process, k=kind: set_namespace(p, k))
-        attempt(f"ptrace {process}", lambda p=process: call("ptrace", 16, p, 0, 0))
+            attempt(f"setns {kind} of {process}", set_namespace, process, kind)
+        attempt(f"ptrace {process}", call, "ptrace", 16, process, 0, 0)
         attempt(
             f"read memory of {process}",
-            lambda p=process: call("process_vm_readv", p, bytes(16), 1, bytes(16), 1, 0),
+            call,
+            "process_vm_readv",
+            process,
+            bytes(16),
+            1,
+            bytes(16),
+            1,
+            0,
         )
-        attempt(f"signal {process}", lambda p=process: foreign_signal(p))
+        attempt(f"signal {process}", foreign_signal, process)
         attempt(f"pidfd of {process}", lambda p=process: p != 1 and call("pidfd_open", p, 0))
-    attempt("mount tmpfs", lambda: libc("mount", b"none", b"/tmp", b"tmpfs", 0, None))
-    attempt("mount proc", lambda: libc("mount", b"proc", b"/tmp", b"proc", 0, None))
-    attempt("remount the root writable", lambda: libc("mount", b"none", b"/", None, 32, None))
-    attempt("unmount", lambda: libc("umount2", b"/proc", 2))
+    attempt("mount tmpfs", libc, "mount", b"none", b"/tmp", b"tmpfs", 0, None)
+    attempt("mount proc", libc, "mount", b"proc", b"/tmp", b"proc", 0, None)
+    attempt("remount the root writable", libc, "mount", b"none", b"/", None, 32, None)
+    attempt("unmount", libc, "umount2", b"/proc", 2)
     attempt("chroot", lambda: os.chroot("/tmp") or "changed")
     attempt("become user 0", lambda: os.setuid(0) or "became root")
     attempt("become group 0", lambda: os.getgid() != 0 and (os.setgid(0) or "became group root"))
@@ -228,7 +252,7 @@ def explore_kernel():
         ("open_by_handle_at", (-100, bytes(16), 0)), ("fsopen", (b"tmpfs", 0)), ("open_tree", (-100, b"/", 1)),
         ("kexec_load", (0, 0, 0, 0)), ("init_module", (bytes(8), 8, b"")), ("pidfd_getfd", (3, 0, 0)),
     ):  # fmt: skip
-        attempt(name, lambda n=name, a=arguments: call(n, *a))
+        attempt(name, call, name, *arguments)
     attempt(
         "set-user-id program",
         lambda: b"uid=0" in subprocess.run(["su", "-c", "id"], capture_output=True, timeout=5).stdout,
@@ -277,7 +301,7 @@ def explore_limits():
     attempt("600 forks", many_forks)
     attempt("600 threads", many_threads)
     attempt("2000 open files", many_files)
-    attempt("a file twice as large as allowed", lambda: large_file(OUT / "large"))
+    attempt("a file twice as large as allowed", large_file, OUT / "large")
     attempt("memory in pipes and socket pairs", much_kernel_memory)
 
 
@@ -503,22 +527,5 @@ def explore():
     (OUT / "downlink.packets").write_text(json.dumps(RESULTS))
 
 
-KINDS = {
-    "explore": explore,
-    "leave files": leave_files,
-    "memory bomb": memory_bomb,
-    "disk fill": disk_fill,
-    "outlive": outlive,
-    "daemon": daemon,
-    "stop others": stop_others,
-    "link out": link_out,
-    "hard link out": hard_link_out,
-    "pipe out": pipe_out,
-    "folder out": folder_out,
-    "sparse out": sparse_out,
-    "swap out": swap_out,
-    "flood": flood,
-}
-
 if __name__ == "__main__":
-    KINDS[sys.argv[1]]()
+    globals()[sys.argv[1].replace(" ", "_")]()

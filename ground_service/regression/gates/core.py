@@ -447,7 +447,7 @@ SPREAD = {
 }
 """Standard error of the change by a threshold of 0.3, times the root of the number of frames.
 
-Measured over the 42 windows of `python -m benchmarks.gate_error_rates`. For a network of similar quality it is a fifth.
+Measured over the 42 windows of docs/results/regression.md. For a network of similar quality it is a fifth.
 """
 
 MINUTES_PER_FRAME = 0.005

@@ -5,9 +5,10 @@ import random
 import sys
 from dataclasses import replace
 
+import httpx
 import pytest
 
-from benchmarks.campaigns._clients import Answer, Session, cut_pieces
+from benchmarks.campaigns._clients import Session, cut_pieces
 from benchmarks.campaigns._ledger import FAULTS, AuditLine, Decision, Entered, HandOut, Ledger, judge
 from benchmarks.campaigns.kill import holds, main, the_pass, totals
 
@@ -105,11 +106,11 @@ def test_a_second_hand_out_and_a_changed_answer_are_faults():
     told.hand_outs.append(HandOut("ann", (1,), b"one"))
     assert judge(told, ROWS, LINES)["double_hand_outs"] == 1
     told = what_clients_were_told()
-    told.count_changed()
+    told.count("changed_answers")
     assert judge(told, ROWS, LINES)["hand_outs_wrong"] == 1
     sent = changed(3, state="sent")
     told = what_clients_were_told()
-    told.count_unanswered()
+    told.count("unanswered_hand_outs")
     assert judge(told, sent, [*LINES, AuditLine("send", 3, "ann")]).total() == 0
 
 
@@ -135,13 +136,13 @@ def test_pieces_are_cut_at_any_octet_and_make_up_the_stream():
 def test_a_pass_whose_definition_was_cut_off_is_looked_for_before_it_is_asked_for_again(monkeypatch):
     asked = []
 
-    def ask(_self, method, _path, _body=None, key=""):
+    def ask(_self, method, _path, _body=None, key="", *_):
         asked.append(f"{method} {key}".strip())
         if method == "GET":
-            return Answer(200, b'{"items": []}', {})
+            return httpx.Response(200, json={"items": []})
         if key == "pass 0":
-            return Answer(409, b"begun and its end is not known", {})
-        return Answer(201, b'{"id": 7}', {})
+            return httpx.Response(409)
+        return httpx.Response(201, json={"id": 7})
 
     monkeypatch.setattr(Session, "ask", ask)
     assert the_pass(Session(("http://nowhere",), "token"), b"{}") == 7

@@ -15,7 +15,6 @@ import pytest
 from pytest import approx
 from sqlalchemy import Connection, select
 
-from benchmarks.gate_error_rates import each, late_headers, late_states, with_values
 from ground_service.client.local import local_client
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground, open_ground
@@ -57,13 +56,36 @@ from ground_service.worker.upkeep import DAY_NS, remove_archives
 from reports.values import Gate
 from tests.ground_service.conftest import enter_files
 from tmtc.dictionary.payload import DICTIONARY
+from tmtc.packets.crc import append_crc
 
 Packets = dict[str, list[bytes]]
 
 
 def altered(packets: Packets, change: Callable[[int, str, bytes], bytes]) -> Packets:
     """Packets changed one by one; `change` gets the number and name of each."""
-    return {name: each(change)(some) for name, some in packets.items()}
+    named = {name: enumerate(some) for name, some in packets.items()}
+    return {name: [change(i, DICTIONARY.unpack(one)[0], one) for i, one in some] for name, some in named.items()}
+
+
+def with_values(name: str, packet: bytes, **changed: Any) -> bytes:
+    """A packet with other values."""
+    decoded = DICTIONARY.unpack_packet(packet)
+    values = {key: value for key, value in decoded.values.items() if key != "count"} | changed
+    count = int.from_bytes(packet[2:4], "big") & 0x3FFF
+    return DICTIONARY.pack(name, values, ticks=decoded.ticks, sequence_count=count)
+
+
+def late_headers(number: int, name: str, packet: bytes) -> bytes:
+    """Set the on-board time of three packets of four 7 s late."""
+    seconds = int.from_bytes(packet[14:18], "big") + 7 * (number % 4 > 0)
+    return append_crc(packet[:14] + seconds.to_bytes(4, "big") + packet[18:-2])
+
+
+def late_states(number: int, name: str, packet: bytes) -> bytes:
+    """Let navigation states after the 100th packet name an image 7 s late."""
+    if name != "navigation_state" or number < 100:
+        return packet
+    return with_values(name, packet, image_ticks=DICTIONARY.unpack_packet(packet).values["image_ticks"] + 7 * 65536)
 
 
 def with_detections(packets: Packets, change: Callable[[dict[str, Any]], dict[str, Any]]) -> Packets:

@@ -10,7 +10,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from benchmarks.campaigns._deployment import ManyApis
+from benchmarks._servers import Deployment
 from ground_service.app import create_app
 from ground_service.settings import Settings
 from ground_service.store import wakeups
@@ -66,7 +66,7 @@ def other(tmp_path: Path, server_url: str, monkeypatch: pytest.MonkeyPatch) -> I
     """An API process A with links, and the client of an API B in this process, which never polls."""
     monkeypatch.setattr(sockets, "POLL_S", NEVER_S)
     monkeypatch.setattr(wakeups, "RETRY_S", 0.1)
-    with ManyApis(tmp_path, server_url, count=1) as processes:
+    with Deployment(tmp_path, url=server_url) as processes:
         settings = Settings(
             home=processes.home, database_url=server_url, broker_url=processes.broker_url, links=False,
         )  # fmt: skip

@@ -13,7 +13,7 @@ from benchmarks.campaigns.race import FAULTS, Answer, Tally, holds, run, table
 def test_of_contradicting_requests_to_two_processes_one_wins_and_all_others_are_told_so(
     new_postgres_database: Callable[[], str], tmp_path: Path
 ) -> None:
-    figures = run(tmp_path, new_postgres_database(), races=60, apis=2, seed=3, quiet=True)
+    figures = run(tmp_path, new_postgres_database(), races=60, seed=3)
     assert {name: figures[name] for name in FAULTS} == dict.fromkeys(FAULTS, 0), figures["examples"]
     assert holds(figures)
     kinds = figures["kinds"]
