@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 from lunar.camera import PinholeCamera
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
@@ -73,8 +73,10 @@ class FlightParameters:
     def sha256(self) -> str:
         """SHA-256 of the parameters as text, hexadecimal."""
         reports = "image_reports" if self.image_reports else ""
-        learned = "" if self.anchored.offset is None else repr(self.anchored.offset)
-        return hashlib.sha256((repr(self) + reports + learned).encode()).hexdigest()
+        # Parameters that older builds did not have enter the hash only if they differ from the default.
+        added = ((getattr(self.anchored, one.name), one.default) for one in fields(AnchoredParameters) if not one.repr)
+        changed = "".join(repr(value) for value, default in added if value != default)
+        return hashlib.sha256((repr(self) + reports + changed).encode()).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
