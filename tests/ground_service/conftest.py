@@ -59,6 +59,11 @@ FILTER_ERROR_RTN_M = np.array([10.0, 20.0, -20.0])  # 30 m in 3-D
 PIXEL_OFFSET = (0.5, -1.25)
 
 
+def cells(table: str) -> list[list[str]]:
+    """Return the cells of a table: each line is a row, and bars separate its cells."""
+    return [[cell.strip() for cell in row.split("|")] for row in table.strip().splitlines()]
+
+
 @pytest.fixture(scope="session", autouse=True)
 def name_of_the_test_client() -> Iterator[None]:
     """Allow the host name that the test client of the web framework gives itself."""
