@@ -15,7 +15,7 @@ import socket
 import subprocess
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -65,7 +65,7 @@ def cells(table: str) -> list[list[str]]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def name_of_the_test_client() -> Iterator[None]:
+def name_of_the_test_client():
     """Allow the host name that the test client of the web framework gives itself."""
     with pytest.MonkeyPatch.context() as environment:
         environment.setenv("LINNA_ALLOWED_HOSTS", "testserver")
@@ -73,7 +73,7 @@ def name_of_the_test_client() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def one_tls_context() -> Iterator[None]:
+def one_tls_context():
     """Read the trusted certificates once: each HTTP client would read them."""
     with pytest.MonkeyPatch.context() as patch:
         made = functools.cache(httpx_transports.create_ssl_context)
@@ -82,7 +82,7 @@ def one_tls_context() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def one_description() -> Iterator[None]:
+def one_description():
     """Make the OpenAPI document, which is the same for every application, once: it takes two seconds."""
     describe, made = DescribedApi.openapi, list[dict[str, Any]]()
 
@@ -96,14 +96,14 @@ def one_description() -> Iterator[None]:
 
 
 @pytest.fixture
-def client(tmp_path: Path) -> Iterator[TestClient]:
+def client(tmp_path):
     """An empty service without users that does its jobs in the requests."""
     with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as opened:
         yield opened
 
 
 @pytest.fixture
-def guarded(tmp_path: Path) -> Iterator[tuple[TestClient, dict[str, dict[str, str]]]]:
+def guarded(tmp_path):
     """An empty service with one user of each role, and the headers of each."""
     with TestClient(create_app(Settings(home=tmp_path / "guarded"), inline_jobs=True)) as opened:
         ground = opened.app.state.ground
@@ -112,7 +112,7 @@ def guarded(tmp_path: Path) -> Iterator[tuple[TestClient, dict[str, dict[str, st
 
 
 @pytest.fixture(scope="session", autouse=True)
-def copied_schema(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[Database], None]]:
+def copied_schema(tmp_path_factory):
     """Copy the tables of new SQLite databases from one that was migrated; the migration itself is yielded."""
     migrate, lock = databases.upgrade_database, threading.Lock()
     made = open_database(f"sqlite:///{tmp_path_factory.mktemp('schema') / 'linna.db'}")
@@ -193,7 +193,7 @@ def _catalogue(latitude_rad: np.ndarray, longitude_rad: np.ndarray, rng: np.rand
 
 
 @pytest.fixture(scope="session")
-def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., SyntheticPass]:
+def make_pass(tmp_path_factory):
     """A function that writes a synthetic pass archive of `frames` frames."""
 
     def make(
@@ -341,13 +341,13 @@ def _housekeeping(k: int) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="session")
-def synthetic_pass(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
+def synthetic_pass(make_pass):
     """The pass that most tests look at; not to be altered."""
     return make_pass()
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
-def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ground]:
+def either(request, tmp_path):
     """An empty service on each database."""
     url = request.getfixturevalue("migrated_postgres")() if request.param == "postgresql" else None
     with open_ground(tmp_path / "home", database_url=url) as ground:
@@ -356,7 +356,7 @@ def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ground]:
 
 
 @pytest.fixture
-def ground(tmp_path: Path) -> Iterator[Ground]:
+def ground(tmp_path):
     """An empty ground service with a SQLite database of its own."""
     opened = open_ground(tmp_path / "home")
     follow_in_process(opened)
@@ -373,7 +373,7 @@ class FlyablePass:
 
 
 @pytest.fixture(scope="session")
-def make_flyable(make_pass: Callable[..., SyntheticPass]) -> Callable[..., FlyablePass]:
+def make_flyable(make_pass):
     """A function that writes a synthetic pass archive with what its payload was given: plain gray images."""
     import io
 
@@ -415,7 +415,7 @@ costs = json.loads((build / "costs.json").read_text())
 
 
 @pytest.fixture(scope="session")
-def make_build(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+def make_build(tmp_path_factory):
     """A function that writes a build: a program that sends packets prepared for each pass, or any other script."""
 
     def make(
@@ -456,7 +456,7 @@ def _postgres_binaries() -> Path | None:
 
 
 @pytest.fixture(scope="module")
-def redis_url() -> Iterator[str]:
+def redis_url():
     """A Redis server of the tests' own, its user as restricted as in the distributed form."""
     program = shutil.which("redis-server")
     if program is None:
@@ -483,7 +483,7 @@ def redis_url() -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
-def postgres_server() -> Iterator[str]:
+def postgres_server():
     """URL of a PostgreSQL server of the tests' own, without the name of a database."""
     binaries = _postgres_binaries()
     if binaries is None:
@@ -526,14 +526,14 @@ def _create_database(server: str, name: str, template: str = "template1") -> str
 
 
 @pytest.fixture(scope="session")
-def new_postgres_database(postgres_server: str) -> Callable[[], str]:
+def new_postgres_database(postgres_server):
     """A function that makes an empty database on the PostgreSQL server and returns its URL."""
     numbers = itertools.count(1)
     return lambda: _create_database(postgres_server, f"empty_{next(numbers)}")
 
 
 @pytest.fixture(scope="session")
-def migrated_postgres(postgres_server: str) -> Callable[[], str]:
+def migrated_postgres(postgres_server):
     """A function that makes a database with the newest schema, a copy of one that was migrated; it returns the URL."""
     numbers = itertools.count(1)
     prepare_database(_create_database(postgres_server, "migrated"), upgrade=True).engine.dispose()
@@ -541,7 +541,7 @@ def migrated_postgres(postgres_server: str) -> Callable[[], str]:
 
 
 @pytest.fixture(scope="module")
-def postgres_url(new_postgres_database: Callable[[], str]) -> str:
+def postgres_url(new_postgres_database):
     """URL of an empty PostgreSQL database that the tests of one module share."""
     return new_postgres_database()
 
@@ -557,7 +557,7 @@ class Clock:
 
 
 @pytest.fixture
-def mission_time() -> Iterator[Clock]:
+def mission_time():
     made = Clock()
     set_mission_clock(lambda: made.utc_ns)
     yield made

@@ -103,14 +103,14 @@ class Service:
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+def clock(monkeypatch):
     made = Clock()
     monkeypatch.setattr(connection, "time", made)
     return made
 
 
 @pytest.fixture
-def service() -> Iterator[Service]:
+def service():
     made = Service()
     yield made
     made.server.shutdown()
@@ -119,7 +119,7 @@ def service() -> Iterator[Service]:
 
 
 @pytest.fixture
-def body(tmp_path: Path) -> Path:
+def body(tmp_path):
     path = tmp_path / "reference.oem"
     path.write_bytes(b"octets " * 1000)
     return path
@@ -130,14 +130,14 @@ def client_of(answer: Callable[[httpx.Request], httpx.Response]) -> Client:
     return Client("http://ground", "secret", transport=httpx.MockTransport(answer))
 
 
-def test_an_upload_that_finds_the_service_busy_is_sent_again_whole(service: Service, clock: Clock, body: Path) -> None:
+def test_an_upload_that_finds_the_service_busy_is_sent_again_whole(service, clock, body):
     service.answers = [(503, {"Retry-After": "1"}), (503, {"Retry-After": "3"}), (201, {})]
     assert Client(service.url).add_ephemeris(body).model_dump(mode="json") == EPHEMERIS
     assert clock.slept == [1.0, 3.0]
     assert service.bodies == [body.read_bytes()] * 3
 
 
-def test_a_service_that_stays_busy_is_given_up_in_its_own_words(service: Service, clock: Clock, body: Path) -> None:
+def test_a_service_that_stays_busy_is_given_up_in_its_own_words(service, clock, body):
     service.answers = [(503, {"Retry-After": "600"})]
     with pytest.raises(ServiceProblem, match="busy now") as caught:
         Client(service.url).add_ephemeris(body)
@@ -148,9 +148,7 @@ def test_a_service_that_stays_busy_is_given_up_in_its_own_words(service: Service
 @pytest.mark.parametrize(
     "answer", [(503, {}), (503, {"Retry-After": "soon"}), (500, {"Retry-After": "1"}), (409, {}), (429, {})]
 )
-def test_what_is_no_invitation_to_come_again_is_told_at_once(
-    service: Service, clock: Clock, body: Path, answer: tuple[int, dict[str, str]]
-) -> None:
+def test_what_is_no_invitation_to_come_again_is_told_at_once(service, clock, body, answer):
     service.answers = [answer]
     with pytest.raises(ServiceProblem) as caught:
         Client(service.url).add_ephemeris(body)
@@ -159,7 +157,7 @@ def test_what_is_no_invitation_to_come_again_is_told_at_once(
 
 
 @pytest.mark.parametrize(
-    ("call", "attempts"),
+    "call, attempts",
     [
         (lambda client: client.evaluate_pass(1), ATTEMPTS),
         (lambda client: client.enter_telecommand("test_connection", 76), ATTEMPTS),
@@ -168,9 +166,7 @@ def test_what_is_no_invitation_to_come_again_is_told_at_once(
         (lambda client: client.delete_window(1), 1),
     ],
 )
-def test_after_a_broken_connection_only_safe_requests_and_those_with_a_key_are_repeated(
-    clock: Clock, call: Callable[[Client], object], attempts: int
-) -> None:
+def test_after_a_broken_connection_only_safe_requests_and_those_with_a_key_are_repeated(clock, call, attempts):
     keys = []
 
     def answer(request: httpx.Request) -> httpx.Response:
@@ -183,7 +179,7 @@ def test_after_a_broken_connection_only_safe_requests_and_those_with_a_key_are_r
     assert len(set(keys)) == 1  # the key stays the same, so the service processes the request once
 
 
-def test_a_service_that_cannot_be_reached_is_not_asked_again(clock: Clock) -> None:
+def test_a_service_that_cannot_be_reached_is_not_asked_again(clock):
     def answer(_: httpx.Request) -> httpx.Response:
         raise httpx.ConnectError("connection refused")
 
@@ -192,16 +188,13 @@ def test_a_service_that_cannot_be_reached_is_not_asked_again(clock: Clock) -> No
     assert clock.slept == []
 
 
-@pytest.mark.parametrize(
-    ("status", "kind"),
+@pytest.mark.parametrize("status, kind",
     [
         (401, NotAuthenticated), (403, NotPermitted), (404, NotFound), (409, Conflict), (412, Conflict),
         (422, InvalidRequest), (507, Unavailable), (500, ServiceProblem), (302, ServiceProblem),
     ],
 )  # fmt: skip
-def test_a_refusal_is_an_exception_of_its_kind_with_the_problem_details(
-    status: int, kind: type[ServiceProblem]
-) -> None:
+def test_a_refusal_is_an_exception_of_its_kind_with_the_problem_details(status, kind):
     problem = {
         "type": "about:blank", "title": "t", "status": status, "detail": "window 3: no", "state": "draft",
     }  # fmt: skip
@@ -212,7 +205,7 @@ def test_a_refusal_is_an_exception_of_its_kind_with_the_problem_details(
     assert caught.value.problem is not None and caught.value.problem.state == "draft"
 
 
-def test_a_response_of_another_program_is_reported_with_the_server() -> None:
+def test_a_response_of_another_program_is_reported_with_the_server():
     with pytest.raises(ServiceProblem, match="http://ground: expected JSON of a LINNA service, found other"):
         client_of(lambda _: httpx.Response(200, text="<html>")).get_job("0" * 32)
     with pytest.raises(ServiceProblem, match="404 Not Found") as caught:
@@ -220,7 +213,7 @@ def test_a_response_of_another_program_is_reported_with_the_server() -> None:
     assert caught.value.problem is None
 
 
-def test_a_failed_job_is_an_exception_with_its_error() -> None:
+def test_a_failed_job_is_an_exception_with_its_error():
     job = {
         "id": "0" * 32, "kind": "ingest", "state": "failed", "progress": 0.0, "attempts": 1, "arguments": {},
         "result": None, "error": "no downlink", "created": "2029-08-07T00:00:00Z", "started": None, "finished": None,
@@ -246,28 +239,27 @@ def passes_of(total: int, asked: list[tuple[int, int]]) -> Callable[[httpx.Reque
     return answer
 
 
-@pytest.mark.parametrize(("total", "pages"), [(0, 1), (999, 1), (1000, 1), (1001, 2), (2500, 3)])
-def test_a_list_is_fetched_page_by_page_until_its_end(total: int, pages: int) -> None:
+@pytest.mark.parametrize("total, pages", [(0, 1), (999, 1), (1000, 1), (1001, 2), (2500, 3)])
+def test_a_list_is_fetched_page_by_page_until_its_end(total, pages):
     asked: list[tuple[int, int]] = []
     client = client_of(passes_of(total, asked))
     assert [one.id for one in client.list_passes()] == list(range(total))
     assert asked == [(1000, 1000 * number) for number in range(pages)]
 
 
-@pytest.mark.parametrize(
-    ("limit", "expected", "requests"),
+@pytest.mark.parametrize("limit, expected, requests",
     [
         (1, 1, [(1, 0)]), (0, 1, [(1, 0)]), (50, 50, [(50, 0)]), (1200, 1200, [(1000, 0), (200, 1000)]),
         (5000, 2500, [(1000, 0), (1000, 1000), (1000, 2000)]),
     ],
 )  # fmt: skip
-def test_a_page_has_as_many_items_as_asked_for(limit: int, expected: int, requests: list[tuple[int, int]]) -> None:
+def test_a_page_has_as_many_items_as_asked_for(limit, expected, requests):
     asked: list[tuple[int, int]] = []
     page = client_of(passes_of(2500, asked)).list_passes().page(limit)
     assert (len(page.items), page.total, asked) == (expected, 2500, requests)
 
 
-def test_a_list_that_shrinks_while_it_is_fetched_ends() -> None:
+def test_a_list_that_shrinks_while_it_is_fetched_ends():
     def answer(request: httpx.Request) -> httpx.Response:
         return httpx.Response(200, json={"items": [], "total": 7, "limit": 1, "offset": 0})
 
@@ -284,7 +276,7 @@ def peak_of(work: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
-def test_large_files_are_sent_and_received_in_blocks(service: Service, tmp_path: Path) -> None:
+def test_large_files_are_sent_and_received_in_blocks(service, tmp_path):
     large = tmp_path / "large"
     with large.open("wb") as stream:
         stream.truncate(64 * MIB)
@@ -297,7 +289,7 @@ def test_large_files_are_sent_and_received_in_blocks(service: Service, tmp_path:
     assert target.stat().st_size == 64 * MIB
 
 
-def test_a_download_that_breaks_leaves_no_file(tmp_path: Path, clock: Clock) -> None:
+def test_a_download_that_breaks_leaves_no_file(tmp_path, clock):
     class Broken(httpx.SyncByteStream):
         def __iter__(self) -> Iterator[bytes]:
             yield b"half"
@@ -315,7 +307,7 @@ ARGUMENTS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def test_the_operations_are_generated_from_the_routes() -> None:
+def test_the_operations_are_generated_from_the_routes():
     assert client_generator.TARGET.read_text() == client_generator.generate()
 
 
@@ -328,7 +320,7 @@ def operations_of(tmp_path: Path) -> list[Any]:
     ]
 
 
-def test_every_operation_of_the_api_has_a_method_of_its_name_with_its_path_keys_and_result(tmp_path: Path) -> None:
+def test_every_operation_of_the_api_has_a_method_of_its_name_with_its_path_keys_and_result(tmp_path):
     sent: list[httpx.Request] = []
 
     def answer(request: httpx.Request) -> httpx.Response:
@@ -370,7 +362,7 @@ def test_every_operation_of_the_api_has_a_method_of_its_name_with_its_path_keys_
         assert found is None or re.search(rf"\b{found[1]}\b", returned), path
 
 
-def test_a_client_that_is_not_closed_lets_python_end(tmp_path: Path) -> None:
+def test_a_client_that_is_not_closed_lets_python_end(tmp_path):
     script = "import linna; passes = linna.open({!r}); print(len(passes))"
     open_ground(tmp_path / "home").close()
     command = [sys.executable, "-c", script.format(str(tmp_path / "home"))]
@@ -378,16 +370,14 @@ def test_a_client_that_is_not_closed_lets_python_end(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "0\n", "")
 
 
-def test_lists_in_one_response_are_lists_of_entities(tmp_path: Path) -> None:
+def test_lists_in_one_response_are_lists_of_entities(tmp_path):
     with local_client(open_ground(tmp_path / "home"), "ann") as ground:
         ground.ingest_file(encode_cadus([event_packet(1, 0)], spacecraft_id=76))
         assert [(one.spacecraft_id, one.instance) for one in ground.list_spacecraft()] == [(76, "flight")]
         assert "oem" in [one.name for one in ground.list_export_formats()]
 
 
-def test_the_example_of_the_documentation_runs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_example_of_the_documentation_runs(tmp_path, capsys, monkeypatch):
     text = (Path(__file__).parents[2] / "docs" / "client.md").read_text()
     example = text.split("```python\n")[1].split("```")[0]
     assert len(example.strip().splitlines()) <= 15

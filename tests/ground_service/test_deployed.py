@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -178,7 +177,7 @@ def carried(downlink: bytes, service: Deployed, overlay: Overlay) -> str:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("kind", ["base", "objects", "provider"])
-def test_no_acknowledged_piece_is_lost_with_any_server_lost(kind: str, synthetic_pass: Any, tmp_path: Path) -> None:
+def test_no_acknowledged_piece_is_lost_with_any_server_lost(kind, synthetic_pass, tmp_path):
     downlink = synthetic_pass.folder / "downlink.cadu"
     with open_ground(tmp_path / "reference") as ground:
         ingest_file(ground, downlink)

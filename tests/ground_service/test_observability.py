@@ -56,7 +56,7 @@ def expressions() -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def samples(tmp_path_factory: pytest.TempPathFactory, synthetic_pass: Any) -> dict[str, set[str]]:
+def samples(tmp_path_factory, synthetic_pass):
     """Names of all samples of /metrics, with the names of their labels."""
     folder = tmp_path_factory.mktemp("observed")
     with open_ground(folder / "home") as ground:
@@ -86,7 +86,7 @@ def add_correlation(ground: Ground, vehicle: int, created_utc_ns: int) -> None:
         repository.add(connection, repository.CORRELATIONS, **line, **given)
 
 
-def test_every_metric_and_label_of_alerts_and_dashboard_exists(samples: dict[str, set[str]]) -> None:
+def test_every_metric_and_label_of_alerts_and_dashboard_exists(samples):
     for expression in expressions():
         named = set(NAME.findall(expression))
         assert named or "up{" in expression or "probe_ssl_earliest_cert_expiry{" in expression, expression
@@ -98,13 +98,13 @@ def test_every_metric_and_label_of_alerts_and_dashboard_exists(samples: dict[str
             assert labels <= set().union(*(samples[name] for name in named)), expression
 
 
-def test_every_metric_of_the_condition_is_drawn_or_has_an_alert(samples: dict[str, set[str]]) -> None:
+def test_every_metric_of_the_condition_is_drawn_or_has_an_alert(samples):
     used = {name for expression in expressions() for name in NAME.findall(expression)}
     families = {re.sub(r"_(bucket|count|sum|created|total)$", "", name) for name in samples}
     assert families == {re.sub(r"_(bucket|total)$", "", name) for name in used}
 
 
-def test_every_alert_has_a_severity_a_summary_and_an_action() -> None:
+def test_every_alert_has_a_severity_a_summary_and_an_action():
     names = [rule["alert"] for rule in alerts()]
     assert len(set(names)) == len(names) >= 10
     for rule in alerts():
@@ -112,7 +112,7 @@ def test_every_alert_has_a_severity_a_summary_and_an_action() -> None:
         assert set(rule["annotations"]) == {"summary", "action"}
 
 
-def test_the_limits_of_the_status_are_those_of_the_alerts() -> None:
+def test_the_limits_of_the_status_are_those_of_the_alerts():
     limits = {rule["alert"]: [float(word) for word in re.findall(r"[<>] ([0-9.]+)", rule["expr"])] for rule in alerts()}
     names = (
         "QueueOld QUEUE_AGE_LIMIT_S IngestLag INGEST_LAG_LIMIT_S DiskFull DISK_FREE_LIMIT BackupOld BACKUP_AGE_LIMIT_S"
@@ -143,7 +143,7 @@ correlation_ages_s | {(76, "flight"): 18e4, (76, "replay"): 1e9} | The time corr
 
 
 @pytest.mark.parametrize("name, value, said", cells(COMPLAINTS))
-def test_the_status_names_what_has_to_be_looked_after(name: str, value: str, said: str) -> None:
+def test_the_status_names_what_has_to_be_looked_after(name, value, said):
     assert condition.complaints(GOOD) == []
     assert condition.complaints(replace(GOOD, **{name: literal_eval(value)})) == [said]
     at_the_limit = {"queue_age_s": 900.0, "ingest_lag_s": 600.0, "disk_free": 10, "backup_age_s": 93_600.0}
@@ -176,12 +176,12 @@ LinnaCertificateExpires | probe_ssl_earliest_cert_expiry{job="linna-proxy"} = 11
 """Alerts with the series that let them fire, and times at which they fire and have cleared."""
 
 
-def test_prometheus_renames_no_label_of_a_metric(samples: dict[str, set[str]]) -> None:
+def test_prometheus_renames_no_label_of_a_metric(samples):
     """Its own labels `job` and `instance` replace those of a metric, so that a rule with them never fires."""
     assert not any({"job", "instance"} & labels for labels in samples.values())
 
 
-def test_the_configuration_of_prometheus_is_valid_and_has_the_jobs_of_the_alerts() -> None:
+def test_the_configuration_of_prometheus_is_valid_and_has_the_jobs_of_the_alerts():
     program = shutil.which("promtool")
     if program is None:
         pytest.skip("promtool is not installed")
@@ -255,7 +255,7 @@ def backup_tests(healthy: list[dict[str, str]]) -> Iterator[dict[str, Any]]:
         yield run_of(others + given, expectation(firing, "150m", configured))
 
 
-def test_alerts_fire_and_only_when_they_should(tmp_path: Path) -> None:
+def test_alerts_fire_and_only_when_they_should(tmp_path):
     program = shutil.which("promtool")
     if program is None:
         pytest.skip("promtool is not installed")
@@ -281,7 +281,7 @@ def test_alerts_fire_and_only_when_they_should(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_ages_of_waiting_work_and_of_correlations(either: Ground, synthetic_pass: Any) -> None:
+def test_ages_of_waiting_work_and_of_correlations(either, synthetic_pass):
     idle = read_condition(either, None)
     assert (idle.queue_age_s, idle.ingest_lag_s, idle.backup_age_s) == (0.0, 0.0, None)
     assert 0 < idle.disk_free <= idle.disk_size and idle.scheduler is None
@@ -308,7 +308,7 @@ def test_ages_of_waiting_work_and_of_correlations(either: Ground, synthetic_pass
     assert key == (76, "flight") and 4000.0 <= age_s < 5000.0
 
 
-def test_the_status_counts_jobs_of_all_kinds_by_state(either: Ground) -> None:
+def test_the_status_counts_jobs_of_all_kinds_by_state(either):
     enter_job(either, "report", {"pass_id": 1})
     run_job(either, enter_job(either, "plan", {}))
     enter_job(either, "plan", {})
@@ -318,7 +318,7 @@ def test_the_status_counts_jobs_of_all_kinds_by_state(either: Ground) -> None:
     assert seen.complaints[0] == "No process does the recurring work."
 
 
-def test_the_newest_complete_backup_counts(ground: Ground, tmp_path: Path) -> None:
+def test_the_newest_complete_backup_counts(ground, tmp_path):
     assert newest_backup_utc_ns(tmp_path / "none") is None
     assert read_condition(ground, tmp_path / "none").backup_missing
     assert not read_condition(ground, None).backup_missing
@@ -333,7 +333,7 @@ TRACE = "4bf92f3577b34da6a3ce929d0e0e4736"
 PARENT = f"00-{TRACE}-00f067aa0ba902b7-01"
 
 
-def test_a_job_that_another_process_does_later_belongs_to_the_trace(ground: Ground) -> None:
+def test_a_job_that_another_process_does_later_belongs_to_the_trace(ground):
     assert logs.current() is None
     with logs.span("request", parent=PARENT):
         job = enter_job(ground, "plan", {})
@@ -343,7 +343,7 @@ def test_a_job_that_another_process_does_later_belongs_to_the_trace(ground: Grou
     assert stored == inner != PARENT and logs.trace_id_of(stored) == TRACE
 
 
-def test_spans_of_a_request_its_job_and_its_report_are_one_tree(tmp_path: Path, synthetic_pass: Any) -> None:
+def test_spans_of_a_request_its_job_and_its_report_are_one_tree(tmp_path, synthetic_pass):
     exporter = InMemorySpanExporter()
     logs.configure(None, exporter=exporter)
     try:
@@ -363,7 +363,7 @@ def test_spans_of_a_request_its_job_and_its_report_are_one_tree(tmp_path: Path, 
     assert (job.attributes["linna.state"], report.attributes["linna.pass"]) == ("done", pass_id)
 
 
-def test_traces_without_the_library_are_refused_with_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_traces_without_the_library_are_refused_with_a_remedy(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "opentelemetry.sdk.trace", None)
     with pytest.raises(SettingsError, match="LINNA_TRACES: expected the extra 'traces'"):
         create_app(Settings(home=tmp_path, traces="http://127.0.0.1:4318/v1/traces"))

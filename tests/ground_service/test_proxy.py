@@ -78,7 +78,7 @@ def configured_proxy(folder: Path, secrets: Path, port: int, upstreams: tuple[in
 
 
 @pytest.fixture(scope="module")
-def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
+def proxied(tmp_path_factory):
     if shutil.which("nginx") is None:
         pytest.skip("nginx is not installed")
     folder = tmp_path_factory.mktemp("proxy")
@@ -114,7 +114,7 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
         service.wait(60)
 
 
-def test_the_service_is_reached_over_tls_with_hsts(proxied: Proxied) -> None:
+def test_the_service_is_reached_over_tls_with_hsts(proxied):
     with proxied.client() as client:
         answer = client.get("/api/v1/passes", headers={"Authorization": f"Bearer {proxied.token}"})
     assert answer.status_code == 200
@@ -123,12 +123,12 @@ def test_the_service_is_reached_over_tls_with_hsts(proxied: Proxied) -> None:
     assert answer.headers["x-content-type-options"] == "nosniff"
 
 
-def test_plain_http_is_sent_to_https(proxied: Proxied) -> None:
+def test_plain_http_is_sent_to_https(proxied):
     answer = httpx.get(f"http://{proxied.host}/passes?a=1")
     assert (answer.status_code, answer.headers["location"]) == (308, f"{proxied.url}/passes?a=1")
 
 
-def test_old_tls_is_refused(proxied: Proxied) -> None:
+def test_old_tls_is_refused(proxied):
     context = ssl.create_default_context(cafile=str(proxied.certificate))
     context.set_ciphers("ALL:@SECLEVEL=0")
     context.options &= ~ssl.OP_NO_TLSv1_1
@@ -139,12 +139,12 @@ def test_old_tls_is_refused(proxied: Proxied) -> None:
 
 
 @pytest.mark.parametrize("path", ["/metrics", "/healthz", "/readyz"])
-def test_metrics_and_health_are_not_passed_on(proxied: Proxied, path: str) -> None:
+def test_metrics_and_health_are_not_passed_on(proxied, path):
     with proxied.client() as client:
         assert client.get(path).status_code == 404
 
 
-def test_the_address_of_the_client_cannot_be_forged(proxied: Proxied) -> None:
+def test_the_address_of_the_client_cannot_be_forged(proxied):
     with proxied.client() as client:
         client.get("/forged", headers={"X-Forwarded-For": "203.0.113.9"})
     log = proxied.folder / "service.log"
@@ -157,7 +157,7 @@ def test_the_address_of_the_client_cannot_be_forged(proxied: Proxied) -> None:
     assert addresses() == ["127.0.0.1"]
 
 
-def test_the_cookie_of_a_session_is_for_tls_only(proxied: Proxied) -> None:
+def test_the_cookie_of_a_session_is_for_tls_only(proxied):
     with proxied.client() as client:
         answer = client.post("/api/v1/session", json={"token": proxied.token}, headers={"Origin": proxied.url})
         assert answer.status_code == 200, answer.text
@@ -165,7 +165,7 @@ def test_the_cookie_of_a_session_is_for_tls_only(proxied: Proxied) -> None:
         assert client.get("/api/v1/session").json()["name"] == "ann"
 
 
-def test_a_websocket_goes_through(proxied: Proxied) -> None:
+def test_a_websocket_goes_through(proxied):
     context = ssl.create_default_context(cafile=str(proxied.certificate))
     address = f"wss://{proxied.host}/api/v1/live"
     headers = {"Authorization": f"Bearer {proxied.token}"}
@@ -173,7 +173,7 @@ def test_a_websocket_goes_through(proxied: Proxied) -> None:
         assert opened.response is not None and opened.response.status_code == 101
 
 
-def test_a_flood_is_limited_before_the_service_but_not_others_of_its_address(proxied: Proxied, tmp_path: Path) -> None:
+def test_a_flood_is_limited_before_the_service_but_not_others_of_its_address(proxied, tmp_path):
     """With smaller figures than the shipped ones: 1 + 5 requests pass, the others are refused by the proxy."""
     port = free_port()
     text = (proxied.folder / "nginx.conf").read_text()
@@ -197,9 +197,7 @@ def test_a_flood_is_limited_before_the_service_but_not_others_of_its_address(pro
     assert all(answer.headers["strict-transport-security"] for answer in answers)
 
 
-def test_a_renewed_certificate_is_served_after_a_reload_and_clients_stay_connected(
-    proxied: Proxied, tmp_path: Path
-) -> None:
+def test_a_renewed_certificate_is_served_after_a_reload_and_clients_stay_connected(proxied, tmp_path):
     tls = proxied.certificate.parent
     before = ssl.get_server_certificate(("localhost", int(proxied.host.split(":")[1])))
     assert before.strip() == proxied.certificate.read_text().strip()

@@ -6,7 +6,6 @@ import socket
 import threading
 import zlib
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ import pytest
 
 from ground_service.evaluation.core import summary_of
 from ground_service.evaluation.service import evaluate
-from ground_service.ground import Ground
 from ground_service.passes.archive_import import import_archive
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
@@ -114,14 +112,14 @@ def of_kind(name: str, packets: list[bytes]) -> dict[int, dict[str, Any]]:
 
 
 @pytest.fixture(scope="module")
-def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def archive(tmp_path_factory):
     folder = tmp_path_factory.mktemp("ways") / "archive"
     emulate(parse_scenario(SCENARIO), NO_DATA, folder, frames_kept=None)
     return folder
 
 
 @pytest.fixture(scope="module")
-def ways(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[bytes]]:
+def ways(archive, tmp_path_factory):
     """Return the packets of each way."""
     world = build_world(parse_scenario(SCENARIO), NO_DATA)
     loaded, _, _ = load_scenario_payload(world, NO_DATA)
@@ -135,7 +133,7 @@ def ways(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, l
     }
 
 
-def test_a_live_flight_and_a_replay_give_the_packets_of_the_archive(ways: dict[str, list[bytes]]) -> None:
+def test_a_live_flight_and_a_replay_give_the_packets_of_the_archive(ways):
     packets, again = ways["archive"], ways["replay"]
     assert len(of_kind("detections", packets)) == FRAMES
     assert ways["live"] == packets
@@ -146,9 +144,7 @@ def test_a_live_flight_and_a_replay_give_the_packets_of_the_archive(ways: dict[s
     assert len(other) < len(packets) / 4
 
 
-def test_every_way_has_the_same_figures_in_its_report(
-    archive: Path, ways: dict[str, list[bytes]], either: Ground, tmp_path: Path
-) -> None:
+def test_every_way_has_the_same_figures_in_its_report(archive, ways, either, tmp_path):
     figures = {}
     for name, packets in ways.items():
         folder = tmp_path / name
@@ -185,7 +181,7 @@ def commanded(scenario: Scenario, start_utc_ns: int, frames: int) -> tuple[LiveS
     return session, flown(session, telecommands)
 
 
-def test_a_window_commanded_by_the_ground_gives_the_images_and_detections_of_the_archive(archive: Path) -> None:
+def test_a_window_commanded_by_the_ground_gives_the_images_and_detections_of_the_archive(archive):
     scenario = parse_scenario(SCENARIO)
     first = int(build_world(scenario, NO_DATA).frame_utc_ns[0])
     session, packets = commanded(scenario, first, FRAMES)
@@ -205,7 +201,7 @@ def test_a_window_commanded_by_the_ground_gives_the_images_and_detections_of_the
     assert found == archived
 
 
-def test_ground_that_cannot_be_rendered_gives_no_image_and_the_flight_goes_on() -> None:
+def test_ground_that_cannot_be_rendered_gives_no_image_and_the_flight_goes_on():
     """Frames across the pole, for which terrain has no tiles."""
     small = SCENARIO.replace("256", "32")
     world = open_world(parse_scenario(small), NO_DATA)

@@ -5,7 +5,6 @@ import hmac
 import json
 import re
 import time
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
@@ -30,7 +29,7 @@ ROLES = ("admin=linna-admins", "operator=linna-operators", "viewer=linna-viewers
 
 
 @pytest.fixture
-def provider() -> Iterator[OpenIdProvider]:
+def provider():
     with running_provider() as running:
         yield running
 
@@ -43,7 +42,7 @@ def settings(home: Path, provider: OpenIdProvider, **given: object) -> Settings:
 
 
 @pytest.fixture
-def client(tmp_path: Path, provider: OpenIdProvider) -> Iterator[TestClient]:
+def client(tmp_path, provider):
     app = create_app(settings(tmp_path, provider), inline_jobs=True)
     with TestClient(app, follow_redirects=False) as opened:
         yield opened
@@ -438,7 +437,7 @@ def test_the_page_offers_the_provider_only_where_there_is_one(client, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "word"),
+    "given, word",
     [
         ({"oidc_client_id": None}, "LINNA_OIDC_CLIENT_ID: expected the name"),
         ({"oidc_roles": ()}, "LINNA_OIDC_ROLES: expected entries"),
@@ -451,7 +450,7 @@ def test_incomplete_settings_are_refused_at_the_start(tmp_path, provider, given,
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "word"),
+    "name, value, word",
     [
         ("OIDC_ISSUER", "http://login.example.org", "expected an https address"),
         ("OIDC_ISSUER", "login", "expected the address"),

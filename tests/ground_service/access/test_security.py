@@ -26,18 +26,18 @@ def bearer(token: str) -> HTTPAuthorizationCredentials:
     return HTTPAuthorizationCredentials(scheme="Bearer", credentials=token)
 
 
-def test_without_users_an_open_service_has_a_local_caller_who_may_do_everything(ground: Ground) -> None:
+def test_without_users_an_open_service_has_a_local_caller_who_may_do_everything(ground):
     asked = request(ground, True)
     assert caller_of(asked, None) == LOCAL_CALLER == Caller("local", "admin", None)
     assert vars(asked.state) == {"caller": "local"}
 
 
-def test_a_service_that_others_reach_is_closed_even_without_users(ground: Ground) -> None:
+def test_a_service_that_others_reach_is_closed_even_without_users(ground):
     with pytest.raises(NotAuthorised, match="expected a bearer token in the Authorization header, found none"):
         caller_of(request(ground, False), None)
 
 
-def test_the_first_user_closes_an_open_service_even_once_disabled(ground: Ground) -> None:
+def test_the_first_user_closes_an_open_service_even_once_disabled(ground):
     add_user(ground, "ann", "viewer")
     change_user(ground, "ann", state="disabled")
     asked = request(ground, True)
@@ -47,7 +47,7 @@ def test_the_first_user_closes_an_open_service_even_once_disabled(ground: Ground
 
 
 @pytest.mark.parametrize("open_without_users", [True, False])
-def test_a_token_names_its_caller_whatever_the_service_is_open_to(ground: Ground, open_without_users: bool) -> None:
+def test_a_token_names_its_caller_whatever_the_service_is_open_to(ground, open_without_users):
     token = add_user(ground, "ann", "operator")
     asked = request(ground, open_without_users)
     caller = caller_of(asked, bearer(token))
@@ -61,7 +61,7 @@ def test_a_token_names_its_caller_whatever_the_service_is_open_to(ground: Ground
 
 @pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("needed", ROLES)
-def test_a_role_may_do_what_those_below_it_may(role: str, needed: str) -> None:
+def test_a_role_may_do_what_those_below_it_may(role, needed):
     caller = Caller("ann", role)
     allowed = ROLES.index(role) >= ROLES.index(needed)
     assert caller.may(needed) is allowed
@@ -73,6 +73,6 @@ def test_a_role_may_do_what_those_below_it_may(role: str, needed: str) -> None:
             asyncio.run(check(NO_REQUEST, caller))
 
 
-def test_a_role_that_does_not_exist_allows_nothing() -> None:
+def test_a_role_that_does_not_exist_allows_nothing():
     with pytest.raises(ValueError, match="not in tuple"):
         Caller("ann", "admin").may("root")

@@ -2,7 +2,7 @@
 document, always a status that the description names."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -39,7 +39,7 @@ OCTETS = (
 
 
 @pytest.fixture(scope="module")
-def client(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+def client(synthetic_pass, tmp_path_factory):
     """A service with one of everything; errors are answered, not raised, as they are in operation."""
     settings = Settings(home=tmp_path_factory.mktemp("nasty"), upload_limit_mib=1)
     with TestClient(create_app(settings, inline_jobs=True), raise_server_exceptions=False) as opened:
@@ -63,7 +63,7 @@ def checked(client: TestClient, method: str, path: str, operation: Any, **reques
 
 
 @pytest.mark.parametrize("every", [20, pytest.param(1, marks=pytest.mark.campaign)])
-def test_no_request_makes_the_server_fail(client: TestClient, every: int) -> None:
+def test_no_request_makes_the_server_fail(client, every):
     """Each parameter and body is asked with one of `every` values, the next one with other values."""
     document = client.get("/api/v1/openapi.json").json()
     asked = 0

@@ -38,7 +38,7 @@ JSON = {"Content-Type": "application/json"}
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+def client(tmp_path_factory):
     """An empty service."""
     settings = Settings(home=tmp_path_factory.mktemp("requests"))
     with TestClient(create_app(settings, inline_jobs=True), raise_server_exceptions=False) as opened:
@@ -52,56 +52,54 @@ def detail(answer: Any, status: int) -> str:
 
 
 @pytest.mark.parametrize("query", ["kind=%00", "kind=a%0Ab", "kind=%1b[31m", "kind=%7f", "kind=%C2%85", "%00=1"])
-def test_control_characters_in_a_query_are_refused(client: TestClient, query: str) -> None:
+def test_control_characters_in_a_query_are_refused(client, query):
     assert detail(client.get(f"{V1}/jobs?{query}"), 422).startswith("query: expected no control characters")
 
 
-def test_control_characters_in_a_path_are_refused(client: TestClient) -> None:
+def test_control_characters_in_a_path_are_refused(client):
     assert detail(client.get(f"{V1}/passes/1/telemetry/a%00b"), 422).startswith("path: expected no control")
 
 
-@pytest.mark.parametrize(
-    ("query", "words"),
+@pytest.mark.parametrize("query, words",
     [
         ("limti=5", "expected 'limit', found 'limti'"), ("kinds=report", "expected 'kind', found 'kinds'"),
         ("x=1", "expected one of kind, limit, offset, found 'x'"), ("limit=5&__=", "found '__'"),
     ],
 )  # fmt: skip
-def test_an_unknown_query_key_is_refused_with_the_nearest_known(client: TestClient, query: str, words: str) -> None:
+def test_an_unknown_query_key_is_refused_with_the_nearest_known(client, query, words):
     assert words in detail(client.get(f"{V1}/jobs?{query}"), 422)
 
 
 @pytest.mark.parametrize(
-    ("path", "words"),
+    "path, words",
     [
         ("/jobs?limit=5&limit=6", "query: expected 'limit' once, found it 2 times"),
         ("/jobs?limit=5&kind=a&limit=5&limit=5", "query: expected 'limit' once, found it 3 times"),
         ("/passes/1/states?value=mode&max_points=5&max_points=5", "query: expected 'max_points' once"),
     ],
 )
-def test_a_query_key_with_one_value_is_taken_once(client: TestClient, path: str, words: str) -> None:
+def test_a_query_key_with_one_value_is_taken_once(client, path, words):
     assert words in detail(client.get(V1 + path), 422)
 
 
-def test_a_query_key_with_a_list_of_values_is_taken_several_times(client: TestClient) -> None:
+def test_a_query_key_with_a_list_of_values_is_taken_several_times(client):
     answer = client.get(f"{V1}/passes/1/states?value=nis&value=matched")
     assert "once" not in detail(answer, 404)
 
 
 @pytest.mark.parametrize("path", ["live?afer=1", "live?after=1&after=2", "payload?after=1"])
-def test_a_websocket_refuses_query_keys_it_does_not_know(client: TestClient, path: str) -> None:
+def test_a_websocket_refuses_query_keys_it_does_not_know(client, path):
     with pytest.raises(WebSocketDenialResponse) as refusal, client.websocket_connect(f"{V1}/{path}"):
         pass
     assert "expected" in detail(refusal.value, 422)
 
 
-def test_known_query_keys_are_taken(client: TestClient) -> None:
+def test_known_query_keys_are_taken(client):
     assert client.get(f"{V1}/jobs?kind=report&limit=5&offset=0").status_code == 200
     assert "expected one of none" in detail(client.get(f"{V1}/links?limit=1"), 422)
 
 
-@pytest.mark.parametrize(
-    ("body", "words"),
+@pytest.mark.parametrize("body, words",
     [
         (b'{"name": "x", "cadence_s": NaN}', "found NaN"),
         (b'{"name": "x", "cadence_s": -Infinity}', "found -Infinity"),
@@ -110,12 +108,12 @@ def test_known_query_keys_are_taken(client: TestClient) -> None:
         (b'{"name": "x", "name": "y"}', "found a duplicate"),
     ],
 )  # fmt: skip
-def test_json_with_no_or_two_meanings_is_refused(client: TestClient, body: bytes, words: str) -> None:
+def test_json_with_no_or_two_meanings_is_refused(client, body, words):
     for path in ("/windows", "/telecommands", "/passes", "/requests"):
         assert words in detail(client.post(f"{V1}{path}", content=body, headers=JSON), 422)
 
 
-def test_ordinary_json_is_read_as_it_stands() -> None:
+def test_ordinary_json_is_read_as_it_stands():
     assert parse_json(b'{"a": [1, 2.5, "\\u00e4\\ud83d\\ude00 \\\\u0000", null, true]}') == {
         "a": [1, 2.5, "ä😀 \\u0000", None, True]
     }
@@ -131,7 +129,7 @@ def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
             yield from models_in(field.annotation)
 
 
-def test_no_request_model_takes_a_value_of_one_type_for_another(client: TestClient) -> None:
+def test_no_request_model_takes_a_value_of_one_type_for_another(client):
     routes = client.app.state.operations
     bodies = [body for route in routes if isinstance(route, APIRoute) for body in route.dependant.body_params]
     models = {model for body in bodies for model in models_in(body.field_info.annotation)}
@@ -141,12 +139,10 @@ def test_no_request_model_takes_a_value_of_one_type_for_another(client: TestClie
 
 
 @pytest.mark.parametrize(
-    ("method", "path", "allowed"),
+    "method, path, allowed",
     [("DELETE", "/passes", "GET, POST"), ("PUT", "/windows/1", "DELETE, GET, PATCH"), ("GET", "/uplink", "POST")],
 )
-def test_a_method_that_is_not_allowed_is_answered_with_those_that_are(
-    client: TestClient, method: str, path: str, allowed: str
-) -> None:
+def test_a_method_that_is_not_allowed_is_answered_with_those_that_are(client, method, path, allowed):
     answer = client.request(method, V1 + path)
     assert detail(answer, 405)
     assert answer.headers["Allow"] == allowed
@@ -161,9 +157,7 @@ def test_a_method_that_is_not_allowed_is_answered_with_those_that_are(
         FileDamaged(Path("/var/lib/linna/files/ab/abcd"), "ab", "cd"),
     ],
 )
-def test_errors_of_the_store_name_no_place_and_carry_the_id_of_the_log_entry(
-    client: TestClient, error: Exception, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_errors_of_the_store_name_no_place_and_carry_the_id_of_the_log_entry(client, error, monkeypatch, caplog):
     def fail(*_: Any, **__: Any) -> Any:
         raise error
 
@@ -176,7 +170,7 @@ def test_errors_of_the_store_name_no_place_and_carry_the_id_of_the_log_entry(
     assert str(error) in caplog.text
 
 
-def test_the_home_and_its_files_are_the_owners_alone(tmp_path: Path) -> None:
+def test_the_home_and_its_files_are_the_owners_alone(tmp_path):
     home = tmp_path / "home"
     home.mkdir()
     home.chmod(0o755)
@@ -229,7 +223,7 @@ class Bodies:
         return parts, asyncio.create_task(run())
 
 
-def test_bodies_of_all_requests_together_are_held_within_one_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bodies_of_all_requests_together_are_held_within_one_budget(monkeypatch):
     monkeypatch.setattr(limits, "HELD_LIMIT_OCTETS", 1000)
 
     async def test() -> None:
@@ -256,7 +250,7 @@ def test_bodies_of_all_requests_together_are_held_within_one_budget(monkeypatch:
         pool.submit(asyncio.run, test()).result()
 
 
-def test_a_log_entry_is_one_json_object_with_what_was_passed() -> None:
+def test_a_log_entry_is_one_json_object_with_what_was_passed():
     try:
         raise ValueError("broken")
     except ValueError:
@@ -276,7 +270,7 @@ def test_a_log_entry_is_one_json_object_with_what_was_passed() -> None:
 
 
 @pytest.mark.parametrize("style", ["text", "json"])
-def test_what_a_client_sent_makes_neither_a_line_nor_a_terminal_sequence(style: str) -> None:
+def test_what_a_client_sent_makes_neither_a_line_nor_a_terminal_sequence(style):
     """A path is decoded before it is logged: `GET /%0a2026-01-01 INFO forged`."""
     configuration = logging.config.DictConfigurator(logging_config(style))
     formatter = configuration.configure_formatter(configuration.config["formatters"]["line"])
@@ -290,6 +284,6 @@ def test_what_a_client_sent_makes_neither_a_line_nor_a_terminal_sequence(style: 
     assert not any(line.startswith("2026-01-01 INFO forged") for line in lines[:-1])
 
 
-def test_addresses_of_webhooks_are_not_logged() -> None:
+def test_addresses_of_webhooks_are_not_logged():
     """The HTTP client logs the address of each request at the level INFO."""
     assert logging_config("json")["loggers"]["httpx"]["level"] == "WARNING"

@@ -3,7 +3,7 @@ answer is one that the schema tells of."""
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import pytest
@@ -62,9 +62,7 @@ class Queue:
 
 
 @pytest.fixture(scope="module", params=["sqlite", pytest.param("postgresql", marks=pytest.mark.campaign)])
-def client(
-    request: pytest.FixtureRequest, synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[TestClient]:
+def client(request, synthetic_pass, tmp_path_factory):
     deployment = Settings(home=tmp_path_factory.mktemp("fuzz"))
     if request.param == "postgresql":
         url = request.getfixturevalue("migrated_postgres")()
@@ -77,7 +75,7 @@ def client(
 
 
 @pytest.mark.parametrize("mode", [GenerationMode.POSITIVE, GenerationMode.NEGATIVE])
-def test_every_operation_answers_as_its_schema_says(client: TestClient, mode: GenerationMode) -> None:
+def test_every_operation_answers_as_its_schema_says(client, mode):
     document = client.get(f"{V1}/openapi.json").json()
     schema = schemathesis.openapi.from_dict(document)
     asked = set()

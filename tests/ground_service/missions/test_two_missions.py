@@ -2,7 +2,6 @@
 Links and resources of a mission description: valid ones, and one clear line for each fault.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +71,7 @@ median_error_m = 100
 
 
 @pytest.fixture(scope="module")
-def made(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
+def made(make_pass):
     return make_pass(frames=24, seed=2)
 
 
@@ -90,9 +89,7 @@ def row(ground: Ground, table: Any, **equal: Any) -> dict[str, Any]:
     return found
 
 
-def test_every_pass_is_judged_by_the_description_of_its_spacecraft(
-    either: Ground, made: SyntheticPass, tmp_path: Path
-) -> None:
+def test_every_pass_is_judged_by_the_description_of_its_spacecraft(either, made, tmp_path):
     missions = {76: add_mission(either, WIDE.encode()), 77: add_mission(either, NARROW.encode())}
     add_reference(either, made.folder / "reference.oem")
     passes = {spacecraft: flown(either, made, spacecraft, tmp_path) for spacecraft in missions}
@@ -112,9 +109,7 @@ def test_every_pass_is_judged_by_the_description_of_its_spacecraft(
         assert [one.limit for one in report.requirements if one.key == "accuracy.median"] == [limit]
 
 
-def test_windows_and_telecommands_reference_the_description_of_their_spacecraft(
-    ground: Ground, made: SyntheticPass
-) -> None:
+def test_windows_and_telecommands_reference_the_description_of_their_spacecraft(ground, made):
     missions = {76: add_mission(ground, WIDE.encode()), 77: add_mission(ground, NARROW.encode())}
     add_reference(ground, made.folder / "reference.oem")
     for spacecraft, mission in missions.items():
@@ -128,9 +123,7 @@ def test_windows_and_telecommands_reference_the_description_of_their_spacecraft(
     assert row(ground, repository.WINDOWS, id=window.id)["mission_id"] == newer.id
 
 
-def test_a_window_is_predicted_with_the_camera_of_its_spacecraft(
-    ground: Ground, made: SyntheticPass, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_window_is_predicted_with_the_camera_of_its_spacecraft(ground, made, monkeypatch):
     add_mission(ground, WIDE.encode())
     add_mission(ground, NARROW.encode())
     add_reference(ground, made.folder / "reference.oem")
@@ -146,8 +139,8 @@ def test_a_window_is_predicted_with_the_camera_of_its_spacecraft(
 
 
 def test_only_the_spacecraft_whose_description_permits_it_is_correlated_automatically(
-    ground: Ground, made: SyntheticPass, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    ground, made, tmp_path, monkeypatch
+):
     fitted: list[int] = []
 
     def reports(_ground: Ground, _connection: Any, vehicle: int) -> Any:
@@ -181,7 +174,7 @@ def text(*parts: str, number: int = 76) -> str:
     return HEAD.format(id=number) + "\n".join(parts)
 
 
-def test_links_are_read_with_their_defaults_and_written_again() -> None:
+def test_links_are_read_with_their_defaults_and_written_again():
     mission = parse_mission(text(LINK))
     assert mission.links is not None
     link = mission.links[0]
@@ -190,14 +183,14 @@ def test_links_are_read_with_their_defaults_and_written_again() -> None:
     assert again == mission and again.revision == mission.revision
 
 
-def test_a_description_without_links_keeps_its_revision() -> None:
+def test_a_description_without_links_keeps_its_revision():
     plain = parse_mission(text())
     assert plain.links is None
     assert plain.revision == parse_mission(text("[resources]")).revision
 
 
 @pytest.mark.parametrize(
-    ("parts", "place", "expected"),
+    "parts, place, expected",
     [
         ((LINK.replace("10015", "99999"),), "links.0", "downlink as HOST:PORT, found '127.0.0.1:99999'"),
         ((LINK.replace("downlink", "downlnk"),), "links.0.downlnk", "'downlink'"),
@@ -209,19 +202,19 @@ def test_a_description_without_links_keeps_its_revision() -> None:
         (("[resources]\nobserve_hours_per_day = 25.0",), "resources.observe_hours_per_day", "24"),
     ],
 )
-def test_a_fault_is_one_line_with_its_place(parts: tuple[str, ...], place: str, expected: str) -> None:
+def test_a_fault_is_one_line_with_its_place(parts, place, expected):
     with pytest.raises(InvalidInput) as refused:
         parse_mission(text(*parts), "mission.toml")
     message = str(refused.value)
     assert place in message and expected in message and "\n" not in message
 
 
-def test_links_need_a_spacecraft() -> None:
+def test_links_need_a_spacecraft():
     with pytest.raises(InvalidInput, match="a spacecraft id with links, found none"):
         parse_mission('name = "x"\n' + LINK)
 
 
-def test_two_spacecraft_cannot_use_the_same_link_name(ground: Ground) -> None:
+def test_two_spacecraft_cannot_use_the_same_link_name(ground):
     add_mission(ground, text(LINK).encode())
     with pytest.raises(InvalidInput, match="'lab' of spacecraft 76"):
         add_mission(ground, text(LINK, number=77).encode())

@@ -5,8 +5,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,7 +13,6 @@ from sqlalchemy.exc import DBAPIError
 
 from ground_service.access.service import add_user
 from ground_service.errors import AuditBroken, GroundError
-from ground_service.ground import Ground
 from ground_service.store import audit
 from ground_service.store.database import Database, prepare_database
 from ground_service.store.models import AUDIT
@@ -51,7 +48,7 @@ def without_guards(database: Database, statement: str) -> None:
         connection.exec_driver_sql(statement)
 
 
-def test_an_entry_is_bound_to_the_one_before_by_a_hash_that_anybody_can_compute(database: Database) -> None:
+def test_an_entry_is_bound_to_the_one_before_by_a_hash_that_anybody_can_compute(database):
     add(database, "first", "second", detail={"b": 1.5, "a": [None, "ü"]})
     found = "0" * 64
     for number, action in enumerate(("first", "second"), 1):
@@ -61,7 +58,7 @@ def test_an_entry_is_bound_to_the_one_before_by_a_hash_that_anybody_can_compute(
     assert broken(database) == []
 
 
-def test_what_is_undone_leaves_no_entry(database: Database) -> None:
+def test_what_is_undone_leaves_no_entry(database):
     with pytest.raises(RuntimeError), database.writing() as connection:
         audit.add_note(connection, audit.Note(5, "ann", "look", "", {}))
         raise RuntimeError
@@ -70,13 +67,13 @@ def test_what_is_undone_leaves_no_entry(database: Database) -> None:
         audit.add_note(connection, audit.Note(5, "ann", "look", "", {}))
 
 
-def test_numbers_that_are_not_finite_and_keys_that_are_no_text_are_kept_as_text(database: Database) -> None:
+def test_numbers_that_are_not_finite_and_keys_that_are_no_text_are_kept_as_text(database):
     add(database, "look", detail={"value": float("nan"), "items": {1: float("inf")}})
     assert broken(database) == []
 
 
 @pytest.mark.parametrize("statement", ["UPDATE audit SET actor = 'bob'", "DELETE FROM audit WHERE id = 1"])
-def test_the_database_refuses_to_change_the_log(database: Database, statement: str) -> None:
+def test_the_database_refuses_to_change_the_log(database, statement):
     add(database, "first")
     with pytest.raises(GroundError, match="audit entries cannot be changed or removed"), database.writing() as one:
         one.execute(text(statement))
@@ -104,7 +101,7 @@ DELETE FROM audit_head | the head of the chain is missing
 
 
 @pytest.mark.parametrize("statement, reason", cells(DAMAGE))
-def test_every_change_of_the_log_is_found(tmp_path: Path, statement: str, reason: str) -> None:
+def test_every_change_of_the_log_is_found(tmp_path, statement, reason):
     database = prepare_database(f"sqlite:///{tmp_path / 'linna.db'}")
     add(database, "first", "second", "third")
     without_guards(database, statement)
@@ -115,7 +112,7 @@ def test_every_change_of_the_log_is_found(tmp_path: Path, statement: str, reason
     database.engine.dispose()
 
 
-def test_entries_that_are_put_in_are_found(database: Database) -> None:
+def test_entries_that_are_put_in_are_found(database):
     add(database, "first")
     row = {
         "id": 2, "utc_ns": 5, "actor": "eve", "action": "a", "target": "", "detail": {},
@@ -126,7 +123,7 @@ def test_entries_that_are_put_in_are_found(database: Database) -> None:
     assert {one.number for one in broken(database)} == {1, 2}
 
 
-def test_without_its_head_the_log_takes_no_entry_and_nothing_is_stored(database: Database) -> None:
+def test_without_its_head_the_log_takes_no_entry_and_nothing_is_stored(database):
     add(database, "first")
     without_guards(database, "DELETE FROM audit_head")
     with pytest.raises(AuditBroken), database.writing() as connection:
@@ -136,7 +133,7 @@ def test_without_its_head_the_log_takes_no_entry_and_nothing_is_stored(database:
         assert connection.execute(text("SELECT count(*) FROM vehicles")).scalar_one() == 0
 
 
-def test_a_failed_statement_of_the_database_is_told_as_one(database: Database) -> None:
+def test_a_failed_statement_of_the_database_is_told_as_one(database):
     with pytest.raises(GroundError) as caught, database.writing() as connection:
         connection.execute(text("INSERT INTO nothing VALUES (1)"))
     assert isinstance(caught.value.__cause__, DBAPIError)
@@ -156,7 +153,7 @@ for k in range(int(sys.argv[3])):
 """
 
 
-def test_several_processes_at_once_make_one_chain(database: Database) -> None:
+def test_several_processes_at_once_make_one_chain(database):
     with database.writing() as connection:
         for key in (1, 2, 3):
             connection.execute(
@@ -180,7 +177,7 @@ def test_several_processes_at_once_make_one_chain(database: Database) -> None:
         assert all(b[2] == a[2] + 1 for a, b in zip(mine[::2], mine[1::2], strict=True))
 
 
-def test_the_lock_is_only_held_at_the_end(migrated_postgres: Callable[[], str]) -> None:
+def test_the_lock_is_only_held_at_the_end(migrated_postgres):
     """A long transaction with an audit entry does not keep another from being committed."""
     database = prepare_database(migrated_postgres())
     with database.writing() as long:
@@ -195,9 +192,7 @@ def test_the_lock_is_only_held_at_the_end(migrated_postgres: Callable[[], str]) 
     database.engine.dispose()
 
 
-def test_a_chain_that_was_cut_is_found_by_the_heads_of_another_machine(
-    ground: Ground, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_chain_that_was_cut_is_found_by_the_heads_of_another_machine(ground, tmp_path, capsys):
     """Triggers that were made again hide the cut from everything inside the database."""
     (ground.home / "secrets").mkdir()
     (ground.home / "secrets/audit").write_text("key")

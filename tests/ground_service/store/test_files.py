@@ -10,21 +10,19 @@ from typing import Any
 import pytest
 from sqlalchemy import text
 
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.store.files import FileArchive, make_durable_folder, replace_durably
 
 
 @pytest.fixture
-def ended_process() -> int:
+def ended_process():
     """Return the id of a process that has ended."""
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     return process.pid
 
 
-def test_octets_name_and_folders_are_synchronised_before_the_file_is_stored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_octets_name_and_folders_are_synchronised_before_the_file_is_stored(tmp_path, monkeypatch):
     operations: list[str] = []
     replace, fsync = os.replace, os.fsync
 
@@ -43,9 +41,7 @@ def test_octets_name_and_folders_are_synchronised_before_the_file_is_stored(
     assert operations == [".", "home", "octets", "replace", f"home/files/{stored.sha256[:2]}", "home/files"]
 
 
-def test_a_file_that_another_process_stored_is_synchronised_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_another_process_stored_is_synchronised_too(tmp_path, monkeypatch):
     files = FileArchive(tmp_path)
     files.put_octets(b"telemetry")
     monkeypatch.setattr("ground_service.store.files._durable", set())  # as in another process
@@ -59,7 +55,7 @@ def test_a_file_that_another_process_stored_is_synchronised_too(
     assert synchronised[-1] == str(stored.path.parent)
 
 
-def test_leftovers_of_ended_processes_are_removed_at_the_start(tmp_path: Path, ended_process: int) -> None:
+def test_leftovers_of_ended_processes_are_removed_at_the_start(tmp_path, ended_process):
     files = FileArchive(tmp_path / "files")
 
     def interrupted() -> Iterator[bytes]:
@@ -97,7 +93,7 @@ def test_leftovers_of_ended_processes_are_removed_at_the_start(tmp_path: Path, e
     assert folders == [name.replace("incoming", "unpacking") for name in left]
 
 
-def test_a_folder_is_whole_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_is_whole_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
     (tmp_path / "partial" / "files").mkdir(parents=True)
     (tmp_path / "partial" / "files" / "a").write_bytes(b"a")
     (tmp_path / "partial" / "list").write_bytes(b"list")
@@ -113,12 +109,12 @@ def test_a_folder_is_whole_on_the_disk_before_it_has_its_name(tmp_path: Path, mo
     assert (tmp_path / "backup" / "files" / "a").read_bytes() == b"a"
 
 
-def test_commits_to_sqlite_are_synchronised(ground: Ground) -> None:
+def test_commits_to_sqlite_are_synchronised(ground):
     with ground.database.reading() as connection:
         assert connection.execute(text("PRAGMA synchronous")).scalar() == 2  # FULL
 
 
-def test_folders_are_made_once(tmp_path: Path) -> None:
+def test_folders_are_made_once(tmp_path):
     make_durable_folder(tmp_path / "a" / "b")
     make_durable_folder(tmp_path / "a" / "b")
     assert (tmp_path / "a" / "b").is_dir()

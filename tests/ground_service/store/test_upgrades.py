@@ -37,7 +37,7 @@ Migrations = Callable[..., None]
 
 
 @pytest.fixture
-def migrations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Migrations:
+def migrations(tmp_path, monkeypatch):
     """A function that makes this version one with a further migration."""
     folder = tmp_path / "migrations"
     shutil.copytree(migrations_folder(), folder)
@@ -75,14 +75,12 @@ def changes_of(folder: Path, migrations: Migrations, *statements: str) -> list[s
         'op.create_index("ix_users_expires", "users", ["role"])',
     ],
 )
-def test_an_expansion_keeps_the_version_before_it_working(
-    tmp_path: Path, migrations: Migrations, statement: str
-) -> None:
+def test_an_expansion_keeps_the_version_before_it_working(tmp_path, migrations, statement):
     assert changes_of(tmp_path, migrations, statement) == []
 
 
 @pytest.mark.parametrize(
-    ("statement", "fault"),
+    "statement, fault",
     [
         ('op.drop_table("leases")', "leases: removed"),
         ('op.drop_column("leases", "owner")', "leases.owner: removed"),
@@ -91,14 +89,12 @@ def test_an_expansion_keeps_the_version_before_it_working(
         ('with op.batch_alter_table("users") as b: b.alter_column("role", type_=sa.Integer())', "users.role: VARCHAR"),
     ],
 )
-def test_a_change_that_breaks_the_version_before_it_is_named(
-    tmp_path: Path, migrations: Migrations, statement: str, fault: str | None
-) -> None:
+def test_a_change_that_breaks_the_version_before_it_is_named(tmp_path, migrations, statement, fault):
     found = changes_of(tmp_path, migrations, statement)
     assert found == [] if fault is None else found[0].startswith(fault)
 
 
-def test_every_shipped_expansion_follows_the_rule(tmp_path: Path) -> None:
+def test_every_shipped_expansion_follows_the_rule(tmp_path):
     oldest_first = known_revisions()[::-1]
     assert oldest_first[0] == "1.0"
     database = open_database(f"sqlite:///{tmp_path / 'one.db'}")
@@ -111,9 +107,7 @@ def test_every_shipped_expansion_follows_the_rule(tmp_path: Path) -> None:
         assert found == [], f"{revision}: {RULE}"
 
 
-def test_a_program_works_with_an_expanded_schema_and_with_no_other_newer_one(
-    tmp_path: Path, migrations: Migrations, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_program_works_with_an_expanded_schema_and_with_no_other_newer_one(tmp_path, migrations, monkeypatch):
     url = f"sqlite:///{tmp_path / 'one.db'}"
     shipped = migrations_folder()
     migrations(EXPANSION, ADD)
@@ -145,9 +139,7 @@ def of_version_1(database: Database) -> None:
 
 
 @pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
-def test_a_database_of_version_1_0_is_upgraded(
-    tmp_path: Path, new_postgres_database: Callable[[], str], kind: str
-) -> None:
+def test_a_database_of_version_1_0_is_upgraded(tmp_path, new_postgres_database, kind):
     url = f"sqlite:///{tmp_path / 'linna.db'}" if kind == "sqlite" else new_postgres_database()
     old, made = open_database(url), open_database(f"sqlite:///{tmp_path / 'made.db'}")
     if kind == "postgresql":
@@ -169,9 +161,7 @@ def test_a_database_of_version_1_0_is_upgraded(
 
 
 @pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
-def test_a_snapshot_of_the_schema_makes_the_tables_of_this_version(
-    tmp_path: Path, new_postgres_database: Callable[[], str], kind: str
-) -> None:
+def test_a_snapshot_of_the_schema_makes_the_tables_of_this_version(tmp_path, new_postgres_database, kind):
     found, made = (
         open_database(f"sqlite:///{tmp_path / name}" if kind == "sqlite" else new_postgres_database())
         for name in ("found", "made")
@@ -187,9 +177,7 @@ def test_a_snapshot_of_the_schema_makes_the_tables_of_this_version(
         database.engine.dispose()
 
 
-def test_a_migration_gives_way_to_requests_that_hold_locks(
-    new_postgres_database: Callable[[], str], tmp_path: Path, migrations: Migrations
-) -> None:
+def test_a_migration_gives_way_to_requests_that_hold_locks(new_postgres_database, tmp_path, migrations):
     url = new_postgres_database()
     prepare_database(url, upgrade=True).engine.dispose()
     with open_ground(tmp_path / "home", database_url=url) as ground:

@@ -149,7 +149,7 @@ def live_frame(number: int) -> dict[str, object]:
 
 
 @pytest.fixture
-def live_frames() -> list[dict[str, object]]:
+def live_frames():
     """Five frames of a live payload."""
     return [live_frame(number) for number in range(5)]
 
@@ -196,7 +196,7 @@ class Service:
 
 
 @pytest.fixture(scope="session")
-def console() -> Iterator[Console]:
+def console():
     """A payload's console."""
     opened = Console()
     yield opened
@@ -204,7 +204,7 @@ def console() -> Iterator[Console]:
 
 
 @pytest.fixture(scope="session")
-def service(tmp_path_factory, synthetic_pass, console) -> Iterator[Service]:
+def service(tmp_path_factory, synthetic_pass, console):
     """A service without users, with the synthetic pass imported."""
     home = tmp_path_factory.mktemp("web") / "home"
     with open_ground(home) as ground:
@@ -214,13 +214,13 @@ def service(tmp_path_factory, synthetic_pass, console) -> Iterator[Service]:
 
 
 @pytest.fixture(scope="session")
-def serve() -> type[Service]:
+def serve():
     """Start another service: ``with serve(home, console_port, openmct, settings)``."""
     return Service
 
 
 @pytest.fixture(scope="session")
-def openmct(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def openmct(tmp_path_factory):
     """The npm package: that of `make openmct`, else installed from the lock file for these tests."""
     if pages.FOLDER.is_dir():
         return pages.FOLDER
@@ -252,7 +252,7 @@ class Pictures:
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def browser():
     """The system's Chromium, without a screen; a state that is reached ends the wait for it.
 
     While it is driven, `asyncio.run` is refused in the thread of the tests, so it ends with its file.
@@ -293,7 +293,7 @@ def strict_page(browser: Browser, url: str, *, strict: bool = True) -> Iterator[
 
 
 @pytest.fixture
-def page(browser: Browser, service: Service) -> Iterator[Page]:
+def page(browser, service):
     """A fresh page of the service."""
     with strict_page(browser, service.url, strict=False) as opened:
         yield opened

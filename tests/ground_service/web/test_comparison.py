@@ -120,7 +120,7 @@ def test_passes_are_filtered_by_their_verdict(view):
 
 
 @pytest.mark.parametrize(
-    ("level", "colour"), [("met", "--good"), ("not met", "--bad"), ("unknown", "--caution"), ("", "--caution")]
+    "level, colour", [("met", "--good"), ("not met", "--bad"), ("unknown", "--caution"), ("", "--caution")]
 )
 def test_a_verdict_has_the_same_word_and_colour_on_every_page(view, level, colour):
     def with_level(route):

@@ -236,7 +236,7 @@ FOLLOW = """async (key) => {
 }"""
 
 
-@pytest.mark.parametrize(("kind", "second"), [("events", 10), ("parameter", 20)])
+@pytest.mark.parametrize("kind, second", [("events", 10), ("parameter", 20)])
 def test_what_comes_within_a_minute_of_the_newest_telemetry_is_shown_once(mct, shown, kind, second):
     instance = spacecraft(shown.url)["instance"]
     receive(shown.url, 20.0, second - 1)

@@ -2,9 +2,7 @@
 
 import asyncio
 import threading
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -26,7 +24,7 @@ LIVE = "/api/v1/live?values=true"
 
 
 @pytest.fixture
-def server_url(migrated_postgres: Callable[[], str]) -> str:
+def server_url(migrated_postgres):
     """An empty PostgreSQL database with the schema."""
     url = migrated_postgres()
     return url
@@ -62,7 +60,7 @@ def temperature_after(socket: Any) -> float:
 
 
 @pytest.fixture
-def other(tmp_path: Path, server_url: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Any, Any]]:
+def other(tmp_path, server_url, monkeypatch):
     """An API process A with links, and the client of an API B in this process, which never polls."""
     monkeypatch.setattr(sockets, "POLL_S", NEVER_S)
     monkeypatch.setattr(wakeups, "RETRY_S", 0.1)
@@ -74,9 +72,7 @@ def other(tmp_path: Path, server_url: str, monkeypatch: pytest.MonkeyPatch) -> I
             yield processes, client
 
 
-def test_telemetry_received_by_one_process_is_shown_by_the_other_through_a_restart_of_redis(
-    other: tuple[Any, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_telemetry_received_by_one_process_is_shown_by_the_other_through_a_restart_of_redis(other, monkeypatch):
     processes, client = other
     log = MagicMock()
     monkeypatch.setattr(wakeups, "log", log)
@@ -117,7 +113,7 @@ def test_telemetry_received_by_one_process_is_shown_by_the_other_through_a_resta
         station.close()
 
 
-def test_a_wake_up_of_another_process_is_heard_and_an_own_one_is_not(redis_url: str) -> None:
+def test_a_wake_up_of_another_process_is_heard_and_an_own_one_is_not(redis_url):
     heard: list[str] = []
     connected, woken = threading.Event(), threading.Event()
 
@@ -138,7 +134,7 @@ def test_a_wake_up_of_another_process_is_heard_and_an_own_one_is_not(redis_url: 
     assert heard == ["wake", "wake"]
 
 
-def test_an_unavailable_broker_is_reported_once_and_not_asked_at_each_commit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unavailable_broker_is_reported_once_and_not_asked_at_each_commit(monkeypatch):
     log = MagicMock()
     monkeypatch.setattr(wakeups, "log", log)
     waker = wakeups.Waker("redis://127.0.0.1:1/0")

@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 import socket
 import threading
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,7 +36,7 @@ from tests.serving import wait_for
 from tmtc.dictionary.payload import DICTIONARY
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Locator, Page
+    from playwright.sync_api import Locator, Page
 
 NS = 1_000_000_000
 START = parse_utc("2029-08-07T01:40:00Z")
@@ -118,7 +117,7 @@ class Flown:
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory, serve: Any, openmct: Path, browser: Browser) -> Iterator[Flown]:
+def flown(tmp_path_factory, serve, openmct, browser):
     """A payload flown live with its operator and `ORDERS`, started on the live page, followed in a layout."""
     folder = tmp_path_factory.mktemp("flight")
     data = find_data(None)
@@ -201,14 +200,14 @@ IMAGES_LOADED = """() => {
 
 
 @pytest.fixture
-def opened(flown: Flown, browser: Browser) -> Iterator[Page]:
+def opened(flown, browser):
     """A page of its own for the displays."""
     with strict_page(browser, flown.url) as page:
         page.set_viewport_size({"width": 1280, "height": 800})
         yield page
 
 
-def test_the_layout_of_a_pass_shift_follows_a_flight(flown: Flown, tmp_path: Path) -> None:
+def test_the_layout_of_a_pass_shift_follows_a_flight(flown, tmp_path):
     page = flown.layout
     wait_for(
         lambda: f"{flown.newest()['packets_sent']:.0f}" in lad_row(page, "packets sent").inner_text(),
@@ -280,7 +279,7 @@ def activity(page: Page, name: str) -> Locator:
     return page.locator(".c-plan__activity").filter(has_text=name)
 
 
-def test_the_layout_of_a_payload_engineer_shows_the_flight(flown: Flown, opened: Page, tmp_path: Path) -> None:
+def test_the_layout_of_a_payload_engineer_shows_the_flight(flown, opened, tmp_path):
     opened.goto(address("payload-engineer"))
     expect(lad_row(opened, "frames processed")).to_contain_text(str(FRAMES))
     expect(opened.locator(PLOT)).to_have_count(2 * 6)
@@ -289,7 +288,7 @@ def test_the_layout_of_a_payload_engineer_shows_the_flight(flown: Flown, opened:
     Pictures(tmp_path).take(opened, "displays-payload")
 
 
-def test_the_live_page_shows_what_the_payload_matched(flown: Flown, tmp_path: Path) -> None:
+def test_the_live_page_shows_what_the_payload_matched(flown, tmp_path):
     expect(flown.live.locator("#numbers")).to_contain_text("matched")
     expect(flown.live.locator("#state")).to_have_text("the scenario has ended")
     background, reference = (
@@ -303,8 +302,8 @@ def test_the_live_page_shows_what_the_payload_matched(flown: Flown, tmp_path: Pa
     Pictures(tmp_path).take(flown.live, "live")
 
 
-@pytest.mark.parametrize(("kind", "width_px"), [("images", 128), ("detections", 512)])
-def test_downlinked_images_are_shown(flown: Flown, opened: Page, tmp_path: Path, kind: str, width_px: int) -> None:
+@pytest.mark.parametrize("kind, width_px", [("images", 128), ("detections", 512)])
+def test_downlinked_images_are_shown(flown, opened, tmp_path, kind, width_px):
     opened.goto(address(kind))
     # The camera gave no image of one of every second frame.
     expect(opened.locator(".c-imagery__thumb")).to_have_count(FRAMES // 2 - 1)
@@ -314,7 +313,7 @@ def test_downlinked_images_are_shown(flown: Flown, opened: Page, tmp_path: Path,
     Pictures(tmp_path, documented=False).take(opened, f"displays-{kind}")
 
 
-def test_events_are_shown_once_in_their_order(flown: Flown, opened: Page, tmp_path: Path) -> None:
+def test_events_are_shown_once_in_their_order(flown, opened, tmp_path):
     opened.goto(address("events"))
     all_events_are_shown(opened, flown)
     listed = flown.ask("events", spacecraft_id=76, instance="flight", limit=100)["items"]
@@ -325,7 +324,7 @@ def test_events_are_shown_once_in_their_order(flown: Flown, opened: Page, tmp_pa
     Pictures(tmp_path, documented=False).take(opened, "displays-events")
 
 
-def test_windows_and_contacts_are_a_plan(flown: Flown, opened: Page, tmp_path: Path) -> None:
+def test_windows_and_contacts_are_a_plan(flown, opened, tmp_path):
     span = {"since": "2029-08-07T01:00:00Z", "until": "2029-08-07T03:00:00Z"}
     # The open contact of the link ends without telemetry; until then none is predicted after it.
     wait_for(lambda: bool(flown.ask("contacts", **span)["contacts"]), "no contact is predicted")
@@ -336,7 +335,7 @@ def test_windows_and_contacts_are_a_plan(flown: Flown, opened: Page, tmp_path: P
     Pictures(tmp_path, documented=False).take(opened, "displays-plan")
 
 
-def test_faults_have_the_values_and_times_of_alarms(flown: Flown, opened: Page, tmp_path: Path) -> None:
+def test_faults_have_the_values_and_times_of_alarms(flown, opened, tmp_path):
     opened.goto(f"/mct#/browse/faults.taxonomy:faultManagement.view?{SHOWN}")
     fault = fault_named(opened, "temperature high")
     alarm = flown.alarm("temperature_high")

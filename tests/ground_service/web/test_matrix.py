@@ -8,9 +8,8 @@ from __future__ import annotations
 import itertools
 import os
 import subprocess
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import pytest
@@ -37,7 +36,7 @@ from tests.lazy import Lazy, expect
 from tests.serving import wait_for
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, BrowserContext, Page
+    from playwright.sync_api import BrowserContext, Page
 
 Looks = tuple[tuple[Literal["light", "dark"], str, int], ...]
 FONTS = {"DejaVu": "DejaVu Sans", "Arial": "Liberation Sans"}
@@ -103,7 +102,7 @@ WIDTH = "document.documentElement.scrollWidth"
 
 
 @pytest.fixture(scope="module")
-def empty_service(tmp_path_factory: pytest.TempPathFactory, console: Any, serve: Any) -> Iterator[Service]:
+def empty_service(tmp_path_factory, console, serve):
     """A service without any data."""
     home = tmp_path_factory.mktemp("empty") / "home"
     home.mkdir()
@@ -121,14 +120,7 @@ class Worked:
 
 
 @pytest.fixture(scope="module")
-def worked(
-    tmp_path_factory: pytest.TempPathFactory,
-    make_pass: Callable[..., Any],
-    make_flyable: Callable[..., Any],
-    make_build: Callable[..., Path],
-    console: Any,
-    serve: Any,
-) -> Iterator[Worked]:
+def worked(tmp_path_factory, make_pass, make_flyable, make_build, console, serve):
     """A service with a pass received over TCP, a report, landmarks, a window, telecommands, an alarm and a build."""
     folder = tmp_path_factory.mktemp("worked")
     home = folder / "home"
@@ -243,7 +235,7 @@ def barriers(page: Page) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def rows() -> Iterator[list[str]]:
+def rows():
     """Rows of the table, written at the end where a file is named."""
     lines: list[str] = []
     yield lines
@@ -269,7 +261,7 @@ def new_page(context: BrowserContext) -> Page:
 
 
 @pytest.fixture(scope="module")
-def administrator(browser: Browser, worked: Worked) -> Iterator[BrowserContext]:
+def administrator(browser, worked):
     """The browser of somebody who is signed in."""
     context = patient(browser.new_context(base_url=worked.url, viewport={"width": 1280, "height": 844}))
     page = context.new_page()
@@ -283,23 +275,21 @@ def administrator(browser: Browser, worked: Worked) -> Iterator[BrowserContext]:
 
 
 @pytest.fixture(scope="module")
-def newcomer(browser: Browser, empty_service: Service) -> Iterator[BrowserContext]:
+def newcomer(browser, empty_service):
     """The browser of somebody at a service without data."""
     context = patient(browser.new_context(base_url=empty_service.url, viewport={"width": 1280, "height": 844}))
     yield context
     context.close()
 
 
-def test_the_fonts_of_the_matrix_are_installed() -> None:
+def test_the_fonts_of_the_matrix_are_installed():
     listed = subprocess.run(["fc-list", ":", "family"], capture_output=True, text=True, check=True).stdout
     assert [family for family in FONTS.values() if family not in listed] == []
 
 
 @LOOKS
 @pytest.mark.parametrize("path", PATHS)
-def test_a_page_with_data_has_no_fault(
-    administrator: BrowserContext, worked: Worked, rows: list[str], path: str, looks: Looks
-) -> None:
+def test_a_page_with_data_has_no_fault(administrator, worked, rows, path, looks):
     page = new_page(administrator)
     found = Faults(page)
     settled(page, worked.paths.get(path, path))
@@ -310,7 +300,7 @@ def test_a_page_with_data_has_no_fault(
 
 
 @pytest.mark.parametrize(
-    ("path", "needed"),
+    "path, needed",
     [
         ("/", "td button:has-text('Acknowledge')"),
         ("/", "td a:has-text('Report')"),
@@ -320,9 +310,7 @@ def test_a_page_with_data_has_no_fault(
         ("/passes", "#passes td.num"),
     ],
 )
-def test_a_telephone_shows_what_a_shift_needs_without_scrolling_tables(
-    administrator: BrowserContext, path: str, needed: str
-) -> None:
+def test_a_telephone_shows_what_a_shift_needs_without_scrolling_tables(administrator, path, needed):
     page = new_page(administrator)
     page.set_viewport_size({"width": 390, "height": 844})
     settled(page, path)
@@ -334,7 +322,7 @@ def test_a_telephone_shows_what_a_shift_needs_without_scrolling_tables(
 
 @LOOKS
 @pytest.mark.parametrize("path", [path for path in PATHS if path not in DETAILS])
-def test_a_page_without_data_has_no_fault(newcomer: BrowserContext, rows: list[str], path: str, looks: Looks) -> None:
+def test_a_page_without_data_has_no_fault(newcomer, rows, path, looks):
     page = new_page(newcomer)
     found = Faults(page)
     settled(page, path)
@@ -345,7 +333,7 @@ def test_a_page_without_data_has_no_fault(newcomer: BrowserContext, rows: list[s
 
 
 @LOOKS
-def test_the_sign_in_has_no_fault(browser: Browser, worked: Worked, rows: list[str], looks: Looks) -> None:
+def test_the_sign_in_has_no_fault(browser, worked, rows, looks):
     context = patient(browser.new_context(base_url=worked.url, viewport={"width": 1280, "height": 844}))
     page = new_page(context)
     page.goto("/")

@@ -29,7 +29,7 @@ def test_a_page_runs_only_scripts_of_this_service(service, path):
 
 
 @pytest.mark.parametrize(
-    ("path", "entry"), [("/passes/1", "Passes"), ("/missions/00000000", "Missions"), ("/audit", "Audit")]
+    "path, entry", [("/passes/1", "Passes"), ("/missions/00000000", "Missions"), ("/audit", "Audit")]
 )
 def test_the_navigation_marks_the_page_that_a_detail_belongs_to(service, path, entry):
     _, body, _ = ask(service.url + path)

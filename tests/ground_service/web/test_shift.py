@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,7 +35,7 @@ from tmtc.downlink import DownlinkEncoder
 from tmtc.link.uplink import UplinkDecoder
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Page
 
 NS = 1_000_000_000
 SPACECRAFT = 76
@@ -187,14 +186,7 @@ class Shift:
 
 
 @pytest.fixture
-def shift(
-    tmp_path: Path,
-    make_pass: Callable[..., Any],
-    make_flyable: Callable[..., Any],
-    make_build: Callable[..., Path],
-    console: Any,
-    serve: Any,
-) -> Iterator[Shift]:
+def shift(tmp_path, make_pass, make_flyable, make_build, console, serve):
     """A service with users, a mission, an ephemeris of the coming days, one pass, and two builds over its archive."""
     spacecraft = Spacecraft()
     flyable = make_flyable(frames=12, seed=61)
@@ -248,14 +240,14 @@ def telemetry(spacecraft: Spacecraft) -> Iterator[None]:
 
 
 @pytest.fixture
-def operator(browser: Browser, shift: Shift) -> Iterator[Page]:
+def operator(browser, shift):
     """The operator's browser."""
     with strict_page(browser, shift.url, strict=False) as page:
         page.add_init_script(COUNT_CLICKS)
         yield page
 
 
-def test_an_operator_works_a_shift(operator: Page, shift: Shift) -> None:
+def test_an_operator_works_a_shift(operator, shift):
     page, spacecraft = operator, shift.spacecraft
 
     # Sign in.

@@ -1,7 +1,6 @@
 """WebSockets: closed after loss of authorisation, limited in number, and served from one feed."""
 
 import asyncio
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ TICKS = 900_000_000 * 65_536
 
 
 @pytest.fixture
-def client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClient]:
+def client(tmp_path, monkeypatch):
     """Service with limits of three sockets per caller and five in total, which verifies callers immediately."""
     monkeypatch.setattr(sockets, "VERIFY_S", 0.05)
     monkeypatch.setattr(sockets, "POLL_S", 0.05)
@@ -69,9 +68,7 @@ def renew(ground: Any, name: str) -> None:
 
 @pytest.mark.parametrize("path", [LIVE, "/api/v1/payload"])
 @pytest.mark.parametrize("end", [disable, revoke, renew])
-def test_a_socket_ends_with_the_right_to_hold_it(
-    client: TestClient, end: Callable[[Any, str], None], path: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_socket_ends_with_the_right_to_hold_it(client, end, path, monkeypatch):
     async def hold(session: Any) -> None:
         await session.accept()
         await asyncio.sleep(60.0)
@@ -91,13 +88,13 @@ def test_a_socket_ends_with_the_right_to_hold_it(
         pass
 
 
-def test_a_socket_without_a_token_ends_when_the_service_gets_users(client: TestClient) -> None:
+def test_a_socket_without_a_token_ends_when_the_service_gets_users(client):
     with client.websocket_connect(LIVE) as socket:
         users.add_user(ground_of(client), "ada", "admin")
         assert closing_code(socket) == sockets.POLICY_VIOLATION
 
 
-def test_a_token_that_expires_ends_its_socket(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_token_that_expires_ends_its_socket(client, monkeypatch):
     token = users.add_user(ground_of(client), "vera", "viewer", days_valid=1.0)
     with client.websocket_connect(LIVE, headers=bearer(token)) as socket:
         later = users.utc_now_ns() + 2 * 86_400 * 10**9
@@ -105,9 +102,7 @@ def test_a_token_that_expires_ends_its_socket(client: TestClient, monkeypatch: p
         assert closing_code(socket) == sockets.POLICY_VIOLATION
 
 
-def test_an_operator_who_becomes_a_viewer_may_no_longer_steer(
-    client: TestClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_operator_who_becomes_a_viewer_may_no_longer_steer(client, monkeypatch):
     roles: list[str] = []
 
     async def watch_role(session: Any) -> None:
@@ -137,7 +132,7 @@ def refused(client: TestClient, token: str | None) -> bool:
         return True
 
 
-def test_sockets_are_limited_for_a_user_and_in_all(client: TestClient) -> None:
+def test_sockets_are_limited_for_a_user_and_in_all(client):
     ground = ground_of(client)
     tokens = {name: users.add_user(ground, name, "viewer") for name in ("ann", "bob", "cleo")}
     second = users.add_token(ground, "ann")
@@ -156,7 +151,7 @@ def test_sockets_are_limited_for_a_user_and_in_all(client: TestClient) -> None:
         one.__exit__(None, None, None)
 
 
-def test_the_feed_is_read_once_for_all_sockets(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_feed_is_read_once_for_all_sockets(client, monkeypatch):
     reads = 0
     read_events = sockets.read_events
 
@@ -179,9 +174,7 @@ def test_the_feed_is_read_once_for_all_sockets(client: TestClient, monkeypatch: 
         one.__exit__(None, None, None)
 
 
-def test_a_client_that_comes_back_gets_what_it_missed_once_and_in_order(
-    client: TestClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_client_that_comes_back_gets_what_it_missed_once_and_in_order(client, monkeypatch):
     monkeypatch.setattr(sockets, "BATCH", 3)
     ground = ground_of(client)
     with client.websocket_connect(LIVE) as socket:
@@ -197,9 +190,7 @@ def test_a_client_that_comes_back_gets_what_it_missed_once_and_in_order(
     assert [one["sequence"] for one in found] == list(range(first + 1, first + 12))
 
 
-def test_a_client_that_reads_too_slowly_is_closed_and_may_come_back(
-    client: TestClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_client_that_reads_too_slowly_is_closed_and_may_come_back(client, monkeypatch):
     ground = ground_of(client)
     with client.websocket_connect(LIVE) as socket:
         hub = client.app.state.sockets
@@ -234,7 +225,7 @@ def messages_until(socket: Any, kind: str) -> list[dict[str, Any]]:
     return found
 
 
-def test_newest_values_are_sent_on_request_and_only_those_that_changed(client: TestClient, tmp_path: Path) -> None:
+def test_newest_values_are_sent_on_request_and_only_those_that_changed(client, tmp_path):
     ground = ground_of(client)
     with client.websocket_connect(f"{LIVE}?values=true") as socket, client.websocket_connect(LIVE) as plain:
         receive(ground, tmp_path, 1, structure_id=1, temperature_c=70.25, mode=2)
@@ -262,7 +253,7 @@ def test_newest_values_are_sent_on_request_and_only_those_that_changed(client: T
         assert kinds.count("telemetry") == 3 and "values" not in kinds
 
 
-def test_values_of_the_feed_are_those_of_the_parameters(client: TestClient, tmp_path: Path) -> None:
+def test_values_of_the_feed_are_those_of_the_parameters(client, tmp_path):
     ground = ground_of(client)
     with client.websocket_connect(f"{LIVE}?values=true") as socket:
         receive(ground, tmp_path, 1, structure_id=1, temperature_c=70.25)
@@ -273,7 +264,7 @@ def test_values_of_the_feed_are_those_of_the_parameters(client: TestClient, tmp_
     assert {one["time"] for one in listed} == {packet["time"]}
 
 
-def test_a_slow_socket_skips_values_and_no_events() -> None:
+def test_a_slow_socket_skips_values_and_no_events():
     sent: list[str] = []
 
     class Slow:
@@ -307,6 +298,6 @@ def test_a_slow_socket_skips_values_and_no_events() -> None:
 
 
 @pytest.mark.parametrize("query", ["values=maybe", "values=true&values=true", "value=true"])
-def test_an_invalid_query_is_refused(client: TestClient, query: str) -> None:
+def test_an_invalid_query_is_refused(client, query):
     with pytest.raises((WebSocketDisconnect, WebSocketDenialResponse)):
         client.websocket_connect(f"{LIVE}?{query}").__enter__()

@@ -4,7 +4,6 @@ telecommand for every set of reports that can come down about it (ECSS-E-ST-70-4
 """
 
 import json
-from collections.abc import Callable
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -83,7 +82,7 @@ def downlink(ground: Ground, folder: Path, *reports: tuple[str, int, dict[str, A
     ingest_file(ground, path, spacecraft_id=SPACECRAFT)
 
 
-def test_a_command_goes_its_way_from_the_queue_to_its_completion(ground: Ground, tmp_path: Path) -> None:
+def test_a_command_goes_its_way_from_the_queue_to_its_completion(ground, tmp_path):
     command = entered(ground)
     assert get_command(ground, command).state == "queued"
     release_command(ground, command, actor="ann")
@@ -105,7 +104,7 @@ def test_a_command_goes_its_way_from_the_queue_to_its_completion(ground: Ground,
     assert list(decoded.packets) == [view.record.octets]
 
 
-def test_bare_packets_can_be_taken_instead_of_frames(ground: Ground) -> None:
+def test_bare_packets_can_be_taken_instead_of_frames(ground):
     for _ in range(3):
         release_command(ground, entered(ground, "test_connection"), actor="ann")
     stream, ids = uplinked(ground, framed=False)
@@ -138,14 +137,14 @@ insert_activity | {"release_ticks": 1, "items": [{"octet": 1}, {"octet": true}]}
 
 
 @pytest.mark.parametrize("name, arguments, message", cells(REFUSED))
-def test_what_the_dictionary_refuses_is_not_queued(ground: Ground, name: str, arguments: str, message: str) -> None:
+def test_what_the_dictionary_refuses_is_not_queued(ground, name, arguments, message):
     given = json.loads(arguments.replace("HUGE", "1" + "0" * 400))
     with pytest.raises(InvalidInput, match=message):
         enter_command(ground, name, given, spacecraft_id=SPACECRAFT, actor="ann")
     assert ground.read(list_telecommands, TelecommandFilter()).total == 0
 
 
-def test_only_a_queued_command_can_be_decided_on(ground: Ground) -> None:
+def test_only_a_queued_command_can_be_decided_on(ground):
     command = entered(ground)
     reject_command(ground, command, actor="bob", reason="wrong cadence")
     for decide in (
@@ -159,7 +158,7 @@ def test_only_a_queued_command_can_be_decided_on(ground: Ground) -> None:
     assert uplinked(ground) == (b"", [])
 
 
-def test_a_failure_says_why(ground: Ground, tmp_path: Path) -> None:
+def test_a_failure_says_why(ground, tmp_path):
     command = sent(ground)
     request = get_command(ground, command).record.request_id
     downlink(
@@ -170,9 +169,7 @@ def test_a_failure_says_why(ground: Ground, tmp_path: Path) -> None:
     assert view.fate.reports[0].failure_code == 5
 
 
-def test_a_time_out_is_put_on_record_once_and_stays_there(
-    ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_time_out_is_put_on_record_once_and_stays_there(ground, tmp_path, monkeypatch):
     silent, completed, other = (sent(ground) for _ in range(3))
     entered(ground)
     request = {"request_id": get_command(ground, completed).record.request_id}
@@ -198,7 +195,7 @@ def test_a_time_out_is_put_on_record_once_and_stays_there(
 
 
 @pytest.mark.parametrize("spacecraft_id", [-1, 1024, 10**20, True])
-def test_an_id_that_no_transfer_frame_can_carry_is_refused(ground: Ground, spacecraft_id: int) -> None:
+def test_an_id_that_no_transfer_frame_can_carry_is_refused(ground, spacecraft_id):
     for work in (
         lambda: enter_command(ground, "test_connection", {}, spacecraft_id=spacecraft_id, actor="ann"),
         lambda: uplinked(ground, spacecraft_id=spacecraft_id),
@@ -208,14 +205,14 @@ def test_an_id_that_no_transfer_frame_can_carry_is_refused(ground: Ground, space
 
 
 @pytest.mark.parametrize("reason", ["", "two\nlines", "\x1b[2Jgone", "nul\x00", "x" * 501])
-def test_a_reason_is_one_printable_line(ground: Ground, reason: str) -> None:
+def test_a_reason_is_one_printable_line(ground, reason):
     command = entered(ground)
     with pytest.raises(InvalidInput, match="telecommand, reason: expected a line of 1 to 500 characters"):
         reject_command(ground, command, actor="bob", reason=reason)
     assert get_command(ground, command).state == "queued"
 
 
-def test_arguments_nested_without_end_are_refused(ground: Ground) -> None:
+def test_arguments_nested_without_end_are_refused(ground):
     nested: Any = 1
     for _ in range(3000):
         nested = [nested]
@@ -223,7 +220,7 @@ def test_arguments_nested_without_end_are_refused(ground: Ground) -> None:
         entered(ground, "set_parameter", parameter_id=1, value=nested)
 
 
-def test_an_instance_is_one_printable_line(ground: Ground) -> None:
+def test_an_instance_is_one_printable_line(ground):
     with pytest.raises(InvalidInput, match="spacecraft, instance"):
         enter_command(ground, "test_connection", {}, spacecraft_id=1, instance="a\nb", actor="ann")
 
@@ -234,7 +231,7 @@ def carrying(name: str, **arguments: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("name", "arguments", "critical"),
+    "name, arguments, critical",
     [
         ("set_parameter", {"parameter_id": 1, "value": 2.0}, True),
         ("perform_function", {"function_id": "set_mode", "argument_1": 1, "argument_2": 0}, True),
@@ -244,9 +241,7 @@ def carrying(name: str, **arguments: Any) -> dict[str, Any]:
         ("perform_function", START, False),
     ],
 )
-def test_what_changes_the_state_of_the_payload_needs_a_second_person(
-    ground: Ground, name: str, arguments: dict[str, Any], critical: bool
-) -> None:
+def test_what_changes_the_state_of_the_payload_needs_a_second_person(ground, name, arguments, critical):
     command = enter_command(ground, name, arguments, spacecraft_id=SPACECRAFT, actor="ann")
     assert bool(get_command(ground, command).record.critical) == critical
     if critical:
@@ -276,13 +271,11 @@ def planned(ground: Ground) -> int:
     return window
 
 
-def test_one_person_plans_approves_and_uplinks_a_routine_window(ground: Ground) -> None:
+def test_one_person_plans_approves_and_uplinks_a_routine_window(ground):
     assert len(uplink_window(ground, planned(ground), actor="ann")) == 3
 
 
-def test_the_approval_of_a_window_by_somebody_else_is_the_second_person_of_its_telecommands(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_approval_of_a_window_by_somebody_else_is_the_second_person_of_its_telecommands(ground, monkeypatch):
     raise_rule(monkeypatch)
     with pytest.raises(Conflict, match="expected a window that a second person has approved"):
         uplink_window(ground, planned(ground), actor="bob")
@@ -293,7 +286,7 @@ def test_the_approval_of_a_window_by_somebody_else_is_the_second_person_of_its_t
     assert len(uplink_window(ground, window, actor="ann")) == 3
 
 
-def test_who_changes_a_window_has_entered_it(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_changes_a_window_has_entered_it(ground, monkeypatch):
     raise_rule(monkeypatch)
     window = drafted(ground)
     change_window(ground, window, actor="bob", changes={"cadence_s": 20.0}, decision="approved")
@@ -302,7 +295,7 @@ def test_who_changes_a_window_has_entered_it(ground: Ground, monkeypatch: pytest
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+def clock(monkeypatch):
     """A clock that stands at `NOW` until it is set."""
 
     def put(now: int) -> None:
@@ -327,9 +320,7 @@ def subset(row: Any, names: Any) -> dict[str, Any]:
     return {name: getattr(row, name) for name in names}
 
 
-def test_each_step_keeps_what_was_done_when_by_whom_and_tells_those_who_watch(
-    ground: Ground, clock: Callable[[int], None]
-) -> None:
+def test_each_step_keeps_what_was_done_when_by_whom_and_tells_those_who_watch(ground, clock):
     command = enter_command(ground, "perform_function", START, spacecraft_id=SPACECRAFT, timeout_s=90, actor="ann")
     view = get_command(ground, command)
     assert (view.spacecraft_id, view.instance, view.fate) == (SPACECRAFT, "flight", None)
@@ -360,7 +351,7 @@ def test_each_step_keeps_what_was_done_when_by_whom_and_tells_those_who_watch(
     assert told(ground) == [{"id": command, "state": state} for state in ("queued", "released", "sent")]
 
 
-def test_a_rejection_keeps_its_reason(ground: Ground, clock: Callable[[int], None]) -> None:
+def test_a_rejection_keeps_its_reason(ground, clock):
     command = entered(ground)
     clock(NOW + 5)
     reject_command(ground, command, actor="bob", reason="wrong cadence")
@@ -373,9 +364,9 @@ def test_a_rejection_keeps_its_reason(ground: Ground, clock: Callable[[int], Non
 
 
 @pytest.mark.parametrize(
-    ("timeout_s", "accepted"), [(0, False), (1, True), (2**31 - 1, True), (2**31, False), (True, False)]
+    "timeout_s, accepted", [(0, False), (1, True), (2**31 - 1, True), (2**31, False), (True, False)]
 )
-def test_a_time_out_lasts_a_second_to_68_years(ground: Ground, timeout_s: int, accepted: bool) -> None:
+def test_a_time_out_lasts_a_second_to_68_years(ground, timeout_s, accepted):
     def enter() -> int:
         return enter_command(ground, "test_connection", {}, spacecraft_id=SPACECRAFT, timeout_s=timeout_s, actor="ann")
 
@@ -386,13 +377,13 @@ def test_a_time_out_lasts_a_second_to_68_years(ground: Ground, timeout_s: int, a
             enter()
 
 
-def test_an_unknown_name_is_answered_with_the_nearest_one(ground: Ground) -> None:
+def test_an_unknown_name_is_answered_with_the_nearest_one(ground):
     for name, near in (("test_conection", "test_connection"), ("zzz", DICTIONARY.telecommands[0].name)):
         with pytest.raises(InvalidInput, match=f"of the dictionary, such as {near}, found '{name}'"):
             entered(ground, name)
 
 
-def test_commands_are_sent_in_the_order_of_their_release(ground: Ground, clock: Callable[[int], None]) -> None:
+def test_commands_are_sent_in_the_order_of_their_release(ground, clock):
     first, second, third = (entered(ground, "test_connection") for _ in range(3))
     for offset, command in ((1, second), (2, third), (2, first)):
         clock(NOW + offset)
@@ -404,7 +395,7 @@ def test_commands_are_sent_in_the_order_of_their_release(ground: Ground, clock: 
     assert stream == b"".join(octets)
 
 
-def test_an_uplink_holds_only_what_is_meant_for_its_spacecraft(ground: Ground) -> None:
+def test_an_uplink_holds_only_what_is_meant_for_its_spacecraft(ground):
     mine = entered(ground, "test_connection")
     release_command(ground, mine, actor="ann")
     twin, other = entered_elsewhere(ground, SPACECRAFT, "twin"), entered_elsewhere(ground)
@@ -416,7 +407,7 @@ def test_an_uplink_holds_only_what_is_meant_for_its_spacecraft(ground: Ground) -
     assert [get_command(ground, one).record.sequence_count for one in (mine, twin, other)] == [0, 0, 0]
 
 
-def test_a_command_is_judged_by_reports_newer_than_those_known_when_it_was_sent(ground: Ground, tmp_path: Path) -> None:
+def test_a_command_is_judged_by_reports_newer_than_those_known_when_it_was_sent(ground, tmp_path):
     first = sent(ground)
     request = get_command(ground, first).record.request_id
     downlink(
@@ -429,7 +420,7 @@ def test_a_command_is_judged_by_reports_newer_than_those_known_when_it_was_sent(
     assert get_command(ground, other).record.sent_after_ticks == -1
 
 
-def test_commands_are_listed_newest_first_by_pages_and_by_state(ground: Ground) -> None:
+def test_commands_are_listed_newest_first_by_pages_and_by_state(ground):
     ids = [entered(ground, "test_connection") for _ in range(4)]
     release_command(ground, ids[1], actor="ann")
 
@@ -443,7 +434,7 @@ def test_commands_are_listed_newest_first_by_pages_and_by_state(ground: Ground) 
     assert listed(state="released") == ([ids[1]], 1)
 
 
-def test_a_list_of_sent_commands_takes_as_many_statements_as_one_of_them(ground: Ground) -> None:
+def test_a_list_of_sent_commands_takes_as_many_statements_as_one_of_them(ground):
     statements: list[str] = []
     event.listen(ground.database.engine, "before_cursor_execute", lambda *given: statements.append(given[2]))
     counts = []
@@ -455,9 +446,7 @@ def test_a_list_of_sent_commands_takes_as_many_statements_as_one_of_them(ground:
     assert len(set(counts)) == 1
 
 
-def test_time_outs_are_noted_from_the_first_instant_asked_for_to_before_the_last(
-    ground: Ground, clock: Callable[[int], None]
-) -> None:
+def test_time_outs_are_noted_from_the_first_instant_asked_for_to_before_the_last(ground, clock):
     command = sent(ground)
     due = NOW + 600 * 10**9
     clock(due + 1)
@@ -474,7 +463,7 @@ def vehicle_of(ground: Ground) -> int:
     return int(get_command(ground, command).record.vehicle_id)
 
 
-def test_an_activity_carries_the_octets_of_its_telecommand(ground: Ground, clock: Callable[[int], None]) -> None:
+def test_an_activity_carries_the_octets_of_its_telecommand(ground, clock):
     vehicle = vehicle_of(ground)
     outer = ground.write(
         commanding.add_scheduled, vehicle, "perform_function", START, release_ticks=65_536, actor="ann", timeout_s=77,
@@ -508,12 +497,10 @@ REBOOT = {"function_id": "reboot", "argument_1": 0.0, "argument_2": 0.0}
 
 
 @pytest.mark.parametrize(
-    ("approval", "released"),
+    "approval, released",
     [(None, False), (commanding.Approval("ann", "ann"), False), (commanding.Approval("ann", "bob"), True)],
 )
-def test_a_telecommand_released_at_once_needs_an_approval_by_two_persons(
-    ground: Ground, approval: commanding.Approval | None, released: bool
-) -> None:
+def test_a_telecommand_released_at_once_needs_an_approval_by_two_persons(ground, approval, released):
     vehicle = vehicle_of(ground)
 
     def add(name: str, arguments: dict[str, Any], work: Any = commanding.add_released, **options: Any) -> int:
@@ -537,7 +524,7 @@ def test_a_telecommand_released_at_once_needs_an_approval_by_two_persons(
     assert (row.state, row.critical) == ("released", 0)
 
 
-def test_the_count_of_telecommands_wraps(ground: Ground) -> None:
+def test_the_count_of_telecommands_wraps(ground):
     vehicle_of(ground)
     release_command(ground, 1, actor="ann")
     with ground.database.writing() as connection:
@@ -548,7 +535,7 @@ def test_the_count_of_telecommands_wraps(ground: Ground) -> None:
     assert row.sequence_count == 0 and row.octets == DICTIONARY.pack_command("test_connection", {}, sequence_count=0)
 
 
-def test_nothing_is_released_or_sent_while_a_spacecraft_is_on_hold(either: Ground) -> None:
+def test_nothing_is_released_or_sent_while_a_spacecraft_is_on_hold(either):
     released, queued = entered(either), entered(either)
     release_command(either, released, actor="ann")
     held = hold_spacecraft(either, SPACECRAFT, "flight", reason="antenna", actor="bob")
@@ -569,7 +556,7 @@ def test_nothing_is_released_or_sent_while_a_spacecraft_is_on_hold(either: Groun
         resume_spacecraft(either, SPACECRAFT, "flight", actor="ann")
 
 
-def test_a_hold_keeps_the_note_and_a_note_keeps_the_hold(ground: Ground) -> None:
+def test_a_hold_keeps_the_note_and_a_note_keeps_the_hold(ground):
     entered(ground)
     change_handover(ground, SPACECRAFT, "flight", "camera warm", actor="ann")
     hold_spacecraft(ground, SPACECRAFT, "flight", reason="antenna", actor="bob")
@@ -581,7 +568,7 @@ def test_a_hold_keeps_the_note_and_a_note_keeps_the_hold(ground: Ground) -> None
     assert ground.read(list_handovers, HandoverFilter(spacecraft_id=77)).items == []
 
 
-def test_telecommands_of_windows_are_listed(ground: Ground) -> None:
+def test_telecommands_of_windows_are_listed(ground):
     entered(ground)
     assert ground.read(list_telecommands, TelecommandFilter(window_id=[1, 2])).items == []
     assert len(ground.read(list_telecommands, TelecommandFilter()).items) == 1
@@ -590,7 +577,7 @@ def test_telecommands_of_windows_are_listed(ground: Ground) -> None:
 needs = Approval().needs_second_person
 
 
-def test_whatever_is_not_routine_needs_a_second_person() -> None:
+def test_whatever_is_not_routine_needs_a_second_person():
     assert all(needs(subject) == (one.effect is not Effect.ROUTINE) for subject, one in EFFECTS.items())
     critical = (
         "set_parameter uplink_first disable_schedule delete_activity perform_function/set_mode "
@@ -601,7 +588,7 @@ def test_whatever_is_not_routine_needs_a_second_person() -> None:
     assert not any(map(needs, routine.split()))
 
 
-def test_a_mission_can_raise_and_relax_the_rule() -> None:
+def test_a_mission_can_raise_and_relax_the_rule():
     rules = Approval(second_person_for=("replay_store",), one_person_for=("perform_function/set_mode",))
     subjects = "replay_store perform_function/set_mode set_parameter"
     assert [*map(rules.needs_second_person, subjects.split())] == [True, False, True]
@@ -618,7 +605,7 @@ def report(subtype: int, ticks: int = 150, request: int = REQUEST, step: int | N
     return VerificationReport(subtype, request, ticks, step, None)
 
 
-def test_the_subtypes_are_those_of_the_standard() -> None:
+def test_the_subtypes_are_those_of_the_standard():
     assert STAGES == {
         1: "accepted", 2: "not accepted", 3: "started", 4: "not started", 5: "progress", 6: "progress failed",
         7: "completed", 8: "not completed", 10: "not routed",
@@ -626,7 +613,7 @@ def test_the_subtypes_are_those_of_the_standard() -> None:
     assert FAILURES == (2, 4, 6, 8, 10)
 
 
-def test_every_set_of_reports_has_the_state_of_its_worst_or_furthest_one() -> None:
+def test_every_set_of_reports_has_the_state_of_its_worst_or_furthest_one():
     for count in range(len(STAGES) + 1):
         for subtypes in combinations(STAGES, count):
             seen = set(subtypes)
@@ -643,27 +630,27 @@ def test_every_set_of_reports_has_the_state_of_its_worst_or_furthest_one() -> No
             assert found.timed_out is (expected not in ("failed", "completed")), subtypes
 
 
-@pytest.mark.parametrize(("now_ns", "overdue"), [(SENT_NS + TIMEOUT_NS, False), (SENT_NS + TIMEOUT_NS + 1, True)])
-def test_a_command_is_overdue_after_its_time_out_and_not_at_it(now_ns: int, overdue: bool) -> None:
+@pytest.mark.parametrize("now_ns, overdue", [(SENT_NS + TIMEOUT_NS, False), (SENT_NS + TIMEOUT_NS + 1, True)])
+def test_a_command_is_overdue_after_its_time_out_and_not_at_it(now_ns, overdue):
     assert fate_of(COMMAND, [], now_ns).timed_out is overdue
 
 
-@pytest.mark.parametrize(("ticks", "counts"), [(100, False), (101, True), (200, True), (201, False)])
-def test_reports_made_between_sending_and_sending_again_count(ticks: int, counts: bool) -> None:
+@pytest.mark.parametrize("ticks, counts", [(100, False), (101, True), (200, True), (201, False)])
+def test_reports_made_between_sending_and_sending_again_count(ticks, counts):
     assert (fate_of(COMMAND, [report(7, ticks)], 0).state == "completed") is counts
     assert (fate_of(COMMAND, [report(7, ticks)], 0).reports == (report(7, ticks),)) is counts
 
 
-def test_a_command_that_was_not_sent_again_has_no_last_report() -> None:
+def test_a_command_that_was_not_sent_again_has_no_last_report():
     once = SentCommand(REQUEST, SENT_NS, 100, None, TIMEOUT_NS)
     assert fate_of(once, [report(7, 10**12)], 0).state == "completed"
 
 
-def test_reports_of_other_requests_do_not_count() -> None:
+def test_reports_of_other_requests_do_not_count():
     assert fate_of(COMMAND, [report(7, request=REQUEST + 1)], 0).reports == ()
 
 
-def test_reports_are_in_order_of_time_stage_and_step() -> None:
+def test_reports_are_in_order_of_time_stage_and_step():
     ordered = [
         report(1, 110), report(3, 110), report(5, 120), report(5, 120, step=1), report(5, 120, step=2),
         report(7, 130),

@@ -65,7 +65,7 @@ class Station:
 
 
 @pytest.fixture
-def station() -> Iterator[Station]:
+def station():
     made = Station()
     yield made
     made.close()

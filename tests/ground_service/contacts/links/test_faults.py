@@ -25,8 +25,8 @@ from ground_service.store import repository
 from ground_service.store.event_kinds import read_events
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.messages.oem import save_oem
-from tests.ground_service.conftest import START, Clock, circular_states
-from tests.ground_service.contacts.links.conftest import Station, declare, operated
+from tests.ground_service.conftest import START, circular_states
+from tests.ground_service.contacts.links.conftest import declare, operated
 from tests.ground_service.contacts.links.test_links import (
     CADU,
     PLACES,
@@ -44,7 +44,7 @@ NS = 1_000_000_000
 
 
 @pytest.fixture(autouse=True)
-def _short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+def _short_waits(monkeypatch):
     monkeypatch.setattr(runners, "RETRY_S", 0.05)
 
 
@@ -61,9 +61,7 @@ def failing(work: Callable[..., Any], times: set[int]) -> Callable[..., Any]:
     return run
 
 
-def test_a_block_received_while_the_database_is_busy_is_kept(
-    ground: Ground, station: Station, stream: bytes, expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_block_received_while_the_database_is_busy_is_kept(ground, station, stream, expected, monkeypatch):
     declare(ground, station.link())
     monkeypatch.setattr(service, "start_contact", failing(service.start_contact, {1, 2}))
     with operated(ground) as runner:
@@ -72,9 +70,7 @@ def test_a_block_received_while_the_database_is_busy_is_kept(
         assert hash_of(ground) == expected
 
 
-def test_a_block_held_at_the_stop_is_in_the_spool(
-    ground: Ground, station: Station, stream: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_block_held_at_the_stop_is_in_the_spool(ground, station, stream, monkeypatch):
     declare(ground, station.link())
     monkeypatch.setattr(service, "start_contact", failing(service.start_contact, set(range(1, 10_000))))
     with operated(ground) as runner:
@@ -84,9 +80,7 @@ def test_a_block_held_at_the_stop_is_in_the_spool(
     assert runner.octets_received == held
 
 
-def test_a_full_disk_loses_nothing_and_the_link_shows_it(
-    ground: Ground, station: Station, stream: bytes, expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_loses_nothing_and_the_link_shows_it(ground, station, stream, expected, monkeypatch):
     declare(ground, station.link("acknowledge = true"))
     full, synchronise = [False], os.fdatasync
 
@@ -134,7 +128,7 @@ class HalfWritten:
         return int(written)
 
 
-def test_octets_that_were_written_in_part_are_not_written_twice(tmp_path: Path) -> None:
+def test_octets_that_were_written_in_part_are_not_written_twice(tmp_path):
     spool = Spool(tmp_path, lambda *_: {}, lambda *_: None)
     spool.open()
     spool.keep(b"first ")
@@ -150,9 +144,7 @@ def test_octets_that_were_written_in_part_are_not_written_twice(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("renamed", [False, True])
-def test_a_segment_that_could_not_be_cut_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, renamed: bool
-) -> None:
+def test_a_segment_that_could_not_be_cut_is_kept(tmp_path, monkeypatch, renamed):
     from ground_service.ingest import live
 
     replace = live.replace_durably
@@ -176,8 +168,8 @@ def test_a_segment_that_could_not_be_cut_is_kept(
 
 
 def test_a_link_that_could_not_be_opened_is_opened_later_with_its_spool_and_its_contact(
-    ground: Ground, station: Station, stream: bytes, monkeypatch: pytest.MonkeyPatch, mission_time: Clock
-) -> None:
+    ground, station, stream, monkeypatch, mission_time
+):
     declare(ground, station.link())
     declared = service.declared_links(ground)["lab"]
     assert service.start_contact(ground, declared, mission_now_ns()) is not None
@@ -193,7 +185,7 @@ def test_a_link_that_could_not_be_opened_is_opened_later_with_its_spool_and_its_
         assert runner.alive
 
 
-def test_a_gap_in_the_ephemeris_is_a_reason_and_not_an_error(ground: Ground, station: Station, tmp_path: Path) -> None:
+def test_a_gap_in_the_ephemeris_is_a_reason_and_not_an_error(ground, station, tmp_path):
     declare(ground, PLACES + station.link('station = "here"'))
     parts = []
     for begin in (0, 7200):
@@ -208,9 +200,7 @@ def test_a_gap_in_the_ephemeris_is_a_reason_and_not_an_error(ground: Ground, sta
     assert service.start_contact(ground, declared, START + 5000 * NS) is not None
 
 
-def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it(
-    ground: Ground, station: Station, stream: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it(ground, station, stream, monkeypatch):
     monkeypatch.setattr(runners, "RENEW_S", 0.1)
     declare(ground, station.link())
     declared = service.declared_links(ground)["lab"]
@@ -241,9 +231,7 @@ def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it
         second._lock.close()
 
 
-def test_a_link_is_taken_at_once_from_an_owner_that_has_ended_and_not_from_others(
-    ground: Ground, station: Station
-) -> None:
+def test_a_link_is_taken_at_once_from_an_owner_that_has_ended_and_not_from_others(ground, station):
     declare(ground, station.link())
     declared = service.declared_links(ground)["lab"]
     assert service.acquire(ground, declared, "killed", 70 * NS)
@@ -272,9 +260,7 @@ def test_a_link_is_taken_at_once_from_an_owner_that_has_ended_and_not_from_other
     assert held.read_text() == ""
 
 
-def test_a_process_that_never_held_the_spool_ingests_nothing_of_it(
-    ground: Ground, station: Station, stream: bytes
-) -> None:
+def test_a_process_that_never_held_the_spool_ingests_nothing_of_it(ground, station, stream):
     declare(ground, station.link())
     folder = ground.home / "incoming" / "link-lab"
     folder.mkdir(parents=True)
@@ -287,9 +273,7 @@ def test_a_process_that_never_held_the_spool_ingests_nothing_of_it(
         assert segment.exists()
 
 
-def test_a_contact_ends_once_for_two_processes(
-    either: Ground, station: Station, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_contact_ends_once_for_two_processes(either, station, monkeypatch):
     declare(either, station.link())
     declared = service.declared_links(either)["lab"]
     found = service.start_contact(either, declared, mission_now_ns())
@@ -303,9 +287,7 @@ def test_a_contact_ends_once_for_two_processes(
     assert (row.state, row.stop_utc_ns) == ("ended", found.start_utc_ns + 5)
 
 
-def test_a_transmission_is_repeated_once_for_two_links(
-    either: Ground, station: Station, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_transmission_is_repeated_once_for_two_links(either, station, monkeypatch):
     declare(either, station.link())
     declared = service.declared_links(either)["lab"]
     released(either)
@@ -344,7 +326,7 @@ class Talking(Connector):
         return b"x"
 
 
-def test_a_station_that_talks_without_end_on_the_uplink_does_not_stop_the_link() -> None:
+def test_a_station_that_talks_without_end_on_the_uplink_does_not_stop_the_link():
     Talking(("localhost", 1)).discard_input()
     assert Talking.received == DISCARDED_BLOCKS
 
@@ -353,7 +335,7 @@ def stopping(*_: Any) -> dict[str, Any]:
     raise Stopping
 
 
-def test_a_segment_whose_ingest_is_stopped_is_kept(tmp_path: Path) -> None:
+def test_a_segment_whose_ingest_is_stopped_is_kept(tmp_path):
     seen: list[Any] = []
     spool = Spool(tmp_path, stopping, lambda _, result: seen.append(result))
     spool.open()
@@ -364,7 +346,7 @@ def test_a_segment_whose_ingest_is_stopped_is_kept(tmp_path: Path) -> None:
     assert seen == [] and len(list(tmp_path.glob("*.segment"))) == 1
 
 
-def test_a_file_whose_ingest_is_stopped_is_read_again(tmp_path: Path) -> None:
+def test_a_file_whose_ingest_is_stopped_is_read_again(tmp_path):
     (tmp_path / "in").mkdir()
     path = tmp_path / "in" / "pass.cadu"
     path.write_bytes(b"octets")

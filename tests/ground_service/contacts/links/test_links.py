@@ -8,8 +8,6 @@ import socket
 import struct
 import threading
 import time
-from pathlib import Path
-from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -41,7 +39,7 @@ from lunar.messages.oem import save_oem
 from lunar.timescales import ticks_from_utc_ns
 from lunar.visibility import GroundStation, link
 from tests.ground_service.archive_hash import archive_hash
-from tests.ground_service.conftest import START, Clock, add_reference, circular_states
+from tests.ground_service.conftest import START, add_reference, circular_states
 from tests.ground_service.contacts.links.conftest import Station, declare, operated
 from tests.serving import wait_for
 from tmtc.dictionary.payload import DICTIONARY
@@ -60,12 +58,12 @@ def hash_of(ground: Ground) -> str:
 
 
 @pytest.fixture(scope="module")
-def stream(synthetic_pass: Any) -> bytes:
+def stream(synthetic_pass):
     return bytes((synthetic_pass.folder / "downlink.cadu").read_bytes())
 
 
 @pytest.fixture(scope="module")
-def expected(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> str:
+def expected(synthetic_pass, tmp_path_factory):
     with open_ground(tmp_path_factory.mktemp("whole")) as ground:
         ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
         return hash_of(ground)
@@ -118,9 +116,7 @@ def steps(runner: LinkRunner) -> None:
 
 
 @pytest.mark.parametrize("cut", [1, 3, 4, CADU - 1, CADU, CADU + 1, 5 * CADU + 700, 9 * CADU + 2])
-def test_a_connection_that_is_cut_at_any_octet_and_continued_loses_nothing(
-    ground: Ground, station: Station, stream: bytes, expected: str, cut: int
-) -> None:
+def test_a_connection_that_is_cut_at_any_octet_and_continued_loses_nothing(ground, station, stream, expected, cut):
     declare(ground, station.link())
     with operated(ground) as runner:
         first = station.accept()
@@ -134,9 +130,7 @@ def test_a_connection_that_is_cut_at_any_octet_and_continued_loses_nothing(
     assert service.get_link(ground, "lab").octets <= len(stream)
 
 
-def test_parts_of_frames_are_ingested_as_they_arrive(
-    ground: Ground, station: Station, stream: bytes, expected: str
-) -> None:
+def test_parts_of_frames_are_ingested_as_they_arrive(ground, station, stream, expected):
     """What follows may never come; if it does, it has a position in the same recording."""
     declare(ground, station.link())
     with operated(ground):
@@ -153,9 +147,7 @@ def test_parts_of_frames_are_ingested_as_they_arrive(
     assert [one.position for one in pieces[1:]] == [one.position + one.octets for one in pieces[:-1]]
 
 
-def test_each_contact_is_a_recording_unless_it_ends_within_a_frame(
-    ground: Ground, station: Station, stream: bytes, expected: str, mission_time: Clock
-) -> None:
+def test_each_contact_is_a_recording_unless_it_ends_within_a_frame(ground, station, stream, expected, mission_time):
     declare(ground, station.link())
     with operated(ground) as runner:
         connection = station.accept()
@@ -176,9 +168,7 @@ def test_each_contact_is_a_recording_unless_it_ends_within_a_frame(
     ]
 
 
-def test_what_an_ended_process_has_left_in_its_spool_is_ingested_by_the_next(
-    either: Ground, station: Station, stream: bytes, expected: str
-) -> None:
+def test_what_an_ended_process_has_left_in_its_spool_is_ingested_by_the_next(either, station, stream, expected):
     declare(either, station.link())
     folder = either.home / "incoming" / "link-lab"
     folder.mkdir(parents=True)
@@ -189,7 +179,7 @@ def test_what_an_ended_process_has_left_in_its_spool_is_ingested_by_the_next(
     assert hash_of(either) == expected
 
 
-def test_octets_are_acknowledged_when_they_are_on_disk(ground: Ground, station: Station, stream: bytes) -> None:
+def test_octets_are_acknowledged_when_they_are_on_disk(ground, station, stream):
     declare(ground, station.link("acknowledge = true"))
     with operated(ground):
         connection = station.accept()
@@ -204,9 +194,7 @@ def test_octets_are_acknowledged_when_they_are_on_disk(ground: Ground, station: 
         assert count == len(stream)
 
 
-def test_released_telecommands_are_sent_in_the_next_contact_and_not_before(
-    either: Ground, station: Station, stream: bytes, mission_time: Clock
-) -> None:
+def test_released_telecommands_are_sent_in_the_next_contact_and_not_before(either, station, stream, mission_time):
     declare(either, station.link())
     keys = released(either, 3)
     with operated(either) as runner:
@@ -230,7 +218,7 @@ def test_released_telecommands_are_sent_in_the_next_contact_and_not_before(
     assert (ended[0].payload["octets"], ended[0].payload["telecommands"]) == (len(stream), 3)
 
 
-def test_manual_links_send_on_request_only(ground: Ground, station: Station, stream: bytes) -> None:
+def test_manual_links_send_on_request_only(ground, station, stream):
     declare(ground, station.link('send = "manual"'))
     with pytest.raises(Conflict, match="expected a process that operates it"):
         service.request_send(ground, "lab", actor="ann")
@@ -261,9 +249,7 @@ def taken_and_not_sent(ground: Ground, station: Station) -> tuple[list[int], ser
     return keys, declared
 
 
-def test_a_link_sends_nothing_of_a_spacecraft_on_hold_and_continues_after_it(
-    either: Ground, station: Station, stream: bytes
-) -> None:
+def test_a_link_sends_nothing_of_a_spacecraft_on_hold_and_continues_after_it(either, station, stream):
     keys, declared = taken_and_not_sent(either, station)
     hold_spacecraft(either, 76, "flight", reason="antenna", actor="ann")
     assert service.take_transmissions(either, declared, "dead") == []
@@ -278,9 +264,7 @@ def test_a_link_sends_nothing_of_a_spacecraft_on_hold_and_continues_after_it(
         wait_for_telecommands(either, station, keys)
 
 
-def test_telecommands_taken_by_a_process_that_ended_are_sent_once_by_the_next(
-    either: Ground, station: Station, stream: bytes
-) -> None:
+def test_telecommands_taken_by_a_process_that_ended_are_sent_once_by_the_next(either, station, stream):
     keys, declared = taken_and_not_sent(either, station)
     assert service.take_transmissions(either, declared, "nobody") == service.take_transmissions(
         either, declared, "dead"
@@ -294,7 +278,7 @@ def test_telecommands_taken_by_a_process_that_ended_are_sent_once_by_the_next(
     assert service.get_link(either, "lab").unconfirmed == 0
 
 
-def test_a_process_without_the_lease_takes_no_telecommands(either: Ground, station: Station) -> None:
+def test_a_process_without_the_lease_takes_no_telecommands(either, station):
     declare(either, station.link())
     keys = released(either)
     declared = service.declared_links(either)["lab"]
@@ -309,8 +293,8 @@ def test_a_process_without_the_lease_takes_no_telecommands(either: Ground, stati
 
 
 def test_transmissions_of_which_nothing_was_heard_are_repeated_in_the_next_contact(
-    ground: Ground, station: Station, stream: bytes, mission_time: Clock
-) -> None:
+    ground, station, stream, mission_time
+):
     declare(ground, station.link())
     keys = released(ground)
     with operated(ground) as runner:
@@ -350,9 +334,7 @@ class Socket:
         pass
 
 
-def test_octets_that_are_read_late_are_no_silence(
-    ground: Ground, station: Station, stream: bytes, mission_time: Clock
-) -> None:
+def test_octets_that_are_read_late_are_no_silence(ground, station, stream, mission_time):
     """A process that was held up finds octets of the whole time: their contact goes on, and no frame is cut."""
     declare(ground, station.link())
     declared = service.declared_links(ground)["lab"]
@@ -389,7 +371,7 @@ def test_octets_that_are_read_late_are_no_silence(
             runner._lock.close()
 
 
-def test_expired_telecommands_are_not_sent(ground: Ground, station: Station, stream: bytes) -> None:
+def test_expired_telecommands_are_not_sent(ground, station, stream):
     declare(ground, station.link())
     late, timely = released(ground, 2)
     with ground.database.writing() as connection:
@@ -407,10 +389,8 @@ def records(stream: bytes, utc_ns: int) -> bytes:
     return b"".join(struct.pack(">q", utc_ns) + row for row in rows)
 
 
-@pytest.mark.parametrize(("hours", "wrong"), [(0, False), (1, True), (-1, True)])
-def test_a_wrong_clock_of_the_station_is_reported_and_nothing_is_lost(
-    ground: Ground, station: Station, stream: bytes, expected: str, hours: int, wrong: bool
-) -> None:
+@pytest.mark.parametrize("hours, wrong", [(0, False), (1, True), (-1, True)])
+def test_a_wrong_clock_of_the_station_is_reported_and_nothing_is_lost(ground, station, stream, expected, hours, wrong):
     declare(
         ground,
         '[link]\nframe_length = 1115\ncoding = "rs"\nrandomiser = "legacy"\nframe_checksum = true\n'
@@ -429,7 +409,7 @@ def test_a_wrong_clock_of_the_station_is_reported_and_nothing_is_lost(
 PATIENCE_OF_CLOCK_S = 20.0
 
 
-def test_states_say_why_a_link_waits(ground: Ground, station: Station) -> None:
+def test_states_say_why_a_link_waits(ground, station):
     declare(ground, station.link())
     assert service.get_link(ground, "lab").reason == "no process operates it"
     station.down.close()
@@ -438,9 +418,7 @@ def test_states_say_why_a_link_waits(ground: Ground, station: Station) -> None:
         assert service.get_link(ground, "lab").state == "waiting"
 
 
-def test_a_link_that_is_not_to_reconnect_fails_when_the_station_closes(
-    ground: Ground, station: Station, stream: bytes
-) -> None:
+def test_a_link_that_is_not_to_reconnect_fails_when_the_station_closes(ground, station, stream):
     declare(ground, station.link("reconnect = false"))
     with operated(ground):
         connection = station.accept()
@@ -450,9 +428,7 @@ def test_a_link_that_is_not_to_reconnect_fails_when_the_station_closes(
         assert service.get_link(ground, "lab").reason == "closed by the station"
 
 
-def test_folders_are_watched_and_telecommands_written(
-    ground: Ground, tmp_path: Path, stream: bytes, expected: str
-) -> None:
+def test_folders_are_watched_and_telecommands_written(ground, tmp_path, stream, expected):
     incoming, outgoing = tmp_path / "in", tmp_path / "out"
     declare(ground, f'[[links]]\nname = "lab"\nkind = "file"\ndownlink = "{incoming}"\nuplink = "{outgoing}"\n')
     with operated(ground) as runner:
@@ -469,7 +445,7 @@ def test_folders_are_watched_and_telecommands_written(
     assert contact_events(ground) == ["contact started", "contact ended"]
 
 
-def test_the_file_is_not_read_again_by_the_next_process(ground: Ground, tmp_path: Path, stream: bytes) -> None:
+def test_the_file_is_not_read_again_by_the_next_process(ground, tmp_path, stream):
     declare(ground, f'[[links]]\nname = "lab"\nkind = "file"\ndownlink = "{tmp_path}/in"\n')
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "pass.cadu").write_bytes(stream)
@@ -481,10 +457,10 @@ def test_the_file_is_not_read_again_by_the_next_process(ground: Ground, tmp_path
         assert runner.octets_received == 2 * CADU
 
 
-@pytest.mark.parametrize(("share", "missed"), [(1.0, 0), (0.3, 1)])
+@pytest.mark.parametrize("share, missed", [(1.0, 0), (0.3, 1)])
 def test_a_contact_in_which_another_station_received_is_not_missed(
-    ground: Ground, station: Station, synthetic_pass: Any, mission_time: Clock, share: float, missed: int
-) -> None:
+    ground, station, synthetic_pass, mission_time, share, missed
+):
     declare(ground, PLACES + both_links(station, station, 'station = "here"'))
     add_reference(ground, synthetic_pass.folder / "reference.oem")
     lab, other = (service.declared_links(ground)[name] for name in ("lab", "other"))
@@ -501,9 +477,7 @@ def test_a_contact_in_which_another_station_received_is_not_missed(
     assert service.note_missed(ground, lab, "me", mission_time.utc_ns, "nothing was received") == missed
 
 
-def test_missed_contacts_are_recorded_once_with_the_reason(
-    either: Ground, station: Station, synthetic_pass: Any, mission_time: Clock
-) -> None:
+def test_missed_contacts_are_recorded_once_with_the_reason(either, station, synthetic_pass, mission_time):
     declare(either, PLACES + station.link('station = "here"'))
     add_reference(either, synthetic_pass.folder / "reference.oem")
     declared = service.declared_links(either)["lab"]
@@ -535,7 +509,7 @@ minimum_elevation_deg = 0.0
 """
 
 
-def test_contacts_without_a_place_or_an_ephemeris_are_not_predicted(ground: Ground, station: Station) -> None:
+def test_contacts_without_a_place_or_an_ephemeris_are_not_predicted(ground, station):
     declare(ground, station.link())
     now = mission_now_ns()
     assert service.list_contacts(ground, now, now + 10**12).unpredicted == {
@@ -547,7 +521,7 @@ def test_contacts_without_a_place_or_an_ephemeris_are_not_predicted(ground: Grou
     }
 
 
-def test_the_lease_is_kept_while_the_link_is_operated(ground: Ground, station: Station) -> None:
+def test_the_lease_is_kept_while_the_link_is_operated(ground, station):
     declare(ground, station.link())
     with operated(ground):
         first = ground.read(store.find_link, "lab")
@@ -585,9 +559,7 @@ class Confirming(Station):
 
 
 @pytest.mark.parametrize("answer", [0, 5, None])
-def test_a_transmission_is_repeated_with_its_number_until_the_station_confirms_it(
-    either: Ground, stream: bytes, answer: int | None
-) -> None:
+def test_a_transmission_is_repeated_with_its_number_until_the_station_confirms_it(either, stream, answer):
     station = Confirming(answer, answer)
     try:
         declare(either, station.link("confirm = true"))
@@ -602,9 +574,7 @@ def test_a_transmission_is_repeated_with_its_number_until_the_station_confirms_i
         station.close()
 
 
-def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(
-    either: Ground, stream: bytes, mission_time: Clock
-) -> None:
+def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(either, stream, mission_time):
     """At a handover the link of the first station does not know yet that its contact has ended."""
     first, second = Confirming(*[0] * 1000), Confirming()
     try:
@@ -649,7 +619,7 @@ def held_elsewhere(ground: Ground, station: Station) -> tuple[TransmissionRow, l
     return transmission, earlier, released(ground, 2)
 
 
-def test_telecommands_do_not_overtake_those_that_another_link_has(either: Ground, stream: bytes) -> None:
+def test_telecommands_do_not_overtake_those_that_another_link_has(either, stream):
     """At a handover the payload would refuse the overtaken ones as out of sequence."""
     station = Confirming()
     try:
@@ -670,9 +640,7 @@ def test_telecommands_do_not_overtake_those_that_another_link_has(either: Ground
         station.close()
 
 
-def test_telecommands_do_not_wait_for_ever_for_those_of_another_link(
-    either: Ground, stream: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_telecommands_do_not_wait_for_ever_for_those_of_another_link(either, stream, monkeypatch):
     monkeypatch.setattr("ground_service.contacts.links.runner.TURN_S", 0.0)
     log = MagicMock()
     monkeypatch.setattr("ground_service.contacts.links.runner.log", log)
@@ -696,9 +664,7 @@ def test_telecommands_do_not_wait_for_ever_for_those_of_another_link(
         ("", "ended"),
     ],
 )  # fmt: skip
-def test_a_refused_transmission_is_given_to_no_link_that_cannot_send_it(
-    either: Ground, station: Station, change: tuple[str, str]
-) -> None:
+def test_a_refused_transmission_is_given_to_no_link_that_cannot_send_it(either, station, change):
     section, event = change
     declare(either, station.link() + station.link(section).replace('"lab"', '"other"'))
     lab, other = (service.declared_links(either)[name] for name in ("lab", "other"))
@@ -717,9 +683,7 @@ def test_a_refused_transmission_is_given_to_no_link_that_cannot_send_it(
     assert [one.id for one in either.read(store.pending_transmissions, "lab")] == [transmission.id]
 
 
-def test_the_next_owner_knows_when_a_contact_was_heard_last(
-    either: Ground, station: Station, stream: bytes, mission_time: Clock
-) -> None:
+def test_the_next_owner_knows_when_a_contact_was_heard_last(either, station, stream, mission_time):
     """Mission time may stand still then: counted from the start of the process, the silence would never end."""
     declare(either, station.link())
     with operated(either) as runner:
@@ -758,7 +722,7 @@ time_offset = 0
 
 
 @pytest.fixture(scope="module")
-def orbit() -> Ephemeris:
+def orbit():
     every = START + np.arange(-1800, 7200, 60, dtype=np.int64) * NS
     return ephemeris_from_states(every, *circular_states(every))
 
@@ -779,16 +743,10 @@ def downlink(orbit: Ephemeris, station_clock_ns: int) -> bytes:
     return records
 
 
-@pytest.mark.parametrize(("station_clock_s", "is_used"), [(0, True), (3600, False), (-3600, False)])
+@pytest.mark.parametrize("station_clock_s, is_used", [(0, True), (3600, False), (-3600, False)])
 def test_the_clock_is_correlated_from_time_reports_of_a_link(
-    either: Ground,
-    station: Station,
-    orbit: Ephemeris,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    station_clock_s: int,
-    is_used: bool,
-) -> None:
+    either, station, orbit, tmp_path, monkeypatch, station_clock_s, is_used
+):
     save_oem(orbit, tmp_path / "orbit.oem")
     add_ephemeris(either, either.files.put_file(tmp_path / "orbit.oem"), name="orbit")
     declare(either, MISSION + station.link('station = "lab"'))

@@ -38,7 +38,7 @@ def line_of(fit: object) -> TimeCorrelation:
 
 
 @pytest.mark.parametrize("drift_ppb", [-20_000.0, 0.0, 350.0])
-def test_offset_and_drift_of_a_clock_are_found_to_its_resolution(drift_ppb: float) -> None:
+def test_offset_and_drift_of_a_clock_are_found_to_its_resolution(drift_ppb):
     """200 reports over 3.3 h, each rounded to a tick of 15 us: the drift is known to about 15 us / 6000 s = 2.5 ppb."""
     ticks, received, light = reports(drift_ppb, 3 * NS)
     fit = fit_correlation(ticks, received, light)
@@ -49,7 +49,7 @@ def test_offset_and_drift_of_a_clock_are_found_to_its_resolution(drift_ppb: floa
     assert set(used.tolist()) == {7}
 
 
-def test_wrong_reports_are_left_out() -> None:
+def test_wrong_reports_are_left_out():
     ticks, received, light = reports(500.0, 0)
     received = received.copy()
     received[[5, 77, 150]] += np.array([2, -40, 7]) * NS
@@ -58,7 +58,7 @@ def test_wrong_reports_are_left_out() -> None:
     assert fit.drift_ppb == pytest.approx(500.0, abs=3.0)
 
 
-def test_one_report_gives_an_offset_and_none_is_refused() -> None:
+def test_one_report_gives_an_offset_and_none_is_refused():
     ticks, received, light = reports(0.0, NS, count=1)
     fit = fit_correlation(ticks, received, light)
     assert (fit.points, fit.drift_ppb) == (1, 0.0)
@@ -67,14 +67,14 @@ def test_one_report_gives_an_offset_and_none_is_refused() -> None:
         fit_correlation(ticks[:0], received[:0], light[:0])
 
 
-def test_without_correlations_the_clock_is_ideal() -> None:
+def test_without_correlations_the_clock_is_ideal():
     ticks = np.array([0, 1 << 40], dtype=np.int64)
     utc, used = utc_ns_of_ticks(ticks, [])
     assert utc.tolist() == [int(utc_ns_from_ticks(int(t))) for t in ticks]
     assert set(used.tolist()) == {IDEAL_CLOCK}
 
 
-def test_the_correlation_nearest_in_time_is_used_outside_all_of_them() -> None:
+def test_the_correlation_nearest_in_time_is_used_outside_all_of_them():
     one = TimeCorrelation(1, 0, 100, 0, START, 0.0)
     two = TimeCorrelation(2, 1000, 1100, 1000, START, 0.0)
     _, used = utc_ns_of_ticks(np.array([-5, 50, 400, 700, 2000]), [one, two])
@@ -82,7 +82,7 @@ def test_the_correlation_nearest_in_time_is_used_outside_all_of_them() -> None:
 
 
 @given(after_s=st.integers(-86_400 * 300, 86_400 * 300), drift_ppb=st.floats(-50_000, 50_000))
-def test_ticks_and_time_are_inverse(after_s: int, drift_ppb: float) -> None:
+def test_ticks_and_time_are_inverse(after_s, drift_ppb):
     line = TimeCorrelation(1, 0, 1 << 50, int(ticks_from_utc_ns(START)), START, drift_ppb)
     utc = START + after_s * NS
     ticks = ticks_of_utc_ns(utc, [line])
@@ -104,15 +104,14 @@ def reports_of_stations(pattern: str, clocks_s: dict[str, list[float]], steps_s:
     return ticks, received, zero, zero, [NAMES[name] for name in pattern]
 
 
-@pytest.mark.parametrize(
-    ("difference", "cause"),
+@pytest.mark.parametrize("difference, cause",
     [
         (37.0, ": TAI instead of UTC?"), (-18.0, ": GPS time instead of UTC?"), (1.0, ": a leap second?"),
         (5.5, ""),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("pattern", ["abababababababab", "bbbbaaaabbbbaaaa", "abcabcabcabcabca"])
-def test_a_station_whose_clock_is_wrong_is_named_and_left_out(pattern: str, difference: float, cause: str) -> None:
+def test_a_station_whose_clock_is_wrong_is_named_and_left_out(pattern, difference, cause):
     clocks = {"a": [difference] * 16, "b": [0.0] * 16, "c": [0.0] * 16}
     kept, doubts = doubted_stations(*reports_of_stations(pattern, clocks))
     assert kept.tolist() == [name != "a" for name in pattern]
@@ -122,13 +121,13 @@ def test_a_station_whose_clock_is_wrong_is_named_and_left_out(pattern: str, diff
     }
 
 
-def test_two_stations_that_disagree_with_the_on_board_clock_as_well_are_both_left_out() -> None:
+def test_two_stations_that_disagree_with_the_on_board_clock_as_well_are_both_left_out():
     clocks = {"a": [37.0] * 8, "b": [0.0] * 8}
     kept, _ = doubted_stations(*reports_of_stations("abababab", clocks, [90.0] * 8))
     assert not kept.any()
 
 
-def test_a_clock_that_was_set_on_board_is_no_fault_of_a_station() -> None:
+def test_a_clock_that_was_set_on_board_is_no_fault_of_a_station():
     right = {"a": [0.0] * 16, "b": [0.0] * 16}
     for pattern in ("a" * 16, "abababababababab", "aaaabbbbaaaabbbb"):
         given = reports_of_stations(pattern, right, [0.0] * 8 + [1.0] * 8)
@@ -137,13 +136,13 @@ def test_a_clock_that_was_set_on_board_is_no_fault_of_a_station() -> None:
         assert len(clock_runs(*given[:4])) == 2
 
 
-def test_a_station_whose_clock_changes_is_left_out_from_then_on() -> None:
+def test_a_station_whose_clock_changes_is_left_out_from_then_on():
     clocks = {"a": [0.0] * 8 + [37.0] * 8, "b": [0.0] * 16, "c": [0.0] * 16}
     kept, _ = doubted_stations(*reports_of_stations("abcabcabcabcabca", clocks))
     assert np.flatnonzero(~kept).tolist() == [9, 12, 15]
 
 
-def test_a_correlation_holds_years_away() -> None:
+def test_a_correlation_holds_years_away():
     line = TimeCorrelation(1, 0, 1, int(ticks_from_utc_ns(START)), START, 0.0)
     for years in (-9, 5):
         utc_ns = START + years * 365 * 86_400 * NS

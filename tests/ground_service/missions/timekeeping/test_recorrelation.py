@@ -91,12 +91,12 @@ class Spacecraft:
 
 
 @pytest.fixture(scope="module")
-def spacecraft() -> Spacecraft:
+def spacecraft():
     return Spacecraft()
 
 
 @pytest.fixture(autouse=True)
-def fixed_light_time(monkeypatch: Any) -> None:
+def fixed_light_time(monkeypatch):
     monkeypatch.setattr(recorrelation, "_light_time_ns", lambda *given: np.full(len(given[3]), round(LIGHT_S * NS)))
 
 
@@ -115,9 +115,7 @@ def content(rows: list[Correlation]) -> list[dict[str, Any]]:
     return [row.model_dump(exclude={"id", "created"}) for row in rows]
 
 
-def test_every_boot_gets_its_line_and_every_derived_time_names_it(
-    ground: Ground, spacecraft: Spacecraft, tmp_path: Path
-) -> None:
+def test_every_boot_gets_its_line_and_every_derived_time_names_it(ground, spacecraft, tmp_path):
     vehicle = ingest(ground, tmp_path, spacecraft.downlink())
     rows = receive(ground, spacecraft.reports)
     assert [row.boot_count for row in rows] == [7, 8]
@@ -137,7 +135,7 @@ def test_every_boot_gets_its_line_and_every_derived_time_names_it(
     assert max(abs(one.residual_ns) for one in left) < 20_000
 
 
-def test_the_order_of_telemetry_and_receptions_does_not_matter(spacecraft: Spacecraft, tmp_path: Path) -> None:
+def test_the_order_of_telemetry_and_receptions_does_not_matter(spacecraft, tmp_path):
     cut = spacecraft.downlink(0, 12), spacecraft.downlink(12, 20), spacecraft.downlink(20)
     found = []
     for number, seed in enumerate(range(4)):
@@ -161,7 +159,7 @@ def test_the_order_of_telemetry_and_receptions_does_not_matter(spacecraft: Space
     assert len(found[0]) == 2
 
 
-def test_a_clock_that_is_set_begins_a_new_line_and_one_bad_report_does_not() -> None:
+def test_a_clock_that_is_set_begins_a_new_line_and_one_bad_report_does_not():
     sent = START + np.arange(20, dtype=np.int64) * 60 * NS
     ticks = np.asarray(ticks_from_utc_ns(sent), dtype=np.int64)
     none = np.zeros(20, dtype=np.int64)
@@ -175,7 +173,7 @@ def test_a_clock_that_is_set_begins_a_new_line_and_one_bad_report_does_not() -> 
 
 
 @pytest.mark.parametrize("drift_ppm", [0.0, 150.0])
-def test_a_step_during_hours_without_reports_begins_a_new_line(drift_ppm: float) -> None:
+def test_a_step_during_hours_without_reports_begins_a_new_line(drift_ppm):
     """In three hours an unknown drift of 200 ppm could be 2 s; that of this clock is known from the reports before."""
     hours = np.array([0.0, 0.1, 2.0, 2.1, 4.0, 4.1, 7.0, 7.1, 10.0])
     sent = START + np.asarray(hours * 3600 * NS, dtype=np.int64)
@@ -187,25 +185,21 @@ def test_a_step_during_hours_without_reports_begins_a_new_line(drift_ppm: float)
         assert [len(one) for one in runs] == lengths
 
 
-def test_a_drift_within_the_resolution_of_the_clock_is_none() -> None:
+def test_a_drift_within_the_resolution_of_the_clock_is_none():
     sent = START + np.arange(4, dtype=np.int64) * NS
     ticks = np.asarray(ticks_from_utc_ns(sent), dtype=np.int64) + np.array([0, 0, 1, 1])
     fit = fit_correlation(ticks, sent, np.zeros(4, dtype=np.int64))
     assert fit.drift_ppb == 0.0
 
 
-def test_what_an_operator_entered_stays_until_asked_otherwise(
-    ground: Ground, spacecraft: Spacecraft, tmp_path: Path
-) -> None:
+def test_what_an_operator_entered_stays_until_asked_otherwise(ground, spacecraft, tmp_path):
     vehicle = ingest(ground, tmp_path, spacecraft.downlink())
     correlate(ground, vehicle, [TimePoint(clock(START, 0), START, 0)])
     assert [row.points for row in receive(ground, spacecraft.reports)] == [1]
     assert len(correlate_again(ground, SPACECRAFT, "flight", actor="ann")) == 2
 
 
-def test_what_an_operator_entered_can_be_withdrawn_with_a_trace(
-    ground: Ground, spacecraft: Spacecraft, tmp_path: Path
-) -> None:
+def test_what_an_operator_entered_can_be_withdrawn_with_a_trace(ground, spacecraft, tmp_path):
     vehicle = ingest(ground, tmp_path, spacecraft.downlink())
     fitted = [row.id for row in receive(ground, spacecraft.reports)]
     with pytest.raises(Conflict, match="expected correlations in force that a person entered, found none"):
@@ -221,7 +215,7 @@ def test_what_an_operator_entered_can_be_withdrawn_with_a_trace(
     assert [(one.actor, one.detail) for one in trace] == [("ann", {"ids": [entered.id]})]
 
 
-def test_an_earlier_reception_of_the_same_report_counts(ground: Ground, spacecraft: Spacecraft, tmp_path: Path) -> None:
+def test_an_earlier_reception_of_the_same_report_counts(ground, spacecraft, tmp_path):
     ingest(ground, tmp_path, spacecraft.downlink())
     played_back = [
         ReceivedReport(one.ticks, one.sequence_count, one.earth_utc_ns + 3600 * NS) for one in spacecraft.reports
@@ -234,9 +228,7 @@ def test_an_earlier_reception_of_the_same_report_counts(ground: Ground, spacecra
     )
 
 
-def test_a_new_reference_ephemeris_gives_new_light_times(
-    ground: Ground, spacecraft: Spacecraft, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_a_new_reference_ephemeris_gives_new_light_times(ground, spacecraft, tmp_path, monkeypatch):
     monkeypatch.undo()
     vehicle = ingest(ground, tmp_path, spacecraft.downlink())
     receive(ground, spacecraft.reports)
@@ -254,9 +246,7 @@ def test_a_new_reference_ephemeris_gives_new_light_times(
     assert len(ground.read(correlations_on_record, vehicle)) == 4
 
 
-def test_an_operator_correlates_from_a_file(
-    spacecraft: Spacecraft, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_operator_correlates_from_a_file(spacecraft, tmp_path, capsys):
     home = ["--home", str(tmp_path / "home"), "--json"]
     who = ["--spacecraft-id", str(SPACECRAFT)]
     (tmp_path / "d.cadu").write_bytes(spacecraft.downlink())
@@ -275,7 +265,7 @@ def test_an_operator_correlates_from_a_file(
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    "text, message",
     [
         ("a,b\n1,2\n", "line 1: expected a column packet_ticks, found a,b"),
         ("packet_ticks,sequence_count,received_utc\n1,2,then\n", "receptions.0"),
@@ -283,21 +273,19 @@ def test_an_operator_correlates_from_a_file(
         ("packet_ticks,sequence_count,received_utc,station\n1,2,2029-08-07T06:00:00Z,Mars\n", "Canberra"),
     ],
 )
-def test_a_file_that_is_none_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+def test_a_file_that_is_none_is_refused_in_one_line(tmp_path, text, message):
     (tmp_path / "t.csv").write_text(text)
     with pytest.raises(InvalidInput, match=message):
         read_receptions(tmp_path / "t.csv")
 
 
-def test_telemetry_without_receptions_leaves_the_clock_ideal(
-    ground: Ground, spacecraft: Spacecraft, tmp_path: Path
-) -> None:
+def test_telemetry_without_receptions_leaves_the_clock_ideal(ground, spacecraft, tmp_path):
     vehicle = ingest(ground, tmp_path, spacecraft.downlink())
     assert ground.read(correlations_in_force, vehicle) == []
 
 
 @pytest.mark.parametrize(
-    ("changes", "kinds"),
+    "changes, kinds",
     [
         ("reference_utc_ns = reference_utc_ns + 900", set()),  # rounding
         ("reference_utc_ns = reference_utc_ns + 1100", {"correlations"}),
@@ -306,9 +294,7 @@ def test_telemetry_without_receptions_leaves_the_clock_ideal(
         ("method = 'entered'", set()),
     ],
 )
-def test_verification_fits_the_correlations_again(
-    either: Ground, tmp_path: Path, spacecraft: Spacecraft, changes: str, kinds: set[str]
-) -> None:
+def test_verification_fits_the_correlations_again(either, tmp_path, spacecraft, changes, kinds):
     ingest(either, tmp_path, spacecraft.downlink())
     receive(either, spacecraft.reports)
     intact = verify(either, rebuild=True)
@@ -320,9 +306,7 @@ def test_verification_fits_the_correlations_again(
     assert bool(found.unchecked) == changes.startswith("method")
 
 
-def test_verification_does_not_expect_correlations_before_the_follow_up_work(
-    either: Ground, tmp_path: Path, spacecraft: Spacecraft, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_verification_does_not_expect_correlations_before_the_follow_up_work(either, tmp_path, spacecraft, monkeypatch):
     receive(either, spacecraft.reports)
     monkeypatch.setattr(either.database.listeners, "_functions", [])
     ingest(either, tmp_path, spacecraft.downlink())
