@@ -57,6 +57,10 @@ PAPER_DRIFT_PER_FRAME_M = 400.0
 SPHERICAL_ERROR_RTN_M = np.array([30.0, -40.0, 120.0])  # 130 m in 3-D
 FILTER_ERROR_RTN_M = np.array([10.0, 20.0, -20.0])  # 30 m in 3-D
 PIXEL_OFFSET = (0.5, -1.25)
+MANIFEST = """{"schema_version": 1, "pass_name": "synthetic pass", "scenario": "synthetic", "light": "paper",
+    "data_sources": ["circular orbit", "synthetic craters", "orientation IAU WGCCRE 2009"],
+    "camera": {"width_px": 512, "height_px": 512, "fov_deg": 120.0}, "estimators": ["paper", "spherical"],
+    "gravity": {"truth": "GRGM1200L (12x12, built in)", "degree": 12}}"""
 
 
 def cells(table: str) -> list[list[str]]:
@@ -284,16 +288,12 @@ def make_pass(tmp_path_factory):
         if mission:
             (folder / "mission.toml").write_text(mission)
         build = {"name": "nothing", "version": "0", "model_sha256": "00" * 32, "parameters_sha256": "11" * 32}
-        manifest = {
-            "schema_version": 1, "pass_name": "synthetic pass", "spacecraft_id": SPACECRAFT, "scenario": "synthetic",
-            "seed": seed, "build": build, "start_utc": format_utc(int(utc_ns[0])),
+        given = {
+            "spacecraft_id": SPACECRAFT, "seed": seed, "build": build, "start_utc": start["utc"],
             "stop_utc": format_utc(int(utc_ns[-1])), "cadence_s": CADENCE_S, "frames_expected": frames,
-            "data_sources": ["circular orbit", "synthetic craters", "orientation IAU WGCCRE 2009"],
-            "light": "paper", "camera": {"width_px": 512, "height_px": 512, "fov_deg": 120.0},
-            "estimators": ["paper", "spherical"], "start_state": start,
-            "gravity": {"truth": "GRGM1200L (12x12, built in)", "degree": 12},
+            "start_state": start,
         }  # fmt: skip
-        write_manifest(folder, manifest)
+        write_manifest(folder, json.loads(MANIFEST) | given)
         return SyntheticPass(folder, sent.packets, utc_ns, tally["expected"], tally["missed"])
 
     return make
@@ -334,10 +334,8 @@ def define_pass_of(ground: Ground, made: Any) -> int:
 
 def _housekeeping(k: int) -> dict[str, Any]:
     values: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
-    return values | {
-        "structure_id": 1, "boot_count": 1, "mode": "observing", "frames_processed": k,
-        "temperature_c": 20.0 + 0.1 * k, "bus_voltage_v": 12.0,
-    }  # fmt: skip
+    known = json.loads('{"structure_id": 1, "boot_count": 1, "mode": "observing", "bus_voltage_v": 12.0}')
+    return values | known | {"frames_processed": k, "temperature_c": 20.0 + 0.1 * k}
 
 
 @pytest.fixture(scope="session")
@@ -450,11 +448,6 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _postgres_binaries() -> Path | None:
-    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
-    return found[-1].parent if found else None
-
-
 @pytest.fixture(scope="module")
 def redis_url():
     """A Redis server of the tests' own, its user as restricted as in the distributed form."""
@@ -485,8 +478,8 @@ def redis_url():
 @pytest.fixture(scope="session")
 def postgres_server():
     """URL of a PostgreSQL server of the tests' own, without the name of a database."""
-    binaries = _postgres_binaries()
-    if binaries is None:
+    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
+    if not found:
         pytest.skip("PostgreSQL is not installed")
     as_user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
     port = free_port()
@@ -495,25 +488,18 @@ def postgres_server():
         shutil.chown(folder, "postgres", "postgres")
     data = folder / "data"
 
-    def run(program: str, *arguments: str) -> None:
-        subprocess.run(
-            [*as_user, str(binaries / program), *arguments], check=True, cwd=folder, stdout=subprocess.DEVNULL
-        )
+    def run(command: str, *arguments: str, check: bool = True) -> None:
+        program, *words = command.split()
+        whole = [*as_user, str(found[-1].with_name(program)), *words, *arguments]
+        subprocess.run(whole, check=check, cwd=folder, stdout=subprocess.DEVNULL)
 
     try:
-        run("initdb", "-D", str(data), "-U", "linna", "-A", "trust", "-E", "UTF8", "--no-sync")
-        run(
-            "pg_ctl", "-D", str(data), "-w", "-l", str(folder / "log"), "start",
-            "-o", f"-p {port} -k {folder} -h 127.0.0.1 -c fsync=off -c synchronous_commit=off",
-        )  # fmt: skip
+        run(f"initdb -D {data} -U linna -A trust -E UTF8 --no-sync")
+        options = f"-p {port} -k {folder} -h 127.0.0.1 -c fsync=off -c synchronous_commit=off"
+        run(f"pg_ctl -D {data} -w -l {folder}/log start -o", options)
         yield f"postgresql+psycopg://linna@127.0.0.1:{port}"
     finally:
-        subprocess.run(
-            [*as_user, str(binaries / "pg_ctl"), "-D", str(data), "-m", "immediate", "-w", "stop"],
-            cwd=folder,
-            stdout=subprocess.DEVNULL,
-            check=False,
-        )
+        run(f"pg_ctl -D {data} -m immediate -w stop", check=False)
         shutil.rmtree(folder, ignore_errors=True)
 
 

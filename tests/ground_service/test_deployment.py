@@ -18,15 +18,16 @@ import yaml
 
 from ground_service.settings import Settings
 from studies.harness.parts import Part, free_port, listens
+from tests.ground_service.conftest import cells
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
-SECRETS = (
-    "database_superuser_password", "database_owner_password", "database_password", "database_backup_password",
-    "broker_password", "admin_token",
-)  # fmt: skip
+(SECRETS,) = cells(
+    "database_superuser_password | database_owner_password | database_password | database_backup_password | "
+    "broker_password | admin_token"
+)
 OPTIONAL = ("objects_access_key", "objects_secret_key", "oidc_client_secret")
 """Secrets of optional parts: empty files until a setting names them."""
 
@@ -42,6 +43,10 @@ def environment_of(name: str) -> dict[str, str]:
         lines = (ROOT / "deploy/service.env").read_text().splitlines()
         found = dict(line.split("=", 1) for line in lines if line and not line.startswith("#"))
     return found | service.get("environment", {})
+
+
+def sets(table: str) -> dict[str, set[str]]:
+    return {name: set(words.split()) for name, words in cells(table)}
 
 
 def default_of(text: str) -> str:
@@ -93,13 +98,13 @@ def test_a_service_is_in_the_networks_that_it_needs_and_no_others():
         network: {name for name in SERVICES if network in SERVICES[name].get("networks", [])}
         for network in COMPOSE["networks"]
     }
-    assert members == {
-        "edge": {"proxy"},
-        "front": {"proxy", "api", "api2"},
-        "data": {"db", "migrate", "api", "api2", "worker", "scheduler", "backup"},
-        "queue": {"broker", "api", "api2", "worker", "scheduler"},
-        "egress": {"api", "api2", "worker", "scheduler", "backup"},
-    }
+    assert members == sets("""
+edge | proxy
+front | proxy api api2
+data | db migrate api api2 worker scheduler backup
+queue | broker api api2 worker scheduler
+egress | api api2 worker scheduler backup
+""")
     inner = {name for name, options in COMPOSE["networks"].items() if (options or {}).get("internal")}
     assert inner == {"front", "data", "queue"}
 
@@ -113,14 +118,15 @@ def test_the_api_believes_the_proxy_and_nobody_else():
 def test_every_process_has_the_same_settings():
     """A setting in the common declaration reaches all; none of them is given to one process alone."""
     own = {name: set(SERVICES[name]["environment"]) for name in PROCESSES}
-    common = {"LINNA_ALLOWED_HOSTS", "LINNA_TRUSTED_PROXIES"}
-    without_broker = {"LINNA_BROKER_URL", "LINNA_BROKER_PASSWORD_FILE"}
-    migration = {f"LINNA_{name}" for name in ("MIGRATION_DATABASE_URL", "MIGRATION_DATABASE_PASSWORD_FILE")}
-    assert own == {
-        "api": common | {"LINNA_BACKUPS"}, "api2": common | {"LINNA_BACKUPS"}, "worker": common,
-        "scheduler": common, "migrate": without_broker | migration | {"LINNA_BACKUP_ROLE"},
-        "backup": without_broker | {"LINNA_DATABASE_URL", "LINNA_DATABASE_PASSWORD_FILE"},
-    }  # fmt: skip
+    without_broker = "LINNA_BROKER_URL LINNA_BROKER_PASSWORD_FILE"
+    assert own == sets(f"""
+api | LINNA_ALLOWED_HOSTS LINNA_TRUSTED_PROXIES LINNA_BACKUPS
+api2 | LINNA_ALLOWED_HOSTS LINNA_TRUSTED_PROXIES LINNA_BACKUPS
+worker | LINNA_ALLOWED_HOSTS LINNA_TRUSTED_PROXIES
+scheduler | LINNA_ALLOWED_HOSTS LINNA_TRUSTED_PROXIES
+migrate | {without_broker} LINNA_MIGRATION_DATABASE_URL LINNA_MIGRATION_DATABASE_PASSWORD_FILE LINNA_BACKUP_ROLE
+backup | {without_broker} LINNA_DATABASE_URL LINNA_DATABASE_PASSWORD_FILE
+""")
     files = {json.dumps(SERVICES[name]["env_file"]) for name in PROCESSES}
     assert len(files) == 1 and "settings.env" in files.pop()
     assert {name for name in SERVICES if "env_file" in SERVICES[name]} == set(PROCESSES)
@@ -155,13 +161,15 @@ def test_secrets_are_files_of_those_who_need_them_and_in_no_command_or_environme
     holders = {
         name: {user for user in SERVICES if name in SERVICES[user].get("secrets", [])} for name in COMPOSE["secrets"]
     }
-    assert holders == {
-        "database_superuser_password": {"db"}, "database_owner_password": {"db", "migrate"},
-        "database_password": {"db", "migrate", "api", "api2", "worker", "scheduler"},
-        "database_backup_password": {"db", "backup"},
-        "broker_password": {"broker", "api", "api2", "worker", "scheduler"}, "admin_token": {"migrate"},
-        **{key: set(PROCESSES) for key in OPTIONAL},
-    }  # fmt: skip
+    needed = sets("""
+database_superuser_password | db
+database_owner_password | db migrate
+database_password | db migrate api api2 worker scheduler
+database_backup_password | db backup
+broker_password | broker api api2 worker scheduler
+admin_token | migrate
+""")
+    assert holders == needed | {key: set(PROCESSES) for key in OPTIONAL}
     for service in SERVICES.values():
         for name, value in service.get("environment", {}).items():
             # A password or token is named by a file, and no URL holds one.
@@ -202,11 +210,27 @@ def test_the_runner_has_no_secret_no_network_and_no_archive():
     assert {name for name in SERVICES if "exchange:/exchange" in SERVICES[name]["volumes"]} == {"worker", "runner"}
 
 
+def sh(name: str, programs: Path | str = "", **environment: object) -> subprocess.CompletedProcess[str]:
+    """Run a script of the deployment, with a folder of programs before the others."""
+    given = {key: str(value) for key, value in environment.items()}
+    return subprocess.run(
+        ["sh", str(ROOT / "deploy" / name)], env={"PATH": f"{programs}:{os.environ['PATH']}", **given},
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+def program(folder: Path, name: str, text: str) -> Path:
+    """Write a program of this name; return its folder."""
+    programs = folder / "programs"
+    programs.mkdir()
+    (programs / name).write_text(f"#!/bin/sh\n{text}\n")
+    (programs / name).chmod(0o755)
+    return programs
+
+
 def test_the_secrets_that_are_missing_are_made_and_those_that_are_there_are_kept(tmp_path):
     folder = tmp_path / "secrets"
-    script = ["sh", str(ROOT / "deploy/secrets.sh")]
-    environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(folder), "LINNA_ADMIN_TOKEN": "given" * 5}
-    subprocess.run(script, check=True, env=environment, capture_output=True)
+    assert sh("secrets.sh", LINNA_SECRETS_DIR=folder, LINNA_ADMIN_TOKEN="given" * 5).returncode == 0
     made = {path.name: path.read_text() for path in folder.rglob("*") if path.is_file()}
     assert set(made) == {*SECRETS, *OPTIONAL, *CERTIFICATE}
     assert {made[name] for name in OPTIONAL} == {""}
@@ -214,20 +238,13 @@ def test_the_secrets_that_are_missing_are_made_and_those_that_are_there_are_kept
     drawn = [made[name] for name in SECRETS if name != "admin_token"]
     assert len(set(drawn)) == 5 and all(re.fullmatch("[0-9a-f]{48}", one) for one in drawn)
     assert folder.stat().st_mode & 0o077 == 0
-    subprocess.run(script, check=True, env={**environment, "LINNA_ADMIN_TOKEN": "other"}, capture_output=True)
+    assert sh("secrets.sh", LINNA_SECRETS_DIR=folder, LINNA_ADMIN_TOKEN="other").returncode == 0
     assert {path.name: path.read_text() for path in folder.rglob("*") if path.is_file()} == made
 
 
 def test_an_error_of_openssl_is_reported(tmp_path):
-    programs = tmp_path / "programs"
-    programs.mkdir()
-    (programs / "openssl").write_text("#!/bin/sh\necho 'a reason' >&2\nexit 1\n")
-    (programs / "openssl").chmod(0o755)
-    done = subprocess.run(
-        ["sh", str(ROOT / "deploy/secrets.sh")],
-        env={"PATH": f"{programs}:{os.environ['PATH']}", "LINNA_SECRETS_DIR": str(tmp_path / "secrets")},
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    programs = program(tmp_path, "openssl", "echo 'a reason' >&2; exit 1")
+    done = sh("secrets.sh", programs, LINNA_SECRETS_DIR=tmp_path / "secrets")
     assert done.returncode == 1 and "secrets are in" not in done.stdout
     assert "no certificate was made for localhost:\na reason" in done.stderr
 
@@ -241,22 +258,14 @@ HOLDERS = {
 
 def start_script(name: str, secrets: dict[str, str], folder: Path) -> tuple[subprocess.CompletedProcess[str], Path]:
     """Run a script with these secrets and a program that only prints its arguments and its input."""
-    program, _ = HOLDERS[name]
-    programs = folder / "programs"
-    programs.mkdir()
-    (programs / program).write_text('#!/bin/sh\necho "started $*"; cat\n')
-    (programs / program).chmod(0o755)
+    programs = program(folder, HOLDERS[name][0], 'echo "started $*"; cat')
     (folder / "secrets").mkdir()
     for secret, value in secrets.items():
         (folder / "secrets" / secret).write_text(value)
     written = folder / "written"
-    environment = {
-        "PATH": f"{programs}:{os.environ['PATH']}", "LINNA_SECRETS": str(folder / "secrets"),
-        "LINNA_REDIS_USERS": str(written), "POSTGRES_USER": "postgres", "POSTGRES_DB": "linna",
-    }  # fmt: skip
-    done = subprocess.run(
-        ["sh", str(ROOT / "deploy" / name)], env=environment, stdin=subprocess.DEVNULL, capture_output=True,
-        text=True, check=False,
+    done = sh(
+        name, programs, LINNA_SECRETS=folder / "secrets", LINNA_REDIS_USERS=written, POSTGRES_USER="postgres",
+        POSTGRES_DB="linna",
     )  # fmt: skip
     return done, written
 
@@ -275,8 +284,7 @@ def test_a_server_does_not_start_with_an_empty_password(name, missing, is_empty,
 
 def test_passwords_may_have_any_character(tmp_path):
     odd = """two words, 'quotes' "and" \\ #%s"""
-    (tmp_path / "redis").mkdir()
-    done, written = start_script("redis.sh", {"broker_password": odd}, tmp_path / "redis")
+    done, written = start_script("redis.sh", {"broker_password": odd}, tmp_path)
     assert done.returncode == 0, done.stderr
     assert f" #{hashlib.sha256(odd.encode()).hexdigest()} " in written.read_text() and odd not in written.read_text()
 
@@ -321,11 +329,7 @@ def test_a_certificate_without_its_key_is_refused_and_kept(name, tmp_path):
     tls = tmp_path / "tls"
     tls.mkdir()
     (tls / name).write_text("of a certification authority")
-    done = subprocess.run(
-        ["sh", str(ROOT / "deploy/secrets.sh")],
-        env={"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(tmp_path)}, capture_output=True, text=True,
-        check=False,
-    )  # fmt: skip
+    done = sh("secrets.sh", LINNA_SECRETS_DIR=tmp_path)
     (other,) = set(CERTIFICATE) - {name}
     assert done.returncode == 2
     assert done.stderr == f"secrets: expected {tls}/{other} for {tls}/{name}, found none\n"
@@ -334,14 +338,9 @@ def test_a_certificate_without_its_key_is_refused_and_kept(name, tmp_path):
 
 
 def test_nothing_stays_of_a_base_backup_that_fails(tmp_path):
-    programs, wal = tmp_path / "programs", tmp_path / "wal"
-    programs.mkdir()
-    (programs / "pg_basebackup").write_text('#!/bin/sh\nmkdir -p "$2" && echo part > "$2/file"\nexit 1\n')
-    (programs / "pg_basebackup").chmod(0o755)
-    done = subprocess.run(
-        ["sh", str(ROOT / "deploy/base-backup.sh")],
-        env={"PATH": f"{programs}:{os.environ['PATH']}", "LINNA_WAL": str(wal)}, capture_output=True, check=False,
-    )  # fmt: skip
+    wal = tmp_path / "wal"
+    programs = program(tmp_path, "pg_basebackup", 'mkdir -p "$2" && echo part > "$2/file"; exit 1')
+    done = sh("base-backup.sh", programs, LINNA_WAL=wal)
     assert done.returncode == 1 and list((wal / "base").iterdir()) == []
 
 

@@ -4,6 +4,7 @@ import pytest
 
 from ground_service.errors import SettingsError
 from ground_service.settings import SECRETS, URLS, load_settings, normalised_url
+from tests.ground_service.conftest import cells
 
 
 @pytest.fixture(autouse=True)
@@ -49,15 +50,15 @@ def test_a_password_can_come_from_a_file_of_its_own(monkeypatch, tmp_path):
     assert settings.resolved_broker_url() == "redis://linna:a%2Fb%40c@broker:6379/0"
 
 
-@pytest.mark.parametrize(
-    "name, value, message",
-    [
-        ("LINNA_PORT", "seventy", "LINNA_PORT: expected input should be a valid integer"),
-        ("LINNA_PORT", "70000", "LINNA_PORT: expected input should be less than or equal to 65535"),
-        ("LINNA_TRUSTED_PROXIES", "proxy", "^LINNA_TRUSTED_PROXIES: expected IP addresses or networks, found 'proxy'$"),
-        ("LINNA_DATABASE_URL_FILE", "/does/not/exist", "LINNA_DATABASE_URL_FILE: expected a readable file"),
-    ],
-)
+WRONG = """
+LINNA_PORT | seventy | LINNA_PORT: expected input should be a valid integer
+LINNA_PORT | 70000 | LINNA_PORT: expected input should be less than or equal to 65535
+LINNA_TRUSTED_PROXIES | proxy | ^LINNA_TRUSTED_PROXIES: expected IP addresses or networks, found 'proxy'$
+LINNA_DATABASE_URL_FILE | /does/not/exist | LINNA_DATABASE_URL_FILE: expected a readable file
+"""
+
+
+@pytest.mark.parametrize("name, value, message", cells(WRONG))
 def test_a_wrong_setting_is_named(monkeypatch, name, value, message):
     monkeypatch.setenv(name, value)
     with pytest.raises(SettingsError, match=message):

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 
 import pytest
 
@@ -30,7 +31,7 @@ SECRET = "a-token-of-a-deployment-0123456789"
 
 def details(ground: Ground) -> list[tuple[str, str, str, object]]:
     entries = ground.read(list_audit, AuditFilter()).items
-    return [(one.actor, one.action, one.target, one.detail) for one in reversed(entries)]
+    return [(one.actor, one.action, one.target, dict(sorted(one.detail.items()))) for one in reversed(entries)]
 
 
 def test_a_disabled_user_is_refused_at_once_in_every_process(either, tmp_path):
@@ -48,10 +49,6 @@ def test_a_disabled_user_is_refused_at_once_in_every_process(either, tmp_path):
             change_user(other, "bob", state="disabled")
         change_user(other, "bob", state="active")
         assert authenticate(either, token).role == "operator"
-    assert [one[:3] for one in details(either)] == [
-        ("local", "add user", "ann"), ("ann", "add user", "bob"), ("ann", "disable user", "bob"),
-        ("local", "enable user", "bob"),
-    ]  # fmt: skip
 
 
 def test_a_revoked_token_is_refused_and_others_stay(either):
@@ -70,7 +67,6 @@ def test_a_revoked_token_is_refused_and_others_stay(either):
         revoke_token(either, oldest.id)
     with pytest.raises(NotFound):
         revoke_token(either, 99)
-    assert details(either)[-1][:3] == ("eve", "revoke token", "ann")
     third = add_token(either, "ann", revoke_others=True)
     assert [token_valid(either, one) for one in (first, second, third)] == [False, False, True]
 
@@ -177,16 +173,22 @@ def test_every_change_is_in_the_audit_log_with_what_it_changed(ground):
     change_user(ground, "bob", state="active", actor="ann")
     revoke_token(ground, 4, actor="ann")
     ensure_user(ground, "cleo", "operator", SECRET, actor="deployment")
-    assert details(ground) == [
-        ("eve", "add user", "ann", {"role": "admin", "token_id": 1}),
-        ("ann", "add user", "bob", {"role": "viewer", "token_id": 2}), ("ann", "add token", "bob", {"token_id": 3}),
-        ("ann", "renew token", "bob", {"token_id": 4, "revoked": 2}),
-        ("ann", "change role", "bob", {"from": "viewer", "to": "operator"}),
-        ("ann", "disable user", "bob", {"sessions": 0}),
-        ("ann", "change role", "bob", {"from": "operator", "to": "viewer"}),
-        ("ann", "enable user", "bob", {"sessions": 0}), ("ann", "revoke token", "bob", {"token_id": 4}),
-        ("deployment", "ensure user", "cleo", {"role": "operator", "token_id": 5}),
-    ]  # fmt: skip
+    found = "\n".join(f"{actor} | {action} | {target} | {detail}" for actor, action, target, detail in details(ground))
+    assert (
+        found
+        == """
+eve | add user | ann | {'role': 'admin', 'token_id': 1}
+ann | add user | bob | {'role': 'viewer', 'token_id': 2}
+ann | add token | bob | {'token_id': 3}
+ann | renew token | bob | {'revoked': 2, 'token_id': 4}
+ann | change role | bob | {'from': 'viewer', 'to': 'operator'}
+ann | disable user | bob | {'sessions': 0}
+ann | change role | bob | {'from': 'operator', 'to': 'viewer'}
+ann | enable user | bob | {'sessions': 0}
+ann | revoke token | bob | {'token_id': 4}
+deployment | ensure user | cleo | {'role': 'operator', 'token_id': 5}
+""".strip()
+    )
 
 
 def test_who_is_not_named_is_local(ground):
@@ -275,11 +277,9 @@ def test_only_the_token_itself_is_accepted(ground):
 
 def test_a_deployment_replaces_role_and_token_and_revokes_the_old_one(ground):
     old = add_user(ground, "ann", "viewer")
-    assert ensure_user(ground, "ann", "operator", SECRET)
-    assert (get_user(ground, "ann").role, token_valid(ground, old)) == ("operator", False)
+    assert ensure_user(ground, "ann", "operator", SECRET) and not token_valid(ground, old)
     caller = authenticate(ground, SECRET)
-    assert (caller.name, caller.role) == ("ann", "operator")
-    assert list_tokens(ground)[0].expires is None
+    assert (caller.name, caller.role, list_tokens(ground)[0].expires) == ("ann", "operator", None)
     assert not ensure_user(ground, "ann", "operator", SECRET)
     # Another token in the same role is a change, too.
     assert ensure_user(ground, "ann", "operator", SECRET[::-1]) and not token_valid(ground, SECRET)
@@ -288,11 +288,10 @@ def test_a_deployment_replaces_role_and_token_and_revokes_the_old_one(ground):
 def test_a_deployment_may_change_the_role_and_keep_the_token(ground):
     ensure_user(ground, "ann", "viewer", SECRET)
     further = add_token(ground, "ann")
-    assert ensure_user(ground, "ann", "operator", SECRET, actor="deployment")
+    assert ensure_user(ground, "ann", "operator", SECRET)
     caller = authenticate(ground, SECRET)
     assert (caller.role, caller.token_id) == ("operator", 1)
     assert not token_valid(ground, further)
-    assert details(ground)[-1] == ("deployment", "ensure user", "ann", {"role": "operator", "token_id": 1})
 
 
 def test_a_deployment_does_not_bring_a_revoked_token_back(ground):
@@ -317,11 +316,9 @@ def test_two_users_of_a_deployment_have_tokens_of_their_own(ground, exists):
 
 @pytest.mark.parametrize("length, accepted", [(23, False), (24, True)])
 def test_a_token_of_a_deployment_has_24_characters_or_more(ground, length, accepted):
-    if accepted:
+    refused = pytest.raises(InvalidInput, match="token: expected 24 characters or more, found 23")
+    with nullcontext() if accepted else refused:
         assert ensure_user(ground, "ann", "viewer", "t" * length)
-    else:
-        with pytest.raises(InvalidInput, match="token: expected 24 characters or more, found 23"):
-            ensure_user(ground, "ann", "viewer", "t" * length)
     assert bool(list_users(ground)) is accepted
 
 
@@ -330,17 +327,15 @@ def test_changes_that_cannot_be_made_are_refused_with_what_was_expected(ground):
     with pytest.raises(Conflict, match="user ann: exists already"):
         add_user(ground, "ann", "viewer")
     for change, message in (
-        ({}, "user ann: expected a new state, role or missions, found none of them"),
-        ({"state": "asleep"}, "user state: expected active or disabled, found 'asleep'"),
-        ({"role": "root"}, "user role: expected viewer, operator, admin, found 'root'"),
+        ({}, "user, ann: expected a new state, role or missions, found none of them"),
+        ({"state": "asleep"}, "user, state: expected active or disabled, found 'asleep'"),
+        ({"role": "root"}, "user, role: expected viewer, operator, admin, found 'root'"),
     ):
-        with pytest.raises(InvalidInput) as caught:
+        with pytest.raises(InvalidInput, match=f"^{message}$"):
             change_user(ground, "ann", **change)
-        assert str(caught.value).replace(",", "") == message.replace(",", "")
-    with pytest.raises(NotFound, match="bob"):
-        change_user(ground, "bob", state="disabled")
-    with pytest.raises(NotFound, match="bob"):
-        get_user(ground, "bob")
+    for work in (lambda: change_user(ground, "bob", state="disabled"), lambda: get_user(ground, "bob")):
+        with pytest.raises(NotFound, match="bob"):
+            work()
     with pytest.raises(InvalidInput, match=r"^user, name: .*service"):
         change_user(ground, "service", role="viewer")
 

@@ -20,18 +20,30 @@ TEXTS = (
     "../../etc/passwd",
 )  # fmt: skip
 NUMBERS = ("1", "0", "-1", str(2**31), str(2**63), str(2**70), "1.5", "x", "")
-BODIES: tuple[Any, ...] = (
-    None, [], {}, "text", 5, {"a": 1}, [[[[]]]], {"start": 5}, {"points": []}, {"points": [{"ticks": 2**70}]},
-    {"name": "test_connection", "spacecraft_id": 76, "arguments": {"x": [[]]}},
-    {"name": "insert_activity", "spacecraft_id": 76, "arguments": {"release_ticks": 1e400, "items": "x"}},
-    {"name": "perform_function", "spacecraft_id": 76, "arguments": {"function_id": {}, "argument_1": None}},
-    {"start": "2029-08-07T06:00:00Z", "stop": "2029-08-07T06:00:00Z", "spacecraft_id": 76},
-    {"start": "9999-12-31T23:59:59Z", "stop": "0001-01-01T00:00:00Z", "spacecraft_id": 76, "cadence_s": 0.1},
-    {"name": "x", "start": "2262-04-11T23:47:16Z", "stop": "2262-04-11T23:47:17Z", "spacecraft_id": 0},
-    {"altitude_km": {"min": -1e308, "max": 1e308}, "step_s": 1, "maximum_duration_s": 30, "latitude_deg": {"min": 0}},
-    {"latitude_deg": {"min": "x", "max": 1e9}},
-    {"state": "approved", "reason": "\x00"}, {"reason": "x"}, {"predecessor_id": 1},
-)  # fmt: skip
+BODIES: list[Any] = [
+    json.loads(line.replace("BIG", str(2**70)))
+    for line in r"""null
+[]
+{}
+"text"
+5
+{"a": 1}
+[[[[]]]]
+{"start": 5}
+{"points": []}
+{"points": [{"ticks": BIG}]}
+{"name": "test_connection", "spacecraft_id": 76, "arguments": {"x": [[]]}}
+{"name": "insert_activity", "spacecraft_id": 76, "arguments": {"release_ticks": 1e400, "items": "x"}}
+{"name": "perform_function", "spacecraft_id": 76, "arguments": {"function_id": {}, "argument_1": null}}
+{"start": "2029-08-07T06:00:00Z", "stop": "2029-08-07T06:00:00Z", "spacecraft_id": 76}
+{"start": "9999-12-31T23:59:59Z", "stop": "0001-01-01T00:00:00Z", "spacecraft_id": 76, "cadence_s": 0.1}
+{"name": "x", "start": "2262-04-11T23:47:16Z", "stop": "2262-04-11T23:47:17Z", "spacecraft_id": 0}
+{"altitude_km": {"min": -1e308, "max": 1e308}, "step_s": 1, "maximum_duration_s": 30, "latitude_deg": {"min": 0}}
+{"latitude_deg": {"min": "x", "max": 1e9}}
+{"state": "approved", "reason": "\u0000"}
+{"reason": "x"}
+{"predecessor_id": 1}""".splitlines()
+]
 OCTETS = (
     b"", b"\x00" * 100, b"PK\x03\x04", b"CCSDS_OEM_VERS = 2.0\n", b"\x1a\xcf\xfc\x1d" * 50, b"[" * 100_000,
     b'{"a":' * 20_000,

@@ -31,6 +31,7 @@ from ground_service.missions.timekeeping.model import ReceptionIn, TimePointIn
 from ground_service.planning.model import WindowIn
 from ground_service.regression.routes import RegressionRequest
 from ground_service.settings import Settings
+from tests.ground_service.conftest import cells
 from tests.serving import TestClient, WebSocketDenialResponse
 
 V1 = "/api/v1"
@@ -60,24 +61,27 @@ def test_control_characters_in_a_path_are_refused(client):
     assert detail(client.get(f"{V1}/passes/1/telemetry/a%00b"), 422).startswith("path: expected no control")
 
 
-@pytest.mark.parametrize("query, words",
-    [
-        ("limti=5", "expected 'limit', found 'limti'"), ("kinds=report", "expected 'kind', found 'kinds'"),
-        ("x=1", "expected one of kind, limit, offset, found 'x'"), ("limit=5&__=", "found '__'"),
-    ],
-)  # fmt: skip
+UNKNOWN = """
+limti=5 | expected 'limit', found 'limti'
+kinds=report | expected 'kind', found 'kinds'
+x=1 | expected one of kind, limit, offset, found 'x'
+limit=5&__= | found '__'
+"""
+
+
+@pytest.mark.parametrize("query, words", cells(UNKNOWN))
 def test_an_unknown_query_key_is_refused_with_the_nearest_known(client, query, words):
     assert words in detail(client.get(f"{V1}/jobs?{query}"), 422)
 
 
-@pytest.mark.parametrize(
-    "path, words",
-    [
-        ("/jobs?limit=5&limit=6", "query: expected 'limit' once, found it 2 times"),
-        ("/jobs?limit=5&kind=a&limit=5&limit=5", "query: expected 'limit' once, found it 3 times"),
-        ("/passes/1/states?value=mode&max_points=5&max_points=5", "query: expected 'max_points' once"),
-    ],
-)
+REPEATED = """
+/jobs?limit=5&limit=6 | query: expected 'limit' once, found it 2 times
+/jobs?limit=5&kind=a&limit=5&limit=5 | query: expected 'limit' once, found it 3 times
+/passes/1/states?value=mode&max_points=5&max_points=5 | query: expected 'max_points' once
+"""
+
+
+@pytest.mark.parametrize("path, words", cells(REPEATED))
 def test_a_query_key_with_one_value_is_taken_once(client, path, words):
     assert words in detail(client.get(V1 + path), 422)
 
@@ -99,15 +103,18 @@ def test_known_query_keys_are_taken(client):
     assert "expected one of none" in detail(client.get(f"{V1}/links?limit=1"), 422)
 
 
-@pytest.mark.parametrize("body, words",
-    [
-        (b'{"name": "x", "cadence_s": NaN}', "found NaN"),
-        (b'{"name": "x", "cadence_s": -Infinity}', "found -Infinity"),
-        (b'{"name": "x", "cadence_s": 1e400}', "found 1e400"), (b'{"name": "a\\u0000b"}', "without NUL"),
-        (b'{"a\\u0000b": 1}', "without NUL"), (b'{"name": ["\\ud800"]}', "lone surrogates"),
-        (b'{"name": "x", "name": "y"}', "found a duplicate"),
-    ],
-)  # fmt: skip
+AMBIGUOUS = r"""
+{"name": "x", "cadence_s": NaN} | found NaN
+{"name": "x", "cadence_s": -Infinity} | found -Infinity
+{"name": "x", "cadence_s": 1e400} | found 1e400
+{"name": "a\u0000b"} | without NUL
+{"a\u0000b": 1} | without NUL
+{"name": ["\ud800"]} | lone surrogates
+{"name": "x", "name": "y"} | found a duplicate
+"""
+
+
+@pytest.mark.parametrize("body, words", cells(AMBIGUOUS))
 def test_json_with_no_or_two_meanings_is_refused(client, body, words):
     for path in ("/windows", "/telecommands", "/passes", "/requests"):
         assert words in detail(client.post(f"{V1}{path}", content=body, headers=JSON), 422)
@@ -138,10 +145,14 @@ def test_no_request_model_takes_a_value_of_one_type_for_another(client):
     assert lax == []
 
 
-@pytest.mark.parametrize(
-    "method, path, allowed",
-    [("DELETE", "/passes", "GET, POST"), ("PUT", "/windows/1", "DELETE, GET, PATCH"), ("GET", "/uplink", "POST")],
-)
+METHODS = """
+DELETE | /passes | GET, POST
+PUT | /windows/1 | DELETE, GET, PATCH
+GET | /uplink | POST
+"""
+
+
+@pytest.mark.parametrize("method, path, allowed", cells(METHODS))
 def test_a_method_that_is_not_allowed_is_answered_with_those_that_are(client, method, path, allowed):
     answer = client.request(method, V1 + path)
     assert detail(answer, 405)

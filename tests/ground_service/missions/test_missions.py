@@ -38,6 +38,7 @@ from ground_service.passes.model import PassDetail
 from ground_service.passes.service import define_pass, get_pass
 from ground_service.passes.store import get_pass as stored_pass
 from linna import cli
+from tests.ground_service.conftest import cells
 
 TEXT = """
 schema_version = 1
@@ -53,24 +54,25 @@ sigma_rtn_m = [10, 30, 15.5]
 """
 
 
-@pytest.mark.parametrize(
-    "line, message",
-    [
-        ("fow_deg = 90", "m.toml, camera.fow_deg: expected 'fov_deg', found unknown key 'fow_deg'"),
-        ("fov_deg = 190", "m.toml, camera.fov_deg: expected less than 180, found 190"),
-        ('fov_deg = "wide"', "m.toml, camera.fov_deg: expected a valid number"),
-        ("fov_deg = nan", "m.toml, camera.fov_deg: expected a finite number, found nan"),
-        ("fov_deg = true", "m.toml, camera.fov_deg: expected a valid number, found True"),
-        ("width_px = true", "m.toml, camera.width_px: expected a valid integer, found True"),
-        ('width_px = "5"', "m.toml, camera.width_px: expected a valid integer, found '5'"),
-        ("fov_deg =", "m.toml: expected TOML"),
-    ],
-)
+FAULTS = """
+fow_deg = 90 | expected 'fov_deg', found unknown key 'fow_deg'
+fov_deg = 190 | expected less than 180, found 190
+fov_deg = "wide" | expected a valid number
+fov_deg = nan | expected a finite number, found nan
+fov_deg = true | expected a valid number, found True
+width_px = true | expected a valid integer, found True
+width_px = "5" | expected a valid integer, found '5'
+fov_deg = | expected TOML
+"""
+
+
+@pytest.mark.parametrize("line, message", cells(FAULTS))
 def test_a_fault_is_named_with_its_place_what_was_expected_and_what_was_found(line, message):
     text = f'name = "test"\n[camera]\n{line}\n'
     with pytest.raises(InvalidInput) as caught:
         parse_mission(text, "m.toml")
-    assert str(caught.value).startswith(message)
+    place = "m.toml" if message == "expected TOML" else f"m.toml, camera.{line.split()[0]}"
+    assert str(caught.value).startswith(f"{place}: {message}")
     assert list(map(str, read_document(text, "m.toml"))) == [str(caught.value)]
 
 
@@ -100,17 +102,23 @@ def test_a_formatted_mission_parses_to_itself():
     assert parse_mission(format_mission(mission)) == mission
 
 
-@pytest.mark.parametrize("values, level",
-    [
-        ({}, None), ({"world": "unit-geometry"}, "1"), ({"world": "procedural"}, "2"),
-        ({"world": "real-terrain"}, None), ({"world": "real-terrain", "unseen_share": 0.0}, "3s"),
-        ({"world": "real-terrain", "unseen_share": 0.999}, "3s"),
-        ({"world": "real-terrain", "unseen_share": 1.0}, "3"), ({"world": "other-renderer"}, "4"),
-        ({"world": "photographs"}, "5"),
-    ],
-)  # fmt: skip
-def test_the_evidence_level_follows_from_the_world_that_was_flown(values, level):
-    assert Evidence(**values).level == level
+LEVELS = """
+None | None | None
+unit-geometry | None | 1
+procedural | None | 2
+real-terrain | None | None
+real-terrain | 0.0 | 3s
+real-terrain | 0.999 | 3s
+real-terrain | 1.0 | 3
+other-renderer | None | 4
+photographs | None | 5
+"""
+
+
+@pytest.mark.parametrize("world, share, level", cells(LEVELS))
+def test_the_evidence_level_follows_from_the_world_that_was_flown(world, share, level):
+    values = {"world": world, "unseen_share": share if share == "None" else float(share)}
+    assert str(Evidence(**{name: value for name, value in values.items() if value != "None"}).level) == level
 
 
 def test_several_passes_stand_on_the_weakest_evidence_among_them():
@@ -207,18 +215,18 @@ def test_a_description_of_another_spacecraft_is_refused_and_nothing_is_stored(gr
     assert ground.read(list_missions, Paging()).items == []
 
 
-@pytest.mark.parametrize(
-    "manifest, expected",
-    [
-        ({"data_sources": ["orientation DE421"]}, "DE421"),
-        ({"data_sources": ["the orientation DE421 is not meant"]}, None),
-        ({"data_sources": ["orientation DE421", "orientation IAU WGCCRE 2009"]}, None),
-        ({"data_sources": "orientation DE421"}, None),
-        ({}, None),
-    ],
-)
+DECLARED = """
+{"data_sources": ["orientation DE421"]} | DE421
+{"data_sources": ["the orientation DE421 is not meant"]} | None
+{"data_sources": ["orientation DE421", "orientation IAU WGCCRE 2009"]} | None
+{"data_sources": "orientation DE421"} | None
+{} | None
+"""
+
+
+@pytest.mark.parametrize("manifest, expected", cells(DECLARED))
 def test_the_orientation_of_an_old_archive_is_read_where_it_was_declared(manifest, expected):
-    assert mission_of_manifest(manifest).frames.orientation == expected
+    assert str(mission_of_manifest(json.loads(manifest)).frames.orientation) == expected
 
 
 def test_text_that_mentions_terrain_does_not_decide_the_evidence_level():

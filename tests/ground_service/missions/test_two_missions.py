@@ -75,6 +75,11 @@ def made(make_pass):
     return make_pass(frames=24, seed=2)
 
 
+def both(ground: Ground) -> dict[int, Any]:
+    """Add the description of each spacecraft."""
+    return {76: add_mission(ground, WIDE.encode()), 77: add_mission(ground, NARROW.encode())}
+
+
 def flown(ground: Ground, made: SyntheticPass, spacecraft: int, folder: Path) -> int:
     """Ingest the same packets as telemetry of a spacecraft; return the id of its pass."""
     path = folder / f"{spacecraft}.cadu"
@@ -90,7 +95,7 @@ def row(ground: Ground, table: Any, **equal: Any) -> dict[str, Any]:
 
 
 def test_every_pass_is_judged_by_the_description_of_its_spacecraft(either, made, tmp_path):
-    missions = {76: add_mission(either, WIDE.encode()), 77: add_mission(either, NARROW.encode())}
+    missions = both(either)
     add_reference(either, made.folder / "reference.oem")
     passes = {spacecraft: flown(either, made, spacecraft, tmp_path) for spacecraft in missions}
     reports = {}
@@ -101,16 +106,14 @@ def test_every_pass_is_judged_by_the_description_of_its_spacecraft(either, made,
         made_report = make_report(either, pass_id)
         for table, key in ((repository.PASSES, pass_id), (repository.REPORTS, made_report.report_id)):
             assert row(either, table, id=key)["mission_id"] == missions[spacecraft].id
-    wide, narrow = reports[76], reports[77]
-    assert (wide.evidence_level[:1], narrow.evidence_level[:1]) == ("2", "5")
-    assert wide.provenance["mission description"].startswith("wide, revision")
-    assert narrow.provenance["mission description"].startswith("narrow, revision")
-    for report, limit in ((wide, 200.0), (narrow, 100.0)):
+    for report, level, name, limit in ((reports[76], "2", "wide", 200.0), (reports[77], "5", "narrow", 100.0)):
+        assert report.evidence_level[:1] == level
+        assert report.provenance["mission description"].startswith(f"{name}, revision")
         assert [one.limit for one in report.requirements if one.key == "accuracy.median"] == [limit]
 
 
 def test_windows_and_telecommands_reference_the_description_of_their_spacecraft(ground, made):
-    missions = {76: add_mission(ground, WIDE.encode()), 77: add_mission(ground, NARROW.encode())}
+    missions = both(ground)
     add_reference(ground, made.folder / "reference.oem")
     for spacecraft, mission in missions.items():
         command = enter_command(ground, "test_connection", {}, spacecraft_id=spacecraft, actor="ann")
@@ -124,8 +127,7 @@ def test_windows_and_telecommands_reference_the_description_of_their_spacecraft(
 
 
 def test_a_window_is_predicted_with_the_camera_of_its_spacecraft(ground, made, monkeypatch):
-    add_mission(ground, WIDE.encode())
-    add_mission(ground, NARROW.encode())
+    both(ground)
     add_reference(ground, made.folder / "reference.oem")
     planners = []
     made_planner = planning.planner_of
@@ -148,8 +150,7 @@ def test_only_the_spacecraft_whose_description_permits_it_is_correlated_automati
         return recorrelation.TimeReports(*[np.zeros(0, dtype=np.int64)] * 6, ())
 
     monkeypatch.setattr(recorrelation, "time_reports", reports)
-    for text in (WIDE, NARROW):
-        add_mission(ground, text.encode())
+    both(ground)
     vehicles = {}
     for spacecraft in (76, 77):
         flown(ground, made, spacecraft, tmp_path)

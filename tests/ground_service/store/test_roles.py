@@ -73,33 +73,50 @@ def assert_refused(url: str, statement: str) -> None:
     assert getattr(error.value.orig, "sqlstate", None) == "42501"
 
 
-@pytest.mark.parametrize(
-    "statement",
-    [
-        "UPDATE audit SET actor = 'nobody'", "DELETE FROM audit", "TRUNCATE audit",
-        "ALTER TABLE audit DISABLE TRIGGER ALL", "DROP TRIGGER audit_no_update ON audit",
-        "ALTER TABLE users ADD COLUMN hidden text", "DROP TABLE packets", "TRUNCATE packets",
-        "CREATE TABLE mine (a int)", "CREATE FUNCTION mine() RETURNS int LANGUAGE sql AS 'SELECT 1'",
-        "CREATE TRIGGER mine AFTER INSERT ON users EXECUTE FUNCTION linna_refuse_audit_change()",
-        "UPDATE alembic_version SET version_num = '9'", "CREATE ROLE mine SUPERUSER",
-        "ALTER ROLE linna_service SUPERUSER", "SET ROLE linna_owner", "SET session_replication_role = replica",
-        "COPY (SELECT 1) TO PROGRAM 'true'", "COPY users FROM '/etc/passwd'", "SELECT pg_read_file('/etc/passwd')",
-        "ALTER SYSTEM SET archive_command = 'true'", "CREATE EXTENSION file_fdw",
-    ],
-)  # fmt: skip
+REFUSED = """
+UPDATE audit SET actor = 'nobody'
+DELETE FROM audit
+TRUNCATE audit
+ALTER TABLE audit DISABLE TRIGGER ALL
+DROP TRIGGER audit_no_update ON audit
+ALTER TABLE users ADD COLUMN hidden text
+DROP TABLE packets
+TRUNCATE packets
+CREATE TABLE mine (a int)
+CREATE FUNCTION mine() RETURNS int LANGUAGE sql AS 'SELECT 1'
+CREATE TRIGGER mine AFTER INSERT ON users EXECUTE FUNCTION linna_refuse_audit_change()
+UPDATE alembic_version SET version_num = '9'
+CREATE ROLE mine SUPERUSER
+ALTER ROLE linna_service SUPERUSER
+SET ROLE linna_owner
+SET session_replication_role = replica
+COPY (SELECT 1) TO PROGRAM 'true'
+COPY users FROM '/etc/passwd'
+SELECT pg_read_file('/etc/passwd')
+ALTER SYSTEM SET archive_command = 'true'
+CREATE EXTENSION file_fdw
+"""
+
+
+@pytest.mark.parametrize("statement", REFUSED.strip().splitlines())
 def test_the_role_of_the_service_is_refused(roles, statement):
     assert_refused(roles.service, statement)
 
 
-@pytest.mark.parametrize(
-    "statement",
-    [
-        "INSERT INTO users (name, role, state, created_utc_ns) VALUES ('a', 'admin', 'active', 0)",
-        "UPDATE users SET role = 'admin'", "DELETE FROM jobs", "TRUNCATE packets", "DROP TABLE packets",
-        "CREATE TABLE mine (a int)", "SELECT nextval('users_id_seq')", "SET ROLE linna_service",
-        "COPY (SELECT 1) TO PROGRAM 'true'",
-    ],
-)  # fmt: skip
+REFUSED_BACKUP = """
+INSERT INTO users (name, role, state, created_utc_ns) VALUES ('a', 'admin', 'active', 0)
+UPDATE users SET role = 'admin'
+DELETE FROM jobs
+TRUNCATE packets
+DROP TABLE packets
+CREATE TABLE mine (a int)
+SELECT nextval('users_id_seq')
+SET ROLE linna_service
+COPY (SELECT 1) TO PROGRAM 'true'
+"""
+
+
+@pytest.mark.parametrize("statement", REFUSED_BACKUP.strip().splitlines())
 def test_the_role_of_the_backup_cannot_write(roles, statement):
     assert_refused(roles.backup, statement)
 

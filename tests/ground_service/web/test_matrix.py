@@ -27,7 +27,7 @@ from ground_service.regression.builds import load_build, register_build
 from ground_service.web.pages import DISPLAYS, PAGES
 from lunar.catalogue import load_catalogue, save_catalogue
 from lunar.timescales import format_utc
-from tests.ground_service.conftest import SPACECRAFT, START
+from tests.ground_service.conftest import SPACECRAFT, START, cells
 from tests.ground_service.evaluation.landmarks.test_learned_landmarks import rewrite
 from tests.ground_service.web.conftest import COUNT_REQUESTS, Service, patient
 from tests.ground_service.web.test_in_browser import answered, settled
@@ -253,6 +253,19 @@ def record(rows: list[str], path: str, state: str, found: Faults) -> None:
     assert {kind: texts for kind, texts in columns.items() if texts} == {}
 
 
+def look(
+    context: BrowserContext, rows: list[str], path: str, state: str, looks: Looks, address: str | None = None
+) -> None:
+    """Open a page, and record its faults."""
+    page = new_page(context)
+    found = Faults(page)
+    settled(page, address or path)
+    answered(page)
+    found.find(page, looks)
+    page.close()
+    record(rows, path, state, found)
+
+
 def new_page(context: BrowserContext) -> Page:
     """Return a page that counts its requests."""
     page = context.new_page()
@@ -290,26 +303,20 @@ def test_the_fonts_of_the_matrix_are_installed():
 @LOOKS
 @pytest.mark.parametrize("path", PATHS)
 def test_a_page_with_data_has_no_fault(administrator, worked, rows, path, looks):
-    page = new_page(administrator)
-    found = Faults(page)
-    settled(page, worked.paths.get(path, path))
-    answered(page)
-    found.find(page, looks)
-    page.close()
-    record(rows, path, "with", found)
+    look(administrator, rows, path, "with", looks, worked.paths.get(path))
 
 
-@pytest.mark.parametrize(
-    "path, needed",
-    [
-        ("/", "td button:has-text('Acknowledge')"),
-        ("/", "td a:has-text('Report')"),
-        ("/alarms", "td button:has-text('Acknowledge')"),
-        ("/commands", "td button:has-text('Send now')"),
-        ("/passes", "#passes a:has-text('open')"),
-        ("/passes", "#passes td.num"),
-    ],
-)
+NEEDED = """
+/ | td button:has-text('Acknowledge')
+/ | td a:has-text('Report')
+/alarms | td button:has-text('Acknowledge')
+/commands | td button:has-text('Send now')
+/passes | #passes a:has-text('open')
+/passes | #passes td.num
+"""
+
+
+@pytest.mark.parametrize("path, needed", cells(NEEDED))
 def test_a_telephone_shows_what_a_shift_needs_without_scrolling_tables(administrator, path, needed):
     page = new_page(administrator)
     page.set_viewport_size({"width": 390, "height": 844})
@@ -323,13 +330,7 @@ def test_a_telephone_shows_what_a_shift_needs_without_scrolling_tables(administr
 @LOOKS
 @pytest.mark.parametrize("path", [path for path in PATHS if path not in DETAILS])
 def test_a_page_without_data_has_no_fault(newcomer, rows, path, looks):
-    page = new_page(newcomer)
-    found = Faults(page)
-    settled(page, path)
-    answered(page)
-    found.find(page, looks)
-    page.close()
-    record(rows, path, "without", found)
+    look(newcomer, rows, path, "without", looks)
 
 
 @LOOKS

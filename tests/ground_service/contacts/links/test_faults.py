@@ -26,7 +26,7 @@ from ground_service.store.event_kinds import read_events
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.messages.oem import save_oem
 from tests.ground_service.conftest import START, circular_states
-from tests.ground_service.contacts.links.conftest import declare, operated
+from tests.ground_service.contacts.links.conftest import acquired, declare, operated
 from tests.ground_service.contacts.links.test_links import (
     CADU,
     PLACES,
@@ -108,7 +108,7 @@ def test_a_full_disk_loses_nothing_and_the_link_shows_it(ground, station, stream
         counts = [0]
         while counts[-1] < len(stream):
             counts.append(ACKNOWLEDGEMENT.unpack(connection.recv(ACKNOWLEDGEMENT.size))[0])
-        assert counts[-1] == len(stream)
+        assert counts[-1] == len(stream) and counts == sorted(set(counts))
 
 
 class HalfWritten:
@@ -203,7 +203,6 @@ def test_a_gap_in_the_ephemeris_is_a_reason_and_not_an_error(ground, station, tm
 def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it(ground, station, stream, monkeypatch):
     monkeypatch.setattr(runners, "RENEW_S", 0.1)
     declare(ground, station.link())
-    declared = service.declared_links(ground)["lab"]
     entered, go_on = threading.Event(), threading.Event()
     with operated(ground, "first") as first:
         ingest = first._spool.ingest
@@ -217,7 +216,7 @@ def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it
         station.accept().sendall(stream[: 3 * CADU])
         assert entered.wait(20)
         service.release(ground, "lab", "first")
-        assert service.acquire(ground, declared, "second", 60 * NS)
+        declared = acquired(ground, "second")
         wait_for(lambda: first.lost, "the lost lease")
         second = LinkRunner(ground, declared, "second")
         threading.Event().wait(0.3)
@@ -233,8 +232,7 @@ def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it
 
 def test_a_link_is_taken_at_once_from_an_owner_that_has_ended_and_not_from_others(ground, station):
     declare(ground, station.link())
-    declared = service.declared_links(ground)["lab"]
-    assert service.acquire(ground, declared, "killed", 70 * NS)
+    acquired(ground, "killed", lease_ns=70 * NS)
     supervisor = LinkSupervisor(ground)
     folder = ground.home / "incoming" / "link-lab"
     folder.mkdir(parents=True)
@@ -289,9 +287,8 @@ def test_a_contact_ends_once_for_two_processes(either, station, monkeypatch):
 
 def test_a_transmission_is_repeated_once_for_two_links(either, station, monkeypatch):
     declare(either, station.link())
-    declared = service.declared_links(either)["lab"]
     released(either)
-    assert service.acquire(either, declared, "here", 60 * NS)
+    declared = acquired(either)
     (transmission,) = service.take_transmissions(either, declared, "here")
     service.note_transmitted(either, transmission, None)
     first = service.start_contact(either, declared, mission_now_ns())

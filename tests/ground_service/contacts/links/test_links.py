@@ -40,7 +40,7 @@ from lunar.timescales import ticks_from_utc_ns
 from lunar.visibility import GroundStation, link
 from tests.ground_service.archive_hash import archive_hash
 from tests.ground_service.conftest import START, add_reference, circular_states
-from tests.ground_service.contacts.links.conftest import Station, declare, operated
+from tests.ground_service.contacts.links.conftest import Station, acquired, declare, operated
 from tests.serving import wait_for
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import DownlinkEncoder
@@ -179,21 +179,6 @@ def test_what_an_ended_process_has_left_in_its_spool_is_ingested_by_the_next(eit
     assert hash_of(either) == expected
 
 
-def test_octets_are_acknowledged_when_they_are_on_disk(ground, station, stream):
-    declare(ground, station.link("acknowledge = true"))
-    with operated(ground):
-        connection = station.accept()
-        connection.settimeout(10.0)
-        connection.sendall(stream)
-        count = 0
-        while count < len(stream):
-            octets = connection.recv(ACKNOWLEDGEMENT.size)
-            assert len(octets) == ACKNOWLEDGEMENT.size
-            assert ACKNOWLEDGEMENT.unpack(octets)[0] > count
-            (count,) = ACKNOWLEDGEMENT.unpack(octets)
-        assert count == len(stream)
-
-
 def test_released_telecommands_are_sent_in_the_next_contact_and_not_before(either, station, stream, mission_time):
     declare(either, station.link())
     keys = released(either, 3)
@@ -242,8 +227,7 @@ def taken_and_not_sent(ground: Ground, station: Station) -> tuple[list[int], ser
     """Two telecommands that a process took and did not send; its lease of 1 ns has ended."""
     declare(ground, station.link())
     keys = released(ground, 2)
-    declared = service.declared_links(ground)["lab"]
-    assert service.acquire(ground, declared, "dead", 1)
+    declared = acquired(ground, "dead", lease_ns=1)
     assert len(service.take_transmissions(ground, declared, "dead")) == 1
     time.sleep(0.01)
     return keys, declared
@@ -281,8 +265,7 @@ def test_telecommands_taken_by_a_process_that_ended_are_sent_once_by_the_next(ei
 def test_a_process_without_the_lease_takes_no_telecommands(either, station):
     declare(either, station.link())
     keys = released(either)
-    declared = service.declared_links(either)["lab"]
-    assert service.acquire(either, declared, "first", 15_000_000_000)
+    declared = acquired(either, "first")
     assert not service.acquire(either, declared, "second", 15_000_000_000)
     assert service.take_transmissions(either, declared, "second") == []
     assert get_command(either, keys[0]).state == "released"
@@ -337,9 +320,7 @@ class Socket:
 def test_octets_that_are_read_late_are_no_silence(ground, station, stream, mission_time):
     """A process that was held up finds octets of the whole time: their contact goes on, and no frame is cut."""
     declare(ground, station.link())
-    declared = service.declared_links(ground)["lab"]
-    assert service.acquire(ground, declared, "me", 3_600_000_000_000)
-    runner, line = LinkRunner(ground, declared, "me"), Socket()
+    runner, line = LinkRunner(ground, acquired(ground, "me", lease_ns=3_600_000_000_000), "me"), Socket()
     ingesting = threading.Thread(target=runner._ingest_all, daemon=True)
     try:
         runner._open()
@@ -463,12 +444,11 @@ def test_a_contact_in_which_another_station_received_is_not_missed(
 ):
     declare(ground, PLACES + both_links(station, station, 'station = "here"'))
     add_reference(ground, synthetic_pass.folder / "reference.oem")
-    lab, other = (service.declared_links(ground)[name] for name in ("lab", "other"))
+    lab, other = (acquired(ground, "me", name) for name in ("lab", "other"))
     mission_time.utc_ns = START - 500 * 10**9
     (contact, _) = service.list_contacts(ground, mission_time.utc_ns, START + 1000 * 10**9).contacts
     assert contact.stop is not None
     start, stop = contact.start.utc_ns, contact.stop.utc_ns
-    assert all(service.acquire(ground, one, "me", 15_000_000_000) for one in (lab, other))
     mission_time.utc_ns = start
     row = service.start_contact(ground, other, start)
     assert row is not None
@@ -480,12 +460,11 @@ def test_a_contact_in_which_another_station_received_is_not_missed(
 def test_missed_contacts_are_recorded_once_with_the_reason(either, station, synthetic_pass, mission_time):
     declare(either, PLACES + station.link('station = "here"'))
     add_reference(either, synthetic_pass.folder / "reference.oem")
-    declared = service.declared_links(either)["lab"]
     mission_time.utc_ns = START - 500 * 10**9
     found = service.list_contacts(either, START - 500 * 10**9, START + 1000 * 10**9)
     assert found.unpredicted == {} and [one.state for one in found.contacts] == ["predicted"]
     (contact,) = found.contacts
-    assert service.acquire(either, declared, "here", 15_000_000_000)
+    declared = acquired(either)
     assert contact.stop is not None
     assert service.note_missed(either, declared, "here", contact.start.utc_ns, "nothing was received") == 0
     after = contact.stop.utc_ns + service.MARGIN_NS + 2 * 10**9
@@ -510,32 +489,22 @@ minimum_elevation_deg = 0.0
 
 
 def test_contacts_without_a_place_or_an_ephemeris_are_not_predicted(ground, station):
-    declare(ground, station.link())
     now = mission_now_ns()
-    assert service.list_contacts(ground, now, now + 10**12).unpredicted == {
-        "lab": "the mission description states no place of the station"
-    }
-    declare(ground, PLACES + station.link('station = "here"'))
-    assert service.list_contacts(ground, now, now + 10**12).unpredicted == {
-        "lab": "no reference ephemeris covers the time"
-    }
+    for section, reason in (
+        (station.link(), "the mission description states no place of the station"),
+        (PLACES + station.link('station = "here"'), "no reference ephemeris covers the time"),
+    ):
+        declare(ground, section)
+        assert service.list_contacts(ground, now, now + 10**12).unpredicted == {"lab": reason}
 
 
 def test_the_lease_is_kept_while_the_link_is_operated(ground, station):
     declare(ground, station.link())
     with operated(ground):
         first = ground.read(store.find_link, "lab")
-        wait_for(
-            lambda: service.get_link(ground, "lab").owner == "here" and _lease(ground) > first.lease_utc_ns,
-            "a longer lease",
-        )
+        wait_for(lambda: ground.read(store.find_link, "lab").lease_utc_ns > first.lease_utc_ns, "a longer lease")
+        assert service.get_link(ground, "lab").owner == "here"
     assert service.get_link(ground, "lab").owner is None
-
-
-def _lease(ground: Ground) -> int:
-    found = ground.read(store.find_link, "lab")
-    assert found is not None
-    return found.lease_utc_ns
 
 
 class Confirming(Station):
@@ -559,102 +528,95 @@ class Confirming(Station):
 
 
 @pytest.mark.parametrize("answer", [0, 5, None])
-def test_a_transmission_is_repeated_with_its_number_until_the_station_confirms_it(either, stream, answer):
-    station = Confirming(answer, answer)
-    try:
-        declare(either, station.link("confirm = true"))
-        keys = released(either, 2)
-        with operated(either) as runner:
-            station.accept().sendall(stream[: 2 * CADU])
-            wait_for(lambda: runner.commands_unsent == 0, "the record of the transmission")
-        numbers, octets = zip(*station.transmissions, strict=True)
-        assert len(numbers) == 3 and len(set(numbers)) == 1 and numbers[0] > 0
-        assert packets_of(octets[-1]) == octets_of(either, keys)
-    finally:
-        station.close()
+def test_a_transmission_is_repeated_with_its_number_until_the_station_confirms_it(either, confirming, stream, answer):
+    station = confirming(answer, answer)
+    declare(either, station.link("confirm = true"))
+    keys = released(either, 2)
+    with operated(either) as runner:
+        station.accept().sendall(stream[: 2 * CADU])
+        wait_for(lambda: runner.commands_unsent == 0, "the record of the transmission")
+    numbers, octets = zip(*station.transmissions, strict=True)
+    assert len(numbers) == 3 and len(set(numbers)) == 1 and numbers[0] > 0
+    assert packets_of(octets[-1]) == octets_of(either, keys)
 
 
-def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(either, stream, mission_time):
+def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(either, confirming, stream, mission_time):
     """At a handover the link of the first station does not know yet that its contact has ended."""
-    first, second = Confirming(*[0] * 1000), Confirming()
-    try:
-        declare(either, both_links(first, second, "confirm = true"))
-        declared = service.declared_links(either)["other"]
-        assert service.acquire(either, declared, "there", 15_000_000_000)
-        other = LinkRunner(either, declared, "there")
-        with operated(either) as runner:
-            other.start()
-            try:
-                first.accept().sendall(stream[: 2 * CADU])
-                wait_for(lambda: either.read(store.open_contact, "lab"), "the first contact")
-                keys = released(either, 2)
-                wait_for(lambda: first.transmissions, "the refused transmission")
-                # Also when its contact has ended, the station is asked.
-                mission_time.advance(100.0)
-                wait_for(lambda: either.read(store.open_contact, "lab") is None, "the end of the first contact")
-                assert not second.transmissions and runner.commands_unsent == 2
-                second.accept().sendall(stream[2 * CADU : 4 * CADU])
-                wait_for(lambda: runner.commands_unsent + other.commands_unsent == 0, "the transmission")
-            finally:
-                other.stop()
-        ((_, octets),) = second.transmissions
-        assert packets_of(octets) == octets_of(either, keys)
-        assert len({number for number, _ in first.transmissions + second.transmissions}) == 1
-        with either.database.reading() as connection:
-            query = select(repository.AUDIT.c.detail).where(repository.AUDIT.c.action == "hand over transmission")
-            (detail,) = connection.execute(query).scalars()
-        assert detail == {"telecommands": keys, "from": "lab", "to": "other"}
-    finally:
-        first.close()
-        second.close()
+    first, second = confirming(*[0] * 1000), confirming()
+    declare(either, both_links(first, second, "confirm = true"))
+    other = LinkRunner(either, acquired(either, "there", "other", 15_000_000_000), "there")
+    with operated(either) as runner:
+        other.start()
+        try:
+            first.accept().sendall(stream[: 2 * CADU])
+            wait_for(lambda: either.read(store.open_contact, "lab"), "the first contact")
+            keys = released(either, 2)
+            wait_for(lambda: first.transmissions, "the refused transmission")
+            # Also when its contact has ended, the station is asked.
+            mission_time.advance(100.0)
+            wait_for(lambda: either.read(store.open_contact, "lab") is None, "the end of the first contact")
+            assert not second.transmissions and runner.commands_unsent == 2
+            second.accept().sendall(stream[2 * CADU : 4 * CADU])
+            wait_for(lambda: runner.commands_unsent + other.commands_unsent == 0, "the transmission")
+        finally:
+            other.stop()
+    ((_, octets),) = second.transmissions
+    assert packets_of(octets) == octets_of(either, keys)
+    assert len({number for number, _ in first.transmissions + second.transmissions}) == 1
+    with either.database.reading() as connection:
+        query = select(repository.AUDIT.c.detail).where(repository.AUDIT.c.action == "hand over transmission")
+        (detail,) = connection.execute(query).scalars()
+    assert detail == {"telecommands": keys, "from": "lab", "to": "other"}
+
+
+@pytest.fixture
+def confirming():
+    """Make stations that confirm."""
+    made: list[Station] = []
+    yield lambda *answers: made.append(Confirming(*answers)) or made[-1]
+    for one in made:
+        one.close()
 
 
 def held_elsewhere(ground: Ground, station: Station) -> tuple[TransmissionRow, list[int], list[int]]:
     """Telecommands that the link "other" has taken and not sent, and later ones that any link may take."""
     declare(ground, both_links(station, station, "confirm = true"))
-    other = service.declared_links(ground)["other"]
-    assert service.acquire(ground, other, "there", 15_000_000_000)
+    other = acquired(ground, "there", "other", 15_000_000_000)
     earlier = released(ground, 2)
     (transmission,) = service.take_transmissions(ground, other, "there")
     return transmission, earlier, released(ground, 2)
 
 
-def test_telecommands_do_not_overtake_those_that_another_link_has(either, stream):
+def test_telecommands_do_not_overtake_those_that_another_link_has(either, confirming, stream):
     """At a handover the payload would refuse the overtaken ones as out of sequence."""
-    station = Confirming()
-    try:
-        transmission, earlier, later = held_elsewhere(either, station)
-        with operated(either) as runner:
-            station.accept().sendall(stream[: 2 * CADU])
-            wait_for(lambda: runner.waits_for_others, "telecommands that wait")
-            assert not station.transmissions
-            other = service.declared_links(either)["other"]
-            assert service.hand_over(either, other, transmission) == "lab"
-            wait_for(lambda: runner.commands_unsent == 0, "both transmissions")
-            assert not runner.waits_for_others
-        assert [packets_of(octets) for _, octets in station.transmissions] == [
-            octets_of(either, earlier),
-            octets_of(either, later),
-        ]
-    finally:
-        station.close()
+    station = confirming()
+    transmission, earlier, later = held_elsewhere(either, station)
+    with operated(either) as runner:
+        station.accept().sendall(stream[: 2 * CADU])
+        wait_for(lambda: runner.waits_for_others, "telecommands that wait")
+        assert not station.transmissions
+        other = service.declared_links(either)["other"]
+        assert service.hand_over(either, other, transmission) == "lab"
+        wait_for(lambda: runner.commands_unsent == 0, "both transmissions")
+        assert not runner.waits_for_others
+    assert [packets_of(octets) for _, octets in station.transmissions] == [
+        octets_of(either, earlier),
+        octets_of(either, later),
+    ]
 
 
-def test_telecommands_do_not_wait_for_ever_for_those_of_another_link(either, stream, monkeypatch):
+def test_telecommands_do_not_wait_for_ever_for_those_of_another_link(either, confirming, stream, monkeypatch):
     monkeypatch.setattr("ground_service.contacts.links.runner.TURN_S", 0.0)
     log = MagicMock()
     monkeypatch.setattr("ground_service.contacts.links.runner.log", log)
-    station = Confirming()
-    try:
-        transmission, _, later = held_elsewhere(either, station)
-        with operated(either) as runner:
-            station.accept().sendall(stream[: 2 * CADU])
-            wait_for(lambda: runner.commands_unsent == 0, "the later telecommands")
-        assert [packets_of(octets) for _, octets in station.transmissions] == [octets_of(either, later)]
-        assert [one.id for one in either.read(store.pending_transmissions, "other")] == [transmission.id]
-        assert log.warning.call_args.args[1:] == ("lab", later, "other")
-    finally:
-        station.close()
+    station = confirming()
+    transmission, _, later = held_elsewhere(either, station)
+    with operated(either) as runner:
+        station.accept().sendall(stream[: 2 * CADU])
+        wait_for(lambda: runner.commands_unsent == 0, "the later telecommands")
+    assert [packets_of(octets) for _, octets in station.transmissions] == [octets_of(either, later)]
+    assert [one.id for one in either.read(store.pending_transmissions, "other")] == [transmission.id]
+    assert log.warning.call_args.args[1:] == ("lab", later, "other")
 
 
 @pytest.mark.parametrize(
@@ -667,10 +629,9 @@ def test_telecommands_do_not_wait_for_ever_for_those_of_another_link(either, str
 def test_a_refused_transmission_is_given_to_no_link_that_cannot_send_it(either, station, change):
     section, event = change
     declare(either, station.link() + station.link(section).replace('"lab"', '"other"'))
-    lab, other = (service.declared_links(either)[name] for name in ("lab", "other"))
     released(either)
+    lab, other = (acquired(either, name=name) for name in ("lab", "other"))
     for one in (lab, other):
-        assert service.acquire(either, one, "here", 15_000_000_000)
         assert service.start_contact(either, one, utc_now_ns()) is not None
     (transmission,) = service.take_transmissions(either, lab, "here")
     if event == "released":
