@@ -46,6 +46,17 @@ class Proxied:
         with socket.socket() as probe:
             return probe.connect_ex(("127.0.0.1", int(self.host.split(":")[1]))) == 0
 
+    def answers(self) -> bool:
+        """Whether the service behind the proxy answers a client that trusts the present certificate only."""
+        with self.client() as client:
+            try:
+                return client.get("/api/v1/session").status_code == 401
+            except httpx.HTTPError:
+                return False
+
+    def served_certificate(self) -> str:
+        return ssl.get_server_certificate(("localhost", int(self.host.split(":")[1]))).strip()
+
     @contextmanager
     def running(self, configuration: Path) -> Iterator[None]:
         """Run the proxy."""
@@ -57,6 +68,11 @@ class Proxied:
         finally:
             process.terminate()
             process.wait(60)
+
+
+def make_secrets(folder: Path) -> None:
+    environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(folder)}
+    subprocess.run(["sh", str(ROOT / "deploy/secrets.sh")], check=True, env=environment, capture_output=True)
 
 
 def configured_proxy(folder: Path, secrets: Path, port: int, upstreams: tuple[int, int]) -> Path:
@@ -83,8 +99,7 @@ def proxied(tmp_path_factory):
         pytest.skip("nginx is not installed")
     folder = tmp_path_factory.mktemp("proxy")
     secrets, upstream, port = folder / "secrets", free_port(), free_port()
-    environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(secrets)}
-    subprocess.run(["sh", str(ROOT / "deploy/secrets.sh")], check=True, env=environment, capture_output=True)
+    make_secrets(secrets)
     configuration = configured_proxy(folder, secrets, port, (upstream, upstream))
     with open_ground(folder / "home") as ground:
         token = add_user(ground, "ann", "operator")
@@ -98,16 +113,9 @@ def proxied(tmp_path_factory):
         )  # fmt: skip
     made = Proxied(f"localhost:{port}", folder, secrets / "tls/certificate", token)
 
-    def answers() -> bool:
-        with made.client() as client:
-            try:
-                return client.get("/api/v1/session").status_code == 401
-            except httpx.HTTPError:
-                return False
-
     try:
         with made.running(configuration):
-            wait_for(answers, "the service behind the proxy")
+            wait_for(made.answers, "the service behind the proxy")
             yield made
     finally:
         service.terminate()
@@ -199,14 +207,11 @@ def test_a_flood_is_limited_before_the_service_but_not_others_of_its_address(pro
 
 def test_a_renewed_certificate_is_served_after_a_reload_and_clients_stay_connected(proxied, tmp_path):
     tls = proxied.certificate.parent
-    before = ssl.get_server_certificate(("localhost", int(proxied.host.split(":")[1])))
-    assert before.strip() == proxied.certificate.read_text().strip()
+    assert proxied.served_certificate() == proxied.certificate.read_text().strip()
     context = ssl.create_default_context(cafile=str(proxied.certificate))
     headers = {"Authorization": f"Bearer {proxied.token}"}
     with connect(f"wss://{proxied.host}/api/v1/live", ssl=context, additional_headers=headers) as opened:
-        environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(tmp_path)}
-        script = str(ROOT / "deploy/secrets.sh")
-        subprocess.run(["sh", script], check=True, env=environment, capture_output=True)
+        make_secrets(tmp_path)
         for name in ("certificate", "key"):
             (tmp_path / "tls" / name).replace(tls / name)
         configuration = str(proxied.folder / "nginx.conf")
@@ -214,16 +219,8 @@ def test_a_renewed_certificate_is_served_after_a_reload_and_clients_stay_connect
         subprocess.run(["nginx", "-c", configuration, "-e", errors, "-s", "reload"], check=True)
 
         def renewed() -> bool:
-            found = ssl.get_server_certificate(("localhost", int(proxied.host.split(":")[1])))
-            return found.strip() == proxied.certificate.read_text().strip()
-
-        def answered() -> bool:
-            try:
-                with proxied.client() as client:
-                    return client.get("/api/v1/session").status_code == 401
-            except httpx.ConnectError:  # by a process of the proxy that still ends, with the old certificate
-                return False
+            return proxied.served_certificate() == proxied.certificate.read_text().strip()
 
         wait_for(renewed, "the new certificate")
-        wait_for(answered, "an answer to a client that trusts the new certificate only")
+        wait_for(proxied.answers, "an answer to a client that trusts the new certificate only")
         opened.ping().wait(10.0)

@@ -230,21 +230,23 @@ def carrying(name: str, **arguments: Any) -> dict[str, Any]:
     return {"release_ticks": 1, "items": [{"octet": octet} for octet in octets]}
 
 
-@pytest.mark.parametrize(
-    "name, arguments, critical",
-    [
-        ("set_parameter", {"parameter_id": 1, "value": 2.0}, True),
-        ("perform_function", {"function_id": "set_mode", "argument_1": 1, "argument_2": 0}, True),
-        ("perform_function", {"function_id": 7, "argument_1": 1, "argument_2": 0}, True),
-        ("insert_activity", carrying("set_parameter", parameter_id=1, value=2.0), True),
-        ("insert_activity", carrying("perform_function", **START), False),
-        ("perform_function", START, False),
-    ],
-)
-def test_what_changes_the_state_of_the_payload_needs_a_second_person(ground, name, arguments, critical):
-    command = enter_command(ground, name, arguments, spacecraft_id=SPACECRAFT, actor="ann")
-    assert bool(get_command(ground, command).record.critical) == critical
-    if critical:
+CRITICAL = """
+set_parameter | {"parameter_id": 1, "value": 2.0} | True
+perform_function | {"function_id": "set_mode", "argument_1": 1, "argument_2": 0} | True
+perform_function | {"function_id": 7, "argument_1": 1, "argument_2": 0} | True
+perform_function | {"function_id": "start_observation", "argument_1": 600.0, "argument_2": 15.0} | False
+"""
+
+
+@pytest.mark.parametrize("name, arguments, critical", cells(CRITICAL))
+@pytest.mark.parametrize("carried", [False, True])
+def test_what_changes_the_state_of_the_payload_needs_a_second_person(ground, name, arguments, critical, carried):
+    given = json.loads(arguments)
+    if carried:
+        name, given = "insert_activity", carrying(name, **given)
+    command = enter_command(ground, name, given, spacecraft_id=SPACECRAFT, actor="ann")
+    assert str(bool(get_command(ground, command).record.critical)) == critical
+    if critical == "True":
         with pytest.raises(
             Conflict, match=r"critical; expected a person other than ann .*\((changes on-board state|destroys data): "
         ):
