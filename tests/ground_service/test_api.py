@@ -5,8 +5,6 @@ import json
 import math
 import re
 import threading
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 
@@ -33,7 +31,7 @@ def client(synthetic_pass, tmp_path_factory):
         yield opened
 
 
-def is_problem(response: Any, status: int) -> bool:
+def is_problem(response, status):
     assert response.status_code == status, response.text
     assert response.headers["content-type"] == "application/problem+json"
     body = response.json()
@@ -74,11 +72,11 @@ def test_an_upload_over_the_limit_is_refused_announced_or_not(client):
 def test_the_telecommand_receiver_is_shown_as_the_newest_telemetry_tells_it(client, make_pass):
     packets = make_pass(frames=3, seed=11).packets
 
-    def receive(clcw: Clcw | None) -> int:
+    def receive(clcw):
         stream = DownlinkEncoder(76).encode(packets, clcw=None if clcw is None else pack_clcw(clcw))
         return int(client.post(f"{V1}/telemetry?instance=uplink", content=stream).json()["ingest_id"])
 
-    def shown() -> list[dict[str, Any]]:
+    def shown():
         return list(client.get(f"{V1}/spacecraft/76/uplink?instance=uplink").json()["channels"])
 
     assert is_problem(client.get(f"{V1}/spacecraft/76/uplink?instance=nobody"), 404)
@@ -120,7 +118,7 @@ def test_what_is_in_a_pass_can_be_read(client, synthetic_pass):
 
 
 def test_pages_of_detections_put_together_are_all_of_them_once(client):
-    def page(limit: int, offset: int) -> list[Any]:
+    def page(limit, offset):
         return list(client.get(f"{V1}/passes/1/detections?limit={limit}&offset={offset}").json()["items"])
 
     total = client.get(f"{V1}/passes/1/detections?limit=1").json()["total"]
@@ -266,7 +264,7 @@ def test_every_operation_asks_for_its_role(guarded):
 
 
 def test_what_happens_is_sent_live_and_can_be_caught_up_with(client, make_pass):
-    def payload_of(message: dict[str, Any]) -> tuple[int, str]:
+    def payload_of(message):
         return message["payload"]["id"], message["payload"]["state"]
 
     stream = (make_pass(frames=3, seed=9).folder / "downlink.cadu").read_bytes()
@@ -294,9 +292,9 @@ def test_a_socket_opens_whose_server_announces_the_client_late(client):
     octets = {"raw_path": b"/api/v1/live", "query_string": b"", "headers": [(b"host", b"testserver")]}
     scope = json.loads(plain) | octets
 
-    async def opened() -> dict[str, Any]:
-        arriving: asyncio.Queue[Any] = asyncio.Queue()
-        sent: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+    async def opened():
+        arriving = asyncio.Queue()
+        sent = asyncio.Queue()
         handler = asyncio.ensure_future(client.app(scope, arriving.get, sent.put))
         await asyncio.sleep(0.5)
         await arriving.put({"type": "websocket.connect"})
@@ -359,7 +357,7 @@ def test_a_telecommand_that_is_sent_again_under_its_key_is_queued_once(guarded):
     operator = heads["operator"] | {"Idempotency-Key": "k1"}
     ping = {"name": "test_connection", "arguments": {}, "spacecraft_id": 76}
 
-    def post(path: str, headers: dict[str, str], **body: Any) -> Any:
+    def post(path, headers, **body):
         return client.post(f"{V1}{path}", headers=headers, **body)
 
     first = post("/telecommands", operator, json=ping)
@@ -388,10 +386,10 @@ def test_a_key_whose_work_was_cut_off_is_refused_and_says_why(ground):
     from ground_service.access.idempotency import once
     from ground_service.errors import Conflict, DatabaseUnavailable
 
-    def ask(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    def ask(work):
         return once(ground, actor="ann", operation="window", key="k", request={"a": 1}, work=work)
 
-    def cut_off() -> dict[str, Any]:
+    def cut_off():
         raise DatabaseUnavailable("db", "gone")
 
     with pytest.raises(DatabaseUnavailable):

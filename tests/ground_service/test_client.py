@@ -7,7 +7,6 @@ import subprocess
 import sys
 import threading
 import tracemalloc
-from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -36,14 +35,14 @@ MIB = 1 << 20
 class Clock:
     """Clock of the client, which advances during sleep."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.now = 0.0
-        self.slept: list[float] = []
+        self.slept = []
 
-    def monotonic(self) -> float:
+    def monotonic(self):
         return self.now
 
-    def sleep(self, seconds: float) -> None:
+    def sleep(self, seconds):
         self.slept.append(seconds)
         self.now += seconds
 
@@ -51,14 +50,14 @@ class Clock:
 class Service:
     """Server with prepared responses, of which the last one is repeated; it records the received bodies."""
 
-    def __init__(self) -> None:
-        self.answers: list[tuple[int, dict[str, str]]] = []
-        self.bodies: list[bytes] = []
+    def __init__(self):
+        self.answers = []
+        self.bodies = []
         self.octets_received = 0
         service = self
 
         class Handler(BaseHTTPRequestHandler):
-            def do_POST(self) -> None:
+            def do_POST(self):
                 octets = int(self.headers.get("Content-Length", "0"))
                 if octets > MIB:
                     while service.octets_received < octets:
@@ -68,13 +67,13 @@ class Service:
                 status, headers = service.answers[min(len(service.bodies), len(service.answers)) - 1]
                 self._answer(status, headers, json.dumps(EPHEMERIS if status < 300 else {"detail": "busy now"}))
 
-            def do_GET(self) -> None:
+            def do_GET(self):
                 self.send_response(200)
                 self.end_headers()
                 for _ in range(64):
                     self.wfile.write(b"\0" * MIB)
 
-            def _answer(self, status: int, headers: dict[str, str], text: str) -> None:
+            def _answer(self, status, headers, text):
                 self.send_response(status)
                 for name, value in headers.items():
                     self.send_header(name, value)
@@ -82,7 +81,7 @@ class Service:
                 self.end_headers()
                 self.wfile.write(text.encode())
 
-            def log_message(self, *_: Any) -> None:
+            def log_message(self, *_):
                 pass
 
         self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
@@ -114,7 +113,7 @@ def body(tmp_path):
     return path
 
 
-def client_of(answer: Callable[[httpx.Request], httpx.Response]) -> Client:
+def client_of(answer):
     """Return a client whose requests are answered by a function."""
     return Client("http://ground", "secret", transport=httpx.MockTransport(answer))
 
@@ -158,7 +157,7 @@ def test_what_is_no_invitation_to_come_again_is_told_at_once(service, clock, bod
 def test_after_a_broken_connection_only_safe_requests_and_those_with_a_key_are_repeated(clock, call, attempts):
     keys = []
 
-    def answer(request: httpx.Request) -> httpx.Response:
+    def answer(request):
         keys.append(request.headers.get("Idempotency-Key"))
         raise httpx.RemoteProtocolError("server disconnected")
 
@@ -169,7 +168,7 @@ def test_after_a_broken_connection_only_safe_requests_and_those_with_a_key_are_r
 
 
 def test_a_service_that_cannot_be_reached_is_not_asked_again(clock):
-    def answer(_: httpx.Request) -> httpx.Response:
+    def answer(_):
         raise httpx.ConnectError("connection refused")
 
     with pytest.raises(Unreachable, match="http://ground: cannot be reached: connection refused"):
@@ -216,10 +215,10 @@ def test_a_failed_job_is_an_exception_with_its_error():
         client_of(lambda _: httpx.Response(200, text=job)).wait("00")
 
 
-def passes_of(total: int, asked: list[tuple[int, int]]) -> Callable[[httpx.Request], httpx.Response]:
+def passes_of(total, asked):
     """Return a service with passes of which it sends at most 1000 in a page."""
 
-    def answer(request: httpx.Request) -> httpx.Response:
+    def answer(request):
         limit, offset = int(request.url.params["limit"]), int(request.url.params["offset"])
         asked.append((limit, offset))
         span = {"start": "2029-08-07T00:00:00Z", "stop": "2029-08-07T01:00:00Z"}
@@ -234,7 +233,7 @@ def passes_of(total: int, asked: list[tuple[int, int]]) -> Callable[[httpx.Reque
 
 @pytest.mark.parametrize("total, pages", [(0, 1), (999, 1), (1000, 1), (1001, 2), (2500, 3)])
 def test_a_list_is_fetched_page_by_page_until_its_end(total, pages):
-    asked: list[tuple[int, int]] = []
+    asked = []
     client = client_of(passes_of(total, asked))
     assert [one.id for one in client.list_passes()] == list(range(total))
     assert asked == [(1000, 1000 * number) for number in range(pages)]
@@ -251,20 +250,20 @@ PAGES = """
 
 @pytest.mark.parametrize("limit, expected, requests", cells(PAGES))
 def test_a_page_has_as_many_items_as_asked_for(limit, expected, requests):
-    asked: list[tuple[int, int]] = []
+    asked = []
     page = client_of(passes_of(2500, asked)).list_passes().page(int(limit))
     assert (str(len(page.items)), page.total, str(asked)) == (expected, 2500, requests)
 
 
 def test_a_list_that_shrinks_while_it_is_fetched_ends():
-    def answer(request: httpx.Request) -> httpx.Response:
+    def answer(request):
         return httpx.Response(200, json={"items": [], "total": 7, "limit": 1, "offset": 0})
 
     assert list(client_of(answer).list_passes()) == []
     assert client_of(answer).list_passes().page(5).items == []
 
 
-def peak_of(work: Callable[[], object]) -> int:
+def peak_of(work):
     tracemalloc.start()
     try:
         work()
@@ -288,7 +287,7 @@ def test_large_files_are_sent_and_received_in_blocks(service, tmp_path):
 
 def test_a_download_that_breaks_leaves_no_file(tmp_path, clock):
     class Broken(httpx.SyncByteStream):
-        def __iter__(self) -> Iterator[bytes]:
+        def __iter__(self):
             yield b"half"
             raise httpx.ReadError("connection reset")
 
@@ -306,7 +305,7 @@ def test_the_operations_are_generated_from_the_routes():
     assert client_generator.TARGET.read_text() == client_generator.generate()
 
 
-def operations_of(tmp_path: Path) -> list[Any]:
+def operations_of(tmp_path):
     document = create_app(Settings(home=tmp_path)).openapi()
     return [
         (path, verb.upper(), operation)
@@ -316,9 +315,9 @@ def operations_of(tmp_path: Path) -> list[Any]:
 
 
 def test_every_operation_of_the_api_has_a_method_of_its_name_with_its_path_keys_and_result(tmp_path):
-    sent: list[httpx.Request] = []
+    sent = []
 
-    def answer(request: httpx.Request) -> httpx.Response:
+    def answer(request):
         sent.append(request)
         return httpx.Response(418, json={})
 
@@ -388,7 +387,7 @@ def test_the_example_of_the_documentation_runs(tmp_path, capsys, monkeypatch):
     class OnThisMachine(Client):
         """Client that ignores the address of the example."""
 
-        def __init__(self, _server: str, token: str | None = None) -> None:
+        def __init__(self, _server, token=None):
             transport = LocalTransport(open_ground(tmp_path / "home"), "ann")
             super().__init__("http://localhost", token, transport=transport)
 

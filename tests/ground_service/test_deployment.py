@@ -36,7 +36,7 @@ PROCESSES = ("api", "api2", "worker", "scheduler", "migrate", "backup")
 EXACT = re.compile(r"[a-z]+:\d+\.\d+(\.\d+)?-[a-z-]+")
 
 
-def environment_of(name: str) -> dict[str, str]:
+def environment_of(name):
     """Return the environment of a service: the common declaration, then what the service itself states."""
     service, found = SERVICES[name], {}
     if "env_file" in service:
@@ -45,11 +45,11 @@ def environment_of(name: str) -> dict[str, str]:
     return found | service.get("environment", {})
 
 
-def sets(table: str) -> dict[str, set[str]]:
+def sets(table):
     return {name: set(words.split()) for name, words in cells(table)}
 
 
-def default_of(text: str) -> str:
+def default_of(text):
     """What a value with a variable and a default is when the variable is not set."""
     return re.sub(r"\$\{[A-Z_]+:-([^}]*)\}", r"\1", text)
 
@@ -210,7 +210,7 @@ def test_the_runner_has_no_secret_no_network_and_no_archive():
     assert {name for name in SERVICES if "exchange:/exchange" in SERVICES[name]["volumes"]} == {"worker", "runner"}
 
 
-def sh(name: str, programs: Path | str = "", **environment: object) -> subprocess.CompletedProcess[str]:
+def sh(name, programs="", **environment):
     """Run a script of the deployment, with a folder of programs before the others."""
     given = {key: str(value) for key, value in environment.items()}
     return subprocess.run(
@@ -219,7 +219,7 @@ def sh(name: str, programs: Path | str = "", **environment: object) -> subproces
     )  # fmt: skip
 
 
-def program(folder: Path, name: str, text: str) -> Path:
+def program(folder, name, text):
     """Write a program of this name; return its folder."""
     programs = folder / "programs"
     programs.mkdir()
@@ -256,7 +256,7 @@ HOLDERS = {
 """Scripts that read passwords, with the program that they start and the names of the passwords."""
 
 
-def start_script(name: str, secrets: dict[str, str], folder: Path) -> tuple[subprocess.CompletedProcess[str], Path]:
+def start_script(name, secrets, folder):
     """Run a script with these secrets and a program that only prints its arguments and its input."""
     programs = program(folder, HOLDERS[name][0], 'echo "started $*"; cat')
     (folder / "secrets").mkdir()

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -50,7 +49,7 @@ def client(service, generated):
     return made.set_httpx_client(service)
 
 
-def operation(name: str) -> ModuleType:
+def operation(name):
     return importlib.import_module(f"{PACKAGE}.api.{name}")
 
 

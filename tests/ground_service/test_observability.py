@@ -6,10 +6,8 @@ import shutil
 import subprocess
 import sys
 from ast import literal_eval
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -20,7 +18,7 @@ from ground_service import logs
 from ground_service.app import create_app
 from ground_service.clock import utc_now_ns
 from ground_service.errors import SettingsError
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import enter_job, get_job
 from ground_service.passes.archive_import import import_archive
@@ -41,16 +39,16 @@ SELECTOR = re.compile(r"\b(linna_[a-z_]+)\{([^}]*)\}")
 S = 1_000_000_000
 
 
-def alerts() -> list[dict[str, Any]]:
+def alerts():
     return [rule for group in yaml.safe_load(RULES.read_text())["groups"] for rule in group["rules"]]
 
 
-def panels() -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = json.loads(DASHBOARD.read_text())["panels"]
+def panels():
+    found = json.loads(DASHBOARD.read_text())["panels"]
     return found
 
 
-def expressions() -> list[str]:
+def expressions():
     drawn = [target["expr"] for panel in panels() for target in panel["targets"]]
     return [rule["expr"] for rule in alerts()] + drawn
 
@@ -67,7 +65,7 @@ def samples(tmp_path_factory, synthetic_pass):
         backup(ground, folder / "backups" / "one", now_utc_ns=utc_now_ns())
     settings = Settings(home=folder / "home", backups=folder / "backups")
 
-    def distributed(*given: Any) -> condition.Condition:
+    def distributed(*given):
         return replace(read_condition(*given), broker=True, runner=True, processes={"worker": 2})
 
     with pytest.MonkeyPatch.context() as patched, TestClient(create_app(settings, inline_jobs=True)) as client:
@@ -79,7 +77,7 @@ def samples(tmp_path_factory, synthetic_pass):
     }
 
 
-def add_correlation(ground: Ground, vehicle: int, created_utc_ns: int) -> None:
+def add_correlation(ground, vehicle, created_utc_ns):
     with ground.database.writing() as connection:
         line = dict.fromkeys(["start_ticks", "stop_ticks", "reference_ticks", "reference_utc_ns", "drift_ppb"], 0)
         given = {"vehicle_id": vehicle, "method": "test", "points": 2, "created_utc_ns": created_utc_ns}
@@ -210,21 +208,21 @@ linna_jobs{state="failed",kind="report"} = 2x200
 """Series of a healthy service; times of certificates are 15 days."""
 
 
-def series_of(text: str) -> list[dict[str, str]]:
+def series_of(text):
     """Return the input series of a test of rules, one a line: name = values."""
     rows = (line.rpartition(" = ") for line in text.strip().splitlines())
     return [{"series": name.strip(), "values": values} for name, _, values in rows]
 
 
-def run_of(series: list[dict[str, str]], *expected: dict[str, Any]) -> dict[str, Any]:
+def run_of(series, *expected):
     return {"interval": "1m", "input_series": series, "promql_expr_test": list(expected)}
 
 
-def expectation(expression: str, at: str, value: float, labels: str = "{}") -> dict[str, Any]:
+def expectation(expression, at, value, labels="{}"):
     return {"expr": expression, "eval_time": at, "exp_samples": [{"labels": labels, "value": value}]}
 
 
-def replicas_test(healthy: list[dict[str, str]]) -> dict[str, Any]:
+def replicas_test(healthy):
     """One of two API processes fails, and both count the same failed job: no call, and one failure."""
     series, up = 'linna_jobs{state="failed",kind="report"', 'up{job="linna"'
     others = [one for one in healthy if not one["series"].startswith((series, up))]
@@ -246,7 +244,7 @@ def replicas_test(healthy: list[dict[str, str]]) -> dict[str, Any]:
     )
 
 
-def backup_tests(healthy: list[dict[str, str]]) -> Iterator[dict[str, Any]]:
+def backup_tests(healthy):
     """Without a backup there is an alert if a folder is configured, otherwise none."""
     others = [one for one in healthy if not one["series"].startswith("linna_backup")]
     for configured in (0, 1):

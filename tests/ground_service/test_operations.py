@@ -25,7 +25,7 @@ from tests.serving import TestClient
 HOUR = 3600 * 10**9
 
 
-def words(text: str) -> set[str]:
+def words(text):
     return set(text.split())
 
 
@@ -149,8 +149,8 @@ def test_pages_of_a_list_link_to_each_other(client):
     for number in range(5):
         define_pass(ground, name=f"w{number}", start_utc_ns=0, stop_utc_ns=10**9, spacecraft_id=77)
     total = client.get("/api/v1/passes").json()["total"]
-    address: str | None = "/api/v1/passes?limit=2"
-    found: list[int] = []
+    address = "/api/v1/passes?limit=2"
+    found = []
     previous = None
     while address is not None:
         page = client.get(address).json()

@@ -7,7 +7,6 @@ import socket
 import ssl
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,19 +33,19 @@ class Proxied:
     token: str
 
     @property
-    def url(self) -> str:
+    def url(self):
         return f"https://{self.host}"
 
-    def client(self) -> httpx.Client:
+    def client(self):
         context = ssl.create_default_context(cafile=str(self.certificate))
         return httpx.Client(base_url=self.url, verify=context, timeout=30.0)
 
-    def listens(self) -> bool:
+    def listens(self):
         """Whether something listens on the port of the proxy; no request is counted."""
         with socket.socket() as probe:
             return probe.connect_ex(("127.0.0.1", int(self.host.split(":")[1]))) == 0
 
-    def answers(self) -> bool:
+    def answers(self):
         """Whether the service behind the proxy answers a client that trusts the present certificate only."""
         with self.client() as client:
             try:
@@ -54,11 +53,11 @@ class Proxied:
             except httpx.HTTPError:
                 return False
 
-    def served_certificate(self) -> str:
+    def served_certificate(self):
         return ssl.get_server_certificate(("localhost", int(self.host.split(":")[1]))).strip()
 
     @contextmanager
-    def running(self, configuration: Path) -> Iterator[None]:
+    def running(self, configuration):
         """Run the proxy."""
         errors = str(configuration.with_name("error.log"))
         command = ["nginx", "-c", str(configuration), "-e", errors, "-g", "daemon off;"]
@@ -70,12 +69,12 @@ class Proxied:
             process.wait(60)
 
 
-def make_secrets(folder: Path) -> None:
+def make_secrets(folder):
     environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(folder)}
     subprocess.run(["sh", str(ROOT / "deploy/secrets.sh")], check=True, env=environment, capture_output=True)
 
 
-def configured_proxy(folder: Path, secrets: Path, port: int, upstreams: tuple[int, int]) -> Path:
+def configured_proxy(folder, secrets, port, upstreams):
     """Write the configuration of the compose file's proxy, with private ports and folders; return its file."""
     text = (ROOT / "deploy/nginx.conf").read_text()
     for old, new in (
@@ -157,7 +156,7 @@ def test_the_address_of_the_client_cannot_be_forged(proxied):
         client.get("/forged", headers={"X-Forwarded-For": "203.0.113.9"})
     log = proxied.folder / "service.log"
 
-    def addresses() -> list[str]:
+    def addresses():
         logged = [json.loads(line) for line in log.read_text().splitlines() if line.startswith("{")]
         return [one["address"] for one in logged if one.get("path") == "/forged"]
 
@@ -218,7 +217,7 @@ def test_a_renewed_certificate_is_served_after_a_reload_and_clients_stay_connect
         errors = str(proxied.folder / "error.log")
         subprocess.run(["nginx", "-c", configuration, "-e", errors, "-s", "reload"], check=True)
 
-        def renewed() -> bool:
+        def renewed():
             return proxied.served_certificate() == proxied.certificate.read_text().strip()
 
         wait_for(renewed, "the new certificate")

@@ -95,7 +95,7 @@ def test_a_terminated_server_drains_before_it_ends(tmp_path):
     running = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     running.start()
 
-    def ask(path: str) -> tuple[int, str | None]:
+    def ask(path):
         answer = httpx.get(f"{url}{path}", timeout=60)
         return answer.status_code, answer.headers.get("Connection")
 

@@ -5,8 +5,6 @@ import shutil
 import socket
 import threading
 import zlib
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +19,7 @@ from payload_emulator.session.archive.recording import frame_path
 from payload_emulator.session.archive.replay import FlightBuild, replay_archive
 from payload_emulator.session.live.session import LiveSession
 from payload_emulator.session.live.station_ports import RECORD_HEADER
-from payload_emulator.session.scenario import Scenario, parse_scenario
+from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.spacecraft.loading import launch, load_scenario_payload
 from payload_emulator.session.world.world import build_world, clock_ticks, open_world
 from tests.lazy import Lazy
@@ -65,13 +63,13 @@ offset_s = 0.4
 """
 
 
-def packets_of(cadus: bytes) -> list[bytes]:
+def packets_of(cadus):
     found = decode(cadus)
     assert found.complete
     return list(found.cut.packets(found.buffer))
 
 
-def flown(session: LiveSession, telecommands: Callable[[LiveSession], bytes] = lambda session: b"") -> list[bytes]:
+def flown(session, telecommands=lambda session: b""):
     """Fly a session that is paused until it has its telecommands, and return what a station receives."""
     thread = threading.Thread(target=session.run, daemon=True)
     thread.start()
@@ -101,7 +99,7 @@ def flown(session: LiveSession, telecommands: Callable[[LiveSession], bytes] = l
     return packets_of(b"".join(records[at : at + LinkSettings().cadu_length] for at in starts))
 
 
-def of_kind(name: str, packets: list[bytes]) -> dict[int, dict[str, Any]]:
+def of_kind(name, packets):
     """Return the values of packets of one kind by the on-board time of the image, as plain values."""
     found = {}
     for packet in packets:
@@ -165,12 +163,12 @@ def test_every_way_has_the_same_figures_in_its_report(archive, ways, either, tmp
     assert figures["replay"] == figures["archive"]
 
 
-def commanded(scenario: Scenario, start_utc_ns: int, frames: int) -> tuple[LiveSession, list[bytes]]:
+def commanded(scenario, start_utc_ns, frames):
     """Fly a window that the ground commands, and a minute beyond it."""
     stop = start_utc_ns + (frames * 15 + 60) * NS
     session = LiveSession(*launch(scenario, NO_DATA), stop_utc_ns=stop, paused=True)
 
-    def telecommands(session: LiveSession) -> bytes:
+    def telecommands(session):
         values = {"function_id": "start_observation", "argument_1": frames * 15.0 - 7.5, "argument_2": 15.0}
         start = DICTIONARY.pack_command("perform_function", values, sequence_count=0, source=1)
         items = {"octet": np.frombuffer(start, dtype=np.uint8)}

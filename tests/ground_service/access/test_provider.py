@@ -6,7 +6,6 @@ import json
 import re
 import time
 from datetime import UTC, datetime
-from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
@@ -21,7 +20,7 @@ from ground_service.app import create_app
 from ground_service.errors import Conflict, SettingsError
 from ground_service.settings import Settings, load_settings
 from ground_service.worker.upkeep import tidy
-from tests.ground_service.access.openid import CLIENT, SECRET, OpenIdProvider, running_provider
+from tests.ground_service.access.openid import CLIENT, SECRET, running_provider
 from tests.ground_service.conftest import cells
 from tests.serving import TestClient, token_valid
 
@@ -35,7 +34,7 @@ def provider():
         yield running
 
 
-def settings(home: Path, provider: OpenIdProvider, **given: object) -> Settings:
+def settings(home, provider, **given):
     return Settings(
         home=home, oidc_issuer=provider.issuer, oidc_client_id=CLIENT, oidc_client_secret=SECRET, oidc_roles=ROLES,
         **given,
@@ -54,25 +53,25 @@ def ground(client):
     return client.app.state.ground
 
 
-def begun(client: TestClient, page: str = "/") -> str:
+def begun(client, page="/"):
     answer = client.get("/sign-in/provider", params={"next": page})
     assert answer.status_code == 303, answer.text
     return str(answer.headers["location"])
 
 
-def answered(client: TestClient, provider: OpenIdProvider, page: str = "/"):
+def answered(client, provider, page="/"):
     """The page of this service after a sign-in at the provider."""
     return client.get(provider.authorise(begun(client, page)))
 
 
-def refused(answer, *words: str, status: int = 401) -> None:
+def refused(answer, *words, status=401):
     assert answer.status_code == status, answer.text
     assert "linna_session=" not in answer.headers.get("set-cookie", "")
     for word in words:
         assert word in answer.text
 
 
-def session_of(client: TestClient) -> dict:
+def session_of(client):
     answer = client.get("/api/v1/session")
     assert answer.status_code == 200, answer.text
     return dict(answer.json())
@@ -163,7 +162,7 @@ def test_a_token_of_another_key_is_refused(client, provider):
 def test_a_token_without_an_asymmetric_signature_is_refused(client, provider, algorithm, monkeypatch):
     """With HS256, the public key of the provider could be used as the secret."""
 
-    def part(octets: bytes) -> str:
+    def part(octets):
         return base64.urlsafe_b64encode(octets).rstrip(b"=").decode()
 
     def signed(claims, key=None):
@@ -364,14 +363,14 @@ def test_sign_out_ends_the_session_here_and_leads_to_the_provider(client, ground
     assert place.startswith(f"{provider.issuer}/end?client_id=linna&")
 
 
-def logout_token(provider: OpenIdProvider, **change: object) -> str:
+def logout_token(provider, **change):
     claims = {
         **provider.common(), "jti": "j-1", "sub": "u-1", "sid": "s-1", "events": {oidc.LOGOUT_EVENT: {}}, **change,
     }  # fmt: skip
     return provider.signed(without_none(claims))
 
 
-def sign_out(client: TestClient, token: str) -> int:
+def sign_out(client, token):
     kept = dict(client.cookies)
     client.cookies.clear()  # it comes from a program of the provider
     status = client.post("/sign-in/provider-sign-out", data={"logout_token": token}).status_code
@@ -433,17 +432,17 @@ def test_the_page_offers_the_provider_only_where_there_is_one(client, tmp_path):
         assert plain.get("/sign-in/provider").status_code == 404
 
 
-@pytest.mark.parametrize(
-    "given, word",
-    [
-        ({"oidc_client_id": None}, "LINNA_OIDC_CLIENT_ID: expected the name"),
-        ({"oidc_roles": ()}, "LINNA_OIDC_ROLES: expected entries"),
-        ({"oidc_roles": ("admin=a", "viewer=a")}, "LINNA_OIDC_ROLES: expected one role"),
-    ],
-)
+INCOMPLETE = """
+{"oidc_client_id": null} | LINNA_OIDC_CLIENT_ID: expected the name
+{"oidc_roles": []} | LINNA_OIDC_ROLES: expected entries
+{"oidc_roles": ["admin=a", "viewer=a"]} | LINNA_OIDC_ROLES: expected one role
+"""
+
+
+@pytest.mark.parametrize("given, word", cells(INCOMPLETE))
 def test_incomplete_settings_are_refused_at_the_start(tmp_path, provider, given, word):
     with pytest.raises(SettingsError, match=word):
-        create_app(settings(tmp_path, provider).model_copy(update=given))
+        create_app(settings(tmp_path, provider).model_copy(update=json.loads(given)))
 
 
 WRONG = """

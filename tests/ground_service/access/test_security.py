@@ -10,19 +10,18 @@ from fastapi.security import HTTPAuthorizationCredentials
 from ground_service.access.security import caller_of, requires
 from ground_service.access.service import LOCAL_CALLER, Caller, add_user, change_user
 from ground_service.errors import NotAuthorised
-from ground_service.ground import Ground
 from ground_service.http.problems import Forbidden
 
 NO_REQUEST: Any = None
 ROLES = ("viewer", "operator", "admin")
 
 
-def request(ground: Ground, open_without_users: bool) -> Any:
+def request(ground, open_without_users):
     app = SimpleNamespace(state=SimpleNamespace(ground=ground, open_without_users=open_without_users))
     return SimpleNamespace(app=app, state=SimpleNamespace(), cookies={})
 
 
-def bearer(token: str) -> HTTPAuthorizationCredentials:
+def bearer(token):
     return HTTPAuthorizationCredentials(scheme="Bearer", credentials=token)
 
 

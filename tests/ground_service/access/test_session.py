@@ -21,7 +21,7 @@ def token(client):
     return users.add_user(client.app.state.ground, "ann", "operator")
 
 
-def start(client: TestClient, token: str) -> None:
+def start(client, token):
     answer = client.post("/api/v1/session", json={"token": token}, headers=OWN)
     assert answer.status_code == 200, answer.text
 

@@ -2,7 +2,6 @@
 
 import json
 import logging
-from typing import Any
 
 import pytest
 from starlette.websockets import WebSocketDisconnect
@@ -28,7 +27,7 @@ def client(tmp_path_factory):
         yield opened
 
 
-def refused(answer: Any, status: int) -> bool:
+def refused(answer, status):
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"
     return bool(answer.json()["status"] == status)

@@ -9,10 +9,9 @@ import logging.config
 import os
 import stat
 import sys
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import pytest
 from fastapi.routing import APIRoute
@@ -46,7 +45,7 @@ def client(tmp_path_factory):
         yield opened
 
 
-def detail(answer: Any, status: int) -> str:
+def detail(answer, status):
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"
     return str(answer.json()["detail"])
@@ -126,7 +125,7 @@ def test_ordinary_json_is_read_as_it_stands():
     }
 
 
-def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+def models_in(annotation):
     """The models that a value of this type consists of."""
     for inner in get_args(annotation):
         yield from models_in(inner)
@@ -169,7 +168,7 @@ def test_a_method_that_is_not_allowed_is_answered_with_those_that_are(client, me
     ],
 )
 def test_errors_of_the_store_name_no_place_and_carry_the_id_of_the_log_entry(client, error, monkeypatch, caplog):
-    def fail(*_: Any, **__: Any) -> Any:
+    def fail(*_, **__):
         raise error
 
     monkeypatch.setattr("ground_service.store.repository.page", fail)
@@ -200,10 +199,10 @@ def test_the_home_and_its_files_are_the_owners_alone(tmp_path):
 class Bodies:
     """Requests to a guarded application that reads bodies; the test sends each body in parts."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.guard = BodyLimit(self._read, upload_paths=("/upload",), upload_limit_octets=1 << 20)
 
-    async def _read(self, _scope: Any, receive: Any, send: Any) -> None:
+    async def _read(self, _scope, receive, send):
         while True:
             message = await receive()
             if message["type"] == "http.disconnect":
@@ -213,20 +212,20 @@ class Bodies:
         await send({"type": "http.response.start", "status": 200, "headers": []})
         await send({"type": "http.response.body", "body": b""})
 
-    def ask(self, path: str = "/x") -> tuple[asyncio.Queue[tuple[bytes, bool]], asyncio.Task[Any]]:
+    def ask(self, path="/x"):
         """Start a request; the queue takes the parts of its body, and whether more follow."""
-        parts: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
-        started: list[Any] = []
+        parts = asyncio.Queue()
+        started = []
 
-        async def receive() -> dict[str, Any]:
+        async def receive():
             body, more = await parts.get()
             return {"type": "http.request", "body": body, "more_body": more}
 
-        async def send(message: Any) -> None:
+        async def send(message):
             if message["type"] == "http.response.start":
                 started.append((message["status"], dict(message["headers"]).get(b"retry-after")))
 
-        async def run() -> Any:
+        async def run():
             scope = {"type": "http", "method": "POST", "path": path, "headers": [], "state": {}}
             await self.guard(scope, receive, send)
             return started[0]
@@ -237,7 +236,7 @@ class Bodies:
 def test_bodies_of_all_requests_together_are_held_within_one_budget(monkeypatch):
     monkeypatch.setattr(limits, "HELD_LIMIT_OCTETS", 1000)
 
-    async def test() -> None:
+    async def test():
         bodies = Bodies()
         first_parts, first = bodies.ask()
         first_parts.put_nowait((b"x" * 600, True))

@@ -3,8 +3,6 @@ answer is one that the schema tells of."""
 
 import json
 import os
-from collections.abc import Mapping
-from typing import Any
 
 import pytest
 import schemathesis
@@ -36,7 +34,7 @@ EXAMPLES = int(os.environ.get("SCHEMA_EXAMPLES", "1"))
 
 
 @schemathesis.serializer("application/zip")
-def _as_octets(_context: Any, value: Any) -> bytes:
+def _as_octets(_context, value):
     """Bodies of archives: whatever octets were made up."""
     octets = getattr(value, "data", value)
     return octets if isinstance(octets, bytes) else json.dumps(octets).encode()
@@ -45,19 +43,19 @@ def _as_octets(_context: Any, value: Any) -> bytes:
 class Queue:
     """Enters jobs and has none of them done: making hundreds of reports is not what is looked at here."""
 
-    def __init__(self, ground: Any) -> None:
+    def __init__(self, ground):
         self._ground = ground
 
-    def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
+    def submit(self, kind, arguments, *, job_id=None):
         return enter_job(self._ground, kind, arguments, job_id=job_id)
 
-    def start(self, job_id: str) -> None:
+    def start(self, job_id):
         pass
 
-    def resume(self) -> None:
+    def resume(self):
         pass
 
-    def close(self) -> None:
+    def close(self):
         pass
 
 
@@ -87,7 +85,7 @@ def test_every_operation_answers_as_its_schema_says(client, mode):
             suppress_health_check=list(HealthCheck),
         )  # fmt: skip
         @given(case=operation.as_strategy(generation_mode=mode))
-        def ask(case: Any) -> None:
+        def ask(case):
             asked.add((case.method, case.operation.path))
             wanted = case.as_transport_kwargs(base_url="http://testserver")
             answer = client.request(

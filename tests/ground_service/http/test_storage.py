@@ -4,7 +4,6 @@ import errno
 import importlib.util
 import os
 import tempfile
-from typing import Any
 
 import pytest
 
@@ -20,11 +19,11 @@ from tests.ground_service.conftest import wait_for
 V1 = "/api/v1"
 
 
-def full(*_: Any, **__: Any) -> Any:
+def full(*_, **__):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def read_only(*_: Any, **__: Any) -> Any:
+def read_only(*_, **__):
     raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
 
@@ -64,7 +63,7 @@ def test_an_ingest_that_a_full_disk_stops_is_done_when_there_is_space(client, sy
     stored = ground.files.put_file(synthetic_pass.folder / "downlink.cadu")
     _, job = enter_ingest(ground, stored, "d", spacecraft_id=76, instance="flight")
 
-    def no_space(*_: Any) -> Any:
+    def no_space(*_):
         raise StorageFull("database")
 
     with monkeypatch.context() as disk:

@@ -9,7 +9,6 @@ from ground_service.access.service import LOCAL_CALLER, session_of
 from ground_service.app import create_app
 from ground_service.clock import follow_missions, independent_now_ns, is_recorded, mission_now_ns, set_mission_clock
 from ground_service.errors import InvalidInput
-from ground_service.ground import Ground
 from ground_service.missions import clocks
 from ground_service.missions.clocks import mission_clock, read_mission_clock
 from ground_service.missions.model import parse_mission
@@ -32,12 +31,12 @@ mission_clock = {{ {clock} }}
 """
 
 
-def simulated(rate: float = 1.0) -> str:
+def simulated(rate=1.0):
     wall = format_utc(time.time_ns())
     return f'source = "simulated", mission = "2029-08-07T06:00:00Z", wall = "{wall}", rate = {rate}'
 
 
-def state(ground: Ground, clock: str, number: int = 76) -> None:
+def state(ground, clock, number=76):
     add_mission(ground, TEXT.format(name=f"m{number}", number=number, clock=clock).encode())
 
 
@@ -48,7 +47,7 @@ def _wall_clock_again():
     set_mission_clock(None)
 
 
-def seconds_after_start() -> float:
+def seconds_after_start():
     return (mission_now_ns() - YEAR_2029) / 1e9
 
 

@@ -5,7 +5,6 @@ Automation and receivers of notifications in a mission description, and those of
 import json
 import logging
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import pytest
 
@@ -34,7 +33,6 @@ from ground_service.missions.service import (
 )
 from ground_service.missions.store import approval_in_force, find_revision, list_missions, newest_of_spacecraft
 from ground_service.passes.archive_import import import_archive
-from ground_service.passes.model import PassDetail
 from ground_service.passes.service import define_pass, get_pass
 from ground_service.passes.store import get_pass as stored_pass
 from linna import cli
@@ -148,7 +146,7 @@ def test_a_revision_that_is_not_entered_is_not_found(ground, name):
 
 
 def test_a_pass_refers_to_the_newest_description_of_its_spacecraft(ground):
-    def define(spacecraft: int) -> PassDetail:
+    def define(spacecraft):
         return get_pass(
             ground, define_pass(ground, name="p", start_utc_ns=0, stop_utc_ns=10**9, spacecraft_id=spacecraft)
         )
@@ -184,7 +182,7 @@ def test_the_description_in_an_archive_becomes_a_revision(ground, make_pass):
 def test_the_description_of_an_archive_holds_for_its_own_pass_only(ground, make_pass):
     folder = make_pass(frames=2, seed=33, mission=TEXT).folder
 
-    def define() -> PassDetail:
+    def define():
         return get_pass(ground, define_pass(ground, name="p", start_utc_ns=0, stop_utc_ns=10**9, spacecraft_id=76))
 
     import_archive(ground, folder)
@@ -230,15 +228,19 @@ def test_the_orientation_of_an_old_archive_is_read_where_it_was_declared(manifes
 
 
 def test_text_that_mentions_terrain_does_not_decide_the_evidence_level():
-    def level(**manifest: object) -> tuple[str | None, str | None]:
+    def level(**manifest):
         evidence = mission_of_manifest({"seed": 7, **manifest}).evidence
         return evidence.world, evidence.level
 
     assert level(data_sources=["height model LROC WAC GLD100"]) == (None, None)
-    assert level(terrain="LROC WAC GLD100") == ("real-terrain", None)
-    assert level(terrain="procedural Moon, seed 7") == ("procedural", "2")
-    assert level(terrain="a procedural Moon beside GLD100") == (None, None)
-    assert level(terrain="photograph big_tile.tif") == ("photographs", "5")
+    declared = """
+LROC WAC GLD100 | real-terrain | None
+procedural Moon, seed 7 | procedural | 2
+a procedural Moon beside GLD100 | None | None
+photograph big_tile.tif | photographs | 5
+"""
+    for terrain, *expected in cells(declared):
+        assert [*map(str, level(terrain=terrain))] == expected
 
 
 def test_values_of_a_wrong_type_in_a_manifest_are_not_stated():
@@ -246,7 +248,7 @@ def test_values_of_a_wrong_type_in_a_manifest_are_not_stated():
     assert mission.camera.width_px == 512 and mission.camera.fov_deg is None
 
 
-def approval_text(*lines: str) -> bytes:
+def approval_text(*lines):
     return "\n".join((TEXT, "[approval]", *lines)).encode()
 
 
@@ -254,7 +256,7 @@ RAISED = 'second_person_for = ["replay_store"]'
 RELAXED = 'one_person_for = ["perform_function/set_mode"]'
 
 
-def released_by_one(ground, name: str, arguments: dict) -> bool:
+def released_by_one(ground, name, arguments):
     command = enter_command(ground, name, arguments, spacecraft_id=76, actor="ann")
     try:
         release_command(ground, command, actor="ann")
@@ -360,7 +362,7 @@ webhook = "https://hooks.example/\\u0054WO"
     client, heads = guarded
     revision = add_mission(client.app.state.ground, text.encode()).revision
 
-    def shown(role: str) -> Any:
+    def shown(role):
         return client.get(f"/api/v1/missions/{revision}", headers=heads[role]).json()
 
     assert shown("operator")["text"] == text
@@ -391,7 +393,7 @@ def test_commands_check_enter_list_and_show_a_description(tmp_path, capsys):
     file.write_text(TEXT)
     revision = parse_mission(TEXT).revision
 
-    def run(*arguments: str) -> dict:
+    def run(*arguments):
         assert cli.run(["mission", *arguments]) == 0
         return json.loads(capsys.readouterr().out)
 
@@ -418,18 +420,19 @@ def test_a_description_names_a_mission():
     assert Mission(name="x").unknown
 
 
-@pytest.mark.parametrize(
-    "keys, expected",
-    [
-        ("latitude_deg = 40.4", "latitude_deg and longitude_deg together"),
-        ('outages = ["2029-08-10T06:00:00Z/2029-08-10T00:00:00Z"]', "a stop after the start"),
-        ('outages = ["tomorrow"]', "START/STOP in UTC"),
-        ("latitude_deg = 95.0\nlongitude_deg = 0.0", "latitude_deg"),
-    ],
-)
+IMPOSSIBLE = """
+latitude_deg = 40.4 | latitude_deg and longitude_deg together
+outages = ["2029-08-10T06:00:00Z/2029-08-10T00:00:00Z"] | a stop after the start
+outages = ["tomorrow"] | START/STOP in UTC
+longitude_deg = 0.0; latitude_deg = 95.0 | latitude_deg
+"""
+
+
+@pytest.mark.parametrize("keys, expected", cells(IMPOSSIBLE))
 def test_an_impossible_place_or_outage_of_a_station_is_refused(keys, expected):
+    lines = keys.replace("; ", "\n")
     with pytest.raises(InvalidInput, match=expected):
-        parse_mission(f'schema_version = 1\nname = "m"\n[link.stations.madrid]\n{keys}\n')
+        parse_mission(f'schema_version = 1\nname = "m"\n[link.stations.madrid]\n{lines}\n')
 
 
 HEAD = 'name = "m"\n'

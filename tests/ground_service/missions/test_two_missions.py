@@ -2,9 +2,6 @@
 Links and resources of a mission description: valid ones, and one clear line for each fault.
 """
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -13,7 +10,6 @@ from ground_service.errors import InvalidInput
 from ground_service.evaluation.core import evaluate_pass
 from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.service import make_report
-from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.frames import camera_of
 from ground_service.missions.model import Camera, format_mission, parse_mission
@@ -25,7 +21,7 @@ from ground_service.planning import service as planning
 from ground_service.store import repository
 from lunar.frames import IauOrientation
 from lunar.timescales import parse_utc
-from tests.ground_service.conftest import SyntheticPass, add_reference
+from tests.ground_service.conftest import add_reference
 from tmtc.downlink import encode_cadus
 
 START, STOP = parse_utc("2029-08-07T06:00:00Z"), parse_utc("2029-08-07T06:05:45Z")
@@ -75,12 +71,12 @@ def made(make_pass):
     return make_pass(frames=24, seed=2)
 
 
-def both(ground: Ground) -> dict[int, Any]:
+def both(ground):
     """Add the description of each spacecraft."""
     return {76: add_mission(ground, WIDE.encode()), 77: add_mission(ground, NARROW.encode())}
 
 
-def flown(ground: Ground, made: SyntheticPass, spacecraft: int, folder: Path) -> int:
+def flown(ground, made, spacecraft, folder):
     """Ingest the same packets as telemetry of a spacecraft; return the id of its pass."""
     path = folder / f"{spacecraft}.cadu"
     path.write_bytes(encode_cadus(made.packets, spacecraft_id=spacecraft))
@@ -88,7 +84,7 @@ def flown(ground: Ground, made: SyntheticPass, spacecraft: int, folder: Path) ->
     return define_pass(ground, name="pass", start_utc_ns=START, stop_utc_ns=STOP, spacecraft_id=spacecraft)
 
 
-def row(ground: Ground, table: Any, **equal: Any) -> dict[str, Any]:
+def row(ground, table, **equal):
     found = ground.read(repository.find, table, **equal)
     assert found is not None
     return found
@@ -143,9 +139,9 @@ def test_a_window_is_predicted_with_the_camera_of_its_spacecraft(ground, made, m
 def test_only_the_spacecraft_whose_description_permits_it_is_correlated_automatically(
     ground, made, tmp_path, monkeypatch
 ):
-    fitted: list[int] = []
+    fitted = []
 
-    def reports(_ground: Ground, _connection: Any, vehicle: int) -> Any:
+    def reports(_ground, _connection, vehicle):
         fitted.append(vehicle)
         return recorrelation.TimeReports(*[np.zeros(0, dtype=np.int64)] * 6, ())
 
@@ -171,7 +167,7 @@ uplink = "127.0.0.1:10025"
 """
 
 
-def text(*parts: str, number: int = 76) -> str:
+def text(*parts, number=76):
     return HEAD.format(id=number) + "\n".join(parts)
 
 

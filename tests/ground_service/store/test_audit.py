@@ -5,7 +5,6 @@ import json
 import os
 import subprocess
 import sys
-from typing import Any
 
 import pytest
 from sqlalchemy import text
@@ -14,7 +13,7 @@ from sqlalchemy.exc import DBAPIError
 from ground_service.access.service import add_user
 from ground_service.errors import AuditBroken, GroundError
 from ground_service.store import audit
-from ground_service.store.database import Database, prepare_database
+from ground_service.store.database import prepare_database
 from ground_service.store.models import AUDIT
 from ground_service.worker.upkeep import nightly
 from linna import cli
@@ -23,23 +22,23 @@ from tests.ground_service.conftest import cells
 PROCESSES, EACH = 4, 25
 
 
-def add(database: Database, *actions: str, detail: dict[str, Any] | None = None) -> None:
+def add(database, *actions, detail=None):
     with database.writing() as connection:
         for action in actions:
             audit.add_note(connection, audit.Note(5, "ann", action, "7", detail or {}))
 
 
-def broken(database: Database) -> list[audit.BrokenEntry]:
+def broken(database):
     with database.snapshot() as connection:
         return list(audit.broken_entries(connection))
 
 
-def head(database: Database) -> audit.Head | None:
+def head(database):
     with database.reading() as connection:
         return audit.read_head(connection)
 
 
-def without_guards(database: Database, statement: str) -> None:
+def without_guards(database, statement):
     """Change the log as a user with the right to change the schema."""
     with database.writing() as connection:
         for name in audit.GUARD_NAMES:

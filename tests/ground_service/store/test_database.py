@@ -5,7 +5,6 @@ database cannot hold are refused in one line on both databases, without the addr
 import errno
 import os
 import sqlite3
-from pathlib import Path
 
 import pytest
 from alembic.autogenerate import compare_metadata
@@ -36,7 +35,7 @@ from ground_service.store.repository import VEHICLES
 from tests.ground_service.schema import described_schema
 
 
-def url(path: Path) -> str:
+def url(path):
     return f"sqlite:///{path / 'linna.db'}"
 
 
@@ -181,7 +180,7 @@ def test_a_file_is_stored_once_and_cannot_be_changed(tmp_path):
 def test_a_file_cut_off_while_stored_leaves_nothing(tmp_path):
     archive = FileArchive(tmp_path / "files")
 
-    def broken() -> object:
+    def broken():
         yield b"abc"
         raise OSError(errno.ENOSPC, "No space left on device")
 

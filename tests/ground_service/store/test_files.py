@@ -3,9 +3,7 @@
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from sqlalchemy import text
@@ -23,14 +21,14 @@ def ended_process():
 
 
 def test_octets_name_and_folders_are_synchronised_before_the_file_is_stored(tmp_path, monkeypatch):
-    operations: list[str] = []
+    operations = []
     replace, fsync = os.replace, os.fsync
 
-    def noted_replace(source: Any, target: Any) -> None:
+    def noted_replace(source, target):
         operations.append("replace")
         replace(source, target)
 
-    def noted_fsync(descriptor: int) -> None:
+    def noted_fsync(descriptor):
         place = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
         operations.append("octets" if place.is_file() else str(place.relative_to(tmp_path)))
         fsync(descriptor)
@@ -45,7 +43,7 @@ def test_a_file_that_another_process_stored_is_synchronised_too(tmp_path, monkey
     files = FileArchive(tmp_path)
     files.put_octets(b"telemetry")
     monkeypatch.setattr("ground_service.store.files._durable", set())  # as in another process
-    synchronised: list[str] = []
+    synchronised = []
     monkeypatch.setattr(os, "fsync", lambda fd: synchronised.append(os.readlink(f"/proc/self/fd/{fd}")))
     stored = files.put_octets(b"telemetry")
     assert synchronised[-2:] == [str(stored.path.parent), str(tmp_path)]
@@ -58,7 +56,7 @@ def test_a_file_that_another_process_stored_is_synchronised_too(tmp_path, monkey
 def test_leftovers_of_ended_processes_are_removed_at_the_start(tmp_path, ended_process):
     files = FileArchive(tmp_path / "files")
 
-    def interrupted() -> Iterator[bytes]:
+    def interrupted():
         yield b"half of it"
         yield Path(next((tmp_path / "files").glob(".incoming-*"))).name.encode()
         raise KeyboardInterrupt
@@ -67,9 +65,9 @@ def test_leftovers_of_ended_processes_are_removed_at_the_start(tmp_path, ended_p
         files.put(interrupted())
     assert not list(files.root.glob(".incoming-*")), "an aborted upload leaves nothing"
 
-    names: list[str] = []
+    names = []
 
-    def watched() -> Iterator[bytes]:
+    def watched():
         yield b"the first "
         names.append(next(files.root.glob(".incoming-*")).name)
         yield b"and the rest"
@@ -97,7 +95,7 @@ def test_a_folder_is_whole_on_the_disk_before_it_has_its_name(tmp_path, monkeypa
     (tmp_path / "partial" / "files").mkdir(parents=True)
     (tmp_path / "partial" / "files" / "a").write_bytes(b"a")
     (tmp_path / "partial" / "list").write_bytes(b"list")
-    steps: list[str] = []
+    steps = []
     replace, read = os.replace, os.readlink
     monkeypatch.setattr(os, "fsync", lambda fd: steps.append(read(f"/proc/self/fd/{fd}")))
     monkeypatch.setattr(os, "replace", lambda a, b: (steps.append("name"), replace(a, b)))

@@ -62,7 +62,7 @@ def roles(new_postgres_database):
     engine.dispose()
 
 
-def assert_refused(url: str, statement: str) -> None:
+def assert_refused(url, statement):
     engine = create_engine(url, isolation_level="AUTOCOMMIT")
     try:
         with pytest.raises(DBAPIError) as error, engine.connect() as connection:

@@ -9,13 +9,12 @@ import pytest
 
 import ground_service
 from ground_service.errors import NotFound, StateConflict
-from ground_service.ground import Ground
 from ground_service.store import repository
 from ground_service.store.states import JOB, TELECOMMAND, change_if, move, move_all
 from ground_service.store.vehicles import hold, next_telecommand, vehicle_id
 
 
-def add_command(ground: Ground, state: str = "queued") -> int:
+def add_command(ground, state="queued"):
     with ground.database.writing() as connection:
         vehicle = vehicle_id(connection, 76, "flight")
         return int(
@@ -26,7 +25,7 @@ def add_command(ground: Ground, state: str = "queued") -> int:
         )  # fmt: skip
 
 
-def state_of(ground: Ground, key: int) -> str:
+def state_of(ground, key):
     with ground.database.reading() as connection:
         return str(repository.get(connection, repository.TELECOMMANDS, key, "telecommand")["state"])
 
@@ -88,7 +87,7 @@ def test_counters_give_every_number_once_to_transactions_at_the_same_time(either
     with either.database.writing() as connection:
         vehicles = [vehicle_id(connection, number, "flight") for number in (1, 2)]
 
-    def count(vehicle: int) -> int:
+    def count(vehicle):
         return either.write(next_telecommand, vehicle)
 
     with ThreadPoolExecutor(8) as pool:
@@ -108,7 +107,7 @@ def test_a_number_that_was_not_used_is_given_again(either):
 def test_one_transaction_at_a_time_holds_a_name(either):
     inside, most, lock = 0, 0, threading.Lock()
 
-    def work(_: int) -> None:
+    def work(_):
         nonlocal inside, most
         with either.database.writing() as connection:
             hold(connection, "archive")

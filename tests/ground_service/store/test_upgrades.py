@@ -5,7 +5,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from sqlalchemy import MetaData, text
@@ -15,7 +14,6 @@ from ground_service.errors import DatabaseTooNew
 from ground_service.ground import open_ground
 from ground_service.store import database as stores
 from ground_service.store.database import (
-    Database,
     known_revisions,
     migrations_folder,
     oldest_program,
@@ -43,7 +41,7 @@ def migrations(tmp_path, monkeypatch):
     folder = tmp_path / "migrations"
     shutil.copytree(migrations_folder(), folder)
 
-    def add(revision: str, *statements: str) -> None:
+    def add(revision, *statements):
         body = "".join(f"    {one}\n" for one in statements)
         (folder / "versions/9999_further.py").write_text(
             "import sqlalchemy as sa\nfrom alembic import op\n"
@@ -54,14 +52,14 @@ def migrations(tmp_path, monkeypatch):
     return add
 
 
-def reflected(database: Database) -> MetaData:
+def reflected(database):
     metadata = MetaData()
     with database.reading() as connection:
         metadata.reflect(connection)
     return metadata
 
 
-def changes_of(folder: Path, migrations: Migrations, *statements: str) -> list[str]:
+def changes_of(folder, migrations, *statements):
     before = reflected(prepare_database(f"sqlite:///{folder / 'one.db'}"))
     migrations(EXPANSION, *statements)
     return breaking_changes(before, reflected(prepare_database(f"sqlite:///{folder / 'one.db'}")))
@@ -121,7 +119,7 @@ def test_a_program_works_with_an_expanded_schema_and_with_no_other_newer_one(tmp
         prepare_database(url)
 
 
-def of_version_1(database: Database) -> None:
+def of_version_1(database):
     """Make a database as version 1.0 left it: its schema, a user, and the triggers of row digests."""
     stores.upgrade_database(database, "1.0")
     statements = [
@@ -191,7 +189,7 @@ def test_a_migration_gives_way_to_requests_that_hold_locks(new_postgres_database
             connection.execute(text("SELECT count(*) FROM jobs"))
             upgrade.start()
 
-            def waits() -> bool:
+            def waits():
                 with other.reading() as looking:
                     return bool(looking.execute(tried).scalar())
 

@@ -120,32 +120,27 @@ class Console:
         self._thread.join(TIMEOUT_S)
 
 
+FRAME = """{"kind": "frame", "mode": "observing", "paused": false, "rate": 1.0, "verifications": [],
+    "altitude_km": 30.0, "detections": [{"u_px": 100.0, "v_px": 120.0, "diameter_px": 40.0, "score": 0.9}],
+    "catalogue": [{"id": 1, "u_px": 101.0, "v_px": 121.0, "diameter_px": 41.0}]}"""
+DARK = """{"severity": "medium", "event": "image_dark", "values": [1.0, 2.0], "text": "mean grey level 1"}"""
+
+
 def live_frame(number: int) -> dict[str, object]:
     """A frame as the console of the emulator tells it."""
     _, jpeg = cv2.imencode(".jpg", np.full((512, 512), 20 + number, np.uint8))
-    return {
-        "kind": "frame",
+    estimate = {
+        "outcome": "fixed", "reset_trigger": "none", "latitude_deg": -50.0 + number, "longitude_deg": 294.001,
+        "altitude_m": 30e3, "error_m": 80.0 + number,
+    }  # fmt: skip
+    return json.loads(FRAME) | {
         "utc": f"2029-08-07T06:{number // 4:02d}:{15 * (number % 4):02d}.000Z",
-        "mode": "observing",
-        "paused": False,
-        "rate": 1.0,
-        "events": [{"severity": "medium", "event": "image_dark", "values": [1.0, 2.0], "text": "mean grey level 1"}]
-        if number == 3
-        else [],
-        "verifications": [],
+        "events": [json.loads(DARK)] if number == 3 else [],
         "frame": number,
         "reference": {"latitude_deg": -50.0 + number, "longitude_deg": 294.0, "altitude_m": 30e3},
-        "altitude_km": 30.0,
-        "detections": [{"u_px": 100.0, "v_px": 120.0, "diameter_px": 40.0, "score": 0.9}],
-        "catalogue": [{"id": 1, "u_px": 101.0, "v_px": 121.0, "diameter_px": 41.0}],
-        "estimates": {
-            "anchored": {
-                "outcome": "fixed", "reset_trigger": "none", "latitude_deg": -50.0 + number,
-                "longitude_deg": 294.001, "altitude_m": 30e3, "error_m": 80.0 + number,
-            }
-        },
+        "estimates": {"anchored": estimate},
         "image_jpeg": base64.b64encode(jpeg.tobytes()).decode(),
-    }  # fmt: skip
+    }
 
 
 @pytest.fixture

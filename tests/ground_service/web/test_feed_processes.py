@@ -3,7 +3,6 @@
 import asyncio
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 from unittest.mock import MagicMock
 
 import pytest
@@ -30,11 +29,11 @@ def server_url(migrated_postgres):
     return url
 
 
-def ask(port: int, path: str, body: bytes | None = None) -> tuple[int, bytes, Any]:
+def ask(port, path, body=None):
     return fetch(f"http://127.0.0.1:{port}/api/v1/{path}", body)
 
 
-def housekeeping(second: int, **values: float) -> bytes:
+def housekeeping(second, **values):
     fields = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
     packet = DICTIONARY.pack(
         "housekeeping", fields | values | {"structure_id": 1}, ticks=(900_000_000 + second) * 65_536,
@@ -43,7 +42,7 @@ def housekeeping(second: int, **values: float) -> bytes:
     return encode_cadus([packet], spacecraft_id=76)
 
 
-def keep_sending(connection: Any, stop: threading.Event) -> None:
+def keep_sending(connection, stop):
     """Send a packet each tenth of a second, from second 23."""
     second = 23
     while not stop.wait(0.1):
@@ -51,7 +50,7 @@ def keep_sending(connection: Any, stop: threading.Event) -> None:
         second += 1
 
 
-def temperature_after(socket: Any) -> float:
+def temperature_after(socket):
     """Return the temperature of the next message with values."""
     while (message := socket.receive_json())["kind"] != "values":
         pass
@@ -114,14 +113,14 @@ def test_telemetry_received_by_one_process_is_shown_by_the_other_through_a_resta
 
 
 def test_a_wake_up_of_another_process_is_heard_and_an_own_one_is_not(redis_url):
-    heard: list[str] = []
+    heard = []
     connected, woken = threading.Event(), threading.Event()
 
-    def wake() -> None:
+    def wake():
         (woken if connected.is_set() else connected).set()
         heard.append("wake")
 
-    async def run() -> None:
+    async def run():
         task = asyncio.create_task(wakeups.listen(redis_url, wake))
         assert await asyncio.to_thread(connected.wait, 60.0)
         wakeups.Waker(redis_url)(frozenset({"telemetry"}))

@@ -3,13 +3,11 @@
 LINNA_PAGE_TABLE=FILE writes the results as the table of the documentation: `make page-table`.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import subprocess
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -29,14 +27,11 @@ from lunar.catalogue import load_catalogue, save_catalogue
 from lunar.timescales import format_utc
 from tests.ground_service.conftest import SPACECRAFT, START, cells
 from tests.ground_service.evaluation.landmarks.test_learned_landmarks import rewrite
-from tests.ground_service.web.conftest import COUNT_REQUESTS, Service, patient
+from tests.ground_service.web.conftest import COUNT_REQUESTS, patient
 from tests.ground_service.web.test_in_browser import answered, settled
 from tests.ground_service.web.test_shift import MISSION, PASS_MISSION, Spacecraft
 from tests.lazy import Lazy, expect
 from tests.serving import wait_for
-
-if TYPE_CHECKING:
-    from playwright.sync_api import BrowserContext, Page
 
 Looks = tuple[tuple[Literal["light", "dark"], str, int], ...]
 FONTS = {"DejaVu": "DejaVu Sans", "Arial": "Liberation Sans"}
@@ -113,7 +108,7 @@ def empty_service(tmp_path_factory, console, serve):
 class Worked:
     """A service with users and data, and the token of an administrator."""
 
-    def __init__(self, service: Service, token: str, paths: dict[str, str]) -> None:
+    def __init__(self, service, token, paths):
         self.url = service.url
         self.token = token
         self.paths = paths
@@ -161,7 +156,7 @@ def worked(tmp_path_factory, make_pass, make_flyable, make_build, console, serve
     spacecraft.close()
 
 
-def work(api: Client, spacecraft: Spacecraft, packets: list[bytes]) -> int:
+def work(api, spacecraft, packets):
     """Receive a pass over TCP, and leave traces on every page; return the number of the pass."""
     spacecraft.replay(packets)
     spacecraft.report("event_high", event_id=20, frame_number=7)
@@ -183,16 +178,16 @@ def work(api: Client, spacecraft: Spacecraft, packets: list[bytes]) -> int:
 class Faults:
     """Faults of a page by kind, in the order of the columns of the table."""
 
-    def __init__(self, page: Page) -> None:
-        self.console: list[str] = []
+    def __init__(self, page):
+        self.console = []
         page.on("console", lambda one: self.console.append(one.text) if one.type == "error" else None)
         page.on("pageerror", lambda error: self.console.append(str(error)))
-        self.layout: list[str] = []
-        self.barriers: list[str] = []
-        self.keyboard: list[str] = []
-        self.unmarked: list[str] = []
+        self.layout = []
+        self.barriers = []
+        self.keyboard = []
+        self.unmarked = []
 
-    def find(self, page: Page, looks: Looks) -> None:
+    def find(self, page, looks):
         """Look at an opened page in some forms: scheme, font and width."""
         page.evaluate(LONG_LOG)
         for scheme, font, width in looks:
@@ -208,7 +203,7 @@ class Faults:
             page.set_viewport_size({"width": width, "height": 844})
             self.tab_through(page, width)
 
-    def tab_through(self, page: Page, width: int) -> None:
+    def tab_through(self, page, width):
         """Find what the Tab key does not reach, from the start of the page to its end, and what it does not mark."""
         count = page.evaluate(USABLE)
         page.evaluate("document.activeElement.blur()")
@@ -219,13 +214,13 @@ class Faults:
         self.keyboard += [f"{width} px: {one}" for one in page.evaluate(MISSED)]
         self.unmarked += [f"{width} px: {one}" for one in page.evaluate("linnaUnmarked")]
 
-    def columns(self) -> dict[str, list[str]]:
+    def columns(self):
         """Return the faults by the name of their column."""
         found = (self.layout, self.barriers, self.console, self.keyboard, self.unmarked)
         return dict(zip(COLUMNS, found, strict=True))
 
 
-def barriers(page: Page) -> list[str]:
+def barriers(page):
     """Return the serious and critical findings of axe."""
     return [
         f"{one['id']} {[node['html'][:100] for node in one['nodes'][:2]]}"
@@ -237,7 +232,7 @@ def barriers(page: Page) -> list[str]:
 @pytest.fixture(scope="module")
 def rows():
     """Rows of the table, written at the end where a file is named."""
-    lines: list[str] = []
+    lines = []
     yield lines
     if file := os.environ.get("LINNA_PAGE_TABLE"):
         head = Path(file).read_text().split("| page |")[0]
@@ -245,7 +240,7 @@ def rows():
         Path(file).write_text("\n".join([f"{head}{heading}", "|---" * (2 + len(COLUMNS)) + "|", *lines, ""]))
 
 
-def record(rows: list[str], path: str, state: str, found: Faults) -> None:
+def record(rows, path, state, found):
     """Add a row of the table, and fail if the page has faults."""
     columns = found.columns()
     counts = " | ".join(str(len(texts)) if texts else "none" for texts in columns.values())
@@ -253,9 +248,7 @@ def record(rows: list[str], path: str, state: str, found: Faults) -> None:
     assert {kind: texts for kind, texts in columns.items() if texts} == {}
 
 
-def look(
-    context: BrowserContext, rows: list[str], path: str, state: str, looks: Looks, address: str | None = None
-) -> None:
+def look(context, rows, path, state, looks, address=None):
     """Open a page, and record its faults."""
     page = new_page(context)
     found = Faults(page)
@@ -266,7 +259,7 @@ def look(
     record(rows, path, state, found)
 
 
-def new_page(context: BrowserContext) -> Page:
+def new_page(context):
     """Return a page that counts its requests."""
     page = context.new_page()
     page.add_init_script(COUNT_REQUESTS)

@@ -1,16 +1,12 @@
 """A shift of one operator in Chromium, from the sign-in to the sign-out, with a ground station in the test."""
 
-from __future__ import annotations
-
 import json
 import re
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -31,9 +27,6 @@ from tests.serving import wait_for
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import DownlinkEncoder
 from tmtc.link.uplink import UplinkDecoder
-
-if TYPE_CHECKING:
-    from playwright.sync_api import Page
 
 NS = 1_000_000_000
 SPACECRAFT = 76
@@ -117,16 +110,16 @@ class Spacecraft:
     _count: int = 0
     _sending: threading.Lock = field(default_factory=threading.Lock)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         for task in (self._accept_listeners, self._take_telecommands):
             self._start(task)
 
-    def _start(self, task: Callable[..., None], *arguments: Any) -> None:
+    def _start(self, task, *arguments):
         thread = threading.Thread(target=task, args=arguments, daemon=True)
         self._tasks.append(thread)
         thread.start()
 
-    def report(self, name: str, **values: Any) -> None:
+    def report(self, name, **values):
         """Send a packet to the service, which has connected."""
         zeros = {one.name: 0 for one in DICTIONARY.packet(name).fields if one.size == 1}
         wait_for(lambda: bool(self._listeners), "the service has not connected")
@@ -136,20 +129,20 @@ class Spacecraft:
             packet = DICTIONARY.pack(name, zeros | values, ticks=ticks, sequence_count=self._count)
             self._listeners[-1].sendall(self._encoder.encode([packet]))
 
-    def replay(self, packets: list[bytes]) -> None:
+    def replay(self, packets):
         """Send packets of a recorded pass."""
         wait_for(lambda: bool(self._listeners), "the service has not connected")
         with self._sending:
             self._listeners[-1].sendall(self._encoder.encode(packets))
 
-    def _accept_listeners(self) -> None:
+    def _accept_listeners(self):
         while True:
             try:
                 self._listeners.append(self.down.accept()[0])
             except OSError:
                 return
 
-    def _take_telecommands(self) -> None:
+    def _take_telecommands(self):
         while True:
             try:
                 connection, _ = self.up.accept()
@@ -158,7 +151,7 @@ class Spacecraft:
             self._connections.append(connection)
             self._start(self._verify, connection)
 
-    def _verify(self, connection: socket.socket) -> None:
+    def _verify(self, connection):
         decoder = UplinkDecoder(SPACECRAFT)
         with connection, suppress(OSError):  # the service may end first
             while octets := connection.recv(1 << 16):
@@ -167,7 +160,7 @@ class Spacecraft:
                     for stage in ("accepted", "started", "completed"):
                         self.report(f"verification_{stage}", request_id=request)
 
-    def close(self) -> None:
+    def close(self):
         for one in (self.down, self.up, *self._listeners, *self._connections):
             end_socket(one)
         for task in self._tasks:
@@ -207,18 +200,18 @@ def shift(tmp_path, make_pass, console, serve):
 COUNT_CLICKS = "addEventListener('click', () => (sessionStorage.n = 1 + Number(sessionStorage.n ?? 0)))"
 
 
-def go(page: Page, *links: str) -> None:
+def go(page, *links):
     """Follow links by their visible texts."""
     for text in links:
         page.get_by_role("link", name=text, exact=True).first.click()
 
 
 @contextmanager
-def telemetry(spacecraft: Spacecraft) -> Iterator[None]:
+def telemetry(spacecraft):
     """Keep a contact open: telemetry comes more often than its silence ends it."""
     over = threading.Event()
 
-    def send() -> None:
+    def send():
         while not over.wait(0.5):
             spacecraft.report("housekeeping", structure_id=1, bus_voltage_v=12.0, temperature_c=21.5)
 

@@ -2,8 +2,6 @@
 
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import Any
 
 import pytest
 from starlette.websockets import WebSocketDisconnect
@@ -32,20 +30,20 @@ def client(tmp_path, monkeypatch):
         yield opened
 
 
-def ground_of(client: TestClient) -> Any:
+def ground_of(client):
     return client.app.state.ground
 
 
-def bearer(token: str) -> dict[str, str]:
+def bearer(token):
     return {"Authorization": f"Bearer {token}"}
 
 
-def say(ground: Any, number: int) -> None:
+def say(ground, number):
     with ground.database.writing() as connection:
         publish(connection, "test", {"number": number})
 
 
-def closing_code(socket: Any) -> int:
+def closing_code(socket):
     """Return the close code of a socket; skip earlier messages."""
     with pytest.raises(WebSocketDisconnect) as closed:
         while True:
@@ -53,23 +51,23 @@ def closing_code(socket: Any) -> int:
     return int(closed.value.code)
 
 
-def disable(ground: Any, name: str) -> None:
+def disable(ground, name):
     users.change_user(ground, name, state="disabled")
 
 
-def revoke(ground: Any, name: str) -> None:
+def revoke(ground, name):
     (token,) = users.list_tokens(ground, name)
     users.revoke_token(ground, token.id)
 
 
-def renew(ground: Any, name: str) -> None:
+def renew(ground, name):
     users.add_token(ground, name, revoke_others=True)
 
 
 @pytest.mark.parametrize("path", [LIVE, "/api/v1/payload"])
 @pytest.mark.parametrize("end", [disable, revoke, renew])
 def test_a_socket_ends_with_the_right_to_hold_it(client, end, path, monkeypatch):
-    async def hold(session: Any) -> None:
+    async def hold(session):
         await session.accept()
         await asyncio.sleep(60.0)
 
@@ -103,9 +101,9 @@ def test_a_token_that_expires_ends_its_socket(client, monkeypatch):
 
 
 def test_an_operator_who_becomes_a_viewer_may_no_longer_steer(client, monkeypatch):
-    roles: list[str] = []
+    roles = []
 
-    async def watch_role(session: Any) -> None:
+    async def watch_role(session):
         await session.accept()
         while True:
             await asyncio.sleep(0.02)
@@ -122,7 +120,7 @@ def test_an_operator_who_becomes_a_viewer_may_no_longer_steer(client, monkeypatc
         assert socket.receive_text() == "viewer"
 
 
-def refused(client: TestClient, token: str | None) -> bool:
+def refused(client, token):
     headers = bearer(token) if token else {}
     try:
         with client.websocket_connect(LIVE, headers=headers):
@@ -155,7 +153,7 @@ def test_the_feed_is_read_once_for_all_sockets(client, monkeypatch):
     reads = 0
     read_events = sockets.read_events
 
-    def counted(*arguments: Any) -> Any:
+    def counted(*arguments):
         nonlocal reads
         items = read_events(*arguments)
         reads += bool(items)
@@ -198,7 +196,7 @@ def test_a_client_that_reads_too_slowly_is_closed_and_may_come_back(client, monk
         (session,) = hub._readers
         monkeypatch.setattr(sockets, "QUEUED_LIMIT", 2)
 
-        async def stuck(_text: str) -> None:
+        async def stuck(_text):
             await asyncio.sleep(60.0)
 
         session.socket.send_text = stuck
@@ -207,17 +205,17 @@ def test_a_client_that_reads_too_slowly_is_closed_and_may_come_back(client, monk
         assert closing_code(socket) == sockets.TRY_AGAIN_LATER
 
 
-def receive(ground: Any, folder: Path, second: int, name: str = "housekeeping", **values: float) -> None:
+def receive(ground, folder, second, name="housekeeping", **values):
     """Ingest a packet of spacecraft 76 of a second."""
     fields = DICTIONARY.packet(name).fields
-    zeros: dict[str, Any] = {field.name: 0 if field.size == 1 else (0.0,) * field.size for field in fields}
+    zeros = {field.name: 0 if field.size == 1 else (0.0,) * field.size for field in fields}
     packet = DICTIONARY.pack(name, zeros | values, ticks=TICKS + second * 65_536, sequence_count=second)
     file = folder / f"{name}-{second}.cadu"
     file.write_bytes(encode_cadus([packet], spacecraft_id=76))
     ingest_file(ground, file)
 
 
-def messages_until(socket: Any, kind: str) -> list[dict[str, Any]]:
+def messages_until(socket, kind):
     """Return the messages up to the next one of a kind."""
     found = [socket.receive_json()]
     while found[-1]["kind"] != kind:
@@ -265,10 +263,10 @@ def test_values_of_the_feed_are_those_of_the_parameters(client, tmp_path):
 
 
 def test_a_slow_socket_skips_values_and_no_events():
-    sent: list[str] = []
+    sent = []
 
     class Slow:
-        async def send_text(self, text: str) -> None:
+        async def send_text(self, text):
             sent.append(text)
             if text == "event 1":  # what comes while this is being sent
                 for number in (2, 3):
@@ -276,9 +274,9 @@ def test_a_slow_socket_skips_values_and_no_events():
                     session.offer_values((1, "housekeeping"), f"values {number}")
             await asyncio.sleep(0)
 
-    session: Any = None
+    session = None
 
-    async def run() -> None:
+    async def run():
         nonlocal session
         session = sockets.Session(
             Slow(),  # only what is sent matters

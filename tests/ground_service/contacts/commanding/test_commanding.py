@@ -5,8 +5,6 @@ telecommand for every set of reports that can come down about it (ECSS-E-ST-70-4
 
 import json
 from itertools import combinations
-from pathlib import Path
-from typing import Any
 
 import pytest
 from sqlalchemy import event, update
@@ -29,7 +27,6 @@ from ground_service.contacts.commanding.service import (
 )
 from ground_service.contacts.commanding.store import list_handovers
 from ground_service.errors import Conflict, InvalidInput, NotFound
-from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.model import Approval
@@ -50,30 +47,30 @@ NOW = parse_utc("2029-08-07T06:00:00Z")
 START = {"function_id": "start_observation", "argument_1": 600.0, "argument_2": 15.0}
 
 
-def entered(ground: Ground, name: str = "perform_function", actor: str = "ann", **arguments: Any) -> int:
+def entered(ground, name="perform_function", actor="ann", **arguments):
     given = arguments or (START if name == "perform_function" else {})
     return enter_command(ground, name, given, spacecraft_id=SPACECRAFT, actor=actor)
 
 
-def entered_elsewhere(ground: Ground, spacecraft: int = 77, instance: str = "flight") -> int:
+def entered_elsewhere(ground, spacecraft=77, instance="flight"):
     """Enter and release a telecommand of another spacecraft."""
     command = enter_command(ground, "test_connection", {}, spacecraft_id=spacecraft, instance=instance, actor="ann")
     release_command(ground, command, actor="ann")
     return command
 
 
-def uplinked(ground: Ground, **options: Any) -> tuple[bytes, list[int]]:
+def uplinked(ground, **options):
     return take_uplink(ground, **{"spacecraft_id": SPACECRAFT, "actor": "ann"} | options)
 
 
-def sent(ground: Ground) -> int:
+def sent(ground):
     command = entered(ground)
     release_command(ground, command, actor="ann")
     uplinked(ground)
     return command
 
 
-def downlink(ground: Ground, folder: Path, *reports: tuple[str, int, dict[str, Any]]) -> None:
+def downlink(ground, folder, *reports):
     path = folder / "reports.bin"
     packets = [
         DICTIONARY.pack(name, values, ticks=ticks, sequence_count=ticks % 16384) for name, ticks, values in reports
@@ -176,7 +173,7 @@ def test_a_time_out_is_put_on_record_once_and_stays_there(ground, tmp_path, monk
     downlink(ground, tmp_path, ("verification_completed", 3000, request))
     due = get_command(ground, silent).record.sent_utc_ns + 600 * 10**9
 
-    def noted(now: int) -> list[int]:
+    def noted(now):
         monkeypatch.setattr("ground_service.contacts.commanding.service.utc_now_ns", lambda: now)
         return note_timeouts(ground, 0, now)
 
@@ -213,7 +210,7 @@ def test_a_reason_is_one_printable_line(ground, reason):
 
 
 def test_arguments_nested_without_end_are_refused(ground):
-    nested: Any = 1
+    nested = 1
     for _ in range(3000):
         nested = [nested]
     with pytest.raises(InvalidInput, match="set_parameter"):
@@ -225,7 +222,7 @@ def test_an_instance_is_one_printable_line(ground):
         enter_command(ground, "test_connection", {}, spacecraft_id=1, instance="a\nb", actor="ann")
 
 
-def carrying(name: str, **arguments: Any) -> dict[str, Any]:
+def carrying(name, **arguments):
     octets = DICTIONARY.pack_command(name, arguments, sequence_count=0)
     return {"release_ticks": 1, "items": [{"octet": octet} for octet in octets]}
 
@@ -257,17 +254,17 @@ def test_what_changes_the_state_of_the_payload_needs_a_second_person(ground, nam
     assert get_command(ground, command).state == "released"
 
 
-def raise_rule(monkeypatch: pytest.MonkeyPatch) -> None:
+def raise_rule(monkeypatch):
     rules = Approval(second_person_for=("perform_function/start_observation",))
     monkeypatch.setattr(commanding, "approval_in_force", lambda *_: rules)
 
 
-def drafted(ground: Ground) -> int:
+def drafted(ground):
     entry = WindowEntry("window", NOW, NOW + 600 * 10**9, 15.0, SPACECRAFT)
     return int(add_window(ground, entry, actor="ann").id)
 
 
-def planned(ground: Ground) -> int:
+def planned(ground):
     window = drafted(ground)
     change_window(ground, window, actor="ann", changes={}, decision="approved")
     return window
@@ -300,25 +297,25 @@ def test_who_changes_a_window_has_entered_it(ground, monkeypatch):
 def clock(monkeypatch):
     """A clock that stands at `NOW` until it is set."""
 
-    def put(now: int) -> None:
+    def put(now):
         monkeypatch.setattr("ground_service.contacts.commanding.service.utc_now_ns", lambda: now)
 
     put(NOW)
     return put
 
 
-def notes(ground: Ground, command: int) -> list[tuple[str, str, Any]]:
+def notes(ground, command):
     """Who did what to a command, and the details, in order."""
     with ground.database.reading() as connection:
         rows = repository.newest(connection, repository.AUDIT, Paging(), target=str(command))[0]
     return [(row["actor"], row["action"], row["detail"]) for row in sorted(rows, key=lambda row: row["id"])]
 
 
-def told(ground: Ground) -> list[Any]:
+def told(ground):
     return [item.payload for item in read_events(ground.database, 0) if item.kind == "telecommand"]
 
 
-def subset(row: Any, names: Any) -> dict[str, Any]:
+def subset(row, names):
     return {name: getattr(row, name) for name in names}
 
 
@@ -369,7 +366,7 @@ def test_a_rejection_keeps_its_reason(ground, clock):
     "timeout_s, accepted", [(0, False), (1, True), (2**31 - 1, True), (2**31, False), (True, False)]
 )
 def test_a_time_out_lasts_a_second_to_68_years(ground, timeout_s, accepted):
-    def enter() -> int:
+    def enter():
         return enter_command(ground, "test_connection", {}, spacecraft_id=SPACECRAFT, timeout_s=timeout_s, actor="ann")
 
     if accepted:
@@ -426,7 +423,7 @@ def test_commands_are_listed_newest_first_by_pages_and_by_state(ground):
     ids = [entered(ground, "test_connection") for _ in range(4)]
     release_command(ground, ids[1], actor="ann")
 
-    def listed(**which: Any) -> tuple[list[int], int]:
+    def listed(**which):
         page = ground.read(list_telecommands, TelecommandFilter(**which))
         return [int(view.id) for view in page.items], page.total
 
@@ -437,7 +434,7 @@ def test_commands_are_listed_newest_first_by_pages_and_by_state(ground):
 
 
 def test_a_list_of_sent_commands_takes_as_many_statements_as_one_of_them(ground):
-    statements: list[str] = []
+    statements = []
     event.listen(ground.database.engine, "before_cursor_execute", lambda *given: statements.append(given[2]))
     counts = []
     for _ in range(3):
@@ -460,7 +457,7 @@ def test_time_outs_are_noted_from_the_first_instant_asked_for_to_before_the_last
     assert note_timeouts(ground, 0, due + 100) == []
 
 
-def vehicle_of(ground: Ground) -> int:
+def vehicle_of(ground):
     command = entered(ground, "test_connection")
     return int(get_command(ground, command).record.vehicle_id)
 
@@ -505,11 +502,11 @@ REBOOT = {"function_id": "reboot", "argument_1": 0.0, "argument_2": 0.0}
 def test_a_telecommand_released_at_once_needs_an_approval_by_two_persons(ground, approval, released):
     vehicle = vehicle_of(ground)
 
-    def add(name: str, arguments: dict[str, Any], work: Any = commanding.add_released, **options: Any) -> int:
+    def add(name, arguments, work=commanding.add_released, **options):
         given = {"actor": "ann", "timeout_s": 50, "window_id": 3, "approval": approval}
         return ground.write(work, vehicle, name, arguments, **given, **options)
 
-    def schedule() -> int:
+    def schedule():
         return add("perform_function", REBOOT, commanding.add_scheduled, release_ticks=1)
 
     if released:
@@ -603,7 +600,7 @@ SENT_NS, TIMEOUT_NS = 5_000, 600
 COMMAND = SentCommand(REQUEST, SENT_NS, 100, 200, TIMEOUT_NS)
 
 
-def report(subtype: int, ticks: int = 150, request: int = REQUEST, step: int | None = None) -> VerificationReport:
+def report(subtype, ticks=150, request=REQUEST, step=None):
     return VerificationReport(subtype, request, ticks, step, None)
 
 

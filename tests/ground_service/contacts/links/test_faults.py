@@ -4,9 +4,6 @@ import errno
 import fcntl
 import os
 import threading
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +15,6 @@ from ground_service.contacts.links import service, store
 from ground_service.contacts.links.runner import ACKNOWLEDGEMENT, DISCARDED_BLOCKS, Connector, LinkRunner, ended_holder
 from ground_service.contacts.links.supervisor import LinkSupervisor
 from ground_service.errors import DatabaseBusy, Stopping, StorageFull
-from ground_service.ground import Ground
 from ground_service.ingest.live import SETTLED_S, Spool, WatchedFolder
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.store import repository
@@ -48,11 +44,11 @@ def _short_waits(monkeypatch):
     monkeypatch.setattr(runners, "RETRY_S", 0.05)
 
 
-def failing(work: Callable[..., Any], times: set[int]) -> Callable[..., Any]:
+def failing(work, times):
     """Return `work` with a busy database at some of its calls, counted from 1."""
     calls = [0]
 
-    def run(*arguments: Any, **named: Any) -> Any:
+    def run(*arguments, **named):
         calls[0] += 1
         if calls[0] in times:
             raise DatabaseBusy("test")
@@ -84,7 +80,7 @@ def test_a_full_disk_loses_nothing_and_the_link_shows_it(ground, station, stream
     declare(ground, station.link("acknowledge = true"))
     full, synchronise = [False], os.fdatasync
 
-    def fdatasync(number: int) -> None:
+    def fdatasync(number):
         if full[0]:
             raise OSError(errno.ENOSPC, "No space left on device")
         synchronise(number)
@@ -114,13 +110,13 @@ def test_a_full_disk_loses_nothing_and_the_link_shows_it(ground, station, stream
 class HalfWritten:
     """A stream to a disk that becomes full after some octets."""
 
-    def __init__(self, stream: Any, room: int) -> None:
+    def __init__(self, stream, room):
         self.stream, self.room = stream, room
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name):
         return getattr(self.stream, name)
 
-    def write(self, octets: memoryview) -> int:
+    def write(self, octets):
         if self.room == 0:
             raise OSError(errno.ENOSPC, "No space left on device")
         written = self.stream.write(octets[: self.room])
@@ -149,7 +145,7 @@ def test_a_segment_that_could_not_be_cut_is_kept(tmp_path, monkeypatch, renamed)
 
     replace = live.replace_durably
 
-    def broken(written: Path, target: Path) -> None:
+    def broken(written, target):
         if renamed:
             replace(written, target)
         raise OSError(errno.EIO, "Input/output error")
@@ -207,7 +203,7 @@ def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it
     with operated(ground, "first") as first:
         ingest = first._spool.ingest
 
-        def slow(*given: Any) -> dict[str, Any]:
+        def slow(*given):
             entered.set()
             assert go_on.wait(20)
             return ingest(*given)
@@ -238,7 +234,7 @@ def test_a_link_is_taken_at_once_from_an_owner_that_has_ended_and_not_from_other
     folder.mkdir(parents=True)
     held = folder / "lock"
 
-    def is_taken() -> bool:
+    def is_taken():
         supervisor.look()
         return "lab" in supervisor.runners
 
@@ -305,7 +301,7 @@ def test_a_transmission_is_repeated_once_for_two_links(either, station, monkeypa
     assert repeated(either) == 1
 
 
-def repeated(ground: Ground) -> int:
+def repeated(ground):
     table = repository.AUDIT
     query = select(func.count()).where(table.c.action == "repeat transmission")
     with ground.database.reading() as connection:
@@ -317,7 +313,7 @@ class Talking(Connector):
 
     received = 0
 
-    def receive(self, timeout_s: float) -> bytes | None:
+    def receive(self, timeout_s):
         type(self).received += 1
         assert self.received <= DISCARDED_BLOCKS
         return b"x"
@@ -328,12 +324,12 @@ def test_a_station_that_talks_without_end_on_the_uplink_does_not_stop_the_link()
     assert Talking.received == DISCARDED_BLOCKS
 
 
-def stopping(*_: Any) -> dict[str, Any]:
+def stopping(*_):
     raise Stopping
 
 
 def test_a_segment_whose_ingest_is_stopped_is_kept(tmp_path):
-    seen: list[Any] = []
+    seen = []
     spool = Spool(tmp_path, stopping, lambda _, result: seen.append(result))
     spool.open()
     spool.keep(b"octets")
@@ -347,7 +343,7 @@ def test_a_file_whose_ingest_is_stopped_is_read_again(tmp_path):
     (tmp_path / "in").mkdir()
     path = tmp_path / "in" / "pass.cadu"
     path.write_bytes(b"octets")
-    seen: list[Any] = []
+    seen = []
     folder = WatchedFolder(tmp_path / "in", tmp_path / "ledger.json", stopping, lambda _, result: seen.append(result))
     with pytest.raises(Stopping):
         folder.look(path.stat().st_mtime + 2 * SETTLED_S)

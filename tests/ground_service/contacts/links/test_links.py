@@ -24,9 +24,8 @@ from ground_service.contacts.commanding.service import (
 )
 from ground_service.contacts.links import service, store
 from ground_service.contacts.links.runner import ACKNOWLEDGEMENT, TRANSMISSION, LinkRunner
-from ground_service.contacts.links.store import TransmissionRow
 from ground_service.errors import Conflict, NotFound
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.timekeeping import recorrelation
@@ -34,7 +33,7 @@ from ground_service.missions.timekeeping.recorrelation import spacecraft_correla
 from ground_service.store import repository
 from ground_service.store.event_kinds import read_events
 from ground_service.store.vehicles import all_vehicles
-from lunar.ephemeris import Ephemeris, ephemeris_from_states
+from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import save_oem
 from lunar.timescales import ticks_from_utc_ns
 from lunar.visibility import GroundStation, link
@@ -51,7 +50,7 @@ CADU = 1279
 SPACECRAFT = 76
 
 
-def hash_of(ground: Ground) -> str:
+def hash_of(ground):
     with ground.database.reading() as connection:
         known = [one.id for one in all_vehicles(connection) if one.instance == "flight"]
         return archive_hash(connection, known[0]) if known else ""
@@ -69,46 +68,46 @@ def expected(synthetic_pass, tmp_path_factory):
         return hash_of(ground)
 
 
-def released(ground: Ground, count: int = 1) -> list[int]:
+def released(ground, count=1):
     keys = [enter_command(ground, "test_connection", {}, spacecraft_id=SPACECRAFT, actor="ann") for _ in range(count)]
     for key in keys:
         release_command(ground, key, actor="bob")
     return keys
 
 
-def packets_of(octets: bytes) -> list[bytes]:
+def packets_of(octets):
     return list(UplinkDecoder(SPACECRAFT).decode(octets).packets)
 
 
-def octets_of(ground: Ground, keys: list[int]) -> list[bytes]:
+def octets_of(ground, keys):
     return [bytes(get_command(ground, key).record.octets or b"") for key in keys]
 
 
-def both_links(lab: Station, other: Station, more: str) -> str:
+def both_links(lab, other, more):
     return lab.link(more) + other.link(more).replace('"lab"', '"other"')
 
 
-def sent_to(station: Station) -> list[bytes]:
+def sent_to(station):
     return packets_of(bytes(station.telecommands))
 
 
-def wait_for_telecommands(ground: Ground, station: Station, keys: list[int]) -> None:
+def wait_for_telecommands(ground, station, keys):
     wait_for(lambda: sent_to(station) == octets_of(ground, keys), f"the telecommands {keys}")
 
 
-def wait_for_state(ground: Ground, state: str) -> None:
+def wait_for_state(ground, state):
     wait_for(lambda: service.get_link(ground, "lab").state == state, f"the state {state}")
 
 
-def received_of(ground: Ground) -> int:
+def received_of(ground):
     return service.get_link(ground, "lab").octets
 
 
-def contact_events(ground: Ground) -> list[str]:
+def contact_events(ground):
     return [one.kind for one in read_events(ground.database, 0, 10_000) if one.kind.startswith("contact")]
 
 
-def steps(runner: LinkRunner) -> None:
+def steps(runner):
     """Wait until the link has looked at what to send once more, from the beginning to the end."""
     for _ in range(3):
         before = runner._sent_s
@@ -223,7 +222,7 @@ def test_manual_links_send_on_request_only(ground, station, stream):
         service.request_send(ground, "other", actor="ann")
 
 
-def taken_and_not_sent(ground: Ground, station: Station) -> tuple[list[int], service.DeclaredLink]:
+def taken_and_not_sent(ground, station):
     """Two telecommands that a process took and did not send; its lease of 1 ns has ended."""
     declare(ground, station.link())
     keys = released(ground, 2)
@@ -304,16 +303,16 @@ class Socket:
     connected = True
     fault = None
 
-    def __init__(self) -> None:
-        self.blocks: list[bytes] = []
+    def __init__(self):
+        self.blocks = []
 
-    def connect(self) -> bool:
+    def connect(self):
         return True
 
-    def receive(self, _seconds: float) -> bytes | None:
+    def receive(self, _seconds):
         return self.blocks.pop(0) if self.blocks else None
 
-    def close(self) -> None:
+    def close(self):
         pass
 
 
@@ -336,7 +335,7 @@ def test_octets_that_are_read_late_are_no_silence(ground, station, stream, missi
         mission_time.advance(3600.0)
         runner._receive()  # finds nothing
 
-        def ended() -> bool:
+        def ended():
             runner._follow_contact()
             return contact_events(ground) == ["contact started", "contact ended"]
 
@@ -365,13 +364,13 @@ def test_expired_telecommands_are_not_sent(ground, station, stream):
     assert get_command(ground, late).state == "released"
 
 
-def records(stream: bytes, utc_ns: int) -> bytes:
+def records(stream, utc_ns):
     rows = [stream[at : at + CADU] for at in range(0, len(stream), CADU)]
     return b"".join(struct.pack(">q", utc_ns) + row for row in rows)
 
 
-@pytest.mark.parametrize("hours, wrong", [(0, False), (1, True), (-1, True)])
-def test_a_wrong_clock_of_the_station_is_reported_and_nothing_is_lost(ground, station, stream, expected, hours, wrong):
+@pytest.mark.parametrize("hours", [0, 1, -1])
+def test_a_wrong_clock_of_the_station_is_reported_and_nothing_is_lost(ground, station, stream, expected, hours):
     declare(
         ground,
         '[link]\nframe_length = 1115\ncoding = "rs"\nrandomiser = "legacy"\nframe_checksum = true\n'
@@ -384,7 +383,7 @@ def test_a_wrong_clock_of_the_station_is_reported_and_nothing_is_lost(ground, st
         wait_for(lambda: service.get_link(ground, "lab").clock_offset_s is not None, "the offset")
         link = service.get_link(ground, "lab")
     assert link.clock_offset_s == pytest.approx(hours * 3600, abs=PATIENCE_OF_CLOCK_S)
-    assert (link.reason is not None and "the clock of the station differs" in link.reason) == wrong
+    assert (link.reason is not None and "the clock of the station differs" in link.reason) == bool(hours)
 
 
 PATIENCE_OF_CLOCK_S = 20.0
@@ -510,12 +509,12 @@ def test_the_lease_is_kept_while_the_link_is_operated(ground, station):
 class Confirming(Station):
     """A station that confirms transmissions: `answers` are given first (None: the connection is closed)."""
 
-    def __init__(self, *answers: int | None) -> None:
+    def __init__(self, *answers):
         self.answers = list(answers)
-        self.transmissions: list[tuple[int, bytes]] = []
+        self.transmissions = []
         super().__init__()
 
-    def _read(self, connection: socket.socket) -> None:
+    def _read(self, connection):
         with contextlib.suppress(OSError):
             while head := connection.recv(TRANSMISSION.size, socket.MSG_WAITALL):
                 number, length = TRANSMISSION.unpack(head)
@@ -572,13 +571,13 @@ def test_a_transmission_that_a_station_refuses_is_sent_by_the_link_in_contact(ei
 @pytest.fixture
 def confirming():
     """Make stations that confirm."""
-    made: list[Station] = []
+    made = []
     yield lambda *answers: made.append(Confirming(*answers)) or made[-1]
     for one in made:
         one.close()
 
 
-def held_elsewhere(ground: Ground, station: Station) -> tuple[TransmissionRow, list[int], list[int]]:
+def held_elsewhere(ground, station):
     """Telecommands that the link "other" has taken and not sent, and later ones that any link may take."""
     declare(ground, both_links(station, station, "confirm = true"))
     other = acquired(ground, "there", "other", 15_000_000_000)
@@ -688,7 +687,7 @@ def orbit():
     return ephemeris_from_states(every, *circular_states(every))
 
 
-def downlink(orbit: Ephemeris, station_clock_ns: int) -> bytes:
+def downlink(orbit, station_clock_ns):
     """Return records with a time report every two minutes, each sent when it was made, of a clock that drifts."""
     encoder = DownlinkEncoder(76, LinkSettings())
     records = b""
@@ -704,9 +703,9 @@ def downlink(orbit: Ephemeris, station_clock_ns: int) -> bytes:
     return records
 
 
-@pytest.mark.parametrize("station_clock_s, is_used", [(0, True), (3600, False), (-3600, False)])
+@pytest.mark.parametrize("station_clock_s", [0, 3600, -3600])
 def test_the_clock_is_correlated_from_time_reports_of_a_link(
-    either, station, orbit, tmp_path, monkeypatch, station_clock_s, is_used
+    either, station, orbit, tmp_path, monkeypatch, station_clock_s
 ):
     save_oem(orbit, tmp_path / "orbit.oem")
     add_ephemeris(either, either.files.put_file(tmp_path / "orbit.oem"), name="orbit")
@@ -718,7 +717,7 @@ def test_the_clock_is_correlated_from_time_reports_of_a_link(
         wait_for(lambda: service.get_link(either, "lab").octets == len(octets), "its account")
     rows = [one for one in spacecraft_correlations(either, 76, "flight") if one.in_force]
     reports = spacecraft_time_reports(either, 76, "flight")
-    if not is_used:
+    if station_clock_s:
         assert rows == [] and reports == []
         return
     (line,) = rows

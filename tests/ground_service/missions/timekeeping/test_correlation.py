@@ -1,7 +1,5 @@
 """Time correlation: whole nanoseconds in and out, drift and offset found, outliers left out."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -18,13 +16,14 @@ from ground_service.missions.timekeeping.core import (
     utc_ns_of_ticks,
 )
 from lunar.timescales import parse_utc, ticks_from_utc_ns, utc_ns_from_ticks
+from tests.ground_service.conftest import cells
 
 START = parse_utc("2029-08-07T00:00:00Z")
 NS = 1_000_000_000
 TICK_NS = 1e9 / 65_536
 
 
-def reports(drift_ppb: float, offset_ns: int, count: int = 200, step_s: int = 60) -> tuple[np.ndarray, ...]:
+def reports(drift_ppb, offset_ns, count=200, step_s=60):
     """Ticks, reception times and light times of a clock whose ticks are too long by `drift_ppb`."""
     utc = START + np.arange(count, dtype=np.int64) * step_s * NS
     shown = utc - offset_ns - np.rint((utc - START) * drift_ppb * 1e-9).astype(np.int64)
@@ -32,7 +31,7 @@ def reports(drift_ppb: float, offset_ns: int, count: int = 200, step_s: int = 60
     return np.asarray(ticks_from_utc_ns(shown)), utc + light, light
 
 
-def line_of(fit: object) -> TimeCorrelation:
+def line_of(fit):
     names = ("start_ticks", "stop_ticks", "reference_ticks", "reference_utc_ns", "drift_ppb")
     return TimeCorrelation(7, *(getattr(fit, name) for name in names))
 
@@ -93,7 +92,7 @@ MINUTE = 60 * 10**9
 NAMES = {"a": "canberra", "b": "madrid", "c": "goldstone"}
 
 
-def reports_of_stations(pattern: str, clocks_s: dict[str, list[float]], steps_s: list[float] | None = None) -> Any:
+def reports_of_stations(pattern, clocks_s, steps_s=None):
     """Time reports, one a minute: station, error of its clock and of the on-board clock by number of the report."""
     sent = START + np.arange(len(pattern), dtype=np.int64) * MINUTE
     on_board = np.asarray(steps_s if steps_s is not None else np.zeros(len(pattern)))
@@ -104,14 +103,18 @@ def reports_of_stations(pattern: str, clocks_s: dict[str, list[float]], steps_s:
     return ticks, received, zero, zero, [NAMES[name] for name in pattern]
 
 
-@pytest.mark.parametrize("difference, cause",
-    [
-        (37.0, ": TAI instead of UTC?"), (-18.0, ": GPS time instead of UTC?"), (1.0, ": a leap second?"),
-        (5.5, ""),
-    ],
-)  # fmt: skip
+CAUSES = """
+37.0 | : TAI instead of UTC?
+-18.0 | : GPS time instead of UTC?
+1.0 | : a leap second?
+5.5 |
+"""
+
+
+@pytest.mark.parametrize("difference, cause", cells(CAUSES))
 @pytest.mark.parametrize("pattern", ["abababababababab", "bbbbaaaabbbbaaaa", "abcabcabcabcabca"])
 def test_a_station_whose_clock_is_wrong_is_named_and_left_out(pattern, difference, cause):
+    difference = float(difference)
     clocks = {"a": [difference] * 16, "b": [0.0] * 16, "c": [0.0] * 16}
     kept, doubts = doubted_stations(*reports_of_stations(pattern, clocks))
     assert kept.tolist() == [name != "a" for name in pattern]

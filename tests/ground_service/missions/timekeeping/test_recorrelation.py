@@ -3,8 +3,6 @@
 import itertools
 import json
 import random
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,13 +11,12 @@ from sqlalchemy import text
 from ground_service.access.model import AuditFilter
 from ground_service.access.store import list_audit
 from ground_service.errors import Conflict, InvalidInput
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.timekeeping import recorrelation
 from ground_service.missions.timekeeping.core import clock_runs, fit_correlation
-from ground_service.missions.timekeeping.model import Correlation
 from ground_service.missions.timekeeping.recorrelation import (
     ReceivedReport,
     TimePoint,
@@ -54,7 +51,7 @@ OFFSETS_S = (0.25, -1.5)  # of the clock, before and after the boot
 LIGHT_S = 1.25
 
 
-def clock(utc_ns: int, number: int) -> int:
+def clock(utc_ns, number):
     off_s = OFFSETS_S[number >= BOOT_AFTER] + DRIFT * (utc_ns - START) / NS
     return int(ticks_from_utc_ns(utc_ns)) + round(off_s * 65_536)
 
@@ -62,12 +59,12 @@ def clock(utc_ns: int, number: int) -> int:
 class Spacecraft:
     """A minute from one time report to the next, a boot in the middle, with housekeeping that tells of it."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         sequencer = PacketSequencer()
-        housekeeping: dict[str, Any] = {field.name: 1 for field in DICTIONARY.packet("housekeeping").fields}
+        housekeeping = {field.name: 1 for field in DICTIONARY.packet("housekeeping").fields}
         self.sent = [START + k * 60 * NS for k in range(REPORTS)]
-        self.packets: list[bytes] = []
-        self.reports: list[ReceivedReport] = []
+        self.packets = []
+        self.reports = []
         for k, utc_ns in enumerate(self.sent):
             ticks = clock(utc_ns, k)
             boot = {**housekeeping, "boot_count": 7 + (k >= BOOT_AFTER)}
@@ -82,7 +79,7 @@ class Spacecraft:
                 if name == "time_report":
                     self.reports.append(ReceivedReport(ticks, count, utc_ns + round(LIGHT_S * NS)))
 
-    def downlink(self, first: int = 0, last: int = REPORTS) -> bytes:
+    def downlink(self, first=0, last=REPORTS):
         return encode_cadus(self.packets[3 * first : 3 * last], spacecraft_id=SPACECRAFT)
 
 
@@ -96,18 +93,18 @@ def fixed_light_time(monkeypatch):
     monkeypatch.setattr(recorrelation, "_light_time_ns", lambda *given: np.full(len(given[3]), round(LIGHT_S * NS)))
 
 
-def ingest(ground: Ground, folder: Path, octets: bytes, name: str = "d.cadu") -> int:
+def ingest(ground, folder, octets, name="d.cadu"):
     (folder / name).write_bytes(octets)
     vehicle = ingest_file(ground, folder / name).vehicle_id
     assert vehicle is not None
     return vehicle
 
 
-def receive(ground: Ground, reports: list[ReceivedReport]) -> list[Correlation]:
+def receive(ground, reports):
     return enter_receptions(ground, SPACECRAFT, "flight", reports, actor="ann")
 
 
-def content(rows: list[Correlation]) -> list[dict[str, Any]]:
+def content(rows):
     return [row.model_dump(exclude={"id", "created"}) for row in rows]
 
 
@@ -138,7 +135,7 @@ def test_the_order_of_telemetry_and_receptions_does_not_matter(spacecraft, tmp_p
         rng = random.Random(seed)
         with open_ground(tmp_path / f"home{number}") as ground:
             follow_in_process(ground)
-            steps: list[tuple[str, Any]] = [("file", octets) for octets in cut]
+            steps = [("file", octets) for octets in cut]
             steps += [("times", spacecraft.reports[k : k + 11]) for k in range(0, REPORTS, 10)]
             rng.shuffle(steps)
             steps += rng.sample(steps, 2)
@@ -251,7 +248,7 @@ def test_an_operator_correlates_from_a_file(spacecraft, tmp_path, capsys):
     table = tmp_path / "times.csv"
     table.write_text("\n".join(["packet_ticks,sequence_count,received_utc,station", *lines]) + "\n")
 
-    def linna(*words: str) -> Any:
+    def linna(*words):
         assert run([*words, *home]) == 0
         return json.loads(capsys.readouterr().out)
 
