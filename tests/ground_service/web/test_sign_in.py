@@ -34,6 +34,10 @@ def stranger(browser, guarded):
     context.close()
 
 
+def asks(page):
+    expect(page.get_by_role("dialog", name="Sign in")).to_be_visible()
+
+
 def sign_in(page, token):
     page.get_by_label("Token", exact=True).fill(token)
     page.locator("dialog").get_by_role("button", name="Sign in").click()
@@ -41,9 +45,9 @@ def sign_in(page, token):
 
 def test_a_stranger_is_asked_for_a_token_and_a_wrong_one_is_no_use(stranger):
     stranger.goto("/")
-    expect(stranger.get_by_role("dialog", name="Sign in")).to_be_visible()
+    asks(stranger)
     sign_in(stranger, "not-a-token")
-    expect(stranger.get_by_role("dialog", name="Sign in")).to_be_visible()
+    asks(stranger)
     expect(stranger.locator("#feed-light")).not_to_have_class("light on")
 
 
@@ -58,7 +62,7 @@ def test_a_viewer_sees_and_may_not_command(stranger, guarded):
     other.goto("/alarms")
     expect(other.locator("#user")).to_have_text("ada, viewer")
     stranger.locator("#caller").click()
-    expect(stranger.get_by_role("dialog", name="Sign in")).to_be_visible()
+    asks(stranger)
 
 
 def test_a_viewer_may_not_steer_the_payload(stranger, guarded, console):
@@ -75,7 +79,7 @@ def test_a_viewer_may_not_steer_the_payload(stranger, guarded, console):
 @pytest.mark.parametrize("address", ["/reports/{key}#part", "/?next=/reports/{key}%23part"])
 def test_the_part_of_a_page_in_the_address_is_kept_over_the_sign_in(stranger, guarded, address):
     stranger.goto(address.format(key="0" * 32))
-    expect(stranger.get_by_role("dialog", name="Sign in")).to_be_visible()
+    asks(stranger)
     sign_in(stranger, guarded[1])
     expect(stranger).to_have_url(f"{guarded[0]}/reports/{'0' * 32}#part")
     expect(stranger.locator("body")).to_contain_text("not found")
@@ -138,7 +142,7 @@ def test_a_user_comes_back_signed_in_to_the_page_and_signs_out_everywhere(browse
     context = patient(browser.new_context(base_url=url))
     page = context.new_page()
     page.goto("/users?offset=0#tokens")
-    expect(page.get_by_role("dialog", name="Sign in")).to_be_visible()
+    asks(page)
     page.get_by_role("link", name="Sign in with the account of your organisation").click()
     expect(page).to_have_url(f"{url}/users?offset=0#tokens")
     expect(page.locator("#user")).to_have_text("ann, admin")
@@ -150,7 +154,7 @@ def test_a_user_comes_back_signed_in_to_the_page_and_signs_out_everywhere(browse
     page.locator("#caller").click()
     page.wait_for_url(f"{provider.issuer}/end?*")
     page.goto(f"{url}/users")
-    expect(page.get_by_role("dialog", name="Sign in")).to_be_visible()
+    asks(page)
     context.close()
 
 
