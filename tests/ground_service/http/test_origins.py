@@ -74,7 +74,7 @@ BROWSERS = """
 """
 
 
-@pytest.mark.parametrize("browser", map(json.loads, BROWSERS.strip().splitlines()), ids=str)
+@pytest.mark.parametrize("browser", [*map(json.loads, BROWSERS.strip().splitlines())], ids=str)
 def test_a_page_of_another_origin_changes_nothing(client, browser):
     queued = client.post(f"{V1}/telecommands", json=PING).json()["id"]
     for method, path, body in (
