@@ -166,15 +166,15 @@ def test_a_failure_says_why(ground, tmp_path):
     assert view.fate.reports[0].failure_code == 5
 
 
-def test_a_time_out_is_put_on_record_once_and_stays_there(ground, tmp_path, monkeypatch):
+def test_a_time_out_is_put_on_record_once_and_stays_there(ground, tmp_path, clock):
     silent, completed, other = (sent(ground) for _ in range(3))
     entered(ground)
     request = {"request_id": get_command(ground, completed).record.request_id}
     downlink(ground, tmp_path, ("verification_completed", 3000, request))
-    due = get_command(ground, silent).record.sent_utc_ns + 600 * 10**9
+    due = NOW + 600 * 10**9
 
     def noted(now):
-        monkeypatch.setattr("ground_service.contacts.commanding.service.utc_now_ns", lambda: now)
+        clock(now)
         return note_timeouts(ground, 0, now)
 
     assert noted(due - 1) == []
