@@ -15,7 +15,7 @@ import socket
 import subprocess
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -57,10 +57,19 @@ PAPER_DRIFT_PER_FRAME_M = 400.0
 SPHERICAL_ERROR_RTN_M = np.array([30.0, -40.0, 120.0])  # 130 m in 3-D
 FILTER_ERROR_RTN_M = np.array([10.0, 20.0, -20.0])  # 30 m in 3-D
 PIXEL_OFFSET = (0.5, -1.25)
+MANIFEST = """{"schema_version": 1, "pass_name": "synthetic pass", "scenario": "synthetic", "light": "paper",
+    "data_sources": ["circular orbit", "synthetic craters", "orientation IAU WGCCRE 2009"],
+    "camera": {"width_px": 512, "height_px": 512, "fov_deg": 120.0}, "estimators": ["paper", "spherical"],
+    "gravity": {"truth": "GRGM1200L (12x12, built in)", "degree": 12}}"""
+
+
+def cells(table: str) -> list[list[str]]:
+    """Return the cells of a table: each line is a row, and bars separate its cells."""
+    return [[cell.strip() for cell in row.split("|")] for row in table.strip().splitlines()]
 
 
 @pytest.fixture(scope="session", autouse=True)
-def name_of_the_test_client() -> Iterator[None]:
+def name_of_the_test_client():
     """Allow the host name that the test client of the web framework gives itself."""
     with pytest.MonkeyPatch.context() as environment:
         environment.setenv("LINNA_ALLOWED_HOSTS", "testserver")
@@ -68,7 +77,7 @@ def name_of_the_test_client() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def one_tls_context() -> Iterator[None]:
+def one_tls_context():
     """Read the trusted certificates once: each HTTP client would read them."""
     with pytest.MonkeyPatch.context() as patch:
         made = functools.cache(httpx_transports.create_ssl_context)
@@ -77,7 +86,7 @@ def one_tls_context() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def one_description() -> Iterator[None]:
+def one_description():
     """Make the OpenAPI document, which is the same for every application, once: it takes two seconds."""
     describe, made = DescribedApi.openapi, list[dict[str, Any]]()
 
@@ -91,14 +100,14 @@ def one_description() -> Iterator[None]:
 
 
 @pytest.fixture
-def client(tmp_path: Path) -> Iterator[TestClient]:
+def client(tmp_path):
     """An empty service without users that does its jobs in the requests."""
     with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as opened:
         yield opened
 
 
 @pytest.fixture
-def guarded(tmp_path: Path) -> Iterator[tuple[TestClient, dict[str, dict[str, str]]]]:
+def guarded(tmp_path):
     """An empty service with one user of each role, and the headers of each."""
     with TestClient(create_app(Settings(home=tmp_path / "guarded"), inline_jobs=True)) as opened:
         ground = opened.app.state.ground
@@ -107,7 +116,7 @@ def guarded(tmp_path: Path) -> Iterator[tuple[TestClient, dict[str, dict[str, st
 
 
 @pytest.fixture(scope="session", autouse=True)
-def copied_schema(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[Database], None]]:
+def copied_schema(tmp_path_factory):
     """Copy the tables of new SQLite databases from one that was migrated; the migration itself is yielded."""
     migrate, lock = databases.upgrade_database, threading.Lock()
     made = open_database(f"sqlite:///{tmp_path_factory.mktemp('schema') / 'linna.db'}")
@@ -188,7 +197,7 @@ def _catalogue(latitude_rad: np.ndarray, longitude_rad: np.ndarray, rng: np.rand
 
 
 @pytest.fixture(scope="session")
-def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., SyntheticPass]:
+def make_pass(tmp_path_factory):
     """A function that writes a synthetic pass archive of `frames` frames."""
 
     def make(
@@ -279,16 +288,12 @@ def make_pass(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Synthet
         if mission:
             (folder / "mission.toml").write_text(mission)
         build = {"name": "nothing", "version": "0", "model_sha256": "00" * 32, "parameters_sha256": "11" * 32}
-        manifest = {
-            "schema_version": 1, "pass_name": "synthetic pass", "spacecraft_id": SPACECRAFT, "scenario": "synthetic",
-            "seed": seed, "build": build, "start_utc": format_utc(int(utc_ns[0])),
+        given = {
+            "spacecraft_id": SPACECRAFT, "seed": seed, "build": build, "start_utc": start["utc"],
             "stop_utc": format_utc(int(utc_ns[-1])), "cadence_s": CADENCE_S, "frames_expected": frames,
-            "data_sources": ["circular orbit", "synthetic craters", "orientation IAU WGCCRE 2009"],
-            "light": "paper", "camera": {"width_px": 512, "height_px": 512, "fov_deg": 120.0},
-            "estimators": ["paper", "spherical"], "start_state": start,
-            "gravity": {"truth": "GRGM1200L (12x12, built in)", "degree": 12},
+            "start_state": start,
         }  # fmt: skip
-        write_manifest(folder, manifest)
+        write_manifest(folder, json.loads(MANIFEST) | given)
         return SyntheticPass(folder, sent.packets, utc_ns, tally["expected"], tally["missed"])
 
     return make
@@ -329,20 +334,18 @@ def define_pass_of(ground: Ground, made: Any) -> int:
 
 def _housekeeping(k: int) -> dict[str, Any]:
     values: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
-    return values | {
-        "structure_id": 1, "boot_count": 1, "mode": "observing", "frames_processed": k,
-        "temperature_c": 20.0 + 0.1 * k, "bus_voltage_v": 12.0,
-    }  # fmt: skip
+    known = json.loads('{"structure_id": 1, "boot_count": 1, "mode": "observing", "bus_voltage_v": 12.0}')
+    return values | known | {"frames_processed": k, "temperature_c": 20.0 + 0.1 * k}
 
 
 @pytest.fixture(scope="session")
-def synthetic_pass(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
+def synthetic_pass(make_pass):
     """The pass that most tests look at; not to be altered."""
     return make_pass()
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
-def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ground]:
+def either(request, tmp_path):
     """An empty service on each database."""
     url = request.getfixturevalue("migrated_postgres")() if request.param == "postgresql" else None
     with open_ground(tmp_path / "home", database_url=url) as ground:
@@ -351,7 +354,7 @@ def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Ground]:
 
 
 @pytest.fixture
-def ground(tmp_path: Path) -> Iterator[Ground]:
+def ground(tmp_path):
     """An empty ground service with a SQLite database of its own."""
     opened = open_ground(tmp_path / "home")
     follow_in_process(opened)
@@ -368,7 +371,7 @@ class FlyablePass:
 
 
 @pytest.fixture(scope="session")
-def make_flyable(make_pass: Callable[..., SyntheticPass]) -> Callable[..., FlyablePass]:
+def make_flyable(make_pass):
     """A function that writes a synthetic pass archive with what its payload was given: plain gray images."""
     import io
 
@@ -410,7 +413,7 @@ costs = json.loads((build / "costs.json").read_text())
 
 
 @pytest.fixture(scope="session")
-def make_build(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+def make_build(tmp_path_factory):
     """A function that writes a build: a program that sends packets prepared for each pass, or any other script."""
 
     def make(
@@ -445,13 +448,8 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _postgres_binaries() -> Path | None:
-    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
-    return found[-1].parent if found else None
-
-
 @pytest.fixture(scope="module")
-def redis_url() -> Iterator[str]:
+def redis_url():
     """A Redis server of the tests' own, its user as restricted as in the distributed form."""
     program = shutil.which("redis-server")
     if program is None:
@@ -478,10 +476,10 @@ def redis_url() -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
-def postgres_server() -> Iterator[str]:
+def postgres_server():
     """URL of a PostgreSQL server of the tests' own, without the name of a database."""
-    binaries = _postgres_binaries()
-    if binaries is None:
+    found = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
+    if not found:
         pytest.skip("PostgreSQL is not installed")
     as_user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
     port = free_port()
@@ -490,25 +488,18 @@ def postgres_server() -> Iterator[str]:
         shutil.chown(folder, "postgres", "postgres")
     data = folder / "data"
 
-    def run(program: str, *arguments: str) -> None:
-        subprocess.run(
-            [*as_user, str(binaries / program), *arguments], check=True, cwd=folder, stdout=subprocess.DEVNULL
-        )
+    def run(command: str, *arguments: str, check: bool = True) -> None:
+        program, *words = command.split()
+        whole = [*as_user, str(found[-1].with_name(program)), *words, *arguments]
+        subprocess.run(whole, check=check, cwd=folder, stdout=subprocess.DEVNULL)
 
     try:
-        run("initdb", "-D", str(data), "-U", "linna", "-A", "trust", "-E", "UTF8", "--no-sync")
-        run(
-            "pg_ctl", "-D", str(data), "-w", "-l", str(folder / "log"), "start",
-            "-o", f"-p {port} -k {folder} -h 127.0.0.1 -c fsync=off -c synchronous_commit=off",
-        )  # fmt: skip
+        run(f"initdb -D {data} -U linna -A trust -E UTF8 --no-sync")
+        options = f"-p {port} -k {folder} -h 127.0.0.1 -c fsync=off -c synchronous_commit=off"
+        run(f"pg_ctl -D {data} -w -l {folder}/log start -o", options)
         yield f"postgresql+psycopg://linna@127.0.0.1:{port}"
     finally:
-        subprocess.run(
-            [*as_user, str(binaries / "pg_ctl"), "-D", str(data), "-m", "immediate", "-w", "stop"],
-            cwd=folder,
-            stdout=subprocess.DEVNULL,
-            check=False,
-        )
+        run(f"pg_ctl -D {data} -m immediate -w stop", check=False)
         shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -521,14 +512,14 @@ def _create_database(server: str, name: str, template: str = "template1") -> str
 
 
 @pytest.fixture(scope="session")
-def new_postgres_database(postgres_server: str) -> Callable[[], str]:
+def new_postgres_database(postgres_server):
     """A function that makes an empty database on the PostgreSQL server and returns its URL."""
     numbers = itertools.count(1)
     return lambda: _create_database(postgres_server, f"empty_{next(numbers)}")
 
 
 @pytest.fixture(scope="session")
-def migrated_postgres(postgres_server: str) -> Callable[[], str]:
+def migrated_postgres(postgres_server):
     """A function that makes a database with the newest schema, a copy of one that was migrated; it returns the URL."""
     numbers = itertools.count(1)
     prepare_database(_create_database(postgres_server, "migrated"), upgrade=True).engine.dispose()
@@ -536,7 +527,7 @@ def migrated_postgres(postgres_server: str) -> Callable[[], str]:
 
 
 @pytest.fixture(scope="module")
-def postgres_url(new_postgres_database: Callable[[], str]) -> str:
+def postgres_url(new_postgres_database):
     """URL of an empty PostgreSQL database that the tests of one module share."""
     return new_postgres_database()
 
@@ -552,7 +543,7 @@ class Clock:
 
 
 @pytest.fixture
-def mission_time() -> Iterator[Clock]:
+def mission_time():
     made = Clock()
     set_mission_clock(lambda: made.utc_ns)
     yield made

@@ -5,16 +5,13 @@ import json
 import math
 import re
 import threading
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from ground_service.app import create_app
-from ground_service.ground import Ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.settings import Settings
+from tests.ground_service.conftest import cells
 from tests.serving import TestClient
 from tmtc.downlink import DownlinkEncoder
 from tmtc.link.frames import Clcw, pack_clcw
@@ -26,7 +23,7 @@ Guarded = tuple[TestClient, dict[str, dict[str, str]]]
 
 
 @pytest.fixture(scope="module")
-def client(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+def client(synthetic_pass, tmp_path_factory):
     """A service without users, with the synthetic pass in it; not to be given users."""
     settings = Settings(home=tmp_path_factory.mktemp("api"), upload_limit_mib=2)
     with TestClient(create_app(settings, inline_jobs=True)) as opened:
@@ -34,7 +31,7 @@ def client(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> Ite
         yield opened
 
 
-def is_problem(response: Any, status: int) -> bool:
+def is_problem(response, status):
     assert response.status_code == status, response.text
     assert response.headers["content-type"] == "application/problem+json"
     body = response.json()
@@ -43,7 +40,7 @@ def is_problem(response: Any, status: int) -> bool:
     return True
 
 
-def test_an_upload_is_ingested_and_doubles_nothing(client: TestClient, make_pass: Callable[..., Any]) -> None:
+def test_an_upload_is_ingested_and_doubles_nothing(client, make_pass):
     stream = (make_pass(frames=3, seed=9).folder / "downlink.cadu").read_bytes()
     first = client.post(f"{V1}/telemetry", content=stream, headers={"Idempotency-Key": "a"})
     assert first.status_code == 202, first.text
@@ -57,7 +54,7 @@ def test_an_upload_is_ingested_and_doubles_nothing(client: TestClient, make_pass
     assert client.get(f"{V1}/ingests/{third['ingest_id']}").json()["accounting"]["packets_new"] == 0
 
 
-def test_an_upload_that_is_no_downlink_becomes_a_failed_ingest(client: TestClient) -> None:
+def test_an_upload_that_is_no_downlink_becomes_a_failed_ingest(client):
     accepted = client.post(f"{V1}/telemetry", content=b"hello world" * 1000).json()
     ingest = client.get(f"{V1}/ingests/{accepted['ingest_id']}").json()
     assert ingest["state"] == "failed"
@@ -65,30 +62,24 @@ def test_an_upload_that_is_no_downlink_becomes_a_failed_ingest(client: TestClien
     assert is_problem(client.post(f"{V1}/telemetry", content=b""), 422)
 
 
-def test_an_upload_over_the_limit_is_refused_announced_or_not(client: TestClient) -> None:
+def test_an_upload_over_the_limit_is_refused_announced_or_not(client):
     assert is_problem(client.post(f"{V1}/telemetry", content=b"\0" * (3 << 20)), 413)
     blocks = (b"\0" * (1 << 18) for _ in range(12))
     assert is_problem(client.post(f"{V1}/telemetry", content=blocks), 413)
     assert is_problem(client.post(f"{V1}/passes", content=b"[" * (2 << 20)), 413)
 
 
-def test_the_telecommand_receiver_is_shown_as_the_newest_telemetry_tells_it(
-    client: TestClient, make_pass: Callable[..., Any]
-) -> None:
+def test_the_telecommand_receiver_is_shown_as_the_newest_telemetry_tells_it(client, make_pass):
     packets = make_pass(frames=3, seed=11).packets
 
-    def receive(clcw: Clcw | None) -> int:
-        field = None if clcw is None else pack_clcw(clcw)
-        stream = DownlinkEncoder(76).encode(packets, clcw=field)
-        query = {"instance": "uplink"}
-        return int(client.post(f"{V1}/telemetry", content=stream, params=query).json()["ingest_id"])
+    def receive(clcw):
+        stream = DownlinkEncoder(76).encode(packets, clcw=None if clcw is None else pack_clcw(clcw))
+        return int(client.post(f"{V1}/telemetry?instance=uplink", content=stream).json()["ingest_id"])
 
-    def shown() -> list[dict[str, Any]]:
-        state = client.get(f"{V1}/spacecraft/76/uplink", params={"instance": "uplink"}).json()
-        channels: list[dict[str, Any]] = state["channels"]
-        return channels
+    def shown():
+        return list(client.get(f"{V1}/spacecraft/76/uplink?instance=uplink").json()["channels"])
 
-    assert is_problem(client.get(f"{V1}/spacecraft/76/uplink", params={"instance": "nobody"}), 404)
+    assert is_problem(client.get(f"{V1}/spacecraft/76/uplink?instance=nobody"), 404)
     receive(None)  # as recorded before frames had the field
     assert shown() == []
     locked = receive(Clcw(0, 4, lockout=True, farm_b_counter=1))
@@ -99,53 +90,46 @@ def test_the_telecommand_receiver_is_shown_as_the_newest_telemetry_tells_it(
     assert (channel["ingest_id"], channel["lockout"], channel["farm_b_counter"]) == (ready, False, 2)
 
 
-def test_passes_are_listed_in_pages_and_shown(client: TestClient) -> None:
-    page = client.get(f"{V1}/passes", params={"limit": 1}).json()
+def test_passes_are_listed_in_pages_and_shown(client):
+    page = client.get(f"{V1}/passes?limit=1").json()
     assert page["total"] >= 1
     assert len(page["items"]) == 1
     shown = client.get(f"{V1}/passes/1").json()
     assert shown["name"] == "synthetic pass"
     assert shown["start"] == "2029-08-07T06:00:00.000000Z"
-    assert is_problem(client.get(f"{V1}/passes/999"), 404)
-    assert is_problem(client.get(f"{V1}/passes/x"), 422)
-    assert is_problem(client.get(f"{V1}/passes", params={"limit": 0}), 422)
+    for path, status in (("/999", 404), ("/x", 422), ("?limit=0", 422)):
+        assert is_problem(client.get(f"{V1}/passes{path}"), status)
 
 
-def test_a_pass_can_be_defined(client: TestClient) -> None:
+def test_a_pass_can_be_defined(client):
     span = {"start": "2029-08-07T06:00:00Z", "stop": "2029-08-07T07:00:00Z"}
     given = {"name": "p", "spacecraft_id": 76, **span}
     assert client.post(f"{V1}/passes", json=given).status_code == 201
     assert is_problem(client.post(f"{V1}/passes", json={**given, "stop": "2029-08-07T05:00:00Z"}), 422)
-    assert is_problem(client.post(f"{V1}/passes", json={**given, "start": "noon"}), 422)
-    assert is_problem(client.post(f"{V1}/passes", json={**given, "colour": "red"}), 422)
 
 
-def test_what_is_in_a_pass_can_be_read(client: TestClient, synthetic_pass: Any) -> None:
+def test_what_is_in_a_pass_can_be_read(client, synthetic_pass):
     complete = client.get(f"{V1}/passes/1/completeness").json()
     assert (complete["packets"], complete["lost"]) == (len(synthetic_pass.packets), 0)
-    found = client.get(f"{V1}/passes/1/detections", params={"limit": 5, "offset": 3}).json()
+    found = client.get(f"{V1}/passes/1/detections?limit=5&offset=3").json()
     assert len(found["items"]) == 5
     assert found["total"] > 1000
     assert client.get(f"{V1}/passes/1/events").json()["items"][0]["name"] == "observation_stopped"
 
 
-def test_pages_of_detections_put_together_are_all_of_them_once(client: TestClient) -> None:
-    def page(limit: int, offset: int) -> list[Any]:
-        answer = client.get(f"{V1}/passes/1/detections", params={"limit": limit, "offset": offset}).json()
-        items: list[Any] = answer["items"]
-        return items
+def test_pages_of_detections_put_together_are_all_of_them_once(client):
+    def page(limit, offset):
+        return list(client.get(f"{V1}/passes/1/detections?limit={limit}&offset={offset}").json()["items"])
 
-    total = client.get(f"{V1}/passes/1/detections", params={"limit": 1}).json()["total"]
+    total = client.get(f"{V1}/passes/1/detections?limit=1").json()["total"]
     large = [item for offset in range(0, total, 1000) for item in page(1000, offset)]
     small = [item for offset in range(0, 300, 7) for item in page(7, offset)]
-    assert len(large) == total
-    assert small == large[: len(small)]
-    assert page(10, total - 3) == large[-3:]
-    assert page(10, total) == []
+    assert len(large) == total and small == large[: len(small)]
+    assert page(10, total - 3) == large[-3:] and page(10, total) == []
     assert sorted(large, key=lambda item: item["time"]) == large
 
 
-def test_a_series_asked_for_twice_is_the_same(client: TestClient) -> None:
+def test_a_series_asked_for_twice_is_the_same(client):
     path = f"{V1}/passes/1/states?estimator=spherical&value=altitude_m&value=nis&max_points=5"
     first, second = client.get(path), client.get(path)
     assert first.content == second.content
@@ -153,10 +137,8 @@ def test_a_series_asked_for_twice_is_the_same(client: TestClient) -> None:
     assert first.headers["content-type"] == "application/json"
 
 
-def test_series_are_made_short_with_their_extremes(client: TestClient) -> None:
-    states = client.get(
-        f"{V1}/passes/1/states", params={"estimator": "spherical", "value": "altitude_m", "max_points": 7}
-    ).json()
+def test_series_are_made_short_with_their_extremes(client):
+    states = client.get(f"{V1}/passes/1/states?estimator=spherical&value=altitude_m&max_points=7").json()
     buckets = states["series"][0]["buckets"]
     assert len(buckets) <= 7
     assert sum(bucket["count"] for bucket in buckets) == 40
@@ -165,19 +147,17 @@ def test_series_are_made_short_with_their_extremes(client: TestClient) -> None:
     assert (temperature["unit"], temperature["samples"]) == ("degC", 40)
     assert temperature["buckets"][-1]["max"] == pytest.approx(23.9)
     assert is_problem(client.get(f"{V1}/passes/1/telemetry/salary"), 404)
-    assert is_problem(client.get(f"{V1}/passes/1/states", params={"estimator": "nobody"}), 404)
-    assert is_problem(client.get(f"{V1}/passes/1/states", params={"value": "salary"}), 422)
+    assert is_problem(client.get(f"{V1}/passes/1/states?estimator=nobody"), 404)
+    assert is_problem(client.get(f"{V1}/passes/1/states?value=salary"), 422)
 
 
-def test_a_page_gets_the_head_of_a_report_and_its_errors_made_short(client: TestClient) -> None:
+def test_a_page_gets_the_head_of_a_report_and_its_errors_made_short(client):
     job = client.get(client.post(f"{V1}/passes/1/reports").headers["location"]).json()
     address = f"{V1}/reports/{job['result']['report_id']}"
     whole = client.get(address, params={"format": "json"}).json()
-    answer = client.get(f"{address}/overview", params={"max_points": 7})
+    answer = client.get(f"{address}/overview?max_points=7")
     short = answer.json()
-    assert short["verdict"] == whole["verdict"]
-    assert short["headline"] == whole["headline"]
-    assert short["requirements"] == whole["requirements"] != []
+    assert all(short[name] == whole[name] != [] for name in ("verdict", "headline", "requirements"))
     assert [one["name"] for one in short["navigation"]] == [one["name"] for one in whole["navigation"]]
     for brief, full in zip(short["navigation"], whole["navigation"], strict=True):
         known = [math.hypot(*error) for error in full["error_rtn_m"] if None not in error]
@@ -186,15 +166,13 @@ def test_a_page_gets_the_head_of_a_report_and_its_errors_made_short(client: Test
         assert max(brief["max_m"]) == pytest.approx(max(known), abs=1e-3)
         columns = ("min_m", "max_m", "mean_m", "after_gap")
         assert all(len(brief[column]) == len(brief["time_s"]) for column in columns)
-    again = client.get(
-        f"{address}/overview", params={"max_points": 7}, headers={"if-none-match": answer.headers["etag"]}
-    )
+    again = client.get(f"{address}/overview?max_points=7", headers={"if-none-match": answer.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
     assert is_problem(client.get(f"{V1}/reports/{'0' * 32}/overview"), 404)
-    assert is_problem(client.get(f"{address}/overview", params={"max_points": 0}), 422)
+    assert is_problem(client.get(f"{address}/overview?max_points=0"), 422)
 
 
-def test_a_report_is_made_and_read_as_html_and_json(client: TestClient) -> None:
+def test_a_report_is_made_and_read_as_html_and_json(client):
     asked = client.post(f"{V1}/passes/1/reports")
     assert asked.status_code == 202
     job = client.get(asked.headers["location"]).json()
@@ -213,7 +191,7 @@ def test_a_report_is_made_and_read_as_html_and_json(client: TestClient) -> None:
     assert is_problem(client.post(f"{V1}/passes/77/reports"), 404)
 
 
-def test_an_ephemeris_is_uploaded_once(client: TestClient, synthetic_pass: Any) -> None:
+def test_an_ephemeris_is_uploaded_once(client, synthetic_pass):
     octets = (synthetic_pass.folder / "reference.oem").read_bytes()
     first = client.post(f"{V1}/ephemerides", content=octets, params={"name": "reference"})
     assert first.status_code == 201, first.text
@@ -224,26 +202,19 @@ def test_an_ephemeris_is_uploaded_once(client: TestClient, synthetic_pass: Any) 
     assert "/files/" not in refused.text
 
 
-def test_answers_carry_a_tag_and_are_not_sent_twice(client: TestClient) -> None:
-    first = client.get(f"{V1}/passes/1")
-    again = client.get(f"{V1}/passes/1", headers={"If-None-Match": first.headers["etag"]})
-    assert again.status_code == 304
-    assert again.content == b""
-
-
-def test_answers_carry_secure_headers_and_no_cors(client: TestClient) -> None:
+def test_answers_carry_secure_headers_and_no_cors(client):
     answer = client.get(f"{V1}/passes", headers={"Origin": "https://elsewhere.example"})
     assert answer.headers["x-content-type-options"] == "nosniff"
     assert "default-src 'none'" in answer.headers["content-security-policy"]
     assert "access-control-allow-origin" not in answer.headers
 
 
-def test_the_service_can_be_watched(client: TestClient) -> None:
+def test_the_service_can_be_watched(client):
     assert client.get("/healthz").json() == {"status": "ok"}
     assert client.get("/readyz").json() == {"status": "ok"}
 
 
-def test_the_description_is_complete(client: TestClient) -> None:
+def test_the_description_is_complete(client):
     document = client.get(f"{V1}/openapi.json").json()
     for path, operations in document["paths"].items():
         assert path.startswith(V1)
@@ -254,15 +225,25 @@ def test_the_description_is_complete(client: TestClient) -> None:
 
 # Viewers read and operators do everything else, except these.
 EXCEPTIONS = {
-    ("GET", "/audit"): "operator", ("GET", "/audit/head"): "operator", ("GET", "/users"): "admin",
-    ("POST", "/users"): "admin", ("GET", "/users/{name}"): "admin", ("PATCH", "/users/{name}"): "admin",
-    ("POST", "/users/{name}/tokens"): "admin", ("GET", "/tokens"): "admin",
-    ("DELETE", "/tokens/{token_id}"): "admin", ("POST", "/exports"): "viewer",
-    ("POST", "/windows/search"): "viewer", ("DELETE", "/session"): "viewer",
-}  # fmt: skip
+    tuple(operation.split()): role
+    for operation, role in cells("""
+GET /audit | operator
+GET /audit/head | operator
+GET /users | admin
+POST /users | admin
+GET /users/{name} | admin
+PATCH /users/{name} | admin
+POST /users/{name}/tokens | admin
+GET /tokens | admin
+DELETE /tokens/{token_id} | admin
+POST /exports | viewer
+POST /windows/search | viewer
+DELETE /session | viewer
+""")
+}
 
 
-def test_every_operation_asks_for_its_role(guarded: Guarded) -> None:
+def test_every_operation_asks_for_its_role(guarded):
     client, heads = guarded
     ranks = ["viewer", "operator", "admin"]
     described = client.get(f"{V1}/openapi.json", headers=heads["viewer"]).json()
@@ -282,8 +263,8 @@ def test_every_operation_asks_for_its_role(guarded: Guarded) -> None:
                 assert status not in (401, 403), (path, role)
 
 
-def test_what_happens_is_sent_live_and_can_be_caught_up_with(client: TestClient, make_pass: Callable[..., Any]) -> None:
-    def payload_of(message: dict[str, Any]) -> tuple[int, str]:
+def test_what_happens_is_sent_live_and_can_be_caught_up_with(client, make_pass):
+    def payload_of(message):
         return message["payload"]["id"], message["payload"]["state"]
 
     stream = (make_pass(frames=3, seed=9).folder / "downlink.cadu").read_bytes()
@@ -304,17 +285,16 @@ def test_what_happens_is_sent_live_and_can_be_caught_up_with(client: TestClient,
         assert [socket.receive_json() for _ in numbers[1:]] == messages[1:]
 
 
-def test_a_socket_opens_whose_server_announces_the_client_late(client: TestClient) -> None:
+def test_a_socket_opens_whose_server_announces_the_client_late(client):
     """The first message of a socket may come after its handler started; nothing else may take it."""
-    scope: dict[str, Any] = {
-        "type": "websocket", "scheme": "ws", "path": f"{V1}/live", "raw_path": f"{V1}/live".encode(), "root_path": "",
-        "query_string": b"", "headers": [(b"host", b"testserver")], "subprotocols": [], "extensions": {},
-        "client": ("testclient", 50000), "server": ("testserver", 80),
-    }  # fmt: skip
+    plain = """{"type": "websocket", "scheme": "ws", "path": "/api/v1/live", "root_path": "", "subprotocols": [],
+        "extensions": {}, "client": ["testclient", 50000], "server": ["testserver", 80]}"""
+    octets = {"raw_path": b"/api/v1/live", "query_string": b"", "headers": [(b"host", b"testserver")]}
+    scope = json.loads(plain) | octets
 
-    async def opened() -> dict[str, Any]:
-        arriving: asyncio.Queue[Any] = asyncio.Queue()
-        sent: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+    async def opened():
+        arriving = asyncio.Queue()
+        sent = asyncio.Queue()
         handler = asyncio.ensure_future(client.app(scope, arriving.get, sent.put))
         await asyncio.sleep(0.5)
         await arriving.put({"type": "websocket.connect"})
@@ -329,7 +309,7 @@ def test_a_socket_opens_whose_server_announces_the_client_late(client: TestClien
     assert client.portal.call(opened)["type"] == "websocket.accept"
 
 
-def test_watching_needs_a_token_where_there_are_users(guarded: Guarded) -> None:
+def test_watching_needs_a_token_where_there_are_users(guarded):
     from starlette.websockets import WebSocketDisconnect
 
     client, heads = guarded
@@ -343,16 +323,14 @@ def test_watching_needs_a_token_where_there_are_users(guarded: Guarded) -> None:
         assert socket.accepted_subprotocol == "bearer"
 
 
-def test_figures_are_kept_by_route(client: TestClient) -> None:
+def test_figures_are_kept_by_route(client):
     client.get(f"{V1}/passes/1")
     figures = client.get("/metrics").text
     assert 'linna_http_requests_total{method="GET",route="/api/v1/passes/{pass_id}",status="200"}' in figures
     assert "linna_passes 1.0" in figures or "linna_passes 2.0" in figures
 
 
-def test_requests_are_logged_with_an_id_that_the_answer_carries(
-    client: TestClient, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_requests_are_logged_with_an_id_that_the_answer_carries(client, caplog):
     with caplog.at_level("INFO", "ground_service.worker.metrics"):
         named = client.get(f"{V1}/passes/999", headers={"X-Request-ID": "abc-1"})
         made_up = client.get(f"{V1}/passes", headers={"X-Request-ID": "two\tlines"})
@@ -367,19 +345,19 @@ def test_requests_are_logged_with_an_id_that_the_answer_carries(
     assert len(made_up.headers["X-Request-ID"]) == 16
 
 
-def test_json_that_no_reader_takes_is_refused_in_one_line(client: TestClient) -> None:
+def test_json_that_no_reader_takes_is_refused_in_one_line(client):
     for body in (b"[" * 500_000, b"1" * 500_000):
         answer = client.post(f"{V1}/windows", content=body, headers={"Content-Type": "application/json"})
         assert is_problem(answer, 400)
         assert "expected JSON of ordinary depth" in answer.json()["detail"]
 
 
-def test_a_telecommand_that_is_sent_again_under_its_key_is_queued_once(guarded: Guarded) -> None:
+def test_a_telecommand_that_is_sent_again_under_its_key_is_queued_once(guarded):
     client, heads = guarded
     operator = heads["operator"] | {"Idempotency-Key": "k1"}
     ping = {"name": "test_connection", "arguments": {}, "spacecraft_id": 76}
 
-    def post(path: str, headers: dict[str, str], **body: Any) -> Any:
+    def post(path, headers, **body):
         return client.post(f"{V1}{path}", headers=headers, **body)
 
     first = post("/telecommands", operator, json=ping)
@@ -404,14 +382,14 @@ def test_a_telecommand_that_is_sent_again_under_its_key_is_queued_once(guarded: 
     assert post("/uplink", {**operator, "Idempotency-Key": "later"}, **query).content == b""
 
 
-def test_a_key_whose_work_was_cut_off_is_refused_and_says_why(ground: Ground) -> None:
+def test_a_key_whose_work_was_cut_off_is_refused_and_says_why(ground):
     from ground_service.access.idempotency import once
     from ground_service.errors import Conflict, DatabaseUnavailable
 
-    def ask(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    def ask(work):
         return once(ground, actor="ann", operation="window", key="k", request={"a": 1}, work=work)
 
-    def cut_off() -> dict[str, Any]:
+    def cut_off():
         raise DatabaseUnavailable("db", "gone")
 
     with pytest.raises(DatabaseUnavailable):
@@ -420,21 +398,17 @@ def test_a_key_whose_work_was_cut_off_is_refused_and_says_why(ground: Ground) ->
         ask(lambda: {"id": 1})
 
 
-def test_passes_and_windows_sent_again_under_their_key_are_entered_once(client: TestClient) -> None:
+def test_passes_and_windows_sent_again_under_their_key_are_entered_once(client):
     span = {"start": "2029-08-07T06:00:00Z", "stop": "2029-08-07T06:05:00Z", "spacecraft_id": 76}
-    for path, body in (
-        ("/passes", {"name": "once", **span}),
-        ("/windows", {"name": "once", "cadence_s": 15.0, **span}),
-    ):
-        headers = {"Idempotency-Key": f"key {path}"}
-        answers = [client.post(f"{V1}{path}", json=body, headers=headers) for _ in range(2)]
-        assert [answer.status_code for answer in answers] == [201, 201], answers[0].text
-        assert answers[0].json() == answers[1].json()
-        for name in ("Location", "ETag"):
-            assert answers[0].headers.get(name) == answers[1].headers.get(name)
+    for path, more in (("/passes", {}), ("/windows", {"cadence_s": 15.0})):
+        headers, body = {"Idempotency-Key": f"key {path}"}, {"name": "once", **more, **span}
+        first, again = (client.post(f"{V1}{path}", json=body, headers=headers) for _ in range(2))
+        assert (first.status_code, again.status_code) == (201, 201), first.text
+        assert first.json() == again.json()
+        assert all(first.headers.get(name) == again.headers.get(name) for name in ("Location", "ETag"))
 
 
-def test_figures_of_work_that_is_over_go_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_figures_of_work_that_is_over_go_away(tmp_path, monkeypatch):
     from ground_service.jobs.service import enter_job
     from ground_service.worker.jobs import run_job
 
@@ -443,9 +417,8 @@ def test_figures_of_work_that_is_over_go_away(tmp_path: Path, monkeypatch: pytes
         ground = opened.app.state.ground
         job = enter_job(ground, "report", {"pass_id": 1})
         figures = opened.get("/metrics").text
-        assert 'linna_jobs{kind="report",state="queued"} 1.0' in figures
-        assert 'linna_jobs{kind="report",state="failed"} 0.0' in figures
-        assert 'linna_jobs{kind="plan",state="failed"} 0.0' in figures
+        for line in ('report",state="queued"} 1.0', 'report",state="failed"} 0.0', 'plan",state="failed"} 0.0'):
+            assert f'linna_jobs{{kind="{line}' in figures
         assert "linna_backup_configured 0.0" in figures and "linna_backup_age_seconds{" not in figures
         run_job(ground, job)
         figures = opened.get("/metrics").text
@@ -453,7 +426,7 @@ def test_figures_of_work_that_is_over_go_away(tmp_path: Path, monkeypatch: pytes
     assert 'state="queued"' not in figures
 
 
-def test_jobs_left_unfinished_are_taken_up_again(synthetic_pass: Any, tmp_path: Path) -> None:
+def test_jobs_left_unfinished_are_taken_up_again(synthetic_pass, tmp_path):
     from ground_service.ground import open_ground
     from ground_service.jobs.service import enter_job
 

@@ -2,8 +2,6 @@
 
 import struct
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -11,12 +9,12 @@ from ground_service.clock import ClockFile, mission_now_ns, set_mission_clock
 
 
 @pytest.fixture(autouse=True)
-def _wall_clock_again() -> Iterator[None]:
+def _wall_clock_again():
     yield
     set_mission_clock()
 
 
-def test_mission_time_is_the_wall_clock_until_a_simulation_sets_it() -> None:
+def test_mission_time_is_the_wall_clock_until_a_simulation_sets_it():
     before = time.time_ns()
     assert before <= mission_now_ns() <= time.time_ns()
     set_mission_clock(lambda: 1_880_000_000_000_000_000)
@@ -25,7 +23,7 @@ def test_mission_time_is_the_wall_clock_until_a_simulation_sets_it() -> None:
     assert mission_now_ns() >= before
 
 
-def test_a_clock_file_is_read_as_it_is_written(tmp_path: Path) -> None:
+def test_a_clock_file_is_read_as_it_is_written(tmp_path):
     path = tmp_path / "clock"
     clock = ClockFile(path)
     before = time.time_ns()

@@ -5,11 +5,10 @@ import re
 import ssl
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -49,7 +48,7 @@ class Deployed:
     secrets: Path
     database_url: str
 
-    def client(self, name: str) -> httpx.Client:
+    def client(self, name):
         """Return a client of the proxy or of one API process."""
         token = (self.secrets / "admin_token").read_text()
         return httpx.Client(
@@ -59,7 +58,7 @@ class Deployed:
 
 
 @contextmanager
-def deployed(folder: Path, overlay: dict[str, str], *, is_shared: bool) -> Iterator[Deployed]:
+def deployed(folder, overlay, *, is_shared):
     """Run every process that stays, after the migration; only addresses and folders are not the declared ones.
 
     The volume of the archive is one folder, or with an object store a folder for each process.
@@ -79,12 +78,12 @@ def deployed(folder: Path, overlay: dict[str, str], *, is_shared: bool) -> Itera
         for volume in volumes.values():
             volume.mkdir()
 
-        def local(text: str) -> str:
+        def local(text):
             found = "|".join(re.escape(one) for one in here)
             text = re.sub(found, lambda match: here[match[0]], default_of(text)).replace("$$", "$")
             return str(volumes.get(text, text))
 
-        def environment(name: str) -> dict[str, str]:
+        def environment(name):
             home = folder / ("home" if is_shared else name)
             home.mkdir(exist_ok=True)
             declared = {key: local(value) for key, value in environment_of(name).items()}
@@ -107,7 +106,7 @@ def deployed(folder: Path, overlay: dict[str, str], *, is_shared: bool) -> Itera
             if name in APIS:
                 command[command.index("--host") + 1] = "127.0.0.1"
                 command[command.index("--port") + 1] = str(ports[name])
-            ready: Callable[[], bool] = {
+            ready = {
                 **{api: lambda api=api: answers_http(f"http://127.0.0.1:{ports[api]}/readyz") for api in APIS},
                 "runner": lambda: alive(folder / "exchange"),
             }.get(name, lambda log=log: log.exists() and log.stat().st_size > 0)
@@ -129,7 +128,7 @@ def deployed(folder: Path, overlay: dict[str, str], *, is_shared: bool) -> Itera
         )  # fmt: skip
 
 
-def carried(downlink: bytes, service: Deployed, overlay: Overlay) -> str:
+def carried(downlink, service, overlay):
     """Give pieces to the proxy while broker, database, an API process and the overlay's server are lost.
 
     Returns
@@ -140,12 +139,12 @@ def carried(downlink: bytes, service: Deployed, overlay: Overlay) -> str:
     size, jobs = -(-len(downlink) // PIECES), []
     with service.client("proxy") as proxy:
 
-        def answer(k: int) -> httpx.Response:
+        def answer(k):
             path = f"/api/v1/telemetry?spacecraft_id=76&stream=downlink&offset={k * size}"
             piece = downlink[k * size : (k + 1) * size]
             return proxy.post(path, content=piece, headers={"Idempotency-Key": f"piece {k}"})
 
-        def accepted(k: int) -> bool:
+        def accepted(k):
             found = answer(k)
             assert found.status_code in (202, 502, 503), found.text
             if found.status_code == 202:
@@ -178,7 +177,7 @@ def carried(downlink: bytes, service: Deployed, overlay: Overlay) -> str:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("kind", ["base", "objects", "provider"])
-def test_no_acknowledged_piece_is_lost_with_any_server_lost(kind: str, synthetic_pass: Any, tmp_path: Path) -> None:
+def test_no_acknowledged_piece_is_lost_with_any_server_lost(kind, synthetic_pass, tmp_path):
     downlink = synthetic_pass.folder / "downlink.cadu"
     with open_ground(tmp_path / "reference") as ground:
         ingest_file(ground, downlink)

@@ -18,15 +18,16 @@ import yaml
 
 from ground_service.settings import Settings
 from studies.harness.parts import Part, free_port, listens
+from tests.ground_service.conftest import cells
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
-SECRETS = (
-    "database_superuser_password", "database_owner_password", "database_password", "database_backup_password",
-    "broker_password", "admin_token",
-)  # fmt: skip
+(SECRETS,) = cells(
+    "database_superuser_password | database_owner_password | database_password | database_backup_password | "
+    "broker_password | admin_token"
+)
 OPTIONAL = ("objects_access_key", "objects_secret_key", "oidc_client_secret")
 """Secrets of optional parts: empty files until a setting names them."""
 
@@ -35,7 +36,7 @@ PROCESSES = ("api", "api2", "worker", "scheduler", "migrate", "backup")
 EXACT = re.compile(r"[a-z]+:\d+\.\d+(\.\d+)?-[a-z-]+")
 
 
-def environment_of(name: str) -> dict[str, str]:
+def environment_of(name):
     """Return the environment of a service: the common declaration, then what the service itself states."""
     service, found = SERVICES[name], {}
     if "env_file" in service:
@@ -44,13 +45,17 @@ def environment_of(name: str) -> dict[str, str]:
     return found | service.get("environment", {})
 
 
-def default_of(text: str) -> str:
+def sets(table):
+    return {name: set(words.split()) for name, words in cells(table)}
+
+
+def default_of(text):
     """What a value with a variable and a default is when the variable is not set."""
     return re.sub(r"\$\{[A-Z_]+:-([^}]*)\}", r"\1", text)
 
 
 @pytest.mark.parametrize("name", sorted(SERVICES))
-def test_every_service_is_confined(name: str) -> None:
+def test_every_service_is_confined(name):
     service = SERVICES[name]
     assert service["read_only"] and service["cap_drop"] == ["ALL"]
     assert "no-new-privileges:true" in service["security_opt"]
@@ -61,7 +66,7 @@ def test_every_service_is_confined(name: str) -> None:
     assert not any("docker.sock" in volume for volume in service["volumes"])
 
 
-def test_images_are_exact_versions() -> None:
+def test_images_are_exact_versions():
     for name in ("db", "broker", "proxy"):
         assert EXACT.fullmatch(default_of(SERVICES[name]["image"]))
     for name in ("PYTHON_IMAGE", "NODE_IMAGE"):
@@ -72,7 +77,7 @@ def test_images_are_exact_versions() -> None:
     assert images == {"${PYTHON_IMAGE}", "${NODE_IMAGE}"}
 
 
-def test_the_lock_file_of_the_displays_names_no_host_and_has_checksums() -> None:
+def test_the_lock_file_of_the_displays_names_no_host_and_has_checksums():
     lock = json.loads((ROOT / "deploy/openmct/package-lock.json").read_text())
     wanted = json.loads((ROOT / "deploy/openmct/package.json").read_text())["dependencies"]
     found = {name: one for name, one in lock["packages"].items() if name}
@@ -83,44 +88,45 @@ def test_the_lock_file_of_the_displays_names_no_host_and_has_checksums() -> None
         assert "resolved" not in one and one["integrity"].startswith("sha512-")
 
 
-def test_only_the_proxy_is_reached_from_outside_and_by_default_from_this_machine_alone() -> None:
+def test_only_the_proxy_is_reached_from_outside_and_by_default_from_this_machine_alone():
     assert [name for name in SERVICES if "ports" in SERVICES[name]] == ["proxy"]
     assert [default_of(port) for port in SERVICES["proxy"]["ports"]] == ["127.0.0.1:8443:8443"]
 
 
-def test_a_service_is_in_the_networks_that_it_needs_and_no_others() -> None:
+def test_a_service_is_in_the_networks_that_it_needs_and_no_others():
     members = {
         network: {name for name in SERVICES if network in SERVICES[name].get("networks", [])}
         for network in COMPOSE["networks"]
     }
-    assert members == {
-        "edge": {"proxy"},
-        "front": {"proxy", "api", "api2"},
-        "data": {"db", "migrate", "api", "api2", "worker", "scheduler", "backup"},
-        "queue": {"broker", "api", "api2", "worker", "scheduler"},
-        "egress": {"api", "api2", "worker", "scheduler", "backup"},
-    }
+    assert members == sets("""
+edge | proxy
+front | proxy api api2
+data | db migrate api api2 worker scheduler backup
+queue | broker api api2 worker scheduler
+egress | api api2 worker scheduler backup
+""")
     inner = {name for name, options in COMPOSE["networks"].items() if (options or {}).get("internal")}
     assert inner == {"front", "data", "queue"}
 
 
-def test_the_api_believes_the_proxy_and_nobody_else() -> None:
+def test_the_api_believes_the_proxy_and_nobody_else():
     (subnet,) = (entry["subnet"] for entry in COMPOSE["networks"]["front"]["ipam"]["config"])
     assert SERVICES["api"]["environment"]["LINNA_TRUSTED_PROXIES"] == subnet
     assert not default_of(subnet).endswith("/0")
 
 
-def test_every_process_has_the_same_settings() -> None:
+def test_every_process_has_the_same_settings():
     """A setting in the common declaration reaches all; none of them is given to one process alone."""
     own = {name: set(SERVICES[name]["environment"]) for name in PROCESSES}
-    common = {"LINNA_ALLOWED_HOSTS", "LINNA_TRUSTED_PROXIES"}
-    without_broker = {"LINNA_BROKER_URL", "LINNA_BROKER_PASSWORD_FILE"}
-    migration = {f"LINNA_{name}" for name in ("MIGRATION_DATABASE_URL", "MIGRATION_DATABASE_PASSWORD_FILE")}
-    assert own == {
-        "api": common | {"LINNA_BACKUPS"}, "api2": common | {"LINNA_BACKUPS"}, "worker": common,
-        "scheduler": common, "migrate": without_broker | migration | {"LINNA_BACKUP_ROLE"},
-        "backup": without_broker | {"LINNA_DATABASE_URL", "LINNA_DATABASE_PASSWORD_FILE"},
-    }  # fmt: skip
+    without_broker = "LINNA_BROKER_URL LINNA_BROKER_PASSWORD_FILE"
+    assert own == sets(f"""
+api | LINNA_ALLOWED_HOSTS LINNA_TRUSTED_PROXIES LINNA_BACKUPS
+api2 | LINNA_ALLOWED_HOSTS LINNA_TRUSTED_PROXIES LINNA_BACKUPS
+worker | LINNA_ALLOWED_HOSTS LINNA_TRUSTED_PROXIES
+scheduler | LINNA_ALLOWED_HOSTS LINNA_TRUSTED_PROXIES
+migrate | {without_broker} LINNA_MIGRATION_DATABASE_URL LINNA_MIGRATION_DATABASE_PASSWORD_FILE LINNA_BACKUP_ROLE
+backup | {without_broker} LINNA_DATABASE_URL LINNA_DATABASE_PASSWORD_FILE
+""")
     files = {json.dumps(SERVICES[name]["env_file"]) for name in PROCESSES}
     assert len(files) == 1 and "settings.env" in files.pop()
     assert {name for name in SERVICES if "env_file" in SERVICES[name]} == set(PROCESSES)
@@ -129,7 +135,7 @@ def test_every_process_has_the_same_settings() -> None:
     assert all(set(environment_of(name)) <= known for name in PROCESSES)
 
 
-def test_the_pools_of_all_processes_fit_into_the_connections_of_the_database() -> None:
+def test_the_pools_of_all_processes_fit_into_the_connections_of_the_database():
     text = (ROOT / "ground_service/store/database.py").read_text()
     each = sum(int(re.search(rf"{name}=(\d+)", text)[1]) for name in ("pool_size", "max_overflow"))
     processes = sum(int(default_of(str(SERVICES[name].get("scale", 1)))) for name in PROCESSES)
@@ -137,7 +143,7 @@ def test_the_pools_of_all_processes_fit_into_the_connections_of_the_database() -
     assert each * processes <= permitted - 10
 
 
-def test_the_role_of_the_backup_reads_an_archive_that_it_cannot_change() -> None:
+def test_the_role_of_the_backup_reads_an_archive_that_it_cannot_change():
     backup = SERVICES["backup"]
     assert backup["profiles"] == ["backup"] and backup["restart"] == "no"
     assert "archive:/var/lib/linna:ro" in backup["volumes"]
@@ -145,7 +151,7 @@ def test_the_role_of_the_backup_reads_an_archive_that_it_cannot_change() -> None
     assert SERVICES["migrate"]["environment"]["LINNA_BACKUP_ROLE"] == "linna_backup"
 
 
-def test_secrets_are_files_of_those_who_need_them_and_in_no_command_or_environment() -> None:
+def test_secrets_are_files_of_those_who_need_them_and_in_no_command_or_environment():
     assert set(COMPOSE["secrets"]) == {*SECRETS, *OPTIONAL}
     for name, secret in COMPOSE["secrets"].items():
         # A file: contents of variables cannot be given to a container with a read-only root.
@@ -155,13 +161,15 @@ def test_secrets_are_files_of_those_who_need_them_and_in_no_command_or_environme
     holders = {
         name: {user for user in SERVICES if name in SERVICES[user].get("secrets", [])} for name in COMPOSE["secrets"]
     }
-    assert holders == {
-        "database_superuser_password": {"db"}, "database_owner_password": {"db", "migrate"},
-        "database_password": {"db", "migrate", "api", "api2", "worker", "scheduler"},
-        "database_backup_password": {"db", "backup"},
-        "broker_password": {"broker", "api", "api2", "worker", "scheduler"}, "admin_token": {"migrate"},
-        **{key: set(PROCESSES) for key in OPTIONAL},
-    }  # fmt: skip
+    needed = sets("""
+database_superuser_password | db
+database_owner_password | db migrate
+database_password | db migrate api api2 worker scheduler
+database_backup_password | db backup
+broker_password | broker api api2 worker scheduler
+admin_token | migrate
+""")
+    assert holders == needed | {key: set(PROCESSES) for key in OPTIONAL}
     for service in SERVICES.values():
         for name, value in service.get("environment", {}).items():
             # A password or token is named by a file, and no URL holds one.
@@ -170,7 +178,7 @@ def test_secrets_are_files_of_those_who_need_them_and_in_no_command_or_environme
             assert not re.search(r"://[^/@]*:[^/@]*@", str(value))
 
 
-def test_the_service_is_not_the_owner_of_its_schema() -> None:
+def test_the_service_is_not_the_owner_of_its_schema():
     for name in ("api", "worker", "scheduler"):
         environment = environment_of(name)
         assert environment["LINNA_DATABASE_URL"].startswith("postgresql+psycopg://linna@")
@@ -182,7 +190,7 @@ def test_the_service_is_not_the_owner_of_its_schema() -> None:
     assert "ALTER SCHEMA public OWNER TO linna_owner" in roles
 
 
-def test_the_runner_has_no_secret_no_network_and_no_archive() -> None:
+def test_the_runner_has_no_secret_no_network_and_no_archive():
     runner = SERVICES["runner"]
     assert runner["network_mode"] == "none" and "networks" not in runner and "secrets" not in runner
     assert runner["volumes"] == ["exchange:/exchange", "${LINNA_DATA_DIR:-empty-data}:/data:ro"]
@@ -202,11 +210,27 @@ def test_the_runner_has_no_secret_no_network_and_no_archive() -> None:
     assert {name for name in SERVICES if "exchange:/exchange" in SERVICES[name]["volumes"]} == {"worker", "runner"}
 
 
-def test_the_secrets_that_are_missing_are_made_and_those_that_are_there_are_kept(tmp_path: Path) -> None:
+def sh(name, programs="", **environment):
+    """Run a script of the deployment, with a folder of programs before the others."""
+    given = {key: str(value) for key, value in environment.items()}
+    return subprocess.run(
+        ["sh", str(ROOT / "deploy" / name)], env={"PATH": f"{programs}:{os.environ['PATH']}", **given},
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+def program(folder, name, text):
+    """Write a program of this name; return its folder."""
+    programs = folder / "programs"
+    programs.mkdir()
+    (programs / name).write_text(f"#!/bin/sh\n{text}\n")
+    (programs / name).chmod(0o755)
+    return programs
+
+
+def test_the_secrets_that_are_missing_are_made_and_those_that_are_there_are_kept(tmp_path):
     folder = tmp_path / "secrets"
-    script = ["sh", str(ROOT / "deploy/secrets.sh")]
-    environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(folder), "LINNA_ADMIN_TOKEN": "given" * 5}
-    subprocess.run(script, check=True, env=environment, capture_output=True)
+    assert sh("secrets.sh", LINNA_SECRETS_DIR=folder, LINNA_ADMIN_TOKEN="given" * 5).returncode == 0
     made = {path.name: path.read_text() for path in folder.rglob("*") if path.is_file()}
     assert set(made) == {*SECRETS, *OPTIONAL, *CERTIFICATE}
     assert {made[name] for name in OPTIONAL} == {""}
@@ -214,20 +238,13 @@ def test_the_secrets_that_are_missing_are_made_and_those_that_are_there_are_kept
     drawn = [made[name] for name in SECRETS if name != "admin_token"]
     assert len(set(drawn)) == 5 and all(re.fullmatch("[0-9a-f]{48}", one) for one in drawn)
     assert folder.stat().st_mode & 0o077 == 0
-    subprocess.run(script, check=True, env={**environment, "LINNA_ADMIN_TOKEN": "other"}, capture_output=True)
+    assert sh("secrets.sh", LINNA_SECRETS_DIR=folder, LINNA_ADMIN_TOKEN="other").returncode == 0
     assert {path.name: path.read_text() for path in folder.rglob("*") if path.is_file()} == made
 
 
-def test_an_error_of_openssl_is_reported(tmp_path: Path) -> None:
-    programs = tmp_path / "programs"
-    programs.mkdir()
-    (programs / "openssl").write_text("#!/bin/sh\necho 'a reason' >&2\nexit 1\n")
-    (programs / "openssl").chmod(0o755)
-    done = subprocess.run(
-        ["sh", str(ROOT / "deploy/secrets.sh")],
-        env={"PATH": f"{programs}:{os.environ['PATH']}", "LINNA_SECRETS_DIR": str(tmp_path / "secrets")},
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+def test_an_error_of_openssl_is_reported(tmp_path):
+    programs = program(tmp_path, "openssl", "echo 'a reason' >&2; exit 1")
+    done = sh("secrets.sh", programs, LINNA_SECRETS_DIR=tmp_path / "secrets")
     assert done.returncode == 1 and "secrets are in" not in done.stdout
     assert "no certificate was made for localhost:\na reason" in done.stderr
 
@@ -239,35 +256,25 @@ HOLDERS = {
 """Scripts that read passwords, with the program that they start and the names of the passwords."""
 
 
-def start_script(name: str, secrets: dict[str, str], folder: Path) -> tuple[subprocess.CompletedProcess[str], Path]:
+def start_script(name, secrets, folder):
     """Run a script with these secrets and a program that only prints its arguments and its input."""
-    program, _ = HOLDERS[name]
-    programs = folder / "programs"
-    programs.mkdir()
-    (programs / program).write_text('#!/bin/sh\necho "started $*"; cat\n')
-    (programs / program).chmod(0o755)
+    programs = program(folder, HOLDERS[name][0], 'echo "started $*"; cat')
     (folder / "secrets").mkdir()
     for secret, value in secrets.items():
         (folder / "secrets" / secret).write_text(value)
     written = folder / "written"
-    environment = {
-        "PATH": f"{programs}:{os.environ['PATH']}", "LINNA_SECRETS": str(folder / "secrets"),
-        "LINNA_REDIS_USERS": str(written), "POSTGRES_USER": "postgres", "POSTGRES_DB": "linna",
-    }  # fmt: skip
-    done = subprocess.run(
-        ["sh", str(ROOT / "deploy" / name)], env=environment, stdin=subprocess.DEVNULL, capture_output=True,
-        text=True, check=False,
+    done = sh(
+        name, programs, LINNA_SECRETS=folder / "secrets", LINNA_REDIS_USERS=written, POSTGRES_USER="postgres",
+        POSTGRES_DB="linna",
     )  # fmt: skip
     return done, written
 
 
 @pytest.mark.parametrize("is_empty", [True, False])
 @pytest.mark.parametrize(
-    ("name", "missing"), [(name, secret) for name, (_, secrets) in HOLDERS.items() for secret in secrets]
+    "name, missing", [(name, secret) for name, (_, secrets) in HOLDERS.items() for secret in secrets]
 )
-def test_a_server_does_not_start_with_an_empty_password(
-    name: str, missing: str, is_empty: bool, tmp_path: Path
-) -> None:
+def test_a_server_does_not_start_with_an_empty_password(name, missing, is_empty, tmp_path):
     secrets = {secret: "given" for secret in HOLDERS[name][1] if secret != missing}
     done, _ = start_script(name, secrets | ({missing: ""} if is_empty else {}), tmp_path)
     assert done.returncode == 2 and "started" not in done.stdout
@@ -275,15 +282,14 @@ def test_a_server_does_not_start_with_an_empty_password(
     assert f"secrets/{missing}: " in line
 
 
-def test_passwords_may_have_any_character(tmp_path: Path) -> None:
+def test_passwords_may_have_any_character(tmp_path):
     odd = """two words, 'quotes' "and" \\ #%s"""
-    (tmp_path / "redis").mkdir()
-    done, written = start_script("redis.sh", {"broker_password": odd}, tmp_path / "redis")
+    done, written = start_script("redis.sh", {"broker_password": odd}, tmp_path)
     assert done.returncode == 0, done.stderr
     assert f" #{hashlib.sha256(odd.encode()).hexdigest()} " in written.read_text() and odd not in written.read_text()
 
 
-def test_the_broker_grants_what_a_worker_needs_and_no_administration(tmp_path: Path) -> None:
+def test_the_broker_grants_what_a_worker_needs_and_no_administration(tmp_path):
     """A right that is missing would be a traceback in the log of the worker every second."""
     for program in ("redis-server", "redis-cli"):
         if shutil.which(program) is None:
@@ -319,15 +325,11 @@ def test_the_broker_grants_what_a_worker_needs_and_no_administration(tmp_path: P
 
 
 @pytest.mark.parametrize("name", CERTIFICATE)
-def test_a_certificate_without_its_key_is_refused_and_kept(name: str, tmp_path: Path) -> None:
+def test_a_certificate_without_its_key_is_refused_and_kept(name, tmp_path):
     tls = tmp_path / "tls"
     tls.mkdir()
     (tls / name).write_text("of a certification authority")
-    done = subprocess.run(
-        ["sh", str(ROOT / "deploy/secrets.sh")],
-        env={"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(tmp_path)}, capture_output=True, text=True,
-        check=False,
-    )  # fmt: skip
+    done = sh("secrets.sh", LINNA_SECRETS_DIR=tmp_path)
     (other,) = set(CERTIFICATE) - {name}
     assert done.returncode == 2
     assert done.stderr == f"secrets: expected {tls}/{other} for {tls}/{name}, found none\n"
@@ -335,19 +337,14 @@ def test_a_certificate_without_its_key_is_refused_and_kept(name: str, tmp_path: 
     assert not (tls / other).exists()
 
 
-def test_nothing_stays_of_a_base_backup_that_fails(tmp_path: Path) -> None:
-    programs, wal = tmp_path / "programs", tmp_path / "wal"
-    programs.mkdir()
-    (programs / "pg_basebackup").write_text('#!/bin/sh\nmkdir -p "$2" && echo part > "$2/file"\nexit 1\n')
-    (programs / "pg_basebackup").chmod(0o755)
-    done = subprocess.run(
-        ["sh", str(ROOT / "deploy/base-backup.sh")],
-        env={"PATH": f"{programs}:{os.environ['PATH']}", "LINNA_WAL": str(wal)}, capture_output=True, check=False,
-    )  # fmt: skip
+def test_nothing_stays_of_a_base_backup_that_fails(tmp_path):
+    wal = tmp_path / "wal"
+    programs = program(tmp_path, "pg_basebackup", 'mkdir -p "$2" && echo part > "$2/file"; exit 1')
+    done = sh("base-backup.sh", programs, LINNA_WAL=wal)
     assert done.returncode == 1 and list((wal / "base").iterdir()) == []
 
 
-def test_an_api_process_drains_before_it_ends_and_the_proxy_has_another_one() -> None:
+def test_an_api_process_drains_before_it_ends_and_the_proxy_has_another_one():
     proxy = (ROOT / "deploy/nginx.conf").read_text()
     upstream = re.findall(r"^ +server (\w+):8042 ", proxy, re.MULTILINE)
     assert upstream == ["api", "api2"] and set(upstream) <= set(SERVICES["proxy"]["depends_on"])
@@ -358,7 +355,7 @@ def test_an_api_process_drains_before_it_ends_and_the_proxy_has_another_one() ->
         assert idle_s < drain_s and drain_s + 20 < int(SERVICES[name]["stop_grace_period"].removesuffix("s"))
 
 
-def test_the_documented_reload_names_the_configuration_of_the_proxy() -> None:
+def test_the_documented_reload_names_the_configuration_of_the_proxy():
     """The default configuration of nginx names another file with the number of the process."""
     program, flag, configuration, *_ = SERVICES["proxy"]["entrypoint"]
     reload = f"`docker compose exec proxy {program} {flag} {configuration} -s reload`"
@@ -368,7 +365,7 @@ def test_the_documented_reload_names_the_configuration_of_the_proxy() -> None:
     assert f"./deploy/nginx.conf:{configuration}:ro" in SERVICES["proxy"]["volumes"]
 
 
-def test_a_renewed_certificate_is_seen_by_the_proxy() -> None:
+def test_a_renewed_certificate_is_seen_by_the_proxy():
     """A mount of one file keeps the old file when a new one takes its place."""
     (mount,) = (one for one in SERVICES["proxy"]["volumes"] if one.endswith(":/run/tls:ro"))
     assert mount == "${LINNA_SECRETS_DIR:-./secrets}/tls:/run/tls:ro"
@@ -376,7 +373,7 @@ def test_a_renewed_certificate_is_seen_by_the_proxy() -> None:
     assert used == [f"/run/tls/{name}" for name in CERTIFICATE]
 
 
-def test_the_documented_restore_uses_services_volumes_and_folders_that_exist() -> None:
+def test_the_documented_restore_uses_services_volumes_and_folders_that_exist():
     text = (ROOT / "docs/deployment.md").read_text()
     (volume, folder) = re.findall(r"--volume linna_(\w+):(/\w+):ro worker db restore /\w+/", text)[0]
     assert COMPOSE["name"] == "linna" and volume in COMPOSE["volumes"]
@@ -387,7 +384,7 @@ def test_the_documented_restore_uses_services_volumes_and_folders_that_exist() -
     assert "LINNA_MIGRATION_DATABASE_URL" in SERVICES["migrate"]["environment"]
 
 
-def test_the_image_runs_as_nobody_in_particular() -> None:
+def test_the_image_runs_as_nobody_in_particular():
     stage = DOCKERFILE.split("\nFROM ")[-1]
     (user,) = re.findall(r"^USER (\d+):\d+$", stage, re.MULTILINE)
     assert int(user) >= 10_000
@@ -395,7 +392,7 @@ def test_the_image_runs_as_nobody_in_particular() -> None:
     assert not re.search(r"^(ADD|RUN .*(curl|wget|chmod 777))", DOCKERFILE, re.MULTILINE)
 
 
-def test_the_image_holds_every_package_and_the_folder_of_the_build_no_more_than_it_needs() -> None:
+def test_the_image_holds_every_package_and_the_folder_of_the_build_no_more_than_it_needs():
     copied = {line.split()[1] for line in re.findall(r"^COPY (?!--from).*$", DOCKERFILE, re.MULTILINE)}
     found = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]["find"]
     packages = {name.rstrip("*") for name in found["include"]}

@@ -4,14 +4,11 @@ import hashlib
 import json
 import shutil
 import tracemalloc
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from ground_service.errors import InvalidInput
-from ground_service.ground import Ground
 from ground_service.missions.service import read_mission
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.model import PassFilter
@@ -26,6 +23,7 @@ from lunar.messages.oem import format_oem
 from lunar.messages.oem_xml import format_oem_xml
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.scenario import parse_scenario
+from tests.ground_service.conftest import cells
 from tmtc.dictionary.definitions import parse_dictionary
 from tmtc.errors import MalformedPacket
 
@@ -33,8 +31,8 @@ DEEP = "a = " + "[" * 50_000 + "]" * 50_000
 LONG = "a = " + "9" * 5_000
 
 
-@pytest.mark.parametrize(("text", "told"), [(DEEP, "nested too deeply"), (LONG, "too many digits")])
-def test_toml_without_end_is_refused_in_one_line(text: str, told: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("text, told", [(DEEP, "nested too deeply"), (LONG, "too many digits")])
+def test_toml_without_end_is_refused_in_one_line(text, told, tmp_path):
     with pytest.raises(InvalidInput, match=told):
         read_mission(text.encode(), "body")
     (tmp_path / "build.toml").write_text(text)
@@ -45,7 +43,7 @@ def test_toml_without_end_is_refused_in_one_line(text: str, told: str, tmp_path:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    "text, told",
     [
         ("a" + ".a" * 16 + " = 1", "a deeper or longer one"),
         ("[a" + ' . "b.c"' * 16 + "]", "a deeper or longer one"),
@@ -55,13 +53,13 @@ def test_toml_without_end_is_refused_in_one_line(text: str, told: str, tmp_path:
         ("# " + "x" * (4 << 20), "at most 4 MiB"),
     ],
 )
-def test_toml_that_would_cost_much_is_not_parsed(text: str, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_toml_that_would_cost_much_is_not_parsed(text, told, monkeypatch):
     monkeypatch.delattr("tomllib.loads")
     with pytest.raises(InvalidInput, match=told):
         read_table(text, "body", "TOML")
 
 
-def test_toml_in_its_limits_is_parsed_whatever_its_strings_contain() -> None:
+def test_toml_in_its_limits_is_parsed_whatever_its_strings_contain():
     text = "a" + ".a" * 15 + " = 1\n" + "b = '''" + "x.[" * 60_000 + "'''\nc = \"\\\"[[[[[[[[[[[[[[[[[[\"\n"
     found = read_table(text, "body", "TOML")
     assert found["b"] == "x.[" * 60_000 and found["c"] == '"' + "[" * 18
@@ -75,7 +73,7 @@ def test_toml_in_its_limits_is_parsed_whatever_its_strings_contain() -> None:
     ],
     ids=["deep", "digits", "overflow", "not a number", "negative", "long"],
 )  # fmt: skip
-def test_costs_that_a_build_states_without_end_are_not_read(text: str, tmp_path: Path) -> None:
+def test_costs_that_a_build_states_without_end_are_not_read(text, tmp_path):
     (tmp_path / "performance.json").write_text('{"stages": {"a": [1.0]}}')
     assert read_performance(tmp_path / "performance.json") == {"stages": {"a": [1.0]}}
     (tmp_path / "performance.json").write_text(text)
@@ -84,8 +82,8 @@ def test_costs_that_a_build_states_without_end_are_not_read(text: str, tmp_path:
         parse_dictionary(text)
 
 
-def test_limits_of_a_build_are_bounded_and_belong_to_a_program(tmp_path: Path) -> None:
-    def digest(limits: str) -> str:
+def test_limits_of_a_build_are_bounded_and_belong_to_a_program(tmp_path):
+    def digest(limits):
         file = tmp_path / "build.toml"
         file.write_text(f'name = "x"\ncommand = ["x", "{{archive}}", "{{out}}"]\n{limits}')
         return load_build(file).digest
@@ -96,27 +94,26 @@ def test_limits_of_a_build_are_bounded_and_belong_to_a_program(tmp_path: Path) -
             digest(f"[limits]\n{name} = 1_000_000_000")
 
 
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        ({"camera": {"width_px": 10**9, "height_px": 512}}, "camera.width_px: expected a number from 1 to"),
-        ({"camera": {"fov_deg": float("nan")}}, "camera.fov_deg: expected"),
-        ({"cadence_s": -1}, "cadence_s: expected"),
-        ({"octets": -1}, "expected -1 octets as in the manifest"),
-        ({"receptions": b"packet_ticks\n1\n"}, "receptions.csv, line 1: expected a column sequence_count"),
-    ],
-)
-def test_an_archive_with_impossible_numbers_leaves_no_pass(
-    change: dict[str, Any], told: str, ground: Ground, synthetic_pass: Any, tmp_path: Path
-) -> None:
-    folder = tmp_path / "archive"
+IMPOSSIBLE = r"""
+{"camera": {"width_px": 1000000000, "height_px": 512}} | camera.width_px: expected a number from 1 to
+{"camera": {"fov_deg": NaN}} | camera.fov_deg: expected
+{"cadence_s": -1} | cadence_s: expected
+{"octets": -1} | expected -1 octets as in the manifest
+{"receptions": "packet_ticks\n1\n"} | receptions.csv, line 1: expected a column sequence_count
+"""
+
+
+@pytest.mark.parametrize("change, told", cells(IMPOSSIBLE))
+def test_an_archive_with_impossible_numbers_leaves_no_pass(change, told, ground, synthetic_pass, tmp_path):
+    folder, change = tmp_path / "archive", json.loads(change)
     shutil.copytree(synthetic_pass.folder, folder)
     manifest = json.loads((folder / "manifest.json").read_text())
     if "octets" in change:
         manifest["files"]["downlink.cadu"]["bytes"] = change["octets"]
     elif "receptions" in change:
-        (folder / "receptions.csv").write_bytes(change["receptions"])
-        manifest["files"]["receptions.csv"] = {"sha256": hashlib.sha256(change["receptions"]).hexdigest()}
+        octets = change["receptions"].encode()
+        (folder / "receptions.csv").write_bytes(octets)
+        manifest["files"]["receptions.csv"] = {"sha256": hashlib.sha256(octets).hexdigest()}
     else:
         manifest |= change
     (folder / "manifest.json").write_text(json.dumps(manifest))
@@ -125,7 +122,7 @@ def test_an_archive_with_impossible_numbers_leaves_no_pass(
     assert ground.read(list_passes, PassFilter()).items == []
 
 
-def test_ephemerides_are_limited_in_size_and_lines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_ephemerides_are_limited_in_size_and_lines(monkeypatch, tmp_path):
     path = tmp_path / "a.oem"
     path.write_text("CCSDS_OEM_VERS = 2.0\n" + "COMMENT\n" * 100)
     monkeypatch.setattr(ephemeris_files, "LINES_LIMIT", 100)
@@ -137,9 +134,7 @@ def test_ephemerides_are_limited_in_size_and_lines(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("name", ["a.oem", "a.xml"])
-def test_an_ephemeris_is_read_as_a_stream_with_a_limit_on_states(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
-) -> None:
+def test_an_ephemeris_is_read_as_a_stream_with_a_limit_on_states(monkeypatch, tmp_path, name):
     """Reading takes less than twice the size of the file, and 4 MiB."""
     count = 20_000
     utc_ns = np.int64(1_800_000_000_000_000_000) + np.arange(count, dtype=np.int64) * 60_000_000_000

@@ -5,11 +5,8 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import pytest
 
@@ -21,13 +18,13 @@ PACKAGE = "linna_generated_client"
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+def service(tmp_path_factory):
     with TestClient(create_app(Settings(home=tmp_path_factory.mktemp("api")))) as opened:
         yield opened
 
 
 @pytest.fixture(scope="module")
-def generated(service: TestClient, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def generated(service, tmp_path_factory):
     folder = tmp_path_factory.mktemp("client")
     (folder / "openapi.json").write_text(json.dumps(service.get("/api/v1/openapi.json").json()))
     command = [
@@ -47,16 +44,16 @@ def generated(service: TestClient, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 @pytest.fixture
-def client(service: TestClient, generated: Path) -> Any:
+def client(service, generated):
     made = importlib.import_module(PACKAGE).Client(base_url="http://testserver")
     return made.set_httpx_client(service)
 
 
-def operation(name: str) -> ModuleType:
+def operation(name):
     return importlib.import_module(f"{PACKAGE}.api.{name}")
 
 
-def test_every_operation_has_a_function(service: TestClient, generated: Path) -> None:
+def test_every_operation_has_a_function(service, generated):
     paths = service.get("/api/v1/openapi.json").json()["paths"]
     wanted = {f"{one['tags'][0]}.{one['operationId']}" for methods in paths.values() for one in methods.values()}
     found = {f"{file.parent.name}.{file.stem}" for file in (generated / "api").glob("*/*.py")}
@@ -65,7 +62,7 @@ def test_every_operation_has_a_function(service: TestClient, generated: Path) ->
         compile(file.read_text(), str(file), "exec")  # a warning is an error
 
 
-def test_a_pass_is_defined_listed_and_shown_with_its_types(client: Any) -> None:
+def test_a_pass_is_defined_listed_and_shown_with_its_types(client):
     models = importlib.import_module(f"{PACKAGE}.models")
     start = datetime(2029, 8, 7, 6, tzinfo=UTC)
     given = models.PassDefinition(name="evening", start=start, stop=start.replace(hour=7), spacecraft_id=76)
@@ -78,14 +75,14 @@ def test_a_pass_is_defined_listed_and_shown_with_its_types(client: Any) -> None:
     assert shown == made
 
 
-def test_errors_are_problem_documents(client: Any) -> None:
+def test_errors_are_problem_documents(client):
     models = importlib.import_module(f"{PACKAGE}.models")
     answer = operation("passes.get_pass").sync_detailed(99, client=client)
     assert answer.status_code == 404
     assert isinstance(answer.parsed, models.Problem) and answer.parsed.status == 404
 
 
-def test_a_file_is_uploaded(client: Any) -> None:
+def test_a_file_is_uploaded(client):
     types = importlib.import_module(f"{PACKAGE}.types")
     import io
 

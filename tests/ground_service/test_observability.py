@@ -5,10 +5,9 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from ast import literal_eval
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -19,7 +18,7 @@ from ground_service import logs
 from ground_service.app import create_app
 from ground_service.clock import utc_now_ns
 from ground_service.errors import SettingsError
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import enter_job, get_job
 from ground_service.passes.archive_import import import_archive
@@ -29,6 +28,7 @@ from ground_service.worker import condition
 from ground_service.worker.backup import backup
 from ground_service.worker.condition import WorkCounts, newest_backup_utc_ns, read_condition
 from ground_service.worker.jobs import run_job
+from tests.ground_service.conftest import cells
 from tests.serving import TestClient
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
@@ -39,22 +39,22 @@ SELECTOR = re.compile(r"\b(linna_[a-z_]+)\{([^}]*)\}")
 S = 1_000_000_000
 
 
-def alerts() -> list[dict[str, Any]]:
+def alerts():
     return [rule for group in yaml.safe_load(RULES.read_text())["groups"] for rule in group["rules"]]
 
 
-def panels() -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = json.loads(DASHBOARD.read_text())["panels"]
+def panels():
+    found = json.loads(DASHBOARD.read_text())["panels"]
     return found
 
 
-def expressions() -> list[str]:
+def expressions():
     drawn = [target["expr"] for panel in panels() for target in panel["targets"]]
     return [rule["expr"] for rule in alerts()] + drawn
 
 
 @pytest.fixture(scope="module")
-def samples(tmp_path_factory: pytest.TempPathFactory, synthetic_pass: Any) -> dict[str, set[str]]:
+def samples(tmp_path_factory, synthetic_pass):
     """Names of all samples of /metrics, with the names of their labels."""
     folder = tmp_path_factory.mktemp("observed")
     with open_ground(folder / "home") as ground:
@@ -65,7 +65,7 @@ def samples(tmp_path_factory: pytest.TempPathFactory, synthetic_pass: Any) -> di
         backup(ground, folder / "backups" / "one", now_utc_ns=utc_now_ns())
     settings = Settings(home=folder / "home", backups=folder / "backups")
 
-    def distributed(*given: Any) -> condition.Condition:
+    def distributed(*given):
         return replace(read_condition(*given), broker=True, runner=True, processes={"worker": 2})
 
     with pytest.MonkeyPatch.context() as patched, TestClient(create_app(settings, inline_jobs=True)) as client:
@@ -77,16 +77,14 @@ def samples(tmp_path_factory: pytest.TempPathFactory, synthetic_pass: Any) -> di
     }
 
 
-def add_correlation(ground: Ground, vehicle: int, created_utc_ns: int) -> None:
+def add_correlation(ground, vehicle, created_utc_ns):
     with ground.database.writing() as connection:
-        line = {
-            "start_ticks": 0, "stop_ticks": 1, "reference_ticks": 0, "reference_utc_ns": 0, "drift_ppb": 0.0,
-        }  # fmt: skip
+        line = dict.fromkeys(["start_ticks", "stop_ticks", "reference_ticks", "reference_utc_ns", "drift_ppb"], 0)
         given = {"vehicle_id": vehicle, "method": "test", "points": 2, "created_utc_ns": created_utc_ns}
         repository.add(connection, repository.CORRELATIONS, **line, **given)
 
 
-def test_every_metric_and_label_of_alerts_and_dashboard_exists(samples: dict[str, set[str]]) -> None:
+def test_every_metric_and_label_of_alerts_and_dashboard_exists(samples):
     for expression in expressions():
         named = set(NAME.findall(expression))
         assert named or "up{" in expression or "probe_ssl_earliest_cert_expiry{" in expression, expression
@@ -98,13 +96,13 @@ def test_every_metric_and_label_of_alerts_and_dashboard_exists(samples: dict[str
             assert labels <= set().union(*(samples[name] for name in named)), expression
 
 
-def test_every_metric_of_the_condition_is_drawn_or_has_an_alert(samples: dict[str, set[str]]) -> None:
+def test_every_metric_of_the_condition_is_drawn_or_has_an_alert(samples):
     used = {name for expression in expressions() for name in NAME.findall(expression)}
     families = {re.sub(r"_(bucket|count|sum|created|total)$", "", name) for name in samples}
     assert families == {re.sub(r"_(bucket|total)$", "", name) for name in used}
 
 
-def test_every_alert_has_a_severity_a_summary_and_an_action() -> None:
+def test_every_alert_has_a_severity_a_summary_and_an_action():
     names = [rule["alert"] for rule in alerts()]
     assert len(set(names)) == len(names) >= 10
     for rule in alerts():
@@ -112,97 +110,76 @@ def test_every_alert_has_a_severity_a_summary_and_an_action() -> None:
         assert set(rule["annotations"]) == {"summary", "action"}
 
 
-def test_the_limits_of_the_status_are_those_of_the_alerts() -> None:
+def test_the_limits_of_the_status_are_those_of_the_alerts():
     limits = {rule["alert"]: [float(word) for word in re.findall(r"[<>] ([0-9.]+)", rule["expr"])] for rule in alerts()}
-    assert limits["LinnaQueueOld"] == [condition.QUEUE_AGE_LIMIT_S]
-    assert limits["LinnaIngestLag"] == [condition.INGEST_LAG_LIMIT_S]
-    assert limits["LinnaDiskFull"] == [condition.DISK_FREE_LIMIT]
-    assert limits["LinnaBackupOld"] == [condition.BACKUP_AGE_LIMIT_S]
-    assert limits["LinnaTimeCorrelationOld"] == [condition.CORRELATION_AGE_LIMIT_S]
+    names = (
+        "QueueOld QUEUE_AGE_LIMIT_S IngestLag INGEST_LAG_LIMIT_S DiskFull DISK_FREE_LIMIT BackupOld BACKUP_AGE_LIMIT_S"
+    )
+    words = f"{names} TimeCorrelationOld CORRELATION_AGE_LIMIT_S".split()
+    for alert, limit in zip(words[::2], words[1::2], strict=True):
+        assert limits[f"Linna{alert}"] == [getattr(condition, limit)]
     assert f'instance="{condition.FLIGHT}"' in RULES.read_text()
 
 
 GOOD = condition.Condition(WorkCounts({}, {}, 0, None, None), 0.0, 0.0, 50, 100, None, {}, "somebody")
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"scheduler": None}, "No process does the recurring work."),
-        ({"broker": False}, "The broker does not answer."),
-        ({"processes": {"api": 2, "worker": 0}}, "No worker does jobs."),
-        ({"runner": False}, "No runner of payload builds responds."),
-        ({"disagreements": ("api b: other files than api a",)}, "Processes disagree: api b: other files than api a."),
-        ({"queue_age_s": 901.0}, "A job has waited for 901 s."),
-        ({"ingest_lag_s": 601.0}, "An ingest has been unfinished for 601 s."),
-        ({"disk_free": 9}, "9% of the disk of the archive are free."),
-        ({"backup_missing": True}, "No backup was found."),
-        ({"uncorrelated": (76,)}, "Spacecraft 76 has no time correlation."),
-        ({"backup_age_s": 97_200.0}, "The newest backup is 27 h old."),
-        (
-            {"correlation_ages_s": {(76, "flight"): 180_000.0, (76, "replay"): 1e9}},
-            "The time correlation of spacecraft 76 is 50 h old.",
-        ),
-    ],
-)
-def test_the_status_names_what_has_to_be_looked_after(change: dict[str, Any], said: str) -> None:
+COMPLAINTS = """
+scheduler | None | No process does the recurring work.
+broker | False | The broker does not answer.
+processes | {"api": 2, "worker": 0} | No worker does jobs.
+runner | False | No runner of payload builds responds.
+disagreements | ("api b: other files than api a",) | Processes disagree: api b: other files than api a.
+queue_age_s | 901.0 | A job has waited for 901 s.
+ingest_lag_s | 601.0 | An ingest has been unfinished for 601 s.
+disk_free | 9 | 9% of the disk of the archive are free.
+backup_missing | True | No backup was found.
+uncorrelated | (76,) | Spacecraft 76 has no time correlation.
+backup_age_s | 97_200.0 | The newest backup is 27 h old.
+correlation_ages_s | {(76, "flight"): 18e4, (76, "replay"): 1e9} | The time correlation of spacecraft 76 is 50 h old.
+"""
+
+
+@pytest.mark.parametrize("name, value, said", cells(COMPLAINTS))
+def test_the_status_names_what_has_to_be_looked_after(name, value, said):
     assert condition.complaints(GOOD) == []
-    assert condition.complaints(replace(GOOD, **change)) == [said]
+    assert condition.complaints(replace(GOOD, **{name: literal_eval(value)})) == [said]
     at_the_limit = {"queue_age_s": 900.0, "ingest_lag_s": 600.0, "disk_free": 10, "backup_age_s": 93_600.0}
     assert condition.complaints(replace(GOOD, **at_the_limit)) == []
 
 
-FAILED = 'linna_jobs{state="failed",kind="report"}'
-CORRELATION = 'linna_time_correlation_age_seconds{spacecraft_id="76",spacecraft_instance="flight"}'
-GET = 'linna_http_request_seconds_bucket{method="GET"'
-
-FIRING: dict[str, tuple[dict[str, str], str, str]] = {
-    "LinnaDown": ({'up{job="linna"}': "1x5 0x20 1x200"}, "20m", "40m"),
-    "LinnaApiLost": ({'up{job="linna"}': "1x200", 'up{job="linna",instance="b"}': "1x5 0x20 1x200"}, "20m", "40m"),
-    "LinnaNoWorker": ({'linna_processes{kind="worker"}': "2x5 0x20 2x200"}, "12m", "40m"),
-    "LinnaProcessLost": ({'linna_processes{kind="worker"}': "2x5 1x40 2x200"}, "30m", "60m"),
-    "LinnaNoRunner": ({'linna_runner_up{kind="exchange"}': "1x5 0x20 1x200"}, "20m", "40m"),
-    "LinnaBrokerDown": ({'linna_broker_up{kind="redis"}': "1x5 0x20 1x200"}, "20m", "40m"),
-    "LinnaDisagreement": ({"linna_disagreements": "0x5 1x20 0x200"}, "20m", "40m"),
-    "LinnaNoScheduler": ({"linna_scheduler": "1x5 0x20 1x200"}, "20m", "40m"),
-    "LinnaQueueOld": ({"linna_queue_age_seconds": "0+60x40 0x200"}, "40m", "60m"),
-    "LinnaIngestLag": ({"linna_ingest_lag_seconds": "0+60x40 0x200"}, "40m", "60m"),
-    "LinnaJobsFailed": ({FAILED: "0x20 1x200"}, "40m", "120m"),
-    "LinnaErrors": (
-        {
-            'linna_http_requests_total{status="200"}': "0+100x300",
-            'linna_http_requests_total{status="500"}': "0+5x40 200x200",
-        },
-        "30m",
-        "60m",
-    ),
-    "LinnaSlow": (
-        {
-            f'{GET},le="0.5"}}': "0+1x60 60+100x200",
-            f'{GET},le="1.0"}}': "0+100x60 6000+100x200",
-            f'{GET},le="+Inf"}}': "0+100x60 6000+100x200",
-        },
-        "40m",
-        "120m",
-    ),
-    "LinnaDiskFull": ({"linna_disk_free_bytes": "50x5 9x20 50x200"}, "20m", "40m"),
-    "LinnaBackupOld": ({"linna_backup_age_seconds": "90000+60x200 60x200"}, "180m", "240m"),
-    "LinnaTimeCorrelationOld": ({f"{CORRELATION}": "172000+60x120 0x200"}, "120m", "160m"),
-    "LinnaCertificateExpires": (
-        {'probe_ssl_earliest_cert_expiry{job="linna-proxy"}': f"{13 * 86_400}x120 {90 * 86_400}x200"},
-        "120m",
-        "160m",
-    ),
-}
+FIRING = """
+LinnaDown | up{job="linna"} = 1x5 0x20 1x200 | 20m | 40m
+LinnaApiLost | up{job="linna"} = 1x200; up{job="linna",instance="b"} = 1x5 0x20 1x200 | 20m | 40m
+LinnaNoWorker | linna_processes{kind="worker"} = 2x5 0x20 2x200 | 12m | 40m
+LinnaProcessLost | linna_processes{kind="worker"} = 2x5 1x40 2x200 | 30m | 60m
+LinnaNoRunner | linna_runner_up{kind="exchange"} = 1x5 0x20 1x200 | 20m | 40m
+LinnaBrokerDown | linna_broker_up{kind="redis"} = 1x5 0x20 1x200 | 20m | 40m
+LinnaDisagreement | linna_disagreements = 0x5 1x20 0x200 | 20m | 40m
+LinnaNoScheduler | linna_scheduler = 1x5 0x20 1x200 | 20m | 40m
+LinnaQueueOld | linna_queue_age_seconds = 0+60x40 0x200 | 40m | 60m
+LinnaIngestLag | linna_ingest_lag_seconds = 0+60x40 0x200 | 40m | 60m
+LinnaJobsFailed | linna_jobs{state="failed",kind="report"} = 0x20 1x200 | 40m | 120m
+LinnaErrors | linna_http_requests_total{status="200"} = 0+100x300; \
+    linna_http_requests_total{status="500"} = 0+5x40 200x200 | 30m | 60m
+LinnaSlow | linna_http_request_seconds_bucket{method="GET",le="0.5"} = 0+1x60 60+100x200; \
+    linna_http_request_seconds_bucket{method="GET",le="1.0"} = 0+100x60 6000+100x200; \
+    linna_http_request_seconds_bucket{method="GET",le="+Inf"} = 0+100x60 6000+100x200 | 40m | 120m
+LinnaDiskFull | linna_disk_free_bytes = 50x5 9x20 50x200 | 20m | 40m
+LinnaBackupOld | linna_backup_age_seconds = 90000+60x200 60x200 | 180m | 240m
+LinnaTimeCorrelationOld | linna_time_correlation_age_seconds{spacecraft_id="76",spacecraft_instance="flight"} \
+    = 172000+60x120 0x200 | 120m | 160m
+LinnaCertificateExpires | probe_ssl_earliest_cert_expiry{job="linna-proxy"} = 1123200x120 7776000x200 | 120m | 160m
+"""
 """Alerts with the series that let them fire, and times at which they fire and have cleared."""
 
 
-def test_prometheus_renames_no_label_of_a_metric(samples: dict[str, set[str]]) -> None:
+def test_prometheus_renames_no_label_of_a_metric(samples):
     """Its own labels `job` and `instance` replace those of a metric, so that a rule with them never fires."""
     assert not any({"job", "instance"} & labels for labels in samples.values())
 
 
-def test_the_configuration_of_prometheus_is_valid_and_has_the_jobs_of_the_alerts() -> None:
+def test_the_configuration_of_prometheus_is_valid_and_has_the_jobs_of_the_alerts():
     program = shutil.which("promtool")
     if program is None:
         pytest.skip("promtool is not installed")
@@ -213,89 +190,86 @@ def test_the_configuration_of_prometheus_is_valid_and_has_the_jobs_of_the_alerts
     assert set(re.findall(r'job="([^"]+)"', RULES.read_text())) == jobs
 
 
-def expectation(expression: str, at: str, labels: str, value: float) -> dict[str, Any]:
+HEALTHY = """
+up{job="linna"} = 1x200
+linna_scheduler = 1x200
+linna_backup_age_seconds = 3600x200
+linna_backup_configured = 1x200
+probe_ssl_earliest_cert_expiry{job="linna-proxy"} = 1296000x200
+linna_queue_age_seconds = 30x200
+linna_processes{kind="worker"} = 2x200
+linna_broker_up{kind="redis"} = 1x200
+linna_runner_up{kind="exchange"} = 1x200
+linna_disagreements = 0x200
+linna_disk_free_bytes = 50x200
+linna_disk_size_bytes = 100x200
+linna_jobs{state="failed",kind="report"} = 2x200
+"""
+"""Series of a healthy service; times of certificates are 15 days."""
+
+
+def series_of(text):
+    """Return the input series of a test of rules, one a line: name = values."""
+    rows = (line.rpartition(" = ") for line in text.strip().splitlines())
+    return [{"series": name.strip(), "values": values} for name, _, values in rows]
+
+
+def run_of(series, *expected):
+    return {"interval": "1m", "input_series": series, "promql_expr_test": list(expected)}
+
+
+def expectation(expression, at, value, labels="{}"):
     return {"expr": expression, "eval_time": at, "exp_samples": [{"labels": labels, "value": value}]}
 
 
-def replicas_test(healthy: list[dict[str, str]]) -> dict[str, Any]:
+def replicas_test(healthy):
     """One of two API processes fails, and both count the same failed job: no call, and one failure."""
     series, up = 'linna_jobs{state="failed",kind="report"', 'up{job="linna"'
     others = [one for one in healthy if not one["series"].startswith((series, up))]
-    added = [
-        {"series": up + ',instance="a"}', "values": "1x200"},
-        {"series": up + ',instance="b"}', "values": "0x200"},
-        {"series": series + ',instance="a"}', "values": "0x20 1x180"},
-        {"series": series + ',instance="b"}', "values": "0x20 1x180"},
-    ]
+    added = series_of(f"""
+{up},instance="a"}} = 1x200
+{up},instance="b"}} = 0x200
+{series},instance="a"}} = 0x20 1x180
+{series},instance="b"}} = 0x20 1x180
+""")
     failed = 'ALERTS{alertstate="firing",alertname="LinnaJobsFailed"}'
     (rule,) = (one["expr"] for one in alerts() if one["alert"] == "LinnaJobsFailed")
-    return {
-        "interval": "1m",
-        "input_series": [*others, *added],
-        "promql_expr_test": [
-            expectation('count(ALERTS{alertname="LinnaDown"}) or vector(0)', "20m", "{}", 0),
-            expectation('count(ALERTS{alertstate="firing",alertname="LinnaApiLost"})', "20m", "{}", 1),
-            expectation(f"count({failed})", "70m", "{}", 1),
-            expectation(f"round({rule})", "70m", '{kind="report", state="failed"}', 1),
-            expectation(f"count({failed}) or vector(0)", "150m", "{}", 0),
-        ],
-    }
+    return run_of(
+        others + added,
+        expectation('count(ALERTS{alertname="LinnaDown"}) or vector(0)', "20m", 0),
+        expectation('count(ALERTS{alertstate="firing",alertname="LinnaApiLost"})', "20m", 1),
+        expectation(f"count({failed})", "70m", 1),
+        expectation(f"round({rule})", "70m", 1, '{kind="report", state="failed"}'),
+        expectation(f"count({failed}) or vector(0)", "150m", 0),
+    )
 
 
-def backup_tests(healthy: list[dict[str, str]]) -> Iterator[dict[str, Any]]:
+def backup_tests(healthy):
     """Without a backup there is an alert if a folder is configured, otherwise none."""
     others = [one for one in healthy if not one["series"].startswith("linna_backup")]
     for configured in (0, 1):
         firing = 'count(ALERTS{alertstate="firing",alertname="LinnaBackupOld"}) or vector(0)'
-        yield {
-            "interval": "1m",
-            "input_series": [*others, {"series": "linna_backup_configured", "values": f"{configured}x200"}],
-            "promql_expr_test": [expectation(firing, "150m", "{}", configured)],
-        }
+        given = series_of(f"linna_backup_configured = {configured}x200")
+        yield run_of(others + given, expectation(firing, "150m", configured))
 
 
-def test_alerts_fire_and_only_when_they_should(tmp_path: Path) -> None:
+def test_alerts_fire_and_only_when_they_should(tmp_path):
     program = shutil.which("promtool")
     if program is None:
         pytest.skip("promtool is not installed")
     checked = subprocess.run([program, "check", "rules", str(RULES)], capture_output=True, text=True, check=False)
     assert checked.returncode == 0, checked.stderr
-    values = {
-        'up{job="linna"}': "1x200", "linna_scheduler": "1x200", "linna_backup_age_seconds": "3600x200",
-        "linna_backup_configured": "1x200",
-        'probe_ssl_earliest_cert_expiry{job="linna-proxy"}': f"{15 * 86_400}x200",
-        "linna_queue_age_seconds": "30x200", 'linna_processes{kind="worker"}': "2x200",
-        'linna_broker_up{kind="redis"}': "1x200", 'linna_runner_up{kind="exchange"}': "1x200",
-        "linna_disagreements": "0x200", "linna_disk_free_bytes": "50x200", "linna_disk_size_bytes": "100x200",
-        'linna_jobs{state="failed",kind="report"}': "2x200",
-    }  # fmt: skip
-    healthy = [{"series": series, "values": value} for series, value in values.items()]
+    healthy = series_of(HEALTHY)
     names = [rule["alert"] for rule in alerts()]
-    tests: list[dict[str, Any]] = [
-        {
-            "interval": "1m",
-            "input_series": healthy,
-            "promql_expr_test": [
-                {"expr": 'count(ALERTS{alertstate="firing"}) or vector(0)', "eval_time": "3h",
-                 "exp_samples": [{"labels": "{}", "value": 0}]}
-            ],
-        }
-    ]  # fmt: skip
-    assert set(FIRING) == set(names)
-    for name, (series, fires, clears) in FIRING.items():
-        others = [one for one in healthy if one["series"] not in series]
+    tests = [run_of(healthy, expectation('count(ALERTS{alertstate="firing"}) or vector(0)', "3h", 0))]
+    assert {row[0] for row in cells(FIRING)} == set(names)
+    for name, text, fires, clears in cells(FIRING):
+        series = series_of(text.replace("; ", "\n"))
+        given = {one["series"] for one in series}
+        others = [one for one in healthy if one["series"] not in given]
         firing = f'count(ALERTS{{alertstate="firing",alertname="{name}"}}) or vector(0)'
-        tests.append(
-            {
-                "interval": "1m",
-                "input_series": [*others, *({"series": key, "values": one} for key, one in series.items())],
-                "promql_expr_test": [
-                    expectation(firing, "1m", "{}", 0),
-                    expectation(firing, fires, "{}", 1),
-                    expectation(firing, clears, "{}", 0),
-                ],
-            }
-        )
+        expected = (expectation(firing, at, value) for at, value in (("1m", 0), (fires, 1), (clears, 0)))
+        tests.append(run_of(others + series, *expected))
     tests += [replicas_test(healthy), *backup_tests(healthy)]
     document = {"rule_files": [str(RULES)], "evaluation_interval": "1m", "tests": tests}
     (tmp_path / "tests.yml").write_text(yaml.safe_dump(document))
@@ -305,7 +279,7 @@ def test_alerts_fire_and_only_when_they_should(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_ages_of_waiting_work_and_of_correlations(either: Ground, synthetic_pass: Any) -> None:
+def test_ages_of_waiting_work_and_of_correlations(either, synthetic_pass):
     idle = read_condition(either, None)
     assert (idle.queue_age_s, idle.ingest_lag_s, idle.backup_age_s) == (0.0, 0.0, None)
     assert 0 < idle.disk_free <= idle.disk_size and idle.scheduler is None
@@ -318,9 +292,8 @@ def test_ages_of_waiting_work_and_of_correlations(either: Ground, synthetic_pass
     run_job(either, done)
     now, jobs, ingests = utc_now_ns(), repository.JOBS, repository.INGESTS
     with either.database.writing() as connection:
-        connection.execute(jobs.update().where(jobs.c.id == waiting).values(created_utc_ns=now - 1000 * S))
-        connection.execute(jobs.update().where(jobs.c.id == verdict).values(created_utc_ns=now - 9000 * S))
-        connection.execute(jobs.update().where(jobs.c.id == done).values(created_utc_ns=now - 9000 * S))
+        for job, age_s in ((waiting, 1000), (verdict, 9000), (done, 9000)):
+            connection.execute(jobs.update().where(jobs.c.id == job).values(created_utc_ns=now - age_s * S))
         connection.execute(ingests.update().values(state="running", received_utc_ns=now - 2000 * S))
         connection.execute(repository.CORRELATIONS.delete())
     assert read_condition(either, None).uncorrelated == (76,)
@@ -333,7 +306,7 @@ def test_ages_of_waiting_work_and_of_correlations(either: Ground, synthetic_pass
     assert key == (76, "flight") and 4000.0 <= age_s < 5000.0
 
 
-def test_the_status_counts_jobs_of_all_kinds_by_state(either: Ground) -> None:
+def test_the_status_counts_jobs_of_all_kinds_by_state(either):
     enter_job(either, "report", {"pass_id": 1})
     run_job(either, enter_job(either, "plan", {}))
     enter_job(either, "plan", {})
@@ -343,7 +316,7 @@ def test_the_status_counts_jobs_of_all_kinds_by_state(either: Ground) -> None:
     assert seen.complaints[0] == "No process does the recurring work."
 
 
-def test_the_newest_complete_backup_counts(ground: Ground, tmp_path: Path) -> None:
+def test_the_newest_complete_backup_counts(ground, tmp_path):
     assert newest_backup_utc_ns(tmp_path / "none") is None
     assert read_condition(ground, tmp_path / "none").backup_missing
     assert not read_condition(ground, None).backup_missing
@@ -358,7 +331,7 @@ TRACE = "4bf92f3577b34da6a3ce929d0e0e4736"
 PARENT = f"00-{TRACE}-00f067aa0ba902b7-01"
 
 
-def test_a_job_that_another_process_does_later_belongs_to_the_trace(ground: Ground) -> None:
+def test_a_job_that_another_process_does_later_belongs_to_the_trace(ground):
     assert logs.current() is None
     with logs.span("request", parent=PARENT):
         job = enter_job(ground, "plan", {})
@@ -368,7 +341,7 @@ def test_a_job_that_another_process_does_later_belongs_to_the_trace(ground: Grou
     assert stored == inner != PARENT and logs.trace_id_of(stored) == TRACE
 
 
-def test_spans_of_a_request_its_job_and_its_report_are_one_tree(tmp_path: Path, synthetic_pass: Any) -> None:
+def test_spans_of_a_request_its_job_and_its_report_are_one_tree(tmp_path, synthetic_pass):
     exporter = InMemorySpanExporter()
     logs.configure(None, exporter=exporter)
     try:
@@ -388,7 +361,7 @@ def test_spans_of_a_request_its_job_and_its_report_are_one_tree(tmp_path: Path, 
     assert (job.attributes["linna.state"], report.attributes["linna.pass"]) == ("done", pass_id)
 
 
-def test_traces_without_the_library_are_refused_with_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_traces_without_the_library_are_refused_with_a_remedy(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "opentelemetry.sdk.trace", None)
     with pytest.raises(SettingsError, match="LINNA_TRACES: expected the extra 'traces'"):
         create_app(Settings(home=tmp_path, traces="http://127.0.0.1:4318/v1/traces"))

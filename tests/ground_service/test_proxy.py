@@ -7,7 +7,6 @@ import socket
 import ssl
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,20 +33,31 @@ class Proxied:
     token: str
 
     @property
-    def url(self) -> str:
+    def url(self):
         return f"https://{self.host}"
 
-    def client(self) -> httpx.Client:
+    def client(self):
         context = ssl.create_default_context(cafile=str(self.certificate))
         return httpx.Client(base_url=self.url, verify=context, timeout=30.0)
 
-    def listens(self) -> bool:
+    def listens(self):
         """Whether something listens on the port of the proxy; no request is counted."""
         with socket.socket() as probe:
             return probe.connect_ex(("127.0.0.1", int(self.host.split(":")[1]))) == 0
 
+    def answers(self):
+        """Whether the service behind the proxy answers a client that trusts the present certificate only."""
+        with self.client() as client:
+            try:
+                return client.get("/api/v1/session").status_code == 401
+            except httpx.HTTPError:
+                return False
+
+    def served_certificate(self):
+        return ssl.get_server_certificate(("localhost", int(self.host.split(":")[1]))).strip()
+
     @contextmanager
-    def running(self, configuration: Path) -> Iterator[None]:
+    def running(self, configuration):
         """Run the proxy."""
         errors = str(configuration.with_name("error.log"))
         command = ["nginx", "-c", str(configuration), "-e", errors, "-g", "daemon off;"]
@@ -59,7 +69,12 @@ class Proxied:
             process.wait(60)
 
 
-def configured_proxy(folder: Path, secrets: Path, port: int, upstreams: tuple[int, int]) -> Path:
+def make_secrets(folder):
+    environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(folder)}
+    subprocess.run(["sh", str(ROOT / "deploy/secrets.sh")], check=True, env=environment, capture_output=True)
+
+
+def configured_proxy(folder, secrets, port, upstreams):
     """Write the configuration of the compose file's proxy, with private ports and folders; return its file."""
     text = (ROOT / "deploy/nginx.conf").read_text()
     for old, new in (
@@ -78,13 +93,12 @@ def configured_proxy(folder: Path, secrets: Path, port: int, upstreams: tuple[in
 
 
 @pytest.fixture(scope="module")
-def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
+def proxied(tmp_path_factory):
     if shutil.which("nginx") is None:
         pytest.skip("nginx is not installed")
     folder = tmp_path_factory.mktemp("proxy")
     secrets, upstream, port = folder / "secrets", free_port(), free_port()
-    environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(secrets)}
-    subprocess.run(["sh", str(ROOT / "deploy/secrets.sh")], check=True, env=environment, capture_output=True)
+    make_secrets(secrets)
     configuration = configured_proxy(folder, secrets, port, (upstream, upstream))
     with open_ground(folder / "home") as ground:
         token = add_user(ground, "ann", "operator")
@@ -98,23 +112,16 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
         )  # fmt: skip
     made = Proxied(f"localhost:{port}", folder, secrets / "tls/certificate", token)
 
-    def answers() -> bool:
-        with made.client() as client:
-            try:
-                return client.get("/api/v1/session").status_code == 401
-            except httpx.HTTPError:
-                return False
-
     try:
         with made.running(configuration):
-            wait_for(answers, "the service behind the proxy")
+            wait_for(made.answers, "the service behind the proxy")
             yield made
     finally:
         service.terminate()
         service.wait(60)
 
 
-def test_the_service_is_reached_over_tls_with_hsts(proxied: Proxied) -> None:
+def test_the_service_is_reached_over_tls_with_hsts(proxied):
     with proxied.client() as client:
         answer = client.get("/api/v1/passes", headers={"Authorization": f"Bearer {proxied.token}"})
     assert answer.status_code == 200
@@ -123,12 +130,12 @@ def test_the_service_is_reached_over_tls_with_hsts(proxied: Proxied) -> None:
     assert answer.headers["x-content-type-options"] == "nosniff"
 
 
-def test_plain_http_is_sent_to_https(proxied: Proxied) -> None:
+def test_plain_http_is_sent_to_https(proxied):
     answer = httpx.get(f"http://{proxied.host}/passes?a=1")
     assert (answer.status_code, answer.headers["location"]) == (308, f"{proxied.url}/passes?a=1")
 
 
-def test_old_tls_is_refused(proxied: Proxied) -> None:
+def test_old_tls_is_refused(proxied):
     context = ssl.create_default_context(cafile=str(proxied.certificate))
     context.set_ciphers("ALL:@SECLEVEL=0")
     context.options &= ~ssl.OP_NO_TLSv1_1
@@ -139,17 +146,17 @@ def test_old_tls_is_refused(proxied: Proxied) -> None:
 
 
 @pytest.mark.parametrize("path", ["/metrics", "/healthz", "/readyz"])
-def test_metrics_and_health_are_not_passed_on(proxied: Proxied, path: str) -> None:
+def test_metrics_and_health_are_not_passed_on(proxied, path):
     with proxied.client() as client:
         assert client.get(path).status_code == 404
 
 
-def test_the_address_of_the_client_cannot_be_forged(proxied: Proxied) -> None:
+def test_the_address_of_the_client_cannot_be_forged(proxied):
     with proxied.client() as client:
         client.get("/forged", headers={"X-Forwarded-For": "203.0.113.9"})
     log = proxied.folder / "service.log"
 
-    def addresses() -> list[str]:
+    def addresses():
         logged = [json.loads(line) for line in log.read_text().splitlines() if line.startswith("{")]
         return [one["address"] for one in logged if one.get("path") == "/forged"]
 
@@ -157,7 +164,7 @@ def test_the_address_of_the_client_cannot_be_forged(proxied: Proxied) -> None:
     assert addresses() == ["127.0.0.1"]
 
 
-def test_the_cookie_of_a_session_is_for_tls_only(proxied: Proxied) -> None:
+def test_the_cookie_of_a_session_is_for_tls_only(proxied):
     with proxied.client() as client:
         answer = client.post("/api/v1/session", json={"token": proxied.token}, headers={"Origin": proxied.url})
         assert answer.status_code == 200, answer.text
@@ -165,7 +172,7 @@ def test_the_cookie_of_a_session_is_for_tls_only(proxied: Proxied) -> None:
         assert client.get("/api/v1/session").json()["name"] == "ann"
 
 
-def test_a_websocket_goes_through(proxied: Proxied) -> None:
+def test_a_websocket_goes_through(proxied):
     context = ssl.create_default_context(cafile=str(proxied.certificate))
     address = f"wss://{proxied.host}/api/v1/live"
     headers = {"Authorization": f"Bearer {proxied.token}"}
@@ -173,7 +180,7 @@ def test_a_websocket_goes_through(proxied: Proxied) -> None:
         assert opened.response is not None and opened.response.status_code == 101
 
 
-def test_a_flood_is_limited_before_the_service_but_not_others_of_its_address(proxied: Proxied, tmp_path: Path) -> None:
+def test_a_flood_is_limited_before_the_service_but_not_others_of_its_address(proxied, tmp_path):
     """With smaller figures than the shipped ones: 1 + 5 requests pass, the others are refused by the proxy."""
     port = free_port()
     text = (proxied.folder / "nginx.conf").read_text()
@@ -197,35 +204,22 @@ def test_a_flood_is_limited_before_the_service_but_not_others_of_its_address(pro
     assert all(answer.headers["strict-transport-security"] for answer in answers)
 
 
-def test_a_renewed_certificate_is_served_after_a_reload_and_clients_stay_connected(
-    proxied: Proxied, tmp_path: Path
-) -> None:
+def test_a_renewed_certificate_is_served_after_a_reload_and_clients_stay_connected(proxied, tmp_path):
     tls = proxied.certificate.parent
-    before = ssl.get_server_certificate(("localhost", int(proxied.host.split(":")[1])))
-    assert before.strip() == proxied.certificate.read_text().strip()
+    assert proxied.served_certificate() == proxied.certificate.read_text().strip()
     context = ssl.create_default_context(cafile=str(proxied.certificate))
     headers = {"Authorization": f"Bearer {proxied.token}"}
     with connect(f"wss://{proxied.host}/api/v1/live", ssl=context, additional_headers=headers) as opened:
-        environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(tmp_path)}
-        script = str(ROOT / "deploy/secrets.sh")
-        subprocess.run(["sh", script], check=True, env=environment, capture_output=True)
+        make_secrets(tmp_path)
         for name in ("certificate", "key"):
             (tmp_path / "tls" / name).replace(tls / name)
         configuration = str(proxied.folder / "nginx.conf")
         errors = str(proxied.folder / "error.log")
         subprocess.run(["nginx", "-c", configuration, "-e", errors, "-s", "reload"], check=True)
 
-        def renewed() -> bool:
-            found = ssl.get_server_certificate(("localhost", int(proxied.host.split(":")[1])))
-            return found.strip() == proxied.certificate.read_text().strip()
-
-        def answered() -> bool:
-            try:
-                with proxied.client() as client:
-                    return client.get("/api/v1/session").status_code == 401
-            except httpx.ConnectError:  # by a process of the proxy that still ends, with the old certificate
-                return False
+        def renewed():
+            return proxied.served_certificate() == proxied.certificate.read_text().strip()
 
         wait_for(renewed, "the new certificate")
-        wait_for(answered, "an answer to a client that trusts the new certificate only")
+        wait_for(proxied.answers, "an answer to a client that trusts the new certificate only")
         opened.ping().wait(10.0)

@@ -10,7 +10,6 @@ import socket
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import httpx
 import pytest
@@ -27,7 +26,7 @@ from studies.harness.parts import listens
 from tests.ground_service.conftest import free_port, wait_for
 
 
-def test_a_port_in_use_is_one_clear_line(tmp_path: Path) -> None:
+def test_a_port_in_use_is_one_clear_line(tmp_path):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -36,17 +35,17 @@ def test_a_port_in_use_is_one_clear_line(tmp_path: Path) -> None:
             serve(Settings(home=tmp_path, port=port))
 
 
-def test_an_address_of_another_machine_cannot_be_bound() -> None:
+def test_an_address_of_another_machine_cannot_be_bound():
     with pytest.raises(ServerError, match="cannot be bound"):
         bind("192.0.2.1", 0)
 
 
-def test_binding_beyond_this_machine_needs_users(tmp_path: Path) -> None:
+def test_binding_beyond_this_machine_needs_users(tmp_path):
     with pytest.raises(ServerError, match=r"0\.0\.0\.0: expected users before binding beyond this machine"):
         serve(Settings(home=tmp_path, host="0.0.0.0", port=0))
 
 
-def test_beyond_this_machine_it_asks_for_a_proxy_and_limits_connections(tmp_path: Path) -> None:
+def test_beyond_this_machine_it_asks_for_a_proxy_and_limits_connections(tmp_path):
     with open_ground(tmp_path) as ground:
         add_user(ground, "ann", "admin")
     port = free_port()
@@ -72,12 +71,12 @@ def test_beyond_this_machine_it_asks_for_a_proxy_and_limits_connections(tmp_path
         process.communicate()
 
 
-def test_the_listener_names_its_protocol_so_that_answers_are_not_held_back_by_nagle() -> None:
+def test_the_listener_names_its_protocol_so_that_answers_are_not_held_back_by_nagle():
     with bind("127.0.0.1", 0) as listener:
         assert listener.proto == socket.IPPROTO_TCP
 
 
-def test_the_service_starts_without_libraries_that_only_computations_need() -> None:
+def test_the_service_starts_without_libraries_that_only_computations_need():
     code = (
         "import sys, ground_service.app; "
         "print([m for m in sys.modules if m in ('scipy', 'matplotlib', 'cv2', 'numba', 'torch', 'celery')])"
@@ -86,7 +85,7 @@ def test_the_service_starts_without_libraries_that_only_computations_need() -> N
     assert found.stdout.strip() == "[]"
 
 
-def test_a_terminated_server_drains_before_it_ends(tmp_path: Path) -> None:
+def test_a_terminated_server_drains_before_it_ends(tmp_path):
     """It is not ready any more, answers for the time of the draining with the end of each connection, and ends."""
     app = create_app(Settings(home=tmp_path))
     listener = bind("127.0.0.1", 0)
@@ -96,7 +95,7 @@ def test_a_terminated_server_drains_before_it_ends(tmp_path: Path) -> None:
     running = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
     running.start()
 
-    def ask(path: str) -> tuple[int, str | None]:
+    def ask(path):
         answer = httpx.get(f"{url}{path}", timeout=60)
         return answer.status_code, answer.headers.get("Connection")
 
@@ -120,12 +119,12 @@ class Named(BaseModel):
 
 
 @pytest.mark.parametrize("text", ["evening pass", "Überflug 7", "\u6708 \U0001f315", "a/b: c=1"])
-def test_a_printable_line_is_taken_as_it_is(text: str) -> None:
+def test_a_printable_line_is_taken_as_it_is(text):
     assert require_line(text, "window", "name") == Named(name=text).name == text
 
 
 @pytest.mark.parametrize("text", BAD)
-def test_control_characters_are_refused_and_shown_by_their_codes(text: str) -> None:
+def test_control_characters_are_refused_and_shown_by_their_codes(text):
     with pytest.raises(InvalidInput, match="window, name: expected a line of 1 to 200 characters") as refused:
         require_line(text, "window", "name")
     assert str(refused.value).isprintable()
@@ -134,6 +133,6 @@ def test_control_characters_are_refused_and_shown_by_their_codes(text: str) -> N
 
 
 @pytest.mark.parametrize("text", ["", "x" * 201, "\ud800", 7, None])
-def test_what_is_no_line_is_refused(text: object) -> None:
+def test_what_is_no_line_is_refused(text):
     with pytest.raises(InvalidInput):
         require_line(text, "pass", "name")

@@ -1,35 +1,34 @@
 """Settings: from the environment, from files, and refused in one line."""
 
-from pathlib import Path
-
 import pytest
 
 from ground_service.errors import SettingsError
 from ground_service.settings import SECRETS, URLS, load_settings, normalised_url
+from tests.ground_service.conftest import cells
 
 
 @pytest.fixture(autouse=True)
-def bare(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def bare(monkeypatch, tmp_path):
     for name in ("HOME", "DATABASE_URL", "BROKER_URL", "HOST", "PORT", "DATABASE_URL_FILE", "BROKER_URL_FILE"):
         monkeypatch.delenv(f"LINNA_{name}", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
 
 
-def test_nothing_set_means_sqlite_and_jobs_in_process(tmp_path: Path) -> None:
+def test_nothing_set_means_sqlite_and_jobs_in_process(tmp_path):
     settings = load_settings()
     assert settings.resolved_database_url() == f"sqlite:///{tmp_path / 'linna' / 'linna.db'}"
     assert settings.resolved_broker_url() is None
     assert settings.host == "127.0.0.1"
 
 
-def test_what_is_given_goes_before_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_given_goes_before_the_environment(monkeypatch):
     monkeypatch.setenv("LINNA_PORT", "9000")
     assert load_settings().port == 9000
     assert load_settings(port=None).port == 9000
     assert load_settings(port=9001).port == 9001
 
 
-def test_secrets_can_come_from_files_and_are_not_printed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_secrets_can_come_from_files_and_are_not_printed(monkeypatch, tmp_path):
     (tmp_path / "url").write_text("postgres://linna:geheim@db/linna\n")
     monkeypatch.setenv("LINNA_DATABASE_URL_FILE", str(tmp_path / "url"))
     settings = load_settings()
@@ -37,7 +36,7 @@ def test_secrets_can_come_from_files_and_are_not_printed(monkeypatch: pytest.Mon
     assert "geheim" not in repr(settings)
 
 
-def test_a_password_can_come_from_a_file_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_password_can_come_from_a_file_of_its_own(monkeypatch, tmp_path):
     (tmp_path / "password").write_text("a/b@c\n")
     for name in ("DATABASE", "MIGRATION_DATABASE", "BROKER"):
         monkeypatch.setenv(f"LINNA_{name}_PASSWORD_FILE", str(tmp_path / "password"))
@@ -51,16 +50,16 @@ def test_a_password_can_come_from_a_file_of_its_own(monkeypatch: pytest.MonkeyPa
     assert settings.resolved_broker_url() == "redis://linna:a%2Fb%40c@broker:6379/0"
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("LINNA_PORT", "seventy", "LINNA_PORT: expected input should be a valid integer"),
-        ("LINNA_PORT", "70000", "LINNA_PORT: expected input should be less than or equal to 65535"),
-        ("LINNA_TRUSTED_PROXIES", "proxy", "^LINNA_TRUSTED_PROXIES: expected IP addresses or networks, found 'proxy'$"),
-        ("LINNA_DATABASE_URL_FILE", "/does/not/exist", "LINNA_DATABASE_URL_FILE: expected a readable file"),
-    ],
-)
-def test_a_wrong_setting_is_named(monkeypatch: pytest.MonkeyPatch, name: str, value: str, message: str) -> None:
+WRONG = """
+LINNA_PORT | seventy | LINNA_PORT: expected input should be a valid integer
+LINNA_PORT | 70000 | LINNA_PORT: expected input should be less than or equal to 65535
+LINNA_TRUSTED_PROXIES | proxy | ^LINNA_TRUSTED_PROXIES: expected IP addresses or networks, found 'proxy'$
+LINNA_DATABASE_URL_FILE | /does/not/exist | LINNA_DATABASE_URL_FILE: expected a readable file
+"""
+
+
+@pytest.mark.parametrize("name, value, message", cells(WRONG))
+def test_a_wrong_setting_is_named(monkeypatch, name, value, message):
     monkeypatch.setenv(name, value)
     with pytest.raises(SettingsError, match=message):
         load_settings()
@@ -68,7 +67,7 @@ def test_a_wrong_setting_is_named(monkeypatch: pytest.MonkeyPatch, name: str, va
 
 @pytest.mark.parametrize("name", [*URLS, *SECRETS, "database_password", "broker_password"])
 @pytest.mark.parametrize(
-    ("octets", "message"),
+    "octets, message",
     [
         (b"", "expected a file with a value, found an empty file"),
         (b" \n", "expected a file with a value, found an empty file"),
@@ -77,8 +76,8 @@ def test_a_wrong_setting_is_named(monkeypatch: pytest.MonkeyPatch, name: str, va
     ],
 )
 def test_an_unusable_secret_is_refused_in_one_line_and_never_replaced_by_a_default(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, octets: bytes, message: str
-) -> None:
+    monkeypatch, tmp_path, name, octets, message
+):
     (tmp_path / "secret").write_bytes(octets)
     monkeypatch.setenv(f"LINNA_{name.upper()}_FILE", str(tmp_path / "secret"))
     monkeypatch.setenv("LINNA_BROKER_URL", "redis://linna@broker:6379/0")
@@ -90,9 +89,7 @@ def test_an_unusable_secret_is_refused_in_one_line_and_never_replaced_by_a_defau
 
 
 @pytest.mark.parametrize("url", ["nonsense", "amqp://linna:geheim@broker/0", "redis://", "//linna:geheim@broker"])
-def test_a_broker_other_than_redis_is_refused_without_showing_its_password(
-    monkeypatch: pytest.MonkeyPatch, url: str
-) -> None:
+def test_a_broker_other_than_redis_is_refused_without_showing_its_password(monkeypatch, url):
     monkeypatch.setenv("LINNA_BROKER_URL", url)
     with pytest.raises(SettingsError) as error:
         load_settings()
@@ -100,7 +97,7 @@ def test_a_broker_other_than_redis_is_refused_without_showing_its_password(
     assert str(error.value) == expected
 
 
-def test_a_password_without_a_user_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_password_without_a_user_is_refused(monkeypatch, tmp_path):
     (tmp_path / "password").write_text("geheim")
     monkeypatch.setenv("LINNA_BROKER_PASSWORD_FILE", str(tmp_path / "password"))
     monkeypatch.setenv("LINNA_BROKER_URL", "redis://broker:6379/0")
@@ -112,5 +109,5 @@ def test_a_password_without_a_user_is_refused(monkeypatch: pytest.MonkeyPatch, t
 
 
 @pytest.mark.parametrize("spelling", ["postgres://h/d", "postgresql://h/d", "postgresql+psycopg://h/d"])
-def test_the_installed_driver_is_used_whatever_the_spelling(spelling: str) -> None:
+def test_the_installed_driver_is_used_whatever_the_spelling(spelling):
     assert normalised_url(spelling) == "postgresql+psycopg://h/d"

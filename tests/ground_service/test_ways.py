@@ -5,16 +5,12 @@ import shutil
 import socket
 import threading
 import zlib
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from ground_service.evaluation.core import summary_of
 from ground_service.evaluation.service import evaluate
-from ground_service.ground import Ground
 from ground_service.passes.archive_import import import_archive
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
@@ -23,7 +19,7 @@ from payload_emulator.session.archive.recording import frame_path
 from payload_emulator.session.archive.replay import FlightBuild, replay_archive
 from payload_emulator.session.live.session import LiveSession
 from payload_emulator.session.live.station_ports import RECORD_HEADER
-from payload_emulator.session.scenario import Scenario, parse_scenario
+from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.spacecraft.loading import launch, load_scenario_payload
 from payload_emulator.session.world.world import build_world, clock_ticks, open_world
 from tests.lazy import Lazy
@@ -67,13 +63,13 @@ offset_s = 0.4
 """
 
 
-def packets_of(cadus: bytes) -> list[bytes]:
+def packets_of(cadus):
     found = decode(cadus)
     assert found.complete
     return list(found.cut.packets(found.buffer))
 
 
-def flown(session: LiveSession, telecommands: Callable[[LiveSession], bytes] = lambda session: b"") -> list[bytes]:
+def flown(session, telecommands=lambda session: b""):
     """Fly a session that is paused until it has its telecommands, and return what a station receives."""
     thread = threading.Thread(target=session.run, daemon=True)
     thread.start()
@@ -103,7 +99,7 @@ def flown(session: LiveSession, telecommands: Callable[[LiveSession], bytes] = l
     return packets_of(b"".join(records[at : at + LinkSettings().cadu_length] for at in starts))
 
 
-def of_kind(name: str, packets: list[bytes]) -> dict[int, dict[str, Any]]:
+def of_kind(name, packets):
     """Return the values of packets of one kind by the on-board time of the image, as plain values."""
     found = {}
     for packet in packets:
@@ -114,14 +110,14 @@ def of_kind(name: str, packets: list[bytes]) -> dict[int, dict[str, Any]]:
 
 
 @pytest.fixture(scope="module")
-def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def archive(tmp_path_factory):
     folder = tmp_path_factory.mktemp("ways") / "archive"
     emulate(parse_scenario(SCENARIO), NO_DATA, folder, frames_kept=None)
     return folder
 
 
 @pytest.fixture(scope="module")
-def ways(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[bytes]]:
+def ways(archive, tmp_path_factory):
     """Return the packets of each way."""
     world = build_world(parse_scenario(SCENARIO), NO_DATA)
     loaded, _, _ = load_scenario_payload(world, NO_DATA)
@@ -135,7 +131,7 @@ def ways(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, l
     }
 
 
-def test_a_live_flight_and_a_replay_give_the_packets_of_the_archive(ways: dict[str, list[bytes]]) -> None:
+def test_a_live_flight_and_a_replay_give_the_packets_of_the_archive(ways):
     packets, again = ways["archive"], ways["replay"]
     assert len(of_kind("detections", packets)) == FRAMES
     assert ways["live"] == packets
@@ -146,9 +142,7 @@ def test_a_live_flight_and_a_replay_give_the_packets_of_the_archive(ways: dict[s
     assert len(other) < len(packets) / 4
 
 
-def test_every_way_has_the_same_figures_in_its_report(
-    archive: Path, ways: dict[str, list[bytes]], either: Ground, tmp_path: Path
-) -> None:
+def test_every_way_has_the_same_figures_in_its_report(archive, ways, either, tmp_path):
     figures = {}
     for name, packets in ways.items():
         folder = tmp_path / name
@@ -169,12 +163,12 @@ def test_every_way_has_the_same_figures_in_its_report(
     assert figures["replay"] == figures["archive"]
 
 
-def commanded(scenario: Scenario, start_utc_ns: int, frames: int) -> tuple[LiveSession, list[bytes]]:
+def commanded(scenario, start_utc_ns, frames):
     """Fly a window that the ground commands, and a minute beyond it."""
     stop = start_utc_ns + (frames * 15 + 60) * NS
     session = LiveSession(*launch(scenario, NO_DATA), stop_utc_ns=stop, paused=True)
 
-    def telecommands(session: LiveSession) -> bytes:
+    def telecommands(session):
         values = {"function_id": "start_observation", "argument_1": frames * 15.0 - 7.5, "argument_2": 15.0}
         start = DICTIONARY.pack_command("perform_function", values, sequence_count=0, source=1)
         items = {"octet": np.frombuffer(start, dtype=np.uint8)}
@@ -185,7 +179,7 @@ def commanded(scenario: Scenario, start_utc_ns: int, frames: int) -> tuple[LiveS
     return session, flown(session, telecommands)
 
 
-def test_a_window_commanded_by_the_ground_gives_the_images_and_detections_of_the_archive(archive: Path) -> None:
+def test_a_window_commanded_by_the_ground_gives_the_images_and_detections_of_the_archive(archive):
     scenario = parse_scenario(SCENARIO)
     first = int(build_world(scenario, NO_DATA).frame_utc_ns[0])
     session, packets = commanded(scenario, first, FRAMES)
@@ -205,7 +199,7 @@ def test_a_window_commanded_by_the_ground_gives_the_images_and_detections_of_the
     assert found == archived
 
 
-def test_ground_that_cannot_be_rendered_gives_no_image_and_the_flight_goes_on() -> None:
+def test_ground_that_cannot_be_rendered_gives_no_image_and_the_flight_goes_on():
     """Frames across the pole, for which terrain has no tiles."""
     small = SCENARIO.replace("256", "32")
     world = open_world(parse_scenario(small), NO_DATA)

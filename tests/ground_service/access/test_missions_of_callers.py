@@ -1,14 +1,12 @@
 """Callers who are limited to missions: every operation has a decision, and none reaches another spacecraft."""
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from fastapi.routing import APIRoute
-from sqlalchemy import BigInteger, Column, Float, Integer, LargeBinary, SmallInteger, Table, func, select
+from sqlalchemy import BigInteger, Float, Integer, LargeBinary, SmallInteger, func, select
 from starlette.datastructures import QueryParams
 
 from ground_service.access.scopes import DECIDED, ROWS, Scope, check_scope, scope_of
@@ -21,7 +19,6 @@ from ground_service.store import repository
 from ground_service.store.event_kinds import (
     CommandStateChanged,
     CorrelationChanged,
-    Event,
     HandoverChanged,
     LinkChanged,
     PlanChanged,
@@ -79,15 +76,15 @@ class Fleet:
     token: str
 
     @property
-    def headers(self) -> dict[str, str]:
+    def headers(self):
         return {"Authorization": f"Bearer {self.token}"}
 
     @property
-    def cookie(self) -> dict[str, str]:
+    def cookie(self):
         return {"Cookie": f"linna_session={self.token}"}
 
 
-def dummy(column: Column[Any]) -> Any:
+def dummy(column):
     if isinstance(column.type, BigInteger | Integer | SmallInteger):
         return 1
     if isinstance(column.type, Float):
@@ -97,14 +94,14 @@ def dummy(column: Column[Any]) -> Any:
     return {} if str(column.type) == "JSON" else KEY
 
 
-def row_of(connection: Any, table: Table, **given: Any) -> None:
+def row_of(connection, table, **given):
     """Insert a row with these values, and others that only have the type of their columns."""
     needed = [one for one in table.c if not one.nullable and one.name not in given]
     repository.add(connection, table, **{one.name: dummy(one) for one in needed}, **given)
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
+def fleet(tmp_path_factory):
     settings = Settings(home=tmp_path_factory.mktemp("fleet"), links=False, plan_hourly=False)
     with TestClient(create_app(settings, inline_jobs=True)) as client:
         ground = client.app.state.ground
@@ -129,28 +126,28 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
         yield Fleet(client, authenticate(ground, token), authenticate(ground, other), token)
 
 
-def values_of(route: APIRoute) -> dict[str, str]:
+def values_of(route):
     """Return the path parameters of a request about spacecraft 76."""
     known = {"spacecraft_id": str(THEIRS), "report_id": KEY, "revision": REVISION, "name": "theirs"}
     known |= {"job_id": KEY, "key": KEY, "regression_id": KEY, "sha256": REVISION, "digest": REVISION}
-    known |= {"parameter": "x", "packet": "x", "month": "2029-08", "ticks": "1", "frame_number": "1"}
+    known |= {"parameter": "x", "packet": "x", "month": "2029-08"}
     return {name: known.get(name, "1") for name in re.findall(r"{(\w+)", route.path)}
 
 
-def test_every_decision_is_that_of_an_operation() -> None:
+def test_every_decision_is_that_of_an_operation():
     names = {route.name for route in SAMPLE.state.operations}
     assert len(CHECKED) > 100
     assert [one for found in DECIDED.values() for one in found if one not in names] == []
 
 
 @pytest.mark.parametrize("route", CHECKED, ids=NAMES)
-def test_an_operation_reaches_only_spacecraft_of_the_callers_missions(route: APIRoute, fleet: Fleet) -> None:
+def test_an_operation_reaches_only_spacecraft_of_the_callers_missions(route, fleet):
     scope = scope_of(route)
     assert scope is not None, "decide in ground_service/access/scopes.py which spacecraft it concerns"
     values = values_of(route)
     stated = {scope.parameter: 1 if scope.parameter in ROWS else THEIRS}
     query = QueryParams(stated if scope.place == "query" else {})
-    body: Any = stated if scope.place == "body" else None
+    body = stated if scope.place == "body" else None
     if scope.decision not in OPEN:
         for method in route.methods - {"HEAD"}:
             path = route.path.format(**values)
@@ -159,7 +156,7 @@ def test_an_operation_reaches_only_spacecraft_of_the_callers_missions(route: API
             assert answer.status_code == 403, answer.text
             assert "expected a spacecraft of the missions ours, found" in answer.json()["detail"]
     state = SimpleNamespace(ground=fleet.client.app.state.ground)
-    asked: Any = SimpleNamespace(
+    asked = SimpleNamespace(
         scope={"route": route}, path_params=values, query_params=query, _json=body,
         app=SimpleNamespace(state=state),
     )  # fmt: skip
@@ -172,7 +169,7 @@ def test_an_operation_reaches_only_spacecraft_of_the_callers_missions(route: API
 
 
 @pytest.mark.parametrize("name", sorted(DECIDED["list"]))
-def test_a_list_leaves_out_other_spacecraft(name: str, fleet: Fleet) -> None:
+def test_a_list_leaves_out_other_spacecraft(name, fleet):
     (route,) = (one for one in CHECKED if one.name == name)
     answer = fleet.client.get(route.path, headers=fleet.headers)
     assert answer.status_code == 200, answer.text
@@ -180,17 +177,17 @@ def test_a_list_leaves_out_other_spacecraft(name: str, fleet: Fleet) -> None:
     assert answer.json().get("total", 0) == OURS_LISTED.get(name, 0)
 
 
-def test_an_operation_without_a_decision_is_refused(fleet: Fleet) -> None:
-    async def new() -> None: ...
+def test_an_operation_without_a_decision_is_refused(fleet):
+    async def new(): ...
 
     route = APIRoute("/new", new)
     assert scope_of(route) is None
-    asked: Any = SimpleNamespace(scope={"route": route})
+    asked = SimpleNamespace(scope={"route": route})
     with pytest.raises(Forbidden, match="operation of the whole service"):
         check_scope(asked, fleet.ours)
 
 
-def test_a_spacecraft_that_is_not_stated_is_not_one_of_the_caller(fleet: Fleet) -> None:
+def test_a_spacecraft_that_is_not_stated_is_not_one_of_the_caller(fleet):
     answer = fleet.client.post(f"{V1}/telemetry", content=b"x", headers=fleet.headers)
     assert answer.status_code == 403
     assert "as spacecraft_id, found none" in answer.json()["detail"]
@@ -200,7 +197,7 @@ def test_a_spacecraft_that_is_not_stated_is_not_one_of_the_caller(fleet: Fleet) 
     assert fleet.client.get(f"{V1}/parameters?spacecraft_id={OURS}", headers=fleet.headers).status_code != 403
 
 
-def test_frames_of_other_spacecraft_in_an_upload_are_not_stored(fleet: Fleet) -> None:
+def test_frames_of_other_spacecraft_in_an_upload_are_not_stored(fleet):
     values = {"event_id": 20, "frame_number": 1, "value_1": 0.0, "value_2": 0.0}
     packets = [DICTIONARY.pack("event_low", values, ticks=k << 16, sequence_count=k) for k in range(200)]
     octets = b"".join(encode_cadus(packets, spacecraft_id=one) for one in (THEIRS, OURS, THEIRS))
@@ -213,7 +210,7 @@ def test_frames_of_other_spacecraft_in_an_upload_are_not_stored(fleet: Fleet) ->
     assert stored == {1: 0, 2: 200}
 
 
-def test_a_description_or_ephemeris_of_another_mission_is_refused(fleet: Fleet, tmp_path: Any) -> None:
+def test_a_description_or_ephemeris_of_another_mission_is_refused(fleet, tmp_path):
     for name, number in (("ours", THEIRS), ("theirs", OURS), ("theirs", THEIRS), ("ours", 5)):
         text = DESCRIPTION.format(name=name, number=number) + "[evidence]\nseed = 1\n"
         answer = fleet.client.post(f"{V1}/missions", content=text.encode(), headers=fleet.headers)
@@ -236,7 +233,7 @@ def test_a_description_or_ephemeris_of_another_mission_is_refused(fleet: Fleet, 
     assert fleet.client.delete(f"{V1}/ephemerides/{own}", headers=fleet.headers).status_code == 204
 
 
-def test_a_token_limits_its_user_further_and_so_do_its_sessions(fleet: Fleet) -> None:
+def test_a_token_limits_its_user_further_and_so_do_its_sessions(fleet):
     client, ground = fleet.client, fleet.client.app.state.ground
     add_user(ground, "fay", "viewer", missions=["ours", "theirs"])
     token = add_token(ground, "fay", missions=["ours", "elsewhere"])
@@ -253,7 +250,7 @@ def test_a_token_limits_its_user_further_and_so_do_its_sessions(fleet: Fleet) ->
     assert authenticate(ground, token).spacecraft == {OURS}
 
 
-def test_a_socket_sends_only_events_of_the_callers_spacecraft(fleet: Fleet) -> None:
+def test_a_socket_sends_only_events_of_the_callers_spacecraft(fleet):
     ground = fleet.client.app.state.ground
     with fleet.client.websocket_connect(f"{V1}/live", headers=fleet.headers) as socket:
         for vehicle in (1, 2):
@@ -274,11 +271,11 @@ def test_a_socket_sends_only_events_of_the_callers_spacecraft(fleet: Fleet) -> N
         PlanChanged(request_id=1, windows_added=(1,)),
     ],
 )  # fmt: skip
-def test_an_event_of_a_row_is_of_the_spacecraft_of_the_row(event: Event, fleet: Fleet) -> None:
+def test_an_event_of_a_row_is_of_the_spacecraft_of_the_row(event, fleet):
     logged = LoggedEvent(1, 0, event.event_kind, event.model_dump(mode="json"))
     assert event_owner(fleet.client.app.state.ground, logged) == THEIRS
 
 
-def test_a_scope_names_its_parameter() -> None:
+def test_a_scope_names_its_parameter():
     (route,) = (one for one in CHECKED if one.name == "enter_telecommand")
     assert scope_of(route) == Scope("spacecraft", "body", "spacecraft_id")

@@ -5,9 +5,7 @@ import hmac
 import json
 import re
 import time
-from collections.abc import Iterator
 from datetime import UTC, datetime
-from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
@@ -22,7 +20,8 @@ from ground_service.app import create_app
 from ground_service.errors import Conflict, SettingsError
 from ground_service.settings import Settings, load_settings
 from ground_service.worker.upkeep import tidy
-from tests.ground_service.access.openid import CLIENT, SECRET, OpenIdProvider, running_provider
+from tests.ground_service.access.openid import CLIENT, SECRET, running_provider
+from tests.ground_service.conftest import cells
 from tests.serving import TestClient, token_valid
 
 OWN = {"Origin": "http://testserver"}
@@ -30,12 +29,12 @@ ROLES = ("admin=linna-admins", "operator=linna-operators", "viewer=linna-viewers
 
 
 @pytest.fixture
-def provider() -> Iterator[OpenIdProvider]:
+def provider():
     with running_provider() as running:
         yield running
 
 
-def settings(home: Path, provider: OpenIdProvider, **given: object) -> Settings:
+def settings(home, provider, **given):
     return Settings(
         home=home, oidc_issuer=provider.issuer, oidc_client_id=CLIENT, oidc_client_secret=SECRET, oidc_roles=ROLES,
         **given,
@@ -43,37 +42,42 @@ def settings(home: Path, provider: OpenIdProvider, **given: object) -> Settings:
 
 
 @pytest.fixture
-def client(tmp_path: Path, provider: OpenIdProvider) -> Iterator[TestClient]:
+def client(tmp_path, provider):
     app = create_app(settings(tmp_path, provider), inline_jobs=True)
     with TestClient(app, follow_redirects=False) as opened:
         yield opened
 
 
-def begun(client: TestClient, page: str = "/") -> str:
+@pytest.fixture
+def ground(client):
+    return client.app.state.ground
+
+
+def begun(client, page="/"):
     answer = client.get("/sign-in/provider", params={"next": page})
     assert answer.status_code == 303, answer.text
     return str(answer.headers["location"])
 
 
-def answered(client: TestClient, provider: OpenIdProvider, page: str = "/"):
+def answered(client, provider, page="/"):
     """The page of this service after a sign-in at the provider."""
     return client.get(provider.authorise(begun(client, page)))
 
 
-def refused(answer, *words: str, status: int = 401) -> None:
+def refused(answer, *words, status=401):
     assert answer.status_code == status, answer.text
     assert "linna_session=" not in answer.headers.get("set-cookie", "")
     for word in words:
         assert word in answer.text
 
 
-def session_of(client: TestClient) -> dict:
+def session_of(client):
     answer = client.get("/api/v1/session")
     assert answer.status_code == 200, answer.text
     return dict(answer.json())
 
 
-def test_a_user_of_the_provider_is_added_with_the_role_and_gets_a_session(client, provider):
+def test_a_user_of_the_provider_is_added_with_the_role_and_gets_a_session(client, ground, provider):
     answer = answered(client, provider, "/passes?x=1#part")
     assert answer.status_code == 200 and answer.headers["cache-control"] == "no-store"
     assert '<meta http-equiv="refresh" content="0;url=/passes?x=1#part">' in answer.text
@@ -87,7 +91,6 @@ def test_a_user_of_the_provider_is_added_with_the_role_and_gets_a_session(client
     left_s = (datetime.fromisoformat(found["expires"]) - datetime.now(UTC)).total_seconds()
     assert 0 < left_s <= 3600.0  # then the provider states the role again
     assert "max-age=3600" in cookies[SESSION_COOKIE]
-    ground = client.app.state.ground
     (user,), (token,) = users.list_users(ground), users.list_tokens(ground)
     assert user.provider == provider.issuer and token.kind == "provider session"
     assert [one.action for one in ground.read(list_audit, AuditFilter()).items] == ["start session", "add user"]
@@ -105,41 +108,43 @@ def test_a_service_with_a_provider_and_without_users_is_closed(client):
     assert client.get("/api/v1/passes").status_code == 401
 
 
-def test_bearer_tokens_remain_valid(client, provider):
-    token = users.add_user(client.app.state.ground, "bob", "viewer")
+def test_bearer_tokens_remain_valid(client, ground, provider):
+    token = users.add_user(ground, "bob", "viewer")
     answered(client, provider)
     found = client.get("/api/v1/session", headers={"Authorization": f"Bearer {token}"}).json()
     assert (found["name"], found["provider"]) == ("bob", False)
 
 
-def test_a_token_that_was_not_made_for_this_sign_in_is_refused(client, provider, subtests):
-    for change, word in (
-        ({"nonce": "another"}, "nonce"),
-        ({"nonce": None}, "nonce"),
-        ({"iss": "https://evil.example"}, "iss"),
-        ({"aud": "another"}, "aud"),
-        ({"aud": ["linna", "another"]}, "azp"),
-        ({"azp": "another"}, "azp"),
-        ({"exp": None}, "exp"),
-        ({"iat": None}, "iat"),
-        ({"at_hash": "another"}, "at_hash"),
-    ):
-        provider.change = lambda claims, change=change: {
-            name: value for name, value in {**claims, **change}.items() if value is not None
-        }
+def without_none(claims):
+    return {name: value for name, value in claims.items() if value is not None}
+
+
+def test_a_token_that_was_not_made_for_this_sign_in_is_refused(client, ground, provider, subtests):
+    wrong = """
+        nonce | "another" | nonce
+        nonce | null | nonce
+        iss | "https://evil.example" | iss
+        aud | "another" | aud
+        aud | ["linna", "another"] | azp
+        azp | "another" | azp
+        exp | null | exp
+        iat | null | iat
+        at_hash | "another" | at_hash
+    """
+    for claim, value, word in cells(wrong):
+        change = {claim: json.loads(value)}
+        provider.change = lambda claims, change=change: without_none(claims | change)
         with subtests.test(change=change):
             refused(answered(client, provider), "ID token", word)
-            assert users.list_users(client.app.state.ground) == []
+            assert users.list_users(ground) == []
 
 
 def test_clocks_may_differ_by_a_minute(client, provider, subtests):
     """The token is valid for 300 s from the time of the provider's clock."""
     for shift_s, word in ((-330, None), (-400, "expired"), (40, None), (100, "iat")):
-        provider.change = lambda claims, shift_s=shift_s: {
-            **claims,
-            "iat": claims["iat"] + shift_s,
-            "exp": claims["exp"] + shift_s,
-        }
+        provider.change = lambda claims, shift_s=shift_s: (
+            claims | {one: claims[one] + shift_s for one in ("iat", "exp")}
+        )
         with subtests.test(shift_s=shift_s):
             answer = answered(client, provider)
             if word is None:
@@ -157,7 +162,7 @@ def test_a_token_of_another_key_is_refused(client, provider):
 def test_a_token_without_an_asymmetric_signature_is_refused(client, provider, algorithm, monkeypatch):
     """With HS256, the public key of the provider could be used as the secret."""
 
-    def part(octets: bytes) -> str:
+    def part(octets):
         return base64.urlsafe_b64encode(octets).rstrip(b"=").decode()
 
     def signed(claims, key=None):
@@ -188,33 +193,33 @@ def test_elliptic_keys_are_accepted(client, provider):
     assert answered(client, provider).status_code == 200
 
 
-def test_a_user_without_a_role_is_refused(client, provider, subtests):
+def test_a_user_without_a_role_is_refused(client, ground, provider, subtests):
     for roles in ([], ["visitors"], None, "", 7):
         provider.claims["roles"] = roles
         with subtests.test(roles=roles):
             told = ("role", "claim roles", "linna-admins, linna-operators, linna-viewers")
             refused(answered(client, provider), *told)
-            assert users.list_users(client.app.state.ground) == []
+            assert users.list_users(ground) == []
 
 
-def test_the_highest_role_counts_and_each_sign_in_brings_the_present_one(client, provider):
+def test_the_highest_role_counts_and_each_sign_in_brings_the_present_one(client, ground, provider):
     provider.claims["roles"] = ["linna-viewers", "linna-admins", "others"]
     answered(client, provider)
     assert session_of(client)["role"] == "admin"
     provider.claims["roles"] = "linna-viewers"
     answered(client, provider)
     assert session_of(client)["role"] == "viewer"
-    assert client.app.state.ground.read(list_audit, AuditFilter(action="change role")).total == 1
+    assert ground.read(list_audit, AuditFilter(action="change role")).total == 1
 
 
-def test_a_user_who_lost_the_role_loses_the_sessions_and_tokens(client, provider):
+def test_a_user_who_lost_the_role_loses_the_sessions_and_tokens(client, ground, provider):
     answered(client, provider)
-    token = users.add_token(client.app.state.ground, "ann")
+    token = users.add_token(ground, "ann")
     provider.claims["roles"] = []
     refused(answered(client, provider), "role")
     assert client.get("/api/v1/session").status_code == 401
-    assert not token_valid(client.app.state.ground, token)
-    assert client.app.state.ground.read(list_audit, AuditFilter(action="refuse sign-in")).total == 1
+    assert not token_valid(ground, token)
+    assert ground.read(list_audit, AuditFilter(action="refuse sign-in")).total == 1
 
 
 def test_roles_inside_an_object_are_found(tmp_path, provider):
@@ -225,10 +230,10 @@ def test_roles_inside_an_object_are_found(tmp_path, provider):
         assert session_of(client)["role"] == "admin"
 
 
-def test_a_name_of_the_provider_does_not_take_over_a_user_of_this_service(client, provider):
-    users.add_user(client.app.state.ground, "ann", "admin")
+def test_a_name_of_the_provider_does_not_take_over_a_user_of_this_service(client, ground, provider):
+    users.add_user(ground, "ann", "admin")
     refused(answered(client, provider), "user ann")
-    assert [one.provider for one in users.list_users(client.app.state.ground)] == [None]
+    assert [one.provider for one in users.list_users(ground)] == [None]
 
 
 def test_another_subject_with_the_same_name_is_refused(client, provider):
@@ -251,8 +256,7 @@ def test_a_name_that_users_cannot_have_is_refused(client, provider, subtests):
             refused(answered(client, provider), "name")
 
 
-def test_a_disabled_user_is_refused(client, provider):
-    ground = client.app.state.ground
+def test_a_disabled_user_is_refused(client, ground, provider):
     answered(client, provider)
     users.change_user(ground, "ann", state="disabled")
     assert client.get("/api/v1/session").status_code == 401
@@ -311,17 +315,8 @@ def test_a_refusal_of_the_provider_is_stated(client, provider):
 
 
 def test_no_other_address_is_opened_after_a_sign_in(client, provider, subtests):
-    for page in (
-        "https://evil.example/",
-        "//evil.example/",
-        "/\\evil.example/",
-        "\\\\evil.example",
-        "javascript:alert(1)",
-        "passes",
-        "",
-        "/ü",
-        "/" + "a" * 2000,
-    ):
+    pages = r"https://evil.example/ //evil.example/ /\evil.example/ \\evil.example javascript:alert(1) passes /ü"
+    for page in (*pages.split(), "", "/" + "a" * 2000):
         with subtests.test(page=page):
             assert 'content="0;url=/"' in answered(client, provider, page).text
 
@@ -359,23 +354,23 @@ def test_a_provider_whose_configuration_is_wrong_cannot_be_used(client, provider
     assert client.get("/sign-in/provider").status_code == 303  # as soon as it is right
 
 
-def test_sign_out_ends_the_session_here_and_leads_to_the_provider(client, provider):
+def test_sign_out_ends_the_session_here_and_leads_to_the_provider(client, ground, provider):
     answered(client, provider)
     secret = client.cookies[SESSION_COOKIE]
     assert client.delete("/api/v1/session", headers=OWN).status_code == 204
-    assert not token_valid(client.app.state.ground, secret)
+    assert not token_valid(ground, secret)
     place = client.get("/sign-in/ended").headers["location"]
     assert place.startswith(f"{provider.issuer}/end?client_id=linna&")
 
 
-def logout_token(provider: OpenIdProvider, **change: object) -> str:
+def logout_token(provider, **change):
     claims = {
         **provider.common(), "jti": "j-1", "sub": "u-1", "sid": "s-1", "events": {oidc.LOGOUT_EVENT: {}}, **change,
     }  # fmt: skip
-    return provider.signed({name: value for name, value in claims.items() if value is not None})
+    return provider.signed(without_none(claims))
 
 
-def sign_out(client: TestClient, token: str) -> int:
+def sign_out(client, token):
     kept = dict(client.cookies)
     client.cookies.clear()  # it comes from a program of the provider
     status = client.post("/sign-in/provider-sign-out", data={"logout_token": token}).status_code
@@ -384,29 +379,30 @@ def sign_out(client: TestClient, token: str) -> int:
 
 
 @pytest.mark.parametrize("change", [{}, {"sub": None}, {"sid": None}])
-def test_the_provider_ends_the_session(client, provider, change):
+def test_the_provider_ends_the_session(client, ground, provider, change):
     answered(client, provider)
     secret = client.cookies[SESSION_COOKIE]
-    bearer = users.add_token(client.app.state.ground, "ann")
+    bearer = users.add_token(ground, "ann")
     client.cookies.clear()
     assert sign_out(client, logout_token(provider, **change)) == 200
-    assert not token_valid(client.app.state.ground, secret)
-    assert token_valid(client.app.state.ground, bearer)  # made by an administrator, not by a sign-in
-    assert client.app.state.ground.read(list_audit, AuditFilter(action="end sessions by provider")).total == 1
+    assert not token_valid(ground, secret)
+    assert token_valid(ground, bearer)  # made by an administrator, not by a sign-in
+    assert ground.read(list_audit, AuditFilter(action="end sessions by provider")).total == 1
 
 
 def test_a_wrong_logout_token_ends_nothing(client, provider, subtests):
     answered(client, provider)
-    for change in (
-        {"aud": "another"},
-        {"iss": "https://evil.example"},
-        {"exp": 1},
-        {"events": {}},
-        {"events": None},
-        {"nonce": "n"},
-        {"jti": None},
-        {"sub": None, "sid": None},
-    ):
+    wrong = """
+        {"aud": "another"}
+        {"iss": "https://evil.example"}
+        {"exp": 1}
+        {"events": {}}
+        {"events": null}
+        {"nonce": "n"}
+        {"jti": null}
+        {"sub": null, "sid": null}
+    """
+    for change in map(json.loads, wrong.strip().splitlines()):
         with subtests.test(change=change):
             assert sign_out(client, logout_token(provider, **change)) == 400
             assert client.get("/api/v1/session").status_code == 200
@@ -421,9 +417,8 @@ def test_a_logout_token_is_used_once_and_ends_its_session_only(client, provider)
     assert (sign_out(client, token), sign_out(client, token)) == (200, 400)
 
 
-def test_ended_sessions_of_the_provider_are_removed(client, provider, monkeypatch):
+def test_ended_sessions_of_the_provider_are_removed(client, ground, provider, monkeypatch):
     answered(client, provider)
-    ground = client.app.state.ground
     later = time.time_ns() + users.SESSION_NS + 1
     monkeypatch.setattr("ground_service.worker.upkeep.utc_now_ns", lambda: later)
     tidy(ground, 90)
@@ -437,30 +432,30 @@ def test_the_page_offers_the_provider_only_where_there_is_one(client, tmp_path):
         assert plain.get("/sign-in/provider").status_code == 404
 
 
-@pytest.mark.parametrize(
-    ("given", "word"),
-    [
-        ({"oidc_client_id": None}, "LINNA_OIDC_CLIENT_ID: expected the name"),
-        ({"oidc_roles": ()}, "LINNA_OIDC_ROLES: expected entries"),
-        ({"oidc_roles": ("admin=a", "viewer=a")}, "LINNA_OIDC_ROLES: expected one role"),
-    ],
-)
+INCOMPLETE = """
+{"oidc_client_id": null} | LINNA_OIDC_CLIENT_ID: expected the name
+{"oidc_roles": []} | LINNA_OIDC_ROLES: expected entries
+{"oidc_roles": ["admin=a", "viewer=a"]} | LINNA_OIDC_ROLES: expected one role
+"""
+
+
+@pytest.mark.parametrize("given, word", cells(INCOMPLETE))
 def test_incomplete_settings_are_refused_at_the_start(tmp_path, provider, given, word):
     with pytest.raises(SettingsError, match=word):
-        create_app(settings(tmp_path, provider).model_copy(update=given))
+        create_app(settings(tmp_path, provider).model_copy(update=json.loads(given)))
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "word"),
-    [
-        ("OIDC_ISSUER", "http://login.example.org", "expected an https address"),
-        ("OIDC_ISSUER", "login", "expected the address"),
-        ("OIDC_ROLES", "root=x", "expected viewer=, operator= or admin="),
-        ("OBJECTS", "/var/lib/linna", "LINNA_OBJECTS"),
-        ("OBJECTS", "s3://", "LINNA_OBJECTS"),
-        ("OBJECTS_ENDPOINT", "127.0.0.1:9000", "LINNA_OBJECTS_ENDPOINT"),
-    ],
-)
+WRONG = """
+OIDC_ISSUER | http://login.example.org | expected an https address
+OIDC_ISSUER | login | expected the address
+OIDC_ROLES | root=x | expected viewer=, operator= or admin=
+OBJECTS | /var/lib/linna | LINNA_OBJECTS
+OBJECTS | s3:// | LINNA_OBJECTS
+OBJECTS_ENDPOINT | 127.0.0.1:9000 | LINNA_OBJECTS_ENDPOINT
+"""
+
+
+@pytest.mark.parametrize("name, value, word", cells(WRONG))
 def test_wrong_settings_are_one_line(monkeypatch, name, value, word):
     monkeypatch.setenv(f"LINNA_{name}", value)
     with pytest.raises(SettingsError, match=word):
@@ -474,7 +469,7 @@ def test_the_secret_may_be_a_file(monkeypatch, tmp_path):
     assert found is not None and found.get_secret_value() == SECRET
 
 
-def test_the_role_of_a_user_of_the_provider_is_not_changed_here(client, provider):
+def test_the_role_of_a_user_of_the_provider_is_not_changed_here(client, ground, provider):
     answered(client, provider)
     with pytest.raises(Conflict, match="states the role"):
-        users.change_user(client.app.state.ground, "ann", role="admin")
+        users.change_user(ground, "ann", role="admin")

@@ -10,34 +10,33 @@ from fastapi.security import HTTPAuthorizationCredentials
 from ground_service.access.security import caller_of, requires
 from ground_service.access.service import LOCAL_CALLER, Caller, add_user, change_user
 from ground_service.errors import NotAuthorised
-from ground_service.ground import Ground
 from ground_service.http.problems import Forbidden
 
 NO_REQUEST: Any = None
 ROLES = ("viewer", "operator", "admin")
 
 
-def request(ground: Ground, open_without_users: bool) -> Any:
+def request(ground, open_without_users):
     app = SimpleNamespace(state=SimpleNamespace(ground=ground, open_without_users=open_without_users))
     return SimpleNamespace(app=app, state=SimpleNamespace(), cookies={})
 
 
-def bearer(token: str) -> HTTPAuthorizationCredentials:
+def bearer(token):
     return HTTPAuthorizationCredentials(scheme="Bearer", credentials=token)
 
 
-def test_without_users_an_open_service_has_a_local_caller_who_may_do_everything(ground: Ground) -> None:
+def test_without_users_an_open_service_has_a_local_caller_who_may_do_everything(ground):
     asked = request(ground, True)
     assert caller_of(asked, None) == LOCAL_CALLER == Caller("local", "admin", None)
     assert vars(asked.state) == {"caller": "local"}
 
 
-def test_a_service_that_others_reach_is_closed_even_without_users(ground: Ground) -> None:
+def test_a_service_that_others_reach_is_closed_even_without_users(ground):
     with pytest.raises(NotAuthorised, match="expected a bearer token in the Authorization header, found none"):
         caller_of(request(ground, False), None)
 
 
-def test_the_first_user_closes_an_open_service_even_once_disabled(ground: Ground) -> None:
+def test_the_first_user_closes_an_open_service_even_once_disabled(ground):
     add_user(ground, "ann", "viewer")
     change_user(ground, "ann", state="disabled")
     asked = request(ground, True)
@@ -47,7 +46,7 @@ def test_the_first_user_closes_an_open_service_even_once_disabled(ground: Ground
 
 
 @pytest.mark.parametrize("open_without_users", [True, False])
-def test_a_token_names_its_caller_whatever_the_service_is_open_to(ground: Ground, open_without_users: bool) -> None:
+def test_a_token_names_its_caller_whatever_the_service_is_open_to(ground, open_without_users):
     token = add_user(ground, "ann", "operator")
     asked = request(ground, open_without_users)
     caller = caller_of(asked, bearer(token))
@@ -61,7 +60,7 @@ def test_a_token_names_its_caller_whatever_the_service_is_open_to(ground: Ground
 
 @pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("needed", ROLES)
-def test_a_role_may_do_what_those_below_it_may(role: str, needed: str) -> None:
+def test_a_role_may_do_what_those_below_it_may(role, needed):
     caller = Caller("ann", role)
     allowed = ROLES.index(role) >= ROLES.index(needed)
     assert caller.may(needed) is allowed
@@ -73,6 +72,6 @@ def test_a_role_may_do_what_those_below_it_may(role: str, needed: str) -> None:
             asyncio.run(check(NO_REQUEST, caller))
 
 
-def test_a_role_that_does_not_exist_allows_nothing() -> None:
+def test_a_role_that_does_not_exist_allows_nothing():
     with pytest.raises(ValueError, match="not in tuple"):
         Caller("ann", "admin").may("root")

@@ -9,10 +9,9 @@ import logging.config
 import os
 import stat
 import sys
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import pytest
 from fastapi.routing import APIRoute
@@ -31,6 +30,7 @@ from ground_service.missions.timekeeping.model import ReceptionIn, TimePointIn
 from ground_service.planning.model import WindowIn
 from ground_service.regression.routes import RegressionRequest
 from ground_service.settings import Settings
+from tests.ground_service.conftest import cells
 from tests.serving import TestClient, WebSocketDenialResponse
 
 V1 = "/api/v1"
@@ -38,90 +38,94 @@ JSON = {"Content-Type": "application/json"}
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+def client(tmp_path_factory):
     """An empty service."""
     settings = Settings(home=tmp_path_factory.mktemp("requests"))
     with TestClient(create_app(settings, inline_jobs=True), raise_server_exceptions=False) as opened:
         yield opened
 
 
-def detail(answer: Any, status: int) -> str:
+def detail(answer, status):
     assert answer.status_code == status, answer.text
     assert answer.headers["content-type"] == "application/problem+json"
     return str(answer.json()["detail"])
 
 
 @pytest.mark.parametrize("query", ["kind=%00", "kind=a%0Ab", "kind=%1b[31m", "kind=%7f", "kind=%C2%85", "%00=1"])
-def test_control_characters_in_a_query_are_refused(client: TestClient, query: str) -> None:
+def test_control_characters_in_a_query_are_refused(client, query):
     assert detail(client.get(f"{V1}/jobs?{query}"), 422).startswith("query: expected no control characters")
 
 
-def test_control_characters_in_a_path_are_refused(client: TestClient) -> None:
+def test_control_characters_in_a_path_are_refused(client):
     assert detail(client.get(f"{V1}/passes/1/telemetry/a%00b"), 422).startswith("path: expected no control")
 
 
-@pytest.mark.parametrize(
-    ("query", "words"),
-    [
-        ("limti=5", "expected 'limit', found 'limti'"), ("kinds=report", "expected 'kind', found 'kinds'"),
-        ("x=1", "expected one of kind, limit, offset, found 'x'"), ("limit=5&__=", "found '__'"),
-    ],
-)  # fmt: skip
-def test_an_unknown_query_key_is_refused_with_the_nearest_known(client: TestClient, query: str, words: str) -> None:
+UNKNOWN = """
+limti=5 | expected 'limit', found 'limti'
+kinds=report | expected 'kind', found 'kinds'
+x=1 | expected one of kind, limit, offset, found 'x'
+limit=5&__= | found '__'
+"""
+
+
+@pytest.mark.parametrize("query, words", cells(UNKNOWN))
+def test_an_unknown_query_key_is_refused_with_the_nearest_known(client, query, words):
     assert words in detail(client.get(f"{V1}/jobs?{query}"), 422)
 
 
-@pytest.mark.parametrize(
-    ("path", "words"),
-    [
-        ("/jobs?limit=5&limit=6", "query: expected 'limit' once, found it 2 times"),
-        ("/jobs?limit=5&kind=a&limit=5&limit=5", "query: expected 'limit' once, found it 3 times"),
-        ("/passes/1/states?value=mode&max_points=5&max_points=5", "query: expected 'max_points' once"),
-    ],
-)
-def test_a_query_key_with_one_value_is_taken_once(client: TestClient, path: str, words: str) -> None:
+REPEATED = """
+/jobs?limit=5&limit=6 | query: expected 'limit' once, found it 2 times
+/jobs?limit=5&kind=a&limit=5&limit=5 | query: expected 'limit' once, found it 3 times
+/passes/1/states?value=mode&max_points=5&max_points=5 | query: expected 'max_points' once
+"""
+
+
+@pytest.mark.parametrize("path, words", cells(REPEATED))
+def test_a_query_key_with_one_value_is_taken_once(client, path, words):
     assert words in detail(client.get(V1 + path), 422)
 
 
-def test_a_query_key_with_a_list_of_values_is_taken_several_times(client: TestClient) -> None:
+def test_a_query_key_with_a_list_of_values_is_taken_several_times(client):
     answer = client.get(f"{V1}/passes/1/states?value=nis&value=matched")
     assert "once" not in detail(answer, 404)
 
 
 @pytest.mark.parametrize("path", ["live?afer=1", "live?after=1&after=2", "payload?after=1"])
-def test_a_websocket_refuses_query_keys_it_does_not_know(client: TestClient, path: str) -> None:
+def test_a_websocket_refuses_query_keys_it_does_not_know(client, path):
     with pytest.raises(WebSocketDenialResponse) as refusal, client.websocket_connect(f"{V1}/{path}"):
         pass
     assert "expected" in detail(refusal.value, 422)
 
 
-def test_known_query_keys_are_taken(client: TestClient) -> None:
+def test_known_query_keys_are_taken(client):
     assert client.get(f"{V1}/jobs?kind=report&limit=5&offset=0").status_code == 200
     assert "expected one of none" in detail(client.get(f"{V1}/links?limit=1"), 422)
 
 
-@pytest.mark.parametrize(
-    ("body", "words"),
-    [
-        (b'{"name": "x", "cadence_s": NaN}', "found NaN"),
-        (b'{"name": "x", "cadence_s": -Infinity}', "found -Infinity"),
-        (b'{"name": "x", "cadence_s": 1e400}', "found 1e400"), (b'{"name": "a\\u0000b"}', "without NUL"),
-        (b'{"a\\u0000b": 1}', "without NUL"), (b'{"name": ["\\ud800"]}', "lone surrogates"),
-        (b'{"name": "x", "name": "y"}', "found a duplicate"),
-    ],
-)  # fmt: skip
-def test_json_with_no_or_two_meanings_is_refused(client: TestClient, body: bytes, words: str) -> None:
+AMBIGUOUS = r"""
+{"name": "x", "cadence_s": NaN} | found NaN
+{"name": "x", "cadence_s": -Infinity} | found -Infinity
+{"name": "x", "cadence_s": 1e400} | found 1e400
+{"name": "a\u0000b"} | without NUL
+{"a\u0000b": 1} | without NUL
+{"name": ["\ud800"]} | lone surrogates
+{"name": "x", "name": "y"} | found a duplicate
+"""
+
+
+@pytest.mark.parametrize("body, words", cells(AMBIGUOUS))
+def test_json_with_no_or_two_meanings_is_refused(client, body, words):
     for path in ("/windows", "/telecommands", "/passes", "/requests"):
         assert words in detail(client.post(f"{V1}{path}", content=body, headers=JSON), 422)
 
 
-def test_ordinary_json_is_read_as_it_stands() -> None:
+def test_ordinary_json_is_read_as_it_stands():
     assert parse_json(b'{"a": [1, 2.5, "\\u00e4\\ud83d\\ude00 \\\\u0000", null, true]}') == {
         "a": [1, 2.5, "ä😀 \\u0000", None, True]
     }
 
 
-def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+def models_in(annotation):
     """The models that a value of this type consists of."""
     for inner in get_args(annotation):
         yield from models_in(inner)
@@ -131,7 +135,7 @@ def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
             yield from models_in(field.annotation)
 
 
-def test_no_request_model_takes_a_value_of_one_type_for_another(client: TestClient) -> None:
+def test_no_request_model_takes_a_value_of_one_type_for_another(client):
     routes = client.app.state.operations
     bodies = [body for route in routes if isinstance(route, APIRoute) for body in route.dependant.body_params]
     models = {model for body in bodies for model in models_in(body.field_info.annotation)}
@@ -140,13 +144,15 @@ def test_no_request_model_takes_a_value_of_one_type_for_another(client: TestClie
     assert lax == []
 
 
-@pytest.mark.parametrize(
-    ("method", "path", "allowed"),
-    [("DELETE", "/passes", "GET, POST"), ("PUT", "/windows/1", "DELETE, GET, PATCH"), ("GET", "/uplink", "POST")],
-)
-def test_a_method_that_is_not_allowed_is_answered_with_those_that_are(
-    client: TestClient, method: str, path: str, allowed: str
-) -> None:
+METHODS = """
+DELETE | /passes | GET, POST
+PUT | /windows/1 | DELETE, GET, PATCH
+GET | /uplink | POST
+"""
+
+
+@pytest.mark.parametrize("method, path, allowed", cells(METHODS))
+def test_a_method_that_is_not_allowed_is_answered_with_those_that_are(client, method, path, allowed):
     answer = client.request(method, V1 + path)
     assert detail(answer, 405)
     assert answer.headers["Allow"] == allowed
@@ -161,10 +167,8 @@ def test_a_method_that_is_not_allowed_is_answered_with_those_that_are(
         FileDamaged(Path("/var/lib/linna/files/ab/abcd"), "ab", "cd"),
     ],
 )
-def test_errors_of_the_store_name_no_place_and_carry_the_id_of_the_log_entry(
-    client: TestClient, error: Exception, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def fail(*_: Any, **__: Any) -> Any:
+def test_errors_of_the_store_name_no_place_and_carry_the_id_of_the_log_entry(client, error, monkeypatch, caplog):
+    def fail(*_, **__):
         raise error
 
     monkeypatch.setattr("ground_service.store.repository.page", fail)
@@ -176,7 +180,7 @@ def test_errors_of_the_store_name_no_place_and_carry_the_id_of_the_log_entry(
     assert str(error) in caplog.text
 
 
-def test_the_home_and_its_files_are_the_owners_alone(tmp_path: Path) -> None:
+def test_the_home_and_its_files_are_the_owners_alone(tmp_path):
     home = tmp_path / "home"
     home.mkdir()
     home.chmod(0o755)
@@ -195,10 +199,10 @@ def test_the_home_and_its_files_are_the_owners_alone(tmp_path: Path) -> None:
 class Bodies:
     """Requests to a guarded application that reads bodies; the test sends each body in parts."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.guard = BodyLimit(self._read, upload_paths=("/upload",), upload_limit_octets=1 << 20)
 
-    async def _read(self, _scope: Any, receive: Any, send: Any) -> None:
+    async def _read(self, _scope, receive, send):
         while True:
             message = await receive()
             if message["type"] == "http.disconnect":
@@ -208,20 +212,20 @@ class Bodies:
         await send({"type": "http.response.start", "status": 200, "headers": []})
         await send({"type": "http.response.body", "body": b""})
 
-    def ask(self, path: str = "/x") -> tuple[asyncio.Queue[tuple[bytes, bool]], asyncio.Task[Any]]:
+    def ask(self, path="/x"):
         """Start a request; the queue takes the parts of its body, and whether more follow."""
-        parts: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
-        started: list[Any] = []
+        parts = asyncio.Queue()
+        started = []
 
-        async def receive() -> dict[str, Any]:
+        async def receive():
             body, more = await parts.get()
             return {"type": "http.request", "body": body, "more_body": more}
 
-        async def send(message: Any) -> None:
+        async def send(message):
             if message["type"] == "http.response.start":
                 started.append((message["status"], dict(message["headers"]).get(b"retry-after")))
 
-        async def run() -> Any:
+        async def run():
             scope = {"type": "http", "method": "POST", "path": path, "headers": [], "state": {}}
             await self.guard(scope, receive, send)
             return started[0]
@@ -229,10 +233,10 @@ class Bodies:
         return parts, asyncio.create_task(run())
 
 
-def test_bodies_of_all_requests_together_are_held_within_one_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bodies_of_all_requests_together_are_held_within_one_budget(monkeypatch):
     monkeypatch.setattr(limits, "HELD_LIMIT_OCTETS", 1000)
 
-    async def test() -> None:
+    async def test():
         bodies = Bodies()
         first_parts, first = bodies.ask()
         first_parts.put_nowait((b"x" * 600, True))
@@ -256,7 +260,7 @@ def test_bodies_of_all_requests_together_are_held_within_one_budget(monkeypatch:
         pool.submit(asyncio.run, test()).result()
 
 
-def test_a_log_entry_is_one_json_object_with_what_was_passed() -> None:
+def test_a_log_entry_is_one_json_object_with_what_was_passed():
     try:
         raise ValueError("broken")
     except ValueError:
@@ -276,7 +280,7 @@ def test_a_log_entry_is_one_json_object_with_what_was_passed() -> None:
 
 
 @pytest.mark.parametrize("style", ["text", "json"])
-def test_what_a_client_sent_makes_neither_a_line_nor_a_terminal_sequence(style: str) -> None:
+def test_what_a_client_sent_makes_neither_a_line_nor_a_terminal_sequence(style):
     """A path is decoded before it is logged: `GET /%0a2026-01-01 INFO forged`."""
     configuration = logging.config.DictConfigurator(logging_config(style))
     formatter = configuration.configure_formatter(configuration.config["formatters"]["line"])
@@ -290,6 +294,6 @@ def test_what_a_client_sent_makes_neither_a_line_nor_a_terminal_sequence(style: 
     assert not any(line.startswith("2026-01-01 INFO forged") for line in lines[:-1])
 
 
-def test_addresses_of_webhooks_are_not_logged() -> None:
+def test_addresses_of_webhooks_are_not_logged():
     """The HTTP client logs the address of each request at the level INFO."""
     assert logging_config("json")["loggers"]["httpx"]["level"] == "WARNING"

@@ -3,8 +3,6 @@ answer is one that the schema tells of."""
 
 import json
 import os
-from collections.abc import Iterator, Mapping
-from typing import Any
 
 import pytest
 import schemathesis
@@ -36,7 +34,7 @@ EXAMPLES = int(os.environ.get("SCHEMA_EXAMPLES", "1"))
 
 
 @schemathesis.serializer("application/zip")
-def _as_octets(_context: Any, value: Any) -> bytes:
+def _as_octets(_context, value):
     """Bodies of archives: whatever octets were made up."""
     octets = getattr(value, "data", value)
     return octets if isinstance(octets, bytes) else json.dumps(octets).encode()
@@ -45,26 +43,24 @@ def _as_octets(_context: Any, value: Any) -> bytes:
 class Queue:
     """Enters jobs and has none of them done: making hundreds of reports is not what is looked at here."""
 
-    def __init__(self, ground: Any) -> None:
+    def __init__(self, ground):
         self._ground = ground
 
-    def submit(self, kind: str, arguments: Mapping[str, Any], *, job_id: str | None = None) -> str:
+    def submit(self, kind, arguments, *, job_id=None):
         return enter_job(self._ground, kind, arguments, job_id=job_id)
 
-    def start(self, job_id: str) -> None:
+    def start(self, job_id):
         pass
 
-    def resume(self) -> None:
+    def resume(self):
         pass
 
-    def close(self) -> None:
+    def close(self):
         pass
 
 
 @pytest.fixture(scope="module", params=["sqlite", pytest.param("postgresql", marks=pytest.mark.campaign)])
-def client(
-    request: pytest.FixtureRequest, synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[TestClient]:
+def client(request, synthetic_pass, tmp_path_factory):
     deployment = Settings(home=tmp_path_factory.mktemp("fuzz"))
     if request.param == "postgresql":
         url = request.getfixturevalue("migrated_postgres")()
@@ -77,7 +73,7 @@ def client(
 
 
 @pytest.mark.parametrize("mode", [GenerationMode.POSITIVE, GenerationMode.NEGATIVE])
-def test_every_operation_answers_as_its_schema_says(client: TestClient, mode: GenerationMode) -> None:
+def test_every_operation_answers_as_its_schema_says(client, mode):
     document = client.get(f"{V1}/openapi.json").json()
     schema = schemathesis.openapi.from_dict(document)
     asked = set()
@@ -89,7 +85,7 @@ def test_every_operation_answers_as_its_schema_says(client: TestClient, mode: Ge
             suppress_health_check=list(HealthCheck),
         )  # fmt: skip
         @given(case=operation.as_strategy(generation_mode=mode))
-        def ask(case: Any) -> None:
+        def ask(case):
             asked.add((case.method, case.operation.path))
             wanted = case.as_transport_kwargs(base_url="http://testserver")
             answer = client.request(

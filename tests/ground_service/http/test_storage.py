@@ -4,7 +4,6 @@ import errno
 import importlib.util
 import os
 import tempfile
-from typing import Any
 
 import pytest
 
@@ -16,25 +15,24 @@ from ground_service.store import repository
 from ground_service.worker.jobs import run_job
 from tests.ground_service.archive_hash import archive_hash
 from tests.ground_service.conftest import wait_for
-from tests.serving import TestClient
 
 V1 = "/api/v1"
 
 
-def full(*_: Any, **__: Any) -> Any:
+def full(*_, **__):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def read_only(*_: Any, **__: Any) -> Any:
+def read_only(*_, **__):
     raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
 
 @pytest.mark.parametrize(
-    ("failing", "status", "words"), [(full, 507, "no space left"), (read_only, 503, "cannot be written")]
+    "failing, status, words", [(full, 507, "no space left"), (read_only, 503, "cannot be written")]
 )
 def test_an_upload_that_cannot_be_kept_is_refused_and_readiness_tells(
-    client: TestClient, synthetic_pass: Any, monkeypatch: Any, failing: Any, status: int, words: str
-) -> None:
+    client, synthetic_pass, monkeypatch, failing, status, words
+):
     stream = (synthetic_pass.folder / "downlink.cadu").read_bytes()
     assert client.get("/readyz").status_code == 200
     with monkeypatch.context() as disk:
@@ -53,21 +51,19 @@ def test_an_upload_that_cannot_be_kept_is_refused_and_readiness_tells(
     assert client.get(f"{V1}/ingests/1").json()["state"] == "done"
 
 
-def test_a_database_that_may_not_be_written_is_not_ready(client: TestClient, monkeypatch: Any) -> None:
+def test_a_database_that_may_not_be_written_is_not_ready(client, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
     answer = client.get("/readyz")
     assert answer.status_code == 503
     assert "cannot be written" in answer.json()["detail"]
 
 
-def test_an_ingest_that_a_full_disk_stops_is_done_when_there_is_space(
-    client: TestClient, synthetic_pass: Any, monkeypatch: Any
-) -> None:
+def test_an_ingest_that_a_full_disk_stops_is_done_when_there_is_space(client, synthetic_pass, monkeypatch):
     ground = client.app.state.ground
     stored = ground.files.put_file(synthetic_pass.folder / "downlink.cadu")
     _, job = enter_ingest(ground, stored, "d", spacecraft_id=76, instance="flight")
 
-    def no_space(*_: Any) -> Any:
+    def no_space(*_):
         raise StorageFull("database")
 
     with monkeypatch.context() as disk:
@@ -90,7 +86,7 @@ def test_an_ingest_that_a_full_disk_stops_is_done_when_there_is_space(
         assert archive_hash(connection, 1) == found
 
 
-def test_a_missing_library_is_named_with_its_remedy(client: TestClient, monkeypatch: Any) -> None:
+def test_a_missing_library_is_named_with_its_remedy(client, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     answer = client.post(f"{V1}/exports", json={"pass_id": 1, "format": "spk"})
     assert answer.status_code == 501 and "install linna[spice]" in answer.json()["detail"]

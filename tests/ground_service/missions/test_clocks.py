@@ -2,8 +2,6 @@
 
 import time
 from argparse import Namespace
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -11,7 +9,6 @@ from ground_service.access.service import LOCAL_CALLER, session_of
 from ground_service.app import create_app
 from ground_service.clock import follow_missions, independent_now_ns, is_recorded, mission_now_ns, set_mission_clock
 from ground_service.errors import InvalidInput
-from ground_service.ground import Ground
 from ground_service.missions import clocks
 from ground_service.missions.clocks import mission_clock, read_mission_clock
 from ground_service.missions.model import parse_mission
@@ -34,27 +31,27 @@ mission_clock = {{ {clock} }}
 """
 
 
-def simulated(rate: float = 1.0) -> str:
+def simulated(rate=1.0):
     wall = format_utc(time.time_ns())
     return f'source = "simulated", mission = "2029-08-07T06:00:00Z", wall = "{wall}", rate = {rate}'
 
 
-def state(ground: Ground, clock: str, number: int = 76) -> None:
+def state(ground, clock, number=76):
     add_mission(ground, TEXT.format(name=f"m{number}", number=number, clock=clock).encode())
 
 
 @pytest.fixture(autouse=True)
-def _wall_clock_again() -> Any:
+def _wall_clock_again():
     yield
     follow_missions(None)
     set_mission_clock(None)
 
 
-def seconds_after_start() -> float:
+def seconds_after_start():
     return (mission_now_ns() - YEAR_2029) / 1e9
 
 
-def test_a_simulated_clock_runs_at_its_rate(ground: Ground) -> None:
+def test_a_simulated_clock_runs_at_its_rate(ground):
     state(ground, simulated(rate=1000.0))
     read_mission_clock(ground)
     first = seconds_after_start()
@@ -62,13 +59,13 @@ def test_a_simulated_clock_runs_at_its_rate(ground: Ground) -> None:
     assert 50.0 <= seconds_after_start() - first < 60_000.0
 
 
-def test_a_command_of_this_machine_has_the_clock_of_its_descriptions(ground: Ground) -> None:
+def test_a_command_of_this_machine_has_the_clock_of_its_descriptions(ground):
     state(ground, simulated())
     with ground_client(Namespace(home=ground.home, server=None, actor="ann")):
         assert 0.0 <= seconds_after_start() < 600.0
 
 
-def test_a_stated_clock_is_behind_that_of_a_simulation_and_ends_with_the_description(ground: Ground) -> None:
+def test_a_stated_clock_is_behind_that_of_a_simulation_and_ends_with_the_description(ground):
     state(ground, simulated())
     set_mission_clock(lambda: 7)
     read_mission_clock(ground)
@@ -80,7 +77,7 @@ def test_a_stated_clock_is_behind_that_of_a_simulation_and_ends_with_the_descrip
     assert abs(mission_now_ns() - time.time_ns()) < 600e9
 
 
-def test_the_clock_of_telemetry_stands_at_the_newest(ground: Ground, synthetic_pass: Any) -> None:
+def test_the_clock_of_telemetry_stands_at_the_newest(ground, synthetic_pass):
     state(ground, 'source = "telemetry"')
     read_mission_clock(ground)
     assert abs(mission_now_ns() - time.time_ns()) < 600e9  # no telemetry yet
@@ -96,7 +93,7 @@ def test_the_clock_of_telemetry_stands_at_the_newest(ground: Ground, synthetic_p
         }
 
 
-def test_archives_alone_have_the_time_of_their_data(ground: Ground, synthetic_pass: Any) -> None:
+def test_archives_alone_have_the_time_of_their_data(ground, synthetic_pass):
     import_archive(ground, synthetic_pass.folder)
     read_mission_clock(ground)
     assert 0 <= mission_now_ns() - synthetic_pass.utc_ns[-1] < 1e9
@@ -110,7 +107,7 @@ def test_archives_alone_have_the_time_of_their_data(ground: Ground, synthetic_pa
     assert not is_recorded() and abs(mission_now_ns() - time.time_ns()) < 600e9
 
 
-def test_several_stated_clocks_are_none(ground: Ground, caplog: pytest.LogCaptureFixture) -> None:
+def test_several_stated_clocks_are_none(ground, caplog):
     state(ground, simulated())
     state(ground, 'source = "telemetry"', number=77)
     read_mission_clock(ground)
@@ -118,7 +115,7 @@ def test_several_stated_clocks_are_none(ground: Ground, caplog: pytest.LogCaptur
     assert "several mission clocks" in caplog.text
 
 
-def test_a_running_service_takes_a_new_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_running_service_takes_a_new_clock(tmp_path, monkeypatch):
     monkeypatch.setattr(clocks, "REFRESH_S", 0.05)
     with TestClient(create_app(Settings(home=tmp_path))) as client:
         state(client.app.state.ground, simulated())
@@ -127,7 +124,7 @@ def test_a_running_service_takes_a_new_clock(tmp_path: Path, monkeypatch: pytest
     assert abs(mission_now_ns() - time.time_ns()) < 600e9  # the service has ended
 
 
-def test_a_worker_and_a_scheduler_have_the_clock_of_the_service(ground: Ground) -> None:
+def test_a_worker_and_a_scheduler_have_the_clock_of_the_service(ground):
     state(ground, simulated())
     _ground_of(Settings(home=ground.home))
     assert abs(seconds_after_start()) < 600.0
@@ -139,6 +136,6 @@ def test_a_worker_and_a_scheduler_have_the_clock_of_the_service(ground: Ground) 
 @pytest.mark.parametrize(
     "clock", ['source = "simulated"', 'source = "wall", mission = "2029-08-07T06:00:00Z"', 'source = "moon"']
 )
-def test_an_incomplete_clock_is_refused(clock: str) -> None:
+def test_an_incomplete_clock_is_refused(clock):
     with pytest.raises(InvalidInput, match="mission_clock"):
         parse_mission(TEXT.format(name="m", number=1, clock=clock))

@@ -5,15 +5,12 @@ Automation and receivers of notifications in a mission description, and those of
 import json
 import logging
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from ground_service.access.service import Caller
 from ground_service.contacts.commanding.service import enter_command, release_command
 from ground_service.errors import Conflict, Forbidden, InvalidInput, NotFound
-from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.missions import store
 from ground_service.missions.frames import mission_of_manifest
@@ -36,10 +33,10 @@ from ground_service.missions.service import (
 )
 from ground_service.missions.store import approval_in_force, find_revision, list_missions, newest_of_spacecraft
 from ground_service.passes.archive_import import import_archive
-from ground_service.passes.model import PassDetail
 from ground_service.passes.service import define_pass, get_pass
 from ground_service.passes.store import get_pass as stored_pass
 from linna import cli
+from tests.ground_service.conftest import cells
 
 TEXT = """
 schema_version = 1
@@ -55,28 +52,29 @@ sigma_rtn_m = [10, 30, 15.5]
 """
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("fow_deg = 90", "m.toml, camera.fow_deg: expected 'fov_deg', found unknown key 'fow_deg'"),
-        ("fov_deg = 190", "m.toml, camera.fov_deg: expected less than or equal to 170, found 190"),
-        ('fov_deg = "wide"', "m.toml, camera.fov_deg: expected a valid number"),
-        ("fov_deg = nan", "m.toml, camera.fov_deg: expected a finite number, found nan"),
-        ("fov_deg = true", "m.toml, camera.fov_deg: expected a valid number, found True"),
-        ("width_px = true", "m.toml, camera.width_px: expected a valid integer, found True"),
-        ('width_px = "5"', "m.toml, camera.width_px: expected a valid integer, found '5'"),
-        ("fov_deg =", "m.toml: expected TOML"),
-    ],
-)
-def test_a_fault_is_named_with_its_place_what_was_expected_and_what_was_found(line: str, message: str) -> None:
+FAULTS = """
+fow_deg = 90 | expected 'fov_deg', found unknown key 'fow_deg'
+fov_deg = 190 | expected less than or equal to 170, found 190
+fov_deg = "wide" | expected a valid number
+fov_deg = nan | expected a finite number, found nan
+fov_deg = true | expected a valid number, found True
+width_px = true | expected a valid integer, found True
+width_px = "5" | expected a valid integer, found '5'
+fov_deg = | expected TOML
+"""
+
+
+@pytest.mark.parametrize("line, message", cells(FAULTS))
+def test_a_fault_is_named_with_its_place_what_was_expected_and_what_was_found(line, message):
     text = f'name = "test"\n[camera]\n{line}\n'
     with pytest.raises(InvalidInput) as caught:
         parse_mission(text, "m.toml")
-    assert str(caught.value).startswith(message)
+    place = "m.toml" if message == "expected TOML" else f"m.toml, camera.{line.split()[0]}"
+    assert str(caught.value).startswith(f"{place}: {message}")
     assert list(map(str, read_document(text, "m.toml"))) == [str(caught.value)]
 
 
-def test_every_unknown_key_has_a_line_of_its_own() -> None:
+def test_every_unknown_key_has_a_line_of_its_own():
     faults = read_document('name = "test"\nlinc = 1\n[camera]\nwidht_px = 5\n', "m.toml")
     assert list(map(str, faults)) == [
         "m.toml, camera.widht_px: expected 'width_px', found unknown key 'widht_px'",
@@ -84,39 +82,44 @@ def test_every_unknown_key_has_a_line_of_its_own() -> None:
     ]
 
 
-def test_what_is_not_stated_is_none_and_listed() -> None:
+def test_what_is_not_stated_is_none_and_listed():
     mission = parse_mission(TEXT)
     assert mission.camera.width_px is None and mission.frames.gravity_field is None
     assert "camera.width_px" in mission.unknown and "camera.fov_deg" not in mission.unknown
     assert mission.evidence.level is None and mission.evidence.text == ""
 
 
-def test_a_revision_depends_on_what_is_stated_and_not_on_its_layout() -> None:
+def test_a_revision_depends_on_what_is_stated_and_not_on_its_layout():
     other = TEXT.replace("[10, 30, 15.5]", "[10.0, 30.0, 15.50] # rounded").replace("\n[", "\n\n[")
     assert parse_mission(other).revision == parse_mission(TEXT).revision
     assert parse_mission(TEXT.replace("15.5", "15.6")).revision != parse_mission(TEXT).revision
 
 
-def test_a_formatted_mission_parses_to_itself() -> None:
+def test_a_formatted_mission_parses_to_itself():
     mission = parse_mission(TEXT)
     assert parse_mission(format_mission(mission)) == mission
 
 
-@pytest.mark.parametrize(
-    ("values", "level"),
-    [
-        ({}, None), ({"world": "unit-geometry"}, "1"), ({"world": "procedural"}, "2"),
-        ({"world": "real-terrain"}, None), ({"world": "real-terrain", "unseen_share": 0.0}, "3s"),
-        ({"world": "real-terrain", "unseen_share": 0.999}, "3s"),
-        ({"world": "real-terrain", "unseen_share": 1.0}, "3"), ({"world": "other-renderer"}, "4"),
-        ({"world": "photographs"}, "5"),
-    ],
-)  # fmt: skip
-def test_the_evidence_level_follows_from_the_world_that_was_flown(values: dict, level: str | None) -> None:
-    assert Evidence(**values).level == level
+LEVELS = """
+None | None | None
+unit-geometry | None | 1
+procedural | None | 2
+real-terrain | None | None
+real-terrain | 0.0 | 3s
+real-terrain | 0.999 | 3s
+real-terrain | 1.0 | 3
+other-renderer | None | 4
+photographs | None | 5
+"""
 
 
-def test_several_passes_stand_on_the_weakest_evidence_among_them() -> None:
+@pytest.mark.parametrize("world, share, level", cells(LEVELS))
+def test_the_evidence_level_follows_from_the_world_that_was_flown(world, share, level):
+    values = {"world": world, "unseen_share": share if share == "None" else float(share)}
+    assert str(Evidence(**{name: value for name, value in values.items() if value != "None"}).level) == level
+
+
+def test_several_passes_stand_on_the_weakest_evidence_among_them():
     seen, unseen = (Evidence(world="real-terrain", unseen_share=share) for share in (0.5, 1.0))
     assert weakest_evidence([unseen, seen]).startswith("3s (")
     assert weakest_evidence([unseen, Evidence(world="photographs")]).startswith("3 (")
@@ -124,7 +127,7 @@ def test_several_passes_stand_on_the_weakest_evidence_among_them() -> None:
     assert weakest_evidence([seen, Evidence()]) == weakest_evidence([]) == ""
 
 
-def test_entering_the_same_content_again_gives_the_same_revision(ground) -> None:
+def test_entering_the_same_content_again_gives_the_same_revision(ground):
     first = add_mission(ground, TEXT.encode(), actor="ada")
     again = add_mission(ground, (TEXT + "# a remark\n").encode(), actor="bob")
     assert again == first and first.entered_by == "ada" and first.text == TEXT
@@ -136,14 +139,14 @@ def test_entering_the_same_content_again_gives_the_same_revision(ground) -> None
 
 
 @pytest.mark.parametrize("name", ["", "xyz", "0000000", "00000000", "%" * 8, "a" * 65])
-def test_a_revision_that_is_not_entered_is_not_found(ground, name: str) -> None:
+def test_a_revision_that_is_not_entered_is_not_found(ground, name):
     add_mission(ground, TEXT.encode())
     with pytest.raises(NotFound):
         ground.read(find_revision, name)
 
 
-def test_a_pass_refers_to_the_newest_description_of_its_spacecraft(ground) -> None:
-    def define(spacecraft: int) -> PassDetail:
+def test_a_pass_refers_to_the_newest_description_of_its_spacecraft(ground):
+    def define(spacecraft):
         return get_pass(
             ground, define_pass(ground, name="p", start_utc_ns=0, stop_utc_ns=10**9, spacecraft_id=spacecraft)
         )
@@ -158,7 +161,7 @@ def test_a_pass_refers_to_the_newest_description_of_its_spacecraft(ground) -> No
     assert get_pass(ground, before.id).mission_revision == first.revision
 
 
-def test_an_archive_without_a_description_states_what_its_manifest_declares(ground, synthetic_pass) -> None:
+def test_an_archive_without_a_description_states_what_its_manifest_declares(ground, synthetic_pass):
     key = import_archive(ground, synthetic_pass.folder)
     with ground.database.reading() as connection:
         record = stored_pass(connection, key)
@@ -170,16 +173,16 @@ def test_an_archive_without_a_description_states_what_its_manifest_declares(grou
     assert mission.requirements.median_error_m is None and mission.link.coding is None
 
 
-def test_the_description_in_an_archive_becomes_a_revision(ground, make_pass) -> None:
+def test_the_description_in_an_archive_becomes_a_revision(ground, make_pass):
     folder = make_pass(frames=2, seed=31, mission=TEXT).folder
     detail = get_pass(ground, import_archive(ground, folder))
     assert (detail.mission, detail.mission_revision) == ("test", parse_mission(TEXT).revision)
 
 
-def test_the_description_of_an_archive_holds_for_its_own_pass_only(ground, make_pass) -> None:
+def test_the_description_of_an_archive_holds_for_its_own_pass_only(ground, make_pass):
     folder = make_pass(frames=2, seed=33, mission=TEXT).folder
 
-    def define() -> PassDetail:
+    def define():
         return get_pass(ground, define_pass(ground, name="p", start_utc_ns=0, stop_utc_ns=10**9, spacecraft_id=76))
 
     import_archive(ground, folder)
@@ -189,7 +192,7 @@ def test_the_description_of_an_archive_holds_for_its_own_pass_only(ground, make_
     assert define().mission_revision == entered.revision
 
 
-def test_a_description_that_came_with_an_archive_is_in_force_once_a_person_enters_it(ground, make_pass) -> None:
+def test_a_description_that_came_with_an_archive_is_in_force_once_a_person_enters_it(ground, make_pass):
     text = TEXT + '\n[approval]\none_person_for = ["perform_function/set_mode"]\n'
     import_archive(ground, make_pass(frames=2, seed=35, mission=text).folder)
     add_mission(ground, TEXT.replace("120", "90").encode(), actor="ada")
@@ -203,45 +206,49 @@ def test_a_description_that_came_with_an_archive_is_in_force_once_a_person_enter
         assert approval_in_force(connection, 77).one_person_for is None
 
 
-def test_a_description_of_another_spacecraft_is_refused_and_nothing_is_stored(ground, make_pass) -> None:
+def test_a_description_of_another_spacecraft_is_refused_and_nothing_is_stored(ground, make_pass):
     folder = make_pass(frames=2, seed=32, mission=TEXT.replace("id = 76", "id = 5")).folder
     with pytest.raises(InvalidInput, match=r"mission\.toml, spacecraft\.id: expected 76 .*, found 5"):
         import_archive(ground, folder)
     assert ground.read(list_missions, Paging()).items == []
 
 
-@pytest.mark.parametrize(
-    ("manifest", "expected"),
-    [
-        ({"data_sources": ["orientation DE421"]}, "DE421"),
-        ({"data_sources": ["the orientation DE421 is not meant"]}, None),
-        ({"data_sources": ["orientation DE421", "orientation IAU WGCCRE 2009"]}, None),
-        ({"data_sources": "orientation DE421"}, None),
-        ({}, None),
-    ],
-)
-def test_the_orientation_of_an_old_archive_is_read_where_it_was_declared(manifest, expected) -> None:
-    assert mission_of_manifest(manifest).frames.orientation == expected
+DECLARED = """
+{"data_sources": ["orientation DE421"]} | DE421
+{"data_sources": ["the orientation DE421 is not meant"]} | None
+{"data_sources": ["orientation DE421", "orientation IAU WGCCRE 2009"]} | None
+{"data_sources": "orientation DE421"} | None
+{} | None
+"""
 
 
-def test_text_that_mentions_terrain_does_not_decide_the_evidence_level() -> None:
-    def level(**manifest: object) -> tuple[str | None, str | None]:
+@pytest.mark.parametrize("manifest, expected", cells(DECLARED))
+def test_the_orientation_of_an_old_archive_is_read_where_it_was_declared(manifest, expected):
+    assert str(mission_of_manifest(json.loads(manifest)).frames.orientation) == expected
+
+
+def test_text_that_mentions_terrain_does_not_decide_the_evidence_level():
+    def level(**manifest):
         evidence = mission_of_manifest({"seed": 7, **manifest}).evidence
         return evidence.world, evidence.level
 
     assert level(data_sources=["height model LROC WAC GLD100"]) == (None, None)
-    assert level(terrain="LROC WAC GLD100") == ("real-terrain", None)
-    assert level(terrain="procedural Moon, seed 7") == ("procedural", "2")
-    assert level(terrain="a procedural Moon beside GLD100") == (None, None)
-    assert level(terrain="photograph big_tile.tif") == ("photographs", "5")
+    declared = """
+LROC WAC GLD100 | real-terrain | None
+procedural Moon, seed 7 | procedural | 2
+a procedural Moon beside GLD100 | None | None
+photograph big_tile.tif | photographs | 5
+"""
+    for terrain, *expected in cells(declared):
+        assert [*map(str, level(terrain=terrain))] == expected
 
 
-def test_values_of_a_wrong_type_in_a_manifest_are_not_stated() -> None:
+def test_values_of_a_wrong_type_in_a_manifest_are_not_stated():
     mission = mission_of_manifest({"gravity": "none", "camera": {"fov_deg": "wide", "width_px": 512}})
     assert mission.camera.width_px == 512 and mission.camera.fov_deg is None
 
 
-def approval_text(*lines: str) -> bytes:
+def approval_text(*lines):
     return "\n".join((TEXT, "[approval]", *lines)).encode()
 
 
@@ -249,7 +256,7 @@ RAISED = 'second_person_for = ["replay_store"]'
 RELAXED = 'one_person_for = ["perform_function/set_mode"]'
 
 
-def released_by_one(ground, name: str, arguments: dict) -> bool:
+def released_by_one(ground, name, arguments):
     command = enter_command(ground, name, arguments, spacecraft_id=76, actor="ann")
     try:
         release_command(ground, command, actor="ann")
@@ -263,13 +270,13 @@ REPLAY = ("replay_store", {"start_ticks": 0, "stop_ticks": 1})
 SET_MODE = ("perform_function", {"function_id": "set_mode", "argument_1": 1.0, "argument_2": 0.0})
 
 
-def test_the_mission_changes_which_telecommands_need_a_second_person(ground) -> None:
+def test_the_mission_changes_which_telecommands_need_a_second_person(ground):
     assert (released_by_one(ground, *REPLAY), released_by_one(ground, *SET_MODE)) == (True, False)
     add_mission(ground, approval_text(RAISED, RELAXED))
     assert (released_by_one(ground, *REPLAY), released_by_one(ground, *SET_MODE)) == (False, True)
 
 
-def test_a_description_in_an_archive_changes_nothing_of_what_people_approve(ground) -> None:
+def test_a_description_in_an_archive_changes_nothing_of_what_people_approve(ground):
     mission, text = read_mission(approval_text(RELAXED))
     ground.write(enter, mission, text, actor="archive")
     assert not released_by_one(ground, *SET_MODE)
@@ -278,7 +285,7 @@ def test_a_description_in_an_archive_changes_nothing_of_what_people_approve(grou
 OPERATOR = Caller("ann", "operator")
 
 
-def test_only_an_administrator_changes_which_telecommands_need_a_second_person(ground) -> None:
+def test_only_an_administrator_changes_which_telecommands_need_a_second_person(ground):
     with pytest.raises(Forbidden, match="expected an administrator"):
         add_mission(ground, approval_text(RELAXED), actor="ann", caller=OPERATOR)
     add_mission(ground, approval_text(RAISED), actor="root")
@@ -289,18 +296,18 @@ def test_only_an_administrator_changes_which_telecommands_need_a_second_person(g
 
 
 @pytest.mark.parametrize(
-    ("line", "message"),
+    "line, message",
     [
         ('one_person_for = ["replay_stor"]', "expected 'replay_store', found 'replay_stor'"),
         ('one_person_for = ["replay_store"]\n' + RAISED, "found replay_store in both"),
     ],
 )
-def test_a_rule_about_a_telecommand_that_does_not_exist_or_twice_is_refused(line: str, message: str) -> None:
+def test_a_rule_about_a_telecommand_that_does_not_exist_or_twice_is_refused(line, message):
     [fault] = read_document(approval_text(line).decode(), "m.toml")
     assert message in str(fault)
 
 
-def test_windows_approved_automatically_with_critical_telecommands_are_refused(ground, tmp_path: Path) -> None:
+def test_windows_approved_automatically_with_critical_telecommands_are_refused(ground, tmp_path):
     extra = '\n[approval]\nwindows = "automatic"\n[uploads]\ntables = ["orientation"]\n'
     found = "a second person needed for perform_function/set_mode, uplink_first, uplink_middle, uplink_last"
     with pytest.raises(InvalidInput, match=found):
@@ -313,7 +320,7 @@ def test_windows_approved_automatically_with_critical_telecommands_are_refused(g
     assert add_mission(ground, (TEXT + released).encode()).document.critical_in_windows == ()
 
 
-def test_a_check_of_texts_that_take_long_to_compare_counts_their_lines(ground) -> None:
+def test_a_check_of_texts_that_take_long_to_compare_counts_their_lines(ground):
     head = TEXT + "\n".join(f"# {k % 7}" for k in range(1500)) + "\n"
     add_mission(ground, head.encode())
     (change,) = check_mission(ground, (TEXT + "# x\n" + "# y\n# z\n" * 700).encode()).changes
@@ -322,12 +329,12 @@ def test_a_check_of_texts_that_take_long_to_compare_counts_their_lines(ground) -
     )
 
 
-def test_a_wrong_address_of_a_webhook_is_not_shown(ground) -> None:
+def test_a_wrong_address_of_a_webhook_is_not_shown(ground):
     (fault,) = check_mission(ground, (TEXT + '[notify.ops]\nwebhook = "htp://ann:S3CRET@x"\n').encode()).faults
     assert "notify.ops.webhook" in fault and "S3CRET" not in fault
 
 
-def test_a_check_tells_all_faults_or_what_changes_and_adds_nothing(ground) -> None:
+def test_a_check_tells_all_faults_or_what_changes_and_adds_nothing(ground):
     add_mission(ground, TEXT.encode())
     assert check_mission(ground, TEXT.encode()).changes == ()
     found = check_mission(ground, TEXT.replace("fov_deg = 120", "fov_deg = 90").encode())
@@ -341,7 +348,7 @@ def test_a_check_tells_all_faults_or_what_changes_and_adds_nothing(ground) -> No
         assert list_missions(connection, Paging()).total == 1
 
 
-def test_viewers_see_neither_passwords_nor_tokens_of_webhooks(guarded: Any) -> None:
+def test_viewers_see_neither_passwords_nor_tokens_of_webhooks(guarded):
     secret = "https://user:p4ss@hooks.example/services/T0KEN"
     text = f'''
 name = "m"
@@ -355,7 +362,7 @@ webhook = "https://hooks.example/\\u0054WO"
     client, heads = guarded
     revision = add_mission(client.app.state.ground, text.encode()).revision
 
-    def shown(role: str) -> Any:
+    def shown(role):
         return client.get(f"/api/v1/missions/{revision}", headers=heads[role]).json()
 
     assert shown("operator")["text"] == text
@@ -367,7 +374,7 @@ webhook = "https://hooks.example/\\u0054WO"
     assert found["revision"] == revision
 
 
-def test_descriptions_are_entered_and_read_over_http(client: Any) -> None:
+def test_descriptions_are_entered_and_read_over_http(client):
     made = client.post("/api/v1/missions", content=TEXT, headers={"Content-Type": "text/plain"})
     assert made.status_code == 201, made.text
     revision = made.json()["revision"]
@@ -381,12 +388,12 @@ def test_descriptions_are_entered_and_read_over_http(client: Any) -> None:
     assert client.get("/api/v1/missions/00000000").status_code == 404
 
 
-def test_commands_check_enter_list_and_show_a_description(tmp_path: Path, capsys) -> None:
+def test_commands_check_enter_list_and_show_a_description(tmp_path, capsys):
     file, home = tmp_path / "mission.toml", ["--home", str(tmp_path / "home"), "--json"]
     file.write_text(TEXT)
     revision = parse_mission(TEXT).revision
 
-    def run(*arguments: str) -> dict:
+    def run(*arguments):
         assert cli.run(["mission", *arguments]) == 0
         return json.loads(capsys.readouterr().out)
 
@@ -400,31 +407,32 @@ def test_commands_check_enter_list_and_show_a_description(tmp_path: Path, capsys
     assert "name: expected a valid string, found 5" in capsys.readouterr().out
 
 
-def test_several_that_enter_one_description_at_once_get_one_revision(either) -> None:
+def test_several_that_enter_one_description_at_once_get_one_revision(either):
     with ThreadPoolExecutor(4) as pool:
         entered = list(pool.map(lambda _: add_mission(either, TEXT.encode()), range(8)))
     assert len({one.id for one in entered}) == 1
     assert either.read(list_missions, Paging()).total == 1
 
 
-def test_a_description_names_a_mission() -> None:
+def test_a_description_names_a_mission():
     with pytest.raises(InvalidInput, match="name: expected"):
         parse_mission("schema_version = 1")
     assert Mission(name="x").unknown
 
 
-@pytest.mark.parametrize(
-    ("keys", "expected"),
-    [
-        ("latitude_deg = 40.4", "latitude_deg and longitude_deg together"),
-        ('outages = ["2029-08-10T06:00:00Z/2029-08-10T00:00:00Z"]', "a stop after the start"),
-        ('outages = ["tomorrow"]', "START/STOP in UTC"),
-        ("latitude_deg = 95.0\nlongitude_deg = 0.0", "latitude_deg"),
-    ],
-)
-def test_an_impossible_place_or_outage_of_a_station_is_refused(keys: str, expected: str) -> None:
+IMPOSSIBLE = """
+latitude_deg = 40.4 | latitude_deg and longitude_deg together
+outages = ["2029-08-10T06:00:00Z/2029-08-10T00:00:00Z"] | a stop after the start
+outages = ["tomorrow"] | START/STOP in UTC
+longitude_deg = 0.0; latitude_deg = 95.0 | latitude_deg
+"""
+
+
+@pytest.mark.parametrize("keys, expected", cells(IMPOSSIBLE))
+def test_an_impossible_place_or_outage_of_a_station_is_refused(keys, expected):
+    lines = keys.replace("; ", "\n")
     with pytest.raises(InvalidInput, match=expected):
-        parse_mission(f'schema_version = 1\nname = "m"\n[link.stations.madrid]\n{keys}\n')
+        parse_mission(f'schema_version = 1\nname = "m"\n[link.stations.madrid]\n{lines}\n')
 
 
 HEAD = 'name = "m"\n'
@@ -432,8 +440,7 @@ RULE = '[[automation.rules]]\nname = "a"\non = "window ended"\ndo = ["report"]\n
 PEOPLE = '[automation.channels.people]\nemail = ["a@b"]\n'
 
 
-@pytest.mark.parametrize(
-    ("text", "line"),
+@pytest.mark.parametrize("text, line",
     [
         (RULE, "automation: expected no rules (the follow-up of an event is fixed, and alert rules are those of "
                "Prometheus), found automation.rules"),
@@ -451,14 +458,12 @@ PEOPLE = '[automation.channels.people]\nemail = ["a@b"]\n'
         ("[notify.ops]\nemail = ['a@b']\nsigning_secret = 'x'\n", "notify.ops: expected signing_secret with a webhook"),
     ],
 )  # fmt: skip
-def test_a_new_description_with_rules_or_an_impossible_receiver_is_refused_with_one_line(text: str, line: str) -> None:
+def test_a_new_description_with_rules_or_an_impossible_receiver_is_refused_with_one_line(text, line):
     [fault] = read_document(HEAD + text, "mission.toml")
     assert str(fault).startswith(f"mission.toml, {line}")
 
 
-def test_rules_of_a_stored_description_are_ignored_with_a_remark_and_its_channels_are_notified(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_rules_of_a_stored_description_are_ignored_with_a_remark_and_its_channels_are_notified(caplog):
     with caplog.at_level(logging.WARNING):
         found = parse_mission(HEAD + RULE + PEOPLE, "revision 1", stored=True)
     assert found == parse_mission(HEAD + PEOPLE.replace("automation.channels", "notify"))
@@ -466,14 +471,14 @@ def test_rules_of_a_stored_description_are_ignored_with_a_remark_and_its_channel
     assert remark.startswith("revision 1: 1 rules of an earlier version have no effect")
 
 
-def test_a_stored_description_with_an_empty_list_of_rules_evaluates_nothing() -> None:
+def test_a_stored_description_with_an_empty_list_of_rules_evaluates_nothing():
     assert parse_mission(f"{HEAD}[automation]\nrules = []\n", stored=True).automation.evaluate is False
     assert parse_mission(HEAD + RULE, stored=True).automation.evaluate is None
     stated = f"{HEAD}[automation]\nevaluate = true\nrules = []\n"
     assert parse_mission(stored=True, text=stated).automation.evaluate is True
 
 
-def test_a_stored_revision_with_rules_opens_and_names_its_receivers(either: Ground) -> None:
+def test_a_stored_revision_with_rules_opens_and_names_its_receivers(either):
     text = f"{HEAD}[spacecraft]\nid = 76\n{RULE}[automation.channels.hook]\nwebhook = 'https://x.example/T0KEN'\n"
     mission = parse_mission(text, stored=True)
     key, _ = either.write(store.add_revision, mission, text, actor="ann", now_utc_ns=1)
@@ -484,7 +489,7 @@ def test_a_stored_revision_with_rules_opens_and_names_its_receivers(either: Grou
     assert shown.document.notify["hook"].webhook == "https://x.example/..."
 
 
-def test_receivers_survive_the_format() -> None:
+def test_receivers_survive_the_format():
     mission = parse_mission(f"{HEAD}[notify.ops]\nwebhook = 'http://x/'\nsigning_secret = 'ops'\n")
     assert parse_mission(format_mission(mission)) == mission
     assert mission.notify["ops"].server == ("x", 80)

@@ -2,10 +2,6 @@
 Links and resources of a mission description: valid ones, and one clear line for each fault.
 """
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -14,7 +10,6 @@ from ground_service.errors import InvalidInput
 from ground_service.evaluation.core import evaluate_pass
 from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.service import make_report
-from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.frames import camera_of
 from ground_service.missions.model import Camera, format_mission, parse_mission
@@ -26,7 +21,7 @@ from ground_service.planning import service as planning
 from ground_service.store import repository
 from lunar.frames import IauOrientation
 from lunar.timescales import parse_utc
-from tests.ground_service.conftest import SyntheticPass, add_reference
+from tests.ground_service.conftest import add_reference
 from tmtc.downlink import encode_cadus
 
 START, STOP = parse_utc("2029-08-07T06:00:00Z"), parse_utc("2029-08-07T06:05:45Z")
@@ -72,11 +67,16 @@ median_error_m = 100
 
 
 @pytest.fixture(scope="module")
-def made(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
+def made(make_pass):
     return make_pass(frames=24, seed=2)
 
 
-def flown(ground: Ground, made: SyntheticPass, spacecraft: int, folder: Path) -> int:
+def both(ground):
+    """Add the description of each spacecraft."""
+    return {76: add_mission(ground, WIDE.encode()), 77: add_mission(ground, NARROW.encode())}
+
+
+def flown(ground, made, spacecraft, folder):
     """Ingest the same packets as telemetry of a spacecraft; return the id of its pass."""
     path = folder / f"{spacecraft}.cadu"
     path.write_bytes(encode_cadus(made.packets, spacecraft_id=spacecraft))
@@ -84,16 +84,14 @@ def flown(ground: Ground, made: SyntheticPass, spacecraft: int, folder: Path) ->
     return define_pass(ground, name="pass", start_utc_ns=START, stop_utc_ns=STOP, spacecraft_id=spacecraft)
 
 
-def row(ground: Ground, table: Any, **equal: Any) -> dict[str, Any]:
+def row(ground, table, **equal):
     found = ground.read(repository.find, table, **equal)
     assert found is not None
     return found
 
 
-def test_every_pass_is_judged_by_the_description_of_its_spacecraft(
-    either: Ground, made: SyntheticPass, tmp_path: Path
-) -> None:
-    missions = {76: add_mission(either, WIDE.encode()), 77: add_mission(either, NARROW.encode())}
+def test_every_pass_is_judged_by_the_description_of_its_spacecraft(either, made, tmp_path):
+    missions = both(either)
     add_reference(either, made.folder / "reference.oem")
     passes = {spacecraft: flown(either, made, spacecraft, tmp_path) for spacecraft in missions}
     reports = {}
@@ -104,18 +102,14 @@ def test_every_pass_is_judged_by_the_description_of_its_spacecraft(
         made_report = make_report(either, pass_id)
         for table, key in ((repository.PASSES, pass_id), (repository.REPORTS, made_report.report_id)):
             assert row(either, table, id=key)["mission_id"] == missions[spacecraft].id
-    wide, narrow = reports[76], reports[77]
-    assert (wide.evidence_level[:1], narrow.evidence_level[:1]) == ("2", "5")
-    assert wide.provenance["mission description"].startswith("wide, revision")
-    assert narrow.provenance["mission description"].startswith("narrow, revision")
-    for report, limit in ((wide, 200.0), (narrow, 100.0)):
+    for report, level, name, limit in ((reports[76], "2", "wide", 200.0), (reports[77], "5", "narrow", 100.0)):
+        assert report.evidence_level[:1] == level
+        assert report.provenance["mission description"].startswith(f"{name}, revision")
         assert [one.limit for one in report.requirements if one.key == "accuracy.median"] == [limit]
 
 
-def test_windows_and_telecommands_reference_the_description_of_their_spacecraft(
-    ground: Ground, made: SyntheticPass
-) -> None:
-    missions = {76: add_mission(ground, WIDE.encode()), 77: add_mission(ground, NARROW.encode())}
+def test_windows_and_telecommands_reference_the_description_of_their_spacecraft(ground, made):
+    missions = both(ground)
     add_reference(ground, made.folder / "reference.oem")
     for spacecraft, mission in missions.items():
         command = enter_command(ground, "test_connection", {}, spacecraft_id=spacecraft, actor="ann")
@@ -128,11 +122,8 @@ def test_windows_and_telecommands_reference_the_description_of_their_spacecraft(
     assert row(ground, repository.WINDOWS, id=window.id)["mission_id"] == newer.id
 
 
-def test_a_window_is_predicted_with_the_camera_of_its_spacecraft(
-    ground: Ground, made: SyntheticPass, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    add_mission(ground, WIDE.encode())
-    add_mission(ground, NARROW.encode())
+def test_a_window_is_predicted_with_the_camera_of_its_spacecraft(ground, made, monkeypatch):
+    both(ground)
     add_reference(ground, made.folder / "reference.oem")
     planners = []
     made_planner = planning.planner_of
@@ -146,17 +137,16 @@ def test_a_window_is_predicted_with_the_camera_of_its_spacecraft(
 
 
 def test_only_the_spacecraft_whose_description_permits_it_is_correlated_automatically(
-    ground: Ground, made: SyntheticPass, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fitted: list[int] = []
+    ground, made, tmp_path, monkeypatch
+):
+    fitted = []
 
-    def reports(_ground: Ground, _connection: Any, vehicle: int) -> Any:
+    def reports(_ground, _connection, vehicle):
         fitted.append(vehicle)
         return recorrelation.TimeReports(*[np.zeros(0, dtype=np.int64)] * 6, ())
 
     monkeypatch.setattr(recorrelation, "time_reports", reports)
-    for text in (WIDE, NARROW):
-        add_mission(ground, text.encode())
+    both(ground)
     vehicles = {}
     for spacecraft in (76, 77):
         flown(ground, made, spacecraft, tmp_path)
@@ -177,11 +167,11 @@ uplink = "127.0.0.1:10025"
 """
 
 
-def text(*parts: str, number: int = 76) -> str:
+def text(*parts, number=76):
     return HEAD.format(id=number) + "\n".join(parts)
 
 
-def test_links_are_read_with_their_defaults_and_written_again() -> None:
+def test_links_are_read_with_their_defaults_and_written_again():
     mission = parse_mission(text(LINK))
     assert mission.links is not None
     link = mission.links[0]
@@ -190,14 +180,14 @@ def test_links_are_read_with_their_defaults_and_written_again() -> None:
     assert again == mission and again.revision == mission.revision
 
 
-def test_a_description_without_links_keeps_its_revision() -> None:
+def test_a_description_without_links_keeps_its_revision():
     plain = parse_mission(text())
     assert plain.links is None
     assert plain.revision == parse_mission(text("[resources]")).revision
 
 
 @pytest.mark.parametrize(
-    ("parts", "place", "expected"),
+    "parts, place, expected",
     [
         ((LINK.replace("10015", "99999"),), "links.0", "downlink as HOST:PORT, found '127.0.0.1:99999'"),
         ((LINK.replace("downlink", "downlnk"),), "links.0.downlnk", "'downlink'"),
@@ -209,19 +199,19 @@ def test_a_description_without_links_keeps_its_revision() -> None:
         (("[resources]\nobserve_hours_per_day = 25.0",), "resources.observe_hours_per_day", "24"),
     ],
 )
-def test_a_fault_is_one_line_with_its_place(parts: tuple[str, ...], place: str, expected: str) -> None:
+def test_a_fault_is_one_line_with_its_place(parts, place, expected):
     with pytest.raises(InvalidInput) as refused:
         parse_mission(text(*parts), "mission.toml")
     message = str(refused.value)
     assert place in message and expected in message and "\n" not in message
 
 
-def test_links_need_a_spacecraft() -> None:
+def test_links_need_a_spacecraft():
     with pytest.raises(InvalidInput, match="a spacecraft id with links, found none"):
         parse_mission('name = "x"\n' + LINK)
 
 
-def test_two_spacecraft_cannot_use_the_same_link_name(ground: Ground) -> None:
+def test_two_spacecraft_cannot_use_the_same_link_name(ground):
     add_mission(ground, text(LINK).encode())
     with pytest.raises(InvalidInput, match="'lab' of spacecraft 76"):
         add_mission(ground, text(LINK, number=77).encode())

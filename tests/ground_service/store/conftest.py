@@ -1,13 +1,10 @@
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
-from ground_service.store.database import Database, prepare_database
+from ground_service.store.database import prepare_database
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
-def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
+def database(request, tmp_path):
     if request.param == "sqlite":
         url = f"sqlite:///{tmp_path / 'linna.db'}"
     else:

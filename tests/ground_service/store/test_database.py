@@ -5,9 +5,6 @@ database cannot hold are refused in one line on both databases, without the addr
 import errno
 import os
 import sqlite3
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 from alembic.autogenerate import compare_metadata
@@ -28,7 +25,7 @@ from ground_service.errors import (
     public_text,
     storage_error,
 )
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.http.model import Paging
 from ground_service.store import repository
 from ground_service.store.database import database_error, open_database, prepare_database, schema_revisions
@@ -38,11 +35,11 @@ from ground_service.store.repository import VEHICLES
 from tests.ground_service.schema import described_schema
 
 
-def url(path: Path) -> str:
+def url(path):
     return f"sqlite:///{path / 'linna.db'}"
 
 
-def test_a_new_database_is_made_with_the_newest_schema(tmp_path: Path) -> None:
+def test_a_new_database_is_made_with_the_newest_schema(tmp_path):
     database = prepare_database(url(tmp_path / "deep" / "folder"))
     found, head, _ = schema_revisions(database)
     assert found == head
@@ -52,9 +49,7 @@ def test_a_new_database_is_made_with_the_newest_schema(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
-def test_a_migrated_database_has_the_schema_of_the_models(
-    tmp_path: Path, new_postgres_database: Callable[[], str], kind: str
-) -> None:
+def test_a_migrated_database_has_the_schema_of_the_models(tmp_path, new_postgres_database, kind):
     """A change of the tables without a migration fails here."""
     urls = [url(tmp_path / "a"), url(tmp_path / "b")]
     if kind == "postgresql":
@@ -67,7 +62,7 @@ def test_a_migrated_database_has_the_schema_of_the_models(
         database.engine.dispose()
 
 
-def test_samples_are_clustered_by_time(tmp_path: Path) -> None:
+def test_samples_are_clustered_by_time(tmp_path):
     """The primary key leads with vehicle, dictionary and time: a time range is one contiguous read."""
     database = prepare_database(url(tmp_path))
     with database.reading() as connection:
@@ -78,7 +73,7 @@ def test_samples_are_clustered_by_time(tmp_path: Path) -> None:
     database.engine.dispose()
 
 
-def test_a_database_of_a_newer_version_is_left_alone(tmp_path: Path) -> None:
+def test_a_database_of_a_newer_version_is_left_alone(tmp_path):
     database = prepare_database(url(tmp_path))
     with database.writing() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
@@ -88,7 +83,7 @@ def test_a_database_of_a_newer_version_is_left_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("revision", ["0001", "0011"])
-def test_a_database_before_version_1_is_refused_with_the_way_to_carry_it_over(tmp_path: Path, revision: str) -> None:
+def test_a_database_before_version_1_is_refused_with_the_way_to_carry_it_over(tmp_path, revision):
     database = prepare_database(url(tmp_path))
     with database.writing() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = :found"), {"found": revision})
@@ -101,26 +96,26 @@ def test_a_database_before_version_1_is_refused_with_the_way_to_carry_it_over(tm
     assert "\n" not in str(caught.value)
 
 
-def test_an_empty_database_is_left_empty_where_it_may_not_be_upgraded(tmp_path: Path) -> None:
+def test_an_empty_database_is_left_empty_where_it_may_not_be_upgraded(tmp_path):
     with pytest.raises(DatabaseNotMigrated, match="found none; run 'linna db upgrade'"):
         prepare_database(url(tmp_path), upgrade=False)
 
 
-def test_a_file_that_is_no_database_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_file_that_is_no_database_is_refused_in_one_line(tmp_path):
     (tmp_path / "linna.db").write_bytes(b"not a database, but long enough to be looked at " * 40)
     with pytest.raises(DatabaseUnavailable, match="file is not a database; expected a SQLite database"):
         prepare_database(url(tmp_path))
 
 
 @pytest.mark.parametrize("wrong", ["nonsense", "oracle+what://x", "postgresql+psycopg://nobody:secret@127.0.0.1:1/x"])
-def test_a_database_that_cannot_be_reached_is_named_without_its_password(wrong: str) -> None:
+def test_a_database_that_cannot_be_reached_is_named_without_its_password(wrong):
     with pytest.raises(DatabaseUnavailable) as caught:
         prepare_database(wrong)
     assert "secret" not in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_connection_for_reading_refuses_changes(postgres_url: str) -> None:
+def test_a_connection_for_reading_refuses_changes(postgres_url):
     database = prepare_database(postgres_url, upgrade=True)
     changes = (insert(VEHICLES).values(ccsds_id=76, instance="flight"), delete(VEHICLES))
     for change in changes:
@@ -133,7 +128,7 @@ def test_a_connection_for_reading_refuses_changes(postgres_url: str) -> None:
     database.engine.dispose()
 
 
-def test_a_write_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_a_write_that_fails_leaves_nothing_behind(tmp_path):
     database = prepare_database(url(tmp_path))
     with pytest.raises(RuntimeError), database.writing() as connection:
         connection.execute(text("INSERT INTO vehicles (ccsds_id, instance) VALUES (1, 'x')"))
@@ -143,7 +138,7 @@ def test_a_write_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
     database.engine.dispose()
 
 
-def test_a_full_database_is_one_clear_line(tmp_path: Path) -> None:
+def test_a_full_database_is_one_clear_line(tmp_path):
     """SQLite itself says that it is full when it may take no more pages."""
     database = prepare_database(url(tmp_path))
     with pytest.raises(StorageFull, match="no space left"), database.writing() as connection:
@@ -156,7 +151,7 @@ def test_a_full_database_is_one_clear_line(tmp_path: Path) -> None:
     database.engine.dispose()
 
 
-def test_a_read_only_database_is_one_clear_line(tmp_path: Path) -> None:
+def test_a_read_only_database_is_one_clear_line(tmp_path):
     prepare_database(url(tmp_path)).engine.dispose()
     database = open_database(f"sqlite:///file:{tmp_path / 'linna.db'}?mode=ro&uri=true")
     with pytest.raises(StorageReadOnly), database.writing() as connection:
@@ -165,15 +160,15 @@ def test_a_read_only_database_is_one_clear_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "kind"), [(errno.ENOSPC, StorageFull), (errno.EROFS, StorageReadOnly), (errno.EACCES, StorageReadOnly)]
+    "number, kind", [(errno.ENOSPC, StorageFull), (errno.EROFS, StorageReadOnly), (errno.EACCES, StorageReadOnly)]
 )
-def test_errors_of_the_disk_are_named(number: int, kind: type[Exception]) -> None:
+def test_errors_of_the_disk_are_named(number, kind):
     error = storage_error(OSError(number, os.strerror(number)), "/archive")
     assert isinstance(error, kind)
     assert str(error).startswith("/archive: ")
 
 
-def test_a_file_is_stored_once_and_cannot_be_changed(tmp_path: Path) -> None:
+def test_a_file_is_stored_once_and_cannot_be_changed(tmp_path):
     archive = FileArchive(tmp_path / "files")
     first = archive.put([b"abc", b"def"])
     assert archive.put_octets(b"abcdef") == first
@@ -182,10 +177,10 @@ def test_a_file_is_stored_once_and_cannot_be_changed(tmp_path: Path) -> None:
     assert first.path.stat().st_mode & 0o222 == 0
 
 
-def test_a_file_cut_off_while_stored_leaves_nothing(tmp_path: Path) -> None:
+def test_a_file_cut_off_while_stored_leaves_nothing(tmp_path):
     archive = FileArchive(tmp_path / "files")
 
-    def broken() -> object:
+    def broken():
         yield b"abc"
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -194,7 +189,7 @@ def test_a_file_cut_off_while_stored_leaves_nothing(tmp_path: Path) -> None:
     assert not [p for p in archive.root.rglob("*") if p.is_file()]
 
 
-def test_a_damaged_file_is_noticed(tmp_path: Path) -> None:
+def test_a_damaged_file_is_noticed(tmp_path):
     archive = FileArchive(tmp_path / "files")
     stored = archive.put_octets(b"abcdef")
     stored.path.chmod(0o644)
@@ -205,7 +200,7 @@ def test_a_damaged_file_is_noticed(tmp_path: Path) -> None:
         archive.get("0" * 64)
 
 
-def test_sqlite_can_be_opened_by_anything_else(tmp_path: Path) -> None:
+def test_sqlite_can_be_opened_by_anything_else(tmp_path):
     """No lock is held and no transaction left open after use."""
     prepare_database(url(tmp_path)).engine.dispose()
     with sqlite3.connect(tmp_path / "linna.db") as connection:
@@ -213,9 +208,7 @@ def test_sqlite_can_be_opened_by_anything_else(tmp_path: Path) -> None:
     connection.close()
 
 
-def test_a_commit_waits_for_the_standby_even_if_the_role_is_set_up_otherwise(
-    new_postgres_database: Callable[[], str],
-) -> None:
+def test_a_commit_waits_for_the_standby_even_if_the_role_is_set_up_otherwise(new_postgres_database):
     url = new_postgres_database()
     for unsafe in ("local", "remote_write", "off"):
         database = open_database(f"{url}?options=-csynchronous_commit%3D{unsafe}")
@@ -224,7 +217,7 @@ def test_a_commit_waits_for_the_standby_even_if_the_role_is_set_up_otherwise(
         database.engine.dispose()
 
 
-def test_a_database_of_another_encoding_is_refused_in_one_line(new_postgres_database: Callable[[], str]) -> None:
+def test_a_database_of_another_encoding_is_refused_in_one_line(new_postgres_database):
     """Its texts come back as octets."""
     url = new_postgres_database()
     engine = open_database(url).engine.execution_options(isolation_level="AUTOCOMMIT")
@@ -242,7 +235,7 @@ def test_a_database_of_another_encoding_is_refused_in_one_line(new_postgres_data
         {"created_utc_ns": -(2**70)}, {"error": "half of a pair \ud800"},
     ],
 )  # fmt: skip
-def test_a_value_that_no_database_can_hold_is_refused(either: Ground, values: dict[str, Any]) -> None:
+def test_a_value_that_no_database_can_hold_is_refused(either, values):
     row = {
         "id": "j", "kind": "report", "state": "queued", "arguments": {}, "progress": 0.0, "attempts": 0,
         "created_utc_ns": 1, **values,
@@ -257,7 +250,7 @@ def test_a_value_that_no_database_can_hold_is_refused(either: Ground, values: di
         assert repository.newest(connection, repository.JOBS, Paging())[1] == 0
 
 
-def test_text_with_nul_is_refused_by_postgresql_as_input(migrated_postgres: Any, tmp_path: Path) -> None:
+def test_text_with_nul_is_refused_by_postgresql_as_input(migrated_postgres, tmp_path):
     url = migrated_postgres()
     with (
         open_ground(tmp_path, database_url=url) as ground,
@@ -268,7 +261,7 @@ def test_text_with_nul_is_refused_by_postgresql_as_input(migrated_postgres: Any,
 
 
 @pytest.mark.parametrize("sqlstate", ["40001", "40P01", "55P03"])
-def test_a_transaction_that_the_database_gave_up_may_be_tried_again(sqlstate: str) -> None:
+def test_a_transaction_that_the_database_gave_up_may_be_tried_again(sqlstate):
     class Original(Exception):
         pass
 

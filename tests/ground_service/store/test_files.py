@@ -3,36 +3,32 @@
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from sqlalchemy import text
 
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.store.files import FileArchive, make_durable_folder, replace_durably
 
 
 @pytest.fixture
-def ended_process() -> int:
+def ended_process():
     """Return the id of a process that has ended."""
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     return process.pid
 
 
-def test_octets_name_and_folders_are_synchronised_before_the_file_is_stored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    operations: list[str] = []
+def test_octets_name_and_folders_are_synchronised_before_the_file_is_stored(tmp_path, monkeypatch):
+    operations = []
     replace, fsync = os.replace, os.fsync
 
-    def noted_replace(source: Any, target: Any) -> None:
+    def noted_replace(source, target):
         operations.append("replace")
         replace(source, target)
 
-    def noted_fsync(descriptor: int) -> None:
+    def noted_fsync(descriptor):
         place = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
         operations.append("octets" if place.is_file() else str(place.relative_to(tmp_path)))
         fsync(descriptor)
@@ -43,13 +39,11 @@ def test_octets_name_and_folders_are_synchronised_before_the_file_is_stored(
     assert operations == [".", "home", "octets", "replace", f"home/files/{stored.sha256[:2]}", "home/files"]
 
 
-def test_a_file_that_another_process_stored_is_synchronised_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_another_process_stored_is_synchronised_too(tmp_path, monkeypatch):
     files = FileArchive(tmp_path)
     files.put_octets(b"telemetry")
     monkeypatch.setattr("ground_service.store.files._durable", set())  # as in another process
-    synchronised: list[str] = []
+    synchronised = []
     monkeypatch.setattr(os, "fsync", lambda fd: synchronised.append(os.readlink(f"/proc/self/fd/{fd}")))
     stored = files.put_octets(b"telemetry")
     assert synchronised[-2:] == [str(stored.path.parent), str(tmp_path)]
@@ -59,10 +53,10 @@ def test_a_file_that_another_process_stored_is_synchronised_too(
     assert synchronised[-1] == str(stored.path.parent)
 
 
-def test_leftovers_of_ended_processes_are_removed_at_the_start(tmp_path: Path, ended_process: int) -> None:
+def test_leftovers_of_ended_processes_are_removed_at_the_start(tmp_path, ended_process):
     files = FileArchive(tmp_path / "files")
 
-    def interrupted() -> Iterator[bytes]:
+    def interrupted():
         yield b"half of it"
         yield Path(next((tmp_path / "files").glob(".incoming-*"))).name.encode()
         raise KeyboardInterrupt
@@ -71,9 +65,9 @@ def test_leftovers_of_ended_processes_are_removed_at_the_start(tmp_path: Path, e
         files.put(interrupted())
     assert not list(files.root.glob(".incoming-*")), "an aborted upload leaves nothing"
 
-    names: list[str] = []
+    names = []
 
-    def watched() -> Iterator[bytes]:
+    def watched():
         yield b"the first "
         names.append(next(files.root.glob(".incoming-*")).name)
         yield b"and the rest"
@@ -97,11 +91,11 @@ def test_leftovers_of_ended_processes_are_removed_at_the_start(tmp_path: Path, e
     assert folders == [name.replace("incoming", "unpacking") for name in left]
 
 
-def test_a_folder_is_whole_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_is_whole_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
     (tmp_path / "partial" / "files").mkdir(parents=True)
     (tmp_path / "partial" / "files" / "a").write_bytes(b"a")
     (tmp_path / "partial" / "list").write_bytes(b"list")
-    steps: list[str] = []
+    steps = []
     replace, read = os.replace, os.readlink
     monkeypatch.setattr(os, "fsync", lambda fd: steps.append(read(f"/proc/self/fd/{fd}")))
     monkeypatch.setattr(os, "replace", lambda a, b: (steps.append("name"), replace(a, b)))
@@ -113,12 +107,12 @@ def test_a_folder_is_whole_on_the_disk_before_it_has_its_name(tmp_path: Path, mo
     assert (tmp_path / "backup" / "files" / "a").read_bytes() == b"a"
 
 
-def test_commits_to_sqlite_are_synchronised(ground: Ground) -> None:
+def test_commits_to_sqlite_are_synchronised(ground):
     with ground.database.reading() as connection:
         assert connection.execute(text("PRAGMA synchronous")).scalar() == 2  # FULL
 
 
-def test_folders_are_made_once(tmp_path: Path) -> None:
+def test_folders_are_made_once(tmp_path):
     make_durable_folder(tmp_path / "a" / "b")
     make_durable_folder(tmp_path / "a" / "b")
     assert (tmp_path / "a" / "b").is_dir()

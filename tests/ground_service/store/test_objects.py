@@ -4,8 +4,6 @@ import hashlib
 import os
 import time
 import uuid
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -15,22 +13,22 @@ from ground_service.store import files as files_module
 from ground_service.store import objects as objects_module
 from ground_service.store.files import FileArchive, files_of
 from ground_service.store.objects import objects_of
-from tests.ground_service.object_server import ObjectServer, running_objects
+from tests.ground_service.object_server import running_objects
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[ObjectServer]:
+def server():
     with running_objects(f"files-{uuid.uuid4().hex[:8]}") as running:
         yield running
 
 
 @pytest.fixture
-def machine(server: ObjectServer, tmp_path: Path):
+def machine(server, tmp_path):
     """A function that returns the file archive of a machine of its own; the tests use different contents."""
     return lambda name: files_of(tmp_path / name, server.store())
 
 
-def test_a_file_stored_on_one_machine_is_read_on_another(machine) -> None:
+def test_a_file_stored_on_one_machine_is_read_on_another(machine):
     stored = machine("a").put_octets(b"telemetry of one")
     other = machine("b")
     assert not other.place(stored.sha256).exists()
@@ -43,7 +41,7 @@ def test_a_file_stored_on_one_machine_is_read_on_another(machine) -> None:
     assert (stored.sha256, True) in set(other.names())
 
 
-def test_storing_again_changes_nothing_and_restores_a_lost_object(machine, server) -> None:
+def test_storing_again_changes_nothing_and_restores_a_lost_object(machine, server):
     one = machine("a")
     stored = one.put_octets(b"again")
     assert one.put_octets(b"again") == stored
@@ -53,7 +51,7 @@ def test_storing_again_changes_nothing_and_restores_a_lost_object(machine, serve
     assert machine("b").get(stored.sha256) == b"again"
 
 
-def test_a_file_that_is_not_stored_is_not_found(machine) -> None:
+def test_a_file_that_is_not_stored_is_not_found(machine):
     sha256 = hashlib.sha256(b"never").hexdigest()
     one = machine("a")
     assert one.octets(sha256) is None and not one.path(sha256).exists()
@@ -63,7 +61,7 @@ def test_a_file_that_is_not_stored_is_not_found(machine) -> None:
         next(one.blocks(sha256))
 
 
-def test_a_removed_file_is_gone_for_all(machine) -> None:
+def test_a_removed_file_is_gone_for_all(machine):
     one = machine("a")
     stored = one.put_octets(b"to be removed")
     one.remove(stored.sha256)
@@ -71,7 +69,7 @@ def test_a_removed_file_is_gone_for_all(machine) -> None:
     assert not stored.path.exists() and machine("b").octets(stored.sha256) is None
 
 
-def test_a_damaged_object_is_not_taken_into_a_cache(machine, server) -> None:
+def test_a_damaged_object_is_not_taken_into_a_cache(machine, server):
     one = machine("a")
     stored = one.put_octets(b"good octets")
     store = server.store().under("files")
@@ -83,7 +81,7 @@ def test_a_damaged_object_is_not_taken_into_a_cache(machine, server) -> None:
     one.remove(stored.sha256)
 
 
-def test_nothing_is_acknowledged_while_the_store_is_away(tmp_path: Path) -> None:
+def test_nothing_is_acknowledged_while_the_store_is_away(tmp_path):
     with running_objects(f"away-{uuid.uuid4().hex[:8]}") as server:
         one, other = (files_of(tmp_path / name, server.store()) for name in "ab")
         known = one.put_octets(b"before")
@@ -105,14 +103,14 @@ def test_nothing_is_acknowledged_while_the_store_is_away(tmp_path: Path) -> None
         assert not list(one.root.glob(".incoming-*"))
 
 
-def test_a_bucket_that_does_not_exist_is_one_line(server, tmp_path: Path) -> None:
+def test_a_bucket_that_does_not_exist_is_one_line(server, tmp_path):
     settings = Settings(**{**server.settings(), "objects": "s3://another-bucket"})
     files = files_of(tmp_path, objects_of(settings))
     with pytest.raises(ObjectsUnavailable, match="bucket another-bucket: cannot be used: NoSuchBucket"):
         files.put_octets(b"x")
 
 
-def test_large_objects_are_sent_in_parts(machine, monkeypatch) -> None:
+def test_large_objects_are_sent_in_parts(machine, monkeypatch):
     monkeypatch.setattr(objects_module, "SINGLE_OCTETS", 1 << 20)
     monkeypatch.setattr(objects_module, "PART_OCTETS", 5 << 20)
     block = bytes(range(256)) * 4096
@@ -121,7 +119,7 @@ def test_large_objects_are_sent_in_parts(machine, monkeypatch) -> None:
     assert hashlib.sha256(b"".join(machine("b").blocks(stored.sha256))).hexdigest() == stored.sha256
 
 
-def test_the_cache_is_trimmed_to_its_size_oldest_first(server, tmp_path: Path) -> None:
+def test_the_cache_is_trimmed_to_its_size_oldest_first(server, tmp_path):
     settings = Settings(**server.settings(), objects_cache_gib=300 / (1 << 30))
     files = files_of(tmp_path, objects_of(settings))
     stored = [files.put_octets(bytes([k]) * 100) for k in range(5)]
@@ -138,7 +136,7 @@ def test_the_cache_is_trimmed_to_its_size_oldest_first(server, tmp_path: Path) -
     assert files.get(stored[3].sha256) == bytes([3]) * 100  # fetched again
 
 
-def test_files_of_the_last_hour_stay_in_the_cache(server, tmp_path: Path) -> None:
+def test_files_of_the_last_hour_stay_in_the_cache(server, tmp_path):
     settings = Settings(**server.settings(), objects_cache_gib=0.0)
     files = files_of(tmp_path, objects_of(settings))
     stored = files.put_octets(b"just stored")
@@ -146,7 +144,7 @@ def test_files_of_the_last_hour_stay_in_the_cache(server, tmp_path: Path) -> Non
     assert files.trim(time.time() + files_module.CACHED_S + 1) == 1
 
 
-def test_the_cache_is_trimmed_at_times_and_without_the_store_not_at_all(server, tmp_path, monkeypatch) -> None:
+def test_the_cache_is_trimmed_at_times_and_without_the_store_not_at_all(server, tmp_path, monkeypatch):
     settings = Settings(**server.settings(), objects_cache_gib=0.0)
     files = files_of(tmp_path, objects_of(settings))
     monkeypatch.setattr(files_module, "TRIM_S", 0.0)
@@ -165,13 +163,13 @@ def test_the_cache_is_trimmed_at_times_and_without_the_store_not_at_all(server, 
     assert first.path.exists()
 
 
-def test_a_folder_is_never_trimmed(tmp_path: Path) -> None:
+def test_a_folder_is_never_trimmed(tmp_path):
     files = FileArchive(tmp_path)
     stored = files.put_octets(b"the only copy")
     assert files.trim(time.time() + 1e9) == 0 and stored.path.exists()
 
 
-def test_keys_come_from_files_and_are_not_shown(monkeypatch, tmp_path: Path) -> None:
+def test_keys_come_from_files_and_are_not_shown(monkeypatch, tmp_path):
     monkeypatch.setenv("LINNA_OBJECTS", "s3://linna")
     for name in ("access", "secret"):
         (tmp_path / name).write_text(f"{name}-value\n")

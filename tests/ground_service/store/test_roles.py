@@ -1,8 +1,6 @@
 """Privileges of the database role of the service with PostgreSQL."""
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 from sqlalchemy import create_engine, make_url, text
@@ -36,7 +34,7 @@ class Roles:
 
 
 @pytest.fixture(scope="module")
-def roles(new_postgres_database: Callable[[], str]) -> Iterator[Roles]:
+def roles(new_postgres_database):
     superuser = new_postgres_database()
     database = make_url(superuser).database
     engine = create_engine(superuser, isolation_level="AUTOCOMMIT")
@@ -64,7 +62,7 @@ def roles(new_postgres_database: Callable[[], str]) -> Iterator[Roles]:
     engine.dispose()
 
 
-def assert_refused(url: str, statement: str) -> None:
+def assert_refused(url, statement):
     engine = create_engine(url, isolation_level="AUTOCOMMIT")
     try:
         with pytest.raises(DBAPIError) as error, engine.connect() as connection:
@@ -75,40 +73,55 @@ def assert_refused(url: str, statement: str) -> None:
     assert getattr(error.value.orig, "sqlstate", None) == "42501"
 
 
-@pytest.mark.parametrize(
-    "statement",
-    [
-        "UPDATE audit SET actor = 'nobody'", "DELETE FROM audit", "TRUNCATE audit",
-        "ALTER TABLE audit DISABLE TRIGGER ALL", "DROP TRIGGER audit_no_update ON audit",
-        "ALTER TABLE users ADD COLUMN hidden text", "DROP TABLE packets", "TRUNCATE packets",
-        "CREATE TABLE mine (a int)", "CREATE FUNCTION mine() RETURNS int LANGUAGE sql AS 'SELECT 1'",
-        "CREATE TRIGGER mine AFTER INSERT ON users EXECUTE FUNCTION linna_refuse_audit_change()",
-        "UPDATE alembic_version SET version_num = '9'", "CREATE ROLE mine SUPERUSER",
-        "ALTER ROLE linna_service SUPERUSER", "SET ROLE linna_owner", "SET session_replication_role = replica",
-        "COPY (SELECT 1) TO PROGRAM 'true'", "COPY users FROM '/etc/passwd'", "SELECT pg_read_file('/etc/passwd')",
-        "ALTER SYSTEM SET archive_command = 'true'", "CREATE EXTENSION file_fdw",
-    ],
-)  # fmt: skip
-def test_the_role_of_the_service_is_refused(roles: Roles, statement: str) -> None:
+REFUSED = """
+UPDATE audit SET actor = 'nobody'
+DELETE FROM audit
+TRUNCATE audit
+ALTER TABLE audit DISABLE TRIGGER ALL
+DROP TRIGGER audit_no_update ON audit
+ALTER TABLE users ADD COLUMN hidden text
+DROP TABLE packets
+TRUNCATE packets
+CREATE TABLE mine (a int)
+CREATE FUNCTION mine() RETURNS int LANGUAGE sql AS 'SELECT 1'
+CREATE TRIGGER mine AFTER INSERT ON users EXECUTE FUNCTION linna_refuse_audit_change()
+UPDATE alembic_version SET version_num = '9'
+CREATE ROLE mine SUPERUSER
+ALTER ROLE linna_service SUPERUSER
+SET ROLE linna_owner
+SET session_replication_role = replica
+COPY (SELECT 1) TO PROGRAM 'true'
+COPY users FROM '/etc/passwd'
+SELECT pg_read_file('/etc/passwd')
+ALTER SYSTEM SET archive_command = 'true'
+CREATE EXTENSION file_fdw
+"""
+
+
+@pytest.mark.parametrize("statement", REFUSED.strip().splitlines())
+def test_the_role_of_the_service_is_refused(roles, statement):
     assert_refused(roles.service, statement)
 
 
-@pytest.mark.parametrize(
-    "statement",
-    [
-        "INSERT INTO users (name, role, state, created_utc_ns) VALUES ('a', 'admin', 'active', 0)",
-        "UPDATE users SET role = 'admin'", "DELETE FROM jobs", "TRUNCATE packets", "DROP TABLE packets",
-        "CREATE TABLE mine (a int)", "SELECT nextval('users_id_seq')", "SET ROLE linna_service",
-        "COPY (SELECT 1) TO PROGRAM 'true'",
-    ],
-)  # fmt: skip
-def test_the_role_of_the_backup_cannot_write(roles: Roles, statement: str) -> None:
+REFUSED_BACKUP = """
+INSERT INTO users (name, role, state, created_utc_ns) VALUES ('a', 'admin', 'active', 0)
+UPDATE users SET role = 'admin'
+DELETE FROM jobs
+TRUNCATE packets
+DROP TABLE packets
+CREATE TABLE mine (a int)
+SELECT nextval('users_id_seq')
+SET ROLE linna_service
+COPY (SELECT 1) TO PROGRAM 'true'
+"""
+
+
+@pytest.mark.parametrize("statement", REFUSED_BACKUP.strip().splitlines())
+def test_the_role_of_the_backup_cannot_write(roles, statement):
     assert_refused(roles.backup, statement)
 
 
-def test_a_backup_is_made_with_the_role_of_the_backup_and_restored(
-    roles: Roles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_backup_is_made_with_the_role_of_the_backup_and_restored(roles, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("LINNA_DATABASE_URL", roles.owner)
     monkeypatch.setenv("LINNA_HOME", str(tmp_path / "home"))
     assert cli.run(["user", "add", "bea", "--role", "viewer"]) == 0
@@ -123,7 +136,7 @@ def test_a_backup_is_made_with_the_role_of_the_backup_and_restored(
 
 
 @pytest.fixture
-def empty(roles: Roles, new_postgres_database: Callable[[], str]) -> Iterator[Roles]:
+def empty(roles, new_postgres_database):
     """Another database of the server, without tables."""
     superuser = new_postgres_database()
     service = make_url(superuser).set(username=SERVICE).render_as_string(hide_password=False)
@@ -134,9 +147,7 @@ def empty(roles: Roles, new_postgres_database: Callable[[], str]) -> Iterator[Ro
     engine.dispose()
 
 
-def test_the_role_of_the_service_restores_a_backup_into_an_upgraded_database(
-    empty: Roles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_role_of_the_service_restores_a_backup_into_an_upgraded_database(empty, tmp_path, monkeypatch, capsys):
     """As the documentation says for the compose file: upgrade, restore, then the administrator."""
     monkeypatch.setenv("LINNA_HOME", str(tmp_path / "home"))
     monkeypatch.setenv("LINNA_ADMIN_TOKEN", "token of the administrator, long")
@@ -160,9 +171,7 @@ def test_the_role_of_the_service_restores_a_backup_into_an_upgraded_database(
     assert "expected an empty service, found rows in" in capsys.readouterr().err
 
 
-def test_granting_for_backups_takes_away_what_is_too_much(
-    roles: Roles, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_granting_for_backups_takes_away_what_is_too_much(roles, monkeypatch, capsys):
     owner = create_engine(roles.owner, isolation_level="AUTOCOMMIT")
     with owner.connect() as connection:
         connection.execute(text(f"GRANT ALL ON ALL TABLES IN SCHEMA public TO {BACKUP}"))
@@ -180,9 +189,7 @@ def test_granting_for_backups_takes_away_what_is_too_much(
     owner.dispose()
 
 
-def test_the_service_does_its_work_with_its_role(
-    roles: Roles, tmp_path: Path, synthetic_pass, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_service_does_its_work_with_its_role(roles, tmp_path, synthetic_pass, monkeypatch):
     monkeypatch.setenv("LINNA_ALLOW_DATABASE_OWNER", "false")
     settings = load_settings(home=tmp_path / "home", database_url=roles.service)
     with ground_from_settings(settings) as ground:
@@ -197,9 +204,7 @@ def test_the_service_does_its_work_with_its_role(
         assert tidy(ground, 30)["events"] >= 1
 
 
-def test_a_role_with_more_power_than_the_service_needs_is_refused(
-    roles: Roles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_role_with_more_power_than_the_service_needs_is_refused(roles, tmp_path, monkeypatch):
     monkeypatch.setenv("LINNA_ALLOW_DATABASE_OWNER", "false")
     for url, powers in (
         (roles.superuser, {"is a superuser", "can create roles", "owns tables", "can change the audit log"}),
@@ -213,7 +218,7 @@ def test_a_role_with_more_power_than_the_service_needs_is_refused(
     ground_from_settings(allowed).close()
 
 
-def test_one_right_too_many_is_noticed(roles: Roles) -> None:
+def test_one_right_too_many_is_noticed(roles):
     owner = create_engine(roles.owner, isolation_level="AUTOCOMMIT")
     database = open_database(roles.service)
     check_role(database)
@@ -230,9 +235,7 @@ def test_one_right_too_many_is_noticed(roles: Roles) -> None:
     database.engine.dispose()
 
 
-def test_granting_again_takes_away_what_is_too_much(
-    roles: Roles, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_granting_again_takes_away_what_is_too_much(roles, monkeypatch, capsys):
     owner = create_engine(roles.owner, isolation_level="AUTOCOMMIT")
     with owner.connect() as connection:
         connection.execute(text(f"GRANT ALL ON ALL TABLES IN SCHEMA public TO {SERVICE}"))
@@ -253,7 +256,7 @@ def test_granting_again_takes_away_what_is_too_much(
     assert f'GRANT SELECT ON "alembic_version" TO "{SERVICE}"' in printed
 
 
-def test_the_service_cannot_take_the_schema_away(roles: Roles, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_service_cannot_take_the_schema_away(roles, monkeypatch):
     monkeypatch.setenv("LINNA_DATABASE_URL", roles.service)
     monkeypatch.delenv("LINNA_MIGRATION_DATABASE_URL", raising=False)
     database = open_database(roles.service)
@@ -264,5 +267,5 @@ def test_the_service_cannot_take_the_schema_away(roles: Roles, monkeypatch: pyte
     database.engine.dispose()
 
 
-def test_sqlite_has_no_roles(tmp_path: Path) -> None:
+def test_sqlite_has_no_roles(tmp_path):
     check_role(open_database(f"sqlite:///{tmp_path / 'a.db'}"))

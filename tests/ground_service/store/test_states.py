@@ -9,13 +9,12 @@ import pytest
 
 import ground_service
 from ground_service.errors import NotFound, StateConflict
-from ground_service.ground import Ground
 from ground_service.store import repository
 from ground_service.store.states import JOB, TELECOMMAND, change_if, move, move_all
 from ground_service.store.vehicles import hold, next_telecommand, vehicle_id
 
 
-def add_command(ground: Ground, state: str = "queued") -> int:
+def add_command(ground, state="queued"):
     with ground.database.writing() as connection:
         vehicle = vehicle_id(connection, 76, "flight")
         return int(
@@ -26,12 +25,12 @@ def add_command(ground: Ground, state: str = "queued") -> int:
         )  # fmt: skip
 
 
-def state_of(ground: Ground, key: int) -> str:
+def state_of(ground, key):
     with ground.database.reading() as connection:
         return str(repository.get(connection, repository.TELECOMMANDS, key, "telecommand")["state"])
 
 
-def test_a_transition_happens_once_and_the_second_is_told_the_state_that_won(either: Ground) -> None:
+def test_a_transition_happens_once_and_the_second_is_told_the_state_that_won(either):
     key = add_command(either)
     either.write(move, TELECOMMAND, key, "released", reason="first")
     with (
@@ -44,12 +43,12 @@ def test_a_transition_happens_once_and_the_second_is_told_the_state_that_won(eit
         assert repository.get(connection, repository.TELECOMMANDS, key, "t")["reason"] == "first"
 
 
-def test_a_row_that_does_not_exist_is_not_found(either: Ground) -> None:
+def test_a_row_that_does_not_exist_is_not_found(either):
     with pytest.raises(NotFound, match="telecommand 99"), either.database.writing() as connection:
         move(connection, TELECOMMAND, 99, "released")
 
 
-def test_a_transition_can_ask_for_more_than_the_state(either: Ground) -> None:
+def test_a_transition_can_ask_for_more_than_the_state(either):
     either.write(
         repository.add, repository.JOBS, id="j", kind="report", state="running", arguments={}, progress=0.0,
         attempts=2, created_utc_ns=1,
@@ -59,7 +58,7 @@ def test_a_transition_can_ask_for_more_than_the_state(either: Ground) -> None:
     either.write(move, JOB, "j", "done", where={"attempts": 2})
 
 
-def test_only_rows_in_a_state_that_may_be_left_are_moved_together(either: Ground) -> None:
+def test_only_rows_in_a_state_that_may_be_left_are_moved_together(either):
     keys = [add_command(either, state) for state in ("released", "queued", "released", "rejected", "sent")]
     with either.database.writing() as connection:
         moved = move_all(connection, TELECOMMAND, [], "sent")
@@ -67,7 +66,7 @@ def test_only_rows_in_a_state_that_may_be_left_are_moved_together(either: Ground
         assert move_all(connection, TELECOMMAND, [], "sent") == []
 
 
-def test_a_row_is_changed_only_as_it_was_found(either: Ground) -> None:
+def test_a_row_is_changed_only_as_it_was_found(either):
     key = add_command(either)
     table = repository.TELECOMMANDS
     with either.database.writing() as connection:
@@ -76,7 +75,7 @@ def test_a_row_is_changed_only_as_it_was_found(either: Ground) -> None:
         assert not change_if(connection, table, key, {"state": "sent"}, reason="y")
 
 
-def test_a_row_is_added_once(either: Ground) -> None:
+def test_a_row_is_added_once(either):
     with either.database.writing() as connection:
         answers = repository.ANSWERS
         assert repository.add_new(connection, answers, key="k", request="a", created_utc_ns=1)
@@ -84,11 +83,11 @@ def test_a_row_is_added_once(either: Ground) -> None:
         assert repository.get(connection, answers, "k", "answer")["request"] == "a"
 
 
-def test_counters_give_every_number_once_to_transactions_at_the_same_time(either: Ground) -> None:
+def test_counters_give_every_number_once_to_transactions_at_the_same_time(either):
     with either.database.writing() as connection:
         vehicles = [vehicle_id(connection, number, "flight") for number in (1, 2)]
 
-    def count(vehicle: int) -> int:
+    def count(vehicle):
         return either.write(next_telecommand, vehicle)
 
     with ThreadPoolExecutor(8) as pool:
@@ -96,7 +95,7 @@ def test_counters_give_every_number_once_to_transactions_at_the_same_time(either
     assert sorted(given[::2]) == sorted(given[1::2]) == list(range(20))
 
 
-def test_a_number_that_was_not_used_is_given_again(either: Ground) -> None:
+def test_a_number_that_was_not_used_is_given_again(either):
     vehicle = either.write(vehicle_id, 1, "flight")
     with pytest.raises(RuntimeError), either.database.writing() as connection:
         next_telecommand(connection, vehicle)
@@ -105,10 +104,10 @@ def test_a_number_that_was_not_used_is_given_again(either: Ground) -> None:
         assert next_telecommand(connection, vehicle) == 0
 
 
-def test_one_transaction_at_a_time_holds_a_name(either: Ground) -> None:
+def test_one_transaction_at_a_time_holds_a_name(either):
     inside, most, lock = 0, 0, threading.Lock()
 
-    def work(_: int) -> None:
+    def work(_):
         nonlocal inside, most
         with either.database.writing() as connection:
             hold(connection, "archive")
@@ -124,7 +123,7 @@ def test_one_transaction_at_a_time_holds_a_name(either: Ground) -> None:
     assert most == 1
 
 
-def test_nothing_writes_a_state_but_the_store() -> None:
+def test_nothing_writes_a_state_but_the_store():
     """`repository.change` and bare updates read first and write afterwards: states are changed by compare-and-set."""
     root = Path(ground_service.__file__).parent
     found = []

@@ -120,36 +120,31 @@ class Console:
         self._thread.join(TIMEOUT_S)
 
 
+FRAME = """{"kind": "frame", "mode": "observing", "paused": false, "rate": 1.0, "verifications": [],
+    "altitude_km": 30.0, "detections": [{"u_px": 100.0, "v_px": 120.0, "diameter_px": 40.0, "score": 0.9}],
+    "catalogue": [{"id": 1, "u_px": 101.0, "v_px": 121.0, "diameter_px": 41.0}]}"""
+DARK = """{"severity": "medium", "event": "image_dark", "values": [1.0, 2.0], "text": "mean grey level 1"}"""
+
+
 def live_frame(number: int) -> dict[str, object]:
     """A frame as the console of the emulator tells it."""
     _, jpeg = cv2.imencode(".jpg", np.full((512, 512), 20 + number, np.uint8))
-    return {
-        "kind": "frame",
+    estimate = {
+        "outcome": "fixed", "reset_trigger": "none", "latitude_deg": -50.0 + number, "longitude_deg": 294.001,
+        "altitude_m": 30e3, "error_m": 80.0 + number,
+    }  # fmt: skip
+    return json.loads(FRAME) | {
         "utc": f"2029-08-07T06:{number // 4:02d}:{15 * (number % 4):02d}.000Z",
-        "mode": "observing",
-        "paused": False,
-        "rate": 1.0,
-        "events": [{"severity": "medium", "event": "image_dark", "values": [1.0, 2.0], "text": "mean grey level 1"}]
-        if number == 3
-        else [],
-        "verifications": [],
+        "events": [json.loads(DARK)] if number == 3 else [],
         "frame": number,
         "reference": {"latitude_deg": -50.0 + number, "longitude_deg": 294.0, "altitude_m": 30e3},
-        "altitude_km": 30.0,
-        "detections": [{"u_px": 100.0, "v_px": 120.0, "diameter_px": 40.0, "score": 0.9}],
-        "catalogue": [{"id": 1, "u_px": 101.0, "v_px": 121.0, "diameter_px": 41.0}],
-        "estimates": {
-            "anchored": {
-                "outcome": "fixed", "reset_trigger": "none", "latitude_deg": -50.0 + number,
-                "longitude_deg": 294.001, "altitude_m": 30e3, "error_m": 80.0 + number,
-            }
-        },
+        "estimates": {"anchored": estimate},
         "image_jpeg": base64.b64encode(jpeg.tobytes()).decode(),
-    }  # fmt: skip
+    }
 
 
 @pytest.fixture
-def live_frames() -> list[dict[str, object]]:
+def live_frames():
     """Five frames of a live payload."""
     return [live_frame(number) for number in range(5)]
 
@@ -196,7 +191,7 @@ class Service:
 
 
 @pytest.fixture(scope="session")
-def console() -> Iterator[Console]:
+def console():
     """A payload's console."""
     opened = Console()
     yield opened
@@ -204,7 +199,7 @@ def console() -> Iterator[Console]:
 
 
 @pytest.fixture(scope="session")
-def service(tmp_path_factory, synthetic_pass, console) -> Iterator[Service]:
+def service(tmp_path_factory, synthetic_pass, console):
     """A service without users, with the synthetic pass imported."""
     home = tmp_path_factory.mktemp("web") / "home"
     with open_ground(home) as ground:
@@ -214,13 +209,13 @@ def service(tmp_path_factory, synthetic_pass, console) -> Iterator[Service]:
 
 
 @pytest.fixture(scope="session")
-def serve() -> type[Service]:
+def serve():
     """Start another service: ``with serve(home, console_port, openmct, settings)``."""
     return Service
 
 
 @pytest.fixture(scope="session")
-def openmct(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def openmct(tmp_path_factory):
     """The npm package: that of `make openmct`, else installed from the lock file for these tests."""
     if pages.FOLDER.is_dir():
         return pages.FOLDER
@@ -252,7 +247,7 @@ class Pictures:
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def browser():
     """The system's Chromium, without a screen; a state that is reached ends the wait for it.
 
     While it is driven, `asyncio.run` is refused in the thread of the tests, so it ends with its file.
@@ -293,7 +288,7 @@ def strict_page(browser: Browser, url: str, *, strict: bool = True) -> Iterator[
 
 
 @pytest.fixture
-def page(browser: Browser, service: Service) -> Iterator[Page]:
+def page(browser, service):
     """A fresh page of the service."""
     with strict_page(browser, service.url, strict=False) as opened:
         yield opened

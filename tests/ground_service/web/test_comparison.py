@@ -9,6 +9,7 @@ from ground_service.evaluation.service import make_report
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
+from tests.ground_service.conftest import cells
 from tests.ground_service.web.conftest import strict_page
 from tests.ground_service.web.test_in_browser import answered, colour_of, settled
 from tests.lazy import expect
@@ -119,9 +120,15 @@ def test_passes_are_filtered_by_their_verdict(view):
     expect(view.locator("#passes")).to_contain_text("No pass matches.")
 
 
-@pytest.mark.parametrize(
-    ("level", "colour"), [("met", "--good"), ("not met", "--bad"), ("unknown", "--caution"), ("", "--caution")]
-)
+COLOURS = """
+met | --good
+not met | --bad
+unknown | --caution
+| --caution
+"""
+
+
+@pytest.mark.parametrize("level, colour", cells(COLOURS))
 def test_a_verdict_has_the_same_word_and_colour_on_every_page(view, level, colour):
     def with_level(route):
         document = route.fetch().json()

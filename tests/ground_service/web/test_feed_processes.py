@@ -2,10 +2,7 @@
 
 import asyncio
 import threading
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import Any
 from unittest.mock import MagicMock
 
 import pytest
@@ -26,17 +23,17 @@ LIVE = "/api/v1/live?values=true"
 
 
 @pytest.fixture
-def server_url(migrated_postgres: Callable[[], str]) -> str:
+def server_url(migrated_postgres):
     """An empty PostgreSQL database with the schema."""
     url = migrated_postgres()
     return url
 
 
-def ask(port: int, path: str, body: bytes | None = None) -> tuple[int, bytes, Any]:
+def ask(port, path, body=None):
     return fetch(f"http://127.0.0.1:{port}/api/v1/{path}", body)
 
 
-def housekeeping(second: int, **values: float) -> bytes:
+def housekeeping(second, **values):
     fields = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
     packet = DICTIONARY.pack(
         "housekeeping", fields | values | {"structure_id": 1}, ticks=(900_000_000 + second) * 65_536,
@@ -45,7 +42,7 @@ def housekeeping(second: int, **values: float) -> bytes:
     return encode_cadus([packet], spacecraft_id=76)
 
 
-def keep_sending(connection: Any, stop: threading.Event) -> None:
+def keep_sending(connection, stop):
     """Send a packet each tenth of a second, from second 23."""
     second = 23
     while not stop.wait(0.1):
@@ -53,7 +50,7 @@ def keep_sending(connection: Any, stop: threading.Event) -> None:
         second += 1
 
 
-def temperature_after(socket: Any) -> float:
+def temperature_after(socket):
     """Return the temperature of the next message with values."""
     while (message := socket.receive_json())["kind"] != "values":
         pass
@@ -62,7 +59,7 @@ def temperature_after(socket: Any) -> float:
 
 
 @pytest.fixture
-def other(tmp_path: Path, server_url: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Any, Any]]:
+def other(tmp_path, server_url, monkeypatch):
     """An API process A with links, and the client of an API B in this process, which never polls."""
     monkeypatch.setattr(sockets, "POLL_S", NEVER_S)
     monkeypatch.setattr(wakeups, "RETRY_S", 0.1)
@@ -74,9 +71,7 @@ def other(tmp_path: Path, server_url: str, monkeypatch: pytest.MonkeyPatch) -> I
             yield processes, client
 
 
-def test_telemetry_received_by_one_process_is_shown_by_the_other_through_a_restart_of_redis(
-    other: tuple[Any, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_telemetry_received_by_one_process_is_shown_by_the_other_through_a_restart_of_redis(other, monkeypatch):
     processes, client = other
     log = MagicMock()
     monkeypatch.setattr(wakeups, "log", log)
@@ -117,15 +112,15 @@ def test_telemetry_received_by_one_process_is_shown_by_the_other_through_a_resta
         station.close()
 
 
-def test_a_wake_up_of_another_process_is_heard_and_an_own_one_is_not(redis_url: str) -> None:
-    heard: list[str] = []
+def test_a_wake_up_of_another_process_is_heard_and_an_own_one_is_not(redis_url):
+    heard = []
     connected, woken = threading.Event(), threading.Event()
 
-    def wake() -> None:
+    def wake():
         (woken if connected.is_set() else connected).set()
         heard.append("wake")
 
-    async def run() -> None:
+    async def run():
         task = asyncio.create_task(wakeups.listen(redis_url, wake))
         assert await asyncio.to_thread(connected.wait, 60.0)
         wakeups.Waker(redis_url)(frozenset({"telemetry"}))
@@ -138,7 +133,7 @@ def test_a_wake_up_of_another_process_is_heard_and_an_own_one_is_not(redis_url: 
     assert heard == ["wake", "wake"]
 
 
-def test_an_unavailable_broker_is_reported_once_and_not_asked_at_each_commit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unavailable_broker_is_reported_once_and_not_asked_at_each_commit(monkeypatch):
     log = MagicMock()
     monkeypatch.setattr(wakeups, "log", log)
     waker = wakeups.Waker("redis://127.0.0.1:1/0")

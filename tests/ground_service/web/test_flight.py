@@ -8,10 +8,8 @@ from __future__ import annotations
 import re
 import socket
 import threading
-from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -37,7 +35,7 @@ from tests.serving import wait_for
 from tmtc.dictionary.payload import DICTIONARY
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Locator, Page
+    from playwright.sync_api import Page
 
 NS = 1_000_000_000
 START = parse_utc("2029-08-07T01:40:00Z")
@@ -96,29 +94,29 @@ class Flown:
     layout: Page
     live: Page
 
-    def ask(self, path: str, **query: Any) -> Any:
+    def ask(self, path, **query):
         """Return an answer of the service."""
         answer = self.layout.request.get(f"{self.url}/api/v1/{path}", params=query)
         assert answer.ok, answer.text()
         return answer.json()
 
-    def alarm(self, name: str) -> Any:
+    def alarm(self, name):
         """Return the alarm with a name."""
         (found,) = (one for one in self.ask("alarms")["items"] if one["name"] == name)
         return found
 
-    def events(self) -> int:
+    def events(self):
         """Return the number of events."""
         return int(self.ask("events", spacecraft_id=76, instance="flight")["total"])
 
-    def newest(self) -> dict[str, Any]:
+    def newest(self):
         """Return the newest housekeeping values by name."""
         items = self.ask("parameters", spacecraft_id=76, instance="flight")["items"]
         return {one["name"]: one["value"] for one in items if one["packet"] == "housekeeping"}
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory, serve: Any, openmct: Path, browser: Browser) -> Iterator[Flown]:
+def flown(tmp_path_factory, serve, openmct, browser):
     """A payload flown live with its operator and `ORDERS`, started on the live page, followed in a layout."""
     folder = tmp_path_factory.mktemp("flight")
     data = find_data(None)
@@ -153,7 +151,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory, serve: Any, openmct: Path, b
     assert not thread.is_alive()
 
 
-def prepared_home(folder: Path, telemetry_port: int) -> Path:
+def prepared_home(folder, telemetry_port):
     """Return the folder of a service with a mission description, an ephemeris and two windows."""
     every = START + np.arange(-12 * 3600, 12 * 3600, 60, dtype=np.int64) * NS
     save_oem(ephemeris_from_states(every, *circular_states(every)), folder / "orbits.oem")
@@ -168,7 +166,7 @@ def prepared_home(folder: Path, telemetry_port: int) -> Path:
     return home
 
 
-def follow(flown: Flown) -> None:
+def follow(flown):
     """Start the flight on the live page, and wait until its last values are in the layout."""
     flown.live.goto("/live")
     expect(flown.live.locator("#state")).to_have_text("connected")
@@ -180,12 +178,12 @@ def follow(flown: Flown) -> None:
     wait_for(lambda: flown.newest().get("frames_processed") == FRAMES, "not all frames were received")
 
 
-def lad_row(page: Page, name: str) -> Locator:
+def lad_row(page, name):
     """Return the row of a table of newest values."""
     return page.get_by_label("lad row").filter(has=page.get_by_text(name, exact=True))
 
 
-def address(kind: str) -> str:
+def address(kind):
     """Return the address of an object of the spacecraft, with the time of the flight."""
     objects = ("linna:spacecraft", "linna:vehicle~76~flight", f"linna:{kind}~76~flight")
     return f"/mct#/browse/{'/'.join(objects)}?{SHOWN}"
@@ -201,14 +199,14 @@ IMAGES_LOADED = """() => {
 
 
 @pytest.fixture
-def opened(flown: Flown, browser: Browser) -> Iterator[Page]:
+def opened(flown, browser):
     """A page of its own for the displays."""
     with strict_page(browser, flown.url) as page:
         page.set_viewport_size({"width": 1280, "height": 800})
         yield page
 
 
-def test_the_layout_of_a_pass_shift_follows_a_flight(flown: Flown, tmp_path: Path) -> None:
+def test_the_layout_of_a_pass_shift_follows_a_flight(flown, tmp_path):
     page = flown.layout
     wait_for(
         lambda: f"{flown.newest()['packets_sent']:.0f}" in lad_row(page, "packets sent").inner_text(),
@@ -243,13 +241,13 @@ def test_the_layout_of_a_pass_shift_follows_a_flight(flown: Flown, tmp_path: Pat
     Pictures(tmp_path).take(page, "displays-shift")
 
 
-def highest_tick(page: Page) -> float:
+def highest_tick(page):
     """Return the greatest value on the y axis of the first plot."""
     labels = page.locator(".gl-plot").first.locator(".gl-plot-y-tick-label")
     return max((float(one) for one in labels.all_inner_texts()), default=0.0)
 
 
-def contrast(*colours: list[int]) -> float:
+def contrast(*colours):
     """Return the contrast ratio of two colours (WCAG 2.2)."""
     weights = np.array([0.2126, 0.7152, 0.0722])
     parts = np.array(colours) / 255.0
@@ -258,29 +256,29 @@ def contrast(*colours: list[int]) -> float:
     return float((light + 0.05) / (dark + 0.05))
 
 
-def fault_named(page: Page, name: str) -> Locator:
+def fault_named(page, name):
     """Return an item of the list of faults."""
     checkbox = page.get_by_label(f"Select fault: {name} in Spacecraft 76, flight", exact=True)
     return page.get_by_role("listitem").filter(has=checkbox)
 
 
-def all_events_are_shown(page: Page, flown: Flown) -> None:
+def all_events_are_shown(page, flown):
     """Wait until the table has as many events as the service, which may still be receiving the last ones."""
     rows = event_rows(page)
     wait_for(lambda: rows.count() == flown.events(), "the table does not show each event once")
 
 
-def event_rows(page: Page) -> Locator:
+def event_rows(page):
     """Return the rows of the table of events."""
     return page.locator(".c-telemetry-table__body tr")
 
 
-def activity(page: Page, name: str) -> Locator:
+def activity(page, name):
     """Return an activity of the plan."""
     return page.locator(".c-plan__activity").filter(has_text=name)
 
 
-def test_the_layout_of_a_payload_engineer_shows_the_flight(flown: Flown, opened: Page, tmp_path: Path) -> None:
+def test_the_layout_of_a_payload_engineer_shows_the_flight(flown, opened, tmp_path):
     opened.goto(address("payload-engineer"))
     expect(lad_row(opened, "frames processed")).to_contain_text(str(FRAMES))
     expect(opened.locator(PLOT)).to_have_count(2 * 6)
@@ -289,7 +287,7 @@ def test_the_layout_of_a_payload_engineer_shows_the_flight(flown: Flown, opened:
     Pictures(tmp_path).take(opened, "displays-payload")
 
 
-def test_the_live_page_shows_what_the_payload_matched(flown: Flown, tmp_path: Path) -> None:
+def test_the_live_page_shows_what_the_payload_matched(flown, tmp_path):
     expect(flown.live.locator("#numbers")).to_contain_text("matched")
     expect(flown.live.locator("#state")).to_have_text("the scenario has ended")
     background, reference = (
@@ -303,8 +301,8 @@ def test_the_live_page_shows_what_the_payload_matched(flown: Flown, tmp_path: Pa
     Pictures(tmp_path).take(flown.live, "live")
 
 
-@pytest.mark.parametrize(("kind", "width_px"), [("images", 128), ("detections", 512)])
-def test_downlinked_images_are_shown(flown: Flown, opened: Page, tmp_path: Path, kind: str, width_px: int) -> None:
+@pytest.mark.parametrize("kind, width_px", [("images", 128), ("detections", 512)])
+def test_downlinked_images_are_shown(flown, opened, tmp_path, kind, width_px):
     opened.goto(address(kind))
     # The camera gave no image of one of every second frame.
     expect(opened.locator(".c-imagery__thumb")).to_have_count(FRAMES // 2 - 1)
@@ -314,7 +312,7 @@ def test_downlinked_images_are_shown(flown: Flown, opened: Page, tmp_path: Path,
     Pictures(tmp_path, documented=False).take(opened, f"displays-{kind}")
 
 
-def test_events_are_shown_once_in_their_order(flown: Flown, opened: Page, tmp_path: Path) -> None:
+def test_events_are_shown_once_in_their_order(flown, opened, tmp_path):
     opened.goto(address("events"))
     all_events_are_shown(opened, flown)
     listed = flown.ask("events", spacecraft_id=76, instance="flight", limit=100)["items"]
@@ -325,7 +323,7 @@ def test_events_are_shown_once_in_their_order(flown: Flown, opened: Page, tmp_pa
     Pictures(tmp_path, documented=False).take(opened, "displays-events")
 
 
-def test_windows_and_contacts_are_a_plan(flown: Flown, opened: Page, tmp_path: Path) -> None:
+def test_windows_and_contacts_are_a_plan(flown, opened, tmp_path):
     span = {"since": "2029-08-07T01:00:00Z", "until": "2029-08-07T03:00:00Z"}
     # The open contact of the link ends without telemetry; until then none is predicted after it.
     wait_for(lambda: bool(flown.ask("contacts", **span)["contacts"]), "no contact is predicted")
@@ -336,7 +334,7 @@ def test_windows_and_contacts_are_a_plan(flown: Flown, opened: Page, tmp_path: P
     Pictures(tmp_path, documented=False).take(opened, "displays-plan")
 
 
-def test_faults_have_the_values_and_times_of_alarms(flown: Flown, opened: Page, tmp_path: Path) -> None:
+def test_faults_have_the_values_and_times_of_alarms(flown, opened, tmp_path):
     opened.goto(f"/mct#/browse/faults.taxonomy:faultManagement.view?{SHOWN}")
     fault = fault_named(opened, "temperature high")
     alarm = flown.alarm("temperature_high")

@@ -1,7 +1,5 @@
 """Landmarks learned from flight, reviewed in Chromium."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -11,11 +9,12 @@ from ground_service.evaluation.landmarks.service import list_landmarks, update_l
 from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
 from lunar.catalogue import load_catalogue, save_catalogue
-from tests.ground_service.conftest import write_manifest
+from tests.ground_service.conftest import enter_files
 from tests.ground_service.web.conftest import COUNT_REQUESTS, patient, press, shows
 from tests.ground_service.web.test_in_browser import answered
+from tests.ground_service.web.test_matrix import barriers
 from tests.ground_service.web.test_sign_in import sign_in
-from tests.lazy import Lazy, expect
+from tests.lazy import expect
 
 FRAMES = 12
 
@@ -29,9 +28,7 @@ def searched(tmp_path_factory, make_flyable, console, serve):
     save_catalogue(full.select(np.arange(len(full)) % 3 != 0), folder / "catalogue.csv")
     with open_ground(home) as ground:
         for name in ("first pass", "second pass"):
-            manifest = json.loads((folder / "manifest.json").read_text())
-            manifest.pop("files", None)
-            write_manifest(folder, manifest | {"pass_name": name})
+            enter_files(folder, pass_name=name)
             update_landmarks(ground, import_archive(ground, folder))
         assert ground.read(list_landmarks, LandmarkFilter(state="proposed")).total > 25  # more than a page
         tokens = {role: add_user(ground, f"ann-{role}", role) for role in ("viewer", "operator")}
@@ -62,16 +59,6 @@ def review(browser, searched):
     assert errors == []
 
 
-def serious(page):
-    """Serious barriers of a page."""
-    found = Lazy("axe_playwright_python.sync_playwright").Axe().run(page).response["violations"]
-    return [
-        (one["id"], [node["html"][:120] for node in one["nodes"]][:3])
-        for one in found
-        if one["impact"] in ("serious", "critical")
-    ]
-
-
 def test_an_operator_reviews_landmarks_with_the_keyboard(review):
     page, other = review("operator"), review("viewer")
     first = page.get_by_role("button", name="Sightings of landmark").first
@@ -88,7 +75,7 @@ def test_an_operator_reviews_landmarks_with_the_keyboard(review):
     answered(page)
     for scheme in ("light", "dark"):
         page.emulate_media(color_scheme=scheme)
-        assert serious(page) == [], scheme
+        assert barriers(page) == [], scheme
     page.keyboard.press("Tab")
     expect(page.get_by_label("Reason")).to_be_focused()
     page.keyboard.type("no rim")

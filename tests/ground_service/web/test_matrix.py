@@ -3,14 +3,11 @@
 LINNA_PAGE_TABLE=FILE writes the results as the table of the documentation: `make page-table`.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import subprocess
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -28,16 +25,13 @@ from ground_service.regression.builds import load_build, register_build
 from ground_service.web.pages import DISPLAYS, PAGES
 from lunar.catalogue import load_catalogue, save_catalogue
 from lunar.timescales import format_utc
-from tests.ground_service.conftest import SPACECRAFT, START
+from tests.ground_service.conftest import SPACECRAFT, START, cells
 from tests.ground_service.evaluation.landmarks.test_learned_landmarks import rewrite
-from tests.ground_service.web.conftest import COUNT_REQUESTS, Service, patient
+from tests.ground_service.web.conftest import COUNT_REQUESTS, patient
 from tests.ground_service.web.test_in_browser import answered, settled
 from tests.ground_service.web.test_shift import MISSION, PASS_MISSION, Spacecraft
 from tests.lazy import Lazy, expect
 from tests.serving import wait_for
-
-if TYPE_CHECKING:
-    from playwright.sync_api import Browser, BrowserContext, Page
 
 Looks = tuple[tuple[Literal["light", "dark"], str, int], ...]
 FONTS = {"DejaVu": "DejaVu Sans", "Arial": "Liberation Sans"}
@@ -103,7 +97,7 @@ WIDTH = "document.documentElement.scrollWidth"
 
 
 @pytest.fixture(scope="module")
-def empty_service(tmp_path_factory: pytest.TempPathFactory, console: Any, serve: Any) -> Iterator[Service]:
+def empty_service(tmp_path_factory, console, serve):
     """A service without any data."""
     home = tmp_path_factory.mktemp("empty") / "home"
     home.mkdir()
@@ -114,21 +108,14 @@ def empty_service(tmp_path_factory: pytest.TempPathFactory, console: Any, serve:
 class Worked:
     """A service with users and data, and the token of an administrator."""
 
-    def __init__(self, service: Service, token: str, paths: dict[str, str]) -> None:
+    def __init__(self, service, token, paths):
         self.url = service.url
         self.token = token
         self.paths = paths
 
 
 @pytest.fixture(scope="module")
-def worked(
-    tmp_path_factory: pytest.TempPathFactory,
-    make_pass: Callable[..., Any],
-    make_flyable: Callable[..., Any],
-    make_build: Callable[..., Path],
-    console: Any,
-    serve: Any,
-) -> Iterator[Worked]:
+def worked(tmp_path_factory, make_pass, make_flyable, make_build, console, serve):
     """A service with a pass received over TCP, a report, landmarks, a window, telecommands, an alarm and a build."""
     folder = tmp_path_factory.mktemp("worked")
     home = folder / "home"
@@ -169,7 +156,7 @@ def worked(
     spacecraft.close()
 
 
-def work(api: Client, spacecraft: Spacecraft, packets: list[bytes]) -> int:
+def work(api, spacecraft, packets):
     """Receive a pass over TCP, and leave traces on every page; return the number of the pass."""
     spacecraft.replay(packets)
     spacecraft.report("event_high", event_id=20, frame_number=7)
@@ -191,16 +178,16 @@ def work(api: Client, spacecraft: Spacecraft, packets: list[bytes]) -> int:
 class Faults:
     """Faults of a page by kind, in the order of the columns of the table."""
 
-    def __init__(self, page: Page) -> None:
-        self.console: list[str] = []
+    def __init__(self, page):
+        self.console = []
         page.on("console", lambda one: self.console.append(one.text) if one.type == "error" else None)
         page.on("pageerror", lambda error: self.console.append(str(error)))
-        self.layout: list[str] = []
-        self.barriers: list[str] = []
-        self.keyboard: list[str] = []
-        self.unmarked: list[str] = []
+        self.layout = []
+        self.barriers = []
+        self.keyboard = []
+        self.unmarked = []
 
-    def find(self, page: Page, looks: Looks) -> None:
+    def find(self, page, looks):
         """Look at an opened page in some forms: scheme, font and width."""
         page.evaluate(LONG_LOG)
         for scheme, font, width in looks:
@@ -216,7 +203,7 @@ class Faults:
             page.set_viewport_size({"width": width, "height": 844})
             self.tab_through(page, width)
 
-    def tab_through(self, page: Page, width: int) -> None:
+    def tab_through(self, page, width):
         """Find what the Tab key does not reach, from the start of the page to its end, and what it does not mark."""
         count = page.evaluate(USABLE)
         page.evaluate("document.activeElement.blur()")
@@ -227,13 +214,13 @@ class Faults:
         self.keyboard += [f"{width} px: {one}" for one in page.evaluate(MISSED)]
         self.unmarked += [f"{width} px: {one}" for one in page.evaluate("linnaUnmarked")]
 
-    def columns(self) -> dict[str, list[str]]:
+    def columns(self):
         """Return the faults by the name of their column."""
         found = (self.layout, self.barriers, self.console, self.keyboard, self.unmarked)
         return dict(zip(COLUMNS, found, strict=True))
 
 
-def barriers(page: Page) -> list[str]:
+def barriers(page):
     """Return the serious and critical findings of axe."""
     return [
         f"{one['id']} {[node['html'][:100] for node in one['nodes'][:2]]}"
@@ -243,9 +230,9 @@ def barriers(page: Page) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def rows() -> Iterator[list[str]]:
+def rows():
     """Rows of the table, written at the end where a file is named."""
-    lines: list[str] = []
+    lines = []
     yield lines
     if file := os.environ.get("LINNA_PAGE_TABLE"):
         head = Path(file).read_text().split("| page |")[0]
@@ -253,7 +240,7 @@ def rows() -> Iterator[list[str]]:
         Path(file).write_text("\n".join([f"{head}{heading}", "|---" * (2 + len(COLUMNS)) + "|", *lines, ""]))
 
 
-def record(rows: list[str], path: str, state: str, found: Faults) -> None:
+def record(rows, path, state, found):
     """Add a row of the table, and fail if the page has faults."""
     columns = found.columns()
     counts = " | ".join(str(len(texts)) if texts else "none" for texts in columns.values())
@@ -261,7 +248,18 @@ def record(rows: list[str], path: str, state: str, found: Faults) -> None:
     assert {kind: texts for kind, texts in columns.items() if texts} == {}
 
 
-def new_page(context: BrowserContext) -> Page:
+def look(context, rows, path, state, looks, address=None):
+    """Open a page, and record its faults."""
+    page = new_page(context)
+    found = Faults(page)
+    settled(page, address or path)
+    answered(page)
+    found.find(page, looks)
+    page.close()
+    record(rows, path, state, found)
+
+
+def new_page(context):
     """Return a page that counts its requests."""
     page = context.new_page()
     page.add_init_script(COUNT_REQUESTS)
@@ -269,7 +267,7 @@ def new_page(context: BrowserContext) -> Page:
 
 
 @pytest.fixture(scope="module")
-def administrator(browser: Browser, worked: Worked) -> Iterator[BrowserContext]:
+def administrator(browser, worked):
     """The browser of somebody who is signed in."""
     context = patient(browser.new_context(base_url=worked.url, viewport={"width": 1280, "height": 844}))
     page = context.new_page()
@@ -283,46 +281,36 @@ def administrator(browser: Browser, worked: Worked) -> Iterator[BrowserContext]:
 
 
 @pytest.fixture(scope="module")
-def newcomer(browser: Browser, empty_service: Service) -> Iterator[BrowserContext]:
+def newcomer(browser, empty_service):
     """The browser of somebody at a service without data."""
     context = patient(browser.new_context(base_url=empty_service.url, viewport={"width": 1280, "height": 844}))
     yield context
     context.close()
 
 
-def test_the_fonts_of_the_matrix_are_installed() -> None:
+def test_the_fonts_of_the_matrix_are_installed():
     listed = subprocess.run(["fc-list", ":", "family"], capture_output=True, text=True, check=True).stdout
     assert [family for family in FONTS.values() if family not in listed] == []
 
 
 @LOOKS
 @pytest.mark.parametrize("path", PATHS)
-def test_a_page_with_data_has_no_fault(
-    administrator: BrowserContext, worked: Worked, rows: list[str], path: str, looks: Looks
-) -> None:
-    page = new_page(administrator)
-    found = Faults(page)
-    settled(page, worked.paths.get(path, path))
-    answered(page)
-    found.find(page, looks)
-    page.close()
-    record(rows, path, "with", found)
+def test_a_page_with_data_has_no_fault(administrator, worked, rows, path, looks):
+    look(administrator, rows, path, "with", looks, worked.paths.get(path))
 
 
-@pytest.mark.parametrize(
-    ("path", "needed"),
-    [
-        ("/", "td button:has-text('Acknowledge')"),
-        ("/", "td a:has-text('Report')"),
-        ("/alarms", "td button:has-text('Acknowledge')"),
-        ("/commands", "td button:has-text('Send now')"),
-        ("/passes", "#passes a:has-text('open')"),
-        ("/passes", "#passes td.num"),
-    ],
-)
-def test_a_telephone_shows_what_a_shift_needs_without_scrolling_tables(
-    administrator: BrowserContext, path: str, needed: str
-) -> None:
+NEEDED = """
+/ | td button:has-text('Acknowledge')
+/ | td a:has-text('Report')
+/alarms | td button:has-text('Acknowledge')
+/commands | td button:has-text('Send now')
+/passes | #passes a:has-text('open')
+/passes | #passes td.num
+"""
+
+
+@pytest.mark.parametrize("path, needed", cells(NEEDED))
+def test_a_telephone_shows_what_a_shift_needs_without_scrolling_tables(administrator, path, needed):
     page = new_page(administrator)
     page.set_viewport_size({"width": 390, "height": 844})
     settled(page, path)
@@ -334,18 +322,12 @@ def test_a_telephone_shows_what_a_shift_needs_without_scrolling_tables(
 
 @LOOKS
 @pytest.mark.parametrize("path", [path for path in PATHS if path not in DETAILS])
-def test_a_page_without_data_has_no_fault(newcomer: BrowserContext, rows: list[str], path: str, looks: Looks) -> None:
-    page = new_page(newcomer)
-    found = Faults(page)
-    settled(page, path)
-    answered(page)
-    found.find(page, looks)
-    page.close()
-    record(rows, path, "without", found)
+def test_a_page_without_data_has_no_fault(newcomer, rows, path, looks):
+    look(newcomer, rows, path, "without", looks)
 
 
 @LOOKS
-def test_the_sign_in_has_no_fault(browser: Browser, worked: Worked, rows: list[str], looks: Looks) -> None:
+def test_the_sign_in_has_no_fault(browser, worked, rows, looks):
     context = patient(browser.new_context(base_url=worked.url, viewport={"width": 1280, "height": 844}))
     page = new_page(context)
     page.goto("/")

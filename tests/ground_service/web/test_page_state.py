@@ -239,15 +239,19 @@ def test_no_button_that_a_viewer_sees_is_refused(signed_in):
     expect(page.get_by_role("heading", name="Enter")).to_be_hidden()
 
 
+def home_with_orbits(home, orbits, more=""):
+    """Make the home of a service with a mission description and an ephemeris."""
+    with open_ground(home) as ground:
+        text = f'name = "camera"\n[spacecraft]\nid = 76\n[camera]\nfov_deg = 120.0\n{more}'
+        add_mission(ground, text.encode(), actor="ann")
+        add_ephemeris(ground, ground.files.put_file(orbits), name="orbits", precedence=0, actor="ann")
+
+
 def test_the_planner_opens_in_the_time_of_the_ephemeris_and_searches_for_its_spacecraft(
     browser, tmp_path, console, serve, day_of_orbits
 ):
     home = tmp_path / "home"
-    with open_ground(home) as ground:
-        text = 'name = "camera"\n[spacecraft]\nid = 76\n[camera]\nfov_deg = 120.0\n'
-        add_mission(ground, text.encode(), actor="ann")
-        stored = ground.files.put_file(day_of_orbits)
-        add_ephemeris(ground, stored, name="orbits", precedence=0, actor="ann")
+    home_with_orbits(home, day_of_orbits)
     with serve(home, console.port) as running:
         page = browser.new_page(base_url=running.url, viewport={"width": 390, "height": 844})
         page.goto("/planner")
@@ -291,14 +295,9 @@ def test_a_live_view_takes_matches_from_the_payload(page, console, live_frames):
 def planner(browser, tmp_path, console, serve, day_of_orbits):
     """The planner of a spacecraft with an ephemeris of six hours, a small battery and two drafts."""
     home = tmp_path / "home"
+    battery = "[resources]\nbattery_wh = 100.0\ngeneration_w = 0.0\nidle_w = 6.0\nobserving_w = 60.0\n"
+    home_with_orbits(home, day_of_orbits, battery)
     with open_ground(home) as ground:
-        text = (
-            'name = "camera"\n[spacecraft]\nid = 76\n[camera]\nfov_deg = 120.0\n'
-            "[resources]\nbattery_wh = 100.0\ngeneration_w = 0.0\nidle_w = 6.0\nobserving_w = 60.0\n"
-        )
-        add_mission(ground, text.encode(), actor="ann")
-        stored = ground.files.put_file(day_of_orbits)
-        add_ephemeris(ground, stored, name="orbits", precedence=0, actor="ann")
         for name, minute in (("first", 60), ("second", 90)):
             start = ORBITS + minute * 60 * 10**9
             add_window(ground, WindowEntry(name, start, start + 1200 * 10**9, 15.0, 76), actor="ann")

@@ -8,6 +8,7 @@ import pytest
 from ground_service.errors import InvalidInput
 from ground_service.evaluation.extras import WIDTH_PX
 from ground_service.web.pages import PAGES, POLICY, basemap_jpeg
+from tests.ground_service.conftest import cells
 from tests.ground_service.web.test_displays import ask
 from tests.lazy import Lazy
 
@@ -28,9 +29,14 @@ def test_a_page_runs_only_scripts_of_this_service(service, path):
             assert ask(service.url + source.decode())[0] == 200, source
 
 
-@pytest.mark.parametrize(
-    ("path", "entry"), [("/passes/1", "Passes"), ("/missions/00000000", "Missions"), ("/audit", "Audit")]
-)
+ENTRIES = """
+/passes/1 | Passes
+/missions/00000000 | Missions
+/audit | Audit
+"""
+
+
+@pytest.mark.parametrize("path, entry", cells(ENTRIES))
 def test_the_navigation_marks_the_page_that_a_detail_belongs_to(service, path, entry):
     _, body, _ = ask(service.url + path)
     assert re.findall(rb'aria-current="page">([^<]+)<', body) == [entry.encode()]

@@ -34,16 +34,20 @@ def stranger(browser, guarded):
     context.close()
 
 
+def asks(page):
+    expect(page.get_by_role("dialog", name="Sign in")).to_be_visible()
+
+
 def sign_in(page, token):
-    page.get_by_label("Token").fill(token)
+    page.get_by_label("Token", exact=True).fill(token)
     page.locator("dialog").get_by_role("button", name="Sign in").click()
 
 
 def test_a_stranger_is_asked_for_a_token_and_a_wrong_one_is_no_use(stranger):
     stranger.goto("/")
-    expect(stranger.get_by_role("dialog", name="Sign in")).to_be_visible()
+    asks(stranger)
     sign_in(stranger, "not-a-token")
-    expect(stranger.get_by_role("dialog", name="Sign in")).to_be_visible()
+    asks(stranger)
     expect(stranger.locator("#feed-light")).not_to_have_class("light on")
 
 
@@ -58,7 +62,7 @@ def test_a_viewer_sees_and_may_not_command(stranger, guarded):
     other.goto("/alarms")
     expect(other.locator("#user")).to_have_text("ada, viewer")
     stranger.locator("#caller").click()
-    expect(stranger.get_by_role("dialog", name="Sign in")).to_be_visible()
+    asks(stranger)
 
 
 def test_a_viewer_may_not_steer_the_payload(stranger, guarded, console):
@@ -72,20 +76,13 @@ def test_a_viewer_may_not_steer_the_payload(stranger, guarded, console):
     assert console.heard == []
 
 
-def test_a_page_that_needs_a_sign_in_opens_after_it(stranger, guarded):
-    stranger.goto("/reports/" + "0" * 32)
-    expect(stranger.get_by_role("dialog", name="Sign in")).to_be_visible()
-    sign_in(stranger, guarded[1])
-    stranger.wait_for_url("**/reports/" + "0" * 32)
-    expect(stranger.locator("body")).to_contain_text("not found")
-
-
 @pytest.mark.parametrize("address", ["/reports/{key}#part", "/?next=/reports/{key}%23part"])
 def test_the_part_of_a_page_in_the_address_is_kept_over_the_sign_in(stranger, guarded, address):
     stranger.goto(address.format(key="0" * 32))
-    expect(stranger.get_by_role("dialog", name="Sign in")).to_be_visible()
+    asks(stranger)
     sign_in(stranger, guarded[1])
     expect(stranger).to_have_url(f"{guarded[0]}/reports/{'0' * 32}#part")
+    expect(stranger.locator("body")).to_contain_text("not found")
 
 
 @pytest.mark.parametrize("next_page", ["//example.org/", "/%5Cexample.org/", "https://example.org/"])
@@ -145,7 +142,7 @@ def test_a_user_comes_back_signed_in_to_the_page_and_signs_out_everywhere(browse
     context = patient(browser.new_context(base_url=url))
     page = context.new_page()
     page.goto("/users?offset=0#tokens")
-    expect(page.get_by_role("dialog", name="Sign in")).to_be_visible()
+    asks(page)
     page.get_by_role("link", name="Sign in with the account of your organisation").click()
     expect(page).to_have_url(f"{url}/users?offset=0#tokens")
     expect(page.locator("#user")).to_have_text("ann, admin")
@@ -157,7 +154,7 @@ def test_a_user_comes_back_signed_in_to_the_page_and_signs_out_everywhere(browse
     page.locator("#caller").click()
     page.wait_for_url(f"{provider.issuer}/end?*")
     page.goto(f"{url}/users")
-    expect(page.get_by_role("dialog", name="Sign in")).to_be_visible()
+    asks(page)
     context.close()
 
 
@@ -181,8 +178,7 @@ def test_the_api_page_uses_the_session_of_the_signed_in_user(browser, serve, con
         token = add_user(ground, "ann", "viewer")
     with serve(tmp_path / "home", console.port) as running, strict_page(browser, running.url, strict=False) as page:
         page.goto("/licences")
-        page.get_by_label("Token").fill(token)
-        page.locator("dialog").get_by_role("button", name="Sign in").click()
+        sign_in(page, token)
         expect(page.locator("#user")).to_have_text("ann, viewer")
         page.goto("/docs")
         page.locator("#operations-passes-list_passes .opblock-summary-control").click()
@@ -209,8 +205,7 @@ def admin(browser, managed):
     context = patient(browser.new_context(base_url=managed[0]))
     page = context.new_page()
     page.goto("/users")
-    page.get_by_label("Token", exact=True).fill(managed[2])
-    page.locator("dialog").get_by_role("button", name="Sign in").click()
+    sign_in(page, managed[2])
     expect(page.get_by_role("button", name="Disable vic")).to_be_visible()
     yield page
     context.close()
@@ -262,13 +257,6 @@ def test_a_token_is_revoked(admin, managed):
     expect(row).to_contain_text("revoked")
     with open_ground(managed[1]) as ground:
         assert not token_valid(ground, token)
-
-
-def test_the_last_administrator_stays(admin, managed):
-    admin.get_by_role("button", name="Disable ann").click()
-    expect(admin.locator("#notices")).to_contain_text("expected another active administrator")
-    with open_ground(managed[1]) as ground:
-        assert {one.name: one.state for one in list_users(ground)}["ann"] == "active"
 
 
 def test_the_status_states_what_is_known_and_what_is_not(admin):

@@ -1,10 +1,7 @@
 """WebSockets: closed after loss of authorisation, limited in number, and served from one feed."""
 
 import asyncio
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import Any
 
 import pytest
 from starlette.websockets import WebSocketDisconnect
@@ -24,7 +21,7 @@ TICKS = 900_000_000 * 65_536
 
 
 @pytest.fixture
-def client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClient]:
+def client(tmp_path, monkeypatch):
     """Service with limits of three sockets per caller and five in total, which verifies callers immediately."""
     monkeypatch.setattr(sockets, "VERIFY_S", 0.05)
     monkeypatch.setattr(sockets, "POLL_S", 0.05)
@@ -33,20 +30,20 @@ def client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClie
         yield opened
 
 
-def ground_of(client: TestClient) -> Any:
+def ground_of(client):
     return client.app.state.ground
 
 
-def bearer(token: str) -> dict[str, str]:
+def bearer(token):
     return {"Authorization": f"Bearer {token}"}
 
 
-def say(ground: Any, number: int) -> None:
+def say(ground, number):
     with ground.database.writing() as connection:
         publish(connection, "test", {"number": number})
 
 
-def closing_code(socket: Any) -> int:
+def closing_code(socket):
     """Return the close code of a socket; skip earlier messages."""
     with pytest.raises(WebSocketDisconnect) as closed:
         while True:
@@ -54,25 +51,23 @@ def closing_code(socket: Any) -> int:
     return int(closed.value.code)
 
 
-def disable(ground: Any, name: str) -> None:
+def disable(ground, name):
     users.change_user(ground, name, state="disabled")
 
 
-def revoke(ground: Any, name: str) -> None:
+def revoke(ground, name):
     (token,) = users.list_tokens(ground, name)
     users.revoke_token(ground, token.id)
 
 
-def renew(ground: Any, name: str) -> None:
+def renew(ground, name):
     users.add_token(ground, name, revoke_others=True)
 
 
 @pytest.mark.parametrize("path", [LIVE, "/api/v1/payload"])
 @pytest.mark.parametrize("end", [disable, revoke, renew])
-def test_a_socket_ends_with_the_right_to_hold_it(
-    client: TestClient, end: Callable[[Any, str], None], path: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def hold(session: Any) -> None:
+def test_a_socket_ends_with_the_right_to_hold_it(client, end, path, monkeypatch):
+    async def hold(session):
         await session.accept()
         await asyncio.sleep(60.0)
 
@@ -91,13 +86,13 @@ def test_a_socket_ends_with_the_right_to_hold_it(
         pass
 
 
-def test_a_socket_without_a_token_ends_when_the_service_gets_users(client: TestClient) -> None:
+def test_a_socket_without_a_token_ends_when_the_service_gets_users(client):
     with client.websocket_connect(LIVE) as socket:
         users.add_user(ground_of(client), "ada", "admin")
         assert closing_code(socket) == sockets.POLICY_VIOLATION
 
 
-def test_a_token_that_expires_ends_its_socket(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_token_that_expires_ends_its_socket(client, monkeypatch):
     token = users.add_user(ground_of(client), "vera", "viewer", days_valid=1.0)
     with client.websocket_connect(LIVE, headers=bearer(token)) as socket:
         later = users.utc_now_ns() + 2 * 86_400 * 10**9
@@ -105,12 +100,10 @@ def test_a_token_that_expires_ends_its_socket(client: TestClient, monkeypatch: p
         assert closing_code(socket) == sockets.POLICY_VIOLATION
 
 
-def test_an_operator_who_becomes_a_viewer_may_no_longer_steer(
-    client: TestClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    roles: list[str] = []
+def test_an_operator_who_becomes_a_viewer_may_no_longer_steer(client, monkeypatch):
+    roles = []
 
-    async def watch_role(session: Any) -> None:
+    async def watch_role(session):
         await session.accept()
         while True:
             await asyncio.sleep(0.02)
@@ -127,7 +120,7 @@ def test_an_operator_who_becomes_a_viewer_may_no_longer_steer(
         assert socket.receive_text() == "viewer"
 
 
-def refused(client: TestClient, token: str | None) -> bool:
+def refused(client, token):
     headers = bearer(token) if token else {}
     try:
         with client.websocket_connect(LIVE, headers=headers):
@@ -137,7 +130,7 @@ def refused(client: TestClient, token: str | None) -> bool:
         return True
 
 
-def test_sockets_are_limited_for_a_user_and_in_all(client: TestClient) -> None:
+def test_sockets_are_limited_for_a_user_and_in_all(client):
     ground = ground_of(client)
     tokens = {name: users.add_user(ground, name, "viewer") for name in ("ann", "bob", "cleo")}
     second = users.add_token(ground, "ann")
@@ -156,11 +149,11 @@ def test_sockets_are_limited_for_a_user_and_in_all(client: TestClient) -> None:
         one.__exit__(None, None, None)
 
 
-def test_the_feed_is_read_once_for_all_sockets(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_feed_is_read_once_for_all_sockets(client, monkeypatch):
     reads = 0
     read_events = sockets.read_events
 
-    def counted(*arguments: Any) -> Any:
+    def counted(*arguments):
         nonlocal reads
         items = read_events(*arguments)
         reads += bool(items)
@@ -179,9 +172,7 @@ def test_the_feed_is_read_once_for_all_sockets(client: TestClient, monkeypatch: 
         one.__exit__(None, None, None)
 
 
-def test_a_client_that_comes_back_gets_what_it_missed_once_and_in_order(
-    client: TestClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_client_that_comes_back_gets_what_it_missed_once_and_in_order(client, monkeypatch):
     monkeypatch.setattr(sockets, "BATCH", 3)
     ground = ground_of(client)
     with client.websocket_connect(LIVE) as socket:
@@ -197,9 +188,7 @@ def test_a_client_that_comes_back_gets_what_it_missed_once_and_in_order(
     assert [one["sequence"] for one in found] == list(range(first + 1, first + 12))
 
 
-def test_a_client_that_reads_too_slowly_is_closed_and_may_come_back(
-    client: TestClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_client_that_reads_too_slowly_is_closed_and_may_come_back(client, monkeypatch):
     ground = ground_of(client)
     with client.websocket_connect(LIVE) as socket:
         hub = client.app.state.sockets
@@ -207,7 +196,7 @@ def test_a_client_that_reads_too_slowly_is_closed_and_may_come_back(
         (session,) = hub._readers
         monkeypatch.setattr(sockets, "QUEUED_LIMIT", 2)
 
-        async def stuck(_text: str) -> None:
+        async def stuck(_text):
             await asyncio.sleep(60.0)
 
         session.socket.send_text = stuck
@@ -216,17 +205,17 @@ def test_a_client_that_reads_too_slowly_is_closed_and_may_come_back(
         assert closing_code(socket) == sockets.TRY_AGAIN_LATER
 
 
-def receive(ground: Any, folder: Path, second: int, name: str = "housekeeping", **values: float) -> None:
+def receive(ground, folder, second, name="housekeeping", **values):
     """Ingest a packet of spacecraft 76 of a second."""
     fields = DICTIONARY.packet(name).fields
-    zeros: dict[str, Any] = {field.name: 0 if field.size == 1 else (0.0,) * field.size for field in fields}
+    zeros = {field.name: 0 if field.size == 1 else (0.0,) * field.size for field in fields}
     packet = DICTIONARY.pack(name, zeros | values, ticks=TICKS + second * 65_536, sequence_count=second)
     file = folder / f"{name}-{second}.cadu"
     file.write_bytes(encode_cadus([packet], spacecraft_id=76))
     ingest_file(ground, file)
 
 
-def messages_until(socket: Any, kind: str) -> list[dict[str, Any]]:
+def messages_until(socket, kind):
     """Return the messages up to the next one of a kind."""
     found = [socket.receive_json()]
     while found[-1]["kind"] != kind:
@@ -234,7 +223,7 @@ def messages_until(socket: Any, kind: str) -> list[dict[str, Any]]:
     return found
 
 
-def test_newest_values_are_sent_on_request_and_only_those_that_changed(client: TestClient, tmp_path: Path) -> None:
+def test_newest_values_are_sent_on_request_and_only_those_that_changed(client, tmp_path):
     ground = ground_of(client)
     with client.websocket_connect(f"{LIVE}?values=true") as socket, client.websocket_connect(LIVE) as plain:
         receive(ground, tmp_path, 1, structure_id=1, temperature_c=70.25, mode=2)
@@ -262,7 +251,7 @@ def test_newest_values_are_sent_on_request_and_only_those_that_changed(client: T
         assert kinds.count("telemetry") == 3 and "values" not in kinds
 
 
-def test_values_of_the_feed_are_those_of_the_parameters(client: TestClient, tmp_path: Path) -> None:
+def test_values_of_the_feed_are_those_of_the_parameters(client, tmp_path):
     ground = ground_of(client)
     with client.websocket_connect(f"{LIVE}?values=true") as socket:
         receive(ground, tmp_path, 1, structure_id=1, temperature_c=70.25)
@@ -273,11 +262,11 @@ def test_values_of_the_feed_are_those_of_the_parameters(client: TestClient, tmp_
     assert {one["time"] for one in listed} == {packet["time"]}
 
 
-def test_a_slow_socket_skips_values_and_no_events() -> None:
-    sent: list[str] = []
+def test_a_slow_socket_skips_values_and_no_events():
+    sent = []
 
     class Slow:
-        async def send_text(self, text: str) -> None:
+        async def send_text(self, text):
             sent.append(text)
             if text == "event 1":  # what comes while this is being sent
                 for number in (2, 3):
@@ -285,9 +274,9 @@ def test_a_slow_socket_skips_values_and_no_events() -> None:
                     session.offer_values((1, "housekeeping"), f"values {number}")
             await asyncio.sleep(0)
 
-    session: Any = None
+    session = None
 
-    async def run() -> None:
+    async def run():
         nonlocal session
         session = sockets.Session(
             Slow(),  # only what is sent matters
@@ -307,6 +296,6 @@ def test_a_slow_socket_skips_values_and_no_events() -> None:
 
 
 @pytest.mark.parametrize("query", ["values=maybe", "values=true&values=true", "value=true"])
-def test_an_invalid_query_is_refused(client: TestClient, query: str) -> None:
+def test_an_invalid_query_is_refused(client, query):
     with pytest.raises((WebSocketDisconnect, WebSocketDenialResponse)):
         client.websocket_connect(f"{LIVE}?{query}").__enter__()

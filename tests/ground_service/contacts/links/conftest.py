@@ -10,6 +10,7 @@ import pytest
 
 from ground_service.contacts.links import service
 from ground_service.contacts.links.runner import LinkRunner
+from ground_service.contacts.links.service import DeclaredLink
 from ground_service.ground import Ground
 from ground_service.missions.service import add_mission
 
@@ -65,7 +66,7 @@ class Station:
 
 
 @pytest.fixture
-def station() -> Iterator[Station]:
+def station():
     made = Station()
     yield made
     made.close()
@@ -79,12 +80,17 @@ def declare(ground: Ground, text: str) -> None:
     add_mission(ground, (HEAD + text).encode(), actor="ann")
 
 
+def acquired(ground: Ground, owner: str = "here", name: str = "lab", lease_ns: int = 60 * 10**9) -> DeclaredLink:
+    """Acquire a declared link; return its declaration."""
+    declared = service.declared_links(ground)[name]
+    assert service.acquire(ground, declared, owner, lease_ns)
+    return declared
+
+
 @contextlib.contextmanager
 def operated(ground: Ground, owner: str = "here") -> Iterator[LinkRunner]:
     """Operate the link "lab" in this process."""
-    declared = service.declared_links(ground)["lab"]
-    assert service.acquire(ground, declared, owner, 15_000_000_000)
-    runner = LinkRunner(ground, declared, owner)
+    runner = LinkRunner(ground, acquired(ground, owner, lease_ns=15 * 10**9), owner)
     runner.start()
     try:
         yield runner

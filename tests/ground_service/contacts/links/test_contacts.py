@@ -19,7 +19,7 @@ from ground_service.contacts.links.core import (
 from ground_service.missions.model import parse_mission
 from ground_service.missions.places import outages_of, station_of, stations_of
 from lunar.constants import NS
-from lunar.ephemeris import Ephemeris, ephemeris_from_states
+from lunar.ephemeris import ephemeris_from_states
 from lunar.visibility import GroundStation, link
 from tests.ground_service.conftest import START, circular_states
 
@@ -29,12 +29,12 @@ MADRID = GroundStation("madrid", np.radians(40.43), np.radians(-4.25), 840.0, np
 
 
 @pytest.fixture(scope="module")
-def orbit() -> Ephemeris:
+def orbit():
     every = START + np.arange(0, 86_400 + 1, 60, dtype=np.int64) * NS
     return ephemeris_from_states(every, *circular_states(every))
 
 
-def test_the_station_sees_the_spacecraft_within_contacts_only(orbit: Ephemeris) -> None:
+def test_the_station_sees_the_spacecraft_within_contacts_only(orbit):
     contacts = predict_contacts(orbit, [MADRID], START, START + DAY)
     assert len(contacts) >= 2  # the orbit has a period of 111 minutes and goes behind the Moon
     for one in contacts:
@@ -45,7 +45,7 @@ def test_the_station_sees_the_spacecraft_within_contacts_only(orbit: Ephemeris) 
                 assert not link(orbit, np.array([edge + step]), MADRID).visible[0]
 
 
-def test_contacts_of_a_query_are_a_cut_of_those_of_a_longer_one(orbit: Ephemeris) -> None:
+def test_contacts_of_a_query_are_a_cut_of_those_of_a_longer_one(orbit):
     whole = predict_contacts(orbit, [MADRID], START, START + DAY)
     edges = range(BLOCK_NS * (START // BLOCK_NS + 1), START + DAY, BLOCK_NS)
     above = predict_contacts(orbit, [ALWAYS], START, START + DAY)
@@ -56,7 +56,7 @@ def test_contacts_of_a_query_are_a_cut_of_those_of_a_longer_one(orbit: Ephemeris
         assert [(one.start_utc_ns, one.stop_utc_ns) for one in found] == [span for span in cut if span[0] < span[1]]
 
 
-def test_contacts_end_where_the_ephemeris_does_and_outages_are_left_out(orbit: Ephemeris) -> None:
+def test_contacts_end_where_the_ephemeris_does_and_outages_are_left_out(orbit):
     contacts = predict_contacts(orbit, [MADRID], START - DAY, START + 5 * DAY)
     assert contacts == predict_contacts(orbit, [MADRID], START, START + DAY)
     assert predict_contacts(orbit, [MADRID], START + 2 * DAY, START + 3 * DAY) == ()
@@ -72,39 +72,39 @@ def test_contacts_end_where_the_ephemeris_does_and_outages_are_left_out(orbit: E
     st.tuples(st.integers(0, 50), st.integers(51, 100)),
     st.lists(st.tuples(st.integers(0, 100), st.integers(0, 100)).map(lambda ab: (min(ab), max(ab))), max_size=4),
 )
-def test_without_keeps_what_no_closed_span_covers(span: tuple[int, int], closed: list[tuple[int, int]]) -> None:
+def test_without_keeps_what_no_closed_span_covers(span, closed):
     parts = without(span, closed)
     for halves in range(2 * span[0] + 1, 2 * span[1], 2):  # the middle of every unit
         kept = any(2 * a < halves < 2 * b for a, b in parts)
         assert kept == (not any(2 * a < halves < 2 * b for a, b in closed))
 
 
-def test_a_contact_contains_its_edges_and_the_margin() -> None:
+def test_a_contact_contains_its_edges_and_the_margin():
     contacts = [PredictedContact("a", 100, 200), PredictedContact("b", 300, 400)]
     assert [contact_at(contacts, t) for t in (99, 100, 200, 201)] == [None, contacts[0], contacts[0], None]
     assert contact_at(contacts, 290, 10) == contacts[1]
     assert contact_at(contacts, 289, 10) is None
 
 
-def test_silence_begins_after_its_time() -> None:
+def test_silence_begins_after_its_time():
     assert not is_silent(0, 60 * NS, 60.0)
     assert is_silent(0, 60 * NS + 1, 60.0)
 
 
-def test_waits_double_up_to_a_limit() -> None:
+def test_waits_double_up_to_a_limit():
     waits = [0.0]
     for _ in range(8):
         waits.append(next_wait_s(waits[-1]))
     assert waits[1:] == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0]
 
 
-def test_only_a_large_offset_of_the_clock_is_a_fault() -> None:
+def test_only_a_large_offset_of_the_clock_is_a_fault():
     limit = round(CLOCK_LIMIT_S * NS)
     assert clock_fault(None) is None and clock_fault(limit) is None and clock_fault(-limit) is None
     assert "+3600 s" in (clock_fault(3600 * NS) or "") and "-3600 s" in (clock_fault(-3600 * NS) or "")
 
 
-def test_stations_are_those_of_the_mission_description() -> None:
+def test_stations_are_those_of_the_mission_description():
     section = parse_mission(
         'name = "x"\n[link.stations.near]\nlatitude_deg = 40.0\nlongitude_deg = -4.0\n'
         'minimum_elevation_deg = 5.0\noutages = ["2029-08-10T00:00:00Z/2029-08-10T06:00:00Z"]\n'

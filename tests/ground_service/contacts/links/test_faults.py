@@ -4,9 +4,6 @@ import errno
 import fcntl
 import os
 import threading
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,15 +15,14 @@ from ground_service.contacts.links import service, store
 from ground_service.contacts.links.runner import ACKNOWLEDGEMENT, DISCARDED_BLOCKS, Connector, LinkRunner, ended_holder
 from ground_service.contacts.links.supervisor import LinkSupervisor
 from ground_service.errors import DatabaseBusy, Stopping, StorageFull
-from ground_service.ground import Ground
 from ground_service.ingest.live import SETTLED_S, Spool, WatchedFolder
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.store import repository
 from ground_service.store.event_kinds import read_events
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.messages.oem import save_oem
-from tests.ground_service.conftest import START, Clock, circular_states
-from tests.ground_service.contacts.links.conftest import Station, declare, operated
+from tests.ground_service.conftest import START, circular_states
+from tests.ground_service.contacts.links.conftest import acquired, declare, operated
 from tests.ground_service.contacts.links.test_links import (
     CADU,
     PLACES,
@@ -44,15 +40,15 @@ NS = 1_000_000_000
 
 
 @pytest.fixture(autouse=True)
-def _short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+def _short_waits(monkeypatch):
     monkeypatch.setattr(runners, "RETRY_S", 0.05)
 
 
-def failing(work: Callable[..., Any], times: set[int]) -> Callable[..., Any]:
+def failing(work, times):
     """Return `work` with a busy database at some of its calls, counted from 1."""
     calls = [0]
 
-    def run(*arguments: Any, **named: Any) -> Any:
+    def run(*arguments, **named):
         calls[0] += 1
         if calls[0] in times:
             raise DatabaseBusy("test")
@@ -61,9 +57,7 @@ def failing(work: Callable[..., Any], times: set[int]) -> Callable[..., Any]:
     return run
 
 
-def test_a_block_received_while_the_database_is_busy_is_kept(
-    ground: Ground, station: Station, stream: bytes, expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_block_received_while_the_database_is_busy_is_kept(ground, station, stream, expected, monkeypatch):
     declare(ground, station.link())
     monkeypatch.setattr(service, "start_contact", failing(service.start_contact, {1, 2}))
     with operated(ground) as runner:
@@ -72,9 +66,7 @@ def test_a_block_received_while_the_database_is_busy_is_kept(
         assert hash_of(ground) == expected
 
 
-def test_a_block_held_at_the_stop_is_in_the_spool(
-    ground: Ground, station: Station, stream: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_block_held_at_the_stop_is_in_the_spool(ground, station, stream, monkeypatch):
     declare(ground, station.link())
     monkeypatch.setattr(service, "start_contact", failing(service.start_contact, set(range(1, 10_000))))
     with operated(ground) as runner:
@@ -84,13 +76,11 @@ def test_a_block_held_at_the_stop_is_in_the_spool(
     assert runner.octets_received == held
 
 
-def test_a_full_disk_loses_nothing_and_the_link_shows_it(
-    ground: Ground, station: Station, stream: bytes, expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_loses_nothing_and_the_link_shows_it(ground, station, stream, expected, monkeypatch):
     declare(ground, station.link("acknowledge = true"))
     full, synchronise = [False], os.fdatasync
 
-    def fdatasync(number: int) -> None:
+    def fdatasync(number):
         if full[0]:
             raise OSError(errno.ENOSPC, "No space left on device")
         synchronise(number)
@@ -114,19 +104,19 @@ def test_a_full_disk_loses_nothing_and_the_link_shows_it(
         counts = [0]
         while counts[-1] < len(stream):
             counts.append(ACKNOWLEDGEMENT.unpack(connection.recv(ACKNOWLEDGEMENT.size))[0])
-        assert counts[-1] == len(stream)
+        assert counts[-1] == len(stream) and counts == sorted(set(counts))
 
 
 class HalfWritten:
     """A stream to a disk that becomes full after some octets."""
 
-    def __init__(self, stream: Any, room: int) -> None:
+    def __init__(self, stream, room):
         self.stream, self.room = stream, room
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name):
         return getattr(self.stream, name)
 
-    def write(self, octets: memoryview) -> int:
+    def write(self, octets):
         if self.room == 0:
             raise OSError(errno.ENOSPC, "No space left on device")
         written = self.stream.write(octets[: self.room])
@@ -134,7 +124,7 @@ class HalfWritten:
         return int(written)
 
 
-def test_octets_that_were_written_in_part_are_not_written_twice(tmp_path: Path) -> None:
+def test_octets_that_were_written_in_part_are_not_written_twice(tmp_path):
     spool = Spool(tmp_path, lambda *_: {}, lambda *_: None)
     spool.open()
     spool.keep(b"first ")
@@ -150,14 +140,12 @@ def test_octets_that_were_written_in_part_are_not_written_twice(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("renamed", [False, True])
-def test_a_segment_that_could_not_be_cut_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, renamed: bool
-) -> None:
+def test_a_segment_that_could_not_be_cut_is_kept(tmp_path, monkeypatch, renamed):
     from ground_service.ingest import live
 
     replace = live.replace_durably
 
-    def broken(written: Path, target: Path) -> None:
+    def broken(written, target):
         if renamed:
             replace(written, target)
         raise OSError(errno.EIO, "Input/output error")
@@ -176,8 +164,8 @@ def test_a_segment_that_could_not_be_cut_is_kept(
 
 
 def test_a_link_that_could_not_be_opened_is_opened_later_with_its_spool_and_its_contact(
-    ground: Ground, station: Station, stream: bytes, monkeypatch: pytest.MonkeyPatch, mission_time: Clock
-) -> None:
+    ground, station, stream, monkeypatch, mission_time
+):
     declare(ground, station.link())
     declared = service.declared_links(ground)["lab"]
     assert service.start_contact(ground, declared, mission_now_ns()) is not None
@@ -193,7 +181,7 @@ def test_a_link_that_could_not_be_opened_is_opened_later_with_its_spool_and_its_
         assert runner.alive
 
 
-def test_a_gap_in_the_ephemeris_is_a_reason_and_not_an_error(ground: Ground, station: Station, tmp_path: Path) -> None:
+def test_a_gap_in_the_ephemeris_is_a_reason_and_not_an_error(ground, station, tmp_path):
     declare(ground, PLACES + station.link('station = "here"'))
     parts = []
     for begin in (0, 7200):
@@ -208,17 +196,14 @@ def test_a_gap_in_the_ephemeris_is_a_reason_and_not_an_error(ground: Ground, sta
     assert service.start_contact(ground, declared, START + 5000 * NS) is not None
 
 
-def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it(
-    ground: Ground, station: Station, stream: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it(ground, station, stream, monkeypatch):
     monkeypatch.setattr(runners, "RENEW_S", 0.1)
     declare(ground, station.link())
-    declared = service.declared_links(ground)["lab"]
     entered, go_on = threading.Event(), threading.Event()
     with operated(ground, "first") as first:
         ingest = first._spool.ingest
 
-        def slow(*given: Any) -> dict[str, Any]:
+        def slow(*given):
             entered.set()
             assert go_on.wait(20)
             return ingest(*given)
@@ -227,7 +212,7 @@ def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it
         station.accept().sendall(stream[: 3 * CADU])
         assert entered.wait(20)
         service.release(ground, "lab", "first")
-        assert service.acquire(ground, declared, "second", 60 * NS)
+        declared = acquired(ground, "second")
         wait_for(lambda: first.lost, "the lost lease")
         second = LinkRunner(ground, declared, "second")
         threading.Event().wait(0.3)
@@ -241,18 +226,15 @@ def test_the_spool_is_locked_until_the_owner_that_lost_the_lease_has_ingested_it
         second._lock.close()
 
 
-def test_a_link_is_taken_at_once_from_an_owner_that_has_ended_and_not_from_others(
-    ground: Ground, station: Station
-) -> None:
+def test_a_link_is_taken_at_once_from_an_owner_that_has_ended_and_not_from_others(ground, station):
     declare(ground, station.link())
-    declared = service.declared_links(ground)["lab"]
-    assert service.acquire(ground, declared, "killed", 70 * NS)
+    acquired(ground, "killed", lease_ns=70 * NS)
     supervisor = LinkSupervisor(ground)
     folder = ground.home / "incoming" / "link-lab"
     folder.mkdir(parents=True)
     held = folder / "lock"
 
-    def is_taken() -> bool:
+    def is_taken():
         supervisor.look()
         return "lab" in supervisor.runners
 
@@ -272,9 +254,7 @@ def test_a_link_is_taken_at_once_from_an_owner_that_has_ended_and_not_from_other
     assert held.read_text() == ""
 
 
-def test_a_process_that_never_held_the_spool_ingests_nothing_of_it(
-    ground: Ground, station: Station, stream: bytes
-) -> None:
+def test_a_process_that_never_held_the_spool_ingests_nothing_of_it(ground, station, stream):
     declare(ground, station.link())
     folder = ground.home / "incoming" / "link-lab"
     folder.mkdir(parents=True)
@@ -287,9 +267,7 @@ def test_a_process_that_never_held_the_spool_ingests_nothing_of_it(
         assert segment.exists()
 
 
-def test_a_contact_ends_once_for_two_processes(
-    either: Ground, station: Station, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_contact_ends_once_for_two_processes(either, station, monkeypatch):
     declare(either, station.link())
     declared = service.declared_links(either)["lab"]
     found = service.start_contact(either, declared, mission_now_ns())
@@ -303,13 +281,10 @@ def test_a_contact_ends_once_for_two_processes(
     assert (row.state, row.stop_utc_ns) == ("ended", found.start_utc_ns + 5)
 
 
-def test_a_transmission_is_repeated_once_for_two_links(
-    either: Ground, station: Station, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_transmission_is_repeated_once_for_two_links(either, station, monkeypatch):
     declare(either, station.link())
-    declared = service.declared_links(either)["lab"]
     released(either)
-    assert service.acquire(either, declared, "here", 60 * NS)
+    declared = acquired(either)
     (transmission,) = service.take_transmissions(either, declared, "here")
     service.note_transmitted(either, transmission, None)
     first = service.start_contact(either, declared, mission_now_ns())
@@ -326,7 +301,7 @@ def test_a_transmission_is_repeated_once_for_two_links(
     assert repeated(either) == 1
 
 
-def repeated(ground: Ground) -> int:
+def repeated(ground):
     table = repository.AUDIT
     query = select(func.count()).where(table.c.action == "repeat transmission")
     with ground.database.reading() as connection:
@@ -338,23 +313,23 @@ class Talking(Connector):
 
     received = 0
 
-    def receive(self, timeout_s: float) -> bytes | None:
+    def receive(self, timeout_s):
         type(self).received += 1
         assert self.received <= DISCARDED_BLOCKS
         return b"x"
 
 
-def test_a_station_that_talks_without_end_on_the_uplink_does_not_stop_the_link() -> None:
+def test_a_station_that_talks_without_end_on_the_uplink_does_not_stop_the_link():
     Talking(("localhost", 1)).discard_input()
     assert Talking.received == DISCARDED_BLOCKS
 
 
-def stopping(*_: Any) -> dict[str, Any]:
+def stopping(*_):
     raise Stopping
 
 
-def test_a_segment_whose_ingest_is_stopped_is_kept(tmp_path: Path) -> None:
-    seen: list[Any] = []
+def test_a_segment_whose_ingest_is_stopped_is_kept(tmp_path):
+    seen = []
     spool = Spool(tmp_path, stopping, lambda _, result: seen.append(result))
     spool.open()
     spool.keep(b"octets")
@@ -364,11 +339,11 @@ def test_a_segment_whose_ingest_is_stopped_is_kept(tmp_path: Path) -> None:
     assert seen == [] and len(list(tmp_path.glob("*.segment"))) == 1
 
 
-def test_a_file_whose_ingest_is_stopped_is_read_again(tmp_path: Path) -> None:
+def test_a_file_whose_ingest_is_stopped_is_read_again(tmp_path):
     (tmp_path / "in").mkdir()
     path = tmp_path / "in" / "pass.cadu"
     path.write_bytes(b"octets")
-    seen: list[Any] = []
+    seen = []
     folder = WatchedFolder(tmp_path / "in", tmp_path / "ledger.json", stopping, lambda _, result: seen.append(result))
     with pytest.raises(Stopping):
         folder.look(path.stat().st_mtime + 2 * SETTLED_S)

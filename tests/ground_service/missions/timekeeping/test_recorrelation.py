@@ -3,8 +3,6 @@
 import itertools
 import json
 import random
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,13 +11,12 @@ from sqlalchemy import text
 from ground_service.access.model import AuditFilter
 from ground_service.access.store import list_audit
 from ground_service.errors import Conflict, InvalidInput
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.timekeeping import recorrelation
 from ground_service.missions.timekeeping.core import clock_runs, fit_correlation
-from ground_service.missions.timekeeping.model import Correlation
 from ground_service.missions.timekeeping.recorrelation import (
     ReceivedReport,
     TimePoint,
@@ -39,7 +36,7 @@ from linna.cli import run
 from lunar.constants import SPEED_OF_LIGHT_M_S
 from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
-from tests.ground_service.conftest import circular_states, save_circle
+from tests.ground_service.conftest import cells, circular_states, save_circle
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.packets.space_packets import PacketSequencer
@@ -54,7 +51,7 @@ OFFSETS_S = (0.25, -1.5)  # of the clock, before and after the boot
 LIGHT_S = 1.25
 
 
-def clock(utc_ns: int, number: int) -> int:
+def clock(utc_ns, number):
     off_s = OFFSETS_S[number >= BOOT_AFTER] + DRIFT * (utc_ns - START) / NS
     return int(ticks_from_utc_ns(utc_ns)) + round(off_s * 65_536)
 
@@ -62,62 +59,56 @@ def clock(utc_ns: int, number: int) -> int:
 class Spacecraft:
     """A minute from one time report to the next, a boot in the middle, with housekeeping that tells of it."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         sequencer = PacketSequencer()
-        housekeeping: dict[str, Any] = {field.name: 1 for field in DICTIONARY.packet("housekeeping").fields}
+        housekeeping = {field.name: 1 for field in DICTIONARY.packet("housekeeping").fields}
         self.sent = [START + k * 60 * NS for k in range(REPORTS)]
-        self.packets: list[bytes] = []
-        self.reports: list[ReceivedReport] = []
+        self.packets = []
+        self.reports = []
         for k, utc_ns in enumerate(self.sent):
             ticks = clock(utc_ns, k)
             boot = {**housekeeping, "boot_count": 7 + (k >= BOOT_AFTER)}
-            values: dict[str, dict[str, Any]] = {
-                "housekeeping": boot,
-                "time_report": {"reported_ticks": ticks, "rate_exponent": 4},
-                "event_info": {"event_id": 3, "frame_number": k, "value_1": 0.0, "value_2": 0.0},
-            }
-            for name, one in values.items():
-                apid = DICTIONARY.packet(name).apid
-                count = sequencer.next(apid)
-                # Housekeeping a little before, so that a run of the clock begins with it.
-                at = ticks - 6553 if name == "housekeeping" else ticks
+            event = {"event_id": 3, "frame_number": k, "value_1": 0.0, "value_2": 0.0}
+            report = {"reported_ticks": ticks, "rate_exponent": 4}
+            # Housekeeping a little before, so that a run of the clock begins with it.
+            for name, one, at in (
+                ("housekeeping", boot, ticks - 6553), ("time_report", report, ticks), ("event_info", event, ticks),
+            ):  # fmt: skip
+                count = sequencer.next(DICTIONARY.packet(name).apid)
                 self.packets.append(DICTIONARY.pack(name, one, ticks=at, sequence_count=count))
                 if name == "time_report":
-                    received = utc_ns + round(LIGHT_S * NS)
-                    self.reports.append(ReceivedReport(ticks, count, received))
+                    self.reports.append(ReceivedReport(ticks, count, utc_ns + round(LIGHT_S * NS)))
 
-    def downlink(self, first: int = 0, last: int = REPORTS) -> bytes:
+    def downlink(self, first=0, last=REPORTS):
         return encode_cadus(self.packets[3 * first : 3 * last], spacecraft_id=SPACECRAFT)
 
 
 @pytest.fixture(scope="module")
-def spacecraft() -> Spacecraft:
+def spacecraft():
     return Spacecraft()
 
 
 @pytest.fixture(autouse=True)
-def fixed_light_time(monkeypatch: Any) -> None:
+def fixed_light_time(monkeypatch):
     monkeypatch.setattr(recorrelation, "_light_time_ns", lambda *given: np.full(len(given[3]), round(LIGHT_S * NS)))
 
 
-def ingest(ground: Ground, folder: Path, octets: bytes, name: str = "d.cadu") -> int:
+def ingest(ground, folder, octets, name="d.cadu"):
     (folder / name).write_bytes(octets)
     vehicle = ingest_file(ground, folder / name).vehicle_id
     assert vehicle is not None
     return vehicle
 
 
-def receive(ground: Ground, reports: list[ReceivedReport]) -> list[Correlation]:
+def receive(ground, reports):
     return enter_receptions(ground, SPACECRAFT, "flight", reports, actor="ann")
 
 
-def content(rows: list[Correlation]) -> list[dict[str, Any]]:
+def content(rows):
     return [row.model_dump(exclude={"id", "created"}) for row in rows]
 
 
-def test_every_boot_gets_its_line_and_every_derived_time_names_it(
-    ground: Ground, spacecraft: Spacecraft, tmp_path: Path
-) -> None:
+def test_every_boot_gets_its_line_and_every_derived_time_names_it(ground, spacecraft, tmp_path):
     vehicle = ingest(ground, tmp_path, spacecraft.downlink())
     rows = receive(ground, spacecraft.reports)
     assert [row.boot_count for row in rows] == [7, 8]
@@ -137,14 +128,14 @@ def test_every_boot_gets_its_line_and_every_derived_time_names_it(
     assert max(abs(one.residual_ns) for one in left) < 20_000
 
 
-def test_the_order_of_telemetry_and_receptions_does_not_matter(spacecraft: Spacecraft, tmp_path: Path) -> None:
+def test_the_order_of_telemetry_and_receptions_does_not_matter(spacecraft, tmp_path):
     cut = spacecraft.downlink(0, 12), spacecraft.downlink(12, 20), spacecraft.downlink(20)
     found = []
     for number, seed in enumerate(range(4)):
         rng = random.Random(seed)
         with open_ground(tmp_path / f"home{number}") as ground:
             follow_in_process(ground)
-            steps: list[tuple[str, Any]] = [("file", octets) for octets in cut]
+            steps = [("file", octets) for octets in cut]
             steps += [("times", spacecraft.reports[k : k + 11]) for k in range(0, REPORTS, 10)]
             rng.shuffle(steps)
             steps += rng.sample(steps, 2)
@@ -161,7 +152,7 @@ def test_the_order_of_telemetry_and_receptions_does_not_matter(spacecraft: Space
     assert len(found[0]) == 2
 
 
-def test_a_clock_that_is_set_begins_a_new_line_and_one_bad_report_does_not() -> None:
+def test_a_clock_that_is_set_begins_a_new_line_and_one_bad_report_does_not():
     sent = START + np.arange(20, dtype=np.int64) * 60 * NS
     ticks = np.asarray(ticks_from_utc_ns(sent), dtype=np.int64)
     none = np.zeros(20, dtype=np.int64)
@@ -175,7 +166,7 @@ def test_a_clock_that_is_set_begins_a_new_line_and_one_bad_report_does_not() -> 
 
 
 @pytest.mark.parametrize("drift_ppm", [0.0, 150.0])
-def test_a_step_during_hours_without_reports_begins_a_new_line(drift_ppm: float) -> None:
+def test_a_step_during_hours_without_reports_begins_a_new_line(drift_ppm):
     """In three hours an unknown drift of 200 ppm could be 2 s; that of this clock is known from the reports before."""
     hours = np.array([0.0, 0.1, 2.0, 2.1, 4.0, 4.1, 7.0, 7.1, 10.0])
     sent = START + np.asarray(hours * 3600 * NS, dtype=np.int64)
@@ -187,26 +178,23 @@ def test_a_step_during_hours_without_reports_begins_a_new_line(drift_ppm: float)
         assert [len(one) for one in runs] == lengths
 
 
-def test_a_drift_within_the_resolution_of_the_clock_is_none() -> None:
+def test_a_drift_within_the_resolution_of_the_clock_is_none():
     sent = START + np.arange(4, dtype=np.int64) * NS
     ticks = np.asarray(ticks_from_utc_ns(sent), dtype=np.int64) + np.array([0, 0, 1, 1])
     fit = fit_correlation(ticks, sent, np.zeros(4, dtype=np.int64))
     assert fit.drift_ppb == 0.0
 
 
-def test_what_an_operator_entered_stays_until_asked_otherwise(
-    ground: Ground, spacecraft: Spacecraft, tmp_path: Path
-) -> None:
+def test_what_an_operator_entered_stays_until_asked_otherwise(ground, spacecraft, tmp_path):
     vehicle = ingest(ground, tmp_path, spacecraft.downlink())
     correlate(ground, vehicle, [TimePoint(clock(START, 0), START, 0)])
     assert [row.points for row in receive(ground, spacecraft.reports)] == [1]
     assert len(correlate_again(ground, SPACECRAFT, "flight", actor="ann")) == 2
 
 
-def test_what_an_operator_entered_can_be_withdrawn_with_a_trace(
-    ground: Ground, spacecraft: Spacecraft, tmp_path: Path
-) -> None:
+def test_what_an_operator_entered_can_be_withdrawn_with_a_trace(ground, spacecraft, tmp_path):
     vehicle = ingest(ground, tmp_path, spacecraft.downlink())
+    assert ground.read(correlations_in_force, vehicle) == []
     fitted = [row.id for row in receive(ground, spacecraft.reports)]
     with pytest.raises(Conflict, match="expected correlations in force that a person entered, found none"):
         withdraw_correlations(ground, SPACECRAFT, "flight", actor="ann")
@@ -221,7 +209,7 @@ def test_what_an_operator_entered_can_be_withdrawn_with_a_trace(
     assert [(one.actor, one.detail) for one in trace] == [("ann", {"ids": [entered.id]})]
 
 
-def test_an_earlier_reception_of_the_same_report_counts(ground: Ground, spacecraft: Spacecraft, tmp_path: Path) -> None:
+def test_an_earlier_reception_of_the_same_report_counts(ground, spacecraft, tmp_path):
     ingest(ground, tmp_path, spacecraft.downlink())
     played_back = [
         ReceivedReport(one.ticks, one.sequence_count, one.earth_utc_ns + 3600 * NS) for one in spacecraft.reports
@@ -234,9 +222,7 @@ def test_an_earlier_reception_of_the_same_report_counts(ground: Ground, spacecra
     )
 
 
-def test_a_new_reference_ephemeris_gives_new_light_times(
-    ground: Ground, spacecraft: Spacecraft, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_a_new_reference_ephemeris_gives_new_light_times(ground, spacecraft, tmp_path, monkeypatch):
     monkeypatch.undo()
     vehicle = ingest(ground, tmp_path, spacecraft.downlink())
     receive(ground, spacecraft.reports)
@@ -254,9 +240,7 @@ def test_a_new_reference_ephemeris_gives_new_light_times(
     assert len(ground.read(correlations_on_record, vehicle)) == 4
 
 
-def test_an_operator_correlates_from_a_file(
-    spacecraft: Spacecraft, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_operator_correlates_from_a_file(spacecraft, tmp_path, capsys):
     home = ["--home", str(tmp_path / "home"), "--json"]
     who = ["--spacecraft-id", str(SPACECRAFT)]
     (tmp_path / "d.cadu").write_bytes(spacecraft.downlink())
@@ -264,7 +248,7 @@ def test_an_operator_correlates_from_a_file(
     table = tmp_path / "times.csv"
     table.write_text("\n".join(["packet_ticks,sequence_count,received_utc,station", *lines]) + "\n")
 
-    def linna(*words: str) -> Any:
+    def linna(*words):
         assert run([*words, *home]) == 0
         return json.loads(capsys.readouterr().out)
 
@@ -274,30 +258,23 @@ def test_an_operator_correlates_from_a_file(
     assert len(linna("correlate", "residuals", *who)["time_reports"]) == REPORTS
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("a,b\n1,2\n", "line 1: expected a column packet_ticks, found a,b"),
-        ("packet_ticks,sequence_count,received_utc\n1,2,then\n", "receptions.0"),
-        ("packet_ticks,sequence_count,received_utc\n1,99999,2029-08-07T06:00:00Z\n", "14 bits of count"),
-        ("packet_ticks,sequence_count,received_utc,station\n1,2,2029-08-07T06:00:00Z,Mars\n", "Canberra"),
-    ],
-)
-def test_a_file_that_is_none_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "t.csv").write_text(text)
+NO_FILES = r"""
+a,b\n1,2\n | line 1: expected a column packet_ticks, found a,b
+packet_ticks,sequence_count,received_utc\n1,2,then\n | receptions.0
+packet_ticks,sequence_count,received_utc\n1,99999,2029-08-07T06:00:00Z\n | 14 bits of count
+packet_ticks,sequence_count,received_utc,station\n1,2,2029-08-07T06:00:00Z,Mars\n | Canberra
+"""
+
+
+@pytest.mark.parametrize("text, message", cells(NO_FILES))
+def test_a_file_that_is_none_is_refused_in_one_line(tmp_path, text, message):
+    (tmp_path / "t.csv").write_text(text.replace(r"\n", "\n"))
     with pytest.raises(InvalidInput, match=message):
         read_receptions(tmp_path / "t.csv")
 
 
-def test_telemetry_without_receptions_leaves_the_clock_ideal(
-    ground: Ground, spacecraft: Spacecraft, tmp_path: Path
-) -> None:
-    vehicle = ingest(ground, tmp_path, spacecraft.downlink())
-    assert ground.read(correlations_in_force, vehicle) == []
-
-
 @pytest.mark.parametrize(
-    ("changes", "kinds"),
+    "changes, kinds",
     [
         ("reference_utc_ns = reference_utc_ns + 900", set()),  # rounding
         ("reference_utc_ns = reference_utc_ns + 1100", {"correlations"}),
@@ -306,9 +283,7 @@ def test_telemetry_without_receptions_leaves_the_clock_ideal(
         ("method = 'entered'", set()),
     ],
 )
-def test_verification_fits_the_correlations_again(
-    either: Ground, tmp_path: Path, spacecraft: Spacecraft, changes: str, kinds: set[str]
-) -> None:
+def test_verification_fits_the_correlations_again(either, tmp_path, spacecraft, changes, kinds):
     ingest(either, tmp_path, spacecraft.downlink())
     receive(either, spacecraft.reports)
     intact = verify(either, rebuild=True)
@@ -320,9 +295,7 @@ def test_verification_fits_the_correlations_again(
     assert bool(found.unchecked) == changes.startswith("method")
 
 
-def test_verification_does_not_expect_correlations_before_the_follow_up_work(
-    either: Ground, tmp_path: Path, spacecraft: Spacecraft, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_verification_does_not_expect_correlations_before_the_follow_up_work(either, tmp_path, spacecraft, monkeypatch):
     receive(either, spacecraft.reports)
     monkeypatch.setattr(either.database.listeners, "_functions", [])
     ingest(either, tmp_path, spacecraft.downlink())

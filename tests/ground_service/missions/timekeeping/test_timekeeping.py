@@ -1,12 +1,9 @@
 """A correlation that is entered moves everything derived, at once, and says which it is."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from ground_service.errors import InvalidInput, NotFound
-from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.timekeeping.recorrelation import TimePoint, correlate
 from ground_service.missions.timekeeping.store import correlations_on_record
@@ -16,7 +13,7 @@ from lunar.timescales import ticks_from_utc_ns
 NS = 1_000_000_000
 
 
-def test_times_of_samples_follow_the_correlation_in_force(ground: Ground, synthetic_pass: Any) -> None:
+def test_times_of_samples_follow_the_correlation_in_force(ground, synthetic_pass):
     vehicle = ingest_file(ground, synthetic_pass.folder / "downlink.cadu").vehicle_id
     assert vehicle is not None
     first, last = int(synthetic_pass.utc_ns[0]), int(synthetic_pass.utc_ns[-1])
@@ -36,14 +33,14 @@ def test_times_of_samples_follow_the_correlation_in_force(ground: Ground, synthe
     assert [(row.id, row.in_force) for row in record] == [(2, True), (1, False)]
 
 
-def test_every_boot_has_a_line_of_its_own(ground: Ground, synthetic_pass: Any) -> None:
+def test_every_boot_has_a_line_of_its_own(ground, synthetic_pass):
     vehicle = ingest_file(ground, synthetic_pass.folder / "downlink.cadu").vehicle_id
     assert vehicle is not None
     points = [TimePoint(k * 65_536 * 60, k * 60 * NS, 0, boot_count=k // 5) for k in range(10)]
     assert len(correlate(ground, vehicle, points)) == 2
 
 
-def test_no_points_and_no_vehicle_are_refused(ground: Ground) -> None:
+def test_no_points_and_no_vehicle_are_refused(ground):
     with pytest.raises(InvalidInput, match="expected at least one time report"):
         correlate(ground, 1, [])
     with pytest.raises(NotFound, match="vehicle 5"):
