@@ -21,9 +21,7 @@ def main(words: list[str]) -> int:
     """Run the benchmarks that are named, all when none is."""
     if words[:1] == ["rooms"]:
         return rooms.main(words[1:])
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks", description=(__doc__ or "").split("\n\n")[0]
-    )
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(NAMES))
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--before", metavar="COMMIT", help="add the ratio to this commit, run in turn")

@@ -83,10 +83,7 @@ def memory_of_a_stream(different: bytes, megabytes: int) -> Row:
     stream is `different` again and again, so most of its packets are stored already when they come.
     """
     limit = str(megabytes + 1)
-    with (
-        tempfile.TemporaryDirectory() as name,
-        Deployment(Path(name), LINNA_UPLOAD_LIMIT_MIB=limit) as service,
-    ):
+    with tempfile.TemporaryDirectory() as name, Deployment(Path(name), LINNA_UPLOAD_LIMIT_MIB=limit) as service:
         idle = resident_mib(service.parts["api 1"], "RssAnon")
         copies = max(round(megabytes * 1e6 / len(different)), 1)
 

@@ -132,9 +132,7 @@ def run(names: Sequence[str], root: Path = ROOT) -> Iterator[tuple[str, list[Row
     for name in names:
         command = [sys.executable, "-m", "benchmarks", "--rows-of", name]
         try:
-            ended = subprocess.run(
-                command, cwd=root, stdout=subprocess.PIPE, text=True, timeout=LIMIT_S, check=False
-            )
+            ended = subprocess.run(command, cwd=root, stdout=subprocess.PIPE, text=True, timeout=LIMIT_S, check=False)
         except subprocess.TimeoutExpired:
             yield name, [], f"did not finish in {LIMIT_S:.0f} s"
             continue

@@ -159,9 +159,7 @@ class Deployment:
     processes alone, with Redis on the PostgreSQL database `url`, where jobs are added but not run, or on SQLite.
     """
 
-    def __init__(
-        self, folder: Path, apis: int = 1, workers: int = 0, url: str | None = None, **settings: str
-    ) -> None:
+    def __init__(self, folder: Path, apis: int = 1, workers: int = 0, url: str | None = None, **settings: str) -> None:
         self.home, self.url = folder / "home", url
         self.ports = tuple(free_port() for _ in range(apis))
         self.apis = tuple(f"http://127.0.0.1:{port}" for port in self.ports)
@@ -183,10 +181,7 @@ class Deployment:
             commands |= {f"worker {k}": ["worker"] for k in range(1, workers + 1)}
             for name, words in commands.items():
                 ready = partial(listens, int(words[2])) if len(words) > 1 else lambda: True
-                command, log = (
-                    [sys.executable, "-m", "linna", *words],
-                    folder / f"{name.replace(' ', '')}.log",
-                )
+                command, log = ([sys.executable, "-m", "linna", *words], folder / f"{name.replace(' ', '')}.log")
                 self.parts[name] = Part(command, log, ready, env=environment)
                 self.parts[name].start()
         except BaseException:

@@ -91,10 +91,7 @@ def telemetry(frames: int, seed: int = 0, settings: LinkSettings = LinkSettings(
 
 @functools.cache
 def cadus(
-    frames: int = SHORT,
-    seed: int = 0,
-    settings: LinkSettings = LinkSettings(),
-    spacecraft: int = SPACECRAFT,
+    frames: int = SHORT, seed: int = 0, settings: LinkSettings = LinkSettings(), spacecraft: int = SPACECRAFT
 ) -> Rows:
     """Return CADUs, one per row."""
     octets = DownlinkEncoder(spacecraft, settings).encode(telemetry(frames, seed, settings))
@@ -165,9 +162,7 @@ def weak_everywhere(rate: float, seed: int) -> Stream:
 def noise_before(octets: int) -> Stream:
     """Return a recording that begins with noise."""
     noise = np.random.default_rng(octets).integers(0, 256, octets, dtype=np.uint8)
-    return _one(
-        f"{octets} octets of noise first", np.concatenate((noise, cadus().reshape(-1))), telemetry(SHORT)
-    )
+    return _one(f"{octets} octets of noise first", np.concatenate((noise, cadus().reshape(-1))), telemetry(SHORT))
 
 
 def station_header(rate: float) -> Stream:
@@ -212,10 +207,7 @@ def settings_change() -> Stream:
     )
     parts = [cadus(SHORT, k, kind).reshape(-1) for k, kind in enumerate(kinds)]
     packets = [one for k, kind in enumerate(kinds) for one in telemetry(SHORT, k, kind)]
-    declared = (
-        'frame_length = 892\ninterleave = 4\nrandomiser = "long"',
-        'frame_length = 1024\ncoding = "none"',
-    )
+    declared = ('frame_length = 892\ninterleave = 4\nrandomiser = "long"', 'frame_length = 1024\ncoding = "none"')
     return _one("settings change twice", np.concatenate(parts), tuple(packets), declared=declared)
 
 
@@ -366,11 +358,7 @@ def rows() -> Iterator[Row]:
         stream = made()
         right = FoundPackets(stream.true, 0, sum(map(len, stream.files)))
         by_check, by_ingest = checked(stream), ingested(stream)
-        wrong = (
-            ""
-            if by_check == by_ingest == right
-            else f"check {by_check}, ingest {by_ingest}, expected {right}"
-        )
+        wrong = "" if by_check == by_ingest == right else f"check {by_check}, ingest {by_ingest}, expected {right}"
         yield Row(stream.name, by_ingest.packets, "packets", "that can be found", stream.true, wrong)
 
 
@@ -391,7 +379,5 @@ def noise_found(files: int) -> dict[str, int]:
         except TmtcError:
             continue
         counts["with_packets"] += bool(decoded.packets)
-        counts["with_good_frames"] += bool(
-            decoded.frame_count - decoded.frames_bad - decoded.frames_unchecked
-        )
+        counts["with_good_frames"] += bool(decoded.frame_count - decoded.frames_bad - decoded.frames_unchecked)
     return counts

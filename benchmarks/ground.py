@@ -123,9 +123,7 @@ def states(rows: int, queries: int = 40) -> tuple[float, float]:
                 "estimator": np.zeros(count, dtype=np.int64),
                 "outcome": np.ones(count, dtype=np.int64),
             }
-            ground.write(
-                store_samples, vehicle, DICTIONARY.version, {"navigation_states": columns}, number + 1
-            )
+            ground.write(store_samples, vehicle, DICTIONARY.version, {"navigation_states": columns}, number + 1)
         span_ns = rows * STEP_NS
         keys = []
         for part in range(queries):
@@ -160,13 +158,7 @@ def rows() -> Iterator[Row]:
 
     def ingested(database: str, url: str | None) -> Row:
         new, again = ingest(24_000, url)
-        return Row(
-            f"ingest, {database}, of processor time",
-            new,
-            "packets/s",
-            "packets that are stored already",
-            again,
-        )
+        return Row(f"ingest, {database}, of processor time", new, "packets/s", "packets that are stored already", again)
 
     yield ingested("sqlite", None)
     try:

@@ -97,10 +97,7 @@ def _files(name: str) -> list[str]:
 GROUPS = {
     name: Group(
         tuple(file for one in modules.split() for file in _files(one)),
-        tuple(
-            one if (ROOT / one).is_dir() else f"{one}.py"
-            for one in (f"tests/{test}" for test in tests.split())
-        ),
+        tuple(one if (ROOT / one).is_dir() else f"{one}.py" for one in (f"tests/{test}" for test in tests.split())),
     )
     for name, modules, tests in (line.split("|") for line in _TABLE.splitlines())
 }
@@ -122,13 +119,9 @@ _LEFT_OUT: tuple[tuple[Callable[[str], str], str], ...] = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the requested groups and print one line for each; return 1 if a score is below the limit."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.mutation", description=__doc__.splitlines()[0]
-    )
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.mutation", description=__doc__.splitlines()[0])
     parser.add_argument("--group", action="append", choices=sorted(GROUPS), help="group to run; default: all")
-    parser.add_argument(
-        "--sample", type=int, default=60, help="mutants of a group; 0: every one (default 60)"
-    )
+    parser.add_argument("--sample", type=int, default=60, help="mutants of a group; 0: every one (default 60)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the sample (default 1)")
     parser.add_argument("--json", type=Path, help="file for the figures and the survivors")
     options = parser.parse_args(arguments)

@@ -43,10 +43,7 @@ def _kernels(field: GravityField) -> Iterator[Row]:
     packed = _gravity_kernel.pack(field.c_bar, field.s_bar, field.gm_m3_s2, field.radius_m)
     ours = _gravity_kernel.accelerations(packed, few)
     ours_us = best_s(lambda: _gravity_kernel.accelerations(packed, positions)) / EVALUATIONS * 1e6
-    for name, rival in (
-        ("brahe, Clenshaw", _brahe),
-        ("heyoka, scalar cfunc", _heyoka),
-    ):
+    for name, rival in (("brahe, Clenshaw", _brahe), ("heyoka, scalar cfunc", _heyoka)):
         try:
             evaluate = rival(field)
         except ImportError as missing:
@@ -94,17 +91,10 @@ def _heyoka(field: GravityField) -> Callable[[np.ndarray], np.ndarray]:
 
     place = heyoka.make_vars("x", "y", "z")
     pairs = [
-        (float(field.c_bar[n, m]), float(field.s_bar[n, m]))
-        for n in range(field.degree + 1)
-        for m in range(n + 1)
+        (float(field.c_bar[n, m]), float(field.s_bar[n, m])) for n in range(field.degree + 1) for m in range(n + 1)
     ]
     formula = heyoka.model.sh_gravity_acc(
-        list(place),
-        pairs,
-        field.gm_m3_s2,
-        field.radius_m,
-        max_degree=field.degree,
-        max_order=field.degree,
+        list(place), pairs, field.gm_m3_s2, field.radius_m, max_degree=field.degree, max_order=field.degree
     )
     compiled = heyoka.cfunc(formula, list(place), compact_mode=True, batch_size=1)
     return lambda places: np.array([compiled(place) for place in places])
@@ -116,9 +106,7 @@ def _propagations(model: ForceModel) -> Iterator[Row]:
     state = np.concatenate(icrf_state_from_elements(elements, epoch_s, model.gravity.gm_m3_s2))
 
     def month() -> None:
-        trajectory, _ = propagate_with_maneuvers(
-            epoch_s, state[:3], state[3:], 30 * 86_400.0, model, ManeuverRule()
-        )
+        trajectory, _ = propagate_with_maneuvers(epoch_s, state[:3], state[3:], 30 * 86_400.0, model, ManeuverRule())
         trajectory.state(epoch_s + np.arange(0.0, 30 * 86_400.0, 30.0))
 
     propagate(epoch_s, state[:3], state[3:], 60.0, model)
@@ -133,10 +121,7 @@ def _propagations(model: ForceModel) -> Iterator[Row]:
 
     rates(0.0, state)
     scipy_s = best_s(
-        lambda: solve_ivp(
-            rates, (0.0, duration_s), state, method="DOP853", rtol=1e-11, atol=1e-6, dense_output=True
-        ),
-        2,
+        lambda: solve_ivp(rates, (0.0, duration_s), state, method="DOP853", rtol=1e-11, atol=1e-6, dense_output=True), 2
     )
     propagate(epoch_s, state[:3], state[3:], 60.0, model)
     ours_s = best_s(lambda: propagate(epoch_s, state[:3], state[3:], duration_s, model), 3)

@@ -84,9 +84,7 @@ def _housekeeping(connection: Any, vehicle: int, first: int, begin: int, count: 
     """Add rows and roll-ups of a number of seconds; the temperature follows the orbit, all else is constant."""
     version = DICTIONARY.version
     names = ", ".join(HOUSEKEEPING_VALUES)
-    values = ", ".join(
-        "abs(i % 7000 - 3500) / 100.0" if n == "temperature_c" else "1" for n in HOUSEKEEPING_VALUES
-    )
+    values = ", ".join("abs(i % 7000 - 3500) / 100.0" if n == "temperature_c" else "1" for n in HOUSEKEEPING_VALUES)
     connection.exec_driver_sql(
         f"WITH RECURSIVE n(i) AS (SELECT {begin} UNION ALL SELECT i + 1 FROM n WHERE i + 1 < {begin + count}) "
         f"INSERT INTO housekeeping (vehicle_id, dictionary_version, ticks, packet_id, {names}) "
@@ -95,9 +93,7 @@ def _housekeeping(connection: Any, vehicle: int, first: int, begin: int, count: 
     i = np.arange(begin, begin + count)
     columns = {name: np.ones(count) for name in HOUSEKEEPING_VALUES}
     columns["temperature_c"] = np.abs(i % 7000 - 3500) / 100.0
-    add_to_rollups(
-        connection, vehicle, version, "housekeeping", {**columns, "ticks": first + i * TICKS_A_SECOND}
-    )
+    add_to_rollups(connection, vehicle, version, "housekeeping", {**columns, "ticks": first + i * TICKS_A_SECOND})
 
 
 @contextmanager

@@ -126,9 +126,7 @@ def compare_renderings(reference: Sequence[Rendering], other: Sequence[Rendering
 def thinned(rendering: Rendering, every: int) -> Rendering:
     """Each so-manieth pixel of each so-manieth row, as `raymarch.render` gives with the same ``every``."""
     return Rendering(
-        rendering.radiance[::every, ::every],
-        rendering.lit[::every, ::every],
-        rendering.range_m[::every, ::every],
+        rendering.radiance[::every, ::every], rendering.lit[::every, ::every], rendering.range_m[::every, ::every]
     )
 
 

@@ -48,9 +48,7 @@ def measure(package: str, modules: Mapping[str, str]) -> Rooms:
         height[room] = 1 + max((height[to] for to in rooms[room]), default=0)
     lines = sum(text.count("\n") for text in own.values())
     arrows = sum(map(len, rooms.values()))
-    return Rooms(
-        len(rooms), max(height.values(), default=0), arrows, len(own), lines, imports / max(lines, 1)
-    )
+    return Rooms(len(rooms), max(height.values(), default=0), arrows, len(own), lines, imports / max(lines, 1))
 
 
 def _room(package: str, module: str) -> str:
@@ -67,9 +65,7 @@ def _targets(node: ast.Import | ast.ImportFrom, modules: Mapping[str, str]) -> I
 
 def load_modules(root: Path) -> dict[str, str]:
     """Return the texts of all Python modules of a checkout by name."""
-    paths = (
-        path for top in {name.partition(".")[0] for name in PACKAGES} for path in (root / top).rglob("*.py")
-    )
+    paths = (path for top in {name.partition(".")[0] for name in PACKAGES} for path in (root / top).rglob("*.py"))
     texts = {str(path.relative_to(root)): path.read_text(encoding="utf-8") for path in paths}
     return {name[:-3].replace("/", ".").removesuffix(".__init__"): text for name, text in texts.items()}
 

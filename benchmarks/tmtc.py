@@ -77,9 +77,7 @@ def rows() -> Iterator[Row]:
     ccsdspy.log.setLevel(logging.ERROR)
     n = PACKETS
     fixed, variable = fixed_packets(n), variable_packets(n)
-    wrong = (
-        "" if _compare(fixed, variable, _ours(fixed), _ours(variable)) else "values of the decoders differ"
-    )
+    wrong = "" if _compare(fixed, variable, _ours(fixed), _ours(variable)) else "values of the decoders differ"
     peers: dict[str, Any] = {
         "fixed 62 octets": (
             fixed,
@@ -233,15 +231,10 @@ def _downlink(octets: bytes) -> dict[str, float]:
     """Megabytes of CADUs a second, from the file to packets, accounted for; settings known and found out."""
     packets = list(cut_packets(octets).packets(octets))
     figures = {}
-    for name, settings in (
-        ("uncoded", LinkSettings(coding="none")),
-        ("coded, clean", LinkSettings(coding="rs")),
-    ):
+    for name, settings in (("uncoded", LinkSettings(coding="none")), ("coded, clean", LinkSettings(coding="rs"))):
         stream = encode_cadus(packets, spacecraft_id=76, coding=settings.coding)
         for how, given in (("settings known", settings), ("settings found out", None)):
-            seconds = best_s(
-                lambda stream=stream, given=given: decode(stream, settings=given, dictionary=DICTIONARY)
-            )
+            seconds = best_s(lambda stream=stream, given=given: decode(stream, settings=given, dictionary=DICTIONARY))
             figures[f"{name}, {how}"] = len(stream) / 1e6 / seconds
         assert decode(stream).packets == len(packets)
     return figures

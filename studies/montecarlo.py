@@ -22,12 +22,7 @@ from lunar.gravity import GravityField
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
 from payload_emulator.flight.navigation import anchored
-from payload_emulator.flight.navigation.anchored import (
-    AnchoredReport,
-    AnchoredSetup,
-    AnchoredState,
-    Observation,
-)
+from payload_emulator.flight.navigation.anchored import AnchoredReport, AnchoredSetup, AnchoredState, Observation
 from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
 from payload_emulator.flight.navigation.landmark_map import FIRST_LANDMARK_ID
 from payload_emulator.flight.navigation.outcomes import Outcome
@@ -319,10 +314,7 @@ def verdict(result: Consistency, runs: int) -> Verdict:
     worst = max(abs(share - 0.95) for share in result.contained_95)
     checks = (
         (low <= result.anees <= high, f"ANEES {result.anees:.2f} outside {low:.2f} to {high:.2f}"),
-        (
-            0.9 <= result.nis_per_degree <= 1.1,
-            f"NIS per degree {result.nis_per_degree:.3f} outside 0.9 to 1.1",
-        ),
+        (0.9 <= result.nis_per_degree <= 1.1, f"NIS per degree {result.nis_per_degree:.3f} outside 0.9 to 1.1"),
         (
             abs(result.innovation_correlation) <= 0.1,
             f"innovations correlated by {result.innovation_correlation:.3f}, over 0.1",
@@ -354,11 +346,7 @@ def _with_drawn_biases(case: NavigationCase, rng: np.random.Generator) -> Naviga
 
 
 def _wandering(
-    first: FloatArray,
-    sigma: float | FloatArray,
-    correlation_s: float,
-    elapsed_s: FloatArray,
-    rng: np.random.Generator,
+    first: FloatArray, sigma: float | FloatArray, correlation_s: float, elapsed_s: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
     """Return a stationary first-order Gauss-Markov process (n + 1, k) from its first value over n steps."""
     decay = np.exp(-elapsed_s / correlation_s)
@@ -381,11 +369,7 @@ def _with_drawn_node(case: NavigationCase, rng: np.random.Generator) -> Navigati
         now = float(np.arctan2(normal[0], -normal[1]))
         angle = float(np.radians(low + (high - low) * angle / (2.0 * np.pi))) - now
     turn = _rotation(angle * rotation[2])
-    return replace(
-        case,
-        position_icrf_m=turn @ case.position_icrf_m,
-        velocity_icrf_m_s=turn @ case.velocity_icrf_m_s,
-    )
+    return replace(case, position_icrf_m=turn @ case.position_icrf_m, velocity_icrf_m_s=turn @ case.velocity_icrf_m_s)
 
 
 def _with_errors(table: CatalogueTable, errors: CatalogueErrors, rng: np.random.Generator) -> CatalogueTable:
@@ -408,9 +392,7 @@ def _with_errors(table: CatalogueTable, errors: CatalogueErrors, rng: np.random.
     return unpack_catalogue_table(pack_catalogue_table(moved))
 
 
-def _truth(
-    case: NavigationCase, rng: np.random.Generator, slow: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
+def _truth(case: NavigationCase, rng: np.random.Generator, slow: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Return true states (n, 6) and rotations mcmf_from_icrf (n, 3, 3) at the frames."""
     model = ForceModel(case.gravity, case.orientation, case.gravity_degree)
     tdb_s = np.asarray(tdb_s_from_utc_ns(case.frame_utc_ns), dtype=np.float64)
@@ -428,11 +410,7 @@ def _truth(
         axis = np.cos(heading) * normal + np.sin(heading) * along
         turn = _rotation(axis * case.kidnap.distance_m / float(np.linalg.norm(states[k, :3])))
         moved = propagate(
-            float(tdb_s[k]),
-            turn @ states[k, :3],
-            turn @ states[k, 3:],
-            float(tdb_s[-1] - tdb_s[k]) + 1.0,
-            model,
+            float(tdb_s[k]), turn @ states[k, :3], turn @ states[k, 3:], float(tdb_s[-1] - tdb_s[k]) + 1.0, model
         )
         states = np.concatenate([states[:k], moved.state(tdb_s[k:])])
     return states, case.orientation.mcmf_from_icrf(tdb_s)
@@ -447,9 +425,7 @@ def _pushed(
     """
     starts = np.arange(epoch_s, float(tdb_s[-1]) + 1.0, _PUSH_S)
     sigma = np.array(case.lasting_m_s2)
-    lasting = _wandering(
-        sigma * rng.standard_normal(3), sigma, case.lasting_correlation_s, np.diff(starts), rng
-    )
+    lasting = _wandering(sigma * rng.standard_normal(3), sigma, case.lasting_correlation_s, np.diff(starts), rng)
     state = np.concatenate([case.position_icrf_m, case.velocity_icrf_m_s])
     states = np.empty((tdb_s.size, 6))
     for start, push in zip(starts, lasting, strict=True):
@@ -487,9 +463,7 @@ def _started(
                 GravityTable(gravity.name, gravity.gm_m3_s2, gravity.radius_m, gravity.c_bar, gravity.s_bar)
             )
         ),
-        unpack_orientation_table(
-            pack_orientation_table(np.asarray(ticks_from_utc_ns(times)), rotations, pa_from_mcmf)
-        ),
+        unpack_orientation_table(pack_orientation_table(np.asarray(ticks_from_utc_ns(times)), rotations, pa_from_mcmf)),
         start,
         case.camera,
         case.parameters,
@@ -509,13 +483,7 @@ def _detect(
     """Return the detections of a frame and the crater that each is of, -1 for none."""
     detector, camera = case.detector, case.camera
     pose = Pose(
-        position_icrf_m,
-        camera_from_icrf,
-        mcmf_from_icrf,
-        np.zeros(3),
-        np.zeros(2),
-        np.zeros(3),
-        detector.scale,
+        position_icrf_m, camera_from_icrf, mcmf_from_icrf, np.zeros(3), np.zeros(2), np.zeros(3), detector.scale
     )
     index = in_view(craters, pose, camera, 0.0).index
     index = index[detector.found(craters.diameter_m[index], rng)]
@@ -526,18 +494,12 @@ def _detect(
     order = rng.permutation(truth.size)
     order = order[np.all((uv[order] >= -0.5) & (uv[order] <= corner + 0.5), axis=1)]
     found = Detections(
-        uv[order, 0],
-        uv[order, 1],
-        diameter[order],
-        np.ones(order.size),
-        np.full(order.size, detector.stated_sigma_px),
+        uv[order, 0], uv[order, 1], diameter[order], np.ones(order.size), np.full(order.size, detector.stated_sigma_px)
     )
     return found, craters.ids[truth[order]] * (truth[order] >= 0) - (truth[order] < 0)
 
 
-def _row(
-    state: AnchoredState, report: AnchoredReport, true_state: FloatArray, truth: IntArray
-) -> tuple[object, ...]:
+def _row(state: AnchoredState, report: AnchoredReport, true_state: FloatArray, truth: IntArray) -> tuple[object, ...]:
     mean, covariance = state.estimate.mean, state.estimate.covariance
     error = mean[:6] - true_state
     rtn = rtn_from_inertial(true_state[:3], true_state[3:])

@@ -89,8 +89,7 @@ def make_paper(steps: StepFolder, *, quick: bool) -> PaperReport:
         evidence_level=sessions[0].level,
         headline=_headline(month, () if quick else detectors, sessions),
         provenance=_provenance(steps, network),
-        data_sources=tuple(steps.data.names())
-        or ("procedural Moon, low-degree gravity and IAU orientation",),
+        data_sources=tuple(steps.data.names()) or ("procedural Moon, low-degree gravity and IAU orientation",),
         remarks=_remarks(quick, steps),
         not_available=missing,
     )
@@ -294,9 +293,7 @@ def _headline(
     for session in sessions[:2]:
         one = session.series[0]
         median = completed(one).median_3d_m
-        figures.append(
-            HeadlineFigure(f"Median error, {one.name}", median, "m", _METHODS[session.key], session.level)
-        )
+        figures.append(HeadlineFigure(f"Median error, {one.name}", median, "m", _METHODS[session.key], session.level))
     return tuple(figures)
 
 

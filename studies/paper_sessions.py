@@ -17,14 +17,7 @@ from ground_service.ground import open_ground
 from payload_emulator.session.archive.emulator import emulate
 from payload_emulator.session.scenario import Scenario, format_scenario, load_scenario
 from reports.paper_values import PaperSession
-from reports.values import (
-    DriftSample,
-    GalleryFrame,
-    NavigationSeries,
-    NavigationStatistics,
-    TimeSpan,
-    TrackSeries,
-)
+from reports.values import DriftSample, GalleryFrame, NavigationSeries, NavigationStatistics, TimeSpan, TrackSeries
 from studies.paper_steps import StepFolder, load_png
 
 ACTOR = "linna paper"
@@ -154,9 +147,7 @@ def _view(archive: Path, gallery: list[dict[str, Any]]) -> GalleryFrame | None:
         return None
     row = kept[len(kept) // 2]
     image = load_png(archive / "frames" / f"{row['frame_number']:06d}.png")
-    fields: dict[str, Any] = {
-        name: _array(value) if isinstance(value, list) else value for name, value in row.items()
-    }
+    fields: dict[str, Any] = {name: _array(value) if isinstance(value, list) else value for name, value in row.items()}
     for name in ("detection_matched", "catalogue_matched"):
         if row[name] is not None:
             fields[name] = np.array(row[name], dtype=np.bool_)

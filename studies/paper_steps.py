@@ -15,13 +15,7 @@ import numpy as np
 
 from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
-from lunar.catalogue import (
-    CraterCatalogue,
-    class_counts,
-    completed_to_paper,
-    load_catalogue,
-    paper_density_catalogue,
-)
+from lunar.catalogue import CraterCatalogue, class_counts, completed_to_paper, load_catalogue, paper_density_catalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder, default_orientation
 from lunar.fov_study import study_field_of_view
@@ -70,14 +64,7 @@ class Effort:
     fov_step_s: float = 30.0
 
 
-QUICK = Effort(
-    hours=3.0,
-    unseen_passes=1,
-    sample_frames=40,
-    method_frames=120,
-    training_steps=60,
-    fov_step_s=300.0,
-)
+QUICK = Effort(hours=3.0, unseen_passes=1, sample_frames=40, method_frames=120, training_steps=60, fov_step_s=300.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,9 +121,7 @@ def orbit(steps: StepFolder) -> dict[str, Any]:
         first_day = even_epochs(ephemeris, 15.0)[: 24 * 240]
         latitude = np.degrees(ground_track(ephemeris, orientation, first_day).latitude_rad)
         return {
-            "elements": {
-                name: text.format(getattr(scenario.orbit, key)) for name, (key, text) in ELEMENTS.items()
-            },
+            "elements": {name: text.format(getattr(scenario.orbit, key)) for name, (key, text) in ELEMENTS.items()},
             "altitude_km": {
                 "mean": float(altitude_km.mean()),
                 "min": float(altitude_km.min()),
@@ -153,9 +138,7 @@ def orbit(steps: StepFolder) -> dict[str, Any]:
 
 def open_catalogue(steps: StepFolder) -> CraterCatalogue:
     """The most complete real catalogue, or a synthetic one of the paper's density."""
-    return (
-        paper_density_catalogue(1) if steps.catalogue_path is None else load_catalogue(steps.catalogue_path)
-    )
+    return paper_density_catalogue(1) if steps.catalogue_path is None else load_catalogue(steps.catalogue_path)
 
 
 def paper_density(steps: StepFolder) -> CraterCatalogue:
@@ -187,12 +170,7 @@ def field_of_view(steps: StepFolder) -> dict[str, Any]:
     return dict(
         steps.step(
             "fov",
-            {
-                "days": steps.effort.days,
-                "step_s": steps.effort.fov_step_s,
-                "density": "paper",
-                "places": "all",
-            },
+            {"days": steps.effort.days, "step_s": steps.effort.fov_step_s, "density": "paper", "places": "all"},
             make,
         )
     )
@@ -266,9 +244,7 @@ def method_dataset(steps: StepFolder) -> Path:
     if not steps.real:
         kept = [source for source in recipe.sources if source.terrain == "procedural"]
         total = sum(source.share for source in kept)
-        recipe = replace(
-            recipe, sources=tuple(replace(source, share=source.share / total) for source in kept)
-        )
+        recipe = replace(recipe, sources=tuple(replace(source, share=source.share / total) for source in kept))
     folder = steps.out / f"method-{recipe.digest[:8]}-{steps.effort.method_frames}"
 
     def make() -> dict[str, Any]:
@@ -320,9 +296,7 @@ def class_only_network(steps: StepFolder, dataset: Path) -> Path | None:
     return path
 
 
-def evaluation(
-    steps: StepFolder, name: str, octets: bytes, dataset: Path, paper_classes: bool
-) -> dict[str, Any]:
+def evaluation(steps: StepFolder, name: str, octets: bytes, dataset: Path, paper_classes: bool) -> dict[str, Any]:
     """Scores of a network on the test frames of the highest evidence level available.
 
     The gallery goes to `gallery-NAME.npz`.
@@ -338,13 +312,7 @@ def evaluation(
 
         detector, sets = open_for_evaluation(octets), [Dataset(dataset)]
         scored = run(
-            detector,
-            sets,
-            "test",
-            source,
-            None,
-            lambda f: steps.progress(f, len(f)),
-            paper_classes=paper_classes,
+            detector, sets, "test", source, None, lambda f: steps.progress(f, len(f)), paper_classes=paper_classes
         )
         figures = summary(detector, sets, scored, "test", source)
         gallery = detector_report(detector, scored, figures).gallery[:GALLERY_FRAMES]
@@ -354,11 +322,7 @@ def evaluation(
 
     if not path.is_file():
         (steps.out / "steps" / f"evaluation of {name}.json").unlink(missing_ok=True)
-    made_from = {
-        "model": hashlib.sha256(octets).hexdigest(),
-        "labels": Dataset(dataset).digest,
-        "source": source,
-    }
+    made_from = {"model": hashlib.sha256(octets).hexdigest(), "labels": Dataset(dataset).digest, "source": source}
     return dict(steps.step(f"evaluation of {name}", made_from, make))
 
 

@@ -106,9 +106,7 @@ def survey_scenario(base: Scenario, region: Region, windows: int, seed: int) -> 
     return replace(base, name=f"survey-{seed}", seed=seed, window=window)
 
 
-def survey_session(
-    scenario: Scenario, data: DataFolder, out: Path | None, progress: Progress
-) -> SurveySession:
+def survey_session(scenario: Scenario, data: DataFolder, out: Path | None, progress: Progress) -> SurveySession:
     """Return the session of a scenario: that kept in the folder `out`, or one that is flown now and kept there."""
     if out is None:
         return _flown(build_world(scenario, data), data, progress)
@@ -227,9 +225,7 @@ def summary(sessions: Sequence[SurveySession]) -> dict[str, Any]:
 
     windows = [window for session in sessions for window in session.windows]
     if not windows:
-        raise ScenarioError(
-            f"survey: expected windows with more than {SETTLED_FRAMES} frames in a session, found none"
-        )
+        raise ScenarioError(f"survey: expected windows with more than {SETTLED_FRAMES} frames in a session, found none")
     position = np.concatenate([window.position_m for window in windows])
     frames = np.array([window.frames for window in windows])
     nees = np.array([window.nees for window in windows])
@@ -288,9 +284,7 @@ def _coasts(windows: Sequence[SurveyWindow]) -> list[dict[str, Any]]:
             inside = np.abs([one.coast_sigmas or () for one in mine]) <= 2.0
             largest_m = max(one.coast_end_m or 0.0 for one in mine)
             share = float(np.mean(inside))
-            rows.append(
-                {"frames_from": least, "coasts": len(mine), "max_m": largest_m, "inside_2_sigma": share}
-            )
+            rows.append({"frames_from": least, "coasts": len(mine), "max_m": largest_m, "inside_2_sigma": share})
     return rows
 
 

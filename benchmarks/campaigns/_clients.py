@@ -49,9 +49,7 @@ class Session:
     apis: tuple[str, ...]
     token: str
 
-    def ask(
-        self, method: str, path: str, body: bytes | None = None, key: str = "", *expected: int
-    ) -> httpx.Response:
+    def ask(self, method: str, path: str, body: bytes | None = None, key: str = "", *expected: int) -> httpx.Response:
         """Repeat a request, with one process after another, until a response is not for an unavailable part.
 
         Raises
@@ -69,9 +67,7 @@ class Session:
         until = time.monotonic() + TIMEOUT_S
         for api in itertools.cycle(random.sample(self.apis, len(self.apis))):
             with contextlib.suppress(httpx.HTTPError):
-                found = httpx.request(
-                    method, f"{api}/api/v1{path}", content=body, headers=headers, timeout=60
-                )
+                found = httpx.request(method, f"{api}/api/v1{path}", content=body, headers=headers, timeout=60)
                 if found.status_code < 500:
                     if expected and found.status_code not in expected:
                         raise SystemExit(f"{method} {path}: {found.status_code} {found.content[:300]!r}")

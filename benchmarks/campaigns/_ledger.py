@@ -114,9 +114,7 @@ def judge(ledger: Ledger, rows: Sequence[Mapping[str, Any]], lines: Iterable[Aud
         if row is not None and decision.decided_by is not None:
             kept = kept and row["decided_by"] == decision.decided_by
         faults["states_lost"] += not kept
-    counts = Counter(
-        (row["vehicle_id"], row["sequence_count"]) for row in rows if row["sequence_count"] is not None
-    )
+    counts = Counter((row["vehicle_id"], row["sequence_count"]) for row in rows if row["sequence_count"] is not None)
     faults["shared_counts"] = sum(count - 1 for count in counts.values())
     faults.update(_judge_hand_outs(ledger, by_id))
     faults["audit_wrong"] = _wrong_lines(ledger, by_id, lines)
@@ -161,6 +159,4 @@ def _wrong_lines(ledger: Ledger, by_id: Mapping[int, Mapping[str, Any]], lines: 
     wrong = sum(abs(found[key] - 1) for key in expected) + sum(
         count for key, count in found.items() if key not in expected
     )
-    return wrong + sum(
-        actors[key] != actor for key, actor in expected.items() if actor is not None and key in actors
-    )
+    return wrong + sum(actors[key] != actor for key, actor in expected.items() if actor is not None and key in actors)

@@ -41,11 +41,7 @@ class Diary:
     def close(self) -> int:
         """Print the result; 1 if there was a wrong turn of the classes A or B."""
         seconds = round(time.monotonic() - self.started)
-        print(
-            json.dumps(
-                {"hour": self.name, "seconds": seconds, "steps": self.steps, "wrong_turns": self.turns}
-            )
-        )
+        print(json.dumps({"hour": self.name, "seconds": seconds, "steps": self.steps, "wrong_turns": self.turns}))
         return int(any(one[0] in "AB" for one in self.turns))
 
 

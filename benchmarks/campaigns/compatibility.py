@@ -115,9 +115,7 @@ def make_samples(folder, demo):
         shutil.copy(demo / "pass" / name, folder)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "LINNA_HOME": str(folder / "ground")}
     for line in SAMPLES.splitlines():
-        subprocess.run(
-            [sys.executable, "-m", "linna", *line.split()], check=True, cwd=folder, env=environment
-        )
+        subprocess.run([sys.executable, "-m", "linna", *line.split()], check=True, cwd=folder, env=environment)
     decoded = decode((folder / "downlink.cadu").read_bytes())
     (folder / "packets.bin").write_bytes(b"".join(decoded.cut.packets(decoded.buffer)))
     (folder / "expected.json").write_text(json.dumps(_expected(folder)))
@@ -147,10 +145,7 @@ def _expected(folder):
             leap.format(day, f"{day:%b}".upper(), day.day, day.toordinal() + 1721424.5, 10 + k)
             for k, day in enumerate(leaps)
         ),
-        "tables": {
-            name: [one[0], *([_number(text) for text in row] for row in one[1:])]
-            for name, one in rows.items()
-        },
+        "tables": {name: [one[0], *([_number(text) for text in row] for row in one[1:])] for name, one in rows.items()},
         "tum": np.loadtxt(folder / "tum" / "anchored.tum").tolist(),
         "packets": json.loads((folder / "linna.json").read_text()),
         "unrolled": json.loads((folder / "unrolled.json").read_text()),
@@ -316,10 +311,7 @@ def run_row(row, samples, out):
         interpreter, environment["PYTHONPATH"] = sys.executable, str(ROOT)
     command = [str(interpreter), str(NEIGHBOURS / row.script), row.function, str(samples), str(out)]
     options = {"start_new_session": True, "env": environment, "cwd": out}
-    with (
-        (out / "log.txt").open("w") as log,
-        subprocess.Popen(command, stdout=log, stderr=log, **options) as process,
-    ):
+    with (out / "log.txt").open("w") as log, subprocess.Popen(command, stdout=log, stderr=log, **options) as process:
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(LIMIT_S)
         with contextlib.suppress(ProcessLookupError):  # what it started, too
@@ -362,9 +354,7 @@ def result(row, samples, *, again):
     digest = hashlib.sha256(b"".join(parts)).hexdigest()
     kept = BUILD / "results" / f"{row.function}.json"
     stored = json.loads(kept.read_text()) if kept.is_file() and not again else {}
-    if stored.get("digest") != digest or any(
-        one.get("not_tried") and not one["what"] for one in stored["entries"]
-    ):
+    if stored.get("digest") != digest or any(one.get("not_tried") and not one["what"] for one in stored["entries"]):
         print(f"{row.name} ...", file=sys.stderr, flush=True)
         stored = {"digest": digest, "entries": run_row(row, samples, BUILD / "files" / row.function)}
         kept.parent.mkdir(parents=True, exist_ok=True)

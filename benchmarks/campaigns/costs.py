@@ -121,11 +121,7 @@ def cases() -> list[tuple[str, str, str, Any]]:
     files = {f"images/{k}.png": {"sha256": f"{k:064x}", "bytes": 1} for k in range(15_000)}
     manifest = {"schema_version": 1, "pass_name": "p", "spacecraft_id": 76, "cadence_s": 15.0, "files": files}
     compared = {"candidate": "current", "archives": [f"{k:064x}" for k in range(14_000)]}
-    command = {
-        "name": "test_connection",
-        "spacecraft_id": 76,
-        "arguments": dict.fromkeys(map(str, range(60_000))),
-    }
+    command = {"name": "test_connection", "spacecraft_id": 76, "arguments": dict.fromkeys(map(str, range(60_000)))}
     listed = json.dumps(manifest).encode()
     formats = "oem oem-xml aem spk ck spice sclk fk ik geojson gpkg czml parquet netcdf csv tum images"
     kinds = [f"{kind}?format={one}" for kind in ("housekeeping", "detections") for one in ("json", "csv")]
@@ -275,9 +271,7 @@ def main(words: Sequence[str] | None = None) -> int:
         if given.write:
             rows = sorted(costs, key=lambda row: (-row.memory_mib, -row.processor_s))
             head = PAGE.read_text().split("|---")[0]
-            PAGE.write_text(
-                f"{head}|---|---|---|---|---|---|\n" + "\n".join(row.cells() for row in rows) + "\n"
-            )
+            PAGE.write_text(f"{head}|---|---|---|---|---|---|\n" + "\n".join(row.cells() for row in rows) + "\n")
     return int(any(one.fault for one in costs))
 
 

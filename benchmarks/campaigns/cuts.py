@@ -107,11 +107,7 @@ def frames_of(rng: Rng, settings: LinkSettings, frames: int, spacecraft: int = S
 def long_packets(rng: Rng, count: int, shortest: int = 2_000, longest: int = 9_000) -> list[bytes]:
     """Packets of an undeclared process, longer than a frame."""
     return [
-        append_crc(
-            pack_packet(0x155, rng.bytes(int(rng.integers(shortest, longest))) + b"\0\0", sequence_count=k)[
-                :-2
-            ]
-        )
+        append_crc(pack_packet(0x155, rng.bytes(int(rng.integers(shortest, longest))) + b"\0\0", sequence_count=k)[:-2])
         for k in range(count)
     ]
 
@@ -159,9 +155,7 @@ def station_records(rng: Rng) -> list[Recording]:
     """Frames in records of a station."""
     rows = frames_of(rng, SHORT, 30, RECORDED)
     head = rng.integers(0, 256, (len(rows), STATION_HEADER), dtype=np.uint8)
-    head[:, 8:] = (
-        (1_900_000_000_000_000_000 + np.arange(len(rows)) * 10**9).astype(">i8").view(np.uint8).reshape(-1, 8)
-    )
+    head[:, 8:] = (1_900_000_000_000_000_000 + np.arange(len(rows)) * 10**9).astype(">i8").view(np.uint8).reshape(-1, 8)
     tail = rng.integers(0, 256, (len(rows), STATION_TRAILER), dtype=np.uint8)
     return [Recording("r", np.hstack((head, rows, tail)).tobytes(), spacecraft=RECORDED, station="madrid")]
 
@@ -192,11 +186,7 @@ def damaged(rng: Rng) -> list[Recording]:
 def bare(rng: Rng) -> list[Recording]:
     """Packets without frames, some longer than others."""
     packets = list(telemetry(12, int(rng.integers(1 << 20)), LinkSettings()))
-    return [
-        Recording(
-            "r", b"".join([*packets[::2], *long_packets(rng, 2), *packets[1::2]]), spacecraft=SPACECRAFT
-        )
-    ]
+    return [Recording("r", b"".join([*packets[::2], *long_packets(rng, 2), *packets[1::2]]), spacecraft=SPACECRAFT)]
 
 
 def foreign(rng: Rng) -> list[Recording]:
@@ -210,8 +200,7 @@ def foreign(rng: Rng) -> list[Recording]:
 def unchecked_packets(rng: Rng, count: int) -> list[bytes]:
     """Packets without checksum and time of two declared processes and of an undeclared one."""
     return [
-        pack_packet(100 + k % 3, bytes(20) + rng.bytes(40 + 40 * (k % 3)), sequence_count=k // 3)
-        for k in range(count)
+        pack_packet(100 + k % 3, bytes(20) + rng.bytes(40 + 40 * (k % 3)), sequence_count=k // 3) for k in range(count)
     ]
 
 
@@ -271,9 +260,7 @@ def ordered(pieces: list[Piece], rng: Rng, order: str) -> list[Piece]:
     if order == "repeated":
         pieces = [*pieces, *(pieces[i] for i in rng.integers(0, len(pieces), max(len(pieces) // 3, 1)))]
     if order == "cut twice":
-        again = [
-            piece for one in dict.fromkeys(piece.recording for piece in pieces) for piece in split(one, rng)
-        ]
+        again = [piece for one in dict.fromkeys(piece.recording for piece in pieces) for piece in split(one, rng)]
         pieces = [*pieces, *(again[i] for i in rng.permutation(len(again))[: len(again) // 2])]
     if order != "in order":
         pieces = [pieces[i] for i in rng.permutation(len(pieces))]
@@ -367,9 +354,7 @@ def sums(ground: Ground, case: Case, results: Sequence[tuple[Piece, int]]) -> di
         total.update({name: getattr(values, name) for name in SUMS})
         if values.reception is not None:
             total.update({name: getattr(values.reception, name) for name in RECEPTION_SUMS})
-    return {
-        name: value for name, value in total.items() if case.kind != "damaged" or name not in OF_LOST_FRAMES
-    }
+    return {name: value for name, value in total.items() if case.kind != "damaged" or name not in OF_LOST_FRAMES}
 
 
 def wholes(case: Case) -> list[Piece]:
@@ -431,9 +416,7 @@ def archive(folder: Path, url: str | None = None, processes: int = 3) -> Iterato
 
 def main() -> int:
     """Ingest all cases; return the exit status."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=500)
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS), metavar="KIND")
     parser.add_argument("--postgresql", action="store_true")
@@ -450,11 +433,7 @@ def main() -> int:
             difference = found.difference(case)
             equal[case.kind] += not difference
             if difference:
-                print(
-                    f"case {case.number} ({case.kind}, {case.order}): {difference}",
-                    file=sys.stderr,
-                    flush=True,
-                )
+                print(f"case {case.number} ({case.kind}, {case.order}): {difference}", file=sys.stderr, flush=True)
     for name, count in sorted(Counter(case.kind for case in cases).items()):
         print(f"{name:<20}{equal[name]:>6} of {count} equal")
     print(f"all {equal.total()} of {len(cases)}, {pieces} pieces, {round(time.monotonic() - started)} s")

@@ -29,21 +29,14 @@ def main(frames: str = "8") -> int:
 
         def run(line: str) -> tuple[int, str]:
             done = subprocess.run(
-                ["bash", "-c", line],
-                cwd=folder,
-                env=environment(folder),
-                capture_output=True,
-                text=True,
-                check=False,
+                ["bash", "-c", line], cwd=folder, env=environment(folder), capture_output=True, text=True, check=False
             )
             return done.returncode, done.stdout + done.stderr
 
         def build(where: str, before: str = "", old: str = "", new: str = "") -> str:
             contract = (ROOT / "docs" / "build-contract.md").read_text().split("### Template of a program")[1]
             (folder / where).mkdir()
-            toml, program = (
-                re.findall(rf"```{one}\n(.*?)```", contract, re.DOTALL)[0] for one in ("toml", "python")
-            )
+            toml, program = (re.findall(rf"```{one}\n(.*?)```", contract, re.DOTALL)[0] for one in ("toml", "python"))
             (folder / where / "build.toml").write_text(toml.replace(old or where, new or where))
             (folder / where / "fly.py").write_text(before + program)
             return f"{where}/build.toml"
@@ -52,27 +45,13 @@ def main(frames: str = "8") -> int:
         for line in commands_of("tutorials/own-build.md", folder):
             status, printed = run(line.replace("--frames 40", f"--frames {frames}"))
             diary.expect("B", f"as printed: {line[:70]}", status in (0, 1), printed)
-        diary.expect(
-            "A", "the worse detector fails with what fell", "\nfail: recall falls" in "\n" + printed, printed
-        )
+        diary.expect("A", "the worse detector fails with what fell", "\nfail: recall falls" in "\n" + printed, printed)
         for kind, step, line, expected, text in (
             ("A", "the template is identical", f"{RUN} {build('same')}", (0,), "identical in every octet"),
-            (
-                "A",
-                "a slow program fails",
-                f"{RUN} {build('slow', SLOW)} --repeat-baseline",
-                (1, 3),
-                "processor time",
-            ),
+            ("A", "a slow program fails", f"{RUN} {build('slow', SLOW)} --repeat-baseline", (1, 3), "processor time"),
             ("B", "a crash shows its traceback", f"{RUN} {build('crash', CRASH)}", (1, 2), "a wrong turn"),
             ("B", "JUnit as well", "cat junit.xml", (0,), "a wrong turn"),
-            (
-                "B",
-                "a missing archive is named",
-                f"{RUN.replace('passes', 'nowhere')} build.toml",
-                (2,),
-                "nowhere",
-            ),
+            ("B", "a missing archive is named", f"{RUN.replace('passes', 'nowhere')} build.toml", (2,), "nowhere"),
         ):
             status, printed = run(line)
             held = status in expected and text in printed and "internal error" not in printed
@@ -89,9 +68,7 @@ def main(frames: str = "8") -> int:
                 diary.expect("B", f"a wrong {where} is refused: {command[:14]}", held, printed)
         (folder / "parameters.toml").write_text("detector.score_treshold = 0.8\n")
         status, printed = run(f"{CHECK} build.toml")
-        diary.expect(
-            "B", "a misspelled parameter is named", status == 2 and "score_threshold" in printed, printed
-        )
+        diary.expect("B", "a misspelled parameter is named", status == 2 and "score_threshold" in printed, printed)
     return diary.close()
 
 

@@ -184,10 +184,7 @@ class Service:
 
     def state(self) -> dict[str, str | None]:
         """Return the contents of the files of the service."""
-        return {
-            path: Path(path).read_text(errors="replace") if Path(path).exists() else None
-            for path in self.secrets
-        }
+        return {path: Path(path).read_text(errors="replace") if Path(path).exists() else None for path in self.secrets}
 
     def damage(self) -> list[str]:
         """Return the effects of a build on the service, by name."""
@@ -279,10 +276,7 @@ def _campaign(
     write_archive(folder / "archive")
     leftovers = {kind: f"{LEFTOVER}-{os.getpid()}-{number}" for number, kind in enumerate(kinds)}
     writable = [ROOT / "ground_service" / "__init__.py", exchange / "runner.json"]
-    builds = [
-        write_build(folder / kind.replace(" ", "-"), kind, service, leftovers[kind], writable)
-        for kind in kinds
-    ]
+    builds = [write_build(folder / kind.replace(" ", "-"), kind, service, leftovers[kind], writable) for kind in kinds]
     out = folder / "out"
     out.mkdir()
     exchange.mkdir()
@@ -300,9 +294,7 @@ def _campaign(
             _in_profile(name, [sys.executable, "-c", RUN, *words, *map(str, builds)], folder),
             stdout=subprocess.PIPE,
             cwd=ROOT,
-            env=_environment(
-                {"LINNA_DATABASE_URL": f"postgresql://linna:{SECRET}@db/linna", "PGPASSWORD": SECRET}
-            ),
+            env=_environment({"LINNA_DATABASE_URL": f"postgresql://linna:{SECRET}@db/linna", "PGPASSWORD": SECRET}),
             text=True,
         )
         assert worker.stdout is not None
@@ -325,13 +317,7 @@ def _campaign(
         findings.append(Finding(profile, "explore", "seen from outside", True, "the program was changed"))
     attempts = len(findings) + sum(kind != "explore" for kind in kinds) if isolation else 0
     return ProfileResult(
-        profile,
-        len(kinds),
-        len(refusals),
-        refusals[0] if refusals else "",
-        isolation,
-        attempts,
-        tuple(findings),
+        profile, len(kinds), len(refusals), refusals[0] if refusals else "", isolation, attempts, tuple(findings)
     )
 
 
@@ -382,10 +368,7 @@ def _left(leftover: str, folder: Path, out: Path) -> list[str]:
 
 def _runner(exchange: Path, folder: Path) -> Part:
     command = [sys.executable, "-m", "linna", "runner", "--exchange", str(exchange)]
-    words, environment = (
-        _in_profile("runner", command, folder, exchange),
-        _environment({"LINNA_HOME": "/tmp"}),
-    )
+    words, environment = (_in_profile("runner", command, folder, exchange), _environment({"LINNA_HOME": "/tmp"}))
     return Part(words, folder / "runner.log", (exchange / "runner.json").exists, 1, cwd=ROOT, env=environment)
 
 
@@ -419,9 +402,7 @@ def table(results: Sequence[ProfileResult]) -> str:
     lines = [f"{'profile':20} {'runs':>5} {'refused':>8} {'attempts':>9} {'successes':>10}  confined by"]
     for one in results:
         by = one.isolation or f"not run: {one.refusal.split(';')[0]}"
-        lines.append(
-            f"{one.profile:20} {one.runs:5} {one.refusals:8} {one.attempts:9} {len(one.successes):10}  {by}"
-        )
+        lines.append(f"{one.profile:20} {one.runs:5} {one.refusals:8} {one.attempts:9} {len(one.successes):10}  {by}")
     return "\n".join(lines)
 
 

@@ -129,9 +129,7 @@ def one_run(kills: int, seed: int, given: argparse.Namespace) -> Figures:
         harassment = Harassment(service, rng, kills, given.pause)
         try:
             with open_ground(service.home, database_url=service.url) as ground:
-                sessions = [
-                    Session(service.apis, add_user(ground, f"client{k}", "operator")) for k in range(CLIENTS)
-                ]
+                sessions = [Session(service.apis, add_user(ground, f"client{k}", "operator")) for k in range(CLIENTS)]
             harassment.start()
             work_meanwhile(sessions, harassment, stream, random.Random(seed + 1), ledger, given)
             harassment.join()
@@ -298,9 +296,7 @@ def table(figures: Mapping[str, Any]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=300)
     parser.add_argument("--state", type=Path, help="file that runs are added to, to go on from")
     parser.add_argument("--laptop", action="store_true", help="the API alone, on SQLite")

@@ -92,9 +92,7 @@ class KilledRun(MissionRun):
     def _open_ground(self) -> MissionGround:
         return DistributedGround(self._folder, self._data, self._files.clock)
 
-    def _operate(
-        self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics
-    ) -> None:
+    def _operate(self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics) -> None:
         assert isinstance(spacecraft, KillableSpacecraft) and isinstance(ground, DistributedGround)
         self._keeper = self._made_keeper(spacecraft, ground)
         flight = self.flight(spacecraft, ground, dynamics)
@@ -151,13 +149,7 @@ class KilledRun(MissionRun):
         return figures
 
 
-def run_killed(
-    scenario: Scenario,
-    data: DataFolder,
-    folder: Path,
-    terms: KillTerms,
-    say: Say,
-) -> dict[str, Any]:
+def run_killed(scenario: Scenario, data: DataFolder, folder: Path, terms: KillTerms, say: Say) -> dict[str, Any]:
     """Run a mission with kills in a folder, or continue the run that is there; return the closing figures."""
     return KilledRun(prepared(scenario, terms), data, folder, terms, say).run()
 

@@ -33,14 +33,10 @@ def main(rate: float = 20.0) -> int:
         folder, api, hook = Path(name), free_port(), free_port()
 
         def ported(text: str) -> str:
-            text = text.replace("linna serve", f"linna serve --port {api}").replace(
-                "--rate 120", f"--rate {rate:g}"
-            )
+            text = text.replace("linna serve", f"linna serve --port {api}").replace("--rate 120", f"--rate {rate:g}")
             return text.replace("8042", str(api)).replace("8099", str(hook))
 
-        lines = [
-            one for one in commands_of("tutorials/first-spacecraft.md", folder) if not one.startswith("kill ")
-        ]
+        lines = [one for one in commands_of("tutorials/first-spacecraft.md", folder) if not one.startswith("kill ")]
         for path in (*folder.glob("*.py"), *folder.glob("*.toml")):
             path.write_text(ported(path.read_text()))
         script = ported("\n".join(["set -e", *lines, "touch end", "sleep 7200"]))
@@ -114,9 +110,7 @@ def commands(diary: Diary, client: httpx.Client) -> None:
     keys = [client.post("telecommands", json=one).json()["id"] for one in (ON_BOARD, CRITICAL)]
     answers = [client.post(f"telecommands/{key}/release") for key in keys]
     diary.expect("A", "a telecommand is released", answers[0].status_code == 200, answers[0].text)
-    diary.expect(
-        "A", "a critical one needs another person", "a person other than" in answers[1].text, answers[1].text
-    )
+    diary.expect("A", "a critical one needs another person", "a person other than" in answers[1].text, answers[1].text)
     wait(lambda: state(f"telecommands/{keys[0]}") in ("completed", "failed"))
     diary.expect("A", "it is verified", state(f"telecommands/{keys[0]}") == "completed")
 

@@ -34,9 +34,7 @@ def main(demo: str = "", pictures: str = "") -> int:
         if not demo:
             command = [sys.executable, "-m", "linna", "demo", "--out", str(folder)]
             made = subprocess.run(command, capture_output=True, text=True, check=False)
-            if not diary.expect(
-                "B", "the demo ends with next steps", "next steps" in made.stdout, made.stderr
-            ):
+            if not diary.expect("B", "the demo ends with next steps", "next steps" in made.stdout, made.stderr):
                 return diary.close()
         with served(folder / "ground") as url, open_chromium() as chromium:
             for width in (390, 1280):
@@ -87,9 +85,7 @@ def operate(diary: Diary, page: Any) -> None:
         page.wait_for_timeout(QUIET_MS)
         if hours < 0:
             text = page.locator("body").inner_text()
-            diary.expect(
-                "A", "a window in the past is refused in words", "after the mission time" in text, text
-            )
+            diary.expect("A", "a window in the past is refused in words", "after the mission time" in text, text)
     windows = page.request.get("/api/v1/windows").json()["items"]
     if not diary.expect("A", "a window is entered", [one["state"] for one in windows] == ["draft"], windows):
         return

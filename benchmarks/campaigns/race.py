@@ -275,9 +275,7 @@ class Campaign:
         answers = self.racers.race(requests, self.rng)
         self.tally.add("approve", answers)
         won = Counter(one.label for one in answers if one.won)
-        self.tally.fault(
-            "two_winners", "approve", f"window {window}: {won}", max(won.values(), default=0) > 1
-        )
+        self.tally.fault("two_winners", "approve", f"window {window}: {won}", max(won.values(), default=0) > 1)
         self.tally.fault("no_winner", "approve", f"window {window}", won.total() == 0)
         expected = "failed" if won["failed"] else "approved"
         found = self.ground.read(repository.get, repository.WINDOWS, window, "window")["state"]
@@ -291,9 +289,7 @@ class Campaign:
         spacecraft = FIRST_SPACECRAFT + SPACECRAFT + number % SPACECRAFT
         window = self._new_window(spacecraft)
         change_window(self.ground, window, actor="bob0", changes={}, decision="approved")
-        if (
-            self.rng.random() < 0.5
-        ):  # half of the windows are uplinked before, so that there are telecommands to fetch
+        if self.rng.random() < 0.5:  # half of the windows are uplinked before, so that there are telecommands to fetch
             uplink_window(self.ground, window, actor="bob0")
         path = f"/windows/{window}"
         requests = [Request("uplink", "POST", f"{path}/uplink", f"bob{k}") for k in range(2)]
@@ -307,9 +303,7 @@ class Campaign:
         table = repository.TELECOMMANDS
         with self.ground.database.reading() as connection:
             state = str(repository.get(connection, repository.WINDOWS, window, "window")["decision"])
-            rows = connection.execute(
-                select(table.c.name, table.c.state).where(table.c.window_id == window)
-            ).all()
+            rows = connection.execute(select(table.c.name, table.c.state).where(table.c.window_id == window)).all()
         live = Counter(row[0] for row in rows if row[1] != "rejected")
         waiting = [row for row in rows if row[1] in ("released", "carried")]
         message = f"window {window} {state}: {[tuple(row) for row in rows]}"
@@ -326,9 +320,7 @@ class Campaign:
 
     def _regress(self, number: int) -> None:
         body = json.dumps({"baseline": self.builds[0], "candidate": self.builds[1]}).encode()
-        requests = [
-            Request("regression", "POST", "/regressions", "bob", body, f"regress {number}") for _ in range(4)
-        ]
+        requests = [Request("regression", "POST", "/regressions", "bob", body, f"regress {number}") for _ in range(4)]
         self._one_job("regress", requests, "id")
 
     def _one_job(self, kind: str, requests: Sequence[Request], name: str) -> None:
@@ -420,9 +412,7 @@ def run(folder: Path, url: str, races: int, apis: int = 2, seed: int = 1) -> Fig
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--races", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()

@@ -129,7 +129,10 @@ def _figures(mission: Any) -> dict[str, Any]:
 
 def _described(figures: Mapping[str, Any]) -> str:
     unknown = figures["unknown"]
-    lines = [f"mission {figures['mission']}, revision {figures['revision'][:16]}", *figures.get("stated", "").splitlines()]
+    lines = [
+        f"mission {figures['mission']}, revision {figures['revision'][:16]}",
+        *figures.get("stated", "").splitlines(),
+    ]
     if unknown:
         lines.append(f"not stated ({len(unknown)}): {', '.join(unknown)}")
     return "\n".join([*lines, *figures.get("remarks", ())])

@@ -28,9 +28,7 @@ def free_port() -> int:
     for port in random.SystemRandom().sample(PORTS, 200):
         with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", port)):
             return port
-    raise GroundError(
-        f"ports {PORTS.start} to {PORTS.stop - 1}: expected a free one, found none in 200 attempts"
-    )
+    raise GroundError(f"ports {PORTS.start} to {PORTS.stop - 1}: expected a free one, found none in 200 attempts")
 
 
 def listens(port: int) -> bool:
@@ -60,12 +58,7 @@ class Part:
     """
 
     def __init__(
-        self,
-        command: list[str],
-        log: Path,
-        ready: Callable[[], bool],
-        attempts: int | None = None,
-        **options: Any,
+        self, command: list[str], log: Path, ready: Callable[[], bool], attempts: int | None = None, **options: Any
     ) -> None:
         self._command, self._log, self._ready, self._options = command, log, ready, options
         self._attempts = attempts
@@ -96,9 +89,7 @@ class Part:
             return
         self.kill()
         tail = self._log.read_text(errors="replace")[-500:].strip().replace("\n", " | ")
-        raise GroundError(
-            f"{' '.join(self._command[:4])}: expected it to start within {START_S:.0f} s, found: {tail}"
-        )
+        raise GroundError(f"{' '.join(self._command[:4])}: expected it to start within {START_S:.0f} s, found: {tail}")
 
     def __enter__(self) -> Part:
         self.start()
@@ -193,11 +184,7 @@ def descendants(pid: int) -> list[int]:
 
 def bare_environment(**settings: str) -> dict[str, str]:
     """Return the environment with these settings of the service and none that it had before."""
-    kept = {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith("LINNA_") or name == "LINNA_DATA"
-    }
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("LINNA_") or name == "LINNA_DATA"}
     return {**kept, **settings}
 
 

@@ -49,10 +49,7 @@ class Checkpoints:
 
     @staticmethod
     def _keep_archive(home: Path, path: Path) -> None:
-        with (
-            closing(sqlite3.connect(home / "linna.db")) as source,
-            closing(sqlite3.connect(path)) as target,
-        ):
+        with closing(sqlite3.connect(home / "linna.db")) as source, closing(sqlite3.connect(path)) as target:
             source.backup(target)
 
     def restore(self) -> Path | None:

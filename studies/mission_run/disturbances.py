@@ -102,9 +102,7 @@ class Disturbances:
                 clock_errors=(*scenario.link.clock_errors, *link.clocks),
             ),
             attitude=replace(
-                attitude,
-                knowledge_bias_deg=bias_deg + payload.attitude_bias_deg,
-                declared_bias_deg=declared_deg,
+                attitude, knowledge_bias_deg=bias_deg + payload.attitude_bias_deg, declared_bias_deg=declared_deg
             ),
             sensor=replace(sensor, hot_pixels=payload.hot_pixels or sensor.hot_pixels),
             faults=replace(scenario.faults, events=(*scenario.faults.events, *steps, *payload.events)),

@@ -99,9 +99,7 @@ def closing_figures(
             "processed": sum(one.state == "processed" for one in windows),
             "failed": sum(one.state == "failed" for one in windows),
         },
-        "window_list": [
-            {"start": str(one.start), "state": one.state, "reason": one.reason} for one in windows
-        ],
+        "window_list": [{"start": str(one.start), "state": one.state, "reason": one.reason} for one in windows],
         "missing_windows": missing_windows(kept, start_utc_ns, per_day, asked, progress),
         "frames": progress.frames,
         "frames_received": sum(one.frames or 0 for one in passes),

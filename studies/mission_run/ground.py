@@ -64,16 +64,14 @@ class MissionGround:
         """Add the mission description, and wait for its links."""
         self.client.add_mission(text)
         self._wait(
-            lambda: all(one.owner is not None for one in self.client.list_links()),
-            "links of the mission description",
+            lambda: all(one.owner is not None for one in self.client.list_links()), "links of the mission description"
         )
 
     def deliver_reference(self, path: Path, day: int) -> None:
         """Add the orbit determination of a day as flight dynamics; later ones are preferred."""
         name = f"orbit determination of day {day}"
         self._wait(
-            lambda: bool(self.flight_dynamics.add_ephemeris(path, name=name, precedence=day)),
-            "upload of " + name,
+            lambda: bool(self.flight_dynamics.add_ephemeris(path, name=name, precedence=day)), "upload of " + name
         )
 
     def wait_sent(self, station: str, spacecraft_id: int) -> None:
@@ -85,9 +83,7 @@ class MissionGround:
             vehicles = {(one.spacecraft_id, one.link.instance) for one in declared if one.station == station}
             # A link whose contact has ended may have taken some, which it gives to the link in contact.
             return not any(
-                links.unsent(self.ground, one)
-                for one in declared
-                if (one.spacecraft_id, one.link.instance) in vehicles
+                links.unsent(self.ground, one) for one in declared if (one.spacecraft_id, one.link.instance) in vehicles
             )
 
         self._wait(is_sent, "telecommands sent")
@@ -102,10 +98,7 @@ class MissionGround:
 
     def wait_settled(self) -> None:
         """Wait until contacts that were silent for too long have ended, and the work that follows is done."""
-        self._wait(
-            lambda: not links.silent_contacts(self.ground) and self._is_idle(),
-            "contacts ended",
-        )
+        self._wait(lambda: not links.silent_contacts(self.ground) and self._is_idle(), "contacts ended")
 
     def _spooled_octets(self) -> int:
         return sum(spooled_octets(one) for one in (self.ground.home / INCOMING).glob("link-*"))

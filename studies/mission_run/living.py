@@ -85,9 +85,7 @@ def living_demo(
             client.add_mission(mission)
             client.add_ephemeris(folder / "reference.oem")
             client.add_request(json.loads((folder / "request.json").read_text(encoding="utf-8")))
-            ports.write_text(
-                json.dumps(stations), encoding="utf-8"
-            )  # all is posted: from now on, it can go on
+            ports.write_text(json.dumps(stations), encoding="utf-8")  # all is posted: from now on, it can go on
         say(f"{address}/ shows the shift at {rate:g} times real time; Ctrl-C ends")
         dynamics, now = None, ClockFile(clock)
         day = (now.read() - scenario.epoch_utc_ns) // DAY_NS if goes_on else 0

@@ -67,9 +67,7 @@ class RunTerms:
     disturbances: Disturbances = UNDISTURBED
 
 
-def run_mission(
-    scenario: Scenario, data: DataFolder, folder: Path, terms: RunTerms, say: Say
-) -> dict[str, Any]:
+def run_mission(scenario: Scenario, data: DataFolder, folder: Path, terms: RunTerms, say: Say) -> dict[str, Any]:
     """Run a mission in a folder, or go on with the one that is there; the closing figures.
 
     Raises
@@ -160,13 +158,7 @@ class MissionRun:
     """True if checkpoints contain the archive of the ground service."""
 
     def __init__(
-        self,
-        scenario: Scenario,
-        data: DataFolder,
-        folder: Path,
-        terms: RunTerms,
-        say: Say,
-        is_of_fleet: bool = False,
+        self, scenario: Scenario, data: DataFolder, folder: Path, terms: RunTerms, say: Say, is_of_fleet: bool = False
     ) -> None:
         self._is_of_fleet = is_of_fleet
         self._settle_ns: int | None = None
@@ -198,9 +190,7 @@ class MissionRun:
         self._progress.posts = posts
         return self._started()
 
-    def flight(
-        self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics
-    ) -> Iterator[int]:
+    def flight(self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics) -> Iterator[int]:
         """Post what a user posts; return the flight, which gives way at each yield, of its mission time."""
         self._post(spacecraft, ground, dynamics)
         follow = self._accompany if self._terms.factor else self._follow
@@ -245,9 +235,7 @@ class MissionRun:
     def _open_ground(self) -> MissionGround:
         return EmbeddedGround.open(self._folder / "ground", self._data, self._files.clock)
 
-    def _operate(
-        self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics
-    ) -> None:
+    def _operate(self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics) -> None:
         flight = self.flight(spacecraft, ground, dynamics)
         self._save()
         fly_whole(flight)
@@ -285,9 +273,7 @@ class MissionRun:
             yield parse_utc(message["utc"])
         raise LinkError(f"spacecraft: expected it to fly for {self._terms.days:g} days, found its end")
 
-    def _follow(
-        self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics
-    ) -> Iterator[int]:
+    def _follow(self, spacecraft: SpacecraftProcess, ground: MissionGround, dynamics: FlightDynamics) -> Iterator[int]:
         """Let time pass from contact to contact until the end of the run."""
         messages = spacecraft.messages()
         now = parse_utc(self._progress.utc) if self._progress.utc else self._scenario.epoch_utc_ns

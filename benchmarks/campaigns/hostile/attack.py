@@ -99,9 +99,7 @@ def secret_in(path):
 
 
 def explore_secrets():
-    attempt(
-        "secret in the environment", lambda: [name for name, value in os.environb.items() if MARKER in value]
-    )
+    attempt("secret in the environment", lambda: [name for name, value in os.environb.items() if MARKER in value])
     for process in {"1", "self", str(os.getppid()), *map(str, TARGETS["victims"]), *numbered("/proc")}:
         for part in ("environ", "cmdline", "mem", "maps", "root/etc/hostname", "cwd/secret.txt"):
             attempt(f"/proc/{process}/{part}", secret_in, f"/proc/{process}/{part}")
@@ -190,15 +188,10 @@ def explore_network():
         name = path.replace("@", "\0", 1)
         attempt(f"connect to unix socket {path}", connect, socket.AF_UNIX, name)
     attempt("connect to an address outside", connect, socket.AF_INET, ("192.0.2.1", 80))
-    attempt(
-        "send UDP", lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b"x", ("127.0.0.1", 53))
-    )
+    attempt("send UDP", lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b"x", ("127.0.0.1", 53)))
     attempt("raw socket", socket.socket, socket.AF_INET, socket.SOCK_RAW, 1)
     attempt("netlink", socket.socket, socket.AF_NETLINK, socket.SOCK_RAW, 0)
-    attempt(
-        "socket to the host of the virtual machine",
-        lambda: socket.socket(socket.AF_VSOCK, socket.SOCK_STREAM),
-    )
+    attempt("socket to the host of the virtual machine", lambda: socket.socket(socket.AF_VSOCK, socket.SOCK_STREAM))
     attempt("packet socket", socket.socket, socket.AF_PACKET, socket.SOCK_RAW)
 
 
@@ -221,17 +214,7 @@ def explore_kernel():
         for kind in ("net", "mnt", "user", "pid"):
             attempt(f"setns {kind} of {process}", set_namespace, process, kind)
         attempt(f"ptrace {process}", call, "ptrace", 16, process, 0, 0)
-        attempt(
-            f"read memory of {process}",
-            call,
-            "process_vm_readv",
-            process,
-            bytes(16),
-            1,
-            bytes(16),
-            1,
-            0,
-        )
+        attempt(f"read memory of {process}", call, "process_vm_readv", process, bytes(16), 1, bytes(16), 1, 0)
         attempt(f"signal {process}", foreign_signal, process)
         attempt(f"pidfd of {process}", lambda p=process: p != 1 and call("pidfd_open", p, 0))
     attempt("mount tmpfs", libc, "mount", b"none", b"/tmp", b"tmpfs", 0, None)
@@ -242,9 +225,7 @@ def explore_kernel():
     attempt("become user 0", lambda: os.setuid(0) or "became root")
     attempt("become group 0", lambda: os.getgid() != 0 and (os.setgid(0) or "became group root"))
     attempt("regain capabilities", regain)
-    attempt(
-        "raise the limits", lambda: resource.setrlimit(resource.RLIMIT_NPROC, (4096, 1 << 20)) or "raised"
-    )
+    attempt("raise the limits", lambda: resource.setrlimit(resource.RLIMIT_NPROC, (4096, 1 << 20)) or "raised")
     for name, arguments in (
         ("pivot_root", (b".", b".")), ("bpf", (0, bytes(64), 64)), ("perf_event_open", (bytes(128), 0, -1, -1, 0)),
         ("userfaultfd", (0,)), ("io_uring_setup", (4, bytes(120))), ("keyctl", (0, -4, 1)),
@@ -376,16 +357,7 @@ def much_kernel_memory():
 
 
 def leave_files():
-    for place in (
-        "/tmp",
-        "/dev/shm",
-        "/var/tmp",
-        "/run",
-        os.environ["HOME"],
-        "/",
-        str(OUT),
-        *TARGETS["folders"],
-    ):
+    for place in ("/tmp", "/dev/shm", "/var/tmp", "/run", os.environ["HOME"], "/", str(OUT), *TARGETS["folders"]):
         with contextlib.suppress(OSError):
             (pathlib.Path(place) / TARGETS["leftover"]).write_bytes(MARKER)
     finish()
@@ -444,13 +416,7 @@ def outlive():
                         signal.signal(number, signal.SIG_IGN)
                 os.execv(
                     sys.executable,
-                    [
-                        sys.executable,
-                        "-I",
-                        "-S",
-                        "-c",
-                        f"import time; {TARGETS['leftover']!r}; time.sleep(600)",
-                    ],
+                    [sys.executable, "-I", "-S", "-c", f"import time; {TARGETS['leftover']!r}; time.sleep(600)"],
                 )
             os._exit(0)
     time.sleep(600)

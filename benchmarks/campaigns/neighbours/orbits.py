@@ -19,9 +19,7 @@ def _messages(cells, states, attitudes, write, why_not=("", ""), aem="pass.aem")
     """Cells of the messages of CCSDS; `why_not` is the form that a program does not read, and the reason."""
     for what, kind, name in _READS:
         read = states if kind == "states" else attitudes
-        cells.reads(
-            what, kind, lambda read=read, name=name: read(name), why=why_not[1] * (what == why_not[0])
-        )
+        cells.reads(what, kind, lambda read=read, name=name: read(name), why=why_not[1] * (what == why_not[0]))
     for what, kind, name in (("OEM", "states", "pass.oem"), ("AEM", "attitude", aem)):
         for form in ("kvn", "xml"):
             reader = "orbit" if kind == "states" else kind
@@ -144,9 +142,7 @@ def brahe(cells):
 
     def rows(states, parts):
         found = [[*one.epoch.to_datetime(), *map(float, parts(one))] for one in states]
-        epochs = [
-            f"{y:.0f}-{o:02.0f}-{d:02.0f}T{h:02.0f}:{m:02.0f}:{s:09.6f}" for y, o, d, h, m, s, *_ in found
-        ]
+        epochs = [f"{y:.0f}-{o:02.0f}-{d:02.0f}T{h:02.0f}:{m:02.0f}:{s:09.6f}" for y, o, d, h, m, s, *_ in found]
         return _rows(epochs, [row[7:] for row in found])
 
     def states(name):
@@ -290,16 +286,12 @@ def orekit(cells):
         frames.put(system.ICRF, gcrf)
         parser = STKEphemerisFileParser("SELENITA", gm, context.getTimeScales().getUTC(), frames)
         file = parser.parse(DataSource(cells.sample("pass.e")))
-        return rows(
-            file.getSatellites().values().iterator().next().getSegments().get(0).getCoordinates(), state
-        )
+        return rows(file.getSatellites().values().iterator().next().getSegments().get(0).getCoordinates(), state)
 
     def write(kind, name, form, path):
         out, gap, schema = FileWriter(path), float("nan"), "ndmxml-3.0.0-master-3.0.xsd"
         is_xml = form == "xml"
-        generator = (
-            XmlGenerator(out, 2, "", gap, True, schema) if is_xml else KvnGenerator(out, 25, "", gap, 60)
-        )
+        generator = XmlGenerator(out, 2, "", gap, True, schema) if is_xml else KvnGenerator(out, 25, "", gap, 60)
         writer = WriterBuilder().buildOemWriter() if kind == "states" else WriterBuilder().buildAemWriter()
         writer.writeMessage(generator, load(kind, name))
         generator.close()

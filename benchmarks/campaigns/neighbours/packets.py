@@ -131,12 +131,8 @@ def fprime_xtce(cells):
         dictionary = {name: [] for name in names} | {
             "metadata": {"deploymentName": "Bus"},
             "typeDefinitions": [mode, alias("FwSizeStoreType"), alias("FwTlmPacketizeIdType"), stamp],
-            "telemetryChannels": [
-                {"name": n, "type": kind, "id": 16 + k} for k, (n, kind) in enumerate(kinds)
-            ],
-            "telemetryPacketSets": [
-                {"members": [{"name": "Sets", "id": 4, "members": ["Bus.count", "Bus.mode"]}]}
-            ],
+            "telemetryChannels": [{"name": n, "type": kind, "id": 16 + k} for k, (n, kind) in enumerate(kinds)],
+            "telemetryPacketSets": [{"members": [{"name": "Sets", "id": 4, "members": ["Bus.count", "Bus.mode"]}]}],
         }
         (cells.out / "bus.json").write_text(json.dumps(dictionary))
         command = [sys.executable, "-m", "fprime_xtce", "bus.json", "-o", "fprime.xml"]
@@ -215,11 +211,7 @@ def ccsdspy(cells):
 
     records = [one for one in cells.expected["packets"] if one["packet"] == "housekeeping"]
     fields = {"PUS": 8, "SERVICE": 8, "SUBTYPE": 8, "MESSAGE": 16, "TO": 16, "P": 8, "COARSE": 32, "FINE": 16}
-    names = {
-        "CCSDS_APID": "PKT_APID",
-        "CCSDS_SEQUENCE_COUNT": "SRC_SEQ_CTR",
-        "CCSDS_PACKET_LENGTH": "PKT_LEN",
-    }
+    names = {"CCSDS_APID": "PKT_APID", "CCSDS_SEQUENCE_COUNT": "SRC_SEQ_CTR", "CCSDS_PACKET_LENGTH": "PKT_LEN"}
     names |= {"SERVICE": "SERVICE", "SUBTYPE": "SUBTYPE", "COARSE": "TIME_COARSE", "FINE": "TIME_FINE"}
 
     def read():

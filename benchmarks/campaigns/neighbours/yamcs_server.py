@@ -184,16 +184,7 @@ def _telecommands(now_ticks):
 def command_payload(cells, server, frame_port, telemetry, telecommands, console, mission):
     """Send each telecommand to the live payload and return the stages that its verification reports state."""
     (cells.out / "live.toml").write_text(SCENARIO)
-    options = [
-        "--port",
-        telemetry,
-        "--tc-port",
-        telecommands,
-        "--console-port",
-        console,
-        "--mission-port",
-        mission,
-    ]
+    options = ["--port", telemetry, "--tc-port", telecommands, "--console-port", console, "--mission-port", mission]
     before = set(server.packets())
     reports = [f"/LINNA/verification_{stage}" for stage in STAGES]
 
@@ -234,9 +225,7 @@ def yamcs(cells):
     with contextlib.ExitStack() as stack:
         server = Server(stack, folder, http)
         right = _by_count(cells.expected["packets"])
-        cells.reads(
-            "frames and XTCE, all values of a pass", right, lambda: receive_pass(cells, server, frames)
-        )
+        cells.reads("frames and XTCE, all values of a pass", right, lambda: receive_pass(cells, server, frames))
         cells.reads(
             "27 telecommands of XTCE, verified by the live payload",
             dict.fromkeys(names, STAGES),
