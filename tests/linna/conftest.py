@@ -15,6 +15,7 @@ def typed(capsys):
         assert run([*line.split(), *map(str, words)]) == status
         out, err = capsys.readouterr()
         if status == 2:
+            assert out == "" or "--json" in line
             (line,) = err.splitlines()
             return line
         return json.loads(out) if out[:1] in ("{", "[") else out
