@@ -4,7 +4,7 @@
 
 Each row has an environment of its own under `build/compatibility`, with the versions of `neighbours/requirements`. A
 program that cannot be installed, or fails, does not stop the others. A row is not run again until its script, versions
-or our files change. `--write` writes `docs/results/compatibility.md`. Exit status 1 if a value differs or is refused
+or our files change. `--write` writes `docs/compatibility.md`. Exit status 1 if a value differs or is refused
 without a reason that the script of the row states.
 """
 
@@ -27,7 +27,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 NEIGHBOURS = Path(__file__).parent / "neighbours"
 BUILD = ROOT / "build" / "compatibility"
-PAGE = ROOT / "docs" / "results" / "compatibility.md"
+PAGE = ROOT / "docs" / "compatibility.md"
 LIMIT_S = 1200
 ENOUGH_DIGITS = 6
 """Values that agree in fewer digits differ."""
@@ -395,7 +395,7 @@ def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("--row", action="append", help="only this row (repeatable)")
     parser.add_argument("--again", action="store_true", help="run rows that have results again")
-    parser.add_argument("--write", action="store_true", help="write docs/results/compatibility.md")
+    parser.add_argument("--write", action="store_true", help="write docs/compatibility.md")
     options = parser.parse_args(arguments)
     samples = BUILD / "samples"
     if not (samples / "expected.json").is_file():
