@@ -5,12 +5,14 @@ import sys
 
 import numpy as np
 import pytest
-from pyarrow import parquet
 
+from tests.lazy import Lazy
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import MissingLibrary, UnknownPacket
 from tmtc.export import format_onboard_time, format_records, packet_records, parquet_octets
 from tmtc.packets.stream import cut_packets
+
+parquet = Lazy("pyarrow.parquet")
 
 STATE = {f.name: [0.0] * 3 if f.size > 1 else 1 for f in DICTIONARY.packet("navigation_state").fields}
 

@@ -278,7 +278,6 @@ def test_a_window_that_cannot_be_released_states_the_reason(ground: Ground, now:
 def test_windows_keep_the_limits_of_images(ground: Ground, now: Clock) -> None:
     planned(
         ground,
-        oem,
         now,
         AUTOMATIC + LINKS + "[observation]\nlatitude_limit_deg = 50\nneeds_daylight = false\n",
         windows=20,

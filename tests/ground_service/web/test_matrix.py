@@ -25,8 +25,7 @@ from ground_service.regression.builds import load_build, register_build
 from ground_service.web.pages import DISPLAYS, PAGES
 from lunar.catalogue import load_catalogue, save_catalogue
 from lunar.timescales import format_utc
-from tests.ground_service.conftest import SPACECRAFT, START, cells
-from tests.ground_service.evaluation.landmarks.test_learned_landmarks import rewrite
+from tests.ground_service.conftest import SPACECRAFT, START, cells, enter_files
 from tests.ground_service.web.conftest import COUNT_REQUESTS, patient
 from tests.ground_service.web.test_in_browser import answered, settled
 from tests.ground_service.web.test_shift import MISSION, PASS_MISSION, Spacecraft
@@ -131,7 +130,7 @@ def worked(tmp_path_factory, make_pass, make_flyable, make_build, console, serve
         token = add_user(ground, "root", "admin")
         make_report(ground, import_archive(ground, received.folder), pdf=False)
         for name in ("first pass", "second pass"):
-            rewrite(learned.folder, name)
+            enter_files(learned.folder, pass_name=name)
             update_landmarks(ground, import_archive(ground, learned.folder))
         mission = add_mission(ground, MISSION.format(**ports).encode(), actor="root")
         stored = ground.files.put_file(received.folder / "reference.oem")
