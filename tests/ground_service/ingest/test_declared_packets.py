@@ -497,7 +497,7 @@ def test_packets_that_nothing_declares_are_kept_between_declared_ones(
 
 
 def test_decoded_packets_of_a_pass_are_exported_with_utc(declared: Ground, synthetic_pass: Any) -> None:
-    packets = synthetic_pass.packets
+    packets = [*synthetic_pass.packets]
     (event,) = (one for one in map(DICTIONARY.unpack_packet, packets) if one.name == "event_info")
     packets.append(DICTIONARY.pack("event_low", event.values, ticks=event.ticks, sequence_count=1))
     take(declared, [*packets, *bus_packets(20)])
