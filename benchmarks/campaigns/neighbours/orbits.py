@@ -126,8 +126,12 @@ def anise(cells):
     def written(write):
         return lambda path: write(path) or cells.expected["states"]
 
-    kernel = lambda: listed("arc", lambda at: almanac.translate_geometric(craft, Frames.MOON_J2000, at))  # noqa: E731
-    stk = lambda: in_file("arc", Ephemeris.from_stk_e_file(cells.sample("pass.e")))  # noqa: E731
+    def kernel():
+        return listed("arc", lambda at: almanac.translate_geometric(craft, Frames.MOON_J2000, at))
+
+    def stk():
+        return in_file("arc", Ephemeris.from_stk_e_file(cells.sample("pass.e")))
+
     bsp = written(lambda path: oem().write_spice_bsp(_CRAFT, path, DataType.Type13HermiteUnequalStep))
     why = "it states frame 22, which SPICE does not know"
     cells.reads("SPK type 3", "arc", kernel)

@@ -13,6 +13,7 @@ import time
 import urllib.error
 import urllib.parse
 import urllib.request
+from functools import partial
 
 import numpy as np
 from _cells import run
@@ -68,6 +69,10 @@ def _linna(*arguments):
 
 def _start(stack, command, log, **more):
     stack.enter_context(Part(list(map(str, command)), log, lambda: True, 1, **more))
+
+
+def _is_linked(server):
+    return server.get("/links/linna/telecommands")["status"] == "OK"
 
 
 def _until(condition, limit_s, what):
@@ -201,8 +206,7 @@ def command_payload(cells, server, frame_port, telemetry, telecommands, console,
         frames = _linna("tm", "frames", f"127.0.0.1:{telemetry}", "--to", f"127.0.0.1:{frame_port}")
         _start(stack, frames, cells.out / "frames.log")
         _until(lambda: fresh("/LINNA/housekeeping"), ANSWER_S, "telemetry of the live payload")
-        is_linked = lambda: server.get("/links/linna/telecommands")["status"] == "OK"  # noqa: E731
-        _until(is_linked, ANSWER_S, "the link of telecommands")
+        _until(partial(_is_linked, server), ANSWER_S, "the link of telecommands")
         now = max(server.values(one)["TIME_COARSE"] for one in fresh("/LINNA/housekeeping")) << 16
         sent = {name: server.issue(name, arguments) for name, arguments in _telecommands(now).items()}
         (cells.out / "telecommands.json").write_text(json.dumps([octets.hex() for octets in sent.values()]))
