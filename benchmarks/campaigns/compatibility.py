@@ -343,8 +343,9 @@ def _judge(entry, expected):
         right = expected[name] if isinstance(name, str) else name
         text, good = compare(right, entry["values"], rotations=str(name).startswith("attitude"))
     why = entry.get("why", "")
+    known = bool(why) and text.startswith("refused")  # a reason excuses a refusal, never other values
     text = f"{text} ({why})" if why and not good else text
-    return {**entry, "text": text.replace("|", "\\|"), "good": good or bool(why)}
+    return {**entry, "text": text.replace("|", "\\|"), "good": good or known}
 
 
 def result(row, samples, *, again):

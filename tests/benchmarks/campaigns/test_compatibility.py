@@ -70,11 +70,12 @@ def test_a_row_is_not_run_again_until_something_changed(samples, monkeypatch):
     assert not result(ROWS[1], samples, again=False)[0]["good"] and len(runs) == 2
 
 
-def test_a_refusal_needs_a_reason(samples, monkeypatch):
+def test_a_refusal_needs_a_reason_and_a_reason_excuses_no_other_values(samples, monkeypatch):
     entry = {"way": "writes", "what": "SPK", "refused": "ValueError: frame"}
-    monkeypatch.setattr(compatibility, "run_row", lambda *_: [entry, {**entry, "why": "a frame | of its own"}])
-    bare, stated = result(ROWS[1], samples, again=True)
-    assert not bare["good"] and stated["good"]
+    other = {"way": "reads", "what": "OEM", "expects": [[1.0]], "values": [[2.0]], "why": "known"}
+    monkeypatch.setattr(compatibility, "run_row", lambda *_: [entry, {**entry, "why": "a frame | of its own"}, other])
+    bare, stated, differing = result(ROWS[1], samples, again=True)
+    assert not bare["good"] and stated["good"] and not differing["good"]
     assert stated["text"] == "refused: ValueError: frame (a frame \\| of its own)"
     assert f"| {ROWS[1].name} |" in format_page({ROWS[1].name: [stated]})
 
