@@ -209,6 +209,11 @@ def test_what_an_operator_entered_can_be_withdrawn_with_a_trace(ground, spacecra
     assert [(one.actor, one.detail) for one in trace] == [("ann", {"ids": [entered.id]})]
 
 
+def test_telemetry_without_receptions_leaves_the_clock_ideal(ground, spacecraft, tmp_path):
+    vehicle = ingest(ground, tmp_path, spacecraft.downlink())
+    assert ground.read(correlations_in_force, vehicle) == []
+
+
 def test_an_earlier_reception_of_the_same_report_counts(ground, spacecraft, tmp_path):
     ingest(ground, tmp_path, spacecraft.downlink())
     played_back = [
