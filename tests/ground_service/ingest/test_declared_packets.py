@@ -126,9 +126,7 @@ def interpreted(packets: list[bytes], tmp_path: Path) -> list[Any]:
         return [definition.parse_bytes(packet) for packet in packets]
 
 
-def test_packets_without_a_checksum_between_others_become_series(
-    either: Ground, tmp_path: Path, synthetic_pass: Any
-) -> None:
+def test_packets_without_a_checksum_between_others_become_series(either: Ground, tmp_path: Path, synthetic_pass: Any):
     enter(either)
     own, bus = synthetic_pass.packets, bus_packets(300)
     mixed = [packet for pair in zip(own, bus, strict=False) for packet in pair]
@@ -161,7 +159,7 @@ def test_packets_without_a_checksum_between_others_become_series(
     assert completeness(either, whole).crc_errors == 0
 
 
-def test_a_minimal_description_of_a_definition_decodes_its_packets(ground: Ground, tmp_path: Path) -> None:
+def test_a_minimal_description_of_a_definition_decodes_its_packets(ground: Ground, tmp_path: Path):
     add_mission(ground, written(tmp_path, foreign.BUS).encode())
     result = take(ground, bus_packets(8))
     assert ground.read(readable_decoding, result.vehicle_id).counts["100"] == {"decoded": 8}
@@ -176,7 +174,7 @@ def written(folder: Path, text: str) -> str:
     return minimal_description(folder / "bus.xml", 76)
 
 
-def test_a_minimal_description_is_one_that_the_check_accepts(tmp_path: Path) -> None:
+def test_a_minimal_description_is_one_that_the_check_accepts(tmp_path: Path):
     bus = foreign.document(
         foreign.HEADER_TYPES,
         foreign.HEADER_PARAMETERS,
@@ -205,7 +203,7 @@ UNIX = (
 
 
 @pytest.mark.parametrize("epoch", ["1970-01-01T00:00:00Z", "1980-01-01T00:00:00Z", "2000-01-01T00:00:00Z"])
-def test_a_unix_clock_counts_no_leap_seconds(epoch: str) -> None:
+def test_a_unix_clock_counts_no_leap_seconds(epoch: str):
     time = PacketTime.model_validate(read_table(f"t = {UNIX.replace('EPOCH', epoch)}", "t", "TOML")["t"])
     count = (START - parse_utc(epoch)) // NS
     packet = foreign.space_packet(100, struct.pack(">IH", count, 1 << 15), 0)
@@ -217,7 +215,7 @@ def test_a_unix_clock_counts_no_leap_seconds(epoch: str) -> None:
         PacketTime.model_validate({**time.model_dump(), "epoch": "1970-01-01T00:00:00 TAI"})
 
 
-def test_parts_of_segmented_packets_are_counted_and_packets_without_header_have_no_time(declared: Ground) -> None:
+def test_parts_of_segmented_packets_are_counted_and_packets_without_header_have_no_time(declared: Ground):
     """The definition asks for the secondary header flag, but not for the sequence flags."""
     packets = bus_packets(8)
     parts = [packets[3][:2] + struct.pack(">H", flags << 14 | 50 + flags) + packets[3][4:] for flags in (1, 0, 2)]
@@ -228,7 +226,7 @@ def test_parts_of_segmented_packets_are_counted_and_packets_without_header_have_
     assert parameter_series(declared, 1, "VOLTAGE", 100).samples == 8
 
 
-def test_an_entry_may_name_several_containers_and_the_unit_of_sizes(tmp_path: Path) -> None:
+def test_an_entry_may_name_several_containers_and_the_unit_of_sizes(tmp_path: Path):
     text = DEFINED.replace("time = ", "container = ['CCSDSPacket', 'TIMED']\nleading_size = 'octets'\ntime = ")
     found, faults = check_mission_file(mission(tmp_path, text))
     assert not faults and found is not None
@@ -236,7 +234,7 @@ def test_an_entry_may_name_several_containers_and_the_unit_of_sizes(tmp_path: Pa
     assert "expected the name of a container" in check_mission_file(mission(tmp_path, text.replace("TIMED", "X")))[1][0]
 
 
-def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground: Ground) -> None:
+def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground: Ground):
     limits = (
         "<DefaultAlarm><StaticAlarmRanges><WarningRange minInclusive='-1' maxInclusive='1000.5'/>"
         "<CriticalRange maxExclusive='1020'/></StaticAlarmRanges></DefaultAlarm>"
@@ -262,7 +260,7 @@ def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground: 
 
 def test_a_series_has_least_greatest_and_mean_value_from_samples_and_from_rollups(
     either: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     enter(either)
     bus = bus_packets(2000)
     for piece in (bus[:900], bus[900:]):
@@ -286,7 +284,7 @@ def test_a_series_has_least_greatest_and_mean_value_from_samples_and_from_rollup
 
 def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_kept_as_unknown(
     either: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     monkeypatch.setattr(decoding, "BLOCK_PACKETS", 50)
     monkeypatch.setitem(cast(dict[str, Any], follow_up.DOING), "decode", lambda *_given: None)  # no job decodes
     declared = "[[packets]]\nname = 'bus'\napids = [100, 101]\npacket_checksum = 'none'\n"
@@ -315,9 +313,7 @@ def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_k
     assert progress.counts == {"100": {"decoded": 100}, "101": {"decoded": 25}}
 
 
-def test_a_revision_reads_raw_files_again_whose_packets_were_taken_for_damaged(
-    either: Ground, synthetic_pass: Any
-) -> None:
+def test_a_revision_reads_raw_files_again_whose_packets_were_taken_for_damaged(either: Ground, synthetic_pass: Any):
     own, bus = synthetic_pass.packets, bus_packets(100)
     mixed = [packet for pair in zip(own, bus, strict=False) for packet in pair]
     result = take(either, mixed)
@@ -334,7 +330,7 @@ def redecodings(ground: Ground) -> list[dict[str, Any]]:
     return ground.read(repository.newest, repository.JOBS, Paging(), kind="redecode")[0]
 
 
-def test_the_integrity_check_finds_packets_without_a_checksum_intact(declared: Ground) -> None:
+def test_the_integrity_check_finds_packets_without_a_checksum_intact(declared: Ground):
     take(declared, bus_packets(30))
     found = verify(declared, rebuild=True)
     assert (found.verdict, found.damaged, found.unchecked) == ("intact", [], {})
@@ -356,9 +352,7 @@ SAMPLES = repository.PARAMETER_SAMPLES
         (None, "expected this row"),
     ],
 )
-def test_the_integrity_check_finds_a_damaged_sample(
-    either: Ground, changes: dict[str, Any] | None, reason: str
-) -> None:
+def test_the_integrity_check_finds_a_damaged_sample(either: Ground, changes: dict[str, Any] | None, reason: str):
     enter(either)
     take(either, bus_packets(8))
     with either.database.writing() as connection:
@@ -372,7 +366,7 @@ def test_the_integrity_check_finds_a_damaged_sample(
 
 def test_the_integrity_check_does_not_expect_samples_of_packets_that_are_not_yet_decoded(
     either: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     monkeypatch.setitem(cast(dict[str, Any], follow_up.DOING), "decode", lambda *_given: None)
     enter(either)
     result = take(either, bus_packets(10))
@@ -411,7 +405,7 @@ def archived(made: Any, folder: Path, packets: list[bytes], text: str = DEFINED)
 
 def test_an_archive_is_decoded_with_the_packets_that_it_declares_and_the_live_spacecraft_is_not(
     either: Ground, tmp_path: Path, synthetic_pass: Any
-) -> None:
+):
     bus = bus_packets(40)
     folder = archived(synthetic_pass, tmp_path, [*synthetic_pass.packets, *bus])
     live = define(either)
@@ -440,7 +434,7 @@ def test_an_archive_is_decoded_with_the_packets_that_it_declares_and_the_live_sp
 
 def test_an_archive_that_was_imported_before_is_decoded_with_its_packets_on_redecoding(
     either: Ground, tmp_path: Path, synthetic_pass: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     checked = DEFINED.replace("'none'", "'crc16'")
     packets = [packet + crc16(packet).to_bytes(2, "big") for packet in map(longer, bus_packets(20))]
     folder = archived(synthetic_pass, tmp_path, packets, checked)
@@ -458,14 +452,14 @@ def test_an_archive_that_was_imported_before_is_decoded_with_its_packets_on_rede
 
 def test_an_archive_that_declares_no_packets_is_decoded_with_the_description_of_the_spacecraft(
     either: Ground, tmp_path: Path, synthetic_pass: Any
-) -> None:
+):
     enter(either)
     pass_id = import_archive(either, archived(synthetic_pass, tmp_path, bus_packets(20), ""))
     instance = get_pass(either, pass_id).instance
     assert trend_series(either, 76, instance, "VOLTAGE", 1000).samples == 20
 
 
-def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(declared: Ground, tmp_path: Path) -> None:
+def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(declared: Ground, tmp_path: Path):
     octets = encode_cadus(bus_packets(120), spacecraft_id=76)
     rng = np.random.default_rng(5)
     cuts = [0, *sorted(rng.choice(len(octets), 11, replace=False).tolist()), len(octets)]
@@ -481,7 +475,7 @@ def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(declared: Ground
 @pytest.mark.parametrize("window", [0, 5_000, 1 << 20])
 def test_packets_that_nothing_declares_are_kept_between_declared_ones(
     declared: Ground, tmp_path: Path, window: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     """In frames, and as a bare stream in windows and at once."""
     packets = bus_packets(274)
     for k in range(49):
@@ -496,7 +490,7 @@ def test_packets_that_nothing_declares_are_kept_between_declared_ones(
     assert parameter_series(declared, define(declared), "VOLTAGE", 1000).samples == 274
 
 
-def test_decoded_packets_of_a_pass_are_exported_with_utc(declared: Ground, synthetic_pass: Any) -> None:
+def test_decoded_packets_of_a_pass_are_exported_with_utc(declared: Ground, synthetic_pass: Any):
     packets = [*synthetic_pass.packets]
     (event,) = (one for one in map(DICTIONARY.unpack_packet, packets) if one.name == "event_info")
     packets.append(DICTIONARY.pack("event_low", event.values, ticks=event.ticks, sequence_count=1))
@@ -514,7 +508,7 @@ def test_decoded_packets_of_a_pass_are_exported_with_utc(declared: Ground, synth
     assert export_packets(declared, pass_id, "Housekeeping", "parquet")[:4] == b"PAR1"
 
 
-def test_the_http_interface_gives_parameters_series_and_packets(client: TestClient) -> None:
+def test_the_http_interface_gives_parameters_series_and_packets(client: TestClient):
     ground = client.app.state.ground
     enter(ground)
     take(ground, bus_packets(20))
@@ -540,14 +534,14 @@ clock | clok | packets.0.time.clok: expected 'clock', found unknown key 'clok'
 
 
 @pytest.mark.parametrize("row", FAULTS.splitlines())
-def test_each_fault_of_a_declaration_is_one_line(tmp_path: Path, row: str) -> None:
+def test_each_fault_of_a_declaration_is_one_line(tmp_path: Path, row: str):
     old, new, message = row.split(" | ")
     text = DEFINED * (new == "'two'") + DEFINED.replace(old, new)
     found, [fault] = check_mission_file(mission(tmp_path, text))
     assert found is None and message in fault and "\n" not in fault
 
 
-def test_each_faulty_document_is_one_line(tmp_path: Path) -> None:
+def test_each_faulty_document_is_one_line(tmp_path: Path):
     two = DEFINED + DEFINED.replace("'bus'", "'two'").replace("[100, 101]", "[102]")
     path = mission(tmp_path, two, foreign.BUS.replace("UnitSet", "UnitsSet"))
     found, faults = check_mission_file(path)
@@ -560,7 +554,7 @@ def test_each_faulty_document_is_one_line(tmp_path: Path) -> None:
     assert "expected texts of XTCE documents" in str(read_document(path.read_text(), "m.toml")[0])
 
 
-def test_documents_have_one_limit_for_their_sum(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_documents_have_one_limit_for_their_sum(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(definitions, "DOCUMENTS_LIMIT_OCTETS", 1000)
     packed = XTCE_COMPRESSED + base64.b64encode(gzip.compress(b"<x>" + b" " * 600)).decode()
     source = {"name": "a", "apids": [5], "packet_checksum": "none", "xtce": [packed]}
@@ -569,7 +563,7 @@ def test_documents_have_one_limit_for_their_sum(monkeypatch: pytest.MonkeyPatch)
     assert "of documents in all, found more" in faults[-1] and "in all" not in faults[0]
 
 
-def test_a_long_document_is_embedded_compressed(ground: Ground, tmp_path: Path) -> None:
+def test_a_long_document_is_embedded_compressed(ground: Ground, tmp_path: Path):
     padded = foreign.BUS.replace("<TelemetryMetaData>", "<TelemetryMetaData><!--" + "x" * 2_000_000 + "-->")
     path = mission(tmp_path, DEFINED, padded)
     octets = read_mission_file(path)
@@ -579,7 +573,7 @@ def test_a_long_document_is_embedded_compressed(ground: Ground, tmp_path: Path) 
     assert parameter_series(ground, define(ground), "VOLTAGE", 100).samples == 5
 
 
-def test_a_declared_packet_from_the_future_is_kept_apart_until_others_agree(declared: Ground) -> None:
+def test_a_declared_packet_from_the_future_is_kept_apart_until_others_agree(declared: Ground):
     rng = np.random.default_rng(7)
     take(declared, bus_packets(40))
     pass_id = define(declared)

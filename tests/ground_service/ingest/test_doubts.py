@@ -76,7 +76,7 @@ def alarms(ground: Ground) -> dict[str, int]:
 
 @pytest.mark.parametrize("ahead", [2 * HOUR, 26 * HOUR, YEARS])
 @pytest.mark.parametrize("source", ["telemetry", "simulated", "time of day"])
-def test_a_report_from_the_future_is_kept_and_decides_nothing(ground: Ground, ahead: int, source: str) -> None:
+def test_a_report_from_the_future_is_kept_and_decides_nothing(ground: Ground, ahead: int, source: str):
     clocks = {"telemetry": TelemetryTime(NOW), "simulated": lambda: NOW, "time of day": None}
     set_mission_clock(clocks[source])
     receive(ground, contact())
@@ -89,14 +89,14 @@ def test_a_report_from_the_future_is_kept_and_decides_nothing(ground: Ground, ah
     assert ("after the mission time" if source == "simulated" else "after all other telemetry") in reason
 
 
-def test_the_same_report_again_is_kept_once(either: Ground) -> None:
+def test_the_same_report_again_is_kept_once(either: Ground):
     receive(either, contact())
     receive(either, report(TICKS + DAY, 12))
     assert receive(either, report(TICKS + DAY, 12)) == 0
     assert len(reasons(either)) == 1 and alarms(either) == {"implausible_time": 1}
 
 
-def test_the_archive_does_not_depend_on_whether_the_wrong_report_came_first(either: Ground) -> None:
+def test_the_archive_does_not_depend_on_whether_the_wrong_report_came_first(either: Ground):
     receive(either, report(TICKS + DAY, 12, temperature_c=99.0))
     receive(either, report(5 << 16, 13, temperature_c=-99.0))
     assert "temperature_c" in alarms(either)
@@ -107,7 +107,7 @@ def test_the_archive_does_not_depend_on_whether_the_wrong_report_came_first(eith
     assert verify(either, rebuild=True).verdict == "intact"
 
 
-def test_the_next_contact_is_believed_and_puts_back_what_was_kept_apart(either: Ground) -> None:
+def test_the_next_contact_is_believed_and_puts_back_what_was_kept_apart(either: Ground):
     receive(either, contact())
     assert receive(either, contact(TICKS + DAY, 1440, number=2)) == 2
     assert receive(either, contact(TICKS + DAY + (120 << 16), 1442)) == 0
@@ -115,20 +115,20 @@ def test_the_next_contact_is_believed_and_puts_back_what_was_kept_apart(either: 
     assert either.read(newest_ticks, 1) == TICKS + DAY + 13 * (60 << 16)
 
 
-def test_a_wrong_report_does_not_become_right_when_its_time_comes(ground: Ground) -> None:
+def test_a_wrong_report_does_not_become_right_when_its_time_comes(ground: Ground):
     receive(ground, contact())
     receive(ground, report(TICKS + DAY + (90 << 16), 12))
     receive(ground, contact(TICKS + DAY, 1440))
     assert len(reasons(ground)) == 1
 
 
-def test_a_clock_of_the_mission_believes_a_single_report_after_a_silence(ground: Ground) -> None:
+def test_a_clock_of_the_mission_believes_a_single_report_after_a_silence(ground: Ground):
     receive(ground, contact())
     set_mission_clock(lambda: NOW + 86_400 * 10**9)
     assert receive(ground, report(TICKS + DAY, 12)) == 0
 
 
-def test_a_clock_that_was_not_set_and_a_stamp_from_the_past_are_kept_apart(ground: Ground) -> None:
+def test_a_clock_that_was_not_set_and_a_stamp_from_the_past_are_kept_apart(ground: Ground):
     receive(ground, contact(TICKS - DAY))
     receive(ground, contact(TICKS, 1440))
     assert receive(ground, report(100 << 16, 1452)) == 1
@@ -136,14 +136,14 @@ def test_a_clock_that_was_not_set_and_a_stamp_from_the_past_are_kept_apart(groun
     assert reasons(ground) == ["its sequence count belongs to another time", "the clock was not set"]
 
 
-def test_a_late_report_and_a_reboot_are_believed(ground: Ground) -> None:
+def test_a_late_report_and_a_reboot_are_believed(ground: Ground):
     receive(ground, contact(TICKS - DAY) + contact(TICKS - DAY + 13 * (60 << 16), 13))
     receive(ground, contact(TICKS, 0))  # counts begin again with the boot
     assert receive(ground, report(TICKS - DAY + 12 * (60 << 16), 12)) == 0
     assert reasons(ground) == []
 
 
-def test_reception_times_decide_for_single_packets_and_not_for_a_station_whose_clock_is_wrong() -> None:
+def test_reception_times_decide_for_single_packets_and_not_for_a_station_whose_clock_is_wrong():
     ticks = TICKS + np.array([0, 1, 2, DAY])
     received = np.full(4, TICKS)
     assert set(implausible_times(ticks, received, TICKS, None)) == {3}
@@ -152,13 +152,13 @@ def test_reception_times_decide_for_single_packets_and_not_for_a_station_whose_c
     assert set(implausible_times(ticks[3:], np.array([NO_TICKS]), TICKS, None)) == {0}
 
 
-def test_a_sequence_count_fits_between_its_neighbours() -> None:
+def test_a_sequence_count_fits_between_its_neighbours():
     for given in ((5, 4, 6), (5, 5, 5), (0, 16_383, 1), (9, None, 1)):
         assert fits_between(*given) is True, given
     assert fits_between(7, 4, 6) is False
 
 
-def test_a_withdrawn_ingest_leaves_no_trace_but_its_record(either: Ground) -> None:
+def test_a_withdrawn_ingest_leaves_no_trace_but_its_record(either: Ground):
     receive(either, contact())
     before, alone = hash_of(either), alarms(either)
     foreign = contact(TICKS - 9 * DAY) + contact(TICKS + (30 << 16), 500) + report(TICKS + 60, 600, 99.0)
@@ -192,7 +192,7 @@ def completed(ticks: int, request: int, count: int = 0) -> bytes:
     return DICTIONARY.pack("verification_completed", {"request_id": request}, ticks=ticks, sequence_count=count)
 
 
-def test_telecommands_are_verified_again_after_a_foreign_flight_is_withdrawn(either: Ground) -> None:
+def test_telecommands_are_verified_again_after_a_foreign_flight_is_withdrawn(either: Ground):
     receive(either, contact())
     receive(either, completed(TICKS + HOUR // 2, 5))  # of another flight
     key, request = sent(either)
@@ -202,7 +202,7 @@ def test_telecommands_are_verified_again_after_a_foreign_flight_is_withdrawn(eit
     assert get_command(either, key).state == "completed"
 
 
-def test_reports_from_before_the_release_do_not_verify_a_telecommand(either: Ground) -> None:
+def test_reports_from_before_the_release_do_not_verify_a_telecommand(either: Ground):
     set_mission_clock(lambda: NOW)
     receive(either, contact())
     receive(either, completed(TICKS - DAY, 5))
@@ -211,7 +211,7 @@ def test_reports_from_before_the_release_do_not_verify_a_telecommand(either: Gro
     assert get_command(either, key).state == "sent"
 
 
-def test_reports_of_an_earlier_boot_do_not_verify_a_telecommand(either: Ground) -> None:
+def test_reports_of_an_earlier_boot_do_not_verify_a_telecommand(either: Ground):
     receive(either, contact(boot=3) + completed(TICKS + HOUR // 2, 5, 1))
     key, request = sent(either)
     later = TICKS + HOUR
@@ -221,7 +221,7 @@ def test_reports_of_an_earlier_boot_do_not_verify_a_telecommand(either: Ground) 
     assert get_command(either, key).state == "completed"
 
 
-def test_commanding_starts_from_the_count_that_the_payload_reports(either: Ground) -> None:
+def test_commanding_starts_from_the_count_that_the_payload_reports(either: Ground):
     fields = DICTIONARY.packet("performance").fields
     values = {one.name: 0 for one in fields} | {"structure_id": 2, "last_command_count": 41}
     receive(either, DICTIONARY.pack("performance", values, ticks=TICKS, sequence_count=0))
@@ -234,7 +234,7 @@ def test_commanding_starts_from_the_count_that_the_payload_reports(either: Groun
     assert "send perform_function resynchronise_commands first" in get_command(either, key).remark
 
 
-def test_a_station_that_the_description_does_not_have_is_refused(either: Ground, tmp_path: Path) -> None:
+def test_a_station_that_the_description_does_not_have_is_refused(either: Ground, tmp_path: Path):
     add_mission(either, b'name = "m"\n[spacecraft]\nid = 76\n[link.stations.madrid]\n')
     file = tmp_path / "a.packets"
     file.write_bytes(contact())
@@ -242,7 +242,7 @@ def test_a_station_that_the_description_does_not_have_is_refused(either: Ground,
         ingest_file(either, file, spacecraft_id=76, station="mars")
 
 
-def test_a_lease_that_ended_in_a_standstill_is_renewed_with_its_state(either: Ground) -> None:
+def test_a_lease_that_ended_in_a_standstill_is_renewed_with_its_state(either: Ground):
     given = {"owner": "a", "until_utc_ns": 15, "mission_utc_ns": 0}
     with either.database.writing() as connection:
         assert links.acquire(connection, "l", 76, "flight", wall_utc_ns=0, **given)
@@ -255,7 +255,7 @@ def test_a_lease_that_ended_in_a_standstill_is_renewed_with_its_state(either: Gr
 
 
 @pytest.mark.parametrize("ahead", [26 * HOUR, YEARS, 100 * (1 << 16) - TICKS])
-def test_a_detection_of_an_image_at_another_time_is_kept_apart(ground: Ground, ahead: int) -> None:
+def test_a_detection_of_an_image_at_another_time_is_kept_apart(ground: Ground, ahead: int):
     def detections(image_ticks: int, count: int) -> bytes:
         values = {"frame_number": count, "image_ticks": image_ticks, "image_quality": 0, "items": []}
         return DICTIONARY.pack("detections", values, ticks=TICKS + (11 << 16), sequence_count=count)
@@ -269,7 +269,7 @@ def test_a_detection_of_an_image_at_another_time_is_kept_apart(ground: Ground, a
     assert len(reasons(ground)) == 1
 
 
-def test_a_day_with_disturbances_ends_with_the_archive_of_the_day_without(tmp_path: Path) -> None:
+def test_a_day_with_disturbances_ends_with_the_archive_of_the_day_without(tmp_path: Path):
     contacts = [contact(TICKS + 2 * HOUR * k, 12 * k) for k in range(12)]
     with open_ground(tmp_path / "calm") as calm, open_ground(tmp_path / "disturbed") as disturbed:
         for octets in contacts:

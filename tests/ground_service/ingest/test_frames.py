@@ -67,7 +67,7 @@ def read(octets: bytes, window: int, spacecraft_id: int | None = None) -> tuple[
 
 
 @pytest.mark.parametrize("window", [1 << 20, 8_000, 997])
-def test_every_packet_comes_through_whatever_the_windows(packets: list[bytes], stream: bytes, window: int) -> None:
+def test_every_packet_comes_through_whatever_the_windows(packets: list[bytes], stream: bytes, window: int):
     found, accounting, skipped = read(stream, window)
     assert set(found) == set(packets)
     assert (accounting.packets, accounting.frames) == (len(packets), len(stream) // 259)
@@ -76,7 +76,7 @@ def test_every_packet_comes_through_whatever_the_windows(packets: list[bytes], s
 
 
 @pytest.mark.parametrize("window", [1 << 20, 60_000])
-def test_damage_is_accounted_for_alike_in_windows_and_at_once(stream: bytes, window: int) -> None:
+def test_damage_is_accounted_for_alike_in_windows_and_at_once(stream: bytes, window: int):
     stream = bytearray(stream)
     rng = np.random.default_rng(5)
     for at in rng.integers(0, len(stream), 3 * len(stream) // 259):
@@ -92,14 +92,12 @@ def test_damage_is_accounted_for_alike_in_windows_and_at_once(stream: bytes, win
     assert skipped == whole.octets_skipped
 
 
-def test_bare_packets_are_read_in_any_windows(packets: list[bytes]) -> None:
+def test_bare_packets_are_read_in_any_windows(packets: list[bytes]):
     found, _, skipped = read(b"".join(packets), 1000, SPACECRAFT)
     assert (found, skipped) == (packets, 0)
 
 
-def test_two_spacecraft_in_one_file_are_told_apart_and_one_that_is_named_excludes_the_other(
-    packets: list[bytes],
-) -> None:
+def test_two_spacecraft_in_one_file_are_told_apart_and_one_that_is_named_excludes_the_other(packets: list[bytes]):
     two = encode_cadus(packets[:40], spacecraft_id=76) + encode_cadus(packets[20:60], spacecraft_id=33)
     reader, by_spacecraft = reader_of(two), {}
     for batch in reader.batches(windows(two, 1 << 20)):
@@ -110,7 +108,7 @@ def test_two_spacecraft_in_one_file_are_told_apart_and_one_that_is_named_exclude
     assert found == packets[20:60] and accounting.frames_bad > 0
 
 
-def test_memory_does_not_grow_with_the_stream(stream: bytes) -> None:
+def test_memory_does_not_grow_with_the_stream(stream: bytes):
     read(stream, 1 << 20)  # imports and compiles
     section = Section(None, 0, 75 * len(stream), 0, 75 * len(stream))
     settings = LinkSettings(frame_length=223)
@@ -128,7 +126,7 @@ def test_memory_does_not_grow_with_the_stream(stream: bytes) -> None:
 
 
 @pytest.mark.parametrize("window", [1 << 20, 60_000])
-def test_the_uplink_is_seen_alike_in_windows_and_at_once(packets: list[bytes], window: int) -> None:
+def test_the_uplink_is_seen_alike_in_windows_and_at_once(packets: list[bytes], window: int):
     encoder = DownlinkEncoder(SPACECRAFT, LinkSettings(frame_length=223))
     clcws = [pack_clcw(Clcw(0, k // 9, lockout=40 < k < 60, farm_b_counter=k % 4)) for k in range(len(packets))]
     stream = encoder.encode(packets, clcw=clcws)
@@ -139,7 +137,7 @@ def test_the_uplink_is_seen_alike_in_windows_and_at_once(packets: list[bytes], w
     assert whole.frames == accounting.frames and whole.changes > 50 and whole.frames_lockout > 0
 
 
-def test_the_uplinks_of_two_spacecraft_in_one_file_are_told_apart(packets: list[bytes]) -> None:
+def test_the_uplinks_of_two_spacecraft_in_one_file_are_told_apart(packets: list[bytes]):
     stream = b"".join(
         DownlinkEncoder(spacecraft).encode(packets[:40], clcw=pack_clcw(Clcw(0, number)))
         for spacecraft, number in ((76, 5), (33, 200))
@@ -166,7 +164,7 @@ def several_processes(
         yield found
 
 
-def test_each_kind_meets_each_order_and_each_piece_is_of_its_recording() -> None:
+def test_each_kind_meets_each_order_and_each_piece_is_of_its_recording():
     cases = [case_of(number) for number in range(len(KINDS) * len(ORDERS))]
     assert {(case.kind, case.order) for case in cases} == {(kind, order) for kind in KINDS for order in ORDERS}
     for case in cases:
@@ -179,16 +177,16 @@ def test_each_kind_meets_each_order_and_each_piece_is_of_its_recording() -> None
 
 
 @pytest.mark.parametrize("number", [k * len(ORDERS) + k for k in range(FEW)])
-def test_any_split_order_and_repetition_gives_the_same_archive(one_process: Archive, number: int) -> None:
+def test_any_split_order_and_repetition_gives_the_same_archive(one_process: Archive, number: int):
     assert one_process.difference(case_of(number)) == ""
 
 
 @pytest.mark.parametrize("number", [200 + k * (len(ORDERS) + 1) for k in range(len(KINDS))])
-def test_any_number_of_processes_gives_the_same_archive(several_processes: Archive, number: int) -> None:
+def test_any_number_of_processes_gives_the_same_archive(several_processes: Archive, number: int):
     assert several_processes.difference(case_of(number)) == ""
 
 
-def test_a_piece_that_proved_nothing_is_read_with_a_later_one_around_it(one_process: Archive) -> None:
+def test_a_piece_that_proved_nothing_is_read_with_a_later_one_around_it(one_process: Archive):
     assert one_process.difference(case_of(10, ["without checksum", "foreign"])) == ""
 
 
@@ -201,14 +199,14 @@ CASES = """\
 
 
 @pytest.mark.parametrize("case", CASES.splitlines())
-def test_what_a_piece_did_not_show_is_read_with_a_later_one(one_process: Archive, case: str) -> None:
+def test_what_a_piece_did_not_show_is_read_with_a_later_one(one_process: Archive, case: str):
     number, kind = case.partition(":")[0].split()
     assert one_process.difference(case_of(int(number), (kind,) * 13)) == ""
 
 
 def test_a_piece_that_became_readable_while_it_was_read_is_read_again(
     one_process: Archive, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     (recording,) = case_of(3, ["without proof"]).recordings
     rest, ground = Piece(recording, 600, len(recording.octets)), one_process.ground
 
@@ -224,7 +222,7 @@ def test_a_piece_that_became_readable_while_it_was_read_is_read_again(
     assert (result.frames, result.octets_pending) == (2, 80)
 
 
-def test_a_lost_piece_is_a_difference(one_process: Archive) -> None:
+def test_a_lost_piece_is_a_difference(one_process: Archive):
     case = case_of(200 * len(ORDERS), ["short frames"])
     case.pieces.pop()
     assert "packets" in one_process.difference(case)
@@ -263,7 +261,7 @@ def downlink(make_pass: Callable[..., Any]) -> Path:
 
 
 @pytest.mark.campaign
-def test_an_ingest_killed_at_any_moment_loses_and_doubles_nothing(downlink: Path, tmp_path: Path) -> None:
+def test_an_ingest_killed_at_any_moment_loses_and_doubles_nothing(downlink: Path, tmp_path: Path):
     """The stream is stored in about ten transactions; the process is killed outright at random moments among them."""
     with open_ground(tmp_path / "whole") as ground:
         result = ingest_file(ground, downlink)
@@ -285,7 +283,7 @@ def test_an_ingest_killed_at_any_moment_loses_and_doubles_nothing(downlink: Path
         assert hash_of(ground) == expected
 
 
-def test_decoding_again_puts_rows_beside_the_old_ones(downlink: Path, ground: Ground) -> None:
+def test_decoding_again_puts_rows_beside_the_old_ones(downlink: Path, ground: Ground):
     result = ingest_file(ground, downlink)
     before = rows_of(ground, DICTIONARY.version)
     newer = dataclasses.replace(DICTIONARY, version=DICTIONARY.version + 1)

@@ -75,7 +75,7 @@ def expected(packets: list[bytes], tmp_path_factory: pytest.TempPathFactory) -> 
         return hash_of(ground)
 
 
-def test_every_packet_is_stored_with_its_rows(ground: Ground, packets: list[bytes]) -> None:
+def test_every_packet_is_stored_with_its_rows(ground: Ground, packets: list[bytes]):
     result = ingest(ground, b"".join(packets))
     assert result.packets == result.packets_new == result.samples == len(packets)
     assert (result.crc_errors, result.octets_skipped, result.unknown) == (0, 0, 0)
@@ -83,9 +83,7 @@ def test_every_packet_is_stored_with_its_rows(ground: Ground, packets: list[byte
     assert rows(ground, repository.SAMPLES["navigation_states"]) == 12
 
 
-def test_a_damaged_packet_and_one_cut_short_are_counted_and_the_rest_is_stored(
-    ground: Ground, packets: list[bytes]
-) -> None:
+def test_a_damaged_packet_and_one_cut_short_are_counted_and_the_rest_is_stored(ground: Ground, packets: list[bytes]):
     octets = bytearray(b"".join(packets)[:-5])
     octets[len(packets[0]) + 30] ^= 0x10
     result = ingest(ground, octets)
@@ -93,7 +91,7 @@ def test_a_damaged_packet_and_one_cut_short_are_counted_and_the_rest_is_stored(
     assert result.octets_skipped == len(packets[-1]) - 5
 
 
-def test_clocks_of_2000_and_of_the_future_are_kept_apart_once(ground: Ground, packets: list[bytes]) -> None:
+def test_clocks_of_2000_and_of_the_future_are_kept_apart_once(ground: Ground, packets: list[bytes]):
     values = {"event_id": 1, "frame_number": 0, "value_1": 0.0, "value_2": 0.0}
     strays = [DICTIONARY.pack("event_info", values, ticks=t, sequence_count=9) for t in (0, (1 << 48) - 1)]
     result = ingest(ground, b"".join([*packets, *strays]))
@@ -102,9 +100,7 @@ def test_clocks_of_2000_and_of_the_future_are_kept_apart_once(ground: Ground, pa
     assert (again.packets_new, again.packets_implausible) == (0, 0)
 
 
-def test_a_downlink_of_another_dictionary_is_kept_octet_by_octet_and_counted(
-    ground: Ground, packets: list[bytes]
-) -> None:
+def test_a_downlink_of_another_dictionary_is_kept_octet_by_octet_and_counted(ground: Ground, packets: list[bytes]):
     def foreign(packet: bytes) -> bytes:
         """The packet under a message type that no dictionary of ours has."""
         return append_crc(packet[:7] + bytes((201, 77)) + packet[9:-2])
@@ -122,7 +118,7 @@ def stored(ground: Ground) -> set[bytes]:
 
 
 @pytest.mark.parametrize("octets", [1_000, 70_000])
-def test_noise_is_refused_in_one_line_and_remembered(ground: Ground, octets: int) -> None:
+def test_noise_is_refused_in_one_line_and_remembered(ground: Ground, octets: int):
     with pytest.raises(
         InvalidInput, match=rf"noise\.bin: expected a stream of CADUs or of space packets, found {octets}"
     ):
@@ -131,7 +127,7 @@ def test_noise_is_refused_in_one_line_and_remembered(ground: Ground, octets: int
     assert record["state"] == "failed" and "noise.bin" in record["error"]
 
 
-def test_a_missing_file_is_refused(ground: Ground, tmp_path: Path) -> None:
+def test_a_missing_file_is_refused(ground: Ground, tmp_path: Path):
     with pytest.raises(InvalidInput, match="expected a downlink file, found nothing there"):
         ingest_file(ground, tmp_path / "no.bin", spacecraft_id=SPACECRAFT)
 
@@ -144,7 +140,7 @@ def place(ground: Ground, octets: bytes, start: int, stream: str = "stream", **m
 
 def test_octets_that_wait_are_counted_and_are_no_error(
     ground: Ground, packets: list[bytes], stream: bytes, expected: str
-) -> None:
+):
     first = place(ground, stream[300:900], 300)
     assert (first.packets, first.octets_pending) == (0, 600)
     record = ground.read(repository.newest, repository.INGESTS, Paging())[0][0]
@@ -157,14 +153,14 @@ def test_octets_that_wait_are_counted_and_are_no_error(
     assert hash_of(ground) == expected
 
 
-def test_an_incomplete_frame_at_either_end_of_a_whole_recording_is_counted(ground: Ground, stream: bytes) -> None:
+def test_an_incomplete_frame_at_either_end_of_a_whole_recording_is_counted(ground: Ground, stream: bytes):
     result = ingest(ground, stream[300 : 4 * 1279 + 100])
     assert (result.frames, result.octets_pending) == (3, 979 + 100)
     with pytest.raises(InvalidInput, match=r"600 octets with no frame or packet of .*--recording NAME FILE"):
         ingest(ground, stream[300:900])
 
 
-def test_a_frame_of_two_recordings_is_none(ground: Ground, stream: bytes) -> None:
+def test_a_frame_of_two_recordings_is_none(ground: Ground, stream: bytes):
     """The octets before and behind a cut belong together only in one recording of one instance."""
     place(ground, stream[:4000], 0)
     for name, instance in (("other", "flight"), ("stream", "twin")):
@@ -172,7 +168,7 @@ def test_a_frame_of_two_recordings_is_none(ground: Ground, stream: bytes) -> Non
     assert place(ground, stream[4000:], 4000).frames_joined == 1
 
 
-def test_pieces_for_one_spacecraft_and_for_any_adjoin(ground: Ground, stream: bytes, expected: str) -> None:
+def test_pieces_for_one_spacecraft_and_for_any_adjoin(ground: Ground, stream: bytes, expected: str):
     """The same octets read for another spacecraft before are read again."""
     for number, start in enumerate(range(0, len(stream), 1_000)):
         mine = SPACECRAFT if number % 2 else None
@@ -181,7 +177,7 @@ def test_pieces_for_one_spacecraft_and_for_any_adjoin(ground: Ground, stream: by
     assert hash_of(ground) == expected
 
 
-def test_octets_that_came_before_are_counted_as_repeated(ground: Ground, stream: bytes) -> None:
+def test_octets_that_came_before_are_counted_as_repeated(ground: Ground, stream: bytes):
     first = place(ground, stream[:5_000], 0)
     again = place(ground, stream[:5_000], 0)
     assert (again.frames, again.packets_new, again.octets_repeated) == (first.frames, 0, 0)
@@ -191,7 +187,7 @@ def test_octets_that_came_before_are_counted_as_repeated(ground: Ground, stream:
     assert (inside.octets_repeated, inside.frames, inside.octets_skipped) == (1_000, 0, 0)
 
 
-def test_single_octets_are_joined_by_their_place(ground: Ground, packets: list[bytes]) -> None:
+def test_single_octets_are_joined_by_their_place(ground: Ground, packets: list[bytes]):
     stream = encode_cadus(packets[:1], spacecraft_id=SPACECRAFT)
     place(ground, stream[:900], 0)
     for start in np.random.default_rng(1).permutation(np.arange(900, 912)).tolist():
@@ -203,7 +199,7 @@ def test_single_octets_are_joined_by_their_place(ground: Ground, packets: list[b
 
 def test_fragments_that_fit_by_length_and_count_alone_make_no_packet(
     ground: Ground, packets: list[bytes], stream: bytes
-) -> None:
+):
     """The rest of other packets with the same frame counts: the checksum shows that it does not belong here."""
     others = [append_crc(one[:9] + b"?" + one[10:-2]) for one in packets]
     other = encode_cadus(others, spacecraft_id=SPACECRAFT)
@@ -215,7 +211,7 @@ def test_fragments_that_fit_by_length_and_count_alone_make_no_packet(
 
 def test_many_fragments_are_stored_before_the_end_of_a_recording(
     ground: Ground, frames: list[bytes], expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     monkeypatch.setattr("ground_service.ingest.reception.WINDOW_OCTETS", 2_000)
     monkeypatch.setattr("ground_service.ingest.reception.FRAGMENTS_LIMIT", 3)
     ingest(ground, b"".join(frames[1::2] + frames[::2]), link="frame_length=223")
@@ -223,7 +219,7 @@ def test_many_fragments_are_stored_before_the_end_of_a_recording(
     assert rows(ground, repository.FRAGMENTS) == 0
 
 
-def test_a_piece_is_stored_in_few_transactions(ground: Ground, stream: bytes) -> None:
+def test_a_piece_is_stored_in_few_transactions(ground: Ground, stream: bytes):
     """Each commit waits for the disk: entered, read, completed with fragments, correlated."""
     middle = len(stream) // 2
     place(ground, stream[:middle], 0)
@@ -240,7 +236,7 @@ class PowerFailure(Exception):
 @pytest.mark.parametrize("shuffled", [False, True])
 def test_an_ingest_that_ends_after_any_commit_is_made_up_for_by_the_next(
     packets: list[bytes], stream: bytes, expected: str, tmp_path: Path, shuffled: bool
-) -> None:
+):
     """A CADU of three pieces, with packets that reach into its neighbours; the piece that completes it is cut off."""
     pieces = [(0, stream[:1700]), (1700, stream[1700:2300]), (2300, stream[2300:])]
     if shuffled:
@@ -305,7 +301,7 @@ def versions(ground: Ground) -> set[int]:
         return set(connection.execute(select(table.c.dictionary_version).distinct()).scalars())
 
 
-def test_an_archive_of_the_old_dictionary_is_read_and_then_decoded_again(old: Ground) -> None:
+def test_an_archive_of_the_old_dictionary_is_read_and_then_decoded_again(old: Ground):
     before = looked_at(old)
     assert before == (1, 40, 40)
     assert vehicles_behind(old) == [1]
@@ -314,7 +310,7 @@ def test_an_archive_of_the_old_dictionary_is_read_and_then_decoded_again(old: Gr
     assert versions(old) == {OLD.version, DICTIONARY.version}
 
 
-def test_serving_enters_the_job_that_decodes_again(tmp_path: Path, synthetic_pass: Any) -> None:
+def test_serving_enters_the_job_that_decodes_again(tmp_path: Path, synthetic_pass: Any):
     fill_with_the_old(tmp_path / "home", synthetic_pass)
     with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as client:
         (job,) = client.get("/api/v1/jobs").json()["items"]
@@ -326,7 +322,7 @@ def test_serving_enters_the_job_that_decodes_again(tmp_path: Path, synthetic_pas
 
 def test_what_comes_in_meanwhile_and_a_kill_in_the_middle_change_nothing(
     old: Ground, tmp_path: Path, make_pass: Any, synthetic_pass: Any, monkeypatch: Any
-) -> None:
+):
     monkeypatch.setattr(parameters, "BLOCK_PACKETS", 50)
     more = make_pass(frames=3, seed=5).folder / "downlink.cadu"
     blocks = Mock(side_effect=[parameters._block, parameters._block, KeyboardInterrupt, *[parameters._block] * 99])
@@ -400,14 +396,14 @@ def upgraded(begun: tuple[int, bytes], tmp_path: Path, caplog: pytest.LogCapture
         return open_ground(home)
 
 
-def test_the_beginning_of_a_packet_is_kept(upgraded: Ground, synthetic_pass: Any, tmp_path: Path) -> None:
+def test_the_beginning_of_a_packet_is_kept(upgraded: Ground, synthetic_pass: Any, tmp_path: Path):
     stream = (synthetic_pass.folder / "downlink.cadu").read_bytes()
     (tmp_path / "rest.cadu").write_bytes(stream[1279:])
     with upgraded as ground:
         assert ingest_file(ground, tmp_path / "rest.cadu").packets_joined == 1
 
 
-def test_waiting_pieces_without_a_position_are_listed(upgraded: Ground, caplog: pytest.LogCaptureFixture) -> None:
+def test_waiting_pieces_without_a_position_are_listed(upgraded: Ground, caplog: pytest.LogCaptureFixture):
     said = [one.getMessage() for one in caplog.get_records("setup")]
     assert [one for one in said if "--recording NAME FILE" in one] == [
         f"ingest 1, file {'1' * 64}: 600 octets wait for others without a position; ingest the files of its "

@@ -37,7 +37,7 @@ def ingest(ground: Ground, octets: bytes) -> None:
     assert (kept.accounting, kept.state) == (made, "done")
 
 
-def test_a_small_piece_takes_few_statements_in_two_transactions(either: Ground, pieces: list[bytes]) -> None:
+def test_a_small_piece_takes_few_statements_in_two_transactions(either: Ground, pieces: list[bytes]):
     for piece in pieces[:3]:
         ingest(either, piece)
     statements = []
@@ -56,7 +56,7 @@ def test_a_small_piece_takes_few_statements_in_two_transactions(either: Ground, 
     assert not any("UPDATE ingests" in one for one in statements[stored:])
 
 
-def test_the_declared_link_follows_new_mission_descriptions(either: Ground) -> None:
+def test_the_declared_link_follows_new_mission_descriptions(either: Ground):
     piece = Piece(1, "flight", SPACECRAFT, "0" * 64, 1279, "", 0)
 
     def known() -> Any:

@@ -59,7 +59,7 @@ def take(spool: Spool, octets: bytes) -> None:
     spool.drain()
 
 
-def test_segments_cut_at_any_octet_are_pieces_of_one_recording(ground: Ground, stream: bytes, expected: str) -> None:
+def test_segments_cut_at_any_octet_are_pieces_of_one_recording(ground: Ground, stream: bytes, expected: str):
     spool = spool_of(ground, seen := [])
     assert spool.open() == 0
     for start, stop in pairwise([0, 700, 4 * 1279 + 300, 4 * 1279 + 301, len(stream)]):
@@ -71,9 +71,7 @@ def test_segments_cut_at_any_octet_are_pieces_of_one_recording(ground: Ground, s
 
 
 @pytest.mark.parametrize("drained", [False, True])
-def test_the_recording_of_a_run_that_crashed_goes_on(
-    ground: Ground, stream: bytes, expected: str, drained: bool
-) -> None:
+def test_the_recording_of_a_run_that_crashed_goes_on(ground: Ground, stream: bytes, expected: str, drained: bool):
     """Also if all its segments are ingested."""
     crashed = spool_of(ground, [])
     crashed.open()
@@ -92,9 +90,7 @@ def test_the_recording_of_a_run_that_crashed_goes_on(
     assert hash_of(ground) == expected
 
 
-def test_the_segments_of_a_version_without_recordings_are_consecutive(
-    ground: Ground, stream: bytes, expected: str
-) -> None:
+def test_the_segments_of_a_version_without_recordings_are_consecutive(ground: Ground, stream: bytes, expected: str):
     folder = ground.home / "spool"
     folder.mkdir()
     (folder / "000000000004.segment").write_bytes(stream[:700])
@@ -106,7 +102,7 @@ def test_the_segments_of_a_version_without_recordings_are_consecutive(
     assert hash_of(ground) == expected
 
 
-def test_a_segment_stays_in_the_spool_while_the_store_is_full(stream: bytes, tmp_path: Path) -> None:
+def test_a_segment_stays_in_the_spool_while_the_store_is_full(stream: bytes, tmp_path: Path):
     def full(*_: Any) -> dict[str, Any]:
         raise StorageFull("here")
 
@@ -119,7 +115,7 @@ def test_a_segment_stays_in_the_spool_while_the_store_is_full(stream: bytes, tmp
 
 def test_noise_is_part_of_the_recording_and_an_unknown_coding_does_not_stop_the_rest(
     ground: Ground, stream: bytes, expected: str
-) -> None:
+):
     spool = spool_of(ground, seen := [])
     spool.open()
     markers = bytes.fromhex("1ACFFC1D") + np.random.default_rng(1).bytes(1275)
@@ -129,7 +125,7 @@ def test_noise_is_part_of_the_recording_and_an_unknown_coding_does_not_stop_the_
     assert hash_of(ground) == expected
 
 
-def test_files_that_appear_are_ingested_once_when_they_are_whole(tmp_path: Path) -> None:
+def test_files_that_appear_are_ingested_once_when_they_are_whole(tmp_path: Path):
     folder, seen = tmp_path / "in", []
     folder.mkdir()
 
@@ -169,7 +165,7 @@ def batch_of(packets: list[bytes], received: IntArray | None) -> PacketBatch:
 
 
 @pytest.mark.parametrize("window_octets", [1 << 20, 3_000])
-def test_a_packet_has_the_reception_time_of_the_frame_in_which_it_begins(window_octets: int) -> None:
+def test_a_packet_has_the_reception_time_of_the_frame_in_which_it_begins(window_octets: int):
     ticks = int(ticks_from_utc_ns(START))
     packets = [report(ticks + k, k) for k in range(400)]
     cadus = encode_cadus(packets, spacecraft_id=76)
@@ -194,7 +190,7 @@ def test_a_packet_has_the_reception_time_of_the_frame_in_which_it_begins(window_
     assert (reader.found.first_utc_ns, reader.found.last_utc_ns) == (times[0], times[-1])
 
 
-def test_reports_of_clocks_that_differ_are_left_out() -> None:
+def test_reports_of_clocks_that_differ_are_left_out():
     ticks = int(ticks_from_utc_ns(START))
     packets = [report(ticks, k) for k in range(6)]
     later = np.array([1.3, 60.0, 60.1, -60.0, 3600.0, 0.0])
@@ -213,7 +209,7 @@ def noted(ground: Ground) -> list[tuple[Any, ...]]:
         return [tuple(getattr(row, name) for name in names) for row in rows]
 
 
-def test_the_first_reception_counts_in_any_order(either: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_reception_counts_in_any_order(either: Ground, monkeypatch: pytest.MonkeyPatch):
     with either.database.writing() as connection:
         vehicle = vehicle_id(connection, 76, "flight")
         for received in ({(7, 1): 500, (8, 2): 600}, {(7, 1): 400}, {(7, 1): 450}):

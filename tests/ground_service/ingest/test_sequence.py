@@ -33,12 +33,12 @@ def counted(ticks: np.ndarray, counts: np.ndarray) -> tuple[int, int, int]:
     return account.lost, account.restarts, account.conflicts
 
 
-def test_no_packets_are_no_packets() -> None:
+def test_no_packets_are_no_packets():
     account = account_sequence(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
     assert (account.lost, account.conflicts, account.restarts, account.gaps) == (0, 0, 0, ())
 
 
-def test_a_wrap_is_no_gap() -> None:
+def test_a_wrap_is_no_gap():
     ticks, counts = stream(40_000, first=16_000)
     account = account_sequence(ticks, counts)
     assert account.lost == 0
@@ -50,7 +50,7 @@ def test_a_wrap_is_no_gap() -> None:
     seed=st.integers(0, 2**32 - 1),
     first=st.integers(0, COUNT_MODULUS - 1),
 )
-def test_what_is_missing_is_found_whatever_the_order_of_arrival(lost: set[int], seed: int, first: int) -> None:
+def test_what_is_missing_is_found_whatever_the_order_of_arrival(lost: set[int], seed: int, first: int):
     ticks, counts = stream(3000, first)
     keep = np.random.default_rng(seed).permutation(np.setdiff1d(np.arange(3000), np.array(sorted(lost), dtype=int)))
     account = account_sequence(ticks[keep], counts[keep])
@@ -60,31 +60,31 @@ def test_what_is_missing_is_found_whatever_the_order_of_arrival(lost: set[int], 
     assert missing == {first + number for number in lost}
 
 
-def test_packets_of_one_instant_on_both_sides_of_a_wrap_are_in_sequence() -> None:
+def test_packets_of_one_instant_on_both_sides_of_a_wrap_are_in_sequence():
     # Yamcs keeps a failing test for this case: same time, wrapped count.
     ticks = np.array([100, 100, 100, 100]) * SECOND
     assert counted(ticks, np.array([16_382, 16_383, 0, 1])) == (0, 0, 0)
 
 
-def test_more_than_a_whole_wrap_lost_in_a_silence_is_counted_by_the_usual_rate() -> None:
+def test_more_than_a_whole_wrap_lost_in_a_silence_is_counted_by_the_usual_rate():
     ticks, counts = stream(60_000)
     keep = np.r_[0:5000, 55_000:60_000]
     assert account_sequence(ticks[keep], counts[keep]).lost == 50_000
 
 
-def test_a_restart_begins_a_new_run_and_loses_nothing() -> None:
+def test_a_restart_begins_a_new_run_and_loses_nothing():
     before, counts_before = stream(500)
     after, counts_after = stream(300)
     assert counted(np.r_[before, after + before[-1] + 60 * SECOND], np.r_[counts_before, counts_after]) == (0, 1, 0)
 
 
-def test_one_count_used_twice_is_a_conflict() -> None:
+def test_one_count_used_twice_is_a_conflict():
     ticks, counts = stream(10)
     assert counted(np.r_[ticks, ticks[4] + 1], np.r_[counts, counts[4]]) == (0, 0, 1)
 
 
 @pytest.mark.parametrize("years", [-29, 40])
-def test_a_packet_from_another_age_does_not_disturb_the_rest(years: int) -> None:
+def test_a_packet_from_another_age_does_not_disturb_the_rest(years: int):
     ticks, counts = stream(1000, first=5000)
     ticks = ticks + 29 * 31_557_600 * SECOND
     stray = ticks[500] + years * 31_557_600 * SECOND
@@ -93,7 +93,7 @@ def test_a_packet_from_another_age_does_not_disturb_the_rest(years: int) -> None
     assert inside.sum() >= 1000
 
 
-def test_few_packets_have_no_rate_and_a_silence_hides_no_wraps() -> None:
+def test_few_packets_have_no_rate_and_a_silence_hides_no_wraps():
     """Sixty packets, an hour of silence, and the count goes on at the one after the next."""
     ticks, counts = stream(60)
     later = np.array([ticks[-1] + 3600 * SECOND])
@@ -105,7 +105,7 @@ def test_few_packets_have_no_rate_and_a_silence_hides_no_wraps() -> None:
 
 
 @pytest.mark.parametrize(("silence_s", "restarts", "lost"), [(600, 1, 0), (1000, 0, 8383)])
-def test_wraps_are_looked_for_where_half_of_one_could_have_been_made(silence_s: int, restarts: int, lost: int) -> None:
+def test_wraps_are_looked_for_where_half_of_one_could_have_been_made(silence_s: int, restarts: int, lost: int):
     """At ten packets a second 600 s hold 6000 of them and 1000 s hold 10,000; half a wrap is 8192.
 
     A fall of 8000 is then a restart, or 8384 packets further on, of which the last came.
@@ -116,12 +116,12 @@ def test_wraps_are_looked_for_where_half_of_one_could_have_been_made(silence_s: 
     assert found[:2] == (lost, restarts)
 
 
-def test_a_fall_within_a_second_is_no_restart_and_one_after_it_is() -> None:
+def test_a_fall_within_a_second_is_no_restart_and_one_after_it_is():
     for ticks, restarts in ((SECOND, 0), (SECOND + 1, 1)):
         assert counted(np.array([0, ticks]), np.array([10, 9]))[1] == restarts
 
 
-def test_counts_go_on_from_the_first_of_each_run() -> None:
+def test_counts_go_on_from_the_first_of_each_run():
     before, counts_before = stream(5, first=16_382)
     after = before[-1] + 60 * SECOND + np.arange(3) * SECOND
     account = account_sequence(np.r_[before, after], np.r_[counts_before, 0, 1, 2])
@@ -140,7 +140,7 @@ def test_an_impossible_on_board_time_is_none_and_never_negative_garbage():
     assert reported.tolist() == [0, 2**48 - 1, NO_TICKS, NO_TICKS, NO_TICKS]
 
 
-def test_only_ingests_with_packets_in_the_time_are_returned(either: Ground, synthetic_pass: Any) -> None:
+def test_only_ingests_with_packets_in_the_time_are_returned(either: Ground, synthetic_pass: Any):
     result = ingest_file(either, synthetic_pass.folder / "downlink.cadu")
     first, last = result.first_ticks, result.last_ticks
     assert first < last

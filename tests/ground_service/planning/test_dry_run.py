@@ -41,7 +41,7 @@ def flown(tmp_path: Path, oem: Path):
     return run
 
 
-def test_a_description_that_flies_has_windows_with_telecommands(flown) -> None:
+def test_a_description_that_flies_has_windows_with_telecommands(flown):
     found = flown()
     assert found.faults == () and len(found.windows) == 2
     # One enables the schedule; start and stop are each inserted into it by another.
@@ -88,13 +88,13 @@ def test_a_description_that_flies_has_windows_with_telecommands(flown) -> None:
         (AUTOMATIC + LINKS, {"spacecraft_id": 5000}, "request.json, spacecraft_id: expected less than"),
     ],
 )
-def test_each_contradiction_is_one_line(flown, extra: str, request_changes: dict, fault: str) -> None:
+def test_each_contradiction_is_one_line(flown, extra: str, request_changes: dict, fault: str):
     found = flown(extra, **request_changes)
     assert len(found.faults) == 1, found.faults
     assert fault in found.faults[0]
 
 
-def test_windows_that_persons_approve_are_approved_and_released_by_two(flown) -> None:
+def test_windows_that_persons_approve_are_approved_and_released_by_two(flown):
     found = flown(UPLOADS + LINKS)
     assert found.faults == ()
     assert [one.decided_by for one in found.windows] == ["dry run, second person"] * 2
@@ -102,7 +102,7 @@ def test_windows_that_persons_approve_are_approved_and_released_by_two(flown) ->
 
 def test_a_text_is_rehearsed_with_the_requests_and_ephemerides_of_the_service(
     ground: Ground, oem: Path, mission_time: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     def rehearse(extra: str = "") -> tuple[int, tuple[str, ...]]:
         text = MISSION.format(extra=AUTOMATIC + LINKS + extra).encode()
         found = rehearsed(ground, text)
@@ -124,7 +124,7 @@ def test_a_text_is_rehearsed_with_the_requests_and_ephemerides_of_the_service(
 
 
 @pytest.mark.parametrize("place", [1, 2, 4])  # a request, a day of its horizon, the release of a window
-def test_a_dry_run_that_takes_too_long_ends(flown, monkeypatch: pytest.MonkeyPatch, place: int) -> None:
+def test_a_dry_run_that_takes_too_long_ends(flown, monkeypatch: pytest.MonkeyPatch, place: int):
     asked = []
 
     def check(_: Ground) -> None:

@@ -33,14 +33,14 @@ def why(one: ResourceGrid, *windows: tuple[float, ...]) -> str | None:
     return violation(one, [window(*each) for each in windows])
 
 
-def test_windows_that_touch_do_not_overlap() -> None:
+def test_windows_that_touch_do_not_overlap():
     assert why(grid(), (1, 1), (2, 1)) is None
     for one, gap in ((grid(), 1.99), (grid(gap_ns=HOUR // 10), 2.09)):
         assert why(one, (1, 1), (gap, 1)) == "overlaps another window or its telecommands"
         assert why(one, (1, 1), (gap + 0.02, 1)) is None
 
 
-def test_the_battery_is_that_of_a_balance_by_hand() -> None:
+def test_the_battery_is_that_of_a_balance_by_hand():
     # 6 Wh an hour in, 20 Wh an hour out: 14 Wh an hour less, from 50 Wh to 15 Wh in 2.5 h
     assert why(grid(), (1, 2.5)) is None
     assert why(grid(), (1, 2.6)) == "the battery would fall to 28 %, expected 30 % or more"
@@ -49,13 +49,13 @@ def test_the_battery_is_that_of_a_balance_by_hand() -> None:
     assert why(grid(), (1, 2), (3 + 14 / 3 - 0.5, 2.5)) is not None
 
 
-def test_energy_of_a_window_does_not_depend_on_the_steps() -> None:
+def test_energy_of_a_window_does_not_depend_on_the_steps():
     for start in (0.0, 0.1, 1.05, 23.0):
         change, _ = grid().flows([window(start, 0.75)])
         assert (grid().gain_wh - change).sum() == pytest.approx(15.0)
 
 
-def test_stored_data_leave_in_contacts() -> None:
+def test_stored_data_leave_in_contacts():
     silent = np.zeros(144)
     silent[60:63] = 1000.0
     assert why(grid(downlink_octets=silent), (1, 1, 3000)) is None
@@ -66,7 +66,7 @@ def test_stored_data_leave_in_contacts() -> None:
     assert why(full, (1, 1, 6000), (11, 1, 5000)) is None  # 3000 left in between
 
 
-def test_data_have_to_be_down_in_time() -> None:
+def test_data_have_to_be_down_in_time():
     late = np.zeros(48 * 6)
     late[6 * 30] = 5000.0
     slow = grid(48, downlink_octets=late)
@@ -75,14 +75,14 @@ def test_data_have_to_be_down_in_time() -> None:
     assert why(slow, (8, 1, 5001)) == "its data would not be down within 24 h"
 
 
-def test_the_duty_limit_counts_windows_that_begin_within_a_day() -> None:
+def test_the_duty_limit_counts_windows_that_begin_within_a_day():
     strong = grid(72, gain_wh=np.full(72 * 6, 10.0), observe_s_per_day=7200.0)
     assert why(strong, (1, 1), (5, 1)) is None
     assert why(strong, (1, 1), (5, 1), (24.99, 0.5)) is not None
     assert why(strong, (1, 1), (5, 1), (25, 0.5)) is None
 
 
-def test_quotas_are_kept_by_period_and_reasons_are_given() -> None:
+def test_quotas_are_kept_by_period_and_reasons_are_given():
     options = [window(k, 0.1, period=k // 4) for k in range(8)]
     chosen, reasons = choose(grid(), options, quota={0: 2, 1: 0})
     assert chosen == options[:2]
@@ -90,13 +90,13 @@ def test_quotas_are_kept_by_period_and_reasons_are_given() -> None:
     assert set(reasons.values()) == {"the number of windows of its period is planned"}
 
 
-def test_planned_windows_keep_their_resources() -> None:
+def test_planned_windows_keep_their_resources():
     committed = [window(1, 2.4)]
     chosen, reasons = choose(grid(), [window(3.5, 1), window(20, 1)], committed)
     assert chosen == [window(20, 1)] and "battery" in reasons[window(3.5, 1)]
 
 
-def test_nothing_is_chosen_of_nothing() -> None:
+def test_nothing_is_chosen_of_nothing():
     assert choose(grid(), []) == ([], {})
 
 
@@ -111,7 +111,7 @@ options_of_a_day = st.lists(
 
 @settings(max_examples=60, deadline=None)
 @given(options_of_a_day, st.integers(0, 4), st.integers(0, 4))
-def test_a_plan_is_feasible_and_not_worse_than_any_order(options: list[Option], first: int, second: int) -> None:
+def test_a_plan_is_feasible_and_not_worse_than_any_order(options: list[Option], first: int, second: int):
     tight = grid(downlink_octets=np.full(144, 150.0), storage_octets=5000.0, observe_s_per_day=4 * 3600.0)
     quota = {0: first, 1: second}
     chosen, reasons = choose(tight, options, quota=quota)
@@ -131,7 +131,7 @@ def test_a_plan_is_feasible_and_not_worse_than_any_order(options: list[Option], 
     assert choose(tight, list(reversed(options)), quota=quota)[0] == chosen
 
 
-def test_one_long_window_gives_way_to_several_of_more_value() -> None:
+def test_one_long_window_gives_way_to_several_of_more_value():
     long, short = window(2, 2.4, value=1.5), [window(2 + k, 0.5, value=1.0) for k in range(3)]
     chosen, _ = choose(grid(), [long, *short])
     assert chosen == short

@@ -63,7 +63,7 @@ def search(plan: Planner, **constraints: Any) -> Any:
     return plan.search(Constraints(**constraints), plan.ephemeris.start_utc_ns, plan.ephemeris.stop_utc_ns, 15.0)
 
 
-def test_altitude_is_kept_all_along_and_missed_just_outside() -> None:
+def test_altitude_is_kept_all_along_and_missed_just_outside():
     plan = planner(circle(eccentric_m=20e3))
     found = search(plan, altitude_m=(45e3, 100e3), maximum_duration_s=7200.0).candidates
     assert len(found) >= 2
@@ -76,7 +76,7 @@ def test_altitude_is_kept_all_along_and_missed_just_outside() -> None:
                 assert np.linalg.norm(position) - MOON_RADIUS_M < 45e3
 
 
-def test_sunlight_on_the_ground_and_on_the_spacecraft() -> None:
+def test_sunlight_on_the_ground_and_on_the_spacecraft():
     plan = planner(circle())
     found = search(plan, sun_elevation_rad=(np.radians(10.0), np.pi), sunlit=True).candidates
     assert found
@@ -90,7 +90,7 @@ def test_sunlight_on_the_ground_and_on_the_spacecraft() -> None:
         assert candidate.sunlit_share == 1.0
 
 
-def test_long_spans_are_cut_and_short_ones_left_out() -> None:
+def test_long_spans_are_cut_and_short_ones_left_out():
     plan = planner(circle())
     everything = search(plan, maximum_duration_s=1200.0)
     assert len(everything.candidates) == 15  # 17980 s in pieces of 1200 s at most
@@ -104,7 +104,7 @@ def test_long_spans_are_cut_and_short_ones_left_out() -> None:
     assert "shorter than the minimum duration 86400 s" in none.reason
 
 
-def test_an_empty_result_names_the_smallest_set_of_constraints_and_the_nearest_relaxation() -> None:
+def test_an_empty_result_names_the_smallest_set_of_constraints_and_the_nearest_relaxation():
     plan = planner(circle(eccentric_m=20e3))
     north, low = (np.radians(60.0), np.radians(90.0)), (0.0, 35e3)
     assert search(plan, latitude_rad=north).candidates
@@ -127,7 +127,7 @@ def test_an_empty_result_names_the_smallest_set_of_constraints_and_the_nearest_r
     assert "latitude 60 to 90 deg relaxed by" in limited.reason and "without" not in limited.reason
 
 
-def test_craters_are_counted_in_the_camera(make_pass: Callable[..., Any]) -> None:
+def test_craters_are_counted_in_the_camera(make_pass: Callable[..., Any]):
     folder = make_pass(frames=6, seed=3).folder
     ephemeris, catalogue = load_oem(folder / "reference.oem"), load_catalogue(folder / "catalogue.csv")
     plan = Planner(ephemeris, IauOrientation(), Resources(), PinholeCamera(), catalogue)
@@ -139,11 +139,11 @@ def test_craters_are_counted_in_the_camera(make_pass: Callable[..., Any]) -> Non
 
 
 @pytest.mark.parametrize(("duration_s", "frames"), [(90.0, 6), (90.1, 7), (104.9, 7), (5.0, 1)])
-def test_an_observation_has_a_frame_at_its_start_and_none_at_its_stop(duration_s: float, frames: int) -> None:
+def test_an_observation_has_a_frame_at_its_start_and_none_at_its_stop(duration_s: float, frames: int):
     assert frames_between(START, START + round(duration_s * NS), 15.0) == frames
 
 
-def test_terrain_is_asked_of_the_map() -> None:
+def test_terrain_is_asked_of_the_map():
     north = Planner(circle(), IauOrientation(), Resources(), PinholeCamera(), mare=lambda latitude, _: latitude > 0.0)
     for wanted, sign in ((True, 1.0), (False, -1.0)):
         found = search(north, mare=wanted).candidates
@@ -152,7 +152,7 @@ def test_terrain_is_asked_of_the_map() -> None:
         assert all(candidate.mare_share == float(wanted) for candidate in found)
 
 
-def test_the_battery_falls_with_the_load() -> None:
+def test_the_battery_falls_with_the_load():
     weak = planner(circle(), battery_wh=4.0, generation_w=13.0)
     none = search(weak, minimum_battery=0.5)
     rejected = none.rejected
@@ -170,7 +170,7 @@ def test_the_battery_falls_with_the_load() -> None:
     )
 
 
-def test_data_leave_the_store_in_the_order_they_came() -> None:
+def test_data_leave_the_store_in_the_order_they_came():
     first, second = Option(0, 100 * NS, 1000), Option(200 * NS, 300 * NS, 500)
     contacts = [
         PredictedContact(one, a * NS, b * NS) for one, a, b in zip("aba", (400, 450, 900), (460, 500, 960), strict=True)
@@ -182,14 +182,14 @@ def test_data_leave_the_store_in_the_order_they_came() -> None:
     assert storage_peak([first], contacts, 0.0, first) == (1000, None)
 
 
-def test_data_of_a_frame_are_as_long_as_its_packets() -> None:
+def test_data_of_a_frame_are_as_long_as_its_packets():
     # Packet lengths by the ICD: detections 35 + 9 n, navigation state 84, frame outcome 59, housekeeping 92 octets.
     names = ("detections", "navigation_state", "frame_outcome", "housekeeping")
     detections, state, outcome, housekeeping = (DICTIONARY.packet(name).base_length for name in names)
     assert data_octets(3, 10.0, 2) == 3 * (detections + 10 * 9 + 2 * (state + outcome) + housekeeping)
 
 
-def test_windows_conflict_where_they_overlap() -> None:
+def test_windows_conflict_where_they_overlap():
     mine = PlannedSpan(1, 100, 200, "draft")
     others = [
         PlannedSpan(2, 50, 101, "approved"), PlannedSpan(3, 200, 300, "approved"),
@@ -224,14 +224,14 @@ approved processed command_states=SENT, frames=9, received_after=True, lost=0, r
 
 
 @pytest.mark.parametrize("row", STATES.splitlines())
-def test_the_state_follows_from_the_facts(row: str) -> None:
+def test_the_state_follows_from_the_facts(row: str):
     decision, expected, facts = f"{row} ".split(" ", 2)
     state, reason = state_of(WindowEvidence(decision, **eval(f"dict({facts})")))
     assert state == expected
     assert (reason is not None) == (state == "failed" and decision == "approved")
 
 
-def test_a_window_that_failed_names_the_telecommand_and_its_failure() -> None:
+def test_a_window_that_failed_names_the_telecommand_and_its_failure():
     evidence = WindowEvidence("approved", command_states=("failed",), failure="insert_activity not accepted: busy")
     assert state_of(evidence)[1] == "a telecommand of it failed: insert_activity not accepted: busy"
 
@@ -249,7 +249,7 @@ def window(ephemeris_id: int | None = None) -> WindowEntry:
 
 def test_a_window_outside_the_ephemerides_has_no_prediction_and_is_refused_if_it_needs_one(
     ground: Ground, synthetic_pass: Any
-) -> None:
+):
     """It names the ephemeris, or its tables are made of one."""
     named = add_reference(ground, synthetic_pass.folder / "reference.oem")
     predicted = add_window(ground, window(), actor="ann").predicted
@@ -260,9 +260,7 @@ def test_a_window_outside_the_ephemerides_has_no_prediction_and_is_refused_if_it
         add_mission(ground, (MISSION + "[uploads]\n").encode())
 
 
-def test_an_ephemeris_that_gravity_does_not_move_is_refused_with_the_accelerations(
-    ground: Ground, tmp_path: Path
-) -> None:
+def test_an_ephemeris_that_gravity_does_not_move_is_refused_with_the_accelerations(ground: Ground, tmp_path: Path):
     (one,) = load_oem(save_circle(tmp_path / "km.oem")).segments
     metres = replace(one, position_m=1e3 * one.position_m, velocity_m_s=1e3 * one.velocity_m_s)
     save_oem(Ephemeris((metres,)), tmp_path / "m.oem")
@@ -272,9 +270,7 @@ def test_an_ephemeris_that_gravity_does_not_move_is_refused_with_the_acceleratio
     assert add_ephemeris(ground, ground.files.put_file(tmp_path / "km.oem"), name="km").states == 240
 
 
-def test_an_ephemeris_belongs_to_a_spacecraft_and_can_be_withdrawn(
-    ground: Ground, synthetic_pass: Any, tmp_path: Path
-) -> None:
+def test_an_ephemeris_belongs_to_a_spacecraft_and_can_be_withdrawn(ground: Ground, synthetic_pass: Any, tmp_path: Path):
     text = (synthetic_pass.folder / "reference.oem").read_text()
     (tmp_path / "other.oem").write_text(text.replace("OBJECT_NAME = SELENITA", "OBJECT_NAME = OTHER"))
     own = add_ephemeris(ground, ground.files.put_file(synthetic_pass.folder / "reference.oem"), name="own")

@@ -72,7 +72,7 @@ def receive(client: TestClient, packets: list[bytes]) -> None:
     assert client.post(f"{V1}/telemetry", content=encode_cadus(packets, spacecraft_id=76)).status_code == 202
 
 
-def test_windows_are_searched_over_the_uploaded_ephemeris(client: TestClient) -> None:
+def test_windows_are_searched_over_the_uploaded_ephemeris(client: TestClient):
     def search(asked: Any) -> Any:
         return client.post(f"{V1}/windows/search", json=asked)
 
@@ -97,7 +97,7 @@ def test_windows_are_searched_over_the_uploaded_ephemeris(client: TestClient) ->
         assert answer.status_code == 422, (refused, answer.text)
 
 
-def test_what_overlaps_a_committed_window_is_answered_with_409(client: TestClient) -> None:
+def test_what_overlaps_a_committed_window_is_answered_with_409(client: TestClient):
     first = approved(client, 0, 300)
     overlapping = window(client, 299, 500)
     assert overlapping.status_code == 409
@@ -110,7 +110,7 @@ def test_what_overlaps_a_committed_window_is_answered_with_409(client: TestClien
     assert window(client, 310, 300).status_code == 422
 
 
-def test_drafts_may_overlap_but_only_one_can_be_approved(client: TestClient) -> None:
+def test_drafts_may_overlap_but_only_one_can_be_approved(client: TestClient):
     keys = [window(client, 0, 300).json()["id"] for _ in range(2)]
     assert change(client, keys[0]).status_code == 200
     assert change(client, keys[1]).status_code == 409
@@ -118,7 +118,7 @@ def test_drafts_may_overlap_but_only_one_can_be_approved(client: TestClient) -> 
     assert client.patch(f"{V1}/windows/{keys[1]}", json={"cadence_s": 5}).status_code == 409
 
 
-def test_resources_that_do_not_suffice_are_a_conflict(client: TestClient) -> None:
+def test_resources_that_do_not_suffice_are_a_conflict(client: TestClient):
     for stated, expected in (
         ("storage_mib = 0.001", "octets would be stored on board"),
         ("battery_wh = 1.0\ngeneration_w = 0.0", "the battery would fall to"),
@@ -129,7 +129,7 @@ def test_resources_that_do_not_suffice_are_a_conflict(client: TestClient) -> Non
         assert refused.status_code == 409 and expected in refused.json()["detail"]
 
 
-def test_a_change_of_what_somebody_else_changed_is_refused(client: TestClient) -> None:
+def test_a_change_of_what_somebody_else_changed_is_refused(client: TestClient):
     made = window(client, 0, 300)
     tag = made.headers["etag"]
     path = f"{V1}/windows/{made.json()['id']}"
@@ -140,7 +140,7 @@ def test_a_change_of_what_somebody_else_changed_is_refused(client: TestClient) -
     assert client.get(path).status_code == 404
 
 
-def test_an_approved_window_becomes_time_tagged_telecommands(client: TestClient) -> None:
+def test_an_approved_window_becomes_time_tagged_telecommands(client: TestClient):
     key = approved(client, 60, 360, cadence_s=10)
     preview = client.get(f"{V1}/windows/{key}/telecommands").json()["items"]
     assert [one["name"] for one in preview] == ["enable_schedule", "perform_function", "perform_function"]
@@ -168,7 +168,7 @@ def test_an_approved_window_becomes_time_tagged_telecommands(client: TestClient)
     assert failed.json()["reason"] == "spacecraft in safe mode"
 
 
-def test_a_draft_or_a_failed_window_is_not_uplinked(client: TestClient) -> None:
+def test_a_draft_or_a_failed_window_is_not_uplinked(client: TestClient):
     key = window(client, 0, 300).json()["id"]
     assert uplink(client, key).status_code == 409
     before = approved(client, 400, 500)
@@ -206,7 +206,7 @@ def telemetry(frames: int = 5) -> list[bytes]:
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
-def test_the_state_follows_telemetry_in_whatever_order_it_comes(client: TestClient, order: tuple[int, ...]) -> None:
+def test_the_state_follows_telemetry_in_whatever_order_it_comes(client: TestClient, order: tuple[int, ...]):
     key = approved(client, 60, 120)
     sent(client, key)
     packets = telemetry()
@@ -234,7 +234,7 @@ def test_the_state_follows_telemetry_in_whatever_order_it_comes(client: TestClie
 )
 def test_a_window_without_images_fails_when_no_packet_of_its_time_may_come(
     client: TestClient, mission_time: Clock, received: tuple[int, int], last_s: int, expected: str
-) -> None:
+):
     key = approved(client, 1860, 1920)
     sent(client, key)
     mission_time.utc_ns = START + (1920 + last_s) * NS
@@ -243,14 +243,14 @@ def test_a_window_without_images_fails_when_no_packet_of_its_time_may_come(
     assert shown(client, key)["state"] == expected
 
 
-def test_a_window_with_a_value_of_another_kind_is_refused(client: TestClient) -> None:
+def test_a_window_with_a_value_of_another_kind_is_refused(client: TestClient):
     names = [("name", name) for name in ("two\nlines", "\x1b[2J", "nul\x00")]
     for field, value in (*names, ("cadence_s", True), ("spacecraft_id", True), ("spacecraft_id", 1024)):
         assert window(client, 0, 300, **{"name": "n", field: value}).status_code == 422, field
     assert client.get(f"{V1}/windows").json()["total"] == 0
 
 
-def test_of_two_decisions_the_second_is_told_the_state_that_won(client: TestClient) -> None:
+def test_of_two_decisions_the_second_is_told_the_state_that_won(client: TestClient):
     key = approved(client, 0, 300)
     assert change(client, key, "failed").status_code == 200
     answer = change(client, key)
@@ -258,7 +258,7 @@ def test_of_two_decisions_the_second_is_told_the_state_that_won(client: TestClie
     assert uplink(client, key).json()["state"] == "failed"
 
 
-def test_each_window_has_the_frames_that_its_event_reports_enclose(client: TestClient) -> None:
+def test_each_window_has_the_frames_that_its_event_reports_enclose(client: TestClient):
     """Adjacent windows, one that was interrupted and begun again, and one whose images were lost."""
     spans = ((60, 120), (120, 180), (200, 260), (270, 330))
     keys = [approved(client, *span, cadence_s=10) for span in spans]
@@ -287,7 +287,7 @@ def test_each_window_has_the_frames_that_its_event_reports_enclose(client: TestC
     assert counts == [(6, 0), (6, 0), (6, 0), (2, 4)]
 
 
-def test_an_observation_has_one_window_the_nearest_and_of_equal_ones_the_last() -> None:
+def test_an_observation_has_one_window_the_nearest_and_of_equal_ones_the_last():
     first, later, same = Planned(0, 100, 1), Planned(30, 130, 2), Planned(0, 100, 3)
     begun = Observation(30, 131, 130)
     assert not belongs_to(begun, first, [later], 60) and belongs_to(begun, later, [first], 60)

@@ -56,7 +56,7 @@ def loaded(activities: list[Any]) -> dict[int, bytes]:
     return found
 
 
-def test_the_tables_hold_the_reference_at_on_board_times(reference: Ephemeris) -> None:
+def test_the_tables_hold_the_reference_at_on_board_times(reference: Ephemeris):
     activities, state = prepared(reference)
     tables = loaded(activities)
     initial = unpack_initial_state(tables[9])
@@ -74,9 +74,7 @@ def test_the_tables_hold_the_reference_at_on_board_times(reference: Ephemeris) -
     assert orientation.ticks[0] < ticks_of(START) < ticks_of(STOP) < orientation.ticks[-1]
 
 
-def test_a_window_of_the_experiment_starts_from_the_stated_error_with_its_declared_accuracy(
-    reference: Ephemeris,
-) -> None:
+def test_a_window_of_the_experiment_starts_from_the_stated_error_with_its_declared_accuracy(reference: Ephemeris):
     made = [experiment_state(reference, 1_000.0, START + k * NS, 76) for k in range(400)]
     known = [reference.at(np.array([one.utc_ns])) for one in made]
     position = np.array([a.position_icrf_m - b[0][0] for a, b in zip(made, known, strict=True)])
@@ -98,7 +96,7 @@ def test_a_window_of_the_experiment_starts_from_the_stated_error_with_its_declar
 
 def test_standby_comes_first_then_the_tables_with_the_start_state_last_and_the_downlink_after_the_window(
     reference: Ephemeris,
-) -> None:
+):
     activities, _ = prepared(reference)
     times = [utc_ns for utc_ns, _, _ in activities]
     assert times == sorted(times)
@@ -109,12 +107,12 @@ def test_standby_comes_first_then_the_tables_with_the_start_state_last_and_the_d
     assert all(START - 60 * NS < utc_ns < START for utc_ns, _ in loads)
 
 
-def test_without_tables_only_the_mode_changes() -> None:
+def test_without_tables_only_the_mode_changes():
     activities, state = prepared(None, Uploads())
     assert [name for _, name, _ in activities] == ["perform_function"] * 2 and state is None
 
 
-def test_a_window_without_a_reference_that_covers_it_is_refused(reference: Ephemeris) -> None:
+def test_a_window_without_a_reference_that_covers_it_is_refused(reference: Ephemeris):
     for ephemeris, late in ((None, 0), (reference, 7_800 * NS)):
         with pytest.raises(Conflict, match="its tables need a reference ephemeris"):
             prepared(ephemeris, late=late)

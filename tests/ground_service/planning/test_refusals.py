@@ -79,7 +79,7 @@ def verified(ground: Ground, window: Window, after: int, outcome: str = "verific
     ]
 
 
-def test_a_window_that_has_begun_is_neither_entered_nor_approved_nor_released(either: Ground, now: Clock) -> None:
+def test_a_window_that_has_begun_is_neither_entered_nor_approved_nor_released(either: Ground, now: Clock):
     add_mission(either, MISSION)
     with pytest.raises(PlanConflicts, match="expected a start after the mission time 2029-08-07T06:00:00"):
         add(either, START)
@@ -94,7 +94,7 @@ def test_a_window_that_has_begun_is_neither_entered_nor_approved_nor_released(ei
         planning.uplink_window(either, window.id, actor="ann")
 
 
-def test_a_draft_whose_time_has_come_ends(either: Ground, now: Clock) -> None:
+def test_a_draft_whose_time_has_come_ends(either: Ground, now: Clock):
     add_mission(either, MISSION)
     window = add(either)
     scheduler = Scheduler(either, MagicMock(), lambda: None, {})
@@ -106,9 +106,7 @@ def test_a_draft_whose_time_has_come_ends(either: Ground, now: Clock) -> None:
     assert (ended.state, ended.reason) == ("failed", standing.NOT_APPROVED)
 
 
-def test_nothing_to_send_is_status_2_and_no_file(
-    ground: Ground, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nothing_to_send_is_status_2_and_no_file(ground: Ground, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     window = on_board(ground)
     out = tmp_path / "w.cltu"
     assert run(["plan", "uplink", str(window.id), "--home", str(ground.home), "--out", str(out)]) == 2
@@ -116,7 +114,7 @@ def test_nothing_to_send_is_status_2_and_no_file(
     assert not out.exists()
 
 
-def test_candidates_in_the_past_are_not_offered(ground: Ground, tmp_path: Path, now: Clock) -> None:
+def test_candidates_in_the_past_are_not_offered(ground: Ground, tmp_path: Path, now: Clock):
     add_reference(ground, save_circle(tmp_path / "a.oem"))
     now.utc_ns = START + 30 * MINUTE
     found = planning.search_windows(ground, WindowSearch())
@@ -126,7 +124,7 @@ def test_candidates_in_the_past_are_not_offered(ground: Ground, tmp_path: Path, 
         planning.search_windows(ground, WindowSearch())
 
 
-def test_a_spacecraft_without_a_description_is_not_planned(either: Ground, now: Clock) -> None:
+def test_a_spacecraft_without_a_description_is_not_planned(either: Ground, now: Clock):
     add_mission(either, MISSION)
     with pytest.raises(Conflict, match=r"spacecraft 77: .*states \(76\), found none"):
         add(either, spacecraft=77)
@@ -136,7 +134,7 @@ def test_a_spacecraft_without_a_description_is_not_planned(either: Ground, now: 
         get_forecast(either, spacecraft_id=77, instance="flight", start_utc_ns=START, stop_utc_ns=START + MINUTE)
 
 
-def test_a_window_on_board_is_cancelling_until_its_activities_are_deleted(either: Ground, now: Clock) -> None:
+def test_a_window_on_board_is_cancelling_until_its_activities_are_deleted(either: Ground, now: Clock):
     window = on_board(either)
     cancelled = decided(either, window, "failed")
     assert cancelled.state == "cancelling"
@@ -152,7 +150,7 @@ def test_a_window_on_board_is_cancelling_until_its_activities_are_deleted(either
     assert (ended.state, ended.reason) == ("failed", "it was cancelled, its activities were deleted on board")
 
 
-def test_a_cancelled_window_that_flies_all_the_same_becomes_a_pass_with_a_remark(either: Ground, now: Clock) -> None:
+def test_a_cancelled_window_that_flies_all_the_same_becomes_a_pass_with_a_remark(either: Ground, now: Clock):
     window = on_board(either)
     decided(either, window, "failed")
     take_uplink(either, spacecraft_id=76, actor="ann")
@@ -171,7 +169,7 @@ def test_a_cancelled_window_that_flies_all_the_same_becomes_a_pass_with_a_remark
     assert made.name == "w (it was flown although it was cancelled)"
 
 
-def test_a_window_that_has_begun_on_board_cannot_be_cancelled(either: Ground, now: Clock) -> None:
+def test_a_window_that_has_begun_on_board_cannot_be_cancelled(either: Ground, now: Clock):
     window = on_board(either)
     now.utc_ns += 61 * MINUTE
     for state in ("uplinked", "executing"):
@@ -189,9 +187,7 @@ def save_with_hole(path: Path) -> Path:
     return path
 
 
-def test_a_search_goes_around_a_hole_or_takes_the_ephemeris_that_has_none(
-    ground: Ground, tmp_path: Path, now: Clock
-) -> None:
+def test_a_search_goes_around_a_hole_or_takes_the_ephemeris_that_has_none(ground: Ground, tmp_path: Path, now: Clock):
     hole = add_reference(ground, save_with_hole(tmp_path / "hole.oem"))
     span = {"start": format_utc(START), "stop": format_utc(START + 239 * MINUTE)}
     asked = WindowSearch.model_validate(span)
@@ -205,7 +201,7 @@ def test_a_search_goes_around_a_hole_or_takes_the_ephemeris_that_has_none(
     assert planning.search_windows(ground, asked).ephemeris_id == whole
 
 
-def test_a_first_window_is_as_long_as_the_error_of_its_coast_requires() -> None:
+def test_a_first_window_is_as_long_as_the_error_of_its_coast_requires():
     """1,650 km s over the duration: 3 km need 550 s, and a longer stated duration stays."""
     assert WindowSearch(first_coast_m=3_000.0).constraints().minimum_duration_s == pytest.approx(550.0)
     assert WindowSearch(first_coast_m=1e6).constraints().minimum_duration_s == 300.0

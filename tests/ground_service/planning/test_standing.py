@@ -114,7 +114,7 @@ def change(ground: Ground, key: int, **changes: object) -> None:
     standing.change_request(ground, key, StandingRequestChange.model_validate(changes), actor="ann")
 
 
-def test_no_more_windows_are_planned_than_have_room_on_board(ground: Ground, now: Clock) -> None:
+def test_no_more_windows_are_planned_than_have_room_on_board(ground: Ground, now: Clock):
     prepare(ground, AUTOMATIC + LINKS + "\n[resources]\nwindows_on_board = 1\n")
     key = request(ground)
     assert plan(ground, now)["added"] == 1
@@ -124,7 +124,7 @@ def test_no_more_windows_are_planned_than_have_room_on_board(ground: Ground, now
     assert plan(ground, now)["added"] == 1
 
 
-def test_the_coming_days_are_filled_approved_and_released(either: Ground, now: Clock) -> None:
+def test_the_coming_days_are_filled_approved_and_released(either: Ground, now: Clock):
     prepare(either)
     key = request(either)
     done = plan(either, now)
@@ -144,7 +144,7 @@ def test_the_coming_days_are_filled_approved_and_released(either: Ground, now: C
     assert [e.payload["request_id"] for e in read_events(either.database, 0, 9999) if e.kind == "plan"] == [key]
 
 
-def test_doing_it_again_changes_nothing(either: Ground, now: Clock) -> None:
+def test_doing_it_again_changes_nothing(either: Ground, now: Clock):
     planned(either, now)
     first = windows_of(either)
     for later in (0, 600, 1200):
@@ -152,7 +152,7 @@ def test_doing_it_again_changes_nothing(either: Ground, now: Clock) -> None:
     assert windows_of(either) == first
 
 
-def test_a_request_is_planned_without_further_action(tmp_path: Path, oem: Path, now: Clock) -> None:
+def test_a_request_is_planned_without_further_action(tmp_path: Path, oem: Path, now: Clock):
     with open_ground(tmp_path / "home") as ground:
         add_reference(ground, oem)
         follow_in_process(ground)
@@ -162,7 +162,7 @@ def test_a_request_is_planned_without_further_action(tmp_path: Path, oem: Path, 
         assert sum(plan(ground, now).values()) == 0
 
 
-def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, now: Clock) -> None:
+def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, now: Clock):
     key = planned(either, now)
     first = windows_of(either)[0]
     now.utc_ns = first.start.utc_ns
@@ -178,7 +178,7 @@ def test_windows_that_found_no_contact_fail_and_are_replaced(either: Ground, now
 
 def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(
     either: Ground, now: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     planned(either, now)
     first = windows_of(either)[0]
     window = either.read(store.get_record, first.id)
@@ -194,7 +194,7 @@ def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(
     assert found[0].reason == "a telecommand of it failed"
 
 
-def test_windows_of_the_present_period_count_long_after_they_ended(ground: Ground, now: Clock) -> None:
+def test_windows_of_the_present_period_count_long_after_they_ended(ground: Ground, now: Clock):
     key = planned(ground, now, windows=1)
     (window,) = ground.read(store.windows_around, 1, now.utc_ns)
     assert ground.write(store.change_window, window, state="processed")
@@ -205,7 +205,7 @@ def test_windows_of_the_present_period_count_long_after_they_ended(ground: Groun
     assert standing.plan_tick(ground, later)["added"] >= 1  # that window belongs to an earlier period
 
 
-def test_without_automatic_approval_windows_wait_for_a_person_and_then_are_released(ground: Ground, now: Clock) -> None:
+def test_without_automatic_approval_windows_wait_for_a_person_and_then_are_released(ground: Ground, now: Clock):
     prepare(ground, LINKS)
     request(ground, windows=2)
     assert plan(ground, now) == {"failed": 0, "added": 2, "approved": 0, "released": 0}
@@ -218,7 +218,7 @@ def test_without_automatic_approval_windows_wait_for_a_person_and_then_are_relea
     assert ground.read(get_window, first.id).reason == standing.NOT_APPROVED
 
 
-def test_windows_need_a_contact_before_them(ground: Ground, now: Clock) -> None:
+def test_windows_need_a_contact_before_them(ground: Ground, now: Clock):
     closed = 'outages = ["2029-08-07T00:00:00Z/2029-08-07T18:00:00Z"]\nminimum_elevation_deg = 0.0\n'
     text = MISSION.format(extra=AUTOMATIC + LINKS).replace("minimum_elevation_deg = 0.0\n", closed)
     add_mission(ground, text.encode(), actor="ann")
@@ -231,7 +231,7 @@ def test_windows_need_a_contact_before_them(ground: Ground, now: Clock) -> None:
     assert planned and all(one.start.utc_ns > START + 12 * HOUR for one in planned)
 
 
-def test_the_duty_limit_of_the_mission_description_is_kept(ground: Ground, now: Clock) -> None:
+def test_the_duty_limit_of_the_mission_description_is_kept(ground: Ground, now: Clock):
     prepare(ground, AUTOMATIC + LINKS + "[resources]\nobserve_hours_per_day = 0.5\n")
     key = request(ground, windows=20, maximum_duration_s=900.0, minimum_duration_s=800.0)
     assert plan(ground, now)["added"] == 2
@@ -239,7 +239,7 @@ def test_the_duty_limit_of_the_mission_description_is_kept(ground: Ground, now: 
     assert "more than 0.5 h of observation within 24 h" in reasons
 
 
-def test_regions_and_the_end_of_the_ephemeris_bound_the_plan(ground: Ground, now: Clock) -> None:
+def test_regions_and_the_end_of_the_ephemeris_bound_the_plan(ground: Ground, now: Clock):
     prepare(ground)
     region = {"latitude_deg": {"min": -20.0, "max": 20.0}}
     key = request(ground, windows=5, horizon_days=10.0, regions=[region], minimum_duration_s=60.0)
@@ -257,7 +257,7 @@ UPLOADS = "[uploads]\ntables = []\n"
 ONE_PERSON = AUTOMATIC + 'one_person_for = ["perform_function/set_mode"]\n'
 
 
-def test_sequences_of_windows_do_not_overlap(ground: Ground, now: Clock) -> None:
+def test_sequences_of_windows_do_not_overlap(ground: Ground, now: Clock):
     planned(ground, now, ONE_PERSON + LINKS + UPLOADS, windows=9, minimum_duration_s=200.0, maximum_duration_s=400.0)
     windows = windows_of(ground)
     between = [(b.start.utc_ns - a.stop.utc_ns) / NS for a, b in pairwise(windows)]
@@ -265,7 +265,7 @@ def test_sequences_of_windows_do_not_overlap(ground: Ground, now: Clock) -> None
     assert len(windows) == 9 and min(between) == 81.0
 
 
-def test_a_window_that_cannot_be_released_states_the_reason(ground: Ground, now: Clock) -> None:
+def test_a_window_that_cannot_be_released_states_the_reason(ground: Ground, now: Clock):
     planned(ground, now, LINKS + UPLOADS, windows=1)
     (window,) = windows_of(ground)
     planning.change_window(ground, window.id, actor=standing.PLANNER, changes={}, decision="approved")
@@ -275,7 +275,7 @@ def test_a_window_that_cannot_be_released_states_the_reason(ground: Ground, now:
     )
 
 
-def test_windows_keep_the_limits_of_images(ground: Ground, now: Clock) -> None:
+def test_windows_keep_the_limits_of_images(ground: Ground, now: Clock):
     planned(
         ground,
         now,
@@ -298,14 +298,14 @@ def test_windows_keep_the_limits_of_images(ground: Ground, now: Clock) -> None:
         planning.add_window(ground, entry, actor="ann")
 
 
-def test_without_an_ephemeris_the_plan_says_so(ground: Ground, now: Clock) -> None:
+def test_without_an_ephemeris_the_plan_says_so(ground: Ground, now: Clock):
     now.utc_ns += 9 * 24 * HOUR
     key = planned(ground, now, AUTOMATIC)
     made = ground.read(get_plan, key)
     assert (windows_of(ground), made.reason) == ([], "no reference ephemeris covers the coming days")
 
 
-def test_paused_and_deleted_requests_are_not_planned(ground: Ground, now: Clock) -> None:
+def test_paused_and_deleted_requests_are_not_planned(ground: Ground, now: Clock):
     prepare(ground)
     key = request(ground)
     change(ground, key, state="paused")
@@ -318,16 +318,14 @@ def test_paused_and_deleted_requests_are_not_planned(ground: Ground, now: Clock)
         ground.read(get_request, key)
 
 
-def test_contradictory_terms_are_refused(ground: Ground) -> None:
+def test_contradictory_terms_are_refused(ground: Ground):
     with pytest.raises(InvalidInput, match="minimum_duration_s: expected at most maximum_duration_s"):
         request(ground, minimum_duration_s=900.0, maximum_duration_s=600.0)
     with pytest.raises(InvalidInput, match="stop: expected a time after the start"):
         request(ground, start="2029-08-07T00:00:00Z", stop="2029-08-06T00:00:00Z")
 
 
-def test_processes_that_plan_at_the_same_time_make_one_plan(
-    migrated_postgres, oem: Path, tmp_path: Path, now: Clock
-) -> None:
+def test_processes_that_plan_at_the_same_time_make_one_plan(migrated_postgres, oem: Path, tmp_path: Path, now: Clock):
     url = migrated_postgres()
     grounds = [open_ground(tmp_path / "home", database_url=url) for _ in range(4)]
     prepare(grounds[0])

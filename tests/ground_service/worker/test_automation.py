@@ -156,7 +156,7 @@ def processed(ground: Ground, window_id: int) -> int:
     return window.pass_id
 
 
-def test_a_live_pass_is_complete_and_processed_without_a_request(either: Ground, flown: SyntheticPass) -> None:
+def test_a_live_pass_is_complete_and_processed_without_a_request(either: Ground, flown: SyntheticPass):
     window_id = followed(either, flown)
     pass_id = processed(either, window_id)
     report, after = follow_up(either)
@@ -178,7 +178,7 @@ def test_a_live_pass_is_complete_and_processed_without_a_request(either: Ground,
 
 def test_an_incomplete_window_is_processed_after_the_contact_and_late_data_change_its_report(
     either: Ground, flown: SyntheticPass
-) -> None:
+):
     window_id = prepared(either, flown)
     lost = slice(20, 26)
     receive(either, flown.packets[: lost.start] + flown.packets[lost.stop :])
@@ -201,7 +201,7 @@ def test_an_incomplete_window_is_processed_after_the_contact_and_late_data_chang
     assert done_steps(either)[3:] == ["archive of pass 1"]
 
 
-def test_a_reference_that_arrives_after_the_report_completes_it(either: Ground, flown: SyntheticPass) -> None:
+def test_a_reference_that_arrives_after_the_report_completes_it(either: Ground, flown: SyntheticPass):
     window_id = followed(either, flown, reference=False)
     pass_id = processed(either, window_id)
     reasons = report_of(either, pass_id)["not_available"]
@@ -218,7 +218,7 @@ def test_a_reference_that_arrives_after_the_report_completes_it(either: Ground, 
 
 def test_a_mission_without_a_camera_is_processed_and_its_report_says_what_that_means(
     ground: Ground, flown: SyntheticPass
-) -> None:
+):
     before, _, rest = MISSION.partition("[camera]")
     window_id = followed(ground, flown, mission=before + "[catalogue]" + rest.partition("[catalogue]")[2])
     pass_id = processed(ground, window_id)
@@ -229,7 +229,7 @@ def test_a_mission_without_a_camera_is_processed_and_its_report_says_what_that_m
     assert made.result["report of pass 1"]["inputs"]["missing"]["camera"].startswith(said)
 
 
-def test_an_event_that_is_followed_again_has_one_result(ground: Ground, flown: SyntheticPass) -> None:
+def test_an_event_that_is_followed_again_has_one_result(ground: Ground, flown: SyntheticPass):
     followed(ground, flown)
     for job in follow_up(ground):
         again = actions.run_steps(ground, job.arguments["event"])
@@ -240,7 +240,7 @@ def test_an_event_that_is_followed_again_has_one_result(ground: Ground, flown: S
 
 def test_a_follow_up_that_a_process_left_is_done_by_the_next(
     tmp_path: Path, flown: SyntheticPass, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     def full(*_: Any, **__: Any) -> Any:
         raise StorageFull("disk")
 
@@ -261,7 +261,7 @@ def test_a_follow_up_that_a_process_left_is_done_by_the_next(
 
 def test_a_report_that_failed_is_stated_at_its_window_and_made_later(
     either: Ground, flown: SyntheticPass, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     def broken(*_: Any, **__: Any) -> Any:
         raise InvalidInput("report", "", "a renderer", "none")
 
@@ -282,7 +282,7 @@ def test_a_report_that_failed_is_stated_at_its_window_and_made_later(
     assert {one.state for one in follow_up(either)} == {"done"}
 
 
-def test_an_unfinished_job_of_a_rule_of_an_earlier_version_ends_without_work(ground: Ground) -> None:
+def test_an_unfinished_job_of_a_rule_of_an_earlier_version_ends_without_work(ground: Ground):
     ground.write(publish, RegressionJudged(id="1" * 32, verdict="fail"))
     for kind in ("automation", "notification"):
         done = run_job(ground, enter_job(ground, kind, {"event": 1}))
@@ -294,7 +294,7 @@ def test_an_unfinished_job_of_a_rule_of_an_earlier_version_ends_without_work(gro
 @pytest.mark.parametrize("evaluate", [False, None])
 def test_an_imported_archive_is_kept_once_unless_the_mission_evaluates_nothing(
     ground: Ground, flown: SyntheticPass, evaluate: bool | None
-) -> None:
+):
     stated = "" if evaluate is None else "[automation]\nevaluate = false\n"
     add_mission(ground, f'name = "m"\n[spacecraft]\nid = {SPACECRAFT}\n{stated}'.encode())
     pass_id = import_archive(ground, flown.folder)
@@ -302,19 +302,19 @@ def test_an_imported_archive_is_kept_once_unless_the_mission_evaluates_nothing(
     assert done_steps(ground) == ([] if evaluate is False else [f"archive of pass {pass_id}"])
 
 
-def test_a_mission_that_evaluates_nothing_leaves_its_windows_to_persons(ground: Ground, flown: SyntheticPass) -> None:
+def test_a_mission_that_evaluates_nothing_leaves_its_windows_to_persons(ground: Ground, flown: SyntheticPass):
     window_id = followed(ground, flown, "[automation]\nevaluate = false\n")
     assert follow_up(ground) == [] and ground.read(get_window, window_id).state == "downlinked"
 
 
-def test_the_catalogue_of_a_live_pass_is_cut_to_its_track(ground: Ground, flown: SyntheticPass) -> None:
+def test_the_catalogue_of_a_live_pass_is_cut_to_its_track(ground: Ground, flown: SyntheticPass):
     window_id = followed(ground, flown)
     whole = evaluation.evaluate(ground, processed(ground, window_id))
     assert whole.detector is not None
     assert any("synthetic craters" in one for one in whole.data_sources)
 
 
-def test_a_mission_without_an_available_catalogue_is_refused_with_the_reason(ground: Ground) -> None:
+def test_a_mission_without_an_available_catalogue_is_refused_with_the_reason(ground: Ground):
     missing = parse_mission(f'name = "m"\n[catalogue]\nsha256 = "{"0" * 64}"\n')
     with pytest.raises(InvalidInput, match=r"m, catalogue.sha256: expected a catalogue that the ground holds"):
         catalogue_of(ground, missing)
@@ -324,7 +324,7 @@ def test_a_mission_without_an_available_catalogue_is_refused_with_the_reason(gro
         catalogue_of(ground, parse_mission('name = "m"\n'))
 
 
-def test_only_a_crater_catalogue_is_held(ground: Ground, flown: SyntheticPass) -> None:
+def test_only_a_crater_catalogue_is_held(ground: Ground, flown: SyntheticPass):
     with pytest.raises(InvalidInput, match="crater catalogue"):
         add_catalogue(ground, ground.files.put_octets(b"a,b\n1,2\n"), "x.csv")
     for _ in range(2):
@@ -333,7 +333,7 @@ def test_only_a_crater_catalogue_is_held(ground: Ground, flown: SyntheticPass) -
     assert held.name == "craters.csv"
 
 
-def test_a_worker_that_only_reads_events_enters_no_job_twice(tmp_path: Path, flown: SyntheticPass) -> None:
+def test_a_worker_that_only_reads_events_enters_no_job_twice(tmp_path: Path, flown: SyntheticPass):
     with open_ground(tmp_path / "home") as ground:
         jobs = []
         follow = FollowUp(ground, start=jobs.append)
@@ -344,7 +344,7 @@ def test_a_worker_that_only_reads_events_enters_no_job_twice(tmp_path: Path, flo
         assert jobs == ground.read(unfinished_jobs) == [one.id for one in follow_up(ground)] != []
 
 
-def test_a_processed_pass_is_searched_for_landmarks(either: Ground, flown: SyntheticPass, tmp_path: Path) -> None:
+def test_a_processed_pass_is_searched_for_landmarks(either: Ground, flown: SyntheticPass, tmp_path: Path):
     full = load_catalogue(flown.folder / "catalogue.csv")
     thin = SyntheticPass(tmp_path / "thin", flown.packets, flown.utc_ns, flown.expected, flown.missed)
     shutil.copytree(flown.folder, thin.folder)

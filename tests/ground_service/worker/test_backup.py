@@ -58,7 +58,7 @@ def saved(filled: tuple[Ground, str], tmp_path: Path) -> Iterator[Path]:
     yield tmp_path / "saved"
 
 
-def test_everything_comes_back(filled: tuple[Ground, str], saved: Path, tmp_path: Path) -> None:
+def test_everything_comes_back(filled: tuple[Ground, str], saved: Path, tmp_path: Path):
     ground, token = filled
     with open_ground(tmp_path / "again") as other:
         restore(saved, other)
@@ -70,7 +70,7 @@ def test_everything_comes_back(filled: tuple[Ground, str], saved: Path, tmp_path
             restore(saved, other)
 
 
-def test_a_backup_overwrites_nothing(filled: tuple[Ground, str], saved: Path) -> None:
+def test_a_backup_overwrites_nothing(filled: tuple[Ground, str], saved: Path):
     before = (saved / "linna.db").read_bytes()
     with pytest.raises(Conflict, match="expected a folder that is new or empty"):
         backup(filled[0], saved, now_utc_ns=START)
@@ -78,7 +78,7 @@ def test_a_backup_overwrites_nothing(filled: tuple[Ground, str], saved: Path) ->
 
 
 @pytest.mark.parametrize("file", [0, -1])
-def test_a_damaged_file_is_found_before_anything_is_restored(saved: Path, tmp_path: Path, file: int) -> None:
+def test_a_damaged_file_is_found_before_anything_is_restored(saved: Path, tmp_path: Path, file: int):
     damaged = sorted(path for path in (saved / "files").rglob("*") if path.is_file())[file]
     damaged.chmod(0o644)
     damaged.write_bytes(b"x" + damaged.read_bytes())
@@ -102,7 +102,7 @@ UPDATE audit_head SET number = 2 | audit_head: expected the rows that were saved
 
 
 @pytest.mark.parametrize("row", CHANGES.splitlines())
-def test_a_changed_row_of_a_backup_is_not_restored(saved: Path, tmp_path: Path, row: str) -> None:
+def test_a_changed_row_of_a_backup_is_not_restored(saved: Path, tmp_path: Path, row: str):
     statement, reason = row.split(" | ")
     with sqlite3.connect(saved / "linna.db") as connection:
         connection.execute(statement)
@@ -113,16 +113,14 @@ def test_a_changed_row_of_a_backup_is_not_restored(saved: Path, tmp_path: Path, 
         assert rows_of_an_empty_service(other)
 
 
-def test_a_restore_that_is_refused_makes_no_database(
-    saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_restore_that_is_refused_makes_no_database(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     next(path for path in (saved / "files").rglob("*") if path.is_file()).write_bytes(b"changed")
     assert cli.run(["db", "restore", str(saved), "--home", str(tmp_path / "new")]) == 2
     assert "expected octets with SHA-256" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
-def test_a_changed_list_of_a_backup_is_not_believed(saved: Path, tmp_path: Path) -> None:
+def test_a_changed_list_of_a_backup_is_not_believed(saved: Path, tmp_path: Path):
     manifest = json.loads((saved / "backup.json").read_text())
     assert manifest["audit_head"]["number"] == manifest["rows"]["audit"] == 5
     for changes, reason in (
@@ -138,7 +136,7 @@ def test_a_changed_list_of_a_backup_is_not_believed(saved: Path, tmp_path: Path)
         restore(tmp_path, other)
 
 
-def test_a_backup_of_version_1_0_is_restored(tmp_path: Path) -> None:
+def test_a_backup_of_version_1_0_is_restored(tmp_path: Path):
     """It has tables that are gone now; digests are those of its own columns."""
     saved = tmp_path / "saved"
     saved.mkdir()

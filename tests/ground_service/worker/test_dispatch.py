@@ -56,7 +56,7 @@ def enter(ground: Ground, downlink: Path) -> str:
 @pytest.mark.usefixtures("small_windows")
 def test_an_ingest_is_broken_off_when_the_service_stops_and_goes_on_at_the_next_start(
     downlink: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     with open_ground(tmp_path / "whole") as ground:
         ingest_file(ground, downlink)
         expected = hash_of(ground)
@@ -97,7 +97,7 @@ def test_an_ingest_is_broken_off_when_the_service_stops_and_goes_on_at_the_next_
 
 def test_a_job_that_the_disk_stops_is_held_back_longer_each_time(
     downlink: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     clock = [0.0]
     tried = []
 
@@ -125,7 +125,7 @@ def test_a_job_that_the_disk_stops_is_held_back_longer_each_time(
         assert row_of(ground, job)["state"] in ("done", "queued")
 
 
-def test_a_job_is_done_once_the_disk_has_space(downlink: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_job_is_done_once_the_disk_has_space(downlink: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     with open_ground(tmp_path) as ground:
         job = enter(ground, downlink)
         dispatcher = ThreadDispatcher(ground)
@@ -143,7 +143,7 @@ def test_a_job_is_done_once_the_disk_has_space(downlink: Path, tmp_path: Path, m
 
 def test_replays_are_separate_jobs_and_the_verdict_follows(
     redis_url: str, make_flyable: Callable, make_build: Callable, tmp_path: Path
-) -> None:
+):
     flown = {f"synthetic pass {seed}": make_flyable(frames=10, seed=seed) for seed in (61, 62)}
     packets = {name: one.packets for name, one in flown.items()}
     home = tmp_path / "home"
@@ -185,7 +185,7 @@ def ingest(ground: Ground, octets: bytes, **stated: Any) -> None:
     "stated",
     [{"spacecraft_id": SPACECRAFT}, {"spacecraft_id": SPACECRAFT, "place": Place("s", 100)}, {"instance": "twin"}],
 )
-def test_what_was_stated_with_a_downlink_holds_for_its_verification(ground: Ground, stated: dict[str, Any]) -> None:
+def test_what_was_stated_with_a_downlink_holds_for_its_verification(ground: Ground, stated: dict[str, Any]):
     """A spacecraft filter excludes the same packets; pieces with a position are joined by position."""
     octets = stream_of() + stream_of(SPACECRAFT + 1)
     place = stated.pop("place", None)
@@ -204,7 +204,7 @@ def test_what_was_stated_with_a_downlink_holds_for_its_verification(ground: Grou
         ("DELETE FROM rollups WHERE level = 6", "expected this row, found none"),
     ],
 )
-def test_a_damaged_row_is_named(either: Ground, damage: str, reason: str) -> None:
+def test_a_damaged_row_is_named(either: Ground, damage: str, reason: str):
     values = {field.name: 1 for field in DICTIONARY.packet("housekeeping").fields}
     packet = DICTIONARY.pack("housekeeping", values, ticks=1 << 16, sequence_count=0)
     ingest(either, encode_cadus([packet], spacecraft_id=SPACECRAFT))
@@ -215,7 +215,7 @@ def test_a_damaged_row_is_named(either: Ground, damage: str, reason: str) -> Non
     assert verify(either).damaged == []
 
 
-def test_an_ingest_before_version_1_has_no_piece(either: Ground) -> None:
+def test_an_ingest_before_version_1_has_no_piece(either: Ground):
     """The spacecraft of the ingest selects the frames."""
     ingest(either, stream_of() + stream_of(SPACECRAFT + 1), spacecraft_id=SPACECRAFT)
     with either.database.writing() as connection:
@@ -223,7 +223,7 @@ def test_an_ingest_before_version_1_has_no_piece(either: Ground) -> None:
     assert verify(either, rebuild=True).damaged == []
 
 
-def test_sums_of_roll_ups_may_differ_by_the_order_of_addition(ground: Ground) -> None:
+def test_sums_of_roll_ups_may_differ_by_the_order_of_addition(ground: Ground):
     row = np.array([3.0, 0.6, 0.1, 0.3, 0.0, 0.0, np.inf, -np.inf])
     for index, change, same in ((1, 1e-16, True), (1, 1e-6, False), (3, 1e-16, False), (0, 1.0, False)):
         other = row.copy()
@@ -232,7 +232,7 @@ def test_sums_of_roll_ups_may_differ_by_the_order_of_addition(ground: Ground) ->
         assert same_values(ROLLUPS, *pair) == same
 
 
-def test_a_rebuild_writes_nothing_to_the_archive(either: Ground) -> None:
+def test_a_rebuild_writes_nothing_to_the_archive(either: Ground):
     ingest(either, stream_of())
     with either.database.snapshot() as connection:
         before = table_digests(connection)

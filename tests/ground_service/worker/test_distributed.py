@@ -56,7 +56,7 @@ def ground_on_postgres(upgraded: str, tmp_path_factory: pytest.TempPathFactory) 
         yield ground
 
 
-def test_the_archive_is_the_same_as_on_sqlite(ground_on_postgres: Ground, ground: Ground, synthetic_pass: Any) -> None:
+def test_the_archive_is_the_same_as_on_sqlite(ground_on_postgres: Ground, ground: Ground, synthetic_pass: Any):
     stream = synthetic_pass.folder / "downlink.cadu"
     hashes = []
     for one in (ground, ground_on_postgres):
@@ -70,7 +70,7 @@ def test_the_archive_is_the_same_as_on_sqlite(ground_on_postgres: Ground, ground
 
 def test_a_worker_makes_the_report(
     ground_on_postgres: Ground, redis_url: str, upgraded: str, synthetic_pass: Any, tmp_path: Path
-) -> None:
+):
     """The worker is another process; a job entered while it is away is done when it comes."""
     ground = ground_on_postgres
     settings = Settings(home=ground.home, database_url=upgraded, broker_url=redis_url)
@@ -101,7 +101,7 @@ def test_a_worker_makes_the_report(
     assert report["summary"]["packets"] == pass_summary(ground, pass_id)["packets"]
 
 
-def test_time_outs_are_found_on_a_server_as_well(ground_on_postgres: Ground) -> None:
+def test_time_outs_are_found_on_a_server_as_well(ground_on_postgres: Ground):
     ground = ground_on_postgres
     command = enter_command(ground, "test_connection", {}, spacecraft_id=SPACECRAFT, timeout_s=7, actor="ann")
     release_command(ground, command, actor="ann")
@@ -113,13 +113,13 @@ def test_time_outs_are_found_on_a_server_as_well(ground_on_postgres: Ground) -> 
     assert note_timeouts(ground, 10**18, 10**18 + 7 * 10**9 + 1) == [command]
 
 
-def test_a_worker_without_a_broker_is_refused(tmp_path: Path) -> None:
+def test_a_worker_without_a_broker_is_refused(tmp_path: Path):
     for use in (run_worker, worker_answers):
         with pytest.raises(SettingsError, match="LINNA_BROKER_URL: expected a broker"):
             use(Settings(home=tmp_path))
 
 
-def test_jobs_that_the_broker_lost_are_sent_again(ground_on_postgres: Ground, redis_url: str, upgraded: str) -> None:
+def test_jobs_that_the_broker_lost_are_sent_again(ground_on_postgres: Ground, redis_url: str, upgraded: str):
     """The queue is emptied as if the broker had been killed; a job that somebody is doing is left to him."""
     import redis
 
@@ -150,7 +150,7 @@ def use_queue(monkeypatch: pytest.MonkeyPatch, **answer: Any) -> None:
     monkeypatch.setattr(app_module, "_app_of", lambda _: SimpleNamespace(connection_for_read=lambda: connection))
 
 
-def test_messages_of_other_programs_in_the_queue_are_no_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_of_other_programs_in_the_queue_are_no_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     messages = [b'{"headers": {"linna-job": "a1"}}', b"{}", b'{"headers": {}}', b"[1]", b"nothing"]
     use_queue(monkeypatch, return_value=messages)
     assert queued_jobs(Settings(home=tmp_path)) == ["a1"]
@@ -158,7 +158,7 @@ def test_messages_of_other_programs_in_the_queue_are_no_jobs(tmp_path: Path, mon
 
 def test_a_broker_that_breaks_off_is_a_broker_that_is_away(
     ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     import redis
 
     log = MagicMock()
@@ -170,7 +170,7 @@ def test_a_broker_that_breaks_off_is_a_broker_that_is_away(
     assert text % error == "the broker is away: reset by peer"
 
 
-def test_a_broker_that_is_away_refuses_nothing(ground: Ground, tmp_path: Path) -> None:
+def test_a_broker_that_is_away_refuses_nothing(ground: Ground, tmp_path: Path):
     settings = Settings(home=tmp_path, broker_url="redis://127.0.0.1:1/0")
     dispatcher = dispatcher_for(ground, settings)
     job = dispatcher.submit("report", {"pass_id": 1})
@@ -178,7 +178,7 @@ def test_a_broker_that_is_away_refuses_nothing(ground: Ground, tmp_path: Path) -
     assert job_row(ground, job)["state"] == "queued"
 
 
-def test_two_files_that_are_ingested_at_once_are_joined(ground_on_postgres: Ground, synthetic_pass: Any) -> None:
+def test_two_files_that_are_ingested_at_once_are_joined(ground_on_postgres: Ground, synthetic_pass: Any):
     """The packets that the cut between them goes through belong to neither, and come to light in any order."""
     octets = (synthetic_pass.folder / "downlink.cadu").read_bytes()
     cadu = 1279

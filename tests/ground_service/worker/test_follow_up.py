@@ -75,7 +75,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> Recorded:
     return Recorded(monkeypatch)
 
 
-def test_an_event_exists_only_if_its_change_was_committed(either: Ground) -> None:
+def test_an_event_exists_only_if_its_change_was_committed(either: Ground):
     with pytest.raises(RuntimeError), either.database.writing() as connection:
         publish(connection, command())
         raise RuntimeError
@@ -84,7 +84,7 @@ def test_an_event_exists_only_if_its_change_was_committed(either: Ground) -> Non
         either.read(publish, command())
 
 
-def test_numbers_have_no_gaps_and_follow_the_order_of_commits(either: Ground) -> None:
+def test_numbers_have_no_gaps_and_follow_the_order_of_commits(either: Ground):
     def write(seed: int) -> None:
         for k in range(10):
             if (seed + k) % 3 == 0:
@@ -101,7 +101,7 @@ def test_numbers_have_no_gaps_and_follow_the_order_of_commits(either: Ground) ->
         assert [event.payload["k"] for event in found if event.payload["seed"] == seed] == list(range(10))
 
 
-def test_equal_work_of_several_events_is_done_once_and_in_order(ground: Ground, recorded: Recorded) -> None:
+def test_equal_work_of_several_events_is_done_once_and_in_order(ground: Ground, recorded: Recorded):
     with ground.database.listeners.held():
         for vehicle in (7, 5, 7):
             say(ground, TelemetryReceived(vehicle_id=vehicle, packets=1))
@@ -113,14 +113,14 @@ def test_equal_work_of_several_events_is_done_once_and_in_order(ground: Ground, 
     assert position(ground) == 3
 
 
-def test_work_of_a_failed_block_is_still_done(ground: Ground, recorded: Recorded) -> None:
+def test_work_of_a_failed_block_is_still_done(ground: Ground, recorded: Recorded):
     with pytest.raises(RuntimeError), ground.database.listeners.held():
         say(ground, command(3))
         raise RuntimeError
     assert recorded.done == [("advance windows", 3)]
 
 
-def test_events_of_a_process_that_ended_are_handled_by_the_next(tmp_path: Path, recorded: Recorded) -> None:
+def test_events_of_a_process_that_ended_are_handled_by_the_next(tmp_path: Path, recorded: Recorded):
     with open_ground(tmp_path) as ground:  # ends between the commit and the follow-up work
         say(ground, command(3))
     assert recorded.done == []
@@ -131,7 +131,7 @@ def test_events_of_a_process_that_ended_are_handled_by_the_next(tmp_path: Path, 
         assert recorded.done == [("advance windows", 3)]
 
 
-def test_work_that_meets_a_passing_error_is_repeated(ground: Ground, recorded: Recorded) -> None:
+def test_work_that_meets_a_passing_error_is_repeated(ground: Ground, recorded: Recorded):
     recorded.error = StorageFull("disk")
     say(ground, command(3))
     assert (recorded.done, position(ground)) == ([], 0)
@@ -141,9 +141,7 @@ def test_work_that_meets_a_passing_error_is_repeated(ground: Ground, recorded: R
     assert FollowUpFailed.event_kind not in kinds(ground)
 
 
-def test_work_that_fails_is_reported_with_its_events_and_does_not_stop_others(
-    ground: Ground, recorded: Recorded
-) -> None:
+def test_work_that_fails_is_reported_with_its_events_and_does_not_stop_others(ground: Ground, recorded: Recorded):
     recorded.error = ValueError("broken")
     say(ground, command(3))
     recorded.error = None
@@ -153,7 +151,7 @@ def test_work_that_fails_is_reported_with_its_events_and_does_not_stop_others(
     assert failed.payload == {"work": "advance windows 3", "events": [1], "error": "ValueError: broken"}
 
 
-def test_an_event_that_cannot_be_read_does_not_stop_others(ground: Ground, recorded: Recorded) -> None:
+def test_an_event_that_cannot_be_read_does_not_stop_others(ground: Ground, recorded: Recorded):
     with ground.database.writing() as connection:
         log.publish(connection, CommandsSent.event_kind, {"vehicle": "?"})
         publish(connection, command(4))
@@ -163,7 +161,7 @@ def test_an_event_that_cannot_be_read_does_not_stop_others(ground: Ground, recor
 
 def test_several_processes_handle_each_event_once(
     migrated_postgres: Callable[[], str], recorded: Recorded, tmp_path: Path
-) -> None:
+):
     url = migrated_postgres()
     grounds = [open_ground(tmp_path / f"{k}", database_url=url) for k in range(3)]
     for ground in grounds:
@@ -184,7 +182,7 @@ def test_several_processes_handle_each_event_once(
 
 def test_a_service_starts_while_another_process_handles_a_backlog(
     migrated_postgres: Callable[[], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     def waits(_seconds: float) -> None:
         raise AssertionError("the start waits for another process")
 
@@ -198,7 +196,7 @@ def test_a_service_starts_while_another_process_handles_a_backlog(
             assert position(other) == 0
 
 
-def test_old_events_are_deleted_only_after_they_were_handled(ground: Ground, recorded: Recorded) -> None:
+def test_old_events_are_deleted_only_after_they_were_handled(ground: Ground, recorded: Recorded):
     say(ground, command())
     recorded.error = StorageFull("disk")
     say(ground, command(2), command(3))
@@ -233,9 +231,7 @@ def reports_of(ground: Ground, pass_id: int) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: int(row["created_utc_ns"]))
 
 
-def test_late_data_make_a_report_with_the_changed_figures_and_their_event(
-    either: Ground, halves: tuple[Path, Path]
-) -> None:
+def test_late_data_make_a_report_with_the_changed_figures_and_their_event(either: Ground, halves: tuple[Path, Path]):
     pass_id = reported_pass(either, halves[0])
     assert len(reports_of(either, pass_id)) == 1
     ingest_file(either, halves[1], spacecraft_id=SPACECRAFT)
@@ -254,13 +250,13 @@ def test_late_data_make_a_report_with_the_changed_figures_and_their_event(
     assert [e.payload.get("event") for e in made] == [None, again["event_number"]]
 
 
-def test_the_same_data_again_make_no_report(ground: Ground, halves: tuple[Path, Path]) -> None:
+def test_the_same_data_again_make_no_report(ground: Ground, halves: tuple[Path, Path]):
     pass_id = reported_pass(ground, halves[0])
     ingest_file(ground, halves[0], spacecraft_id=SPACECRAFT)
     assert len(reports_of(ground, pass_id)) == 1 and jobs_of(ground, "re-evaluation") == []
 
 
-def test_an_event_that_changes_nothing_of_a_pass_makes_no_report(ground: Ground, halves: tuple[Path, Path]) -> None:
+def test_an_event_that_changes_nothing_of_a_pass_makes_no_report(ground: Ground, halves: tuple[Path, Path]):
     pass_id = reported_pass(ground, halves[0])
     vehicle = ground.read(repository.get, repository.PASSES, pass_id, "pass")["vehicle_id"]
     # Telemetry of another time does not evaluate the pass again.
@@ -272,7 +268,7 @@ def test_an_event_that_changes_nothing_of_a_pass_makes_no_report(ground: Ground,
     assert len(reports_of(ground, pass_id)) == 1
 
 
-def test_a_re_evaluation_that_waits_already_is_not_added_again(tmp_path: Path, halves: tuple[Path, Path]) -> None:
+def test_a_re_evaluation_that_waits_already_is_not_added_again(tmp_path: Path, halves: tuple[Path, Path]):
     with open_ground(tmp_path) as ground:
         follow = FollowUp(ground, start=lambda _job: None)
         pass_id = reported_pass(ground, halves[0])
@@ -285,7 +281,7 @@ def test_a_re_evaluation_that_waits_already_is_not_added_again(tmp_path: Path, h
         assert len(reports_of(ground, pass_id)) == 1
 
 
-def test_changed_figures_of_nested_summaries() -> None:
+def test_changed_figures_of_nested_summaries():
     before = {"a": 1, "b": {"c": 2.0, "d": None}, "e": [1, 2]}
     after = {"a": 1, "b": {"c": 3.0, "d": None}, "e": [1, 3], "f": "new"}
     changes = ("b.c", 2.0, 3.0), ("e", [1, 2], [1, 3]), ("f", None, "new")

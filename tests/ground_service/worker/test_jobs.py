@@ -55,7 +55,7 @@ MISSING = FileNotFoundError(errno.ENOENT, "No such file or directory", "/srv/lin
 )  # fmt: skip
 def test_whatever_error_a_job_meets_it_ends_as_failed_and_is_not_repeated(
     ground: Ground, job_that: Any, error: Exception, shown: str
-) -> None:
+):
     work = Mock(side_effect=error)
     job = job_that(work)
     for _ in range(3):
@@ -64,9 +64,7 @@ def test_whatever_error_a_job_meets_it_ends_as_failed_and_is_not_repeated(
     assert ground.read(unfinished_jobs) == []
 
 
-def test_a_failed_ingest_is_repeated_with_longer_and_longer_waits(
-    either: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_ingest_is_repeated_with_longer_and_longer_waits(either: Ground, monkeypatch: pytest.MonkeyPatch):
     """What was acknowledged is done when its cause is gone, at most 85 minutes later without anybody."""
     work, waits_min = Mock(side_effect=[*[FileNotFoundError("gone")] * 5, {}]), (1, 4, 16, 64)
     monkeypatch.setitem(jobs.WORK, "ingest", work)
@@ -86,7 +84,7 @@ def test_a_failed_ingest_is_repeated_with_longer_and_longer_waits(
     assert (row_of(either, job)["state"], row_of(either, other)["attempts"]) == ("done", 1)
 
 
-def test_a_failed_job_is_repeated_by_one_action(ground: Ground, job_that: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_job_is_repeated_by_one_action(ground: Ground, job_that: Any, monkeypatch: pytest.MonkeyPatch):
     job = job_that(lambda *_: {}["missing"])
     assert run_job(ground, job).state == "failed"
     monkeypatch.setitem(jobs.WORK, "nightly", lambda *_: {"repeated": True})
@@ -99,7 +97,7 @@ def test_a_failed_job_is_repeated_by_one_action(ground: Ground, job_that: Any, m
             client.delete_job(job)
 
 
-def test_a_failed_ingest_is_dismissed(ground: Ground, job_that: Any) -> None:
+def test_a_failed_ingest_is_dismissed(ground: Ground, job_that: Any):
     job = job_that(lambda *_: {}["missing"])
     run_job(ground, job)
     with local_client(ground, "ann") as client:
@@ -110,14 +108,14 @@ def test_a_failed_ingest_is_dismissed(ground: Ground, job_that: Any) -> None:
 
 def test_the_traceback_of_an_unexpected_error_is_in_the_log(
     ground: Ground, job_that: Any, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     job = job_that(lambda *_: {}["missing"])
     run_job(ground, job)
     [record] = [one for one in caplog.records if one.levelname == "ERROR"]
     assert record.exc_info is not None and job in record.getMessage()
 
 
-def test_a_full_disk_is_no_fault_of_the_job(ground: Ground, job_that: Any) -> None:
+def test_a_full_disk_is_no_fault_of_the_job(ground: Ground, job_that: Any):
     job = job_that(Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
     with pytest.raises(StorageFull):
         run_job(ground, job)
@@ -125,12 +123,12 @@ def test_a_full_disk_is_no_fault_of_the_job(ground: Ground, job_that: Any) -> No
     assert (row["state"], row["attempts"]) == ("queued", 0)
 
 
-def test_a_result_that_the_database_cannot_hold_fails_the_job(ground: Ground, job_that: Any) -> None:
+def test_a_result_that_the_database_cannot_hold_fails_the_job(ground: Ground, job_that: Any):
     row = run_job(ground, job_that(lambda *_: {"median": float("nan")}))
     assert row.state == "failed" and "JSON" in row.error
 
 
-def test_an_attempt_that_another_has_overtaken_changes_nothing(ground: Ground, job_that: Any) -> None:
+def test_an_attempt_that_another_has_overtaken_changes_nothing(ground: Ground, job_that: Any):
     """This occurs after a network failure, if the database grants the lock of the first worker to a second one."""
 
     def work(_ground: Ground, _arguments: Any, job_id: str) -> Row:
@@ -141,7 +139,7 @@ def test_an_attempt_that_another_has_overtaken_changes_nothing(ground: Ground, j
     assert (row.state, row.attempts, row.result) == ("running", 2, None)
 
 
-def test_an_id_that_stands_for_another_request_is_refused(ground: Ground) -> None:
+def test_an_id_that_stands_for_another_request_is_refused(ground: Ground):
     enter_job(ground, "report", {"pass_id": 1}, job_id="a" * 32)
     assert enter_job(ground, "report", {"pass_id": 1}, job_id="a" * 32) == "a" * 32
     for kind, arguments in (("report", {"pass_id": 2}), ("nightly", {})):
@@ -149,7 +147,7 @@ def test_an_id_that_stands_for_another_request_is_refused(ground: Ground) -> Non
             ground.write(add_job, kind, arguments, job_id="a" * 32)
 
 
-def test_an_ingest_asked_for_twice_is_one_and_of_another_file_is_refused(ground: Ground) -> None:
+def test_an_ingest_asked_for_twice_is_one_and_of_another_file_is_refused(ground: Ground):
     one, other = (ground.files.put_octets(octets) for octets in (b"one", b"other"))
     given = {"spacecraft_id": 76, "instance": "flight", "job_id": "b" * 32}
     first = enter_ingest(ground, one, "one", **given)
@@ -170,9 +168,9 @@ def test_an_ingest_asked_for_twice_is_one_and_of_another_file_is_refused(ground:
         (InvalidInput("x", "", "a number from 0/1 to 3", "and/or"), "x: expected a number from 0/1 to 3, found and/or"),
     ],
 )  # fmt: skip
-def test_what_is_shown_of_an_error_is_one_line_without_places_of_the_server(error: Exception, shown: str) -> None:
+def test_what_is_shown_of_an_error_is_one_line_without_places_of_the_server(error: Exception, shown: str):
     assert public_text(error) == shown
 
 
-def test_a_long_error_is_cut() -> None:
+def test_a_long_error_is_cut():
     assert len(public_text(ValueError("x" * 9000))) == 500

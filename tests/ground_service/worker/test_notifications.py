@@ -153,7 +153,7 @@ def mailbox() -> Iterator[Mailbox]:
         yield receiver
 
 
-def test_a_webhook_gets_a_signed_document_with_its_id(webhook: Webhook, tmp_path: Path) -> None:
+def test_a_webhook_gets_a_signed_document_with_its_id(webhook: Webhook, tmp_path: Path):
     (tmp_path / "secrets").mkdir()
     (tmp_path / "secrets" / "hook").write_text("key\n")
     channel = Channel(webhook=webhook.url, signing_secret="hook")
@@ -166,33 +166,33 @@ def test_a_webhook_gets_a_signed_document_with_its_id(webhook: Webhook, tmp_path
     )
 
 
-def test_a_webhook_that_is_out_of_order_is_tried_again_with_the_same_id(webhook: Webhook, tmp_path: Path) -> None:
+def test_a_webhook_that_is_out_of_order_is_tried_again_with_the_same_id(webhook: Webhook, tmp_path: Path):
     webhook.statuses = [503, 500]
     assert send(tmp_path, Channel(webhook=webhook.url), "id-2") == ATTEMPTS
     assert {headers["Idempotency-Key"] for headers, _ in webhook.received} == {"id-2"}
 
 
-def test_a_refused_message_is_not_tried_again(webhook: Webhook, tmp_path: Path) -> None:
+def test_a_refused_message_is_not_tried_again(webhook: Webhook, tmp_path: Path):
     webhook.statuses = [404]
     with pytest.raises(NotDelivered, match="status 404"):
         send(tmp_path, Channel(webhook=webhook.url))
     assert len(webhook.received) == 1
 
 
-def test_a_receiver_that_is_away_is_named_after_all_attempts(tmp_path: Path) -> None:
+def test_a_receiver_that_is_away_is_named_after_all_attempts(tmp_path: Path):
     waited = []
     with pytest.raises(NotDelivered, match=f"not delivered in {ATTEMPTS} attempts: ConnectError"):
         send(tmp_path, Channel(webhook="http://127.0.0.1:9/"), wait=waited.append)
     assert waited == [1.0, 2.0]
 
 
-def test_a_missing_key_is_stated(tmp_path: Path) -> None:
+def test_a_missing_key_is_stated(tmp_path: Path):
     channel = Channel(webhook="http://127.0.0.1:9/", signing_secret="hook")
     with pytest.raises(InvalidInput, match="signing_secret, hook: expected a file in secrets of the service"):
         send(tmp_path, channel)
 
 
-def test_an_e_mail_reaches_all_recipients(mailbox: Mailbox, tmp_path: Path) -> None:
+def test_an_e_mail_reaches_all_recipients(mailbox: Mailbox, tmp_path: Path):
     channel = Channel(email=("a@b.example", "c@d.example"), smtp=mailbox.address, sender="ground@x.example")
     assert send(tmp_path, channel, "id-3", {"event": 3, "pass": None}) == 1
     [(recipients, message)] = mailbox.received
@@ -201,7 +201,7 @@ def test_an_e_mail_reaches_all_recipients(mailbox: Mailbox, tmp_path: Path) -> N
     assert "event: 3" in message and "pass" not in message.partition("\r\n\r\n")[2]
 
 
-def test_a_mail_server_that_refuses_every_recipient_is_stated(mailbox: Mailbox, tmp_path: Path) -> None:
+def test_a_mail_server_that_refuses_every_recipient_is_stated(mailbox: Mailbox, tmp_path: Path):
     mailbox.refusal = "550 unknown"
     channel = Channel(email=("a@b.example",), smtp=mailbox.address)
     with pytest.raises(NotDelivered, match="SMTPRecipientsRefused"):
@@ -218,7 +218,7 @@ def local(tmp_path: Path) -> Iterator[Ground]:
 @pytest.mark.parametrize("offers_tls", [False, True])
 def test_a_public_mail_server_needs_tls_with_its_certificate(
     mailbox: Mailbox, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, offers_tls: bool
-) -> None:
+):
     """What is sent to the internet is neither readable on the way nor given to another server."""
     if offers_tls:
         environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(tmp_path)}
@@ -251,7 +251,7 @@ class DrippingMail(Dripping):
 
 
 @pytest.mark.parametrize("handler", [Dripping, DrippingMail])
-def test_a_receiver_that_drips_is_left_after_the_deadline(handler: type[Dripping], tmp_path: Path) -> None:
+def test_a_receiver_that_drips_is_left_after_the_deadline(handler: type[Dripping], tmp_path: Path):
     with running(socketserver.ThreadingTCPServer(("127.0.0.1", 0), handler)) as place:
         mail = Channel(email=("a@b.example",), smtp=place)
         channel = Channel(webhook=f"http://{place}/") if handler is Dripping else mail
@@ -259,7 +259,7 @@ def test_a_receiver_that_drips_is_left_after_the_deadline(handler: type[Dripping
             send(tmp_path, channel, deadline_s=0.3)
 
 
-def test_the_body_of_an_answer_is_not_read(tmp_path: Path) -> None:
+def test_the_body_of_an_answer_is_not_read(tmp_path: Path):
     sent = 0
 
     class Endless(socketserver.StreamRequestHandler):
@@ -279,19 +279,19 @@ def test_the_body_of_an_answer_is_not_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "host", ["127.0.0.1", "localhost", "::1", "::ffff:10.0.0.1", "10.1.2.3", "169.254.169.254", "0.0.0.0", "224.0.0.1"]
 )
-def test_an_address_that_is_not_public_is_refused(host: str) -> None:
+def test_an_address_that_is_not_public_is_refused(host: str):
     with pytest.raises(NotDelivered, match="expected a public address or one of LINNA_NOTIFY_NETWORKS"):
         permitted_address(host, 80, ())
 
 
-def test_a_public_address_and_a_listed_network_are_permitted() -> None:
+def test_a_public_address_and_a_listed_network_are_permitted():
     assert permitted_address("1.1.1.1", 443, ()) == "1.1.1.1"
     assert permitted_address("10.1.2.3", 443, (ip_network("10.0.0.0/8"),)) == "10.1.2.3"
 
 
 def test_one_private_address_of_several_refuses_a_name_and_the_checked_address_is_used(
     webhook: Webhook, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     """A name server could answer the second question with another address."""
     asked = []
     answers = [["1.1.1.1", "10.0.0.1"], ["127.0.0.1"]]
@@ -311,7 +311,7 @@ def test_one_private_address_of_several_refuses_a_name_and_the_checked_address_i
     assert asked == ["ops.example"] * 2 and webhook.received[0][0]["Host"].startswith("ops.example:")
 
 
-def test_the_networks_are_a_setting(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_networks_are_a_setting(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("LINNA_NOTIFY_NETWORKS", "127.0.0.1, 10.0.0.0/8")
     assert load_settings().notify_networks == ("127.0.0.1", "10.0.0.0/8")
     monkeypatch.delenv("LINNA_NOTIFY_NETWORKS")
@@ -329,7 +329,7 @@ def add_channels(ground: Ground, webhook: Webhook, mailbox: Mailbox) -> None:
 
 def test_signed_heads_that_a_webhook_and_an_e_mail_got_are_checked(
     webhook: Webhook, mailbox: Mailbox, local: Ground, tmp_path: Path
-) -> None:
+):
     add_channels(local, webhook, mailbox)
     (local.home / "secrets").mkdir()
     (local.home / "secrets/audit").write_text("key")
@@ -350,9 +350,7 @@ def notifications(ground: Ground) -> list[Job]:
     return list(ground.read(list_jobs, JobFilter(kind="notification")).items)
 
 
-def test_every_receiver_is_notified_also_if_another_one_fails(
-    webhook: Webhook, mailbox: Mailbox, local: Ground
-) -> None:
+def test_every_receiver_is_notified_also_if_another_one_fails(webhook: Webhook, mailbox: Mailbox, local: Ground):
     follow_in_process(local)
     add_channels(local, webhook, mailbox)
     local.write(publish, RegressionJudged(id="1" * 32, verdict="fail"))
@@ -398,7 +396,7 @@ def raised(vehicle: int = 1, state: str = "raised") -> Event:
 )  # fmt: skip
 def test_receivers_get_the_events_of_their_spacecraft_that_a_person_needs(
     webhook: Webhook, local: Ground, monkeypatch: pytest.MonkeyPatch, event: Event, texts: list[str]
-) -> None:
+):
     follow_in_process(local)
     add_hook(local, webhook)
     with local.database.writing() as connection:
@@ -415,7 +413,7 @@ def test_receivers_get_the_events_of_their_spacecraft_that_a_person_needs(
     assert [json.loads(body)["text"] for _, body in webhook.received] == texts
 
 
-def test_a_slow_receiver_does_not_hold_up_other_jobs(local: Ground, webhook: Webhook) -> None:
+def test_a_slow_receiver_does_not_hold_up_other_jobs(local: Ground, webhook: Webhook):
     """The embedded service does notifications in a thread of their own."""
     held = threading.Event()
     webhook.answered = lambda: held.wait(60.0)

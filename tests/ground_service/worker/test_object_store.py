@@ -90,7 +90,7 @@ def test_upload_report_and_regression_on_hosts_without_a_common_folder(
     make_flyable: Callable[..., Any],
     make_build: Callable[..., Path],
     tmp_path: Path,
-) -> None:
+):
     common = {"database_url": migrated_postgres(), "broker_url": redis_url}
     environment = {f"LINNA_{name.upper()}": value for name, value in common.items()} | server.environment()
     environment["LINNA_ALLOW_DATABASE_OWNER"] = "true"
@@ -130,7 +130,7 @@ def test_upload_report_and_regression_on_hosts_without_a_common_folder(
 
 def test_an_upload_is_refused_while_the_store_is_away_and_accepted_afterwards(
     server: ObjectServer, synthetic_pass: Any, tmp_path: Path
-) -> None:
+):
     octets = (synthetic_pass.folder / "downlink.cadu").read_bytes()
     settings = Settings(home=tmp_path / "home", **server.settings())
     with TestClient(create_app(settings, inline_jobs=True), headers=OWN) as client:
@@ -153,7 +153,7 @@ def test_an_upload_is_refused_while_the_store_is_away_and_accepted_afterwards(
 
 def test_a_job_without_the_store_waits_and_loses_nothing(
     server: ObjectServer, opened: Callable[..., Ground], synthetic_pass: Any, tmp_path: Path
-) -> None:
+):
     """The store goes away between the acknowledgement and the work, on a host that has no copy."""
     first = opened("first")
     url = f"sqlite:///{tmp_path / 'first' / 'linna.db'}"
@@ -173,7 +173,7 @@ def test_a_job_without_the_store_waits_and_loses_nothing(
 
 def test_an_import_that_loses_the_store_half_way_is_repeated(
     server: ObjectServer, opened: Callable[..., Ground], synthetic_pass: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+):
     ground = opened("home")
     put, calls = type(server.store()).put, []
 
@@ -194,7 +194,7 @@ def test_an_import_that_loses_the_store_half_way_is_repeated(
 
 def test_integrity_check_reads_the_store_and_not_the_cache(
     server: ObjectServer, opened: Callable[..., Ground], synthetic_pass: Any
-) -> None:
+):
     ground = opened("home")
     ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
     store = server.store().under("files")
@@ -219,7 +219,7 @@ def test_integrity_check_reads_the_store_and_not_the_cache(
 
 def test_a_backup_of_an_object_store_is_restored_into_another(
     opened: Callable[..., Ground], synthetic_pass: Any, make_build: Callable[..., Path], tmp_path: Path
-) -> None:
+):
     """Also the way to move a service from folders into an object store."""
     ground = opened("home")
     pass_id = import_archive(ground, synthetic_pass.folder)
@@ -238,7 +238,7 @@ def test_a_backup_of_an_object_store_is_restored_into_another(
 
 def test_a_build_keeps_its_programs_on_another_host(
     opened: Callable[..., Ground], make_build: Callable[..., Path], tmp_path: Path
-) -> None:
+):
     file = make_build("runs", {"a": [b"packet"]})
     (file.parent / "fly.py").chmod(0o755)
     first = opened("first")
@@ -252,7 +252,7 @@ def test_a_build_keeps_its_programs_on_another_host(
 
 def test_files_of_an_archive_that_is_let_go_leave_the_store(
     opened: Callable[..., Ground], make_flyable: Callable[..., Any]
-) -> None:
+):
     ground = opened("home")
     archive = keep_archive(ground, make_flyable(frames=4, seed=81).folder)
     kept = keep_archive(ground, make_flyable(frames=4, seed=82).folder, pinned=True)

@@ -46,7 +46,7 @@ def changed(settings: Settings, **fields: Any) -> Settings:
     return Settings(**settings.model_dump() | fields)
 
 
-def test_a_process_is_known_while_it_runs(opened: Ground, settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_is_known_while_it_runs(opened: Ground, settings: Settings, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(condition, "BEAT_S", 0.05)
     assert not running_processes(opened.database)
     with present(opened, settings, "worker"):
@@ -75,9 +75,7 @@ def test_a_process_is_known_while_it_runs(opened: Ground, settings: Settings, mo
         ({"retention_days": 7}, "settings"),
     ],
 )
-def test_a_start_with_disagreeing_peers_fails(
-    opened: Ground, settings: Settings, change: dict[str, Any], group: str
-) -> None:
+def test_a_start_with_disagreeing_peers_fails(opened: Ground, settings: Settings, change: dict[str, Any], group: str):
     """An upload acknowledged by one process must not be invisible to the other."""
     other = changed(settings, **change)
     with present(opened, settings, "api"):
@@ -89,7 +87,7 @@ def test_a_start_with_disagreeing_peers_fails(
         assert len(running_processes(opened.database)) == 1
 
 
-def test_another_home_folder_and_other_data_are_noticed(opened: Ground, settings: Settings, tmp_path: Path) -> None:
+def test_another_home_folder_and_other_data_are_noticed(opened: Ground, settings: Settings, tmp_path: Path):
     mine = statement_of(opened, settings)
     (tmp_path / "elsewhere").mkdir()
     other = replace(opened, home=tmp_path / "elsewhere")
@@ -110,7 +108,7 @@ def faults(ground: Ground, settings: Settings) -> dict[str, str]:
 
 def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
     opened: Ground, settings: Settings, redis_url: str, synthetic_pass: Any, tmp_path: Path
-) -> None:
+):
     given = changed(settings, broker_url=redis_url)
     ingest_file(opened, synthetic_pass.folder / "downlink.cadu")
     with opened.database.writing() as connection:
@@ -172,7 +170,7 @@ def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
 
 def test_the_command_has_an_exit_status_and_json(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+):
     monkeypatch.setenv("LINNA_HOME", str(tmp_path / "home"))
     assert cli.run(["doctor", "--json"]) == 1
     told = json.loads(capsys.readouterr().out)
@@ -180,7 +178,7 @@ def test_the_command_has_an_exit_status_and_json(
     assert [one["name"] for one in told["checks"] if not one["ok"]] == ["recurring work"]
 
 
-def test_the_statement_fits_into_its_column() -> None:
+def test_the_statement_fits_into_its_column():
     digests = tuple("f" * condition.DIGITS for _ in condition.GROUPS)
     text = condition.Statement("10.10.10.dev1000", digests, -86_400_000, "yes").text()
     assert len(text) <= 96 and condition.Statement.of_text(text).digests == digests

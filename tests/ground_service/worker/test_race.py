@@ -12,7 +12,7 @@ from benchmarks.campaigns.race import FAULTS, Answer, Tally, holds, run, table
 @pytest.mark.campaign
 def test_of_contradicting_requests_to_two_processes_one_wins_and_all_others_are_told_so(
     new_postgres_database: Callable[[], str], tmp_path: Path
-) -> None:
+):
     figures = run(tmp_path, new_postgres_database(), races=60, seed=3)
     assert {name: figures[name] for name in FAULTS} == dict.fromkeys(FAULTS, 0), figures["examples"]
     assert holds(figures)
@@ -24,7 +24,7 @@ def test_of_contradicting_requests_to_two_processes_one_wins_and_all_others_are_
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_any_fault_fails_the_campaign_and_is_in_its_table(name: str) -> None:
+def test_any_fault_fails_the_campaign_and_is_in_its_table(name: str):
     figures = {one: int(one == name) for one in FAULTS}
     assert not holds(figures)
     text = table({**figures, "kinds": {}, "seconds": 1, "examples": ["what happened"]})
@@ -32,7 +32,7 @@ def test_any_fault_fails_the_campaign_and_is_in_its_table(name: str) -> None:
     assert "what happened" in text
 
 
-def test_answers_are_counted() -> None:
+def test_answers_are_counted():
     tally = Tally()
     told, untold = b'{"state": "released"}', b"{}"
     tally.add("release", [Answer("release", 200, told), Answer("release", 409, told), Answer("reject", 409, untold)])

@@ -128,7 +128,7 @@ def archive_all(ground: Ground) -> None:
     wait_for(is_archived, f"{segment} in the archive")
 
 
-def test_a_recovery_without_its_conditions_is_refused(server: Server) -> None:
+def test_a_recovery_without_its_conditions_is_refused(server: Server):
     server.base_backup()
     before = (datetime.now(UTC) - timedelta(hours=1)).strftime("%Y-%m-%d %H:%M:%S+00")
     refused = server.script("restore-to.sh", str(server.folder / "new"), before, check=False)
@@ -137,7 +137,7 @@ def test_a_recovery_without_its_conditions_is_refused(server: Server) -> None:
     assert refused.returncode == 2 and "expected an empty folder" in refused.stderr
 
 
-def test_old_base_backups_go_with_the_log_that_only_they_need(server: Server) -> None:
+def test_old_base_backups_go_with_the_log_that_only_they_need(server: Server):
     made = [Path(server.base_backup()) for _ in range(3)]
     assert sorted(path.name for path in (server.wal / "base").iterdir()) == [one.name for one in made[1:]]
     (first,) = re.findall(r"\(file (\w+)\)", (made[1] / "backup_label").read_text().splitlines()[0])
@@ -145,7 +145,7 @@ def test_old_base_backups_go_with_the_log_that_only_they_need(server: Server) ->
     assert all(name >= first for name in kept)
 
 
-def test_a_segment_that_differs_from_the_archived_one_is_not_overwritten(tmp_path: Path) -> None:
+def test_a_segment_that_differs_from_the_archived_one_is_not_overwritten(tmp_path: Path):
     (tmp_path / "one").write_bytes(b"1")
     (tmp_path / "two").write_bytes(b"2")
     (tmp_path / "wal").mkdir()
@@ -160,7 +160,7 @@ def test_a_segment_that_differs_from_the_archived_one_is_not_overwritten(tmp_pat
     assert [path.name for path in (tmp_path / "wal").iterdir()] == ["0001"]
 
 
-def test_the_database_is_restored_to_a_chosen_second(server: Server, tmp_path: Path) -> None:
+def test_the_database_is_restored_to_a_chosen_second(server: Server, tmp_path: Path):
     prepare_database(server.url, upgrade=True).engine.dispose()
     with open_ground(tmp_path / "home", database_url=server.url) as ground:
         users.add_user(ground, "in-the-backup", "viewer")

@@ -50,7 +50,7 @@ def by_day(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scheduling, "utc_now_ns", lambda: parse_utc("2029-08-07T00:10:00Z"))
 
 
-def test_one_of_two_works_until_its_lease_ends(either: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_of_two_works_until_its_lease_ends(either: Ground, monkeypatch: pytest.MonkeyPatch):
     (first, work_1), (second, work_2) = make(either), make(either)
     now = [parse_utc("2029-08-07T00:00:00Z")]
     monkeypatch.setattr(leases, "database_now_ns", lambda connection: now[0])
@@ -65,7 +65,7 @@ def test_one_of_two_works_until_its_lease_ends(either: Ground, monkeypatch: pyte
     assert (work_1.resumed, work_2.resumed) == (2, 1)
 
 
-def test_a_lease_of_a_clock_that_was_ahead_is_ended(either: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lease_of_a_clock_that_was_ahead_is_ended(either: Ground, monkeypatch: pytest.MonkeyPatch):
     (first, _), (second, _) = make(either), make(either)
     now = [parse_utc("2031-08-07T00:00:00Z")]
     monkeypatch.setattr(leases, "database_now_ns", lambda connection: now[0])
@@ -75,7 +75,7 @@ def test_a_lease_of_a_clock_that_was_ahead_is_ended(either: Ground, monkeypatch:
     assert second.tick() and has_scheduler(either) and not first.tick()
 
 
-def test_a_process_that_stops_gives_its_lease_back(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_stops_gives_its_lease_back(ground: Ground, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(scheduling, "TICK_S", 0.01)
     (first, work), (second, _) = make(ground), make(ground)
     first.start()
@@ -85,7 +85,7 @@ def test_a_process_that_stops_gives_its_lease_back(ground: Ground, monkeypatch: 
     assert second.tick()
 
 
-def test_a_lease_is_not_given_back_by_somebody_else(either: Ground) -> None:
+def test_a_lease_is_not_given_back_by_somebody_else(either: Ground):
     with either.database.writing() as connection:
         assert leases.acquire(connection, "x", "ann", LEASE_NS)
         leases.release(connection, "x", "ben")
@@ -94,9 +94,7 @@ def test_a_lease_is_not_given_back_by_somebody_else(either: Ground) -> None:
         assert leases.acquire(connection, "y", "ben", LEASE_NS)
 
 
-def test_the_nightly_job_is_entered_once_after_half_past_midnight(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_nightly_job_is_entered_once_after_half_past_midnight(ground: Ground, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(scheduling, "CATCH_UP_S", -1.0)
     one, work = make(ground)
     midnight = parse_utc("2029-08-07T00:00:00Z")
@@ -108,7 +106,7 @@ def test_the_nightly_job_is_entered_once_after_half_past_midnight(
     assert work.submitted == [nightly_job_id(midnight), nightly_job_id(midnight + DAY_NS)]
 
 
-def test_each_night_a_placebo_takes_kept_archives_by_turns(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_night_a_placebo_takes_kept_archives_by_turns(ground: Ground, monkeypatch: pytest.MonkeyPatch):
     kept = [MagicMock(digest=f"{k}" * 64, state=COMPLETE if k else TELEMETRY_ONLY) for k in range(5)]
     monkeypatch.setattr(jobs, "kept_archives", lambda ground: kept)
     chosen = []
@@ -130,9 +128,7 @@ def test_each_night_a_placebo_takes_kept_archives_by_turns(ground: Ground, monke
 
 
 @pytest.mark.parametrize("hourly", [False, True])
-def test_without_the_hourly_plan_only_events_plan(
-    ground: Ground, hourly: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_the_hourly_plan_only_events_plan(ground: Ground, hourly: bool, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
     begin, (one, work) = parse_utc("2029-08-07T05:00:00Z"), make(ground, plan_hourly=hourly)
     monkeypatch.setattr(scheduling, "mission_now_ns", lambda: begin)
@@ -140,7 +136,7 @@ def test_without_the_hourly_plan_only_events_plan(
     assert (plan_job_id(begin) in work.submitted) == hourly
 
 
-def test_the_plan_is_entered_once_an_hour_of_mission_time(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_plan_is_entered_once_an_hour_of_mission_time(ground: Ground, monkeypatch: pytest.MonkeyPatch):
     one, work = make(ground)
     monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
     begin = parse_utc("2029-08-07T05:00:00Z")
@@ -155,7 +151,7 @@ def test_the_plan_is_entered_once_an_hour_of_mission_time(ground: Ground, monkey
 @pytest.mark.parametrize("error", [StorageFull("database"), ConnectionError("refused")])
 def test_one_part_of_the_work_that_fails_does_not_stop_the_others(
     ground: Ground, error: Exception, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+):
     one, work = make(ground)
     monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
     work.resume = Mock(side_effect=error)
@@ -165,7 +161,7 @@ def test_one_part_of_the_work_that_fails_does_not_stop_the_others(
     ]
 
 
-def test_a_night_that_was_missed_is_made_up_for_after_a_while(ground: Ground, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_night_that_was_missed_is_made_up_for_after_a_while(ground: Ground, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(scheduling, "utc_now_ns", lambda: parse_utc("2029-08-07T12:00:00Z"))
     one, work = make(ground)
     one.tick()
@@ -179,7 +175,7 @@ def test_a_night_that_was_missed_is_made_up_for_after_a_while(ground: Ground, mo
 
 def test_the_command_has_the_lease_until_it_is_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+):
     home = tmp_path / "home"
     monkeypatch.setenv("LINNA_HOME", str(home))
     with open_ground(home) as ground:
@@ -225,7 +221,7 @@ PROCESS = """
 
 def test_processes_on_postgresql_have_the_lease_one_after_the_other(
     migrated_postgres: Callable[[], str], tmp_path: Path
-) -> None:
+):
     """The one with the lease is killed, twice; each next one begins after the end of the lease before."""
     url, lines, lease_ns = migrated_postgres(), tmp_path / "lines", 700_000_000
     command = [sys.executable, "-c", textwrap.dedent(PROCESS), str(tmp_path / "home"), url, str(lines)]
