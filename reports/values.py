@@ -9,12 +9,12 @@ field is ``None`` or empty its section says that it is not available, with the r
 A report reads no clock: the same value gives the same octets.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Gt, Interval
 from numpy.typing import NDArray
 
 from reports.arrays import BoolArray, FloatArray, IntArray
@@ -24,6 +24,50 @@ ByteArray = NDArray[np.uint8]
 ODOMETRY_OUTCOMES = ("anchored", "multi", "single", "predicted", "missed", "rejected")
 FIX_OUTCOMES = ("fixed", "coasted", "refused", "no_image")
 RESET_TRIGGERS = ("none", "initialization", "time_gap", "manual_step", "safety_timeout")
+
+Positive = Annotated[float, Gt(0.0)]
+NotNegative = Annotated[float, Ge(0.0)]
+Percent = Annotated[float, Interval(ge=0.0, le=100.0)]
+Share = Annotated[float, Interval(ge=0.0, le=1.0)]
+Estimator = Literal["paper", "spherical", "anchored"]
+
+
+@dataclass(frozen=True, slots=True)
+class Requirements:
+    """Limits of the verdict; a requirement without a limit is shown without judgement.
+
+    Attributes
+    ----------
+    estimator
+        Name of the estimator whose accuracy is judged.
+    better_than
+        Names of baselines whose median error must be larger than that of the estimator.
+    consistency_inside_percent
+        Share of the passes of a consistent filter whose mean NEES or NIS is inside the bounds for the number of its
+        independent draws. A mean above the upper bound is a failure.
+    """
+
+    estimator: Estimator | None = None
+    median_error_m: Positive | None = None
+    p95_error_m: Positive | None = None
+    better_than: tuple[str, ...] | None = None
+    consistency_inside_percent: Percent | None = None
+    packets_percent: Percent | None = None
+    frames_percent: Percent | None = None
+    images_percent: Percent | None = None
+    recall: Share | None = None
+    precision: Share | None = None
+    anchor_reads: NotNegative | None = None
+    resets: NotNegative | None = None
+    cpu_percent: Percent | None = None
+    memory_mib: Positive | None = None
+    storage_percent: Percent | None = None
+    temperature_max_c: float | None = None
+    temperature_min_c: float | None = None
+    convergence_s: Positive | None = None
+    drift_percent: Positive | None = None
+    offset_px: Positive | None = None
+    clock_step_s: Positive | None = None
 
 
 @dataclass(frozen=True, slots=True)
