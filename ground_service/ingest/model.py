@@ -1,7 +1,5 @@
 """Entities of ingests."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from pydantic import ConfigDict, Field

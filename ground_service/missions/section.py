@@ -1,7 +1,5 @@
 """Base class of the sections of a mission description."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler

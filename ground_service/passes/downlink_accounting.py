@@ -11,8 +11,6 @@ could have been made, the number of whole wraps is chosen nearest to what the us
 back while time goes on is a restart and begins a new run.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields

@@ -4,8 +4,6 @@ Missing packets follow from sequence counts and from the planned frames. Frames 
 with on-board times in the pass (`passes.downlink_accounting`); other passes of the spacecraft have no influence.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 from collections.abc import Hashable

@@ -1,7 +1,5 @@
 """`linna catalogue register`: the shift from the craters of a list to the rims on a terrain, by place."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`linna detector detect` and `linna detector evaluate --coco`: single pictures and labelled sets of them."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from pathlib import Path

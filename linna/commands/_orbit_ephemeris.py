@@ -1,7 +1,5 @@
 """`linna orbit compare`, `interpolate` and `convert`: what is done with ephemeris files."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """`linna camera`: the choice of the field of view."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

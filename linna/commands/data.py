@@ -1,7 +1,5 @@
 """`linna data`: the public data products, their licences and checksums; fetching and re-checking them."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`linna dataset`: build and check detector data sets."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`linna demo`: one observation window from the orbit to the report, or a spacecraft that flies on."""
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """`linna detector`: train, export, evaluate and run the crater detector."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`linna doctor`: check a deployment from one of its processes."""
 
-from __future__ import annotations
-
 import argparse
 
 from linna.commands._ground import add_service_options, settings_of

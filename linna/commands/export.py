@@ -1,7 +1,5 @@
 """`linna export PASS --format F --out F`: a pass in the formats of other tools."""
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 import zipfile

@@ -1,7 +1,5 @@
 """`linna ingest`: ingest of downlink files and pass archives."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`linna mission write | check | add | list | show | run`: mission descriptions, and simulated missions."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping
 from pathlib import Path

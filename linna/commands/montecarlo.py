@@ -1,7 +1,5 @@
 """`linna montecarlo`: many seeded runs of anchored navigation with simulated detections, errors against claims."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import asdict
 from typing import Any

@@ -1,7 +1,5 @@
 """`linna navigation survey`: detection and navigation over the terrain of a region."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`linna orbit`: propagate a scenario to an ephemeris; compare, interpolate and convert ephemerides."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import os

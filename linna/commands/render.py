@@ -1,7 +1,5 @@
 """`linna render`: a frame of a scenario as a picture, or several on a labelled contact sheet."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 from pathlib import Path

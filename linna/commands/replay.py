@@ -1,7 +1,5 @@
 """`linna replay`: a payload build over an archived pass."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`linna runner`: execution of payload builds for a ground service, in a separate container."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

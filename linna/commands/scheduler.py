@@ -1,7 +1,5 @@
 """`linna scheduler`: recurring work of a distributed ground service."""
 
-from __future__ import annotations
-
 import argparse
 
 from linna.commands._ground import add_service_options, event_of_signals, settings_of

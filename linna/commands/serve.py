@@ -1,7 +1,5 @@
 """`linna serve`: the HTTP interface of the ground service."""
 
-from __future__ import annotations
-
 import argparse
 
 from linna.commands._ground import add_service_options, settings_of

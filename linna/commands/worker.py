@@ -1,7 +1,5 @@
 """`linna worker`: does jobs that the service sends over its broker."""
 
-from __future__ import annotations
-
 import argparse
 
 from linna.commands._ground import add_service_options, settings_of

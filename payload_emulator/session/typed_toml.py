@@ -4,8 +4,6 @@ A table names only what it sets; the rest keeps the defaults of the dataclass, o
 table changes. Types are strict: a whole number counts as a number, and nothing else is converted.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import math

@@ -4,8 +4,6 @@ The description states what a ground segment needs to know about the spacecraft 
 TOML, read by the ground service.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import math
