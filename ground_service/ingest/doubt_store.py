@@ -132,10 +132,10 @@ def latest_ticks(newest: int | None) -> int | None:
     None if only telemetry states the time, or if the archive is from after it, as recordings of simulated flights are.
     """
     now = independent_now_ns()
-    if now is None or newest is None:
+    if now is None:
         return None
     latest = int(ticks_from_utc_ns(now)) + LONGEST_STEP
-    return latest if newest <= latest else None
+    return latest if newest is None or newest <= latest else None
 
 
 def _is_firm(connection: Connection, vehicle: int) -> bool:
