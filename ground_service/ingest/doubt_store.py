@@ -262,5 +262,7 @@ def _put_back(connection: Connection, vehicle: int) -> None:
     if not supported:
         return
     connection.execute(delete(_DOUBTED).where(_DOUBTED.c.id.in_([row["id"] for row in supported])))
+    for row in supported:
+        store.widen_extent(connection, row["ingest_id"], row["ticks"])
     spacecraft = get_vehicle(connection, vehicle).ccsds_id
     store.store_batch(connection, vehicle, _batch([bytes(row["octets"]) for row in supported], spacecraft))
