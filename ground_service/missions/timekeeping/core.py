@@ -99,7 +99,12 @@ def utc_ns_of_ticks(ticks: IntArray, correlations: Sequence[TimeCorrelation]) ->
 
 
 def moved_ticks(old: Sequence[TimeCorrelation], new: Sequence[TimeCorrelation]) -> tuple[int | None, int | None]:
-    """Return the first and last on-board time whose UTC differs between two sets of lines; None if there is none."""
+    """Return the first and last on-board time whose UTC differs between two sets of lines; None if there is none.
+
+    Any line in place of the ideal clock changes what a report can say.
+    """
+    if bool(old) != bool(new):
+        return 0, (1 << 48) - 1
     ends = {tick for line in (*old, *new) for tick in (line.start_ticks, line.stop_ticks)}
     at = np.array(sorted({*ends, *((a + b) // 2 for a, b in pairwise(sorted(ends)))}), dtype=np.int64)
     moved = np.flatnonzero(np.abs(utc_ns_of_ticks(at, old)[0] - utc_ns_of_ticks(at, new)[0]) > MOVED_NS)
