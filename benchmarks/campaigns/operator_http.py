@@ -2,7 +2,7 @@
 
 `python -m benchmarks.campaigns.operator_http [RATE]`: the commands of `tutorials/first-spacecraft.md` as printed, at 20
 times real time, then telecommands, a window that is taken back, and requests that a service must refuse. The exit
-status is 1 if there was a wrong turn of the classes A or B, or the report took more than `LIMIT_S`.
+status is 1 if there was a wrong turn of the classes A or B, or the report took more than `LIMIT_S` on a free machine.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 import httpx
 
-from benchmarks.campaigns._strangers import Diary, commands_of, environment
+from benchmarks.campaigns._strangers import Diary, commands_of, environment, is_loaded
 from lunar.timescales import format_utc, parse_utc
 from studies.harness.parts import free_port, kill_family
 
@@ -50,18 +50,19 @@ def main(rate: float = 20.0) -> int:
                 printed = (folder / "log").read_text(errors="replace")
                 if not diary.expect("B", "the page leads to a report", (folder / "end").exists(), printed):
                     return diary.close()
-                diary.expect("B", f"within {LIMIT_S:.0f} s", spent <= LIMIT_S, f"{spent:.0f} s")
+                kind = "C" if is_loaded() else "B"
+                diary.expect(kind, f"within {LIMIT_S:.0f} s", spent <= LIMIT_S, f"{spent:.0f} s")
                 headers = {"Authorization": f"Bearer {(folder / 'token').read_text().strip()}"}
                 url = f"http://127.0.0.1:{api}/api/v1/"
                 with httpx.Client(base_url=url, headers=headers, timeout=60.0) as client:
                     refusals(diary, client, (folder / "reference.oem").read_text())
                     commands(diary, client)
+                return diary.close()
             finally:
                 kill_family(shell.pid)
-    return diary.close()
 
 
-def wait(reached: Callable[[], Any], seconds: float = 1800.0) -> bool:
+def wait(reached: Callable[[], Any], seconds: float = 3600.0) -> bool:
     """Wait until a condition holds; return whether it does in time."""
     until = time.monotonic() + seconds
     while not reached() and time.monotonic() < until:

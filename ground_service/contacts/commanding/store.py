@@ -387,7 +387,7 @@ def _fates(
             PACKETS.c.sequence_count,
             _boot_at(vehicle, VERIFICATIONS.c.ticks),
         )
-        .join(PACKETS, PACKETS.c.id == VERIFICATIONS.c.packet_id)
+        .select_from(VERIFICATIONS.join(PACKETS, PACKETS.c.id == VERIFICATIONS.c.packet_id))
         .where(
             *_readable_reports(connection, vehicle),
             VERIFICATIONS.c.ticks > min(one.sent_after_ticks for one in sent.values()),
@@ -400,7 +400,7 @@ def _fates(
     before = PACKETS.alias()
     mine = (before.c.vehicle_id == vehicle, before.c.apid == REPORTED, before.c.ticks >= 0)
     newest = select(before.c.id).where(*mine, before.c.ticks <= TELECOMMANDS.c.sent_after_ticks)
-    newest = newest.order_by(before.c.ticks.desc(), before.c.sequence_count.desc()).limit(1)
+    newest = newest.order_by(before.c.ticks.desc(), before.c.sequence_count.desc()).limit(1).correlate(TELECOMMANDS)
     copies = connection.execute(
         select(
             TELECOMMANDS.c.request_id,
@@ -410,7 +410,7 @@ def _fates(
             PACKETS.c.sequence_count,
             _boot_at(vehicle, PACKETS.c.ticks),
         )
-        .outerjoin(PACKETS, PACKETS.c.id == newest.scalar_subquery())
+        .select_from(TELECOMMANDS.outerjoin(PACKETS, PACKETS.c.id == newest.scalar_subquery()))
         .where(
             TELECOMMANDS.c.vehicle_id == vehicle,
             TELECOMMANDS.c.request_id.in_(requests),
