@@ -1,6 +1,7 @@
 """Shared by all tests: where the real data are, and what is skipped without them."""
 
 import csv
+import gc
 import os
 import sys
 from collections import Counter
@@ -25,6 +26,7 @@ def _keep_temporary_files_in_memory() -> None:
 
 
 _keep_temporary_files_in_memory()
+gc.disable()  # until all modules are imported: what the collection makes stays
 os.environ.setdefault("MALLOC_ARENA_MAX", "2")  # memory that threads of ended tests have used is used again
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
@@ -64,6 +66,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(Cost(), "cost")
     if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
         _rewrite_assertions(config)
+        gc.enable()
 
 
 def _rewrite_assertions(config: pytest.Config) -> None:
@@ -81,8 +84,11 @@ def _rewrite_assertions(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Note which heavy libraries the collection has imported."""
+    """Note which heavy libraries the collection has imported; search garbage in what the tests make only."""
     session.config.stash[IMPORTED] = [name for name in HEAVY if name in sys.modules]
+    gc.freeze()
+    gc.set_threshold(20_000)
+    gc.enable()
 
 
 @pytest.fixture(scope="session")
