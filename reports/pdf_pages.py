@@ -20,7 +20,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from kernels import keep, kept
+from kernels import made_once
 from reports.document import (
     VERDICT_ROLES,
     Block,
@@ -111,14 +111,14 @@ def _font_folder() -> Path:
 def _characters() -> frozenset[int]:
     """Return the characters of the font; kept on disk by the hash of its file."""
     file = _font_folder() / "DejaVuSans.ttf"
-    name = f"figure-characters-{hashlib.sha256(file.read_bytes()).hexdigest()}"
-    known = kept(name)
-    if known is None:
+
+    def read() -> bytes:
         from matplotlib.ft2font import FT2Font
 
-        known = array("I", sorted(FT2Font(str(file)).get_charmap())).tobytes()
-        keep(name, known)
-    return frozenset(array("I", known))
+        return array("I", sorted(FT2Font(str(file)).get_charmap())).tobytes()
+
+    name = f"figure-characters-{hashlib.sha256(file.read_bytes()).hexdigest()}"
+    return frozenset(array("I", made_once(name, read)))
 
 
 def _printable(value: Any) -> Any:

@@ -13,7 +13,7 @@ from ground_service.evaluation.alignment import ReferenceStates, error_of_places
 from ground_service.evaluation.fixes import Pairs, snapshot_positions, wrong_fixes
 from ground_service.evaluation.recall import Viewing
 from ground_service.telemetry.samples import NavigationSamples
-from kernels import keep, kept
+from kernels import made_once
 from lunar.arrays import FloatArray
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.third_bodies import sun_position_icrf_m
@@ -151,10 +151,7 @@ def albedo_picture(path: Path) -> NDArray[np.uint8]:
     except OSError:
         octets = b""
     name = f"figure-albedo-{hashlib.sha256(octets + Path(__file__).read_bytes()).hexdigest()}"
-    levels = kept(name)
-    if levels is None:
-        levels = _grey_levels(path, octets).tobytes()
-        keep(name, levels)
+    levels = made_once(name, lambda: _grey_levels(path, octets).tobytes())
     return np.frombuffer(levels, np.uint8).reshape(WIDTH_PX // 2, WIDTH_PX)
 
 
