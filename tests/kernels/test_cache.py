@@ -99,7 +99,7 @@ def run(folder, cache, also="", **variables):
 def test_clones_share_compiled_code_until_a_callee_changes(tmp_path):
     cache, first, second = tmp_path / "cache", write(tmp_path / "first"), write(tmp_path / "second")
     assert run(first, cache) == "20 0"
-    assert run(second, cache, WHAT_COMPILES) == "20 1\nFalse"  # compiled by another clone
+    assert run(second, cache) == "20 1"  # compiled by another clone
     write(second, "x + by", "x - by")
     assert run(second, cache) == "0 0"
     assert run(first, cache) == "20 1"  # both versions are kept
@@ -222,9 +222,9 @@ def test_declared_versions_are_compiled_at_the_same_time_and_once(tmp_path, monk
         with compiling_ahead([["caller"], ["callee"]], said.append) as wait:
             wait()
     assert said == ["compiling, once: 1 of 2", "compiling, once: 2 of 2"]
-    assert module.outer(1) == 20
+    assert run(folder, cache, WHAT_COMPILES) == "20 1\nFalse"
     assert module.of_pair(module.Pair(2.0, 3.0)) == 2.0
-    assert [len(kernel.stats.cache_hits) for kernel in (module.outer, module.of_pair)] == [1, 1]
+    assert len(module.of_pair.stats.cache_hits) == 1
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder / "caller.py"))  # not a folder: no process could keep a file
     with compiling_ahead([["caller"]], said.append) as wait:
         wait()
