@@ -11,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from linna.data import data_folder, load_orbit
+from linna.errors import UsageError
 from linna.output import emit, finish, log, save
 from linna.parser import ABOVE_ZERO, option
 
@@ -51,7 +53,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run_compare(arguments: argparse.Namespace) -> int:
-    from linna.data import load_orbit
     from lunar.comparison import compare
     from lunar.timescales import format_utc
 
@@ -86,7 +87,6 @@ def run_compare(arguments: argparse.Namespace) -> int:
 def run_interpolate(arguments: argparse.Namespace) -> int:
     import numpy as np
 
-    from linna.data import data_folder, load_orbit
     from lunar.datafolder import default_orientation
     from lunar.timescales import format_tai, tdb_s_from_tai_ns
     from lunar.visibility import subsatellite
@@ -133,8 +133,6 @@ def run_interpolate(arguments: argparse.Namespace) -> int:
 
 
 def run_convert(arguments: argparse.Namespace) -> int:
-    from linna.data import data_folder, load_orbit
-    from linna.errors import UsageError
     from lunar.datafolder import default_orientation
     from lunar.ephemeris import resampled
     from lunar.messages.oem import format_oem
@@ -178,7 +176,6 @@ def run_convert(arguments: argparse.Namespace) -> int:
 
 
 def _spice_id(arguments: argparse.Namespace) -> int:
-    from linna.errors import UsageError
 
     if arguments.spice_id is None:
         raise UsageError("--spice-id: expected the SPICE number of the spacecraft, such as -85, found none")
@@ -214,7 +211,6 @@ def _read_epochs(name: str) -> list[int]:
 
 
 def run_propagate(arguments: argparse.Namespace) -> int:
-    from linna.data import data_folder
     from lunar.messages.oem import format_oem
     from payload_emulator.session.scenario import load_scenario
     from payload_emulator.session.world.orbit import force_model, propagate_to_impact, sample
