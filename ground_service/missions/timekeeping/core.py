@@ -288,11 +288,11 @@ def doubted_stations(
         if not kept[units[mine[0]]].all() or not _is_whole(ahead_ns) or abs(ahead_ns) < LEAP_NS:
             continue
         doubt = StationDoubt(name, ahead_ns * 1e-9, "the on-board clock")
-        for rows in (units[number] for number in mine if group[number] not in shared):
-            if np.abs(off[rows] + ahead_ns).max() > STATION_DIFFERENCE_NS:
+        for own in (units[number] for number in mine if group[number] not in shared):
+            if np.abs(off[own] + ahead_ns).max() > STATION_DIFFERENCE_NS:
                 break  # the clock was set on board
-            kept[rows] = False
-            doubts.update(dict.fromkeys(rows.tolist(), doubt))
+            kept[own] = False
+            doubts.update(dict.fromkeys(own.tolist(), doubt))
     return kept, doubts
 
 
