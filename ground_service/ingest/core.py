@@ -30,7 +30,7 @@ def implausible_times(
 
     Time goes on in stretches without a longer silence than `LONGEST_STEP`. One that begins later than that after all
     telemetry is believed if a station received it then, or by a clock of the mission, or because enough of its packets
-    agree. A clock that shows the time since its epoch was not set.
+    agree. Without other telemetry, two packets agree. A clock that shows the time since its epoch was not set.
 
     Parameters
     ----------
@@ -62,7 +62,12 @@ def implausible_times(
     for stretch in np.split(order, np.flatnonzero(np.diff(times) > LONGEST_STEP) + 1):
         first, last = int(ticks[stretch[0]]), int(ticks[stretch[-1]])
         reason = None
-        if reached is not None and first - reached > LONGEST_STEP and not agreed[stretch].any():
+        if agreed[stretch].any():
+            pass
+        elif reached is None:
+            if len(stretch) == 1 and (latest is None or not UNSET_TICKS <= first <= latest):
+                reason = "not judged: no clock, reception or other packet states this time"
+        elif first - reached > LONGEST_STEP:
             if latest is not None:
                 reason = f"{span_words(last - latest)} after the mission time" if last > latest else None
             elif len(stretch) < AGREEING_PACKETS:

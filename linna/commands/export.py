@@ -6,6 +6,7 @@ import zipfile
 from pathlib import Path
 
 from linna.commands._ground import add_operator_options, ground_client
+from linna.errors import UsageError
 from linna.output import emit, finish, log
 from linna.parser import RawFormatter, option
 
@@ -38,7 +39,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from ground_service.exports.model import FORMATS
-    from linna.errors import UsageError
 
     out: Path = arguments.out
     unpacked = FORMATS[arguments.format].several_files and out.suffix.lower() != ".zip"
