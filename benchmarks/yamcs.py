@@ -136,7 +136,7 @@ def _exported(server: Server) -> str:
 
 
 def rows() -> Iterator[Row]:
-    """Yield packets to durable storage, values read back, memory and start beside those of Yamcs."""
+    """Yield packets to durable storage, values read back, memory and start, compared with those of Yamcs."""
     if not ENVIRONMENT.is_file():
         raise NotMeasured("Yamcs is not installed: python -m benchmarks.campaigns.compatibility --row Yamcs")
     stream, warm = mixed_downlink(PACKETS, START, STEP_NS), mixed_downlink(WARM, START - DAY_NS, STEP_NS)

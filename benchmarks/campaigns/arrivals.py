@@ -33,7 +33,7 @@ RELATIVE = 1e-4
 """Tolerance of figures: a report uses the time correlation that exists when it is made."""
 
 KEYS = ("start", "key", "day", "factor", "group", "metric", "time")
-"""What identifies an item of a list of figures."""
+"""Keys that identify an item of a list of figures."""
 
 OF_PACKETS = {"packets", "packets_received", "packets_implausible", "alerts"}
 OF_TIME = ("performance.passes[", "window_list[")
