@@ -34,7 +34,7 @@ RELATIVE = 1e-3
 spacecraft by 5 cm along the track, and the errors of a pass have 60 m and more."""
 
 KEYS = ("start", "key", "day", "factor", "group", "metric", "time")
-"""What identifies an item of a list of figures."""
+"""Keys that identify an item of a list of figures."""
 
 OF_PACKETS = {"packets", "packets_received", "packets_implausible", "alerts"}
 OF_TIME = ("performance.passes[", "window_list[")

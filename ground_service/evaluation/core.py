@@ -59,7 +59,6 @@ from ground_service.evaluation.verdict import (
     verdict_of,
     without_mission,
 )
-from ground_service.missions.model import Requirements
 from ground_service.telemetry.samples import DetectionSamples, NavigationSamples, OutcomeSamples
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
@@ -84,6 +83,7 @@ from reports.values import (
     PacketAccounting,
     PassEvent,
     PassReport,
+    Requirements,
     SettingsComparison,
     TerrainMap,
     TimeSpan,

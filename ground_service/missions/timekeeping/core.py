@@ -282,17 +282,17 @@ def doubted_stations(
                 doubt = StationDoubt(str(names[rows[0]]), sign * found.least_ns * 1e-9)
                 doubts.update(dict.fromkeys(rows.tolist(), doubt))
     for name in sorted(set(station)):
-        runs_of = [number for number, rows in enumerate(units) if names[rows[0]] == name]
-        shared = {group[number] for number in range(len(units)) if number not in runs_of}
-        ahead_ns = -float(np.median(off[units[runs_of[0]]]))
-        if not kept[units[runs_of[0]]].all() or not _is_whole(ahead_ns) or abs(ahead_ns) < LEAP_NS:
+        numbers = [number for number, rows in enumerate(units) if names[rows[0]] == name]
+        shared = {group[number] for number in range(len(units)) if number not in numbers}
+        ahead_ns = -float(np.median(off[units[numbers[0]]]))
+        if not kept[units[numbers[0]]].all() or not _is_whole(ahead_ns) or abs(ahead_ns) < LEAP_NS:
             continue
         doubt = StationDoubt(name, ahead_ns * 1e-9, "the on-board clock")
-        for rows in (units[number] for number in runs_of if group[number] not in shared):
-            if np.abs(off[rows] + ahead_ns).max() > STATION_DIFFERENCE_NS:
+        for own in (units[number] for number in numbers if group[number] not in shared):
+            if np.abs(off[own] + ahead_ns).max() > STATION_DIFFERENCE_NS:
                 break  # the clock was set on board
-            kept[rows] = False
-            doubts.update(dict.fromkeys(rows.tolist(), doubt))
+            kept[own] = False
+            doubts.update(dict.fromkeys(own.tolist(), doubt))
     return kept, doubts
 
 

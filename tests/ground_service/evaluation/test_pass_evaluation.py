@@ -20,7 +20,6 @@ from ground_service.evaluation.fixes import IdentificationSamples, MappedCraters
 from ground_service.evaluation.model import PassFigures
 from ground_service.evaluation.recall import Viewing
 from ground_service.evaluation.smoother import ONBOARD, FilterStates, StartState
-from ground_service.missions.model import Requirements
 from ground_service.telemetry.samples import DetectionSamples, NavigationSamples, OutcomeSamples, no_detections
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, make_catalogue
@@ -37,6 +36,7 @@ from reports.values import (
     NavigationSeries,
     PacketAccounting,
     PassReport,
+    Requirements,
     TerrainMap,
     TimeSpan,
 )

@@ -242,6 +242,16 @@ def test_reports_of_an_earlier_boot_do_not_verify_a_telecommand(either: Ground):
     assert get_command(either, key).state == "completed"
 
 
+def test_reports_of_another_source_do_not_verify_a_telecommand(either: Ground):
+    receive(either, contact() + completed(TICKS + HOUR // 2, 5, 40))
+    key, request = sent(either)
+    later = TICKS + HOUR
+    receive(either, report(later, 900) + completed(later + 9, request, 7))  # of another flight
+    assert get_command(either, key).state == "sent"
+    receive(either, completed(later + 10, request, 41))
+    assert get_command(either, key).state == "completed"
+
+
 def test_commanding_starts_from_the_count_that_the_payload_reports(either: Ground):
     fields = DICTIONARY.packet("performance").fields
     values = {one.name: 0 for one in fields} | {"structure_id": 2, "last_command_count": 41}
