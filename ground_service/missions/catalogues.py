@@ -30,6 +30,8 @@ def add_catalogue(ground: Ground, stored: StoredFile, name: str, *, actor: str =
     except LunarError as error:
         reason = str(error).replace(str(stored.path), name)
         raise InvalidInput("catalogue", "", "a crater catalogue", reason) from None
+    if not craters:
+        raise InvalidInput("catalogue", "", "a crater catalogue", f"{name}: no crater")
     with ground.database.writing() as connection:
         register_file(connection, stored, store.CATALOGUE_KIND, name, utc_now_ns())
         store.set_catalogue_kind(connection, stored.sha256, store.CATALOGUE_KIND)
