@@ -37,8 +37,8 @@ from payload_emulator.errors import TerrainError, install_hint
 from payload_emulator.sim.terrain.tiles import Heights
 
 CHUNK_PIXELS = 1024
-CHUNK_LIMIT_OCTETS = 48 << 20
-"""Decoded pixels that a terrain keeps of all its files: those under some consecutive frames."""
+CHUNK_LIMIT_OCTETS = 32 << 20
+"""Decoded pixels that a terrain keeps in memory of all its files: those under neighbouring tiles."""
 
 KEPT_PIXELS = 128
 """Chunks of 2 MB of decoded pixels that are kept on disk: those under a pole-to-pole pass, whose rims are measured
@@ -438,7 +438,7 @@ def _require_slopes(file: RasterFile, reading: Reading, values: Heights, pixel_m
     """Refuse heights without a unit that are steeper than ground of the Moon is; columns are ``narrow`` pixels wide."""
     if reading.unit or pixel_m < SLOPE_BASE_M or min(values.shape) < 2 or narrow < _NARROW:
         return
-    south, east = np.gradient(values, pixel_m)
+    south, east = (np.gradient(values, pixel_m, axis=axis) for axis in (0, 1))
     square = south * south + east * east / np.float32(narrow * narrow)
     good = np.isfinite(square)
     share = float(np.mean(square[good] > math.tan(math.radians(SLOPE_DEG)) ** 2)) if good.any() else 0.0

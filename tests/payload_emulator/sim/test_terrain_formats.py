@@ -13,7 +13,7 @@ from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain.albedo import open_albedo
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.raster import RasterTerrain
-from payload_emulator.sim.terrain.rasters import RasterFile, open_layers
+from payload_emulator.sim.terrain.rasters import CHUNK_LIMIT_OCTETS, ChunkCache, RasterFile, open_layers
 from tests.lazy import Lazy
 
 rasterio, warp = Lazy("rasterio"), Lazy("rasterio.warp")
@@ -159,6 +159,15 @@ def test_jpeg_2000_of_16_bits_is_decoded_once_until_the_kept_pixels_are_damaged(
         assert_array_equal(layer.read(68 * 16, 8 * 16, 160, 160), values)
     kept.write_bytes(kept.read_bytes()[:-1] + b"?")
     assert_array_equal(open_layers([path])[0].read(68 * 16, 8 * 16, 160, 160), values)
+
+
+def test_decoded_pixels_stay_within_their_limit_after_a_week_of_passes():
+    chunks, newest, chunk = ChunkCache(), 7 * 13 * 90, np.zeros((1024, 1024), np.float32)
+    for number in range(newest + 1):
+        chunks.put((0, 0, number, 0), chunk)
+    held = [number for number in range(newest + 1) if chunks.get((0, 0, number, 0)) is not None]
+    assert held == list(range(newest - 7, newest + 1))
+    assert chunks.octets == CHUNK_LIMIT_OCTETS == len(held) << 22
 
 
 def test_reflectance_tiles_are_averaged_over_the_grid_and_relative_to_their_median(tmp_path):
