@@ -316,8 +316,8 @@ def checked(stream: Stream) -> FoundPackets:
 
 
 def ingested(stream: Stream) -> FoundPackets:
-    """Return what `linna ingest` stores of the files in an empty archive."""
-    from sqlalchemy import select
+    """Return what `linna ingest` stores of the files in an empty archive, with packets of implausible times."""
+    from sqlalchemy import select, union_all
 
     from ground_service.errors import GroundError
     from ground_service.ground import open_ground
@@ -340,12 +340,12 @@ def ingested(stream: Stream) -> FoundPackets:
             except (GroundError, TmtcError):
                 continue
         found = false = 0
-        table = repository.PACKETS
+        tables = repository.PACKETS, repository.IMPLAUSIBLE_PACKETS
         with ground.database.reading() as connection:
             for spacecraft, packets in stream.packets.items():
                 vehicle = vehicle_id(connection, spacecraft, "flight")
-                rows = connection.execute(select(table.c.octets).where(table.c.vehicle_id == vehicle))
-                mine = {bytes(row) for row in rows.scalars()}
+                stored = union_all(*(select(one.c.octets).where(one.c.vehicle_id == vehicle) for one in tables))
+                mine = {bytes(row) for row in connection.execute(stored).scalars()}
                 found += len(mine & packets)
                 false += len(mine - packets)
         ground.close()

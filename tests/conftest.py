@@ -1,17 +1,19 @@
 """Shared by all tests: where the real data are, and what is skipped without them."""
 
 import csv
+import gc
 import os
 import sys
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 from _pytest.assertion import rewrite
 from hypothesis import settings
 
 from ground_service import clock
-from tests.cost import Cost
+from tests.cost import TABLE, Cost, read
 
 
 def _keep_temporary_files_in_memory() -> None:
@@ -25,6 +27,7 @@ def _keep_temporary_files_in_memory() -> None:
 
 
 _keep_temporary_files_in_memory()
+gc.disable()  # until all modules are imported: what the collection makes stays
 os.environ.setdefault("MALLOC_ARENA_MAX", "2")  # memory that threads of ended tests have used is used again
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("GOMP_SPINCOUNT", "0")
@@ -64,6 +67,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(Cost(), "cost")
     if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
         _rewrite_assertions(config)
+        gc.enable()
 
 
 def _rewrite_assertions(config: pytest.Config) -> None:
@@ -81,8 +85,11 @@ def _rewrite_assertions(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Note which heavy libraries the collection has imported."""
+    """Note which heavy libraries the collection has imported; search garbage in what the tests make only."""
     session.config.stash[IMPORTED] = [name for name in HEAVY if name in sys.modules]
+    gc.freeze()
+    gc.set_threshold(20_000)
+    gc.enable()
 
 
 @pytest.fixture(scope="session")
@@ -99,7 +106,7 @@ def _campaigns() -> set[str]:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark campaigns; run browser tests and slow files first, the largest first; real data only with LINNA_DATA.
+    """Mark campaigns; run the costliest folders first, in them browser tests and slow files; real data with LINNA_DATA.
 
     With several processes this needs `--no-loadscope-reorder`.
     """
@@ -114,13 +121,35 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     driven = {item.path for item in items if "browser" in getattr(item, "fixturenames", ())}
     sizes = Counter(item.path for item in items if item.path in driven)
     slow = Counter(item.path for item in items if "slow" in item.keywords)
-    items.sort(key=lambda item: (-sizes[item.path], -slow[item.path]))
+    costs = read(TABLE) if _by_folder(config) else {}
+    items.sort(key=lambda item: (-costs.get(_folder(item.nodeid), 0.0), -sizes[item.path], -slow[item.path]))
     if os.environ.get("LINNA_DATA"):
         return
     skip = pytest.mark.skip(reason="LINNA_DATA is not set: no real data on this machine")
     for item in items:
         if "real_data" in item.keywords:
             item.add_marker(skip)
+
+
+def _folder(nodeid: str) -> str:
+    return nodeid.partition("::")[0].rpartition("/")[0]
+
+
+def _by_folder(config: pytest.Config) -> bool:
+    """Whether each process gets whole folders; campaigns, of which a few folders hold nearly all, go by file."""
+    return config.getoption("markexpr") == "not campaign"
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give each process whole folders, so that the tests of a folder share servers, flights and libraries."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    if not _by_folder(config):
+        return None
+    scheduling = LoadScopeScheduling(config, log)
+    scheduling._split_scope = _folder
+    return scheduling
 
 
 @pytest.hookimpl(wrapper=True)

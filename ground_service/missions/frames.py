@@ -3,8 +3,6 @@
 The local data folder decides only whether a declared model is available, never which model is used.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping
