@@ -112,8 +112,9 @@ def cases() -> list[tuple[str, str, str, Any]]:
     """Return operation, what is largest, path, and body (made when it is sent) of requests."""
     region = {"latitude_deg": {"min": -60.0, "max": 60.0}, "west_deg": 300.0, "east_deg": 40.0}
     terms = {"windows": 100, "period_days": 1.0, "regions": [region] * 50}
-    times = [{"ticks": (1 << 40) + 65_536 * 60 * k, "received": at(k / 1440)} for k in range(9_000)]
-    points = [one | {"light_time_s": 1.3, "boot_count": 0} for one in times]
+    ticks = [((1 << 40) + 65_536 * 60 * k, {"received": at(k / 1440)}) for k in range(9_000)]
+    points = [time | {"ticks": one, "light_time_s": 1.3, "boot_count": 0} for one, time in ticks]
+    times = [time | {"packet_ticks": one, "sequence_count": k} for k, (one, time) in enumerate(ticks)]
     link = '[[links]]\nname = "l{}"\nkind = "file"\ndownlink = "/nowhere"\n'
     described = (MISSION + "".join(map(link.format, range(14_000)))).encode()
     span = {"spacecraft_id": 76, "start": at(0), "stop": at(31)}
