@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fastapi import routing
 from httpx._transports import default as httpx_transports
 from sqlalchemy import create_engine, text
 
@@ -96,6 +97,22 @@ def one_description():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(DescribedApi, "openapi", openapi)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_set_of_routes():
+    """Resolve the routes, which are the same for every application, once: the first request would do it in 0.2 s."""
+    resolve, made = routing._EffectiveRouteContext.from_api_route, dict[tuple[int, str], Any]()
+
+    def from_api_route(*, original_route: Any, include_context: Any) -> Any:
+        key = (id(original_route), include_context.path_for(original_route))
+        if key not in made:
+            made[key] = resolve(original_route=original_route, include_context=include_context)
+        return made[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(routing._EffectiveRouteContext, "from_api_route", from_api_route)
         yield
 
 
