@@ -5,8 +5,6 @@ ray march over the same frame. Pictures of both are compared over random poses o
 any azimuth and yaw, tilt to 5 degrees.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence

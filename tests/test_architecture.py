@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import itertools
 import re
 import shutil
 import subprocess
@@ -287,6 +288,52 @@ def test_a_planted_function_of_one_line_more_is_found(tmp_path: Path) -> None:
     assert long_functions(tmp_path) == []
     file.write_text("async def longer():\n" + "    pass\n" * LONGEST_FUNCTION)
     assert long_functions(tmp_path) == ["lunar.planted.longer: 81 lines"]
+
+
+TWO_ENTITIES = {
+    ("Requirement", "RequirementFigures"): "stored summaries and the API state relation and margin",
+    ("ApidAccounting", "ApidCompleteness"): "lists of passes must not import NumPy, which values of reports do",
+    ("ReceptionQuality", "Reception"): "values have integer times, the API has texts",
+    ("PacketAccounting", "Completeness"): "lists of passes must not import NumPy; the API has a list by APID",
+    ("NavigationStatistics", "NavigationFigures"): "values have NaN for numbers, stored summaries and the API null",
+    ("Gate", "JudgedGate"): "the stored verdict has null for NaN, and keys of earlier versions",
+    ("Detections", "FrameDetections"): "detections that are scored always have a diameter on the ground",
+    ("CameraSection", "Camera"): "the simulated camera has defaults, the declared one states only known values",
+    ("Format", "ExportFormatInfo"): "the second says whether the library is installed",
+    ("PassSummary", "EventFilter"): "an entity, and the query of another",
+}
+"""Pairs of classes with nearly the same fields that are two entities, with the reason."""
+
+
+def repeated_entities(root: Path) -> set[tuple[str, str]]:
+    """Pairs of classes of at least six fields that share 80 % of the fields of the larger one."""
+    fields = [
+        (
+            node.name,
+            {one.target.id for one in node.body if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name)},
+        )
+        for file in modules_of(root).values()
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.ClassDef)
+    ]
+    large = [(name, names) for name, names in fields if len(names) >= 6]
+    return {
+        (one, other)
+        for (one, its), (other, others) in itertools.combinations(large, 2)
+        if len(its & others) >= 0.8 * max(len(its), len(others))
+    }
+
+
+def test_no_class_repeats_the_fields_of_another() -> None:
+    assert repeated_entities(ROOT) == set(TWO_ENTITIES)
+
+
+def test_a_planted_repetition_of_fields_is_found(tmp_path: Path) -> None:
+    (tmp_path / "lunar").mkdir()
+    shared = "".join(f"    {name}: float\n" for name in "abcd")
+    planted = f"class A:\n{shared}    e: int\n    f: int\nclass B:\n{shared}    e: int\n    g: int\nclass C:\n{shared}"
+    (tmp_path / "lunar" / "planted.py").write_text(planted)
+    assert repeated_entities(tmp_path) == {("A", "B")}
 
 
 DECODED = re.compile(

@@ -5,8 +5,6 @@ codeblocks → randomised → behind markers. Receiving goes the other way, find
 by trial where they are not given, and never fails on damage: what is lost is counted and located.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any

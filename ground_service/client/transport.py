@@ -4,7 +4,7 @@ import asyncio
 import sys
 import threading
 import weakref
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack
 
 import httpx
@@ -20,7 +20,6 @@ from ground_service.http.common import OPERATIONS
 from ground_service.http.requests import PlainText
 from ground_service.http.uploads import UploadPool
 from ground_service.jobs.service import Dispatcher
-from ground_service.store.events import Notify
 
 LOCAL_UPLOADS = 2
 
@@ -82,7 +81,7 @@ class FollowUpOnDemand:
 
     def __init__(self, ground: Ground) -> None:
         self._ground = ground
-        self._follow_up: Notify | None = None
+        self._follow_up: Callable[[frozenset[str]], None] | None = None
 
     def __call__(self, kinds: frozenset[str]) -> None:
         if self._follow_up is None:

@@ -4,8 +4,6 @@ A section is read in windows. Frames that the octets before or after a piece giv
 pieces; the others are read now. Octets of packets that are not complete are left as fragments.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise

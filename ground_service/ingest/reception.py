@@ -5,8 +5,6 @@ the octets that earlier pieces have before and behind it, so that every frame is
 whatever the order and whatever process reads. Packets are stored once, by content.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial

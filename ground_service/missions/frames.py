@@ -3,8 +3,6 @@
 The local data folder decides only whether a declared model is available, never which model is used.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping
@@ -124,17 +122,19 @@ def _kernel(data: DataFolder) -> Orientation:
     return load_orientation(data.orientation_bpc, data.orientation_tf)
 
 
-@functools.lru_cache(maxsize=8)
 def _named_field(name: str, data: DataFolder) -> GravityField | None:
     built_in = builtin_gravity()
     if name == built_in.name:
         return built_in
     for path in (data.gravity, data.gravity_alternative):
         if path is not None:
-            found = load_gravity(path)
+            found = _field(path)
             if found.name == name:
                 return found
     return None
+
+
+_field = functools.lru_cache(maxsize=4)(load_gravity)
 
 
 AnySection = TypeVar("AnySection", bound=Section)

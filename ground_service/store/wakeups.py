@@ -26,10 +26,6 @@ SENDER = uuid.uuid4().hex.encode()
 """Name of this process, which ignores its own wake-ups: it is notified by its database object."""
 
 
-def is_redis(broker_url: str | None) -> bool:
-    return broker_url is not None and broker_url.startswith(("redis://", "rediss://"))
-
-
 class Waker:
     """Listener of a database that publishes a wake-up after each commit with events; faults are logged once."""
 

@@ -1,7 +1,5 @@
 """`linna catalogue landmarks`: the payload's own map, from a downlink, compared with a catalogue."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,11 +1,11 @@
 """`linna catalogue register`: the shift from the craters of a list to the rims on a terrain, by place."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
 from linna.commands._choices import parse_region
+from linna.data import data_directory, data_folder
+from linna.errors import UsageError
 from linna.output import emit, finish
 from linna.parser import option
 
@@ -34,8 +34,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from datetime import UTC, datetime
 
-    from linna.data import data_directory, data_folder
-    from linna.errors import UsageError
     from payload_emulator.sim.terrain.registering import PRODUCT, register, save_registration
     from payload_emulator.sim.terrain.registration import by_tile
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from linna.data import data_folder
+from linna.errors import UsageError
+
 if TYPE_CHECKING:
     from lunar.catalogue import CraterCatalogue
     from payload_emulator.sim.terrain.curation import Region
@@ -22,7 +25,6 @@ def open_catalogue(name: str | None, seed: int) -> CraterCatalogue:
     The catalogue of the paper's density is the real catalogue with random craters in its empty tiles, or entirely
     synthetic if no real catalogue is available.
     """
-    from linna.data import data_folder
     from lunar.catalogue import completed_to_paper, load_catalogue, paper_density_catalogue
 
     if name is not None and name not in SYNTHETIC:
@@ -38,7 +40,6 @@ def open_catalogue(name: str | None, seed: int) -> CraterCatalogue:
 
 def parse_region(text: str) -> Region:
     """Return the region of the option `--region`: W,E,S,N in degrees."""
-    from linna.errors import UsageError
     from payload_emulator.sim.terrain.curation import Region
 
     try:

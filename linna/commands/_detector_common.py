@@ -1,7 +1,5 @@
 """Common parts of the verbs of `linna detector`: the model option and torch."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

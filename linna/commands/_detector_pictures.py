@@ -1,14 +1,13 @@
 """`linna detector detect` and `linna detector evaluate --coco`: single pictures and labelled sets of them."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from pathlib import Path
 from typing import Any
 
 from linna.commands._detector_common import add_model, model_octets
-from linna.output import finish
+from linna.errors import UsageError
+from linna.output import emit, finish, log, progress
 from linna.parser import ABOVE_ZERO, number, option
 
 FIELD_OF_VIEW = number(above=0, below=180)
@@ -42,8 +41,6 @@ def add_evaluation(evaluate: argparse.ArgumentParser, tested: Any) -> None:
 
 def evaluate_set(arguments: argparse.Namespace) -> int:
     """Evaluate on a labelled set."""
-    from linna.errors import UsageError
-    from linna.output import emit, progress
     from payload_emulator.training.evaluate.evaluate import open_for_evaluation
     from payload_emulator.training.evaluate.pictures import PictureSetOptions, evaluate_pictures, format_picture_figures
 
@@ -83,7 +80,6 @@ def refuse_options_of_sets(arguments: argparse.Namespace) -> None:
     UsageError
         One of them was given.
     """
-    from linna.errors import UsageError
 
     if arguments.two_scales:
         raise UsageError("--two-scales: expected together with --coco, found with --dataset")
@@ -110,8 +106,6 @@ def _add_search(parser: Any) -> None:
 
 
 def _detect(arguments: argparse.Namespace) -> int:
-    from linna.errors import UsageError
-    from linna.output import emit, log
     from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
     from payload_emulator.flight.vision.picture_search import search_picture, sun_at_azimuth
     from payload_emulator.flight.vision.preprocess import quality_reason

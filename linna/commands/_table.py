@@ -1,7 +1,5 @@
 """Tables of commands that call the client: options from the signature of an operation, results as text or JSON."""
 
-from __future__ import annotations
-
 import argparse
 import inspect
 import types

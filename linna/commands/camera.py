@@ -1,11 +1,10 @@
 """`linna camera`: the choice of the field of view."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
 from linna.commands._choices import CATALOGUE_HELP, open_catalogue
+from linna.data import data_folder, load_orbit
 from linna.output import emit, finish, log
 from linna.parser import ABOVE_ZERO, number, option
 
@@ -31,7 +30,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run_fov_study(arguments: argparse.Namespace) -> int:
     import numpy as np
 
-    from linna.data import data_folder, load_orbit
     from lunar.datafolder import default_orientation
     from lunar.fov_study import PAPER_COUNTS, study_field_of_view
     from lunar.frames import mcmf_from_spherical

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 from linna.commands._choices import CATALOGUE_HELP, open_catalogue, parse_region
 from linna.commands._table import Command, Option
+from linna.data import data_folder
+from linna.errors import UsageError
 from linna.output import emit, finish
 from linna.parser import number, option
 
@@ -90,8 +92,6 @@ def run_stats(arguments: argparse.Namespace) -> int:
 def run_curate(arguments: argparse.Namespace) -> int:
     import numpy as np
 
-    from linna.data import data_folder
-    from linna.errors import UsageError
     from lunar.catalogue import catalogue_words, format_catalogue, load_catalogue
     from payload_emulator.sim.terrain.curation import CurationRules, RasterHeights, curate
     from tmtc.dictionary.tables import pack_catalogue_table, table_hash

@@ -1,13 +1,11 @@
 """`linna detector`: train, export, evaluate and run the crater detector."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any
 
 from linna.commands._detector_common import add_model, model_octets, need_torch, restart_for_training
-from linna.output import finish
+from linna.output import emit, finish, log, progress, save
 from linna.parser import option
 
 
@@ -117,7 +115,6 @@ def _add_bench_and_info(verbs: Any) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> int:
-    from linna.output import emit, log
 
     need_torch()
     from payload_emulator.flight.vision.preprocess import Preparation
@@ -146,7 +143,6 @@ def _train(arguments: argparse.Namespace) -> int:
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from linna.output import emit
 
     need_torch()
     from payload_emulator.training.data.dataset import Dataset
@@ -171,7 +167,6 @@ def _export(arguments: argparse.Namespace) -> int:
 
 
 def _calibrate(arguments: argparse.Namespace) -> int:
-    from linna.output import emit, progress
     from payload_emulator.training.data.dataset import Dataset, write_whole
     from payload_emulator.training.model.fit_calibration import fit_calibration, format_calibration_figures
 
@@ -187,7 +182,6 @@ def _calibrate(arguments: argparse.Namespace) -> int:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     from linna.commands._detector_pictures import evaluate_set, refuse_options_of_sets
-    from linna.output import emit, progress, save
     from payload_emulator.training.data.dataset import Dataset
     from payload_emulator.training.evaluate.evaluate import format_figures, open_for_evaluation, run, summary
 
@@ -217,7 +211,6 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 
 def _bench(arguments: argparse.Namespace) -> int:
-    from linna.output import emit
     from payload_emulator.training.model.bench import bench
 
     return emit(arguments, bench(model_octets(arguments.model), arguments.threads, arguments.frames))
@@ -226,7 +219,6 @@ def _bench(arguments: argparse.Namespace) -> int:
 def _info(arguments: argparse.Namespace) -> int:
     import json
 
-    from linna.output import emit
     from payload_emulator.flight.models import describe_networks
     from payload_emulator.flight.vision.detector import OnnxDetector
 

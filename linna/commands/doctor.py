@@ -1,10 +1,9 @@
 """`linna doctor`: check a deployment from one of its processes."""
 
-from __future__ import annotations
-
 import argparse
 
 from linna.commands._ground import add_service_options, settings_of
+from linna.data import data_folder
 from linna.output import add_json_flag, emit
 
 
@@ -21,7 +20,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from ground_service.ground import ground_from_settings
     from ground_service.worker.doctor import examine
-    from linna.data import data_folder
 
     settings = settings_of(arguments, data=data_folder().root)
     with ground_from_settings(settings) as ground:

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from linna.data import data_folder
+from linna.errors import UsageError
 from linna.output import emit, finish, log, progress
 from linna.parser import ABOVE_ZERO, number, option
 
@@ -104,8 +106,6 @@ def _add_live(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from linna.data import data_folder
-    from linna.errors import UsageError
     from payload_emulator.session.archive.emulator import emulate
     from payload_emulator.session.scenario import load_scenario
     from payload_emulator.session.world.external import SCENARIO, load_external
@@ -142,7 +142,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _check(arguments: argparse.Namespace, scenario: Scenario, external: ExternalFrames | None) -> int:
     from ground_service.missions.model import parse_mission
-    from linna.data import data_folder
     from lunar.timescales import format_utc
     from payload_emulator.session.archive.emulator import checked_world
     from payload_emulator.session.archive.mission import mission_text
@@ -178,7 +177,6 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
     import signal
     from dataclasses import asdict
 
-    from linna.data import data_folder
     from lunar.timescales import format_utc
     from payload_emulator.session.archive.mission import OPERATIONS, default_ports, live_mission_text
     from payload_emulator.session.live.contacts import station_names
@@ -231,7 +229,6 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
 
 
 def _station_ports(texts: list[str], stations: tuple[str, ...]) -> dict[str, tuple[int, int]]:
-    from linna.errors import UsageError
 
     ports = {}
     for text in texts:

@@ -1,13 +1,12 @@
 """`linna export PASS --format F --out F`: a pass in the formats of other tools."""
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 import zipfile
 from pathlib import Path
 
 from linna.commands._ground import add_operator_options, ground_client
+from linna.errors import UsageError
 from linna.output import emit, finish, log
 from linna.parser import RawFormatter, option
 
@@ -40,7 +39,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from ground_service.exports.model import FORMATS
-    from linna.errors import UsageError
 
     out: Path = arguments.out
     unpacked = FORMATS[arguments.format].several_files and out.suffix.lower() != ".zip"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from linna.commands._ground import add_service_options, event_of_signals, open_ground_only, settings_of
 from linna.commands._table import Command, Commands, CustomCommand, Option, add_commands
+from linna.errors import UsageError
 from linna.output import emit, finish, log
 from linna.parser import option
 
@@ -35,7 +36,6 @@ def _configure_check(parser: LinnaParser) -> None:
 
 
 def check(arguments: argparse.Namespace) -> int:
-    from linna.errors import UsageError
     from tmtc.downlink import propose_packets, propose_settings
 
     octets = arguments.file.read_bytes()
@@ -142,7 +142,6 @@ def operate(arguments: argparse.Namespace) -> int:
     from ground_service.contacts.links.supervisor import LinkSupervisor
     from ground_service.worker.dispatch import dispatcher_for
     from ground_service.worker.follow_up import follow_in_process
-    from linna.errors import UsageError
 
     stopping = event_of_signals()
     with open_ground_only(arguments) as ground:

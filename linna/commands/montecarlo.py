@@ -1,11 +1,10 @@
 """`linna montecarlo`: many seeded runs of anchored navigation with simulated detections, errors against claims."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import asdict
 from typing import Any
 
+from linna.data import data_folder
 from linna.output import emit, finish
 from linna.parser import number, option
 
@@ -37,7 +36,6 @@ def run(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
     from math import radians
 
-    from linna.data import data_folder
     from studies.montecarlo import consistency, fly_many, verdict
     from studies.montecarlo_world import standard_case
 

@@ -1,11 +1,10 @@
 """`linna navigation survey`: detection and navigation over the terrain of a region."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
 from linna.commands._choices import parse_region
+from linna.data import data_folder
 from linna.output import emit, finish, log, progress
 from linna.parser import number, option
 
@@ -34,7 +33,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run_survey(arguments: argparse.Namespace) -> int:
-    from linna.data import data_folder
     from payload_emulator.session.scenario import load_scenario
     from studies.survey import format_survey, summary, survey_scenario, survey_session
 

@@ -7,6 +7,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from linna.data import data_folder
+from linna.errors import UsageError
 from linna.output import as_json, emit, finish, log, progress
 from linna.parser import number, option
 
@@ -35,9 +37,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     import importlib.util
-
-    from linna.data import data_folder
-    from linna.errors import UsageError
 
     if arguments.model is not None and not arguments.model.is_file():
         raise UsageError(f"--model: expected a file, found none at {arguments.model}")

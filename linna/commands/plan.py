@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from linna.commands._table import Command, Commands, Group, Option, add_commands, as_json
+from linna.errors import UsageError
 
 if TYPE_CHECKING:
     from ground_service.client import Client
@@ -84,7 +85,6 @@ def _delete(service: Client, window_id: int) -> dict[str, Any]:
 
 
 def _uplink(service: Client, window_id: int, *, out: Path | None = None) -> dict[str, Any]:
-    from linna.errors import UsageError
 
     released = service.uplink_window(window_id)
     if out is not None:

@@ -1,13 +1,13 @@
 """`linna replay`: a payload build over an archived pass."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from linna.commands.emulate import outcomes_line
+from linna.data import data_folder
+from linna.errors import UsageError
 from linna.output import emit, finish, progress
 from linna.parser import option
 
@@ -36,8 +36,6 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.check_build is not None:
         return _check(arguments)
     if arguments.archive is None or arguments.out is None:
-        from linna.errors import UsageError
-
         lacking = "ARCHIVE" if arguments.archive is None else "--out DIR"
         raise UsageError(f"replay: expected {lacking}, or --check-build BUILD, found neither")
     if arguments.archive.is_dir():
@@ -59,8 +57,6 @@ def _fly(arguments: argparse.Namespace, archive: Path) -> int:
     flight = FlightBuild() if current else load_flight_build(Path(arguments.build))
     data = None
     if not arguments.recorded_only:
-        from linna.data import data_folder
-
         data = data_folder()
     summary = replay_archive(archive, flight, arguments.out, data=data, progress=_bar)
     return emit(arguments, summary, text=_describe(summary, arguments.out))
@@ -89,7 +85,6 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _complete(arguments: argparse.Namespace, archive: Path) -> int:
-    from linna.data import data_folder
     from payload_emulator.session.archive.replay import complete_archive
 
     manifest = complete_archive(archive, arguments.out, data_folder(), progress=_bar)

@@ -1,7 +1,5 @@
 """`linna report PASS`: report of a pass as HTML, PDF and JSON."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

@@ -1,11 +1,10 @@
 """`linna runner`: execution of payload builds for a ground service, in a separate container."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 
 from linna.commands._ground import event_of_signals
+from linna.errors import UsageError
 from linna.output import checked
 from linna.parser import option
 
@@ -24,7 +23,6 @@ def run(arguments: argparse.Namespace) -> int:
     from ground_service.regression.runner import alive, serve_exchange
     from ground_service.regression.sandbox import SandboxRefused, protection
     from ground_service.settings import load_settings
-    from linna.errors import UsageError
 
     settings = load_settings()
     exchange = arguments.exchange or settings.runner_exchange

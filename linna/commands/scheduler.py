@@ -1,10 +1,9 @@
 """`linna scheduler`: recurring work of a distributed ground service."""
 
-from __future__ import annotations
-
 import argparse
 
 from linna.commands._ground import add_service_options, event_of_signals, settings_of
+from linna.data import data_folder
 from linna.output import checked
 from linna.parser import option
 
@@ -29,7 +28,6 @@ def run(arguments: argparse.Namespace) -> int:
     from ground_service.worker.dispatch import dispatcher_for
     from ground_service.worker.follow_up import follow_in_process
     from ground_service.worker.scheduler import Scheduler, has_scheduler
-    from linna.data import data_folder
 
     settings = settings_of(arguments, data=data_folder().root)
     with ground_from_settings(settings) as ground:

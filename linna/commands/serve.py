@@ -1,10 +1,9 @@
 """`linna serve`: the HTTP interface of the ground service."""
 
-from __future__ import annotations
-
 import argparse
 
 from linna.commands._ground import add_service_options, settings_of
+from linna.data import data_folder
 from linna.parser import option
 
 
@@ -17,7 +16,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from ground_service.app import serve
-    from linna.data import data_folder
 
     serve(settings_of(arguments, host=arguments.host, port=arguments.port, data=data_folder().root))
     return 0

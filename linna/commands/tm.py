@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from linna.errors import UsageError
 from linna.output import emit, finish, save
 from linna.parser import option
 
@@ -91,7 +92,6 @@ def run_decode(arguments: argparse.Namespace) -> int:
 
 def _decode_foreign(arguments: argparse.Namespace) -> int:
     """Decode packets of another mission through its XTCE."""
-    from linna.errors import UsageError
     from tmtc.xtce.records import format_xtce_records, xtce_records
 
     decoded, found, definition = _read_foreign(arguments)
@@ -149,7 +149,6 @@ def _read_foreign(arguments: argparse.Namespace) -> tuple[DownlinkDecode, XtceDe
 
 
 def _refuse_without_definition(arguments: argparse.Namespace) -> None:
-    from linna.errors import UsageError
 
     for name in ("container", "leading_size", "raw"):
         if getattr(arguments, name, None):
@@ -211,8 +210,6 @@ def _file_pieces(path: Path) -> Iterator[bytes]:
 def _received(address: tuple[str, int]) -> Iterator[bytes]:
     import socket
 
-    from linna.errors import UsageError
-
     try:
         connection = socket.create_connection(address)
     except OSError as error:
@@ -224,7 +221,6 @@ def _received(address: tuple[str, int]) -> Iterator[bytes]:
 
 
 def _address(option: str, text: str) -> tuple[str, int]:
-    from linna.errors import UsageError
 
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
@@ -290,7 +286,6 @@ def _link_settings(arguments: argparse.Namespace) -> LinkSettings | None:
 
 
 def _read(arguments: argparse.Namespace, dictionary: Dictionary | None = None) -> DownlinkDecode:
-    from linna.errors import UsageError
     from tmtc.arrays import as_octets
     from tmtc.dictionary.payload import DICTIONARY
     from tmtc.downlink import decode

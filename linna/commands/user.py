@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from linna.commands._ground import add_service_options, local_actor, open_service
 from linna.commands._table import Command, Commands, CustomCommand, Option, add_commands
+from linna.errors import UsageError
 from linna.output import emit, finish, log
 from linna.parser import option
 
@@ -68,7 +69,6 @@ def _ensure(arguments: argparse.Namespace) -> int:
     import os
 
     from ground_service.access.service import ensure_user
-    from linna.errors import UsageError
 
     token = os.environ.get(arguments.token_variable, "")
     if not token:

@@ -1,7 +1,5 @@
 """`linna verify`: integrity check of the archive of the ground service."""
 
-from __future__ import annotations
-
 import argparse
 import time
 

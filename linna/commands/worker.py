@@ -1,10 +1,9 @@
 """`linna worker`: does jobs that the service sends over its broker."""
 
-from __future__ import annotations
-
 import argparse
 
 from linna.commands._ground import add_service_options, settings_of
+from linna.data import data_folder
 from linna.output import checked
 from linna.parser import option
 
@@ -18,7 +17,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from ground_service.worker.app import run_worker, worker_answers
-    from linna.data import data_folder
 
     if arguments.check:
         return checked(worker_answers(settings_of(arguments)), "an answer of the worker of this machine")

@@ -1,7 +1,5 @@
 """Section on the craters that the payload mapped."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -91,6 +91,7 @@ def closing_figures(
     alarms = [one.model_dump(mode="json") for one in ground.client.list_alarms(spacecraft_id=spacecraft_id)]
     interventions = ground.interventions(progress.posts)
     received = ground.packets_received(spacecraft_id)
+    apart = len(list(ground.client.list_implausible(spacecraft_id=spacecraft_id)))
     return {
         "end": progress.utc,
         "windows": {
@@ -107,7 +108,8 @@ def closing_figures(
         "packets": progress.packets,
         "packets_lost_on_link": progress.packets_lost_on_link,
         "packets_received": received,
-        "packets_lost": progress.packets - progress.packets_lost_on_link - received,
+        "packets_implausible": apart,
+        "packets_lost": progress.packets - progress.packets_lost_on_link - received - apart,
         "contacts": progress.contacts,
         "telecommands": progress.telecommands,
         "telecommand_octets_lost": progress.telecommand_octets_lost,

@@ -56,6 +56,10 @@ _INSTANCE = """services:
   - class: org.yamcs.archive.AlarmRecorder
   - class: org.yamcs.archive.EventRecorder
   - class: org.yamcs.archive.ReplayServer
+  - class: org.yamcs.parameterarchive.ParameterArchive
+    args:
+      realtimeFiller:
+        enabled: true
   - class: org.yamcs.archive.CommandHistoryRecorder
   - class: org.yamcs.ProcessorCreatorService
     args:

@@ -1,7 +1,5 @@
 """The simulated world of a scenario: its true flight, its terrain, its light, and what the payload's senses get."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

@@ -4,8 +4,6 @@ A dump is what the encoder is given at once; frames of a dump hold whole packets
 of order and come twice without touching each other. Bit errors come in two states (Gilbert–Elliott), frame by frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

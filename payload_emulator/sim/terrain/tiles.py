@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from kernels import keep, kept
+from kernels import made_once
 from lunar import constants
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
@@ -360,10 +360,7 @@ class Terrain(ABC):
         if not self.sources:
             return self.make_heights(latitude, longitude)
         name = f"tile-{ground_hash(self._ground_hash, np.array(key))}"
-        octets = kept(name)
-        if octets is None:
-            octets = self.make_heights(latitude, longitude).tobytes()
-            keep(name, octets, FILED_TILES)
+        octets = made_once(name, lambda: self.make_heights(latitude, longitude).tobytes(), FILED_TILES)
         return np.frombuffer(octets, np.float32).reshape(latitude.size, -1)
 
     @functools.cached_property

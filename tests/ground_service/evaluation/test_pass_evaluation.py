@@ -20,7 +20,6 @@ from ground_service.evaluation.fixes import IdentificationSamples, MappedCraters
 from ground_service.evaluation.model import PassFigures
 from ground_service.evaluation.recall import Viewing
 from ground_service.evaluation.smoother import ONBOARD, FilterStates, StartState
-from ground_service.missions.model import Requirements
 from ground_service.telemetry.samples import DetectionSamples, NavigationSamples, OutcomeSamples, no_detections
 from lunar.camera import PinholeCamera
 from lunar.catalogue import CraterCatalogue, make_catalogue
@@ -37,6 +36,7 @@ from reports.values import (
     NavigationSeries,
     PacketAccounting,
     PassReport,
+    Requirements,
     TerrainMap,
     TimeSpan,
 )
@@ -398,7 +398,16 @@ def test_a_start_within_the_pass_is_propagated_from_there():
     assert (plain.name, kepler.name) == ("propagate-only", "Kepler")
     assert kepler.utc_ns.tolist() == TIMES[2:].tolist()
     assert_allclose(kepler.error_rtn_m, 0.0, atol=0.01)
-    assert of_baselines(evaluated(start_state=StartState(int(TIMES[-1]) + 1, *state))) == []
+    assert of_baselines(evaluated(start_state=StartState(int(TIMES[-1]) + SECOND, *state))) == []
+
+
+def test_a_sample_that_the_time_correlation_moved_before_the_start_state_is_the_same_instant():
+    position, velocity = circle(0.0)
+    moved = position + np.array([0.0, 1.5, 0.0])
+    exact, late = (of_baselines(evaluated(start_state=StartState(EPOCH + ns, moved, velocity))) for ns in (0, 12_000))
+    assert [one.name for one in exact] == [one.name for one in late] == [*BASELINES]
+    for one, other in zip(exact, late, strict=True):
+        assert_allclose(one.error_rtn_m, other.error_rtn_m, atol=0.1)
 
 
 def test_why_there_is_no_baseline(report, monkeypatch):

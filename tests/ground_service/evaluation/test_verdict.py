@@ -15,7 +15,6 @@ from ground_service.evaluation.verdict import (
     verdict_of,
     without_mission,
 )
-from ground_service.missions.model import Requirements
 from reports.values import (
     ClassScore,
     DetectorScore,
@@ -25,6 +24,7 @@ from reports.values import (
     NavigationStatistics,
     PacketAccounting,
     Requirement,
+    Requirements,
     ResidualSeries,
 )
 
@@ -142,7 +142,7 @@ def test_the_declared_estimator_is_judged_and_not_the_best_one():
     assert (row("accuracy.median", limits, evaluated).value, verdict_of(requirements(limits, evaluated))[1]) == (
         70.0, "not met",
     )  # fmt: skip
-    undeclared = row("accuracy.median", limits.model_copy(update={"estimator": None}), evaluated)
+    undeclared = row("accuracy.median", replace(limits, estimator=None), evaluated)
     assert (undeclared.value, undeclared.status) == (None, "unknown")
     assert undeclared.note == "the mission description declares no estimator"
 
@@ -171,7 +171,7 @@ def test_every_baseline_is_shown_and_one_that_is_missing_is_unknown():
     for name in ("Kepler", "smoothed"):
         shown = row(f"better_than.{name}", limits, evaluated)
         assert (shown.status, shown.value, shown.limit) == ("not judged", 50.0, 1.0)
-    rival = limits.model_copy(update={"better_than": ("Kepler",)})
+    rival = replace(limits, better_than=("Kepler",))
     assert row("better_than.Kepler", rival, evaluated).status == "not judged"  # from the best known orbit
     assert row("better_than.Kepler", rival, replace(evaluated, experiment=StartOrbit(1e3))).status == "not met"
 
@@ -377,7 +377,7 @@ def test_the_first_sample_is_no_reset_and_a_series_without_outcomes_has_no_count
 
 @pytest.mark.parametrize("limit", [float("nan"), float("inf")])
 def test_a_limit_that_is_no_number_judges_nothing_as_met(limit):
-    one = row("accuracy.median", EVERY_LIMIT.model_copy(update={"median_error_m": limit}), found())
+    one = row("accuracy.median", replace(EVERY_LIMIT, median_error_m=limit), found())
     assert (one.limit, one.status) == (None, "unknown")
 
 

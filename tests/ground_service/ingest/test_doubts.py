@@ -98,10 +98,11 @@ def test_the_same_report_again_is_kept_once(either: Ground):
 
 def test_the_archive_does_not_depend_on_whether_the_wrong_report_came_first(either: Ground):
     receive(either, report(TICKS + DAY, 12, temperature_c=99.0))
-    receive(either, report(5 << 16, 13, temperature_c=-99.0))
+    receive(either, report(TICKS + DAY + HOUR, 13, temperature_c=99.0) + report(TICKS + DAY + HOUR, 14))
     assert "temperature_c" in alarms(either)
+    receive(either, report(5 << 16, 13, temperature_c=-99.0))
     receive(either, contact())
-    assert len(reasons(either)) == 2
+    assert len(reasons(either)) == 4
     assert either.read(newest_ticks, 1) == LAST
     assert "temperature_c" not in alarms(either)
     assert verify(either, rebuild=True).verdict == "intact"
@@ -150,6 +151,26 @@ def test_reception_times_decide_for_single_packets_and_not_for_a_station_whose_c
     assert implausible_times(ticks[:3], received[:3] - DAY, TICKS, None) == {}
     assert implausible_times(ticks[3:], received[3:] + DAY, TICKS, None) == {}
     assert set(implausible_times(ticks[3:], np.array([NO_TICKS]), TICKS, None)) == {0}
+
+
+@pytest.mark.parametrize("first", [TICKS, TICKS + YEARS, 100 << 16])
+def test_the_first_packet_of_an_archive_decides_nothing_until_a_clock_or_a_second_one_supports_it(
+    ground: Ground, first: int
+):
+    set_mission_clock(TelemetryTime(NOW))
+    assert receive(ground, report(first, 0, temperature_c=99.0)) == 1
+    assert ground.read(newest_ticks, 1) is None and alarms(ground) == {"implausible_time": 1}
+    assert reasons(ground)[0].startswith("not judged: ")
+    assert receive(ground, report(first + (60 << 16), 1)) == 1  # the next review finds both
+    assert reasons(ground) == [] and ground.read(newest_ticks, 1) == first + (60 << 16)
+
+
+def test_a_clock_of_the_mission_judges_the_first_packet():
+    for late, doubted in ((-DAY, set()), (0, set()), (DAY, {0}), (100 - TICKS, {0})):
+        ticks = np.array([TICKS + late])
+        assert set(implausible_times(ticks, None, None, TICKS)) == doubted
+        assert implausible_times(ticks, ticks, None, TICKS) == {}
+        assert implausible_times(np.append(ticks, ticks + HOUR), None, None, TICKS) == {}
 
 
 def test_a_sequence_count_fits_between_its_neighbours():
@@ -218,6 +239,16 @@ def test_reports_of_an_earlier_boot_do_not_verify_a_telecommand(either: Ground):
     receive(either, report(later, 900, boot=1) + completed(later + 9, request, 1))  # of another flight
     assert get_command(either, key).state == "sent"
     receive(either, report(later + HOUR, 13, boot=4) + completed(later + HOUR + 9, request, 1))  # after a reboot
+    assert get_command(either, key).state == "completed"
+
+
+def test_reports_of_another_source_do_not_verify_a_telecommand(either: Ground):
+    receive(either, contact() + completed(TICKS + HOUR // 2, 5, 40))
+    key, request = sent(either)
+    later = TICKS + HOUR
+    receive(either, report(later, 900) + completed(later + 9, request, 7))  # of another flight
+    assert get_command(either, key).state == "sent"
+    receive(either, completed(later + 10, request, 41))
     assert get_command(either, key).state == "completed"
 
 

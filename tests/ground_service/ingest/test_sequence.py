@@ -10,13 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ground_service.ground import Ground
-from ground_service.ingest.core import COUNT_MODULUS, account_sequence
 from ground_service.ingest.service import ingest_file
 from ground_service.ingest.store import recordings_of_vehicle
+from ground_service.passes.downlink_accounting import account_sequence
 from ground_service.store import repository
 from ground_service.telemetry.packets import batch_of_cut
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.packets.cuc import NO_TICKS, TICKS_PER_SECOND
+from tmtc.packets.space_packets import SEQUENCE_COUNT_LIMIT
 from tmtc.packets.stream import cut_packets
 
 SECOND = TICKS_PER_SECOND
@@ -24,7 +25,7 @@ SECOND = TICKS_PER_SECOND
 
 def stream(count: int, first: int = 0, step_ticks: int = SECOND // 10) -> tuple[np.ndarray, np.ndarray]:
     numbers = np.arange(first, first + count)
-    return numbers * step_ticks, numbers % COUNT_MODULUS
+    return numbers * step_ticks, numbers % SEQUENCE_COUNT_LIMIT
 
 
 def counted(ticks: np.ndarray, counts: np.ndarray) -> tuple[int, int, int]:
@@ -48,7 +49,7 @@ def test_a_wrap_is_no_gap():
 @given(
     lost=st.sets(st.integers(1, 2998), max_size=60),
     seed=st.integers(0, 2**32 - 1),
-    first=st.integers(0, COUNT_MODULUS - 1),
+    first=st.integers(0, SEQUENCE_COUNT_LIMIT - 1),
 )
 def test_what_is_missing_is_found_whatever_the_order_of_arrival(lost: set[int], seed: int, first: int):
     ticks, counts = stream(3000, first)

@@ -24,7 +24,14 @@ from ground_service.settings import Settings
 from ground_service.store import event_kinds as events
 from ground_service.store import events as log
 from ground_service.store import repository
-from ground_service.store.event_kinds import CommandsSent, FollowUpFailed, PassEvaluated, TelemetryReceived, publish
+from ground_service.store.event_kinds import (
+    CommandsSent,
+    CorrelationChanged,
+    FollowUpFailed,
+    PassEvaluated,
+    TelemetryReceived,
+    publish,
+)
 from ground_service.worker import follow_up
 from ground_service.worker.follow_up import FollowUp, follow_in_process
 from lunar.timescales import parse_utc
@@ -261,8 +268,10 @@ def test_an_event_that_changes_nothing_of_a_pass_makes_no_report(ground: Ground,
     vehicle = ground.read(repository.get, repository.PASSES, pass_id, "pass")["vehicle_id"]
     # Telemetry of another time does not evaluate the pass again.
     say(ground, TelemetryReceived(vehicle_id=vehicle, packets=1, first_ticks=0, last_ticks=1))
+    say(ground, CorrelationChanged(vehicle_id=vehicle, segments=1))
     assert jobs_of(ground, "re-evaluation") == []
-    say(ground, TelemetryReceived(vehicle_id=vehicle, packets=1, first_ticks=0, last_ticks=(1 << 48) - 1))
+    # A correlation that moves its time does.
+    say(ground, CorrelationChanged(vehicle_id=vehicle, segments=1, first_ticks=0, last_ticks=(1 << 48) - 1))
     [job] = jobs_of(ground, "re-evaluation")
     assert (job["state"], job["result"]["report_id"]) == ("done", None)
     assert len(reports_of(ground, pass_id)) == 1

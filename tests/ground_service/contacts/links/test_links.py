@@ -12,7 +12,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from sqlalchemy import select
+from sqlalchemy import select, update
 
 from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.contacts.commanding.service import (
@@ -504,6 +504,19 @@ def test_the_lease_is_kept_while_the_link_is_operated(ground, station):
         wait_for(lambda: ground.read(store.find_link, "lab").lease_utc_ns > first.lease_utc_ns, "a longer lease")
         assert service.get_link(ground, "lab").owner == "here"
     assert service.get_link(ground, "lab").owner is None
+
+
+def test_after_a_standstill_the_state_is_what_the_process_sees(either, station):
+    """Another process had the link meanwhile, and gave it back."""
+    declare(either, station.link())
+    with operated(either) as runner:
+        station.accept()
+        wait_for_state(either, "connected")
+        lost = {"owner": None, "lease_utc_ns": 0, "state": "waiting"}
+        with either.database.writing() as connection:
+            connection.execute(update(repository.LINKS).values(**lost))
+        runner._renewed_s -= 25.0
+        wait_for_state(either, "connected")
 
 
 class Confirming(Station):
