@@ -4,6 +4,7 @@ import csv
 import gc
 import os
 import sys
+import tempfile
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ def _keep_temporary_files_in_memory() -> None:
     found = os.statvfs(place)
     if found.f_bavail * found.f_frsize >= 4 << 30 and not found.f_flag & os.ST_NOEXEC:
         os.environ.setdefault("TMPDIR", str(place))
+        tempfile.tempdir = None  # chosen already, when pytest began to keep what is printed
 
 
 _keep_temporary_files_in_memory()

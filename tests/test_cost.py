@@ -1,6 +1,8 @@
 """The cost of the suite: collection without heavy libraries, and folders compared with the table."""
 
 import csv
+import os
+import tempfile
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
@@ -49,3 +51,7 @@ def test_every_entry_of_the_campaigns_is_a_test_with_a_twin() -> None:
         file, _, name = row["test"].partition("[")[0].partition("::")
         assert f"def {name}(" in (tests / file).read_text() or not name, row
         assert row["twin"], row
+
+
+def test_temporary_files_are_where_the_environment_says() -> None:
+    assert tempfile.gettempdir() == os.environ.get("TMPDIR", tempfile.gettempdir())
