@@ -43,6 +43,7 @@ from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
+from reports.drawings import Drawings
 from tests.serving import TestClient, wait_for
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
@@ -114,6 +115,15 @@ def one_set_of_routes():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(routing._EffectiveRouteContext, "from_api_route", from_api_route)
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def undrawn_figures():
+    """Leave the figures of reports blank: they are the larger part of the time of a report; what draws is yielded."""
+    draw = Drawings.svg
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Drawings, "svg", lambda *_: '<svg viewBox="0 0 1 1"></svg>')
+        yield draw
 
 
 @pytest.fixture

@@ -22,6 +22,7 @@ from lunar.frames import IauOrientation
 from lunar.ground_track import ground_track
 from lunar.lens import BrownCamera
 from lunar.timescales import ticks_from_utc_ns
+from reports.drawings import Drawings
 from reports.render import render_html, to_json
 from reports.values import PassReport, Requirement
 from tests.ground_service.conftest import (
@@ -104,7 +105,7 @@ def report_on(ground: Ground) -> Callable[[Any], PassReport]:
     return lambda made: evaluate(ground, import_archive(ground, made.folder))
 
 
-def test_a_whole_pass(made, report_on):
+def test_a_whole_pass(made, report_on, undrawn_figures, monkeypatch):
     """130 m in 3-D put in, the reference good to 5 m: 129.9 m are the estimate's. Two thirds of four craters found."""
     flown = made(41)
     report = report_on(flown)
@@ -133,8 +134,10 @@ def test_a_whole_pass(made, report_on):
     assert report.headline[0].value == table["accuracy.median"].value
     assert report.remarks == () and len(report.events) == 1
     assert solutions["paper"].reset_trigger[:2] == ("initialization", "none")
+    monkeypatch.setattr(Drawings, "svg", undrawn_figures)
     page = render_html(report)
     assert "Requirements of the mission description" in page and "not met" in page and "Error budget" in page
+    assert "<path " in page
     stored = summary_of(report)["requirements"]
     assert [(one["key"], one["status"]) for one in stored] == [(k, one.status) for k, one in table.items()]
 
