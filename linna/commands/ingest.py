@@ -10,7 +10,7 @@ from linna.output import emit, finish, log
 from linna.parser import number, option
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_ingest(parser: argparse.ArgumentParser) -> None:
     option(parser, "files FILE", Path, "downlink file or pass archive folder", nargs="+")
     option(
         parser,

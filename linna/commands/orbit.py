@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lunar.ephemeris import Ephemeris
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_orbit(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     propagate = commands.add_parser("propagate", help="propagate a scenario's orbit, write it as OEM")
     option(propagate, "scenario", str, "scenario file, or the name of a shipped one")

@@ -25,7 +25,7 @@ _PAUSE_S = 0.03
 """Time between two frames of a file, so that a receiver loses none."""
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_tm(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     decode = commands.add_parser("decode", help="packets of a downlink (CADUs or bare packets) as JSON, CSV or Parquet")
