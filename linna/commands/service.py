@@ -1,7 +1,5 @@
 """`linna serve | worker | scheduler | runner | doctor | verify`: processes of the ground service, and checks of it."""
 
-from __future__ import annotations
-
 import argparse
 import time
 from pathlib import Path
