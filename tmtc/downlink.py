@@ -27,11 +27,11 @@ from tmtc.link.frames import (
     ONLY_IDLE_DATA,
     append_frame_checksums,
     idle_data,
+    randomise,
 )
 from tmtc.link.link_check import CountPackets, LinkProposal, propose_link
 from tmtc.link.link_plan import LinkPlan, LinkSection, one_section, plan_link
 from tmtc.link.marker_survey import survey_markers
-from tmtc.link.randomiser import randomise
 from tmtc.link.settings import LinkSettings
 from tmtc.packets.crc import CRC_LENGTH, crc16
 from tmtc.packets.pus import TM_HEADER_LENGTH

@@ -20,8 +20,7 @@ from tmtc.downlink import (
 )
 from tmtc.errors import LinkFormatError, ValueRefused
 from tmtc.link.cadu import ASM
-from tmtc.link.frames import Clcw, pack_clcw, unpack_clcw
-from tmtc.link.randomiser import randomise
+from tmtc.link.frames import Clcw, pack_clcw, randomise, unpack_clcw
 from tmtc.packets.crc import append_crc
 from tmtc.packets.space_packets import PacketSequencer, pack_packet
 

@@ -13,9 +13,10 @@ from tmtc.link.frames import (
     frame_headers,
     idle_data,
     pack_clcw,
+    randomise,
+    sequence,
     unpack_clcw,
 )
-from tmtc.link.randomiser import randomise, sequence
 from tmtc.packets.crc import append_crc, check_crc, crc16
 
 HEADERS = (

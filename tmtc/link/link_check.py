@@ -17,9 +17,8 @@ import numpy as np
 from tmtc.arrays import BoolArray, IntArray, OctetArray
 from tmtc.errors import LinkFormatError
 from tmtc.link import cadu, reed_solomon
-from tmtc.link.frames import FRAME_HEADER_LENGTH, FRAME_MAX_LENGTH, frame_checksums_hold
+from tmtc.link.frames import FRAME_HEADER_LENGTH, FRAME_MAX_LENGTH, Randomiser, frame_checksums_hold, randomise
 from tmtc.link.marker_survey import MarkerSurvey
-from tmtc.link.randomiser import Randomiser, randomise
 from tmtc.link.settings import FRAME_MIN_LENGTH, LinkSettings
 
 CountPackets = Callable[[cadu.CaduSync, LinkSettings], tuple[int, float]]
