@@ -17,7 +17,6 @@ from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Dictionary, Table
 from tmtc.errors import UnknownCoding, ValueRefused
 from tmtc.link import cadu, reed_solomon
-from tmtc.link.clcw import UplinkSeen, uplink_seen
 from tmtc.link.frame_reading import Frames, proof_of, read_frames
 from tmtc.link.frames import (
     FRAME_HEADER_LENGTH,
@@ -25,9 +24,11 @@ from tmtc.link.frames import (
     NO_PACKET_BEGINS,
     OCF_LENGTH,
     ONLY_IDLE_DATA,
+    UplinkSeen,
     append_frame_checksums,
     idle_data,
     randomise,
+    uplink_seen,
 )
 from tmtc.link.link_check import CountPackets, LinkProposal, propose_link
 from tmtc.link.link_plan import LinkPlan, LinkSection, one_section, plan_link

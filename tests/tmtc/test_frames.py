@@ -5,7 +5,6 @@ import pytest
 from spacepackets.ccsds.tm_frame import TmFramePrimaryHeader
 
 from tmtc.errors import ChecksumError, FrameError, LinkFormatError, TruncatedPacket
-from tmtc.link.clcw import uplink_seen
 from tmtc.link.frames import (
     Clcw,
     append_frame_checksums,
@@ -16,6 +15,7 @@ from tmtc.link.frames import (
     randomise,
     sequence,
     unpack_clcw,
+    uplink_seen,
 )
 from tmtc.packets.crc import append_crc, check_crc, crc16
 
