@@ -30,9 +30,8 @@ from tmtc.link.frames import (
     randomise,
     uplink_seen,
 )
-from tmtc.link.link_check import CountPackets, LinkProposal, propose_link
+from tmtc.link.link_check import CountPackets, LinkProposal, propose_link, survey_markers
 from tmtc.link.link_plan import LinkPlan, LinkSection, one_section, plan_link
-from tmtc.link.marker_survey import survey_markers
 from tmtc.link.settings import LinkSettings
 from tmtc.packets.crc import CRC_LENGTH, crc16
 from tmtc.packets.pus import TM_HEADER_LENGTH
