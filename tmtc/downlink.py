@@ -33,10 +33,9 @@ from tmtc.link.frames import (
 from tmtc.link.link_check import CountPackets, LinkProposal, propose_link, survey_markers
 from tmtc.link.link_plan import LinkPlan, LinkSection, one_section, plan_link
 from tmtc.link.settings import LinkSettings
-from tmtc.packets.crc import CRC_LENGTH, crc16
 from tmtc.packets.pus import TM_HEADER_LENGTH
 from tmtc.packets.sequence import SequenceReport, account
-from tmtc.packets.space_packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, idle_packet
+from tmtc.packets.space_packets import CRC_LENGTH, PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, crc16, idle_packet
 from tmtc.packets.stream import (
     CHECKED,
     PacketCut,

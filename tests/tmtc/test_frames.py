@@ -17,7 +17,7 @@ from tmtc.link.frames import (
     unpack_clcw,
     uplink_seen,
 )
-from tmtc.packets.crc import append_crc, check_crc, crc16
+from tmtc.packets.space_packets import append_crc, check_crc, crc16
 
 HEADERS = (
     # version 00, spacecraft 0001001100, channel 010, OCF 1 | 5 | 6 | flags 000, segment length id 11, pointer 10

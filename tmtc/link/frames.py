@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from tmtc.arrays import BoolArray, IntArray, OctetArray
 from tmtc.errors import FrameError, LinkFormatError, TruncatedPacket, ValueRefused
-from tmtc.packets.crc import CRC_LENGTH, crc16
+from tmtc.packets.space_packets import CRC_LENGTH, crc16
 
 FRAME_HEADER_LENGTH = 6
 FRAME_MAX_LENGTH = 2048

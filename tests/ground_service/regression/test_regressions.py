@@ -56,7 +56,7 @@ from ground_service.worker.upkeep import DAY_NS, remove_archives
 from reports.values import Gate
 from tests.ground_service.conftest import enter_files
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.packets.crc import append_crc
+from tmtc.packets.space_packets import append_crc
 
 Packets = dict[str, list[bytes]]
 
