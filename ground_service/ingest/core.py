@@ -13,7 +13,7 @@ from ground_service.telemetry.packets import NO_TIME
 from lunar.arrays import IntArray, OctetArray
 from lunar.plausible import AGREEING_PACKETS, CLOCK_ERROR_S, SILENCE_S, UNSET_CLOCK_S
 from tmtc.link.frames import UplinkSeen
-from tmtc.packets.cuc import NO_TICKS, TICKS_PER_SECOND
+from tmtc.packets.pus import NO_TICKS, TICKS_PER_SECOND
 from tmtc.packets.space_packets import (
     CRC_LENGTH,
     IDLE_APID,

@@ -7,9 +7,29 @@ ECSS-E-ST-70-41C sections 7.4.3.1 (telemetry) and 7.4.4.1 (telecommand).
 
 import struct
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
+from tmtc.arrays import IntArray
 from tmtc.errors import MalformedPacket, TruncatedPacket, ValueRefused
-from tmtc.packets.cuc import CUC_LENGTH, P_FIELD, TICKS_LIMIT
+
+P_FIELD = 0x2E
+TICKS_PER_SECOND = 1 << 16
+TICKS_LIMIT = 1 << 48
+CUC_LENGTH = 7
+
+NO_TICKS = -1
+"""On-board time of a packet that carries none, or none that is possible."""
+
+
+def onboard_ticks(values: npt.NDArray[Any]) -> IntArray:
+    """Return on-board times (n,) given as u64 in signed integers; `NO_TICKS` for those beyond 48 bits."""
+    ticks = values.astype(np.int64)
+    ticks[values >= TICKS_LIMIT] = NO_TICKS
+    return ticks
+
 
 PUS_VERSION = 2
 TM_HEADER_LENGTH = 7 + CUC_LENGTH

@@ -36,7 +36,7 @@ from payload_emulator.sim.terrain.raster import RasterTerrain
 from payload_emulator.sim.terrain.registering import fitted
 from payload_emulator.sim.terrain.registration import joined
 from payload_emulator.sim.terrain.tiles import Terrain
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 CHUNK_S = 86_400.0
 """Time that the orbit is propagated at once; another division gives other last digits."""

@@ -36,7 +36,7 @@ from tests.ground_service.conftest import (
 )
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import LinkSettings, encode_cadus
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 FRAMES = 12
 PACKETS_PER_FRAME = 6  # detections, two states, two outcomes, housekeeping
