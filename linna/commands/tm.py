@@ -92,7 +92,7 @@ def run_decode(arguments: argparse.Namespace) -> int:
 
 def _decode_foreign(arguments: argparse.Namespace) -> int:
     """Decode packets of another mission through its XTCE."""
-    from tmtc.xtce.records import format_xtce_records, xtce_records
+    from tmtc.xtce.series import format_xtce_records, xtce_records
 
     decoded, found, definition = _read_foreign(arguments)
     wanted, known = set(arguments.packet or ()), set(definition.containers)
