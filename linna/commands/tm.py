@@ -169,7 +169,7 @@ def run_xtce(arguments: argparse.Namespace) -> int:
 
 
 def run_yamcs(arguments: argparse.Namespace) -> int:
-    from tmtc.xtce.yamcs import yamcs_files
+    from tmtc.xtce.export import yamcs_files
 
     checksum, station = not arguments.no_frame_checksum, _address("--station", arguments.station)
     files = yamcs_files(arguments.spacecraft_id, arguments.frame_length, checksum, arguments.frame_port, station)
