@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
-from lunar.camera import PinholeCamera
+from lunar.camera import BrownCamera, PinholeCamera, pointed_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue
 from lunar.comparison import check_pointing
 from lunar.constants import MOON_RADIUS_M, NS
@@ -18,7 +18,6 @@ from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import ImpactError
 from lunar.frames import Orientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.gravity import GravityField
-from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from lunar.maneuvers import Maneuver
 from lunar.messages.ephemeris_files import load_orbit
 from lunar.plausible import HEIGHT_M

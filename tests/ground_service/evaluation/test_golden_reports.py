@@ -16,11 +16,11 @@ from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
 from ground_service.passes.archive_import import import_archive, instance_of, read_manifest
 from ground_service.passes.service import completeness, define_pass
+from lunar.camera import BrownCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation
 from lunar.ground_track import ground_track
-from lunar.lens import BrownCamera
 from lunar.timescales import ticks_from_utc_ns
 from reports.render import render_html, to_json
 from reports.values import PassReport, Requirement
