@@ -181,7 +181,7 @@ def _spice_id(arguments: argparse.Namespace) -> int:
 
 
 def _epochs(step_s: float | None, ephemeris: Any) -> Any:
-    from lunar.ground_track import even_epochs
+    from lunar.visibility import even_epochs
 
     return None if step_s is None else even_epochs(ephemeris, step_s)
 

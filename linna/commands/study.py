@@ -251,7 +251,7 @@ def run_fov_study(arguments: argparse.Namespace) -> int:
     from lunar.datafolder import default_orientation
     from lunar.fov_study import PAPER_COUNTS, study_field_of_view
     from lunar.frames import mcmf_from_spherical
-    from lunar.ground_track import even_epochs, ground_track
+    from lunar.visibility import even_epochs, ground_track
 
     ephemeris = load_orbit(arguments.ephemeris)
     catalogue = open_catalogue(arguments.catalogue, arguments.seed)

@@ -20,8 +20,8 @@ from lunar.camera import BrownCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation
-from lunar.ground_track import ground_track
 from lunar.timescales import ticks_from_utc_ns
+from lunar.visibility import ground_track
 from reports.render import render_html, to_json
 from reports.values import PassReport, Requirement
 from tests.ground_service.conftest import (
