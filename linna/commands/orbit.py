@@ -136,8 +136,7 @@ def run_convert(arguments: argparse.Namespace) -> int:
     from lunar.messages.oem import format_oem
     from lunar.messages.oem_xml import format_oem_xml
     from lunar.messages.spice import spk_kernel
-    from lunar.messages.stk import format_stk
-    from lunar.messages.tabular import format_csv, format_tum
+    from lunar.messages.stk import format_csv, format_stk, format_tum
 
     writers: dict[str, Callable[[Ephemeris], Any]] = {
         ".oem": format_oem,
