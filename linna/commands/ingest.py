@@ -39,7 +39,7 @@ def configure_ingest(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from ground_service.client.problems import InvalidRequest, JobFailed
+    from ground_service.client.connection import InvalidRequest, JobFailed
     from ground_service.errors import InvalidInput
 
     if arguments.offset is not None and arguments.recording is None:
