@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
 from ground_service.errors import Stopping, storage_error
 from ground_service.store.database import Database, prepare_database
 from ground_service.store.files import UNPACKING, FileArchive, files_of, make_durable_folder, remove_leftovers
+from ground_service.store.leases import Waker
 from ground_service.store.objects import ObjectStore, objects_of
 from ground_service.store.roles import check_role
-from ground_service.store.wakeups import Waker
 from lunar.datafolder import DataFolder, default_orientation, find_data
 
 if TYPE_CHECKING:

@@ -13,10 +13,16 @@ from ground_service.telemetry.packets import NO_TIME
 from lunar.arrays import IntArray, OctetArray
 from lunar.constants import DAY_NS
 from lunar.plausible import AGREEING_PACKETS, CLOCK_ERROR_S, SILENCE_S, UNSET_CLOCK_S
-from tmtc.link.clcw import UplinkSeen
-from tmtc.packets.crc import CRC_LENGTH, crc16
-from tmtc.packets.cuc import NO_TICKS, TICKS_PER_SECOND
-from tmtc.packets.space_packets import IDLE_APID, PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, SEQUENCE_COUNT_LIMIT
+from tmtc.link.frames import UplinkSeen
+from tmtc.packets.pus import NO_TICKS, TICKS_PER_SECOND
+from tmtc.packets.space_packets import (
+    CRC_LENGTH,
+    IDLE_APID,
+    PACKET_MAX_LENGTH,
+    PRIMARY_HEADER_LENGTH,
+    SEQUENCE_COUNT_LIMIT,
+    crc16,
+)
 from tmtc.packets.stream import PacketForm
 
 LONGEST_STEP = round(CLOCK_ERROR_S * TICKS_PER_SECOND)

@@ -45,9 +45,8 @@ from lunar.messages.ephemeris_files import load_orbit
 from lunar.timescales import TICKS_PER_SECOND, parse_utc
 from tmtc.dictionary.payload import APID_LARGE_DATA, DICTIONARY
 from tmtc.errors import ValueRefused
-from tmtc.packets.large_data import LargeDataReceiver
+from tmtc.packets.large_data import LargeDataReceiver, Thumbnail, unpack_thumbnail
 from tmtc.packets.stream import cut_packets
-from tmtc.packets.thumbnails import Thumbnail, unpack_thumbnail
 
 SCHEMA_VERSION = 1
 RECEPTIONS_FILE = "receptions.csv"

@@ -34,8 +34,7 @@ from lunar.timescales import ONBOARD_EPOCH_TAI_NS, TICKS_PER_SECOND, parse_utc, 
 from tmtc.arrays import Octets
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Dictionary
-from tmtc.packets.cuc import NO_TICKS, TICKS_LIMIT
-from tmtc.packets.packet_times import TimeCode, elapsed
+from tmtc.packets.pus import NO_TICKS, TICKS_LIMIT, TimeCode, elapsed
 from tmtc.packets.stream import PacketCut, primary_headers, whole_packets
 from tmtc.xtce.decode import DECODED, VERDICTS
 from tmtc.xtce.series import series_matrix

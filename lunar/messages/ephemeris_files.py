@@ -8,7 +8,7 @@ import itertools
 from pathlib import Path
 
 from lunar.comparison import check_gravity
-from lunar.compressed import read_expanded
+from lunar.datafolder import read_expanded
 from lunar.ephemeris import Ephemeris
 from lunar.errors import DataFileError
 from lunar.messages.horizons import is_horizons, parse_horizons

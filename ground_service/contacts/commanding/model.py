@@ -11,7 +11,7 @@ from ground_service.toml import LINE_PATTERN_JSON
 from lunar.timescales import format_utc, utc_ns_from_ticks
 from tmtc.dictionary.arguments import argument_text
 from tmtc.dictionary.codes import FAILURES
-from tmtc.link.clcw import UplinkSeen
+from tmtc.link.frames import UplinkSeen
 
 _FAILURES = dict(FAILURES)
 REMEDY = "; the payload expects other sequence counts: send perform_function resynchronise_commands first"

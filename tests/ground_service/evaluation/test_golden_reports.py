@@ -13,12 +13,12 @@ from ground_service.evaluation.service import evaluate
 from ground_service.ingest.service import ingest_file
 from ground_service.passes.archive_import import import_archive, instance_of, read_manifest
 from ground_service.passes.service import completeness, define_pass
+from lunar.camera import BrownCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation
-from lunar.ground_track import ground_track
-from lunar.lens import BrownCamera
 from lunar.timescales import ticks_from_utc_ns
+from lunar.visibility import ground_track
 from reports.drawings import Drawings
 from reports.render import render_html, to_json
 from tests.ground_service.conftest import (
@@ -33,7 +33,7 @@ from tests.ground_service.conftest import (
 )
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import LinkSettings, encode_cadus
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 FRAMES = 12
 PACKETS_PER_FRAME = 6  # detections, two states, two outcomes, housekeeping

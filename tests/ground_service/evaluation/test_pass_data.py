@@ -21,11 +21,10 @@ from ground_service.missions.frames import camera_of, declared_frames
 from ground_service.missions.model import Camera, Frames, Mission
 from ground_service.missions.service import add_mission
 from ground_service.passes.archive_import import import_archive
-from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
+from lunar.camera import BrownCamera, PinholeCamera, nadir_camera_from_mcmf
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation, continuous_quaternions, matrix_from_quaternion, quaternion_from_matrix
 from lunar.gravity import builtin_gravity
-from lunar.lens import BrownCamera
 from lunar.messages.aem import AttitudeSegment, format_aem
 from lunar.timescales import ticks_from_utc_ns
 from reports.render import to_json

@@ -27,7 +27,7 @@ from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service.archive_hash import hash_of
 from tests.ground_service.conftest import _housekeeping
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.packets.cuc import NO_TICKS
+from tmtc.packets.pus import NO_TICKS
 
 NOW = parse_utc("2029-08-18T09:00:00Z")
 TICKS = int(ticks_from_utc_ns(NOW))

@@ -33,7 +33,7 @@ from tests.ground_service.conftest import define_pass_of
 from tests.serving import TestClient
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode, encode_cadus
-from tmtc.packets.crc import append_crc
+from tmtc.packets.space_packets import append_crc
 
 SPACECRAFT = 76
 

@@ -27,7 +27,7 @@ from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.link.frames import FRAME_HEADER_LENGTH
 from tmtc.link.settings import LinkSettings
-from tmtc.packets.crc import CRC_LENGTH
+from tmtc.packets.space_packets import CRC_LENGTH
 from tmtc.packets.stream import cut_packets
 
 

@@ -13,7 +13,7 @@ from ground_service.passes.downlink_accounting import account_sequence
 from ground_service.store import repository
 from ground_service.telemetry.packets import batch_of_cut
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.packets.cuc import NO_TICKS, TICKS_PER_SECOND
+from tmtc.packets.pus import NO_TICKS, TICKS_PER_SECOND
 from tmtc.packets.space_packets import SEQUENCE_COUNT_LIMIT
 from tmtc.packets.stream import cut_packets
 

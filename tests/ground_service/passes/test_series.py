@@ -42,9 +42,8 @@ from tests.ground_service.conftest import NS, SPACECRAFT, define_pass_of, encode
 from tests.lazy import Lazy
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
-from tmtc.packets.large_data import split
+from tmtc.packets.large_data import Thumbnail, pack_thumbnail, split
 from tmtc.packets.stream import cut_packets
-from tmtc.packets.thumbnails import Thumbnail, pack_thumbnail
 
 cv2 = Lazy("cv2")
 

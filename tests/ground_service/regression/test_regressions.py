@@ -57,7 +57,7 @@ from lunar.constants import DAY_NS
 from reports.values import Gate
 from tests.ground_service.conftest import enter_files
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.packets.crc import append_crc
+from tmtc.packets.space_packets import append_crc
 
 Packets = dict[str, list[bytes]]
 

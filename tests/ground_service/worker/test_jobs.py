@@ -7,8 +7,8 @@ from unittest.mock import Mock
 
 import pytest
 
+from ground_service.client.connection import Conflict as ClientConflict
 from ground_service.client.local import local_client
-from ground_service.client.problems import Conflict as ClientConflict
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, DatabaseUnavailable, FileDamaged, InvalidInput, StorageFull, public_text
 from ground_service.http.model import Paging
