@@ -65,7 +65,7 @@ class Station:
             one.close()
 
 
-WAITS = {"TICK_S": 0.02, "POLL_S": 0.02, "PAUSE_S": 0.1, "RETRY_S": 0.1, "MISSED_S": 0.1, "REFUSED_S": 0.1}
+WAITS = {"TICK_S": 0.05, "PAUSE_S": 0.1, "RETRY_S": 0.1, "MISSED_S": 0.1, "REFUSED_S": 0.1}
 
 
 @pytest.fixture
