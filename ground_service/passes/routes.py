@@ -23,8 +23,7 @@ from ground_service.http.common import (
 )
 from ground_service.http.model import PageOf, RequestTime, ns_of
 from ground_service.http.requests import operations, problems
-from ground_service.jobs.model import Job
-from ground_service.jobs.service import DispatcherOf, get_job
+from ground_service.jobs.service import DispatcherOf, Job, get_job
 from ground_service.passes import archive_import, parameters, service, store
 from ground_service.passes import live as newest
 from ground_service.passes.model import (
