@@ -5,8 +5,7 @@ from typing import Annotated, Any
 from fastapi import Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 
-from ground_service.access.idempotency import added_once
-from ground_service.access.security import Operator, UploadOf, Viewer, add_list, idempotent_id
+from ground_service.access.security import Operator, UploadOf, Viewer, add_list, added_once, idempotent_id
 from ground_service.errors import InvalidInput
 from ground_service.http.common import (
     API_PREFIX,

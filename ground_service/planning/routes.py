@@ -4,8 +4,7 @@ from typing import Annotated
 
 from fastapi import Header, Query, Response
 
-from ground_service.access.idempotency import added_once
-from ground_service.access.security import Operator, Viewer, add_list
+from ground_service.access.security import Operator, Viewer, add_list, added_once
 from ground_service.contacts.commanding import service as commanding
 from ground_service.contacts.commanding.model import Telecommand
 from ground_service.http.common import API_PREFIX, IF_MATCH_HEADER, GroundOf, Instance, OnceKey, PassId
