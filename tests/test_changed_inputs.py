@@ -617,8 +617,8 @@ CODE = {
 }
 KEYS = re.compile(r"""(?m)^_(?:META|HEADER)_KEYS\b|^_(?:MANDATORY|IGNORED|READERS|COLUMNS)\b|^OWN_COLUMNS\b""")
 LOOKED_UP = re.compile(
-    r"""(?:\b(?:item|row|document|head|one)(?:\.get\(|\[)|_(?:value|number|positive)\(item, |prefix \+ )"(\w+)\""""
-    r"""|"(\w+)" (?:not )?in (?:item|document)\b"""
+    r'(?:\b(?:item|row|document|head|one)(?:\.get\(|\[)|_(?:value|number|positive)\(item, |prefix \+ )"(\w+)"'
+    r'|"(\w+)" (?:not )?in (?:item|document)\b'
 )
 NOT_OF_FILES = {"received"}
 """Keys of requests to the service."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from ground_service.telemetry.packets import NO_TIME
 from lunar.arrays import IntArray, OctetArray
+from lunar.constants import DAY_NS
 from lunar.plausible import AGREEING_PACKETS, CLOCK_ERROR_S, SILENCE_S, UNSET_CLOCK_S
 from tmtc.link.frames import UplinkSeen
 from tmtc.packets.pus import NO_TICKS, TICKS_PER_SECOND
@@ -268,7 +269,6 @@ def is_idle(octets: bytes) -> bool:
     return len(octets) >= 2 and int.from_bytes(octets[:2], "big") & 0x7FF == IDLE_APID
 
 
-DAY_NS = 86_400_000_000_000
 CDS_EPOCH_DAYS = 4383
 """Days from 1958-01-01 to 1970-01-01."""
 

@@ -64,7 +64,7 @@ def run_stats(arguments: argparse.Namespace) -> int:
         f"class {k} ({name}): {count} (paper {paper})"
         for k, (name, count, paper) in enumerate(zip(names, counts, PAPER_CLASS_COUNTS, strict=True))
     ]
-    return emit(arguments, figures, text="\n".join(lines))
+    return emit(arguments, figures, text="\n".join(lines)) or int(not len(catalogue))
 
 
 def run_curate(arguments: argparse.Namespace) -> int:
@@ -92,7 +92,8 @@ def run_curate(arguments: argparse.Namespace) -> int:
         written = format_catalogue(curation.catalogue(f"curated {listed.source}")).encode("ascii")
     else:
         written = octets
-    arguments.out.write_bytes(written)
+    if len(table):
+        arguments.out.write_bytes(written)
     shift_m = np.hypot(*curation.shift_m.T)
     figures = {
         "kept": len(table),
@@ -118,9 +119,11 @@ def run_curate(arguments: argparse.Namespace) -> int:
         f"{heights.pixels_per_degree:g} px/deg, rim heights raised by {curation.height_correction_m:.0f} m",
         f"{listed.source}: {catalogue_words(listed)}",
         *(heights.readings if arguments.terrain else ()),
-        f"{arguments.out}: {len(written)} octets, table {table_hash(octets):08x}",
+        f"{arguments.out}: {len(written)} octets, table {table_hash(octets):08x}"
+        if len(table)
+        else f"{arguments.out}: not written, no crater is kept",
     ]
-    return emit(arguments, figures, text="\n".join(lines))
+    return emit(arguments, figures, text="\n".join(lines)) or int(not len(table))
 
 
 def _range(values: FloatArray) -> dict[str, float]:

@@ -63,7 +63,10 @@ def _uplink(arguments: argparse.Namespace) -> int:
         file.write(taken.octets)
     figures = {"file": str(out), "octets": len(taken.octets), "telecommands": list(taken.telecommands)}
     text = f"{out}: {len(taken.telecommands)} telecommands, {len(taken.octets)} octets"
-    return emit(arguments, figures, text=text)
+    if not taken.octets:
+        out.unlink()
+        text = f"{out}: not written, no released telecommand waits"
+    return emit(arguments, figures, text=text) or int(not taken.octets)
 
 
 def _figures(telecommand: Telecommand) -> dict[str, Any]:

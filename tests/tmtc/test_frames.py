@@ -140,7 +140,7 @@ def test_an_unknown_randomiser_is_refused():
 TYPE_TWO_REPORT = 0x8000_0001
 
 
-def words(*clcws: Clcw | int):
+def words(*clcws):
     return np.array(
         [one if isinstance(one, int) else int.from_bytes(pack_clcw(one), "big") for one in clcws], dtype=np.uint32
     )

@@ -206,7 +206,11 @@ class HandoverFilter(Paging):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UplinkChannel(UplinkSeen):
-    """A telecommand channel as the newest reception shows it."""
+    """A telecommand channel as the newest reception shows it; flags are those of its newest control word.
+
+    `report_value` is the number of the sequence-controlled frame that is expected next, `farm_b_counter` the number of
+    accepted expedited frames modulo 4.
+    """
 
     ingest_id: int
     received: UtcTime

@@ -4,7 +4,6 @@ import json
 import math
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +35,7 @@ MISSING_FILES = DataFolder(orientation_bpc=Path("no.bpc"), gravity=Path("no.gfc"
 """A data folder with other models; none of them may even be opened."""
 
 
-def changed_archive(synthetic_pass: Any, folder: Path, attitude: str = "", **changed: Any) -> Path:
+def changed_archive(synthetic_pass, folder, attitude="", **changed):
     """Copy the archive, with a table of attitudes if any is given."""
     shutil.copytree(synthetic_pass.folder, folder)
     if attitude:
@@ -45,7 +44,7 @@ def changed_archive(synthetic_pass: Any, folder: Path, attitude: str = "", **cha
     return folder
 
 
-def report_text(home: Path, data: DataFolder, archive: Path) -> str:
+def report_text(home, data, archive):
     with open_ground(home, data) as ground:
         return to_json(evaluate(ground, import_archive(ground, archive)))
 
@@ -146,12 +145,12 @@ def test_the_attitude_of_an_archive_is_found_by_the_time_of_the_image(synthetic_
     assert viewing.q_wxyz.tolist() == q_wxyz[::-1].tolist()
 
 
-def first_nadir(synthetic_pass: Any) -> np.ndarray:
+def first_nadir(synthetic_pass):
     """Rotation (3, 3) of a camera that looks down at the first image."""
     return nadir_camera_from_mcmf(circular_states(synthetic_pass.utc_ns[:1])[0])[0]
 
 
-def with_attitude_message(synthetic_pass: Any, folder: Path, **fields: Any) -> AttitudeSegment:
+def with_attitude_message(synthetic_pass, folder, **fields):
     """Copy the archive with an AEM of a steady turn about the boresight, a sample every 10 s; return what it has."""
     shutil.copytree(synthetic_pass.folder, folder)
     utc_ns = synthetic_pass.utc_ns[0] + np.arange(0, 121, 10) * 10**9
