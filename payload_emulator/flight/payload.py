@@ -21,8 +21,7 @@ from payload_emulator.flight.onboard.loads import MODEL_NUMBER, TABLE_NUMBERS, F
 from payload_emulator.flight.onboard.machine import PARAMETERS_NUMBER, Machine, Observation, ProtectedMemory
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.onboard.observer import Observer
-from payload_emulator.flight.onboard.parameters import ParameterStore
-from payload_emulator.flight.onboard.settings import Recovery, Settings
+from payload_emulator.flight.onboard.settings import ParameterStore, Recovery, Settings
 from payload_emulator.flight.onboard.telecommands import check, execute, name_of
 from payload_emulator.flight.ports import BareBoard, Board, Load, ResetCause, Stage
 from payload_emulator.flight.telemetry.packets import Telemetry
