@@ -24,8 +24,7 @@ from payload_emulator.flight.onboard.observer import Observer
 from payload_emulator.flight.onboard.settings import ParameterStore, Recovery, Settings
 from payload_emulator.flight.onboard.telecommands import check, execute, name_of
 from payload_emulator.flight.ports import BareBoard, Board, Load, ResetCause, Stage
-from payload_emulator.flight.telemetry.packets import Telemetry
-from payload_emulator.flight.telemetry.products import image_report, thumbnail_octets
+from payload_emulator.flight.telemetry.packets import Telemetry, image_report, thumbnail_octets
 from payload_emulator.flight.telemetry.store import PacketStore, StoreClass
 from payload_emulator.flight.vision.detections import Detector
 from tmtc.packets.pus import ACK_ACCEPTANCE, ACK_COMPLETION, ACK_START, TICKS_LIMIT, TICKS_PER_SECOND

@@ -23,7 +23,7 @@ from lunar.datafolder import DataFolder
 from payload_emulator.errors import RecordError
 from payload_emulator.flight.onboard.commanding import Refusal, parse_commands
 from payload_emulator.flight.ports import UNLIMITED, ResetCause
-from payload_emulator.flight.telemetry.products import image_report
+from payload_emulator.flight.telemetry.packets import image_report
 from payload_emulator.session.archive import recording
 from payload_emulator.session.archive.emulator import Progress, file_entries
 from payload_emulator.session.archive.mission import save_attitudes
