@@ -19,6 +19,7 @@ from lunar.frames import mcmf_from_spherical
 from lunar.timescales import parse_utc
 from payload_emulator.errors import LinkError
 from payload_emulator.flight.onboard.modes import PayloadMode
+from payload_emulator.session.live.console import step_message
 from payload_emulator.session.live.session import LiveSession
 from payload_emulator.session.live.station_ports import (
     CLIENT_LIMIT,
@@ -27,7 +28,6 @@ from payload_emulator.session.live.station_ports import (
     Server,
     TelecommandBuffer,
 )
-from payload_emulator.session.live.viewing import step_message
 from payload_emulator.session.scenario import FaultsSection, parse_scenario
 from payload_emulator.session.spacecraft.loading import load_scenario_payload
 from payload_emulator.session.spacecraft.loop import StepInput, StepResult, new_spacecraft
