@@ -34,8 +34,8 @@ from payload_emulator.session.spacecraft.loop import StepInput, StepResult, new_
 from payload_emulator.session.spacecraft.schedule import Operator, fly_scenario
 from payload_emulator.session.world.camera import Exposure, expose
 from payload_emulator.session.world.world import build_world
-from payload_emulator.sim.board.faults import FAULT_KINDS
 from payload_emulator.sim.board.link import Receiver
+from payload_emulator.sim.board.platform import FAULT_KINDS
 from studies.harness.parts import free_port, listens
 from tests.scenarios import live_scenario
 from tmtc.dictionary.payload import DICTIONARY
