@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray
-from payload_emulator.training.data.truth import FrameTruth
+from payload_emulator.training.data.dataset import FrameTruth
 from payload_emulator.training.evaluate.scoring import Tally, resampled_sums
 
 FEWEST_PAIRS = 20

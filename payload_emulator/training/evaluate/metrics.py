@@ -9,7 +9,7 @@ import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray
 from payload_emulator.flight.vision.detections import DEGRADED_DEPTH_RATIO, FRESH_DEPTH_RATIO
-from payload_emulator.training.data.truth import FrameTruth
+from payload_emulator.training.data.dataset import FrameTruth
 from payload_emulator.training.evaluate.localisation import bias_by_octant, bias_overall, right
 from payload_emulator.training.evaluate.scoring import (
     DEGRADATION_EDGES,

@@ -26,8 +26,8 @@ from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.flight.vision.picture_search import PictureSearch, search_picture, sun_at_azimuth
 from payload_emulator.session.world.external import read_picture
+from payload_emulator.training.data.dataset import FrameTruth
 from payload_emulator.training.data.pictures import LabelledPicture, load_pictures, set_words
-from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate import scoring
 from payload_emulator.training.evaluate.localisation import bias_by_octant, bias_overall
 

@@ -23,8 +23,7 @@ from payload_emulator.errors import DatasetError, ModelError
 from payload_emulator.flight.vision import calibration
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
-from payload_emulator.training.data.dataset import Dataset, Frame, frame_truth
-from payload_emulator.training.data.truth import FrameTruth
+from payload_emulator.training.data.dataset import Dataset, Frame, FrameTruth, frame_truth
 from payload_emulator.training.evaluate import evaluate
 from payload_emulator.training.evaluate.scoring import FrameDetections, MatchRule, match, tally
 
