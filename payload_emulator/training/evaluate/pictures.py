@@ -29,7 +29,7 @@ from payload_emulator.session.world.external import read_picture
 from payload_emulator.training.data.dataset import FrameTruth
 from payload_emulator.training.data.pictures import LabelledPicture, load_pictures, set_words
 from payload_emulator.training.evaluate import scoring
-from payload_emulator.training.evaluate.localisation import bias_by_octant, bias_overall
+from payload_emulator.training.evaluate.metrics import bias_by_octant, bias_overall
 
 DIAMETER_RANGE_PX = (8.0, 150.0)
 DIAMETER_EDGES_PX = (8.0, 12.0, 16.0, 32.0, 64.0, 150.0)
