@@ -185,8 +185,7 @@ def run_frames(arguments: argparse.Namespace) -> int:
     import socket
     import time
 
-    from tmtc.link.frame_reading import plain_frames
-    from tmtc.link.settings import LinkSettings
+    from tmtc.link.settings import LinkSettings, plain_frames
 
     target, count = _address("--to", arguments.to), 0
     settings = _link_settings(arguments) or LinkSettings()

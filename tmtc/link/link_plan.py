@@ -15,7 +15,6 @@ import numpy as np
 
 from tmtc.arrays import BoolArray, IntArray, OctetArray
 from tmtc.link import cadu, reed_solomon
-from tmtc.link.frame_reading import proof_of
 from tmtc.link.frames import frame_checksums_hold, randomise
 from tmtc.link.link_check import (
     BLOCK_OCTETS,
@@ -26,7 +25,7 @@ from tmtc.link.link_check import (
     propose_link,
     survey_markers,
 )
-from tmtc.link.settings import LinkSettings
+from tmtc.link.settings import LinkSettings, proof_of
 
 TRIED_PER_BLOCK = 3
 """Number of CADUs of a block on which settings are tried."""
