@@ -27,9 +27,8 @@ from tmtc.dictionary.definitions import format_dictionary, parse_dictionary
 from tmtc.dictionary.effects import CARRIER, EFFECTS, FUNCTION, Effect, effect_of
 from tmtc.dictionary.estimates import filter_estimates
 from tmtc.dictionary.event_texts import EVENT_TEXTS, event_text
-from tmtc.dictionary.fields import Field
+from tmtc.dictionary.fields import PARAMETERS, Field
 from tmtc.dictionary.icd import format_icd
-from tmtc.dictionary.onboard_parameters import PARAMETERS
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import (
     ALARM,

@@ -14,8 +14,7 @@ OMG XTCE 1.2, namespace http://www.omg.org/spec/XTCE/20180204; CCSDS 660.0-B-2.
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 
-from tmtc.dictionary.fields import Field
-from tmtc.dictionary.onboard_parameters import PARAMETERS
+from tmtc.dictionary.fields import PARAMETERS, Field
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Dictionary, PacketDefinition
 

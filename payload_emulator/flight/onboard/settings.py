@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from payload_emulator.flight.ports import Memory
-from tmtc.dictionary.onboard_parameters import BY_NAME, Parameter
+from tmtc.dictionary.fields import BY_NAME, Parameter
 
 _MAGIC = b"LNST"
 _HEADER = struct.Struct(">4sIII")

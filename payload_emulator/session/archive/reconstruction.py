@@ -32,7 +32,7 @@ from payload_emulator.session.spacecraft.loading import LoadedPayload, launch_pa
 from payload_emulator.session.world.camera import Exposure, expose
 from payload_emulator.session.world.world import CHUNK_S, World, extended_flight, first_utc_ns, frame_utc_ns, open_world
 from payload_emulator.sim.board.platform import parse_fault
-from tmtc.dictionary.onboard_parameters import find_parameter
+from tmtc.dictionary.fields import find_parameter
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Table
 from tmtc.dictionary.tables import table_hash
