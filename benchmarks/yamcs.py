@@ -30,7 +30,8 @@ from lunar.constants import DAY_NS
 from lunar.timescales import format_utc
 from studies.harness.parts import Part, descendants, free_port
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.link.settings import LinkSettings, plain_frames
+from tmtc.link.frame_reading import plain_frames
+from tmtc.link.settings import LinkSettings
 
 ENVIRONMENT = ROOT / "build" / "compatibility" / "environments" / "yamcs" / "bin" / "python"
 PACKETS, WARM = 36_000, 4_000

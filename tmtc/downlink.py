@@ -17,6 +17,7 @@ from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Dictionary, Table
 from tmtc.errors import UnknownCoding, ValueRefused
 from tmtc.link import cadu, reed_solomon
+from tmtc.link.frame_reading import Frames, proof_of, read_frames
 from tmtc.link.frames import (
     FRAME_HEADER_LENGTH,
     IDLE_CHANNEL,
@@ -31,7 +32,7 @@ from tmtc.link.frames import (
 )
 from tmtc.link.link_check import CountPackets, LinkProposal, propose_link, survey_markers
 from tmtc.link.link_plan import LinkPlan, LinkSection, one_section, plan_link
-from tmtc.link.settings import Frames, LinkSettings, proof_of, read_frames
+from tmtc.link.settings import LinkSettings
 from tmtc.packets.pus import TM_HEADER_LENGTH
 from tmtc.packets.sequence import SequenceReport, account
 from tmtc.packets.space_packets import CRC_LENGTH, PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, crc16, idle_packet

@@ -59,7 +59,7 @@ from ground_service.evaluation.verdict import (
     verdict_of,
     without_mission,
 )
-from ground_service.telemetry.values import DetectionSamples, NavigationSamples, OutcomeSamples
+from ground_service.telemetry.samples import DetectionSamples, NavigationSamples, OutcomeSamples
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
 from lunar.constants import MOON_RADIUS_M, NS

@@ -12,7 +12,7 @@ from ground_service.errors import InvalidInput
 from ground_service.evaluation.alignment import ReferenceStates, error_of_places_rtn_m, navigation_statistics
 from ground_service.evaluation.fixes import Pairs, snapshot_positions, wrong_fixes
 from ground_service.evaluation.recall import Viewing
-from ground_service.telemetry.values import NavigationSamples
+from ground_service.telemetry.samples import NavigationSamples
 from kernels import made_once
 from lunar.arrays import FloatArray
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ground_service.evaluation.recall import CENTRE_TOLERANCE_PX, CENTRE_TOLERANCE_RADII
-from ground_service.telemetry.values import DetectionSamples
+from ground_service.telemetry.samples import DetectionSamples
 from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue

@@ -37,8 +37,8 @@ from ground_service.passes.sample_store import code_labels, detection_samples, e
 from ground_service.passes.span import PassSpan, pass_span
 from ground_service.store.files import FileArchive, register_file
 from ground_service.store.vehicles import Vehicle, get_vehicle
+from ground_service.telemetry.samples import NavigationSamples, OutcomeSamples
 from ground_service.telemetry.store import unpack_filter_states, unpack_identifications
-from ground_service.telemetry.values import NavigationSamples, OutcomeSamples
 from ground_service.toml import read_table
 from lunar.boxes import share_outside
 from lunar.camera import PinholeCamera

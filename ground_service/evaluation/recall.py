@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ground_service.telemetry.values import DetectionSamples
+from ground_service.telemetry.samples import DetectionSamples
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import (
     PinholeCamera,

@@ -14,8 +14,8 @@ from ground_service.passes.span import PassSpan
 from ground_service.store import repository
 from ground_service.store.models import TELECOMMANDS
 from ground_service.telemetry import store as telemetry
+from ground_service.telemetry.samples import DetectionSamples, no_detections
 from ground_service.telemetry.store import DETECTION_ITEM, unpack_detections
-from ground_service.telemetry.values import DetectionSamples, no_detections
 from lunar.arrays import IntArray
 from lunar.timescales import format_utc
 from reports.values import PassEvent

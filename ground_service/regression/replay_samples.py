@@ -22,7 +22,7 @@ from ground_service.passes.archive_import import archived_mission
 from ground_service.regression.archives import PassArchive, frame_inputs
 from ground_service.regression.builds import flat
 from ground_service.regression.gates.samples import KINDS, CraterRows, PassFrames, TimeTags, pass_frames
-from ground_service.telemetry.values import DetectionSamples, NavigationSamples, no_detections
+from ground_service.telemetry.samples import DetectionSamples, NavigationSamples, no_detections
 from ground_service.toml import read_table
 from lunar.arrays import IntArray
 from lunar.camera import PinholeCamera

@@ -185,7 +185,8 @@ def run_frames(arguments: argparse.Namespace) -> int:
     import socket
     import time
 
-    from tmtc.link.settings import LinkSettings, plain_frames
+    from tmtc.link.frame_reading import plain_frames
+    from tmtc.link.settings import LinkSettings
 
     target, count = _address("--to", arguments.to), 0
     settings = _link_settings(arguments) or LinkSettings()

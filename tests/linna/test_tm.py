@@ -309,7 +309,8 @@ def test_plain_frames_of_a_downlink_are_sent_as_datagrams(downlink, typed):
 
 
 def test_frames_are_found_across_pieces_of_a_stream(downlink):
-    from tmtc.link.settings import LinkSettings, plain_frames
+    from tmtc.link.frame_reading import plain_frames
+    from tmtc.link.settings import LinkSettings
 
     octets = downlink.read_bytes()
     whole = list(plain_frames([octets], LinkSettings()))

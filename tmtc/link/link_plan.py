@@ -15,6 +15,7 @@ import numpy as np
 
 from tmtc.arrays import BoolArray, IntArray, OctetArray
 from tmtc.link import cadu, reed_solomon
+from tmtc.link.frame_reading import proof_of
 from tmtc.link.frames import frame_checksums_hold, randomise
 from tmtc.link.link_check import (
     BLOCK_OCTETS,
@@ -25,7 +26,7 @@ from tmtc.link.link_check import (
     propose_link,
     survey_markers,
 )
-from tmtc.link.settings import LinkSettings, proof_of
+from tmtc.link.settings import LinkSettings
 
 TRIED_PER_BLOCK = 3
 """Number of CADUs of a block on which settings are tried."""

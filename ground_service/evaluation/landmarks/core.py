@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ground_service.evaluation.recall import ExpectedCraters, Matches
-from ground_service.telemetry.values import DetectionSamples
+from ground_service.telemetry.samples import DetectionSamples
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, above_horizon, intersect_sphere
 from lunar.catalogue import NAVIGATION_MINIMUM_M, CraterCatalogue

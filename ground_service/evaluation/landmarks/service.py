@@ -41,7 +41,7 @@ from ground_service.store.event_kinds import LandmarkChanged, publish
 from ground_service.store.files import files_beginning
 from ground_service.store.states import LANDMARK, change_if, move
 from ground_service.store.vehicles import get_vehicle, lock_spacecraft
-from ground_service.telemetry.values import DetectionSamples
+from ground_service.telemetry.samples import DetectionSamples
 from lunar.arrays import FloatArray
 from lunar.catalogue import CraterCatalogue, make_catalogue
 from tmtc.dictionary.payload import DICTIONARY

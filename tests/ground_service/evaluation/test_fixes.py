@@ -22,7 +22,7 @@ from ground_service.evaluation.fixes import (
     snapshot_positions,
     wrong_fixes,
 )
-from ground_service.telemetry.values import DetectionSamples
+from ground_service.telemetry.samples import DetectionSamples
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import make_catalogue
 from lunar.frames import mcmf_from_spherical

@@ -18,7 +18,7 @@ from ground_service.evaluation.fixes import IdentificationSamples, MappedCraters
 from ground_service.evaluation.model import PassFigures
 from ground_service.evaluation.recall import Viewing
 from ground_service.evaluation.smoother import ONBOARD, FilterStates, StartState
-from ground_service.telemetry.values import DetectionSamples, NavigationSamples, OutcomeSamples, no_detections
+from ground_service.telemetry.samples import DetectionSamples, NavigationSamples, OutcomeSamples, no_detections
 from lunar.camera import PinholeCamera
 from lunar.catalogue import make_catalogue
 from lunar.ephemeris import ephemeris_from_states

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx
 
 from ground_service.evaluation.recall import ExpectedCraters, expected_craters, match_detections, score_detections
-from ground_service.telemetry.values import DetectionSamples
+from ground_service.telemetry.samples import DetectionSamples
 from lunar.camera import PinholeCamera
 from lunar.catalogue import make_catalogue
 from lunar.frames import mcmf_from_spherical

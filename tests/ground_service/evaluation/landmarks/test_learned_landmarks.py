@@ -33,7 +33,7 @@ from ground_service.evaluation.recall import expected_craters, match_detections
 from ground_service.ground import open_ground
 from ground_service.missions.catalogues import add_catalogue
 from ground_service.passes.archive_import import import_archive
-from ground_service.telemetry.values import DetectionSamples
+from ground_service.telemetry.samples import DetectionSamples
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.catalogue import load_catalogue, make_catalogue, save_catalogue
 from lunar.constants import MOON_RADIUS_M
