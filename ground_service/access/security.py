@@ -1,4 +1,4 @@
-"""Authentication of requests, and roles that operations require."""
+"""Authentication of requests, roles that operations require, and idempotency keys."""
 
 import functools
 import hashlib

@@ -1,4 +1,4 @@
-"""Mission time of a service as the mission descriptions in force state it."""
+"""Mission time of a service and places of stations, as the mission descriptions in force state them."""
 
 import logging
 import math

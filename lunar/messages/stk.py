@@ -1,4 +1,4 @@
-"""STK ephemeris files (``.e``), both ways.
+"""STK ephemeris files (``.e``), both ways; trajectories as CSV and TUM.
 
 Read are the formats EphemerisTimePosVel and EphemerisTimePosVelAcc (accelerations are not used) about the
 Moon in ICRF or J2000 axes, times in seconds since ScenarioEpoch (UTC).  An epoch that occurs twice in a row,

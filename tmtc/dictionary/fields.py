@@ -1,4 +1,4 @@
-"""One number of a packet: how it is stored and what it means. Tables of names need no numerical library."""
+"""Fields of packets, those of housekeeping, and on-board parameters. Tables of names need no numerical library."""
 
 import math
 from dataclasses import dataclass

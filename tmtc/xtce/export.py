@@ -1,4 +1,4 @@
-"""The dictionary as XTCE 1.2, for exchange with other ground systems; nothing here runs on it.
+"""The dictionary as XTCE 1.2, and the configuration of Yamcs, for exchange with other ground systems.
 
 Repeated items are an array whose size is the count in the packet, of aggregates, or of numbers if an item is one
 number; repeated octets are one binary parameter. Some decoders do not support arrays: for these, the unrolled form

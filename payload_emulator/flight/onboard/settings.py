@@ -1,4 +1,4 @@
-"""Settings that survive a reset: one text of settings in two copies, the newer of which that is whole counts.
+"""On-board parameters, and settings that survive a reset: a text in two copies, of which the newer whole one counts.
 
 Each half of the memory holds a block: magic `LNST`, generation (u32), length (u32), CRC-32 of generation, length and
 content (u32), content (JSON, UTF-8); big-endian. Both are written at every change, one after the other: a reset in the

@@ -1,4 +1,4 @@
-"""Console of a live session: one word a line in, one JSON object a line out.
+"""Console of a live session and its viewers: one word a line in, one JSON object a line out.
 
 The words control the flow of simulated time: `run`, `pause`, `step`, `until UTC`, `rate X`; or ask for something:
 `state`, `watch`, `save`, `quit`.

@@ -1,4 +1,4 @@
-"""The board and the bus around the payload: power, heat, processor time, memory that radiation reaches, watchdog.
+"""The board and the bus around the payload: power, heat, processor time, memory, watchdog, and injected faults.
 
 A lumped model. Power: a battery charged by the arrays in sunlight, whose open-circuit voltage follows its charge,
 behind a resistance. Heat: the processor board and the camera, each a heat

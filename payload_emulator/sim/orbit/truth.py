@@ -1,4 +1,4 @@
-"""The true flight: trajectory of the spacecraft, when it observes, how it points, where the Sun stands.
+"""The true flight: trajectory of the spacecraft, its disturbances, when it observes, how it points.
 
 Everything here is truth: it reaches flight software as images, attitude readings and clock ticks only.
 """

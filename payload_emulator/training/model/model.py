@@ -1,4 +1,4 @@
-"""The crater network: MobileNetV3 backbone, depthwise feature pyramid, CenterNet heads at stride 4.
+"""The crater network: MobileNetV3 backbone, depthwise feature pyramid, CenterNet heads at stride 4; its loss.
 
 Input (B, 1, H, W), H and W multiples of 32, as `flight.vision.preprocess` makes it. Outputs at (H/4, W/4), finer where
 the network enlarges the image first: heatmap logits (B, 1 or 4, h, w): any crater, then the three classes of the paper;
