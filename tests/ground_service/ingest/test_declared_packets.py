@@ -114,7 +114,7 @@ def define(ground: Ground, seconds: float = 600.0) -> int:
 
 
 def interpreted(packets: list[bytes], tmp_path: Path) -> list[Any]:
-    """What space_packet_parser reads in the packets."""
+    """Return the values that space_packet_parser reads in the packets."""
     import space_packet_parser
 
     path = tmp_path / "interpreter.xml"

@@ -259,7 +259,7 @@ OLD = replace(DICTIONARY, version=DICTIONARY.version - 1)
 
 
 def fill_with_the_old(home, made):
-    """What the program before this one left: all packets, decoded by its dictionary."""
+    """Restore the state of an earlier program: all packets, decoded by its dictionary."""
     found = decode((made.folder / "downlink.cadu").read_bytes())
     with open_ground(home) as ground:
         with ground.database.writing() as connection:

@@ -255,5 +255,5 @@ def test_the_link_quality_of_both_stations_is_shown_with_the_merged_packets_of_t
     assert [one.frames for one in found.receptions] == [len(stream.files[1]) // 1279, len(stream.files[0]) // 1279]
     assert found.frames == sum(one.frames for one in found.receptions)
     assert {one.source for one in found.receptions} == {"mission"}
-    told = Completeness.of_accounting(found).receptions
-    assert [one.station for one in told] == ["goldstone", "madrid"]
+    receptions = Completeness.of_accounting(found).receptions
+    assert [one.station for one in receptions] == ["goldstone", "madrid"]

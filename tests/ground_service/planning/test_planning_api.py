@@ -192,7 +192,7 @@ class Observations(Downlink):
 
 
 def telemetry(frames=5):
-    """What a payload sends about an observation that begins at START + 60 s and ends 60 s later."""
+    """Return the packets of a payload about an observation that begins at START + 60 s and ends 60 s later."""
     sent = Observations()
     sent.event("observation_started", 60)
     sent.images(0, range(60, 60 + 15 * frames, 15))
@@ -246,7 +246,7 @@ def test_a_window_with_a_value_of_another_kind_is_refused(client):
     assert client.get(f"{V1}/windows").json()["total"] == 0
 
 
-def test_of_two_decisions_the_second_is_told_the_state_that_won(client):
+def test_of_two_decisions_the_second_is_refused_with_the_state_that_won(client):
     key = approved(client, 0, 300)
     assert change(client, key, "failed").status_code == 200
     answer = change(client, key)
