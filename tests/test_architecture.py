@@ -152,7 +152,7 @@ CYCLES = """\
 ground_service/ingest/frames|def late():;    from ground_service.ingest import service|ground_service.ingest.frames
 ground_service/store/files|if TYPE_CHECKING:;    from ground_service.store import database|ground_service.store.files
 lunar/constants|import lunar.frames|lunar.constants
-tmtc/packets/pus|from tmtc.link import frames|tmtc.packets"""
+tmtc/packets/sequence|from tmtc.link import frames|tmtc.packets"""
 
 
 def test_planted_cycles_are_found(copy_of_the_tree):

@@ -63,8 +63,6 @@ class LocalClient(Client):
         self._end()
 
     def _transport(self) -> httpx.BaseTransport:
-        from ground_service.client.transport import LocalTransport
-
         actor, background = self._caller
         return LocalTransport(self._ground, actor, background=background)
 
