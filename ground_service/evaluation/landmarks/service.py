@@ -20,8 +20,8 @@ from ground_service.evaluation.core import PassInputs
 from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.landmarks.core import (
     Frames,
+    LandmarkFix,
     PassPlaces,
-    Place,
     combined,
     in_view,
     is_listed,
@@ -327,9 +327,9 @@ def _changed(connection: Connection, landmark: LandmarkDetail, evidence: Sequenc
     change_landmark(connection, landmark.id, landmark.state, state, evidence, now, **figures)
 
 
-def place_of(one: Landmark | PassSightings) -> Place:
+def place_of(one: Landmark | PassSightings) -> LandmarkFix:
     """Return place and uncertainty of a landmark for computation."""
-    return Place(
+    return LandmarkFix(
         math.radians(one.latitude_deg),
         math.radians(one.longitude_deg),
         one.height_m,
@@ -354,7 +354,7 @@ def _figures(evidence: Sequence[PassSightings]) -> dict[str, float]:
     }
 
 
-def _columns(place: Place) -> dict[str, float]:
+def _columns(place: LandmarkFix) -> dict[str, float]:
     return {
         "latitude_deg": math.degrees(place.latitude_rad),
         "longitude_deg": math.degrees(place.longitude_rad) % 360.0,
@@ -368,31 +368,31 @@ def _columns(place: Place) -> dict[str, float]:
     }
 
 
-def _unseen(place: Place, looks: int) -> Place:
+def _unseen(place: LandmarkFix, looks: int) -> LandmarkFix:
     nothing = np.zeros(0, dtype=np.int64)
-    return Place(
+    return LandmarkFix(
         place.latitude_rad, place.longitude_rad, place.height_m, place.sigma_m, place.diameter_m,
         place.diameter_sigma_m, 0.0, nothing, looks,
     )  # fmt: skip
 
 
-def _evidence(pass_id: int, place: Place, controls: int, frames: Frames, detections: DetectionSamples) -> PassSightings:
-    owner = np.searchsorted(detections.offsets, place.rows, side="right") - 1
+def _evidence(pass_id: int, fix: LandmarkFix, controls: int, frames: Frames, found: DetectionSamples) -> PassSightings:
+    owner = np.searchsorted(found.offsets, fix.rows, side="right") - 1
     sightings = [
         Sighting(
-            frame_number=int(detections.frame_number[frame]),
-            time=UtcTime(int(detections.utc_ns[frame])),
-            u_px=float(detections.u_px[row]),
-            v_px=float(detections.v_px[row]),
-            diameter_px=float(detections.diameter_px[row]),
-            score=float(detections.score[row]),
+            frame_number=int(found.frame_number[frame]),
+            time=UtcTime(int(found.utc_ns[frame])),
+            u_px=float(found.u_px[row]),
+            v_px=float(found.v_px[row]),
+            diameter_px=float(found.diameter_px[row]),
+            score=float(found.score[row]),
         )
-        for row, frame in zip(place.rows.tolist(), owner.tolist(), strict=True)
+        for row, frame in zip(fix.rows.tolist(), owner.tolist(), strict=True)
     ]
-    figures = _columns(place)
+    figures = _columns(fix)
     return PassSightings(
         pass_id=pass_id,
-        looks=place.looks,
+        looks=fix.looks,
         controls=controls,
         frame_width_px=frames.camera.width_px,
         frame_height_px=frames.camera.height_px,

@@ -21,7 +21,7 @@ from ground_service.ground import open_ground
 from ground_service.ingest.core import NO_RECORD, LinkContent
 from ground_service.ingest.frames import FrameReader, PacketReader, Section
 from ground_service.ingest.reception import Reading
-from ground_service.ingest.service import Place, ingest_file
+from ground_service.ingest.service import PiecePosition, ingest_file
 from ground_service.store import repository
 from ground_service.telemetry.decoding import redecode
 from tests.ground_service.archive_hash import hash_of
@@ -212,7 +212,7 @@ def test_a_piece_that_became_readable_while_it_was_read_is_read_again(one_proces
     monkeypatch.setattr(Reading, "_links_of_recording", just_before_the_rest)
     path = ground.home / "first"
     path.write_bytes(recording.octets[:600])
-    result = ingest_file(ground, path, instance="late", place=Place("r", 0))
+    result = ingest_file(ground, path, instance="late", place=PiecePosition("r", 0))
     assert (result.frames, result.octets_pending) == (2, 80)
 
 

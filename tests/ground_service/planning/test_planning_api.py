@@ -3,7 +3,7 @@
 import pytest
 
 from ground_service.app import create_app
-from ground_service.passes.span import Observation, Planned, belongs_to
+from ground_service.passes.span import ObservationSpan, Planned, belongs_to
 from ground_service.settings import Settings
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
 from tests.ground_service.conftest import Downlink, event_packet
@@ -285,9 +285,9 @@ def test_each_window_has_the_frames_that_its_event_reports_enclose(client):
 
 def test_an_observation_has_one_window_the_nearest_and_of_equal_ones_the_last():
     first, later, same = Planned(0, 100, 1), Planned(30, 130, 2), Planned(0, 100, 3)
-    begun = Observation(30, 131, 130)
+    begun = ObservationSpan(30, 131, 130)
     assert not belongs_to(begun, first, [later], 60) and belongs_to(begun, later, [first], 60)
-    again = Observation(0, 100, 100)
+    again = ObservationSpan(0, 100, 100)
     assert not belongs_to(again, first, [same], 60) and belongs_to(again, same, [first], 60)
-    assert not belongs_to(Observation(None, 40), later, [], 60)  # the end of the one before
+    assert not belongs_to(ObservationSpan(None, 40), later, [], 60)  # the end of the one before
     assert belongs_to(begun, Planned(-50, 150), [], 60)
