@@ -375,9 +375,9 @@ def test_placebos_are_rejected_as_often_as_their_level_allows_and_a_noisier_metr
     parts = [found["detector.recall", kind].placebos for kind in ("cratered", "sparse")]
     assert sum(parts) == 60 and min(parts) > 20
     worse = [one.model_copy(update={"p_value": 0.01}) if k < 60 else one for k, one in enumerate(noise)]
-    found = {one.metric: one for one in calibrations(worse) if not one.condition}["detector.recall"]
-    assert not found.calibrated
-    assert found.text == f"uncalibrated: detector.recall: {found.rejected} of 60 placebos rejected at 0.05"
+    noisy = {one.metric: one for one in calibrations(worse) if not one.condition}["detector.recall"]
+    assert not noisy.calibrated
+    assert noisy.text == f"uncalibrated: detector.recall: {noisy.rejected} of 60 placebos rejected at 0.05"
 
 
 def test_exact_gates_and_the_verdict_of_a_placebo_are_rejected_if_they_fail():
