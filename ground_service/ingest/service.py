@@ -34,7 +34,7 @@ from tmtc.packets.pus import NO_TICKS
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class PiecePosition:
     """Position of a file in its recording, as stated by its sender."""
 
     stream: str
@@ -48,7 +48,7 @@ def ingest_file(
     spacecraft_id: int | None = None,
     instance: str = FLOWN,
     name: str | None = None,
-    place: Place | None = None,
+    place: PiecePosition | None = None,
     station: str = "",
     link: str | None = None,
 ) -> IngestResult:
@@ -94,7 +94,7 @@ def ingest_stored(
     spacecraft_id: int | None = None,
     instance: str = FLOWN,
     name: str,
-    place: Place | None = None,
+    place: PiecePosition | None = None,
     station: str = "",
     link: str | None = None,
 ) -> IngestResult:
@@ -111,7 +111,7 @@ def enter_ingest(
     *,
     spacecraft_id: int | None,
     instance: str,
-    place: Place | None = None,
+    place: PiecePosition | None = None,
     station: str = "",
     link: str | None = None,
     job_id: str | None = None,
@@ -141,7 +141,7 @@ def _add(
     state: str,
     spacecraft_id: int | None,
     instance: str,
-    place: Place | None,
+    place: PiecePosition | None,
     station: str,
     link: str | None,
 ) -> Piece:

@@ -131,7 +131,7 @@ def test_frames_that_nothing_proves_are_inconclusive(typed, tmp_path):
     assert found["settings"] is None and found["distances"]["700"] == 29
 
 
-def test_packets_without_frames_are_told_and_noise_is_refused(typed, tmp_path):
+def test_packets_without_frames_are_reported_and_noise_is_refused(typed, tmp_path):
     path = tmp_path / "packets.bin"
     path.write_bytes(b"".join(make_packets(20)))
     assert typed(f"link check {path} --json")["packets_without_frames"] == 42

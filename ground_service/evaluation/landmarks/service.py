@@ -317,9 +317,9 @@ def _changed(connection: Connection, landmark: LandmarkDetail, evidence: Sequenc
     change_landmark(connection, landmark.id, landmark.state, state, evidence, now, **figures)
 
 
-def place_of(one: Landmark | PassSightings) -> core.Place:
+def place_of(one: Landmark | PassSightings) -> core.LandmarkFix:
     """Return place and uncertainty of a landmark for computation."""
-    return core.Place(
+    return core.LandmarkFix(
         math.radians(one.latitude_deg),
         math.radians(one.longitude_deg),
         one.height_m,
@@ -344,7 +344,7 @@ def _figures(evidence: Sequence[PassSightings]) -> dict[str, float]:
     }
 
 
-def _columns(place: core.Place) -> dict[str, float]:
+def _columns(place: core.LandmarkFix) -> dict[str, float]:
     return {
         "latitude_deg": math.degrees(place.latitude_rad),
         "longitude_deg": math.degrees(place.longitude_rad) % 360.0,
@@ -358,16 +358,16 @@ def _columns(place: core.Place) -> dict[str, float]:
     }
 
 
-def _unseen(place: core.Place, looks: int) -> core.Place:
+def _unseen(place: core.LandmarkFix, looks: int) -> core.LandmarkFix:
     nothing = np.zeros(0, dtype=np.int64)
-    return core.Place(
+    return core.LandmarkFix(
         place.latitude_rad, place.longitude_rad, place.height_m, place.sigma_m, place.diameter_m,
         place.diameter_sigma_m, 0.0, nothing, looks,
     )  # fmt: skip
 
 
 def _evidence(
-    pass_id: int, place: core.Place, controls: int, frames: core.Frames, detections: DetectionSamples
+    pass_id: int, place: core.LandmarkFix, controls: int, frames: core.Frames, detections: DetectionSamples
 ) -> PassSightings:
     owner = np.searchsorted(detections.offsets, place.rows, side="right") - 1
     sightings = [

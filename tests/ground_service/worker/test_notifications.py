@@ -210,7 +210,7 @@ def local(tmp_path):
 
 @pytest.mark.parametrize("offers_tls", [False, True])
 def test_a_public_mail_server_needs_tls_with_its_certificate(mailbox, monkeypatch, tmp_path, offers_tls):
-    """What is sent to the internet is neither readable on the way nor given to another server."""
+    """A message to the internet is neither readable on the way nor given to another server."""
     if offers_tls:
         environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(tmp_path)}
         subprocess.run(["sh", "deploy/secrets.sh"], check=True, env=environment, capture_output=True)
@@ -218,8 +218,8 @@ def test_a_public_mail_server_needs_tls_with_its_certificate(mailbox, monkeypatc
         mailbox.tls.load_cert_chain(tmp_path / "tls/certificate", tmp_path / "tls/key")
     monkeypatch.setattr(outgoing.ipaddress.IPv4Address, "is_global", property(lambda _: True))
     channel = Channel(email=("a@b.example",), smtp=mailbox.address)
-    told = "SSLCertVerificationError" if offers_tls else "expected a mail server with STARTTLS"
-    with pytest.raises(NotDelivered, match=told):
+    message = "SSLCertVerificationError" if offers_tls else "expected a mail server with STARTTLS"
+    with pytest.raises(NotDelivered, match=message):
         send(tmp_path, channel)
     assert mailbox.received == []
 

@@ -22,7 +22,7 @@ from payload_emulator.flight.navigation.landmark_map import MapState
 from payload_emulator.flight.navigation.outcomes import Outcome
 from payload_emulator.flight.navigation.search.acquisition import Acquisition
 from payload_emulator.flight.navigation.search.identification import Identification
-from payload_emulator.flight.navigation.search.lost_in_space import Place
+from payload_emulator.flight.navigation.search.lost_in_space import PoseHypothesis
 from payload_emulator.flight.navigation.sighting import Pose, in_view, landmark_map
 from payload_emulator.flight.vision.detections import Detections
 from studies import montecarlo
@@ -357,7 +357,7 @@ def test_a_place_found_without_a_prior_turns_the_orbit_with_it(orbit, monkeypatc
     axis = np.cross(prior.mean[:3], [0.3, -0.5, 0.8])
     turn = Rotation.from_rotvec(0.4 * axis / norm(axis))
     there = 1.01 * turn.apply(prior.mean[:3])
-    place = Place(
+    place = PoseHypothesis(
         orbit.rotations[0] @ there, np.zeros(3), np.array([30.0, 80.0, 50.0]), np.array([2, 5, 7]), np.array([4, 1, 9]),
         -20.0
     )  # fmt: skip

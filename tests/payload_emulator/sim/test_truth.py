@@ -1,4 +1,4 @@
-"""When the spacecraft observes and how it points, on an orbit simple enough to check by hand. Power, heat and
+"""Observation times and pointing of the spacecraft, on an orbit simple enough to check by hand. Power, heat and
 processor time of the simulated board; faults as text.
 """
 

@@ -203,7 +203,7 @@ def bias_of(*scenes):
     # Toward a Sun at the top, right, bottom, left: up, right, down, left in an image whose v grows downward.
     [(1.0, (0.0, -0.5)), (91.0, (0.5, 0.0)), (181.0, (0.0, 0.5)), (271.0, (-0.5, 0.0))],
 )
-def test_a_pull_toward_the_sun_is_told_as_such_wherever_the_sun_is(azimuth_deg, shift):
+def test_a_pull_toward_the_sun_is_reported_as_such_wherever_the_sun_is(azimuth_deg, shift):
     octants, overall = bias_of(shifted_scene(azimuth_deg, shift))
     row = octants[int(azimuth_deg // 45)]
     assert row["pairs"] == overall["pairs"] == 25
