@@ -20,8 +20,7 @@ from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import DownlinkEncoder, decode
 from tmtc.errors import TmtcError
 from tmtc.link import reed_solomon
-from tmtc.link.frames import frame_checksums_hold
-from tmtc.link.randomiser import randomise
+from tmtc.link.frames import frame_checksums_hold, randomise
 from tmtc.link.settings import LinkSettings
 from tmtc.packets.space_packets import PacketSequencer, pack_packet
 from tmtc.packets.stream import PacketForm

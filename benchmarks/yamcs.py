@@ -26,6 +26,7 @@ from benchmarks._rows import ROOT, NotMeasured, Row
 from benchmarks._servers import Deployment
 from benchmarks._yamcs import Server, until
 from benchmarks.ground import START, mixed_downlink
+from lunar.constants import DAY_NS
 from lunar.timescales import format_utc
 from studies.harness.parts import Part, descendants, free_port
 from tmtc.dictionary.payload import DICTIONARY
@@ -38,7 +39,6 @@ STEP_NS = 4 * 3_600 * 1_000_000_000 // PACKETS
 FRAMES_A_TURN, TURN_S = 50, 5.0
 """Datagrams that are sent before Yamcs is asked whether it has them, and the time after which they are lost."""
 PACKET = "housekeeping"
-DAY_NS = 86_400 * 1_000_000_000
 FIGURES = (
     ("store", "frames to durable packets and parameters", "packets/s"),
     ("read", "values of an hour of housekeeping read as CSV", "values/s"),

@@ -25,7 +25,7 @@ def cache_folder() -> Path:
 
 def _folder_of(kind: str) -> Path:
     """Return the folder of a kind; builds under test read that of compiled code: no ground and no figure lie in it."""
-    return Path(f"{cache_folder()}-ground") if kind in ("tile", "rims", "figure") else cache_folder()
+    return Path(f"{cache_folder()}-ground") if kind in ("tile", "rims", "figure", "pixels") else cache_folder()
 
 
 def kept(name: str) -> bytes | None:

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
-from lunar.compressed import EXPANDED_LIMIT_OCTETS, open_expanded
 from lunar.constants import MOON_RADIUS_M
+from lunar.datafolder import EXPANDED_LIMIT_OCTETS, open_expanded
 from lunar.errors import DataFileError, LunarError
 from lunar.frames import mcmf_from_spherical
 from lunar.plausible import CRATER_COVER, CRATER_DEPTH, CRATER_DEPTH_RATIO, CRATER_DIAMETER_M, CRATER_MEDIAN_M, HEIGHT_M

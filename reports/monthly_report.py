@@ -34,9 +34,10 @@ def monthly_document(report: MonthlyReportValue) -> Document:
 
 
 def _trend(report: MonthlyReportValue) -> Picture:
+    series = monthly.series(report)
     medians = {
         name: float(np.nanmedian(values)) if np.isfinite(values).any() else float("nan")
-        for name, values in monthly.series(report).items()
+        for name, values in series.items()
     }
     words = "; ".join(
         f"{label}: {number_text(scale * medians[name], decimals)} {unit}"
@@ -49,7 +50,7 @@ def _trend(report: MonthlyReportValue) -> Picture:
         "are changes of level. "
         f"Median of the passes: {words}.",
         f"Recall, drift and median error over time. Median of the passes: {words}.",
-        4.2,
+        0.6 + 1.2 * len(series),
         lambda canvas: monthly.draw_trend(canvas, report, _DRAWN),
     )
 

@@ -36,6 +36,9 @@ Estimator = Literal["paper", "spherical", "anchored"]
 class Requirements:
     """Limits of the verdict; a requirement without a limit is shown without judgement.
 
+    A negative limit of a scenario is not stated, except `temperature_min_c`; its estimator is the filter if it is used,
+    otherwise the first one, where none is stated.
+
     Attributes
     ----------
     estimator

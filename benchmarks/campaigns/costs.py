@@ -33,7 +33,7 @@ from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.store.database import prepare_database
 from lunar.catalogue import ROWS_LIMIT
-from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
+from lunar.constants import DAY_NS, GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import format_oem
 from lunar.timescales import format_utc
@@ -42,7 +42,6 @@ from studies.harness.parts import Part
 MEMORY_MIB, PROCESSOR_S = 256, 10.0
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "requests.md"
 PACKETS, ROWS = 40_000, 100
-DAY_NS = 86_400 * 10**9
 MISSION = (
     'name = "largest"\n[spacecraft]\nid = 76\nname = "SelenITA"\n'
     '[camera]\nwidth_px = 512\nheight_px = 512\nfov_deg = 120.0\npointing = "nadir"\n'
@@ -113,8 +112,9 @@ def cases() -> list[tuple[str, str, str, Any]]:
     """Return operation, what is largest, path, and body (made when it is sent) of requests."""
     region = {"latitude_deg": {"min": -60.0, "max": 60.0}, "west_deg": 300.0, "east_deg": 40.0}
     terms = {"windows": 100, "period_days": 1.0, "regions": [region] * 50}
-    times = [{"ticks": (1 << 40) + 65_536 * 60 * k, "received": at(k / 1440)} for k in range(9_000)]
-    points = [one | {"light_time_s": 1.3, "boot_count": 0} for one in times]
+    ticks = [((1 << 40) + 65_536 * 60 * k, {"received": at(k / 1440)}) for k in range(9_000)]
+    points = [time | {"ticks": one, "light_time_s": 1.3, "boot_count": 0} for one, time in ticks]
+    times = [time | {"packet_ticks": one, "sequence_count": k} for k, (one, time) in enumerate(ticks)]
     link = '[[links]]\nname = "l{}"\nkind = "file"\ndownlink = "/nowhere"\n'
     described = (MISSION + "".join(map(link.format, range(14_000)))).encode()
     span = {"spacecraft_id": 76, "start": at(0), "stop": at(31)}

@@ -16,8 +16,8 @@ from ground_service.errors import EvaluationError
 from ground_service.evaluation.core import PassInputs
 from lunar.arrays import FloatArray, IntArray
 from lunar.frames import continuous_quaternions
-from lunar.ground_track import ground_track
 from lunar.timescales import parse_utc
+from lunar.visibility import ground_track
 from reports.values import NavigationSeries
 from tmtc.errors import MissingLibrary
 from tmtc.export import Record, column_metadata, parquet_octets, record_columns

@@ -11,11 +11,18 @@ import numpy as np
 
 from ground_service.telemetry.packets import NO_TIME
 from lunar.arrays import IntArray, OctetArray
+from lunar.constants import DAY_NS
 from lunar.plausible import AGREEING_PACKETS, CLOCK_ERROR_S, SILENCE_S, SIMULATED_AHEAD_S, UNSET_CLOCK_S
-from tmtc.link.clcw import UplinkSeen
-from tmtc.packets.crc import CRC_LENGTH, crc16
-from tmtc.packets.cuc import NO_TICKS, TICKS_PER_SECOND
-from tmtc.packets.space_packets import IDLE_APID, PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, SEQUENCE_COUNT_LIMIT
+from tmtc.link.frames import UplinkSeen
+from tmtc.packets.pus import NO_TICKS, TICKS_PER_SECOND
+from tmtc.packets.space_packets import (
+    CRC_LENGTH,
+    IDLE_APID,
+    PACKET_MAX_LENGTH,
+    PRIMARY_HEADER_LENGTH,
+    SEQUENCE_COUNT_LIMIT,
+    crc16,
+)
 from tmtc.packets.stream import PacketForm
 
 LONGEST_STEP = round(CLOCK_ERROR_S * TICKS_PER_SECOND)
@@ -263,7 +270,6 @@ def is_idle(octets: bytes) -> bool:
     return len(octets) >= 2 and int.from_bytes(octets[:2], "big") & 0x7FF == IDLE_APID
 
 
-DAY_NS = 86_400_000_000_000
 CDS_EPOCH_DAYS = 4383
 """Days from 1958-01-01 to 1970-01-01."""
 

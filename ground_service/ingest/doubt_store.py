@@ -32,7 +32,7 @@ from lunar.arrays import IntArray
 from lunar.plausible import AGREEING_PACKETS
 from lunar.timescales import ticks_from_utc_ns, utc_ns_from_ticks
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.packets.cuc import NO_TICKS
+from tmtc.packets.pus import NO_TICKS
 from tmtc.packets.stream import whole_packets
 
 _DOUBTED, _PACKETS, _VEHICLES = repository.IMPLAUSIBLE_PACKETS, repository.PACKETS, repository.VEHICLES

@@ -6,7 +6,7 @@ from pydantic import ConfigDict, Field
 
 from ground_service.http.model import Entity, InstanceName, Paging, RequestModel, SpacecraftNumber, UtcTime
 from ground_service.toml import LINE_PATTERN_JSON
-from tmtc.link.clcw import UplinkSeen
+from tmtc.link.frames import UplinkSeen
 
 
 class IngestAccepted(Entity):

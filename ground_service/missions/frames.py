@@ -13,11 +13,10 @@ from pydantic import ValidationError
 
 from ground_service.missions.model import Camera, DictionarySection, Evidence, Frames, Mission, Spacecraft, World
 from ground_service.missions.section import Section
-from lunar.camera import PinholeCamera
+from lunar.camera import BrownCamera, PinholeCamera
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation, Orientation, load_orientation
 from lunar.gravity import GravityField, builtin_gravity, load_gravity
-from lunar.lens import BrownCamera
 
 REMEDY = "set LINNA_DATA to a folder that has it, or run linna data fetch"
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Final, Literal, get_args
 
@@ -649,9 +650,9 @@ class Mission(Section):
 
     @model_validator(mode="after")
     def _links_once(self) -> Mission:
-        names = [one.name for one in self.links or ()]
-        for name in names:
-            if names.count(name) > 1:
+        names = Counter(one.name for one in self.links or ())
+        for name, number in names.items():
+            if number > 1:
                 raise ValueError(f"each name of links once, found {name!r} again")
         if names and self.spacecraft.id is None:
             raise ValueError("a spacecraft id with links, found none")

@@ -23,7 +23,7 @@ from lunar.arrays import BoolArray, IntArray
 from tmtc.arrays import Octets
 from tmtc.downlink import FRAME_FOREIGN, FRAME_GOOD, DownlinkDecode, decode
 from tmtc.link.link_plan import LinkPlan, LinkSection
-from tmtc.packets.cuc import NO_TICKS, TICKS_PER_SECOND
+from tmtc.packets.pus import NO_TICKS, TICKS_PER_SECOND
 from tmtc.packets.space_packets import SEQUENCE_COUNT_LIMIT
 from tmtc.packets.stream import CHECKED, PacketForm
 

@@ -23,13 +23,12 @@ from ground_service.passes.span import STARTED, STOPPED, PassSpan
 from ground_service.store.files import FileArchive
 from ground_service.store.vehicles import get_vehicle
 from ground_service.telemetry import store as telemetry
+from lunar.arrays import IntArray
 from reports.values import ApidAccounting, CompletenessSeries, PacketAccounting, ReceptionQuality
 from tmtc.dictionary.payload import APID_DETECTIONS, DICTIONARY
 from tmtc.link.link_plan import LinkSection
 from tmtc.link.settings import LinkSettings
 from tmtc.packets.stream import PacketForm
-
-IntArray = NDArray[np.int64]
 
 COMPLETENESS_BINS = 60
 GAP_POINTS = 256

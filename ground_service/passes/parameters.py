@@ -27,8 +27,7 @@ from tmtc.dictionary.payload import DICTIONARY, STRUCTURES
 from tmtc.dictionary.schema import PacketDefinition
 from tmtc.export import Record, format_records, packet_records
 from tmtc.packets.stream import cut_packets, whole_packets
-from tmtc.xtce.records import format_xtce_records, xtce_records
-from tmtc.xtce.series import SeriesValue
+from tmtc.xtce.series import SeriesValue, format_xtce_records, xtce_records
 
 OWN_PACKET = "housekeeping"
 PACKET_FIELDS = {

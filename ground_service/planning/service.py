@@ -14,7 +14,7 @@ from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.contacts.commanding import service as commanding
 from ground_service.contacts.commanding import store as commands
 from ground_service.errors import Conflict, InvalidInput, NotFound, PlanConflict, PlanConflicts, StateConflict
-from ground_service.ground import Ground
+from ground_service.ground import Ground, run_apart
 from ground_service.http.model import Paging, UtcTime
 from ground_service.missions import store as missions
 from ground_service.missions.catalogues import catalogue_of
@@ -70,6 +70,9 @@ from tmtc.dictionary.arguments import argument_text
 
 SEARCH_LIMIT_S = 31 * 86_400
 STEPS_LIMIT = 100_000
+APART_S = 7 * 86_400
+"""Longer spans are searched in another process."""
+
 BATTERY_FLOOR = 0.3
 """A window that would draw the battery below this share is in conflict with the power there is."""
 
@@ -128,13 +131,14 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     if constraints.mare is not None and mare is None:
         raise InvalidInput("search", "terrain", "an albedo map among the public data", "none")
     planner = planner_of(ground, reference, mission, catalogue, mare)
-    found = [
-        replace(planner, ephemeris=_part(planner.ephemeris, first, last)).search(
-            constraints, max(first, start), last, given.cadence_s, step_s=given.step_s, commitments=commitments
-        )
-        for first, last in spans
-        if last > start
-    ]
+    found = []
+    for first, last in spans:
+        if last > start:
+            part = replace(planner, ephemeris=_part(planner.ephemeris, first, last))
+            terms = (constraints, max(first, start), last, given.cadence_s)
+            is_long = last - terms[1] > APART_S * NS and mare is None  # a map cannot be handed over
+            search = functools.partial(part.search, *terms, step_s=given.step_s, commitments=commitments)
+            found.append(run_apart(search) if is_long else search())
     names = [f"ephemeris {reference.name}", f"orientation {planner.orientation.name}"]
     if len(spans) > 1:
         names[0] += f" without {len(spans) - 1} spans that it does not cover"

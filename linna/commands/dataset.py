@@ -11,7 +11,7 @@ from linna.parser import option
 _CLASSES = ("5-10 km", "10-15 km", "15-30 km")
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_dataset(parser: argparse.ArgumentParser) -> None:
     verbs = parser.add_subparsers(title="verbs", required=True)
     build = verbs.add_parser("build", help="render frames with labels; resumes an unfinished data set")
     option(build, "recipe SCENARIO", Path, "TOML with a [dataset] table, or the name of a shipped scenario")

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ground_service.settings import Settings
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_db(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(metavar="ACTION", required=True)
     upgrade = actions.add_parser("upgrade", help="upgrade the schema to this version")
     upgrade.set_defaults(handler=run_upgrade)

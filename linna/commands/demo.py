@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from linna.commands._ground import event_of_signals, local_actor
-from linna.commands.pass_ import requirement_lines
+from linna.commands.results import requirement_lines
 from linna.data import data_folder
 from linna.output import emit, finish, log, progress, watched_rims
 from linna.parser import option
@@ -27,7 +27,7 @@ KERNELS = (
 """Modules of kernels that are compiled at the same time, while the orbit is propagated."""
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_demo(parser: argparse.ArgumentParser) -> None:
     option(
         parser, "--out DIR", Path, "folder for the pass archive, the ground database and the report", Path("linna-demo")
     )

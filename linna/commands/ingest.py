@@ -10,7 +10,7 @@ from linna.output import emit, finish, log
 from linna.parser import number, option
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_ingest(parser: argparse.ArgumentParser) -> None:
     option(parser, "files FILE", Path, "downlink file or pass archive folder", nargs="+")
     option(
         parser,
@@ -39,7 +39,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from ground_service.client.problems import InvalidRequest, JobFailed
+    from ground_service.client.connection import InvalidRequest, JobFailed
     from ground_service.errors import InvalidInput
 
     if arguments.offset is not None and arguments.recording is None:

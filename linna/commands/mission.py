@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from linna.commands._table import Command, Commands, CustomCommand, add_commands, as_json
+from linna.commands._table import Command, Commands, CustomCommand, as_json
 from linna.data import data_folder
 from linna.errors import UsageError
 from linna.output import emit, finish, log, watched_rims
@@ -195,7 +195,7 @@ def went_well(figures: Mapping[str, Any]) -> bool:
     return explained and windows["processed"] == windows["flown"] and not figures["packets_lost"]
 
 
-COMMANDS: Commands = {
+MISSION: Commands = {
     "write": CustomCommand("write the mission description of a scenario", _configure_write),
     "check": CustomCommand("check a mission description; print one line for each fault", _configure_check),
     "add": Command("add_mission", "add a mission description as a revision", lambda made: _described(as_json(made))),
@@ -214,7 +214,3 @@ COMMANDS: Commands = {
     ),
     "run": CustomCommand("run payload, stations, ground service and automation for days", _configure_run),
 }
-
-
-def configure(parser: argparse.ArgumentParser) -> None:
-    add_commands(parser, COMMANDS)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lunar.ephemeris import Ephemeris
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_orbit(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     propagate = commands.add_parser("propagate", help="propagate a scenario's orbit, write it as OEM")
     option(propagate, "scenario", str, "scenario file, or the name of a shipped one")
@@ -136,8 +136,7 @@ def run_convert(arguments: argparse.Namespace) -> int:
     from lunar.messages.oem import format_oem
     from lunar.messages.oem_xml import format_oem_xml
     from lunar.messages.spice import spk_kernel
-    from lunar.messages.stk import format_stk
-    from lunar.messages.tabular import format_csv, format_tum
+    from lunar.messages.stk import format_csv, format_stk, format_tum
 
     writers: dict[str, Callable[[Ephemeris], Any]] = {
         ".oem": format_oem,
@@ -181,7 +180,7 @@ def _spice_id(arguments: argparse.Namespace) -> int:
 
 
 def _epochs(step_s: float | None, ephemeris: Any) -> Any:
-    from lunar.ground_track import even_epochs
+    from lunar.visibility import even_epochs
 
     return None if step_s is None else even_epochs(ephemeris, step_s)
 

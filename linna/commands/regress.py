@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ground_service.regression.model import Build
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_regress(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="what", metavar="COMMAND", required=True)
     run = commands.add_parser(
         "run",

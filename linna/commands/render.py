@@ -16,7 +16,7 @@ TERRAINS = ("auto", "raster", "procedural")
 SHEET_COLUMNS = 3
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_render(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Render one frame; with --sheet several frames on one picture. Sheets take the epochs named, or --views "
         "frames spread over the scenario's observation windows."

@@ -25,7 +25,7 @@ _PAUSE_S = 0.03
 """Time between two frames of a file, so that a receiver loses none."""
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_tm(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     decode = commands.add_parser("decode", help="packets of a downlink (CADUs or bare packets) as JSON, CSV or Parquet")
@@ -92,7 +92,7 @@ def run_decode(arguments: argparse.Namespace) -> int:
 
 def _decode_foreign(arguments: argparse.Namespace) -> int:
     """Decode packets of another mission through its XTCE."""
-    from tmtc.xtce.records import format_xtce_records, xtce_records
+    from tmtc.xtce.series import format_xtce_records, xtce_records
 
     decoded, found, definition = _read_foreign(arguments)
     wanted, known = set(arguments.packet or ()), set(definition.containers)
@@ -169,7 +169,7 @@ def run_xtce(arguments: argparse.Namespace) -> int:
 
 
 def run_yamcs(arguments: argparse.Namespace) -> int:
-    from tmtc.xtce.yamcs import yamcs_files
+    from tmtc.xtce.export import yamcs_files
 
     checksum, station = not arguments.no_frame_checksum, _address("--station", arguments.station)
     files = yamcs_files(arguments.spacecraft_id, arguments.frame_length, checksum, arguments.frame_port, station)

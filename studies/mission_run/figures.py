@@ -10,13 +10,12 @@ import numpy as np
 
 from ground_service.evaluation.performance.model import PassPerformance
 from ground_service.planning.model import RequestPlan
-from lunar.constants import NS
+from lunar.constants import DAY_NS
 from studies.mission_run.ground import MissionGround
 
 UNKNOWN = "not known"
 """Reason of a missing window that no plan states."""
 
-DAY_NS = 86_400 * NS
 FLOWN = ("executing", "executed", "downlinked", "processed")
 
 

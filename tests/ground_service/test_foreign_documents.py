@@ -126,6 +126,7 @@ def test_ephemerides_are_limited_in_size_and_lines(monkeypatch, tmp_path):
     path = tmp_path / "a.oem"
     path.write_text("CCSDS_OEM_VERS = 2.0\n" + "COMMENT\n" * 100)
     monkeypatch.setattr(ephemeris_files, "LINES_LIMIT", 100)
+    monkeypatch.setattr(ephemeris_files, "LINE_OCTETS", 1000)
     with pytest.raises(DataFileError, match="expected at most 100 lines, found 101"):
         ephemeris_files.load_ephemeris(path)
     path.write_bytes(bytes(ephemeris_files.OCTETS_LIMIT + 1))

@@ -229,6 +229,12 @@ def test_whole_arrays_of_epochs_keep_their_shape():
         assert_allclose(many[1, 2], position(times[1, 2]), atol=1e-3)  # m
 
 
+def test_many_epochs_have_the_positions_of_each():
+    times = 9e8 + np.arange(2100.0).reshape(3, 700) * 60.0
+    for position in (earth_position_icrf_m, sun_position_icrf_m):
+        assert_allclose(position(times)[::2, ::50], position(times[::2, ::50]), rtol=0.0, atol=0.02)  # m
+
+
 ELAPSED_S = np.arange(200) * 30.0
 
 

@@ -11,7 +11,7 @@ from ground_service.toml import LINE_PATTERN_JSON
 from lunar.timescales import format_utc, utc_ns_from_ticks
 from tmtc.dictionary.arguments import argument_text
 from tmtc.dictionary.codes import FAILURES
-from tmtc.link.clcw import UplinkSeen
+from tmtc.link.frames import UplinkSeen
 
 _FAILURES = dict(FAILURES)
 REMEDY = "; the payload expects other sequence counts: send perform_function resynchronise_commands first"
@@ -206,7 +206,11 @@ class HandoverFilter(Paging):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UplinkChannel(UplinkSeen):
-    """A telecommand channel as the newest reception shows it."""
+    """A telecommand channel as the newest reception shows it; flags are those of its newest control word.
+
+    `report_value` is the number of the sequence-controlled frame that is expected next, `farm_b_counter` the number of
+    accepted expedited frames modulo 4.
+    """
 
     ingest_id: int
     received: UtcTime

@@ -44,6 +44,7 @@ from ground_service.passes.model import PassRecord
 from ground_service.store import repository
 from ground_service.store.files import register_file
 from ground_service.store.vehicles import FLOWN, get_vehicle
+from lunar.constants import DAY_NS
 from lunar.timescales import format_utc, parse_utc
 from reports.statistics import sigma_remark
 from reports.values import HeadlineFigure, MeanByGroup, MonthlyReportValue, RequirementOverTime
@@ -190,7 +191,6 @@ def _headline(found: Performance) -> tuple[HeadlineFigure, ...]:
 
 
 WINDOW_DAYS = 7.0
-DAY_NS = 86_400_000_000_000
 NOT_STATED = "not stated"
 _MONTH = re.compile(r"^(2[0-9]{3})-(0[1-9]|1[0-2])$")
 

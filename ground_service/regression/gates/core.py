@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
-from annotated_types import Interval, MinLen
+from annotated_types import Interval
 
 from ground_service.regression.gates.metrics import (
     FRAMES,
@@ -123,9 +123,9 @@ class GateRule:
         The same for less than `WINDOW_FRAMES` frames, and for single passes; None: the same values.
     """
 
-    metric: Annotated[str, MinLen(1)]
+    metric: str
     margin: Size
-    reason: Annotated[str, MinLen(1)]
+    reason: str
     weight: Annotated[float, Interval(ge=0.0, le=1.0)] = 0.0
     materiality: Size = 0.0
     window_margin: Annotated[float, Interval(gt=0.0, le=1e9)] | None = None

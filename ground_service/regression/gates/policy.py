@@ -85,6 +85,8 @@ def read_policy(octets: bytes, source: str) -> PolicyFile:
         raise InvalidInput(source, "schema_version", str(SCHEMA_VERSION), repr(table.get("schema_version")))
     read = parse_table(PolicyTable, table, source)
     for i, item in enumerate(read.gate):
+        if not item.reason.strip():
+            raise InvalidInput(source, f"gate.{i}.reason", "a text", "none")
         if (item.weight == 0.0) != (item.metric in EXACT_METRICS):
             expected = "no weight: the metric is exact" if item.weight else "a weight above 0"
             raise InvalidInput(source, f"gate.{i}.weight", expected, f"{item.weight:g}")

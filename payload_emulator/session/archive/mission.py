@@ -37,7 +37,7 @@ from payload_emulator.sim.board.link import STATIONS, LinkSection
 from payload_emulator.sim.terrain.tiles import POLE_LIMIT_RAD
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.link.settings import LinkSettings
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 MISSION_FILE = "mission.toml"
 ATTITUDE_FILE = "attitude.csv"

@@ -23,7 +23,7 @@ from tmtc.link import cadu
 from tmtc.link.frames import FRAME_HEADER_LENGTH, OCF_LENGTH, pack_clcw
 from tmtc.link.settings import LinkSettings
 from tmtc.link.uplink import Farm, UplinkDecoder, UplinkEncoder
-from tmtc.packets.crc import CRC_LENGTH
+from tmtc.packets.space_packets import CRC_LENGTH
 from tmtc.packets.stream import cut_packets
 
 LIGHT_S = 1.28

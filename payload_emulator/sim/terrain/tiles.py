@@ -52,8 +52,9 @@ ALBEDO_SHIFT = 6
 MEAN_ALBEDO = 0.12
 """Normal albedo of an average lunar surface (the maps of Hapke 2012 span about 0.06 to 0.2)."""
 
-KEPT_TILES = 64
-"""Tiles of 1 MB that are kept for later windows: a pass over new ground needs each in neighbouring frames only."""
+KEPT_TILES = 32
+"""Tiles of 1 MB that are kept for later windows: a pass over new ground needs each in neighbouring frames only, and
+reads others again from disk."""
 
 FILED_TILES = 1024
 """Tiles of 1 MB that are kept on disk for later runs: six windows of a pole-to-pole orbit side by side need 650."""

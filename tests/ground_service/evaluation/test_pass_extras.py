@@ -36,10 +36,10 @@ from ground_service.evaluation.core import WORST_FRAMES, _choose_frames, event_r
 from ground_service.evaluation.extras import albedo_picture, dark_limit, surface_map, with_terrain
 from ground_service.evaluation.fixes import Pairs, snapshot_positions, wrong_fixes
 from ground_service.evaluation.recall import ExpectedCraters, Matches, Viewing, expected_craters
+from lunar.camera import BrownCamera
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import find_data
 from lunar.frames import quaternion_from_matrix
-from lunar.lens import BrownCamera
 from lunar.timescales import parse_utc
 from reports.values import NavigationSeries, PassEvent, TerrainMap
 

@@ -31,7 +31,7 @@ from reports.values import (
 N = 10
 
 
-def series(name: str, kind: str = "estimate", median: float = 50.0, p95: float = 90.0, **more) -> NavigationSeries:
+def series(name, kind="estimate", median=50.0, p95=90.0, **more):
     nothing = np.zeros(N)
     return NavigationSeries(
         name,
@@ -46,11 +46,11 @@ def series(name: str, kind: str = "estimate", median: float = 50.0, p95: float =
     )
 
 
-def found(*navigation: NavigationSeries, **more) -> Evaluated:
+def found(*navigation, **more):
     return Evaluated(navigation or (series("anchored"),), **more)
 
 
-def row(key: str, limits: Requirements, evaluated: Evaluated) -> Requirement:
+def row(key, limits, evaluated):
     return next(one for one in requirements(limits, evaluated) if one.key == key)
 
 
@@ -233,7 +233,7 @@ def test_two_frames_are_judged_and_one_is_not():
         assert (judged.status, judged.note) == told
 
 
-def table(*statuses: str) -> list[Requirement]:
+def table(*statuses):
     return [Requirement(f"k{i}", f"thing {i}", "m", 2.0, 1.0, True, s) for i, s in enumerate(statuses)]
 
 

@@ -45,9 +45,8 @@ from tests.serving import TestClient
 from tests.tmtc import foreign
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
-from tmtc.packets.crc import crc16
-from tmtc.packets.cuc import NO_TICKS
-from tmtc.packets.space_packets import pack_packet
+from tmtc.packets.pus import NO_TICKS
+from tmtc.packets.space_packets import crc16, pack_packet
 from tmtc.packets.stream import whole_packets
 
 NS = 1_000_000_000

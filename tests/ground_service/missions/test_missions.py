@@ -339,6 +339,8 @@ def test_a_check_tells_all_faults_or_what_changes_and_adds_nothing(ground):
     assert check_mission(ground, TEXT.encode()).changes == ()
     found = check_mission(ground, TEXT.replace("fov_deg = 120", "fov_deg = 90").encode())
     assert "camera.width_px" in found.unknown
+    line = TEXT.splitlines().index("fov_deg = 120")
+    assert found.changes[0] == f"@@ -{line},3 +{line},3 @@"
     assert [one for one in found.changes if one[0] in "+-"] == ["-fov_deg = 120", "+fov_deg = 90"]
     assert len(check_mission(ground, (TEXT + "[linc]\n[camara]\n").encode()).faults) == 2
     other = Caller("eve", "operator", missions=("other",), spacecraft=frozenset({77}))

@@ -2,6 +2,7 @@
 Windows outside the reference ephemerides: refused where the ground needs the ephemeris.
 """
 
+import os
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +17,7 @@ from ground_service.access.model import AuditFilter
 from ground_service.access.store import list_audit
 from ground_service.contacts.links.core import PredictedContact
 from ground_service.errors import InvalidInput, PlanConflicts
-from ground_service.ground import Ground
+from ground_service.ground import Ground, run_apart
 from ground_service.missions.ephemerides.service import add_ephemeris, covering_ephemerides, withdraw_ephemeris
 from ground_service.missions.service import add_mission
 from ground_service.planning.core import Constraints, Planner, Resources, data_octets, frames_between, storage_peak
@@ -296,3 +297,7 @@ def test_an_ephemeris_belongs_to_a_spacecraft_and_can_be_withdrawn(ground: Groun
     withdraw_ephemeris(ground, own.id, actor="ann")  # one action, also while a window names it
     assert ground.read(get_record, window.id).entry().ephemeris_id is None
     assert used(76) == []
+
+
+def test_a_function_runs_apart_from_this_process():
+    assert run_apart(os.getpid) != os.getpid()

@@ -293,6 +293,18 @@ def test_a_list_has_the_columns_and_filters_of_its_operation(page):
     expect(page.locator("#items")).to_have_text("No entry.")
 
 
+def test_a_received_file_is_withdrawn_on_its_page(page):
+    receive(page, [camera_fault(5000)])
+    newest = page.request.get("/api/v1/ingests").json()["items"][0]["id"]
+    settled(page, "/ingests")
+    page.get_by_role("button", name=f"Withdraw ingest {newest}").click()
+    page.get_by_role("dialog").get_by_label("Reason").fill("another flight")
+    page.get_by_role("dialog").get_by_role("button", name="Withdraw").click()
+    wait_for(lambda: page.request.get(f"/api/v1/ingests/{newest}").json()["state"] == "withdrawn", "the withdrawal")
+    entry = page.request.get("/api/v1/audit?action=withdraw%20ingest").json()["items"][0]
+    assert entry["detail"]["reason"] == "another flight"
+
+
 def test_arguments_have_names_units_and_ranges(page):
     settled(page, "/commands")
     page.locator("#name").select_option("perform_function")

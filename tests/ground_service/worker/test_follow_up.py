@@ -1,5 +1,6 @@
 """Events and their follow-up work: nothing lost, nothing done twice, re-evaluation after late data."""
 
+import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,6 +13,7 @@ from sqlalchemy import update
 
 from ground_service.app import create_app
 from ground_service.errors import StorageFull
+from ground_service.evaluation.core import PassInputs, evaluate_pass
 from ground_service.evaluation.model import ChangedFigure, changed_figures
 from ground_service.evaluation.service import make_report
 from ground_service.evaluation.store import list_reports
@@ -35,6 +37,7 @@ from ground_service.store.event_kinds import (
 from ground_service.worker import follow_up
 from ground_service.worker.follow_up import FollowUp, follow_in_process
 from lunar.timescales import parse_utc
+from reports.values import PassReport
 from tests.ground_service.conftest import SPACECRAFT, SyntheticPass, encode_downlink
 
 
@@ -261,6 +264,23 @@ def test_the_same_data_again_make_no_report(ground: Ground, halves: tuple[Path, 
     pass_id = reported_pass(ground, halves[0])
     ingest_file(ground, halves[0], spacecraft_id=SPACECRAFT)
     assert len(reports_of(ground, pass_id)) == 1 and jobs_of(ground, "re-evaluation") == []
+
+
+def test_late_data_evaluate_a_pass_once_for_the_comparison_and_the_report(
+    ground: Ground, halves: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+):
+    pass_id, evaluated = reported_pass(ground, halves[0]), list[str]()
+
+    def evaluate(inputs: PassInputs) -> PassReport:
+        evaluated.append(inputs.pass_id)
+        return evaluate_pass(inputs)
+
+    monkeypatch.setattr("ground_service.evaluation.service.evaluate_pass", evaluate)
+    ingest_file(ground, halves[1], spacecraft_id=SPACECRAFT)
+    _, again = reports_of(ground, pass_id)
+    assert evaluated == [str(pass_id)]
+    made = json.loads(ground.files.get(again["json_sha256"]))["created_utc"]
+    assert parse_utc(made) // 10**9 == again["created_utc_ns"] // 10**9
 
 
 def test_an_event_that_changes_nothing_of_a_pass_makes_no_report(ground: Ground, halves: tuple[Path, Path]):

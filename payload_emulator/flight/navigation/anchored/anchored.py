@@ -60,7 +60,7 @@ from payload_emulator.flight.navigation.sighting import (
 )
 from payload_emulator.flight.vision.detections import Detections
 from tmtc.dictionary.tables import BurnTable, CatalogueTable, GravityTable, InitialState, OrientationTable, no_burns
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 _NAN = float("nan")
 _NO_CRATERS = np.empty(0, dtype=np.int64)
