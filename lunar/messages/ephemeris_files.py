@@ -40,8 +40,8 @@ def load_ephemeris(path: Path | str) -> Ephemeris:
     octets = read_expanded(path, EXPECTED, OCTETS_LIMIT)
     if (lines := octets.count(b"\n")) > LINES_LIMIT:
         raise DataFileError(path, "", f"at most {LINES_LIMIT} lines", str(lines))
-    text = io.BytesIO(octets)
-    while line := text.readline(LINE_OCTETS + 1):
+    lines_of = io.BytesIO(octets)
+    while line := lines_of.readline(LINE_OCTETS + 1):
         if len(line) > LINE_OCTETS and b"<" not in octets[:LINE_OCTETS]:
             raise DataFileError(path, "", f"at most {LINE_OCTETS} octets in a line", "more")
     if octets.startswith(SPK_MARK):
