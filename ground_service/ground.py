@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
 from ground_service.errors import Stopping, storage_error
 from ground_service.store.database import Database, prepare_database
 from ground_service.store.files import UNPACKING, FileArchive, files_of, make_durable_folder, remove_leftovers
+from ground_service.store.leases import Waker
 from ground_service.store.objects import ObjectStore, objects_of
 from ground_service.store.roles import check_role
-from ground_service.store.wakeups import Waker, is_redis
 from lunar.datafolder import DataFolder, default_orientation, find_data
 
 if TYPE_CHECKING:
@@ -213,9 +213,8 @@ def ground_from_settings(settings: Settings) -> Ground:
     except BaseException:
         ground.close()
         raise
-    broker = settings.resolved_broker_url()
-    if broker is not None and is_redis(broker):
-        ground.database.listeners.add(Waker(broker))
+    if settings.redis_url is not None:
+        ground.database.listeners.add(Waker(settings.redis_url))
     return ground
 
 

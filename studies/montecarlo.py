@@ -21,9 +21,14 @@ from lunar.frames import Orientation, matrix_from_quaternion, rtn_from_inertial
 from lunar.gravity import GravityField
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
-from payload_emulator.flight.navigation import anchored
-from payload_emulator.flight.navigation.anchored import AnchoredReport, AnchoredSetup, AnchoredState, Observation
-from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
+from payload_emulator.flight.navigation.anchored import anchored
+from payload_emulator.flight.navigation.anchored.anchored import (
+    AnchoredReport,
+    AnchoredSetup,
+    AnchoredState,
+    Observation,
+)
+from payload_emulator.flight.navigation.anchored.parameters import AnchoredParameters
 from payload_emulator.flight.navigation.landmark_map import FIRST_LANDMARK_ID
 from payload_emulator.flight.navigation.outcomes import Outcome
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, in_view, landmark_map, look

@@ -33,7 +33,7 @@ from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.store.database import prepare_database
 from lunar.catalogue import ROWS_LIMIT
-from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
+from lunar.constants import DAY_NS, GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import format_oem
 from lunar.timescales import format_utc
@@ -42,7 +42,6 @@ from studies.harness.parts import Part
 MEMORY_MIB, PROCESSOR_S = 256, 10.0
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "requests.md"
 PACKETS, ROWS = 40_000, 100
-DAY_NS = 86_400 * 10**9
 MISSION = (
     'name = "largest"\n[spacecraft]\nid = 76\nname = "SelenITA"\n'
     '[camera]\nwidth_px = 512\nheight_px = 512\nfov_deg = 120.0\npointing = "nadir"\n'

@@ -43,8 +43,7 @@ from tmtc.downlink import DownlinkEncoder
 from tmtc.errors import TmtcError
 from tmtc.link.frames import Clcw, pack_clcw
 from tmtc.link.settings import LinkSettings
-from tmtc.packets.crc import append_crc
-from tmtc.packets.space_packets import pack_packet
+from tmtc.packets.space_packets import append_crc, pack_packet
 
 SPACECRAFT, OTHER, RECORDED, FOREIGN, PREFIXED, BARE = 76, 33, 90, 91, 92, 93
 ORDERS = ("in order", "reversed", "shuffled", "interleaved", "repeated", "cut twice")

@@ -5,8 +5,6 @@ times real time, then telecommands, a window that is taken back, and requests th
 status is 1 if there was a wrong turn of the classes A or B, or the report took more than `LIMIT_S` on a free machine.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

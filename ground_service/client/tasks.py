@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ground_service.client.connection import new_key
+from ground_service.client.connection import JobFailed, new_key
 from ground_service.client.operations import Operations
-from ground_service.client.problems import JobFailed
 from ground_service.errors import InvalidInput
 
 if TYPE_CHECKING:

@@ -1,7 +1,5 @@
 """Stored data of a pass, prepared and read into the plain arrays of the evaluation."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence

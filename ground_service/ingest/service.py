@@ -31,7 +31,7 @@ from ground_service.toml import REASON_LIMIT, require_line
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import TmtcError
 from tmtc.link.settings import LinkSettings
-from tmtc.packets.cuc import NO_TICKS
+from tmtc.packets.pus import NO_TICKS
 
 
 @dataclass(frozen=True, slots=True)

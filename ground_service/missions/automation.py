@@ -1,7 +1,5 @@
 """Sections `[automation]` and `[notify]` of a mission description, and how those of earlier versions are read."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from typing import Annotated, Any, Final, Self

@@ -32,6 +32,8 @@ def add_catalogue(ground: Ground, stored: StoredFile, name: str, *, actor: str =
     craters = run_apart(_craters_in, stored.path) if is_large else _craters_in(stored.path)
     if isinstance(craters, str):
         raise InvalidInput("catalogue", "", "a crater catalogue", craters.replace(str(stored.path), name))
+    if not craters:
+        raise InvalidInput("catalogue", "", "a crater catalogue", f"{name}: no crater")
     with ground.database.writing() as connection:
         register_file(connection, stored, store.CATALOGUE_KIND, name, utc_now_ns())
         store.set_catalogue_kind(connection, stored.sha256, store.CATALOGUE_KIND)

@@ -92,7 +92,7 @@ def _changes(before: list[str], after: list[str]) -> tuple[str, ...]:
     if removed * added > COMPARED_LIMIT:
         return (f"@@ {removed} lines from line {head + 1} on are replaced by {added}: too many to compare @@",)
     begin, end = max(head - 1, 0), max(tail - 1, 0)
-    old, new = (lines[begin : len(lines) - end] for lines in (before, after))
+    old, new = before[begin : len(before) - end], after[begin : len(after) - end]
     found = tuple(difflib.unified_diff(old, new, lineterm="", n=1))[2:]
     return tuple(_LINE.sub(lambda at: f"{at[1]}{int(at[2]) + begin}", one) if one[:2] == "@@" else one for one in found)
 

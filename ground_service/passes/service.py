@@ -38,13 +38,13 @@ from ground_service.store.vehicles import FLOWN, find_vehicle, vehicle_id
 from ground_service.telemetry import rollups
 from ground_service.telemetry.decoding import readable_version
 from ground_service.toml import require_line
+from lunar.constants import DAY_NS
 from lunar.timescales import format_utc
 from reports.values import PacketAccounting
 from tmtc.dictionary.fields import Field
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import limit_states
 
-DAY_NS = 86_400_000_000_000
 LIMIT_STATES = ("within", "warning", "alarm")
 TREND_DAYS = 30
 TREND_POINTS = 60

@@ -22,6 +22,7 @@ from ground_service.planning import service as planning
 from ground_service.planning import standing, store
 from ground_service.planning.model import StandingRequestIn, Window, WindowFilter
 from ground_service.toml import parse_table, read_json
+from lunar.constants import DAY_NS
 from lunar.datafolder import DataFolder
 from lunar.errors import LunarError
 
@@ -154,7 +155,7 @@ def _no_uplink(ground: Ground, now: int) -> str | None:
     reasons = []
     for declared in links.declared_links(ground).values():
         if declared.link.uplink is not None:
-            contacts, reason = links.predict(ground, declared, now, now + standing.DAY_NS)
+            contacts, reason = links.predict(ground, declared, now, now + DAY_NS)
             if contacts:
                 return None
             reasons.append(f"{declared.link.name}: {reason or 'no contact in the first day'}")

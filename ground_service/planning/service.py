@@ -135,11 +135,9 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     for first, last in spans:
         if last > start:
             part = replace(planner, ephemeris=_part(planner.ephemeris, first, last))
-            begin = max(first, start)
-            search = functools.partial(
-                part.search, constraints, begin, last, given.cadence_s, step_s=given.step_s, commitments=commitments
-            )
-            is_long = last - begin > APART_S * NS and mare is None  # a map cannot be handed over
+            terms = (constraints, max(first, start), last, given.cadence_s)
+            is_long = last - terms[1] > APART_S * NS and mare is None  # a map cannot be handed over
+            search = functools.partial(part.search, *terms, step_s=given.step_s, commitments=commitments)
             found.append(run_apart(search) if is_long else search())
     names = [f"ephemeris {reference.name}", f"orientation {planner.orientation.name}"]
     if len(spans) > 1:

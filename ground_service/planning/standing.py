@@ -44,13 +44,12 @@ from ground_service.planning.store import RequestRecord
 from ground_service.planning.window_states import COMMITTED
 from ground_service.store.event_kinds import PlanChanged, RequestChanged, publish
 from ground_service.store.vehicles import get_vehicle, lock_spacecraft, vehicle_id
-from lunar.constants import NS
+from lunar.constants import DAY_NS, NS
 from lunar.errors import EphemerisCoverageError, LunarError
 
 log = logging.getLogger(__name__)
 
 PLANNER = "planner"
-DAY_NS = 86_400 * NS
 STEP_S = 300.0
 LEAD_NS = 600 * NS
 """Windows begin at least this long after the plan is made, and after the contact that carries their telecommands."""

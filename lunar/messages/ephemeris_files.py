@@ -8,7 +8,7 @@ import itertools
 from pathlib import Path
 
 from lunar.comparison import check_gravity
-from lunar.compressed import read_expanded
+from lunar.datafolder import read_expanded
 from lunar.ephemeris import Ephemeris
 from lunar.errors import DataFileError
 from lunar.messages.horizons import is_horizons, parse_horizons
@@ -40,8 +40,8 @@ def load_ephemeris(path: Path | str) -> Ephemeris:
     octets = read_expanded(path, EXPECTED, OCTETS_LIMIT)
     if (lines := octets.count(b"\n")) > LINES_LIMIT:
         raise DataFileError(path, "", f"at most {LINES_LIMIT} lines", str(lines))
-    lines_of = io.BytesIO(octets)
-    while line := lines_of.readline(LINE_OCTETS + 1):
+    pieces = io.BytesIO(octets)
+    while line := pieces.readline(LINE_OCTETS + 1):
         if len(line) > LINE_OCTETS and b"<" not in octets[:LINE_OCTETS]:
             raise DataFileError(path, "", f"at most {LINE_OCTETS} octets in a line", "more")
     if octets.startswith(SPK_MARK):

@@ -547,7 +547,7 @@ def _spk_segment(spice: Any, handle: int, place: str, arc: _Arc, step_s: float) 
     # A float64 of seconds is good to 0.1 us.
     tai_ns = np.rint(tai_ns_from_et(np.linspace(arc.start_s, arc.stop_s, count)) / 1000).astype(np.int64) * 1000
     states = []
-    for et in et_from_tai_ns(tai_ns).tolist():
+    for et in np.clip(et_from_tai_ns(tai_ns), arc.start_s, arc.stop_s).tolist():  # SPICE refuses 0.1 us beyond an end
         state = spice.spkpvn(handle, arc.descriptor, et)[1]
         state = _turn(spice, place, arc.frame, et) @ state
         if arc.centre != MOON:

@@ -29,8 +29,7 @@ from payload_emulator.flight.telemetry.packets import Telemetry
 from payload_emulator.flight.telemetry.products import image_report, thumbnail_octets
 from payload_emulator.flight.telemetry.store import PacketStore, StoreClass
 from payload_emulator.flight.vision.detections import Detector
-from tmtc.packets.cuc import TICKS_LIMIT, TICKS_PER_SECOND
-from tmtc.packets.pus import ACK_ACCEPTANCE, ACK_COMPLETION, ACK_START
+from tmtc.packets.pus import ACK_ACCEPTANCE, ACK_COMPLETION, ACK_START, TICKS_LIMIT, TICKS_PER_SECOND
 
 __all__ = ["FlightParameters", "FlightTables", "Payload", "PayloadMode"]
 

@@ -34,6 +34,7 @@ tilt_deg = 20.0
 k1 = -0.05
 [requirements]
 recall = -1.0
+temperature_min_c = -15.0
 median_error_m = 42.0
 """
 )
@@ -106,6 +107,7 @@ def test_limits_of_the_scenario_are_stated_and_negative_ones_are_not(world):
     requirements = stated_of(world).requirements
     assert requirements.estimator == "anchored"
     assert (requirements.median_error_m, requirements.recall, requirements.memory_mib) == (42.0, None, None)
+    assert (requirements.temperature_max_c, requirements.temperature_min_c) == (60.0, -15.0)
 
 
 PLACES = """

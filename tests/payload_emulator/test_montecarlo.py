@@ -12,7 +12,7 @@ from lunar.datafolder import DataFolder
 from lunar.frames import rtn_from_inertial
 from lunar.timescales import tdb_s_from_utc_ns
 from payload_emulator.flight.navigation import landmark_map
-from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
+from payload_emulator.flight.navigation.anchored.parameters import AnchoredParameters
 from payload_emulator.flight.navigation.filter.dynamics import ProcessNoise, process_noise
 from payload_emulator.flight.navigation.filter.filter import CommonErrors
 from payload_emulator.flight.navigation.filter.map_offset import OffsetRule

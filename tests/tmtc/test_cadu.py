@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from tmtc.link.cadu import ASM, cadu_octets, synchronise
-from tmtc.link.marker_survey import survey_markers
+from tmtc.link.link_check import survey_markers
 
 PERIOD = 128
 PLACES = list(range(0, 20 * PERIOD, PERIOD))

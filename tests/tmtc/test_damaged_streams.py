@@ -19,8 +19,7 @@ from tmtc.downlink import (
     propose_settings,
 )
 from tmtc.errors import LinkFormatError
-from tmtc.packets.crc import append_crc
-from tmtc.packets.space_packets import pack_packet
+from tmtc.packets.space_packets import append_crc, pack_packet
 
 SETTINGS = LinkSettings()
 ZONE = 1115 - 6 - 2

@@ -42,8 +42,8 @@ from tmtc.dictionary.schema import (
     limit_states,
 )
 from tmtc.errors import ChecksumError, MalformedPacket, TruncatedPacket, UnknownPacket, ValueRefused
+from tmtc.packets.large_data import HEADER, Thumbnail, pack_thumbnail, unpack_thumbnail
 from tmtc.packets.stream import cut_packets
-from tmtc.packets.thumbnails import HEADER, Thumbnail, pack_thumbnail, unpack_thumbnail
 
 HOUSEKEEPING = {f.name: 1 for f in DICTIONARY.packet("housekeeping").fields} | {
     "mode": "observing", "frames_processed": 148, "frames_bad": 2, "detections_total": 4000, "packets_sent": 900,

@@ -15,8 +15,7 @@ from spacepackets.ccsds.spacepacket import parse_space_packets
 from tests.tmtc.foreign import bus_like, capture, comparison, container, floating, integer, space_packet
 from tmtc.downlink import decode, encode_cadus
 from tmtc.errors import ValueRefused
-from tmtc.packets.crc import append_crc
-from tmtc.packets.space_packets import idle_packet
+from tmtc.packets.space_packets import append_crc, idle_packet
 from tmtc.packets.stream import UNCHECKED, PacketForm, cut_packets, find_prefix
 from tmtc.xtce.decode import Decoder
 from tmtc.xtce.importing import parse_xtce

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from tests.tmtc.test_downlink import make_packets
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.packets.crc import append_crc, crc16
-from tmtc.packets.space_packets import idle_packet, pack_packet
+from tmtc.packets.space_packets import append_crc, crc16, idle_packet, pack_packet
 from tmtc.packets.stream import cut_packets
 
 PACKETS = make_packets(480)[:1000]

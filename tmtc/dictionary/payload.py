@@ -17,8 +17,7 @@ from tmtc.dictionary.codes import (
     STORE_CLASSES,
     TABLES,
 )
-from tmtc.dictionary.fields import Field
-from tmtc.dictionary.housekeeping import HOUSEKEEPING_FIELDS
+from tmtc.dictionary.fields import HOUSEKEEPING_FIELDS, Field
 from tmtc.dictionary.schema import Dictionary, Group, PacketDefinition
 from tmtc.packets.space_packets import TYPE_TELECOMMAND
 

@@ -24,7 +24,6 @@ import numpy.typing as npt
 from tmtc.arrays import BoolArray, IntArray, OctetArray, Octets, RecordArray, as_octets
 from tmtc.dictionary.fields import Field
 from tmtc.errors import MalformedPacket, TruncatedPacket, UnknownPacket, ValueRefused
-from tmtc.packets.crc import CRC_LENGTH, append_crc, check_crc
 from tmtc.packets.pus import (
     ACK_ALL,
     TC_HEADER_LENGTH,
@@ -37,9 +36,12 @@ from tmtc.packets.pus import (
     unpack_tm_header,
 )
 from tmtc.packets.space_packets import (
+    CRC_LENGTH,
     PRIMARY_HEADER_LENGTH,
     TYPE_TELECOMMAND,
     TYPE_TELEMETRY,
+    append_crc,
+    check_crc,
     pack_packet,
     unpack_primary_header,
 )

@@ -17,7 +17,7 @@ from ground_service.contacts.commanding.model import (
     TelecommandFilter,
     UplinkChannel,
 )
-from ground_service.http.model import PageOf
+from ground_service.http.model import PageOf, UtcTime
 from ground_service.ingest.core import LONGEST_SILENCE, LONGEST_STEP
 from ground_service.ingest.doubt_store import latest_ticks
 from ground_service.store import repository
@@ -329,8 +329,8 @@ def newest_channels(connection: Connection, spacecraft_id: int, instance: str) -
     newest: dict[int, UplinkChannel] = {}
     for ingest_id, received_utc_ns, accounting in rows:
         for seen in accounting.get("uplink", ()):
-            if seen["spacecraft_id"] == spacecraft_id:
-                channel = UplinkChannel.of(seen, ingest_id=ingest_id, received=received_utc_ns)
+            if seen.pop("spacecraft_id") == spacecraft_id:
+                channel = UplinkChannel(**seen, ingest_id=ingest_id, received=UtcTime(received_utc_ns))
                 newest.setdefault(channel.virtual_channel, channel)
     return [newest[number] for number in sorted(newest)]
 

@@ -7,8 +7,6 @@ of a command that it has accepted. A transmission that its station refuses, beca
 given to the link of that station.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 

@@ -28,9 +28,11 @@ from ground_service.missions.timekeeping import store
 from ground_service.missions.timekeeping.core import (
     CorrelationFit,
     StationDoubt,
+    TimeCorrelation,
     clock_runs,
     doubted_stations,
     fit_correlation,
+    moved_ticks,
     utc_ns_of_ticks,
 )
 from ground_service.missions.timekeeping.model import RECEPTIONS_LIMIT, Correlation, TimeReport
@@ -187,9 +189,17 @@ def recorrelate(ground: Ground, vehicle: int, *, over_manual: bool = False) -> b
         lines = {_line(one.boot_count, one) for one in old}
         if lines == {_line(*fit) for fit in fits} and len(old) == len(fits):
             return False
+        before = store.load_correlations(connection, vehicle)
         store.replace_correlations(connection, vehicle, fits, method=AUTOMATIC, now_utc_ns=utc_now_ns())
-        publish(connection, CorrelationChanged(vehicle_id=vehicle, segments=len(fits)))
+        _publish_change(connection, vehicle, before)
     return True
+
+
+def _publish_change(connection: Connection, vehicle: int, before: Sequence[TimeCorrelation]) -> None:
+    now = store.load_correlations(connection, vehicle)
+    first, last = moved_ticks(before, now)
+    changed = CorrelationChanged(vehicle_id=vehicle, segments=len(now), first_ticks=first, last_ticks=last)
+    publish(connection, changed)
 
 
 def fit_runs(reports: TimeReports) -> tuple[list[tuple[int, CorrelationFit]], list[StationDoubt]]:
@@ -363,9 +373,10 @@ def correlate(
         )
     with ground.database.writing() as connection:
         lock_vehicle(connection, vehicle)
+        before = store.load_correlations(connection, vehicle)
         store.replace_correlations(connection, vehicle, fits.items(), method=MANUAL, now_utc_ns=utc_now_ns())
         audit(connection, actor, "correlate time", str(vehicle), {"boots": len(fits), "points": len(points)})
-        publish(connection, CorrelationChanged(vehicle_id=vehicle, segments=len(fits)))
+        _publish_change(connection, vehicle, before)
     return list(fits.values())
 
 
@@ -409,9 +420,10 @@ def withdraw_correlations(ground: Ground, spacecraft_id: int, instance: str, *, 
             raise Conflict(
                 f"spacecraft {spacecraft_id}: expected correlations in force that a person entered, found none"
             )
+        before = store.load_correlations(connection, vehicle)
         store.replace_correlations(connection, vehicle, (), method=MANUAL, now_utc_ns=utc_now_ns())
         audit(connection, actor, "withdraw correlations", str(vehicle), {"ids": entered})
-        publish(connection, CorrelationChanged(vehicle_id=vehicle, segments=0))
+        _publish_change(connection, vehicle, before)
     recorrelate(ground, vehicle)
     return ground.read(store.correlations_in_force, vehicle)
 

@@ -22,9 +22,10 @@ R. L. Berger, "Multiparameter hypothesis testing and acceptance sampling", Techn
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 
 from ground_service.regression.gates.metrics import (
     FRAMES,
@@ -104,9 +105,12 @@ IDENTICAL = "identical in every octet"
 _LARGEST_LOG = 50.0
 
 
+Size = Annotated[float, Interval(ge=0.0, le=1e9)]
+
+
 @dataclass(frozen=True, slots=True)
 class GateRule:
-    """Gate of a policy.
+    """Gate of a policy: an exact metric with a margin, or a primary metric with a weight and the sizes that count.
 
     Attributes
     ----------
@@ -116,22 +120,22 @@ class GateRule:
         A failure proves a larger loss, a pass excludes one as large: in the metric's unit, or as a share of the
         baseline.
     window_materiality, window_margin
-        The same for less than `WINDOW_FRAMES` frames, and for single passes.
+        The same for less than `WINDOW_FRAMES` frames, and for single passes; None: the same values.
     """
 
     metric: str
-    margin: float
-    weight: float = 0.0
-    materiality: float = 0.0
-    window_margin: float = math.nan
-    window_materiality: float = math.nan
-    reason: str = ""
+    margin: Size
+    reason: str
+    weight: Annotated[float, Interval(ge=0.0, le=1.0)] = 0.0
+    materiality: Size = 0.0
+    window_margin: Annotated[float, Interval(gt=0.0, le=1e9)] | None = None
+    window_materiality: Size | None = None
 
     def sizes(self, window: bool) -> tuple[float, float]:
         """Return materiality and margin."""
-        if window and math.isfinite(self.window_margin):
-            return self.window_materiality, self.window_margin
-        return self.materiality, self.margin
+        pairs = ((self.window_materiality, self.materiality), (self.window_margin, self.margin))
+        materiality, margin = (own if window and own is not None else general for own, general in pairs)
+        return materiality, margin
 
 
 @dataclass(frozen=True, slots=True)

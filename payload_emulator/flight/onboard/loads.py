@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 
 from lunar.camera import PinholeCamera
-from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
+from payload_emulator.flight.navigation.anchored.parameters import AnchoredParameters
 from payload_emulator.flight.navigation.odometry.odometry import OdometryParameters
 from payload_emulator.flight.navigation.outcomes import Mode
 from tmtc.dictionary.tables import (

@@ -19,7 +19,7 @@ from tmtc.dictionary.fields import Field
 from tmtc.dictionary.onboard_parameters import find_parameter
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import TableError
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 Values = Mapping[str, Any]
 _FUNCTIONS = DICTIONARY.labels("perform_function", "function_id")

@@ -1,6 +1,6 @@
 """Products of images: thumbnails, checksums, and the map of landmarks that were used.
 
-Thumbnail: see `tmtc.packets.thumbnails`. Landmark map: for every crater, by identity: identity (u32), frames that
+Thumbnail: see `tmtc.packets.large_data`. Landmark map: for every crater, by identity: identity (u32), frames that
 used it (u16). Big-endian.
 """
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray
-from tmtc.packets.thumbnails import Thumbnail, pack_thumbnail
+from tmtc.packets.large_data import Thumbnail, pack_thumbnail
 
 _LANDMARK = np.dtype([("crater_id", ">u4"), ("frames", ">u2")])
 

@@ -52,7 +52,7 @@ from payload_emulator.sim.board.link import (
 )
 from tmtc.dictionary.payload import APID_TIME_REPORT, DICTIONARY
 from tmtc.link.settings import LinkSettings
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 _FRAMES = 3
 _WIDEST_DEG = 45.0  # a quarter turn of the image brings no other Sun within 45 degrees of its top

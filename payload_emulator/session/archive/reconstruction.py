@@ -44,7 +44,7 @@ from tmtc.dictionary.schema import Table
 from tmtc.dictionary.tables import table_hash
 from tmtc.downlink import DownlinkDecode, decode
 from tmtc.errors import TmtcError
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 DOWNLINK = "downlink.packets"
 TELECOMMANDS = "telecommands.packets"

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lunar.arrays import FloatArray, OctetArray
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 Memory = OctetArray
 

@@ -15,10 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lunar.arrays import FloatArray
-from lunar.camera import PinholeCamera
+from lunar.camera import BrownCamera, PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import spherical_from_mcmf
-from lunar.lens import BrownCamera
 from payload_emulator.errors import TerrainError
 from payload_emulator.sim.render.light import SUN_ANGULAR_RADIUS_RAD
 from payload_emulator.sim.render.photometry import Photometry

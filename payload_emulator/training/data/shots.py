@@ -3,8 +3,6 @@
 Everything is drawn from the generator passed in, in a fixed order, so that a shard's frames follow from its number.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

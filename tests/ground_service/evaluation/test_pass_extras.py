@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from pytest import approx
 
 from ground_service.errors import InvalidInput
+from ground_service.evaluation import extras
 from ground_service.evaluation.alignment import (
     bounds,
     bounds_per_degree,
@@ -32,13 +33,13 @@ from ground_service.evaluation.alignment import (
     squared_normalised_errors,
 )
 from ground_service.evaluation.core import WORST_FRAMES, _choose_frames, event_remarks
-from ground_service.evaluation.extras import dark_limit, surface_map, with_terrain
+from ground_service.evaluation.extras import albedo_picture, dark_limit, surface_map, with_terrain
 from ground_service.evaluation.fixes import Pairs, snapshot_positions, wrong_fixes
 from ground_service.evaluation.recall import ExpectedCraters, Matches, Viewing, expected_craters
+from lunar.camera import BrownCamera
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import find_data
 from lunar.frames import quaternion_from_matrix
-from lunar.lens import BrownCamera
 from lunar.timescales import parse_utc
 from reports.values import NavigationSeries, PassEvent, TerrainMap
 
@@ -173,6 +174,23 @@ def test_a_map_of_minus_180_to_180_is_turned_to_begin_at_0(tmp_path):
     assert (found.image.shape, found.west_deg, found.east_deg) == ((1024, 2048), 0.0, 360.0)
     assert int(found.image[512, 1020]) > 210  # just west of 180 degrees: the eastern edge of the file
     assert int(found.image[512, 1030]) < 50
+
+
+def test_an_albedo_map_is_read_once_by_all_processes_until_its_file_changes(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+    albedo = tmp_path / "albedo.png"
+
+    def shown(columns):
+        Image.fromarray(np.repeat(columns.astype(np.uint8)[None], 32, axis=0)).save(albedo)
+        albedo_picture.cache_clear()
+        return albedo_picture(albedo)
+
+    even = np.linspace(0, 255, 64)
+    first = shown(even)
+    with monkeypatch.context() as patch:
+        patch.setattr(extras, "_grey_levels", None)
+        assert_array_equal(shown(even), first)
+    assert shown(even[::-1])[512, 0] > 200 > 50 > first[512, 0]
 
 
 def test_a_file_that_is_no_picture_is_told(tmp_path):

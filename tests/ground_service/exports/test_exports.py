@@ -416,6 +416,7 @@ def test_a_pass_without_content_of_a_format_is_one_line(rich_ground):
         ("aem", "expected attitudes of its frames, found none"),
         ("parquet", "expected packets, found none"),
         ("images", "expected archived images, found none"),
+        ("csv", "expected samples of the payload, found none"),
         ("oem", "states: expected none, found 'reference'"),
         ("geojson", "lunar orientation"),
     ):

@@ -15,7 +15,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from ground_service.errors import InvalidInput, NotFound
+from ground_service.errors import EvaluationError, InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.doubt_store import list_implausible
@@ -45,9 +45,8 @@ from tests.serving import TestClient
 from tests.tmtc import foreign
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
-from tmtc.packets.crc import crc16
-from tmtc.packets.cuc import NO_TICKS
-from tmtc.packets.space_packets import pack_packet
+from tmtc.packets.pus import NO_TICKS
+from tmtc.packets.space_packets import crc16, pack_packet
 from tmtc.packets.stream import whole_packets
 
 NS = 1_000_000_000
@@ -505,6 +504,8 @@ def test_decoded_packets_of_a_pass_are_exported_with_utc(declared: Ground, synth
     assert {one["packet"] for one in own} == {"event_low"}
     with pytest.raises(NotFound, match="packet"):
         export_packets(declared, pass_id, "nothing", "csv")
+    with pytest.raises(EvaluationError, match="pass 1: expected packets 'store_report', found none"):
+        export_packets(declared, pass_id, "store_report", "csv")
     assert export_packets(declared, pass_id, "Housekeeping", "parquet")[:4] == b"PAR1"
 
 

@@ -110,6 +110,7 @@ def test_nothing_to_send_is_status_2_and_no_file(ground: Ground, tmp_path: Path,
     window = on_board(ground)
     out = tmp_path / "w.cltu"
     assert run(["plan", "uplink", str(window.id), "--home", str(ground.home), "--out", str(out)]) == 2
+    assert run(["command", "uplink", "--spacecraft-id", "76", "--home", str(ground.home), "--out", str(out)]) == 1
     assert "nothing to send: its telecommands are sent" in capsys.readouterr().err
     assert not out.exists()
 

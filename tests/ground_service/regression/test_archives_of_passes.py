@@ -5,8 +5,6 @@ import hashlib
 import json
 import shutil
 import threading
-from collections.abc import Callable
-from pathlib import Path
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -16,7 +14,7 @@ from pytest import raises
 
 from ground_service.client.local import local_client
 from ground_service.errors import InvalidInput
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.http.model import UtcTime
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.model import JobFilter
@@ -25,7 +23,6 @@ from ground_service.passes.archive_import import import_archive, read_manifest
 from ground_service.passes.service import define_pass
 from ground_service.regression import rendering, service, store
 from ground_service.regression.archives import (
-    PassArchive,
     check_out,
     keep_archive,
     kept_archives,
@@ -33,7 +30,7 @@ from ground_service.regression.archives import (
     store_of,
     write_flight_view,
 )
-from ground_service.regression.builds import Build, load_build, register_build
+from ground_service.regression.builds import load_build, register_build
 from ground_service.regression.documents import regression_junit, regression_text, verdict_document
 from ground_service.regression.gates.policy import load_policy
 from ground_service.regression.jobs import compared, missing_replays
@@ -42,7 +39,7 @@ from ground_service.regression.pass_archives import LIVE, NO_INPUTS, archive_of_
 from ground_service.regression.service import find_replay, run_regression
 from linna.commands import regress
 from lunar.datafolder import find_data
-from tests.ground_service.conftest import SPACECRAFT, START, FlyablePass, SyntheticPass, encode_downlink, enter_files
+from tests.ground_service.conftest import SPACECRAFT, START, encode_downlink, enter_files
 
 REPLAY = KeptReplay(
     outcome="ok", detail="", downlink_sha256=None, performance_sha256=None, wall_s=1.0, cpu_s=1.0, peak_rss_mib=1.0,
@@ -50,22 +47,22 @@ REPLAY = KeptReplay(
 )  # fmt: skip
 
 
-def live_pass(ground: Ground) -> int:
+def live_pass(ground):
     stop = START + 600_000_000_000
     return define_pass(ground, name="live", start_utc_ns=START, stop_utc_ns=stop, spacecraft_id=SPACECRAFT)
 
 
-def good(ground: Ground, make_build: Callable, packets: dict[str, list[bytes]]) -> Build:
+def good(ground, make_build, packets):
     return register_build(ground, load_build(make_build("good", packets)))
 
 
 @pytest.fixture(scope="module")
-def archive(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
+def archive(make_pass):
     return make_pass(frames=4, seed=3)
 
 
 @pytest.fixture(scope="module")
-def flown(make_flyable: Callable[..., FlyablePass]) -> FlyablePass:
+def flown(make_flyable):
     return make_flyable(frames=4, seed=5)
 
 
@@ -146,7 +143,7 @@ def test_a_pass_without_telemetry_has_no_archive(ground):
 
 
 @pytest.fixture
-def unrendered(flown: FlyablePass, tmp_path: Path) -> Path:
+def unrendered(flown, tmp_path):
     """An archive without two of its frames, whose scenario is not one."""
     folder = shutil.copytree(flown.folder, tmp_path / "unrendered")
     for number in (1, 3):
@@ -156,10 +153,10 @@ def unrendered(flown: FlyablePass, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def render_whole(flown: FlyablePass, monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+def render_whole(flown, monkeypatch):
     """From its call on, rendering an archive gives the flown one."""
 
-    def render(_ground: Ground, given: PassArchive, out: Path) -> str:
+    def render(_ground, given, out):
         assert not (given.folder / "payload/detections.jsonl").exists()
         shutil.copytree(flown.folder, out)
         return ""

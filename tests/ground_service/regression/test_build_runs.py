@@ -8,9 +8,7 @@ import subprocess
 import tempfile
 import time
 import venv
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from pytest import raises
@@ -19,7 +17,7 @@ from ground_service.errors import BuildNotChecked, InvalidInput
 from ground_service.http.model import Paging, UtcTime
 from ground_service.regression import builds
 from ground_service.regression import sandbox as host
-from ground_service.regression.build_runs import BuildRun, run_build
+from ground_service.regression.build_runs import run_build
 from ground_service.regression.builds import changes, load_build, register_build
 from ground_service.regression.model import REASONS_LIMIT, JudgedGate, Regression, Verdict
 from ground_service.regression.sandbox import SandboxRefused
@@ -30,13 +28,13 @@ LIMITS = "\n[limits]\nwall_s = 20\ncpu_s = 10\nmemory_mib = 300\nfile_mib = 4\nf
 
 
 @pytest.fixture(scope="module")
-def archive(make_flyable: Callable) -> Path:
+def archive(make_flyable):
     return make_flyable(frames=2, seed=31).folder
 
 
 @pytest.fixture
-def fly(make_build: Callable, archive: Path, tmp_path: Path) -> Callable[..., BuildRun]:
-    def run(program: str, limits: str = LIMITS) -> BuildRun:
+def fly(make_build, archive, tmp_path):
+    def run(program, limits=LIMITS):
         build = load_build(make_build("bad", program="import os, pathlib, sys, time\n" + program, extra=limits))
         return run_build(build, archive, tmp_path / "out")
 
@@ -263,8 +261,8 @@ def test_what_differs_between_two_builds_on_the_flight_code_is_named(tmp_path, m
 
 
 @pytest.fixture
-def write(tmp_path: Path) -> Callable[[str], str]:
-    def build(parameters: str) -> str:
+def write(tmp_path):
+    def build(parameters):
         (tmp_path / "p.toml").write_text(parameters)
         (tmp_path / "build.toml").write_text('name = "b"\nparameters = "p.toml"\n')
         return str(tmp_path / "build.toml")
@@ -301,12 +299,12 @@ def test_right_parameters_are_registered_and_checked_once(ground, write, monkeyp
     assert register_build(ground, load_build(file)).digest == first.digest
 
 
-def _refused(*_: Any, **__: Any) -> dict[str, Any]:
+def _refused(*_, **__):
     raise SandboxRefused("no user namespaces")
 
 
-def _ended(**changes: Any) -> Callable[..., dict[str, Any]]:
-    def run(request: Any, staged: Path, written: Path, printed: Path, **_: Any) -> dict[str, Any]:
+def _ended(**changes):
+    def run(request, staged, written, printed, **_):
         printed.write_text("Traceback\nMemoryError\n")
         return {"cause": "", "exit_status": 0} | changes
 
@@ -352,7 +350,7 @@ POLICY = {"version": "1", "sha256": "00", "confidence": 0.95, "power": 0.8}  # o
 UNKNOWN = ("pass_id", "margin", "p_value", "level", "resolution", "frames_needed", "reason")
 
 
-def gate(name: str, outcome: str, **values: Any) -> JudgedGate:
+def gate(name, outcome, **values):
     known = {
         "passed": outcome == "pass", "baseline": 0.9, "candidate": 0.7, "limit": 0.05, "unit": "",
         "change_bounds": (None, None), "frames": 10,
@@ -360,7 +358,7 @@ def gate(name: str, outcome: str, **values: Any) -> JudgedGate:
     return JudgedGate(name=name, outcome=outcome, **dict.fromkeys(UNKNOWN) | known | values)
 
 
-def regression(verdict: str, gates: list[JudgedGate], **values: Any) -> Regression:
+def regression(verdict, gates, **values):
     result = Verdict(
         verdict=verdict,
         baseline={"name": "old", **BUILD},

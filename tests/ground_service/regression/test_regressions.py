@@ -52,11 +52,12 @@ from ground_service.regression.store import ARCHIVES, REPLAYS, get_archive
 from ground_service.regression.store import keep_archive as store_archive_record
 from ground_service.settings import Settings
 from ground_service.store.states import change_if
-from ground_service.worker.upkeep import DAY_NS, remove_archives
+from ground_service.worker.upkeep import remove_archives
+from lunar.constants import DAY_NS
 from reports.values import Gate
 from tests.ground_service.conftest import enter_files
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.packets.crc import append_crc
+from tmtc.packets.space_packets import append_crc
 
 Packets = dict[str, list[bytes]]
 

@@ -1,5 +1,6 @@
 """Events and their follow-up work: nothing lost, nothing done twice, re-evaluation after late data."""
 
+import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,6 +13,7 @@ from sqlalchemy import update
 
 from ground_service.app import create_app
 from ground_service.errors import StorageFull
+from ground_service.evaluation.core import PassInputs, evaluate_pass
 from ground_service.evaluation.model import ChangedFigure, changed_figures
 from ground_service.evaluation.service import make_report
 from ground_service.evaluation.store import list_reports
@@ -24,10 +26,18 @@ from ground_service.settings import Settings
 from ground_service.store import event_kinds as events
 from ground_service.store import events as log
 from ground_service.store import repository
-from ground_service.store.event_kinds import CommandsSent, FollowUpFailed, PassEvaluated, TelemetryReceived, publish
+from ground_service.store.event_kinds import (
+    CommandsSent,
+    CorrelationChanged,
+    FollowUpFailed,
+    PassEvaluated,
+    TelemetryReceived,
+    publish,
+)
 from ground_service.worker import follow_up
 from ground_service.worker.follow_up import FollowUp, follow_in_process
 from lunar.timescales import parse_utc
+from reports.values import PassReport
 from tests.ground_service.conftest import SPACECRAFT, SyntheticPass, encode_downlink
 
 
@@ -256,13 +266,32 @@ def test_the_same_data_again_make_no_report(ground: Ground, halves: tuple[Path, 
     assert len(reports_of(ground, pass_id)) == 1 and jobs_of(ground, "re-evaluation") == []
 
 
+def test_late_data_evaluate_a_pass_once_for_the_comparison_and_the_report(
+    ground: Ground, halves: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+):
+    pass_id, evaluated = reported_pass(ground, halves[0]), list[str]()
+
+    def evaluate(inputs: PassInputs) -> PassReport:
+        evaluated.append(inputs.pass_id)
+        return evaluate_pass(inputs)
+
+    monkeypatch.setattr("ground_service.evaluation.service.evaluate_pass", evaluate)
+    ingest_file(ground, halves[1], spacecraft_id=SPACECRAFT)
+    _, again = reports_of(ground, pass_id)
+    assert evaluated == [str(pass_id)]
+    made = json.loads(ground.files.get(again["json_sha256"]))["created_utc"]
+    assert parse_utc(made) // 10**9 == again["created_utc_ns"] // 10**9
+
+
 def test_an_event_that_changes_nothing_of_a_pass_makes_no_report(ground: Ground, halves: tuple[Path, Path]):
     pass_id = reported_pass(ground, halves[0])
     vehicle = ground.read(repository.get, repository.PASSES, pass_id, "pass")["vehicle_id"]
     # Telemetry of another time does not evaluate the pass again.
     say(ground, TelemetryReceived(vehicle_id=vehicle, packets=1, first_ticks=0, last_ticks=1))
+    say(ground, CorrelationChanged(vehicle_id=vehicle, segments=1))
     assert jobs_of(ground, "re-evaluation") == []
-    say(ground, TelemetryReceived(vehicle_id=vehicle, packets=1, first_ticks=0, last_ticks=(1 << 48) - 1))
+    # A correlation that moves its time does.
+    say(ground, CorrelationChanged(vehicle_id=vehicle, segments=1, first_ticks=0, last_ticks=(1 << 48) - 1))
     [job] = jobs_of(ground, "re-evaluation")
     assert (job["state"], job["result"]["report_id"]) == ("done", None)
     assert len(reports_of(ground, pass_id)) == 1

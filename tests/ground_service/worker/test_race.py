@@ -1,8 +1,5 @@
 """Shortest race campaign: two API processes over HTTP and one PostgreSQL database."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import pytest
 
 from benchmarks.campaigns import race
@@ -11,7 +8,7 @@ from benchmarks.campaigns.race import FAULTS, Answer, Tally, holds, run, table
 
 @pytest.mark.campaign
 def test_of_contradicting_requests_to_two_processes_one_wins_and_all_others_are_told_so(
-    new_postgres_database: Callable[[], str], tmp_path: Path
+    new_postgres_database, tmp_path
 ):
     figures = run(tmp_path, new_postgres_database(), races=60, seed=3)
     assert {name: figures[name] for name in FAULTS} == dict.fromkeys(FAULTS, 0), figures["examples"]
@@ -24,7 +21,7 @@ def test_of_contradicting_requests_to_two_processes_one_wins_and_all_others_are_
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_any_fault_fails_the_campaign_and_is_in_its_table(name: str):
+def test_any_fault_fails_the_campaign_and_is_in_its_table(name):
     figures = {one: int(one == name) for one in FAULTS}
     assert not holds(figures)
     text = table({**figures, "kinds": {}, "seconds": 1, "examples": ["what happened"]})

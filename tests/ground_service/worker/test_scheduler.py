@@ -19,8 +19,9 @@ from ground_service.regression.model import COMPLETE, TELEMETRY_ONLY
 from ground_service.store import leases
 from ground_service.worker import scheduler as scheduling
 from ground_service.worker.scheduler import LEASE, LEASE_NS, Scheduler, has_scheduler
-from ground_service.worker.upkeep import DAY_NS, nightly_job_id, plan_job_id
+from ground_service.worker.upkeep import nightly_job_id, plan_job_id
 from linna import cli
+from lunar.constants import DAY_NS
 from lunar.timescales import parse_utc
 from tests.serving import wait_for
 
@@ -200,7 +201,6 @@ PROCESS = """
     from ground_service.ground import open_ground
     from ground_service.store import repository
     from ground_service.worker import scheduler as scheduling
-    from ground_service.worker.upkeep import DAY_NS
 
     scheduling.TICK_S, scheduling.LEASE_NS = 0.05, int(sys.argv[4])
     scheduling.utc_now_ns = lambda: 20 * DAY_NS

@@ -15,7 +15,7 @@ from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.spacecraft.loop import new_board
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.tables import pack_anchor_table
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 RADIUS_M = 1_737_400.0
 GM_M3_S2 = 4.902800066e12

@@ -12,10 +12,10 @@ from scipy.special import chdtri, ndtr
 from lunar.camera import nadir_camera_from_mcmf
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
-from payload_emulator.flight.navigation import anchored, correction, recovery
-from payload_emulator.flight.navigation.anchored import Observation
-from payload_emulator.flight.navigation.anchored_parameters import AnchoredLimits, AnchoredParameters
-from payload_emulator.flight.navigation.correction import frame_limit, is_usable
+from payload_emulator.flight.navigation.anchored import anchored, correction, recovery
+from payload_emulator.flight.navigation.anchored.anchored import Observation
+from payload_emulator.flight.navigation.anchored.correction import frame_limit, is_usable
+from payload_emulator.flight.navigation.anchored.parameters import AnchoredLimits, AnchoredParameters
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.filter import FilterState
 from payload_emulator.flight.navigation.landmark_map import MapState

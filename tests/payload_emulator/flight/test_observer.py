@@ -6,8 +6,8 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark
 
-from payload_emulator.flight.navigation import anchored
-from payload_emulator.flight.navigation.anchored import AnchoredReport
+from payload_emulator.flight.navigation.anchored import anchored
+from payload_emulator.flight.navigation.anchored.anchored import AnchoredReport
 from payload_emulator.flight.navigation.filter.map_offset import OffsetSize
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.onboard.loads import FlightParameters, FlightTables

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from pytest import mark
 
-from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
+from payload_emulator.flight.navigation.anchored.parameters import AnchoredParameters
 from payload_emulator.flight.navigation.search.lost_in_space import LostParameters
 from studies.montecarlo import CatalogueErrors, Kidnap, fly
 

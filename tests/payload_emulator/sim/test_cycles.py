@@ -15,10 +15,9 @@ from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark, raises
 
-from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
+from lunar.camera import BrownCamera, PinholeCamera, nadir_camera_from_mcmf
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import axis_rotation, enu_from_mcmf, mcmf_from_spherical
-from lunar.lens import BrownCamera
 from payload_emulator.errors import RendererError, TerrainError
 from payload_emulator.sim.render import cycles, cycles_worker, renderer
 from payload_emulator.sim.render.cycles_scene import GRID, MATT_SPECULAR_IOR, CyclesSettings, describe_scene

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from ground_service.contacts.links import service
+from ground_service.contacts.links import core, runner, service
 from ground_service.contacts.links.runner import LinkRunner
 from ground_service.contacts.links.service import DeclaredLink
 from ground_service.ground import Ground
@@ -65,8 +65,15 @@ class Station:
             one.close()
 
 
+WAITS = {"TICK_S": 0.02, "POLL_S": 0.02, "PAUSE_S": 0.1, "RETRY_S": 0.1, "MISSED_S": 0.1, "REFUSED_S": 0.1}
+
+
 @pytest.fixture
-def station():
+def station(monkeypatch):
+    """A station whose link waits less than in operation, for events that the test causes."""
+    for name, seconds in WAITS.items():
+        monkeypatch.setattr(runner, name, seconds)
+    monkeypatch.setattr(core, "FIRST_WAIT_S", 0.05)
     made = Station()
     yield made
     made.close()

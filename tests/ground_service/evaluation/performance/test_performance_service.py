@@ -37,7 +37,7 @@ from ground_service.store.vehicles import FLOWN, vehicle_id
 from ground_service.worker import upkeep
 from ground_service.worker.upkeep import nightly
 from linna.cli import run
-from linna.commands.performance import performance_lines
+from linna.commands.results import performance_lines
 from lunar.timescales import parse_utc
 from tests.ground_service.conftest import ALTITUDE_M, SPACECRAFT, SyntheticPass
 
