@@ -42,6 +42,7 @@ from studies.harness.parts import Part
 MEMORY_MIB, PROCESSOR_S = 256, 10.0
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "requests.md"
 PACKETS, ROWS = 40_000, 100
+NOT_MEASURED = "not measured: the last run was stopped before it"
 MISSION = (
     'name = "largest"\n[spacecraft]\nid = 76\nname = "SelenITA"\n'
     '[camera]\nwidth_px = 512\nheight_px = 512\nfov_deg = 120.0\npointing = "nadir"\n'
@@ -236,6 +237,11 @@ def table() -> dict[str, str]:
     return {row.split("|", 3)[1] + row.split("|", 3)[2]: row for row in rows}
 
 
+def weight(row: str) -> list[float]:
+    """Return the order of a row: the dearest first, those that were not measured last."""
+    return [-float(cell.replace("–", "-1")) for cell in row.split("|")[4:7:2]]
+
+
 def measured(only: Sequence[str], but: Collection[str] = ()) -> Iterator[Cost]:
     """Yield the costs of all operations, or of some."""
     with tempfile.TemporaryDirectory(prefix="costs-") as name, PostgresServer(Path(name)) as server:
@@ -281,12 +287,14 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--write", action="store_true", help=f"enter the rows into {PAGE.name}")
     given = parser.parse_args(words)
     rows, are_faulty = table(), False
-    for one in measured(given.only, {key.split("`")[1] for key in rows} if given.missing else ()):
+    known = {key.split("`")[1] for key, row in rows.items() if NOT_MEASURED not in row}
+    for one in measured(given.only, known if given.missing else ()):
         are_faulty |= bool(one.fault)
         print(one.cells(), one.fault, one.detail, flush=True)
         if given.write:
+            rows.pop(f" `{one.operation}`  {NOT_MEASURED} ", None)
             rows[f" `{one.operation}`  {one.what} "] = one.cells()
-            shown = sorted(rows.values(), key=lambda row: [-float(cell) for cell in row.split("|")[4:7:2]])
+            shown = sorted(rows.values(), key=weight)
             head = PAGE.read_text().split("|---")[0]
             PAGE.write_text(f"{head}|---|---|---|---|---|---|\n" + "\n".join(shown) + "\n")
     return int(are_faulty)
