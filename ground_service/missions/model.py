@@ -29,6 +29,9 @@ from tmtc.dictionary.payload import DICTIONARY
 
 SCHEMA_VERSION: Final = 1
 MISSION_LIMIT_OCTETS = 1 << 20
+LINKS_LIMIT = 100
+"""Most links of a description: each takes threads of a process."""
+
 EPOCH_TAI = " TAI"
 XTCE_COMPRESSED = "gzip:"
 DICTIONARY_APIDS = frozenset(one.apid for one in (*DICTIONARY.telemetry, *DICTIONARY.telecommands))
@@ -642,7 +645,7 @@ class Mission(Section):
     approval: Approval = Approval()
     uploads: Uploads | None = None
     resources: SpacecraftResources = SpacecraftResources()
-    links: Annotated[tuple[StationConnection, ...], Array] | None = None
+    links: Annotated[tuple[StationConnection, ...], Array, Field(max_length=LINKS_LIMIT)] | None = None
     packets: Annotated[tuple[PacketSource, ...], Array] | None = None
     procedures: dict[str, Annotated[str, Field(min_length=1, max_length=4000)]] = Field(default_factory=dict)
     """Procedures of the operator for alarms, by the name of event or parameter."""
