@@ -52,6 +52,8 @@ observation ends |
 the declared one until it is restored |
 | the crater list has an offset of another size than believed | map_offset | the size, learned from the fixes, is \
 used from then on; it is kept until another catalogue is loaded or the estimators are reset |
+| detections have another noise than stated | detection_noise | the factor, learned from the fixes, is used and kept \
+like the offset |
 | processor hangs | watchdog_reset | reset by the watchdog; the observation is resumed; `watchdog_limit` within an \
 hour: safe |
 | bits of model, parameters or tables change | model_hash_mismatch, parameters_hash_mismatch, \
