@@ -162,7 +162,7 @@ wrong_by_m = 500.0
 """
 
 
-def test_disturbances_change_the_spacecraft_and_not_what_the_ground_is_told(tmp_path):
+def test_disturbances_change_the_spacecraft_and_not_the_inputs_of_the_ground(tmp_path):
     path = tmp_path / "disturbed.toml"
     path.write_text(DISTURBED)
     scenario = parse_scenario(SCENARIO + "[link]\nstations = ['madrid', 'canberra']\n")
@@ -174,7 +174,7 @@ def test_disturbances_change_the_spacecraft_and_not_what_the_ground_is_told(tmp_
     assert found.faults.events == ("clock_jump at 1800.0 size 1.0", "camera_dark at 600 for 60")
     assert found.attitude.knowledge_bias_deg == 0.2 and found.sensor.hot_pixels == 0.001
     assert UNDISTURBED.apply(scenario) == scenario
-    # The ground is told of announced outages only, and never of these.
+    # The ground knows of announced outages only, and never of these.
     text = live_mission_text(open_world(found, NO_DATA), NO_DATA, "127.0.0.1", {"madrid": (1, 2)}, "")
     assert "missed" not in text.partition("[world]")[0]
     assert load_disturbances("month").link.clocks == ("madrid 3600",)

@@ -97,7 +97,7 @@ def test_a_stream_that_is_joined_in_mid_packet_loses_only_that_one():
     assert cut.octets_skipped == len(PACKETS[0]) - 7
 
 
-def test_several_damaged_packets_in_a_row_are_told_apart():
+def test_several_damaged_packets_in_a_row_are_separated():
     octets = bytearray(WHOLE)
     at = AT_500
     for packet in PACKETS[500:504]:

@@ -236,7 +236,7 @@ def test_text_that_mentions_terrain_does_not_decide_the_evidence_level():
     declared = """
 LROC WAC GLD100 | real-terrain | None
 procedural Moon, seed 7 | procedural | 2
-a procedural Moon beside GLD100 | None | None
+a procedural Moon and GLD100 | None | None
 photograph big_tile.tif | photographs | 5
 """
     for terrain, *expected in cells(declared):
@@ -318,6 +318,14 @@ def test_windows_approved_automatically_with_critical_telecommands_are_refused(g
     subjects = '["perform_function/set_mode", "uplink_first", "uplink_middle", "uplink_last"]'
     released = extra.replace("[uploads]", f"one_person_for = {subjects}\n[uploads]")
     assert add_mission(ground, (TEXT + released).encode()).document.critical_in_windows == ()
+
+
+def test_a_description_has_a_hundred_links_at_most():
+    link = '[[links]]\nname = "l{}"\nkind = "file"\ndownlink = "/nowhere"\n'
+    links = [link.format(k) for k in range(101)]
+    assert len(read_mission((TEXT + "".join(links[1:])).encode())[0].links or ()) == 100
+    with pytest.raises(InvalidInput, match="at most 100 items"):
+        read_mission((TEXT + "".join(links)).encode())
 
 
 def test_a_check_of_texts_that_take_long_to_compare_counts_their_lines(ground):

@@ -48,8 +48,8 @@ def test_there_is_no_step_at_the_prime_meridian(procedural):
     latitude = np.radians(np.linspace(9.0, 11.0, 200))
     step = math.radians(0.5 / 256.0)
     across = procedural.height_m(latitude, 2.0 * math.pi - step) - procedural.height_m(latitude, step)
-    beside = procedural.height_m(latitude, step) - procedural.height_m(latitude, 3.0 * step)
-    assert np.sqrt(np.mean(across**2)) < 2.0 * np.sqrt(np.mean(beside**2)) + 1.0
+    nearby = procedural.height_m(latitude, step) - procedural.height_m(latitude, 3.0 * step)
+    assert np.sqrt(np.mean(across**2)) < 2.0 * np.sqrt(np.mean(nearby**2)) + 1.0
 
 
 def test_worlds_of_other_seeds_are_other_worlds(procedural):
