@@ -33,7 +33,7 @@ import tomllib
 from collections.abc import Iterator
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 ROOT = Path(__file__).resolve().parent
 NOTEBOOKS = ROOT / "docs" / "notebooks"
@@ -373,31 +373,37 @@ def scenario_page() -> str:
         "Generated from the program. A scenario is a TOML file: see [your own scenario](../tutorials/own-scenario.md). "
         "`linna emulate NAME` flies a shipped one. A key that is not stated has its default, an unknown key is refused "
         "with the nearest known one.",
-        *_keys("Top of the file", Scenario, ""),
+        *_keys("Top of the file", Scenario(""), ""),
     ]
     for section in dataclasses.fields(Scenario):
-        kind = section.default_factory
-        if dataclasses.is_dataclass(kind):
-            lines += _keys(f"`[{section.name}]`", kind, inspect.getdoc(kind) or "")
+        values = getattr(Scenario(""), section.name)
+        if dataclasses.is_dataclass(values):
+            lines += _keys(f"`[{section.name}]`", values, inspect.getdoc(values) or "")
     return "\n".join(lines) + "\n"
 
 
-def _keys(heading: str, kind: Any, text: str) -> list[str]:
+def _type_text(hint: Any) -> str:
+    if get_origin(hint) is Literal:
+        return ", ".join(map(json.dumps, get_args(hint)))
+    if get_origin(hint) is tuple:
+        return f"list of {get_args(hint)[0].__name__}"
+    return _type_text(get_args(hint)[0]) if get_args(hint) else str(hint.__name__)
+
+
+def _keys(heading: str, values: Any, text: str) -> list[str]:
     text, _, attributes = text.partition("\nAttributes\n----------\n")
     meanings: dict[str, str] = {}
     for names, meaning in re.findall(r"^(\S[^\n]*)\n((?:    [^\n]*\n?)+)", attributes, re.MULTILINE):
         meanings |= dict.fromkeys(names.split(", "), " ".join(meaning.split()))
     rows = []
-    for key in dataclasses.fields(kind):
-        if key.default_factory is not dataclasses.MISSING:
+    hints = get_type_hints(type(values))
+    for key in dataclasses.fields(values):
+        value, stated = getattr(values, key.name), _type_text(hints[key.name])
+        if dataclasses.is_dataclass(value):
             continue
-        default = "required" if key.default is dataclasses.MISSING else f"`{json.dumps(key.default)}`"
-        # Types are texts where annotations are deferred.
-        stated = key.type if isinstance(key.type, str) else getattr(key.type, "__name__", str(key.type))
-        if choices := re.fullmatch(r"Literal\[(.*)\]", stated):
-            stated = ", ".join(choices[1].replace("'", '"').split(", "))
-        elif repeated := re.fullmatch(r"tuple\[(\w+), \.\.\.\]", stated):
-            stated = f"list of {repeated[1]}"
+        default = "not stated" if value is None else f"`{json.dumps(value)}`"
+        if key.default is key.default_factory is dataclasses.MISSING:
+            default = "required"
         meaning = f" {_cell(meanings.get(key.name, ''))} |" if meanings else ""
         rows.append(f"| `{key.name}` | {_cell(stated)} | {default} |{meaning}")
     return [

@@ -12,7 +12,7 @@ from benchmarks import rooms
 from benchmarks._rows import NotMeasured, checkout, measure, report
 
 NAMES = (
-    "tmtc", "downlink", "ground", "orbit", "render", "pages",
+    "tmtc", "downlink", "ground", "orbit", "render", "pages", "yamcs",
 )  # fmt: skip
 """Benchmarks of `make bench`, in this order."""
 

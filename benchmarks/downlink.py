@@ -20,8 +20,7 @@ from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import DownlinkEncoder, decode
 from tmtc.errors import TmtcError
 from tmtc.link import reed_solomon
-from tmtc.link.frames import frame_checksums_hold
-from tmtc.link.randomiser import randomise
+from tmtc.link.frames import frame_checksums_hold, randomise
 from tmtc.link.settings import LinkSettings
 from tmtc.packets.space_packets import PacketSequencer, pack_packet
 from tmtc.packets.stream import PacketForm
@@ -316,8 +315,8 @@ def checked(stream: Stream) -> FoundPackets:
 
 
 def ingested(stream: Stream) -> FoundPackets:
-    """Return what `linna ingest` stores of the files in an empty archive."""
-    from sqlalchemy import select
+    """Return what `linna ingest` stores of the files in an empty archive, with packets of implausible times."""
+    from sqlalchemy import select, union_all
 
     from ground_service.errors import GroundError
     from ground_service.ground import open_ground
@@ -340,12 +339,12 @@ def ingested(stream: Stream) -> FoundPackets:
             except (GroundError, TmtcError):
                 continue
         found = false = 0
-        table = repository.PACKETS
+        tables = repository.PACKETS, repository.IMPLAUSIBLE_PACKETS
         with ground.database.reading() as connection:
             for spacecraft, packets in stream.packets.items():
                 vehicle = vehicle_id(connection, spacecraft, "flight")
-                rows = connection.execute(select(table.c.octets).where(table.c.vehicle_id == vehicle))
-                mine = {bytes(row) for row in rows.scalars()}
+                stored = union_all(*(select(one.c.octets).where(one.c.vehicle_id == vehicle) for one in tables))
+                mine = {bytes(row) for row in connection.execute(stored).scalars()}
                 found += len(mine & packets)
                 false += len(mine - packets)
         ground.close()

@@ -37,14 +37,14 @@ START = parse_utc("2029-08-07T00:00:00Z")
 STEP_NS = 100_000_000
 
 
-def mixed_downlink(count: int, start_utc_ns: int = START) -> bytes:
-    """CADUs that hold `count` packets of four kinds, ten of each kind a second."""
+def mixed_downlink(count: int, start_utc_ns: int = START, step_ns: int = STEP_NS) -> bytes:
+    """CADUs that hold `count` packets of four kinds, one of each kind a step."""
     rng = np.random.default_rng(1)
     sequencer = PacketSequencer()
     housekeeping: dict[str, Any] = {field.name: 1 for field in DICTIONARY.packet("housekeeping").fields}
     packets = []
     for k in range(count // 4):
-        ticks = int(ticks_from_utc_ns(start_utc_ns + k * STEP_NS))
+        ticks = int(ticks_from_utc_ns(start_utc_ns + k * step_ns))
         frame = {"frame_number": k, "image_ticks": ticks}
         items = {
             "u_px": rng.integers(0, 32_000, 20) / 64,

@@ -5,8 +5,6 @@ ray march over the same frame. Pictures of both are compared over random poses o
 any azimuth and yaw, tilt to 5 degrees.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
@@ -15,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks._rows import Row, best_s
-from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
+from lunar.camera import PinholeCamera, nadir_camera_from_mcmf, pointed_camera_from_mcmf
 from lunar.datafolder import find_data
 from lunar.errors import LunarError
 from lunar.frames import mcmf_from_spherical
-from lunar.lens import pointed_camera_from_mcmf
 from payload_emulator.errors import PayloadError
 from payload_emulator.sim.render import raymarch, renderer
 from payload_emulator.sim.render.light import sun_direction_mcmf

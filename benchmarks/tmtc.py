@@ -22,7 +22,7 @@ from tmtc.dictionary.fields import Field
 from tmtc.dictionary.schema import Dictionary, Group, PacketDefinition
 from tmtc.downlink import LinkSettings, decode, encode_cadus
 from tmtc.link import reed_solomon
-from tmtc.packets.crc import append_crc
+from tmtc.packets.space_packets import append_crc
 from tmtc.packets.stream import cut_packets
 from tmtc.xtce.export import format_xtce
 

@@ -35,7 +35,6 @@ from ground_service.http.uploads import UPLOADS_AT_ONCE, UploadPool
 from ground_service.logs import logging_config
 from ground_service.missions.clocks import mission_clock
 from ground_service.settings import Settings, start_tracing
-from ground_service.store.wakeups import is_redis
 from ground_service.web.pages import FOLDER, displays, documentation, pages
 from ground_service.web.payload_console import payload_console
 from ground_service.web.sign_in import sign_in
@@ -84,8 +83,6 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
         Do jobs before the answer is sent (without a broker only), for tests and scripts.
     """
 
-    broker = settings.resolved_broker_url()
-
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         ground = ground_from_settings(settings)
@@ -113,7 +110,7 @@ def create_app(settings: Settings, *, inline_jobs: bool = False) -> FastAPI:
             open_without_users=app.state.open_without_users,
             per_user=settings.sockets_per_user,
             total=settings.sockets,
-            redis_url=broker if is_redis(broker) else None,
+            redis_url=settings.redis_url,
         )
         sockets = asyncio.create_task(app.state.sockets.run())
         scheduler = Scheduler(

@@ -8,18 +8,20 @@ import stat
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from ipaddress import IPv4Network, IPv6Network, ip_network
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
 
 from ground_service.errors import Stopping, storage_error
 from ground_service.store.database import Database, prepare_database
 from ground_service.store.files import UNPACKING, FileArchive, files_of, make_durable_folder, remove_leftovers
+from ground_service.store.leases import Waker
 from ground_service.store.objects import ObjectStore, objects_of
 from ground_service.store.roles import check_role
-from ground_service.store.wakeups import Waker, is_redis
 from lunar.datafolder import DataFolder, default_orientation, find_data
 
 if TYPE_CHECKING:
@@ -211,10 +213,15 @@ def ground_from_settings(settings: Settings) -> Ground:
     except BaseException:
         ground.close()
         raise
-    broker = settings.resolved_broker_url()
-    if broker is not None and is_redis(broker):
-        ground.database.listeners.add(Waker(broker))
+    if settings.redis_url is not None:
+        ground.database.listeners.add(Waker(settings.redis_url))
     return ground
+
+
+def run_apart(function: Callable[Arguments, Result], *given: Arguments.args, **named: Arguments.kwargs) -> Result:
+    """Return the result of a function of a module in a process of its own, which takes its memory with it."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(function, *given, **named).result()
 
 
 @functools.lru_cache(maxsize=4)

@@ -257,6 +257,12 @@ class Settings(BaseSettings):
         """The Celery broker in force; None for in-process jobs."""
         return self.broker_url.get_secret_value() if self.broker_url is not None else None
 
+    @property
+    def redis_url(self) -> str | None:
+        """The Celery broker in force if it is Redis, which wakes up other processes."""
+        broker = self.resolved_broker_url()
+        return broker if broker is not None and broker.startswith(("redis://", "rediss://")) else None
+
 
 def load_settings(**given: object) -> Settings:
     """Return the settings of the environment, overridden by the arguments that are not None.

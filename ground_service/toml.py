@@ -5,8 +5,9 @@ import json
 import re
 import tomllib
 from collections.abc import Sequence
+from dataclasses import is_dataclass
 from itertools import accumulate
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar, get_args, get_type_hints
 
 from pydantic import BaseModel, ValidationError
 
@@ -110,15 +111,19 @@ def parse_table(kind: type[Model], table: Any, source: str) -> Model:
 def faults(kind: type[BaseModel], error: ValidationError, source: str) -> list[InvalidInput]:
     """Return the faults of a table: unknown keys alone if there are any, because they cause others."""
     found = error.errors(include_url=False)
-    unknown = [one for one in found if one["type"] == "extra_forbidden"]
+    unknown = [one for one in found if one["type"] in _UNKNOWN_KEY]
     return [_fault(kind, one, source) for one in unknown or found]
+
+
+_UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
+"""Faults of models and of dataclasses."""
 
 
 def _fault(kind: type[BaseModel], error: Any, source: str) -> InvalidInput:
     place = ".".join(map(str, error["loc"]))
     if error["type"] == "missing":
         return InvalidInput(source, place, "a value", "nothing")
-    if error["type"] == "extra_forbidden":
+    if error["type"] in _UNKNOWN_KEY:
         key = str(error["loc"][-1])
         known = keys_at(kind, error["loc"][:-1])
         near = difflib.get_close_matches(key, known, n=1)
@@ -135,20 +140,24 @@ def _fault(kind: type[BaseModel], error: Any, source: str) -> InvalidInput:
     return InvalidInput(source, place, expected, found)
 
 
-def keys_at(kind: type[BaseModel], place: Sequence[int | str]) -> list[str]:
+def keys_at(kind: type, place: Sequence[int | str]) -> list[str]:
     """Return the keys of the table at a place; numbers in lists and names in tables of tables lead to no field."""
     for part in place:
-        field = next((one for name, one in kind.model_fields.items() if part in (name, one.alias)), None)
-        if field is not None:
-            kind = model_in(field.annotation) or kind
-    return [one.alias or name for name, one in kind.model_fields.items()]
+        kind = table_in(_annotations(kind).get(str(part))) or kind
+    return list(_annotations(kind))
 
 
-def model_in(annotation: Any) -> type[BaseModel] | None:
-    """Return the model in an annotation such as ``tuple[Model, ...] | None``."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+def _annotations(kind: type) -> dict[str, Any]:
+    if issubclass(kind, BaseModel):
+        return {one.alias or name: one.annotation for name, one in kind.model_fields.items()}
+    return get_type_hints(kind)
+
+
+def table_in(annotation: Any) -> type | None:
+    """Return the model or dataclass in an annotation such as ``tuple[Model, ...] | None``."""
+    if isinstance(annotation, type) and (issubclass(annotation, BaseModel) or is_dataclass(annotation)):
         return annotation
-    return next(filter(None, map(model_in, get_args(annotation))), None)
+    return next(filter(None, map(table_in, get_args(annotation))), None)
 
 
 LINE_PATTERN = r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]*$"

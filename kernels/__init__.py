@@ -6,6 +6,7 @@ import logging
 import os
 import time
 import uuid
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -24,7 +25,7 @@ def cache_folder() -> Path:
 
 def _folder_of(kind: str) -> Path:
     """Return the folder of a kind; builds under test read that of compiled code: no ground and no figure lie in it."""
-    return Path(f"{cache_folder()}-ground") if kind in ("tile", "rims", "figure") else cache_folder()
+    return Path(f"{cache_folder()}-ground") if kind in ("tile", "rims", "figure", "pixels") else cache_folder()
 
 
 def kept(name: str) -> bytes | None:
@@ -38,6 +39,15 @@ def kept(name: str) -> bytes | None:
         return None
     octets = content[_DIGEST_OCTETS:]
     return octets if hashlib.sha256(octets).digest() == content[:_DIGEST_OCTETS] else None
+
+
+def made_once(name: str, make: Callable[[], bytes], most: int = 0) -> bytes:
+    """Return what is kept under a name, otherwise make and keep it; see `keep`."""
+    octets = kept(name)
+    if octets is None:
+        octets = make()
+        keep(name, octets, most)
+    return octets
 
 
 def keep(name: str, octets: bytes, most: int = 0) -> None:

@@ -32,6 +32,7 @@ from numba.core import event, types
 from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 from numba.core.registry import cpu_target
+from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 from numba.core.types.containers import BaseTuple
 from numba.core.types.misc import unliteral
@@ -173,8 +174,11 @@ class _KernelCache:
         self.cache_path = str(cache_folder())
 
     def load_overload(self, signature: Any, target: Any) -> Any:
-        """Return the compiled version for a signature, or None."""
-        target.refresh()
+        """Return the compiled version for a signature, or None.
+
+        Code that is complete needs numba's runtime, not its implementations, whose import takes half a second.
+        """
+        rtsys.initialize(target)
         octets = kept(self._name(signature, target.codegen()))
         return None if octets is None else CompileResult._rebuild(target, *pickle.loads(octets))
 

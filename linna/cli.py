@@ -4,19 +4,18 @@ Exit status: 0 done, 1 a gate or requirement not met, 2 bad usage or bad input, 
 """
 
 import argparse
-import importlib
 import json
 import os
 import sys
 from collections.abc import Callable, Sequence
 
 from linna import __version__
-from linna.parser import BadUsage, LinnaParser
+from linna.parser import BadUsage, LinnaParser, configure_group
 
 # Threads of numerical libraries that spin while they wait make two busy cores ten times slower: wait passively.
 _THREAD_POLICY = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "0", "NUMBA_SLP_VECTORIZE": "1"}
 
-# task -> name -> (module, one line of help); the order is that of `linna --help`.
+# task -> group -> (module, one line of help); the order is that of `linna --help`. See `configure_group`.
 TASKS: dict[str, dict[str, tuple[str, str]]] = {
     "simulate": {
         "demo": ("demo", "emulate one observation window, ingest its downlink and write the report"),
@@ -28,41 +27,41 @@ TASKS: dict[str, dict[str, tuple[str, str]]] = {
         "mission": ("mission", "write, check, add, list and show mission descriptions"),
         "link": ("link", "link settings of a recorded downlink; links to ground stations and their contacts"),
         "ingest": ("ingest", "ingest downlink files or pass archives"),
-        "pass": ("pass_", "list and show passes"),
-        "report": ("report", "write the report of a pass"),
-        "performance": ("performance", "recall, drift and error over many passes, and monthly reports"),
-        "export": ("export", "write a pass in the formats of other tools: ephemerides, SPICE, maps, tables"),
+        "pass": ("results", "list and show passes"),
+        "report": ("results", "write the report of a pass"),
+        "performance": ("results", "recall, drift and error over many passes, and monthly reports"),
+        "export": ("results", "write a pass in the formats of other tools: ephemerides, SPICE, maps, tables"),
         "correlate": ("correlate", "time correlation of a spacecraft: segments, residuals, reception times"),
         "plan": ("plan", "search, enter, approve and uplink observation windows"),
-        "alarm": ("alarm", "list, acknowledge and shelve alarms"),
+        "alarm": ("results", "list, acknowledge and shelve alarms"),
         "landmarks": ("landmarks", "craters learned from flight: candidates, decisions, new catalogue, labels, upload"),
         "command": ("command", "queue, release, uplink and verify telecommands"),
     },
     "build and gate": {
-        "replay": ("replay", "replay an archived pass with a payload build"),
+        "replay": ("emulate", "replay an archived pass with a payload build"),
         "regress": ("regress", "compare a payload build with a baseline over archived passes"),
         "dataset": ("dataset", "build and check detector data sets"),
         "detector": ("detector", "train, export, evaluate and run the crater detector"),
     },
     "study": {
-        "paper": ("paper", "every figure and table of the LINNA paper, next to the values of the paper"),
-        "montecarlo": ("montecarlo", "Monte Carlo runs of anchored navigation: errors compared with covariances"),
-        "navigation": ("navigation", "survey detection and navigation over the terrain of a region"),
-        "camera": ("camera", "probability of craters in the footprint over the field of view"),
+        "paper": ("study", "every figure and table of the LINNA paper, next to the values of the paper"),
+        "montecarlo": ("study", "Monte Carlo runs of anchored navigation: errors compared with covariances"),
+        "navigation": ("study", "survey detection and navigation over the terrain of a region"),
+        "camera": ("study", "probability of craters in the footprint over the field of view"),
         "catalogue": ("catalogue", "crater catalogues: registration to terrain and on-board curation"),
         "tm": ("tm", "decode and check telemetry; export the dictionary as ICD and XTCE"),
         "data": ("data", "list, fetch and verify the public data products"),
     },
     "administer": {
-        "serve": ("serve", "run the HTTP server of the ground service"),
-        "worker": ("worker", "run a job worker of the ground service"),
-        "scheduler": ("scheduler", "run the recurring work of a distributed ground service"),
-        "runner": ("runner", "run payload builds for the ground service, in a separate container"),
+        "serve": ("service", "run the HTTP server of the ground service"),
+        "worker": ("service", "run a job worker of the ground service"),
+        "scheduler": ("service", "run the recurring work of a distributed ground service"),
+        "runner": ("service", "run payload builds for the ground service, in a separate container"),
         "db": ("db", "schema, backup and restore of the database"),
-        "verify": ("verify", "check the integrity of the archive: files, packets, audit chain"),
-        "audit": ("audit", "list the audit log, and show the head of its hash chain"),
+        "verify": ("service", "check the integrity of the archive: files, packets, audit chain"),
+        "audit": ("user", "list the audit log, and show the head of its hash chain"),
         "user": ("user", "manage the users of the ground service and their tokens"),
-        "doctor": ("doctor", "check a deployment: processes, clocks, broker, files, provider"),
+        "doctor": ("service", "check a deployment: processes, clocks, broker, files, provider"),
     },
 }
 GROUPS = {name: group for groups in TASKS.values() for name, group in groups.items()}
@@ -90,9 +89,8 @@ def _run(arguments: Sequence[str]) -> int:
     if group not in GROUPS:
         return _refused(f"unknown command '{group}'{_nearest(group)}; see linna --help", arguments)
     module_name, help_line = GROUPS[group]
-    module = importlib.import_module(f"linna.commands.{module_name}")
     parser = LinnaParser(prog=f"linna {group}", description=help_line[0].upper() + help_line[1:])
-    module.configure(parser)
+    configure_group(parser, module_name, group)
     try:
         namespace = parser.parse_args(list(arguments[1:]))
     except SystemExit as stop:  # --help

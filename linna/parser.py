@@ -152,5 +152,22 @@ def command_parser(groups: Mapping[str, tuple[str, str]], group: str) -> argpars
     for name, (module_name, help_line) in groups.items():
         parser = commands.add_parser(name, help=help_line)
         if name == group:
-            importlib.import_module(f"linna.commands.{module_name}").configure(parser)
+            configure_group(parser, module_name, group)
     return top
+
+
+def configure_group(parser: argparse.ArgumentParser, module_name: str, group: str) -> None:
+    """Add the commands or options of a group: the table with its name in a module, or a function `configure_GROUP`."""
+    module = importlib.import_module(f"linna.commands.{module_name}")
+    table = getattr(module, group.upper(), None)
+    if table is None:
+        getattr(module, f"configure_{group}")(parser)
+    else:
+        add_commands(parser, table)
+
+
+def add_commands(parser: argparse.ArgumentParser, commands: Mapping[str, Any]) -> None:
+    """Add the commands of a table."""
+    actions = parser.add_subparsers(metavar="ACTION", required=True, parser_class=LinnaParser)
+    for name, one in commands.items():
+        actions.add_parser(name, help=one.help).fill(one.configure)

@@ -24,6 +24,7 @@ from ground_service.client import Client
 from ground_service.evaluation.model import PassFigures
 from ground_service.exports.model import FormatName
 from ground_service.exports.tables import CSV_METADATA
+from linna.data import data_folder
 from linna.errors import UsageError
 from tmtc.errors import MissingLibrary
 
@@ -60,7 +61,6 @@ def _home(path: Path | None) -> Archive:
 def _imported(archive: Path) -> Archive:
     from ground_service.client.local import local_client
     from ground_service.ground import open_ground
-    from linna.data import data_folder
 
     folder = tempfile.TemporaryDirectory(prefix="linna-archive-")
     client = local_client(open_ground(Path(folder.name), data_folder()), "notebook")

@@ -485,7 +485,7 @@ def _force_gradient(
     error_model="numpy",
     boundscheck=False,
     nogil=True,
-    ahead="f8[::1], f8, i8, *3 * [f8[::1]], f8[:, :, ::1], i8, f8[:, :], f8[::1], f8[::1]",
+    ahead="f8[::1], f8, i8, *3 * [f8[::1]], f8[:, :, ::1], i8, f8[:, ::1], f8[::1], f8[::1]",
 )
 def transition(
     y0: FloatArray,

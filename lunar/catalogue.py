@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
-from lunar.compressed import EXPANDED_LIMIT_OCTETS, open_expanded
 from lunar.constants import MOON_RADIUS_M
+from lunar.datafolder import EXPANDED_LIMIT_OCTETS, open_expanded
 from lunar.errors import DataFileError, LunarError
 from lunar.frames import mcmf_from_spherical
 from lunar.plausible import CRATER_COVER, CRATER_DEPTH, CRATER_DEPTH_RATIO, CRATER_DIAMETER_M, CRATER_MEDIAN_M, HEIGHT_M
@@ -463,6 +463,10 @@ def _columns_of(path: Path, text: str, header: list[str], first: int) -> tuple[_
     _check_widths(path, widths, len(header), first - begins)
     lines, rows = lines[begins:], rows[begins:]
     wanted = [k for k, name in enumerate(header) if name.strip() in _KNOWN_COLUMNS]
+    names = [header[k].strip() for k in wanted]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise DataFileError(path, "line 1", "each column once", f"{twice} {names.count(twice)} times")
     if lines and 2 * len(wanted) < len(header):
         # Parse only the required columns of a wide table (Robbins: 21 columns, 1.3 million rows).
         columns = _some_columns(header, lines, wanted)

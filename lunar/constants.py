@@ -30,3 +30,5 @@ SOLAR_PRESSURE_1AU_N_M2 = 1361.0 / SPEED_OF_LIGHT_M_S
 SECONDS_PER_DAY = 86_400.0
 NS = 1_000_000_000
 """Nanoseconds in a second."""
+
+DAY_NS = 86_400 * NS

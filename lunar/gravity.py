@@ -18,6 +18,7 @@ Degree 2, order 0 of the Moon: -9.088e-5 fully normalised, -2.032e-4 not (Lemoin
 
 from __future__ import annotations
 
+import math
 import re
 import weakref
 from collections.abc import Callable, Iterator
@@ -309,7 +310,7 @@ def _assembled(
             continue
         if seen[n, m]:
             raise DataFileError(file, f"line {number}", "every coefficient once", f"degree {n}, order {m} again")
-        if not (np.isfinite(c) and np.isfinite(s)):
+        if not (math.isfinite(c) and math.isfinite(s)):
             raise DataFileError(file, f"line {number}", "finite coefficients", f"{c:g} {s:g}")
         c_bar[n, m], s_bar[n, m], seen[n, m] = c, s, True
     missing = np.argwhere(np.tril(~seen))

@@ -195,9 +195,8 @@ def propagate_with_stm(
     The state moves under the whole model, the matrix under its field to ``stm_degree`` with Earth and Sun.  Equal
     steps of the eighth-order method, none longer than ``step_s``: within 0.1 mm per orbit at 15 s and degree 100.
     """
-    from scipy.integrate import DOP853
-
     from lunar import _dynamics_kernel as kernel
+    from lunar._tableaux import DOP853_A, DOP853_B, DOP853_C
 
     start = state_vector(position_icrf_m, velocity_icrf_m_s)
     if duration_s == 0.0:
@@ -206,7 +205,7 @@ def propagate_with_stm(
     low = packed_gradient(model.gravity, min(stm_degree, _degree(model)))
     steps = max(1, int(np.ceil(abs(duration_s) / step_s - 1e-9)))
     y = kernel.transition(
-        start, float(duration_s), steps, gravity, low, force, table, scratch, DOP853.A, DOP853.B, DOP853.C
+        start, float(duration_s), steps, gravity, low, force, table, scratch, DOP853_A, DOP853_B, DOP853_C
     )
     return y[:3], y[3:6], y[6:].reshape(6, 6)
 

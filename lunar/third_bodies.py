@@ -21,6 +21,7 @@ from lunar.constants import ASTRONOMICAL_UNIT_M, SECONDS_PER_DAY
 _J2000_JD = 2_451_545.0
 _CENTURY_S = 36_525.0 * SECONDS_PER_DAY
 _OBLIQUITY_RAD = np.radians(84_381.406 / 3600.0)
+_DENSE, _NODE_S = 2000, 3600.0
 
 
 def earth_position_icrf_m(tdb_s: ArrayLike) -> FloatArray:
@@ -39,12 +40,27 @@ def moon_barycentric_icrf_m(tdb_s: ArrayLike) -> FloatArray:
 
 def sun_position_icrf_m(tdb_s: ArrayLike) -> FloatArray:
     """Return the Sun's position from the Moon's centre, shape ``(..., 3)``, at TDB seconds past J2000 ``(...)``."""
-    import erfa
 
     seconds = np.asarray(tdb_s, dtype=np.float64)
-    heliocentric, _ = erfa.epv00(_J2000_JD, seconds / SECONDS_PER_DAY)
-    earth = ASTRONOMICAL_UNIT_M * np.asarray(heliocentric["p"], dtype=np.float64)
-    return -(earth + _moon_from_earth_m(seconds))
+    return -(_earth_from_sun_m(seconds) + _moon_from_earth_m(seconds))
+
+
+def _earth_from_sun_m(tdb_s: FloatArray) -> FloatArray:
+    """Return the Earth's position from the Sun; that of many epochs from one each hour (cubic Hermite, 1 cm)."""
+    import erfa
+
+    first, last = (tdb_s.min(), tdb_s.max()) if tdb_s.size > _DENSE else (0.0, np.inf)
+    nodes = np.arange(first, last + _NODE_S, _NODE_S) if (last - first) / _NODE_S < tdb_s.size / 4 else tdb_s
+    heliocentric, _ = erfa.epv00(_J2000_JD, nodes / SECONDS_PER_DAY)
+    at = ASTRONOMICAL_UNIT_M * np.asarray(heliocentric["p"], dtype=np.float64)
+    if nodes is tdb_s:
+        return at
+    step = ASTRONOMICAL_UNIT_M * np.asarray(heliocentric["v"], dtype=np.float64) * (_NODE_S / SECONDS_PER_DAY)
+    k = np.minimum(((tdb_s - first) / _NODE_S).astype(np.int64), len(nodes) - 2)
+    u = ((tdb_s - nodes[k]) / _NODE_S)[..., None]
+    change = at[k + 1] - at[k]
+    bend = (1.0 - u) * (step[k] - change) - u * (step[k + 1] - change)
+    return np.asarray(at[k] + u * change + u * (1.0 - u) * bend)
 
 
 def _moon_from_earth_m(tdb_s: FloatArray) -> FloatArray:
@@ -79,10 +95,12 @@ def _missing_terms(tdb_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
         ],
         axis=-1,
     )
-    angles = arguments @ multipliers.T
-    values = np.where(cosine, np.cos(angles), np.sin(angles))
-    values = np.where(secular, centuries[..., None], values)
-    sums = values @ weights
+    sums = np.empty((*centuries.shape, 3))
+    for block in range(0, max(centuries.size, 1), _DENSE):  # 225 terms of many epochs take hundreds of megabytes
+        part = (slice(block, block + _DENSE),) if centuries.ndim else ()
+        angles = arguments[part] @ multipliers.T
+        values = np.where(cosine, np.cos(angles), np.sin(angles))
+        sums[part] = np.where(secular, centuries[part][..., None], values) @ weights
     return sums[..., 0], sums[..., 1], sums[..., 2]
 
 

@@ -1,4 +1,4 @@
-"""Visibility: sub-satellite point, Sun and shadow, the Earth and its stations behind the limb.
+"""Visibility: sub-satellite point and ground track, Sun and shadow, the Earth and its stations behind the limb.
 
 Bodies are spheres: the Moon of `MOON_RADIUS_M`, the Sun and the Earth of their mean radii.  Positions are
 Moon-centred in ICRF axes unless a name says otherwise; directions to the Sun are geometric (its light is 500
@@ -220,3 +220,28 @@ def _itrf_from_icrf(utc_ns: ArrayLike) -> FloatArray:
     unix_jd = 2_440_587.5
     matrix = erfa.c2t06a(unix_jd + tt_day, tt_rest / day, unix_jd + ut_day, ut_rest / day, 0.0, 0.0)
     return np.asarray(matrix, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroundTrack:
+    """Sub-satellite points at epochs (n,): mean-Earth latitude, east longitude (0..2 pi), altitude over the sphere."""
+
+    utc_ns: IntArray
+    latitude_rad: FloatArray
+    longitude_rad: FloatArray
+    altitude_m: FloatArray
+
+
+def ground_track(ephemeris: Ephemeris, orientation: Orientation, utc_ns: ArrayLike | None = None) -> GroundTrack:
+    """Return the ground track at epochs (n,), or at all states of the ephemeris."""
+    epochs = ephemeris.utc_ns if utc_ns is None else np.atleast_1d(np.asarray(utc_ns, dtype=np.int64))
+    position_m, _ = ephemeris.at(epochs)
+    latitude, longitude, altitude = subsatellite(position_m, tdb_s_from_utc_ns(epochs), orientation)
+    return GroundTrack(epochs, latitude, np.mod(longitude, 2.0 * math.pi), altitude)
+
+
+def even_epochs(ephemeris: Ephemeris, step_s: float) -> IntArray:
+    """Return the epochs every ``step_s`` from the start that the ephemeris covers."""
+    step_ns = max(round(step_s * NS), 1)
+    epochs = np.arange(ephemeris.start_utc_ns, ephemeris.stop_utc_ns + 1, step_ns, dtype=np.int64)
+    return np.asarray(epochs[ephemeris.covers(epochs)])

@@ -1,7 +1,5 @@
 """Values of a detector report, from the figures of an evaluation (`linna detector evaluate --json`)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, TypeVar

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kernels import keep, kept
+from kernels import made_once
 from reports.document import Picture
 from reports.figures.canvas import Canvas
 from reports.figures.svg import draw_svg
@@ -47,12 +47,8 @@ class KeptDrawings(Drawings):
     """Drawings that are kept on disk by the hash of what they show, and drawn again if that or the code changed."""
 
     def _drawn(self, one: Picture) -> str:
-        name = f"figure-{drawing_hash(one)}"
-        octets = kept(name)
-        if octets is None:
-            octets = super()._drawn(one).encode()
-            keep(name, octets, KEPT_FIGURES)
-        return octets.decode()
+        draw = super()._drawn
+        return made_once(f"figure-{drawing_hash(one)}", lambda: draw(one).encode(), KEPT_FIGURES).decode()
 
 
 def drawing_hash(one: Picture) -> str:

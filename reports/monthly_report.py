@@ -5,7 +5,7 @@ import numpy as np
 from reports.document import VERDICT_ROLES, Block, Bullets, Cell, Column, Document, Heading, Paragraph, Picture, Table
 from reports.figures import monthly
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
-from reports.text import count_text, number_text, percent_text, significant_text, utc_text
+from reports.text import count_text, number_text, percent_text, significant_text, utc_ns_of, utc_text
 from reports.values import MonthlyReportValue
 
 METRICS = {
@@ -71,7 +71,7 @@ def _changes(report: MonthlyReportValue) -> list[Block]:
             (
                 Cell(label, strong=True),
                 str(one.pass_id),
-                utc_text(one.utc_ns),
+                utc_text(utc_ns_of(one.time)),
                 f"{number_text(scale * one.before, decimals)} {unit}",
                 f"{number_text(scale * one.after, decimals)} {unit}",
                 count_text(one.passes_before),
@@ -99,7 +99,9 @@ def _requirements(report: MonthlyReportValue) -> list[Block]:
     for one in report.requirements:
         judged = one.met + one.not_met
         share = percent_text(one.met, judged) if judged else "not judged"
-        between = f"{100.0 * one.low:.0f} to {100.0 * one.high:.0f} %" if judged else "–"
+        between = "–"
+        if judged and one.low is not None and one.high is not None:
+            between = f"{100.0 * one.low:.0f} to {100.0 * one.high:.0f} %"
         swatch = "" if not judged else "green" if not one.not_met else "vermillion"
         rows.append(
             (
@@ -134,13 +136,8 @@ def _groups(report: MonthlyReportValue) -> list[Block]:
         cells: list[Cell | str] = [factor, group, count_text(max(found[factor, group, m].passes for m in METRICS))]
         for metric, (_, _, scale, decimals) in METRICS.items():
             one = found[factor, group, metric]
-            cells.append(number_text(scale * one.mean, decimals))
-            known = np.isfinite(one.low)
-            cells.append(
-                f"{number_text(scale * one.low, decimals)} to {number_text(scale * one.high, decimals)}"
-                if known
-                else "unknown"
-            )
+            mean, low, high = (number_text(_scaled(value, scale), decimals) for value in (one.mean, one.low, one.high))
+            cells += [mean, "unknown" if one.low is None else f"{low} to {high}"]
         rows.append(tuple(cells))
     if not rows:
         return [absent(report, "groups", "Conditions", "no pass has a report")]
@@ -156,12 +153,16 @@ def _groups(report: MonthlyReportValue) -> list[Block]:
     ]
 
 
+def _scaled(value: float | None, scale: float) -> float | None:
+    return None if value is None else scale * value
+
+
 def _passes(report: MonthlyReportValue) -> Table:
     rows = tuple(
         (
             Cell(str(one.pass_id), swatch=VERDICT_ROLES.get(one.verdict_level, "")),
-            utc_text(one.start_utc_ns),
-            number_text(100.0 * one.recall, 1),
+            utc_text(utc_ns_of(one.start)),
+            number_text(_scaled(one.recall, 100.0), 1),
             number_text(one.drift_percent, 3),
             number_text(one.median_error_m, 0),
             number_text(one.altitude_km, 1),

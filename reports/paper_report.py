@@ -1,7 +1,5 @@
 """The document that repeats the figures and tables of the LINNA paper, with the paper's values and the differences."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import asdict
 from functools import partial

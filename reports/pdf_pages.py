@@ -5,18 +5,22 @@ drawings of the HTML page in the light colours. Fonts are those that matplotlib 
 used, so the same document gives the same octets.
 """
 
+import hashlib
 import json
 import re
 import subprocess
 import sys
+from array import array
 from collections.abc import Iterator
 from dataclasses import asdict
 from functools import lru_cache
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from kernels import made_once
 from reports.document import (
     VERDICT_ROLES,
     Block,
@@ -97,16 +101,24 @@ def _template() -> str:
 
 @lru_cache(maxsize=1)
 def _font_folder() -> Path:
-    import matplotlib
-
-    return Path(matplotlib.get_data_path()) / "fonts" / "ttf"
+    """Return the folder of the fonts of matplotlib, whose import takes longer than all that is made here."""
+    found = find_spec("matplotlib")
+    assert found is not None and found.origin is not None
+    return Path(found.origin).parent / "mpl-data" / "fonts" / "ttf"
 
 
 @lru_cache(maxsize=1)
 def _characters() -> frozenset[int]:
-    from matplotlib.ft2font import FT2Font
+    """Return the characters of the font; kept on disk by the hash of its file."""
+    file = _font_folder() / "DejaVuSans.ttf"
 
-    return frozenset(FT2Font(str(_font_folder() / "DejaVuSans.ttf")).get_charmap())
+    def read() -> bytes:
+        from matplotlib.ft2font import FT2Font
+
+        return array("I", sorted(FT2Font(str(file)).get_charmap())).tobytes()
+
+    name = f"figure-characters-{hashlib.sha256(file.read_bytes()).hexdigest()}"
+    return frozenset(array("I", made_once(name, read)))
 
 
 def _printable(value: Any) -> Any:

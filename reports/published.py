@@ -6,8 +6,6 @@ References
 (altitudes, catalogue, labels of its data set) and Section VII (images of its session).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -4,11 +4,12 @@ import math
 from functools import partial
 
 from reports.document import Block, Cell, Column, Document, Heading, Picture, Table
-from reports.figures.regression import draw_changed_craters
+from reports.figures.canvas import Canvas
+from reports.figures.theme import color
 from reports.sections.detection import gallery_picture
 from reports.sections.opening import about, absent, judgement, missing_and_remarks, provenance_and_data
 from reports.text import count_text, loss_text, number_text, significant_text
-from reports.values import Gate, RegressionReport
+from reports.values import ChangedCraters, Gate, RegressionReport
 
 _ORDER = ("fail", "inconclusive", "not judged", "pass")
 _SWATCHES = {"pass": "green", "inconclusive": "orange", "fail": "vermillion", "not judged": ""}
@@ -87,7 +88,7 @@ def _changed(report: RegressionReport) -> list[Block]:
                 "without a crater.",
                 counts,
                 3.6,
-                partial(draw_changed_craters, craters=craters),
+                partial(_draw_changed_craters, craters=craters),
             )
         )
     if not report.changed_tracks:
@@ -151,3 +152,20 @@ def _passes(report: RegressionReport) -> Block:
     )
     columns = (Column("pass", numeric=False), Column("frames"), Column("first different frame"), *figures)
     return Table("Passes with both builds; position errors of the anchored estimator.", columns, rows)
+
+
+def _draw_changed_craters(canvas: Canvas, craters: ChangedCraters) -> None:
+    """Draw tracks of craters by longitude and latitude, coloured by their change, and new false detections."""
+    axes = canvas.axes(0.75, 0.55, canvas.width_in - 1.0, canvas.height_in - 0.75)
+    for chosen, role, size in (
+        (craters.change == 0, "muted", 2.0),
+        (craters.change > 0, "blue", 5.0),
+        (craters.change < 0, "vermillion", 5.0),
+    ):
+        x, y = craters.longitude_deg[chosen], craters.latitude_deg[chosen]
+        axes.plot(x, y, "o", color=color(role), markersize=size, alpha=0.8)
+    x, y = craters.false_longitude_deg, craters.false_latitude_deg
+    axes.plot(x, y, "x", color=color("orange"), markersize=4.0)
+    axes.grid(True, axis="both")
+    axes.set_xlabel("longitude, degrees east")
+    axes.set_ylabel("latitude, degrees")

@@ -22,6 +22,11 @@ def month_name(month: int) -> str:
     return _MONTHS[month - 1]
 
 
+def utc_ns_of(text: str) -> int:
+    """Return the nanoseconds since 1970 of an RFC 3339 text in UTC, to the microsecond."""
+    return (datetime.fromisoformat(text) - _EPOCH) // timedelta(microseconds=1) * 1000
+
+
 def utc_text(utc_ns: int | None, *, date: bool = True) -> str:
     """A time to the second: 2029-08-09 10:14:32 UTC."""
     if utc_ns is None:

@@ -9,12 +9,12 @@ field is ``None`` or empty its section says that it is not available, with the r
 A report reads no clock: the same value gives the same octets.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Gt, Interval
 from numpy.typing import NDArray
 
 from reports.arrays import BoolArray, FloatArray, IntArray
@@ -24,6 +24,53 @@ ByteArray = NDArray[np.uint8]
 ODOMETRY_OUTCOMES = ("anchored", "multi", "single", "predicted", "missed", "rejected")
 FIX_OUTCOMES = ("fixed", "coasted", "refused", "no_image")
 RESET_TRIGGERS = ("none", "initialization", "time_gap", "manual_step", "safety_timeout")
+
+Positive = Annotated[float, Gt(0.0)]
+NotNegative = Annotated[float, Ge(0.0)]
+Percent = Annotated[float, Interval(ge=0.0, le=100.0)]
+Share = Annotated[float, Interval(ge=0.0, le=1.0)]
+Estimator = Literal["paper", "spherical", "anchored"]
+
+
+@dataclass(frozen=True, slots=True)
+class Requirements:
+    """Limits of the verdict; a requirement without a limit is shown without judgement.
+
+    A negative limit of a scenario is not stated, except `temperature_min_c`; its estimator is the filter if it is used,
+    otherwise the first one, where none is stated.
+
+    Attributes
+    ----------
+    estimator
+        Name of the estimator whose accuracy is judged.
+    better_than
+        Names of baselines whose median error must be larger than that of the estimator.
+    consistency_inside_percent
+        Share of the passes of a consistent filter whose mean NEES or NIS is inside the bounds for the number of its
+        independent draws. A mean above the upper bound is a failure.
+    """
+
+    estimator: Estimator | None = None
+    median_error_m: Positive | None = None
+    p95_error_m: Positive | None = None
+    better_than: tuple[str, ...] | None = None
+    consistency_inside_percent: Percent | None = None
+    packets_percent: Percent | None = None
+    frames_percent: Percent | None = None
+    images_percent: Percent | None = None
+    recall: Share | None = None
+    precision: Share | None = None
+    anchor_reads: NotNegative | None = None
+    resets: NotNegative | None = None
+    cpu_percent: Percent | None = None
+    memory_mib: Positive | None = None
+    storage_percent: Percent | None = None
+    temperature_max_c: float | None = None
+    temperature_min_c: float | None = None
+    convergence_s: Positive | None = None
+    drift_percent: Positive | None = None
+    offset_px: Positive | None = None
+    clock_step_s: Positive | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -709,47 +756,60 @@ class RegressionReport(ReportCommon):
     changed_tracks: tuple[ChangedTrack, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MonthPass:
-    """One pass of a monthly report; NaN and empty texts where unknown."""
+    """Figures and conditions of one pass from its newest report; None and empty texts: not known.
+
+    ``start`` is in RFC 3339, UTC. ``estimator`` is that of error and drift, the latter in percent of the ground path.
+    Altitude and elevation of the Sun at the sub-satellite point are medians. ``map_offset_m`` is the offset of the
+    crater list as learned on board, 1 sigma east and north. ``terrain`` is the evidence level of the world, ``build``
+    the hashes of model and parameters in housekeeping.
+    """
 
     pass_id: int
     name: str
-    start_utc_ns: int
-    estimator: str
-    recall: float
-    drift_percent: float
-    median_error_m: float
-    altitude_km: float
-    sun_elevation_deg: float
+    start: str
+    estimator: str | None
+    recall: float | None
+    drift_percent: float | None
+    median_error_m: float | None
+    altitude_km: float | None
+    sun_elevation_deg: float | None
     terrain: str
     build: str
     packets: int
     packets_lost: int
     verdict_level: str
-    map_offset_m: float = math.nan
+    map_offset_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class MeanByGroup:
-    """Mean of a metric over the passes of a group and its 95 % interval; NaN where unknown."""
+    """Mean of a metric over the passes of a group, with its 95 % confidence interval; None: unknown.
+
+    ``factor`` is altitude, sun elevation, terrain or build; ``passes`` have a value of the metric.
+    """
 
     factor: str
     group: str
     metric: str
     passes: int
-    mean: float
-    low: float
-    high: float
+    mean: float | None
+    low: float | None
+    high: float | None
 
 
 @dataclass(frozen=True, slots=True)
 class LevelChange:
-    """Significant change of the level of a metric; `pass_id` is the first pass after it."""
+    """Significant change of the level of a metric.
+
+    ``pass_id`` is the first pass after it and ``time`` the start of this pass, ``before`` and ``after`` are medians up
+    to the adjacent changes. ``p_value`` is the probability of such a change by chance.
+    """
 
     metric: str
     pass_id: int
-    utc_ns: int
+    time: str
     before: float
     after: float
     passes_before: int
@@ -759,11 +819,14 @@ class LevelChange:
 
 @dataclass(frozen=True, slots=True)
 class RequirementOverTime:
-    """Requirement over the passes of a rolling window; the share of met ones is NaN where none was judged.
+    """Requirement over the passes of a rolling window; None: unknown.
 
-    ``remark`` says that the mean of a NEES or NIS over the passes is outside its bounds.
+    ``limit`` is that of the newest report. ``share_met`` is the share of the judged passes, ``low`` to ``high`` its
+    95 % confidence interval, ``lowest_share`` the smallest share of all windows that end at a pass. ``remark`` says
+    that the mean of a NEES or NIS over the passes is outside its bounds.
     """
 
+    key: str
     name: str
     unit: str
     limit: float | None
@@ -771,9 +834,10 @@ class RequirementOverTime:
     met: int
     not_met: int
     unknown: int
-    share_met: float
-    low: float
-    high: float
+    share_met: float | None
+    low: float | None
+    high: float | None
+    lowest_share: float | None = None
     remark: str = ""
 
 

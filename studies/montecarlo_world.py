@@ -15,7 +15,7 @@ from lunar.elements import Elements, icrf_state_from_elements
 from lunar.frames import IauOrientation
 from lunar.gravity import GravityField, builtin_gravity, load_gravity
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
-from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
+from payload_emulator.flight.navigation.anchored.parameters import AnchoredParameters
 from payload_emulator.flight.navigation.filter.dynamics import process_noise
 from payload_emulator.flight.navigation.filter.map_offset import OffsetRule
 from payload_emulator.sim.detector import SimulatedDetector

@@ -1,7 +1,5 @@
 """The figures and tables of the LINNA paper, produced by this system and set against the paper's values."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Flown sessions of the document on the paper's figures: emulated, ingested and evaluated by the ground service."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

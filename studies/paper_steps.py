@@ -20,7 +20,7 @@ from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder, default_orientation
 from lunar.fov_study import study_field_of_view
 from lunar.frames import mcmf_from_spherical
-from lunar.ground_track import even_epochs, ground_track
+from lunar.visibility import even_epochs, ground_track
 from payload_emulator.session.scenario import SHIPPED, load_scenario
 from payload_emulator.session.world.orbit import force_model, propagate_scenario, sample
 from payload_emulator.session.world.recipe import Recipe, load_recipe

@@ -10,7 +10,6 @@ import time
 import timeit
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -20,12 +19,12 @@ MARGIN = 1.2
 SMALLEST_TURNS = 20  # folders below this are noise
 
 
-def processor_s() -> float:
+def processor_s():
     """Return the processor time of this process and its ended children, s."""
     return sum(os.times()[:4])
 
 
-def turn_s() -> float:
+def turn_s():
     """Return the processor time of one turn of the calibration loop, s: the fastest of five."""
     return min(timeit.repeat("sum(n * n % 7 for n in range(500_000))", timer=time.process_time, number=1))
 
@@ -35,19 +34,19 @@ class Cost:
 
     last_s, files = 0.0, Counter[str]()
 
-    def pytest_collection_finish(self) -> None:
+    def pytest_collection_finish(self):
         self.last_s = processor_s()
 
     @pytest.hookimpl(wrapper=True)
-    def pytest_runtest_makereport(self, item: pytest.Item):
+    def pytest_runtest_makereport(self, item):
         report, now = (yield), processor_s()
         report.processor_s, self.last_s = now - self.last_s, now
         return report
 
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+    def pytest_runtest_logreport(self, report):
         self.files[report.nodeid.partition("::")[0]] += getattr(report, "processor_s", 0.0)
 
-    def pytest_terminal_summary(self, terminalreporter: Any, config: pytest.Config) -> None:
+    def pytest_terminal_summary(self, terminalreporter, config):
         turn, folders = turn_s(), Counter[str]()
         for name, spent in self.files.items():
             folders[str(Path(name).parent)] += spent
@@ -62,12 +61,12 @@ class Cost:
             MEASURED.write_text("".join(rows))
 
 
-def read(path: Path) -> dict[str, float]:
+def read(path):
     """Read a table of turns by folder."""
     return {name: float(n) for name, _, n in (line.partition(",") for line in path.read_text().split())}
 
 
-def grown(table: dict[str, float], measured: dict[str, float]) -> list[str]:
+def grown(table, measured):
     """Return a line for each folder that costs more than the table allows."""
     limits = {name: max(MARGIN * table.get(name, 0.0), SMALLEST_TURNS) for name in measured}
     found = sorted((name, turns) for name, turns in measured.items() if turns > limits[name])

@@ -1,12 +1,10 @@
 """Figures of mission runs that do not depend on processes, the wall clock or the numbers that a database gives."""
 
-from typing import Any
-
 OF_PROCESSES = {"alarms", "form", "interventions_list", "kills", "monthly_reports", "starts", "wall_s"}
 SKIPPED = {"pass_id", "report_id", "limit"}
 
 
-def figures_of(value: Any, name: str = "") -> dict[str, Any]:
+def figures_of(value, name=""):
     """Return the numbers of a closing report by their paths; other values are part of the path."""
     if isinstance(value, dict) and value:
         left = SKIPPED | (OF_PROCESSES if not name else set())

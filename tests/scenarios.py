@@ -21,7 +21,7 @@ filter_degree = 8
 """
 
 
-def live_scenario(name: str, seed: int, duration_s: float) -> str:
+def live_scenario(name, seed, duration_s):
     """Return a window of reduced images for the spherical estimator in gravity of degree 8."""
     return (
         f'name = "{name}"\nseed = {seed}\n[dynamics]\ngravity = "builtin"\ndegree = 8\norientation = "iau"'
@@ -30,7 +30,7 @@ def live_scenario(name: str, seed: int, duration_s: float) -> str:
     )
 
 
-def still_scenario(name: str, duration_s: float, seed: int = 7) -> str:
+def still_scenario(name, duration_s, seed=7):
     """Return a window of rendered images in the built-in gravity field; further sections may follow."""
     return (
         f'name = "{name}"\nseed = {seed}\n[dynamics]\ngravity = "builtin"\norientation = "iau"'
@@ -38,12 +38,12 @@ def still_scenario(name: str, duration_s: float, seed: int = 7) -> str:
     )
 
 
-def short_scenario(duration_s: float, estimators: str = 'estimators = ["anchored"]\n') -> str:
+def short_scenario(duration_s, estimators='estimators = ["anchored"]\n'):
     """Return a window of a few rendered images; it ends in the section `navigation`."""
     return f"{still_scenario('short', duration_s)}[navigation]\n{estimators}{_FILTER}"
 
 
-def commanded_scenario(name: str, further: str = "") -> str:
+def commanded_scenario(name, further=""):
     """Return a flight of reduced images whose windows the ground commands."""
     return f"""
 name = "{name}"

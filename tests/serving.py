@@ -3,17 +3,14 @@
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import uvicorn
 
 from ground_service.access.service import add_user, authenticate
 from ground_service.app import bind, create_app
 from ground_service.errors import NotAuthorised
-from ground_service.ground import Ground, ground_from_settings
-from ground_service.settings import Settings
+from ground_service.ground import ground_from_settings
 
 with warnings.catch_warnings():
     # It recommends another HTTP library than the installed one; both serve it.
@@ -22,7 +19,7 @@ with warnings.catch_warnings():
     from starlette.testclient import WebSocketDenialResponse as WebSocketDenialResponse
 
 
-def wait_for(reached: Callable[[], Any], what: str) -> None:
+def wait_for(reached, what):
     """Wait until a condition holds, on a loaded machine as well: only the limit of the suite ends the wait.
 
     `what` is among the values that the failure shows.
@@ -31,7 +28,7 @@ def wait_for(reached: Callable[[], Any], what: str) -> None:
         time.sleep(0.01)
 
 
-def token_valid(ground: Ground, token: str) -> bool:
+def token_valid(ground, token):
     """Return whether a token is accepted now."""
     try:
         return bool(authenticate(ground, token))
@@ -40,7 +37,7 @@ def token_valid(ground: Ground, token: str) -> bool:
 
 
 @contextmanager
-def served(settings: Settings, role: str = "operator") -> Iterator[tuple[str, str]]:
+def served(settings, role="operator"):
     """Serve a deployment with the user ann; yield its URL and her token."""
     with ground_from_settings(settings) as ground:
         token = add_user(ground, "ann", role)

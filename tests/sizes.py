@@ -26,13 +26,13 @@ TOKEN = re.compile(
 Sizes = dict[str, tuple[int, int]]
 
 
-def size_of(source: str) -> tuple[int, int]:
+def size_of(source):
     """Return lines and code tokens of a module; comments, docstrings and layout are no tokens."""
     tokens = sum(not found.group().startswith("#") for found in TOKEN.finditer(source))
     return len(source.splitlines()), tokens - _docstrings(ast.parse(source))
 
 
-def _docstrings(node: ast.AST) -> int:
+def _docstrings(node):
     """Return the number of docstrings of a module, class, function or other statement and of all that it contains."""
     count = 0
     if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
@@ -43,7 +43,7 @@ def _docstrings(node: ast.AST) -> int:
     return count
 
 
-def sizes_of(root: Path) -> Sizes:
+def sizes_of(root):
     """Return lines and code tokens of each package of a checkout."""
     found = {}
     for package in PACKAGES:
@@ -56,12 +56,12 @@ def sizes_of(root: Path) -> Sizes:
     return found
 
 
-def load_table(text: str) -> Sizes:
+def load_table(text):
     """Return the limits by package from a table with the columns package, lines and tokens."""
     return {row["package"]: (int(row["lines"]), int(row["tokens"])) for row in csv.DictReader(io.StringIO(text))}
 
 
-def above(sizes: Sizes, limits: Sizes) -> list[str]:
+def above(sizes, limits):
     """Return a line for each package that is larger than its limit, or has none."""
     excess = []
     for package, measured in sizes.items():
@@ -74,7 +74,7 @@ def above(sizes: Sizes, limits: Sizes) -> list[str]:
     return excess
 
 
-def unpaid(before: Sizes, after: Sizes) -> list[str]:
+def unpaid(before, after):
     """Return why a change of the table is refused: entries it raises need others that fall by more."""
     refused = []
     for place, unit in enumerate(("lines", "tokens")):
@@ -89,15 +89,15 @@ def unpaid(before: Sizes, after: Sizes) -> list[str]:
     return refused
 
 
-def committed_table(revision: str) -> Sizes | None:
+def committed_table(revision):
     """Return the table of a revision; None where it had none or there is no repository."""
     command = ["git", "-C", str(ROOT), "show", f"{revision}:tests/sizes.csv"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     return load_table(result.stdout) if result.returncode == 0 else None
 
 
-def main(arguments: list[str]) -> int:
-    """Print the sizes beside their limits; with `--write`, store them as the limits."""
+def main(arguments):
+    """Print the sizes with their limits; with `--write`, store them as the limits."""
     sizes = sizes_of(ROOT)
     limits = load_table(TABLE.read_text(encoding="utf-8")) if TABLE.exists() else {}
     for package, (lines, tokens) in sizes.items():

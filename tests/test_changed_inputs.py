@@ -8,6 +8,7 @@ table of all of them.
 
 import contextlib
 import csv
+import importlib
 import io
 import json
 import math
@@ -60,7 +61,7 @@ from tmtc.downlink import decode, encode_cadus
 from tmtc.errors import TmtcError
 
 TABLE_NAMES = (RADIUS_M, icrf_from_j2000)
-"""What only the table of changes uses."""
+"""Inputs that only the table of changes uses."""
 
 REFUSALS = (LunarError, GroundError, PayloadError, TmtcError)
 REFERENCES = Path(__file__).with_name("references")
@@ -599,6 +600,52 @@ def test_a_changed_field_never_gives_other_figures_in_silence(name: str, tmp_pat
         folder.mkdir()
         found = outcome(name, row, folder)
         assert not found.startswith("SILENT"), f"{row['change']}: {found}"
+
+
+CODE = {
+    "Ephemerides": ("lunar.messages.oem", "lunar.messages.kvn", "lunar.messages.stk", "lunar.messages.horizons"),
+    "Attitudes": ("lunar.messages.aem",),
+    "Gravity and orientation": ("lunar.frames",),
+    "Height rasters": ("payload_emulator.sim.terrain.rasters",),
+    "Crater lists": ("lunar.catalogue",),
+    "COCO files": ("payload_emulator.training.data.pictures",),
+    "Documents of the ground": (
+        "payload_emulator.sim.terrain.registration",
+        "ground_service.missions.timekeeping.recorrelation",
+        "payload_emulator.session.world.external",
+    ),
+}
+KEYS = re.compile(r"""(?m)^_(?:META|HEADER)_KEYS\b|^_(?:MANDATORY|IGNORED|READERS|COLUMNS)\b|^OWN_COLUMNS\b""")
+LOOKED_UP = re.compile(
+    r'(?:\b(?:item|row|document|head|one)(?:\.get\(|\[)|_(?:value|number|positive)\(item, |prefix \+ )"(\w+)"'
+    r'|"(\w+)" (?:not )?in (?:item|document)\b'
+)
+NOT_OF_FILES = {"received"}
+"""Keys of requests to the service."""
+
+
+def code_of(names: tuple[str, ...]) -> str:
+    return "\n".join(Path(importlib.import_module(name).__file__ or "").read_text() for name in names)
+
+
+def keys_of(code: str) -> set[str]:
+    """Return the names that a reader takes from a file: its constants of keys and columns, and what it looks up."""
+    constants = [code[at.start() : code.index("\n)\n" if "(\n" in code[at.start() : at.end() + 60] else "\n", at.end())]
+                 for at in KEYS.finditer(code)]  # fmt: skip
+    found = {name for one in constants for name in re.findall(r'"(\w+)"', one)}
+    return found | {name for pair in LOOKED_UP.findall(code) for name in pair if name}
+
+
+@pytest.mark.parametrize("section", CODE)
+def test_the_table_of_readers_has_the_names_that_the_code_reads_and_no_others(section: str) -> None:
+    page = Path(__file__).parents[1] / "docs" / "reference" / "readers.md"
+    body = page.read_text().partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+    rows = "\n".join(line for line in body.splitlines() if line.startswith("|"))
+    stated = {name.casefold() for name in re.findall(r"`(\w[\w ()]*)`", rows)}
+    code = code_of(CODE[section])
+    read = {name.casefold() for name in keys_of(code)} - NOT_OF_FILES
+    assert read <= stated
+    assert {name for name in stated if name not in code.casefold() and " " not in name} == set()
 
 
 def main() -> None:

@@ -1,6 +1,8 @@
 """The cost of the suite: collection without heavy libraries, and folders compared with the table."""
 
 import csv
+import os
+import tempfile
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,22 +12,20 @@ import pytest
 from tests import cost
 
 
-def test_the_collection_imports_no_heavy_library(imported_while_collecting: list[str]) -> None:
+def test_the_collection_imports_no_heavy_library(imported_while_collecting):
     assert imported_while_collecting == []
 
 
 @pytest.mark.parametrize(("turns", "named"), [(119.0, []), (121.0, ["a: 121 turns, limit 120"])])
-def test_a_folder_that_costs_a_fifth_more_than_the_table_is_named(turns: float, named: list[str]) -> None:
+def test_a_folder_that_costs_a_fifth_more_than_the_table_is_named(turns, named):
     assert cost.grown({"a": 100.0, "gone": 50.0}, {"a": turns}) == named
 
 
-def test_a_new_folder_may_cost_little() -> None:
+def test_a_new_folder_may_cost_little():
     assert cost.grown({}, {"small": 19.0, "large": 21.0}) == ["large: 21 turns, limit 20"]
 
 
-def test_what_was_measured_is_written_and_read_as_turns_by_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_measured_is_written_and_read_as_turns_by_folder(tmp_path, monkeypatch):
     written = tmp_path / "build" / "cost.csv"
     monkeypatch.setattr(cost, "MEASURED", written)
     monkeypatch.setattr(cost, "turn_s", lambda: 0.5)
@@ -40,7 +40,7 @@ def test_what_was_measured_is_written_and_read_as_turns_by_folder(
     assert [line.split()[-1] for line in lines[1:3]] == ["tests/a", "tests/b"]
 
 
-def test_every_entry_of_the_campaigns_is_a_test_with_a_twin() -> None:
+def test_every_entry_of_the_campaigns_is_a_test_with_a_twin():
     tests = Path(__file__).parent
     with (tests / "campaigns.csv").open(newline="") as lines:
         rows = list(csv.DictReader(lines))
@@ -49,3 +49,7 @@ def test_every_entry_of_the_campaigns_is_a_test_with_a_twin() -> None:
         file, _, name = row["test"].partition("[")[0].partition("::")
         assert f"def {name}(" in (tests / file).read_text() or not name, row
         assert row["twin"], row
+
+
+def test_temporary_files_are_where_the_environment_says():
+    assert tempfile.gettempdir() == os.environ.get("TMPDIR", tempfile.gettempdir())

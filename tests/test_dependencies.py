@@ -1,15 +1,13 @@
-"""What the project stands on: pinned, installed as pinned, under licences that a product can carry."""
+"""Dependencies of the project: pinned, installed as pinned, under licences that a product can carry."""
 
 import importlib.util
 import json
 import re
 import threading
 import tomllib
-from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import metadata
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 from packaging.markers import default_environment
@@ -18,7 +16,7 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def script(name: str) -> ModuleType:
+def script(name):
     """Return a script of the folder deploy as a module."""
     found = importlib.util.spec_from_file_location(name, ROOT / "deploy" / f"{name}.py")
     module = importlib.util.module_from_spec(found)
@@ -30,21 +28,21 @@ materials = script("materials")
 NORMAL = re.compile(r"[-_.]+")
 
 
-def name_of(text: str) -> str:
+def name_of(text):
     return NORMAL.sub("-", re.split(r"[\[<>=!~ ;]", text, maxsplit=1)[0]).lower()
 
 
-def pins(name: str) -> dict[str, Requirement]:
+def pins(name):
     lines = (ROOT / "requirements" / f"{name}.txt").read_text().splitlines()
     entries = [line.split("#")[0].strip() for line in lines]
     return {name_of(entry): Requirement(entry) for entry in entries if entry}
 
 
-def version_of(pin: Requirement) -> str:
+def version_of(pin):
     return str(pin.specifier).removeprefix("==")
 
 
-def applies(requirement: Requirement, python: str | None = None, extras: frozenset[str] = frozenset()) -> bool:
+def applies(requirement, python=None, extras=frozenset()):
     """Return whether a requirement holds for a version of Python (without one: for this)."""
     here = dict(default_environment())
     if python is not None:
@@ -61,7 +59,7 @@ RUNTIME = {
 EVERYTHING = {**RUNTIME, **pins("train"), **pins("dev")}
 
 
-def test_every_requirement_is_pinned_to_one_version() -> None:
+def test_every_requirement_is_pinned_to_one_version():
     for pin in EVERYTHING.values():
         assert re.fullmatch(r"==[^=<>~*, ]+", str(pin.specifier)) and not pin.url and not pin.extras, pin
 
@@ -70,7 +68,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 
 
-def needed(python: str, files: tuple[str, ...]) -> dict[str, list[Requirement]]:
+def needed(python, files):
     """Return what the pinned packages of files require of each package, for a version of Python."""
     texts = PROJECT["dependencies"] + [text for file in files for text in EXTRAS.get(file, [])]
     waiting, seen = [Requirement(text) for text in texts], set()
@@ -94,7 +92,7 @@ def needed(python: str, files: tuple[str, ...]) -> dict[str, list[Requirement]]:
 
 @pytest.mark.parametrize("python", ["3.11.0", "3.11.2", "3.11.3", "3.12.0"])
 @pytest.mark.parametrize("names", ["runtime", "runtime terrain", "runtime postgres parquet traces oidc objects"])
-def test_what_packages_require_is_pinned_for_every_python(names: str, python: str) -> None:
+def test_what_packages_require_is_pinned_for_every_python(names, python):
     """An installation with hashes fails for a package without a pin, also one that only some versions need."""
     files = names.split()
     known = {name: pin for file in files for name, pin in pins(file).items() if applies(pin, python)}
@@ -106,19 +104,19 @@ def test_what_packages_require_is_pinned_for_every_python(names: str, python: st
             assert one.specifier.contains(version_of(known[name]), prereleases=True), one
 
 
-def test_a_package_that_only_older_pythons_need_is_looked_for() -> None:
+def test_a_package_that_only_older_pythons_need_is_looked_for():
     assert "async-timeout" in needed("3.11.2", ("runtime",))
     assert "async-timeout" not in needed("3.11.3", ("runtime",))
 
 
-def test_every_declared_dependency_has_its_pin() -> None:
+def test_every_declared_dependency_has_its_pin():
     assert {name_of(text) for text in PROJECT["dependencies"]} <= pins("runtime").keys()
     for extra in ["terrain", "postgres", "parquet", "traces", "oidc", "objects", "docs"]:
         assert {name_of(text) for text in EXTRAS[extra]} <= (pins("runtime") | pins(extra)).keys()
 
 
 @pytest.mark.parametrize("name", sorted(name for name, pin in RUNTIME.items() if applies(pin)))
-def test_what_runs_is_what_was_pinned_and_may_be_carried(name: str) -> None:
+def test_what_runs_is_what_was_pinned_and_may_be_carried(name):
     found = metadata.distribution(name)
     assert version_of(RUNTIME[name]) == found.version
     stated = materials.licences_of(name)
@@ -129,7 +127,7 @@ HASHED = ["runtime", "postgres", "parquet", "traces", "oidc", "objects", "terrai
 
 
 @pytest.mark.parametrize("name", HASHED)
-def test_the_requirements_with_hashes_are_the_same_versions(name: str) -> None:
+def test_the_requirements_with_hashes_are_the_same_versions(name):
     text = (ROOT / "requirements" / "hashed" / f"{name}.txt").read_text().replace("\\\n", " ")
     entries = {name_of(line): line for line in text.splitlines() if line and not line.startswith("#")}
     assert {key: Requirement(line.partition("--hash")[0].strip()) for key, line in entries.items()} == pins(name)
@@ -137,7 +135,7 @@ def test_the_requirements_with_hashes_are_the_same_versions(name: str) -> None:
         assert re.fullmatch("(--hash=sha256:[0-9a-f]{64} *)+", line[line.index("--hash") :])
 
 
-def test_what_is_installed_for_users_is_installed_with_hashes() -> None:
+def test_what_is_installed_for_users_is_installed_with_hashes():
     installed = re.findall(r"pip install (.*(?:\\\n.*)*)", (ROOT / "Dockerfile").read_text())
     assert [line.startswith("--require-hashes") or "--no-deps ." in line for line in installed] == [True] * 3
     image = (ROOT / "Dockerfile").read_text()
@@ -148,16 +146,14 @@ def test_what_is_installed_for_users_is_installed_with_hashes() -> None:
         assert re.search(rf"--require-hashes .*-r requirements/hashed/{name}\.txt", rules)
 
 
-def test_the_gpl_is_found_and_the_lgpl_permitted() -> None:
+def test_the_gpl_is_found_and_the_lgpl_permitted():
     named = ["GPL-3.0-only", "AGPL-3.0", "GNU General Public License v2 (GPLv2)", "GNU Affero General Public License"]
     assert [text for text in named if not materials.is_copyleft(["MIT", text])] == []
     others = ["LGPL-3.0", "GNU Lesser General Public License v3", "MIT", "BSD-3-Clause", "MPL-2.0"]
     assert [text for text in others if materials.is_copyleft([text])] == []
 
 
-def test_a_package_without_licence_or_not_installed_is_a_fault(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_package_without_licence_or_not_installed_is_a_fault(tmp_path, capsys, monkeypatch):
     file = tmp_path / "a.txt"
     file.write_text("# packages\nnumpy==1.0\nabsent==1.0 ; python_version < '3'\n")
     assert materials.main(["licences", str(file)]) == 0
@@ -174,7 +170,7 @@ def test_a_package_without_licence_or_not_installed_is_a_fault(
 class Osv(BaseHTTPRequestHandler):
     """A database in which version 1.0 of the package bad has a vulnerability."""
 
-    def do_POST(self) -> None:
+    def do_POST(self):
         given = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
         bad = {"package": {"name": "bad", "ecosystem": "PyPI"}, "version": "1.0"}
         results = [{"vulns": [{"id": "OSV-1"}]} if query == bad else {} for query in given["queries"]]
@@ -184,11 +180,11 @@ class Osv(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(body)
 
-    def log_message(self, *_: object) -> None: ...
+    def log_message(self, *_): ...
 
 
 @pytest.fixture
-def osv() -> Iterator[str]:
+def osv():
     with ThreadingHTTPServer(("127.0.0.1", 0), Osv) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
@@ -197,7 +193,7 @@ def osv() -> Iterator[str]:
         thread.join()
 
 
-def test_the_audit_finds_a_known_vulnerability(osv: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_audit_finds_a_known_vulnerability(osv, tmp_path, capsys):
     file = tmp_path / "a.txt"
     file.write_text("# packages\nbad==1.1\ngood==1.0 \\\n    --hash=sha256:00\n")
     assert materials.main(["audit", str(file), "--url", osv]) == 0
@@ -207,9 +203,7 @@ def test_the_audit_finds_a_known_vulnerability(osv: str, tmp_path: Path, capsys:
     assert "bad 1.0: OSV-1" in capsys.readouterr().err
 
 
-def test_the_audit_reports_a_database_that_cannot_be_reached(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_audit_reports_a_database_that_cannot_be_reached(tmp_path, capsys):
     (tmp_path / "a.txt").write_text("bad==1.0\n")
     words = ["audit", str(tmp_path / "a.txt"), "--url", "http://127.0.0.1:1/"]
     assert materials.main(words) == 0

@@ -23,7 +23,7 @@ README = (ROOT / "README.md").read_text()
 TUTORIALS = sorted(path.name for path in (DOCS / "tutorials").glob("*.md"))
 
 
-def read(name: str) -> str:
+def read(name):
     return (DOCS / name).read_text()
 
 
@@ -36,7 +36,7 @@ MARK = re.compile(
 
 
 @pytest.fixture(scope="session")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
     built = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
@@ -46,7 +46,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_site_builds_without_a_warning_and_has_the_generated_reference(site: Path) -> None:
+def test_the_site_builds_without_a_warning_and_has_the_generated_reference(site):
     commands = (site / "reference" / "cli.html").read_text()
     for group in GROUPS:
         for name, _ in all_commands(command_parser(GROUPS, group)):
@@ -55,14 +55,14 @@ def test_the_site_builds_without_a_warning_and_has_the_generated_reference(site:
     assert "/api/v1/passes" in (site / "reference" / "http.html").read_text()
 
 
-def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
+def test_pages_load_nothing_from_elsewhere(site):
     for page in site.rglob("*.html"):
         body = page.read_text()
         for source in re.findall(r'<(?:script|img|link)[^>]+(?:src|href)="(https?:[^"]+)"', body):
             assert 'rel="canonical"' in body and source.startswith("https://linna"), f"{page.name}: {source}"
 
 
-def test_the_service_shows_the_site_under_its_policy(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_service_shows_the_site_under_its_policy(site, monkeypatch):
     monkeypatch.setattr(pages, "HELP", Path("absent"))
     monkeypatch.setattr(pages, "DOCS", Path("absent"))
     absent = pages.documentation_file("index.html")
@@ -78,7 +78,7 @@ def test_the_service_shows_the_site_under_its_policy(site: Path, monkeypatch: py
             pages.documentation_file(path)
 
 
-def test_every_page_links_to_help_and_help_needs_no_build(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_page_links_to_help_and_help_needs_no_build(monkeypatch):
     assert {pages.rendered.__wrapped__(one).count('href="/help"') for one in pages.PAGES} == {1}
     monkeypatch.setattr(pages, "HELP", Path("absent"))
     answer = pages.documentation_file("index.html")
@@ -89,7 +89,7 @@ def test_every_page_links_to_help_and_help_needs_no_build(monkeypatch: pytest.Mo
     assert b"<strong>What went wrong</strong>" in warned and b"!!!" not in warned
 
 
-def test_links_and_anchors_of_help_lead_to_what_is_there() -> None:
+def test_links_and_anchors_of_help_lead_to_what_is_there():
     names = [one.relative_to(DOCS).as_posix() for one in DOCS.rglob("*.md")]
     found = {name: pages.page_of(name) for name in names}
     for source, page in found.items():
@@ -100,7 +100,7 @@ def test_links_and_anchors_of_help_lead_to_what_is_there() -> None:
             assert (DOCS / name).exists() and (not anchor or f'id="{anchor}"' in found[name]), (source, target, anchor)
 
 
-def test_spelling() -> None:
+def test_spelling():
     checked = subprocess.run(
         [str(Path(sys.executable).with_name("typos")), "--config", str(ROOT / "typos.toml"), "docs", "README.md"],
         cwd=ROOT, capture_output=True, text=True, check=False,
@@ -108,12 +108,12 @@ def test_spelling() -> None:
     assert checked.returncode == 0, checked.stdout
 
 
-def test_the_readme_has_the_tour_of_the_first_tutorial() -> None:
+def test_the_readme_has_the_tour_of_the_first_tutorial():
     (tour,) = [m["text"] for m in MARK.finditer(read("tutorials/first-pass.md")) if m["kind"] == "tour"]
     assert tour in README
 
 
-def environment(home: Path) -> dict[str, str]:
+def environment(home):
     taken = ("LINNA_DATA", "LINNA_HOME", "LINNA_SERVER")
     return {name: value for name, value in os.environ.items() if name not in taken} | {
         "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
@@ -122,7 +122,7 @@ def environment(home: Path) -> dict[str, str]:
     }
 
 
-def run_script(script: str, folder: Path) -> str:
+def run_script(script, folder):
     """Return what a shell script prints that ends with status 0."""
     with (folder / "log").open("w") as log:
         command, known = ["bash", "-c", script], environment(folder / "data")
@@ -132,7 +132,7 @@ def run_script(script: str, folder: Path) -> str:
     return printed
 
 
-def command_lines(text: str) -> list[list[str]]:
+def command_lines(text):
     """Return the words of each `linna` command of a shell script, without redirections and pipes."""
     lines = []
     for line in text.replace("\\\n", " ").splitlines():
@@ -144,7 +144,7 @@ def command_lines(text: str) -> list[list[str]]:
 
 
 @pytest.mark.parametrize("name", TUTORIALS)
-def test_the_commands_of_a_tutorial_are_accepted_by_the_parser(name: str) -> None:
+def test_the_commands_of_a_tutorial_are_accepted_by_the_parser(name):
     marks = [m for m in MARK.finditer(read(f"tutorials/{name}")) if m["kind"] in ("run", "tour")]
     commands = [words for mark in marks for words in command_lines(mark["text"])]
     assert commands
@@ -155,7 +155,7 @@ def test_the_commands_of_a_tutorial_are_accepted_by_the_parser(name: str) -> Non
 # `test_packaging` runs the first tutorial, the tour of the README.
 @pytest.mark.campaign
 @pytest.mark.parametrize("name", [name for name in TUTORIALS if name != "first-pass.md"])
-def test_the_commands_of_a_tutorial_run_as_written(name: str, tmp_path: Path) -> None:
+def test_the_commands_of_a_tutorial_run_as_written(name, tmp_path):
     script, expected = ["set -e", "trap 'kill $(jobs -p) || true' EXIT"], list[str]()
     for mark in MARK.finditer(read(f"tutorials/{name}")):
         if mark["kind"] == "file":
@@ -172,16 +172,16 @@ def test_the_commands_of_a_tutorial_run_as_written(name: str, tmp_path: Path) ->
     if name == "first-spacecraft.md":
         _check_first_spacecraft(tmp_path)
     if name == "own-build.md":
-        told, found = (
+        stated, found = (
             re.search(r"^fail: recall falls by ([\d.]+) .*$", text, re.MULTILINE)
             for text in (read(f"tutorials/{name}"), printed)
         )
-        assert told and found and float(found[1]) == pytest.approx(float(told[1]), abs=0.02)
-        assert re.sub(r"[\d.]+", "1", found[0]) == re.sub(r"[\d.]+", "1", told[0])
+        assert stated and found and float(found[1]) == pytest.approx(float(stated[1]), abs=0.02)
+        assert re.sub(r"[\d.]+", "1", found[0]) == re.sub(r"[\d.]+", "1", stated[0])
 
 
 @pytest.mark.campaign
-def test_the_workflow_of_the_ci_page_runs_with_short_passes(tmp_path: Path) -> None:
+def test_the_workflow_of_the_ci_page_runs_with_short_passes(tmp_path):
     (workflow,) = re.findall(r"```yaml\n(.*?)```", read("ci.md"), re.DOTALL)
     steps = [step.get("run", "") for step in yaml.safe_load(workflow)["jobs"]["gates"]["steps"]]
     script = [step for step in steps if "linna regress" in step]
@@ -194,7 +194,7 @@ def test_the_workflow_of_the_ci_page_runs_with_short_passes(tmp_path: Path) -> N
     assert "</testsuite>" in (tmp_path / "junit.xml").read_text() and (tmp_path / "report.html").exists()
 
 
-def _check_first_spacecraft(folder: Path) -> None:
+def _check_first_spacecraft(folder):
     """Check report, archive, webhook and alarms of the spacecraft that was flown with the page alone."""
     names = ("summary", "archives", "alarms", "notification")
     summary, archives, alarms, notified = (json.loads((folder / f"{name}.json").read_text()) for name in names)
@@ -205,7 +205,7 @@ def _check_first_spacecraft(folder: Path) -> None:
     assert "first" in (folder / "report.html").read_text()
 
 
-def test_the_table_of_changes_names_files_that_exist() -> None:
+def test_the_table_of_changes_names_files_that_exist():
     table = read("contributing.md").split("## Where do I change")[1].split("\n## ")[0]
     named = re.findall(r"`([\w./]+)`", " ".join(row.split("|")[2] for row in re.findall(r"^\| .*\|$", table, re.M)))
     found = {name for name in named if (ROOT / name).exists() or [*ROOT.glob(f"ground_service/**/{name}")]}
@@ -213,7 +213,7 @@ def test_the_table_of_changes_names_files_that_exist() -> None:
 
 
 @pytest.mark.parametrize("page", ["explanation/walks", "results/attempts"])
-def test_the_walks_and_attempts_name_functions_that_exist(page: str) -> None:
+def test_the_walks_and_attempts_name_functions_that_exist(page):
     steps = re.findall(r"`([\w/]+\.py): (\w+)`", read(f"{page}.md"))
     gone = [
         (file, name)
@@ -223,22 +223,22 @@ def test_the_walks_and_attempts_name_functions_that_exist(page: str) -> None:
     assert len(steps) > 20 and gone == []
 
 
-def test_the_page_of_scenario_keys_states_types_and_defaults() -> None:
+def test_the_page_of_scenario_keys_states_types_and_defaults():
     page = docs_site.scenario_page()
     assert "| `fov_deg` | float | `120.0` |" in page.split("## `[camera]`")[1].split("\n## ")[0]
     assert "| `name` | str | required |" in page
 
 
-def test_figures_of_pages_are_those_of_the_program() -> None:
+def test_figures_of_pages_are_those_of_the_program():
     blocks = [block for page in DOCS.rglob("*.md") for block in docs_site.BLOCK.findall(page.read_text())]
     assert {name: text.strip() for _, name, text, _ in blocks} == docs_site.generated_figures()
 
 
-def test_the_animation_of_the_readme_shows_the_figures_of_the_text() -> None:
+def test_the_animation_of_the_readme_shows_the_figures_of_the_text():
     with Image.open(DOCS / "pictures" / "tour.gif") as picture:
         shown = picture.info["comment"].decode()
-    told = read("tutorials/first-pass.md").split("```text\n")[1].split("```")[0].strip()
-    assert shown == told
+    stated = read("tutorials/first-pass.md").split("```text\n")[1].split("```")[0].strip()
+    assert shown == stated
     median, p95, level = re.findall(r"^anchored +(\d+) +(\d+) .*level (\d)", shown, re.MULTILINE | re.DOTALL)[0]
     navigation = read("navigation.md")
     assert f"| `linna demo` with `LINNA_DATA`, one window | {level} | {median} m | {p95} m |" in navigation
@@ -250,5 +250,5 @@ def test_the_animation_of_the_readme_shows_the_figures_of_the_text() -> None:
     assert (DOCS / "pictures" / "tour.gif").stat().st_size < 1e6 and "pictures/tour.gif" in README
 
 
-def test_the_release_notes_are_one_page() -> None:
+def test_the_release_notes_are_one_page():
     assert len((ROOT / "CHANGELOG.md").read_bytes()) <= 8_000

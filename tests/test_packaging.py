@@ -36,7 +36,7 @@ SCENARIO_NAMES = sorted(path.name for path in (ROOT / "scenarios").glob("*.toml"
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def built(tmp_path_factory):
     """Folder with wheel and sdist, built from the tracked files and a page where `make docs` writes the site.
 
     `test_documentation` builds the site itself.
@@ -61,7 +61,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_every_pinned_package_runs_on_the_oldest_python_that_the_project_states() -> None:
+def test_every_pinned_package_runs_on_the_oldest_python_that_the_project_states():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     oldest = project["requires-python"].removeprefix(">=") + ".0"
     pins = {
@@ -90,7 +90,7 @@ ground_service/web/static/site.css ground_service/web/templates/pass.html
 
 
 @pytest.mark.slow
-def test_the_wheel_holds_scenarios_models_templates_and_migrations(built: Path) -> None:
+def test_the_wheel_holds_scenarios_models_templates_and_migrations(built):
     (wheel,) = built.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {f"scenarios/{name}" for name in SCENARIO_NAMES} <= names
@@ -99,7 +99,7 @@ def test_the_wheel_holds_scenarios_models_templates_and_migrations(built: Path) 
 
 
 @pytest.mark.slow
-def test_the_source_distribution_can_be_built_again(built: Path, tmp_path: Path) -> None:
+def test_the_source_distribution_can_be_built_again(built, tmp_path):
     (sdist,) = built.glob("*.tar.gz")
     with tarfile.open(sdist) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
@@ -108,7 +108,7 @@ def test_the_source_distribution_can_be_built_again(built: Path, tmp_path: Path)
 
 
 @pytest.fixture(scope="module")
-def installed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def installed(built, tmp_path_factory):
     """Folder `bin` of a new environment into which pip has installed the wheel; it sees the packages of this one."""
     (wheel,) = built.glob("*.whl")
     home = tmp_path_factory.mktemp("installed") / "venv"
@@ -121,19 +121,19 @@ def installed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @cache
-def has_base_pip() -> bool:
+def has_base_pip():
     version = [sys._base_executable, "-m", "pip", "--version"]
     return subprocess.run(version, env=OUTSIDE, capture_output=True, check=False).returncode == 0
 
 
-def pip_of(programs: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def pip_of(programs, *arguments):
     """Run pip for an environment: that of the base interpreter, as `make` does, else that of the environment."""
     python = programs / "python"
     pip = [sys._base_executable, "-m", "pip", "--python", python] if has_base_pip() else [python, "-m", "pip"]
     return subprocess.run([*pip, *arguments], env=OUTSIDE, capture_output=True, text=True, check=False)
 
 
-def in_folder(folder: Path, *command: str | Path) -> str:
+def in_folder(folder, *command):
     """Output of a command that runs outside of the checkout."""
     done = subprocess.run(
         command, cwd=folder, env=OUTSIDE | {"XDG_DATA_HOME": str(folder)}, capture_output=True, text=True, check=False,
@@ -158,12 +158,12 @@ filter_degree = 8
 
 
 @pytest.mark.slow
-def test_the_commands_of_the_tour_run_with_the_installed_wheel(installed: Path, tmp_path: Path) -> None:
+def test_the_commands_of_the_tour_run_with_the_installed_wheel(installed, tmp_path):
     """The tour of the README on a short pass; the service answers on a free port."""
     tour = re.findall(r"^linna (?:demo|serve|plan|report) .*$", (ROOT / "README.md").read_text(), re.MULTILINE)
     (tmp_path / "short.toml").write_text(SHORT)
 
-    def command(line: str, *more: str) -> list[str | Path]:
+    def command(line, *more):
         return [installed / "linna", *shlex.split(line)[1:], *more]
 
     printed = in_folder(tmp_path, *command(tour[0], "--scenario", "short.toml")).splitlines()
@@ -185,7 +185,7 @@ def test_the_commands_of_the_tour_run_with_the_installed_wheel(installed: Path, 
     assert (tmp_path / "linna-demo" / "report" / "report.pdf").read_bytes().startswith(b"%PDF")
 
 
-def answers(port: int) -> bool:
+def answers(port):
     try:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/help/tutorials/first-pass.html", timeout=10) as answer:
             return answer.status == 200 and b"First pass" in answer.read()
@@ -193,7 +193,7 @@ def answers(port: int) -> bool:
         return False
 
 
-def test_the_project_has_its_legal_and_citation_files() -> None:
+def test_the_project_has_its_legal_and_citation_files():
     for name in ("LICENSE", "CITATION.cff", "CODE_OF_CONDUCT.md", "SECURITY.md"):
         assert (ROOT / name).stat().st_size > 300, name
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
@@ -201,7 +201,7 @@ def test_the_project_has_its_legal_and_citation_files() -> None:
 
 
 @pytest.mark.campaign
-def test_the_bill_of_materials_has_hashes_licences_and_the_graph_of_everything_shipped(tmp_path: Path) -> None:
+def test_the_bill_of_materials_has_hashes_licences_and_the_graph_of_everything_shipped(tmp_path):
     from cyclonedx.schema import SchemaVersion
     from cyclonedx.validation.json import JsonStrictValidator
 

@@ -1,6 +1,6 @@
 """Faults that are planted in short flights are flagged by the requirement that they break, and by no other."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -40,10 +40,10 @@ Fly = Callable[[Scenario], PassReport]
 
 
 @pytest.fixture(scope="module")
-def fly(tmp_path_factory: pytest.TempPathFactory) -> Fly:
+def fly(tmp_path_factory):
     """Emulate a flight, import its archive and evaluate it."""
 
-    def flown(scenario: Scenario) -> PassReport:
+    def flown(scenario):
         folder = tmp_path_factory.mktemp("planted")
         emulate(scenario, DataFolder(None), folder / "pass", frames_kept=0)
         with open_ground(folder / "home") as ground:
@@ -54,16 +54,16 @@ def fly(tmp_path_factory: pytest.TempPathFactory) -> Fly:
     return flown
 
 
-def statuses(report: PassReport) -> Mapping[str, str]:
+def statuses(report):
     return {one.key: one.status for one in report.requirements if one.status != "not judged"}
 
 
 @pytest.fixture(scope="module")
-def healthy(fly: Fly) -> PassReport:
+def healthy(fly):
     return fly(SCENARIO)
 
 
-def test_a_healthy_pass_is_met(healthy: PassReport) -> None:
+def test_a_healthy_pass_is_met(healthy):
     assert healthy.verdict_level == "met", healthy.verdict
     assert {"detector.recall", "pointing.offset", "time.step"} <= statuses(healthy).keys()
 
@@ -75,9 +75,7 @@ def test_a_healthy_pass_is_met(healthy: PassReport) -> None:
         ("recall of four fifths", "detector.recall"), ("clock step of 1 s", "time.step"),
     ],
 )  # fmt: skip
-def test_a_planted_fault_is_flagged_in_the_first_pass_by_its_requirement(
-    fault: str, requirement: str, healthy: PassReport, fly: Fly, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_planted_fault_is_flagged_in_the_first_pass_by_its_requirement(fault, requirement, healthy, fly, monkeypatch):
     scenario = SCENARIO
     if fault.startswith("camera"):
         monkeypatch.setattr(camera, "_REDUCED_DETECTOR", replace(camera._REDUCED_DETECTOR, bias_px=(0.5, 0.0)))

@@ -5,7 +5,6 @@ of the shipped suite.
 """
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -22,7 +21,7 @@ FRAMES = 8
 
 
 @pytest.fixture(scope="module")
-def suite(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def suite(tmp_path_factory):
     folder = tmp_path_factory.mktemp("suite")
     chosen = [str(SUITE / f"{name}.toml") for name in ("paper-light", "faults")]
     write_suite(suite_scenarios(chosen, frames=FRAMES), DataFolder(), folder)
@@ -30,17 +29,17 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def home(tmp_path_factory):
     return tmp_path_factory.mktemp("service")
 
 
-def regress(suite: Path, home: Path, build: str, capsys: pytest.CaptureFixture[str]) -> tuple[int, dict]:
+def regress(suite, home, build, capsys):
     words = ["--archive", str(suite), "--build", build, "--home", str(home), "--json"]
     status = cli.run(["regress", "run", *words])
     return status, json.loads(capsys.readouterr().out)
 
 
-def test_the_shipped_network_and_parameters_pass_their_own_suite(suite, home, capsys) -> None:
+def test_the_shipped_network_and_parameters_pass_their_own_suite(suite, home, capsys):
     status, figures = regress(suite, home, "current", capsys)
     assert (status, figures["verdict"]) == (0, "pass"), figures
     gates = {gate["name"]: gate for gate in figures["gates"] if gate["pass"] is None}
@@ -52,9 +51,7 @@ def test_the_shipped_network_and_parameters_pass_their_own_suite(suite, home, ca
     assert [one["frames"] for one in figures["passes"]] == [FRAMES, FRAMES]
 
 
-def test_an_imported_pass_without_its_world_is_replayed_from_received_detections(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_imported_pass_without_its_world_is_replayed_from_received_detections(tmp_path, capsys):
     """The archive has two of five frames and declares no scenario."""
     emulate(parse_scenario(SCENARIO), DataFolder(), tmp_path / "a", frames_kept=2)
     manifest = json.loads((tmp_path / "a/manifest.json").read_text())

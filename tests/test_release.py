@@ -17,14 +17,14 @@ FILES = {
 }  # fmt: skip
 
 
-def release(*words: object) -> int:
+def release(*words):
     command = ["sh", str(ROOT / "deploy" / "release.sh"), *map(str, words)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     sys.stderr.write(done.stderr)
     return done.returncode
 
 
-def made_key(path: Path) -> Path:
+def made_key(path):
     """Make a key pair with the documented commands."""
     page = (ROOT / "docs" / "deployment.md").read_text()
     for command in re.findall(r"^    (\(umask.*|openssl pkey -in.*)$", page, re.MULTILINE):
@@ -34,12 +34,12 @@ def made_key(path: Path) -> Path:
 
 
 @pytest.fixture
-def key(tmp_path: Path) -> Path:
+def key(tmp_path):
     return made_key(tmp_path / "release.key")
 
 
 @pytest.fixture
-def signed(tmp_path: Path, key: Path) -> Path:
+def signed(tmp_path, key):
     folder = tmp_path / "release"
     folder.mkdir()
     for name, octets in FILES.items():
@@ -48,18 +48,18 @@ def signed(tmp_path: Path, key: Path) -> Path:
     return folder
 
 
-def verified(folder: Path, key: Path) -> int:
+def verified(folder, key):
     return release("verify", folder, f"{key}.pub")
 
 
-def test_a_release_as_it_was_signed_is_accepted(signed: Path, key: Path) -> None:
+def test_a_release_as_it_was_signed_is_accepted(signed, key):
     assert verified(signed, key) == 0
     lines = (signed / "SHA256SUMS").read_text().splitlines()
     assert [line[66:] for line in lines] == sorted(FILES)
 
 
 @pytest.mark.parametrize("name", [*FILES, "SHA256SUMS", "SHA256SUMS.sig"])
-def test_one_changed_bit_of_any_file_and_a_missing_file_are_refused(signed: Path, key: Path, name: str, capsys) -> None:
+def test_one_changed_bit_of_any_file_and_a_missing_file_are_refused(signed, key, name, capsys):
     octets = bytearray((signed / name).read_bytes())
     octets[len(octets) // 2] ^= 1
     (signed / name).write_bytes(octets)
@@ -70,7 +70,7 @@ def test_one_changed_bit_of_any_file_and_a_missing_file_are_refused(signed: Path
     assert name in capsys.readouterr().err
 
 
-def test_an_added_file_and_a_link_are_refused(signed: Path, key: Path, capsys) -> None:
+def test_an_added_file_and_a_link_are_refused(signed, key, capsys):
     (signed / "extra.whl").write_bytes(b"x")
     assert verified(signed, key) == 1
     assert "not listed" in capsys.readouterr().err
@@ -80,7 +80,7 @@ def test_an_added_file_and_a_link_are_refused(signed: Path, key: Path, capsys) -
     assert verified(signed, key) == 1
 
 
-def test_a_release_signed_with_another_key_is_refused(signed: Path, key: Path, tmp_path: Path) -> None:
+def test_a_release_signed_with_another_key_is_refused(signed, key, tmp_path):
     other = made_key(tmp_path / "other.key")
     (signed / WHEEL).write_bytes(b"changed and signed again")
     release("sign", signed, other)
@@ -89,13 +89,13 @@ def test_a_release_signed_with_another_key_is_refused(signed: Path, key: Path, t
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_an_incomplete_release_is_not_signed(signed: Path, key: Path, name: str, capsys) -> None:
+def test_an_incomplete_release_is_not_signed(signed, key, name, capsys):
     (signed / name).unlink()
     assert release("sign", signed, key) == 2
     assert "expected one" in capsys.readouterr().err
 
 
-def test_the_private_key_is_private_and_outside_of_the_repository(signed: Path, key: Path, capsys) -> None:
+def test_the_private_key_is_private_and_outside_of_the_repository(signed, key, capsys):
     assert key.stat().st_mode & 0o777 == 0o600
     inside = ROOT / "LICENSE"
     assert release("sign", signed, inside) == 2
@@ -105,7 +105,7 @@ def test_the_private_key_is_private_and_outside_of_the_repository(signed: Path, 
     assert "chmod 600" in capsys.readouterr().err
 
 
-def test_make_release_builds_lists_and_signs() -> None:
+def test_make_release_builds_lists_and_signs():
     rules = (ROOT / "Makefile").read_text()
     rule = rules[rules.index("\nrelease:") :].split("\n\n")[0]
     words = "release: docs;-m build;deploy/materials.py bom;deploy/materials.py licences;deploy/release.sh sign"
@@ -114,7 +114,7 @@ def test_make_release_builds_lists_and_signs() -> None:
     assert "deploy/materials.py audit $(SHIPPED)" in check
 
 
-def test_a_source_distribution_has_the_same_octets_whenever_and_wherever_it_is_packed(tmp_path: Path) -> None:
+def test_a_source_distribution_has_the_same_octets_whenever_and_wherever_it_is_packed(tmp_path):
     made = []
     for k in range(2):
         folder = tmp_path / str(k)

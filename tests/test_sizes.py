@@ -15,12 +15,12 @@ sys.modules["sizes"] = sizes
 _SPEC.loader.exec_module(sizes)
 
 
-def test_no_package_is_larger_than_the_table_allows() -> None:
+def test_no_package_is_larger_than_the_table_allows():
     limits = sizes.load_table(sizes.TABLE.read_text(encoding="utf-8"))
     assert sizes.above(sizes.sizes_of(sizes.ROOT), limits) == []
 
 
-def test_a_change_of_the_table_that_raises_an_entry_lowers_another_by_more() -> None:
+def test_a_change_of_the_table_that_raises_an_entry_lowers_another_by_more():
     """Both the uncommitted change and the newest committed one."""
     log = ["git", "-C", str(sizes.ROOT), "log", "-2", "--format=%H", "--", "tests/sizes.csv"]
     revisions = subprocess.run(log, capture_output=True, text=True, check=False).stdout.split()
@@ -29,7 +29,7 @@ def test_a_change_of_the_table_that_raises_an_entry_lowers_another_by_more() -> 
     assert [sizes.unpaid(before, after) for after, before in itertools.pairwise(tables)] in ([], [[]], [[], []])
 
 
-def test_tokens_do_not_count_comments_docstrings_and_line_breaks() -> None:
+def test_tokens_do_not_count_comments_docstrings_and_line_breaks():
     long = '"""A module."""\n\n\ndef f(a):  # why\n    """Return a."""\n    return (\n        a\n    )\n'
     assert sizes.size_of("def f(a): return (a)\n")[1] == sizes.size_of(long)[1] == 10
     assert sizes.size_of(long)[0] == 8
@@ -44,11 +44,11 @@ def test_tokens_do_not_count_comments_docstrings_and_line_breaks() -> None:
         ((11, 100), ["p: 11 lines, limit 10: remove 1 there, or lower another entry by more"]),
     ],
 )
-def test_a_package_above_its_limit_is_named(sized: tuple[int, int], expected: list[str]) -> None:
+def test_a_package_above_its_limit_is_named(sized, expected):
     assert sizes.above({"p": sized}, {"p": (10, 100)}) == expected
 
 
-def test_a_package_that_the_table_does_not_know_is_above_its_limit() -> None:
+def test_a_package_that_the_table_does_not_know_is_above_its_limit():
     assert len(sizes.above({"new": (1, 1)}, {"p": (10, 100)})) == 2
 
 
@@ -64,5 +64,5 @@ def test_a_package_that_the_table_does_not_know_is_above_its_limit() -> None:
         ({"b": (10, 10), "c": (10, 9)}, 1),
     ],
 )
-def test_a_limit_rises_only_if_another_falls_by_more(after: dict[str, tuple[int, int]], refused: int) -> None:
+def test_a_limit_rises_only_if_another_falls_by_more(after, refused):
     assert len(sizes.unpaid({"a": (10, 10), "b": (10, 10)}, after)) == refused

@@ -5,8 +5,6 @@ codeblocks → randomised → behind markers. Receiving goes the other way, find
 by trial where they are not given, and never fails on damage: what is lost is counted and located.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
@@ -19,7 +17,6 @@ from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Dictionary, Table
 from tmtc.errors import UnknownCoding, ValueRefused
 from tmtc.link import cadu, reed_solomon
-from tmtc.link.clcw import UplinkSeen, uplink_seen
 from tmtc.link.frame_reading import Frames, proof_of, read_frames
 from tmtc.link.frames import (
     FRAME_HEADER_LENGTH,
@@ -27,18 +24,18 @@ from tmtc.link.frames import (
     NO_PACKET_BEGINS,
     OCF_LENGTH,
     ONLY_IDLE_DATA,
+    UplinkSeen,
     append_frame_checksums,
     idle_data,
+    randomise,
+    uplink_seen,
 )
-from tmtc.link.link_check import CountPackets, LinkProposal, propose_link
+from tmtc.link.link_check import CountPackets, LinkProposal, propose_link, survey_markers
 from tmtc.link.link_plan import LinkPlan, LinkSection, one_section, plan_link
-from tmtc.link.marker_survey import survey_markers
-from tmtc.link.randomiser import randomise
 from tmtc.link.settings import LinkSettings
-from tmtc.packets.crc import CRC_LENGTH, crc16
 from tmtc.packets.pus import TM_HEADER_LENGTH
 from tmtc.packets.sequence import SequenceReport, account
-from tmtc.packets.space_packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, idle_packet
+from tmtc.packets.space_packets import CRC_LENGTH, PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, crc16, idle_packet
 from tmtc.packets.stream import (
     CHECKED,
     PacketCut,

@@ -14,7 +14,7 @@ from tmtc.dictionary.fields import Field
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Table
 from tmtc.errors import MissingLibrary, UnknownPacket
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 _INT64_LIMIT = 1 << 63
 

@@ -1,5 +1,6 @@
 """Record of an hour of a new user: what the documents state and what happened."""
 
+import contextlib
 import json
 import os
 import re
@@ -9,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from studies.harness.parts import bare_environment
+from studies.harness.parts import bare_environment, descendants
 
 ROOT = Path(__file__).resolve().parents[2]
 MARK = re.compile(
@@ -40,9 +41,24 @@ class Diary:
 
     def close(self) -> int:
         """Print the result; 1 if there was a wrong turn of the classes A or B."""
-        seconds = round(time.monotonic() - self.started)
-        print(json.dumps({"hour": self.name, "seconds": seconds, "steps": self.steps, "wrong_turns": self.turns}))
+        wall = round(time.monotonic() - self.started)
+        spent = {"wall_s": wall, "processor_s": round(processor_s()), "load": round(os.getloadavg()[1], 1)}
+        print(json.dumps({"hour": self.name, **spent, "steps": self.steps, "wrong_turns": self.turns}))
         return int(any(one[0] in "AB" for one in self.turns))
+
+
+def processor_s() -> float:
+    """Return the processor time of this process and of its descendants, those that have ended included, s."""
+    spent = 0
+    for pid in (os.getpid(), *descendants(os.getpid())):
+        with contextlib.suppress(OSError):
+            spent += sum(map(int, Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:15]))
+    return spent / os.sysconf("SC_CLK_TCK")
+
+
+def is_loaded() -> bool:
+    """Return whether other programs need the processors too, so that minutes do not count."""
+    return os.getloadavg()[1] > (os.cpu_count() or 1) + 1
 
 
 def commands_of(page: str, folder: Path) -> Iterator[str]:

@@ -187,7 +187,7 @@ def read_packets(path, entry):
     from tmtc.packets.stream import PacketForm, cut_packets, primary_headers
     from tmtc.xtce.decode import Decoder
     from tmtc.xtce.importing import parse_xtce
-    from tmtc.xtce.records import xtce_records
+    from tmtc.xtce.series import xtce_records
 
     octets = path.read_bytes()
     cut = cut_packets(octets, form=PacketForm(error_control=False))

@@ -1,10 +1,10 @@
 """Cost of every route: memory above the resting memory of a web process, and processor time, with the largest inputs.
 
-`python -m benchmarks.campaigns.costs [--only NAME ...] [--write]`: an API process on PostgreSQL without workers, so
-that jobs are added and not run, answers each operation of the API. An operation without a case is called with the
-largest value of each of its parameters. Memory is that of the process. The exit status is 1 if an answer
-is above `MEMORY_MIB` or `PROCESSOR_S`, or is an internal error.
-`--write` stores the table in `docs/results/requests.md`.
+`python -m benchmarks.campaigns.costs [--only NAME ...] [--missing] [--write]`: an API process on PostgreSQL without
+workers, so that jobs are added and not run, answers each operation of the API. An operation without a case is called
+with the largest value of each of its parameters and the longest texts. Memory is that of the process. The exit status
+is 1 if an answer is above `MEMORY_MIB` or `PROCESSOR_S`, or is an internal error.
+`--write` enters the rows into the table of `docs/results/requests.md`; `--missing` measures operations without a row.
 """
 
 import argparse
@@ -17,7 +17,7 @@ import tempfile
 import time
 import urllib.parse
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.store.database import prepare_database
 from lunar.catalogue import ROWS_LIMIT
-from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
+from lunar.constants import DAY_NS, GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.messages.oem import format_oem
 from lunar.timescales import format_utc
@@ -42,7 +42,7 @@ from studies.harness.parts import Part
 MEMORY_MIB, PROCESSOR_S = 256, 10.0
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "requests.md"
 PACKETS, ROWS = 40_000, 100
-DAY_NS = 86_400 * 10**9
+NOT_MEASURED = "not measured: the last run was stopped before it"
 MISSION = (
     'name = "largest"\n[spacecraft]\nid = 76\nname = "SelenITA"\n'
     '[camera]\nwidth_px = 512\nheight_px = 512\nfov_deg = 120.0\npointing = "nadir"\n'
@@ -113,10 +113,12 @@ def cases() -> list[tuple[str, str, str, Any]]:
     """Return operation, what is largest, path, and body (made when it is sent) of requests."""
     region = {"latitude_deg": {"min": -60.0, "max": 60.0}, "west_deg": 300.0, "east_deg": 40.0}
     terms = {"windows": 100, "period_days": 1.0, "regions": [region] * 50}
-    times = [{"ticks": (1 << 40) + 65_536 * 60 * k, "received": at(k / 1440)} for k in range(9_000)]
-    points = [one | {"light_time_s": 1.3, "boot_count": 0} for one in times]
+    ticks = [((1 << 40) + 65_536 * 60 * k, {"received": at(k / 1440)}) for k in range(9_000)]
+    points = [time | {"ticks": one, "light_time_s": 1.3, "boot_count": 0} for one, time in ticks]
+    times = [time | {"packet_ticks": one, "sequence_count": k} for k, (one, time) in enumerate(ticks)]
     link = '[[links]]\nname = "l{}"\nkind = "file"\ndownlink = "/nowhere"\n'
-    described = (MISSION + "".join(map(link.format, range(14_000)))).encode()
+    words = "".join(f'{name} = "{"x" * 80}"\n' for name in map("e{}".format, range(10_000)))
+    described = (MISSION + "".join(map(link.format, range(100))) + "[procedures]\n" + words).encode()
     span = {"spacecraft_id": 76, "start": at(0), "stop": at(31)}
     files = {f"images/{k}.png": {"sha256": f"{k:064x}", "bytes": 1} for k in range(15_000)}
     manifest = {"schema_version": 1, "pass_name": "p", "spacecraft_id": 76, "cadence_s": 15.0, "files": files}
@@ -151,7 +153,7 @@ def cases() -> list[tuple[str, str, str, Any]]:
         "measured": {"reason": "measured"},
     }
     lines = CASES.format(rows=ROWS_LIMIT, start=at(0), later=at(8), end=at(31)).splitlines()
-    rows = [(*words, bodies.get(body)) for *words, body in (line.split("|") for line in lines)]
+    rows = [(one, what, path, bodies.get(body)) for one, what, path, body in (line.split("|") for line in lines)]
     rows += [("export_pass", one, "exports", {"pass_id": 1, "format": one}) for one in formats.split()]
     rows += [("get_packets", f"10,000 {one}", f"passes/1/packets/{one}", None) for one in kinds]
     newest = "reports?" + "&".join(f"pass_id={k}" for k in range(1, 101))
@@ -164,8 +166,8 @@ upload_telemetry|1 GiB|telemetry?spacecraft_id=76|1 GiB
 add_ephemeris|800,000 states|ephemerides|states
 add_ephemeris|96 MiB in one line|ephemerides|line
 add_catalogue|{rows:,} rows|catalogues|craters
-add_mission|1 MiB, 14,000 links|missions|described
-check_mission|1 MiB, 14,000 links|missions/check|described
+add_mission|1 MiB, 100 links|missions|described
+check_mission|1 MiB, 100 links|missions/check|described
 check_mission|a plan|missions/check?plan=true|mission
 define_pass||passes|pass
 search_windows|31 days|windows/search|span
@@ -197,16 +199,21 @@ VALUES: dict[str, Any] = {
 """Values of parameters of the operations that have no case; those of others are 1."""
 
 
-def derived(path: str, operation: Mapping[str, Any], values: Mapping[str, Any]) -> tuple[str, str, Any]:
-    """Return the request of an operation with the largest values of its parameters."""
-    query = {}
+def derived(path: str, operation: Mapping[str, Any], schemas: Mapping[str, Any]) -> tuple[str, str, Any]:
+    """Return the request of an operation with the largest values of its parameters and the longest texts."""
+    query, values = {}, VALUES
     for one in operation.get("parameters", ()):
         name = one["name"]
         if one["in"] == "query" and (one.get("required") or name in ("limit", "max_points")):
             query[name] = values.get(name, one["schema"].get("maximum", 1))
     filled = re.sub(r"\{(\w+)\}", lambda found: urllib.parse.quote(str(values.get(found[1], 1))), path)
-    body = {} if "requestBody" in operation else None
-    return "largest page" if "limit" in query else "", f"{filled}?{urllib.parse.urlencode(query)}", body
+    body = None
+    if content := operation.get("requestBody", {}).get("content"):
+        named = content["application/json"]["schema"]["$ref"].rpartition("/")[2]
+        fields = schemas[named]["properties"].items()
+        body = {name: "x" * one["maxLength"] for name, one in fields if "maxLength" in one}
+    what = "largest page" if "limit" in query else "longest texts" if body else ""
+    return what, f"{filled}?{urllib.parse.urlencode(query)}", body
 
 
 def measure(client: httpx.Client, part: Part, name: str, method: str, case: tuple[str, str, Any]) -> Cost:
@@ -224,8 +231,19 @@ def measure(client: httpx.Client, part: Part, name: str, method: str, case: tupl
     return Cost(name, what, answer.status_code, peak, resident_mib(part, "VmRSS") - resting, spent, detail)
 
 
-def measured(only: Sequence[str]) -> Iterator[Cost]:
-    """Yield the costs of all operations."""
+def table() -> dict[str, str]:
+    """Return the rows of the page by operation and input."""
+    rows = [line for line in PAGE.read_text().splitlines() if line.startswith("| `")]
+    return {row.split("|", 3)[1] + row.split("|", 3)[2]: row for row in rows}
+
+
+def weight(row: str) -> list[float]:
+    """Return the order of a row: the dearest first, those that were not measured last."""
+    return [-float(cell.replace("–", "-1")) for cell in row.split("|")[4:7:2]]
+
+
+def measured(only: Sequence[str], but: Collection[str] = ()) -> Iterator[Cost]:
+    """Yield the costs of all operations, or of some."""
     with tempfile.TemporaryDirectory(prefix="costs-") as name, PostgresServer(Path(name)) as server:
         folder, url = Path(name), server.url
         prepare_database(url, upgrade=True).engine.dispose()
@@ -243,15 +261,18 @@ def measured(only: Sequence[str]) -> Iterator[Cost]:
                     downlink = folder / "all.cadu"
                     downlink.write_bytes(mixed_downlink(PACKETS))
                     ingest_file(ground, downlink, spacecraft_id=76)
-                    values = {**VALUES, "report_id": make_report(ground, 1).report_id}
-                part, paths = service.parts["api 1"], client.get("openapi.json").json()["paths"]
-                found = [(one, m, path[8:]) for path, methods in paths.items() for m, one in methods.items()]
+                    VALUES["report_id"] = make_report(ground, 1).report_id
+                part, document = service.parts["api 1"], client.get("openapi.json").json()
+                schemas = document["components"]["schemas"]
+                found = [
+                    (one, m, path[8:]) for path, methods in document["paths"].items() for m, one in methods.items()
+                ]
                 found.sort(key=lambda one: (one[0]["operationId"] == "withdraw_ingest", one[1] == "delete"))
                 for described, method, path in found:
                     operation = described["operationId"]
                     mine = [one[1:] for one in cases() if one[0] == operation]
-                    for case in mine or [derived(path, described, values)]:
-                        if not only or operation in only:
+                    for case in mine or [derived(path, described, schemas)]:
+                        if (not only or operation in only) and operation not in but:
                             cost = measure(client, part, operation, method, case)
                             if cost.fault and cost.status == 200:  # the first answer may compile kernels
                                 cost = measure(client, part, operation, method, case)
@@ -262,17 +283,21 @@ def main(words: Sequence[str] | None = None) -> int:
     """Run the campaign; 1 if a request costs more than the rule allows."""
     parser = argparse.ArgumentParser(prog="costs", description=__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="+", default=(), metavar="OPERATION")
-    parser.add_argument("--write", action="store_true", help=f"store the table in {PAGE.name}")
+    parser.add_argument("--missing", action="store_true", help="measure operations without a row")
+    parser.add_argument("--write", action="store_true", help=f"enter the rows into {PAGE.name}")
     given = parser.parse_args(words)
-    costs: list[Cost] = []
-    for one in measured(given.only):
-        costs.append(one)
+    rows, are_faulty = table(), False
+    known = {key.split("`")[1] for key, row in rows.items() if NOT_MEASURED not in row}
+    for one in measured(given.only, known if given.missing else ()):
+        are_faulty |= bool(one.fault)
         print(one.cells(), one.fault, one.detail, flush=True)
         if given.write:
-            rows = sorted(costs, key=lambda row: (-row.memory_mib, -row.processor_s))
+            rows.pop(f" `{one.operation}`  {NOT_MEASURED} ", None)
+            rows[f" `{one.operation}`  {one.what} "] = one.cells()
+            shown = sorted(rows.values(), key=weight)
             head = PAGE.read_text().split("|---")[0]
-            PAGE.write_text(f"{head}|---|---|---|---|---|---|\n" + "\n".join(row.cells() for row in rows) + "\n")
-    return int(any(one.fault for one in costs))
+            PAGE.write_text(f"{head}|---|---|---|---|---|---|\n" + "\n".join(shown) + "\n")
+    return int(are_faulty)
 
 
 if __name__ == "__main__":

@@ -5,8 +5,6 @@ some frames (default 8), then programs after the template of `build-contract.md`
 wrong turn of the classes A or B.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

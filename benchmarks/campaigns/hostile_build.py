@@ -11,8 +11,6 @@ Exit status 1 if anything succeeded, or a profile that can confine a build refus
 other user `user` alone. The transcript goes to stderr, the table to stdout.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import hashlib

@@ -21,10 +21,11 @@ from benchmarks.campaigns._kills import SPACECRAFT, Keeper, plan_kills
 from linna.commands.mission import went_well
 from linna.data import data_folder
 from linna.output import log
+from lunar.constants import DAY_NS
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import LinkError
 from payload_emulator.session.scenario import Scenario, load_scenario
-from studies.mission_run.dynamics import DAY_NS, FlightDynamics
+from studies.mission_run.dynamics import FlightDynamics
 from studies.mission_run.figures import Progress
 from studies.mission_run.ground import MissionGround
 from studies.mission_run.run import REPORT, MissionRun, RunTerms, Say, fly_whole, prepared, read_progress

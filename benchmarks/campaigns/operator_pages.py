@@ -5,8 +5,6 @@ then the pages in the widths of a desk and a telephone, with pictures in a folde
 released and taken back, and mistakes. The exit status is 1 if there was a wrong turn of the classes A or B.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -4,7 +4,7 @@
 models of the capabilities; lists fetch their pages during iteration.
 """
 
-from ground_service.client.problems import ServiceProblem
+from ground_service.client.connection import ServiceProblem
 from ground_service.client.tasks import Client
 
 __all__ = ["Client", "ServiceProblem"]

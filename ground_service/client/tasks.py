@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ground_service.client.connection import new_key
+from ground_service.client.connection import JobFailed, new_key
 from ground_service.client.operations import Operations
-from ground_service.client.problems import JobFailed
 from ground_service.errors import InvalidInput
 
 if TYPE_CHECKING:
     from ground_service.ingest.model import Ingest
-    from ground_service.jobs.model import Job
+    from ground_service.jobs.service import Job
     from ground_service.missions.model import MissionDetail
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 2.0

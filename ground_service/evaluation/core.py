@@ -59,7 +59,6 @@ from ground_service.evaluation.verdict import (
     verdict_of,
     without_mission,
 )
-from ground_service.missions.model import Requirements
 from ground_service.telemetry.samples import DetectionSamples, NavigationSamples, OutcomeSamples
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
@@ -84,6 +83,7 @@ from reports.values import (
     PacketAccounting,
     PassEvent,
     PassReport,
+    Requirements,
     SettingsComparison,
     TerrainMap,
     TimeSpan,
@@ -113,6 +113,9 @@ RESETS = ("initialization", "time_gap", "manual_step", "safety_timeout")
 PERFECT_START = "propagate-only, perfect start"
 PERFECT_START_M = 1.0
 """A start state this close to the reference is equivalent to it, so it gives no separate baseline."""
+
+SAME_INSTANT_NS = 100_000
+"""Ticks of the clock and time correlations move a sample by less, and the spacecraft by 0.2 m in that time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -559,7 +562,7 @@ def _baselines(
     track: ReferenceStates,
     path_m: FloatArray,
 ) -> list[NavigationSeries]:
-    rows = np.flatnonzero(track.covered & (track.utc_ns >= start.utc_ns))
+    rows = np.flatnonzero(track.covered & (track.utc_ns >= start.utc_ns - SAME_INSTANT_NS))
     if len(rows) == 0:
         return []
     here = track.at_rows(rows)
@@ -572,7 +575,8 @@ def _baselines(
     if _apart_m(start, perfect) > PERFECT_START_M:
         runs.append((PERFECT_START, perfect, gravity, runs[0][3]))
     for name, begin, field_used, degree in (*runs, ("Kepler", start, gravity, 0)):
-        position = propagated_positions(begin, here.utc_ns, field_used, degree, orientation, third_bodies=degree > 0)
+        since = np.maximum(here.utc_ns, begin.utc_ns)
+        position = propagated_positions(begin, since, field_used, degree, orientation, third_bodies=degree > 0)
         origin = "state of the reference" if begin is perfect else "start state of the filter"
         text = (
             f"{origin} propagated with {field_used.name} to degree {degree}, Earth and Sun"
@@ -601,7 +605,7 @@ def _baselines(
 
 def _apart_m(start: StartState, other: StartState) -> float:
     """Distance of two states of the same instant; not a number (never "apart") for states of different instants."""
-    if start.utc_ns != other.utc_ns:
+    if abs(start.utc_ns - other.utc_ns) > SAME_INSTANT_NS:
         return float("nan")
     return float(np.linalg.norm(np.asarray(start.position_icrf_m) - other.position_icrf_m))
 

@@ -1,5 +1,6 @@
 """Additional contents of a pass report: Sun geometry, ground track, wrong fixes, and positions from single frames."""
 
+import hashlib
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -12,6 +13,7 @@ from ground_service.evaluation.alignment import ReferenceStates, error_of_places
 from ground_service.evaluation.fixes import Pairs, snapshot_positions, wrong_fixes
 from ground_service.evaluation.recall import Viewing
 from ground_service.telemetry.samples import NavigationSamples
+from kernels import made_once
 from lunar.arrays import FloatArray
 from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.third_bodies import sun_position_icrf_m
@@ -137,23 +139,32 @@ WIDTH_PX = 2048
 
 @lru_cache(maxsize=2)
 def albedo_picture(path: Path) -> NDArray[np.uint8]:
-    """Grey values (1024, 2048) over the whole range, -180 to 180 degrees east, 90 to -90 north.
+    """Grey values (1024, 2048), -180 to 180 degrees east, 90 to -90 north; kept on disk by the hash of the file.
 
     Raises
     ------
     InvalidInput
         If the file is no picture.
     """
+    try:
+        octets = path.read_bytes()
+    except OSError:
+        octets = b""
+    name = f"figure-albedo-{hashlib.sha256(octets + Path(__file__).read_bytes()).hexdigest()}"
+    levels = made_once(name, lambda: _grey_levels(path, octets).tobytes())
+    return np.frombuffer(levels, np.uint8).reshape(WIDTH_PX // 2, WIDTH_PX)
+
+
+def _grey_levels(path: Path, octets: bytes) -> NDArray[np.uint8]:
     import cv2
 
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    grey = cv2.imdecode(np.frombuffer(octets, np.uint8), cv2.IMREAD_GRAYSCALE) if octets else None
     if grey is None:
         raise InvalidInput(str(path), "", "an albedo map as a picture", "a file that cannot be read as one")
     small = cv2.resize(grey, (WIDTH_PX, WIDTH_PX // 2), interpolation=cv2.INTER_AREA).astype(np.float32)
     low, high = np.percentile(small, (0.5, 99.5))
     stretched = np.clip((small - low) / max(float(high - low), 1.0), 0.0, 1.0)
-    grey_levels: NDArray[np.uint8] = np.rint(40.0 + 180.0 * stretched).astype(np.uint8)
-    return grey_levels
+    return np.asarray(np.rint(40.0 + 180.0 * stretched), dtype=np.uint8)
 
 
 def surface_map(path: Path) -> TerrainMap:

@@ -14,10 +14,16 @@ import numpy as np
 
 from ground_service.telemetry.samples import DetectionSamples
 from lunar.arrays import BoolArray, FloatArray, IntArray
-from lunar.camera import PinholeCamera, above_horizon, ground_arc_m, horizon_arc_m, nadir_camera_from_mcmf
+from lunar.camera import (
+    PinholeCamera,
+    above_horizon,
+    ground_arc_m,
+    horizon_arc_m,
+    nadir_camera_from_mcmf,
+    pointed_camera_from_mcmf,
+)
 from lunar.catalogue import CraterCatalogue, size_class
 from lunar.frames import matrix_from_quaternion, mcmf_from_spherical
-from lunar.lens import pointed_camera_from_mcmf
 from reports.values import BinScore, CalibrationBin, ClassScore, DetectorScore, PrecisionRecallCurve, ResidualSeries
 
 CLASS_LABELS = ("5–10 km", "10–15 km", "15–30 km")

@@ -75,10 +75,12 @@ class MadeReport:
 
 @dataclass(frozen=True, slots=True)
 class Reevaluation:
-    """Number of the event that causes a re-evaluation, and the report before it."""
+    """Number of the event that causes a re-evaluation, the report before it, and what was evaluated again."""
 
     event: int
     previous: StoredReport
+    inputs: PassInputs
+    report: PassReport
 
 
 def evaluate(ground: Ground, pass_id: int, *, created_utc: str = "") -> PassReport:
@@ -118,12 +120,15 @@ def make_report(
     out
         Folder for the documents; ``reports/pass-<id>`` under the service's home when None.
     again
-        Cause of a re-evaluation and the report before it; the changed figures are stored with the new report.
+        Re-evaluation to render; the changed figures are stored with the new report.
     """
     identity = report_id or uuid.uuid4().hex
     now = utc_now_ns()
-    inputs = load_pass_inputs(ground, pass_id, created_utc=format_utc(now))
-    report = _evaluated(ground, inputs)
+    if again is None:
+        inputs = load_pass_inputs(ground, pass_id, created_utc=format_utc(now))
+        report = _evaluated(ground, inputs)
+    else:
+        inputs, report = again.inputs, replace(again.report, created_utc=format_utc(now))
     documents = _documents(report, pdf=pdf)
     stored = {kind: ground.files.put_octets(octets) for kind, octets in documents.items()}
     summary = _summary(report, inputs)
@@ -177,16 +182,16 @@ def reevaluate(ground: Ground, pass_id: int, *, report_id: str, event: int) -> M
         previous = store.newest_report(connection, pass_id, other_than=report_id)
     if previous is None:
         return None
+    from reports.render import to_json
+
     if not made:
         align_pass(ground, pass_id)  # late data can be what its catalogue was missing
-        from reports.render import to_json
-
-        report = evaluate(ground, pass_id, created_utc=format_utc(previous.created_utc_ns))
-        if hashlib.sha256(to_json(report).encode()).hexdigest() == previous.json_sha256:
-            return None
-    return make_report(
-        ground, pass_id, report_id=report_id, pdf=previous.pdf_sha256 is not None, again=Reevaluation(event, previous)
-    )
+    inputs = load_pass_inputs(ground, pass_id, created_utc=format_utc(previous.created_utc_ns))
+    report = _evaluated(ground, inputs)
+    if not made and hashlib.sha256(to_json(report).encode()).hexdigest() == previous.json_sha256:
+        return None
+    again = Reevaluation(event, previous, inputs, report)
+    return make_report(ground, pass_id, report_id=report_id, pdf=previous.pdf_sha256 is not None, again=again)
 
 
 def _documents(report: PassReport, *, pdf: bool) -> dict[str, bytes]:

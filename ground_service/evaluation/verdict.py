@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ground_service.evaluation.alignment import bounds_per_degree, independent_samples
-from ground_service.missions.model import Requirements
 from lunar.arrays import FloatArray
 from lunar.constants import NS
 from reports.statistics import per_degree, sigma_remark
@@ -23,6 +22,7 @@ from reports.values import (
     NavigationSeries,
     PacketAccounting,
     Requirement,
+    Requirements,
 )
 
 FROM_START = ("propagate-only", "Kepler")

@@ -10,7 +10,7 @@ import tempfile
 import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import chain
 from typing import IO
 
@@ -63,14 +63,7 @@ class Exported:
 def list_formats() -> list[ExportFormatInfo]:
     """Return the formats, and whether their libraries are installed here."""
     return [
-        ExportFormatInfo(
-            name=one.name,
-            description=one.description,
-            ending=one.ending,
-            states=one.states,
-            extra=one.extra,
-            available=not one.library or importlib.util.find_spec(one.library) is not None,
-        )
+        ExportFormatInfo.of(asdict(one), available=not one.library or importlib.util.find_spec(one.library) is not None)
         for one in FORMATS.values()
     ]
 

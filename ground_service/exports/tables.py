@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ground_service.errors import EvaluationError
 from ground_service.evaluation.core import PassInputs
 from lunar.arrays import FloatArray, IntArray
 from lunar.frames import continuous_quaternions
-from lunar.ground_track import ground_track
 from lunar.timescales import parse_utc
+from lunar.visibility import ground_track
 from reports.values import NavigationSeries
 from tmtc.errors import MissingLibrary
 from tmtc.export import Record, column_metadata, parquet_octets, record_columns
@@ -51,7 +52,7 @@ class Table:
 
 def pass_tables(inputs: PassInputs, navigation: Sequence[NavigationSeries]) -> tuple[Table, ...]:
     """Return the tables of a pass, with the errors of its navigation solutions as evaluated."""
-    return (
+    tables = (
         _states(inputs),
         _residuals(navigation),
         _frames(inputs),
@@ -63,6 +64,9 @@ def pass_tables(inputs: PassInputs, navigation: Sequence[NavigationSeries]) -> t
         _reference(inputs),
         _attitude(inputs),
     )
+    if not any(len(one) for one in tables):
+        raise EvaluationError(f"pass {inputs.pass_id}: expected samples of the payload, found none")
+    return tables
 
 
 def _utc(values: IntArray) -> Column:

@@ -31,7 +31,7 @@ from ground_service.errors import (
     StoreError,
     public_text,
 )
-from ground_service.toml import keys_at, model_in
+from ground_service.toml import keys_at, table_in
 from lunar.errors import LunarError
 from lunar.errors import MissingLibrary as MissingLunarLibrary
 from reports.errors import ReportError
@@ -142,7 +142,7 @@ def _expected(fault: dict[str, Any], request: Request) -> str:
         return "expected a value, found none"
     if fault["type"] == "extra_forbidden":
         body = getattr(request.scope.get("route"), "body_field", None)
-        kind = None if body is None else model_in(body.field_info.annotation)
+        kind = None if body is None else table_in(body.field_info.annotation)
         known = [] if kind is None else keys_at(kind, fault["loc"][1:-1])
         near = get_close_matches(str(fault["loc"][-1]), known, n=1)
         return f"expected {near[0] if near else ', '.join(known) or 'no field'}, found an unknown field"

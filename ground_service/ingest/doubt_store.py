@@ -9,11 +9,18 @@ from dataclasses import replace
 import numpy as np
 from sqlalchemy import Connection, delete, func, insert, select
 
-from ground_service.clock import independent_now_ns
+from ground_service.clock import independent_now_ns, is_stated
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf
 from ground_service.ingest import store
-from ground_service.ingest.core import LONGEST_STEP, UNSET_TICKS, fits_between, implausible_times, span_words
+from ground_service.ingest.core import (
+    LONGEST_STEP,
+    SIMULATED_AHEAD,
+    UNSET_TICKS,
+    fits_between,
+    implausible_times,
+    span_words,
+)
 from ground_service.ingest.model import ImplausibleFilter, ImplausiblePacket
 from ground_service.store import repository
 from ground_service.store.event_kinds import TelemetryWithdrawn, TimesDoubted, publish
@@ -25,7 +32,7 @@ from lunar.arrays import IntArray
 from lunar.plausible import AGREEING_PACKETS
 from lunar.timescales import ticks_from_utc_ns, utc_ns_from_ticks
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.packets.cuc import NO_TICKS
+from tmtc.packets.pus import NO_TICKS
 from tmtc.packets.stream import whole_packets
 
 _DOUBTED, _PACKETS, _VEHICLES = repository.IMPLAUSIBLE_PACKETS, repository.PACKETS, repository.VEHICLES
@@ -132,10 +139,12 @@ def latest_ticks(newest: int | None) -> int | None:
     None if only telemetry states the time, or if the archive is from after it, as recordings of simulated flights are.
     """
     now = independent_now_ns()
-    if now is None or newest is None:
+    if now is None:
         return None
     latest = int(ticks_from_utc_ns(now)) + LONGEST_STEP
-    return latest if newest <= latest else None
+    if newest is None and not is_stated():
+        return latest + SIMULATED_AHEAD
+    return latest if newest is None or newest <= latest else None
 
 
 def _is_firm(connection: Connection, vehicle: int) -> bool:
@@ -262,5 +271,7 @@ def _put_back(connection: Connection, vehicle: int) -> None:
     if not supported:
         return
     connection.execute(delete(_DOUBTED).where(_DOUBTED.c.id.in_([row["id"] for row in supported])))
+    for row in supported:
+        store.widen_extent(connection, row["ingest_id"], row["ticks"])
     spacecraft = get_vehicle(connection, vehicle).ccsds_id
     store.store_batch(connection, vehicle, _batch([bytes(row["octets"]) for row in supported], spacecraft))

@@ -4,8 +4,6 @@ A section is read in windows. Frames that the octets before or after a piece giv
 pieces; the others are read now. Octets of packets that are not complete are left as fragments.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -20,12 +18,10 @@ from lunar.arrays import BoolArray, IntArray, OctetArray
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Dictionary
 from tmtc.link import cadu
-from tmtc.link.clcw import uplink_seen
 from tmtc.link.frame_reading import Frames, proof_of, read_frames
-from tmtc.link.frames import FRAME_HEADER_LENGTH, FRAME_MAX_LENGTH, OCF_LENGTH, ONLY_IDLE_DATA
+from tmtc.link.frames import FRAME_HEADER_LENGTH, FRAME_MAX_LENGTH, OCF_LENGTH, ONLY_IDLE_DATA, uplink_seen
 from tmtc.link.settings import LinkSettings
-from tmtc.packets.crc import CRC_LENGTH
-from tmtc.packets.space_packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
+from tmtc.packets.space_packets import CRC_LENGTH, PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH
 from tmtc.packets.stream import CHECKED, PacketCut, PacketForm, cut_packets
 
 CADU_MAX_OCTETS = FRAME_MAX_LENGTH + 2 * 16 * 8 + cadu.ASM_LENGTH

@@ -1,11 +1,12 @@
 """Entities of ingests."""
 
-from __future__ import annotations
+from dataclasses import dataclass
 
 from pydantic import ConfigDict, Field
 
 from ground_service.http.model import Entity, InstanceName, Paging, RequestModel, SpacecraftNumber, UtcTime
 from ground_service.toml import LINE_PATTERN_JSON
+from tmtc.link.frames import UplinkSeen
 
 
 class IngestAccepted(Entity):
@@ -58,26 +59,8 @@ class ReceivedLink(Entity):
     sections: tuple[ReceivedSection, ...]
 
 
-class ControlWords(Entity):
-    """Telecommand channel as its command link control words show it, see `tmtc.link.clcw.UplinkSeen`."""
-
-    virtual_channel: int = Field(ge=0, le=63, examples=[0])
-    frames: int = Field(description="Frames of the reception that carry a word of the channel", examples=[120])
-    changes: int = Field(description="Number of changes of the word in the reception")
-    frames_lockout: int
-    frames_wait: int
-    frames_retransmit: int
-    frames_no_rf: int
-    report_value: int = Field(ge=0, le=255, description="Number of the sequence-controlled frame that is expected next")
-    farm_b_counter: int = Field(ge=0, le=3, description="Expedited frames accepted, modulo 4", examples=[3])
-    lockout: bool = Field(description="Flags are those of the newest word")
-    wait: bool
-    retransmit: bool
-    no_rf_available: bool
-    no_bit_lock: bool
-
-
-class ReceivedControlWords(ControlWords):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReceivedControlWords(UplinkSeen):
     """Telecommand channel of a spacecraft as reported in the frames of one file."""
 
     spacecraft_id: int

@@ -5,8 +5,6 @@ the octets that earlier pieces have before and behind it, so that every frame is
 whatever the order and whatever process reads. Packets are stored once, by content.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
@@ -35,10 +33,10 @@ from ground_service.telemetry.packets import PacketBatch, batch_of_cut, time_rec
 from lunar.arrays import OctetArray
 from tmtc.arrays import as_octets
 from tmtc.dictionary.payload import DICTIONARY
+from tmtc.link.link_check import survey_markers
 from tmtc.link.link_plan import declared_sections
-from tmtc.link.marker_survey import survey_markers
 from tmtc.link.settings import LinkSettings
-from tmtc.packets.cuc import NO_TICKS
+from tmtc.packets.pus import NO_TICKS
 from tmtc.packets.space_packets import PACKET_MAX_LENGTH
 from tmtc.packets.stream import PacketForm, cut_packets, whole_packets
 

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from pydantic import ValidationError
-from sqlalchemy import ColumnElement, Connection, bindparam, delete, func, or_, select, update
+from sqlalchemy import ColumnElement, Connection, bindparam, case, delete, func, or_, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
 from ground_service.http.model import PageOf, Paging
@@ -387,6 +387,16 @@ def limit_extents(connection: Connection, vehicle: int, newest_ticks: int | None
     """Limit the extent of the ingests of a vehicle to the times of its packets."""
     later = (_INGESTS.c.vehicle_id == vehicle, _INGESTS.c.last_ticks > (newest_ticks or 0))
     connection.execute(update(_INGESTS).where(*later).values(last_ticks=newest_ticks))
+
+
+def widen_extent(connection: Connection, ingest_id: int, ticks: int) -> None:
+    """Extend the extent of an ingest to a time."""
+    first, last = (func.coalesce(one, ticks) for one in (_INGESTS.c.first_ticks, _INGESTS.c.last_ticks))
+    wider = {
+        "first_ticks": case((first > ticks, ticks), else_=first),
+        "last_ticks": case((last < ticks, ticks), else_=last),
+    }
+    connection.execute(update(_INGESTS).where(_INGESTS.c.id == ingest_id).values(**wider))
 
 
 def change_ingest(connection: Connection, ingest_id: int, state: str, new: str) -> bool:

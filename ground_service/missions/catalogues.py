@@ -8,13 +8,16 @@ from pathlib import Path
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput
-from ground_service.ground import Ground
+from ground_service.ground import Ground, run_apart
 from ground_service.missions import store
 from ground_service.missions.model import HeldCatalogue, Mission
 from ground_service.store.files import StoredFile, register_file
 from lunar.catalogue import CraterCatalogue, load_catalogue
 from lunar.datafolder import DataFolder
 from lunar.errors import LunarError
+
+APART_OCTETS = 1 << 20
+"""Catalogues of more octets are read in another process."""
 
 
 def add_catalogue(ground: Ground, stored: StoredFile, name: str, *, actor: str = "local") -> HeldCatalogue:
@@ -25,16 +28,25 @@ def add_catalogue(ground: Ground, stored: StoredFile, name: str, *, actor: str =
     InvalidInput
         It is not a crater catalogue.
     """
-    try:
-        craters = len(load_catalogue(stored.path))
-    except LunarError as error:
-        reason = str(error).replace(str(stored.path), name)
-        raise InvalidInput("catalogue", "", "a crater catalogue", reason) from None
+    is_large = stored.path.stat().st_size > APART_OCTETS
+    craters = run_apart(_craters_in, stored.path) if is_large else _craters_in(stored.path)
+    if isinstance(craters, str):
+        raise InvalidInput("catalogue", "", "a crater catalogue", craters.replace(str(stored.path), name))
+    if not craters:
+        raise InvalidInput("catalogue", "", "a crater catalogue", f"{name}: no crater")
     with ground.database.writing() as connection:
         register_file(connection, stored, store.CATALOGUE_KIND, name, utc_now_ns())
         store.set_catalogue_kind(connection, stored.sha256, store.CATALOGUE_KIND)
         audit(connection, actor, "add catalogue", name, {"sha256": stored.sha256, "craters": craters})
         return store.get_catalogue(connection, stored.sha256)
+
+
+def _craters_in(path: Path) -> int | str:
+    """Return the number of craters in a file, or why it is not a catalogue."""
+    try:
+        return len(load_catalogue(path))
+    except LunarError as error:
+        return str(error)
 
 
 def withdraw_catalogue(ground: Ground, sha256: str, *, actor: str) -> None:

@@ -3,8 +3,6 @@
 The local data folder decides only whether a declared model is available, never which model is used.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Mapping
@@ -13,13 +11,12 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
+from ground_service.missions.automation import Section
 from ground_service.missions.model import Camera, DictionarySection, Evidence, Frames, Mission, Spacecraft, World
-from ground_service.missions.section import Section
-from lunar.camera import PinholeCamera
+from lunar.camera import BrownCamera, PinholeCamera
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation, Orientation, load_orientation
 from lunar.gravity import GravityField, builtin_gravity, load_gravity
-from lunar.lens import BrownCamera
 
 REMEDY = "set LINNA_DATA to a folder that has it, or run linna data fetch"
 
@@ -124,17 +121,19 @@ def _kernel(data: DataFolder) -> Orientation:
     return load_orientation(data.orientation_bpc, data.orientation_tf)
 
 
-@functools.lru_cache(maxsize=8)
 def _named_field(name: str, data: DataFolder) -> GravityField | None:
     built_in = builtin_gravity()
     if name == built_in.name:
         return built_in
     for path in (data.gravity, data.gravity_alternative):
         if path is not None:
-            found = load_gravity(path)
+            found = _field(path)
             if found.name == name:
                 return found
     return None
+
+
+_field = functools.lru_cache(maxsize=4)(load_gravity)
 
 
 AnySection = TypeVar("AnySection", bound=Section)

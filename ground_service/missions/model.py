@@ -9,33 +9,33 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Final, Literal, get_args
 
-from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from ground_service.errors import InvalidInput
 from ground_service.http.model import Entity, InstanceName, UtcTime
-from ground_service.missions.automation import Automation, Channel, ChannelName, without_rules
-from ground_service.missions.section import Array, Section
-from ground_service.toml import faults, read_table
+from ground_service.missions.automation import Array, Automation, Channel, ChannelName, Section, Table, without_rules
+from ground_service.toml import faults, keys_at, read_table
 from lunar.boxes import Box, Region
 from lunar.errors import TimeFormatError
 from lunar.plausible import CAMERA_FIELD_DEG, CAMERA_PIXELS, EXPOSURE_S, MAP_SHIFT_M, REFERENCE_SIGMA_M, Limit
 from lunar.timescales import parse_utc
+from reports.values import NotNegative, Positive, Requirements, Share
 from tmtc.dictionary.effects import EFFECTS, FUNCTION, Effect
 from tmtc.dictionary.payload import DICTIONARY
 
 SCHEMA_VERSION: Final = 1
 MISSION_LIMIT_OCTETS = 1 << 20
+LINKS_LIMIT = 100
+"""Most links of a description: each takes threads of a process."""
+
 EPOCH_TAI = " TAI"
 XTCE_COMPRESSED = "gzip:"
 DICTIONARY_APIDS = frozenset(one.apid for one in (*DICTIONARY.telemetry, *DICTIONARY.telecommands))
 NOT_STATED = "not stated"
-
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
 
 
 def _within(limit: Limit) -> Any:
@@ -44,8 +44,6 @@ def _within(limit: Limit) -> Any:
 
 MapShift = Annotated[float, Field(ge=-MAP_SHIFT_M, le=MAP_SHIFT_M)]
 ReferenceSigma = Annotated[float, _within(REFERENCE_SIGMA_M)]
-Percent = Annotated[float, Field(ge=0.0, le=100.0)]
-Estimator = Literal["paper", "spherical", "anchored"]
 
 
 def _known_subject(subject: str) -> str:
@@ -413,43 +411,6 @@ class DeclaredWorld(Section):
     scenario: Annotated[str, Field(max_length=100_000)] | None = None
 
 
-class Requirements(Section):
-    """Limits of the verdict; a requirement without a limit is shown without judgement.
-
-    Attributes
-    ----------
-    estimator
-        Name of the estimator whose accuracy is judged.
-    better_than
-        Names of baselines whose median error must be larger than that of the estimator.
-    consistency_inside_percent
-        Share of the passes of a consistent filter whose mean NEES or NIS is inside the bounds for the number of its
-        independent draws. A mean above the upper bound is a failure.
-    """
-
-    estimator: Estimator | None = None
-    median_error_m: Positive | None = None
-    p95_error_m: Positive | None = None
-    better_than: Annotated[tuple[str, ...], Array] | None = None
-    consistency_inside_percent: Percent | None = None
-    packets_percent: Percent | None = None
-    frames_percent: Percent | None = None
-    images_percent: Percent | None = None
-    recall: Share | None = None
-    precision: Share | None = None
-    anchor_reads: NotNegative | None = None
-    resets: NotNegative | None = None
-    cpu_percent: Percent | None = None
-    memory_mib: Positive | None = None
-    storage_percent: Percent | None = None
-    temperature_max_c: float | None = None
-    temperature_min_c: float | None = None
-    convergence_s: Positive | None = None
-    drift_percent: Positive | None = None
-    offset_px: Positive | None = None
-    clock_step_s: Positive | None = None
-
-
 class Experiment(Section):
     """Start of the windows for measuring how well the payload navigates without help.
 
@@ -675,7 +636,7 @@ class Mission(Section):
     evidence: Evidence = Evidence()
     observation: Observation = Observation()
     world: DeclaredWorld = DeclaredWorld()
-    requirements: Requirements = Requirements()
+    requirements: Annotated[Requirements, Table] = Requirements()
     experiment: Experiment = Experiment()
     automation: Automation = Automation()
     notify: dict[ChannelName, Channel] = Field(default_factory=dict)
@@ -684,16 +645,16 @@ class Mission(Section):
     approval: Approval = Approval()
     uploads: Uploads | None = None
     resources: SpacecraftResources = SpacecraftResources()
-    links: Annotated[tuple[StationConnection, ...], Array] | None = None
+    links: Annotated[tuple[StationConnection, ...], Array, Field(max_length=LINKS_LIMIT)] | None = None
     packets: Annotated[tuple[PacketSource, ...], Array] | None = None
     procedures: dict[str, Annotated[str, Field(min_length=1, max_length=4000)]] = Field(default_factory=dict)
     """Procedures of the operator for alarms, by the name of event or parameter."""
 
     @model_validator(mode="after")
     def _links_once(self) -> Mission:
-        names = [one.name for one in self.links or ()]
-        for name in names:
-            if names.count(name) > 1:
+        names = Counter(one.name for one in self.links or ())
+        for name, number in names.items():
+            if number > 1:
                 raise ValueError(f"each name of links once, found {name!r} again")
         if names and self.spacecraft.id is None:
             raise ValueError("a spacecraft id with links, found none")
@@ -824,11 +785,11 @@ def _listed(value: Any, path: str = "") -> Iterator[str]:
         yield f"{path} {json.dumps(value)[:80]}"
 
 
-def _not_stated(section: BaseModel, path: str = "") -> Iterator[str]:
-    for name in type(section).model_fields:
+def _not_stated(section: Section | Requirements, path: str = "") -> Iterator[str]:
+    for name in keys_at(type(section), ()):
         value = getattr(section, name)
         place = f"{path}{name}"
-        if isinstance(value, Section):
+        if isinstance(value, Section | Requirements):
             yield from _not_stated(value, f"{place}.")
         elif value is None:
             yield place

@@ -1,6 +1,7 @@
 """Use cases of mission descriptions: add, list, show, and find the description of a pass."""
 
 import difflib
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from ground_service.missions.model import (
 from ground_service.store.event_kinds import MissionAdded, publish
 
 COMPARED_LIMIT = 1_000_000
+_LINE = re.compile(r"([-+])(\d+)")
 """Largest product of the numbers of lines that are compared; the comparison of lines that repeat takes seconds."""
 
 
@@ -89,7 +91,10 @@ def _changes(before: list[str], after: list[str]) -> tuple[str, ...]:
     removed, added = len(before) - head - tail, len(after) - head - tail
     if removed * added > COMPARED_LIMIT:
         return (f"@@ {removed} lines from line {head + 1} on are replaced by {added}: too many to compare @@",)
-    return tuple(difflib.unified_diff(before, after, lineterm="", n=1))[2:]
+    begin, end = max(head - 1, 0), max(tail - 1, 0)
+    old, new = before[begin : len(before) - end], after[begin : len(after) - end]
+    found = tuple(difflib.unified_diff(old, new, lineterm="", n=1))[2:]
+    return tuple(_LINE.sub(lambda at: f"{at[1]}{int(at[2]) + begin}", one) if one[:2] == "@@" else one for one in found)
 
 
 def _text_of(octets: bytes, source: str) -> str:

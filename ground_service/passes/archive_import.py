@@ -38,15 +38,15 @@ from ground_service.store.vehicles import ARCHIVE_ACTOR, SPACECRAFT_ID_MAX, find
 from ground_service.toml import read_json, require_line
 from lunar.arrays import FloatArray
 from lunar.catalogue import load_catalogue
+from lunar.constants import DAY_NS
 from lunar.ephemeris import Ephemeris
 from lunar.errors import LunarError
 from lunar.messages.ephemeris_files import load_orbit
 from lunar.timescales import TICKS_PER_SECOND, parse_utc
 from tmtc.dictionary.payload import APID_LARGE_DATA, DICTIONARY
 from tmtc.errors import ValueRefused
-from tmtc.packets.large_data import LargeDataReceiver
+from tmtc.packets.large_data import LargeDataReceiver, Thumbnail, unpack_thumbnail
 from tmtc.packets.stream import cut_packets
-from tmtc.packets.thumbnails import Thumbnail, unpack_thumbnail
 
 SCHEMA_VERSION = 1
 RECEPTIONS_FILE = "receptions.csv"
@@ -482,7 +482,6 @@ DRAWN_PX = 512
 FRAME_MARGIN_S = 1
 """A frame and the report of its detections have times that differ by less."""
 
-DAY_NS = 86_400_000_000_000
 DAYS_LIMIT = 31
 DELAY_NS = DAY_NS
 """Thumbnails are looked for in packets up to a day later than their frame."""

@@ -4,9 +4,12 @@ Frames carry no time. A frame is assigned the time of the last packet that begin
 begins (damaged, idle, or the middle of a long packet) is assigned the time of the previous frame, or of the next one at
 the start of a file. Therefore, every frame is assigned to the same pass as its neighbours. Files without a readable
 packet belong to no pass.
-"""
 
-from __future__ import annotations
+The sequence count of a space packet has 14 bits and wraps; before anything is called a gap or a conflict it is
+unwrapped, step by step in on-board time, never by arrival. Over a silence in which more than half a wrap of packets
+could have been made, the number of whole wraps is chosen nearest to what the usual rate predicts. A count that falls
+back while time goes on is a restart and begins a new run.
+"""
 
 import hashlib
 from collections.abc import Sequence
@@ -20,10 +23,114 @@ from lunar.arrays import BoolArray, IntArray
 from tmtc.arrays import Octets
 from tmtc.downlink import FRAME_FOREIGN, FRAME_GOOD, DownlinkDecode, decode
 from tmtc.link.link_plan import LinkPlan, LinkSection
-from tmtc.packets.cuc import NO_TICKS
+from tmtc.packets.pus import NO_TICKS, TICKS_PER_SECOND
+from tmtc.packets.space_packets import SEQUENCE_COUNT_LIMIT
 from tmtc.packets.stream import CHECKED, PacketForm
 
 DIGEST_OCTETS = 16
+
+REORDER_TICKS = TICKS_PER_SECOND
+"""Counts may fall back within this time without meaning a restart: packets made in the same instant are stored in
+no particular order. One second is far above the time between making two packets of one frame."""
+
+RATE_PACKETS = 64
+"""Packets over which a rate is taken."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Packets missing between two that came: how many, and the on-board times around them."""
+
+    run: int
+    first_count: int
+    last_count: int
+    before_ticks: int
+    after_ticks: int
+
+    @property
+    def missing(self) -> int:
+        """Return the number of missing packets."""
+        return self.last_count - self.first_count + 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SequenceAccount:
+    """Sequence accounting of one vehicle and APID.
+
+    `order` sorts the packets given into on-board order; `run` and `count` (n,) are in that order: the number of the
+    run since a restart, and the unwrapped count within it. `conflicts` are packets whose unwrapped count another
+    packet of other content has as well.
+    """
+
+    order: IntArray
+    run: IntArray
+    count: IntArray
+    gaps: tuple[Gap, ...]
+    restarts: int
+    conflicts: int
+
+    @property
+    def lost(self) -> int:
+        """Packets known to be missing."""
+        return sum(gap.missing for gap in self.gaps)
+
+
+def account_sequence(ticks: IntArray, sequence_count: IntArray) -> SequenceAccount:
+    """Unwrap the counts of one APID and find what is missing.
+
+    Parameters
+    ----------
+    ticks, sequence_count
+        (n,) on-board time and 14-bit count of distinct packets, in any order.
+    """
+    ticks = np.asarray(ticks, dtype=np.int64)
+    counts = np.asarray(sequence_count, dtype=np.int64)
+    order = np.lexsort((counts, ticks)).astype(np.int64)
+    if order.size == 0:
+        return SequenceAccount(order, order.copy(), order.copy(), (), 0, 0)
+    ticks, counts = ticks[order], counts[order]
+    step_ticks = np.diff(ticks)
+    near = np.mod(np.diff(counts) + SEQUENCE_COUNT_LIMIT // 2, SEQUENCE_COUNT_LIMIT) - SEQUENCE_COUNT_LIMIT // 2
+    predicted = _usual_rate(near, step_ticks) * step_ticks
+    far = predicted >= SEQUENCE_COUNT_LIMIT // 2
+    wraps = np.where(far, np.rint((predicted - near) / SEQUENCE_COUNT_LIMIT), 0.0).astype(np.int64)
+    steps = near + wraps * SEQUENCE_COUNT_LIMIT
+    restart = (steps < 0) & (step_ticks > REORDER_TICKS)
+    run = np.concatenate(([0], np.cumsum(restart))).astype(np.int64)
+    total = np.concatenate(([0], np.cumsum(steps)))
+    first = np.flatnonzero(np.concatenate(([True], restart)))
+    count = total - total[first][run] + counts[first][run]
+
+    by_count = np.lexsort((ticks, count, run))
+    sorted_run, sorted_count, sorted_ticks = run[by_count], count[by_count], ticks[by_count]
+    jump = np.diff(sorted_count)
+    same_run = np.diff(sorted_run) == 0
+    gaps = tuple(
+        Gap(
+            int(sorted_run[i]),
+            int(sorted_count[i]) + 1,
+            int(sorted_count[i + 1]) - 1,
+            int(sorted_ticks[i]),
+            int(sorted_ticks[i + 1]),
+        )
+        for i in np.flatnonzero(same_run & (jump > 1))
+    )
+    conflicts = int(np.count_nonzero(same_run & (jump == 0)))
+    return SequenceAccount(order, run, count, gaps, int(run[-1]), conflicts)
+
+
+def _usual_rate(near: IntArray, step_ticks: IntArray) -> float:
+    """Packets per tick, as the median over stretches of `RATE_PACKETS` packets; 0 where too few packets say.
+
+    Stretches, because packets come in bursts: the time between two of one burst says nothing about the rate.
+    """
+    if len(near) < RATE_PACKETS:
+        return 0.0
+    count = np.concatenate(([0], np.cumsum(near)))
+    time = np.concatenate(([0], np.cumsum(step_ticks)))
+    packets, ticks = count[RATE_PACKETS:] - count[:-RATE_PACKETS], time[RATE_PACKETS:] - time[:-RATE_PACKETS]
+    forward = (packets > 0) & (ticks > 0)
+    return float(np.median(packets[forward] / ticks[forward])) if forward.any() else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

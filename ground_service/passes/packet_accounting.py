@@ -4,8 +4,6 @@ Missing packets follow from sequence counts and from the planned frames. Frames 
 with on-board times in the pass (`passes.downlink_accounting`); other passes of the spacecraft have no influence.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 from collections.abc import Hashable
@@ -15,24 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection
 
-from ground_service.ingest.core import Gap, account_sequence
 from ground_service.ingest.link_settings import packet_form
 from ground_service.ingest.model import ReceivedLink
 from ground_service.ingest.store import Received, recordings_of_vehicle
 from ground_service.passes import sample_store
-from ground_service.passes.downlink_accounting import RawAccount, RawFile, account_raw, read_raw
+from ground_service.passes.downlink_accounting import Gap, RawAccount, RawFile, account_raw, account_sequence, read_raw
 from ground_service.passes.model import PassRecord
 from ground_service.passes.span import STARTED, STOPPED, PassSpan
 from ground_service.store.files import FileArchive
 from ground_service.store.vehicles import get_vehicle
 from ground_service.telemetry import store as telemetry
+from lunar.arrays import IntArray
 from reports.values import ApidAccounting, CompletenessSeries, PacketAccounting, ReceptionQuality
 from tmtc.dictionary.payload import APID_DETECTIONS, DICTIONARY
 from tmtc.link.link_plan import LinkSection
 from tmtc.link.settings import LinkSettings
 from tmtc.packets.stream import PacketForm
-
-IntArray = NDArray[np.int64]
 
 COMPLETENESS_BINS = 60
 GAP_POINTS = 256

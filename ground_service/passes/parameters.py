@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection
 
-from ground_service.errors import InvalidInput, NotFound
+from ground_service.errors import EvaluationError, InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.missions import store as missions
 from ground_service.missions.definitions import DeclaredPackets, PacketDefinitions, packet_definitions
@@ -27,8 +27,7 @@ from tmtc.dictionary.payload import DICTIONARY, STRUCTURES
 from tmtc.dictionary.schema import PacketDefinition
 from tmtc.export import Record, format_records, packet_records
 from tmtc.packets.stream import cut_packets, whole_packets
-from tmtc.xtce.records import format_xtce_records, xtce_records
-from tmtc.xtce.series import SeriesValue
+from tmtc.xtce.series import SeriesValue, format_xtce_records, xtce_records
 
 OWN_PACKET = "housekeeping"
 PACKET_FIELDS = {
@@ -262,12 +261,16 @@ def export_packets(ground: Ground, pass_id: int, packet: str, kind: ExportFormat
         There is no such pass or no such packet.
     InvalidInput
         There are more packets than one file may have.
+    EvaluationError
+        The pass has no such packets.
     """
     with ground.database.reading() as connection:
         span = pass_span(connection, store.get_pass(connection, pass_id))
-        if packet in {definition.name for definition in DICTIONARY.telemetry}:
-            return format_records(_own_records(connection, span, packet), kind)
-        return format_xtce_records(_declared_records(connection, span, packet), kind)
+        is_own = packet in {definition.name for definition in DICTIONARY.telemetry}
+        records = (_own_records if is_own else _declared_records)(connection, span, packet)
+    if not records:
+        raise EvaluationError(f"pass {pass_id}: expected packets {packet[:80]!r}, found none")
+    return format_records(records, kind) if is_own else format_xtce_records(records, kind)
 
 
 def _declared_records(connection: Connection, span: PassSpan, packet: str) -> list[Record]:

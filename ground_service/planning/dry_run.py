@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import TIMEOUT_MAX, Timer
 
-from ground_service.clock import mission_now_ns
+from ground_service.clock import mission_now_ns, set_mission_clock
 from ground_service.contacts.links import service as links
 from ground_service.errors import GroundError, InvalidInput, Stopping
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import Ground, open_ground, run_apart
 from ground_service.http.model import Paging
 from ground_service.missions.catalogues import add_catalogue
 from ground_service.missions.definitions import read_mission_file
@@ -22,6 +22,7 @@ from ground_service.planning import service as planning
 from ground_service.planning import standing, store
 from ground_service.planning.model import StandingRequestIn, Window, WindowFilter
 from ground_service.toml import parse_table, read_json
+from lunar.constants import DAY_NS
 from lunar.datafolder import DataFolder
 from lunar.errors import LunarError
 
@@ -71,8 +72,13 @@ def rehearsed(ground: Ground, octets: bytes) -> DryRun:
         (folder / MISSION).write_bytes(octets)
         (folder / REQUEST).write_text(json.dumps(asked or [ASSUMED | {"spacecraft_id": spacecraft.id}]))
         shutil.copyfile(ground.files.path(mine[0]), folder / REFERENCE)
-        flown = fly(folder / MISSION, ground.data, now, MOST_S)
+        flown = run_apart(_fly_at, folder / MISSION, ground.data, now, MOST_S)
     return replace(flown, faults=tuple(one.replace(f"{folder}/", "") for one in flown.faults))
+
+
+def _fly_at(mission: Path, data: DataFolder, now_utc_ns: int, most_s: float) -> DryRun:
+    set_mission_clock(lambda: now_utc_ns)
+    return fly(mission, data, now_utc_ns, most_s)
 
 
 def fly(mission: Path, data: DataFolder, now_utc_ns: int = 0, most_s: float = TIMEOUT_MAX) -> DryRun:
@@ -149,7 +155,7 @@ def _no_uplink(ground: Ground, now: int) -> str | None:
     reasons = []
     for declared in links.declared_links(ground).values():
         if declared.link.uplink is not None:
-            contacts, reason = links.predict(ground, declared, now, now + standing.DAY_NS)
+            contacts, reason = links.predict(ground, declared, now, now + DAY_NS)
             if contacts:
                 return None
             reasons.append(f"{declared.link.name}: {reason or 'no contact in the first day'}")

@@ -11,9 +11,8 @@ from itertools import pairwise
 import numpy as np
 
 from lunar.arrays import FloatArray
-from lunar.constants import NS
+from lunar.constants import DAY_NS, NS
 
-DAY_NS = 86_400 * NS
 ROUNDS = 3
 """Passes of the exchange over all options; later ones found nothing in the months that were tried."""
 

@@ -11,8 +11,8 @@ from sqlalchemy import Connection
 from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.contacts.commanding.store import views_of_window
 from ground_service.ground import Ground
-from ground_service.ingest.core import account_sequence
 from ground_service.missions import store as missions
+from ground_service.passes.downlink_accounting import account_sequence
 from ground_service.passes.span import STARTED, STOPPED, PassSpan, observation_events, observed_span
 from ground_service.passes.store import received_frames
 from ground_service.planning import store

@@ -39,7 +39,7 @@ from ground_service.regression.archives import (
 )
 from ground_service.regression.builds import Limits
 from ground_service.regression.model import COMPLETE, TELEMETRY_ONLY, TO_RENDER, KeptArchive
-from ground_service.regression.runner import RunRequest, run_confined
+from ground_service.regression.runner import DOWNLINKS, RunRequest, run_confined
 from ground_service.regression.sandbox import SandboxRefused, tail
 from tmtc.dictionary.definitions import parse_dictionary
 from tmtc.downlink import decode
@@ -69,7 +69,6 @@ LIVE_BEGINNING = "the pass was received live"
 NO_DETECTIONS = "; no received detections: "
 """Part of the reason of an archive whose downlink has no detections that can be decoded."""
 
-_DOWNLINKS = ("downlink.cadu", "downlink.packets")
 _ARCHIVE = re.compile(r"(?:/[\w.-]+)*/archive\b")
 
 
@@ -199,9 +198,9 @@ def recorded_detections(archive: PassArchive) -> list[dict[str, Any]]:
         The archive has no downlink that its packet dictionary decodes.
     """
     files = archive.manifest["files"]
-    name = next((one for one in _DOWNLINKS if one in files), None)
+    name = next((one for one in DOWNLINKS if one in files), None)
     if name is None:
-        raise InvalidInput(archive.name, "", " or ".join(_DOWNLINKS), "neither")
+        raise InvalidInput(archive.name, "", " or ".join(DOWNLINKS), "neither")
     text = (archive.folder / "payload/dictionary.json").read_text(encoding="utf-8")
     dictionary = parse_dictionary(text, "payload/dictionary.json")
     try:

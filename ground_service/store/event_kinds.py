@@ -74,11 +74,13 @@ class ReceptionsEntered(Event):
 
 
 class CorrelationChanged(Event):
-    """The time correlations of a vehicle were replaced."""
+    """The time correlations of a vehicle were replaced, which moved the UTC of these on-board times; None: none."""
 
     event_kind = "correlation"
     vehicle_id: int
     segments: int
+    first_ticks: int | None = None
+    last_ticks: int | None = None
 
 
 class ClockDoubted(Event):

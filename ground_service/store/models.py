@@ -30,7 +30,7 @@ from sqlalchemy import (
     UniqueConstraint,
 )
 
-from tmtc.dictionary.housekeeping import HOUSEKEEPING_FIELDS
+from tmtc.dictionary.fields import HOUSEKEEPING_FIELDS
 
 NO_TICKS = -1
 """On-board time of a packet that carries none."""

@@ -4,8 +4,6 @@ Every function takes the connection of the caller's transaction. Rows are dictio
 turns into the entities of its capability.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 

@@ -1,17 +1,25 @@
-"""Roles of a PostgreSQL database: the owner of the schema, and the service with limited privileges.
+"""Roles of a PostgreSQL database (owner of the schema, limited service); frozen schema of a release.
 
 The service reads and writes rows. It is not a superuser, owns nothing, cannot change the schema, and can add entries to
 the audit log but neither change nor remove them. Migrations run as the owner, who then grants the service its
 privileges.
 """
 
+import json
+import re
+import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 from sqlalchemy import Connection, text
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.engine import Dialect
 from sqlalchemy.exc import DBAPIError
+from sqlalchemy.schema import CreateIndex, CreateTable
 
 from ground_service.errors import DatabaseUnavailable, StoreError
 from ground_service.store.database import Database
+from ground_service.store.models import METADATA
 
 READ_ONLY = ("alembic_version",)
 APPEND_ONLY = ("audit",)
@@ -142,3 +150,26 @@ def check_role(database: Database) -> None:
 def quoted(name: str) -> str:
     """Return a quoted SQL identifier."""
     return '"' + name.replace('"', '""') + '"'
+
+
+DIALECTS: dict[str, type[Dialect]] = {"sqlite": sqlite.dialect, "postgresql": postgresql.dialect}
+
+
+def schema_statements(dialect: Dialect) -> list[str]:
+    """Return the statements that create all tables and indexes, referenced tables first."""
+    made: list[CreateTable | CreateIndex] = []
+    for table in METADATA.sorted_tables:
+        made.append(CreateTable(table))
+        made += map(CreateIndex, sorted(table.indexes, key=lambda index: str(index.name)))
+    return [re.sub(r"\s+", " ", str(one.compile(dialect=dialect))).strip() for one in made]
+
+
+def create_schema(connection: Connection, snapshot: Path) -> None:
+    """Create the tables of a snapshot in an empty database."""
+    for statement in json.loads(snapshot.read_text(encoding="utf-8"))[connection.dialect.name]:
+        connection.exec_driver_sql(statement)
+
+
+if __name__ == "__main__":
+    statements = {name: schema_statements(dialect()) for name, dialect in DIALECTS.items()}
+    Path(sys.argv[1]).write_text(json.dumps(statements, indent=1) + "\n", encoding="utf-8")

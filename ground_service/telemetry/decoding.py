@@ -29,19 +29,17 @@ from ground_service.telemetry import writing
 from ground_service.telemetry.packets import batch_of_cut
 from ground_service.telemetry.values import Decoding, StoredPackets, last_packet
 from lunar.arrays import FloatArray, IntArray
-from lunar.constants import NS
+from lunar.constants import DAY_NS, NS
 from lunar.timescales import ONBOARD_EPOCH_TAI_NS, TICKS_PER_SECOND, parse_utc, tai_ns_from_utc_ns, ticks_from_utc_ns
 from tmtc.arrays import Octets
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Dictionary
-from tmtc.packets.cuc import NO_TICKS, TICKS_LIMIT
-from tmtc.packets.packet_times import TimeCode, elapsed
+from tmtc.packets.pus import NO_TICKS, TICKS_LIMIT, TimeCode, elapsed
 from tmtc.packets.stream import PacketCut, primary_headers, whole_packets
 from tmtc.xtce.decode import DECODED, VERDICTS
 from tmtc.xtce.series import series_matrix
 
 BLOCK_PACKETS = 20_000
-_DAY_NS = 86_400 * NS
 
 Samples = dict[int, tuple[IntArray, IntArray, FloatArray]]
 """Times (n,), packet ids (n,) and values (n, v) by container number."""
@@ -175,7 +173,7 @@ def packet_times(buffer: Octets, cut: PacketCut, time: PacketTime | None) -> Int
     known &= primary_headers(buffer, cut).secondary_header
     epoch_ns = parse_utc(time.epoch.removesuffix(EPOCH_TAI))
     if time.code == "cds":
-        ticks = np.asarray(ticks_from_utc_ns(epoch_ns + whole * _DAY_NS + part))
+        ticks = np.asarray(ticks_from_utc_ns(epoch_ns + whole * DAY_NS + part))
     elif time.clock == "unix":
         ticks = np.asarray(ticks_from_utc_ns(epoch_ns + whole * NS + part * NS // TICKS_PER_SECOND))
     else:

@@ -15,7 +15,7 @@ from tmtc.arrays import Octets, as_octets
 from tmtc.dictionary.estimates import ESTIMATE_PACKETS, filter_estimates
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Dictionary, Table, gather
-from tmtc.packets.cuc import NO_TICKS, onboard_ticks
+from tmtc.packets.pus import NO_TICKS, onboard_ticks
 from tmtc.packets.stream import PacketCut, primary_headers
 
 Columns = dict[str, Any]

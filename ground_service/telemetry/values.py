@@ -11,7 +11,7 @@ from ground_service.store import repository
 from ground_service.store.repository import insert_columns
 from ground_service.telemetry import rollups
 from lunar.arrays import FloatArray, IntArray
-from tmtc.packets.cuc import NO_TICKS
+from tmtc.packets.pus import NO_TICKS
 
 _DEFINITIONS = repository.PACKET_DEFINITIONS
 _DECODINGS = repository.PACKET_DECODINGS

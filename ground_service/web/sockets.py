@@ -43,8 +43,8 @@ from ground_service.store.event_kinds import (
     read_events,
 )
 from ground_service.store.events import LoggedEvent
+from ground_service.store.leases import listen
 from ground_service.store.vehicles import all_vehicles
-from ground_service.store.wakeups import listen
 
 Source = tuple[int, str]
 """Vehicle and kind of packet: a message replaces an older one of the same source that was not sent yet."""

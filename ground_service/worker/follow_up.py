@@ -81,12 +81,21 @@ def _after_telemetry(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
     yield "recorrelate", event.vehicle_id
     yield "alarms", event.vehicle_id
     yield "advance windows", event.vehicle_id
+    yield from _again(_ground, event)
+
+
+def _after_correlation(ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
+    event = CorrelationChanged.of(logged)
+    yield "advance windows", event.vehicle_id
+    yield from _again(ground, event)
+
+
+def _again(ground: Ground, event: TelemetryReceived | TelemetryWithdrawn | CorrelationChanged) -> Iterator[Work]:
+    """Yield the evaluation of the passes with a report that contain the on-board times of an event."""
     if event.first_ticks is not None and event.last_ticks is not None:
-        with _ground.database.reading() as connection:
-            yield from (
-                ("re-evaluate", pass_id)
-                for pass_id in _reported_passes(connection, event.vehicle_id, event.first_ticks, event.last_ticks)
-            )
+        with ground.database.reading() as connection:
+            found = _reported_passes(connection, event.vehicle_id, event.first_ticks, event.last_ticks)
+        yield from (("re-evaluate", pass_id) for pass_id in found)
 
 
 def _after_doubt(_ground: Ground, logged: LoggedEvent) -> Iterator[Work]:
@@ -134,7 +143,7 @@ FOLLOWING: Mapping[str, Following] = {
     TimesDoubted.event_kind: _after_doubt,
     ClockDoubted.event_kind: _after_doubt,
     ReceptionsEntered.event_kind: _of_vehicle("recorrelate"),
-    CorrelationChanged.event_kind: _of_vehicle("advance windows"),
+    CorrelationChanged.event_kind: _after_correlation,
     EphemerisAdded.event_kind: _after_ephemeris,
     CommandsSent.event_kind: _of_vehicle("advance windows"),
     PassEvaluated.event_kind: _of_vehicle("advance windows"),

@@ -26,8 +26,9 @@ from ground_service.planning.standing import fail_late, needs_plan
 from ground_service.planning.store import WINDOWS, records_where
 from ground_service.regression.jobs import nightly_placebo
 from ground_service.store import leases
-from ground_service.worker.upkeep import DAY_NS, nightly_job_id, plan_job_id
+from ground_service.worker.upkeep import nightly_job_id, plan_job_id
 from kernels.memory import give_back
+from lunar.constants import DAY_NS
 
 HOLDS_S = 300.0
 """A condition is an alarm when it has held for so long."""

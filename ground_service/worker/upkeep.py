@@ -30,12 +30,12 @@ from ground_service.store.event_kinds import LimitsBroken, publish
 from ground_service.store.files import UNPACKING, remove_leftovers
 from ground_service.store.vehicles import all_vehicles, get_vehicle
 from ground_service.worker.notifications import key_of, send, signature
+from lunar.constants import DAY_NS
 from lunar.timescales import format_utc
 
 log = logging.getLogger(__name__)
 
 RETENTION_DAYS = 90
-DAY_NS = 86_400_000_000_000
 CHANNEL = "channel:"
 _HEAD = re.compile(r"\b([0-9]+):([0-9a-f]{64})\b(?:\W+(?:signature\W+)?([0-9a-f]{64})\b)?")
 """Number, hash and signature in a line of a file, a JSON document or an e-mail."""

@@ -10,6 +10,8 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from linna.data import data_folder
+from linna.errors import UsageError
 from linna.output import log
 from linna.parser import option
 
@@ -56,7 +58,6 @@ def ground_client(arguments: argparse.Namespace, *, background: bool = False) ->
         follow_missions(read_clock)  # when the time is first asked for: few lists need it
         return local_client(ground, str(arguments.actor or local_actor()), background=background)
     from ground_service.client import Client
-    from linna.errors import UsageError
 
     if arguments.home:
         raise UsageError("--home and --server: expected one of them, found both")
@@ -117,7 +118,6 @@ def open_ground_only(arguments: argparse.Namespace) -> Ground:
     """Return the opened service of this machine, which does not handle events."""
     from ground_service.ground import open_ground
     from ground_service.store.objects import objects_of
-    from linna.data import data_folder
 
     settings = settings_of(arguments)
     return open_ground(

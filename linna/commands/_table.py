@@ -1,7 +1,5 @@
 """Tables of commands that call the client: options from the signature of an operation, results as text or JSON."""
 
-from __future__ import annotations
-
 import argparse
 import inspect
 import types
@@ -12,7 +10,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 
 from linna.commands._ground import add_operator_options, ground_client
 from linna.output import emit, finish
-from linna.parser import LinnaParser
+from linna.parser import LinnaParser, add_commands
 
 LIMIT = 50
 HELP = {
@@ -152,13 +150,6 @@ class CustomCommand:
 
     help: str
     configure: Callable[[LinnaParser], None]
-
-
-def add_commands(parser: argparse.ArgumentParser, commands: Commands) -> None:
-    """Add the commands of a table."""
-    actions = parser.add_subparsers(metavar="ACTION", required=True, parser_class=LinnaParser)
-    for name, one in commands.items():
-        actions.add_parser(name, help=one.help).fill(one.configure)
 
 
 def _add(parser: argparse.ArgumentParser, name: str, kind: Any, default: Any, option: Option, positional: bool) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linna.commands._ground import add_operator_options, ground_client
-from linna.commands._table import Command, Commands, CustomCommand, Option, add_commands
+from linna.commands._table import Command, Commands, CustomCommand, Option
 from linna.errors import UsageError
 from linna.output import emit, finish
 from linna.parser import option
@@ -63,7 +63,10 @@ def _uplink(arguments: argparse.Namespace) -> int:
         file.write(taken.octets)
     figures = {"file": str(out), "octets": len(taken.octets), "telecommands": list(taken.telecommands)}
     text = f"{out}: {len(taken.telecommands)} telecommands, {len(taken.octets)} octets"
-    return emit(arguments, figures, text=text)
+    if not taken.octets:
+        out.unlink()
+        text = f"{out}: not written, no released telecommand waits"
+    return emit(arguments, figures, text=text) or int(not taken.octets)
 
 
 def _figures(telecommand: Telecommand) -> dict[str, Any]:
@@ -95,7 +98,7 @@ def _handover(one: Handover) -> str:
     return f"spacecraft {one.spacecraft_id} ({one.instance}): {hold}; {one.note or 'no note'}"
 
 
-COMMANDS: Commands = {
+COMMAND: Commands = {
     "enter": Command(
         _enter,
         "queue a telecommand",
@@ -142,7 +145,3 @@ COMMANDS: Commands = {
         "get_uplink_state", "show the state of the telecommand receiver according to the newest telemetry", _receiver
     ),
 }
-
-
-def configure(parser: argparse.ArgumentParser) -> None:
-    add_commands(parser, COMMANDS)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from linna.commands._table import Command, Option, add_commands
+from linna.commands._table import Command, Option
 from linna.output import log
 
 if TYPE_CHECKING:
@@ -66,7 +65,7 @@ def _implausible(row: ImplausiblePacket) -> str:
 
 
 SEGMENTS = (_segment, "correlations", "no time correlation: the on-board clock is assumed to be ideal")
-COMMANDS = {
+CORRELATE = {
     "list": Command(
         _list,
         "list the segments in force, one for each run of the clock",
@@ -110,7 +109,3 @@ COMMANDS = {
         options={"file": Option("columns packet_ticks, sequence_count, received_utc; optional: station", "file")},
     ),
 }
-
-
-def configure(parser: argparse.ArgumentParser) -> None:
-    add_commands(parser, COMMANDS)

@@ -1,16 +1,16 @@
 """`linna data`: the public data products, their licences and checksums; fetching and re-checking them."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path
 
-from linna.output import finish
+from linna.data import data_directory
+from linna.errors import UsageError
+from linna.output import emit, finish, log
 from linna.parser import option
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_data(parser: argparse.ArgumentParser) -> None:
     verbs = parser.add_subparsers(title="verbs", required=True)
     listing = verbs.add_parser("list", help="list the products: available files, size, licence, address")
     fetch = verbs.add_parser("fetch", help="download products into the data folder")
@@ -24,7 +24,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _list(arguments: argparse.Namespace) -> int:
-    from linna.output import emit
     from payload_emulator.data_products import PRODUCTS
     from payload_emulator.fetching import survey
 
@@ -48,8 +47,6 @@ def _list(arguments: argparse.Namespace) -> int:
 
 
 def _fetch(arguments: argparse.Namespace) -> int:
-    from linna.errors import UsageError
-    from linna.output import emit, log
     from payload_emulator.data_products import PRODUCTS, find_product
     from payload_emulator.fetching import fetch, from_mirror
 
@@ -75,7 +72,6 @@ def _fetch(arguments: argparse.Namespace) -> int:
 
 
 def _verify(arguments: argparse.Namespace) -> int:
-    from linna.output import emit, log
     from payload_emulator.fetching import verify
 
     root = _root(arguments)
@@ -92,7 +88,6 @@ def _verify(arguments: argparse.Namespace) -> int:
 
 
 def _root(arguments: argparse.Namespace) -> Path:
-    from linna.data import data_directory
 
     chosen: Path | None = arguments.to
     return data_directory() if chosen is None else chosen

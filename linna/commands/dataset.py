@@ -1,18 +1,17 @@
 """`linna dataset`: build and check detector data sets."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any
 
-from linna.output import finish
+from linna.data import blender_python, data_folder
+from linna.output import emit, finish, log
 from linna.parser import option
 
 _CLASSES = ("5-10 km", "10-15 km", "15-30 km")
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_dataset(parser: argparse.ArgumentParser) -> None:
     verbs = parser.add_subparsers(title="verbs", required=True)
     build = verbs.add_parser("build", help="render frames with labels; resumes an unfinished data set")
     option(build, "recipe SCENARIO", Path, "TOML with a [dataset] table, or the name of a shipped scenario")
@@ -36,8 +35,6 @@ def _build(arguments: argparse.Namespace) -> int:
     import resource
     import time
 
-    from linna.data import blender_python, data_folder
-    from linna.output import emit, log
     from payload_emulator.session.world.recipe import load_recipe
     from payload_emulator.training.data.build import build
     from payload_emulator.training.data.integrity import summarise
@@ -70,7 +67,6 @@ def _build(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    from linna.output import emit, log
     from payload_emulator.training.data.integrity import check, summarise
 
     problems = check(arguments.folder)
@@ -84,7 +80,6 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _stats(arguments: argparse.Namespace) -> int:
-    from linna.output import emit
     from payload_emulator.training.data.integrity import summarise
 
     figures = summarise(arguments.folder)

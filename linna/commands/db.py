@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from linna.commands._ground import add_service_options, open_service, settings_of
+from linna.errors import UsageError
 from linna.output import add_json_flag, emit
 from linna.parser import option
 
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from ground_service.settings import Settings
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_db(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(metavar="ACTION", required=True)
     upgrade = actions.add_parser("upgrade", help="upgrade the schema to this version")
     upgrade.set_defaults(handler=run_upgrade)
@@ -64,7 +65,6 @@ def run_grant(arguments: argparse.Namespace) -> int:
     from ground_service.store import roles
     from ground_service.store.database import prepare_database
     from ground_service.store.models import METADATA
-    from linna.errors import UsageError
 
     settings = settings_of(arguments)
     purpose = "backups" if arguments.backup else "the service"

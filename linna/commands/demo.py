@@ -1,7 +1,5 @@
 """`linna demo`: one observation window from the orbit to the report, or a spacecraft that flies on."""
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Iterable, Iterator
@@ -9,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from linna.commands._ground import event_of_signals, local_actor
-from linna.commands.pass_ import requirement_lines
+from linna.commands.results import requirement_lines
+from linna.data import data_folder
 from linna.output import emit, finish, log, progress, watched_rims
 from linna.parser import option
 
@@ -28,7 +27,7 @@ KERNELS = (
 """Modules of kernels that are compiled at the same time, while the orbit is propagated."""
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_demo(parser: argparse.ArgumentParser) -> None:
     option(
         parser, "--out DIR", Path, "folder for the pass archive, the ground database and the report", Path("linna-demo")
     )
@@ -44,7 +43,6 @@ def run(arguments: argparse.Namespace) -> int:
     from ground_service.client.local import local_client
     from ground_service.ground import open_ground
     from kernels.compiled import compiling_ahead
-    from linna.data import data_folder
     from payload_emulator.session.archive.emulator import emulate
     from payload_emulator.session.scenario import load_scenario
 

@@ -1,11 +1,14 @@
-"""`linna emulate`: run the payload over a scenario and write a pass archive."""
+"""`linna emulate | replay`: the payload over a scenario, and a payload build over an archived pass."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from linna.data import data_folder
+from linna.errors import UsageError
 from linna.output import emit, finish, log, progress
 from linna.parser import ABOVE_ZERO, number, option
 
@@ -14,7 +17,7 @@ if TYPE_CHECKING:
     from payload_emulator.session.world.external import ExternalFrames
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_emulate(parser: argparse.ArgumentParser) -> None:
     option(
         parser,
         "scenario",
@@ -53,7 +56,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     option(parser, "--check", bool, "fly nothing: print what would be flown; exit status 2 with a fault")
     _add_live(parser)
-    finish(parser, run)
+    finish(parser, run_emulate)
 
 
 def _add_live(parser: argparse.ArgumentParser) -> None:
@@ -103,9 +106,7 @@ def _add_live(parser: argparse.ArgumentParser) -> None:
     add("--clock-file", type=Path, metavar="FILE", help="file for the mission time")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    from linna.data import data_folder
-    from linna.errors import UsageError
+def run_emulate(arguments: argparse.Namespace) -> int:
     from payload_emulator.session.archive.emulator import emulate
     from payload_emulator.session.scenario import load_scenario
     from payload_emulator.session.world.external import SCENARIO, load_external
@@ -122,7 +123,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     if arguments.check:
         external = None if arguments.images is None else load_external(arguments.images, scenario)
-        return _check(arguments, scenario, external)
+        return _check_scenario(arguments, scenario, external)
     if arguments.live:
         return _live(arguments, scenario)
     if arguments.out is None:
@@ -140,9 +141,8 @@ def run(arguments: argparse.Namespace) -> int:
     return emit(arguments, summary, text=describe(summary, arguments.out))
 
 
-def _check(arguments: argparse.Namespace, scenario: Scenario, external: ExternalFrames | None) -> int:
+def _check_scenario(arguments: argparse.Namespace, scenario: Scenario, external: ExternalFrames | None) -> int:
     from ground_service.missions.model import parse_mission
-    from linna.data import data_folder
     from lunar.timescales import format_utc
     from payload_emulator.session.archive.emulator import checked_world
     from payload_emulator.session.archive.mission import mission_text
@@ -178,7 +178,6 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
     import signal
     from dataclasses import asdict
 
-    from linna.data import data_folder
     from lunar.timescales import format_utc
     from payload_emulator.session.archive.mission import OPERATIONS, default_ports, live_mission_text
     from payload_emulator.session.live.contacts import station_names
@@ -231,7 +230,6 @@ def _live(arguments: argparse.Namespace, scenario: Scenario) -> int:
 
 
 def _station_ports(texts: list[str], stations: tuple[str, ...]) -> dict[str, tuple[int, int]]:
-    from linna.errors import UsageError
 
     ports = {}
     for text in texts:
@@ -270,3 +268,112 @@ def outcomes_line(summary: dict[str, Any]) -> str:
         for key in ("outcomes", "no_image_reasons")
     )
     return f"outcomes: {outcomes}" + (f"; no image: {reasons}" if reasons else "")
+
+
+def configure_replay(parser: argparse.ArgumentParser) -> None:
+    option(parser, "archive", Path, "pass archive: a folder or a zip file", nargs="?")
+    option(parser, "--build", str, "build file (TOML), or 'current': this flight code and its network", "current")
+    option(parser, "--out DIR", Path, "output folder for downlink and summary")
+    option(parser, "--check-build BUILD", Path, "only check a build file, and its parameters against this flight code")
+    option(
+        parser,
+        "--complete",
+        bool,
+        "fly nothing; write to --out a copy of the archive with all its frames, rendered from its scenario",
+    )
+    option(
+        parser,
+        "--recorded-only",
+        bool,
+        "refuse an archive that lacks frames instead of rendering them from its scenario",
+    )
+    finish(parser, run_replay)
+
+
+def run_replay(arguments: argparse.Namespace) -> int:
+    if arguments.check_build is not None:
+        return _check_build(arguments)
+    if arguments.archive is None or arguments.out is None:
+        lacking = "ARCHIVE" if arguments.archive is None else "--out DIR"
+        raise UsageError(f"replay: expected {lacking}, or --check-build BUILD, found neither")
+    if arguments.archive.is_dir():
+        return _fly(arguments, arguments.archive)
+    from ground_service.regression.archives import opened_archive
+
+    with opened_archive(arguments.archive) as archive:
+        return _fly(arguments, archive)
+
+
+def _fly(arguments: argparse.Namespace, archive: Path) -> int:
+    if arguments.complete:
+        return _complete(arguments, archive)
+    from payload_emulator.session.archive.replay import FlightBuild, load_flight_build, names_command, replay_archive
+
+    current = arguments.build == "current"
+    if not current and names_command(Path(arguments.build)):
+        return _run_command(arguments, archive)
+    flight = FlightBuild() if current else load_flight_build(Path(arguments.build))
+    data = None
+    if not arguments.recorded_only:
+        data = data_folder()
+    summary = replay_archive(archive, flight, arguments.out, data=data, progress=_bar)
+    return emit(arguments, summary, text=_describe(summary, arguments.out))
+
+
+def _check_build(arguments: argparse.Namespace) -> int:
+    from ground_service.errors import InvalidInput
+    from ground_service.regression.builds import load_build
+    from payload_emulator.errors import ParameterError
+    from payload_emulator.session.archive.replay import check_parameters
+
+    fault: InvalidInput | ParameterError
+    try:
+        load_build(arguments.check_build)
+        check_parameters(arguments.check_build)
+    except InvalidInput as error:
+        fault, place = error, (error.what, error.where)
+    except ParameterError as error:
+        fault, place = error, (error.file, error.key)
+    else:
+        return emit(arguments, {"fault": None}, text=f"{arguments.check_build}: the build is valid")
+    names = ("file", "key", "expected", "found")
+    figures = {"fault": dict(zip(names, (*place, fault.expected, fault.found), strict=True))}
+    emit(arguments, figures, text=str(fault))
+    return 2
+
+
+def _complete(arguments: argparse.Namespace, archive: Path) -> int:
+    from payload_emulator.session.archive.replay import complete_archive
+
+    manifest = complete_archive(archive, arguments.out, data_folder(), progress=_bar)
+    frames = sum(name.startswith("frames/") for name in manifest["files"])
+    return emit(
+        arguments, {"archive": str(arguments.out), "frames": frames}, text=f"{frames} frames, archive: {arguments.out}"
+    )
+
+
+def _run_command(arguments: argparse.Namespace, archive: Path) -> int:
+    from ground_service.regression.build_runs import run_build
+    from ground_service.regression.builds import load_build
+    from ground_service.settings import load_settings
+
+    runner = load_settings().runner_exchange
+    summary = run_build(load_build(arguments.build), archive, arguments.out, runner=runner).summary()
+    emit(arguments, summary, text=summary["text"])
+    return 0 if summary["outcome"] == "ok" else 1
+
+
+def _bar(items: Iterable[Any], total: int) -> Any:
+    return progress(items, total, "frames", "frame")
+
+
+def _describe(summary: dict[str, Any], out: Path) -> str:
+    return "\n".join(
+        [
+            f"{summary['frames']} frames flown again, {summary['packets']} packets, "
+            f"{summary['downlink_octets']} octets of downlink",
+            outcomes_line(summary),
+            f"CPU time: {summary['cpu_ms_per_frame']:.1f} ms per frame",
+            f"downlink: {out / 'downlink.cadu'}",
+        ]
+    )

@@ -1,17 +1,16 @@
 """`linna ingest`: ingest of downlink files and pass archives."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any
 
 from linna.commands._ground import add_operator_options, ground_client
+from linna.errors import UsageError
 from linna.output import emit, finish, log
 from linna.parser import number, option
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_ingest(parser: argparse.ArgumentParser) -> None:
     option(parser, "files FILE", Path, "downlink file or pass archive folder", nargs="+")
     option(
         parser,
@@ -40,9 +39,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from ground_service.client.problems import InvalidRequest, JobFailed
+    from ground_service.client.connection import InvalidRequest, JobFailed
     from ground_service.errors import InvalidInput
-    from linna.errors import UsageError
 
     if arguments.offset is not None and arguments.recording is None:
         raise UsageError("--offset: expected --recording NAME with it, found none")

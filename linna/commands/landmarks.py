@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from linna.commands._table import Command, Option, add_commands
+from linna.commands._table import Command, Option
 from linna.errors import UsageError
 
 if TYPE_CHECKING:
@@ -107,7 +106,7 @@ def _decided(landmark: LandmarkDetail) -> dict[str, Any]:
 
 ONLY = "only of this spacecraft"
 WHY = {"reason": "why"}
-COMMANDS = {
+LANDMARKS = {
     "find": Command(
         _find,
         "search passes for places of detections without a crater",
@@ -153,7 +152,3 @@ COMMANDS = {
         options={"transaction": "number of the transfer"},
     ),
 }
-
-
-def configure(parser: argparse.ArgumentParser) -> None:
-    add_commands(parser, COMMANDS)

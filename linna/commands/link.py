@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linna.commands._ground import add_service_options, event_of_signals, open_ground_only, settings_of
-from linna.commands._table import Command, Commands, CustomCommand, Option, add_commands
+from linna.commands._table import Command, Commands, CustomCommand, Option
+from linna.errors import UsageError
 from linna.output import emit, finish, log
 from linna.parser import option
 
@@ -35,7 +36,6 @@ def _configure_check(parser: LinnaParser) -> None:
 
 
 def check(arguments: argparse.Namespace) -> int:
-    from linna.errors import UsageError
     from tmtc.downlink import propose_packets, propose_settings
 
     octets = arguments.file.read_bytes()
@@ -142,7 +142,6 @@ def operate(arguments: argparse.Namespace) -> int:
     from ground_service.contacts.links.supervisor import LinkSupervisor
     from ground_service.worker.dispatch import dispatcher_for
     from ground_service.worker.follow_up import follow_in_process
-    from linna.errors import UsageError
 
     stopping = event_of_signals()
     with open_ground_only(arguments) as ground:
@@ -177,7 +176,7 @@ def _contacts(found: Contacts) -> str:
     return "\n".join(lines) or "no contacts"
 
 
-COMMANDS: Commands = {
+LINK: Commands = {
     "check": CustomCommand("propose the link settings of a recording from the whole file", _configure_check),
     "list": Command(
         "list_links",
@@ -204,7 +203,3 @@ COMMANDS: Commands = {
     ),
     "run": CustomCommand("operate links in a process of their own", _configure_run),
 }
-
-
-def configure(parser: argparse.ArgumentParser) -> None:
-    add_commands(parser, COMMANDS)

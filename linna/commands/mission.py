@@ -1,13 +1,13 @@
 """`linna mission write | check | add | list | show | run`: mission descriptions, and simulated missions."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from linna.commands._table import Command, Commands, CustomCommand, add_commands, as_json
+from linna.commands._table import Command, Commands, CustomCommand, as_json
+from linna.data import data_folder
+from linna.errors import UsageError
 from linna.output import emit, finish, log, watched_rims
 from linna.parser import ABOVE_ZERO, LinnaParser, number, option
 
@@ -60,8 +60,6 @@ def _configure_run(running: LinnaParser) -> None:
 def write(arguments: argparse.Namespace) -> int:
     from ground_service.missions.definitions import minimal_description
     from ground_service.missions.service import read_mission
-    from linna.data import data_folder
-    from linna.errors import UsageError
     from payload_emulator.session.archive.mission import scenario_mission_text
     from payload_emulator.session.scenario import load_scenario
 
@@ -97,7 +95,6 @@ def check(arguments: argparse.Namespace) -> int:
     lines = [_described(figures)]
     if arguments.flight:
         from ground_service.planning.dry_run import fly
-        from linna.data import data_folder
 
         flown = fly(arguments.file, data_folder())
         figures |= {
@@ -139,9 +136,6 @@ def _described(figures: Mapping[str, Any]) -> str:
 
 
 def run_mission(arguments: argparse.Namespace) -> int:
-    from linna.data import data_folder
-    from linna.errors import UsageError
-    from linna.output import log
     from payload_emulator.session.scenario import load_scenario
     from studies.mission_run import run
     from studies.mission_run.disturbances import UNDISTURBED, load_disturbances
@@ -201,7 +195,7 @@ def went_well(figures: Mapping[str, Any]) -> bool:
     return explained and windows["processed"] == windows["flown"] and not figures["packets_lost"]
 
 
-COMMANDS: Commands = {
+MISSION: Commands = {
     "write": CustomCommand("write the mission description of a scenario", _configure_write),
     "check": CustomCommand("check a mission description; print one line for each fault", _configure_check),
     "add": Command("add_mission", "add a mission description as a revision", lambda made: _described(as_json(made))),
@@ -220,7 +214,3 @@ COMMANDS: Commands = {
     ),
     "run": CustomCommand("run payload, stations, ground service and automation for days", _configure_run),
 }
-
-
-def configure(parser: argparse.ArgumentParser) -> None:
-    add_commands(parser, COMMANDS)

@@ -1,20 +1,24 @@
 """`linna orbit`: propagate a scenario to an ephemeris; compare, interpolate and convert ephemerides."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import os
+import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from linna.commands._orbit_ephemeris import configure_compare, configure_convert, configure_interpolate
+from linna.data import data_folder, load_orbit
+from linna.errors import UsageError
 from linna.output import emit, finish, log, save
 from linna.parser import ABOVE_ZERO, option
 
+if TYPE_CHECKING:
+    from lunar.ephemeris import Ephemeris
 
-def configure(parser: argparse.ArgumentParser) -> None:
+
+def configure_orbit(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     propagate = commands.add_parser("propagate", help="propagate a scenario's orbit, write it as OEM")
     option(propagate, "scenario", str, "scenario file, or the name of a shipped one")
@@ -25,14 +29,185 @@ def configure(parser: argparse.ArgumentParser) -> None:
     option(propagate, "--degree N", int, "degree of the gravity field")
     option(propagate, "--no-maneuvers", bool, "let the orbit drift freely")
     finish(propagate, run_propagate)
-    configure_compare(commands)
-    configure_interpolate(commands)
-    configure_convert(commands)
-    configure_visibility(commands)
+
+    compare = commands.add_parser("compare", help="difference of two ephemerides on common epochs")
+    option(compare, "a A", Path, "ephemeris file; its orbit gives the axes")
+    option(compare, "b B", Path, "ephemeris file (OEM, STK .e, Horizons CSV)")
+    option(compare, "--step S", ABOVE_ZERO, "seconds between epochs (default: the states of A)")
+    finish(compare, run_compare)
+
+    interpolate = commands.add_parser("interpolate", help="states of an ephemeris at given UTC epochs")
+    option(interpolate, "ephemeris F", Path, "ephemeris file (OEM, STK .e, Horizons CSV)")
+    option(interpolate, "--epochs FILE", str, "UTC epochs, one a line (- reads standard input)", required=True)
+    finish(interpolate, run_interpolate)
+
+    convert = commands.add_parser("convert", help="an ephemeris as OEM, SPK, STK .e, CSV or TUM")
+    option(convert, "ephemeris F", Path, "OEM (text or XML), STK .e, Horizons CSV (all also as .gz or .zip), or SPK")
+    option(convert, "--out FILE", Path, "ending in .oem, .xml, .bsp, .e, .csv or .tum", required=True)
+    option(convert, "--spice-id N", int, "SPICE number of the spacecraft in an SPK, such as -85")
+    option(convert, "--step S", ABOVE_ZERO, "seconds between states (default: the states of the file)")
+    option(convert, "--type N", ("3", "13"), "type of an SPK: 3 (polynomials) or 13 (states); default: 3 if exact")
+    finish(convert, run_convert)
+
+
+def run_compare(arguments: argparse.Namespace) -> int:
+    from lunar.comparison import compare
+    from lunar.timescales import format_utc
+
+    first, second = load_orbit(arguments.a), load_orbit(arguments.b)
+    epochs = _epochs(arguments.step, first)
+    if epochs is not None:
+        epochs = epochs[second.covers(epochs)]
+    difference = compare(first, second, epochs if epochs is not None and len(epochs) else None)
+    figures: dict[str, Any] = {
+        "max_m": difference.max_m,
+        "rms_m": difference.rms_m,
+        "mean_rtn_m": list(difference.mean_rtn_m),
+        "rms_rtn_m": list(difference.rms_rtn_m),
+        "samples": difference.samples,
+        "start": format_utc(int(difference.utc_ns[0])),
+        "stop": format_utc(int(difference.utc_ns[-1])),
+        "a": first.words,
+        "b": second.words,
+    }
+    rows = [
+        f"{name:<4} radial {radial:.6g} m, transverse {transverse:.6g} m, normal {normal:.6g} m"
+        for name, (radial, transverse, normal) in (("mean", difference.mean_rtn_m), ("rms", difference.rms_rtn_m))
+    ]
+    text = (
+        f"A: {figures['a']}; B: {figures['b']}\n"
+        f"{difference.samples} epochs from {figures['start']} to {figures['stop']}\n"
+        f"distance: max {difference.max_m:.6g} m, rms {difference.rms_m:.6g} m\n" + "\n".join(rows)
+    )
+    return emit(arguments, figures, text=text)
+
+
+def run_interpolate(arguments: argparse.Namespace) -> int:
+    import numpy as np
+
+    from lunar.datafolder import default_orientation
+    from lunar.timescales import format_tai, tdb_s_from_tai_ns
+    from lunar.visibility import subsatellite
+
+    ephemeris = load_orbit(arguments.ephemeris)
+    epochs = np.array(_read_epochs(arguments.epochs), dtype=np.int64)
+    orientation = default_orientation(data_folder())
+    position_m, velocity_m_s = ephemeris.at_tai(epochs)
+    latitude, longitude, altitude_m = subsatellite(position_m, tdb_s_from_tai_ns(epochs), orientation)
+    states = [
+        {
+            "epoch": format_tai(int(epoch), 9 if epoch % 1_000_000 else 3),
+            "position_km": (position_m[k] / 1e3).tolist(),
+            "velocity_km_s": (velocity_m_s[k] / 1e3).tolist(),
+            "latitude_deg": float(np.degrees(latitude[k])),
+            "longitude_deg": float(np.degrees(longitude[k])) % 360.0,
+            "altitude_km": float(altitude_m[k]) / 1e3,
+        }
+        for k, epoch in enumerate(epochs)
+    ]
+    lines = ["epoch,x_km,y_km,z_km,vx_km_s,vy_km_s,vz_km_s,latitude_deg,longitude_deg,altitude_km"]
+    lines += [
+        ",".join(
+            [
+                state["epoch"],
+                *(f"{v:.9f}" for v in state["position_km"]),
+                *(f"{v:.12f}" for v in state["velocity_km_s"]),
+                f"{state['latitude_deg']:.8f},{state['longitude_deg']:.8f},{state['altitude_km']:.6f}",
+            ]
+        )
+        for state in states
+    ]
+    return emit(
+        arguments,
+        {
+            "states": states,
+            "file": ephemeris.words,
+            "frame": "ICRF, Moon-centred",
+            "orientation": orientation.name,
+            "data": [f"lunar orientation {orientation.name}"],
+        },
+        text="\n".join(lines),
+    )
+
+
+def run_convert(arguments: argparse.Namespace) -> int:
+    from lunar.datafolder import default_orientation
+    from lunar.ephemeris import resampled
+    from lunar.messages.oem import format_oem
+    from lunar.messages.oem_xml import format_oem_xml
+    from lunar.messages.spice import spk_kernel
+    from lunar.messages.stk import format_csv, format_stk, format_tum
+
+    writers: dict[str, Callable[[Ephemeris], Any]] = {
+        ".oem": format_oem,
+        ".xml": format_oem_xml,
+        ".bsp": lambda states: spk_kernel(states, _spice_id(arguments), int(arguments.type or 0) or None),
+        ".e": format_stk,
+        ".csv": lambda states: format_csv(states, default_orientation(data_folder())),
+        ".tum": format_tum,
+    }
+    out: Path = arguments.out
+    if out.suffix.lower() not in writers:
+        raise UsageError(f"--out: expected a name ending in {', '.join(writers)}, found {out.name!r}")
+    ephemeris = load_orbit(arguments.ephemeris, arguments.spice_id, arguments.step)
+    words = ephemeris.words
+    if arguments.step or out.suffix.lower() in (".e", ".csv", ".tum"):
+        ephemeris = resampled(ephemeris, arguments.step)
+    written = writers[out.suffix.lower()](ephemeris)
+    figures: dict[str, Any] = {
+        "out": str(out),
+        "states": sum(len(segment.utc_ns) for segment in ephemeris.segments),
+        "segments": len(ephemeris.segments),
+        "file": words,
+        "frame": "ICRF, Moon-centred",
+    }
+    text = f"{figures['states']} states in {figures['segments']} segments, {figures['frame']}"
+    if out.suffix.lower() == ".bsp":
+        figures |= {"states": written.states, "spk_type": written.data_type, "error_m": written.error_m}
+        text = f"SPK of type {written.data_type}, {written.states} states, {figures['frame']}"
+        if written.error_m is not None:
+            text = text.replace("states", "records of polynomials") + f", within {written.error_m:.1e} m"
+        written = written.octets
+    save(out, written if isinstance(written, bytes) else written.encode())
+    return emit(arguments, figures, text=f"{words}: {text} -> {out}")
+
+
+def _spice_id(arguments: argparse.Namespace) -> int:
+
+    if arguments.spice_id is None:
+        raise UsageError("--spice-id: expected the SPICE number of the spacecraft, such as -85, found none")
+    return int(arguments.spice_id)
+
+
+def _epochs(step_s: float | None, ephemeris: Any) -> Any:
+    from lunar.visibility import even_epochs
+
+    return None if step_s is None else even_epochs(ephemeris, step_s)
+
+
+def _read_epochs(name: str) -> list[int]:
+    """TAI of UTC epochs in a file, one a line; blank lines and what follows a # are left out."""
+    from lunar.ephemeris import read_text
+    from lunar.errors import DataFileError, TimeFormatError
+    from lunar.timescales import parse_tai
+
+    text = sys.stdin.read() if name == "-" else read_text(name, "a list of UTC epochs")
+    epochs = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        wanted = line.partition("#")[0].strip()
+        if not wanted:
+            continue
+        try:
+            epochs.append(parse_tai(wanted))
+        except TimeFormatError:
+            expected = "a UTC epoch like 2029-08-07T00:00:00.000Z"
+            raise DataFileError(name, f"line {number}", expected, repr(wanted)) from None
+    if not epochs:
+        raise DataFileError(name, "", "at least one UTC epoch", "none")
+    return epochs
 
 
 def run_propagate(arguments: argparse.Namespace) -> int:
-    from linna.data import data_folder
     from lunar.messages.oem import format_oem
     from payload_emulator.session.scenario import load_scenario
     from payload_emulator.session.world.orbit import force_model, propagate_to_impact, sample
@@ -131,90 +306,3 @@ def _text(figures: dict[str, Any]) -> str:
     lines += [figures["ends"]] if figures["ends"] else []
     lines.append(f"{figures['states']} states in {figures['wall_s']:.2f} s -> {figures['out']}")
     return "\n".join(lines)
-
-
-def configure_visibility(commands: Any) -> None:
-    """Add `visibility` to the subparsers of `linna orbit`."""
-    visibility = commands.add_parser(
-        "visibility", help="eclipses, nights, occultations and station contacts of an ephemeris"
-    )
-    option(visibility, "ephemeris F", Path, "ephemeris file (OEM, STK .e, Horizons CSV)")
-    option(
-        visibility,
-        "--station NAME=LAT,LON[,HEIGHT_M[,MIN_ELEVATION]]",
-        str,
-        "ground station in degrees and metres, WGS 84; may be given several times",
-        [],
-        action="append",
-    )
-    option(visibility, "--step S", ABOVE_ZERO, "seconds between looks", 60.0)
-    finish(visibility, run_visibility)
-
-
-def run_visibility(arguments: argparse.Namespace) -> int:
-    from linna.data import data_folder, load_orbit
-    from linna.errors import UsageError
-    from lunar.contacts import visibility_spans
-    from lunar.datafolder import default_orientation
-    from lunar.timescales import format_utc
-
-    stations = tuple(_station(text) for text in arguments.station)
-    if len({one.name for one in stations}) < len(stations):
-        raise UsageError(f"--station: expected names of their own, found {', '.join(one.name for one in stations)}")
-    orientation = default_orientation(data_folder())
-    ephemeris = load_orbit(arguments.ephemeris)
-    found = visibility_spans(ephemeris, orientation, stations, arguments.step)
-
-    def listed(spans: tuple[tuple[int, int], ...]) -> list[dict[str, Any]]:
-        return [
-            {"start": format_utc(start), "stop": format_utc(stop), "duration_s": round((stop - start) / 1e9, 3)}
-            for start, stop in spans
-        ]
-
-    figures: dict[str, Any] = {
-        "start": format_utc(found.start_utc_ns),
-        "stop": format_utc(found.stop_utc_ns),
-        "eclipses": listed(found.eclipse),
-        "nights": listed(found.night),
-        "occultations": listed(found.occultation),
-        "contacts": {name: listed(spans) for name, spans in found.contacts.items()},
-        "range_km": {"min": found.range_m[0] / 1e3, "max": found.range_m[1] / 1e3},
-        "light_time_s": {"min": found.light_time_s[0], "max": found.light_time_s[1]},
-        "orientation": orientation.name,
-        "data": [f"lunar orientation {orientation.name}"],
-    }
-    kinds = {
-        "eclipses": figures["eclipses"],
-        "nights below": figures["nights"],
-        "occultations": figures["occultations"],
-        **{f"contacts {name}": spans for name, spans in figures["contacts"].items()},
-    }
-    whole_s = (found.stop_utc_ns - found.start_utc_ns) / 1e9
-    lines = [f"{figures['start']} to {figures['stop']}, orientation {orientation.name}"]
-    for name, spans in kinds.items():
-        total_s = sum(span["duration_s"] for span in spans)
-        lines.append(f"{name:<24} {len(spans):4d}, {total_s / 3600.0:8.2f} h, {total_s / whole_s:6.1%}")
-    lines.append(
-        f"range {figures['range_km']['min']:.0f} to {figures['range_km']['max']:.0f} km, "
-        f"light time {found.light_time_s[0]:.3f} to {found.light_time_s[1]:.3f} s"
-    )
-    return emit(arguments, figures, text="\n".join(lines))
-
-
-def _station(text: str) -> Any:
-    from linna.errors import UsageError
-    from lunar.visibility import GroundStation
-
-    name, found, numbers = text.partition("=")
-    try:
-        values = [float(number) for number in numbers.split(",")]
-    except ValueError:
-        values = []
-    good = bool(name and found) and 2 <= len(values) <= 4 and all(math.isfinite(value) for value in values)
-    if not good or abs(values[0]) > 90.0:
-        raise UsageError(
-            f"--station: expected NAME=LATITUDE,LONGITUDE[,HEIGHT_M[,MIN_ELEVATION]] in degrees, found {text!r}"
-        )
-    height_m = values[2] if len(values) > 2 else 0.0
-    elevation_deg = values[3] if len(values) > 3 else 10.0
-    return GroundStation(name, math.radians(values[0]), math.radians(values[1]), height_m, math.radians(elevation_deg))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from linna.commands._table import Command, Commands, Group, Option, add_commands, as_json
+from linna.commands._table import Command, Commands, Group, Option, as_json
+from linna.errors import UsageError
 
 if TYPE_CHECKING:
     from ground_service.client import Client
@@ -84,7 +84,6 @@ def _delete(service: Client, window_id: int) -> dict[str, Any]:
 
 
 def _uplink(service: Client, window_id: int, *, out: Path | None = None) -> dict[str, Any]:
-    from linna.errors import UsageError
 
     released = service.uplink_window(window_id)
     if out is not None:
@@ -212,7 +211,7 @@ REQUESTS: Commands = {
         lambda made: f"request {made['deleted']} deleted",
     ),
 }
-COMMANDS: Commands = {
+PLAN: Commands = {
     "withdraw": Command("withdraw_ephemeris", "withdraw a reference ephemeris", lambda _: "withdrawn"),
     "ephemeris": Command(
         "add_ephemeris",
@@ -266,7 +265,3 @@ COMMANDS: Commands = {
     ),
     "request": Group("standing requests, which the planner keeps in the plan", REQUESTS),
 }
-
-
-def configure(parser: argparse.ArgumentParser) -> None:
-    add_commands(parser, COMMANDS)

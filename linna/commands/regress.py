@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linna.commands._ground import add_operator_options, ground_client, server_of
+from linna.data import data_folder
+from linna.errors import UsageError
 from linna.output import emit, finish, log, progress
 from linna.parser import option
 
@@ -20,11 +22,11 @@ LISTED = 16
 
 if TYPE_CHECKING:
     from ground_service.client import Client
-    from ground_service.jobs.model import Job
+    from ground_service.jobs.service import Job
     from ground_service.regression.model import Build
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_regress(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="what", metavar="COMMAND", required=True)
     run = commands.add_parser(
         "run",
@@ -184,7 +186,6 @@ def _placebo(arguments: argparse.Namespace) -> int:
 def _suite(arguments: argparse.Namespace) -> int:
     from ground_service.regression.gates.core import detectable, power_text
     from ground_service.regression.gates.policy import load_policy
-    from linna.data import data_folder
     from payload_emulator.session.archive.suite import suite_scenarios, write_suite
 
     scenarios = suite_scenarios(arguments.scenario, frames=arguments.frames, seeds=arguments.seeds)
@@ -211,7 +212,6 @@ def _suite(arguments: argparse.Namespace) -> int:
 
 def _comparison(service: Client, arguments: argparse.Namespace, candidate: str, baseline: str) -> dict[str, Any]:
     """Return a request to compare two builds over archives, which are uploaded if needed."""
-    from linna.errors import UsageError
 
     if not arguments.archive and not arguments.passes:
         raise UsageError(f"regress {arguments.what}: expected --archive ARCHIVE or --pass ID, found neither")
@@ -291,7 +291,6 @@ def _percent() -> Callable[[Job], None]:
 
 def _archive(arguments: argparse.Namespace) -> int:
     from ground_service.regression import archives
-    from linna.errors import UsageError
 
     if arguments.action in ("add", "render", "pin", "unpin", "pack") and not arguments.target:
         raise UsageError(f"regress archive {arguments.action}: expected an archive, found none")
@@ -336,7 +335,6 @@ def _is_pass(target: str) -> bool:
 
 
 def _build(arguments: argparse.Namespace) -> int:
-    from linna.errors import UsageError
 
     if arguments.action == "register":
         if not arguments.file:

@@ -1,12 +1,12 @@
 """`linna render`: a frame of a scenario as a picture, or several on a labelled contact sheet."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 from pathlib import Path
 from typing import Any
 
+from linna.data import blender_python, data_folder
+from linna.errors import UsageError
 from linna.output import emit, finish, log, progress
 from linna.parser import number, option
 
@@ -16,7 +16,7 @@ TERRAINS = ("auto", "raster", "procedural")
 SHEET_COLUMNS = 3
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_render(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Render one frame; with --sheet several frames on one picture. Sheets take the epochs named, or --views "
         "frames spread over the scenario's observation windows."
@@ -34,7 +34,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run_render(arguments: argparse.Namespace) -> int:
-    from linna.errors import UsageError
 
     if arguments.out.suffix.lower() != ".png":
         raise UsageError(f"--out: expected a .png file, found {arguments.out.name}")
@@ -48,7 +47,6 @@ def run_render(arguments: argparse.Namespace) -> int:
 
 
 def _run_frame(arguments: argparse.Namespace) -> int:
-    from linna.data import blender_python, data_folder
     from lunar.timescales import parse_utc
     from payload_emulator.session.world.frame import render_frame
     from payload_emulator.training.data.dataset import write_whole
@@ -80,7 +78,6 @@ def _run_frame(arguments: argparse.Namespace) -> int:
 
 
 def _run_sheet(arguments: argparse.Namespace) -> int:
-    from linna.data import blender_python
     from payload_emulator.session.world.frame import take_frame, view_at
     from payload_emulator.training.evaluate.sheets import contact_sheet, draw_labels, eight_bits, save_png
 
@@ -124,7 +121,6 @@ def _scenario(arguments: argparse.Namespace) -> Any:
 
 def _views(arguments: argparse.Namespace) -> tuple[Any, list[int]]:
     """The world, and the epochs named or those spread over its observation windows."""
-    from linna.data import data_folder
     from lunar.timescales import parse_utc
     from payload_emulator.session.world.frame import window_epochs, world_at
 

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from linna.errors import UsageError
 from linna.output import emit, finish, save
 from linna.parser import option
 
@@ -24,7 +25,7 @@ _PAUSE_S = 0.03
 """Time between two frames of a file, so that a receiver loses none."""
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_tm(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     decode = commands.add_parser("decode", help="packets of a downlink (CADUs or bare packets) as JSON, CSV or Parquet")
@@ -91,8 +92,7 @@ def run_decode(arguments: argparse.Namespace) -> int:
 
 def _decode_foreign(arguments: argparse.Namespace) -> int:
     """Decode packets of another mission through its XTCE."""
-    from linna.errors import UsageError
-    from tmtc.xtce.records import format_xtce_records, xtce_records
+    from tmtc.xtce.series import format_xtce_records, xtce_records
 
     decoded, found, definition = _read_foreign(arguments)
     wanted, known = set(arguments.packet or ()), set(definition.containers)
@@ -149,7 +149,6 @@ def _read_foreign(arguments: argparse.Namespace) -> tuple[DownlinkDecode, XtceDe
 
 
 def _refuse_without_definition(arguments: argparse.Namespace) -> None:
-    from linna.errors import UsageError
 
     for name in ("container", "leading_size", "raw"):
         if getattr(arguments, name, None):
@@ -170,7 +169,7 @@ def run_xtce(arguments: argparse.Namespace) -> int:
 
 
 def run_yamcs(arguments: argparse.Namespace) -> int:
-    from tmtc.xtce.yamcs import yamcs_files
+    from tmtc.xtce.export import yamcs_files
 
     checksum, station = not arguments.no_frame_checksum, _address("--station", arguments.station)
     files = yamcs_files(arguments.spacecraft_id, arguments.frame_length, checksum, arguments.frame_port, station)
@@ -211,8 +210,6 @@ def _file_pieces(path: Path) -> Iterator[bytes]:
 def _received(address: tuple[str, int]) -> Iterator[bytes]:
     import socket
 
-    from linna.errors import UsageError
-
     try:
         connection = socket.create_connection(address)
     except OSError as error:
@@ -224,7 +221,6 @@ def _received(address: tuple[str, int]) -> Iterator[bytes]:
 
 
 def _address(option: str, text: str) -> tuple[str, int]:
-    from linna.errors import UsageError
 
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
@@ -290,7 +286,6 @@ def _link_settings(arguments: argparse.Namespace) -> LinkSettings | None:
 
 
 def _read(arguments: argparse.Namespace, dictionary: Dictionary | None = None) -> DownlinkDecode:
-    from linna.errors import UsageError
     from tmtc.arrays import as_octets
     from tmtc.dictionary.payload import DICTIONARY
     from tmtc.downlink import decode

@@ -1,4 +1,4 @@
-"""`linna user add | token | ensure | list | disable | enable | role | missions | tokens | revoke`: users and tokens."""
+"""`linna user | audit`: users, their tokens and missions; the audit log."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 from linna.commands._ground import add_service_options, local_actor, open_service
-from linna.commands._table import Command, Commands, CustomCommand, Option, add_commands
+from linna.commands._table import Command, Commands, CustomCommand, Option
+from linna.errors import UsageError
 from linna.output import emit, finish, log
 from linna.parser import option
 
 if TYPE_CHECKING:
-    from ground_service.access.model import Token, User
+    from ground_service.access.model import AuditEntry, Token, User
     from ground_service.client import Client
     from linna.parser import LinnaParser
+
 
 Role = Literal["viewer", "operator", "admin"]
 
@@ -68,7 +70,6 @@ def _ensure(arguments: argparse.Namespace) -> int:
     import os
 
     from ground_service.access.service import ensure_user
-    from linna.errors import UsageError
 
     token = os.environ.get(arguments.token_variable, "")
     if not token:
@@ -99,7 +100,7 @@ DAYS = {
     "days": Option("validity of the token in days (default: unlimited)", "D"),
     "missions": Option("only this mission; can be repeated (default: all)", "NAME", "--mission"),
 }
-COMMANDS: Commands = {
+USER: Commands = {
     "add": Command(
         _add, "add a user and print the token, which cannot be printed again", lambda made: made["token"], options=DAYS
     ),
@@ -152,5 +153,27 @@ COMMANDS: Commands = {
 }
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    add_commands(parser, COMMANDS)
+def _line(one: AuditEntry) -> str:
+    text = one.detail.get("text", "")
+    return f"{one.number:>6}  {one.time[:19]}Z  {one.actor:<12} {one.action} {one.target} {text}".rstrip()
+
+
+AUDIT = {
+    "list": Command(
+        "list_audit",
+        "list the entries, newest first",
+        _line,
+        "entries",
+        "no entries",
+        options={
+            "actor": Option("only entries of this user", "NAME"),
+            "action": "only actions that contain this text",
+            "target": "only entries with this target",
+        },
+    ),
+    "head": Command(
+        "get_audit_head",
+        "show number and hash of the newest entry, to be stored elsewhere",
+        lambda head: f"{head.number}:{head.sha256}",
+    ),
+}

@@ -8,7 +8,7 @@ import itertools
 from pathlib import Path
 
 from lunar.comparison import check_gravity
-from lunar.compressed import read_expanded
+from lunar.datafolder import read_expanded
 from lunar.ephemeris import Ephemeris
 from lunar.errors import DataFileError
 from lunar.messages.horizons import is_horizons, parse_horizons
@@ -20,8 +20,8 @@ from lunar.messages.stk import parse_stk
 EXPECTED = "a CCSDS OEM, STK .e or Horizons ephemeris"
 SPK_MARK = b"DAF/SPK"
 OCTETS_LIMIT = 96 << 20
-LINES_LIMIT = 1_000_000
-"""Limits of a file: a year of states each minute has 60 MB, and reading it takes 280 MB of memory."""
+LINES_LIMIT, LINE_OCTETS = 1_000_000, 1 << 16
+"""Limits of a file, and of a line that is not XML: a year of states each minute has 60 MB; reading it takes 280 MB."""
 
 _FIRST = "CCSDS_OEM_VERS, stk.v., XML or a Horizons table"
 
@@ -40,6 +40,10 @@ def load_ephemeris(path: Path | str) -> Ephemeris:
     octets = read_expanded(path, EXPECTED, OCTETS_LIMIT)
     if (lines := octets.count(b"\n")) > LINES_LIMIT:
         raise DataFileError(path, "", f"at most {LINES_LIMIT} lines", str(lines))
+    pieces = io.BytesIO(octets)
+    while line := pieces.readline(LINE_OCTETS + 1):
+        if len(line) > LINE_OCTETS and b"<" not in octets[:LINE_OCTETS]:
+            raise DataFileError(path, "", f"at most {LINE_OCTETS} octets in a line", "more")
     if octets.startswith(SPK_MARK):
         raise DataFileError(path, "", EXPECTED, "a SPICE kernel; convert it with 'linna orbit convert'")
     stream = io.TextIOWrapper(io.BytesIO(octets), "utf-8-sig")

@@ -1,4 +1,4 @@
-"""STK ephemeris files (``.e``), both ways.
+"""STK ephemeris files (``.e``), both ways; trajectories as CSV and TUM.
 
 Read are the formats EphemerisTimePosVel and EphemerisTimePosVelAcc (accelerations are not used) about the
 Moon in ICRF or J2000 axes, times in seconds since ScenarioEpoch (UTC).  An epoch that occurs twice in a row,
@@ -14,12 +14,13 @@ from itertools import pairwise
 
 import numpy as np
 
+from lunar import frames
 from lunar.arrays import FloatArray, IntArray
 from lunar.constants import NS
 from lunar.ephemeris import Ephemeris, EphemerisSegment, parse_numbers, resampled
 from lunar.errors import DataFileError, EphemerisError, TimeFormatError, UnknownFrameError, UnknownTimeSystemError
-from lunar.frames import ICRF_NAMES, J2000_NAMES, icrf_from_j2000
-from lunar.timescales import format_tai, parse_tai, utc_ns_from_tai_ns
+from lunar.timescales import format_tai, parse_tai, tdb_s_from_tai_ns, utc_ns_from_tai_ns
+from lunar.visibility import subsatellite
 
 _STATE_WIDTH = {"EPHEMERISTIMEPOSVEL": 7, "EPHEMERISTIMEPOSVELACC": 10}
 _UNITS_M = {"METERS": 1.0, "KILOMETERS": 1000.0, "METER": 1.0, "KILOMETER": 1000.0}
@@ -207,13 +208,13 @@ def _units_and_axes(source: str, header: dict[str, tuple[str, int]]) -> tuple[fl
         place = f"line {number}" if number else "header"
         raise DataFileError(source, place, "CentralBody Moon", repr(body) if number else "none, which means Earth")
     axes, number = header.get("COORDINATESYSTEM", ("Fixed", 0))
-    if axes.upper() in ICRF_NAMES:
+    if axes.upper() in frames.ICRF_NAMES:
         turn = np.eye(3)
-    elif axes.upper() in J2000_NAMES:
-        turn = icrf_from_j2000()
+    elif axes.upper() in frames.J2000_NAMES:
+        turn = frames.icrf_from_j2000()
     else:
         place = f"{source}: line {number}" if number else f"{source}: CoordinateSystem"
-        raise UnknownFrameError(axes, (*ICRF_NAMES, *J2000_NAMES), place)
+        raise UnknownFrameError(axes, (*frames.ICRF_NAMES, *frames.J2000_NAMES), place)
     return _UNITS_M[unit.upper()], turn
 
 
@@ -263,3 +264,47 @@ def _format_epoch(tai_ns: int) -> str:
 
 def _seconds(elapsed_ns: int) -> str:
     return f"{elapsed_ns // NS}.{elapsed_ns % NS:09d}"
+
+
+CSV_COLUMNS = (
+    *("utc", "x_km", "y_km", "z_km", "vx_km_s", "vy_km_s", "vz_km_s"),
+    *("latitude_deg", "longitude_deg", "altitude_km"),
+)
+
+
+def format_csv(ephemeris: Ephemeris, orientation: frames.Orientation) -> str:
+    """Return states (ICRF, Moon-centred) and sub-satellite points (mean-Earth, 0..360 E) as CSV text.
+
+    An epoch that two arcs share has two lines.
+    """
+    tai_ns, position_m, velocity_m_s = _states(ephemeris)
+    latitude, longitude, altitude_m = subsatellite(position_m, tdb_s_from_tai_ns(tai_ns), orientation)
+    states = np.concatenate([position_m, velocity_m_s], axis=1) / 1e3
+    places = np.stack([np.degrees(latitude), np.degrees(longitude) % 360.0, altitude_m / 1e3], axis=1)
+    row = "%s,%.9f,%.9f,%.9f,%.12f,%.12f,%.12f,%.8f,%.8f,%.6f"
+    values = np.concatenate([states, places], axis=1).tolist()
+    lines = [
+        row % (format_tai(t, 3 if t % 10**6 == 0 else 9), *v) for t, v in zip(tai_ns.tolist(), values, strict=True)
+    ]
+    return "\n".join([",".join(CSV_COLUMNS), *lines, ""])
+
+
+def format_tum(ephemeris: Ephemeris) -> str:
+    """Return poses in TUM form: seconds since 1970 UTC, ICRF metres, and the RTN axes as the body's attitude."""
+    tai_ns, position_m, velocity_m_s = _states(ephemeris)
+    icrf_from_rtn = np.swapaxes(frames.rtn_from_inertial(position_m, velocity_m_s), -1, -2)
+    # Scalar last in this format.
+    attitude = np.roll(frames.continuous_quaternions(frames.quaternion_from_matrix(icrf_from_rtn)), -1, axis=-1)
+    values = np.concatenate([position_m, attitude], axis=1).tolist()
+    row = "%d.%09d %.6f %.6f %.6f %.12f %.12f %.12f %.12f"
+    utc_ns = utc_ns_from_tai_ns(tai_ns).tolist()
+    lines = [row % (*divmod(t, NS), *v) for t, v in zip(utc_ns, values, strict=True)]
+    return "\n".join([*lines, ""])
+
+
+def _states(ephemeris: Ephemeris) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return the epochs, positions and velocities of all arcs."""
+    segments = resampled(ephemeris).segments
+    parts = zip(*((one.tai_ns, one.position_m, one.velocity_m_s) for one in segments), strict=True)
+    tai_ns, position_m, velocity_m_s = map(np.concatenate, parts)
+    return tai_ns, position_m, velocity_m_s

@@ -29,9 +29,10 @@ from lunar.timescales import parse_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.typed_toml import TableFault, read_table, toml_text
 from payload_emulator.sim.board.contact_plan import parse_clock_error, parse_outage
-from payload_emulator.sim.board.faults import parse_fault
 from payload_emulator.sim.board.link import LinkSection
+from payload_emulator.sim.board.platform import parse_fault
 from payload_emulator.sim.render.sensor import SensorModel
+from reports.values import Requirements
 
 SPACECRAFT_ID = 76
 """Spacecraft of a scenario that states none."""
@@ -295,36 +296,23 @@ class ReferenceSection:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class RequirementsSection:
-    """Limits that the mission description states for verdicts; a negative limit is not stated.
-
-    `estimator` names the estimator whose accuracy is judged; the default is the filter if it is used, otherwise the
-    first listed. Errors are 3-D position errors. Consistency is the share of passes of a consistent filter whose mean
-    NEES or NIS is inside its bounds. The temperature is the warning limit of the packet dictionary, the limits of other
-    resources leave a fifth free.
-    """
-
-    estimator: Literal["", "paper", "spherical", "anchored"] = ""
-    median_error_m: float = 100.0
-    p95_error_m: float = 300.0
-    better_than: tuple[str, ...] = ("propagate-only", "snapshot")
-    consistency_inside_percent: float = 90.0
-    packets_percent: float = 99.9
-    frames_percent: float = 99.0
-    images_percent: float = 95.0
-    recall: float = 0.25
-    precision: float = 0.8
-    anchor_reads: float = 0.0
-    resets: float = 0.0
-    cpu_percent: float = 80.0
-    memory_mib: float = -1.0
-    storage_percent: float = 80.0
-    temperature_max_c: float = 60.0
-    convergence_s: float = -1.0
-    drift_percent: float = -1.0
-    offset_px: float = -1.0
-    clock_step_s: float = -1.0
+REQUIREMENTS = Requirements(
+    median_error_m=100.0,
+    p95_error_m=300.0,
+    better_than=("propagate-only", "snapshot"),
+    consistency_inside_percent=90.0,
+    packets_percent=99.9,
+    frames_percent=99.0,
+    images_percent=95.0,
+    recall=0.25,
+    precision=0.8,
+    anchor_reads=0.0,
+    resets=0.0,
+    cpu_percent=80.0,
+    storage_percent=80.0,
+    temperature_max_c=60.0,
+)
+"""Limits of a scenario that states none; negative ones are not stated, except `temperature_min_c`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -352,7 +340,7 @@ class Scenario:
     link: LinkSection = field(default_factory=LinkSection)
     faults: FaultsSection = field(default_factory=FaultsSection)
     reference: ReferenceSection = field(default_factory=ReferenceSection)
-    requirements: RequirementsSection = field(default_factory=RequirementsSection)
+    requirements: Requirements = REQUIREMENTS
 
     @property
     def has_flat_ground(self) -> bool:
@@ -434,9 +422,12 @@ def parse_scenario(text: str, source: str = "scenario") -> Scenario:
             "or declare the packets of the instrument in the mission description"
         )
     dynamics = table.get("dynamics")
-    # Scenarios of archives state the integrator of versions that had two.
+    # Scenarios of archives state the integrator of versions that had two, and an empty estimator.
     if isinstance(dynamics, dict) and dynamics.pop("integrator", "rkn86") != "rkn86":
         raise ScenarioError(f"{source}: dynamics.integrator: only 'rkn86' is left; leave the key out")
+    requirements = table.get("requirements")
+    if isinstance(requirements, dict) and requirements.get("estimator") == "":
+        del requirements["estimator"]
     scenario = _read(table, source)
     _check(scenario, source)
     return scenario
@@ -456,17 +447,14 @@ def format_scenario(scenario: Scenario) -> str:
 
 
 def _section(name: str, values: Any) -> list[str]:
-    return [
-        "",
-        f"[{name}]",
-        *(f"{key.name} = {toml_text(getattr(values, key.name))}" for key in dataclasses.fields(values)),
-    ]
+    stated = ((key.name, getattr(values, key.name)) for key in dataclasses.fields(values))
+    return ["", f"[{name}]", *(f"{key} = {toml_text(value)}" for key, value in stated if value is not None)]
 
 
 def _read(table: object, source: str) -> Scenario:
     """Return the scenario from its table; a fault becomes one line that names source and key."""
     try:
-        return read_table(Scenario, table)
+        return read_table(Scenario, table, present=Scenario(""))
     except TableFault as fault:
         if not fault.known:
             raise ScenarioError(f"{source}: {fault.place} must be {fault.expected}, found {fault.found}") from None

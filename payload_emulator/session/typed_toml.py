@@ -4,8 +4,6 @@ A table names only what it sets; the rest keeps the defaults of the dataclass, o
 table changes. Types are strict: a whole number counts as a number, and nothing else is converted.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import math
@@ -13,7 +11,7 @@ from collections.abc import Callable, Sequence
 from enum import IntEnum
 from functools import lru_cache
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
 from pydantic_core import PydanticCustomError
@@ -198,7 +196,8 @@ def _fault(kind: type, error: ValidationError, path: str) -> TableFault:
         known = [item.name for item in dataclasses.fields(here)]
         return TableFault(f"{place}.{name}" if place else name, f"one of {', '.join(known)}", "an unknown key", known)
     if first["type"] == "literal_error":
-        choices = get_args(get_type_hints(here)[str(first["loc"][-1])])
+        hint = get_type_hints(here)[str(first["loc"][-1])]
+        choices = [one for kind in (hint, *get_args(hint)) if get_origin(kind) is Literal for one in get_args(kind)]
         return TableFault(place, f"one of {', '.join(map(repr, choices))}", found)
     return TableFault(place, str(context.get("expected", _EXPECTED.get(first["type"], first["msg"]))), found)
 

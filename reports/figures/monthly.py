@@ -7,6 +7,7 @@ import numpy as np
 from reports.arrays import FloatArray
 from reports.figures.canvas import Canvas, TimeScale, time_axis
 from reports.figures.theme import color
+from reports.text import utc_ns_of
 from reports.values import MonthlyReportValue
 
 _LEFT, _RIGHT, _BOTTOM, _TOP, _GAP = 0.85, 0.2, 0.50, 0.25, 0.22
@@ -23,7 +24,7 @@ def series(report: MonthlyReportValue) -> dict[str, FloatArray]:
 
 def draw_trend(canvas: Canvas, report: MonthlyReportValue, metrics: Mapping[str, tuple[str, str, float, int]]) -> None:
     """Draw one panel for each metric; vertical lines are changes of its level."""
-    starts = np.array([one.start_utc_ns for one in report.passes], dtype=np.int64)
+    starts = np.array([utc_ns_of(one.start) for one in report.passes], dtype=np.int64)
     room = max(int(starts.max() - starts.min()) // 40, 1_800_000_000_000)
     time = TimeScale(int(starts.min()) - room, int(starts.max()) + room)
     panels = series(report)
@@ -40,4 +41,4 @@ def draw_trend(canvas: Canvas, report: MonthlyReportValue, metrics: Mapping[str,
             axes.set_ylim(bottom=0.0, top=max(1.1 * scale * float(values[known].max()), 1e-6))
         for change in report.changes:
             if change.metric == name:
-                axes.axvline(float(time.x(change.utc_ns)), color=color("vermillion"), linewidth=1.1)
+                axes.axvline(float(time.x(utc_ns_of(change.time))), color=color("vermillion"), linewidth=1.1)

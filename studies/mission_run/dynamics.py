@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lunar.catalogue import save_catalogue
+from lunar.constants import DAY_NS
 from lunar.constants import NS as NS
 from lunar.datafolder import DataFolder
 from lunar.messages.oem import save_oem
@@ -31,7 +32,6 @@ from payload_emulator.session.world.world import (
 )
 from studies.mission_run.disturbances import ReferenceDisturbances
 
-DAY_NS = 86_400 * NS
 BEFORE_NS = 6 * 3600 * NS
 AHEAD_NS = 54 * 3600 * NS
 LAST_NS = 4 * 3600 * NS

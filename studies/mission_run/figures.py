@@ -10,13 +10,12 @@ import numpy as np
 
 from ground_service.evaluation.performance.model import PassPerformance
 from ground_service.planning.model import RequestPlan
-from lunar.constants import NS
+from lunar.constants import DAY_NS
 from studies.mission_run.ground import MissionGround
 
 UNKNOWN = "not known"
 """Reason of a missing window that no plan states."""
 
-DAY_NS = 86_400 * NS
 FLOWN = ("executing", "executed", "downlinked", "processed")
 
 
@@ -91,6 +90,7 @@ def closing_figures(
     alarms = [one.model_dump(mode="json") for one in ground.client.list_alarms(spacecraft_id=spacecraft_id)]
     interventions = ground.interventions(progress.posts)
     received = ground.packets_received(spacecraft_id)
+    apart = len(list(ground.client.list_implausible(spacecraft_id=spacecraft_id)))
     return {
         "end": progress.utc,
         "windows": {
@@ -107,7 +107,8 @@ def closing_figures(
         "packets": progress.packets,
         "packets_lost_on_link": progress.packets_lost_on_link,
         "packets_received": received,
-        "packets_lost": progress.packets - progress.packets_lost_on_link - received,
+        "packets_implausible": apart,
+        "packets_lost": progress.packets - progress.packets_lost_on_link - received - apart,
         "contacts": progress.contacts,
         "telecommands": progress.telecommands,
         "telecommand_octets_lost": progress.telecommand_octets_lost,

@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 from ground_service.access.model import AuditEntry
 from ground_service.access.service import RESERVED_NAMES
 from ground_service.client import Client
+from ground_service.client.connection import Unavailable, Unreachable
 from ground_service.client.local import local_client
-from ground_service.client.problems import Unavailable, Unreachable
 from ground_service.clock import ClockFile, set_mission_clock
 from ground_service.contacts.links import service as links
 from ground_service.contacts.links.runner import INCOMING

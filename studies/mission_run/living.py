@@ -10,6 +10,7 @@ from pathlib import Path
 from ground_service.client import Client
 from ground_service.clock import ClockFile
 from ground_service.errors import GroundError
+from lunar.constants import DAY_NS
 from lunar.datafolder import DataFolder
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.live.contacts import station_names
@@ -17,7 +18,7 @@ from payload_emulator.session.scenario import Scenario, format_scenario
 from payload_emulator.session.world.rims import Watched
 from payload_emulator.session.world.world import open_world
 from studies.harness.parts import Part, answers_http, bare_environment, free_port
-from studies.mission_run.dynamics import DAY_NS, FlightDynamics, write_flight
+from studies.mission_run.dynamics import FlightDynamics, write_flight
 
 WINDOWS_A_DAY = 12
 """A window in almost every revolution, so that a visitor sees one soon."""

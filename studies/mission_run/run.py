@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ground_service.clock import ClockFile, set_mission_clock
+from lunar.constants import DAY_NS
 from lunar.constants import NS as NS
 from lunar.datafolder import DataFolder
 from lunar.timescales import format_utc, parse_utc
@@ -22,7 +23,7 @@ from payload_emulator.session.scenario import Scenario, format_scenario, parse_s
 from payload_emulator.session.world.world import open_world
 from studies.mission_run.checkpoints import Checkpoints
 from studies.mission_run.disturbances import UNDISTURBED, Disturbances
-from studies.mission_run.dynamics import DAY_NS, LAST_NS, FlightDynamics
+from studies.mission_run.dynamics import LAST_NS, FlightDynamics
 from studies.mission_run.figures import Progress, closing_figures, months, note_plan, windows_asked
 from studies.mission_run.ground import POLL_S, SETTLE_S, EmbeddedGround, MissionGround
 from studies.mission_run.spacecraft import SpacecraftFiles, SpacecraftProcess

@@ -2,23 +2,21 @@
 
 import hashlib
 import struct
-from typing import Any
 
-from sqlalchemy import Connection, select
+from sqlalchemy import select
 
-from ground_service.ground import Ground
 from ground_service.store.repository import PACKETS, SAMPLES
 from ground_service.store.vehicles import vehicle_id
 
 _BOOKKEEPING = ("vehicle_id", "packet_id")
 
 
-def hash_of(ground: Ground) -> str:
+def hash_of(ground):
     """Return the hash of the archive of the spacecraft of the synthetic passes."""
     return ground.read(lambda connection: archive_hash(connection, vehicle_id(connection, 76, "flight")))
 
 
-def archive_hash(connection: Connection, vehicle: int) -> str:
+def archive_hash(connection, vehicle):
     """SHA-256 (hex) over the packets of a vehicle and all rows decoded from them, in an order of their content.
 
     Row numbers, times of arrival and the files that things came in are left out: they differ between two ways of
@@ -46,7 +44,7 @@ def archive_hash(connection: Connection, vehicle: int) -> str:
     return digest.hexdigest()
 
 
-def _update(digest: Any, row: Any) -> None:
+def _update(digest, row):
     for value in row:
         if value is None or (isinstance(value, float) and value != value):
             digest.update(b"n")

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import textwrap
 import types
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -47,7 +46,7 @@ from ground_service.client.connection import Connection, Document, Listing, impo
 class Spelling:
     """Python text of types; `modules` are the modules of entities that it names."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.modules: dict[str, str] = {}
         self._aliases = {
             value: (module.__name__, name)
@@ -57,18 +56,18 @@ class Spelling:
             if get_origin(value) is Literal
         }
 
-    def named(self, module: str, name: str) -> str:
+    def named(self, module, name):
         """Return the text of a name of a module of entities."""
         *_, package, last = module.split(".")
         alias = package if last == "model" else last
         self.modules[alias] = module
         return f"{alias}.{name}"
 
-    def model(self, model: Any) -> str:
+    def model(self, model):
         """Return the text of an entity."""
         return self.named(model.__module__, model.__name__)
 
-    def kind(self, kind: Any) -> str:
+    def kind(self, kind):
         """Return the text of the type of an argument."""
         origin, inner = get_origin(kind), get_args(kind)
         if kind in PLAIN:
@@ -89,13 +88,13 @@ class Spelling:
 class Argument:
     """An argument of a method."""
 
-    def __init__(self, name: str, kind: str, default: object = inspect.Parameter.empty) -> None:
+    def __init__(self, name, kind, default=inspect.Parameter.empty):
         self.name = name
         self.required = default is inspect.Parameter.empty
         self.text = f"{name}: {kind}" if self.required else f"{name}: {kind} = {default!r}"
 
 
-def fields_of(fields: Mapping[str, Any], spelling: Spelling) -> Iterator[Argument]:
+def fields_of(fields, spelling):
     """Yield the fields of a query or body as arguments; a default that is made by a function is left out."""
     for name, field in fields.items():
         kind = spelling.kind(field.annotation)
@@ -107,10 +106,10 @@ def fields_of(fields: Mapping[str, Any], spelling: Spelling) -> Iterator[Argumen
             yield Argument(name, kind, field.default)
 
 
-def is_flat(model: type[BaseModel]) -> bool:
+def is_flat(model):
     """Return whether the fields of a body are arguments: a few plain values, or a single field."""
 
-    def is_plain(kind: Any) -> bool:
+    def is_plain(kind):
         origin = get_origin(kind)
         if origin is Annotated:
             return is_plain(get_args(kind)[0])
@@ -122,7 +121,7 @@ def is_flat(model: type[BaseModel]) -> bool:
     return len(fields) == 1 or (len(fields) <= FEW and all(is_plain(field.annotation) for field in fields))
 
 
-def method_of(route: APIRoute, spelling: Spelling) -> str:
+def method_of(route, spelling):
     """Return the text of the method of an operation."""
     dependant = route.dependant
     (verb,) = route.methods
@@ -173,7 +172,7 @@ def method_of(route: APIRoute, spelling: Spelling) -> str:
     )
 
 
-def result_of(route: APIRoute, is_paged: bool, spelling: Spelling) -> str:
+def result_of(route, is_paged, spelling):
     """Return the type of the result of an operation."""
     model = route.response_model
     if model is None:
@@ -186,7 +185,7 @@ def result_of(route: APIRoute, is_paged: bool, spelling: Spelling) -> str:
     return spelling.model(model)
 
 
-def generate() -> str:
+def generate():
     """Return the module of the operations."""
     routers = [one.load() for one in OPERATIONS]
     spelling = Spelling()

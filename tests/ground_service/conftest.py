@@ -15,33 +15,36 @@ import socket
 import subprocess
 import tempfile
 import threading
-from collections.abc import Callable
+from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from fastapi import routing
 from httpx._transports import default as httpx_transports
 from sqlalchemy import create_engine, text
+from sqlalchemy.util import LRUCache
 
 from ground_service.access.service import add_user
 from ground_service.app import DescribedApi, create_app
 from ground_service.clock import set_mission_clock, utc_now_ns
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.passes.service import define_pass
 from ground_service.settings import Settings
 from ground_service.store import database as databases
-from ground_service.store.database import Database, open_database, prepare_database, schema_revisions
+from ground_service.store.database import open_database, prepare_database, schema_revisions
 from ground_service.worker.follow_up import follow_in_process
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
-from lunar.catalogue import CraterCatalogue, make_catalogue, save_catalogue, size_class
+from lunar.catalogue import make_catalogue, save_catalogue, size_class
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc, parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
+from reports.drawings import Drawings
 from tests.serving import TestClient, wait_for
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
@@ -63,7 +66,7 @@ MANIFEST = """{"schema_version": 1, "pass_name": "synthetic pass", "scenario": "
     "gravity": {"truth": "GRGM1200L (12x12, built in)", "degree": 12}}"""
 
 
-def cells(table: str) -> list[list[str]]:
+def cells(table):
     """Return the cells of a table: each line is a row, and bars separate its cells."""
     return [[cell.strip() for cell in row.split("|")] for row in table.strip().splitlines()]
 
@@ -90,13 +93,63 @@ def one_description():
     """Make the OpenAPI document, which is the same for every application, once: it takes two seconds."""
     describe, made = DescribedApi.openapi, list[dict[str, Any]]()
 
-    def openapi(app: DescribedApi) -> dict[str, Any]:
+    def openapi(app):
         made[:] = made or [describe(app)]
         return made[0]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(DescribedApi, "openapi", openapi)
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_set_of_routes():
+    """Resolve the routes, which are the same for every application, once: the first request would do it in 0.2 s."""
+    resolve, made = routing._EffectiveRouteContext.from_api_route, dict[tuple[int, str], Any]()
+
+    def from_api_route(*, original_route, include_context):
+        key = (id(original_route), include_context.path_for(original_route))
+        if key not in made:
+            made[key] = resolve(original_route=original_route, include_context=include_context)
+        return made[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(routing._EffectiveRouteContext, "from_api_route", from_api_route)
+        yield
+
+
+class Statements(LRUCache):
+    """Compiled statements by all of their key but its first part, the dialect, of which each engine has its own."""
+
+    def get(self, key, default=None):
+        return super().get(key[1:], default)
+
+    def __setitem__(self, key, value):
+        super().__setitem__(key[1:], value)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_set_of_statements():
+    """Compile a statement once for all databases of a kind: it is half of the time of an import into a new one."""
+    create, kept = databases.create_engine, defaultdict(lambda: Statements(4000))
+
+    def create_engine(*given, **options):
+        engine = create(*given, **options)
+        engine._compiled_cache = kept[engine.dialect.name]
+        return engine
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(databases, "create_engine", create_engine)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def undrawn_figures():
+    """Leave the figures of reports blank: they are the larger part of the time of a report; what draws is yielded."""
+    draw = Drawings.svg
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Drawings, "svg", lambda *_: '<svg viewBox="0 0 1 1"></svg>')
+        yield draw
 
 
 @pytest.fixture
@@ -123,7 +176,7 @@ def copied_schema(tmp_path_factory):
     migrate(made)
     whole = schema_revisions(made)
 
-    def upgrade(database: Database, revision: str = "head") -> None:
+    def upgrade(database, revision="head"):
         with lock:
             is_new = database.dialect == "sqlite" and schema_revisions(database) == (None, *whole[1:])
             if revision != "head" or not is_new:
@@ -151,20 +204,20 @@ class SyntheticPass:
 class Downlink:
     """Packets of a payload with the sequence counts of their APIDs."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.sequencer, self.packets = PacketSequencer(), list[bytes]()
 
-    def send(self, name: str, values: dict[str, Any], ticks: int) -> None:
+    def send(self, name, values, ticks):
         count = self.sequencer.next(DICTIONARY.packet(name).apid)
         self.packets.append(DICTIONARY.pack(name, values, ticks=ticks, sequence_count=count))
 
 
-def encode_downlink(packets: list[bytes]) -> bytes:
+def encode_downlink(packets):
     """CADUs of the synthetic spacecraft."""
     return encode_cadus(packets, spacecraft_id=SPACECRAFT)
 
 
-def circular_states(utc_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def circular_states(utc_ns):
     """ICRF states (n, 3) of a circular orbit, inclined by 80 degrees to the ICRF equator."""
     radius = MOON_RADIUS_M + ALTITUDE_M
     rate = np.sqrt(GM_MOON_M3_S2 / radius**3)
@@ -176,14 +229,14 @@ def circular_states(utc_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return radius * (c * along + s * across), radius * rate * (c * across - s * along)
 
 
-def save_circle(path: Path, start_utc_ns: int = START, hours: float = 4.0) -> Path:
+def save_circle(path, start_utc_ns=START, hours=4.0):
     """Write an ephemeris of the circular orbit."""
     utc_ns = start_utc_ns + np.arange(0, round(hours * 3600), 60, dtype=np.int64) * NS
     save_oem(ephemeris_from_states(utc_ns, *circular_states(utc_ns)), path)
     return path
 
 
-def _catalogue(latitude_rad: np.ndarray, longitude_rad: np.ndarray, rng: np.random.Generator) -> CraterCatalogue:
+def _catalogue(latitude_rad, longitude_rad, rng):
     """Craters on a jittered grid of half a degree around the track, so that no two are near one another."""
     cells = np.unique(np.round(np.degrees(np.column_stack([latitude_rad, longitude_rad])) / 0.5).astype(int), axis=0)
     grid = np.unique(
@@ -201,14 +254,8 @@ def make_pass(tmp_path_factory):
     """A function that writes a synthetic pass archive of `frames` frames."""
 
     def make(
-        frames: int = 40,
-        seed: int = 1,
-        encode: Callable[[list[bytes]], bytes] = encode_downlink,
-        camera: PinholeCamera = PinholeCamera(),
-        tilt_rad: float = 0.0,
-        filter_nis: float | None = None,
-        mission: str = "",
-    ) -> SyntheticPass:
+        frames=40, seed=1, encode=encode_downlink, camera=PinholeCamera(), tilt_rad=0.0, filter_nis=None, mission=""
+    ):
         folder = tmp_path_factory.mktemp("archive")
         rng = np.random.default_rng(seed)
         utc_ns = START + np.arange(frames, dtype=np.int64) * CADENCE_S * NS
@@ -299,7 +346,7 @@ def make_pass(tmp_path_factory):
     return make
 
 
-def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
+def write_manifest(folder, manifest):
     """Write manifest.json over the files that lie in `folder`."""
     files = {}
     for path in sorted(folder.rglob("*")):
@@ -310,29 +357,29 @@ def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     (folder / "manifest.json").write_text(json.dumps({**manifest, "files": files}))
 
 
-def enter_files(folder: Path, **changed: Any) -> None:
+def enter_files(folder, **changed):
     """Enter the files of a pass archive in its manifest again, and change other keys of it."""
     write_manifest(folder, json.loads((folder / "manifest.json").read_text()) | changed)
 
 
-def add_reference(ground: Ground, path: Path) -> int:
+def add_reference(ground, path):
     """Add a reference ephemeris."""
     return add_ephemeris(ground, ground.files.put_file(path), name="reference").id
 
 
-def event_packet(ticks: int, count: int, event: str | int = "mode_changed", frame: int = 0) -> bytes:
+def event_packet(ticks, count, event="mode_changed", frame=0):
     """Return the packet of an event report without values."""
     values = {"event_id": event, "frame_number": frame, "value_1": 0.0, "value_2": 0.0}
     return DICTIONARY.pack("event_info", values, ticks=ticks, sequence_count=count)
 
 
-def define_pass_of(ground: Ground, made: Any) -> int:
+def define_pass_of(ground, made):
     """Define a pass of the spacecraft from a second before the first frame to a second after the last one."""
     start, stop = int(made.utc_ns[0]) - NS, int(made.utc_ns[-1]) + NS
     return define_pass(ground, name="p", start_utc_ns=start, stop_utc_ns=stop, spacecraft_id=SPACECRAFT)
 
 
-def _housekeeping(k: int) -> dict[str, Any]:
+def _housekeeping(k):
     values: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
     known = json.loads('{"structure_id": 1, "boot_count": 1, "mode": "observing", "bus_voltage_v": 12.0}')
     return values | known | {"frames_processed": k, "temperature_c": 20.0 + 0.1 * k}
@@ -379,7 +426,7 @@ def make_flyable(make_pass):
 
     from tmtc.dictionary.definitions import format_dictionary
 
-    def make(frames: int = 12, seed: int = 1, **options: Any) -> FlyablePass:
+    def make(frames=12, seed=1, **options):
         made = make_pass(frames=frames, seed=seed, **options)
         folder = made.folder
         (folder / "payload").mkdir()
@@ -416,14 +463,7 @@ costs = json.loads((build / "costs.json").read_text())
 def make_build(tmp_path_factory):
     """A function that writes a build: a program that sends packets prepared for each pass, or any other script."""
 
-    def make(
-        name: str,
-        packets: dict[str, list[bytes]] | None = None,
-        *,
-        program: str = PROGRAM,
-        network_ms: float = 10.0,
-        extra: str = "",
-    ) -> Path:
+    def make(name, packets=None, *, program=PROGRAM, network_ms=10.0, extra=""):
         folder = tmp_path_factory.mktemp("builds") / f"build-{name}"
         folder.mkdir()
         files = {"fly.py": program, "costs.json": json.dumps({"network": network_ms})}
@@ -441,7 +481,7 @@ def make_build(tmp_path_factory):
     return make
 
 
-def free_port() -> int:
+def free_port():
     """A port that nobody listens on now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -463,7 +503,7 @@ def redis_url():
         words = f"--aclfile {users} --port {port} --bind 127.0.0.1 --dir {folder} --appendonly no".split()
         server = subprocess.Popen([program, *words, "--save", ""], stdout=subprocess.DEVNULL)
 
-        def answers() -> bool:
+        def answers():
             with socket.socket() as probe:
                 return probe.connect_ex(("127.0.0.1", port)) == 0
 
@@ -488,7 +528,7 @@ def postgres_server():
         shutil.chown(folder, "postgres", "postgres")
     data = folder / "data"
 
-    def run(command: str, *arguments: str, check: bool = True) -> None:
+    def run(command, *arguments, check=True):
         program, *words = command.split()
         whole = [*as_user, str(found[-1].with_name(program)), *words, *arguments]
         subprocess.run(whole, check=check, cwd=folder, stdout=subprocess.DEVNULL)
@@ -503,7 +543,7 @@ def postgres_server():
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _create_database(server: str, name: str, template: str = "template1") -> str:
+def _create_database(server, name, template="template1"):
     engine = create_engine(f"{server}/postgres", isolation_level="AUTOCOMMIT")
     with engine.connect() as connection:
         connection.execute(text(f"CREATE DATABASE {name} TEMPLATE {template}"))
@@ -538,7 +578,7 @@ class Clock:
 
     utc_ns: int = field(default_factory=utc_now_ns)
 
-    def advance(self, seconds: float) -> None:
+    def advance(self, seconds):
         self.utc_ns += round(seconds * 1e9)
 
 

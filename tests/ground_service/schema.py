@@ -1,13 +1,9 @@
 """Schema of a database as plain values, to compare two databases."""
 
-from typing import Any
-
 from sqlalchemy import inspect, text
 
-from ground_service.store.database import Database
 
-
-def described_schema(database: Database) -> dict[str, Any]:
+def described_schema(database):
     """Return columns, keys, constraints and indexes of every table, except the table of Alembic."""
     with database.reading() as connection:
         inspector = inspect(connection)

@@ -80,7 +80,7 @@ def test_a_conversion_prints_as_many_states_as_it_writes(tmp_path, typed, ending
 def test_figures_of_states_that_gravity_does_not_move_are_refused(tmp_path, typed):
     (one,) = polar_orbit(2.0).segments
     save_oem(Ephemeris((replace(one, velocity_m_s=0.9 * one.velocity_m_s),)), tmp_path / "slow.oem")
-    line = typed(f"orbit visibility {tmp_path}/slow.oem", 2)
+    line = typed(f"orbit convert {tmp_path}/slow.oem --out {tmp_path}/fast.oem", 2)
     assert "expected an acceleration of" in line and "% off" in line
 
 
@@ -98,20 +98,6 @@ def test_a_file_cut_short_is_one_line(oem_path, tmp_path, typed):
     cut = tmp_path / "cut.oem"
     cut.write_text(oem_path.read_text()[:2000])
     assert "cut.oem: line" in typed(f"orbit compare {cut} {oem_path}", 2)
-
-
-def test_visibility_lists_eclipses_and_the_contacts_of_a_station(oem_path, typed):
-    figures = typed(f"orbit visibility {oem_path} --station Madrid=40.43,-4.25,830 --json")
-    assert len(figures["eclipses"]) in (25, 26, 27)  # a revolution of 111 min, 48 h
-    assert figures["contacts"]["Madrid"]
-    assert 1.1 < figures["light_time_s"]["min"] < figures["light_time_s"]["max"] < 1.4  # s
-    first, second, *_ = figures["eclipses"]
-    assert first["stop"] < second["start"]
-
-
-@pytest.mark.parametrize("station", ["Madrid", "Madrid=here", "Madrid=400,0", "=1,2", "Madrid=1"])
-def test_a_station_that_cannot_be_read_is_one_line(oem_path, typed, station):
-    assert "expected NAME=LATITUDE,LONGITUDE" in typed(f"orbit visibility {oem_path} --station {station}", 2)
 
 
 def test_interpolate_gives_states_at_the_epochs_of_a_file(oem_path, tmp_path, typed):

@@ -24,7 +24,7 @@ def document(tmp_path_factory):
         find_spec = importlib.util.find_spec
         patch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "torch" else find_spec(name, *a))
         patch.setattr(paper_steps, "QUICK", SMALL)
-        patch.setattr("linna.commands.paper.log", lines.append)
+        patch.setattr("linna.commands.study.log", lines.append)
         patch.delenv("LINNA_DATA", raising=False)
         patch.setenv("XDG_DATA_HOME", str(out.parent))
         words = ["paper", "--quick", "--out", str(out)]

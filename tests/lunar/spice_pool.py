@@ -20,7 +20,7 @@ DELTET/DELTA_AT  = ( 36, @2015-JUL-1
 
 
 @contextmanager
-def kernels(folder, **octets: bytes | str):
+def kernels(folder, **octets):
     """Yield spiceypy with leap seconds and the given kernels (name = content) loaded."""
     spiceypy.kclear()
     try:

@@ -209,6 +209,7 @@ OWN = """id,latitude_deg,longitude_deg,diameter_m,rim_height_m,depth_m,complete
     ("1.7", "", "", "line 3, column id: expected a whole number, found 1.7"),
     ("3", ",112.0,", ",1737512.0,", "line 2: expected a rim height"),
     ("3", ",1060.0,1", ",1060.0,yes", "line 2, column complete"),
+    ("3", "depth_m,complete", "depth_m,depth_m", "line 1: expected each column once, found depth_m 2 times"),
 ])  # fmt: skip
 def test_two_craters_of_one_id_and_impossible_values_are_refused(tmp_path, identity, old, new, message):
     path = tmp_path / "own.csv"

@@ -30,7 +30,7 @@ from lunar.frames import (
     rtn_from_inertial,
     spherical_from_mcmf,
 )
-from lunar.ground_track import even_epochs, ground_track
+from lunar.visibility import even_epochs, ground_track
 from tests.lunar.orbits import polar_orbit
 
 SPICE = json.loads(Path(__file__).parents[1].joinpath("references/lunar/spice_moon_rotations.json").read_text())

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from lunar import _dynamics_kernel
+from lunar._tableaux import DOP853_A, DOP853_B, DOP853_C
 from lunar.comparison import compare
 from lunar.constants import GM_EARTH_M3_S2, GM_SUN_M3_S2, MOON_RADIUS_M, NS, SPEED_OF_LIGHT_M_S
 from lunar.elements import Elements, elements_from_state, state_from_elements
@@ -126,7 +127,7 @@ def across_the_light():
 
 
 def pushed(position_m):
-    """What sunlight adds to the acceleration at a place, m/s^2."""
+    """Return the acceleration by sunlight at a place, m/s^2."""
     return acceleration(SUNLIT, position_m) - acceleration(DARK, position_m)
 
 
@@ -168,6 +169,13 @@ def test_sunlight_moves_a_low_orbit_by_what_its_push_does_in_ten_minutes():
     expected_m = f / n**2 * math.hypot(1 - math.cos(600 * n), 2 * (600 * n - math.sin(600 * n)))
     # The push turns with the Sun, not with the orbit: 0.57 rad over the ten minutes.
     assert np.linalg.norm(lit[:3] - dark[:3]) == pytest.approx(expected_m, rel=0.1)
+
+
+def test_the_coefficients_of_transition_matrices_are_those_of_scipy():
+    from scipy.integrate import DOP853
+
+    for ours, theirs in ((DOP853_A, DOP853.A), (DOP853_B, DOP853.B), (DOP853_C, DOP853.C)):
+        assert_array_equal(ours, theirs)
 
 
 @pytest.mark.parametrize("duration_s", [900.0, -900.0])
@@ -219,6 +227,12 @@ def test_whole_arrays_of_epochs_keep_their_shape():
         many = position(times)
         assert many.shape == (2, 3, 3)
         assert_allclose(many[1, 2], position(times[1, 2]), atol=1e-3)  # m
+
+
+def test_many_epochs_have_the_positions_of_each():
+    times = 9e8 + np.arange(2100.0).reshape(3, 700) * 60.0
+    for position in (earth_position_icrf_m, sun_position_icrf_m):
+        assert_allclose(position(times)[::2, ::50], position(times[::2, ::50]), rtol=0.0, atol=0.02)  # m
 
 
 ELAPSED_S = np.arange(200) * 30.0

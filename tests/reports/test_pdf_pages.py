@@ -2,6 +2,7 @@
 
 import io
 import logging
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -149,6 +150,22 @@ def test_a_fault_of_typesetting_is_one_line(tmp_path):
     with pytest.raises(RuntimeError, match=r"^PDF of a report: expected a document, found: .*unknown") as raised:
         _typeset(tmp_path)
     assert "\n" not in str(raised.value)
+
+
+def test_the_characters_of_the_font_are_known_without_matplotlib_the_second_time(tmp_path):
+    program = (
+        "import sys\n"
+        "from reports.pdf_pages import _characters\n"
+        "print(ord('σ') in _characters(), ord('月') in _characters(), 'matplotlib' in sys.modules)"
+    )
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", program],
+            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept")}, capture_output=True, text=True, check=True,
+        ).stdout
+        for _ in range(2)
+    ]  # fmt: skip
+    assert said == ["True False True\n", "True False False\n"]
 
 
 def test_a_kept_figure_is_shown_again_unless_it_is_damaged_or_of_another_version(tmp_path, monkeypatch, caplog):

@@ -210,7 +210,7 @@ _PARAMETERS = {
 APID_HOUSEKEEPING, APID_EVENT, APID_DUMP, APID_BARE = 0x064, 0x065, 0x066, 0x3E7
 
 
-def _either(*conditions: tuple[str, str, object]):
+def _either(*conditions):
     listed = "".join(
         f'<Condition><ParameterInstanceRef parameterRef="{p}" useCalibratedValue="false"/>'
         f"<ComparisonOperator>{o}</ComparisonOperator><Value>{v}</Value></Condition>"

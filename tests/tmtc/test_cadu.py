@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from tmtc.link.cadu import ASM, cadu_octets, synchronise
-from tmtc.link.marker_survey import survey_markers
+from tmtc.link.link_check import survey_markers
 
 PERIOD = 128
 PLACES = list(range(0, 20 * PERIOD, PERIOD))
@@ -160,7 +160,7 @@ def test_a_frame_with_a_worn_marker_and_no_neighbours_is_accepted_only_when_it_p
     assert starts(stream, verify=lambda sync: sync.offsets == 4 * PERIOD) == [4 * PERIOD]
 
 
-def test_the_period_is_told_from_the_whole_stream_however_long_the_noise_before_it():
+def test_the_period_is_found_in_the_whole_stream_however_long_the_noise_before_it():
     noise = noise_of(5_000_000, 7)
     assert find_period(np.concatenate((noise, stream_of(40)))) == PERIOD
 

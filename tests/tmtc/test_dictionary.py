@@ -27,9 +27,8 @@ from tmtc.dictionary.definitions import format_dictionary, parse_dictionary
 from tmtc.dictionary.effects import CARRIER, EFFECTS, FUNCTION, Effect, effect_of
 from tmtc.dictionary.estimates import filter_estimates
 from tmtc.dictionary.event_texts import EVENT_TEXTS, event_text
-from tmtc.dictionary.fields import Field
+from tmtc.dictionary.fields import PARAMETERS, Field
 from tmtc.dictionary.icd import format_icd
-from tmtc.dictionary.onboard_parameters import PARAMETERS
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import (
     ALARM,
@@ -42,8 +41,8 @@ from tmtc.dictionary.schema import (
     limit_states,
 )
 from tmtc.errors import ChecksumError, MalformedPacket, TruncatedPacket, UnknownPacket, ValueRefused
+from tmtc.packets.large_data import HEADER, Thumbnail, pack_thumbnail, unpack_thumbnail
 from tmtc.packets.stream import cut_packets
-from tmtc.packets.thumbnails import HEADER, Thumbnail, pack_thumbnail, unpack_thumbnail
 
 HOUSEKEEPING = {f.name: 1 for f in DICTIONARY.packet("housekeeping").fields} | {
     "mode": "observing", "frames_processed": 148, "frames_bad": 2, "detections_total": 4000, "packets_sent": 900,

@@ -20,10 +20,8 @@ from tmtc.downlink import (
 )
 from tmtc.errors import LinkFormatError, ValueRefused
 from tmtc.link.cadu import ASM
-from tmtc.link.frames import Clcw, pack_clcw, unpack_clcw
-from tmtc.link.randomiser import randomise
-from tmtc.packets.crc import append_crc
-from tmtc.packets.space_packets import PacketSequencer, pack_packet
+from tmtc.link.frames import Clcw, pack_clcw, randomise, unpack_clcw
+from tmtc.packets.space_packets import PacketSequencer, append_crc, pack_packet
 
 # Packet of the altimeter that the payload had until commit 7787a11f, from a recording.
 WITHDRAWN = bytes.fromhex(

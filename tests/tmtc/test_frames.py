@@ -5,7 +5,6 @@ import pytest
 from spacepackets.ccsds.tm_frame import TmFramePrimaryHeader
 
 from tmtc.errors import ChecksumError, FrameError, LinkFormatError, TruncatedPacket
-from tmtc.link.clcw import uplink_seen
 from tmtc.link.frames import (
     Clcw,
     append_frame_checksums,
@@ -13,10 +12,12 @@ from tmtc.link.frames import (
     frame_headers,
     idle_data,
     pack_clcw,
+    randomise,
+    sequence,
     unpack_clcw,
+    uplink_seen,
 )
-from tmtc.link.randomiser import randomise, sequence
-from tmtc.packets.crc import append_crc, check_crc, crc16
+from tmtc.packets.space_packets import append_crc, check_crc, crc16
 
 HEADERS = (
     # version 00, spacecraft 0001001100, channel 010, OCF 1 | 5 | 6 | flags 000, segment length id 11, pointer 10
@@ -96,7 +97,7 @@ def test_octets_with_their_checksum_leave_no_remainder():
     check_crc(octets, "test")
 
 
-def test_a_wrong_checksum_is_told_with_both_values():
+def test_a_wrong_checksum_is_reported_with_both_values():
     with pytest.raises(ChecksumError, match="expected checksum 0x29B1, found 0x0000"):
         check_crc(b"123456789\0\0", "test")
     with pytest.raises(TruncatedPacket):
@@ -139,7 +140,7 @@ def test_an_unknown_randomiser_is_refused():
 TYPE_TWO_REPORT = 0x8000_0001
 
 
-def words(*clcws: Clcw | int):
+def words(*clcws):
     return np.array(
         [one if isinstance(one, int) else int.from_bytes(pack_clcw(one), "big") for one in clcws], dtype=np.uint32
     )

@@ -7,7 +7,7 @@ import numpy as np
 
 from tmtc.arrays import FloatArray, IntArray
 from tmtc.dictionary.schema import Table
-from tmtc.packets.cuc import onboard_ticks
+from tmtc.packets.pus import onboard_ticks
 
 ESTIMATE_PACKETS = ("filter_state", "filter_estimate")
 """Packets that carry an estimate: in version 2, and from version 3 on."""

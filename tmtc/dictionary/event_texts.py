@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 from tmtc.dictionary.codes import EVENTS, FAILURES, IMAGE_QUALITIES, MODES, RESET_TRIGGERS, TABLES, Labels
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 _EPOCH = datetime(2000, 1, 1)
 

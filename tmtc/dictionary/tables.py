@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tmtc.arrays import BoolArray, FloatArray, IntArray
 from tmtc.errors import TableError
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 MAGIC = b"LINNATBL"
 VERSION = 1

@@ -8,8 +8,7 @@ import numpy.typing as npt
 
 from tmtc.arrays import BoolArray, IntArray, OctetArray, as_octets
 from tmtc.link import cadu, reed_solomon
-from tmtc.link.frames import TmFrameHeaders, frame_checksums_hold, frame_headers
-from tmtc.link.randomiser import randomise
+from tmtc.link.frames import TmFrameHeaders, frame_checksums_hold, frame_headers, randomise
 from tmtc.link.settings import LinkSettings
 
 _BATCH = 512

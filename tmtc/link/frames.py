@@ -1,4 +1,4 @@
-"""TM transfer frames: header, operational control field (CLCW), frame error control; many frames at once.
+"""TM transfer frames: header, control field (CLCW) and its summary, error control, randomiser; many frames at once.
 
 References
 ----------
@@ -8,13 +8,18 @@ synchronisation flag, packet order flag (1 each), segment length id 11 (2), firs
 232.0-B 4.2 for the CLCW.
 """
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from tmtc.arrays import BoolArray, IntArray, OctetArray
-from tmtc.errors import FrameError, TruncatedPacket, ValueRefused
-from tmtc.packets.crc import CRC_LENGTH, crc16
+from tmtc.errors import FrameError, LinkFormatError, TruncatedPacket, ValueRefused
+from tmtc.packets.space_packets import CRC_LENGTH, crc16
 
 FRAME_HEADER_LENGTH = 6
 FRAME_MAX_LENGTH = 2048
@@ -137,3 +142,131 @@ def idle_data(length: int) -> bytes:
     for n in range(32, 8 * length):
         bits.append(bits[n - 1] ^ bits[n - 2] ^ bits[n - 22] ^ bits[n - 32])
     return np.packbits(np.array(bits[: 8 * length], dtype=np.uint8)).tobytes()
+
+
+Randomiser = Literal["none", "legacy", "long", "telecommand"]
+
+# s[n + degree] is the sum of s[n + tap] over the taps; first bits of the sequence
+_REGISTERS: dict[str, tuple[int, tuple[int, ...], str]] = {
+    "legacy": (8, (0, 3, 5, 7), "11111111"),
+    "long": (17, (0, 14), "00011100011100011"),
+    "telecommand": (8, (0, 1, 2, 3, 4, 6), "11111111"),
+}
+
+
+def sequence(randomiser: str, length: int) -> OctetArray:
+    """The first `length` octets of the sequence; zeros for `none`."""
+    if randomiser == "none":
+        return np.zeros(length, dtype=np.uint8)
+    period = _period(randomiser)
+    return period[np.arange(length) % period.size]
+
+
+def randomise(frames: OctetArray, randomiser: str) -> OctetArray:
+    """`frames` (..., n) with the sequence added to each, which also takes it away again."""
+    if randomiser == "none":
+        return frames
+    return frames ^ sequence(randomiser, frames.shape[-1])
+
+
+@functools.cache
+def _period(randomiser: str) -> OctetArray:
+    try:
+        degree, taps, start = _REGISTERS[randomiser]
+    except KeyError:
+        known = ", ".join(("none", *_REGISTERS))
+        raise LinkFormatError(f"randomiser: expected one of {known}, found {randomiser!r}") from None
+    bits = [int(digit) for digit in start]
+    # a period of an odd number of bits fills whole octets after eight of them
+    count = 8 * ((1 << degree) - 1)
+    for n in range(len(bits), count):
+        bit = 0
+        for tap in taps:
+            bit ^= bits[n - degree + tap]
+        bits.append(bit)
+    return np.packbits(np.array(bits[:count], dtype=np.uint8))
+
+
+@dataclass(frozen=True, slots=True)
+class UplinkSeen:
+    """The telecommand channel of a spacecraft as a stretch of its frames shows it.
+
+    The first numbers count frames: with a CLCW of the channel, and with each flag set in it; `changes` counts words
+    that differ from the one before. The others are those of the newest word: `report_value` is the number of the
+    sequence-controlled frame that is expected next, `farm_b_counter` counts accepted expedited frames modulo 4.
+    """
+
+    virtual_channel: int
+    frames: int
+    changes: int
+    frames_lockout: int
+    frames_wait: int
+    frames_retransmit: int
+    frames_no_rf: int
+    report_value: int
+    farm_b_counter: int
+    lockout: bool
+    wait: bool
+    retransmit: bool
+    no_rf_available: bool
+    no_bit_lock: bool
+
+    def followed_by(self, later: UplinkSeen, sign: int = 1) -> UplinkSeen:
+        """Both stretches, the newest word from `later`; `sign` -1 takes the counts of `later` off, and nothing else."""
+        counts = {
+            name: getattr(self, name) + sign * getattr(later, name)
+            for name in (
+                "frames", "changes", "frames_lockout", "frames_wait", "frames_retransmit", "frames_no_rf",
+            )
+        }  # fmt: skip
+        return replace(later if sign > 0 else self, **counts)
+
+
+def uplink_seen(words: npt.NDArray[np.uint32]) -> tuple[UplinkSeen, ...]:
+    """Return the state of each telecommand channel from the control fields of frames (n,); 0 where there is none.
+
+    Fields that are no CLCW (of another control word type or version) are passed over.
+    """
+    distinct, which = np.unique(words, return_inverse=True)
+    known = [_clcw(int(word)) for word in distinct]
+    by_channel: dict[int, list[int]] = {}
+    for index, clcw in enumerate(known):
+        if clcw is not None:
+            by_channel.setdefault(clcw.virtual_channel, []).append(index)
+    return tuple(_seen(which[np.isin(which, mine)], known) for _, mine in sorted(by_channel.items()))
+
+
+def _seen(which: npt.NDArray[np.intp], known: list[Clcw | None]) -> UplinkSeen:
+    """The channel whose words (n,), as indices of `known`, came in this order."""
+    counts = np.bincount(which, minlength=len(known)).tolist()
+
+    def frames_with(flag: str) -> int:
+        return sum(n for n, clcw in zip(counts, known, strict=True) if n and getattr(clcw, flag))
+
+    last = known[int(which[-1])]
+    assert last is not None
+    return UplinkSeen(
+        virtual_channel=last.virtual_channel,
+        frames=which.size,
+        changes=int(np.count_nonzero(np.diff(which))),
+        frames_lockout=frames_with("lockout"),
+        frames_wait=frames_with("wait"),
+        frames_retransmit=frames_with("retransmit"),
+        frames_no_rf=frames_with("no_rf_available"),
+        report_value=last.report_value,
+        farm_b_counter=last.farm_b_counter,
+        lockout=last.lockout,
+        wait=last.wait,
+        retransmit=last.retransmit,
+        no_rf_available=last.no_rf_available,
+        no_bit_lock=last.no_bit_lock,
+    )
+
+
+def _clcw(word: int) -> Clcw | None:
+    if word == 0:
+        return None
+    try:
+        return unpack_clcw(word.to_bytes(OCF_LENGTH, "big"))
+    except FrameError:
+        return None

@@ -16,10 +16,16 @@ import numpy as np
 from tmtc.arrays import BoolArray, IntArray, OctetArray
 from tmtc.link import cadu, reed_solomon
 from tmtc.link.frame_reading import proof_of
-from tmtc.link.frames import frame_checksums_hold
-from tmtc.link.link_check import CountPackets, LinkProposal, are_regular, propose_link
-from tmtc.link.marker_survey import BLOCK_OCTETS, MarkerSurvey, survey_markers
-from tmtc.link.randomiser import randomise
+from tmtc.link.frames import frame_checksums_hold, randomise
+from tmtc.link.link_check import (
+    BLOCK_OCTETS,
+    CountPackets,
+    LinkProposal,
+    MarkerSurvey,
+    are_regular,
+    propose_link,
+    survey_markers,
+)
 from tmtc.link.settings import LinkSettings
 
 TRIED_PER_BLOCK = 3

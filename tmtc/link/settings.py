@@ -12,8 +12,7 @@ from typing import Any, Literal
 
 from tmtc.errors import LinkFormatError, ValueRefused
 from tmtc.link.cadu import ASM_LENGTH
-from tmtc.link.frames import FRAME_MAX_LENGTH
-from tmtc.link.randomiser import Randomiser
+from tmtc.link.frames import FRAME_MAX_LENGTH, Randomiser
 from tmtc.link.reed_solomon import ReedSolomon, code_for
 
 Coding = Literal["rs", "none"]

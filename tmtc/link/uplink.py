@@ -15,10 +15,8 @@ import numpy as np
 
 from tmtc.arrays import Octets
 from tmtc.errors import ChecksumError, FrameError, TruncatedPacket, ValueRefused
-from tmtc.link.frames import Clcw
-from tmtc.link.randomiser import sequence
-from tmtc.packets.crc import CRC_LENGTH, append_crc, crc16
-from tmtc.packets.space_packets import PRIMARY_HEADER_LENGTH
+from tmtc.link.frames import Clcw, sequence
+from tmtc.packets.space_packets import CRC_LENGTH, PRIMARY_HEADER_LENGTH, append_crc, crc16
 
 CLTU_START = bytes.fromhex("EB90")
 CLTU_TAIL = bytes.fromhex("C5C5C5C5C5C5C579")

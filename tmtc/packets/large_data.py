@@ -1,4 +1,4 @@
-"""Large data in parts (PUS service 13): a table, an image or a map cut up for packets, and put together again.
+"""Large data in parts (PUS service 13): tables, maps and thumbnails cut up for packets, and put together again.
 
 References
 ----------
@@ -6,11 +6,14 @@ ECSS-E-ST-70-41C section 6.13. Downlink parts are TM[13,1..3], uplink parts TC[1
 A transfer that fits into one part is sent as its last.
 """
 
+import struct
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tmtc.errors import ValueRefused
 
@@ -87,3 +90,44 @@ class LargeDataReceiver:
         self._kept -= sum(map(len, self._parts.pop(transaction, {}).values()))
         self._tables.pop(transaction, None)
         self._last.pop(transaction, None)
+
+
+HEADER = struct.Struct(">IQHH")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Thumbnail:
+    """Reduced image of a frame: on-board time in ticks, gray levels (rows, columns)."""
+
+    frame_number: int
+    ticks: int
+    levels: NDArray[np.uint8]
+
+
+def pack_thumbnail(thumbnail: Thumbnail) -> bytes:
+    """Return the octets of a thumbnail."""
+    rows, columns = thumbnail.levels.shape
+    head = HEADER.pack(thumbnail.frame_number & 0xFFFFFFFF, thumbnail.ticks, rows, columns)
+    return head + zlib.compress(thumbnail.levels.astype(np.uint8).tobytes(), 9)
+
+
+def unpack_thumbnail(octets: bytes) -> Thumbnail:
+    """Return a thumbnail.
+
+    Raises
+    ------
+    ValueRefused
+        The octets are no thumbnail, or their levels are not as many as rows and columns.
+    """
+    if len(octets) < HEADER.size:
+        raise ValueRefused("thumbnail", "header", f"{len(octets)} octets", f"{HEADER.size} octets")
+    frame_number, ticks, rows, columns = HEADER.unpack_from(octets)
+    wanted = rows * columns
+    inflate: Any = zlib.decompressobj()
+    try:
+        levels = inflate.decompress(octets[HEADER.size :], wanted + 1)
+    except zlib.error as error:
+        raise ValueRefused("thumbnail", "levels", str(error), "levels compressed with zlib") from None
+    if len(levels) != wanted or not inflate.eof:
+        raise ValueRefused("thumbnail", "levels", f"{len(levels)} octets", f"{wanted} octets")
+    return Thumbnail(frame_number, ticks, np.frombuffer(levels, dtype=np.uint8).reshape(rows, columns))

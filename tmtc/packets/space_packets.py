@@ -1,4 +1,4 @@
-"""Space packets: primary header, idle packets, sequence counts.
+"""Space packets: primary header, idle packets, sequence counts, CRC-16 of the packet error control.
 
 References
 ----------
@@ -6,10 +6,11 @@ CCSDS 133.0-B-2 section 4.1. Octets of the primary header: version (3 bits), typ
 (1), APID (11) | sequence flags (2), sequence count (14) | octets of the data field minus one (16).
 """
 
+import binascii
 import struct
 from dataclasses import dataclass, field
 
-from tmtc.errors import MalformedPacket, TruncatedPacket, ValueRefused
+from tmtc.errors import ChecksumError, MalformedPacket, TruncatedPacket, ValueRefused
 
 PRIMARY_HEADER_LENGTH = 6
 PACKET_MAX_LENGTH = 65_542
@@ -90,3 +91,26 @@ class PacketSequencer:
         count = self.counts.get(apid, 0)
         self.counts[apid] = (count + 1) % SEQUENCE_COUNT_LIMIT
         return count
+
+
+CRC_LENGTH = 2
+CRC_START = 0xFFFF
+
+
+def crc16(octets: bytes | bytearray | memoryview, start: int = CRC_START) -> int:
+    """The checksum of `octets`; zero when `octets` end with their own checksum."""
+    return binascii.crc_hqx(octets, start)
+
+
+def append_crc(octets: bytes) -> bytes:
+    """`octets` followed by their checksum."""
+    return octets + crc16(octets).to_bytes(CRC_LENGTH, "big")
+
+
+def check_crc(octets: bytes | bytearray | memoryview, what: str) -> None:
+    """Raise when the last two octets are not the checksum of those before them."""
+    if len(octets) < CRC_LENGTH:
+        raise TruncatedPacket(what, CRC_LENGTH, len(octets))
+    if crc16(octets):
+        view = memoryview(octets)
+        raise ChecksumError(what, crc16(view[:-CRC_LENGTH]), int.from_bytes(view[-CRC_LENGTH:], "big"))

@@ -20,8 +20,7 @@ import numpy.typing as npt
 
 from tmtc.arrays import BoolArray, IntArray, OctetArray, Octets, as_octets
 from tmtc.errors import ValueRefused
-from tmtc.packets.crc import crc16
-from tmtc.packets.space_packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, TYPE_TELEMETRY
+from tmtc.packets.space_packets import PACKET_MAX_LENGTH, PRIMARY_HEADER_LENGTH, TYPE_TELEMETRY, crc16
 
 _GOOD, _BAD, _SKIPPED, _IDLE = 0, 1, 2, 3
 _NO_CHECKSUM, _UNKNOWN = 1, 2

@@ -1,16 +1,18 @@
-"""Numbers of imported packets as matrices: one column for every parameter that is one number in each packet.
+"""Imported packets as records, and their numbers as matrices: a column for every parameter of one number a packet.
 
 Enumerations are their codes, booleans 0 and 1. Texts, octets and arrays have no column.
 """
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from tmtc.arrays import FloatArray
+from tmtc.export import Record, format_records, plain
 from tmtc.xtce.columns import Column, OptionalColumn, RecordColumn, ValueColumn
-from tmtc.xtce.decode import XtceTable
+from tmtc.xtce.decode import XtceDecode, XtceTable
 from tmtc.xtce.definition import AggregateType, ArrayType, BinaryEncoding, Container, Entry, ScalarType, StringEncoding
 
 
@@ -80,3 +82,47 @@ def _numbers(column: Column, value: SeriesValue) -> FloatArray:
     named = bool(value.type.labels) or value.type.is_boolean
     found: FloatArray = (column.raw if named else column.values).astype(np.float64)
     return found
+
+
+_CONTAINER = "packet"
+
+
+def xtce_records(found: XtceDecode, *, raw: bool = False) -> list[Record]:
+    """Return a record for each decoded packet in stream order: `packet` names the container, then its parameters.
+
+    Arrays are lists, aggregates mappings, octets hexadecimal digits, numbers that are not finite None. `raw` gives
+    values as transmitted instead of calibrated and named ones. A parameter that is called `packet` becomes `packet_`.
+    """
+    numbered: list[tuple[int, Record]] = []
+    for name, table in found.tables.items():
+        columns = {
+            f"{key}_" if key == _CONTAINER else key: column.to_list(raw) for key, column in table.columns.items()
+        }
+        rows = zip(*columns.values(), strict=True) if columns else ((),) * len(table)
+        for index, values in zip(table.packet_index.tolist(), rows, strict=True):
+            record: Record = {_CONTAINER: name}
+            record.update(zip(columns, map(plain, values), strict=True))
+            numbered.append((index, record))
+    numbered.sort(key=lambda pair: pair[0])
+    return [record for _, record in numbered]
+
+
+def format_xtce_records(records: list[Record], kind: str) -> bytes:
+    """Return the records as a file of that kind (`json`, `csv`, `parquet`).
+
+    CSV and Parquet hold a row for each packet and a column for every parameter that occurs; members of aggregates are
+    columns `parameter.member`, arrays are JSON in one column.
+    """
+    return format_records(records if kind == "json" else [_flat(record) for record in records], kind)
+
+
+def _flat(record: Record) -> Record:
+    flat: Record = {}
+    for key, value in record.items():
+        if isinstance(value, dict):
+            flat.update({f"{key}.{inner}": one for inner, one in _flat(value).items()})
+        elif isinstance(value, list):
+            flat[key] = json.dumps(value, allow_nan=False)
+        else:
+            flat[key] = value
+    return flat

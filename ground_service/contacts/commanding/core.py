@@ -1,15 +1,16 @@
 """Verification state of a telecommand, from its received verification reports (PUS service 1).
 
 A report names its telecommand by the first four octets of the packet, and those return after 16384 commands. So a
-report counts for a command only when it was made after the command was sent, not in an earlier boot, and before the
-same octets were sent again. Reports that come late, even after a time-out was declared, still count; the time-out
-stays on record.
+report counts for a command only when it was made after the command was sent, not in an earlier boot, with a sequence
+count that follows those of the reports before, and before the same octets were sent again. Reports that come late,
+even after a time-out was declared, still count; the time-out stays on record.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from tmtc.dictionary.codes import FAILURES as _CODES
+from tmtc.packets.space_packets import SEQUENCE_COUNT_LIMIT
 
 _FAILURE_CODES = {name: code for code, name in _CODES}
 
@@ -45,12 +46,16 @@ class VerificationReport:
     ticks: int
     step: int | None
     failure_code: int | None
+    count: int | None = None
     boot: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class SentCommand:
-    """A telecommand that was sent in `boot`, when the newest on-board time known was `sent_after_ticks`."""
+    """A telecommand that was sent when the newest on-board time known was `sent_after_ticks`, in `boot`.
+
+    `count` is the sequence count of the newest report until then, and `count_boot` its boot (None: unknown).
+    """
 
     request_id: int
     sent_utc_ns: int
@@ -58,6 +63,8 @@ class SentCommand:
     repeated_after_ticks: int | None
     timeout_ns: int
     boot: int | None = None
+    count: int | None = None
+    count_boot: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +87,7 @@ def fate_of(command: SentCommand, reports: Sequence[VerificationReport], now_utc
                 and report.ticks > command.sent_after_ticks
                 and (command.repeated_after_ticks is None or report.ticks <= command.repeated_after_ticks)
                 and (command.boot is None or report.boot is None or report.boot >= command.boot)
+                and _is_of_the_source(command, report)
             ),
             key=lambda report: (report.ticks, report.subtype, report.step or 0),
         )
@@ -101,3 +109,10 @@ def fate_of(command: SentCommand, reports: Sequence[VerificationReport], now_utc
         state = "sent"
     ended = state in ("failed", "completed")
     return CommandFate(state, not ended and now_utc_ns > command.sent_utc_ns + command.timeout_ns, mine)
+
+
+def _is_of_the_source(command: SentCommand, report: VerificationReport) -> bool:
+    """Return whether the sequence count of a report follows that of the newest one before, unless a boot reset it."""
+    if command.count is None or report.count is None or report.boot is None or report.boot != command.count_boot:
+        return True
+    return 0 < (report.count - command.count) % SEQUENCE_COUNT_LIMIT < SEQUENCE_COUNT_LIMIT // 2

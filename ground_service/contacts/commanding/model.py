@@ -7,11 +7,11 @@ from pydantic import Field
 
 from ground_service.contacts.commanding.core import DUPLICATE, OUT_OF_SEQUENCE, STAGES, CommandFate
 from ground_service.http.model import Entity, InstanceName, Paging, RequestModel, SpacecraftNumber, UtcTime
-from ground_service.ingest.model import ControlWords
 from ground_service.toml import LINE_PATTERN_JSON
 from lunar.timescales import format_utc, utc_ns_from_ticks
 from tmtc.dictionary.arguments import argument_text
 from tmtc.dictionary.codes import FAILURES
+from tmtc.link.frames import UplinkSeen
 
 _FAILURES = dict(FAILURES)
 REMEDY = "; the payload expects other sequence counts: send perform_function resynchronise_commands first"
@@ -204,10 +204,15 @@ class HandoverFilter(Paging):
     instance: InstanceName | None = None
 
 
-class UplinkChannel(ControlWords):
-    """A telecommand channel as the newest reception shows it."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UplinkChannel(UplinkSeen):
+    """A telecommand channel as the newest reception shows it; flags are those of its newest control word.
 
-    ingest_id: int = Field(examples=[1])
+    `report_value` is the number of the sequence-controlled frame that is expected next, `farm_b_counter` the number of
+    accepted expedited frames modulo 4.
+    """
+
+    ingest_id: int
     received: UtcTime
 
 

@@ -17,7 +17,7 @@ from ground_service.contacts.commanding.model import (
     TelecommandFilter,
     UplinkChannel,
 )
-from ground_service.http.model import PageOf
+from ground_service.http.model import PageOf, UtcTime
 from ground_service.ingest.core import LONGEST_SILENCE, LONGEST_STEP
 from ground_service.ingest.doubt_store import latest_ticks
 from ground_service.store import repository
@@ -30,11 +30,14 @@ from tmtc.dictionary.payload import DICTIONARY
 from tmtc.packets.stream import cut_packets
 
 TELECOMMANDS, VERIFICATIONS = TELECOMMAND.table, repository.SAMPLES["verifications"]
+PACKETS = repository.PACKETS
 HANDOVERS = repository.HANDOVERS
 
 COUNTED = "performance"
 NO_COMMAND = 65_535
 """Packet that reports the count of the newest telecommand, and the count if there was none."""
+
+REPORTED = DICTIONARY.packet("verification_completed").apid
 
 SEARCHED_INGESTS = 200
 """Number of newest ingests that are searched for channels: some contain no frames of a channel."""
@@ -326,8 +329,8 @@ def newest_channels(connection: Connection, spacecraft_id: int, instance: str) -
     newest: dict[int, UplinkChannel] = {}
     for ingest_id, received_utc_ns, accounting in rows:
         for seen in accounting.get("uplink", ()):
-            if seen["spacecraft_id"] == spacecraft_id:
-                channel = UplinkChannel.of(seen, ingest_id=ingest_id, received=received_utc_ns)
+            if seen.pop("spacecraft_id") == spacecraft_id:
+                channel = UplinkChannel(**seen, ingest_id=ingest_id, received=UtcTime(received_utc_ns))
                 newest.setdefault(channel.virtual_channel, channel)
     return [newest[number] for number in sorted(newest)]
 
@@ -380,9 +383,12 @@ def _fates(
     requests = {one.request_id for one in sent.values()}
     reports = connection.execute(
         select(
-            *(VERIFICATIONS.c[one.name] for one in fields(VerificationReport) if one.name != "boot"),
+            *(VERIFICATIONS.c[one.name] for one in fields(VerificationReport) if one.name not in ("count", "boot")),
+            PACKETS.c.sequence_count,
             _boot_at(vehicle, VERIFICATIONS.c.ticks),
-        ).where(
+        )
+        .select_from(VERIFICATIONS.join(PACKETS, PACKETS.c.id == VERIFICATIONS.c.packet_id))
+        .where(
             *_readable_reports(connection, vehicle),
             VERIFICATIONS.c.ticks > min(one.sent_after_ticks for one in sent.values()),
             VERIFICATIONS.c.request_id.in_(requests),
@@ -391,13 +397,21 @@ def _fates(
     by_request: dict[int, list[VerificationReport]] = {}
     for row in reports:
         by_request.setdefault(row.request_id, []).append(VerificationReport(*tuple(row)))
+    before = PACKETS.alias()
+    mine = (before.c.vehicle_id == vehicle, before.c.apid == REPORTED, before.c.ticks >= 0)
+    newest = select(before.c.id).where(*mine, before.c.ticks <= TELECOMMANDS.c.sent_after_ticks)
+    newest = newest.order_by(before.c.ticks.desc(), before.c.sequence_count.desc()).limit(1).correlate(TELECOMMANDS)
     copies = connection.execute(
         select(
             TELECOMMANDS.c.request_id,
             TELECOMMANDS.c.id,
             TELECOMMANDS.c.sent_after_ticks,
             _boot_at(vehicle, TELECOMMANDS.c.sent_after_ticks),
-        ).where(
+            PACKETS.c.sequence_count,
+            _boot_at(vehicle, PACKETS.c.ticks),
+        )
+        .select_from(TELECOMMANDS.outerjoin(PACKETS, PACKETS.c.id == newest.scalar_subquery()))
+        .where(
             TELECOMMANDS.c.vehicle_id == vehicle,
             TELECOMMANDS.c.request_id.in_(requests),
             TELECOMMANDS.c.sent_after_ticks.is_not(None),
@@ -406,9 +420,9 @@ def _fates(
     fates = {}
     for key, one in sent.items():
         later = [row[2] for row in copies if row[0] == one.request_id and row[1] > key]
-        boot = next((row[3] for row in copies if row[1] == key), None)
+        boot, count, count_boot = next((row[3:] for row in copies if row[1] == key), (None, None, None))
         fates[key] = fate_of(
-            replace(one, repeated_after_ticks=min(later, default=None), boot=boot),
+            replace(one, repeated_after_ticks=min(later, default=None), boot=boot, count=count, count_boot=count_boot),
             by_request.get(one.request_id, ()),
             now_utc_ns,
         )

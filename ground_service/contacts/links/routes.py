@@ -11,13 +11,11 @@ from ground_service.contacts.links.model import Contacts, LinkStatus
 from ground_service.http.common import GroundOf
 from ground_service.http.model import PageOf, RequestTime
 from ground_service.http.requests import operations, problems
-from lunar.constants import NS
+from lunar.constants import DAY_NS
 
 links = operations("links")
 
 LinkName = Annotated[str, Path(max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", examples=["lab"])]
-
-DAY_NS = 86_400 * NS
 
 
 @links.get("/links")

@@ -7,12 +7,11 @@ from fastapi import Path, Query, Response
 from ground_service.access.security import Operator, Viewer, add_list
 from ground_service.evaluation.performance import service
 from ground_service.evaluation.performance.model import MonthlyReport, Performance
+from ground_service.evaluation.routes import REPORT_MEDIA
 from ground_service.http.common import GroundOf, Key
 from ground_service.http.model import InstanceName, RequestTime, ns_of
 from ground_service.http.requests import operations
 from ground_service.store.vehicles import FLOWN
-
-REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}
 
 Spacecraft = Annotated[int, Path(ge=0, le=1023)]
 Month = Annotated[str, Path(pattern=r"^2[0-9]{3}-(0[1-9]|1[0-2])$", examples=["2029-08"])]

@@ -6,8 +6,7 @@ import logging
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import fields
-from typing import Any, TypeVar
+from typing import Any
 
 from sqlalchemy import Connection, func, select
 
@@ -15,41 +14,28 @@ from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.errors import DatabaseBusy, InvalidInput, NotFound, Stopping, fault_of
 from ground_service.evaluation.alignment import bounds_per_degree
 from ground_service.evaluation.model import PassFigures, StoredReport
-from ground_service.evaluation.performance.core import (
-    ALTITUDE_EDGES_KM,
-    CONFIDENCE,
-    FALSE_ALARM_RATE,
-    METRICS,
-    SUN_EDGES_DEG,
-    change_points,
-    interval_name,
-    interval_names,
-    mean_level,
-    rolling_counts,
-    wilson,
-)
+from ground_service.evaluation.performance import core
 from ground_service.evaluation.performance.model import (
     ChangePoint,
-    GroupFigures,
     MonthlyReport,
     MonthlyReportFilter,
     PassPerformance,
     Performance,
-    RollingRequirement,
     StoredMonthlyReport,
 )
 from ground_service.evaluation.service import PREFERRED_ESTIMATORS
 from ground_service.evaluation.store import newest_reports
 from ground_service.evaluation.verdict import NEES_DEGREES
 from ground_service.ground import Ground
-from ground_service.http.model import Entity, PageOf, UtcTime
+from ground_service.http.model import PageOf, UtcTime
 from ground_service.passes.model import PassRecord
 from ground_service.store import repository
 from ground_service.store.files import register_file
 from ground_service.store.vehicles import FLOWN, get_vehicle
+from lunar.constants import DAY_NS
 from lunar.timescales import format_utc, parse_utc
 from reports.statistics import sigma_remark
-from reports.values import HeadlineFigure, LevelChange, MeanByGroup, MonthlyReportValue, MonthPass, RequirementOverTime
+from reports.values import HeadlineFigure, MeanByGroup, MonthlyReportValue, RequirementOverTime
 
 _PASSES, _VEHICLES = repository.PASSES, repository.VEHICLES
 _MONTHLY = repository.MONTHLY_REPORTS
@@ -123,9 +109,6 @@ def _shown(report: StoredMonthlyReport) -> MonthlyReport:
     return MonthlyReport.model_validate(report.model_dump(include=set(MonthlyReport.model_fields)))
 
 
-Value = TypeVar("Value", MonthPass, MeanByGroup, LevelChange, RequirementOverTime)
-
-
 def monthly_value(found: Performance, month: str) -> MonthlyReportValue:
     """Return the report of a month as a value; it follows from the performance alone."""
     verdict, level = _verdict(found)
@@ -140,12 +123,10 @@ def monthly_value(found: Performance, month: str) -> MonthlyReportValue:
         verdict_level=level,
         evidence_level=levels[0] if len(levels) == 1 else "",
         headline=_headline(found),
-        passes=tuple(
-            _value(MonthPass, one, start_utc_ns=one.start.utc_ns, estimator=one.estimator or "") for one in found.passes
-        ),
-        groups=tuple(_value(MeanByGroup, one) for one in found.groups),
-        changes=tuple(_value(LevelChange, one, utc_ns=one.time.utc_ns) for one in found.changes),
-        requirements=tuple(_value(RequirementOverTime, one, limit=one.limit) for one in found.requirements),
+        passes=tuple(found.passes),
+        groups=tuple(found.groups),
+        changes=tuple(found.changes),
+        requirements=tuple(found.requirements),
         window_days=found.window_days,
         false_alarm_rate=found.false_alarm_rate,
         provenance={
@@ -197,16 +178,7 @@ def _headline(found: Performance) -> tuple[HeadlineFigure, ...]:
     )
 
 
-def _value(kind: type[Value], entity: Entity, **values: Any) -> Value:
-    """Return the fields of an entity as a value of a report, NaN where unknown; `values` replace them."""
-    names = (one.name for one in fields(kind))
-    found = {name: values[name] if name in values else getattr(entity, name) for name in names}
-    unknown = {name: math.nan for name, value in found.items() if value is None and name not in values}
-    return kind(**found | unknown)
-
-
 WINDOW_DAYS = 7.0
-DAY_NS = 86_400_000_000_000
 NOT_STATED = "not stated"
 _MONTH = re.compile(r"^(2[0-9]{3})-(0[1-9]|1[0-2])$")
 
@@ -248,7 +220,7 @@ def performance(
         spacecraft_id=spacecraft_id,
         instance=instance,
         window_days=window_days,
-        false_alarm_rate=FALSE_ALARM_RATE,
+        false_alarm_rate=core.FALSE_ALARM_RATE,
         passes_in_span=total,
         passes=passes,
         groups=group_figures(passes),
@@ -284,15 +256,15 @@ def _pass_performance(record: PassRecord, report: StoredReport, figures: PassFig
     )
 
 
-def group_figures(passes: Sequence[PassPerformance]) -> list[GroupFigures]:
+def group_figures(passes: Sequence[PassPerformance]) -> list[MeanByGroup]:
     """Return the mean of each metric by altitude, elevation of the Sun, terrain and build."""
     factors: list[tuple[str, list[str], list[str]]] = []
     for factor, name, edges, unit in (
-        ("altitude", "altitude_km", ALTITUDE_EDGES_KM, "km"),
-        ("sun elevation", "sun_elevation_deg", SUN_EDGES_DEG, "°"),
+        ("altitude", "altitude_km", core.ALTITUDE_EDGES_KM, "km"),
+        ("sun elevation", "sun_elevation_deg", core.SUN_EDGES_DEG, "°"),
     ):
-        groups = [interval_name(_number(getattr(one, name)), edges, unit) for one in passes]
-        factors.append((factor, groups, interval_names(edges, unit)))
+        groups = [core.interval_name(_number(getattr(one, name)), edges, unit) for one in passes]
+        factors.append((factor, groups, core.interval_names(edges, unit)))
     for factor, name in (("terrain", "terrain"), ("build", "build")):
         groups = [getattr(one, name) or NOT_STATED for one in passes]
         factors.append((factor, groups, sorted(set(groups))))
@@ -300,10 +272,10 @@ def group_figures(passes: Sequence[PassPerformance]) -> list[GroupFigures]:
     for factor, groups, order in factors:
         for group in order:
             members = [one for one, its in zip(passes, groups, strict=True) if its == group]
-            for metric in METRICS if members else ():
-                level = mean_level([_number(getattr(one, metric)) for one in members])
+            for metric in core.METRICS if members else ():
+                level = core.mean_level([_number(getattr(one, metric)) for one in members])
                 found.append(
-                    GroupFigures(
+                    MeanByGroup(
                         factor=factor,
                         group=group,
                         metric=metric,
@@ -318,8 +290,8 @@ def group_figures(passes: Sequence[PassPerformance]) -> list[GroupFigures]:
 
 def _changes(passes: Sequence[PassPerformance]) -> list[ChangePoint]:
     found = []
-    for metric in METRICS:
-        for change in change_points([_number(getattr(one, metric)) for one in passes]):
+    for metric in core.METRICS:
+        for change in core.change_points([_number(getattr(one, metric)) for one in passes]):
             first = passes[change.index]
             found.append(
                 ChangePoint(
@@ -336,7 +308,7 @@ def _changes(passes: Sequence[PassPerformance]) -> list[ChangePoint]:
     return sorted(found, key=lambda one: (one.time.utc_ns, one.metric))
 
 
-def _requirements(found: Sequence[Reported], window_ns: int) -> list[RollingRequirement]:
+def _requirements(found: Sequence[Reported], window_ns: int) -> list[RequirementOverTime]:
     """Return the requirements of all reports over the window that ends at the newest pass.
 
     Name, unit and limit are those of the newest report that has the requirement.
@@ -351,7 +323,7 @@ def _requirements(found: Sequence[Reported], window_ns: int) -> list[RollingRequ
     for key in order:
         newest = newest_of[key]
         statuses = [row[key].status if key in row else "unknown" for row in rows]
-        counts = rolling_counts(times, statuses, window_ns)
+        counts = core.rolling_counts(times, statuses, window_ns)
         shares = [
             one.get("met", 0) / (one.get("met", 0) + one.get("not met", 0))
             for one in counts
@@ -359,9 +331,9 @@ def _requirements(found: Sequence[Reported], window_ns: int) -> list[RollingRequ
         ]
         last = counts[-1]
         met, not_met = last.get("met", 0), last.get("not met", 0)
-        share = wilson(met, met + not_met)
+        share = core.wilson(met, met + not_met)
         requirements.append(
-            RollingRequirement(
+            RequirementOverTime(
                 key=key,
                 name=newest.name,
                 unit=newest.unit,
@@ -388,10 +360,10 @@ def _consistency_remark(key: str, values: Sequence[float | None]) -> str:
     known = [value for value in values if value is not None]
     if not key.startswith("consistency.") or len(known) < 2:
         return ""
-    level = mean_level(known)
+    level = core.mean_level(known)
     low, high = 1.0 - level.high + level.mean, 1.0 + level.mean - level.low
     if key == "consistency.nees":
-        low, high = bounds_per_degree(NEES_DEGREES, len(known), CONFIDENCE)
+        low, high = bounds_per_degree(NEES_DEGREES, len(known), core.CONFIDENCE)
     wrong = sigma_remark(level.mean, low, high)
     return f"mean {level.mean:.2f} of {len(known)} passes: {wrong}" if wrong else ""
 

@@ -12,17 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.errors import EvaluationError
+from lunar import timescales
 from lunar.arrays import BoolArray, IntArray
 from lunar.constants import NS
 from lunar.plausible import STATION_DIFFERENCE_NS, WHOLE_SECONDS
-from lunar.timescales import (
-    ONBOARD_EPOCH_TAI_NS,
-    TICKS_PER_SECOND,
-    tai_ns_from_utc_ns,
-    ticks_from_utc_ns,
-    utc_ns_from_tai_ns,
-    utc_ns_from_ticks,
-)
 
 IDEAL_CLOCK = 0
 """Id of the correlation of a clock that shows TAI without error."""
@@ -45,6 +38,15 @@ JUMP_NS = 20e6
 JUMP_RATE = 200e-6
 """No oscillator drifts faster, in real time."""
 
+MOVED_NS = 10e6
+"""Passes are evaluated again if a new correlation moves their time by more: 16 m along the track."""
+
+LEAP_NS = 2e9
+"""An on-board clock alone cannot tell a station that is off by a leap second."""
+
+LONE_DRIFT = 50e-6
+"""Crystal oscillators without compensation drift by up to 50 ppm."""
+
 DRIFT_CHANGE = 2e-6
 """No oscillator changes its drift by more between two time reports."""
 
@@ -66,18 +68,18 @@ class TimeCorrelation:
     def utc_ns(self, ticks: IntArray) -> IntArray:
         """UTC (n,) of on-board ticks (n,)."""
         since = np.asarray(ticks, dtype=np.int64) - self.reference_ticks
-        whole, part = np.divmod(since, TICKS_PER_SECOND)  # the product overflows after two years
+        whole, part = np.divmod(since, timescales.TICKS_PER_SECOND)  # the product overflows after two years
         nominal = whole * NS + part * _NS_NUMERATOR // _NS_DENOMINATOR
         drift = np.rint(nominal * (self.drift_ppb * 1e-9)).astype(np.int64)
-        tai = int(tai_ns_from_utc_ns(self.reference_utc_ns)) + nominal + drift
-        return np.asarray(utc_ns_from_tai_ns(tai), dtype=np.int64)
+        tai = int(timescales.tai_ns_from_utc_ns(self.reference_utc_ns)) + nominal + drift
+        return np.asarray(timescales.utc_ns_from_tai_ns(tai), dtype=np.int64)
 
 
 def utc_ns_of_ticks(ticks: IntArray, correlations: Sequence[TimeCorrelation]) -> tuple[IntArray, IntArray]:
     """UTC (n,) of on-board ticks (n,), and the id of the correlation used for each."""
     ticks = np.asarray(ticks, dtype=np.int64)
     if not correlations:
-        return np.asarray(utc_ns_from_ticks(ticks), dtype=np.int64), np.full(len(ticks), IDEAL_CLOCK)
+        return np.asarray(timescales.utc_ns_from_ticks(ticks), dtype=np.int64), np.full(len(ticks), IDEAL_CLOCK)
     start = np.array([c.start_ticks for c in correlations])
     stop = np.array([c.stop_ticks for c in correlations])
     outside = np.maximum(np.maximum(start[None, :] - ticks[:, None], ticks[:, None] - stop[None, :]), 0)
@@ -87,6 +89,22 @@ def utc_ns_of_ticks(ticks: IntArray, correlations: Sequence[TimeCorrelation]) ->
         here = chosen == number
         utc[here] = correlations[number].utc_ns(ticks[here])
     return utc, np.array([c.id for c in correlations], dtype=np.int64)[chosen]
+
+
+def moved_ticks(old: Sequence[TimeCorrelation], new: Sequence[TimeCorrelation]) -> tuple[int | None, int | None]:
+    """Return the first and last on-board time whose UTC differs between two sets of lines; None if there is none.
+
+    Any line in place of the ideal clock changes what a report can say.
+    """
+    if bool(old) != bool(new):
+        return 0, (1 << 48) - 1
+    ends = {tick for line in (*old, *new) for tick in (line.start_ticks, line.stop_ticks)}
+    at = np.array(sorted({*ends, *((a + b) // 2 for a, b in pairwise(sorted(ends)))}), dtype=np.int64)
+    moved = np.flatnonzero(np.abs(utc_ns_of_ticks(at, old)[0] - utc_ns_of_ticks(at, new)[0]) > MOVED_NS)
+    if not moved.size:
+        return None, None
+    first, last = int(moved[0]), int(moved[-1])
+    return int(at[first - 1]) if first else 0, int(at[last + 1]) if last + 1 < len(at) else (1 << 48) - 1
 
 
 def largest_step_s(runs: Sequence[TimeCorrelation], after_utc_ns: int, until_utc_ns: int) -> float:
@@ -102,7 +120,7 @@ def largest_step_s(runs: Sequence[TimeCorrelation], after_utc_ns: int, until_utc
 
 def ticks_of_utc_ns(utc_ns: int, correlations: Sequence[TimeCorrelation]) -> int:
     """On-board ticks that the clock shows at `utc_ns`, to about a tick."""
-    ticks = int(ticks_from_utc_ns(utc_ns))
+    ticks = int(timescales.ticks_from_utc_ns(utc_ns))
     for _ in range(3):
         shown, _ = utc_ns_of_ticks(np.array([ticks], dtype=np.int64), correlations)
         ticks += int((utc_ns - int(shown[0])) * _NS_DENOMINATOR // _NS_NUMERATOR)
@@ -138,7 +156,9 @@ def fit_correlation(ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntA
     ticks = np.asarray(ticks, dtype=np.int64)
     if len(ticks) == 0:
         raise EvaluationError("time correlation: expected at least one time report, found none")
-    sent_tai = np.asarray(tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - np.asarray(light_time_ns)
+    sent_tai = np.asarray(timescales.tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - np.asarray(
+        light_time_ns
+    )
     middle = int(np.argsort(ticks, kind="stable")[len(ticks) // 2])
     nominal = (ticks - ticks[middle]) * _NS_NUMERATOR // _NS_DENOMINATOR
     # Small numbers from here on: what the clock is off by, against the middle point.
@@ -160,7 +180,7 @@ def fit_correlation(ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntA
         start_ticks=int(ticks[kept].min()),
         stop_ticks=int(ticks[kept].max()),
         reference_ticks=int(ticks[middle]),
-        reference_utc_ns=int(utc_ns_from_tai_ns(reference_tai)),
+        reference_utc_ns=int(timescales.utc_ns_from_tai_ns(reference_tai)),
         drift_ppb=slope * 1e9,
         residual_rms_ns=float(np.sqrt(np.mean(residual**2))),
         residual_max_ns=float(np.abs(residual).max()),
@@ -196,10 +216,11 @@ def _without_chance(
 
 @dataclass(frozen=True, slots=True)
 class StationDoubt:
-    """A station whose reception times disagree with those of others, by how much, and the usual cause."""
+    """A station whose reception times disagree with those of `others`, by how much, and the usual cause."""
 
     station: str
     difference_s: float
+    others: str = "the others"
 
     def __str__(self) -> str:
         """Return the remark for a person."""
@@ -207,7 +228,7 @@ class StationDoubt:
         cause = f": {WHOLE_SECONDS[whole]}?" if _is_whole(1e9 * self.difference_s) else ""
         side = "ahead of" if self.difference_s > 0 else "behind"
         name = self.station or "without a name"
-        return f"the clock of station {name} is {abs(self.difference_s):.3f} s {side} the others{cause}"
+        return f"the clock of station {name} is {abs(self.difference_s):.3f} s {side} {self.others}{cause}"
 
 
 def doubted_stations(
@@ -217,12 +238,13 @@ def doubted_stations(
 
     The reports of a station are split into runs as those of the clock. Two runs disagree if every change between them
     shows it: a clock that was set changes for all stations. Of runs that disagree, those count that more stations
-    share, or that agree with the on-board clock; otherwise neither.
+    share, or that agree with the on-board clock; otherwise neither. A single station counts as little if it differs
+    from the on-board clock by whole seconds with a usual cause, from its first report on.
     """
-    sent = np.asarray(tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - light_time_ns
-    whole, part = np.divmod(np.asarray(ticks, dtype=np.int64), TICKS_PER_SECOND)
+    sent = np.asarray(timescales.tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - light_time_ns
+    whole, part = np.divmod(np.asarray(ticks, dtype=np.int64), timescales.TICKS_PER_SECOND)
     nominal = whole * NS + part * _NS_NUMERATOR // _NS_DENOMINATOR
-    off = (nominal + ONBOARD_EPOCH_TAI_NS - sent).astype(np.float64)
+    off = (nominal + timescales.ONBOARD_EPOCH_TAI_NS - sent).astype(np.float64)
     kept = np.ones(len(ticks), dtype=np.bool_)
     names = np.array(station)
     units: list[IntArray] = []
@@ -233,10 +255,10 @@ def doubted_stations(
     unit = np.zeros(len(ticks), dtype=np.int64)
     for number, rows in enumerate(units):
         unit[rows] = number
-    differences = _differences(ticks, nominal, off, boot, unit, units)
+    differences = _differences(ticks, nominal, off, boot, unit, units, station)
     group = list(range(len(units)))
     for (one, other), found in differences.items():
-        if abs(found.least_ns) <= found.tolerance_ns:
+        if found.changes and abs(found.least_ns) <= found.tolerance_ns:
             group = [group[one] if number == group[other] else number for number in group]
     doubts: dict[int, StationDoubt] = {}
     for (one, other), found in differences.items():
@@ -254,6 +276,18 @@ def doubted_stations(
                 kept[rows] = False
                 doubt = StationDoubt(str(names[rows[0]]), sign * found.least_ns * 1e-9)
                 doubts.update(dict.fromkeys(rows.tolist(), doubt))
+    for name in sorted(set(station)):
+        numbers = [number for number, rows in enumerate(units) if names[rows[0]] == name]
+        shared = {group[number] for number in range(len(units)) if number not in numbers}
+        ahead_ns = -float(np.median(off[units[numbers[0]]]))
+        if not kept[units[numbers[0]]].all() or not _is_whole(ahead_ns) or abs(ahead_ns) < LEAP_NS:
+            continue
+        doubt = StationDoubt(name, ahead_ns * 1e-9, "the on-board clock")
+        for own in (units[number] for number in numbers if group[number] not in shared):
+            if np.abs(off[own] + ahead_ns).max() > STATION_DIFFERENCE_NS:
+                break  # the clock was set on board
+            kept[own] = False
+            doubts.update(dict.fromkeys(own.tolist(), doubt))
     return kept, doubts
 
 
@@ -273,8 +307,12 @@ def _differences(
     boot: IntArray,
     unit: IntArray,
     units: Sequence[IntArray],
+    names: Sequence[str],
 ) -> dict[tuple[int, int], _Difference]:
-    """Return the differences of the offsets of runs (second minus first) that follow one another in time."""
+    """Return the differences of the offsets of runs (second minus first) that follow one another in time.
+
+    A run is also compared with the last one of every other station before it, which counts as no change.
+    """
     drifts = []
     for rows in units:
         lasted = float(np.ptp(nominal[rows])) if len(rows) > 2 else 0.0
@@ -283,18 +321,24 @@ def _differences(
         drifts.append((drift, DRIFT_CHANGE + JUMP_NS / lasted if known else JUMP_RATE))
     found: dict[tuple[int, int], _Difference] = {}
     order = np.lexsort((ticks, boot))
+    latest: dict[str, int] = {}
     for k in np.flatnonzero((np.diff(unit[order]) != 0) & (np.diff(boot[order]) == 0)).tolist():
         first, second = int(order[k]), int(order[k + 1])
-        since = float(nominal[second] - nominal[first])
-        drift, unknown = drifts[unit[first]]
-        value = off[second] - off[first] - drift * since
-        pair = int(unit[first]), int(unit[second])
-        if pair[0] > pair[1]:
-            pair, value = (pair[1], pair[0]), -value
-        one = _Difference(float(value), STATION_DIFFERENCE_NS + unknown * since, 1)
-        before = found.get(pair, one)
-        least = one if abs(one.least_ns) <= abs(before.least_ns) else before
-        found[pair] = replace(least, changes=before.changes + (pair in found))
+        latest[names[first]] = first
+        for name, earlier in latest.items():
+            pair = int(unit[earlier]), int(unit[second])
+            if boot[earlier] != boot[second] or (name == names[second] and earlier != first):
+                continue
+            since = float(nominal[second] - nominal[earlier])
+            drift, unknown = drifts[unit[earlier]]
+            value = off[second] - off[earlier] - drift * since
+            if pair[0] > pair[1]:
+                pair, value = (pair[1], pair[0]), -value
+            one = _Difference(float(value), STATION_DIFFERENCE_NS + unknown * since, int(earlier == first))
+            before = found.get(pair, replace(one, changes=0))
+            if one.changes or not before.changes:
+                least = one if abs(one.least_ns) <= abs(before.least_ns) or not before.changes else before
+                found[pair] = replace(least, changes=before.changes + one.changes)
     return found
 
 
@@ -309,10 +353,11 @@ def clock_runs(ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray,
 
     A run ends with a boot, and where the clock was set: where it is off by more than `JUMP_NS` from where its drift
     would have taken it, and the next report says so too. The drift is at most `JUMP_RATE`; a run that has lasted for a
-    time shows it to `JUMP_NS` over that time and `DRIFT_CHANGE`, so that a step is found after hours without reports. A
-    report that stands alone with what it says stays in the run, where the fit leaves it out.
+    time shows it to `JUMP_NS` over that time and `DRIFT_CHANGE`, so that a step is found after hours without reports.
+    Two reports alone show a drift up to `LONE_DRIFT`, otherwise a step. A report that stands alone with what it says
+    stays in the run, where the fit leaves it out.
     """
-    sent = np.asarray(tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - light_time_ns
+    sent = np.asarray(timescales.tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - light_time_ns
     order = np.lexsort((ticks, sent))
     runs: list[IntArray] = []
     for number in np.unique(boot[order]):
@@ -320,7 +365,7 @@ def clock_runs(ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray,
         nominal = (ticks[mine] - ticks[mine[0]]) * _NS_NUMERATOR // _NS_DENOMINATOR
         at = (sent[mine] - sent[mine[0]]).astype(np.float64)
         off = (nominal - nominal[0]).astype(np.float64) - at
-        start, level = 0, 0
+        start, level, ends = 0, 0, list[int]()
         for k in range(1, len(mine)):
             lasted, since = at[level] - at[start], at[k] - at[level]
             drift, unknown = 0.0, JUMP_RATE
@@ -329,7 +374,9 @@ def clock_runs(ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray,
             if abs(off[k] - off[level] - drift * since) <= JUMP_NS + unknown * since:
                 level = k
             elif k + 1 < len(mine) and abs(off[k + 1] - off[k]) <= JUMP_NS + JUMP_RATE * (at[k + 1] - at[k]):
-                runs.append(mine[start:k])
+                ends.append(k)
                 start = level = k
-        runs.append(mine[start:])
+        for run in np.split(np.arange(len(mine)), ends):
+            lone = len(run) == 2 and abs(off[run[1]] - off[run[0]]) > JUMP_NS + LONE_DRIFT * (at[run[1]] - at[run[0]])
+            runs += np.split(mine[run], [1] if lone else [])
     return runs

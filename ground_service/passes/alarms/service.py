@@ -31,6 +31,7 @@ from ground_service.store.states import StateMachine
 from ground_service.store.vehicles import FLOWN, lock_vehicle, vehicle_id
 from ground_service.telemetry import store as telemetry
 from ground_service.telemetry import values as parameters
+from lunar.constants import DAY_NS
 from lunar.timescales import format_utc
 from tmtc.dictionary.payload import STRUCTURES
 
@@ -242,8 +243,6 @@ BATCH = 2000
 
 QUIET = 200
 """Packets without any alarm that are examined again with later ones, which saves a transaction for each piece."""
-
-DAY_NS = 86_400_000_000_000
 
 
 def examine_packets(ground: Ground, vehicle: int) -> int:

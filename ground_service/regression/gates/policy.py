@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from ground_service.errors import InvalidInput, storage_error
+from ground_service.missions.automation import Table
 from ground_service.regression.gates.core import EXACT_METRICS, GatePolicy, GateRule
 from ground_service.regression.gates.metrics import FRAMES, TIMES, UNDECODABLE
 from ground_service.toml import parse_table, read_table
@@ -32,18 +33,6 @@ class LevelTable(_Table):
     reason: Text
 
 
-class GateTable(_Table):
-    """Gate: an exact metric with a margin, or a primary metric with a weight and the sizes that count."""
-
-    metric: Text
-    weight: float = Field(default=0.0, ge=0.0, le=1.0)
-    materiality: float = Field(default=0.0, ge=0.0, le=1e9)
-    margin: float = Field(ge=0.0, le=1e9)
-    window_materiality: float | None = Field(default=None, ge=0.0, le=1e9)
-    window_margin: float | None = Field(default=None, gt=0.0, le=1e9)
-    reason: Text
-
-
 class PolicyTable(_Table):
     """Content of a policy file."""
 
@@ -51,7 +40,7 @@ class PolicyTable(_Table):
     version: Text
     inconclusive: Literal["failure", "skip"] = "failure"
     fail: LevelTable
-    gate: list[GateTable] = Field(min_length=1)
+    gate: list[Annotated[GateRule, Table]] = Field(min_length=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +85,8 @@ def read_policy(octets: bytes, source: str) -> PolicyFile:
         raise InvalidInput(source, "schema_version", str(SCHEMA_VERSION), repr(table.get("schema_version")))
     read = parse_table(PolicyTable, table, source)
     for i, item in enumerate(read.gate):
+        if not item.reason.strip():
+            raise InvalidInput(source, f"gate.{i}.reason", "a text", "none")
         if (item.weight == 0.0) != (item.metric in EXACT_METRICS):
             expected = "no weight: the metric is exact" if item.weight else "a weight above 0"
             raise InvalidInput(source, f"gate.{i}.weight", expected, f"{item.weight:g}")
@@ -107,17 +98,8 @@ def read_policy(octets: bytes, source: str) -> PolicyFile:
     if not 0.0 < weights <= 1.0 + 1e-9:
         raise InvalidInput(source, "gate", "weights above 0 that sum to at most 1", f"{weights:g}")
     named = {item.metric for item in read.gate}
-    always = (GateRule(name, 0.0, reason=ALWAYS) for name in (UNDECODABLE, TIMES, FRAMES) if name not in named)
+    always = (GateRule(name, 0.0, ALWAYS) for name in (UNDECODABLE, TIMES, FRAMES) if name not in named)
     policy = GatePolicy(
-        version=read.version,
-        fail_level=read.fail.level,
-        rules=(*always, *(_rule(item) for item in read.gate)),
-        inconclusive=read.inconclusive,
+        version=read.version, fail_level=read.fail.level, rules=(*always, *read.gate), inconclusive=read.inconclusive
     )
     return PolicyFile(policy, hashlib.sha256(octets).hexdigest(), source)
-
-
-def _rule(item: GateTable) -> GateRule:
-    pairs = ((item.window_margin, item.margin), (item.window_materiality, item.materiality))
-    margin, materiality = (value if own is None else own for own, value in pairs)
-    return GateRule(item.metric, item.margin, item.weight, item.materiality, margin, materiality, item.reason)

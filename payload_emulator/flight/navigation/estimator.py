@@ -12,9 +12,14 @@ import numpy as np
 
 from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
-from payload_emulator.flight.navigation import anchored
-from payload_emulator.flight.navigation.anchored import AnchoredReport, AnchoredSetup, AnchoredState, Observation
-from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
+from payload_emulator.flight.navigation.anchored import anchored
+from payload_emulator.flight.navigation.anchored.anchored import (
+    AnchoredReport,
+    AnchoredSetup,
+    AnchoredState,
+    Observation,
+)
+from payload_emulator.flight.navigation.anchored.parameters import AnchoredParameters
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.filter import KalmanFilter
 from payload_emulator.flight.navigation.odometry import odometry

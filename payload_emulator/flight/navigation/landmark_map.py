@@ -25,7 +25,7 @@ from lunar.frames import enu_from_mcmf
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Sighting, landmark_map
 from payload_emulator.flight.vision.detections import Detections
 from tmtc.dictionary.tables import CatalogueTable
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 FIRST_LANDMARK_ID = 3_000_000_000
 """Identities of landmarks begin here; catalogues stay below."""

@@ -4,11 +4,11 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 from lunar.arrays import FloatArray
-from payload_emulator.flight.onboard.parameters import ParameterStore
+from payload_emulator.flight.onboard.settings import ParameterStore
 from payload_emulator.flight.ports import SENSORS
 from payload_emulator.flight.telemetry.packets import Telemetry
 from payload_emulator.flight.vision.preprocess import ImageQuality
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 _VOLTAGE, _TEMPERATURE = SENSORS.index("bus_voltage_v"), SENSORS.index("temperature_c")
 # A limit counts as left only when it is left by this much, so that noise makes no stream of events.

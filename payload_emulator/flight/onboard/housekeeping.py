@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from payload_emulator.flight.ports import Board, Stage
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 STATE, PERFORMANCE = 1, 2
 FIRST_DEFINED = 16

@@ -5,7 +5,7 @@ import inspect
 from payload_emulator.flight.onboard.modes import ALL_MODES, ALLOWED, TRANSITIONS, PayloadMode
 from payload_emulator.flight.ports import SENSORS, Board, Load, ResetCause, Stage
 from payload_emulator.flight.telemetry.store import SHARES, StoreClass
-from tmtc.dictionary.onboard_parameters import PARAMETERS, Parameter
+from tmtc.dictionary.fields import PARAMETERS, Parameter
 
 _PORTS = {
     "EPS": (("sensors", "switch"), "power in, switched loads"),

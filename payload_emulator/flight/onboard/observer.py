@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lunar.arrays import FloatArray, IntArray
 from lunar.catalogue import size_class
 from lunar.frames import matrix_from_quaternion
-from payload_emulator.flight.navigation.anchored import AnchoredReport, AnchoredState
+from payload_emulator.flight.navigation.anchored.anchored import AnchoredReport, AnchoredState
 from payload_emulator.flight.navigation.estimator import ESTIMATORS, Frame
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.landmark_map import map_rows

@@ -4,13 +4,11 @@ The description states what a ground segment needs to know about the spacecraft 
 TOML, read by the ground service.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import astuple, fields, replace
+from dataclasses import asdict, astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +26,7 @@ from payload_emulator.flight.navigation.filter.map_offset import OffsetRule
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.session.archive.recording import RecordedStep
 from payload_emulator.session.live.station_ports import RECORD_HEADER
-from payload_emulator.session.scenario import SHIPPED, SPACECRAFT_ID, RequirementsSection, Scenario, format_scenario
+from payload_emulator.session.scenario import SHIPPED, SPACECRAFT_ID, Scenario, format_scenario
 from payload_emulator.session.spacecraft.loading import detector_parameters, filter_field, network_octets
 from payload_emulator.session.spacecraft.loop import PLAYBACK_CHANNEL
 from payload_emulator.session.typed_toml import toml_text
@@ -39,7 +37,7 @@ from payload_emulator.sim.board.link import STATIONS, LinkSection
 from payload_emulator.sim.terrain.tiles import POLE_LIMIT_RAD
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.link.settings import LinkSettings
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 MISSION_FILE = "mission.toml"
 ATTITUDE_FILE = "attitude.csv"
@@ -251,7 +249,7 @@ def live_mission_text(
         latitude, _, _ = spherical_from_mcmf(world.truth.positions_mcmf(times))
         low_deg, high_deg = scenario.window.latitude_band_deg
         band = times[(np.degrees(latitude) >= low_deg) & (np.degrees(latitude) <= high_deg)]
-        if scenario.requirements.clock_step_s < 0.0:
+        if "clock_step_s" not in _requirements(scenario):
             timed = replace(scenario.requirements, clock_step_s=CLOCK_STEP_S)
             world = replace(world, scenario=replace(scenario, requirements=timed))
         lines = [mission_text(replace(world, frame_utc_ns=band), data, ORBIT_AGE_H).rstrip()]
@@ -399,15 +397,10 @@ def _detector(scenario: Scenario) -> dict[str, Value]:
 
 def _requirements(scenario: Scenario) -> dict[str, Value]:
     section, flown = scenario.requirements, scenario.navigation.estimators
-    values: dict[str, Value] = {
-        "estimator": section.estimator or ("anchored" if "anchored" in flown else flown[0]),
-        "better_than": list(section.better_than),
-    }
-    for item in fields(RequirementsSection):
-        limit = getattr(section, item.name)
-        if isinstance(limit, float) and limit >= 0.0:
-            values[item.name] = limit
-    return values
+    values = asdict(section) | {"estimator": section.estimator or ("anchored" if "anchored" in flown else flown[0])}
+    negative = {name for name, limit in values.items() if isinstance(limit, float) and limit < 0.0}
+    left_out = negative - {"temperature_min_c"}
+    return {name: limit for name, limit in values.items() if limit is not None and name not in left_out}
 
 
 def _toml(value: Value) -> str:

@@ -23,7 +23,7 @@ from lunar.gravity import GravityField, builtin_gravity, load_gravity
 from lunar.timescales import format_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
 from payload_emulator.errors import ModelError
 from payload_emulator.flight.models import NETWORKS, load_shipped_model
-from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
+from payload_emulator.flight.navigation.anchored.parameters import AnchoredParameters
 from payload_emulator.flight.navigation.filter.filter import CommonErrors
 from payload_emulator.flight.navigation.filter.map_offset import OffsetRule
 from payload_emulator.flight.navigation.odometry.odometry import OdometryParameters
@@ -42,7 +42,7 @@ from payload_emulator.session.world.world import (
     sample_truth,
     with_reference_error,
 )
-from payload_emulator.sim.orbit.disturbances import TrueBurn
+from payload_emulator.sim.orbit.truth import TrueBurn
 from tmtc.dictionary.tables import (
     BurnTable,
     CatalogueTable,

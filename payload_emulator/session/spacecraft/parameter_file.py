@@ -5,8 +5,6 @@ A file names only what it changes; the rest stays as it was flown. Sections foll
 away by leaving its key out of a full file.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import tomllib

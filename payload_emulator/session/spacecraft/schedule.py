@@ -16,7 +16,7 @@ from payload_emulator.session.spacecraft.loop import Spacecraft, StepInput, Step
 from payload_emulator.session.world.world import World, clock_ticks, sample_truth
 from payload_emulator.sim.board.link import contacts
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 # Source of the planned telecommands; a person who commands by hand has another one, with separate counts.
 _PLANNING_SOURCE = 1

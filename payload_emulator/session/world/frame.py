@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from lunar.arrays import FloatArray, IntArray
-from lunar.camera import ground_point_sphere
+from lunar.camera import BrownCamera, ground_point_sphere
 from lunar.datafolder import DataFolder
 from lunar.frames import spherical_from_mcmf
-from lunar.lens import BrownCamera
 from lunar.messages.ephemeris_files import load_orbit
 from lunar.timescales import format_utc
 from payload_emulator.errors import ScenarioError

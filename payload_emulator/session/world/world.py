@@ -1,7 +1,5 @@
 """The simulated world of a scenario: its true flight, its terrain, its light, and what the payload's senses get."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math
@@ -11,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
-from lunar.camera import PinholeCamera
+from lunar.camera import BrownCamera, PinholeCamera, pointed_camera_from_mcmf
 from lunar.catalogue import CraterCatalogue
 from lunar.comparison import check_pointing
 from lunar.constants import MOON_RADIUS_M, NS
@@ -20,7 +18,6 @@ from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import ImpactError
 from lunar.frames import Orientation, rtn_from_inertial, spherical_from_mcmf
 from lunar.gravity import GravityField
-from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from lunar.maneuvers import Maneuver
 from lunar.messages.ephemeris_files import load_orbit
 from lunar.plausible import HEIGHT_M
@@ -31,14 +28,24 @@ from payload_emulator.session.scenario import ReferenceSection, Scenario, Window
 from payload_emulator.session.world.external import ExternalFrames, external_scenario
 from payload_emulator.session.world.orbit import force_model, propagate_from, propagate_to_impact
 from payload_emulator.session.world.rims import rims_of, sources_of
-from payload_emulator.sim.orbit.disturbances import TrueBurn, changed, executed, turned_state
-from payload_emulator.sim.orbit.truth import Crossing, Truth, find_crossings, frame_times, require_above_ground, spliced
+from payload_emulator.sim.orbit.truth import (
+    Crossing,
+    TrueBurn,
+    Truth,
+    changed,
+    executed,
+    find_crossings,
+    frame_times,
+    require_above_ground,
+    spliced,
+    turned_state,
+)
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.raster import RasterTerrain
 from payload_emulator.sim.terrain.registering import fitted
 from payload_emulator.sim.terrain.registration import joined
 from payload_emulator.sim.terrain.tiles import Terrain
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 CHUNK_S = 86_400.0
 """Time that the orbit is propagated at once; another division gives other last digits."""

@@ -3,8 +3,6 @@
 One station at a time has the contact: the one that will see the spacecraft longest, until it sets.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol

@@ -4,8 +4,6 @@ A dump is what the encoder is given at once; frames of a dump hold whole packets
 of order and come twice without touching each other. Bit errors come in two states (Gilbert–Elliott), frame by frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,7 +23,7 @@ from tmtc.link import cadu
 from tmtc.link.frames import FRAME_HEADER_LENGTH, OCF_LENGTH, pack_clcw
 from tmtc.link.settings import LinkSettings
 from tmtc.link.uplink import Farm, UplinkDecoder, UplinkEncoder
-from tmtc.packets.crc import CRC_LENGTH
+from tmtc.packets.space_packets import CRC_LENGTH
 from tmtc.packets.stream import cut_packets
 
 LIGHT_S = 1.28

@@ -1,7 +1,5 @@
 """From radiance to the RGB picture that the camera hands over."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

@@ -7,6 +7,7 @@ are compared with what the Moon can have (`lunar.plausible`).  Pixels are areas;
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 import warnings
@@ -19,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from kernels import keep, kept
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.constants import MOON_RADIUS_M
 from lunar.plausible import (
@@ -35,8 +37,12 @@ from payload_emulator.errors import TerrainError, install_hint
 from payload_emulator.sim.terrain.tiles import Heights
 
 CHUNK_PIXELS = 1024
-CHUNK_LIMIT_OCTETS = 48 << 20
-"""Decoded pixels that a terrain keeps of all its files: those under some consecutive frames."""
+CHUNK_LIMIT_OCTETS = 32 << 20
+"""Decoded pixels that a terrain keeps in memory of all its files: those under neighbouring tiles."""
+
+KEPT_PIXELS = 128
+"""Chunks of 2 MB of decoded pixels that are kept on disk: those under a pole-to-pole pass, whose rims are measured
+before its frames are taken."""
 
 SAME_LATTICE_PIXELS = 0.1
 """Files whose pixels lie on lattices that differ by less (pixels of 100 m do not divide the degree) are one layer."""
@@ -255,8 +261,7 @@ class RasterLayer:
 
         top, left = i * CHUNK_PIXELS, j * CHUNK_PIXELS
         window = Window(left, top, min(CHUNK_PIXELS, file.columns - left), min(CHUNK_PIXELS, file.rows - top))
-        with file.opened() as source:
-            raw = source.read(1, window=window, masked=_has_mask(source))
+        raw = _decoded(file, window)
         is_wide = (raw.dtype.kind != "f" and raw.dtype.itemsize > 2) or raw.dtype == np.float64
         values = np.ma.filled(raw.astype(np.float64 if is_wide else np.float32), np.nan)
         if file.reading.nodata is not None:
@@ -275,9 +280,10 @@ class RasterLayer:
             return raw.astype(np.float32)
         chosen = reading or _plausible(file, raw)
         values = _scaled(raw, chosen)
-        with np.errstate(invalid="ignore"):
-            wrong = ~HEIGHT_M.holds(values) & np.isfinite(values)
-        if wrong.any():
+        extremes = np.array([np.fmin.reduce(values, axis=None), np.fmax.reduce(values, axis=None)])
+        if not HEIGHT_M.holds(extremes).all():
+            with np.errstate(invalid="ignore"):
+                wrong = ~HEIGHT_M.holds(values) & np.isfinite(values)
             constant, count = np.unique(raw[wrong]), np.count_nonzero(np.isfinite(values))
             if constant.size > 1 and np.count_nonzero(wrong) > _SPIKES * count:
                 raise _implausible(file, values)
@@ -399,11 +405,10 @@ def _plausible(file: RasterFile, raw: Heights | FloatArray) -> Reading:
     """Return how the values of a file are taken: as it states, or as radii where that is all that they can be."""
     stated = file.reading
     values = _scaled(raw, stated)[np.isfinite(raw)].astype(np.float64)
-    middle = float(np.median(values))
     for words, factor in (("radii in metres", 1.0), ("radii in kilometres", 1e3)):
         if np.mean(RADIUS_M.holds(values * factor)) > 0.5 and (factor == 1.0 or not stated.unit):
             scale_m, offset_m = stated.scale_m * factor, stated.offset_m * factor - MOON_RADIUS_M
-            words = f"{stated.words}; values of {middle:.7g} as {words}"
+            words = f"{stated.words}; values of {np.median(values):.7g} as {words}"
             return replace(stated, scale_m=scale_m, offset_m=offset_m, words=words)
     return stated
 
@@ -433,16 +438,38 @@ def _require_slopes(file: RasterFile, reading: Reading, values: Heights, pixel_m
     """Refuse heights without a unit that are steeper than ground of the Moon is; columns are ``narrow`` pixels wide."""
     if reading.unit or pixel_m < SLOPE_BASE_M or min(values.shape) < 2 or narrow < _NARROW:
         return
-    south, east = np.gradient(values.astype(np.float64), pixel_m)
-    steep = np.hypot(south, east / narrow)
-    good = np.isfinite(steep)
-    share = float(np.mean(steep[good] > math.tan(math.radians(SLOPE_DEG)))) if good.any() else 0.0
+    south, east = (np.gradient(values, pixel_m, axis=axis) for axis in (0, 1))
+    square = south * south + east * east / np.float32(narrow * narrow)
+    good = np.isfinite(square)
+    share = float(np.mean(square[good] > math.tan(math.radians(SLOPE_DEG)) ** 2)) if good.any() else 0.0
     if share > STEEP_SHARE:
         raise TerrainError(
             f"{file.path}: expected at most {STEEP_SHARE:.1%} of the pixels steeper than {SLOPE_DEG:g} deg, found "
             f"{share:.1%} (heights of {np.nanmin(values):.4g} to {np.nanmax(values):.4g} m, no unit stated): half "
             f"metres, feet or another scale? {_STATE_IT}"
         )
+
+
+def _decoded(file: RasterFile, window: Any) -> Any:
+    """Return the pixels of a window; those of 16 bits of JPEG 2000, slow to decode, are decoded once for all runs."""
+    from rasterio import __gdal_version__
+
+    def decode() -> Any:
+        with file.opened() as source:
+            return source.read(1, window=window, masked=_has_mask(source))
+
+    if file.path.suffix.lower() != ".jp2" or file.warp is not None:
+        return decode()
+    state = file.path.stat()
+    key = repr((str(file.path.resolve()), state.st_size, state.st_mtime_ns, str(window), __gdal_version__))
+    name = f"pixels-{hashlib.sha256(key.encode()).hexdigest()}"
+    octets, size = kept(name), int(window.height * window.width)
+    if octets is not None and len(octets) == 2 * size:
+        return np.frombuffer(octets, np.int16).reshape(int(window.height), -1)
+    raw = decode()
+    if raw.dtype == np.int16 and not np.ma.isMaskedArray(raw):
+        keep(name, raw.tobytes(), KEPT_PIXELS)
+    return raw
 
 
 def _has_mask(source: Any) -> bool:

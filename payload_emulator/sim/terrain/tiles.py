@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from kernels import keep, kept
+from kernels import made_once
 from lunar import constants
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.catalogue import CraterCatalogue
@@ -52,8 +52,9 @@ ALBEDO_SHIFT = 6
 MEAN_ALBEDO = 0.12
 """Normal albedo of an average lunar surface (the maps of Hapke 2012 span about 0.06 to 0.2)."""
 
-KEPT_TILES = 64
-"""Tiles of 1 MB that are kept for later windows: a pass over new ground needs each in neighbouring frames only."""
+KEPT_TILES = 32
+"""Tiles of 1 MB that are kept for later windows: a pass over new ground needs each in neighbouring frames only, and
+reads others again from disk."""
 
 FILED_TILES = 1024
 """Tiles of 1 MB that are kept on disk for later runs: six windows of a pole-to-pole orbit side by side need 650."""
@@ -360,10 +361,7 @@ class Terrain(ABC):
         if not self.sources:
             return self.make_heights(latitude, longitude)
         name = f"tile-{ground_hash(self._ground_hash, np.array(key))}"
-        octets = kept(name)
-        if octets is None:
-            octets = self.make_heights(latitude, longitude).tobytes()
-            keep(name, octets, FILED_TILES)
+        octets = made_once(name, lambda: self.make_heights(latitude, longitude).tobytes(), FILED_TILES)
         return np.frombuffer(octets, np.float32).reshape(latitude.size, -1)
 
     @functools.cached_property

@@ -9,7 +9,7 @@ import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, ground_point_sphere, nadir_camera_from_mcmf
-from lunar.constants import NS
+from lunar.constants import NS, SECONDS_PER_DAY
 from lunar.datafolder import DataFolder, default_orientation
 from lunar.frames import spherical_from_mcmf
 from lunar.timescales import tdb_s_from_utc_ns
@@ -18,7 +18,6 @@ from payload_emulator.session.world.recipe import EVERYWHERE, PAPER_SHARES, PAPE
 from payload_emulator.training.data.shots import allowed, edge_pixels
 
 _BATCH = 4096  # places looked at together: their footprints take a few MB
-_DAY_S = 86_400.0
 _STRIP_RAD = np.radians(10.0)  # a few footprints wide: the tiles of one crossing fit the terrain's cache
 
 
@@ -125,7 +124,7 @@ def _places(source: Source, data: DataFolder) -> tuple[IntArray, FloatArray]:
 
         scenario = load_scenario(source.ephemeris)
         model = force_model(scenario, data)
-        orbit = propagate_scenario(scenario, model, source.days * _DAY_S)
+        orbit = propagate_scenario(scenario, model, source.days * SECONDS_PER_DAY)
         ephemeris, orientation = sample(orbit, source.step_s)[0], model.orientation
     step_ns = round(source.step_s * NS)
     utc_ns: list[IntArray] = []

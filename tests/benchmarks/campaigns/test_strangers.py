@@ -43,13 +43,17 @@ def test_commands_and_files_are_those_of_the_page(tmp_path):
 
 
 def test_every_operation_has_a_request_and_every_request_an_operation(tmp_path):
-    paths = create_app(Settings(home=tmp_path)).openapi()["paths"]
+    document = create_app(Settings(home=tmp_path)).openapi()
+    paths, schemas = document["paths"], document["components"]["schemas"]
     found = {one["operationId"]: (path, one) for path, methods in paths.items() for one in methods.values()}
+    assert {key.split("`")[1] for key in costs.table()} == set(found), (
+        "python -m benchmarks.campaigns.costs --missing --write"
+    )
     special = {one[0] for one in costs.cases()}
     assert special <= set(found)
     for name, (path, described) in found.items():
         if name not in special:
-            assert "{" not in costs.derived(path, described, costs.VALUES)[1]
+            assert "{" not in costs.derived(path, described, schemas)[1]
 
 
 @pytest.mark.parametrize(

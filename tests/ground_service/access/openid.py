@@ -6,7 +6,7 @@ import json
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -21,7 +21,7 @@ KEY = jwk.RSAKey.generate_key(2048, {"kid": "1"}, private=True)
 class OpenIdProvider:
     """Provider in which every visitor of the sign-in page is `claims`."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.claims: dict[str, Any] = {
             "sub": "u-1", "preferred_username": "ann", "roles": ["linna-operators"], "sid": "s-1",
         }  # fmt: skip
@@ -36,20 +36,20 @@ class OpenIdProvider:
         self.start()
         self.issuer = f"http://127.0.0.1:{self.port}/realms/ops"
 
-    def start(self) -> None:
+    def start(self):
         """Answer, on the port of before after a stop."""
         self._server = ThreadingHTTPServer(("127.0.0.1", getattr(self, "port", 0)), self._handler())
         self.port = self._server.server_port
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,))
         self._thread.start()
 
-    def stop(self) -> None:
+    def stop(self):
         """Answer no more."""
         self._server.shutdown()
         self._thread.join()
         self._server.server_close()
 
-    def authorise(self, address: str) -> str:
+    def authorise(self, address):
         """Return where the provider sends the browser that opens its sign-in page."""
         query = {name: values[0] for name, values in parse_qs(urlsplit(address).query).items()}
         assert query["response_type"] == "code" and query["client_id"] == CLIENT
@@ -58,18 +58,18 @@ class OpenIdProvider:
         self.codes[code] = query
         return f"{query['redirect_uri']}?{urlencode({'code': code, 'state': query['state'], 'iss': self.issuer})}"
 
-    def signed(self, claims: dict[str, Any], key: Any = None) -> str:
+    def signed(self, claims, key=None):
         """Return a signed token."""
         key = key or self.key
         header = {"alg": self.algorithm, "kid": key.kid}
         return jwt.encode(header, claims, key, algorithms=[self.algorithm])
 
-    def common(self) -> dict[str, Any]:
+    def common(self):
         """Return the claims of every token."""
         now = int(time.time())
         return {"iss": self.issuer, "aud": CLIENT, "iat": now, "exp": now + 300}
 
-    def exchange(self, form: dict[str, str], login: str | None) -> tuple[int, dict[str, Any]]:
+    def exchange(self, form, login):
         """Answer a request to the token endpoint."""
         expected = base64.b64encode(b"linna:s3cret%2Fwith%2Bsigns").decode()
         if login != f"Basic {expected}":
@@ -83,11 +83,11 @@ class OpenIdProvider:
         claims = self.change({**self.common(), "nonce": query["nonce"], **self.claims})
         return 200, {"access_token": "a", "token_type": "Bearer", "id_token": self.signed(claims)}
 
-    def _handler(self) -> type[BaseHTTPRequestHandler]:
+    def _handler(self):
         provider = self
 
         class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
+            def do_GET(self):
                 provider.requests.append(self.path)
                 if self.path.endswith("/.well-known/openid-configuration"):
                     issuer = provider.issuer
@@ -111,13 +111,13 @@ class OpenIdProvider:
                 else:
                     self._send(200, {"page": "of the provider"})
 
-            def do_POST(self) -> None:
+            def do_POST(self):
                 provider.requests.append(self.path)
                 text = self.rfile.read(int(self.headers["Content-Length"])).decode()
                 form = {name: values[0] for name, values in parse_qs(text).items()}
                 self._send(*provider.exchange(form, self.headers.get("Authorization")))
 
-            def _send(self, status: int, body: dict[str, Any]) -> None:
+            def _send(self, status, body):
                 octets = json.dumps(body).encode()
                 self.send_response(status)
                 self.send_header("Content-Type", "application/json")
@@ -125,13 +125,13 @@ class OpenIdProvider:
                 self.end_headers()
                 self.wfile.write(octets)
 
-            def log_message(self, *_: object) -> None: ...
+            def log_message(self, *_): ...
 
         return Handler
 
 
 @contextmanager
-def running_provider() -> Iterator[OpenIdProvider]:
+def running_provider():
     """Yield a provider that answers on a private port."""
     provider = OpenIdProvider()
     try:

@@ -164,7 +164,7 @@ def test_an_administrator_manages_users(guarded):
     assert again.json()["detail"] == "user ann: expected state active, found disabled"
 
 
-BODIES = """
+BODIES = r"""
 {"name": "ann", "role": "root"}
 {"name": "ann", "role": "viewer", "days_valid": true}
 {"name": "ann", "role": "viewer", "days_valid": -1}

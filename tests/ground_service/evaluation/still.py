@@ -1,7 +1,6 @@
 """Orientations for tests: a Moon that does not turn, and one that is turned against the IAU series."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from lunar.frames import IauOrientation, axis_rotation
 
@@ -11,21 +10,21 @@ class Still:
 
     name = "still"
 
-    def mcmf_from_icrf(self, tdb_s: ArrayLike) -> np.ndarray:
+    def mcmf_from_icrf(self, tdb_s):
         return np.broadcast_to(np.eye(3), (*np.shape(tdb_s), 3, 3)).copy()
 
-    def pa_from_icrf(self, tdb_s: ArrayLike) -> np.ndarray:
+    def pa_from_icrf(self, tdb_s):
         return self.mcmf_from_icrf(tdb_s)
 
 
 class TurnedOrientation:
     """An orientation that turns the ground by 0.01 degrees (300 m) from the IAU series."""
 
-    def __init__(self, name: str = "DE421") -> None:
+    def __init__(self, name="DE421"):
         self.name = name
 
-    def mcmf_from_icrf(self, tdb_s: ArrayLike) -> np.ndarray:
+    def mcmf_from_icrf(self, tdb_s):
         return axis_rotation(3, np.radians(0.01)) @ IauOrientation().mcmf_from_icrf(tdb_s)
 
-    def pa_from_icrf(self, tdb_s: ArrayLike) -> np.ndarray:
+    def pa_from_icrf(self, tdb_s):
         return IauOrientation().pa_from_icrf(tdb_s)

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from numpy.typing import ArrayLike
 
 from ground_service.evaluation.alignment import (
     ReferenceStates,
@@ -17,7 +16,7 @@ from ground_service.evaluation.alignment import (
     places_of_positions,
     reference_states,
 )
-from lunar.ephemeris import Ephemeris, ephemeris_from_states
+from lunar.ephemeris import ephemeris_from_states
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
@@ -32,17 +31,17 @@ class Turning:
 
     name = "turning"
 
-    def mcmf_from_icrf(self, tdb_s: ArrayLike) -> np.ndarray:
+    def mcmf_from_icrf(self, tdb_s):
         angle = TURN_RAD_S * (np.asarray(tdb_s, dtype=np.float64) - START_S)
         c, s, zero, one = np.cos(angle), np.sin(angle), np.zeros_like(angle), np.ones_like(angle)
         rows = [[c, s, zero], [-s, c, zero], [zero, zero, one]]
         return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
-    def pa_from_icrf(self, tdb_s: ArrayLike) -> np.ndarray:
+    def pa_from_icrf(self, tdb_s):
         return self.mcmf_from_icrf(tdb_s)
 
 
-def polar() -> Ephemeris:
+def polar():
     """A circle over the poles in the plane of the x and z axes, at a steady angle."""
     seconds = np.arange(0.0, 601.0, 10.0)
     angle = SPEED_M_S / RADIUS_M * seconds
@@ -52,11 +51,11 @@ def polar() -> Ephemeris:
     return ephemeris_from_states(EPOCH + (seconds * 1e9).astype(np.int64), RADIUS_M * outward, SPEED_M_S * ahead)
 
 
-def after(*seconds: float) -> np.ndarray:
+def after(*seconds):
     return EPOCH + (np.array(seconds) * 1e9).astype(np.int64)
 
 
-def flown(*seconds: float) -> ReferenceStates:
+def flown(*seconds):
     return reference_states(polar(), Turning(), after(*seconds))
 
 

@@ -23,7 +23,7 @@ SECONDS = np.array([0.0, 600.0, 1800.0, 5400.0])
 TIMES = EPOCH + (SECONDS * 1e9).astype(np.int64)
 
 
-def oblate(degree: int = 2) -> GravityField:
+def oblate(degree=2):
     """J2 alone: the fully normalised C20 is -J2 over root five."""
     c = np.zeros((degree + 1, degree + 1))
     c[0, 0] = 1.0
@@ -36,11 +36,11 @@ INCLINED = np.array([0.0, math.cos(1.0), math.sin(1.0)])
 START = StartState(EPOCH, np.array([RADIUS_M, 0.0, 0.0]), SPEED_M_S * INCLINED)
 
 
-def flown(degree: int, field: GravityField | None = None, **more: bool) -> np.ndarray:
+def flown(degree, field=None, **more):
     return propagated_positions(START, TIMES, field or oblate(), degree, Still(), **more)
 
 
-def circle() -> np.ndarray:
+def circle():
     angle = SPEED_M_S / RADIUS_M * SECONDS[:, None]
     return np.array(RADIUS_M * (np.cos(angle) * np.array([1.0, 0.0, 0.0]) + np.sin(angle) * INCLINED))
 
@@ -50,11 +50,11 @@ EARTH: Body = (3.986004355e14, lambda tdb_s: np.asarray(earth_position_icrf_m(td
 SUN: Body = (1.32712440041e20, lambda tdb_s: np.asarray(sun_position_icrf_m(tdb_s)))
 
 
-def integrated(j2: float = J2, bodies: tuple[Body, ...] = ()) -> np.ndarray:
+def integrated(j2=J2, bodies=()):
     """The same orbit with the accelerations written out (Vallado, 4th edition, equations 8-28 and 8-34)."""
     epoch_s = float(tdb_s_from_utc_ns(EPOCH))
 
-    def rate(seconds: float, state: np.ndarray) -> np.ndarray:
+    def rate(seconds, state):
         x, y, z = state[:3]
         r = math.sqrt(x * x + y * y + z * z)
         factor = -1.5 * j2 * GM * MOON_M**2 / r**5

@@ -2,8 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Iterator
-from typing import Any
 
 import pytest
 
@@ -24,7 +22,7 @@ FRAMES = 40
 
 
 @pytest.fixture(scope="module")
-def imported(synthetic_pass: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Imported]:
+def imported(synthetic_pass, tmp_path_factory):
     with open_ground(tmp_path_factory.mktemp("imported") / "home") as ground:
         pass_id = import_archive(ground, synthetic_pass.folder)
         yield ground, pass_id, evaluate(ground, pass_id)

@@ -1,10 +1,9 @@
-"""Fixes repeated from single frames, and told right from wrong, on exact projections. The payload's own map
-beside the catalogue.
+"""Fixes repeated from single frames, and classified as right or wrong, on exact projections. Landmarks of the
+payload with the catalogue.
 """
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ from ground_service.evaluation.fixes import (
 )
 from ground_service.telemetry.samples import DetectionSamples
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
-from lunar.catalogue import CraterCatalogue, make_catalogue
+from lunar.catalogue import make_catalogue
 from lunar.frames import mcmf_from_spherical
 
 CAMERA = PinholeCamera()
@@ -33,13 +32,13 @@ POSITION = mcmf_from_spherical(np.radians([20.0, 21.0]), np.radians([40.0, 40.5]
 UTC_NS = np.array([1000, 2000], dtype=np.int64)
 
 
-def craters(seed: int = 2) -> np.ndarray:
+def craters(seed=2):
     rng = np.random.default_rng(seed)
     places = np.radians(rng.uniform([19.8, 39.7], [21.2, 40.8], (8, 2)))
     return mcmf_from_spherical(places[:, 0], places[:, 1], rng.uniform(-800.0, 800.0, 8))
 
 
-def pairs(noise_px: float = 0.0, seed: int = 3) -> Pairs:
+def pairs(noise_px=0.0, seed=3):
     """Eight craters seen in both of two frames."""
     rng = np.random.default_rng(seed)
     uv = [
@@ -50,7 +49,7 @@ def pairs(noise_px: float = 0.0, seed: int = 3) -> Pairs:
     return Pairs(frame, UTC_NS[frame], np.concatenate(uv), np.full(16, 40.0), np.tile(craters(), (2, 1)))
 
 
-def some(values: Any, rows: Any) -> Any:
+def some(values, rows):
     """Return rows of pairs or of mapped craters."""
     return type(values)(*(getattr(values, name)[rows] for name in values.__slots__))
 
@@ -143,7 +142,7 @@ def test_identifications_are_joined_by_time_place_and_number():
 METRES_PER_DEG = math.radians(1.0) * 1_737_400.0
 
 
-def catalogue(count: int = 200) -> CraterCatalogue:
+def catalogue(count=200):
     rng = np.random.default_rng(1)
     # A grid of a degree, over the zero meridian: no two craters near each other.
     latitude, longitude = np.arange(count) % 20 - 10.0, (355.0 + np.arange(count) // 20) % 360.0
@@ -153,7 +152,7 @@ def catalogue(count: int = 200) -> CraterCatalogue:
     )  # fmt: skip
 
 
-def mapped(known: CraterCatalogue, sigma_m: float, seed: int = 2, shift_m: float = 0.0) -> MappedCraters:
+def mapped(known, sigma_m, seed=2, shift_m=0.0):
     rng = np.random.default_rng(seed)
     east, north, up = sigma_m * rng.standard_normal((3, len(known)))
     latitude = np.degrees(known.latitude_rad) + (north + shift_m) / METRES_PER_DEG

@@ -1,9 +1,7 @@
 """Golden reports: constructed passes with known figures."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,18 +10,17 @@ from pytest import approx
 from ground_service.evaluation.core import summary_of
 from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.service import evaluate
-from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
 from ground_service.passes.archive_import import import_archive, instance_of, read_manifest
 from ground_service.passes.service import completeness, define_pass
+from lunar.camera import BrownCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation
-from lunar.ground_track import ground_track
-from lunar.lens import BrownCamera
 from lunar.timescales import ticks_from_utc_ns
+from lunar.visibility import ground_track
+from reports.drawings import Drawings
 from reports.render import render_html, to_json
-from reports.values import PassReport, Requirement
 from tests.ground_service.conftest import (
     CADENCE_S,
     NS,
@@ -36,7 +33,7 @@ from tests.ground_service.conftest import (
 )
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import LinkSettings, encode_cadus
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 FRAMES = 12
 PACKETS_PER_FRAME = 6  # detections, two states, two outcomes, housekeeping
@@ -81,30 +78,30 @@ cpu_percent = 50.0
 """
 
 
-def rows(report: PassReport) -> dict[str, Requirement]:
+def rows(report):
     return {one.key: one for one in report.requirements}
 
 
-def statuses(report: PassReport) -> dict[str, str]:
+def statuses(report):
     return {key: one.status for key, one in rows(report).items() if one.status != "not judged"}
 
 
 @pytest.fixture
-def made(make_pass: Callable[..., Any]) -> Callable[..., Any]:
+def made(make_pass):
     """Make a pass of twelve frames with the mission description."""
 
-    def make(seed: int, mission: str = MISSION, **options: Any) -> Any:
+    def make(seed, mission=MISSION, **options):
         return make_pass(frames=FRAMES, seed=seed, mission=mission, **options)
 
     return make
 
 
 @pytest.fixture
-def report_on(ground: Ground) -> Callable[[Any], PassReport]:
+def report_on(ground):
     return lambda made: evaluate(ground, import_archive(ground, made.folder))
 
 
-def test_a_whole_pass(made, report_on):
+def test_a_whole_pass(made, report_on, undrawn_figures, monkeypatch):
     """130 m in 3-D put in, the reference good to 5 m: 129.9 m are the estimate's. Two thirds of four craters found."""
     flown = made(41)
     report = report_on(flown)
@@ -133,8 +130,10 @@ def test_a_whole_pass(made, report_on):
     assert report.headline[0].value == table["accuracy.median"].value
     assert report.remarks == () and len(report.events) == 1
     assert solutions["paper"].reset_trigger[:2] == ("initialization", "none")
+    monkeypatch.setattr(Drawings, "svg", undrawn_figures)
     page = render_html(report)
     assert "Requirements of the mission description" in page and "not met" in page and "Error budget" in page
+    assert "<path " in page
     stored = summary_of(report)["requirements"]
     assert [(one["key"], one["status"]) for one in stored] == [(k, one.status) for k, one in table.items()]
 
@@ -273,7 +272,7 @@ def test_two_spacecraft_in_one_file(made, ground, tmp_path, monkeypatch):
     assert len(set(read)) == 1
 
 
-def later_events(start_utc_ns: int, count: int, spacecraft_id: int = SPACECRAFT) -> bytes:
+def later_events(start_utc_ns, count, spacecraft_id=SPACECRAFT):
     start = int(ticks_from_utc_ns(start_utc_ns))
     packets = [event_packet(start + (k << 16), k) for k in range(count)]
     return encode_cadus(packets, spacecraft_id=spacecraft_id)

@@ -4,7 +4,6 @@ import json
 import math
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,11 +21,10 @@ from ground_service.missions.frames import camera_of, declared_frames
 from ground_service.missions.model import Camera, Frames, Mission
 from ground_service.missions.service import add_mission
 from ground_service.passes.archive_import import import_archive
-from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
+from lunar.camera import BrownCamera, PinholeCamera, nadir_camera_from_mcmf
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation, continuous_quaternions, matrix_from_quaternion, quaternion_from_matrix
 from lunar.gravity import builtin_gravity
-from lunar.lens import BrownCamera
 from lunar.messages.aem import AttitudeSegment, format_aem
 from lunar.timescales import ticks_from_utc_ns
 from reports.render import to_json
@@ -37,7 +35,7 @@ MISSING_FILES = DataFolder(orientation_bpc=Path("no.bpc"), gravity=Path("no.gfc"
 """A data folder with other models; none of them may even be opened."""
 
 
-def changed_archive(synthetic_pass: Any, folder: Path, attitude: str = "", **changed: Any) -> Path:
+def changed_archive(synthetic_pass, folder, attitude="", **changed):
     """Copy the archive, with a table of attitudes if any is given."""
     shutil.copytree(synthetic_pass.folder, folder)
     if attitude:
@@ -46,7 +44,7 @@ def changed_archive(synthetic_pass: Any, folder: Path, attitude: str = "", **cha
     return folder
 
 
-def report_text(home: Path, data: DataFolder, archive: Path) -> str:
+def report_text(home, data, archive):
     with open_ground(home, data) as ground:
         return to_json(evaluate(ground, import_archive(ground, archive)))
 
@@ -147,12 +145,12 @@ def test_the_attitude_of_an_archive_is_found_by_the_time_of_the_image(synthetic_
     assert viewing.q_wxyz.tolist() == q_wxyz[::-1].tolist()
 
 
-def first_nadir(synthetic_pass: Any) -> np.ndarray:
+def first_nadir(synthetic_pass):
     """Rotation (3, 3) of a camera that looks down at the first image."""
     return nadir_camera_from_mcmf(circular_states(synthetic_pass.utc_ns[:1])[0])[0]
 
 
-def with_attitude_message(synthetic_pass: Any, folder: Path, **fields: Any) -> AttitudeSegment:
+def with_attitude_message(synthetic_pass, folder, **fields):
     """Copy the archive with an AEM of a steady turn about the boresight, a sample every 10 s; return what it has."""
     shutil.copytree(synthetic_pass.folder, folder)
     utc_ns = synthetic_pass.utc_ns[0] + np.arange(0, 121, 10) * 10**9

@@ -7,12 +7,10 @@ south.
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from numpy.typing import ArrayLike
 from pytest import approx
 
 from ground_service.evaluation.core import PassInputs, _imaging_arcs, _joined, evaluate_pass, summary_of
@@ -20,26 +18,16 @@ from ground_service.evaluation.fixes import IdentificationSamples, MappedCraters
 from ground_service.evaluation.model import PassFigures
 from ground_service.evaluation.recall import Viewing
 from ground_service.evaluation.smoother import ONBOARD, FilterStates, StartState
-from ground_service.missions.model import Requirements
 from ground_service.telemetry.samples import DetectionSamples, NavigationSamples, OutcomeSamples, no_detections
 from lunar.camera import PinholeCamera
-from lunar.catalogue import CraterCatalogue, make_catalogue
-from lunar.ephemeris import Ephemeris, ephemeris_from_states
+from lunar.catalogue import make_catalogue
+from lunar.ephemeris import ephemeris_from_states
 from lunar.errors import LunarError
 from lunar.frames import axis_rotation, quaternion_from_matrix
 from lunar.gravity import GravityField, builtin_gravity
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
-from reports.values import (
-    AnchorRead,
-    ClassScore,
-    FrameAccounting,
-    NavigationSeries,
-    PacketAccounting,
-    PassReport,
-    TerrainMap,
-    TimeSpan,
-)
+from reports.values import AnchorRead, FrameAccounting, PacketAccounting, Requirements, TerrainMap, TimeSpan
 from tests.ground_service.evaluation.still import Still
 
 SECOND = 1_000_000_000
@@ -60,7 +48,7 @@ POINT = GravityField("point", RATE**2 * (RADIUS_M + 30.0) ** 3, MOON_M, np.ones(
 """A field in which a circle 30 m higher is flown in the same time."""
 
 
-def circle(seconds: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def circle(seconds):
     """Position and velocity (n, 3) of the orbit so long after the epoch."""
     angle = RATE * np.asarray(seconds, dtype=np.float64)
     zero = np.zeros_like(angle)
@@ -69,12 +57,12 @@ def circle(seconds: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     return RADIUS_M * outward, RADIUS_M * RATE * ahead
 
 
-def reference(stop_s: float = 600.0) -> Ephemeris:
+def reference(stop_s=600.0):
     seconds = np.arange(-300.0, stop_s + 1.0, 10.0)
     return ephemeris_from_states(EPOCH + (seconds * SECOND).astype(np.int64), *circle(seconds))
 
 
-def catalogue() -> CraterCatalogue:
+def catalogue():
     """Craters 10 k, 10 k + 1 and 10 k + 2 below, north and south of frame k."""
     return make_catalogue(
         np.radians(np.tile([0.0, 0.1, -0.1], FRAMES)),
@@ -93,7 +81,7 @@ LOST, PARTLY, DARK = 3, 5, 7
 """Frames in which the detector sees nothing but a false alarm; misses the 20 km crater; has no fit image."""
 
 
-def detections() -> DetectionSamples:
+def detections():
     """Each crater is seen 0.6 px to the right of and 0.8 px below where it is."""
     frame, crater = np.divmod(np.arange(3 * FRAMES), 3)
     lost = frame == LOST
@@ -117,7 +105,7 @@ EAST_M = 200.0 * (np.arange(FRAMES) % 6)
 """Arc by which odometry runs ahead: 200 m a frame, taken back by a reset at the seventh."""
 
 
-def paper(**changed: Any) -> NavigationSamples:
+def paper(**changed):
     values = {
         "estimator": "paper",
         "frame_number": 100 + np.arange(FRAMES),
@@ -133,7 +121,7 @@ def paper(**changed: Any) -> NavigationSamples:
     return NavigationSamples(**{**values, **changed})
 
 
-def anchored(**changed: Any) -> NavigationSamples:
+def anchored(**changed):
     """30 m too high, with a fix at the frames 1 and 4."""
     fixed = np.isin(np.arange(FRAMES), (1, 4))
     values = {
@@ -148,7 +136,7 @@ def anchored(**changed: Any) -> NavigationSamples:
     return paper(**{**values, **changed})
 
 
-def first(count: int) -> NavigationSamples:
+def first(count):
     """The first states of the paper's estimator."""
     _, *names = NavigationSamples.__slots__
     return paper(**{name: getattr(paper(), name)[:count] for name in names})
@@ -157,7 +145,7 @@ def first(count: int) -> NavigationSamples:
 TRIGGERS = ("initialization", *["none"] * 5, "safety_timeout", *["none"] * 5)
 
 
-def outcomes() -> OutcomeSamples:
+def outcomes():
     """Of all frames but the third; the anchor is read at the start and at the reset."""
     kept = np.delete(np.arange(FRAMES), 2)
     triggers = tuple(TRIGGERS[k] for k in kept)
@@ -165,7 +153,7 @@ def outcomes() -> OutcomeSamples:
     return OutcomeSamples("paper", 100 + kept, TIMES[kept], matched, triggers, 50 + kept, 1 + kept // 6)
 
 
-def filter_states() -> FilterStates:
+def filter_states():
     """States 30 m above the circle, 10 m to each axis, and one between two frames."""
     seconds = np.sort(np.append(CADENCE_S * np.arange(FRAMES), 20.0))
     position, velocity = circle(seconds)
@@ -182,7 +170,7 @@ BASELINES = ("propagate-only", "propagate-only, perfect start", "Kepler")
 START = StartState(EPOCH, circle(0.0)[0] + np.array([100.0, 0.0, 0.0]), circle(0.0)[1])
 
 
-def inputs(**changed: Any) -> PassInputs:
+def inputs(**changed):
     values = {
         "pass_id": "7",
         "title": "a made pass",
@@ -207,21 +195,21 @@ def inputs(**changed: Any) -> PassInputs:
     return PassInputs(**{**values, **changed})
 
 
-def evaluated(**changed: Any) -> PassReport:
+def evaluated(**changed):
     return evaluate_pass(inputs(**changed))
 
 
 @pytest.fixture(scope="module")
-def report() -> PassReport:
+def report():
     return evaluated()
 
 
-def series(report: PassReport, name: str) -> NavigationSeries:
+def series(report, name):
     (found,) = [one for one in report.navigation if one.name == name]
     return found
 
 
-def scored(report: PassReport) -> tuple[ClassScore, str]:
+def scored(report):
     """The score over all classes and how it was made."""
     return report.detector.micro, report.detector.method
 
@@ -344,7 +332,7 @@ def test_why_there_is_no_smoothed_orbit(changed, reasons):
     assert remarks == [f"no smoothed orbit: {reason}" for reason in reasons]
 
 
-def of_baselines(report: PassReport) -> list[NavigationSeries]:
+def of_baselines(report):
     return [one for one in report.navigation if one.kind == "baseline"]
 
 
@@ -398,7 +386,16 @@ def test_a_start_within_the_pass_is_propagated_from_there():
     assert (plain.name, kepler.name) == ("propagate-only", "Kepler")
     assert kepler.utc_ns.tolist() == TIMES[2:].tolist()
     assert_allclose(kepler.error_rtn_m, 0.0, atol=0.01)
-    assert of_baselines(evaluated(start_state=StartState(int(TIMES[-1]) + 1, *state))) == []
+    assert of_baselines(evaluated(start_state=StartState(int(TIMES[-1]) + SECOND, *state))) == []
+
+
+def test_a_sample_that_the_time_correlation_moved_before_the_start_state_is_the_same_instant():
+    position, velocity = circle(0.0)
+    moved = position + np.array([0.0, 1.5, 0.0])
+    exact, late = (of_baselines(evaluated(start_state=StartState(EPOCH + ns, moved, velocity))) for ns in (0, 12_000))
+    assert [one.name for one in exact] == [one.name for one in late] == [*BASELINES]
+    for one, other in zip(exact, late, strict=True):
+        assert_allclose(one.error_rtn_m, other.error_rtn_m, atol=0.1)
 
 
 def test_why_there_is_no_baseline(report, monkeypatch):
@@ -534,13 +531,13 @@ def test_frames_are_accounted_for(report):
     assert evaluated(navigation=(more,)).accounting.navigated == 6
 
 
-def test_the_pointing_is_told_from_what_is_known_of_it():
+def test_the_pointing_is_described_by_what_is_known_of_it():
     nadir = Viewing(CAMERA).pointed(circle(CADENCE_S * np.arange(FRAMES))[0])
     every = evaluated(viewing=Viewing(CAMERA, attitude_utc_ns=TIMES, q_wxyz=quaternion_from_matrix(nadir)))
     assert scored(every)[0].detected_true == 29
     assert "into the camera in its telemetered attitude;" in scored(every)[1]
     assert len(every.remarks) == 1
-    # The first five frames were told a quarter of a turn off: of the four that see anything, only the centre is found.
+    # The attitude of five frames is a quarter of a turn off: of four that see anything, only the centre is found.
     turned = quaternion_from_matrix(axis_rotation(3, -math.pi / 2.0) @ nadir[:5])
     some = evaluated(viewing=Viewing(CAMERA, attitude_utc_ns=TIMES[:5], q_wxyz=turned))
     assert [one.detected_true for one in some.detector.per_class] == [10, 6, 5]
@@ -551,7 +548,7 @@ def test_the_pointing_is_told_from_what_is_known_of_it():
     assert refused.remarks[-1] == "the camera is not declared"
 
 
-def identified() -> IdentificationSamples:
+def identified():
     """Three craters of each of the frames 0, 1, 2 and 4; those of frame 4 are named wrongly."""
     frames = np.repeat([0, 1, 2, 4], 3)
     place = np.tile([0, 1, 2], 4)
@@ -559,7 +556,7 @@ def identified() -> IdentificationSamples:
     return IdentificationSamples(TIMES[frames], place, 10 * frames + named)
 
 
-def test_fixes_are_repeated_from_single_frames_and_told_right_from_wrong():
+def test_fixes_are_repeated_from_single_frames_and_classified_as_right_or_wrong():
     """A shift of 0.6 and 0.8 px is one of 20 and 27 m over the ground, on a camera that looks straight down."""
     report = evaluated(identifications=identified())
     assert series(report, "anchored").wrong_fixes == 1
@@ -595,7 +592,7 @@ def test_the_map_of_the_payload_is_compared_with_the_catalogue(report):
     assert report.payload_map is None
 
 
-def test_the_sun_and_the_ground_stand_beside_every_estimate():
+def test_every_estimate_has_the_sun_and_the_ground():
     dark_west = np.full((4, 360), 200, dtype=np.uint8)
     dark_west[:, :4] = 50
     surface = TerrainMap(dark_west, 0.0, 360.0, -90.0, 90.0)

@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from pytest import approx
 
 from ground_service.errors import InvalidInput
+from ground_service.evaluation import extras
 from ground_service.evaluation.alignment import (
     bounds,
     bounds_per_degree,
@@ -32,13 +33,13 @@ from ground_service.evaluation.alignment import (
     squared_normalised_errors,
 )
 from ground_service.evaluation.core import WORST_FRAMES, _choose_frames, event_remarks
-from ground_service.evaluation.extras import dark_limit, surface_map, with_terrain
+from ground_service.evaluation.extras import albedo_picture, dark_limit, surface_map, with_terrain
 from ground_service.evaluation.fixes import Pairs, snapshot_positions, wrong_fixes
 from ground_service.evaluation.recall import ExpectedCraters, Matches, Viewing, expected_craters
+from lunar.camera import BrownCamera
 from lunar.catalogue import make_catalogue
 from lunar.datafolder import find_data
 from lunar.frames import quaternion_from_matrix
-from lunar.lens import BrownCamera
 from lunar.timescales import parse_utc
 from reports.values import NavigationSeries, PassEvent, TerrainMap
 
@@ -179,7 +180,24 @@ def test_a_map_of_minus_180_to_180_is_turned_to_begin_at_0(tmp_path):
     assert int(found.image[512, 1030]) < 50
 
 
-def test_a_file_that_is_no_picture_is_told(tmp_path):
+def test_an_albedo_map_is_read_once_by_all_processes_until_its_file_changes(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+    albedo = tmp_path / "albedo.png"
+
+    def shown(columns):
+        Image.fromarray(np.repeat(columns.astype(np.uint8)[None], 32, axis=0)).save(albedo)
+        albedo_picture.cache_clear()
+        return albedo_picture(albedo)
+
+    even = np.linspace(0, 255, 64)
+    first = shown(even)
+    with monkeypatch.context() as patch:
+        patch.setattr(extras, "_grey_levels", None)
+        assert_array_equal(shown(even), first)
+    assert shown(even[::-1])[512, 0] > 200 > 50 > first[512, 0]
+
+
+def test_a_file_that_is_no_picture_is_reported(tmp_path):
     (tmp_path / "albedo.jpg").write_text("no picture")
     with pytest.raises(InvalidInput, match="cannot be read"):
         surface_map(tmp_path / "albedo.jpg")
@@ -187,7 +205,7 @@ def test_a_file_that_is_no_picture_is_told(tmp_path):
 
 @pytest.mark.real_data
 def test_a_fifth_of_the_real_moon_is_dark_and_the_sea_of_tranquillity_is(data_path):
-    # Maria cover about 17 % of the Moon (Head 1976, Reviews of Geophysics 14, 265); other ground is dark beside them.
+    # Maria cover about 17 % of the Moon (Head 1976, Reviews of Geophysics 14, 265); other ground is darker.
     albedo = find_data(data_path).albedo
     assert albedo is not None
     found = surface_map(albedo)
@@ -371,8 +389,8 @@ def test_a_telemetered_attitude_wins_over_the_declared_pointing():
     mcmf_from_icrf = np.array([[[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
     q = quaternion_from_matrix(tilted @ mcmf_from_icrf)
     viewing = Viewing(CAMERA, attitude_utc_ns=np.array([1_000]), q_wxyz=q)
-    told = viewing.camera_from_mcmf(np.array([1_000]), POSITION, mcmf_from_icrf)
-    assert_allclose(told, tilted, atol=1e-12)
+    rotation = viewing.camera_from_mcmf(np.array([1_000]), POSITION, mcmf_from_icrf)
+    assert_allclose(rotation, tilted, atol=1e-12)
     other = viewing.camera_from_mcmf(np.array([1_001]), POSITION, mcmf_from_icrf)
     assert_allclose(other, Viewing(CAMERA).pointed(POSITION), atol=1e-12)
     assert viewing.known(np.array([999, 1_000, 1_001])).tolist() == [False, True, False]

@@ -2,23 +2,16 @@
 
 from dataclasses import replace
 from operator import attrgetter
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx
 
-from ground_service.evaluation.recall import (
-    ExpectedCraters,
-    Matches,
-    expected_craters,
-    match_detections,
-    score_detections,
-)
+from ground_service.evaluation.recall import ExpectedCraters, expected_craters, match_detections, score_detections
 from ground_service.telemetry.samples import DetectionSamples
 from lunar.camera import PinholeCamera
-from lunar.catalogue import CraterCatalogue, make_catalogue
+from lunar.catalogue import make_catalogue
 from lunar.frames import mcmf_from_spherical
 
 ALTITUDE_M = 30_000.0
@@ -26,7 +19,7 @@ CAMERA = PinholeCamera()
 POSITION = mcmf_from_spherical(np.array([0.0]), np.array([0.0]), np.array([ALTITUDE_M]))
 
 
-def field(complete: bool = True, rim_height_m: float = 0.0) -> CraterCatalogue:
+def field(complete=True, rim_height_m=0.0):
     """Four craters of 6, 12, 20 and 4 km around latitude 0, longitude 0, and one on the far side."""
     latitude = np.radians([0.0, 0.6, -0.6, 0.3, 0.0])
     longitude = np.radians([0.0, 0.6, 0.6, -0.7, 180.0])
@@ -36,7 +29,7 @@ def field(complete: bool = True, rim_height_m: float = 0.0) -> CraterCatalogue:
     )
 
 
-def detections(u: Any, v: Any, d: Any, classes: list[int], usable: bool = True) -> DetectionSamples:
+def detections(u, v, d, classes, usable=True):
     n = len(u)
     return DetectionSamples(
         frame_number=np.array([7]),
@@ -53,11 +46,11 @@ def detections(u: Any, v: Any, d: Any, classes: list[int], usable: bool = True) 
 
 
 @pytest.fixture(scope="module")
-def expected() -> ExpectedCraters:
+def expected():
     return expected_craters(field(), CAMERA, POSITION)
 
 
-def scored(found: Any, expected: Any) -> Any:
+def scored(found, expected):
     """Return the scores of the detections of one frame."""
     return score_detections(found, expected, match_detections(found, expected), np.array([ALTITUDE_M]))
 
@@ -134,7 +127,7 @@ def test_no_craters_and_no_frames_are_no_error():
     assert len(expected_craters(field(), CAMERA, np.zeros((0, 3))).index) == 0
 
 
-def three_frames() -> tuple[DetectionSamples, ExpectedCraters, Matches]:
+def three_frames():
     """Three frames of craters of 40 px each, classes 0, 1, 2 and 0; the detections are 1 px off, one is an alarm.
 
     Frame 0 has the craters 0 to 3, of which the last lies where the catalogue is not complete; 1 and 2 find theirs,

@@ -1,11 +1,10 @@
-"""The smoother against a batch solution of the same measurements, and on what it was not told of."""
+"""The smoother against a batch solution of the same measurements, and with unannounced changes."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal, assert_array_less
-from numpy.typing import ArrayLike
 from pytest import approx
 
 from ground_service.errors import EvaluationError
@@ -39,7 +38,7 @@ QUIET = SmootherModel(FORCES, (1e-18, 1e-18, 1e-18), (1e-15, 1e-15, 1e-15), 900.
 TIMES = EPOCH + np.arange(STATES) * round(STEP_S) * 10**9
 
 
-def carried(state: np.ndarray, k: int) -> Arrays:
+def carried(state, k):
     """Return state (6,) and transition (6, 6) from sample k to the next."""
     position, velocity, transition = propagate_with_stm(
         float(tdb_s_from_utc_ns(int(TIMES[k]))), state[:3], state[3:], STEP_S, FORCES
@@ -50,7 +49,7 @@ def carried(state: np.ndarray, k: int) -> Arrays:
 class Session:
     """A true orbit, positions measured along it, and a plain Kalman filter of them, written out here."""
 
-    def __init__(self, seed: int, kick: ArrayLike = 0.0, kick_at: int = -1) -> None:
+    def __init__(self, seed, kick=0.0, kick_at=-1):
         push = np.concatenate([np.zeros(3), np.broadcast_to(kick, 3)])
         rng = np.random.default_rng(seed)
         truth = [start_state()[:6]]
@@ -82,7 +81,7 @@ class Session:
         self.filtered = FilterStates(TIMES, np.array(states), np.array(covariances), ICRF)
 
 
-def batch(session: Session) -> Arrays:
+def batch(session):
     """Return the first state and its covariance by one least squares over all measurements and the prior."""
     state = session.prior_mean.copy()
     for _ in range(4):
@@ -169,7 +168,7 @@ WHITE, MARKOV, MEMORY_S = (6e-4, 3e-4, 2e-4), (2e-3, 3e-3, 4e-3), 80.0
 PUSHED = SmootherModel(NOTHING, WHITE, MARKOV, MEMORY_S)
 
 
-def step_matrices(seconds: float) -> Arrays:
+def step_matrices(seconds):
     """Transition and noise of constant velocity under white acceleration and under one that decays."""
     one, q, decay = np.eye(3), np.diag(WHITE), np.exp(-seconds / MEMORY_S)
     nothing = np.zeros((3, 3))
@@ -186,7 +185,7 @@ def step_matrices(seconds: float) -> Arrays:
     return transition, noise
 
 
-def straight(seconds: list[float], seed: int = 9) -> FilterStates:
+def straight(seconds, seed=9):
     """States near a straight line with covariances that correlate everything."""
     rng = np.random.default_rng(seed)
     states, covariances = [], []
@@ -201,9 +200,7 @@ def straight(seconds: list[float], seed: int = 9) -> FilterStates:
     return FilterStates(times, np.array(states), np.array(covariances), ICRF, np.arange(len(seconds)))
 
 
-def rauch_tung_striebel(
-    filtered: FilterStates, legs: list[list[float]], kicks: list[list[float]], sigma_m_s: float = 0.0
-) -> Arrays:
+def rauch_tung_striebel(filtered, legs, kicks, sigma_m_s=0.0):
     """Return smoothed states and covariances by equations 3.28 to 3.30, with plain inverses.
 
     `kicks` are the changes of the y velocity at the end of each leg.
@@ -225,7 +222,7 @@ def rauch_tung_striebel(
     return state, covariance
 
 
-def assert_same(found: FilterStates, expected: Arrays, start: FilterStates) -> None:
+def assert_same(found, expected, start):
     state, covariance = expected
     scale = np.sqrt(np.einsum("nii->ni", start.covariance))
     # Positions of 1e9 m have seven digits behind the point; the axes are turned by 1e-7.

@@ -15,7 +15,6 @@ from ground_service.evaluation.verdict import (
     verdict_of,
     without_mission,
 )
-from ground_service.missions.model import Requirements
 from reports.values import (
     ClassScore,
     DetectorScore,
@@ -25,13 +24,14 @@ from reports.values import (
     NavigationStatistics,
     PacketAccounting,
     Requirement,
+    Requirements,
     ResidualSeries,
 )
 
 N = 10
 
 
-def series(name: str, kind: str = "estimate", median: float = 50.0, p95: float = 90.0, **more) -> NavigationSeries:
+def series(name, kind="estimate", median=50.0, p95=90.0, **more):
     nothing = np.zeros(N)
     return NavigationSeries(
         name,
@@ -46,11 +46,11 @@ def series(name: str, kind: str = "estimate", median: float = 50.0, p95: float =
     )
 
 
-def found(*navigation: NavigationSeries, **more) -> Evaluated:
+def found(*navigation, **more):
     return Evaluated(navigation or (series("anchored"),), **more)
 
 
-def row(key: str, limits: Requirements, evaluated: Evaluated) -> Requirement:
+def row(key, limits, evaluated):
     return next(one for one in requirements(limits, evaluated) if one.key == key)
 
 
@@ -142,7 +142,7 @@ def test_the_declared_estimator_is_judged_and_not_the_best_one():
     assert (row("accuracy.median", limits, evaluated).value, verdict_of(requirements(limits, evaluated))[1]) == (
         70.0, "not met",
     )  # fmt: skip
-    undeclared = row("accuracy.median", limits.model_copy(update={"estimator": None}), evaluated)
+    undeclared = row("accuracy.median", replace(limits, estimator=None), evaluated)
     assert (undeclared.value, undeclared.status) == (None, "unknown")
     assert undeclared.note == "the mission description declares no estimator"
 
@@ -171,7 +171,7 @@ def test_every_baseline_is_shown_and_one_that_is_missing_is_unknown():
     for name in ("Kepler", "smoothed"):
         shown = row(f"better_than.{name}", limits, evaluated)
         assert (shown.status, shown.value, shown.limit) == ("not judged", 50.0, 1.0)
-    rival = limits.model_copy(update={"better_than": ("Kepler",)})
+    rival = replace(limits, better_than=("Kepler",))
     assert row("better_than.Kepler", rival, evaluated).status == "not judged"  # from the best known orbit
     assert row("better_than.Kepler", rival, replace(evaluated, experiment=StartOrbit(1e3))).status == "not met"
 
@@ -224,16 +224,16 @@ def test_packets_whose_loss_at_the_edges_is_not_known_are_never_complete():
 
 
 def test_two_frames_are_judged_and_one_is_not():
-    for count, told in (
+    for count, expected in (
         (2, ("met", "anchored, 2 samples")),
         (1, ("unknown", "only one frame was navigated, too few for a judgement")),
     ):
         flown = replace(series("anchored"), utc_ns=np.zeros(count, dtype=np.int64))
         judged = row("accuracy.median", EVERY_LIMIT, found(flown))
-        assert (judged.status, judged.note) == told
+        assert (judged.status, judged.note) == expected
 
 
-def table(*statuses: str) -> list[Requirement]:
+def table(*statuses):
     return [Requirement(f"k{i}", f"thing {i}", "m", 2.0, 1.0, True, s) for i, s in enumerate(statuses)]
 
 
@@ -377,7 +377,7 @@ def test_the_first_sample_is_no_reset_and_a_series_without_outcomes_has_no_count
 
 @pytest.mark.parametrize("limit", [float("nan"), float("inf")])
 def test_a_limit_that_is_no_number_judges_nothing_as_met(limit):
-    one = row("accuracy.median", EVERY_LIMIT.model_copy(update={"median_error_m": limit}), found())
+    one = row("accuracy.median", replace(EVERY_LIMIT, median_error_m=limit), found())
     assert (one.limit, one.status) == (None, "unknown")
 
 

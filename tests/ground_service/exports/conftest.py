@@ -1,7 +1,6 @@
 """The synthetic pass with attitudes, images, identifications and states of the filter."""
 
 import json
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.missions import frames as declared
 from ground_service.passes.archive_import import import_archive
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
@@ -21,7 +20,6 @@ from tests.ground_service.conftest import (
     FILTER_ERROR_RTN_M,
     PIXEL_OFFSET,
     Downlink,
-    SyntheticPass,
     circular_states,
     encode_downlink,
     write_manifest,
@@ -49,7 +47,7 @@ class RichPass:
 
 
 @pytest.fixture(scope="session")
-def rich_pass(make_pass: Callable[..., SyntheticPass]) -> RichPass:
+def rich_pass(make_pass):
     made = make_pass(frames=FRAMES, filter_nis=2.0)
     folder = made.folder
     position, velocity = circular_states(made.utc_ns)
@@ -96,7 +94,7 @@ def rich_pass(make_pass: Callable[..., SyntheticPass]) -> RichPass:
     return RichPass(folder, made.utc_ns, onboard_from_icrf, position_mcmf, camera_from_icrf, craters)
 
 
-def _detections(packets: list[bytes], tick: int) -> np.ndarray:
+def _detections(packets, tick):
     """Pixels (n, 2) of the detections of the image taken at an on-board time."""
     from tmtc.packets.stream import cut_packets
 
@@ -108,7 +106,7 @@ def _detections(packets: list[bytes], tick: int) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def rich_ground(rich_pass: RichPass, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
+def rich_ground(rich_pass, tmp_path_factory):
     """A service with the pass as pass 1, and with the orientation of the payload; not to be altered."""
     data = DataFolder(orientation_bpc=Path("turned.bpc"))
     with (

@@ -6,7 +6,6 @@ import json
 import re
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +16,9 @@ import docs_site
 import linna
 from ground_service.access.service import add_user
 from ground_service.app import create_app
-from ground_service.ground import Ground
 from ground_service.passes.archive_import import zip_folder
 from ground_service.settings import Settings
 from linna.errors import UsageError
-from linna.passes import Archive
 from tests.ground_service.conftest import SPHERICAL_ERROR_RTN_M, free_port
 from tests.ground_service.exports.conftest import FRAMES
 from tmtc.errors import MissingLibrary
@@ -30,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[3]
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 
 
-def check(archive: Archive) -> None:
+def check(archive):
     """The tables and figures of the synthetic pass."""
     one = archive.passes[0]
     residuals = one.residuals
@@ -74,7 +71,7 @@ def test_an_archive_is_opened_as_folder_and_as_zip(rich_pass):
 
 
 @pytest.fixture
-def server(rich_ground: Ground) -> Iterator[tuple[str, str]]:
+def server(rich_ground):
     """Address of a server on the home folder, and a token."""
     port = free_port()
     app = create_app(Settings(home=rich_ground.home, allowed_hosts="127.0.0.1"), inline_jobs=True)

@@ -15,12 +15,12 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from ground_service.errors import InvalidInput, NotFound
+from ground_service.errors import EvaluationError, InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.doubt_store import list_implausible
 from ground_service.ingest.model import ImplausibleFilter
-from ground_service.ingest.service import Place, decode_all_again, ingest_file, undecoded_vehicles
+from ground_service.ingest.service import PiecePosition, decode_all_again, ingest_file, undecoded_vehicles
 from ground_service.missions import definitions
 from ground_service.missions import store as missions
 from ground_service.missions.definitions import definition_remarks, minimal_description, read_mission_file
@@ -45,9 +45,8 @@ from tests.serving import TestClient
 from tests.tmtc import foreign
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
-from tmtc.packets.crc import crc16
-from tmtc.packets.cuc import NO_TICKS
-from tmtc.packets.space_packets import pack_packet
+from tmtc.packets.pus import NO_TICKS
+from tmtc.packets.space_packets import crc16, pack_packet
 from tmtc.packets.stream import whole_packets
 
 NS = 1_000_000_000
@@ -115,7 +114,7 @@ def define(ground: Ground, seconds: float = 600.0) -> int:
 
 
 def interpreted(packets: list[bytes], tmp_path: Path) -> list[Any]:
-    """What space_packet_parser reads in the packets."""
+    """Return the values that space_packet_parser reads in the packets."""
     import space_packet_parser
 
     path = tmp_path / "interpreter.xml"
@@ -468,7 +467,7 @@ def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(declared: Ground
         start, stop = pieces[index]
         path = tmp_path / f"{index}.piece"
         path.write_bytes(octets[start:stop])
-        ingest_file(declared, path, spacecraft_id=76, place=Place("s", start))
+        ingest_file(declared, path, spacecraft_id=76, place=PiecePosition("s", start))
     assert parameter_series(declared, define(declared), "VOLTAGE", 1000).samples == 120
 
 
@@ -505,6 +504,8 @@ def test_decoded_packets_of_a_pass_are_exported_with_utc(declared: Ground, synth
     assert {one["packet"] for one in own} == {"event_low"}
     with pytest.raises(NotFound, match="packet"):
         export_packets(declared, pass_id, "nothing", "csv")
+    with pytest.raises(EvaluationError, match="pass 1: expected packets 'store_report', found none"):
+        export_packets(declared, pass_id, "store_report", "csv")
     assert export_packets(declared, pass_id, "Housekeeping", "parquet")[:4] == b"PAR1"
 
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -14,7 +11,7 @@ from ground_service.clock import TelemetryTime, set_mission_clock
 from ground_service.contacts.commanding.service import enter_command, get_command, release_command, take_uplink
 from ground_service.contacts.links import store as links
 from ground_service.errors import Conflict, StateConflict
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.ingest.core import fits_between, implausible_times
 from ground_service.ingest.doubt_store import list_implausible
 from ground_service.ingest.model import ImplausibleFilter
@@ -30,7 +27,7 @@ from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service.archive_hash import hash_of
 from tests.ground_service.conftest import _housekeeping
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.packets.cuc import NO_TICKS
+from tmtc.packets.pus import NO_TICKS
 
 NOW = parse_utc("2029-08-18T09:00:00Z")
 TICKS = int(ticks_from_utc_ns(NOW))
@@ -40,7 +37,7 @@ YEARS = 70 * 365 * DAY
 
 
 @pytest.fixture(autouse=True)
-def clock() -> Iterator[None]:
+def clock():
     yield
     set_mission_clock()
 
@@ -48,35 +45,35 @@ def clock() -> Iterator[None]:
 LAST = TICKS + 11 * (60 << 16)
 
 
-def report(ticks: int, count: int, temperature_c: float = 20.0, boot: int = 1) -> bytes:
+def report(ticks, count, temperature_c=20.0, boot=1):
     values = _housekeeping(1) | {"temperature_c": temperature_c, "boot_count": boot}
     return DICTIONARY.pack("housekeeping", values, ticks=ticks, sequence_count=count)
 
 
-def contact(start: int = TICKS, count: int = 0, number: int = 12, boot: int = 1) -> bytes:
+def contact(start=TICKS, count=0, number=12, boot=1):
     """Reports of a contact, one a minute, the last one at `start` plus their time."""
     return b"".join(report(start + (60 << 16) * k, count + k, boot=boot) for k in range(number))
 
 
-def receive(ground: Ground, octets: bytes) -> int:
+def receive(ground, octets):
     """Ingest packets; return the number of those that are kept apart."""
     file = ground.home / f"{abs(hash(octets))}.packets"
     file.write_bytes(octets)
     return ingest_file(ground, file, spacecraft_id=76).packets_implausible
 
 
-def reasons(ground: Ground) -> list[str]:
+def reasons(ground):
     return [one.reason for one in ground.read(list_implausible, ImplausibleFilter(limit=99)).items]
 
 
-def alarms(ground: Ground) -> dict[str, int]:
+def alarms(ground):
     asked = AlarmFilter(limit=99, state=["raised", "acknowledged"])
     return {one.name: one.count for one in ground.read(list_alarms, asked).items}
 
 
 @pytest.mark.parametrize("ahead", [2 * HOUR, 26 * HOUR, YEARS])
 @pytest.mark.parametrize("source", ["telemetry", "simulated", "time of day"])
-def test_a_report_from_the_future_is_kept_and_decides_nothing(ground: Ground, ahead: int, source: str):
+def test_a_report_from_the_future_is_kept_and_decides_nothing(ground, ahead, source):
     clocks = {"telemetry": TelemetryTime(NOW), "simulated": lambda: NOW, "time of day": None}
     set_mission_clock(clocks[source])
     receive(ground, contact())
@@ -89,25 +86,26 @@ def test_a_report_from_the_future_is_kept_and_decides_nothing(ground: Ground, ah
     assert ("after the mission time" if source == "simulated" else "after all other telemetry") in reason
 
 
-def test_the_same_report_again_is_kept_once(either: Ground):
+def test_the_same_report_again_is_kept_once(either):
     receive(either, contact())
     receive(either, report(TICKS + DAY, 12))
     assert receive(either, report(TICKS + DAY, 12)) == 0
     assert len(reasons(either)) == 1 and alarms(either) == {"implausible_time": 1}
 
 
-def test_the_archive_does_not_depend_on_whether_the_wrong_report_came_first(either: Ground):
+def test_the_archive_does_not_depend_on_whether_the_wrong_report_came_first(either):
     receive(either, report(TICKS + DAY, 12, temperature_c=99.0))
-    receive(either, report(5 << 16, 13, temperature_c=-99.0))
+    receive(either, report(TICKS + DAY + HOUR, 13, temperature_c=99.0) + report(TICKS + DAY + HOUR, 14))
     assert "temperature_c" in alarms(either)
+    receive(either, report(5 << 16, 13, temperature_c=-99.0))
     receive(either, contact())
-    assert len(reasons(either)) == 2
+    assert len(reasons(either)) == 4
     assert either.read(newest_ticks, 1) == LAST
     assert "temperature_c" not in alarms(either)
     assert verify(either, rebuild=True).verdict == "intact"
 
 
-def test_the_next_contact_is_believed_and_puts_back_what_was_kept_apart(either: Ground):
+def test_the_next_contact_is_believed_and_puts_back_what_was_kept_apart(either):
     receive(either, contact())
     assert receive(either, contact(TICKS + DAY, 1440, number=2)) == 2
     assert receive(either, contact(TICKS + DAY + (120 << 16), 1442)) == 0
@@ -115,20 +113,20 @@ def test_the_next_contact_is_believed_and_puts_back_what_was_kept_apart(either: 
     assert either.read(newest_ticks, 1) == TICKS + DAY + 13 * (60 << 16)
 
 
-def test_a_wrong_report_does_not_become_right_when_its_time_comes(ground: Ground):
+def test_a_wrong_report_does_not_become_right_when_its_time_comes(ground):
     receive(ground, contact())
     receive(ground, report(TICKS + DAY + (90 << 16), 12))
     receive(ground, contact(TICKS + DAY, 1440))
     assert len(reasons(ground)) == 1
 
 
-def test_a_clock_of_the_mission_believes_a_single_report_after_a_silence(ground: Ground):
+def test_a_clock_of_the_mission_believes_a_single_report_after_a_silence(ground):
     receive(ground, contact())
     set_mission_clock(lambda: NOW + 86_400 * 10**9)
     assert receive(ground, report(TICKS + DAY, 12)) == 0
 
 
-def test_a_clock_that_was_not_set_and_a_stamp_from_the_past_are_kept_apart(ground: Ground):
+def test_a_clock_that_was_not_set_and_a_stamp_from_the_past_are_kept_apart(ground):
     receive(ground, contact(TICKS - DAY))
     receive(ground, contact(TICKS, 1440))
     assert receive(ground, report(100 << 16, 1452)) == 1
@@ -136,7 +134,7 @@ def test_a_clock_that_was_not_set_and_a_stamp_from_the_past_are_kept_apart(groun
     assert reasons(ground) == ["its sequence count belongs to another time", "the clock was not set"]
 
 
-def test_a_late_report_and_a_reboot_are_believed(ground: Ground):
+def test_a_late_report_and_a_reboot_are_believed(ground):
     receive(ground, contact(TICKS - DAY) + contact(TICKS - DAY + 13 * (60 << 16), 13))
     receive(ground, contact(TICKS, 0))  # counts begin again with the boot
     assert receive(ground, report(TICKS - DAY + 12 * (60 << 16), 12)) == 0
@@ -152,13 +150,37 @@ def test_reception_times_decide_for_single_packets_and_not_for_a_station_whose_c
     assert set(implausible_times(ticks[3:], np.array([NO_TICKS]), TICKS, None)) == {0}
 
 
+@pytest.mark.parametrize("first", [TICKS, TICKS + YEARS, 100 << 16])
+def test_the_first_packet_of_an_archive_decides_nothing_until_a_clock_or_a_second_one_supports_it(ground, first):
+    set_mission_clock(TelemetryTime(NOW))
+    assert receive(ground, report(first, 0, temperature_c=99.0)) == 1
+    assert ground.read(newest_ticks, 1) is None and alarms(ground) == {"implausible_time": 1}
+    assert reasons(ground)[0].startswith("not judged: ")
+    assert receive(ground, report(first + (60 << 16), 1)) == 1  # the next review finds both
+    assert reasons(ground) == [] and ground.read(newest_ticks, 1) == first + (60 << 16)
+
+
+def test_without_a_stated_clock_the_first_packet_may_be_of_a_simulated_flight_and_not_of_another_century(ground):
+    assert receive(ground, report(TICKS + YEARS, 0)) == 1
+    assert receive(ground, report(TICKS, 1)) == 0
+    assert ground.read(newest_ticks, 1) == TICKS
+
+
+def test_a_clock_of_the_mission_judges_the_first_packet():
+    for late, doubted in ((-DAY, set()), (0, set()), (DAY, {0}), (100 - TICKS, set())):
+        ticks = np.array([TICKS + late])
+        assert set(implausible_times(ticks, None, None, TICKS)) == doubted
+        assert implausible_times(ticks, ticks, None, TICKS) == {}
+        assert implausible_times(np.append(ticks, ticks + HOUR), None, None, TICKS) == {}
+
+
 def test_a_sequence_count_fits_between_its_neighbours():
     for given in ((5, 4, 6), (5, 5, 5), (0, 16_383, 1), (9, None, 1)):
         assert fits_between(*given) is True, given
     assert fits_between(7, 4, 6) is False
 
 
-def test_a_withdrawn_ingest_leaves_no_trace_but_its_record(either: Ground):
+def test_a_withdrawn_ingest_leaves_no_trace_but_its_record(either):
     receive(either, contact())
     before, alone = hash_of(either), alarms(either)
     foreign = contact(TICKS - 9 * DAY) + contact(TICKS + (30 << 16), 500) + report(TICKS + 60, 600, 99.0)
@@ -175,24 +197,24 @@ def test_a_withdrawn_ingest_leaves_no_trace_but_its_record(either: Ground):
     assert entry.detail["reason"] == "another flight"
 
 
-def entered(ground: Ground) -> int:
+def entered(ground):
     key = enter_command(ground, "test_connection", {}, spacecraft_id=76, actor="ann")
     release_command(ground, key, actor="ann")
     return key
 
 
-def sent(ground: Ground) -> tuple[int, int]:
+def sent(ground):
     """Send a telecommand; return its keys on the ground and on board."""
     key = entered(ground)
     take_uplink(ground, spacecraft_id=76, actor="ann")
     return key, get_command(ground, key).record.request_id
 
 
-def completed(ticks: int, request: int, count: int = 0) -> bytes:
+def completed(ticks, request, count=0):
     return DICTIONARY.pack("verification_completed", {"request_id": request}, ticks=ticks, sequence_count=count)
 
 
-def test_telecommands_are_verified_again_after_a_foreign_flight_is_withdrawn(either: Ground):
+def test_telecommands_are_verified_again_after_a_foreign_flight_is_withdrawn(either):
     receive(either, contact())
     receive(either, completed(TICKS + HOUR // 2, 5))  # of another flight
     key, request = sent(either)
@@ -202,7 +224,7 @@ def test_telecommands_are_verified_again_after_a_foreign_flight_is_withdrawn(eit
     assert get_command(either, key).state == "completed"
 
 
-def test_reports_from_before_the_release_do_not_verify_a_telecommand(either: Ground):
+def test_reports_from_before_the_release_do_not_verify_a_telecommand(either):
     set_mission_clock(lambda: NOW)
     receive(either, contact())
     receive(either, completed(TICKS - DAY, 5))
@@ -211,7 +233,7 @@ def test_reports_from_before_the_release_do_not_verify_a_telecommand(either: Gro
     assert get_command(either, key).state == "sent"
 
 
-def test_reports_of_an_earlier_boot_do_not_verify_a_telecommand(either: Ground):
+def test_reports_of_an_earlier_boot_do_not_verify_a_telecommand(either):
     receive(either, contact(boot=3) + completed(TICKS + HOUR // 2, 5, 1))
     key, request = sent(either)
     later = TICKS + HOUR
@@ -221,7 +243,17 @@ def test_reports_of_an_earlier_boot_do_not_verify_a_telecommand(either: Ground):
     assert get_command(either, key).state == "completed"
 
 
-def test_commanding_starts_from_the_count_that_the_payload_reports(either: Ground):
+def test_reports_of_another_source_do_not_verify_a_telecommand(either):
+    receive(either, contact() + completed(TICKS + HOUR // 2, 5, 40))
+    key, request = sent(either)
+    later = TICKS + HOUR
+    receive(either, report(later, 900) + completed(later + 9, request, 7))  # of another flight
+    assert get_command(either, key).state == "sent"
+    receive(either, completed(later + 10, request, 41))
+    assert get_command(either, key).state == "completed"
+
+
+def test_commanding_starts_from_the_count_that_the_payload_reports(either):
     fields = DICTIONARY.packet("performance").fields
     values = {one.name: 0 for one in fields} | {"structure_id": 2, "last_command_count": 41}
     receive(either, DICTIONARY.pack("performance", values, ticks=TICKS, sequence_count=0))
@@ -234,7 +266,7 @@ def test_commanding_starts_from_the_count_that_the_payload_reports(either: Groun
     assert "send perform_function resynchronise_commands first" in get_command(either, key).remark
 
 
-def test_a_station_that_the_description_does_not_have_is_refused(either: Ground, tmp_path: Path):
+def test_a_station_that_the_description_does_not_have_is_refused(either, tmp_path):
     add_mission(either, b'name = "m"\n[spacecraft]\nid = 76\n[link.stations.madrid]\n')
     file = tmp_path / "a.packets"
     file.write_bytes(contact())
@@ -242,7 +274,7 @@ def test_a_station_that_the_description_does_not_have_is_refused(either: Ground,
         ingest_file(either, file, spacecraft_id=76, station="mars")
 
 
-def test_a_lease_that_ended_in_a_standstill_is_renewed_with_its_state(either: Ground):
+def test_a_lease_that_ended_in_a_standstill_is_renewed_with_its_state(either):
     given = {"owner": "a", "until_utc_ns": 15, "mission_utc_ns": 0}
     with either.database.writing() as connection:
         assert links.acquire(connection, "l", 76, "flight", wall_utc_ns=0, **given)
@@ -255,8 +287,8 @@ def test_a_lease_that_ended_in_a_standstill_is_renewed_with_its_state(either: Gr
 
 
 @pytest.mark.parametrize("ahead", [26 * HOUR, YEARS, 100 * (1 << 16) - TICKS])
-def test_a_detection_of_an_image_at_another_time_is_kept_apart(ground: Ground, ahead: int):
-    def detections(image_ticks: int, count: int) -> bytes:
+def test_a_detection_of_an_image_at_another_time_is_kept_apart(ground, ahead):
+    def detections(image_ticks, count):
         values = {"frame_number": count, "image_ticks": image_ticks, "image_quality": 0, "items": []}
         return DICTIONARY.pack("detections", values, ticks=TICKS + (11 << 16), sequence_count=count)
 
@@ -269,7 +301,7 @@ def test_a_detection_of_an_image_at_another_time_is_kept_apart(ground: Ground, a
     assert len(reasons(ground)) == 1
 
 
-def test_a_day_with_disturbances_ends_with_the_archive_of_the_day_without(tmp_path: Path):
+def test_a_day_with_disturbances_ends_with_the_archive_of_the_day_without(tmp_path):
     contacts = [contact(TICKS + 2 * HOUR * k, 12 * k) for k in range(12)]
     with open_ground(tmp_path / "calm") as calm, open_ground(tmp_path / "disturbed") as disturbed:
         for octets in contacts:

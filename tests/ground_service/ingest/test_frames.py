@@ -10,20 +10,18 @@ import subprocess
 import sys
 import time
 import tracemalloc
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from sqlalchemy import func, select
 
-from benchmarks.campaigns.cuts import KINDS, ORDERS, Archive, Piece, archive, case_of, ingest
-from ground_service.ground import Ground, open_ground
+from benchmarks.campaigns.cuts import KINDS, ORDERS, Piece, archive, case_of, ingest
+from ground_service.ground import open_ground
 from ground_service.ingest.core import NO_RECORD, LinkContent
 from ground_service.ingest.frames import FrameReader, PacketReader, Section
-from ground_service.ingest.reception import Reading, Run
-from ground_service.ingest.service import Place, ingest_file
+from ground_service.ingest.reception import Reading
+from ground_service.ingest.service import PiecePosition, ingest_file
 from ground_service.store import repository
 from ground_service.telemetry.decoding import redecode
 from tests.ground_service.archive_hash import hash_of
@@ -36,21 +34,21 @@ SPACECRAFT = 76
 
 
 @pytest.fixture(scope="module")
-def packets(make_pass: Callable[..., Any]) -> list[bytes]:
+def packets(make_pass):
     return list(make_pass(frames=30).packets)
 
 
 @pytest.fixture(scope="module")
-def stream(packets: list[bytes]) -> bytes:
+def stream(packets):
     return encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=223)
 
 
-def windows(octets: bytes, size: int) -> Iterator[tuple[Any, bool]]:
+def windows(octets, size):
     for start in range(0, len(octets), size):
         yield as_octets(octets[start : start + size]), start + size >= len(octets)
 
 
-def reader_of(octets: bytes, spacecraft_id: int | None = None) -> FrameReader | PacketReader:
+def reader_of(octets, spacecraft_id=None):
     sections = plan_of(octets).sections
     section = Section(None, 0, len(octets), 0, len(octets))
     if not sections:
@@ -58,7 +56,7 @@ def reader_of(octets: bytes, spacecraft_id: int | None = None) -> FrameReader | 
     return FrameReader(section, sections[0].settings, LinkContent(), spacecraft_id=spacecraft_id, record=NO_RECORD)
 
 
-def read(octets: bytes, window: int, spacecraft_id: int | None = None) -> tuple[list[bytes], LinkContent, int]:
+def read(octets, window, spacecraft_id=None):
     """The packets, the counts, and the octets in no frame or packet."""
     reader = reader_of(octets, spacecraft_id)
     packets = [packet for batch in reader.batches(windows(octets, window)) for packet in batch.octets]
@@ -67,7 +65,7 @@ def read(octets: bytes, window: int, spacecraft_id: int | None = None) -> tuple[
 
 
 @pytest.mark.parametrize("window", [1 << 20, 8_000, 997])
-def test_every_packet_comes_through_whatever_the_windows(packets: list[bytes], stream: bytes, window: int):
+def test_every_packet_comes_through_whatever_the_windows(packets, stream, window):
     found, accounting, skipped = read(stream, window)
     assert set(found) == set(packets)
     assert (accounting.packets, accounting.frames) == (len(packets), len(stream) // 259)
@@ -76,7 +74,7 @@ def test_every_packet_comes_through_whatever_the_windows(packets: list[bytes], s
 
 
 @pytest.mark.parametrize("window", [1 << 20, 60_000])
-def test_damage_is_accounted_for_alike_in_windows_and_at_once(stream: bytes, window: int):
+def test_damage_is_accounted_for_alike_in_windows_and_at_once(stream, window):
     stream = bytearray(stream)
     rng = np.random.default_rng(5)
     for at in rng.integers(0, len(stream), 3 * len(stream) // 259):
@@ -92,12 +90,12 @@ def test_damage_is_accounted_for_alike_in_windows_and_at_once(stream: bytes, win
     assert skipped == whole.octets_skipped
 
 
-def test_bare_packets_are_read_in_any_windows(packets: list[bytes]):
+def test_bare_packets_are_read_in_any_windows(packets):
     found, _, skipped = read(b"".join(packets), 1000, SPACECRAFT)
     assert (found, skipped) == (packets, 0)
 
 
-def test_two_spacecraft_in_one_file_are_told_apart_and_one_that_is_named_excludes_the_other(packets: list[bytes]):
+def test_two_spacecraft_in_one_file_are_separated_and_one_that_is_named_excludes_the_other(packets):
     two = encode_cadus(packets[:40], spacecraft_id=76) + encode_cadus(packets[20:60], spacecraft_id=33)
     reader, by_spacecraft = reader_of(two), {}
     for batch in reader.batches(windows(two, 1 << 20)):
@@ -108,7 +106,7 @@ def test_two_spacecraft_in_one_file_are_told_apart_and_one_that_is_named_exclude
     assert found == packets[20:60] and accounting.frames_bad > 0
 
 
-def test_memory_does_not_grow_with_the_stream(stream: bytes):
+def test_memory_does_not_grow_with_the_stream(stream):
     read(stream, 1 << 20)  # imports and compiles
     section = Section(None, 0, 75 * len(stream), 0, 75 * len(stream))
     settings = LinkSettings(frame_length=223)
@@ -121,12 +119,12 @@ def test_memory_does_not_grow_with_the_stream(stream: bytes):
         tracemalloc.reset_peak()
     tracemalloc.stop()
     assert len(peaks) == 15
-    # The first windows leave behind what is kept for good; ten more windows of the stream do not.
+    # The first windows leave behind what is kept until the end; ten more windows of the stream do not.
     assert max(peaks[4:]) - peaks[3] < len(stream)
 
 
 @pytest.mark.parametrize("window", [1 << 20, 60_000])
-def test_the_uplink_is_seen_alike_in_windows_and_at_once(packets: list[bytes], window: int):
+def test_the_uplink_is_seen_alike_in_windows_and_at_once(packets, window):
     encoder = DownlinkEncoder(SPACECRAFT, LinkSettings(frame_length=223))
     clcws = [pack_clcw(Clcw(0, k // 9, lockout=40 < k < 60, farm_b_counter=k % 4)) for k in range(len(packets))]
     stream = encoder.encode(packets, clcw=clcws)
@@ -137,7 +135,7 @@ def test_the_uplink_is_seen_alike_in_windows_and_at_once(packets: list[bytes], w
     assert whole.frames == accounting.frames and whole.changes > 50 and whole.frames_lockout > 0
 
 
-def test_the_uplinks_of_two_spacecraft_in_one_file_are_told_apart(packets: list[bytes]):
+def test_the_uplinks_of_two_spacecraft_in_one_file_are_separated(packets):
     stream = b"".join(
         DownlinkEncoder(spacecraft).encode(packets[:40], clcw=pack_clcw(Clcw(0, number)))
         for spacecraft, number in ((76, 5), (33, 200))
@@ -151,15 +149,13 @@ FEW = 2 * len(KINDS)
 
 
 @pytest.fixture(scope="module")
-def one_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Archive]:
+def one_process(tmp_path_factory):
     with archive(tmp_path_factory.mktemp("pieces") / "home") as found:
         yield found
 
 
 @pytest.fixture(scope="module")
-def several_processes(
-    tmp_path_factory: pytest.TempPathFactory, new_postgres_database: Callable[[], str]
-) -> Iterator[Archive]:
+def several_processes(tmp_path_factory, new_postgres_database):
     with archive(tmp_path_factory.mktemp("pieces") / "home", new_postgres_database(), 3) as found:
         yield found
 
@@ -177,16 +173,16 @@ def test_each_kind_meets_each_order_and_each_piece_is_of_its_recording():
 
 
 @pytest.mark.parametrize("number", [k * len(ORDERS) + k for k in range(FEW)])
-def test_any_split_order_and_repetition_gives_the_same_archive(one_process: Archive, number: int):
+def test_any_split_order_and_repetition_gives_the_same_archive(one_process, number):
     assert one_process.difference(case_of(number)) == ""
 
 
 @pytest.mark.parametrize("number", [200 + k * (len(ORDERS) + 1) for k in range(len(KINDS))])
-def test_any_number_of_processes_gives_the_same_archive(several_processes: Archive, number: int):
+def test_any_number_of_processes_gives_the_same_archive(several_processes, number):
     assert several_processes.difference(case_of(number)) == ""
 
 
-def test_a_piece_that_proved_nothing_is_read_with_a_later_one_around_it(one_process: Archive):
+def test_a_piece_that_proved_nothing_is_read_with_a_later_one_around_it(one_process):
     assert one_process.difference(case_of(10, ["without checksum", "foreign"])) == ""
 
 
@@ -199,18 +195,16 @@ CASES = """\
 
 
 @pytest.mark.parametrize("case", CASES.splitlines())
-def test_what_a_piece_did_not_show_is_read_with_a_later_one(one_process: Archive, case: str):
+def test_what_a_piece_did_not_show_is_read_with_a_later_one(one_process, case):
     number, kind = case.partition(":")[0].split()
     assert one_process.difference(case_of(int(number), (kind,) * 13)) == ""
 
 
-def test_a_piece_that_became_readable_while_it_was_read_is_read_again(
-    one_process: Archive, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_piece_that_became_readable_while_it_was_read_is_read_again(one_process, monkeypatch):
     (recording,) = case_of(3, ["without proof"]).recordings
     rest, ground = Piece(recording, 600, len(recording.octets)), one_process.ground
 
-    def just_before_the_rest(_reading: Reading, _run: Run) -> list[object]:
+    def just_before_the_rest(_reading, _run):
         monkeypatch.undo()
         ingest(ground, rest, "late", "rest")
         return []
@@ -218,11 +212,11 @@ def test_a_piece_that_became_readable_while_it_was_read_is_read_again(
     monkeypatch.setattr(Reading, "_links_of_recording", just_before_the_rest)
     path = ground.home / "first"
     path.write_bytes(recording.octets[:600])
-    result = ingest_file(ground, path, instance="late", place=Place("r", 0))
+    result = ingest_file(ground, path, instance="late", place=PiecePosition("r", 0))
     assert (result.frames, result.octets_pending) == (2, 80)
 
 
-def test_a_lost_piece_is_a_difference(one_process: Archive):
+def test_a_lost_piece_is_a_difference(one_process):
     case = case_of(200 * len(ORDERS), ["short frames"])
     case.pieces.pop()
     assert "packets" in one_process.difference(case)
@@ -245,7 +239,7 @@ with open_ground(Path(sys.argv[1])) as ground:
 """
 
 
-def rows_of(ground: Ground, version: int) -> dict[str, int]:
+def rows_of(ground, version):
     with ground.database.reading() as connection:
         return {
             name: connection.execute(
@@ -256,12 +250,12 @@ def rows_of(ground: Ground, version: int) -> dict[str, int]:
 
 
 @pytest.fixture(scope="module")
-def downlink(make_pass: Callable[..., Any]) -> Path:
+def downlink(make_pass):
     return Path(make_pass(frames=30, seed=4).folder) / "downlink.cadu"
 
 
 @pytest.mark.campaign
-def test_an_ingest_killed_at_any_moment_loses_and_doubles_nothing(downlink: Path, tmp_path: Path):
+def test_an_ingest_killed_at_any_moment_loses_and_doubles_nothing(downlink, tmp_path):
     """The stream is stored in about ten transactions; the process is killed outright at random moments among them."""
     with open_ground(tmp_path / "whole") as ground:
         result = ingest_file(ground, downlink)
@@ -283,7 +277,7 @@ def test_an_ingest_killed_at_any_moment_loses_and_doubles_nothing(downlink: Path
         assert hash_of(ground) == expected
 
 
-def test_decoding_again_puts_rows_beside_the_old_ones(downlink: Path, ground: Ground):
+def test_decoding_again_adds_rows_to_the_old_ones(downlink, ground):
     result = ingest_file(ground, downlink)
     before = rows_of(ground, DICTIONARY.version)
     newer = dataclasses.replace(DICTIONARY, version=DICTIONARY.version + 1)

@@ -6,10 +6,7 @@ archive of a version that joined pieces by content: fragments are kept, waiting 
 import contextlib
 import json
 import logging
-from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -18,9 +15,9 @@ from sqlalchemy import event, func, select, text
 
 from ground_service.app import create_app
 from ground_service.errors import InvalidInput
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.http.model import Paging
-from ground_service.ingest.service import Place, ingest_file
+from ground_service.ingest.service import PiecePosition, ingest_file
 from ground_service.ingest.store import store_batch
 from ground_service.passes.service import list_events, parameter_series, state_series
 from ground_service.settings import Settings
@@ -36,46 +33,46 @@ from tests.ground_service.conftest import define_pass_of
 from tests.serving import TestClient
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import decode, encode_cadus
-from tmtc.packets.crc import append_crc
+from tmtc.packets.space_packets import append_crc
 
 SPACECRAFT = 76
 
 
-def ingest(ground: Ground, octets: bytes, name: str = "downlink.bin", link: str | None = None) -> Any:
+def ingest(ground, octets, name="downlink.bin", link=None):
     path = ground.home / name
     path.write_bytes(octets)
     return ingest_file(ground, path, spacecraft_id=SPACECRAFT, link=link)
 
 
-def rows(ground: Ground, table: Any) -> int:
+def rows(ground, table):
     with ground.database.reading() as connection:
         return int(connection.execute(select(func.count()).select_from(table)).scalar_one())
 
 
 @pytest.fixture(scope="module")
-def packets(make_pass: Callable[..., Any]) -> list[bytes]:
+def packets(make_pass):
     return list(make_pass(frames=6).packets)
 
 
 @pytest.fixture(scope="module")
-def stream(packets: list[bytes]) -> bytes:
+def stream(packets):
     return encode_cadus(packets, spacecraft_id=SPACECRAFT)
 
 
 @pytest.fixture(scope="module")
-def frames(packets: list[bytes]) -> list[bytes]:
+def frames(packets):
     stream = encode_cadus(packets, spacecraft_id=SPACECRAFT, frame_length=223)
     return [stream[at : at + 259] for at in range(0, len(stream), 259)]
 
 
 @pytest.fixture(scope="module")
-def expected(packets: list[bytes], tmp_path_factory: pytest.TempPathFactory) -> str:
+def expected(packets, tmp_path_factory):
     with open_ground(tmp_path_factory.mktemp("whole") / "home") as ground:
         ingest(ground, b"".join(packets))
         return hash_of(ground)
 
 
-def test_every_packet_is_stored_with_its_rows(ground: Ground, packets: list[bytes]):
+def test_every_packet_is_stored_with_its_rows(ground, packets):
     result = ingest(ground, b"".join(packets))
     assert result.packets == result.packets_new == result.samples == len(packets)
     assert (result.crc_errors, result.octets_skipped, result.unknown) == (0, 0, 0)
@@ -83,7 +80,7 @@ def test_every_packet_is_stored_with_its_rows(ground: Ground, packets: list[byte
     assert rows(ground, repository.SAMPLES["navigation_states"]) == 12
 
 
-def test_a_damaged_packet_and_one_cut_short_are_counted_and_the_rest_is_stored(ground: Ground, packets: list[bytes]):
+def test_a_damaged_packet_and_one_cut_short_are_counted_and_the_rest_is_stored(ground, packets):
     octets = bytearray(b"".join(packets)[:-5])
     octets[len(packets[0]) + 30] ^= 0x10
     result = ingest(ground, octets)
@@ -91,7 +88,7 @@ def test_a_damaged_packet_and_one_cut_short_are_counted_and_the_rest_is_stored(g
     assert result.octets_skipped == len(packets[-1]) - 5
 
 
-def test_clocks_of_2000_and_of_the_future_are_kept_apart_once(ground: Ground, packets: list[bytes]):
+def test_clocks_of_2000_and_of_the_future_are_kept_apart_once(ground, packets):
     values = {"event_id": 1, "frame_number": 0, "value_1": 0.0, "value_2": 0.0}
     strays = [DICTIONARY.pack("event_info", values, ticks=t, sequence_count=9) for t in (0, (1 << 48) - 1)]
     result = ingest(ground, b"".join([*packets, *strays]))
@@ -100,8 +97,8 @@ def test_clocks_of_2000_and_of_the_future_are_kept_apart_once(ground: Ground, pa
     assert (again.packets_new, again.packets_implausible) == (0, 0)
 
 
-def test_a_downlink_of_another_dictionary_is_kept_octet_by_octet_and_counted(ground: Ground, packets: list[bytes]):
-    def foreign(packet: bytes) -> bytes:
+def test_a_downlink_of_another_dictionary_is_kept_octet_by_octet_and_counted(ground, packets):
+    def foreign(packet):
         """The packet under a message type that no dictionary of ours has."""
         return append_crc(packet[:7] + bytes((201, 77)) + packet[9:-2])
 
@@ -112,13 +109,13 @@ def test_a_downlink_of_another_dictionary_is_kept_octet_by_octet_and_counted(gro
     assert set(strangers) <= stored(ground)
 
 
-def stored(ground: Ground) -> set[bytes]:
+def stored(ground):
     with ground.database.reading() as connection:
         return set(connection.execute(select(repository.PACKETS.c.octets)).scalars())
 
 
 @pytest.mark.parametrize("octets", [1_000, 70_000])
-def test_noise_is_refused_in_one_line_and_remembered(ground: Ground, octets: int):
+def test_noise_is_refused_in_one_line_and_remembered(ground, octets):
     with pytest.raises(
         InvalidInput, match=rf"noise\.bin: expected a stream of CADUs or of space packets, found {octets}"
     ):
@@ -127,20 +124,18 @@ def test_noise_is_refused_in_one_line_and_remembered(ground: Ground, octets: int
     assert record["state"] == "failed" and "noise.bin" in record["error"]
 
 
-def test_a_missing_file_is_refused(ground: Ground, tmp_path: Path):
+def test_a_missing_file_is_refused(ground, tmp_path):
     with pytest.raises(InvalidInput, match="expected a downlink file, found nothing there"):
         ingest_file(ground, tmp_path / "no.bin", spacecraft_id=SPACECRAFT)
 
 
-def place(ground: Ground, octets: bytes, start: int, stream: str = "stream", **more: Any) -> Any:
+def place(ground, octets, start, stream="stream", **more):
     path = ground.home / "piece"
     path.write_bytes(octets)
-    return ingest_file(ground, path, place=Place(stream, start), **more)
+    return ingest_file(ground, path, place=PiecePosition(stream, start), **more)
 
 
-def test_octets_that_wait_are_counted_and_are_no_error(
-    ground: Ground, packets: list[bytes], stream: bytes, expected: str
-):
+def test_octets_that_wait_are_counted_and_are_no_error(ground, packets, stream, expected):
     first = place(ground, stream[300:900], 300)
     assert (first.packets, first.octets_pending) == (0, 600)
     record = ground.read(repository.newest, repository.INGESTS, Paging())[0][0]
@@ -153,14 +148,14 @@ def test_octets_that_wait_are_counted_and_are_no_error(
     assert hash_of(ground) == expected
 
 
-def test_an_incomplete_frame_at_either_end_of_a_whole_recording_is_counted(ground: Ground, stream: bytes):
+def test_an_incomplete_frame_at_either_end_of_a_whole_recording_is_counted(ground, stream):
     result = ingest(ground, stream[300 : 4 * 1279 + 100])
     assert (result.frames, result.octets_pending) == (3, 979 + 100)
     with pytest.raises(InvalidInput, match=r"600 octets with no frame or packet of .*--recording NAME FILE"):
         ingest(ground, stream[300:900])
 
 
-def test_a_frame_of_two_recordings_is_none(ground: Ground, stream: bytes):
+def test_a_frame_of_two_recordings_is_none(ground, stream):
     """The octets before and behind a cut belong together only in one recording of one instance."""
     place(ground, stream[:4000], 0)
     for name, instance in (("other", "flight"), ("stream", "twin")):
@@ -168,7 +163,7 @@ def test_a_frame_of_two_recordings_is_none(ground: Ground, stream: bytes):
     assert place(ground, stream[4000:], 4000).frames_joined == 1
 
 
-def test_pieces_for_one_spacecraft_and_for_any_adjoin(ground: Ground, stream: bytes, expected: str):
+def test_pieces_for_one_spacecraft_and_for_any_adjoin(ground, stream, expected):
     """The same octets read for another spacecraft before are read again."""
     for number, start in enumerate(range(0, len(stream), 1_000)):
         mine = SPACECRAFT if number % 2 else None
@@ -177,7 +172,7 @@ def test_pieces_for_one_spacecraft_and_for_any_adjoin(ground: Ground, stream: by
     assert hash_of(ground) == expected
 
 
-def test_octets_that_came_before_are_counted_as_repeated(ground: Ground, stream: bytes):
+def test_octets_that_came_before_are_counted_as_repeated(ground, stream):
     first = place(ground, stream[:5_000], 0)
     again = place(ground, stream[:5_000], 0)
     assert (again.frames, again.packets_new, again.octets_repeated) == (first.frames, 0, 0)
@@ -187,7 +182,7 @@ def test_octets_that_came_before_are_counted_as_repeated(ground: Ground, stream:
     assert (inside.octets_repeated, inside.frames, inside.octets_skipped) == (1_000, 0, 0)
 
 
-def test_single_octets_are_joined_by_their_place(ground: Ground, packets: list[bytes]):
+def test_single_octets_are_joined_by_their_place(ground, packets):
     stream = encode_cadus(packets[:1], spacecraft_id=SPACECRAFT)
     place(ground, stream[:900], 0)
     for start in np.random.default_rng(1).permutation(np.arange(900, 912)).tolist():
@@ -197,9 +192,7 @@ def test_single_octets_are_joined_by_their_place(ground: Ground, packets: list[b
     assert rows(ground, repository.PACKETS) == 1
 
 
-def test_fragments_that_fit_by_length_and_count_alone_make_no_packet(
-    ground: Ground, packets: list[bytes], stream: bytes
-):
+def test_fragments_that_fit_by_length_and_count_alone_make_no_packet(ground, packets, stream):
     """The rest of other packets with the same frame counts: the checksum shows that it does not belong here."""
     others = [append_crc(one[:9] + b"?" + one[10:-2]) for one in packets]
     other = encode_cadus(others, spacecraft_id=SPACECRAFT)
@@ -209,9 +202,7 @@ def test_fragments_that_fit_by_length_and_count_alone_make_no_packet(
     assert ingest(ground, stream[2 * 1279 :]).packets_joined == 1
 
 
-def test_many_fragments_are_stored_before_the_end_of_a_recording(
-    ground: Ground, frames: list[bytes], expected: str, monkeypatch: pytest.MonkeyPatch
-):
+def test_many_fragments_are_stored_before_the_end_of_a_recording(ground, frames, expected, monkeypatch):
     monkeypatch.setattr("ground_service.ingest.reception.WINDOW_OCTETS", 2_000)
     monkeypatch.setattr("ground_service.ingest.reception.FRAGMENTS_LIMIT", 3)
     ingest(ground, b"".join(frames[1::2] + frames[::2]), link="frame_length=223")
@@ -219,7 +210,7 @@ def test_many_fragments_are_stored_before_the_end_of_a_recording(
     assert rows(ground, repository.FRAGMENTS) == 0
 
 
-def test_a_piece_is_stored_in_few_transactions(ground: Ground, stream: bytes):
+def test_a_piece_is_stored_in_few_transactions(ground, stream):
     """Each commit waits for the disk: entered, read, completed with fragments, correlated."""
     middle = len(stream) // 2
     place(ground, stream[:middle], 0)
@@ -234,9 +225,7 @@ class PowerFailure(Exception):
 
 
 @pytest.mark.parametrize("shuffled", [False, True])
-def test_an_ingest_that_ends_after_any_commit_is_made_up_for_by_the_next(
-    packets: list[bytes], stream: bytes, expected: str, tmp_path: Path, shuffled: bool
-):
+def test_an_ingest_that_ends_after_any_commit_is_made_up_for_by_the_next(packets, stream, expected, tmp_path, shuffled):
     """A CADU of three pieces, with packets that reach into its neighbours; the piece that completes it is cut off."""
     pieces = [(0, stream[:1700]), (1700, stream[1700:2300]), (2300, stream[2300:])]
     if shuffled:
@@ -248,7 +237,7 @@ def test_an_ingest_that_ends_after_any_commit_is_made_up_for_by_the_next(
             dialect, left = ground.database.engine.dialect, [commits]
             commit = dialect.do_commit
 
-            def failing(connection: Any, commit: Any = commit, left: list[int] = left) -> None:
+            def failing(connection, commit=commit, left=left):
                 commit(connection)
                 left[0] -= 1
                 if left[0] == 0:
@@ -269,8 +258,8 @@ def test_an_ingest_that_ends_after_any_commit_is_made_up_for_by_the_next(
 OLD = replace(DICTIONARY, version=DICTIONARY.version - 1)
 
 
-def fill_with_the_old(home: Path, made: Any) -> None:
-    """What the program before this one left: all packets, decoded by its dictionary."""
+def fill_with_the_old(home, made):
+    """Restore the state of an earlier program: all packets, decoded by its dictionary."""
     found = decode((made.folder / "downlink.cadu").read_bytes())
     with open_ground(home) as ground:
         with ground.database.writing() as connection:
@@ -281,13 +270,13 @@ def fill_with_the_old(home: Path, made: Any) -> None:
 
 
 @pytest.fixture
-def old(tmp_path: Path, synthetic_pass: Any) -> Iterator[Ground]:
+def old(tmp_path, synthetic_pass):
     fill_with_the_old(tmp_path / "home", synthetic_pass)
     with open_ground(tmp_path / "home") as ground:
         yield ground
 
 
-def looked_at(ground: Ground) -> tuple[int, int, int]:
+def looked_at(ground):
     return (
         list_events(ground, 1, Paging(limit=1)).total,
         parameter_series(ground, 1, "power_w", 1000).samples,
@@ -295,13 +284,13 @@ def looked_at(ground: Ground) -> tuple[int, int, int]:
     )
 
 
-def versions(ground: Ground) -> set[int]:
+def versions(ground):
     table = repository.SAMPLES["housekeeping"]
     with ground.database.reading() as connection:
         return set(connection.execute(select(table.c.dictionary_version).distinct()).scalars())
 
 
-def test_an_archive_of_the_old_dictionary_is_read_and_then_decoded_again(old: Ground):
+def test_an_archive_of_the_old_dictionary_is_read_and_then_decoded_again(old):
     before = looked_at(old)
     assert before == (1, 40, 40)
     assert vehicles_behind(old) == [1]
@@ -310,7 +299,7 @@ def test_an_archive_of_the_old_dictionary_is_read_and_then_decoded_again(old: Gr
     assert versions(old) == {OLD.version, DICTIONARY.version}
 
 
-def test_serving_enters_the_job_that_decodes_again(tmp_path: Path, synthetic_pass: Any):
+def test_serving_enters_the_job_that_decodes_again(tmp_path, synthetic_pass):
     fill_with_the_old(tmp_path / "home", synthetic_pass)
     with TestClient(create_app(Settings(home=tmp_path / "home"), inline_jobs=True)) as client:
         (job,) = client.get("/api/v1/jobs").json()["items"]
@@ -321,7 +310,7 @@ def test_serving_enters_the_job_that_decodes_again(tmp_path: Path, synthetic_pas
 
 
 def test_what_comes_in_meanwhile_and_a_kill_in_the_middle_change_nothing(
-    old: Ground, tmp_path: Path, make_pass: Any, synthetic_pass: Any, monkeypatch: Any
+    old, tmp_path, make_pass, synthetic_pass, monkeypatch
 ):
     monkeypatch.setattr(parameters, "BLOCK_PACKETS", 50)
     more = make_pass(frames=3, seed=5).folder / "downlink.cadu"
@@ -359,7 +348,7 @@ PIECE = (
 
 
 @pytest.fixture
-def begun(synthetic_pass: Any) -> tuple[int, bytes]:
+def begun(synthetic_pass):
     """Octets of a packet in the first frame of the downlink and behind it."""
     at = 0
     for packet in synthetic_pass.packets:
@@ -370,7 +359,7 @@ def begun(synthetic_pass: Any) -> tuple[int, bytes]:
 
 
 @pytest.fixture
-def upgraded(begun: tuple[int, bytes], tmp_path: Path, caplog: pytest.LogCaptureFixture) -> Ground:
+def upgraded(begun, tmp_path, caplog):
     """An archive in which the beginning of a packet waits, and two pieces of 600 octets, one without a position."""
     home = tmp_path / "home"
     home.mkdir()
@@ -396,14 +385,14 @@ def upgraded(begun: tuple[int, bytes], tmp_path: Path, caplog: pytest.LogCapture
         return open_ground(home)
 
 
-def test_the_beginning_of_a_packet_is_kept(upgraded: Ground, synthetic_pass: Any, tmp_path: Path):
+def test_the_beginning_of_a_packet_is_kept(upgraded, synthetic_pass, tmp_path):
     stream = (synthetic_pass.folder / "downlink.cadu").read_bytes()
     (tmp_path / "rest.cadu").write_bytes(stream[1279:])
     with upgraded as ground:
         assert ingest_file(ground, tmp_path / "rest.cadu").packets_joined == 1
 
 
-def test_waiting_pieces_without_a_position_are_listed(upgraded: Ground, caplog: pytest.LogCaptureFixture):
+def test_waiting_pieces_without_a_position_are_listed(upgraded, caplog):
     said = [one.getMessage() for one in caplog.get_records("setup")]
     assert [one for one in said if "--recording NAME FILE" in one] == [
         f"ingest 1, file {'1' * 64}: 600 octets wait for others without a position; ingest the files of its "

@@ -1,12 +1,8 @@
 """Small pieces: few statements, the stored result, knowledge that is up to date."""
 
-from collections.abc import Callable
-from typing import Any
-
 import pytest
 from sqlalchemy import event
 
-from ground_service.ground import Ground
 from ground_service.ingest import store
 from ground_service.ingest.link_settings import known_before
 from ground_service.ingest.recording_store import Piece
@@ -22,13 +18,13 @@ STATEMENTS = 10
 
 
 @pytest.fixture(scope="module")
-def pieces(make_pass: Callable[..., Any]) -> list[bytes]:
+def pieces(make_pass):
     """The first one shows the link; the others hold one packet each, in complete frames."""
     packets = list(make_pass(frames=6).packets)
     return [encode_cadus(one, spacecraft_id=SPACECRAFT) for one in (packets[:4], *([one] for one in packets[4:]))]
 
 
-def ingest(ground: Ground, octets: bytes) -> None:
+def ingest(ground, octets):
     """Ingest a piece and check its stored result."""
     path = ground.home / "piece"
     path.write_bytes(octets)
@@ -37,7 +33,7 @@ def ingest(ground: Ground, octets: bytes) -> None:
     assert (kept.accounting, kept.state) == (made, "done")
 
 
-def test_a_small_piece_takes_few_statements_in_two_transactions(either: Ground, pieces: list[bytes]):
+def test_a_small_piece_takes_few_statements_in_two_transactions(either, pieces):
     for piece in pieces[:3]:
         ingest(either, piece)
     statements = []
@@ -56,10 +52,10 @@ def test_a_small_piece_takes_few_statements_in_two_transactions(either: Ground, 
     assert not any("UPDATE ingests" in one for one in statements[stored:])
 
 
-def test_the_declared_link_follows_new_mission_descriptions(either: Ground):
+def test_the_declared_link_follows_new_mission_descriptions(either):
     piece = Piece(1, "flight", SPACECRAFT, "0" * 64, 1279, "", 0)
 
-    def known() -> Any:
+    def known():
         return either.read(known_before, piece)
 
     assert known().expected.settings == (LinkSettings().explicit,)

@@ -5,24 +5,21 @@ reports from the records of a station.
 import os
 import struct
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from ground_service.errors import InvalidInput, StorageFull
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.ingest import store
 from ground_service.ingest.core import NO_TIME, LinkContent, RecordFormat
 from ground_service.ingest.frames import FrameReader, Section
 from ground_service.ingest.live import Spool, WatchedFolder
-from ground_service.ingest.service import Place, ingest_file
+from ground_service.ingest.service import PiecePosition, ingest_file
 from ground_service.store.event_kinds import read_events
 from ground_service.store.repository import RECEPTIONS
 from ground_service.store.vehicles import vehicle_id
-from ground_service.telemetry.packets import CLOCKS_AGREE_NS, PacketBatch, batch_of_cut, time_receptions
-from lunar.arrays import IntArray
+from ground_service.telemetry.packets import CLOCKS_AGREE_NS, batch_of_cut, time_receptions
 from lunar.timescales import parse_utc, ticks_from_utc_ns
 from tests.ground_service.archive_hash import hash_of
 from tmtc.arrays import as_octets
@@ -30,36 +27,36 @@ from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.link.frames import FRAME_HEADER_LENGTH
 from tmtc.link.settings import LinkSettings
-from tmtc.packets.crc import CRC_LENGTH
+from tmtc.packets.space_packets import CRC_LENGTH
 from tmtc.packets.stream import cut_packets
 
 
 @pytest.fixture
-def expected(synthetic_pass: Any, tmp_path: Path) -> str:
+def expected(synthetic_pass, tmp_path):
     with open_ground(tmp_path / "whole") as ground:
         ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
         return hash_of(ground)
 
 
 @pytest.fixture
-def stream(synthetic_pass: Any) -> bytes:
+def stream(synthetic_pass):
     return bytes((synthetic_pass.folder / "downlink.cadu").read_bytes())
 
 
-def spool_of(ground: Ground, seen: list[Any]) -> Spool:
-    def ingest(path: Path, recording: str, offset: int) -> dict[str, Any]:
-        return {"packets_new": ingest_file(ground, path, place=Place(recording, offset)).packets_new}
+def spool_of(ground, seen):
+    def ingest(path, recording, offset):
+        return {"packets_new": ingest_file(ground, path, place=PiecePosition(recording, offset)).packets_new}
 
     return Spool(ground.home / "spool", ingest, lambda _path, result: seen.append(result))
 
 
-def take(spool: Spool, octets: bytes) -> None:
+def take(spool, octets):
     spool.keep(octets)
     spool.cut()
     spool.drain()
 
 
-def test_segments_cut_at_any_octet_are_pieces_of_one_recording(ground: Ground, stream: bytes, expected: str):
+def test_segments_cut_at_any_octet_are_pieces_of_one_recording(ground, stream, expected):
     spool = spool_of(ground, seen := [])
     assert spool.open() == 0
     for start, stop in pairwise([0, 700, 4 * 1279 + 300, 4 * 1279 + 301, len(stream)]):
@@ -71,7 +68,7 @@ def test_segments_cut_at_any_octet_are_pieces_of_one_recording(ground: Ground, s
 
 
 @pytest.mark.parametrize("drained", [False, True])
-def test_the_recording_of_a_run_that_crashed_goes_on(ground: Ground, stream: bytes, expected: str, drained: bool):
+def test_the_recording_of_a_run_that_crashed_goes_on(ground, stream, expected, drained):
     """Also if all its segments are ingested."""
     crashed = spool_of(ground, [])
     crashed.open()
@@ -90,7 +87,7 @@ def test_the_recording_of_a_run_that_crashed_goes_on(ground: Ground, stream: byt
     assert hash_of(ground) == expected
 
 
-def test_the_segments_of_a_version_without_recordings_are_consecutive(ground: Ground, stream: bytes, expected: str):
+def test_the_segments_of_a_version_without_recordings_are_consecutive(ground, stream, expected):
     folder = ground.home / "spool"
     folder.mkdir()
     (folder / "000000000004.segment").write_bytes(stream[:700])
@@ -102,8 +99,8 @@ def test_the_segments_of_a_version_without_recordings_are_consecutive(ground: Gr
     assert hash_of(ground) == expected
 
 
-def test_a_segment_stays_in_the_spool_while_the_store_is_full(stream: bytes, tmp_path: Path):
-    def full(*_: Any) -> dict[str, Any]:
+def test_a_segment_stays_in_the_spool_while_the_store_is_full(stream, tmp_path):
+    def full(*_):
         raise StorageFull("here")
 
     spool = Spool(tmp_path, full, lambda *_: None)
@@ -113,9 +110,7 @@ def test_a_segment_stays_in_the_spool_while_the_store_is_full(stream: bytes, tmp
     assert b"".join(path.read_bytes() for path in tmp_path.glob("*.segment")) == stream
 
 
-def test_noise_is_part_of_the_recording_and_an_unknown_coding_does_not_stop_the_rest(
-    ground: Ground, stream: bytes, expected: str
-):
+def test_noise_is_part_of_the_recording_and_an_unknown_coding_does_not_stop_the_rest(ground, stream, expected):
     spool = spool_of(ground, seen := [])
     spool.open()
     markers = bytes.fromhex("1ACFFC1D") + np.random.default_rng(1).bytes(1275)
@@ -125,11 +120,11 @@ def test_noise_is_part_of_the_recording_and_an_unknown_coding_does_not_stop_the_
     assert hash_of(ground) == expected
 
 
-def test_files_that_appear_are_ingested_once_when_they_are_whole(tmp_path: Path):
+def test_files_that_appear_are_ingested_once_when_they_are_whole(tmp_path):
     folder, seen = tmp_path / "in", []
     folder.mkdir()
 
-    def watched() -> WatchedFolder:
+    def watched():
         return WatchedFolder(
             folder, tmp_path / "ledger.json", lambda path: {"file": path.name}, lambda p, r: seen.append(r)
         )
@@ -154,18 +149,18 @@ SETTINGS = LinkSettings().explicit
 RECORD = RecordFormat(header_octets=8, time_code="unix_ns")
 
 
-def report(ticks: int, count: int) -> bytes:
+def report(ticks, count):
     values = {"reported_ticks": ticks, "rate_exponent": 4}
     return DICTIONARY.pack("time_report", values, ticks=ticks, sequence_count=count)
 
 
-def batch_of(packets: list[bytes], received: IntArray | None) -> PacketBatch:
+def batch_of(packets, received):
     octets = b"".join(packets)
     return batch_of_cut(octets, cut_packets(octets), DICTIONARY, 76, received)
 
 
 @pytest.mark.parametrize("window_octets", [1 << 20, 3_000])
-def test_a_packet_has_the_reception_time_of_the_frame_in_which_it_begins(window_octets: int):
+def test_a_packet_has_the_reception_time_of_the_frame_in_which_it_begins(window_octets):
     ticks = int(ticks_from_utc_ns(START))
     packets = [report(ticks + k, k) for k in range(400)]
     cadus = encode_cadus(packets, spacecraft_id=76)
@@ -202,14 +197,14 @@ def test_reports_of_clocks_that_differ_are_left_out():
     assert time_receptions(batch_of(packets, None)) == {}
 
 
-def noted(ground: Ground) -> list[tuple[Any, ...]]:
+def noted(ground):
     names = ("ticks", "sequence_count", "station", "earth_utc_ns")
     with ground.database.reading() as connection:
         rows = connection.execute(RECEPTIONS.select().order_by(*(RECEPTIONS.c[name] for name in names)))
         return [tuple(getattr(row, name) for name in names) for row in rows]
 
 
-def test_the_first_reception_counts_in_any_order(either: Ground, monkeypatch: pytest.MonkeyPatch):
+def test_the_first_reception_counts_in_any_order(either, monkeypatch):
     with either.database.writing() as connection:
         vehicle = vehicle_id(connection, 76, "flight")
         for received in ({(7, 1): 500, (8, 2): 600}, {(7, 1): 400}, {(7, 1): 450}):

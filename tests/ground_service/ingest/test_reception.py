@@ -2,8 +2,6 @@
 
 import itertools
 import struct
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,10 +21,9 @@ from benchmarks.downlink import (
     without_error_control,
 )
 from ground_service.errors import InvalidInput
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.http.model import Paging
-from ground_service.ingest.model import IngestResult
-from ground_service.ingest.service import Place, ingest_file
+from ground_service.ingest.service import PiecePosition, ingest_file
 from ground_service.missions.service import add_mission
 from ground_service.missions.store import links_in_force
 from ground_service.passes.archive_import import import_archive
@@ -67,18 +64,18 @@ randomiser = "long"
 FOREIGN = b'name = "foreign"\n[spacecraft]\nid = 76\n[link]\npacket_checksum = "none"\n'
 
 
-def ingest(ground: Ground, octets: Any, **options: Any) -> IngestResult:
+def ingest(ground, octets, **options):
     path = ground.home / "downlink.bin"
     path.write_bytes(octets)
     return ingest_file(ground, path, **options)
 
 
-def section(result: IngestResult) -> dict[str, Any]:
+def section(result):
     (one,) = result.reception.sections
     return one.model_dump()
 
 
-def stored(ground: Ground, spacecraft: int = SPACECRAFT) -> set[bytes]:
+def stored(ground, spacecraft=SPACECRAFT):
     table = repository.PACKETS
     with ground.database.reading() as connection:
         vehicle = vehicle_id(connection, spacecraft, "flight")
@@ -86,7 +83,7 @@ def stored(ground: Ground, spacecraft: int = SPACECRAFT) -> set[bytes]:
         return {bytes(row) for row in rows.scalars()}
 
 
-def recorded(rows: np.ndarray) -> bytes:
+def recorded(rows):
     """CADUs in records with a header that holds the reception time, and a trailer."""
     rng = np.random.default_rng(5)
     parts = []
@@ -95,7 +92,7 @@ def recorded(rows: np.ndarray) -> bytes:
     return b"".join(parts)
 
 
-def test_settings_come_from_the_sender_then_from_the_mission_and_else_from_the_defaults(ground: Ground):
+def test_settings_come_from_the_sender_then_from_the_mission_and_else_from_the_defaults(ground):
     rows = cadus(30)
     assert section(ingest(ground, rows[:10]))["source"] == "default"
     add_mission(ground, MISSION.encode())
@@ -104,7 +101,7 @@ def test_settings_come_from_the_sender_then_from_the_mission_and_else_from_the_d
     assert (section(stated)["source"], stated.remark) == ("stated", "")
 
 
-def test_an_archive_is_read_with_the_settings_of_its_own_mission(ground: Ground, make_pass: Any):
+def test_an_archive_is_read_with_the_settings_of_its_own_mission(ground, make_pass):
     """The description of the archive holds for its instance only, not for the spacecraft in flight."""
     archive = make_pass(mission=MISSION)
     pass_id = import_archive(ground, archive.folder)
@@ -114,7 +111,7 @@ def test_an_archive_is_read_with_the_settings_of_its_own_mission(ground: Ground,
     assert {one["source"] for one in kept["accounting"]["reception"]["sections"]} == {"mission"}
 
 
-def test_stated_settings_are_used_as_they_are_and_impossible_ones_are_refused(ground: Ground):
+def test_stated_settings_are_used_as_they_are_and_impossible_ones_are_refused(ground):
     octets = cadus(30)
     right = "frame_length=1115,coding=rs,randomiser=legacy,checksum=true"
     wrong = ingest(ground, octets, link=right.replace("legacy", "long"))
@@ -126,14 +123,14 @@ def test_stated_settings_are_used_as_they_are_and_impossible_ones_are_refused(gr
             ingest(ground, octets, link=text)
 
 
-def test_a_station_may_have_settings_of_its_own(ground: Ground):
+def test_a_station_may_have_settings_of_its_own(ground):
     add_mission(ground, MISSION.encode())
     settings = LinkSettings(frame_length=892, interleave=4, randomiser="long")
     result = ingest(ground, cadus(30, 1, settings), station="canberra")
     assert (section(result)["source"], section(result)["frame_length"]) == ("mission", 892)
 
 
-def test_octets_that_do_not_fit_the_declared_settings_are_kept_with_a_remark(ground: Ground):
+def test_octets_that_do_not_fit_the_declared_settings_are_kept_with_a_remark(ground):
     add_mission(ground, MISSION.encode())
     settings = LinkSettings(frame_length=1024, coding="none")
     octets = cadus(30, 1, settings)
@@ -147,13 +144,13 @@ def test_octets_that_do_not_fit_the_declared_settings_are_kept_with_a_remark(gro
     assert (again.packets, again.remark) == (len(telemetry(30, 1, settings)), "")
 
 
-def test_a_file_with_few_frames_of_the_declared_settings_has_a_remark(ground: Ground):
+def test_a_file_with_few_frames_of_the_declared_settings_has_a_remark(ground):
     other = cadus(30, 1, LinkSettings(frame_length=1024, coding="none")).tobytes()
     result = ingest(ground, cadus(30)[:10].tobytes() + other)
     assert f"10 of {result.frames} frames are valid with the default link settings" in result.remark
 
 
-def test_each_section_has_the_declared_settings_of_its_spacecraft(ground: Ground):
+def test_each_section_has_the_declared_settings_of_its_spacecraft(ground):
     other = LinkSettings(frame_length=1024, coding="none")
     add_mission(ground, b'name = "other"\n[spacecraft]\nid = 33\n[link]\nframe_length = 1024\ncoding = "none"\n')
     octets = cadus(200).tobytes() + cadus(200, 1, other, OTHER_SPACECRAFT).tobytes()
@@ -162,7 +159,7 @@ def test_each_section_has_the_declared_settings_of_its_spacecraft(ground: Ground
     assert result.packets == len(telemetry(200)) + len(telemetry(200, 1, other))
 
 
-def test_records_of_a_station_give_reception_times_and_their_octets_are_accounted_for(ground: Ground):
+def test_records_of_a_station_give_reception_times_and_their_octets_are_accounted_for(ground):
     add_mission(ground, MISSION.encode())
     rows = with_bit_errors(cadus(60), 2e-3, 3)
     octets = recorded(rows)
@@ -175,7 +172,7 @@ def test_records_of_a_station_give_reception_times_and_their_octets_are_accounte
     assert (quality.frames, quality.lock_losses, quality.station) == (n, 0, "madrid")
 
 
-def test_the_bit_error_rate_is_estimated_from_the_corrected_bits(ground: Ground):
+def test_the_bit_error_rate_is_estimated_from_the_corrected_bits(ground):
     quality = ingest(ground, with_bit_errors(cadus(SHORT), 2e-3, 3)).reception
     assert quality.codewords_lost == 0
     # of 4e6 bits 8,200 are wrong: one standard deviation is 1.1 %
@@ -183,7 +180,7 @@ def test_the_bit_error_rate_is_estimated_from_the_corrected_bits(ground: Ground)
     assert quality.symbols_corrected > 7_000
 
 
-def test_lost_bits_and_inverted_frames_are_lock_losses(ground: Ground):
+def test_lost_bits_and_inverted_frames_are_lock_losses(ground):
     bits = np.unpackbits(cadus(30).reshape(-1))
     rows = np.packbits(np.delete(bits, [9 * 8 * 1279 + 4000]))
     quality = ingest(ground, rows).reception
@@ -192,7 +189,7 @@ def test_lost_bits_and_inverted_frames_are_lock_losses(ground: Ground):
     assert quality.frames_inverted == len(cadus(30))
 
 
-def test_packets_without_error_control_are_read_if_the_mission_says_so(ground: Ground):
+def test_packets_without_error_control_are_read_if_the_mission_says_so(ground):
     capture = without_error_control()
     with pytest.raises(InvalidInput):
         ingest(ground, capture.files[0], spacecraft_id=SPACECRAFT)
@@ -202,7 +199,7 @@ def test_packets_without_error_control_are_read_if_the_mission_says_so(ground: G
     assert stored(ground) == capture.packets[SPACECRAFT]
 
 
-def test_packets_behind_octets_of_a_recorder_are_read_if_the_mission_says_so(ground: Ground):
+def test_packets_behind_octets_of_a_recorder_are_read_if_the_mission_says_so(ground):
     packets = without_error_control().packets[SPACECRAFT]
     octets = b"".join(bytes(3) + packet for packet in sorted(packets))
     with pytest.raises(InvalidInput, match=r"`linna link check FILE` shows"):
@@ -214,7 +211,7 @@ def test_packets_behind_octets_of_a_recorder_are_read_if_the_mission_says_so(gro
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.campaign) for k in (1, 2, 3))])
-def test_receptions_of_two_stations_are_merged_in_any_order_and_split(ground: Ground, seed: int):
+def test_receptions_of_two_stations_are_merged_in_any_order_and_split(ground, seed):
     rng = np.random.default_rng(seed)
     stream = two_receivers(one_file=False)
     pieces = []
@@ -223,25 +220,25 @@ def test_receptions_of_two_stations_are_merged_in_any_order_and_split(ground: Gr
         pieces += [(station, a, octets[a:b]) for a, b in itertools.pairwise(cuts) if b > a]
     for k in rng.permutation(len(pieces)).tolist():
         station, start, octets = pieces[k]
-        ingest(ground, octets, station=station, place=Place(station, start))
+        ingest(ground, octets, station=station, place=PiecePosition(station, start))
     assert stored(ground) == stream.packets[SPACECRAFT]
 
 
-def test_two_spacecraft_have_the_same_archives_whatever_the_split(tmp_path: Path):
+def test_two_spacecraft_have_the_same_archives_whatever_the_split(tmp_path):
     stream = two_spacecraft()
     hashes = set()
     for cut in (0, 1279 * 301, 400_001):
         with open_ground(tmp_path / str(cut)) as ground:
             for start, part in ((cut, stream.files[0][cut:]), (0, stream.files[0][:cut])):
                 if part:
-                    ingest(ground, part, place=Place("both", start))
+                    ingest(ground, part, place=PiecePosition("both", start))
             assert {one: stored(ground, one) for one in stream.packets} == stream.packets
             vehicles = [ground.read(vehicle_id, one, "flight") for one in sorted(stream.packets)]
             hashes.add(tuple(ground.read(archive_hash, vehicle) for vehicle in vehicles))
     assert len(hashes) == 1
 
 
-def test_the_link_quality_of_both_stations_is_shown_with_the_merged_packets_of_the_pass(ground: Ground):
+def test_the_link_quality_of_both_stations_is_shown_with_the_merged_packets_of_the_pass(ground):
     add_mission(ground, f"{MISSION}\n[link.stations.goldstone]\n".encode())
     stream = two_receivers(one_file=False)
     for station, octets in zip(("madrid", "goldstone"), stream.files, strict=True):
@@ -258,5 +255,5 @@ def test_the_link_quality_of_both_stations_is_shown_with_the_merged_packets_of_t
     assert [one.frames for one in found.receptions] == [len(stream.files[1]) // 1279, len(stream.files[0]) // 1279]
     assert found.frames == sum(one.frames for one in found.receptions)
     assert {one.source for one in found.receptions} == {"mission"}
-    told = Completeness.of_accounting(found).receptions
-    assert [one.station for one in told] == ["goldstone", "madrid"]
+    receptions = Completeness.of_accounting(found).receptions
+    assert [one.station for one in receptions] == ["goldstone", "madrid"]

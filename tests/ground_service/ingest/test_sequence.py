@@ -2,32 +2,30 @@
 Ingests are found by the on-board times of their packets.
 """
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ground_service.ground import Ground
-from ground_service.ingest.core import COUNT_MODULUS, account_sequence
 from ground_service.ingest.service import ingest_file
 from ground_service.ingest.store import recordings_of_vehicle
+from ground_service.passes.downlink_accounting import account_sequence
 from ground_service.store import repository
 from ground_service.telemetry.packets import batch_of_cut
 from tmtc.dictionary.payload import DICTIONARY
-from tmtc.packets.cuc import NO_TICKS, TICKS_PER_SECOND
+from tmtc.packets.pus import NO_TICKS, TICKS_PER_SECOND
+from tmtc.packets.space_packets import SEQUENCE_COUNT_LIMIT
 from tmtc.packets.stream import cut_packets
 
 SECOND = TICKS_PER_SECOND
 
 
-def stream(count: int, first: int = 0, step_ticks: int = SECOND // 10) -> tuple[np.ndarray, np.ndarray]:
+def stream(count, first=0, step_ticks=SECOND // 10):
     numbers = np.arange(first, first + count)
-    return numbers * step_ticks, numbers % COUNT_MODULUS
+    return numbers * step_ticks, numbers % SEQUENCE_COUNT_LIMIT
 
 
-def counted(ticks: np.ndarray, counts: np.ndarray) -> tuple[int, int, int]:
+def counted(ticks, counts):
     """Return packets lost, restarts and conflicts."""
     account = account_sequence(ticks, counts)
     return account.lost, account.restarts, account.conflicts
@@ -48,9 +46,9 @@ def test_a_wrap_is_no_gap():
 @given(
     lost=st.sets(st.integers(1, 2998), max_size=60),
     seed=st.integers(0, 2**32 - 1),
-    first=st.integers(0, COUNT_MODULUS - 1),
+    first=st.integers(0, SEQUENCE_COUNT_LIMIT - 1),
 )
-def test_what_is_missing_is_found_whatever_the_order_of_arrival(lost: set[int], seed: int, first: int):
+def test_what_is_missing_is_found_whatever_the_order_of_arrival(lost, seed, first):
     ticks, counts = stream(3000, first)
     keep = np.random.default_rng(seed).permutation(np.setdiff1d(np.arange(3000), np.array(sorted(lost), dtype=int)))
     account = account_sequence(ticks[keep], counts[keep])
@@ -84,7 +82,7 @@ def test_one_count_used_twice_is_a_conflict():
 
 
 @pytest.mark.parametrize("years", [-29, 40])
-def test_a_packet_from_another_age_does_not_disturb_the_rest(years: int):
+def test_a_packet_from_another_age_does_not_disturb_the_rest(years):
     ticks, counts = stream(1000, first=5000)
     ticks = ticks + 29 * 31_557_600 * SECOND
     stray = ticks[500] + years * 31_557_600 * SECOND
@@ -105,7 +103,7 @@ def test_few_packets_have_no_rate_and_a_silence_hides_no_wraps():
 
 
 @pytest.mark.parametrize(("silence_s", "restarts", "lost"), [(600, 1, 0), (1000, 0, 8383)])
-def test_wraps_are_looked_for_where_half_of_one_could_have_been_made(silence_s: int, restarts: int, lost: int):
+def test_wraps_are_looked_for_where_half_of_one_could_have_been_made(silence_s, restarts, lost):
     """At ten packets a second 600 s hold 6000 of them and 1000 s hold 10,000; half a wrap is 8192.
 
     A fall of 8000 is then a restart, or 8384 packets further on, of which the last came.
@@ -140,18 +138,18 @@ def test_an_impossible_on_board_time_is_none_and_never_negative_garbage():
     assert reported.tolist() == [0, 2**48 - 1, NO_TICKS, NO_TICKS, NO_TICKS]
 
 
-def test_only_ingests_with_packets_in_the_time_are_returned(either: Ground, synthetic_pass: Any):
+def test_only_ingests_with_packets_in_the_time_are_returned(either, synthetic_pass):
     result = ingest_file(either, synthetic_pass.folder / "downlink.cadu")
     first, last = result.first_ticks, result.last_ticks
     assert first < last
 
-    def found(start_ticks: int, stop_ticks: int) -> int:
+    def found(start_ticks, stop_ticks):
         return len(either.read(recordings_of_vehicle, result.vehicle_id, start_ticks, stop_ticks))
 
     assert found(first, last) == found(first - 9, first) == found(last, last + 9) == found(first + 1, first + 2) == 1
     assert found(first - 9, first - 1) == found(last + 1, last + 9) == 0
 
-    def without_times(**counts: int) -> int:
+    def without_times(**counts):
         accounting = {"packets": 0, "vehicle_ids": [result.vehicle_id], **counts}
         changed = repository.INGESTS.update().values(first_ticks=None, last_ticks=None, accounting=accounting)
         with either.database.writing() as connection:

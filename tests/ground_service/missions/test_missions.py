@@ -236,7 +236,7 @@ def test_text_that_mentions_terrain_does_not_decide_the_evidence_level():
     declared = """
 LROC WAC GLD100 | real-terrain | None
 procedural Moon, seed 7 | procedural | 2
-a procedural Moon beside GLD100 | None | None
+a procedural Moon and GLD100 | None | None
 photograph big_tile.tif | photographs | 5
 """
     for terrain, *expected in cells(declared):
@@ -320,6 +320,14 @@ def test_windows_approved_automatically_with_critical_telecommands_are_refused(g
     assert add_mission(ground, (TEXT + released).encode()).document.critical_in_windows == ()
 
 
+def test_a_description_has_a_hundred_links_at_most():
+    link = '[[links]]\nname = "l{}"\nkind = "file"\ndownlink = "/nowhere"\n'
+    links = [link.format(k) for k in range(101)]
+    assert len(read_mission((TEXT + "".join(links[1:])).encode())[0].links or ()) == 100
+    with pytest.raises(InvalidInput, match="at most 100 items"):
+        read_mission((TEXT + "".join(links)).encode())
+
+
 def test_a_check_of_texts_that_take_long_to_compare_counts_their_lines(ground):
     head = TEXT + "\n".join(f"# {k % 7}" for k in range(1500)) + "\n"
     add_mission(ground, head.encode())
@@ -339,6 +347,8 @@ def test_a_check_tells_all_faults_or_what_changes_and_adds_nothing(ground):
     assert check_mission(ground, TEXT.encode()).changes == ()
     found = check_mission(ground, TEXT.replace("fov_deg = 120", "fov_deg = 90").encode())
     assert "camera.width_px" in found.unknown
+    line = TEXT.splitlines().index("fov_deg = 120")
+    assert found.changes[0] == f"@@ -{line},3 +{line},3 @@"
     assert [one for one in found.changes if one[0] in "+-"] == ["-fov_deg = 120", "+fov_deg = 90"]
     assert len(check_mission(ground, (TEXT + "[linc]\n[camara]\n").encode()).faults) == 2
     other = Caller("eve", "operator", missions=("other",), spacecraft=frozenset({77}))

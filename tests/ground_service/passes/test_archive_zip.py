@@ -3,24 +3,21 @@
 import stat
 import tracemalloc
 import zipfile
-from pathlib import Path
-from typing import Any
 
 import pytest
 from pytest import raises
 
 from ground_service.errors import InvalidInput
-from ground_service.ground import Ground
 from ground_service.passes import archive_import
 from ground_service.passes.archive_import import import_archive, import_zip, unpacked, zip_folder
 
 
-def refused(ground: Ground, path: Path, message: str) -> None:
+def refused(ground, path, message):
     with raises(InvalidInput, match=message):
         import_zip(ground, path)
 
 
-def zipped(path: Path, entries: dict[Any, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
+def zipped(path, entries, method=zipfile.ZIP_DEFLATED):
     with zipfile.ZipFile(path, "w", method) as archive:
         for name, octets in entries.items():
             archive.writestr(name, octets)
@@ -75,7 +72,7 @@ def test_too_many_files_files_twice_and_no_zip_at_all_are_refused(ground, tmp_pa
     refused(ground, zipped(tmp_path / "many.zip", {str(i): b"" for i in range(4)}), "expected at most 3 files, found 4")
 
 
-def with_directory(folder: Path, entries: int, claimed: int) -> Path:
+def with_directory(folder, entries, claimed):
     """Write a zip file with a central directory of empty files, named by number, and another number at its end."""
     fixed = b"PK\1\2" + bytes(24) + (7).to_bytes(2, "little") + bytes(16)
     directory = b"".join(fixed + b"%07d" % number for number in range(entries))
@@ -87,7 +84,7 @@ def with_directory(folder: Path, entries: int, claimed: int) -> Path:
 @pytest.mark.parametrize("claimed", [None, 1])
 def test_a_great_directory_is_refused_before_it_is_read(ground, tmp_path, claimed):
     """The number of entries is counted in the directory, not taken from the end record."""
-    entries = 1_200_000 if claimed is None else 100_000
+    entries = 1_200_000 if claimed is None else 25_000
     path = with_directory(tmp_path, entries, claimed or 0xFFFF)
     tracemalloc.start()
     try:

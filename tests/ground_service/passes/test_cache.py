@@ -1,16 +1,13 @@
 """Cached answers: kept while other data come, made again with new data of their interval, made once for many."""
 
 import threading
-from collections.abc import Hashable
 
 import pytest
 from sqlalchemy import delete
 
-from ground_service.ground import Ground
 from ground_service.passes import series
 from ground_service.passes.series import Cache
 from ground_service.store.event_kinds import CorrelationChanged, LinkChanged, TelemetryReceived, publish
-from ground_service.store.event_kinds import Event as Published
 from ground_service.store.models import EVENT_LOG
 from ground_service.store.vehicles import change_vehicle, vehicle_id
 
@@ -20,34 +17,34 @@ START, STOP = 1000, 2000
 class Archive:
     """Events of two vehicles, and a cached answer on an interval of the first: how often it was made."""
 
-    def __init__(self, ground: Ground) -> None:
+    def __init__(self, ground):
         self.ground = ground
         with ground.database.writing() as connection:
             self.vehicle, self.other = (vehicle_id(connection, 76, name) for name in ("flight", "other"))
             publish(connection, LinkChanged(link="first", state="open"))
         self.made = 0
 
-    def happens(self, *events: Published) -> None:
+    def happens(self, *events):
         with self.ground.database.writing() as connection:
             for one in events:
                 publish(connection, one)
 
-    def telemetry(self, first: int | None, last: int | None, **more: int) -> None:
+    def telemetry(self, first, last, **more):
         vehicle = more.pop("vehicle", self.vehicle)
         self.happens(TelemetryReceived(vehicle_id=vehicle, packets=1, first_ticks=first, last_ticks=last, **more))
 
-    def make(self) -> int:
+    def make(self):
         self.made += 1
         return self.made
 
-    def ask(self, state: Hashable = None) -> int:
+    def ask(self, state=None):
         with self.ground.database.reading() as connection:
             cache = Cache(self.ground, connection, self.vehicle)
             return cache.answer("answer", self.make, start_ticks=START, stop_ticks=STOP, state=state)
 
 
 @pytest.fixture
-def archive(ground: Ground) -> Archive:
+def archive(ground):
     return Archive(ground)
 
 

@@ -1,7 +1,5 @@
 """Raw files accounted for by on-board time, against streams whose every frame and packet is known."""
 
-from typing import Any
-
 import numpy as np
 
 from ground_service.passes.downlink_accounting import account_raw, read_raw
@@ -14,22 +12,22 @@ HOUR = 3600 << 16
 HOUSEKEEPING, EVENTS = 0x0A0, 0x0A4
 
 
-def event(ticks: int, count: int) -> bytes:
+def event(ticks, count):
     values = {"event_id": "observation_stopped", "frame_number": count, "value_1": 0.0, "value_2": 0.0}
     return DICTIONARY.pack("event_info", values, ticks=ticks, sequence_count=count)
 
 
-def stream(start_ticks: int, packets: int) -> bytes:
+def stream(start_ticks, packets):
     """Events a second apart from `start_ticks` on, in one stream of CADUs."""
     return encode_cadus([event(start_ticks + (k << 16), k) for k in range(packets)], spacecraft_id=SPACECRAFT)
 
 
-def found(*files: bytes, hours: tuple[int, int] = (0, 11)) -> Any:
+def found(*files, hours=(0, 11)):
     """Account for raw files between two hours."""
     return account_raw([read_raw(one, SPACECRAFT) for one in files], *(hour * HOUR for hour in hours))
 
 
-def both(*files: bytes) -> tuple[Any, Any]:
+def both(*files):
     """Account for the first and for the second pass."""
     return found(*files), found(*files, hours=(19, 30))
 
@@ -38,7 +36,7 @@ FIRST, SECOND = stream(10 * HOUR, 300), stream(20 * HOUR, 90)
 """Two passes; an event is 39 octets or so, a frame holds 28 of them."""
 
 
-def test_two_passes_in_one_file_are_told_apart():
+def test_two_passes_in_one_file_are_separated():
     one, two = both(FIRST + SECOND)
     assert (one.frames, two.frames) == (len(FIRST) // CADU, len(SECOND) // CADU)
     assert (one.octets, two.octets) == (len(FIRST), len(SECOND))

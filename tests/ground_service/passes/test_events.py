@@ -6,8 +6,6 @@ list of passes by the verdict of their newest report, on each database.
 
 import random
 import time
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +17,6 @@ from ground_service.errors import NotFound
 from ground_service.evaluation import inputs, store
 from ground_service.evaluation.model import StoredReport
 from ground_service.evaluation.service import make_report, pass_summary
-from ground_service.ground import Ground
 from ground_service.http.model import Paging, UtcTime
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.ephemerides.service import add_ephemeris
@@ -47,21 +44,21 @@ ZEROS = {name: {field.name: 0 for field in DICTIONARY.packet(name).fields} for n
 CODES = {name: code for code, name in DICTIONARY.labels("event_info", "event_id").items()}
 
 
-def event(second: int, severity: str, name: str) -> bytes:
+def event(second, severity, name):
     values = {"event_id": CODES[name], "frame_number": 7, "value_1": 1.0, "value_2": 2.0}
     return DICTIONARY.pack(f"event_{severity}", values, ticks=TICKS + second * 65_536, sequence_count=second)
 
 
-def utc_ns(second: int) -> int:
+def utc_ns(second):
     return int(utc_ns_from_ticks(TICKS + second * 65_536))
 
 
-def defined(ground: Ground, start_utc_ns: int, stop_utc_ns: int, name: str = "p") -> int:
+def defined(ground, start_utc_ns, stop_utc_ns, name="p"):
     return define_pass(ground, name=name, start_utc_ns=start_utc_ns, stop_utc_ns=stop_utc_ns, spacecraft_id=76)
 
 
 @pytest.fixture
-def passed(either: Ground, tmp_path: Path) -> Ground:
+def passed(either, tmp_path):
     """Events of two passes, an hour each, and one between them."""
     given = [
         event(0, "info", "mode_changed"),
@@ -77,7 +74,7 @@ def passed(either: Ground, tmp_path: Path) -> Ground:
     return either
 
 
-def names(ground: Ground, **filters: Any) -> list[str]:
+def names(ground, **filters):
     page = service.spacecraft_events(ground, EventFilter(spacecraft_id=76, **filters))
     assert page.total >= len(page.items)
     return [one.name for one in page.items]
@@ -133,7 +130,7 @@ def test_a_pass_without_a_catalogue_has_no_craters(passed):
     assert service.craters(passed, 1, Paging(limit=10)).total == 0
 
 
-def receive(ground: Ground, tmp_path: Path, second: int, **values: float) -> None:
+def receive(ground, tmp_path, second, **values):
     given = ZEROS["housekeeping"] | values | {"structure_id": 1}
     packet = DICTIONARY.pack("housekeeping", given, ticks=TICKS + second * 65_536, sequence_count=second)
     file = tmp_path / f"{second}.cadu"
@@ -212,7 +209,7 @@ orientation = "IAU WGCCRE 2009"
 """
 
 
-def housekeeping(day: int) -> list[bytes]:
+def housekeeping(day):
     """A packet every ten seconds; the counts of a day go on where those of the day before ended."""
     values = dict.fromkeys(ZEROS["housekeeping"], 1)
     first = int(ticks_from_utc_ns(START + day * DAY * NS))
@@ -227,7 +224,7 @@ def housekeeping(day: int) -> list[bytes]:
     ]
 
 
-def day_pass(ground: Ground, day: int) -> int:
+def day_pass(ground, day):
     start = START + day * DAY * NS
     return defined(ground, start, start + 10 * FRAMES * NS)
 
@@ -265,7 +262,7 @@ def test_a_reference_that_does_not_cover_gives_figures_where_it_does(ground, syn
     assert make_report(ground, key).report_id
 
 
-def add_report(ground: Ground, pass_id: int, level: str, created_utc_ns: int) -> None:
+def add_report(ground, pass_id, level, created_utc_ns):
     stored = ground.files.put_octets(b"report")
     with ground.database.writing() as connection:
         register_file(connection, stored, "report", "report", created_utc_ns)
@@ -287,7 +284,7 @@ def add_report(ground: Ground, pass_id: int, level: str, created_utc_ns: int) ->
         )
 
 
-def listed(ground: Ground, **terms: Any) -> tuple[list[int], int]:
+def listed(ground, **terms):
     page = ground.read(list_passes, PassFilter(**terms))
     return sorted(one.id for one in page.items), page.total
 

@@ -4,8 +4,6 @@ downlinked thumbnails and frames of pass archives, on spacecraft time.
 """
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +14,7 @@ from sqlalchemy import event, select
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.evaluation.core import evaluate_pass
 from ground_service.evaluation.inputs import filter_states, load_pass_inputs
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.ingest.store import store_batch
@@ -44,9 +42,8 @@ from tests.ground_service.conftest import NS, SPACECRAFT, define_pass_of, encode
 from tests.lazy import Lazy
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
-from tmtc.packets.large_data import split
+from tmtc.packets.large_data import Thumbnail, pack_thumbnail, split
 from tmtc.packets.stream import cut_packets
-from tmtc.packets.thumbnails import Thumbnail, pack_thumbnail
 
 cv2 = Lazy("cv2")
 
@@ -57,7 +54,7 @@ ALWAYS = (0, (1 << 48) - 1)
 
 
 @pytest.fixture(scope="module")
-def columns() -> dict[str, Any]:
+def columns():
     """Samples of two estimators every 5 s with two silences; some values unknown, two samples at one time."""
     rng = np.random.default_rng(1)
     each = np.arange(COUNT)
@@ -75,12 +72,12 @@ def columns() -> dict[str, Any]:
 
 
 @pytest.fixture
-def vehicle(ground: Ground, columns: dict[str, Any]) -> int:
+def vehicle(ground, columns):
     """A spacecraft with these samples."""
     return stored(ground, columns, [np.arange(COUNT)])
 
 
-def stored(ground: Ground, columns: dict[str, Any], batches: list[np.ndarray]) -> int:
+def stored(ground, columns, batches):
     with ground.database.writing() as connection:
         vehicle = vehicle_id(connection, 76, "flight")
         for batch in batches:
@@ -90,7 +87,7 @@ def stored(ground: Ground, columns: dict[str, Any], batches: list[np.ndarray]) -
     return vehicle
 
 
-def read(ground: Ground, span: tuple[int, ...], name: str = "altitude_m", points: int = 50) -> Any:
+def read(ground, span, name="altitude_m", points=50):
     with ground.database.reading() as connection:
         return series.SeriesReading(
             connection,
@@ -100,7 +97,7 @@ def read(ground: Ground, span: tuple[int, ...], name: str = "altitude_m", points
         ).series({name: ""})[0]
 
 
-def rollup_statistics(ground: Ground) -> tuple[list[Any], np.ndarray]:
+def rollup_statistics(ground):
     table = ROLLUPS
     with ground.database.reading() as connection:
         rows = connection.execute(table.select().order_by(*table.primary_key.columns)).all()
@@ -108,7 +105,7 @@ def rollup_statistics(ground: Ground) -> tuple[list[Any], np.ndarray]:
 
 
 @pytest.fixture
-def few(monkeypatch: pytest.MonkeyPatch) -> None:
+def few(monkeypatch):
     """Few samples are read from roll-ups too."""
     monkeypatch.setattr(series, "FEW_ROWS", 10)
     monkeypatch.setattr(series, "COARSE", 10**9)
@@ -210,7 +207,7 @@ NEES = (1.5**2 + 0.8**2 + 2.0 * CORRELATION * 1.5 * 0.8) / (1.0 - CORRELATION**2
 DIAGONAL = 1.5**2 + 0.8**2 + 1.0
 
 
-def anchored_packets(made: Any, version: int) -> list[bytes]:
+def anchored_packets(made, version):
     """States and estimates of an anchored filter on the orbit of the synthetic pass, erring by `ERROR_RTN_M`."""
 
     reference = load_oem(made.folder / "reference.oem")
@@ -244,14 +241,14 @@ def anchored_packets(made: Any, version: int) -> list[bytes]:
 
 
 @pytest.fixture(params=[2, 3])
-def flown(request: Any, tmp_path: Path, make_pass: Any) -> tuple[Path, Any, int]:
+def flown(request, tmp_path, make_pass):
     made = make_pass(frames=8, seed=3)
     path = tmp_path / "anchored.cadu"
     path.write_bytes(encode_cadus(anchored_packets(made, request.param), spacecraft_id=SPACECRAFT))
     return path, made, request.param
 
 
-def reported(ground: Ground, made: Any, packets: list[bytes]) -> Any:
+def reported(ground, made, packets):
     """Return the anchored series of a report on the synthetic pass with further packets in its downlink."""
     octets = encode_cadus([*made.packets, *packets], spacecraft_id=SPACECRAFT)
     (made.folder / "downlink.cadu").write_bytes(octets)
@@ -260,14 +257,14 @@ def reported(ground: Ground, made: Any, packets: list[bytes]) -> Any:
     return next(one for one in report.navigation if one.name == "anchored")
 
 
-def versions(ground: Ground) -> set[int]:
+def versions(ground):
     """Return the versions of the dictionary by which states were decoded."""
     chosen = select(repository.SAMPLES["filter_states"].c.dictionary_version)
     with ground.database.reading() as connection:
         return set(connection.execute(chosen).scalars())
 
 
-def states_of(ground: Ground, pass_id: int) -> Any:
+def states_of(ground, pass_id):
     with ground.database.reading() as connection:
         return filter_states(connection, pass_span(connection, get_pass(connection, pass_id)))
 
@@ -327,13 +324,13 @@ TICKS = int(ticks_from_utc_ns(START))
 HOUR_NS = 3600 * NS
 
 
-def thumbnail(frame_number: int, ticks: int) -> tuple[Thumbnail, bytes]:
+def thumbnail(frame_number, ticks):
     levels = np.random.default_rng(frame_number).integers(0, 256, (8, 12), dtype=np.uint8)
     made = Thumbnail(frame_number, ticks, levels)
     return made, pack_thumbnail(made)
 
 
-def large_data(octets: bytes, transaction: int, ticks: int, table: str = "thumbnail") -> list[bytes]:
+def large_data(octets, transaction, ticks, table="thumbnail"):
     """Packets of a transfer; their sequence counts continue those of earlier transfers."""
     parts = split(octets, transaction=transaction, table=table, part_length=50)
     return [
@@ -343,8 +340,8 @@ def large_data(octets: bytes, transaction: int, ticks: int, table: str = "thumbn
 
 
 @pytest.fixture
-def receive(ground: Ground, tmp_path: Path) -> Any:
-    def run(*packets: bytes) -> None:
+def receive(ground, tmp_path):
+    def run(*packets):
         file = tmp_path / "downlink.cadu"
         file.write_bytes(encode_downlink(list(packets)))
         ingest_file(ground, file, spacecraft_id=SPACECRAFT)
@@ -352,17 +349,17 @@ def receive(ground: Ground, tmp_path: Path) -> Any:
     return run
 
 
-def images(ground: Ground, start: int = START, stop: int = START + HOUR_NS) -> list[Any]:
+def images(ground, start=START, stop=START + HOUR_NS):
     return archive_import.list_images(ground, SPACECRAFT, "flight", start, stop)
 
 
-def picture(ground: Ground, ticks: int = TICKS, colour: bool = True) -> np.ndarray:
+def picture(ground, ticks=TICKS, colour=True):
     """Return a thumbnail, with detections drawn or in grey."""
     png = archive_import.thumbnail_image(ground, SPACECRAFT, "flight", ticks, detections=colour)
     return decoded(png, cv2.IMREAD_COLOR if colour else cv2.IMREAD_UNCHANGED)
 
 
-def decoded(png: bytes, how: int) -> np.ndarray:
+def decoded(png, how):
     return cv2.imdecode(np.frombuffer(png, np.uint8), how)
 
 
@@ -424,7 +421,7 @@ def test_frames_of_an_archive_are_listed_and_read(ground, synthetic_pass):
 MISSION = 'name = "camera"\n[spacecraft]\nid = 76\n[camera]\nwidth_px = 96\nheight_px = 64\n'
 
 
-def detection(frame_number: int, ticks: int, count: int = 1) -> bytes:
+def detection(frame_number, ticks, count=1):
     """A report with detections at u = 55.5 and v = 31.5, with a diameter of 16 pixels."""
     shape = {"u_px": 55.5, "v_px": 31.5, "diameter_px": 16.0, "score": 0.9, "size_class": 0, "sigma_px": 1.0}
     items = {name: np.full(count, value) for name, value in shape.items()}

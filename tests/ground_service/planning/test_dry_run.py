@@ -1,7 +1,6 @@
 """Dry run of a mission description: what contradicts the flight is found before it, one line each."""
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -11,10 +10,10 @@ from ground_service.http.model import Paging
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.store import list_missions
 from ground_service.planning import dry_run, standing
-from ground_service.planning.dry_run import NO_EPHEMERIS, TOO_LONG, DryRun, fly, rehearsed
+from ground_service.planning.dry_run import NO_EPHEMERIS, TOO_LONG, fly, rehearsed
 from ground_service.planning.model import StandingRequestIn
 from lunar.datafolder import DataFolder
-from tests.ground_service.conftest import START, Clock, save_circle
+from tests.ground_service.conftest import START, save_circle
 from tests.ground_service.planning.test_standing import AUTOMATIC, LINKS, MISSION
 
 UPLOADS = '[uploads]\ntables = ["orientation"]\n'
@@ -24,15 +23,15 @@ REQUEST = {"name": "low Sun", "spacecraft_id": 76, "windows": 2, "period_days": 
 
 
 @pytest.fixture(scope="module")
-def oem(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def oem(tmp_path_factory):
     return save_circle(tmp_path_factory.mktemp("oem") / "reference.oem", START, 30.0)
 
 
 @pytest.fixture
-def flown(tmp_path: Path, oem: Path):
+def flown(tmp_path, oem):
     """A function that writes the files and makes the dry run."""
 
-    def run(extra: str = AUTOMATIC + LINKS, **request: object) -> DryRun:
+    def run(extra=AUTOMATIC + LINKS, **request):
         (tmp_path / "mission.toml").write_text(MISSION.format(extra=extra))
         (tmp_path / "reference.oem").write_bytes(oem.read_bytes())
         (tmp_path / "request.json").write_text(json.dumps(REQUEST | request))
@@ -88,7 +87,7 @@ def test_a_description_that_flies_has_windows_with_telecommands(flown):
         (AUTOMATIC + LINKS, {"spacecraft_id": 5000}, "request.json, spacecraft_id: expected less than"),
     ],
 )
-def test_each_contradiction_is_one_line(flown, extra: str, request_changes: dict, fault: str):
+def test_each_contradiction_is_one_line(flown, extra, request_changes, fault):
     found = flown(extra, **request_changes)
     assert len(found.faults) == 1, found.faults
     assert fault in found.faults[0]
@@ -100,10 +99,8 @@ def test_windows_that_persons_approve_are_approved_and_released_by_two(flown):
     assert [one.decided_by for one in found.windows] == ["dry run, second person"] * 2
 
 
-def test_a_text_is_rehearsed_with_the_requests_and_ephemerides_of_the_service(
-    ground: Ground, oem: Path, mission_time: Clock, monkeypatch: pytest.MonkeyPatch
-):
-    def rehearse(extra: str = "") -> tuple[int, tuple[str, ...]]:
+def test_a_text_is_rehearsed_with_the_requests_and_ephemerides_of_the_service(ground, oem, mission_time, monkeypatch):
+    def rehearse(extra=""):
         text = MISSION.format(extra=AUTOMATIC + LINKS + extra).encode()
         found = rehearsed(ground, text)
         return len(found.windows), found.faults
@@ -124,10 +121,10 @@ def test_a_text_is_rehearsed_with_the_requests_and_ephemerides_of_the_service(
 
 
 @pytest.mark.parametrize("place", [1, 2, 4])  # a request, a day of its horizon, the release of a window
-def test_a_dry_run_that_takes_too_long_ends(flown, monkeypatch: pytest.MonkeyPatch, place: int):
+def test_a_dry_run_that_takes_too_long_ends(flown, monkeypatch, place):
     asked = []
 
-    def check(_: Ground) -> None:
+    def check(_):
         asked.append(None)
         if len(asked) == place:
             raise Stopping

@@ -15,7 +15,7 @@ HOUR = 3600 * NS
 STEP_S = 600.0
 
 
-def grid(hours: int = 24, **changes: object) -> ResourceGrid:
+def grid(hours=24, **changes):
     n = round(hours * 3600 / STEP_S)
     plain = ResourceGrid(
         start_utc_ns=0, step_s=STEP_S, gain_wh=np.full(n, 1.0), downlink_octets=np.full(n, 1000.0), battery_wh=50.0,
@@ -24,11 +24,11 @@ def grid(hours: int = 24, **changes: object) -> ResourceGrid:
     return replace(plain, **changes)
 
 
-def window(start_h: float, hours: float, octets: int = 100, value: float = 1.0, period: int = 0) -> Option:
+def window(start_h, hours, octets=100, value=1.0, period=0):
     return Option(round(start_h * HOUR), round((start_h + hours) * HOUR), octets, value, period)
 
 
-def why(one: ResourceGrid, *windows: tuple[float, ...]) -> str | None:
+def why(one, *windows):
     """Return why windows are not feasible."""
     return violation(one, [window(*each) for each in windows])
 
@@ -111,7 +111,7 @@ options_of_a_day = st.lists(
 
 @settings(max_examples=60, deadline=None)
 @given(options_of_a_day, st.integers(0, 4), st.integers(0, 4))
-def test_a_plan_is_feasible_and_not_worse_than_any_order(options: list[Option], first: int, second: int):
+def test_a_plan_is_feasible_and_not_worse_than_any_order(options, first, second):
     tight = grid(downlink_octets=np.full(144, 150.0), storage_octets=5000.0, observe_s_per_day=4 * 3600.0)
     quota = {0: first, 1: second}
     chosen, reasons = choose(tight, options, quota=quota)

@@ -1,8 +1,6 @@
 """Forecast of a plan: conditions, resources and conflicts over time; density of craters."""
 
 import math
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +8,6 @@ import pytest
 from ground_service.access.model import AuditFilter
 from ground_service.access.store import list_audit
 from ground_service.errors import Conflict, InvalidInput, NotFound
-from ground_service.ground import Ground
 from ground_service.missions.catalogues import add_catalogue, withdraw_catalogue
 from ground_service.missions.service import add_mission
 from ground_service.planning import forecast, service
@@ -55,24 +52,24 @@ def test_curves_fill_and_empty_battery_and_storage():
 
 
 @pytest.fixture
-def planned(ground: Ground, synthetic_pass: Any) -> Ground:
+def planned(ground, synthetic_pass):
     """A service with an ephemeris of half an hour and a mission of small resources."""
     add_mission(ground, MISSION.format(catalogue="").encode(), actor="ann")
     add_reference(ground, synthetic_pass.folder / "reference.oem")
     return ground
 
 
-def enter(ground: Ground, start_s: float, stop_s: float) -> int:
+def enter(ground, start_s, stop_s):
     start, stop = (START + round(one * NS) for one in (start_s, stop_s))
     return service.add_window(ground, WindowEntry("w", start, stop, 15.0, 76), actor="ann").id
 
 
-def shown(ground: Ground, start_s: float = 0.0, stop_s: float = 600.0) -> Any:
+def shown(ground, start_s=0.0, stop_s=600.0):
     start, stop = (START + round(one * NS) for one in (start_s, stop_s))
     return forecast.get_forecast(ground, spacecraft_id=76, instance="flight", start_utc_ns=start, stop_utc_ns=stop)
 
 
-def test_a_forecast_has_the_conditions_of_the_ephemeris_and_the_resources_of_the_mission(planned: Ground):
+def test_a_forecast_has_the_conditions_of_the_ephemeris_and_the_resources_of_the_mission(planned):
     found = shown(planned)
     assert found.step_s == 60.0 and len(found.time_s) == 10
     assert found.time_s[0] == START / NS + 30.0
@@ -86,7 +83,7 @@ def test_a_forecast_has_the_conditions_of_the_ephemeris_and_the_resources_of_the
     assert found.conflicts == [] and found.reason is None
 
 
-def test_conflicts_of_drafts_are_explained(planned: Ground):
+def test_conflicts_of_drafts_are_explained(planned):
     first, second = enter(planned, 0, 60), enter(planned, 30, 120)
     both = {one.window_id: one.reasons for one in shown(planned).conflicts}
     assert both == {
@@ -99,7 +96,7 @@ def test_conflicts_of_drafts_are_explained(planned: Ground):
     assert reasons[0].endswith(" %, expected 50 % or more")
 
 
-def test_windows_lower_the_battery_and_fill_the_storage(planned: Ground):
+def test_windows_lower_the_battery_and_fill_the_storage(planned):
     before = shown(planned)
     octets = planned.read(get_window, enter(planned, 60, 180)).data_octets
     after = shown(planned)
@@ -111,7 +108,7 @@ def test_windows_lower_the_battery_and_fill_the_storage(planned: Ground):
     assert sum(after.sent_octets) <= octets
 
 
-def test_an_interval_without_an_ephemeris_states_the_reason(planned: Ground):
+def test_an_interval_without_an_ephemeris_states_the_reason(planned):
     later = shown(planned, 86_400.0, 90_000.0)
     assert later.time_s == [] and later.reason == "no reference ephemeris covers the interval"
     partly = shown(planned, 0.0, 86_400.0)
@@ -119,12 +116,12 @@ def test_an_interval_without_an_ephemeris_states_the_reason(planned: Ground):
 
 
 @pytest.mark.parametrize("stop_s", [0.0, -5.0, 8.1 * 86_400])
-def test_an_empty_or_too_long_interval_is_an_error(planned: Ground, stop_s: float):
+def test_an_empty_or_too_long_interval_is_an_error(planned, stop_s):
     with pytest.raises(InvalidInput, match="at most 8 days"):
         shown(planned, 0.0, stop_s)
 
 
-def test_craters_are_counted_by_area_and_searched_for(planned: Ground, tmp_path: Path):
+def test_craters_are_counted_by_area_and_searched_for(planned, tmp_path):
     degrees = np.array([[1.0, 1.0, 6.0], [5.0, 9.0, 8.0], [85.0, -5.0, 7.0], [5.0, 5.0, 60.0]])
     ids, radians = np.arange(4), np.radians(degrees[:, :2])
     catalogue = CraterCatalogue(
@@ -147,7 +144,7 @@ def test_craters_are_counted_by_area_and_searched_for(planned: Ground, tmp_path:
     assert rows[17, 17] > rows[9, 18] / 2  # one crater in a smaller cell
 
 
-def test_a_withdrawn_catalogue_is_not_used_and_can_be_held_again(ground: Ground, tmp_path: Path):
+def test_a_withdrawn_catalogue_is_not_used_and_can_be_held_again(ground, tmp_path):
     octets = b"id,latitude_deg,longitude_deg,diameter_m,depth_m\n1,2.0,3.0,6000.0,600.0\n"
     stored = ground.files.put_octets(octets)
     add_catalogue(ground, stored, "one.csv")
@@ -166,7 +163,7 @@ def test_a_withdrawn_catalogue_is_not_used_and_can_be_held_again(ground: Ground,
     assert forecast.crater_density(ground, 76).reason is None
 
 
-def test_a_density_without_a_catalogue_states_the_reason(planned: Ground):
+def test_a_density_without_a_catalogue_states_the_reason(planned):
     found = forecast.crater_density(planned, 76)
     assert found.rows == [] and "catalogue" in (found.reason or "")
     assert "expected the source or SHA-256" in (forecast.crater_density(planned, 5).reason or "")

@@ -1,7 +1,5 @@
 """Tables of a window: what they hold, when they are taken on board, and what is refused."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -22,13 +20,13 @@ ALL = Uploads(
 )
 
 
-def ticks_of(utc_ns: int) -> int:
+def ticks_of(utc_ns):
     """Return the reading of a clock that is 7 s ahead, counted from the start of the window."""
     return 1_000_000 + (utc_ns - START + 7 * NS) * 65_536 // NS
 
 
 @pytest.fixture(scope="module")
-def reference() -> Ephemeris:
+def reference():
     times = np.arange(START - 3_600 * NS, STOP + 3_600 * NS, 30 * NS)
     angle = 2.0 * np.pi * (times - START) / (6_672.0 * NS)
     rate = 2.0 * np.pi / 6_672.0
@@ -39,11 +37,11 @@ def reference() -> Ephemeris:
     return Ephemeris((segment,))
 
 
-def prepared(ephemeris: Ephemeris | None, uploads: Uploads = ALL, *start: Any, late: int = 0) -> Any:
+def prepared(ephemeris, uploads=ALL, *start, late=0):
     return prepare_window(uploads, ephemeris, IauOrientation(), START + late, STOP + late, ticks_of, 8, *start)
 
 
-def loaded(activities: list[Any]) -> dict[int, bytes]:
+def loaded(activities):
     """Octets by number of the table, as the payload puts the parts together."""
     receiver, found = LargeDataReceiver(), {}
     numbers = {"anchor_ephemeris": 1, "orientation": 8, "initial_state": 9}
@@ -56,7 +54,7 @@ def loaded(activities: list[Any]) -> dict[int, bytes]:
     return found
 
 
-def test_the_tables_hold_the_reference_at_on_board_times(reference: Ephemeris):
+def test_the_tables_hold_the_reference_at_on_board_times(reference):
     activities, state = prepared(reference)
     tables = loaded(activities)
     initial = unpack_initial_state(tables[9])
@@ -74,7 +72,7 @@ def test_the_tables_hold_the_reference_at_on_board_times(reference: Ephemeris):
     assert orientation.ticks[0] < ticks_of(START) < ticks_of(STOP) < orientation.ticks[-1]
 
 
-def test_a_window_of_the_experiment_starts_from_the_stated_error_with_its_declared_accuracy(reference: Ephemeris):
+def test_a_window_of_the_experiment_starts_from_the_stated_error_with_its_declared_accuracy(reference):
     made = [experiment_state(reference, 1_000.0, START + k * NS, 76) for k in range(400)]
     known = [reference.at(np.array([one.utc_ns])) for one in made]
     position = np.array([a.position_icrf_m - b[0][0] for a, b in zip(made, known, strict=True)])
@@ -94,9 +92,7 @@ def test_a_window_of_the_experiment_starts_from_the_stated_error_with_its_declar
     np.testing.assert_allclose(initial.position_icrf_m, again.position_icrf_m, atol=1e-3)
 
 
-def test_standby_comes_first_then_the_tables_with_the_start_state_last_and_the_downlink_after_the_window(
-    reference: Ephemeris,
-):
+def test_standby_comes_first_then_the_tables_with_the_start_state_last_and_the_downlink_after_the_window(reference):
     activities, _ = prepared(reference)
     times = [utc_ns for utc_ns, _, _ in activities]
     assert times == sorted(times)
@@ -112,7 +108,7 @@ def test_without_tables_only_the_mode_changes():
     assert [name for _, name, _ in activities] == ["perform_function"] * 2 and state is None
 
 
-def test_a_window_without_a_reference_that_covers_it_is_refused(reference: Ephemeris):
+def test_a_window_without_a_reference_that_covers_it_is_refused(reference):
     for ephemeris, late in ((None, 0), (reference, 7_800 * NS)):
         with pytest.raises(Conflict, match="its tables need a reference ephemeris"):
             prepared(ephemeris, late=late)

@@ -5,8 +5,6 @@ import hashlib
 import json
 import shutil
 import threading
-from collections.abc import Callable
-from pathlib import Path
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -16,16 +14,14 @@ from pytest import raises
 
 from ground_service.client.local import local_client
 from ground_service.errors import InvalidInput
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.http.model import UtcTime
 from ground_service.ingest.service import ingest_file
-from ground_service.jobs.model import JobFilter
-from ground_service.jobs.service import list_jobs
+from ground_service.jobs.service import JobFilter, list_jobs
 from ground_service.passes.archive_import import import_archive, read_manifest
 from ground_service.passes.service import define_pass
 from ground_service.regression import rendering, service, store
 from ground_service.regression.archives import (
-    PassArchive,
     check_out,
     keep_archive,
     kept_archives,
@@ -33,7 +29,7 @@ from ground_service.regression.archives import (
     store_of,
     write_flight_view,
 )
-from ground_service.regression.builds import Build, load_build, register_build
+from ground_service.regression.builds import load_build, register_build
 from ground_service.regression.documents import regression_junit, regression_text, verdict_document
 from ground_service.regression.gates.policy import load_policy
 from ground_service.regression.jobs import compared, missing_replays
@@ -42,7 +38,7 @@ from ground_service.regression.pass_archives import LIVE, NO_INPUTS, archive_of_
 from ground_service.regression.service import find_replay, run_regression
 from linna.commands import regress
 from lunar.datafolder import find_data
-from tests.ground_service.conftest import SPACECRAFT, START, FlyablePass, SyntheticPass, encode_downlink, enter_files
+from tests.ground_service.conftest import SPACECRAFT, START, encode_downlink, enter_files
 
 REPLAY = KeptReplay(
     outcome="ok", detail="", downlink_sha256=None, performance_sha256=None, wall_s=1.0, cpu_s=1.0, peak_rss_mib=1.0,
@@ -50,22 +46,22 @@ REPLAY = KeptReplay(
 )  # fmt: skip
 
 
-def live_pass(ground: Ground) -> int:
+def live_pass(ground):
     stop = START + 600_000_000_000
     return define_pass(ground, name="live", start_utc_ns=START, stop_utc_ns=stop, spacecraft_id=SPACECRAFT)
 
 
-def good(ground: Ground, make_build: Callable, packets: dict[str, list[bytes]]) -> Build:
+def good(ground, make_build, packets):
     return register_build(ground, load_build(make_build("good", packets)))
 
 
 @pytest.fixture(scope="module")
-def archive(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
+def archive(make_pass):
     return make_pass(frames=4, seed=3)
 
 
 @pytest.fixture(scope="module")
-def flown(make_flyable: Callable[..., FlyablePass]) -> FlyablePass:
+def flown(make_flyable):
     return make_flyable(frames=4, seed=5)
 
 
@@ -90,10 +86,10 @@ def test_an_imported_pass_is_kept_without_a_request(either, flown):
     _, digest = read_manifest(flown.folder)
     assert keep_pass(either, pass_id).digest == digest
     [kept] = kept_archives(either)
-    told = {"frames": 4, "state": "complete", "reason": ""}
-    assert kept.model_dump().items() >= {**told, "digest": digest, "pass_id": pass_id, "frames_stored": 4}.items()
+    stated = {"frames": 4, "state": "complete", "reason": ""}
+    assert kept.model_dump().items() >= {**stated, "digest": digest, "pass_id": pass_id, "frames_stored": 4}.items()
     [job] = either.read(list_jobs, JobFilter(kind="automation")).items
-    assert job.result["archive of pass 1"] == {**told, "archive": digest}
+    assert job.result["archive of pass 1"] == {**stated, "archive": digest}
     given = Comparison(candidate="current", passes=[pass_id])
     assert compared(either, given)["archives"] == [digest]
 
@@ -146,7 +142,7 @@ def test_a_pass_without_telemetry_has_no_archive(ground):
 
 
 @pytest.fixture
-def unrendered(flown: FlyablePass, tmp_path: Path) -> Path:
+def unrendered(flown, tmp_path):
     """An archive without two of its frames, whose scenario is not one."""
     folder = shutil.copytree(flown.folder, tmp_path / "unrendered")
     for number in (1, 3):
@@ -156,10 +152,10 @@ def unrendered(flown: FlyablePass, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def render_whole(flown: FlyablePass, monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+def render_whole(flown, monkeypatch):
     """From its call on, rendering an archive gives the flown one."""
 
-    def render(_ground: Ground, given: PassArchive, out: Path) -> str:
+    def render(_ground, given, out):
         assert not (given.folder / "payload/detections.jsonl").exists()
         shutil.copytree(flown.folder, out)
         return ""
@@ -181,10 +177,10 @@ def test_frames_that_cannot_be_rendered_leave_telemetry_only_with_the_reason(
     assert str(tmp_path) not in kept.reason and str(either.home) not in kept.reason
     [one] = outcome.passes
     assert (one.state, outcome.verdict, outcome.gates) == ("not judged", "inconclusive", ())
-    told = "good is a program, which needs frames: the frames cannot be rendered"
-    assert one.detail.startswith(told)
+    reason = "good is a program, which needs frames: the frames cannot be rendered"
+    assert one.detail.startswith(reason)
     verdict = verdict_document(outcome)
-    assert verdict.headline.startswith(f"inconclusive: synthetic pass 5: {told}")
+    assert verdict.headline.startswith(f"inconclusive: synthetic pass 5: {reason}")
     assert "0 of 0 gates passed" in regression_text(verdict)
     assert 'failures="1" errors="0" skipped="1"' in regression_junit(verdict, 0)
     check_out(either, digest, tmp_path / "kept")
@@ -235,9 +231,9 @@ def test_a_renderer_that_fails_without_a_refusal_leaves_the_archive_to_render(
 
 
 def test_only_a_message_of_the_renderer_itself_is_a_refusal():
-    told = "archive: expected pixels with SHA-256 0, found 1"
-    error = f"linna: error: {told}"
-    assert rendering._refusal(2, f"progress\n{error}\n") == told
+    refusal = "archive: expected pixels with SHA-256 0, found 1"
+    error = f"linna: error: {refusal}"
+    assert rendering._refusal(2, f"progress\n{error}\n") == refusal
     full = ("No space left on device (/x)", "[('a', 'b', '[Errno 28] No space left on device')]")
     printed = ["Traceback\nMemoryError", "", *(f"linna: error: {one}" for one in full)]
     for given in ((1, error), (-9, error), *((2, one) for one in printed)):

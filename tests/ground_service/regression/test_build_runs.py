@@ -8,9 +8,7 @@ import subprocess
 import tempfile
 import time
 import venv
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from pytest import raises
@@ -19,7 +17,7 @@ from ground_service.errors import BuildNotChecked, InvalidInput
 from ground_service.http.model import Paging, UtcTime
 from ground_service.regression import builds
 from ground_service.regression import sandbox as host
-from ground_service.regression.build_runs import BuildRun, run_build
+from ground_service.regression.build_runs import run_build
 from ground_service.regression.builds import changes, load_build, register_build
 from ground_service.regression.model import REASONS_LIMIT, JudgedGate, Regression, Verdict
 from ground_service.regression.sandbox import SandboxRefused
@@ -30,13 +28,13 @@ LIMITS = "\n[limits]\nwall_s = 20\ncpu_s = 10\nmemory_mib = 300\nfile_mib = 4\nf
 
 
 @pytest.fixture(scope="module")
-def archive(make_flyable: Callable) -> Path:
+def archive(make_flyable):
     return make_flyable(frames=2, seed=31).folder
 
 
 @pytest.fixture
-def fly(make_build: Callable, archive: Path, tmp_path: Path) -> Callable[..., BuildRun]:
-    def run(program: str, limits: str = LIMITS) -> BuildRun:
+def fly(make_build, archive, tmp_path):
+    def run(program, limits=LIMITS):
         build = load_build(make_build("bad", program="import os, pathlib, sys, time\n" + program, extra=limits))
         return run_build(build, archive, tmp_path / "out")
 
@@ -98,7 +96,7 @@ def test_a_program_that_makes_too_many_files_is_stopped(fly, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("program", "outcome", "told"),
+    ("program", "outcome", "message"),
     [
         ("os.kill(os.getpid(), 11)", "crashed", "11"),
         ("while True: pass", "cpu", ""),
@@ -109,9 +107,9 @@ def test_a_program_that_makes_too_many_files_is_stopped(fly, monkeypatch):
         ),
     ],
 )
-def test_a_program_that_kills_itself_or_exceeds_a_limit_is_told_so(fly, program, outcome, told):
+def test_a_program_that_kills_itself_or_exceeds_a_limit_is_reported(fly, program, outcome, message):
     run = fly(program, LIMITS.replace("cpu_s = 10", "cpu_s = 1"))
-    assert run.outcome == outcome and told in run.detail
+    assert run.outcome == outcome and message in run.detail
 
 
 def test_a_program_that_is_not_there_is_a_crash_and_no_error_of_the_ground(archive, tmp_path):
@@ -141,13 +139,13 @@ def test_what_a_program_leaves_running_is_killed_with_it(fly, tmp_path):
 def test_a_program_gets_no_socket_but_pairs_of_its_own(fly):
     run = fly(
         "import socket\n"
-        "told = []\n"
+        "found = []\n"
         "for family in (socket.AF_INET, socket.AF_INET6, socket.AF_UNIX, socket.AF_NETLINK, socket.AF_VSOCK):\n"
-        "    try:\n        socket.socket(family); told.append('made')\n"
-        "    except OSError as error: told.append(error.errno)\n"
-        "a, b = socket.socketpair(); a.send(b'x'); told.append(b.recv(1).decode())\n"
-        "told.append(pathlib.Path('/proc/net/dev').read_text().count('\\n') - 2)\n"
-        "pathlib.Path(sys.argv[2], 'downlink.packets').write_text(str(told))\n"
+        "    try:\n        socket.socket(family); found.append('made')\n"
+        "    except OSError as error: found.append(error.errno)\n"
+        "a, b = socket.socketpair(); a.send(b'x'); found.append(b.recv(1).decode())\n"
+        "found.append(pathlib.Path('/proc/net/dev').read_text().count('\\n') - 2)\n"
+        "pathlib.Path(sys.argv[2], 'downlink.packets').write_text(str(found))\n"
     )
     # EPERM of the system call filter; and behind it a network of its own that holds an idle loopback only.
     assert run.downlink.read_text() == "[1, 1, 1, 1, 1, 'x', 1]"
@@ -158,13 +156,13 @@ def test_a_program_sees_what_the_payload_was_given_and_no_truth_or_secret(fly, m
         monkeypatch.setenv(secret, "postgresql://secret")
     run = fly(
         "seen = sorted(str(p.relative_to(sys.argv[1])) for p in pathlib.Path(sys.argv[1]).rglob('*') if p.is_file())\n"
-        "told = [*seen, *sorted(os.environ)]\n"
-        "pathlib.Path(sys.argv[2], 'downlink.packets').write_text('\\n'.join(told))\n"
+        "found = [*seen, *sorted(os.environ)]\n"
+        "pathlib.Path(sys.argv[2], 'downlink.packets').write_text('\\n'.join(found))\n"
     )
-    told = run.downlink.read_text().split("\n")
-    assert {"manifest.json", "payload/inputs.jsonl", "frames/000000.png"} <= set(told)
-    assert not {"reference.oem", "truth.oem", "catalogue.csv", "downlink.cadu"} & set(told)
-    assert "PATH" in told and not {"LINNA_DATABASE_URL", "HTTPS_PROXY", "LINNA_DATA"} & set(told)
+    found = run.downlink.read_text().split("\n")
+    assert {"manifest.json", "payload/inputs.jsonl", "frames/000000.png"} <= set(found)
+    assert not {"reference.oem", "truth.oem", "catalogue.csv", "downlink.cadu"} & set(found)
+    assert "PATH" in found and not {"LINNA_DATABASE_URL", "HTTPS_PROXY", "LINNA_DATA"} & set(found)
 
 
 def test_a_program_reads_compiled_functions_of_the_service_and_changes_none(fly, tmp_path, monkeypatch):
@@ -173,10 +171,10 @@ def test_a_program_reads_compiled_functions_of_the_service_and_changes_none(fly,
     (cache / "one").write_text("code")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
     run = fly(
-        "folder, told = pathlib.Path(os.environ['NUMBA_CACHE_DIR']), ''\n"
+        "folder, found = pathlib.Path(os.environ['NUMBA_CACHE_DIR']), ''\n"
         "try: (folder / 'two').touch()\n"
-        "except OSError as error: told = error.strerror\n"
-        "pathlib.Path(sys.argv[2], 'downlink.packets').write_text((folder / 'one').read_text() + told)\n"
+        "except OSError as error: found = error.strerror\n"
+        "pathlib.Path(sys.argv[2], 'downlink.packets').write_text((folder / 'one').read_text() + found)\n"
     )
     assert run.downlink.read_text() == "codeRead-only file system"
 
@@ -214,13 +212,13 @@ name = "x" | command = ["x", "{archive}", "{out}"] | model = "m" -> expected a c
 
 
 @pytest.mark.parametrize("row", WRONG_BUILDS.strip().split("\n"))
-def test_a_bad_build_file_is_told_by_its_key(row, tmp_path):
-    text, told = row.replace("0xF", f"0x{'f' * 5000}").split(" -> ")
+def test_a_bad_build_file_is_refused_with_its_key(row, tmp_path):
+    text, message = row.replace("0xF", f"0x{'f' * 5000}").split(" -> ")
     file = tmp_path / "build.toml"
     file.write_text(text.replace(" | ", "\n"))
     with raises(InvalidInput) as error:
         load_build(file)
-    assert told in str(error.value)
+    assert message in str(error.value)
 
 
 def test_the_identity_of_a_build_is_that_of_what_it_runs(make_build, tmp_path):
@@ -263,8 +261,8 @@ def test_what_differs_between_two_builds_on_the_flight_code_is_named(tmp_path, m
 
 
 @pytest.fixture
-def write(tmp_path: Path) -> Callable[[str], str]:
-    def build(parameters: str) -> str:
+def write(tmp_path):
+    def build(parameters):
         (tmp_path / "p.toml").write_text(parameters)
         (tmp_path / "build.toml").write_text('name = "b"\nparameters = "p.toml"\n')
         return str(tmp_path / "build.toml")
@@ -273,7 +271,7 @@ def write(tmp_path: Path) -> Callable[[str], str]:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         (
             "flight.anchored.gravity_degre = 60",
@@ -285,10 +283,10 @@ def write(tmp_path: Path) -> Callable[[str], str]:
         ),
     ],
 )
-def test_a_wrong_parameter_is_refused_in_one_line_and_nothing_is_registered(ground, write, text, told):
+def test_a_wrong_parameter_is_refused_in_one_line_and_nothing_is_registered(ground, write, text, message):
     with raises(InvalidInput) as error:
         register_build(ground, load_build(write(text)))
-    assert str(error.value) == told
+    assert str(error.value) == message
     assert ground.read(list_builds, Paging()).items == []
     assert not list((ground.home / "regression" / "builds").glob("*"))
 
@@ -301,12 +299,12 @@ def test_right_parameters_are_registered_and_checked_once(ground, write, monkeyp
     assert register_build(ground, load_build(file)).digest == first.digest
 
 
-def _refused(*_: Any, **__: Any) -> dict[str, Any]:
+def _refused(*_, **__):
     raise SandboxRefused("no user namespaces")
 
 
-def _ended(**changes: Any) -> Callable[..., dict[str, Any]]:
-    def run(request: Any, staged: Path, written: Path, printed: Path, **_: Any) -> dict[str, Any]:
+def _ended(**changes):
+    def run(request, staged, written, printed, **_):
         printed.write_text("Traceback\nMemoryError\n")
         return {"cause": "", "exit_status": 0} | changes
 
@@ -314,7 +312,7 @@ def _ended(**changes: Any) -> Callable[..., dict[str, Any]]:
 
 
 @pytest.mark.parametrize(
-    ("run", "told"),
+    ("run", "message"),
     [
         (_refused, "no user namespaces"),
         (_ended(exit_status=1), "status 1: MemoryError"),
@@ -323,9 +321,9 @@ def _ended(**changes: Any) -> Callable[..., dict[str, Any]]:
         (_ended(cause="timeout"), "ended with timeout"),
     ],
 )
-def test_a_build_that_cannot_be_checked_is_not_registered(ground, write, monkeypatch, run, told):
+def test_a_build_that_cannot_be_checked_is_not_registered(ground, write, monkeypatch, run, message):
     monkeypatch.setattr(builds, "run_confined", run)
-    with raises(BuildNotChecked, match=told):
+    with raises(BuildNotChecked, match=message):
         register_build(ground, load_build(write("flight.anchored.gravity_degree = 60")))
     assert ground.read(list_builds, Paging()).items == []
 
@@ -336,11 +334,11 @@ def test_the_command_checks_a_build_file(write, capsys):
     file = write("detector.max_detections = 3")
     assert run_command(["replay", "--check-build", file]) == 0
     text = Path(file).read_text()
-    for wrong, told in (("schema_version = 7", "expected 1, found 7"), ("modle = 'x'", "expected 'model'")):
+    for wrong, message in (("schema_version = 7", "expected 1, found 7"), ("modle = 'x'", "expected 'model'")):
         Path(file).write_text(f"{wrong}\n{text.replace('schema_version = 1', '')}")
         capsys.readouterr()
         assert run_command(["replay", "--check-build", file]) == 2
-        assert told in capsys.readouterr().out
+        assert message in capsys.readouterr().out
     assert run_command(["replay", "--out", "x"]) == 2
     assert "expected ARCHIVE, or --check-build BUILD" in capsys.readouterr().err
 
@@ -352,7 +350,7 @@ POLICY = {"version": "1", "sha256": "00", "confidence": 0.95, "power": 0.8}  # o
 UNKNOWN = ("pass_id", "margin", "p_value", "level", "resolution", "frames_needed", "reason")
 
 
-def gate(name: str, outcome: str, **values: Any) -> JudgedGate:
+def gate(name, outcome, **values):
     known = {
         "passed": outcome == "pass", "baseline": 0.9, "candidate": 0.7, "limit": 0.05, "unit": "",
         "change_bounds": (None, None), "frames": 10,
@@ -360,7 +358,7 @@ def gate(name: str, outcome: str, **values: Any) -> JudgedGate:
     return JudgedGate(name=name, outcome=outcome, **dict.fromkeys(UNKNOWN) | known | values)
 
 
-def regression(verdict: str, gates: list[JudgedGate], **values: Any) -> Regression:
+def regression(verdict, gates, **values):
     result = Verdict(
         verdict=verdict,
         baseline={"name": "old", **BUILD},

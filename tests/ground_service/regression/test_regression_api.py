@@ -3,27 +3,25 @@
 import json
 import zipfile
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from ground_service.regression.archives import pack_archive
 from linna.cli import run
-from tests.serving import TestClient, wait_for
+from tests.serving import wait_for
 
 V1 = "/api/v1"
 
 
-def found(client: TestClient, path: str, **params: Any) -> Any:
+def found(client, path, **params):
     return client.get(f"{V1}/{path}", params=params).json()
 
 
-def is_done(client: TestClient, job_id: str) -> bool:
+def is_done(client, job_id):
     return found(client, f"jobs/{job_id}")["state"] == "done"
 
 
-def zipped(folder: Path, target: Path) -> bytes:
+def zipped(folder, target):
     with zipfile.ZipFile(target, "w") as packed:
         for path in sorted(folder.iterdir()):
             packed.write(path, path.name)

@@ -4,7 +4,6 @@ and Holm's procedure: against printed examples and simulation.
 """
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -70,19 +69,19 @@ Passes = dict[str, PassFrames]
 
 
 def simulated(
-    scene: int,
-    noise: int,
+    scene,
+    noise,
     *,
-    frames: int = FRAMES,
-    tracks: int = 150,
-    recall: float = 0.7,
-    other_kind_recall: float | None = None,
-    false_cells: int = 12,
-    off_px: float = 0.0,
-    fixes: float = 0.95,
-    error: float = 1.0,
-    **more: Any,
-) -> PassFrames:
+    frames=FRAMES,
+    tracks=150,
+    recall=0.7,
+    other_kind_recall=None,
+    false_cells=12,
+    off_px=0.0,
+    fixes=0.95,
+    error=1.0,
+    **more,
+):
     """Return a pass over a scene with the noise of one camera and filter run.
 
     Each crater is in view for 3 frames. The scene determines how easily each is detected; noise changes one row in
@@ -115,32 +114,32 @@ def simulated(
     )
 
 
-def suite(noise: int, passes: int = 5, first_scene: int = 0, **faults: Any) -> Passes:
+def suite(noise, passes=5, first_scene=0, **faults):
     return {f"pass {k}": simulated(first_scene + k, noise, **faults) for k in range(passes)}
 
 
-def by_name(gates: list[Gate]) -> dict[str, Gate]:
+def by_name(gates):
     return {gate.name: gate for gate in gates if not gate.pass_id}
 
 
-def judged(before: Passes, after: Passes, name: str = "detector.recall") -> Gate:
+def judged(before, after, name="detector.recall"):
     return by_name(judge(before, after, POLICY))[name]
 
 
-def failed(before: Passes, after: Passes, policy: Any = POLICY) -> set[str]:
+def failed(before, after, policy=POLICY):
     return {gate.name for gate in judge(before, after, policy) if gate.outcome == "fail"}
 
 
-def changed(passes: Passes, **values: Any) -> Passes:
+def changed(passes, **values):
     """Return the passes with another pass 0."""
     return {**passes, "pass 0": replace(passes["pass 0"], **values)}
 
 
-def places(gates: list[Gate]) -> set[str]:
+def places(gates):
     return {gate.pass_id for gate in gates if gate.outcome == "fail"}
 
 
-def largest_count(trials: int, rate: float) -> int:
+def largest_count(trials, rate):
     """Count that a binomial of this rate exceeds once in ten thousand tests."""
     return int(stats.binom.isf(1e-4, trials, rate))
 
@@ -202,12 +201,12 @@ def test_few_tracks_claim_only_a_loss_beyond_the_margin_and_say_how_many_frames_
     assert "detector.recall" in failed(before, great) and "detector.recall" not in failed(before, slight)
 
 
-def rows(before: list[list[int]], after: list[list[int]], copies: int = 30) -> tuple[Passes, Passes]:
+def rows(before, after, copies=30):
     """Return a pass of two builds with these hits of each track, repeated."""
     frames = simulated(0, 0, frames=300)
     track = np.repeat(np.arange(len(before) * copies), [len(one) for one in before] * copies)
 
-    def made(hits: list[list[int]], digest: bytes) -> Passes:
+    def made(hits, digest):
         hit = np.array([value for one in hits for value in one] * copies, dtype=np.bool_)
         none = np.zeros_like(track)
         craters = CraterRows(none, track, track, none, np.where(hit, 1.0, np.nan), 0.0 * none)
@@ -313,18 +312,18 @@ EXACT = [
 ]
 
 
-def wrong(passes: Passes, count: int) -> Passes:
+def wrong(passes, count):
     """Return the passes with so many wrong fixes in pass 0."""
     of = passes["pass 0"].estimators["anchored"]
     return changed(passes, estimators={"anchored": replace(of, wrong=(np.arange(FRAMES) < count) * 1.0)})
 
 
-@pytest.mark.parametrize(("name", "fault", "told"), EXACT)
-def test_a_gross_failure_on_one_pass_fails_in_one_sentence(name, fault, told):
+@pytest.mark.parametrize(("name", "fault", "reason"), EXACT)
+def test_a_gross_failure_on_one_pass_fails_in_one_sentence(name, fault, reason):
     before = suite(0, 1, 1, **TIMES)
     after = wrong(before, fault["wrong"]) if "wrong" in fault else changed(before, **fault)
     assert name in failed(before, after)
-    assert judged(before, after, name).reason == (told if name in COSTS else f"pass 0: {told}")
+    assert judged(before, after, name).reason == (reason if name in COSTS else f"pass 0: {reason}")
     # It is one of both builds' if the baseline has it too.
     assert name not in failed(after, after)
     # Faults of the telemetry fail under a policy that names other gates only.
@@ -376,9 +375,9 @@ def test_placebos_are_rejected_as_often_as_their_level_allows_and_a_noisier_metr
     parts = [found["detector.recall", kind].placebos for kind in ("cratered", "sparse")]
     assert sum(parts) == 60 and min(parts) > 20
     worse = [one.model_copy(update={"p_value": 0.01}) if k < 60 else one for k, one in enumerate(noise)]
-    told = {one.metric: one for one in calibrations(worse) if not one.condition}["detector.recall"]
-    assert not told.calibrated
-    assert told.text == f"uncalibrated: detector.recall: {told.rejected} of 60 placebos rejected at 0.05"
+    noisy = {one.metric: one for one in calibrations(worse) if not one.condition}["detector.recall"]
+    assert not noisy.calibrated
+    assert noisy.text == f"uncalibrated: detector.recall: {noisy.rejected} of 60 placebos rejected at 0.05"
 
 
 def test_exact_gates_and_the_verdict_of_a_placebo_are_rejected_if_they_fail():
@@ -555,7 +554,7 @@ def test_holm_steps_down_as_in_the_textbook_example():
     assert holm_levels([], 0.05) == []
 
 
-def sums(unit: list[int], numerator: list[float], denominator: list[float], stratum: int = 0) -> UnitSums:
+def sums(unit, numerator, denominator, stratum=0):
     return unit_sums(
         np.array(unit), np.full(len(unit), stratum), np.array(numerator, float), np.array(denominator, float)
     )

@@ -1,11 +1,9 @@
 """Rule of upgrades without interruption: what a migration may change while the version before it runs."""
 
-from sqlalchemy import MetaData, Table
-
 RULE = "an expansion only adds tables, indexes that are not unique, and columns that are nullable or have a default"
 
 
-def breaking_changes(before: MetaData, after: MetaData) -> list[str]:
+def breaking_changes(before, after):
     """Return the differences between two reflected schemas that break a program written for the first one."""
     found = []
     for name, old in before.tables.items():
@@ -28,7 +26,7 @@ def breaking_changes(before: MetaData, after: MetaData) -> list[str]:
     return found
 
 
-def _changed_columns(old: Table, new: Table) -> list[tuple[str, str]]:
+def _changed_columns(old, new):
     changes = []
     for column in old.columns:
         other = new.columns.get(column.name)

@@ -22,7 +22,7 @@ from ground_service.store.database import (
     upgrade_database,
 )
 from ground_service.store.models import METADATA
-from ground_service.store.snapshot import create_schema
+from ground_service.store.roles import create_schema
 from tests.ground_service.conftest import cells
 from tests.ground_service.schema import described_schema
 from tests.ground_service.store.schema_rules import RULE, breaking_changes
@@ -165,7 +165,7 @@ def test_a_snapshot_of_the_schema_makes_the_tables_of_this_version(tmp_path, new
         open_database(f"sqlite:///{tmp_path / name}" if kind == "sqlite" else new_postgres_database())
         for name in ("found", "made")
     )
-    command = [sys.executable, "-m", "ground_service.store.snapshot", str(tmp_path / "schema.json")]
+    command = [sys.executable, "-m", "ground_service.store.roles", str(tmp_path / "schema.json")]
     subprocess.run(command, check=True)
     with found.writing() as connection:
         create_schema(connection, tmp_path / "schema.json")

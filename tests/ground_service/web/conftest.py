@@ -12,7 +12,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,7 +32,7 @@ from tests.serving import wait_for
 cv2 = Lazy("cv2")
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, BrowserContext, Page
+    pass
 
 CHROMIUM = "/usr/bin/chromium"
 OPENMCT = Path(__file__).parents[3] / "deploy" / "openmct"
@@ -66,15 +65,15 @@ FLAGS = [
 ]  # fmt: skip
 
 
-def press(page: Page, name: str) -> None:
+def press(page, name):
     page.get_by_role("button", name=name).click()
 
 
-def shows(page: Page, place: str, text: str) -> None:
+def shows(page, place, text):
     expect(page.locator(place)).to_contain_text(text)
 
 
-def end_socket(one: socket.socket) -> None:
+def end_socket(one):
     """Close a socket, and wake a thread that waits on it."""
     with suppress(OSError):
         one.shutdown(socket.SHUT_RDWR)
@@ -82,17 +81,17 @@ def end_socket(one: socket.socket) -> None:
 
 
 class Console:
-    """The console of a payload flown live, without the payload: sends what it is told to, keeps what it hears."""
+    """The console of a payload flown live, without the payload: sends given lines, keeps received ones."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = self._listener.getsockname()[1]
-        self.heard: list[str] = []
+        self.received: list[str] = []
         self._clients: list[socket.socket] = []
         self._thread = threading.Thread(target=self._accept, daemon=True)
         self._thread.start()
 
-    def _accept(self) -> None:
+    def _accept(self):
         while True:
             try:
                 client, _ = self._listener.accept()
@@ -101,20 +100,20 @@ class Console:
             self._clients.append(client)
             threading.Thread(target=self._hear, args=(client,), daemon=True).start()
 
-    def _hear(self, client: socket.socket) -> None:
+    def _hear(self, client):
         with client, suppress(OSError), client.makefile("r") as lines:
             for line in lines:
-                self.heard += [line.strip()] if line.strip() != "watch" else []
+                self.received += [line.strip()] if line.strip() != "watch" else []
         self._clients.remove(client)
 
-    def say(self, message: dict[str, object]) -> None:
+    def say(self, message):
         """One message to everyone connected, of whom there is at least one in time."""
         wait_for(lambda: bool(self._clients), "nobody has connected to the console")
         for client in list(self._clients):
             with suppress(OSError):  # one that has just hung up
                 client.sendall(json.dumps(message).encode() + b"\n")
 
-    def close(self) -> None:
+    def close(self):
         for one in (self._listener, *self._clients):
             end_socket(one)
         self._thread.join(TIMEOUT_S)
@@ -126,7 +125,7 @@ FRAME = """{"kind": "frame", "mode": "observing", "paused": false, "rate": 1.0, 
 DARK = """{"severity": "medium", "event": "image_dark", "values": [1.0, 2.0], "text": "mean grey level 1"}"""
 
 
-def live_frame(number: int) -> dict[str, object]:
+def live_frame(number):
     """A frame as the console of the emulator tells it."""
     _, jpeg = cv2.imencode(".jpg", np.full((512, 512), 20 + number, np.uint8))
     estimate = {
@@ -152,9 +151,7 @@ def live_frames():
 class Service:
     """A running `linna serve`."""
 
-    def __init__(
-        self, home: Path, console_port: int, openmct: Path | None = None, settings: dict[str, str] | None = None
-    ) -> None:
+    def __init__(self, home, console_port, openmct=None, settings=None):
         self.home = home
         environment = {key: value for key, value in os.environ.items() if not key.startswith("LINNA_")}
         environment["LINNA_LIVE_CONSOLE"] = f"127.0.0.1:{console_port}"
@@ -171,7 +168,7 @@ class Service:
             self.__exit__()
             raise
 
-    def _wait_for_address(self, log: Path) -> str:
+    def _wait_for_address(self, log):
         while True:
             text = log.read_text(errors="replace")
             if "startup complete" in text:
@@ -181,10 +178,10 @@ class Service:
             time.sleep(0.1)
         raise RuntimeError(f"the service did not start:\n{log.read_text(errors='replace')}")
 
-    def __enter__(self) -> Service:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self._process.terminate()
         self._process.wait(TIMEOUT_S)
         self._log.close()
@@ -235,10 +232,10 @@ def openmct(tmp_path_factory):
 class Pictures:
     """Pictures of the pages in 256 colours; documented ones are kept in the folder that LINNA_PICTURES names."""
 
-    def __init__(self, folder: Path, *, documented: bool = True) -> None:
+    def __init__(self, folder, *, documented=True):
         self.folder = Path((documented and os.environ.get("LINNA_PICTURES")) or folder)
 
-    def take(self, page: Page, name: str, part: str = "body") -> None:
+    def take(self, page, name, part="body"):
         """Take the upper 800 px of a part of the page."""
         picture = Image.open(io.BytesIO(page.locator(part).screenshot())).convert("RGB")
         picture = picture.crop((0, 0, picture.width, min(picture.height, 800)))
@@ -260,14 +257,14 @@ def browser():
         chromium.close()
 
 
-def patient(context: BrowserContext) -> BrowserContext:
+def patient(context):
     """Let the pages of a context wait long."""
     context.set_default_timeout(TIMEOUT_S * 1e3)
     return context
 
 
 @contextmanager
-def strict_page(browser: Browser, url: str, *, strict: bool = True) -> Iterator[Page]:
+def strict_page(browser, url, *, strict=True):
     """Open a page that permits no failure of a script and no request to another host.
 
     A strict one permits no error in the console and no violation of the policy; others count their requests.
@@ -294,7 +291,7 @@ def page(browser, service):
         yield opened
 
 
-def _note_foreign(url: str, own: str, errors: list[str]) -> None:
+def _note_foreign(url, own, errors):
     if not url.startswith((own, own.replace("http", "ws", 1), "blob:", "data:")):
         errors.append(f"asked another host: {url}")
 

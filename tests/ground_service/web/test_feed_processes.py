@@ -10,7 +10,7 @@ import pytest
 from benchmarks._servers import Deployment
 from ground_service.app import create_app
 from ground_service.settings import Settings
-from ground_service.store import wakeups
+from ground_service.store import leases
 from ground_service.web import sockets
 from tests.ground_service.contacts.links.conftest import HEAD, Station
 from tests.ground_service.web.test_displays import ask as fetch
@@ -62,7 +62,7 @@ def temperature_after(socket):
 def other(tmp_path, server_url, monkeypatch):
     """An API process A with links, and the client of an API B in this process, which never polls."""
     monkeypatch.setattr(sockets, "POLL_S", NEVER_S)
-    monkeypatch.setattr(wakeups, "RETRY_S", 0.1)
+    monkeypatch.setattr(leases, "RETRY_S", 0.1)
     with Deployment(tmp_path, url=server_url) as processes:
         settings = Settings(
             home=processes.home, database_url=server_url, broker_url=processes.broker_url, links=False,
@@ -74,7 +74,7 @@ def other(tmp_path, server_url, monkeypatch):
 def test_telemetry_received_by_one_process_is_shown_by_the_other_through_a_restart_of_redis(other, monkeypatch):
     processes, client = other
     log = MagicMock()
-    monkeypatch.setattr(wakeups, "log", log)
+    monkeypatch.setattr(leases, "log", log)
     station = Station()
     try:
         with client.websocket_connect(LIVE) as socket:
@@ -112,31 +112,31 @@ def test_telemetry_received_by_one_process_is_shown_by_the_other_through_a_resta
         station.close()
 
 
-def test_a_wake_up_of_another_process_is_heard_and_an_own_one_is_not(redis_url):
-    heard = []
+def test_a_wake_up_of_another_process_is_received_and_an_own_one_is_not(redis_url):
+    received = []
     connected, woken = threading.Event(), threading.Event()
 
     def wake():
         (woken if connected.is_set() else connected).set()
-        heard.append("wake")
+        received.append("wake")
 
     async def run():
-        task = asyncio.create_task(wakeups.listen(redis_url, wake))
+        task = asyncio.create_task(leases.listen(redis_url, wake))
         assert await asyncio.to_thread(connected.wait, 60.0)
-        wakeups.Waker(redis_url)(frozenset({"telemetry"}))
-        wakeups.Waker(redis_url, b"another process")(frozenset({"telemetry"}))
+        leases.Waker(redis_url)(frozenset({"telemetry"}))
+        leases.Waker(redis_url, b"another process")(frozenset({"telemetry"}))
         assert await asyncio.to_thread(woken.wait, 60.0)
         task.cancel()
 
     with ThreadPoolExecutor(1) as pool:
         pool.submit(asyncio.run, run()).result()
-    assert heard == ["wake", "wake"]
+    assert received == ["wake", "wake"]
 
 
 def test_an_unavailable_broker_is_reported_once_and_not_asked_at_each_commit(monkeypatch):
     log = MagicMock()
-    monkeypatch.setattr(wakeups, "log", log)
-    waker = wakeups.Waker("redis://127.0.0.1:1/0")
+    monkeypatch.setattr(leases, "log", log)
+    waker = leases.Waker("redis://127.0.0.1:1/0")
     for _ in range(3):
         waker(frozenset({"telemetry"}))
     assert log.warning.call_count == 1
@@ -144,6 +144,6 @@ def test_an_unavailable_broker_is_reported_once_and_not_asked_at_each_commit(mon
     waker._client = client
     waker(frozenset({"telemetry"}))
     assert not client.publish.called
-    monkeypatch.setattr(wakeups.time, "monotonic", lambda: float("inf"))
+    monkeypatch.setattr(leases.time, "monotonic", lambda: float("inf"))
     waker(frozenset({"telemetry"}))
     assert client.publish.call_count == 1 and log.info.call_count == 1

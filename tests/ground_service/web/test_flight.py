@@ -139,7 +139,9 @@ def flown(tmp_path_factory, serve, openmct, browser):
             ]
             station.sendall(b"".join(sent))
             octets = sum(len(one) for one in sent)
-            wait_for(lambda: sum(len(one) for _, one in payload._uplinked) == octets, "no telecommands have arrived")
+            wait_for(
+                lambda: sum(len(one) for _, one in payload.contacts._uplink) == octets, "no telecommands have arrived"
+            )
             clients = payload.contacts.stations["earth"].telemetry.clients
             wait_for(lambda: bool(clients), "the link is not connected")
             found = Flown(service.url, layout, live)

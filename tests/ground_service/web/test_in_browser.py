@@ -1,4 +1,4 @@
-"""What operators do on the pages, in Chromium, also with the keyboard while the pages change."""
+"""Actions of operators on the pages, in Chromium, also with the keyboard while the pages change."""
 
 import re
 import time
@@ -139,12 +139,15 @@ def test_small_figures_have_a_power_of_ten_and_zero_has_none_and_long_times_have
     page.goto("/licences")
     found = page.evaluate(
         """async () => {
-            const { figure, lengthText } = await import("/static/page.js");
+            const { element, figure, lengthText } = await import("/static/page.js");
             const lengths = [59, 3600 * 47 + 60, 3600 * 49];
-            return [[0, 4.51e-11, -2e-5, 0.00012, 0.5].map((value) => figure(value)), lengths.map(lengthText)];
+            const title = element("h1", {}, "selenita-2029-08-18T08:17:55Z").querySelector(".keep").textContent;
+            const figures = [0, 4.51e-11, -2e-5, 0.00012, 0.5, 1544].map((value) => figure(value));
+            return [figures, lengths.map(lengthText), title];
         }"""
     )
-    assert found == [["0", "4.51 × 10⁻¹¹", "-2 × 10⁻⁵", "0.00012", "0.5"], ["59 s", "47 h 1 min", "2 d 1 h"]]
+    figures = ["0", "4.51 × 10⁻¹¹", "-2 × 10⁻⁵", "0.00012", "0.5", "1\u00a0544"]
+    assert found == [figures, ["59 s", "47 h 1 min", "2 d 1 h"], "2029-08-18T08:17"]
 
 
 def test_the_pass_page_shows_what_came_and_makes_a_report(page):
@@ -293,6 +296,18 @@ def test_a_list_has_the_columns_and_filters_of_its_operation(page):
     expect(page.locator("#items")).to_have_text("No entry.")
 
 
+def test_a_received_file_is_withdrawn_on_its_page(page):
+    receive(page, [camera_fault(5000)])
+    newest = page.request.get("/api/v1/ingests").json()["items"][0]["id"]
+    settled(page, "/ingests")
+    page.get_by_role("button", name=f"Withdraw ingest {newest}").click()
+    page.get_by_role("dialog").get_by_label("Reason").fill("another flight")
+    page.get_by_role("dialog").get_by_role("button", name="Withdraw").click()
+    wait_for(lambda: page.request.get(f"/api/v1/ingests/{newest}").json()["state"] == "withdrawn", "the withdrawal")
+    entry = page.request.get("/api/v1/audit?action=withdraw%20ingest").json()["items"][0]
+    assert entry["detail"]["reason"] == "another flight"
+
+
 def test_arguments_have_names_units_and_ranges(page):
     settled(page, "/commands")
     page.locator("#name").select_option("perform_function")
@@ -321,7 +336,7 @@ def test_arguments_have_names_units_and_ranges(page):
     assert not value.evaluate("input => input.validity.valid")
 
 
-def test_a_telecommand_that_the_dictionary_refuses_is_told(page):
+def test_a_telecommand_that_the_dictionary_refuses_is_reported(page):
     settled(page, "/commands")
     page.locator("#name").select_option("insert_activity")
     page.locator("#argument-items").fill("300\n4")
@@ -424,32 +439,32 @@ def test_a_live_payload_is_watched_and_steered(page, console, live_frames):
         "Array.from(document.getElementById('frame').getContext('2d').getImageData(300, 300, 1, 1).data).slice(0, 3)"
     )
     assert grey == [24, 24, 24]  # the last frame's level
-    console.heard.clear()
+    console.received.clear()
     press(page, "Pause")
     press(page, "Step")
     page.get_by_label("Rate").select_option("60")
-    wait_for(lambda: len(console.heard) >= 3, f"heard no more than {console.heard}")
-    assert console.heard == ["pause", "step", "rate 60"]
+    wait_for(lambda: len(console.received) >= 3, f"received no more than {console.received}")
+    assert console.received == ["pause", "step", "rate 60"]
 
 
 def test_words_that_could_do_harm_do_not_reach_the_payload(page, console):
     settled(page, "/live")
     expect(page.locator("#state")).to_have_text("connected")
-    console.heard.clear()
+    console.received.clear()
     answer = page.evaluate(
         """() => new Promise((resolve) => {
           const socket = new WebSocket(`ws://${location.host}/api/v1/payload`);
           socket.onopen = () => ["quit", "run\\nquit", "rate -1", "x".repeat(3000)].forEach((one) => socket.send(one));
-          const heard = [];
+          const received = [];
           socket.onmessage = (event) => {
             const message = JSON.parse(event.data);
-            if (message.kind === "error") heard.push(message);
-            if (heard.length === 4) resolve(heard);
+            if (message.kind === "error") received.push(message);
+            if (received.length === 4) resolve(received);
           };
         })"""
     )
     assert [one["kind"] for one in answer] == ["error"] * 4
-    assert console.heard == []
+    assert console.received == []
 
 
 KEYBOARD = 79

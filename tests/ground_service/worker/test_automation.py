@@ -2,9 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,11 +12,10 @@ from ground_service.evaluation import service as evaluation
 from ground_service.evaluation.landmarks.model import LandmarkFilter
 from ground_service.evaluation.landmarks.service import list_landmarks
 from ground_service.evaluation.store import newest_report
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
-from ground_service.jobs.model import Job, JobFilter
-from ground_service.jobs.service import enter_job, list_jobs, repeat_failed, unfinished_jobs
+from ground_service.jobs.service import JobFilter, enter_job, list_jobs, repeat_failed, unfinished_jobs
 from ground_service.missions.catalogues import add_catalogue, catalogue_of
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.model import parse_mission
@@ -82,17 +78,15 @@ recall = 0.5
 
 
 @pytest.fixture(scope="module")
-def flown(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
+def flown(make_pass):
     return make_pass(frames=FRAMES, seed=9)
 
 
-def deliver_reference(ground: Ground, flown: SyntheticPass) -> None:
+def deliver_reference(ground, flown):
     add_ephemeris(ground, ground.files.put_file(flown.folder / "reference.oem"), name="reference")
 
 
-def prepared(
-    ground: Ground, flown: SyntheticPass, settings: str = "", *, mission: str = MISSION, reference: bool = True
-) -> int:
+def prepared(ground, flown, settings="", *, mission=MISSION, reference=True):
     """Enter what a ground knows before a pass; return an approved window."""
     held = add_catalogue(ground, ground.files.put_file(flown.folder / "catalogue.csv"), "craters.csv")
     add_mission(ground, (mission.format(sha256=held.sha256) + settings).encode())
@@ -113,30 +107,30 @@ def prepared(
     return window.id
 
 
-def receive(ground: Ground, packets: list[bytes]) -> None:
+def receive(ground, packets):
     file = ground.home / f"{len(packets)}.cadu"
     file.write_bytes(encode_downlink(packets))
     ingest_file(ground, file, spacecraft_id=SPACECRAFT)
 
 
-def followed(ground: Ground, flown: SyntheticPass, *given: str, **how: Any) -> int:
+def followed(ground, flown, *given, **how):
     """Receive a prepared pass; return its window."""
     window_id = prepared(ground, flown, *given, **how)
     receive(ground, flown.packets)
     return window_id
 
 
-def follow_up(ground: Ground) -> list[Job]:
+def follow_up(ground):
     """Jobs of the follow-up, oldest first."""
     return list(ground.read(list_jobs, JobFilter(kind="automation")).items)[::-1]
 
 
-def done_steps(ground: Ground) -> list[str]:
+def done_steps(ground):
     """Steps of the follow-up that were done, in their order."""
     return [name for one in follow_up(ground) for name in one.result or {} if name != "event"]
 
 
-def end_contact(ground: Ground, vehicle: int, utc_ns: int) -> None:
+def end_contact(ground, vehicle, utc_ns):
     ended = ContactEnded(
         contact_id=1, link="x", station="madrid", vehicle_id=vehicle, start_utc_ns=utc_ns - 60 * NS,
         stop_utc_ns=utc_ns, octets=1, telecommands=0,
@@ -144,19 +138,19 @@ def end_contact(ground: Ground, vehicle: int, utc_ns: int) -> None:
     ground.write(publish, ended)
 
 
-def report_of(ground: Ground, pass_id: int) -> dict[str, Any]:
+def report_of(ground, pass_id):
     path = ground.home / "reports" / f"pass-{pass_id}" / "report.json"
     return json.loads(path.read_text())
 
 
-def processed(ground: Ground, window_id: int) -> int:
+def processed(ground, window_id):
     """Return the pass of a window that is processed."""
     window = ground.read(get_window, window_id)
     assert window.state == "processed"
     return window.pass_id
 
 
-def test_a_live_pass_is_complete_and_processed_without_a_request(either: Ground, flown: SyntheticPass):
+def test_a_live_pass_is_complete_and_processed_without_a_request(either, flown):
     window_id = followed(either, flown)
     pass_id = processed(either, window_id)
     report, after = follow_up(either)
@@ -176,9 +170,7 @@ def test_a_live_pass_is_complete_and_processed_without_a_request(either: Ground,
     assert not {"detector", "reference", "error"} & set(document["not_available"])
 
 
-def test_an_incomplete_window_is_processed_after_the_contact_and_late_data_change_its_report(
-    either: Ground, flown: SyntheticPass
-):
+def test_an_incomplete_window_is_processed_after_the_contact_and_late_data_change_its_report(either, flown):
     window_id = prepared(either, flown)
     lost = slice(20, 26)
     receive(either, flown.packets[: lost.start] + flown.packets[lost.stop :])
@@ -201,7 +193,7 @@ def test_an_incomplete_window_is_processed_after_the_contact_and_late_data_chang
     assert done_steps(either)[3:] == ["archive of pass 1"]
 
 
-def test_a_reference_that_arrives_after_the_report_completes_it(either: Ground, flown: SyntheticPass):
+def test_a_reference_that_arrives_after_the_report_completes_it(either, flown):
     window_id = followed(either, flown, reference=False)
     pass_id = processed(either, window_id)
     reasons = report_of(either, pass_id)["not_available"]
@@ -216,9 +208,7 @@ def test_a_reference_that_arrives_after_the_report_completes_it(either: Ground, 
     assert {one.state for one in follow_up(either)} == {"done"}
 
 
-def test_a_mission_without_a_camera_is_processed_and_its_report_says_what_that_means(
-    ground: Ground, flown: SyntheticPass
-):
+def test_a_mission_without_a_camera_is_processed_and_its_report_says_what_that_means(ground, flown):
     before, _, rest = MISSION.partition("[camera]")
     window_id = followed(ground, flown, mission=before + "[catalogue]" + rest.partition("[catalogue]")[2])
     pass_id = processed(ground, window_id)
@@ -229,7 +219,7 @@ def test_a_mission_without_a_camera_is_processed_and_its_report_says_what_that_m
     assert made.result["report of pass 1"]["inputs"]["missing"]["camera"].startswith(said)
 
 
-def test_an_event_that_is_followed_again_has_one_result(ground: Ground, flown: SyntheticPass):
+def test_an_event_that_is_followed_again_has_one_result(ground, flown):
     followed(ground, flown)
     for job in follow_up(ground):
         again = actions.run_steps(ground, job.arguments["event"])
@@ -238,10 +228,8 @@ def test_an_event_that_is_followed_again_has_one_result(ground: Ground, flown: S
     assert kinds.count(PassEvaluated.event_kind) == 1 and len(follow_up(ground)) == 2
 
 
-def test_a_follow_up_that_a_process_left_is_done_by_the_next(
-    tmp_path: Path, flown: SyntheticPass, monkeypatch: pytest.MonkeyPatch
-):
-    def full(*_: Any, **__: Any) -> Any:
+def test_a_follow_up_that_a_process_left_is_done_by_the_next(tmp_path, flown, monkeypatch):
+    def full(*_, **__):
         raise StorageFull("disk")
 
     with open_ground(tmp_path / "home") as ground:
@@ -259,10 +247,8 @@ def test_a_follow_up_that_a_process_left_is_done_by_the_next(
         assert ground.read(unfinished_jobs) == []
 
 
-def test_a_report_that_failed_is_stated_at_its_window_and_made_later(
-    either: Ground, flown: SyntheticPass, monkeypatch: pytest.MonkeyPatch
-):
-    def broken(*_: Any, **__: Any) -> Any:
+def test_a_report_that_failed_is_stated_at_its_window_and_made_later(either, flown, monkeypatch):
+    def broken(*_, **__):
         raise InvalidInput("report", "", "a renderer", "none")
 
     with monkeypatch.context() as patched:
@@ -282,7 +268,7 @@ def test_a_report_that_failed_is_stated_at_its_window_and_made_later(
     assert {one.state for one in follow_up(either)} == {"done"}
 
 
-def test_an_unfinished_job_of_a_rule_of_an_earlier_version_ends_without_work(ground: Ground):
+def test_an_unfinished_job_of_a_rule_of_an_earlier_version_ends_without_work(ground):
     ground.write(publish, RegressionJudged(id="1" * 32, verdict="fail"))
     for kind in ("automation", "notification"):
         done = run_job(ground, enter_job(ground, kind, {"event": 1}))
@@ -292,9 +278,7 @@ def test_an_unfinished_job_of_a_rule_of_an_earlier_version_ends_without_work(gro
 
 
 @pytest.mark.parametrize("evaluate", [False, None])
-def test_an_imported_archive_is_kept_once_unless_the_mission_evaluates_nothing(
-    ground: Ground, flown: SyntheticPass, evaluate: bool | None
-):
+def test_an_imported_archive_is_kept_once_unless_the_mission_evaluates_nothing(ground, flown, evaluate):
     stated = "" if evaluate is None else "[automation]\nevaluate = false\n"
     add_mission(ground, f'name = "m"\n[spacecraft]\nid = {SPACECRAFT}\n{stated}'.encode())
     pass_id = import_archive(ground, flown.folder)
@@ -302,19 +286,19 @@ def test_an_imported_archive_is_kept_once_unless_the_mission_evaluates_nothing(
     assert done_steps(ground) == ([] if evaluate is False else [f"archive of pass {pass_id}"])
 
 
-def test_a_mission_that_evaluates_nothing_leaves_its_windows_to_persons(ground: Ground, flown: SyntheticPass):
+def test_a_mission_that_evaluates_nothing_leaves_its_windows_to_persons(ground, flown):
     window_id = followed(ground, flown, "[automation]\nevaluate = false\n")
     assert follow_up(ground) == [] and ground.read(get_window, window_id).state == "downlinked"
 
 
-def test_the_catalogue_of_a_live_pass_is_cut_to_its_track(ground: Ground, flown: SyntheticPass):
+def test_the_catalogue_of_a_live_pass_is_cut_to_its_track(ground, flown):
     window_id = followed(ground, flown)
     whole = evaluation.evaluate(ground, processed(ground, window_id))
     assert whole.detector is not None
     assert any("synthetic craters" in one for one in whole.data_sources)
 
 
-def test_a_mission_without_an_available_catalogue_is_refused_with_the_reason(ground: Ground):
+def test_a_mission_without_an_available_catalogue_is_refused_with_the_reason(ground):
     missing = parse_mission(f'name = "m"\n[catalogue]\nsha256 = "{"0" * 64}"\n')
     with pytest.raises(InvalidInput, match=r"m, catalogue.sha256: expected a catalogue that the ground holds"):
         catalogue_of(ground, missing)
@@ -324,7 +308,7 @@ def test_a_mission_without_an_available_catalogue_is_refused_with_the_reason(gro
         catalogue_of(ground, parse_mission('name = "m"\n'))
 
 
-def test_only_a_crater_catalogue_is_held(ground: Ground, flown: SyntheticPass):
+def test_only_a_crater_catalogue_is_held(ground, flown):
     with pytest.raises(InvalidInput, match="crater catalogue"):
         add_catalogue(ground, ground.files.put_octets(b"a,b\n1,2\n"), "x.csv")
     for _ in range(2):
@@ -333,7 +317,7 @@ def test_only_a_crater_catalogue_is_held(ground: Ground, flown: SyntheticPass):
     assert held.name == "craters.csv"
 
 
-def test_a_worker_that_only_reads_events_enters_no_job_twice(tmp_path: Path, flown: SyntheticPass):
+def test_a_worker_that_only_reads_events_enters_no_job_twice(tmp_path, flown):
     with open_ground(tmp_path / "home") as ground:
         jobs = []
         follow = FollowUp(ground, start=jobs.append)
@@ -344,7 +328,7 @@ def test_a_worker_that_only_reads_events_enters_no_job_twice(tmp_path: Path, flo
         assert jobs == ground.read(unfinished_jobs) == [one.id for one in follow_up(ground)] != []
 
 
-def test_a_processed_pass_is_searched_for_landmarks(either: Ground, flown: SyntheticPass, tmp_path: Path):
+def test_a_processed_pass_is_searched_for_landmarks(either, flown, tmp_path):
     full = load_catalogue(flown.folder / "catalogue.csv")
     thin = SyntheticPass(tmp_path / "thin", flown.packets, flown.utc_ns, flown.expected, flown.missed)
     shutil.copytree(flown.folder, thin.folder)

@@ -4,9 +4,6 @@ import hashlib
 import json
 import re
 import sqlite3
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 from sqlalchemy import select, text
@@ -14,7 +11,7 @@ from sqlalchemy import select, text
 from ground_service.access.service import add_user, authenticate, list_users
 from ground_service.errors import Conflict, FileDamaged, InvalidInput, NotFound
 from ground_service.evaluation.service import pass_summary
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
 from ground_service.planning.service import WindowEntry, add_window, change_window
 from ground_service.store.audit import read_head
@@ -28,7 +25,7 @@ NS = 1_000_000_000
 START = 2_000_000_000 * NS
 
 
-def everything(ground: Ground) -> dict[str, list[Any]]:
+def everything(ground):
     with ground.database.reading() as connection:
         return {
             table.name: sorted(map(tuple, connection.execute(select(table))), key=str)
@@ -36,13 +33,13 @@ def everything(ground: Ground) -> dict[str, list[Any]]:
         }
 
 
-def rows_of_an_empty_service(ground: Ground) -> bool:
+def rows_of_an_empty_service(ground):
     """Check that the database contains only the head of an empty audit chain."""
     return {name: rows for name, rows in everything(ground).items() if rows} == {"audit_head": [(1, 0, "0" * 64)]}
 
 
 @pytest.fixture
-def filled(ground: Ground, synthetic_pass: Any) -> tuple[Ground, str]:
+def filled(ground, synthetic_pass):
     import_archive(ground, synthetic_pass.folder)
     for k in (2, 1):
         start = START + k * 100 * NS
@@ -52,13 +49,13 @@ def filled(ground: Ground, synthetic_pass: Any) -> tuple[Ground, str]:
 
 
 @pytest.fixture
-def saved(filled: tuple[Ground, str], tmp_path: Path) -> Iterator[Path]:
+def saved(filled, tmp_path):
     manifest = backup(filled[0], tmp_path / "saved", now_utc_ns=START)
     assert manifest["made_utc"] == "2033-05-18T03:33:20.000Z"
     yield tmp_path / "saved"
 
 
-def test_everything_comes_back(filled: tuple[Ground, str], saved: Path, tmp_path: Path):
+def test_everything_comes_back(filled, saved, tmp_path):
     ground, token = filled
     with open_ground(tmp_path / "again") as other:
         restore(saved, other)
@@ -70,7 +67,7 @@ def test_everything_comes_back(filled: tuple[Ground, str], saved: Path, tmp_path
             restore(saved, other)
 
 
-def test_a_backup_overwrites_nothing(filled: tuple[Ground, str], saved: Path):
+def test_a_backup_overwrites_nothing(filled, saved):
     before = (saved / "linna.db").read_bytes()
     with pytest.raises(Conflict, match="expected a folder that is new or empty"):
         backup(filled[0], saved, now_utc_ns=START)
@@ -78,7 +75,7 @@ def test_a_backup_overwrites_nothing(filled: tuple[Ground, str], saved: Path):
 
 
 @pytest.mark.parametrize("file", [0, -1])
-def test_a_damaged_file_is_found_before_anything_is_restored(saved: Path, tmp_path: Path, file: int):
+def test_a_damaged_file_is_found_before_anything_is_restored(saved, tmp_path, file):
     damaged = sorted(path for path in (saved / "files").rglob("*") if path.is_file())[file]
     damaged.chmod(0o644)
     damaged.write_bytes(b"x" + damaged.read_bytes())
@@ -102,7 +99,7 @@ UPDATE audit_head SET number = 2 | audit_head: expected the rows that were saved
 
 
 @pytest.mark.parametrize("row", CHANGES.splitlines())
-def test_a_changed_row_of_a_backup_is_not_restored(saved: Path, tmp_path: Path, row: str):
+def test_a_changed_row_of_a_backup_is_not_restored(saved, tmp_path, row):
     statement, reason = row.split(" | ")
     with sqlite3.connect(saved / "linna.db") as connection:
         connection.execute(statement)
@@ -113,14 +110,14 @@ def test_a_changed_row_of_a_backup_is_not_restored(saved: Path, tmp_path: Path, 
         assert rows_of_an_empty_service(other)
 
 
-def test_a_restore_that_is_refused_makes_no_database(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_restore_that_is_refused_makes_no_database(saved, tmp_path, capsys):
     next(path for path in (saved / "files").rglob("*") if path.is_file()).write_bytes(b"changed")
     assert cli.run(["db", "restore", str(saved), "--home", str(tmp_path / "new")]) == 2
     assert "expected octets with SHA-256" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
-def test_a_changed_list_of_a_backup_is_not_believed(saved: Path, tmp_path: Path):
+def test_a_changed_list_of_a_backup_is_not_believed(saved, tmp_path):
     manifest = json.loads((saved / "backup.json").read_text())
     assert manifest["audit_head"]["number"] == manifest["rows"]["audit"] == 5
     for changes, reason in (
@@ -136,7 +133,7 @@ def test_a_changed_list_of_a_backup_is_not_believed(saved: Path, tmp_path: Path)
         restore(tmp_path, other)
 
 
-def test_a_backup_of_version_1_0_is_restored(tmp_path: Path):
+def test_a_backup_of_version_1_0_is_restored(tmp_path):
     """It has tables that are gone now; digests are those of its own columns."""
     saved = tmp_path / "saved"
     saved.mkdir()

@@ -5,19 +5,17 @@ their first ingest, and compares.
 
 import itertools
 import threading
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from sqlalchemy import text
 
 from ground_service.errors import StorageFull
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.ingest import reception
 from ground_service.ingest import store as ingest_store
-from ground_service.ingest.service import Place, enter_ingest, ingest_file
+from ground_service.ingest.service import PiecePosition, enter_ingest, ingest_file
 from ground_service.regression.archives import keep_archive
 from ground_service.regression.builds import load_build, register_build
 from ground_service.regression.jobs import missing_replays, prepared
@@ -37,26 +35,24 @@ from tmtc.downlink import encode_cadus
 
 
 @pytest.fixture(scope="module")
-def downlink(make_pass: Callable[..., Any]) -> Path:
+def downlink(make_pass):
     return Path(make_pass(frames=30, seed=4).folder) / "downlink.cadu"
 
 
 @pytest.fixture
-def small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+def small_windows(monkeypatch):
     """The stream is stored in about ten transactions."""
     monkeypatch.setattr(files, "BLOCK_OCTETS", 4_000)
     monkeypatch.setattr(reception, "WINDOW_OCTETS", 4_000)
 
 
-def enter(ground: Ground, downlink: Path) -> str:
+def enter(ground, downlink):
     stored = ground.files.put_file(downlink)
     return enter_ingest(ground, stored, "d", spacecraft_id=76, instance="flight")[1]
 
 
 @pytest.mark.usefixtures("small_windows")
-def test_an_ingest_is_broken_off_when_the_service_stops_and_goes_on_at_the_next_start(
-    downlink: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_an_ingest_is_broken_off_when_the_service_stops_and_goes_on_at_the_next_start(downlink, tmp_path, monkeypatch):
     with open_ground(tmp_path / "whole") as ground:
         ingest_file(ground, downlink)
         expected = hash_of(ground)
@@ -64,7 +60,7 @@ def test_an_ingest_is_broken_off_when_the_service_stops_and_goes_on_at_the_next_
     middle, go_on = threading.Event(), threading.Event()
     original = ingest_store.store_batch
 
-    def store(*given: Any) -> Any:
+    def store(*given):
         result = original(*given)
         stored.append(result.new)
         if len(stored) == 3:
@@ -95,13 +91,11 @@ def test_an_ingest_is_broken_off_when_the_service_stops_and_goes_on_at_the_next_
         assert hash_of(ground) == expected
 
 
-def test_a_job_that_the_disk_stops_is_held_back_longer_each_time(
-    downlink: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_job_that_the_disk_stops_is_held_back_longer_each_time(downlink, tmp_path, monkeypatch):
     clock = [0.0]
     tried = []
 
-    def no_space(*_: Any) -> Any:
+    def no_space(*_):
         tried.append(clock[0])
         raise StorageFull("database")
 
@@ -125,7 +119,7 @@ def test_a_job_that_the_disk_stops_is_held_back_longer_each_time(
         assert row_of(ground, job)["state"] in ("done", "queued")
 
 
-def test_a_job_is_done_once_the_disk_has_space(downlink: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_job_is_done_once_the_disk_has_space(downlink, tmp_path, monkeypatch):
     with open_ground(tmp_path) as ground:
         job = enter(ground, downlink)
         dispatcher = ThreadDispatcher(ground)
@@ -141,9 +135,7 @@ def test_a_job_is_done_once_the_disk_has_space(downlink: Path, tmp_path: Path, m
         dispatcher.close()
 
 
-def test_replays_are_separate_jobs_and_the_verdict_follows(
-    redis_url: str, make_flyable: Callable, make_build: Callable, tmp_path: Path
-):
+def test_replays_are_separate_jobs_and_the_verdict_follows(redis_url, make_flyable, make_build, tmp_path):
     flown = {f"synthetic pass {seed}": make_flyable(frames=10, seed=seed) for seed in (61, 62)}
     packets = {name: one.packets for name, one in flown.items()}
     home = tmp_path / "home"
@@ -171,27 +163,27 @@ def test_replays_are_separate_jobs_and_the_verdict_follows(
 SPACECRAFT = 76
 
 
-def stream_of(spacecraft: int = SPACECRAFT) -> bytes:
+def stream_of(spacecraft=SPACECRAFT):
     return encode_cadus([event_packet(k << 16, k, "boot") for k in range(1, 41)], spacecraft_id=spacecraft)
 
 
-def ingest(ground: Ground, octets: bytes, **stated: Any) -> None:
+def ingest(ground, octets, **stated):
     path = ground.home / "d.cadu"
     path.write_bytes(octets)
     ingest_file(ground, path, **stated)
 
 
-@pytest.mark.parametrize(
-    "stated",
-    [{"spacecraft_id": SPACECRAFT}, {"spacecraft_id": SPACECRAFT, "place": Place("s", 100)}, {"instance": "twin"}],
-)
-def test_what_was_stated_with_a_downlink_holds_for_its_verification(ground: Ground, stated: dict[str, Any]):
+HERE = {"spacecraft_id": SPACECRAFT}
+
+
+@pytest.mark.parametrize("stated", [HERE, {**HERE, "place": PiecePosition("s", 100)}, {"instance": "twin"}])
+def test_what_was_stated_with_a_downlink_holds_for_its_verification(ground, stated):
     """A spacecraft filter excludes the same packets; pieces with a position are joined by position."""
     octets = stream_of() + stream_of(SPACECRAFT + 1)
     place = stated.pop("place", None)
     cuts = [0, len(octets)] if place is None else [*range(0, 1200, 60), len(octets)]
     for start, stop in reversed(list(itertools.pairwise(cuts))):
-        stands = None if place is None else Place(place.stream, place.offset + start)
+        stands = None if place is None else PiecePosition(place.stream, place.offset + start)
         ingest(ground, octets[start:stop], place=stands, **stated)
     result = verify(ground, rebuild=True)
     assert (result.verdict, result.damaged) == ("intact", [])
@@ -204,7 +196,7 @@ def test_what_was_stated_with_a_downlink_holds_for_its_verification(ground: Grou
         ("DELETE FROM rollups WHERE level = 6", "expected this row, found none"),
     ],
 )
-def test_a_damaged_row_is_named(either: Ground, damage: str, reason: str):
+def test_a_damaged_row_is_named(either, damage, reason):
     values = {field.name: 1 for field in DICTIONARY.packet("housekeeping").fields}
     packet = DICTIONARY.pack("housekeeping", values, ticks=1 << 16, sequence_count=0)
     ingest(either, encode_cadus([packet], spacecraft_id=SPACECRAFT))
@@ -215,7 +207,7 @@ def test_a_damaged_row_is_named(either: Ground, damage: str, reason: str):
     assert verify(either).damaged == []
 
 
-def test_an_ingest_before_version_1_has_no_piece(either: Ground):
+def test_an_ingest_before_version_1_has_no_piece(either):
     """The spacecraft of the ingest selects the frames."""
     ingest(either, stream_of() + stream_of(SPACECRAFT + 1), spacecraft_id=SPACECRAFT)
     with either.database.writing() as connection:
@@ -223,7 +215,7 @@ def test_an_ingest_before_version_1_has_no_piece(either: Ground):
     assert verify(either, rebuild=True).damaged == []
 
 
-def test_sums_of_roll_ups_may_differ_by_the_order_of_addition(ground: Ground):
+def test_sums_of_roll_ups_may_differ_by_the_order_of_addition(ground):
     row = np.array([3.0, 0.6, 0.1, 0.3, 0.0, 0.0, np.inf, -np.inf])
     for index, change, same in ((1, 1e-16, True), (1, 1e-6, False), (3, 1e-16, False), (0, 1.0, False)):
         other = row.copy()
@@ -232,7 +224,7 @@ def test_sums_of_roll_ups_may_differ_by_the_order_of_addition(ground: Ground):
         assert same_values(ROLLUPS, *pair) == same
 
 
-def test_a_rebuild_writes_nothing_to_the_archive(either: Ground):
+def test_a_rebuild_writes_nothing_to_the_archive(either):
     ingest(either, stream_of())
     with either.database.snapshot() as connection:
         before = table_digests(connection)

@@ -4,11 +4,8 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 from unittest.mock import MagicMock
 
 import pytest
@@ -16,7 +13,7 @@ import pytest
 from ground_service.contacts.commanding.service import enter_command, note_timeouts, release_command, take_uplink
 from ground_service.errors import DatabaseNotMigrated, SettingsError
 from ground_service.evaluation.service import pass_summary
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
@@ -33,17 +30,17 @@ from tests.serving import wait_for
 SPACECRAFT = 76
 
 
-def job_row(ground: Ground, job_id: str) -> dict[str, Any]:
+def job_row(ground, job_id):
     return ground.read(repository.get, repository.JOBS, job_id, "job")
 
 
-def finished(ground: Ground, job_id: str) -> dict[str, Any]:
+def finished(ground, job_id):
     wait_for(lambda: job_row(ground, job_id)["state"] in ("done", "failed"), f"the end of job {job_id}")
     return job_row(ground, job_id)
 
 
 @pytest.fixture(scope="module")
-def upgraded(postgres_url: str) -> str:
+def upgraded(postgres_url):
     with pytest.raises(DatabaseNotMigrated, match="run 'linna db upgrade'"):
         prepare_database(postgres_url)
     prepare_database(postgres_url, upgrade=True).engine.dispose()
@@ -51,12 +48,12 @@ def upgraded(postgres_url: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def ground_on_postgres(upgraded: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ground]:
+def ground_on_postgres(upgraded, tmp_path_factory):
     with open_ground(tmp_path_factory.mktemp("pg") / "home", database_url=upgraded) as ground:
         yield ground
 
 
-def test_the_archive_is_the_same_as_on_sqlite(ground_on_postgres: Ground, ground: Ground, synthetic_pass: Any):
+def test_the_archive_is_the_same_as_on_sqlite(ground_on_postgres, ground, synthetic_pass):
     stream = synthetic_pass.folder / "downlink.cadu"
     hashes = []
     for one in (ground, ground_on_postgres):
@@ -68,9 +65,7 @@ def test_the_archive_is_the_same_as_on_sqlite(ground_on_postgres: Ground, ground
     assert hashes[0] == hashes[1]
 
 
-def test_a_worker_makes_the_report(
-    ground_on_postgres: Ground, redis_url: str, upgraded: str, synthetic_pass: Any, tmp_path: Path
-):
+def test_a_worker_makes_the_report(ground_on_postgres, redis_url, upgraded, synthetic_pass, tmp_path):
     """The worker is another process; a job entered while it is away is done when it comes."""
     ground = ground_on_postgres
     settings = Settings(home=ground.home, database_url=upgraded, broker_url=redis_url)
@@ -101,7 +96,7 @@ def test_a_worker_makes_the_report(
     assert report["summary"]["packets"] == pass_summary(ground, pass_id)["packets"]
 
 
-def test_time_outs_are_found_on_a_server_as_well(ground_on_postgres: Ground):
+def test_time_outs_are_found_on_a_server_as_well(ground_on_postgres):
     ground = ground_on_postgres
     command = enter_command(ground, "test_connection", {}, spacecraft_id=SPACECRAFT, timeout_s=7, actor="ann")
     release_command(ground, command, actor="ann")
@@ -113,13 +108,13 @@ def test_time_outs_are_found_on_a_server_as_well(ground_on_postgres: Ground):
     assert note_timeouts(ground, 10**18, 10**18 + 7 * 10**9 + 1) == [command]
 
 
-def test_a_worker_without_a_broker_is_refused(tmp_path: Path):
+def test_a_worker_without_a_broker_is_refused(tmp_path):
     for use in (run_worker, worker_answers):
         with pytest.raises(SettingsError, match="LINNA_BROKER_URL: expected a broker"):
             use(Settings(home=tmp_path))
 
 
-def test_jobs_that_the_broker_lost_are_sent_again(ground_on_postgres: Ground, redis_url: str, upgraded: str):
+def test_jobs_that_the_broker_lost_are_sent_again(ground_on_postgres, redis_url, upgraded):
     """The queue is emptied as if the broker had been killed; a job that somebody is doing is left to him."""
     import redis
 
@@ -142,7 +137,7 @@ def test_jobs_that_the_broker_lost_are_sent_again(ground_on_postgres: Ground, re
     assert run_job(ground, lost).error == "pass 4712: not found"
 
 
-def use_queue(monkeypatch: pytest.MonkeyPatch, **answer: Any) -> None:
+def use_queue(monkeypatch, **answer):
     """Let the queue of the broker give this answer."""
     connection = MagicMock()
     connection.__enter__.return_value.default_channel.client.lrange = MagicMock(**answer)
@@ -150,15 +145,13 @@ def use_queue(monkeypatch: pytest.MonkeyPatch, **answer: Any) -> None:
     monkeypatch.setattr(app_module, "_app_of", lambda _: SimpleNamespace(connection_for_read=lambda: connection))
 
 
-def test_messages_of_other_programs_in_the_queue_are_no_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_messages_of_other_programs_in_the_queue_are_no_jobs(tmp_path, monkeypatch):
     messages = [b'{"headers": {"linna-job": "a1"}}', b"{}", b'{"headers": {}}', b"[1]", b"nothing"]
     use_queue(monkeypatch, return_value=messages)
     assert queued_jobs(Settings(home=tmp_path)) == ["a1"]
 
 
-def test_a_broker_that_breaks_off_is_a_broker_that_is_away(
-    ground: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_broker_that_breaks_off_is_a_broker_that_is_away(ground, tmp_path, monkeypatch):
     import redis
 
     log = MagicMock()
@@ -170,7 +163,7 @@ def test_a_broker_that_breaks_off_is_a_broker_that_is_away(
     assert text % error == "the broker is away: reset by peer"
 
 
-def test_a_broker_that_is_away_refuses_nothing(ground: Ground, tmp_path: Path):
+def test_a_broker_that_is_away_refuses_nothing(ground, tmp_path):
     settings = Settings(home=tmp_path, broker_url="redis://127.0.0.1:1/0")
     dispatcher = dispatcher_for(ground, settings)
     job = dispatcher.submit("report", {"pass_id": 1})
@@ -178,7 +171,7 @@ def test_a_broker_that_is_away_refuses_nothing(ground: Ground, tmp_path: Path):
     assert job_row(ground, job)["state"] == "queued"
 
 
-def test_two_files_that_are_ingested_at_once_are_joined(ground_on_postgres: Ground, synthetic_pass: Any):
+def test_two_files_that_are_ingested_at_once_are_joined(ground_on_postgres, synthetic_pass):
     """The packets that the cut between them goes through belong to neither, and come to light in any order."""
     octets = (synthetic_pass.folder / "downlink.cadu").read_bytes()
     cadu = 1279

@@ -7,11 +7,10 @@ from unittest.mock import Mock
 
 import pytest
 
+from ground_service.client.connection import Conflict as ClientConflict
 from ground_service.client.local import local_client
-from ground_service.client.problems import Conflict as ClientConflict
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, DatabaseUnavailable, FileDamaged, InvalidInput, StorageFull, public_text
-from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import enter_ingest
 from ground_service.jobs.service import add_job, enter_job, unfinished_jobs
@@ -27,17 +26,17 @@ Row = dict[str, Any]
 
 
 @pytest.fixture
-def job_that(monkeypatch: pytest.MonkeyPatch, ground: Ground) -> Any:
+def job_that(monkeypatch, ground):
     """A function that enters a job with the given work."""
 
-    def enter(work: Any) -> str:
+    def enter(work):
         monkeypatch.setitem(jobs.WORK, "nightly", work)
         return enter_job(ground, "nightly", {})
 
     return enter
 
 
-def row_of(ground: Ground, job: str) -> Row:
+def row_of(ground, job):
     return ground.read(repository.get, repository.JOBS, job, "job")
 
 
@@ -53,9 +52,7 @@ MISSING = FileNotFoundError(errno.ENOENT, "No such file or directory", "/srv/lin
         (InvalidInput("/srv/linna/a.zip", "", "a zip", "none"), "a.zip: expected a zip, found none"),
     ],
 )  # fmt: skip
-def test_whatever_error_a_job_meets_it_ends_as_failed_and_is_not_repeated(
-    ground: Ground, job_that: Any, error: Exception, shown: str
-):
+def test_whatever_error_a_job_meets_it_ends_as_failed_and_is_not_repeated(ground, job_that, error, shown):
     work = Mock(side_effect=error)
     job = job_that(work)
     for _ in range(3):
@@ -64,16 +61,16 @@ def test_whatever_error_a_job_meets_it_ends_as_failed_and_is_not_repeated(
     assert ground.read(unfinished_jobs) == []
 
 
-def test_a_failed_ingest_is_repeated_with_longer_and_longer_waits(either: Ground, monkeypatch: pytest.MonkeyPatch):
-    """What was acknowledged is done when its cause is gone, at most 85 minutes later without anybody."""
+def test_a_failed_ingest_is_repeated_with_longer_and_longer_waits(either, monkeypatch):
+    """An acknowledged ingest is done at most 85 minutes after its cause is gone, without anybody."""
     work, waits_min = Mock(side_effect=[*[FileNotFoundError("gone")] * 5, {}]), (1, 4, 16, 64)
     monkeypatch.setitem(jobs.WORK, "ingest", work)
     monkeypatch.setitem(jobs.WORK, "report", work)
     job, other = (enter_job(either, kind, {"pass_id": 1, "ingest_id": 1}) for kind in ("ingest", "report"))
     scheduler = Scheduler(either, InlineDispatcher(either), lambda: None, {"retention_days": 90})
     assert run_job(either, other).state == run_job(either, job).state == "failed"
-    told = complaints(read_condition(either, None))
-    assert "1 ingests have failed; repeat or dismiss them on the page Shift." in told
+    shown = complaints(read_condition(either, None))
+    assert "1 ingests have failed; repeat or dismiss them on the page Shift." in shown
     for attempt, minutes in enumerate(waits_min, start=1):
         for passed_min, attempts in ((minutes - 0.5, attempt), (minutes, attempt + 1)):
             since = utc_now_ns() - int(passed_min * 60e9)
@@ -84,7 +81,7 @@ def test_a_failed_ingest_is_repeated_with_longer_and_longer_waits(either: Ground
     assert (row_of(either, job)["state"], row_of(either, other)["attempts"]) == ("done", 1)
 
 
-def test_a_failed_job_is_repeated_by_one_action(ground: Ground, job_that: Any, monkeypatch: pytest.MonkeyPatch):
+def test_a_failed_job_is_repeated_by_one_action(ground, job_that, monkeypatch):
     job = job_that(lambda *_: {}["missing"])
     assert run_job(ground, job).state == "failed"
     monkeypatch.setitem(jobs.WORK, "nightly", lambda *_: {"repeated": True})
@@ -97,7 +94,7 @@ def test_a_failed_job_is_repeated_by_one_action(ground: Ground, job_that: Any, m
             client.delete_job(job)
 
 
-def test_a_failed_ingest_is_dismissed(ground: Ground, job_that: Any):
+def test_a_failed_ingest_is_dismissed(ground, job_that):
     job = job_that(lambda *_: {}["missing"])
     run_job(ground, job)
     with local_client(ground, "ann") as client:
@@ -106,16 +103,14 @@ def test_a_failed_ingest_is_dismissed(ground: Ground, job_that: Any):
         assert next(iter(client.list_audit(action="dismiss job"))).target == job
 
 
-def test_the_traceback_of_an_unexpected_error_is_in_the_log(
-    ground: Ground, job_that: Any, caplog: pytest.LogCaptureFixture
-):
+def test_the_traceback_of_an_unexpected_error_is_in_the_log(ground, job_that, caplog):
     job = job_that(lambda *_: {}["missing"])
     run_job(ground, job)
     [record] = [one for one in caplog.records if one.levelname == "ERROR"]
     assert record.exc_info is not None and job in record.getMessage()
 
 
-def test_a_full_disk_is_no_fault_of_the_job(ground: Ground, job_that: Any):
+def test_a_full_disk_is_no_fault_of_the_job(ground, job_that):
     job = job_that(Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
     with pytest.raises(StorageFull):
         run_job(ground, job)
@@ -123,15 +118,15 @@ def test_a_full_disk_is_no_fault_of_the_job(ground: Ground, job_that: Any):
     assert (row["state"], row["attempts"]) == ("queued", 0)
 
 
-def test_a_result_that_the_database_cannot_hold_fails_the_job(ground: Ground, job_that: Any):
+def test_a_result_that_the_database_cannot_hold_fails_the_job(ground, job_that):
     row = run_job(ground, job_that(lambda *_: {"median": float("nan")}))
     assert row.state == "failed" and "JSON" in row.error
 
 
-def test_an_attempt_that_another_has_overtaken_changes_nothing(ground: Ground, job_that: Any):
+def test_an_attempt_that_another_has_overtaken_changes_nothing(ground, job_that):
     """This occurs after a network failure, if the database grants the lock of the first worker to a second one."""
 
-    def work(_ground: Ground, _arguments: Any, job_id: str) -> Row:
+    def work(_ground, _arguments, job_id):
         ground.write(move, JOB, job_id, "running", attempts=2)
         return {"made by": "the first"}
 
@@ -139,7 +134,7 @@ def test_an_attempt_that_another_has_overtaken_changes_nothing(ground: Ground, j
     assert (row.state, row.attempts, row.result) == ("running", 2, None)
 
 
-def test_an_id_that_stands_for_another_request_is_refused(ground: Ground):
+def test_an_id_that_stands_for_another_request_is_refused(ground):
     enter_job(ground, "report", {"pass_id": 1}, job_id="a" * 32)
     assert enter_job(ground, "report", {"pass_id": 1}, job_id="a" * 32) == "a" * 32
     for kind, arguments in (("report", {"pass_id": 2}), ("nightly", {})):
@@ -147,7 +142,7 @@ def test_an_id_that_stands_for_another_request_is_refused(ground: Ground):
             ground.write(add_job, kind, arguments, job_id="a" * 32)
 
 
-def test_an_ingest_asked_for_twice_is_one_and_of_another_file_is_refused(ground: Ground):
+def test_an_ingest_asked_for_twice_is_one_and_of_another_file_is_refused(ground):
     one, other = (ground.files.put_octets(octets) for octets in (b"one", b"other"))
     given = {"spacecraft_id": 76, "instance": "flight", "job_id": "b" * 32}
     first = enter_ingest(ground, one, "one", **given)
@@ -168,7 +163,7 @@ def test_an_ingest_asked_for_twice_is_one_and_of_another_file_is_refused(ground:
         (InvalidInput("x", "", "a number from 0/1 to 3", "and/or"), "x: expected a number from 0/1 to 3, found and/or"),
     ],
 )  # fmt: skip
-def test_what_is_shown_of_an_error_is_one_line_without_places_of_the_server(error: Exception, shown: str):
+def test_what_is_shown_of_an_error_is_one_line_without_places_of_the_server(error, shown):
     assert public_text(error) == shown
 
 

@@ -9,28 +9,23 @@ import ssl
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import ip_network
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
 from ground_service.access.store import audit_head
 from ground_service.errors import InvalidInput
-from ground_service.ground import Ground, open_ground
-from ground_service.jobs.model import Job, JobFilter
-from ground_service.jobs.service import get_job, list_jobs
+from ground_service.ground import open_ground
+from ground_service.jobs.service import JobFilter, get_job, list_jobs
 from ground_service.missions.automation import Channel
 from ground_service.missions.service import add_mission
 from ground_service.settings import load_settings
 from ground_service.store.audit import Head
 from ground_service.store.event_kinds import (
     AlarmChanged,
-    Event,
     LimitsBroken,
     PassEvaluated,
     RegressionJudged,
@@ -52,9 +47,7 @@ from tests.ground_service.conftest import wait_for
 HERE = (ip_network("127.0.0.1"),)
 
 
-def send(
-    folder: Path, channel: Channel, key: str = "id", document: Any = None, networks: Any = HERE, **how: Any
-) -> int:
+def send(folder, channel, key="id", document=None, networks=HERE, **how):
     """Send over a channel without waits; the receivers of these tests are on this machine."""
     waits = {"wait": lambda _seconds: None} | how
     return send_to(folder, channel, key, "subject", document or {}, networks=networks, **waits)
@@ -63,20 +56,20 @@ def send(
 class Webhook:
     """Receiver that answers with the given statuses, then 200, and keeps what it was sent."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.statuses, self.received = [], []
         self.answered = lambda: None
         receiver = self
 
         class Handler(BaseHTTPRequestHandler):
-            def do_POST(self) -> None:
+            def do_POST(self):
                 body = self.rfile.read(int(self.headers["Content-Length"]))
                 receiver.received.append((dict(self.headers), body))
                 receiver.answered()
                 self.send_response(receiver.statuses.pop(0) if receiver.statuses else 200)
                 self.end_headers()
 
-            def log_message(self, *_: Any) -> None:
+            def log_message(self, *_):
                 pass
 
         self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
@@ -86,14 +79,14 @@ class Webhook:
 class Mailbox:
     """SMTP server (RFC 5321) that keeps the envelopes and messages; `refusal` is its answer to recipients."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.received = []
         self.refusal = ""
         self.tls = None
         mailbox = self
 
         class Handler(socketserver.StreamRequestHandler):
-            def handle(self) -> None:
+            def handle(self):
                 self.say("220 mailbox")
                 recipients = []
                 while line := self.rfile.readline().decode().strip():
@@ -122,7 +115,7 @@ class Mailbox:
                     else:
                         self.say("250 ok")
 
-            def say(self, text: str) -> None:
+            def say(self, text):
                 self.wfile.write(f"{text}\r\n".encode())
 
         self.server = socketserver.ThreadingTCPServer(("127.0.0.1", 0), Handler)
@@ -130,7 +123,7 @@ class Mailbox:
 
 
 @contextlib.contextmanager
-def running(server: socketserver.ThreadingTCPServer) -> Iterator[str]:
+def running(server):
     """Serve in a thread; give the address."""
     server.daemon_threads = True
     with server:
@@ -140,20 +133,20 @@ def running(server: socketserver.ThreadingTCPServer) -> Iterator[str]:
 
 
 @pytest.fixture
-def webhook() -> Iterator[Webhook]:
+def webhook():
     receiver = Webhook()
     with running(receiver.server):
         yield receiver
 
 
 @pytest.fixture
-def mailbox() -> Iterator[Mailbox]:
+def mailbox():
     receiver = Mailbox()
     with running(receiver.server):
         yield receiver
 
 
-def test_a_webhook_gets_a_signed_document_with_its_id(webhook: Webhook, tmp_path: Path):
+def test_a_webhook_gets_a_signed_document_with_its_id(webhook, tmp_path):
     (tmp_path / "secrets").mkdir()
     (tmp_path / "secrets" / "hook").write_text("key\n")
     channel = Channel(webhook=webhook.url, signing_secret="hook")
@@ -166,33 +159,33 @@ def test_a_webhook_gets_a_signed_document_with_its_id(webhook: Webhook, tmp_path
     )
 
 
-def test_a_webhook_that_is_out_of_order_is_tried_again_with_the_same_id(webhook: Webhook, tmp_path: Path):
+def test_a_webhook_that_is_out_of_order_is_tried_again_with_the_same_id(webhook, tmp_path):
     webhook.statuses = [503, 500]
     assert send(tmp_path, Channel(webhook=webhook.url), "id-2") == ATTEMPTS
     assert {headers["Idempotency-Key"] for headers, _ in webhook.received} == {"id-2"}
 
 
-def test_a_refused_message_is_not_tried_again(webhook: Webhook, tmp_path: Path):
+def test_a_refused_message_is_not_tried_again(webhook, tmp_path):
     webhook.statuses = [404]
     with pytest.raises(NotDelivered, match="status 404"):
         send(tmp_path, Channel(webhook=webhook.url))
     assert len(webhook.received) == 1
 
 
-def test_a_receiver_that_is_away_is_named_after_all_attempts(tmp_path: Path):
+def test_a_receiver_that_is_away_is_named_after_all_attempts(tmp_path):
     waited = []
     with pytest.raises(NotDelivered, match=f"not delivered in {ATTEMPTS} attempts: ConnectError"):
         send(tmp_path, Channel(webhook="http://127.0.0.1:9/"), wait=waited.append)
     assert waited == [1.0, 2.0]
 
 
-def test_a_missing_key_is_stated(tmp_path: Path):
+def test_a_missing_key_is_stated(tmp_path):
     channel = Channel(webhook="http://127.0.0.1:9/", signing_secret="hook")
     with pytest.raises(InvalidInput, match="signing_secret, hook: expected a file in secrets of the service"):
         send(tmp_path, channel)
 
 
-def test_an_e_mail_reaches_all_recipients(mailbox: Mailbox, tmp_path: Path):
+def test_an_e_mail_reaches_all_recipients(mailbox, tmp_path):
     channel = Channel(email=("a@b.example", "c@d.example"), smtp=mailbox.address, sender="ground@x.example")
     assert send(tmp_path, channel, "id-3", {"event": 3, "pass": None}) == 1
     [(recipients, message)] = mailbox.received
@@ -201,7 +194,7 @@ def test_an_e_mail_reaches_all_recipients(mailbox: Mailbox, tmp_path: Path):
     assert "event: 3" in message and "pass" not in message.partition("\r\n\r\n")[2]
 
 
-def test_a_mail_server_that_refuses_every_recipient_is_stated(mailbox: Mailbox, tmp_path: Path):
+def test_a_mail_server_that_refuses_every_recipient_is_stated(mailbox, tmp_path):
     mailbox.refusal = "550 unknown"
     channel = Channel(email=("a@b.example",), smtp=mailbox.address)
     with pytest.raises(NotDelivered, match="SMTPRecipientsRefused"):
@@ -209,17 +202,15 @@ def test_a_mail_server_that_refuses_every_recipient_is_stated(mailbox: Mailbox, 
 
 
 @pytest.fixture
-def local(tmp_path: Path) -> Iterator[Ground]:
+def local(tmp_path):
     """A service that may send to this machine."""
     with open_ground(tmp_path / "home") as opened:
         yield replace(opened, networks=HERE)
 
 
 @pytest.mark.parametrize("offers_tls", [False, True])
-def test_a_public_mail_server_needs_tls_with_its_certificate(
-    mailbox: Mailbox, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, offers_tls: bool
-):
-    """What is sent to the internet is neither readable on the way nor given to another server."""
+def test_a_public_mail_server_needs_tls_with_its_certificate(mailbox, monkeypatch, tmp_path, offers_tls):
+    """A message to the internet is neither readable on the way nor given to another server."""
     if offers_tls:
         environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(tmp_path)}
         subprocess.run(["sh", "deploy/secrets.sh"], check=True, env=environment, capture_output=True)
@@ -227,8 +218,8 @@ def test_a_public_mail_server_needs_tls_with_its_certificate(
         mailbox.tls.load_cert_chain(tmp_path / "tls/certificate", tmp_path / "tls/key")
     monkeypatch.setattr(outgoing.ipaddress.IPv4Address, "is_global", property(lambda _: True))
     channel = Channel(email=("a@b.example",), smtp=mailbox.address)
-    told = "SSLCertVerificationError" if offers_tls else "expected a mail server with STARTTLS"
-    with pytest.raises(NotDelivered, match=told):
+    message = "SSLCertVerificationError" if offers_tls else "expected a mail server with STARTTLS"
+    with pytest.raises(NotDelivered, match=message):
         send(tmp_path, channel)
     assert mailbox.received == []
 
@@ -238,7 +229,7 @@ class Dripping(socketserver.StreamRequestHandler):
 
     octets = b"HTTP/1.1 200 OK\r\nX: "
 
-    def handle(self) -> None:
+    def handle(self):
         with contextlib.suppress(OSError):
             self.wfile.write(self.octets)
             for _ in range(200):
@@ -251,7 +242,7 @@ class DrippingMail(Dripping):
 
 
 @pytest.mark.parametrize("handler", [Dripping, DrippingMail])
-def test_a_receiver_that_drips_is_left_after_the_deadline(handler: type[Dripping], tmp_path: Path):
+def test_a_receiver_that_drips_is_left_after_the_deadline(handler, tmp_path):
     with running(socketserver.ThreadingTCPServer(("127.0.0.1", 0), handler)) as place:
         mail = Channel(email=("a@b.example",), smtp=place)
         channel = Channel(webhook=f"http://{place}/") if handler is Dripping else mail
@@ -259,11 +250,11 @@ def test_a_receiver_that_drips_is_left_after_the_deadline(handler: type[Dripping
             send(tmp_path, channel, deadline_s=0.3)
 
 
-def test_the_body_of_an_answer_is_not_read(tmp_path: Path):
+def test_the_body_of_an_answer_is_not_read(tmp_path):
     sent = 0
 
     class Endless(socketserver.StreamRequestHandler):
-        def handle(self) -> None:
+        def handle(self):
             nonlocal sent
             self.rfile.readline()
             self.wfile.write(b"HTTP/1.1 200 OK\r\nContent-Length: 1000000000\r\n\r\n")
@@ -279,7 +270,7 @@ def test_the_body_of_an_answer_is_not_read(tmp_path: Path):
 @pytest.mark.parametrize(
     "host", ["127.0.0.1", "localhost", "::1", "::ffff:10.0.0.1", "10.1.2.3", "169.254.169.254", "0.0.0.0", "224.0.0.1"]
 )
-def test_an_address_that_is_not_public_is_refused(host: str):
+def test_an_address_that_is_not_public_is_refused(host):
     with pytest.raises(NotDelivered, match="expected a public address or one of LINNA_NOTIFY_NETWORKS"):
         permitted_address(host, 80, ())
 
@@ -289,15 +280,13 @@ def test_a_public_address_and_a_listed_network_are_permitted():
     assert permitted_address("10.1.2.3", 443, (ip_network("10.0.0.0/8"),)) == "10.1.2.3"
 
 
-def test_one_private_address_of_several_refuses_a_name_and_the_checked_address_is_used(
-    webhook: Webhook, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_one_private_address_of_several_refuses_a_name_and_the_checked_address_is_used(webhook, tmp_path, monkeypatch):
     """A name server could answer the second question with another address."""
     asked = []
     answers = [["1.1.1.1", "10.0.0.1"], ["127.0.0.1"]]
     resolve = socket.getaddrinfo
 
-    def found(host: Any, port: int, *given: Any, **how: Any) -> list[Any]:
+    def found(host, port, *given, **how):
         if host != "ops.example":
             return resolve(host, port, *given, **how)
         asked.append(host)
@@ -311,25 +300,23 @@ def test_one_private_address_of_several_refuses_a_name_and_the_checked_address_i
     assert asked == ["ops.example"] * 2 and webhook.received[0][0]["Host"].startswith("ops.example:")
 
 
-def test_the_networks_are_a_setting(monkeypatch: pytest.MonkeyPatch):
+def test_the_networks_are_a_setting(monkeypatch):
     monkeypatch.setenv("LINNA_NOTIFY_NETWORKS", "127.0.0.1, 10.0.0.0/8")
     assert load_settings().notify_networks == ("127.0.0.1", "10.0.0.0/8")
     monkeypatch.delenv("LINNA_NOTIFY_NETWORKS")
     assert load_settings().notify_networks == ()
 
 
-def add_hook(ground: Ground, webhook: Webhook, more: str = "") -> None:
+def add_hook(ground, webhook, more=""):
     text = f'name = "m"\n[spacecraft]\nid = 76\n[notify.hook]\nwebhook = "{webhook.url}"\n{more}'
     add_mission(ground, text.encode())
 
 
-def add_channels(ground: Ground, webhook: Webhook, mailbox: Mailbox) -> None:
+def add_channels(ground, webhook, mailbox):
     add_hook(ground, webhook, f'[notify.people]\nemail = ["a@b.example"]\nsmtp = "{mailbox.address}"\n')
 
 
-def test_signed_heads_that_a_webhook_and_an_e_mail_got_are_checked(
-    webhook: Webhook, mailbox: Mailbox, local: Ground, tmp_path: Path
-):
+def test_signed_heads_that_a_webhook_and_an_e_mail_got_are_checked(webhook, mailbox, local, tmp_path):
     add_channels(local, webhook, mailbox)
     (local.home / "secrets").mkdir()
     (local.home / "secrets/audit").write_text("key")
@@ -345,12 +332,12 @@ def test_signed_heads_that_a_webhook_and_an_e_mail_got_are_checked(
         nightly(local, {"audit_heads": "channel:none"})
 
 
-def notifications(ground: Ground) -> list[Job]:
+def notifications(ground):
     """Jobs of notifications, newest first."""
     return list(ground.read(list_jobs, JobFilter(kind="notification")).items)
 
 
-def test_every_receiver_is_notified_also_if_another_one_fails(webhook: Webhook, mailbox: Mailbox, local: Ground):
+def test_every_receiver_is_notified_also_if_another_one_fails(webhook, mailbox, local):
     follow_in_process(local)
     add_channels(local, webhook, mailbox)
     local.write(publish, RegressionJudged(id="1" * 32, verdict="fail"))
@@ -375,11 +362,11 @@ def test_every_receiver_is_notified_also_if_another_one_fails(webhook: Webhook, 
     assert (failed.error or "").startswith("hook of spacecraft 76: the webhook refuses the message")
 
 
-def broken(spacecraft: int) -> dict[str, Any]:
+def broken(spacecraft):
     return {"spacecraft_id": spacecraft, "instance": "flight", "parameter": "voltage", "limit_state": "low"}
 
 
-def raised(vehicle: int = 1, state: str = "raised") -> Event:
+def raised(vehicle=1, state="raised"):
     return AlarmChanged(id=1, vehicle_id=vehicle, name="voltage", severity="alarm", state=state)
 
 
@@ -394,9 +381,7 @@ def raised(vehicle: int = 1, state: str = "raised") -> Event:
         (WindowChanged(id=1, state="executed"), []), (WindowChanged(id=9, state="failed"), []),
     ],
 )  # fmt: skip
-def test_receivers_get_the_events_of_their_spacecraft_that_a_person_needs(
-    webhook: Webhook, local: Ground, monkeypatch: pytest.MonkeyPatch, event: Event, texts: list[str]
-):
+def test_receivers_get_the_events_of_their_spacecraft_that_a_person_needs(webhook, local, monkeypatch, event, texts):
     follow_in_process(local)
     add_hook(local, webhook)
     with local.database.writing() as connection:
@@ -413,7 +398,7 @@ def test_receivers_get_the_events_of_their_spacecraft_that_a_person_needs(
     assert [json.loads(body)["text"] for _, body in webhook.received] == texts
 
 
-def test_a_slow_receiver_does_not_hold_up_other_jobs(local: Ground, webhook: Webhook):
+def test_a_slow_receiver_does_not_hold_up_other_jobs(local, webhook):
     """The embedded service does notifications in a thread of their own."""
     held = threading.Event()
     webhook.answered = lambda: held.wait(60.0)
@@ -423,7 +408,7 @@ def test_a_slow_receiver_does_not_hold_up_other_jobs(local: Ground, webhook: Web
         add_hook(local, webhook)
         local.write(publish, RegressionJudged(id="1" * 32, verdict="fail"))
 
-        def kinds(state: str) -> list[str]:
+        def kinds(state):
             return [one.kind for one in local.read(list_jobs, JobFilter()).items if one.state == state]
 
         wait_for(lambda: "notification" in kinds("running"), "the notification")

@@ -4,16 +4,13 @@ import os
 import subprocess
 import sys
 import uuid
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from ground_service.app import create_app
 from ground_service.errors import ObjectsUnavailable
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import enter_job
@@ -27,24 +24,24 @@ from ground_service.worker.backup import backup, restore
 from ground_service.worker.follow_up import follow_in_process
 from ground_service.worker.integrity import verify
 from ground_service.worker.jobs import run_job
-from tests.ground_service.object_server import ObjectServer, running_objects
+from tests.ground_service.object_server import running_objects
 from tests.serving import TestClient, wait_for
 
 OWN = {"Origin": "http://testserver"}
 
 
 @pytest.fixture
-def server() -> Iterator[ObjectServer]:
+def server():
     with running_objects(f"path-{uuid.uuid4().hex[:8]}") as running:
         yield running
 
 
 @pytest.fixture
-def opened(server: ObjectServer, tmp_path: Path) -> Iterator[Callable[..., Ground]]:
+def opened(server, tmp_path):
     """A function that opens the service on a host with its own folder; by default with a database there."""
     made = []
 
-    def make(host: str, database_url: str | None = None, folder: str = "") -> Ground:
+    def make(host, database_url=None, folder=""):
         objects = server.store().under(folder) if folder else server.store()
         made.append(open_ground(tmp_path / host, database_url=database_url, objects=objects))
         follow_in_process(made[-1])
@@ -56,7 +53,7 @@ def opened(server: ObjectServer, tmp_path: Path) -> Iterator[Callable[..., Groun
 
 
 @contextmanager
-def worker(home: Path, environment: dict[str, str]) -> Iterator[None]:
+def worker(home, environment):
     """A worker on a host with this folder, while the context lasts."""
     home.mkdir(exist_ok=True)
     with (home.parent / f"{home.name}.log").open("ab") as log:
@@ -71,11 +68,11 @@ def worker(home: Path, environment: dict[str, str]) -> Iterator[None]:
             process.wait(60)
 
 
-def job_of(ground: Ground, key: str) -> dict[str, Any]:
+def job_of(ground, key):
     return ground.read(repository.get, repository.JOBS, key, "job")
 
 
-def result_of(ground: Ground, key: str) -> dict[str, Any]:
+def result_of(ground, key):
     wait_for(lambda: job_of(ground, key)["state"] in ("done", "failed"), f"the end of job {key}")
     row = job_of(ground, key)
     assert row["state"] == "done", row
@@ -84,12 +81,7 @@ def result_of(ground: Ground, key: str) -> dict[str, Any]:
 
 @pytest.mark.campaign
 def test_upload_report_and_regression_on_hosts_without_a_common_folder(
-    server: ObjectServer,
-    migrated_postgres: Callable[[], str],
-    redis_url: str,
-    make_flyable: Callable[..., Any],
-    make_build: Callable[..., Path],
-    tmp_path: Path,
+    server, migrated_postgres, redis_url, make_flyable, make_build, tmp_path
 ):
     common = {"database_url": migrated_postgres(), "broker_url": redis_url}
     environment = {f"LINNA_{name.upper()}": value for name, value in common.items()} | server.environment()
@@ -128,14 +120,12 @@ def test_upload_report_and_regression_on_hosts_without_a_common_folder(
     assert homes["b"] and homes["c"] and homes["b"] != homes["c"] != homes["a"]
 
 
-def test_an_upload_is_refused_while_the_store_is_away_and_accepted_afterwards(
-    server: ObjectServer, synthetic_pass: Any, tmp_path: Path
-):
+def test_an_upload_is_refused_while_the_store_is_away_and_accepted_afterwards(server, synthetic_pass, tmp_path):
     octets = (synthetic_pass.folder / "downlink.cadu").read_bytes()
     settings = Settings(home=tmp_path / "home", **server.settings())
     with TestClient(create_app(settings, inline_jobs=True), headers=OWN) as client:
 
-        def upload() -> Any:
+        def upload():
             return client.post("/api/v1/telemetry", params={"name": "a.cadu"}, content=octets)
 
         assert client.get("/readyz").status_code == 200
@@ -151,9 +141,7 @@ def test_an_upload_is_refused_while_the_store_is_away_and_accepted_afterwards(
         assert verify(ground, rebuild=True).verdict == "intact"
 
 
-def test_a_job_without_the_store_waits_and_loses_nothing(
-    server: ObjectServer, opened: Callable[..., Ground], synthetic_pass: Any, tmp_path: Path
-):
+def test_a_job_without_the_store_waits_and_loses_nothing(server, opened, synthetic_pass, tmp_path):
     """The store goes away between the acknowledgement and the work, on a host that has no copy."""
     first = opened("first")
     url = f"sqlite:///{tmp_path / 'first' / 'linna.db'}"
@@ -171,13 +159,11 @@ def test_a_job_without_the_store_waits_and_loses_nothing(
     assert verify(first, rebuild=True).verdict == "intact"
 
 
-def test_an_import_that_loses_the_store_half_way_is_repeated(
-    server: ObjectServer, opened: Callable[..., Ground], synthetic_pass: Any, monkeypatch: pytest.MonkeyPatch
-):
+def test_an_import_that_loses_the_store_half_way_is_repeated(server, opened, synthetic_pass, monkeypatch):
     ground = opened("home")
     put, calls = type(server.store()).put, []
 
-    def failing(*given: Any) -> None:
+    def failing(*given):
         calls.append(given)
         if len(calls) == 3:
             server.stop()
@@ -192,9 +178,7 @@ def test_an_import_that_loses_the_store_half_way_is_repeated(
     assert verify(ground, rebuild=True).verdict == "intact"
 
 
-def test_integrity_check_reads_the_store_and_not_the_cache(
-    server: ObjectServer, opened: Callable[..., Ground], synthetic_pass: Any
-):
+def test_integrity_check_reads_the_store_and_not_the_cache(server, opened, synthetic_pass):
     ground = opened("home")
     ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
     store = server.store().under("files")
@@ -202,7 +186,7 @@ def test_integrity_check_reads_the_store_and_not_the_cache(
     octets = ground.files.get(sha256)
     assert verify(ground, rebuild=True).verdict == "intact"
 
-    def found(body: bytes | None) -> list[str]:
+    def found(body):
         if body is None:
             store.remove(sha256)
         else:
@@ -217,9 +201,7 @@ def test_integrity_check_reads_the_store_and_not_the_cache(
     assert "expected no such file in the archive" in found(octets)[0]
 
 
-def test_a_backup_of_an_object_store_is_restored_into_another(
-    opened: Callable[..., Ground], synthetic_pass: Any, make_build: Callable[..., Path], tmp_path: Path
-):
+def test_a_backup_of_an_object_store_is_restored_into_another(opened, synthetic_pass, make_build, tmp_path):
     """Also the way to move a service from folders into an object store."""
     ground = opened("home")
     pass_id = import_archive(ground, synthetic_pass.folder)
@@ -236,9 +218,7 @@ def test_a_backup_of_an_object_store_is_restored_into_another(
     assert pass_id > 0
 
 
-def test_a_build_keeps_its_programs_on_another_host(
-    opened: Callable[..., Ground], make_build: Callable[..., Path], tmp_path: Path
-):
+def test_a_build_keeps_its_programs_on_another_host(opened, make_build, tmp_path):
     file = make_build("runs", {"a": [b"packet"]})
     (file.parent / "fly.py").chmod(0o755)
     first = opened("first")
@@ -250,14 +230,12 @@ def test_a_build_keeps_its_programs_on_another_host(
     assert not (there.folder / "costs.json").stat().st_mode & 0o111
 
 
-def test_files_of_an_archive_that_is_let_go_leave_the_store(
-    opened: Callable[..., Ground], make_flyable: Callable[..., Any]
-):
+def test_files_of_an_archive_that_is_let_go_leave_the_store(opened, make_flyable):
     ground = opened("home")
     archive = keep_archive(ground, make_flyable(frames=4, seed=81).folder)
     kept = keep_archive(ground, make_flyable(frames=4, seed=82).folder, pinned=True)
 
-    def names() -> set[str]:
+    def names():
         return {name for name, _ in store_of(ground).names()}
 
     before = names()

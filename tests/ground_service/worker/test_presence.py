@@ -2,16 +2,13 @@
 
 import json
 import time
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from ground_service.errors import ServerError
-from ground_service.ground import Ground, ground_from_settings
+from ground_service.ground import ground_from_settings
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.service import add_mission
 from ground_service.settings import Settings
@@ -32,21 +29,21 @@ from tests.ground_service.access.openid import running_provider
 
 
 @pytest.fixture
-def settings(tmp_path: Path, migrated_postgres: Callable[[], str]) -> Settings:
+def settings(tmp_path, migrated_postgres):
     return Settings(home=tmp_path / "home", database_url=migrated_postgres(), allow_database_owner=True)
 
 
 @pytest.fixture
-def opened(settings: Settings) -> Iterator[Ground]:
+def opened(settings):
     with ground_from_settings(settings) as ground:
         yield ground
 
 
-def changed(settings: Settings, **fields: Any) -> Settings:
+def changed(settings, **fields):
     return Settings(**settings.model_dump() | fields)
 
 
-def test_a_process_is_known_while_it_runs(opened: Ground, settings: Settings, monkeypatch: pytest.MonkeyPatch):
+def test_a_process_is_known_while_it_runs(opened, settings, monkeypatch):
     monkeypatch.setattr(condition, "BEAT_S", 0.05)
     assert not running_processes(opened.database)
     with present(opened, settings, "worker"):
@@ -75,7 +72,7 @@ def test_a_process_is_known_while_it_runs(opened: Ground, settings: Settings, mo
         ({"retention_days": 7}, "settings"),
     ],
 )
-def test_a_start_with_disagreeing_peers_fails(opened: Ground, settings: Settings, change: dict[str, Any], group: str):
+def test_a_start_with_disagreeing_peers_fails(opened, settings, change, group):
     """An upload acknowledged by one process must not be invisible to the other."""
     other = changed(settings, **change)
     with present(opened, settings, "api"):
@@ -87,7 +84,7 @@ def test_a_start_with_disagreeing_peers_fails(opened: Ground, settings: Settings
         assert len(running_processes(opened.database)) == 1
 
 
-def test_another_home_folder_and_other_data_are_noticed(opened: Ground, settings: Settings, tmp_path: Path):
+def test_another_home_folder_and_other_data_are_noticed(opened, settings, tmp_path):
     mine = statement_of(opened, settings)
     (tmp_path / "elsewhere").mkdir()
     other = replace(opened, home=tmp_path / "elsewhere")
@@ -102,12 +99,12 @@ def test_another_home_folder_and_other_data_are_noticed(opened: Ground, settings
     assert all_disagreements(processes) == ["worker b:2: other files than api a:1"]
 
 
-def faults(ground: Ground, settings: Settings) -> dict[str, str]:
+def faults(ground, settings):
     return {one.name: one.found for one in examine(ground, settings) if not one.ok}
 
 
 def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
-    opened: Ground, settings: Settings, redis_url: str, synthetic_pass: Any, tmp_path: Path
+    opened, settings, redis_url, synthetic_pass, tmp_path
 ):
     given = changed(settings, broker_url=redis_url)
     ingest_file(opened, synthetic_pass.folder / "downlink.cadu")
@@ -161,21 +158,19 @@ def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
         assert "audit heads" not in faults(opened, opened_to_people)
 
         # 6. Audit heads go to a channel that no mission description has, or to a folder that does not exist.
-        for target, told in (("channel:nobody", "found nobody"), (str(tmp_path / "none"), "a folder that can")):
+        for target, fault in (("channel:nobody", "found nobody"), (str(tmp_path / "none"), "a folder that can")):
             given_heads = given.model_copy(update={"audit_heads": target})
-            assert told in faults(opened, given_heads)["audit heads"]
+            assert fault in faults(opened, given_heads)["audit heads"]
     found = faults(opened, given)
     assert "expected a running api, found none; expected a running worker" in found["processes"]
 
 
-def test_the_command_has_an_exit_status_and_json(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_the_command_has_an_exit_status_and_json(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("LINNA_HOME", str(tmp_path / "home"))
     assert cli.run(["doctor", "--json"]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert told["verdict"] == "broken"
-    assert [one["name"] for one in told["checks"] if not one["ok"]] == ["recurring work"]
+    report = json.loads(capsys.readouterr().out)
+    assert report["verdict"] == "broken"
+    assert [one["name"] for one in report["checks"] if not one["ok"]] == ["recurring work"]
 
 
 def test_the_statement_fits_into_its_column():

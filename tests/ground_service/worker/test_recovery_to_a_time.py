@@ -6,16 +6,14 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
 
 import pytest
 from sqlalchemy import text
 
 from ground_service.access import service as users
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.store import audit
 from ground_service.store.database import open_database, prepare_database
 from ground_service.store.models import METADATA
@@ -29,7 +27,7 @@ DEPLOY = Path(__file__).resolve().parents[3] / "deploy"
 class Server:
     """A PostgreSQL server with the options of deploy/postgres.sh and the archive of its log in `wal`."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self.folder, self.wal, self.data, self.port = folder, folder / "wal", folder / "data", free_port()
         self.bin = sorted(Path("/usr/lib/postgresql").glob("*/bin"))[-1]
         self.user = ["runuser", "-u", "postgres", "--"] if os.geteuid() == 0 else []
@@ -39,14 +37,14 @@ class Server:
         shutil.copytree(DEPLOY, self.scripts)
         self.scripts.chmod(0o755)
 
-    def run(self, *words: str, check: bool = True) -> subprocess.CompletedProcess[str]:
+    def run(self, *words, check=True):
         environment = {"PATH": f"{self.bin}:{SYSTEM}", "LINNA_WAL": str(self.wal)}
         return subprocess.run(
             [*self.user, *words], check=check, cwd=self.folder, env=environment, text=True,
             capture_output=True,
         )  # fmt: skip
 
-    def start(self) -> None:
+    def start(self):
         script = (self.scripts / "postgres.sh").read_text()
         options = re.findall(r"-c (\w+)=('[^']*'|\S+)", script)
         named = ["max_connections", "wal_level", "archive_mode", "archive_timeout", "archive_command"]
@@ -65,13 +63,13 @@ class Server:
         started = subprocess.run(command, cwd=self.folder, env=environment, stdout=subprocess.DEVNULL, check=False)
         assert started.returncode == 0, Path(log).read_text()
 
-    def stop(self) -> None:
+    def stop(self):
         self.run(*f"{self.bin / 'pg_ctl'} -D {self.data} -m immediate -w stop".split(), check=False)
 
-    def script(self, name: str, *words: str, check: bool = True) -> subprocess.CompletedProcess[str]:
+    def script(self, name, *words, check=True):
         return self.run("sh", str(self.scripts / name), *words, check=check)
 
-    def base_backup(self) -> str:
+    def base_backup(self):
         while int(time.time()) == self.second:  # names of backups have seconds
             time.sleep(0.02)
         self.second = int(time.time())
@@ -80,7 +78,7 @@ class Server:
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
+def server():
     """A server for all tests; the last one destroys and restores its database."""
     if not sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres")):
         pytest.skip("PostgreSQL is not installed")
@@ -99,36 +97,36 @@ def server() -> Iterator[Server]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def scalar(ground: Ground, statement: str) -> Any:
+def scalar(ground, statement):
     """Return the value of a statement in a transaction that only reads, also while the server recovers."""
     with ground.database.snapshot() as connection:
         return connection.execute(text(statement)).scalar()
 
 
-def server_time(ground: Ground) -> datetime:
+def server_time(ground):
     return scalar(ground, "SELECT clock_timestamp()").astimezone(UTC)
 
 
-def next_second(ground: Ground) -> datetime:
+def next_second(ground):
     """Return the next full second, when it has passed."""
     chosen = server_time(ground).replace(microsecond=0) + timedelta(seconds=1)
     wait_for(lambda: server_time(ground) > chosen, "the next second")
     return chosen
 
 
-def archive_all(ground: Ground) -> None:
+def archive_all(ground):
     """Have the log so far archived, and wait until it is."""
     with ground.database.writing() as connection:
         segment = connection.execute(text("SELECT pg_walfile_name(pg_switch_wal())")).scalar_one()
 
-    def is_archived() -> bool:
+    def is_archived():
         last = scalar(ground, "SELECT last_archived_wal FROM pg_stat_archiver")
         return last is not None and not last.endswith(".backup") and last >= segment
 
     wait_for(is_archived, f"{segment} in the archive")
 
 
-def test_a_recovery_without_its_conditions_is_refused(server: Server):
+def test_a_recovery_without_its_conditions_is_refused(server):
     server.base_backup()
     before = (datetime.now(UTC) - timedelta(hours=1)).strftime("%Y-%m-%d %H:%M:%S+00")
     refused = server.script("restore-to.sh", str(server.folder / "new"), before, check=False)
@@ -137,7 +135,7 @@ def test_a_recovery_without_its_conditions_is_refused(server: Server):
     assert refused.returncode == 2 and "expected an empty folder" in refused.stderr
 
 
-def test_old_base_backups_go_with_the_log_that_only_they_need(server: Server):
+def test_old_base_backups_go_with_the_log_that_only_they_need(server):
     made = [Path(server.base_backup()) for _ in range(3)]
     assert sorted(path.name for path in (server.wal / "base").iterdir()) == [one.name for one in made[1:]]
     (first,) = re.findall(r"\(file (\w+)\)", (made[1] / "backup_label").read_text().splitlines()[0])
@@ -145,13 +143,13 @@ def test_old_base_backups_go_with_the_log_that_only_they_need(server: Server):
     assert all(name >= first for name in kept)
 
 
-def test_a_segment_that_differs_from_the_archived_one_is_not_overwritten(tmp_path: Path):
+def test_a_segment_that_differs_from_the_archived_one_is_not_overwritten(tmp_path):
     (tmp_path / "one").write_bytes(b"1")
     (tmp_path / "two").write_bytes(b"2")
     (tmp_path / "wal").mkdir()
     environment = {"PATH": os.environ["PATH"], "LINNA_WAL": str(tmp_path / "wal")}
 
-    def archive(name: str) -> int:
+    def archive(name):
         command = ["sh", str(DEPLOY / "wal-archive.sh"), str(tmp_path / name), "0001"]
         return subprocess.run(command, env=environment, check=False).returncode
 
@@ -160,7 +158,7 @@ def test_a_segment_that_differs_from_the_archived_one_is_not_overwritten(tmp_pat
     assert [path.name for path in (tmp_path / "wal").iterdir()] == ["0001"]
 
 
-def test_the_database_is_restored_to_a_chosen_second(server: Server, tmp_path: Path):
+def test_the_database_is_restored_to_a_chosen_second(server, tmp_path):
     prepare_database(server.url, upgrade=True).engine.dispose()
     with open_ground(tmp_path / "home", database_url=server.url) as ground:
         users.add_user(ground, "in-the-backup", "viewer")

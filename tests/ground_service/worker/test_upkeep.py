@@ -3,7 +3,6 @@
 import os
 import re
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -14,7 +13,6 @@ from ground_service.access import service as users
 from ground_service.access.service import audit
 from ground_service.clock import utc_now_ns
 from ground_service.evaluation.service import make_report
-from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import enter_job
@@ -49,7 +47,7 @@ def test_a_trend_has_the_slope_of_its_line():
     assert trend_of(field, downsample(utc_ns[:0], np.zeros(0), 5)) is None
 
 
-def test_the_night_tells_trends_and_broken_limits(ground: Ground, synthetic_pass: Any):
+def test_the_night_tells_trends_and_broken_limits(ground, synthetic_pass):
     ingest_file(ground, synthetic_pass.folder / "downlink.cadu")
     trends = {trend.parameter: trend for trend in spacecraft_trends(ground, 76, "flight")}
     # 0.1 degrees more every 15 s: 576 degrees a day
@@ -62,7 +60,7 @@ def test_the_night_tells_trends_and_broken_limits(ground: Ground, synthetic_pass
     assert (done.result["spacecraft"][0]["spacecraft_id"], done.result["limits_broken"]) == (76, [])
 
 
-def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pytest.MonkeyPatch):
+def test_what_is_old_goes_and_the_record_stays(ground, monkeypatch):
     with ground.database.writing() as connection:
         for _ in range(3):
             publish(connection, "note", {})
@@ -91,9 +89,7 @@ def test_what_is_old_goes_and_the_record_stays(ground: Ground, monkeypatch: pyte
     assert ground.read(repository.newest, repository.AUDIT, Paging())[1] == 1
 
 
-def test_nothing_is_removed_in_the_first_night_after_a_jump_of_the_clock(
-    ground: Ground, monkeypatch: pytest.MonkeyPatch
-):
+def test_nothing_is_removed_in_the_first_night_after_a_jump_of_the_clock(ground, monkeypatch):
     enter_job(ground, "plan", {})
     now = utc_now_ns() + 400 * DAY_NS
     monkeypatch.setattr("ground_service.worker.upkeep.utc_now_ns", lambda: now)
@@ -103,7 +99,7 @@ def test_nothing_is_removed_in_the_first_night_after_a_jump_of_the_clock(
     assert "events" in nightly(ground, {})["removed"]
 
 
-def counts(ground: Ground) -> dict[str, int]:
+def counts(ground):
     with ground.database.reading() as connection:
         return {
             name: connection.execute(select(func.count()).select_from(table)).scalar_one()
@@ -111,9 +107,7 @@ def counts(ground: Ground) -> dict[str, int]:
         }
 
 
-def test_ten_years_later_the_record_is_complete_and_the_operation_is_gone(
-    ground: Ground, synthetic_pass: Any, monkeypatch: pytest.MonkeyPatch
-):
+def test_ten_years_later_the_record_is_complete_and_the_operation_is_gone(ground, synthetic_pass, monkeypatch):
     """The documented policy names every table, and the nightly job deletes from no other one."""
     text = (Path(__file__).parents[3] / "docs/archive.md").read_text()
     rows = text.partition("## Retention")[2].partition("## Schema")[0].splitlines()
@@ -132,7 +126,7 @@ def test_ten_years_later_the_record_is_complete_and_the_operation_is_gone(
     assert files == sorted(ground.files.root.rglob("*"))
 
 
-def test_expired_sessions_are_deleted_and_tokens_are_kept(ground: Ground, monkeypatch: pytest.MonkeyPatch):
+def test_expired_sessions_are_deleted_and_tokens_are_kept(ground, monkeypatch):
     token = users.add_user(ground, "ann", "operator", days_valid=0.001)
     old, _ = users.start_session(ground, token)
     later = utc_now_ns() + DAY_NS
@@ -147,7 +141,7 @@ def test_expired_sessions_are_deleted_and_tokens_are_kept(ground: Ground, monkey
     assert token_valid(ground, new) and not token_valid(ground, old)
 
 
-def test_answers_are_kept_until_telemetry_is_new(ground: Ground, synthetic_pass: Any, monkeypatch: Any, tmp_path: Any):
+def test_answers_are_kept_until_telemetry_is_new(ground, synthetic_pass, monkeypatch, tmp_path):
     half = len(synthetic_pass.packets) // 2
     (tmp_path / "a.cadu").write_bytes(encode_cadus(synthetic_pass.packets[:half], spacecraft_id=76))
     vehicle = ingest_file(ground, tmp_path / "a.cadu").vehicle_id

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from lxml import etree
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lunar.compressed import read_expanded
 from lunar.constants import NS
+from lunar.datafolder import read_expanded
 from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError, EphemerisError, TimeFormatError, UnknownFrameError
 from lunar.frames import continuous_quaternions, matrix_from_quaternion

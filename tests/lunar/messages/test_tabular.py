@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from lunar.constants import NS
 from lunar.ephemeris import ephemeris_from_states
 from lunar.frames import IauOrientation, rtn_from_inertial
-from lunar.messages.tabular import format_csv, format_tum
+from lunar.messages.stk import format_csv, format_tum
 from lunar.timescales import parse_utc
 
 START = parse_utc("2029-08-07T00:00:00")

@@ -15,7 +15,7 @@ from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.spacecraft.loop import new_board
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.tables import pack_anchor_table
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 RADIUS_M = 1_737_400.0
 GM_M3_S2 = 4.902800066e12
@@ -104,7 +104,7 @@ def detections(u_px, v_px, diameter_px):
 
 @dataclass(frozen=True)
 class Toolbox:
-    """What tests of flight share, since test files cannot import each other."""
+    """Helpers that tests of flight share, since test files cannot import each other."""
 
     orbit: Callable[..., FloatArray] = paper_orbit_mcmf_m
     place: Callable[[FloatArray], tuple[float, float, float]] = place

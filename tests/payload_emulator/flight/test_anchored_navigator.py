@@ -12,10 +12,10 @@ from scipy.special import chdtri, ndtr
 from lunar.camera import nadir_camera_from_mcmf
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import tdb_s_from_utc_ns, ticks_from_utc_ns
-from payload_emulator.flight.navigation import anchored, correction, recovery
-from payload_emulator.flight.navigation.anchored import Observation
-from payload_emulator.flight.navigation.anchored_parameters import AnchoredLimits, AnchoredParameters
-from payload_emulator.flight.navigation.correction import frame_limit, is_usable
+from payload_emulator.flight.navigation.anchored import anchored, correction, recovery
+from payload_emulator.flight.navigation.anchored.anchored import Observation
+from payload_emulator.flight.navigation.anchored.correction import frame_limit, is_usable
+from payload_emulator.flight.navigation.anchored.parameters import AnchoredLimits, AnchoredParameters
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.filter import FilterState
 from payload_emulator.flight.navigation.filter.map_offset import OffsetRule
@@ -23,7 +23,7 @@ from payload_emulator.flight.navigation.landmark_map import MapState
 from payload_emulator.flight.navigation.outcomes import Outcome
 from payload_emulator.flight.navigation.search.acquisition import Acquisition
 from payload_emulator.flight.navigation.search.identification import Identification
-from payload_emulator.flight.navigation.search.lost_in_space import Place
+from payload_emulator.flight.navigation.search.lost_in_space import PoseHypothesis
 from payload_emulator.flight.navigation.sighting import Pose, in_view, landmark_map
 from payload_emulator.flight.vision.detections import Detections
 from studies import montecarlo
@@ -368,7 +368,7 @@ def test_a_place_found_without_a_prior_turns_the_orbit_with_it(orbit, monkeypatc
     axis = np.cross(prior.mean[:3], [0.3, -0.5, 0.8])
     turn = Rotation.from_rotvec(0.4 * axis / norm(axis))
     there = 1.01 * turn.apply(prior.mean[:3])
-    place = Place(
+    place = PoseHypothesis(
         orbit.rotations[0] @ there, np.zeros(3), np.array([30.0, 80.0, 50.0]), np.array([2, 5, 7]), np.array([4, 1, 9]),
         -20.0
     )  # fmt: skip

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
 from lunar.timescales import ticks_from_utc_ns
-from payload_emulator.flight.navigation import anchored, recovery
-from payload_emulator.flight.navigation.anchored import Observation
-from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
+from payload_emulator.flight.navigation.anchored import anchored, recovery
+from payload_emulator.flight.navigation.anchored.anchored import Observation
+from payload_emulator.flight.navigation.anchored.parameters import AnchoredParameters
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.attitude_monitor import (
     AttitudeMonitor,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lunar.datafolder import find_data
-from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
+from payload_emulator.flight.navigation.anchored.parameters import AnchoredParameters
 from payload_emulator.flight.navigation.estimator import ESTIMATORS, AnchoredEstimator
 from payload_emulator.flight.navigation.filter.map_offset import OffsetRule, OffsetSize
 from payload_emulator.flight.navigation.outcomes import Mode

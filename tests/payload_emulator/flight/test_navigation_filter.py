@@ -193,7 +193,7 @@ def test_an_update_is_the_least_squares_solution_with_its_covariance():
     assert np.all(eigvalsh(free.rotation.information) > 0.0)
 
 
-def test_what_all_craters_share_is_told_apart_from_the_position_by_its_prior_alone():
+def test_what_all_craters_share_is_distinguished_from_the_position_by_its_prior_alone():
     """A shift of the catalogue to the east looks like one of the camera: they divide it by their variances."""
     landmarks, index = craters(40, seed=1), np.arange(40)
     errors = replace(ERRORS, attitude_noise_rad=1e-9, catalogue_offset_m=(30.0, 1e-3, 1e-3))

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark
 
-from payload_emulator.flight.navigation import anchored
-from payload_emulator.flight.navigation.anchored import AnchoredReport
+from payload_emulator.flight.navigation.anchored import anchored
+from payload_emulator.flight.navigation.anchored.anchored import AnchoredReport
 from payload_emulator.flight.navigation.filter.map_offset import OffsetSize
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.onboard.loads import FlightParameters, FlightTables
@@ -55,8 +55,8 @@ class Clock:
         return self.now_ns
 
 
-class Eye:
-    """A detector that returns what it is told to."""
+class ScriptedDetector:
+    """A detector that returns given detections."""
 
     def __init__(self):
         self.quality, self.found, self.fails = ImageQuality.OK, detections(6), False
@@ -69,7 +69,7 @@ class Eye:
 
 
 class Navigator:
-    """An anchored estimator that keeps what it is given and answers as it is told to."""
+    """An anchored estimator that keeps what it is given and returns given reports."""
 
     def __init__(self):
         self.given = []
@@ -109,7 +109,7 @@ def detections(count):
 
 @fixture
 def rig(monkeypatch):
-    eye, telemetry, clock, navigator = Eye(), Recorder(), Clock(), Navigator()
+    eye, telemetry, clock, navigator = ScriptedDetector(), Recorder(), Clock(), Navigator()
     observer = Observer(eye, FlightParameters(modes=(Mode.anchored,)), telemetry, clock)
     observer._states[Mode.anchored] = ("the tables", navigator.start)
     monkeypatch.setattr(anchored, "step", navigator.step)
@@ -252,7 +252,7 @@ def test_the_size_of_the_map_offset_and_the_noise_are_sent_when_the_size_changes
         assert sent == list(zip(values, (0.0, 40.0, 80.0), strict=True))
 
 
-def test_a_reset_of_the_filter_is_told_and_counted(rig):
+def test_a_reset_of_the_filter_is_reported_and_counted(rig):
     rig.navigator.reacquired = True
     look(rig)
     assert ("medium", "filter_reset", 3.0, 6.0) in rig.telemetry.events
@@ -418,7 +418,7 @@ def test_without_an_altitude_no_detection_has_a_class(rig):
     assert items(rig, "detections", "size_class") == [[-1] * 6]
 
 
-def test_a_damaged_table_is_told_by_its_number_and_its_hash(rig):
+def test_a_damaged_table_is_reported_by_its_number_and_its_hash(rig):
     octets = b"no table at all"
     observer = observing(rig, Mode.anchored)
     observer.load_tables(FlightTables(catalogue=octets, burns=octets, anchor_ephemeris=octets))

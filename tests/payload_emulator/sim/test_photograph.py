@@ -9,21 +9,19 @@ from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark, raises
 
-from lunar.camera import PinholeCamera, ground_point_sphere
+from lunar.camera import PinholeCamera, ground_point_sphere, pointed_camera_from_mcmf
 from lunar.catalogue import make_catalogue, save_catalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder
 from lunar.elements import Elements, icrf_state_from_elements
 from lunar.frames import IauOrientation, spherical_from_mcmf
 from lunar.gravity import builtin_gravity
-from lunar.lens import pointed_camera_from_mcmf
 from lunar.propagation import ForceModel, propagate
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError, TerrainError
 from payload_emulator.session.archive.mission import level_of
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.sim.orbit.disturbances import changed, executed, turned_state
-from payload_emulator.sim.orbit.truth import Truth
+from payload_emulator.sim.orbit.truth import Truth, changed, executed, turned_state
 from payload_emulator.sim.render.light import sun_direction_mcmf
 from payload_emulator.sim.render.renderer import PHOTOGRAPH_RADIANCE, render
 from payload_emulator.sim.terrain.opening import open_terrain

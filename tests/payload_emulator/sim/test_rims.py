@@ -5,12 +5,11 @@ from math import hypot, radians, sqrt
 import numpy as np
 from pytest import approx, mark
 
-from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
+from lunar.camera import BrownCamera, PinholeCamera, nadir_camera_from_mcmf, pointed_camera_from_mcmf
 from lunar.catalogue import make_catalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import find_data
 from lunar.frames import mcmf_from_spherical
-from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from payload_emulator.sim.render.labels import label_frame, project_craters
 from payload_emulator.sim.render.raymarch import cast
 from payload_emulator.sim.terrain.opening import open_terrain

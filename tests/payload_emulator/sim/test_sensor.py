@@ -7,11 +7,10 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark, raises
 
-from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
+from lunar.camera import BrownCamera, PinholeCamera, nadir_camera_from_mcmf, pointed_camera_from_mcmf
 from lunar.catalogue import make_catalogue
 from lunar.errors import LensError
 from lunar.frames import mcmf_from_spherical
-from lunar.lens import BrownCamera, pointed_camera_from_mcmf
 from payload_emulator.errors import PayloadError
 from payload_emulator.sim.render import raymarch, renderer
 from payload_emulator.sim.render.labels import project_craters

@@ -13,7 +13,7 @@ from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain.albedo import open_albedo
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.raster import RasterTerrain
-from payload_emulator.sim.terrain.rasters import open_layers
+from payload_emulator.sim.terrain.rasters import CHUNK_LIMIT_OCTETS, ChunkCache, RasterFile, open_layers
 from tests.lazy import Lazy
 
 rasterio, warp = Lazy("rasterio"), Lazy("rasterio.warp")
@@ -144,13 +144,30 @@ def test_projected_metres_join_across_tiles_whose_pixels_do_not_divide_the_degre
     assert layer.holds(*places).tolist() == [True, False]
 
 
-def test_jpeg_2000_of_16_bits(tmp_path):
+def test_jpeg_2000_of_16_bits_is_decoded_once_until_the_kept_pixels_are_damaged(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
     values = np.rint(plane(*grid())).astype("int16")
     path = write_tiff(
         tmp_path / "a.jp2", rasterio.Affine(1 / 16, 0, 8.0, 0, -1 / 16, 22.0), values,
         MOON, driver="JP2OpenJPEG", quality="100", reversible="YES"
     )  # fmt: skip
     heights_agree(RasterTerrain([path], NONE, **AS_IT_IS), np.array([14.3]), np.array([12.2]), 1.0)
+    (kept,) = (tmp_path / "kept-ground").glob("pixels-*")
+    (layer,) = open_layers([path])
+    with monkeypatch.context() as patch:
+        patch.setattr(RasterFile, "opened", None)
+        assert_array_equal(layer.read(68 * 16, 8 * 16, 160, 160), values)
+    kept.write_bytes(kept.read_bytes()[:-1] + b"?")
+    assert_array_equal(open_layers([path])[0].read(68 * 16, 8 * 16, 160, 160), values)
+
+
+def test_decoded_pixels_stay_within_their_limit_after_a_week_of_passes():
+    chunks, newest, chunk = ChunkCache(), 7 * 13 * 90, np.zeros((1024, 1024), np.float32)
+    for number in range(newest + 1):
+        chunks.put((0, 0, number, 0), chunk)
+    held = [number for number in range(newest + 1) if chunks.get((0, 0, number, 0)) is not None]
+    assert held == list(range(newest - 7, newest + 1))
+    assert chunks.octets == CHUNK_LIMIT_OCTETS == len(held) << 22
 
 
 def test_reflectance_tiles_are_averaged_over_the_grid_and_relative_to_their_median(tmp_path):

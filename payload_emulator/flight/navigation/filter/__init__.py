@@ -1,1 +1,1 @@
-"""The filter with its dynamics, attitude monitor and landmark map."""
+"""The filter with its dynamics, attitude monitor and offset of the map."""

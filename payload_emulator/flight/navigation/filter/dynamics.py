@@ -15,7 +15,7 @@ from lunar.gravity_omission import FAR_SIDE_COSINE, MEASURED_ALTITUDES_M, REFERE
 from lunar.third_bodies import earth_position_icrf_m, sun_position_icrf_m
 from lunar.timescales import tdb_s_from_utc_ns, utc_ns_from_ticks
 from tmtc.dictionary.tables import BurnTable, GravityTable, OrientationTable
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 # Arc over which the Moon's rotation rate and the third bodies are held: the Earth moves 60 km of 384,000 in it,
 # 4e-9 m/s^2 in its tide.

@@ -21,7 +21,7 @@ from lunar.camera import PinholeCamera
 from payload_emulator.flight.navigation.filter.attitude_monitor import RotationEvidence
 from payload_emulator.flight.navigation.filter.dynamics import OrbitModel
 from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, Sighting, look
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 SIZE = 18
 POSITION, VELOCITY, ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)

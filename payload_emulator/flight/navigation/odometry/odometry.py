@@ -34,7 +34,7 @@ from payload_emulator.flight.navigation.odometry.matcher import GroundFeatures, 
 from payload_emulator.flight.navigation.outcomes import Mode, Outcome, ResetTrigger
 from payload_emulator.flight.vision.detections import Detections
 from tmtc.dictionary.tables import AnchorTable
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 PAPER_CLASSES = 3
 _NAN = float("nan")

@@ -12,7 +12,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from sqlalchemy import select
+from sqlalchemy import select, update
 
 from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.contacts.commanding.service import (
@@ -130,7 +130,7 @@ def test_a_connection_that_is_cut_at_any_octet_and_continued_loses_nothing(groun
 
 
 def test_parts_of_frames_are_ingested_as_they_arrive(ground, station, stream, expected):
-    """What follows may never come; if it does, it has a position in the same recording."""
+    """The rest may never come; if it does, it has a position in the same recording."""
     declare(ground, station.link())
     with operated(ground):
         connection = station.accept()
@@ -274,7 +274,7 @@ def test_a_process_without_the_lease_takes_no_telecommands(either, station):
     assert service.acquire(either, declared, "second", 15_000_000_000)
 
 
-def test_transmissions_of_which_nothing_was_heard_are_repeated_in_the_next_contact(
+def test_transmissions_without_a_sign_of_reception_are_repeated_in_the_next_contact(
     ground, station, stream, mission_time
 ):
     declare(ground, station.link())
@@ -506,6 +506,19 @@ def test_the_lease_is_kept_while_the_link_is_operated(ground, station):
     assert service.get_link(ground, "lab").owner is None
 
 
+def test_after_a_standstill_the_state_is_what_the_process_sees(either, station):
+    """Another process had the link meanwhile, and gave it back."""
+    declare(either, station.link())
+    with operated(either) as runner:
+        station.accept()
+        wait_for_state(either, "connected")
+        lost = {"owner": None, "lease_utc_ns": 0, "state": "waiting"}
+        with either.database.writing() as connection:
+            connection.execute(update(repository.LINKS).values(**lost))
+        runner._renewed_s -= 25.0
+        wait_for_state(either, "connected")
+
+
 class Confirming(Station):
     """A station that confirms transmissions: `answers` are given first (None: the connection is closed)."""
 
@@ -643,7 +656,7 @@ def test_a_refused_transmission_is_given_to_no_link_that_cannot_send_it(either, 
     assert [one.id for one in either.read(store.pending_transmissions, "lab")] == [transmission.id]
 
 
-def test_the_next_owner_knows_when_a_contact_was_heard_last(either, station, stream, mission_time):
+def test_the_next_owner_knows_when_a_contact_last_received_telemetry(either, station, stream, mission_time):
     """Mission time may stand still then: counted from the start of the process, the silence would never end."""
     declare(either, station.link())
     with operated(either) as runner:

@@ -15,7 +15,7 @@ import pytest
 from ground_service.evaluation.inputs import load_pass_inputs
 from ground_service.evaluation.landmarks.service import decide_landmark, uploaded_tables
 from ground_service.evaluation.service import pass_summary
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.passes.archive_import import import_archive
 from linna import cli
 from lunar.catalogue import CraterCatalogue, load_catalogue, save_catalogue
@@ -48,11 +48,11 @@ class Learned:
 
 
 @pytest.fixture(scope="module")
-def linna(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
+def linna(tmp_path_factory):
     """Run a command on one service; return its JSON output."""
     home = tmp_path_factory.mktemp("chain") / "home"
 
-    def run(words: str) -> Any:
+    def run(words):
         with redirect_stdout(io.StringIO()) as output:
             assert cli.run([*words.split(), "--home", str(home), "--json"]) == 0, words
         return json.loads(output.getvalue())
@@ -62,7 +62,7 @@ def linna(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
 
 
 @pytest.fixture(scope="module")
-def learned(linna: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Learned:
+def learned(linna, tmp_path_factory):
     """An emulated pass over a procedural Moon, imported twice as two passes, up to the decisions and exports."""
     folder = tmp_path_factory.mktemp("learned")
     [scenario] = [one for one in suite_scenarios(frames=FRAMES) if one.name == SCENARIO]
@@ -123,7 +123,7 @@ def test_the_uploaded_table_gives_a_later_pass_more_landmarks(learned):
     assert after["unmatched"] < 0.3 * learned.unmatched
 
 
-def _pass(archive: Path, folder: Path, name: str, catalogue: CraterCatalogue) -> Path:
+def _pass(archive, folder, name, catalogue):
     """Copy an archive as another pass, with the catalogue that the ground has."""
     target = shutil.copytree(archive, folder / name)
     save_catalogue(catalogue, target / "catalogue.csv")
@@ -131,7 +131,7 @@ def _pass(archive: Path, folder: Path, name: str, catalogue: CraterCatalogue) ->
     return target
 
 
-def _flown(learned: Learned, name: str, table: bytes, catalogue: CraterCatalogue) -> Path:
+def _flown(learned, name, table, catalogue):
     """Fly the frames of the pass with a table of landmarks; return the archive of that pass."""
     target = _pass(learned.archive, learned.folder, name, catalogue)
     (target / "payload/tables/catalogue.bin").write_bytes(table)
@@ -141,7 +141,7 @@ def _flown(learned: Learned, name: str, table: bytes, catalogue: CraterCatalogue
     return target
 
 
-def _matched(ground: Ground, pass_id: int) -> int:
+def _matched(ground, pass_id):
     """Return the number of landmarks that the anchored estimator used in all frames."""
     [anchored] = [one for one in load_pass_inputs(ground, pass_id).navigation if one.estimator == "anchored"]
     return int(anchored.matched.sum())

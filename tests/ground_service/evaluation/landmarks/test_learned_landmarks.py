@@ -1,9 +1,7 @@
 """Landmarks learned from synthetic passes whose ground catalogue lacks known craters."""
 
 import shutil
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from pytest import approx, raises
 from ground_service.errors import EvaluationError, InvalidInput, NotFound, StateConflict
 from ground_service.evaluation.landmarks.core import (
     Frames,
-    Place,
+    LandmarkFix,
     combined,
     distance_m,
     is_persistent,
@@ -32,17 +30,17 @@ from ground_service.evaluation.landmarks.service import (
     upload_entries,
 )
 from ground_service.evaluation.recall import expected_craters, match_detections
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.missions.catalogues import add_catalogue
 from ground_service.passes.archive_import import import_archive
 from ground_service.telemetry.samples import DetectionSamples
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
-from lunar.catalogue import CraterCatalogue, load_catalogue, make_catalogue, save_catalogue
+from lunar.catalogue import load_catalogue, make_catalogue, save_catalogue
 from lunar.constants import MOON_RADIUS_M
 from lunar.datafolder import DataFolder
 from lunar.frames import mcmf_from_spherical
 from payload_emulator.training.data.landmarks import load_landmarks
-from tests.ground_service.conftest import SyntheticPass, enter_files
+from tests.ground_service.conftest import enter_files
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.tables import CatalogueTable, pack_catalogue_table, unpack_catalogue_table
 from tmtc.packets.large_data import LargeDataReceiver
@@ -51,7 +49,7 @@ FRAMES = 24
 
 
 @pytest.fixture(scope="module")
-def thinned(make_pass: Callable[..., SyntheticPass]) -> tuple[Path, CraterCatalogue, CraterCatalogue]:
+def thinned(make_pass):
     """An archive whose catalogue lacks every third crater; the catalogue with all craters, and the withheld ones.
 
     Synthetic detections leave out every fourth scored crater of a frame, whichever it is.
@@ -64,14 +62,14 @@ def thinned(make_pass: Callable[..., SyntheticPass]) -> tuple[Path, CraterCatalo
     return made.folder, full, full.select(withheld)
 
 
-def distances_m(catalogue: CraterCatalogue, one: Landmark) -> np.ndarray:
+def distances_m(catalogue, one):
     latitude, longitude = np.radians([one.latitude_deg, one.longitude_deg])
     turn = np.mod(longitude - catalogue.longitude_rad + np.pi, 2.0 * np.pi) - np.pi
     east = turn * np.cos(latitude)
     return MOON_RADIUS_M * np.hypot(east, latitude - catalogue.latitude_rad)
 
 
-def both_passes(ground: Ground, thinned: tuple[Path, ...]) -> list[int]:
+def both_passes(ground, thinned):
     """Import one archive under two names, as two passes over the same ground."""
     folder, ids = thinned[0], []
     for name in ("first pass", "second pass"):
@@ -80,7 +78,7 @@ def both_passes(ground: Ground, thinned: tuple[Path, ...]) -> list[int]:
     return ids
 
 
-def landmarks(ground: Ground, **terms: str) -> list[Landmark]:
+def landmarks(ground, **terms):
     page = ground.read(list_landmarks, LandmarkFilter(limit=1000, **terms))
     assert page.total == len(page.items)
     return page.items
@@ -212,9 +210,9 @@ def test_a_pass_without_a_catalogue_is_refused_with_the_reason(ground, make_pass
         update_landmarks(ground, import_archive(ground, folder))
 
 
-def _place(east_m: float = 0.0, sigma_m: float = 50.0, diameter_m: float = 8000.0, looks: int = 4) -> Place:
+def _place(east_m=0.0, sigma_m=50.0, diameter_m=8000.0, looks=4):
     rows = np.arange(3)
-    return Place(0.0, east_m / MOON_RADIUS_M, 100.0, (sigma_m,) * 3, diameter_m, 200.0, 0.8, rows, looks)
+    return LandmarkFix(0.0, east_m / MOON_RADIUS_M, 100.0, (sigma_m,) * 3, diameter_m, 200.0, 0.8, rows, looks)
 
 
 def test_passes_that_agree_reduce_the_variance_but_not_what_is_common_to_them():
@@ -282,7 +280,7 @@ def test_the_uncertainty_is_that_of_the_errors_on_one_pass_and_on_three(error_px
     columns = (latitude[withheld], longitude[withheld], heights[withheld], sizes[withheld])
     squares: dict[int, list[float]] = {1: [], 3: []}
     for a, b, height, size in zip(*columns, strict=True):
-        crater = Place(a, b, height, (0.0, 0.0, 0.0), size, 0.0, 1.0, np.zeros(0, dtype=np.int64), 0)
+        crater = LandmarkFix(a, b, height, (0.0, 0.0, 0.0), size, 0.0, 1.0, np.zeros(0, dtype=np.int64), 0)
         some = [one for places in found for one in places if same_place(one, crater)]
         for count in squares:
             if len(some) >= count:
@@ -292,7 +290,7 @@ def test_the_uncertainty_is_that_of_the_errors_on_one_pass_and_on_three(error_px
         assert len(some) > 50 and 0.7 < np.mean(some) < 1.4, count
 
 
-def _landmark(key: int, state: str = "accepted") -> Landmark:
+def _landmark(key, state="accepted"):
     return Landmark.of(
         {
             "id": key, "spacecraft_id": 76, "state": state, "latitude_deg": 10.0 + key, "longitude_deg": 359.5,
@@ -303,7 +301,7 @@ def _landmark(key: int, state: str = "accepted") -> Landmark:
     )  # fmt: skip
 
 
-def _table() -> CatalogueTable:
+def _table():
     one = np.array([0.1])
     return CatalogueTable(np.array([7]), one, one, np.array([5000.0]), np.array([10.0]), np.full((1, 3), 60.0))
 

@@ -12,9 +12,11 @@ from ground_service.missions.timekeeping.core import (
     clock_runs,
     doubted_stations,
     fit_correlation,
+    moved_ticks,
     ticks_of_utc_ns,
     utc_ns_of_ticks,
 )
+from ground_service.missions.timekeeping.recorrelation import TimeReports, fit_runs
 from lunar.timescales import parse_utc, ticks_from_utc_ns, utc_ns_from_ticks
 from tests.ground_service.conftest import cells
 
@@ -143,6 +145,60 @@ def test_a_station_whose_clock_changes_is_left_out_from_then_on():
     clocks = {"a": [0.0] * 8 + [37.0] * 8, "b": [0.0] * 16, "c": [0.0] * 16}
     kept, _ = doubted_stations(*reports_of_stations("abcabcabcabcabca", clocks))
     assert np.flatnonzero(~kept).tolist() == [9, 12, 15]
+
+
+ALONE = """
+aaaaaa | -18.0 | behind the on-board clock: GPS time instead of UTC?
+a | 37.0 | ahead of the on-board clock: TAI instead of UTC?
+aaaaaa | 1.0 |
+aaaaaa | 5.5 |
+"""
+
+
+@pytest.mark.parametrize("pattern, difference, remark", cells(ALONE))
+def test_a_single_station_off_by_whole_seconds_of_a_usual_cause_decides_nothing(pattern, difference, remark):
+    clocks = {"a": [float(difference)] * len(pattern)}
+    kept, doubts = doubted_stations(*reports_of_stations(pattern, clocks))
+    assert kept.all() if not remark else not kept.any()
+    words = f"the clock of station canberra is {abs(float(difference)):.3f} s {remark}"
+    assert {str(one) for one in doubts.values()} == ({words} if remark else set())
+
+
+def test_the_one_of_three_stations_that_agrees_with_the_on_board_clock_counts():
+    clocks = {"a": [-18.0] * 12, "b": [37.0] * 12, "c": [0.0] * 12}
+    kept, _ = doubted_stations(*reports_of_stations("aaaabbbbbccc", clocks))
+    assert np.flatnonzero(kept).tolist() == [9, 10, 11]
+
+
+def test_a_clock_that_was_set_after_its_only_station_was_right_is_no_fault_of_the_station():
+    given = reports_of_stations("a" * 8, {"a": [0.0] * 8}, [0.0] * 4 + [18.0] * 4)
+    assert doubted_stations(*given)[0].all() and len(clock_runs(*given[:4])) == 2
+
+
+@pytest.mark.parametrize("step_s, runs", [(0.1, 1), (1.0, 2)])
+def test_two_reports_hours_apart_show_a_drift_that_an_oscillator_can_have_and_otherwise_a_step(step_s, runs):
+    ticks, sent, *zero = reports_of_stations("aa", {"a": [0.0] * 2}, [0.0, step_s])[:4]
+    later = np.array([0, 3 * 3600 * NS])
+    found = clock_runs(ticks + (later // NS << 16), sent + later, *zero)
+    assert len(found) == runs
+
+
+def test_reports_that_scatter_by_seconds_are_not_put_in_force_and_each_says_why():
+    clocks = {"a": [0.0, 2.0, -1.5, 1.0, -2.0, 0.5, 1.5, -1.0]}
+    ticks, received, light, boot, names = reports_of_stations("a" * 8, clocks)
+    fits, doubts = fit_runs(TimeReports(ticks, boot, ticks, received, light, boot, tuple(names)))
+    assert fits == [] and set(doubts) == set(range(8))
+    assert str(doubts[0]).endswith(" s ahead of one line through all (rms)")
+
+
+def test_a_new_correlation_moves_the_times_that_its_line_changes():
+    one = TimeCorrelation(1, 0, 100 << 16, 0, START, 0.0)
+    two = TimeCorrelation(2, 1000 << 16, 1100 << 16, 1000 << 16, START + 1000 * NS, 0.0)
+    moved = TimeCorrelation(3, 1000 << 16, 1100 << 16, 1000 << 16, START + 1000 * NS + 11_000_000, 0.0)
+    assert moved_ticks([one, two], [one, two]) == (None, None)
+    assert moved_ticks([one, two], [one, moved]) == (550 << 16, (1 << 48) - 1)
+    assert moved_ticks([moved], [one, moved]) == (0, 1000 << 16)
+    assert moved_ticks([], [one]) == (0, (1 << 48) - 1)
 
 
 def test_a_correlation_holds_years_away():

@@ -12,11 +12,11 @@ from ground_service.access.store import list_audit
 from ground_service.clock import set_mission_clock, utc_now_ns
 from ground_service.contacts.links.service import acquire, change_state, declared_links
 from ground_service.errors import Conflict, InvalidInput, NotFound
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.service import add_mission
 from ground_service.passes.alarms import core
-from ground_service.passes.alarms.model import Alarm, AlarmFilter
+from ground_service.passes.alarms.model import AlarmFilter
 from ground_service.passes.alarms.service import (
     acknowledge_alarm,
     examine_packets,
@@ -39,43 +39,43 @@ SECOND = 65_536
 START = 1_900_000_000 * SECOND
 
 
-def housekeeping(second: int, temperature_c: float) -> bytes:
+def housekeeping(second, temperature_c):
     """A housekeeping packet with one value outside its limits, if that of the temperature is."""
     values = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
     values |= {"structure_id": 1, "bus_voltage_v": 12.0, "temperature_c": temperature_c}
     return DICTIONARY.pack("housekeeping", values, ticks=START + second * SECOND, sequence_count=second % 16_384)
 
 
-def event(second: int, name: str = "event_high", event_id: int = 20) -> bytes:
+def event(second, name="event_high", event_id=20):
     values = {"event_id": event_id, "frame_number": second, "value_1": 0.0, "value_2": 0.0}
     return DICTIONARY.pack(name, values, ticks=START + second * SECOND, sequence_count=second % 16_384)
 
 
-def receive(ground: Ground, *packets: bytes) -> None:
+def receive(ground, *packets):
     """Ingest packets as a downlink of the flown spacecraft."""
     file = ground.home / "in.cadu"
     file.write_bytes(encode_cadus(list(packets), spacecraft_id=SPACECRAFT))
     ingest_file(ground, file)
 
 
-def alarms(ground: Ground, *states: str) -> list[Alarm]:
+def alarms(ground, *states):
     return ground.read(list_alarms, AlarmFilter(state=list(states))).items
 
 
-def acknowledge(ground: Ground) -> Alarm:
+def acknowledge(ground):
     """Acknowledge the newest alarm."""
     return acknowledge_alarm(ground, alarms(ground)[0].id, "", actor="eva")
 
 
-def active(ground: Ground) -> set[str]:
+def active(ground):
     return {one.name for one in alarms(ground) if one.active}
 
 
-def states(ground: Ground) -> list[tuple[str, int]]:
+def states(ground):
     return [(one.state, one.count) for one in alarms(ground)]
 
 
-def published(ground: Ground) -> list[str]:
+def published(ground):
     """Return the states of alarms that were published."""
     return [AlarmChanged.of(one).state for one in read_events(ground.database, 0) if one.kind == "alarm"]
 
@@ -108,10 +108,10 @@ def test_a_limit_is_broken_once_and_cleared_after_acknowledgement_and_return(eit
 def test_a_worse_condition_must_be_acknowledged_again(ground):
     receive(ground, housekeeping(0, 70.0))
     acknowledge(ground)
-    for second, temperature_c, told in ((1, 75.0, ("acknowledged", "warning")), (2, 90.0, ("raised", "alarm"))):
+    for second, temperature_c, expected in ((1, 75.0, ("acknowledged", "warning")), (2, 90.0, ("raised", "alarm"))):
         receive(ground, housekeeping(second, temperature_c))
         (alarm,) = alarms(ground)
-        assert (alarm.state, alarm.severity) == told
+        assert (alarm.state, alarm.severity) == expected
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
@@ -203,7 +203,7 @@ def test_events_of_low_severity_and_refused_fixes_raise_no_alarm(ground):
     assert alarms(ground) == []
 
 
-def condition(ticks: int, severity: int, value: float) -> core.Condition:
+def condition(ticks, severity, value):
     return core.Condition("parameter", "temperature_c", severity, ticks, ticks, 1, value)
 
 

@@ -4,7 +4,7 @@ It reads neither truth nor the anchor ephemeris. `step` is a function from a fro
 frame to a new state and a report of all decisions:
 
 1. predict the orbit to the time of the frame (`correction`, `dynamics`);
-2. associate detections with craters of the map (`association`) and correct the estimate (`correction`);
+2. associate detections with craters of the map and correct the estimate (`correction`);
 3. where image and map keep disagreeing, widen the search, then search without a prior (`recovery`);
 4. monitor the noise of the attitude (`attitude_monitor`);
 5. map craters that the catalogue does not contain (`landmark_map`).
@@ -22,9 +22,8 @@ from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
 from lunar.frames import rtn_from_inertial
 from payload_emulator.flight.navigation import landmark_map as mapping
-from payload_emulator.flight.navigation import recovery
-from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
-from payload_emulator.flight.navigation.correction import (
+from payload_emulator.flight.navigation.anchored import recovery
+from payload_emulator.flight.navigation.anchored.correction import (
     Fix,
     altitude_above_sphere_m,
     associate,
@@ -35,6 +34,7 @@ from payload_emulator.flight.navigation.correction import (
     search_margin_px,
     tracking_limit_m,
 )
+from payload_emulator.flight.navigation.anchored.parameters import AnchoredParameters
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.attitude_monitor import (
     AttitudeMonitor,
@@ -60,7 +60,7 @@ from payload_emulator.flight.navigation.sighting import (
 )
 from payload_emulator.flight.vision.detections import Detections
 from tmtc.dictionary.tables import BurnTable, CatalogueTable, GravityTable, InitialState, OrientationTable, no_burns
-from tmtc.packets.cuc import TICKS_PER_SECOND
+from tmtc.packets.pus import TICKS_PER_SECOND
 
 _NAN = float("nan")
 _NO_CRATERS = np.empty(0, dtype=np.int64)

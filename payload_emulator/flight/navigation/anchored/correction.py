@@ -7,7 +7,7 @@ import numpy as np
 from lunar.arrays import FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M
-from payload_emulator.flight.navigation.anchored_parameters import AnchoredLimits, AnchoredParameters
+from payload_emulator.flight.navigation.anchored.parameters import AnchoredLimits, AnchoredParameters
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.dynamics import OrbitModel
 from payload_emulator.flight.navigation.filter.filter import CommonErrors, FilterState, KalmanFilter, Update

@@ -7,8 +7,13 @@ import numpy as np
 
 from lunar.arrays import FloatArray
 from lunar.camera import PinholeCamera
-from payload_emulator.flight.navigation.anchored_parameters import AnchoredParameters
-from payload_emulator.flight.navigation.correction import Fix, altitude_above_sphere_m, correct, detection_variance_px2
+from payload_emulator.flight.navigation.anchored.correction import (
+    Fix,
+    altitude_above_sphere_m,
+    correct,
+    detection_variance_px2,
+)
+from payload_emulator.flight.navigation.anchored.parameters import AnchoredParameters
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.filter import FilterState, KalmanFilter
 from payload_emulator.flight.navigation.search.acquisition import acquire

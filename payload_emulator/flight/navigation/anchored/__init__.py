@@ -1,0 +1,1 @@
+"""Anchored estimator: craters of the catalogue correct a dynamical orbit estimate."""
