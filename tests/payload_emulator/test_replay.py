@@ -252,6 +252,8 @@ flight.anchored.detection_sigma_px = -0.1 -> expected a finite number from 0, fo
 flight.anchored.errors.catalogue_offset_m = [1.0, -1.0, 1.0] -> catalogue_offset_m[1]: expected a finite
 flight.housekeeping_interval_s = 0 -> expected a finite number from 0.001, found 0
 detector.max_detections = 0 -> expected a finite number from 1, found 0
+flight.anchored.offset.noise_fixes = 0 -> expected a finite number from 1, found 0
+flight.anchored.offset.noise_largest = 0.5 -> expected a finite number from 1, found 0.5
 flight.anchored.lost.minimum_altitude_m = 60000 -> flight.anchored.lost.minimum_altitude_m: expected at most\
  maximum_altitude_m = 55000.0, found 60000.0
 flight.anchored.limits.highest_radius_m = 1 -> lowest_radius_m: expected at most highest_radius_m = 1.0

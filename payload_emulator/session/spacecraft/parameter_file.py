@@ -32,6 +32,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "height_px": _COUNT,
     "minimum_pairs": _COUNT,
     "lost_search_every": _COUNT,  # the number of frames is divided by it
+    "noise_fixes": _COUNT,
+    "noise_largest": (1.0, math.inf),
     "housekeeping_interval_s": (1e-3, math.inf),
     "reference_interval_s": (1e-3, math.inf),
     "fov_rad": (1e-3, math.pi),
