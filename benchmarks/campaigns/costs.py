@@ -42,6 +42,7 @@ from studies.harness.parts import Part
 MEMORY_MIB, PROCESSOR_S = 256, 10.0
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "results" / "requests.md"
 PACKETS, ROWS = 40_000, 100
+NOT_MEASURED = "not measured: the last run was stopped before it"
 MISSION = (
     'name = "largest"\n[spacecraft]\nid = 76\nname = "SelenITA"\n'
     '[camera]\nwidth_px = 512\nheight_px = 512\nfov_deg = 120.0\npointing = "nadir"\n'
@@ -116,7 +117,8 @@ def cases() -> list[tuple[str, str, str, Any]]:
     points = [time | {"ticks": one, "light_time_s": 1.3, "boot_count": 0} for one, time in ticks]
     times = [time | {"packet_ticks": one, "sequence_count": k} for k, (one, time) in enumerate(ticks)]
     link = '[[links]]\nname = "l{}"\nkind = "file"\ndownlink = "/nowhere"\n'
-    described = (MISSION + "".join(map(link.format, range(14_000)))).encode()
+    words = "".join(f'{name} = "{"x" * 80}"\n' for name in map("e{}".format, range(10_000)))
+    described = (MISSION + "".join(map(link.format, range(100))) + "[procedures]\n" + words).encode()
     span = {"spacecraft_id": 76, "start": at(0), "stop": at(31)}
     files = {f"images/{k}.png": {"sha256": f"{k:064x}", "bytes": 1} for k in range(15_000)}
     manifest = {"schema_version": 1, "pass_name": "p", "spacecraft_id": 76, "cadence_s": 15.0, "files": files}
@@ -151,7 +153,7 @@ def cases() -> list[tuple[str, str, str, Any]]:
         "measured": {"reason": "measured"},
     }
     lines = CASES.format(rows=ROWS_LIMIT, start=at(0), later=at(8), end=at(31)).splitlines()
-    rows = [(*words, bodies.get(body)) for *words, body in (line.split("|") for line in lines)]
+    rows = [(one, what, path, bodies.get(body)) for one, what, path, body in (line.split("|") for line in lines)]
     rows += [("export_pass", one, "exports", {"pass_id": 1, "format": one}) for one in formats.split()]
     rows += [("get_packets", f"10,000 {one}", f"passes/1/packets/{one}", None) for one in kinds]
     newest = "reports?" + "&".join(f"pass_id={k}" for k in range(1, 101))
@@ -164,8 +166,8 @@ upload_telemetry|1 GiB|telemetry?spacecraft_id=76|1 GiB
 add_ephemeris|800,000 states|ephemerides|states
 add_ephemeris|96 MiB in one line|ephemerides|line
 add_catalogue|{rows:,} rows|catalogues|craters
-add_mission|1 MiB, 14,000 links|missions|described
-check_mission|1 MiB, 14,000 links|missions/check|described
+add_mission|1 MiB, 100 links|missions|described
+check_mission|1 MiB, 100 links|missions/check|described
 check_mission|a plan|missions/check?plan=true|mission
 define_pass||passes|pass
 search_windows|31 days|windows/search|span
@@ -235,6 +237,11 @@ def table() -> dict[str, str]:
     return {row.split("|", 3)[1] + row.split("|", 3)[2]: row for row in rows}
 
 
+def weight(row: str) -> list[float]:
+    """Return the order of a row: the dearest first, those that were not measured last."""
+    return [-float(cell.replace("–", "-1")) for cell in row.split("|")[4:7:2]]
+
+
 def measured(only: Sequence[str], but: Collection[str] = ()) -> Iterator[Cost]:
     """Yield the costs of all operations, or of some."""
     with tempfile.TemporaryDirectory(prefix="costs-") as name, PostgresServer(Path(name)) as server:
@@ -280,12 +287,14 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--write", action="store_true", help=f"enter the rows into {PAGE.name}")
     given = parser.parse_args(words)
     rows, are_faulty = table(), False
-    for one in measured(given.only, {key.split("`")[1] for key in rows} if given.missing else ()):
+    known = {key.split("`")[1] for key, row in rows.items() if NOT_MEASURED not in row}
+    for one in measured(given.only, known if given.missing else ()):
         are_faulty |= bool(one.fault)
         print(one.cells(), one.fault, one.detail, flush=True)
         if given.write:
+            rows.pop(f" `{one.operation}`  {NOT_MEASURED} ", None)
             rows[f" `{one.operation}`  {one.what} "] = one.cells()
-            shown = sorted(rows.values(), key=lambda row: [-float(cell) for cell in row.split("|")[4:7:2]])
+            shown = sorted(rows.values(), key=weight)
             head = PAGE.read_text().split("|---")[0]
             PAGE.write_text(f"{head}|---|---|---|---|---|---|\n" + "\n".join(shown) + "\n")
     return int(are_faulty)

@@ -19,8 +19,7 @@ from ground_service.ingest import doubt_store, store
 from ground_service.ingest.model import IngestResult
 from ground_service.ingest.reception import Progress, Reading
 from ground_service.ingest.recording_store import Piece, add_piece, get_piece
-from ground_service.jobs.model import Job
-from ground_service.jobs.service import OTHER_REQUEST, add_job, find_job
+from ground_service.jobs.service import OTHER_REQUEST, Job, add_job, find_job
 from ground_service.missions.store import stations_in_force
 from ground_service.store.files import StoredFile, register_file
 from ground_service.store.vehicles import FLOWN, all_vehicles, hold, lock_vehicle

@@ -17,8 +17,7 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from ground_service.errors import InvalidInput
 from ground_service.http.model import Entity, InstanceName, UtcTime
-from ground_service.missions.automation import Automation, Channel, ChannelName, without_rules
-from ground_service.missions.section import Array, Section, Table
+from ground_service.missions.automation import Array, Automation, Channel, ChannelName, Section, Table, without_rules
 from ground_service.toml import faults, keys_at, read_table
 from lunar.boxes import Box, Region
 from lunar.errors import TimeFormatError
@@ -30,6 +29,9 @@ from tmtc.dictionary.payload import DICTIONARY
 
 SCHEMA_VERSION: Final = 1
 MISSION_LIMIT_OCTETS = 1 << 20
+LINKS_LIMIT = 100
+"""Most links of a description: each takes threads of a process."""
+
 EPOCH_TAI = " TAI"
 XTCE_COMPRESSED = "gzip:"
 DICTIONARY_APIDS = frozenset(one.apid for one in (*DICTIONARY.telemetry, *DICTIONARY.telecommands))
@@ -643,7 +645,7 @@ class Mission(Section):
     approval: Approval = Approval()
     uploads: Uploads | None = None
     resources: SpacecraftResources = SpacecraftResources()
-    links: Annotated[tuple[StationConnection, ...], Array] | None = None
+    links: Annotated[tuple[StationConnection, ...], Array, Field(max_length=LINKS_LIMIT)] | None = None
     packets: Annotated[tuple[PacketSource, ...], Array] | None = None
     procedures: dict[str, Annotated[str, Field(min_length=1, max_length=4000)]] = Field(default_factory=dict)
     """Procedures of the operator for alarms, by the name of event or parameter."""

@@ -18,8 +18,9 @@ from tmtc.dictionary.codes import EVENTS
 _EVENT_CODES = {name: code for code, name in EVENTS}
 STARTED, STOPPED = _EVENT_CODES["observation_started"], _EVENT_CODES["observation_stopped"]
 
-HOUSEKEEPING_NS = 60_000_000_000
-"""Housekeeping this far before and after the observations of a pass belongs to it, if no other observation is near."""
+HOUSEKEEPING_NS = 60_001_000_000
+"""Housekeeping this far before and after the observations of a pass belongs to it, if no other observation is near: a
+minute, and what time correlations differ by."""
 
 REACH_NS = 3_600_000_000_000
 """Event reports this far outside the planned time of a pass are read."""

@@ -21,12 +21,10 @@ from payload_emulator.flight.onboard.loads import MODEL_NUMBER, TABLE_NUMBERS, F
 from payload_emulator.flight.onboard.machine import PARAMETERS_NUMBER, Machine, ObservationWindow, ProtectedMemory
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.onboard.observer import Observer
-from payload_emulator.flight.onboard.parameters import ParameterStore
-from payload_emulator.flight.onboard.settings import Recovery, Settings
+from payload_emulator.flight.onboard.settings import ParameterStore, Recovery, Settings
 from payload_emulator.flight.onboard.telecommands import check, execute, name_of
 from payload_emulator.flight.ports import BareBoard, Board, Load, ResetCause, Stage
-from payload_emulator.flight.telemetry.packets import Telemetry
-from payload_emulator.flight.telemetry.products import image_report, thumbnail_octets
+from payload_emulator.flight.telemetry.packets import Telemetry, image_report, thumbnail_octets
 from payload_emulator.flight.telemetry.store import PacketStore, StoreClass
 from payload_emulator.flight.vision.detections import Detector
 from tmtc.packets.pus import ACK_ACCEPTANCE, ACK_COMPLETION, ACK_START, TICKS_LIMIT, TICKS_PER_SECOND

@@ -383,7 +383,7 @@ def test_a_telecommand_that_is_sent_again_under_its_key_is_queued_once(guarded):
 
 
 def test_a_key_whose_work_was_cut_off_is_refused_and_says_why(ground):
-    from ground_service.access.idempotency import once
+    from ground_service.access.security import once
     from ground_service.errors import Conflict, DatabaseUnavailable
 
     def ask(work):

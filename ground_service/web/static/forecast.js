@@ -27,7 +27,8 @@ export async function loadForecast([from, to], spacecraft, ephemeris) {
   found = await get("plan/forecast", { ...spacecraft, start: isoText(Math.floor(from)), stop: isoText(stop), ephemeris_id: ephemeris });
   const shortened = to - from > LONGEST_S ? `Conditions and resources are shown for the first ${LONGEST_S / 86400} days of the view.` : "";
   const reason = found.reason ? (found.time_s.length ? `Part of the time has no forecast: ${found.reason}.` : `There is no forecast: ${found.reason}.`) : "";
-  byId("forecast-state").textContent = [shortened, reason].filter(Boolean).join(" ");
+  const next = found.reason ? [" Windows can be found where an ephemeris is: ", element("a", { href: "/#upload" }, "upload one"), "."] : [];
+  show("forecast-state", [shortened, reason].filter(Boolean).join(" "), next);
 }
 
 // Curves of the forecast: name, unit, values, greatest value of the lane, limit.

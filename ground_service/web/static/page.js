@@ -24,7 +24,7 @@ export function element(name, attributes = {}, ...children) {
     if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
     else made.setAttribute(key, value === true ? "" : value);
   }
-  const parts = ["a", "td"].includes(name) ? children.flat().flatMap(unbroken) : children.flat();
+  const parts = ["a", "h1", "p", "td"].includes(name) ? children.flat().flatMap(unbroken) : children.flat();
   made.append(...parts.filter((child) => child !== null && child !== undefined));
   return made;
 }
@@ -198,12 +198,13 @@ function powerOfTen(value, digits) {
   return `${Number(mantissa)} × 10${[...exponent].map((sign) => SUPERSCRIPTS[sign]).join("")}`;
 }
 
+// A number stays in one line.
 export function figure(value, digits = 3) {
   if (value === null || value === undefined || Number.isNaN(value)) return "–";
   if (typeof value !== "number") return String(value);
-  if (Number.isInteger(value)) return value.toLocaleString("en").replaceAll(",", " ");
+  if (Number.isInteger(value)) return value.toLocaleString("en").replaceAll(",", "\u00a0");
   if (Math.abs(value) < 1e-4) return powerOfTen(value, digits);
-  return Math.abs(value) >= 1000 ? Math.round(value).toLocaleString("en").replaceAll(",", " ") : String(+value.toPrecision(digits));
+  return Math.abs(value) >= 1000 ? Math.round(value).toLocaleString("en").replaceAll(",", "\u00a0") : String(+value.toPrecision(digits));
 }
 
 // Names end in their unit: "Median error, m" for median_error_m.

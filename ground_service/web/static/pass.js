@@ -233,7 +233,7 @@ byId("only-alarms").addEventListener("change", showEvents);
 async function load() {
   const pass = await get(`passes/${passId}`);
   document.title = `${pass.name} · LINNA`;
-  document.querySelector("h1").textContent = pass.name;
+  document.querySelector("h1").replaceWith(element("h1", {}, pass.name));
   byId("span").textContent =
     `${timeText(pass.start)} to ${timeText(pass.stop)}, ${lengthText(seconds(pass.stop) - seconds(pass.start))}, ` +
     `spacecraft ${pass.spacecraft_id} (${pass.instance})`;

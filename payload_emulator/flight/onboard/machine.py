@@ -12,9 +12,8 @@ from payload_emulator.flight.onboard.housekeeping import STATE, Housekeeping, St
 from payload_emulator.flight.onboard.loads import MODEL_NUMBER, FlightParameters, FlightTables
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.onboard.observer import Observer
-from payload_emulator.flight.onboard.parameters import ParameterStore
 from payload_emulator.flight.onboard.schedule import Schedule
-from payload_emulator.flight.onboard.settings import Settings
+from payload_emulator.flight.onboard.settings import ParameterStore, Settings
 from payload_emulator.flight.ports import Board, Load, Memory
 from payload_emulator.flight.telemetry.packets import Telemetry
 from payload_emulator.flight.telemetry.store import PacketStore

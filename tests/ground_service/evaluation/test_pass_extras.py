@@ -103,9 +103,13 @@ def test_times_with_a_degraded_attitude_and_the_newest_offset_of_the_list_on_boa
     offsets = (
         event(90, "map_offset", newest),
         event(5, "map_offset", "frame 0: 60 m east and north, from 0 fixes"),
+        event(90, "detection_noise", "frame 80: 0.8 times the stated noise, from 80 fixes"),
         event(99, "boot"),
     )
-    assert event_remarks(offsets) == [f"offset of the crater list used on board, 1 sigma: {newest}"]
+    assert event_remarks(offsets) == [
+        f"offset of the crater list used on board, 1 sigma: {newest}",
+        "noise of detections used on board: frame 80: 0.8 times the stated noise, from 80 fixes",
+    ]
     assert event_remarks(()) == []
 
 

@@ -320,6 +320,14 @@ def test_windows_approved_automatically_with_critical_telecommands_are_refused(g
     assert add_mission(ground, (TEXT + released).encode()).document.critical_in_windows == ()
 
 
+def test_a_description_has_a_hundred_links_at_most():
+    link = '[[links]]\nname = "l{}"\nkind = "file"\ndownlink = "/nowhere"\n'
+    links = [link.format(k) for k in range(101)]
+    assert len(read_mission((TEXT + "".join(links[1:])).encode())[0].links or ()) == 100
+    with pytest.raises(InvalidInput, match="at most 100 items"):
+        read_mission((TEXT + "".join(links)).encode())
+
+
 def test_a_check_of_texts_that_take_long_to_compare_counts_their_lines(ground):
     head = TEXT + "\n".join(f"# {k % 7}" for k in range(1500)) + "\n"
     add_mission(ground, head.encode())

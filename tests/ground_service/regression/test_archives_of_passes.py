@@ -17,8 +17,7 @@ from ground_service.errors import InvalidInput
 from ground_service.ground import open_ground
 from ground_service.http.model import UtcTime
 from ground_service.ingest.service import ingest_file
-from ground_service.jobs.model import JobFilter
-from ground_service.jobs.service import list_jobs
+from ground_service.jobs.service import JobFilter, list_jobs
 from ground_service.passes.archive_import import import_archive, read_manifest
 from ground_service.passes.service import define_pass
 from ground_service.regression import rendering, service, store

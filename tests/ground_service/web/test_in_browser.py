@@ -139,12 +139,15 @@ def test_small_figures_have_a_power_of_ten_and_zero_has_none_and_long_times_have
     page.goto("/licences")
     found = page.evaluate(
         """async () => {
-            const { figure, lengthText } = await import("/static/page.js");
+            const { element, figure, lengthText } = await import("/static/page.js");
             const lengths = [59, 3600 * 47 + 60, 3600 * 49];
-            return [[0, 4.51e-11, -2e-5, 0.00012, 0.5].map((value) => figure(value)), lengths.map(lengthText)];
+            const title = element("h1", {}, "selenita-2029-08-18T08:17:55Z").querySelector(".keep").textContent;
+            const figures = [0, 4.51e-11, -2e-5, 0.00012, 0.5, 1544].map((value) => figure(value));
+            return [figures, lengths.map(lengthText), title];
         }"""
     )
-    assert found == [["0", "4.51 × 10⁻¹¹", "-2 × 10⁻⁵", "0.00012", "0.5"], ["59 s", "47 h 1 min", "2 d 1 h"]]
+    figures = ["0", "4.51 × 10⁻¹¹", "-2 × 10⁻⁵", "0.00012", "0.5", "1\u00a0544"]
+    assert found == [figures, ["59 s", "47 h 1 min", "2 d 1 h"], "2029-08-18T08:17"]
 
 
 def test_the_pass_page_shows_what_came_and_makes_a_report(page):

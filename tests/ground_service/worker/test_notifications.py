@@ -19,8 +19,7 @@ import pytest
 from ground_service.access.store import audit_head
 from ground_service.errors import InvalidInput
 from ground_service.ground import open_ground
-from ground_service.jobs.model import JobFilter
-from ground_service.jobs.service import get_job, list_jobs
+from ground_service.jobs.service import JobFilter, get_job, list_jobs
 from ground_service.missions.automation import Channel
 from ground_service.missions.service import add_mission
 from ground_service.settings import load_settings

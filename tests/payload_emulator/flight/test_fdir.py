@@ -9,7 +9,7 @@ from payload_emulator.flight.onboard.settings import Settings
 from payload_emulator.flight.payload import PayloadMode
 from payload_emulator.flight.ports import ResetCause
 from payload_emulator.flight.vision.preprocess import ImageQuality
-from tmtc.dictionary.onboard_parameters import PARAMETERS
+from tmtc.dictionary.fields import PARAMETERS
 
 NUMBERS = {parameter.name: parameter.number for parameter in PARAMETERS}
 NO_IMAGE = np.zeros((0, 0), np.uint8)

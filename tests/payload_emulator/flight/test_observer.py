@@ -243,12 +243,13 @@ def test_an_attitude_noisier_than_declared_is_reported_at_its_beginning_and_end(
     assert_allclose([event[2:] for event in found], [(0.2, 0.01), (0.01, 0.0), (1.0, 0.01)])
 
 
-def test_the_size_of_the_map_offset_is_sent_when_it_changes(rig):
+def test_the_size_of_the_map_offset_and_the_noise_are_sent_when_the_size_changes(rig):
     for sigma_m, fixes, pending in ((60.0, 0, 0), (60.0, 0, 7), (31.0, 40, 0), (31.0, 40, 9), (31.0, 80, 0)):
-        rig.navigator.offset = OffsetSize(sigma_m, 0.5, fixes, pending=pending)
+        rig.navigator.offset = OffsetSize(sigma_m, 0.5, fixes, pending=pending, noise_factor=0.8)
         look(rig)
-    sent = [event[2:] for event in rig.telemetry.events if event[:2] == ("info", "map_offset")]
-    assert sent == [(60.0, 0.0), (31.0, 40.0), (31.0, 80.0)]
+    for name, values in (("map_offset", (60.0, 31.0, 31.0)), ("detection_noise", (0.8, 0.8, 0.8))):
+        sent = [event[2:] for event in rig.telemetry.events if event[:2] == ("info", name)]
+        assert sent == list(zip(values, (0.0, 40.0, 80.0), strict=True))
 
 
 def test_a_reset_of_the_filter_is_reported_and_counted(rig):

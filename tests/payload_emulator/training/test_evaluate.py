@@ -26,8 +26,7 @@ from payload_emulator.training.evaluate.evaluate import (
     run,
     summary,
 )
-from payload_emulator.training.evaluate.localisation import bias_by_octant, bias_overall
-from payload_emulator.training.evaluate.metrics import Scene, Thresholds, score
+from payload_emulator.training.evaluate.metrics import Scene, Thresholds, bias_by_octant, bias_overall, score
 from payload_emulator.training.evaluate.report import detector_report
 from payload_emulator.training.evaluate.scoring import average_precision, tally
 from payload_emulator.training.model.calibrate import fit_parallax, paper_threshold, without_parallax
