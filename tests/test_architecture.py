@@ -80,7 +80,7 @@ def modules_of(root):
 
 @functools.cache
 def contents_of(name, text, is_package):
-    """Dotted names that a module imports anywhere, also for type checking; its long functions; its classes with fields."""
+    """Dotted names that a module imports anywhere, also for type checking; its long functions; its classes."""
     package = name if is_package else name.rpartition(".")[0]
     imported, long, classes = set[str](), list[str](), []
     for node in ast.walk(ast.parse(text)):
