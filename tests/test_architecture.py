@@ -80,9 +80,9 @@ def modules_of(root):
 
 @functools.cache
 def contents_of(name, text, is_package):
-    """Dotted names that a module imports anywhere, also in functions and for type checking; its long functions."""
+    """Dotted names that a module imports anywhere, also for type checking; its long functions; its classes."""
     package = name if is_package else name.rpartition(".")[0]
-    imported, long = set[str](), list[str]()
+    imported, long, classes = set[str](), list[str](), []
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
             imported |= {alias.name for alias in node.names}
@@ -94,7 +94,10 @@ def contents_of(name, text, is_package):
             lines = node.end_lineno - node.lineno + 1
             if lines > LONGEST_FUNCTION:
                 long.append(f"{name}.{node.name}: {lines} lines")
-    return imported, long
+        elif isinstance(node, ast.ClassDef):
+            fields = [one.target for one in node.body if isinstance(one, ast.AnnAssign)]
+            classes.append((node.name, {one.id for one in fields if isinstance(one, ast.Name)}))
+    return imported, long, classes
 
 
 def imported_names(name, file):
@@ -307,16 +310,12 @@ TWO_ENTITIES = {
 
 def repeated_entities(root):
     """Pairs of classes of at least six fields that share 80 % of the fields of the larger one."""
-    fields = [
-        (
-            node.name,
-            {one.target.id for one in node.body if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name)},
-        )
-        for file in modules_of(root).values()
-        for node in ast.walk(ast.parse(file.read_text()))
-        if isinstance(node, ast.ClassDef)
+    large = [
+        one
+        for name, file in modules_of(root).items()
+        for one in contents_of(name, file.read_text(), file.name == "__init__.py")[2]
+        if len(one[1]) >= 6
     ]
-    large = [(name, names) for name, names in fields if len(names) >= 6]
     return {
         (one, other)
         for (one, its), (other, others) in itertools.combinations(large, 2)
