@@ -72,8 +72,9 @@ smoother|ground_service/evaluation/smoother\
 |ground_service/evaluation/test_smoother ground_service/exports/test_exports
 gates|ground_service/regression/gates/core ground_service/regression/gates/statistics\
 |ground_service/regression/test_regression_gates
-filter|payload_emulator/flight/navigation/filter/filter payload_emulator/flight/navigation/anchored/anchored \
-payload_emulator/flight/navigation/anchored/correction payload_emulator/flight/navigation/anchored/recovery \
+filter|payload_emulator/flight/navigation/filter/filter payload_emulator/flight/navigation/filter/map_offset \
+payload_emulator/flight/navigation/anchored/anchored payload_emulator/flight/navigation/anchored/correction \
+payload_emulator/flight/navigation/anchored/recovery \
 payload_emulator/flight/onboard/observer payload_emulator/flight/navigation/search/acquisition\
 |payload_emulator/flight/test_navigation_filter payload_emulator/flight/test_anchored \
 payload_emulator/flight/test_anchored_navigator payload_emulator/flight/test_observer \

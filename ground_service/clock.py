@@ -61,6 +61,11 @@ def independent_now_ns() -> int | None:
     return now
 
 
+def is_stated() -> bool:
+    """Return whether a mission description or a simulation states the mission time, which is else the wall clock."""
+    return (_mission.read or _mission.stated) is not None
+
+
 def is_recorded() -> bool:
     """Return whether the mission time is that of recorded passes, of which nothing flies."""
     mission_now_ns()  # a clock that is read when it is first needed

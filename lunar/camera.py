@@ -1,4 +1,4 @@
-"""Pinhole camera over the sphere: projection, rays, ground points and footprints.
+"""Camera over the sphere, pinhole or with a distorting lens: projection, rays, ground points and footprints.
 
 Camera axes: x right (image u), y down (image v), z along the boresight.  Pixel centres have integer
 coordinates, so 512 pixels reach from -0.5 to 511.5 and their centre is at 255.5.  The nadir camera looks down

@@ -1,4 +1,4 @@
-"""Public data products present in a data folder, and the default models for them.
+"""Public data products in a data folder, plain or compressed, and the default models for them.
 
 A folder is laid out as ``gravity/ kernels/ craters/ dem/ albedo/ photometry/``; any part may be absent. Heights and
 craters of a user are ``dem/own*.tif`` and ``craters/own*.csv``.

@@ -1,4 +1,4 @@
-"""Visibility: sub-satellite point, Sun and shadow, the Earth and its stations behind the limb.
+"""Visibility: sub-satellite point and ground track, Sun and shadow, the Earth and its stations behind the limb.
 
 Bodies are spheres: the Moon of `MOON_RADIUS_M`, the Sun and the Earth of their mean radii.  Positions are
 Moon-centred in ICRF axes unless a name says otherwise; directions to the Sun are geometric (its light is 500

@@ -35,17 +35,7 @@ from payload_emulator.flight.navigation.sighting import LandmarkMap, Pose, in_vi
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.session.world.regions import regional_field
 from payload_emulator.sim.detector import SimulatedDetector
-from tmtc.dictionary.tables import (
-    CatalogueTable,
-    GravityTable,
-    InitialState,
-    pack_catalogue_table,
-    pack_gravity_table,
-    pack_orientation_table,
-    unpack_catalogue_table,
-    unpack_gravity_table,
-    unpack_orientation_table,
-)
+from tmtc.dictionary import tables
 
 _ORIENTATION_STEP_NS = 7_200 * NS
 _PUSH_S = 60.0
@@ -330,9 +320,9 @@ def verdict(result: Consistency, runs: int) -> Verdict:
     return Verdict(not reasons, (low, high), reasons)
 
 
-def catalogue_table(craters: CraterCatalogue) -> CatalogueTable:
+def catalogue_table(craters: CraterCatalogue) -> tables.CatalogueTable:
     """Return craters as a table without uncertainty; those without a rim height stand on the sphere."""
-    return CatalogueTable(
+    return tables.CatalogueTable(
         np.arange(len(craters), dtype=np.int64),
         craters.latitude_rad,
         craters.longitude_rad,
@@ -377,7 +367,9 @@ def _with_drawn_node(case: NavigationCase, rng: np.random.Generator) -> Navigati
     return replace(case, position_icrf_m=turn @ case.position_icrf_m, velocity_icrf_m_s=turn @ case.velocity_icrf_m_s)
 
 
-def _with_errors(table: CatalogueTable, errors: CatalogueErrors, rng: np.random.Generator) -> CatalogueTable:
+def _with_errors(
+    table: tables.CatalogueTable, errors: CatalogueErrors, rng: np.random.Generator
+) -> tables.CatalogueTable:
     centre_m = errors.centre_of_diameter * table.diameter_m
     sigma_m = np.stack([centre_m, centre_m, np.full(len(table), errors.height_m)], axis=1)
     shift_m = sigma_m * rng.standard_normal(sigma_m.shape)
@@ -386,7 +378,7 @@ def _with_errors(table: CatalogueTable, errors: CatalogueErrors, rng: np.random.
         shift_m = shift_m + np.array(errors.regional_sigma_m) * field
     wrong = rng.uniform(size=len(table)) < errors.wrong_share
     turned = np.where(wrong, rng.uniform(0.0, 2.0 * np.pi, len(table)), 0.0)
-    moved = CatalogueTable(
+    moved = tables.CatalogueTable(
         table.ids,
         table.latitude_rad + shift_m[:, 1] / MOON_RADIUS_M,
         table.longitude_rad + turned + shift_m[:, 0] / (MOON_RADIUS_M * np.cos(table.latitude_rad)),
@@ -394,7 +386,7 @@ def _with_errors(table: CatalogueTable, errors: CatalogueErrors, rng: np.random.
         table.rim_height_m + shift_m[:, 2],
         sigma_m,
     )
-    return unpack_catalogue_table(pack_catalogue_table(moved))
+    return tables.unpack_catalogue_table(tables.pack_catalogue_table(moved))
 
 
 def _truth(case: NavigationCase, rng: np.random.Generator, slow: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -443,7 +435,7 @@ def _pushed(
 
 
 def _started(
-    case: NavigationCase, table: CatalogueTable, state: FloatArray, ticks: int, rng: np.random.Generator
+    case: NavigationCase, table: tables.CatalogueTable, state: FloatArray, ticks: int, rng: np.random.Generator
 ) -> tuple[AnchoredSetup, AnchoredState]:
     times = np.arange(
         int(case.frame_utc_ns[0]) - _ORIENTATION_MARGIN_NS,
@@ -454,7 +446,7 @@ def _started(
     rotations = case.filter_orientation.mcmf_from_icrf(tdb_s)
     pa_from_mcmf = case.filter_orientation.pa_from_icrf(tdb_s[0]) @ rotations[0].T
     gravity = case.filter_gravity
-    start = InitialState(
+    start = tables.InitialState(
         ticks,
         state[:3] + case.start_position_m / np.sqrt(3.0) * rng.standard_normal(3),
         state[3:] + case.start_velocity_m_s / np.sqrt(3.0) * rng.standard_normal(3),
@@ -463,12 +455,14 @@ def _started(
     )
     return anchored.start(
         table,
-        unpack_gravity_table(
-            pack_gravity_table(
-                GravityTable(gravity.name, gravity.gm_m3_s2, gravity.radius_m, gravity.c_bar, gravity.s_bar)
+        tables.unpack_gravity_table(
+            tables.pack_gravity_table(
+                tables.GravityTable(gravity.name, gravity.gm_m3_s2, gravity.radius_m, gravity.c_bar, gravity.s_bar)
             )
         ),
-        unpack_orientation_table(pack_orientation_table(np.asarray(ticks_from_utc_ns(times)), rotations, pa_from_mcmf)),
+        tables.unpack_orientation_table(
+            tables.pack_orientation_table(np.asarray(ticks_from_utc_ns(times)), rotations, pa_from_mcmf)
+        ),
         start,
         case.camera,
         case.parameters,

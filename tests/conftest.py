@@ -137,7 +137,7 @@ def _folder(nodeid):
 
 
 def _by_folder(config):
-    """Whether each process gets whole folders; campaigns, of which a few folders hold nearly all, go by file."""
+    """Return whether each process gets whole folders; campaigns, of which a few folders hold nearly all, go by file."""
     return config.getoption("markexpr") == "not campaign"
 
 

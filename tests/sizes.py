@@ -97,7 +97,7 @@ def committed_table(revision):
 
 
 def main(arguments):
-    """Print the sizes beside their limits; with `--write`, store them as the limits."""
+    """Print the sizes with their limits; with `--write`, store them as the limits."""
     sizes = sizes_of(ROOT)
     limits = load_table(TABLE.read_text(encoding="utf-8")) if TABLE.exists() else {}
     for package, (lines, tokens) in sizes.items():

@@ -61,7 +61,7 @@ from tmtc.downlink import decode, encode_cadus
 from tmtc.errors import TmtcError
 
 TABLE_NAMES = (RADIUS_M, icrf_from_j2000)
-"""What only the table of changes uses."""
+"""Inputs that only the table of changes uses."""
 
 REFUSALS = (LunarError, GroundError, PayloadError, TmtcError)
 REFERENCES = Path(__file__).with_name("references")

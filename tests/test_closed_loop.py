@@ -13,7 +13,7 @@ from linna.commands.demo import KERNELS
 from tests.scenarios import still_scenario
 
 SCENARIO = (
-    still_scenario("closed-loop", 180.0)
+    still_scenario("closed-loop", 120.0)
     + """[navigation]
 filter_gravity = "builtin"
 filter_degree = 8
@@ -21,7 +21,7 @@ initial_position_error_m = 1000.0
 initial_velocity_error_m_s = 1.0
 """
 )
-FRAMES = 12
+FRAMES = 8
 
 
 @pytest.fixture(scope="module")

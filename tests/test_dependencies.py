@@ -1,4 +1,4 @@
-"""What the project stands on: pinned, installed as pinned, under licences that a product can carry."""
+"""Dependencies of the project: pinned, installed as pinned, under licences that a product can carry."""
 
 import importlib.util
 import json

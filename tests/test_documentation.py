@@ -172,12 +172,12 @@ def test_the_commands_of_a_tutorial_run_as_written(name, tmp_path):
     if name == "first-spacecraft.md":
         _check_first_spacecraft(tmp_path)
     if name == "own-build.md":
-        told, found = (
+        stated, found = (
             re.search(r"^fail: recall falls by ([\d.]+) .*$", text, re.MULTILINE)
             for text in (read(f"tutorials/{name}"), printed)
         )
-        assert told and found and float(found[1]) == pytest.approx(float(told[1]), abs=0.02)
-        assert re.sub(r"[\d.]+", "1", found[0]) == re.sub(r"[\d.]+", "1", told[0])
+        assert stated and found and float(found[1]) == pytest.approx(float(stated[1]), abs=0.02)
+        assert re.sub(r"[\d.]+", "1", found[0]) == re.sub(r"[\d.]+", "1", stated[0])
 
 
 @pytest.mark.campaign
@@ -237,8 +237,8 @@ def test_figures_of_pages_are_those_of_the_program():
 def test_the_animation_of_the_readme_shows_the_figures_of_the_text():
     with Image.open(DOCS / "pictures" / "tour.gif") as picture:
         shown = picture.info["comment"].decode()
-    told = read("tutorials/first-pass.md").split("```text\n")[1].split("```")[0].strip()
-    assert shown == told
+    stated = read("tutorials/first-pass.md").split("```text\n")[1].split("```")[0].strip()
+    assert shown == stated
     median, p95, level = re.findall(r"^anchored +(\d+) +(\d+) .*level (\d)", shown, re.MULTILINE | re.DOTALL)[0]
     navigation = read("navigation.md")
     assert f"| `linna demo` with `LINNA_DATA`, one window | {level} | {median} m | {p95} m |" in navigation

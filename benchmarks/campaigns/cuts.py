@@ -30,7 +30,7 @@ from benchmarks.campaigns.compatibility import compare
 from benchmarks.downlink import telemetry
 from ground_service.errors import DatabaseBusy, GroundError
 from ground_service.ground import Ground, open_ground
-from ground_service.ingest.service import Place, ingest_file
+from ground_service.ingest.service import PiecePosition, ingest_file
 from ground_service.ingest.store import get_ingest
 from ground_service.missions.service import add_mission
 from ground_service.passes.service import completeness, define_pass
@@ -301,7 +301,7 @@ def ingest(ground: Ground, piece: Piece, instance: str, name: str) -> int:
                 path,
                 spacecraft_id=piece.recording.spacecraft,
                 instance=instance,
-                place=None if piece.whole else Place(piece.recording.name, piece.start),
+                place=None if piece.whole else PiecePosition(piece.recording.name, piece.start),
                 station=piece.recording.station,
             ).ingest_id
         except DatabaseBusy:

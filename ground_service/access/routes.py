@@ -4,23 +4,8 @@ from typing import Annotated
 
 from fastapi import Path, Query, Request, Response
 
+from ground_service.access import model, store
 from ground_service.access import service as users
-from ground_service.access import store
-from ground_service.access.model import (
-    USER_NAME,
-    AuditEntry,
-    AuditFilter,
-    AuditHead,
-    NewSession,
-    NewToken,
-    NewUser,
-    Session,
-    Token,
-    User,
-    UserChange,
-    UserWithToken,
-    Words,
-)
 from ground_service.access.security import SESSION_COOKIE, Admin, Operator, Viewer
 from ground_service.errors import InvalidInput
 from ground_service.http.common import GroundOf, RowId, linked
@@ -29,14 +14,14 @@ from ground_service.http.requests import operations, problems
 
 access = operations("access")
 
-UserName = Annotated[str, Path(pattern=USER_NAME)]
+UserName = Annotated[str, Path(pattern=model.USER_NAME)]
 
 
-_LONGEST_TOKEN = NewToken.model_validate({})
+_LONGEST_TOKEN = model.NewToken.model_validate({})
 
 
 @access.post("/session", responses=problems(401))
-def start_session(request: Request, response: Response, ground: GroundOf, given: NewSession) -> Session:
+def start_session(request: Request, response: Response, ground: GroundOf, given: model.NewSession) -> model.Session:
     """Start a browser session with a token; the response sets its cookie."""
     secret, session = users.start_session(ground, given.token)
     response.set_cookie(
@@ -51,7 +36,7 @@ def start_session(request: Request, response: Response, ground: GroundOf, given:
 
 
 @access.get("/session")
-def get_session(request: Request, ground: GroundOf, caller: Viewer) -> Session:
+def get_session(request: Request, ground: GroundOf, caller: Viewer) -> model.Session:
     """Show the user of this request, the role, and the end of the validity."""
     return users.session_of(ground, caller, browser=_by_cookie(request))
 
@@ -71,28 +56,28 @@ def _by_cookie(request: Request) -> bool:
 
 
 @access.get("/users")
-def list_users(ground: GroundOf, _: Admin) -> PageOf[User]:
+def list_users(ground: GroundOf, _: Admin) -> PageOf[model.User]:
     """List all users."""
     return PageOf.all_of(users.list_users(ground))
 
 
 @access.post("/users", status_code=201, responses=problems(409))
-def add_user(ground: GroundOf, caller: Admin, given: NewUser) -> UserWithToken:
+def add_user(ground: GroundOf, caller: Admin, given: model.NewUser) -> model.UserWithToken:
     """Add a user; the response contains the token, which cannot be read again."""
     token = users.add_user(
         ground, given.name, given.role, days_valid=given.days_valid, missions=given.missions, actor=caller.name
     )
-    return UserWithToken(user=users.get_user(ground, given.name), token=token)
+    return model.UserWithToken(user=users.get_user(ground, given.name), token=token)
 
 
 @access.get("/users/{name}")
-def get_user(ground: GroundOf, _: Admin, name: UserName) -> User:
+def get_user(ground: GroundOf, _: Admin, name: UserName) -> model.User:
     """Show one user."""
     return users.get_user(ground, name)
 
 
 @access.patch("/users/{name}", responses=problems(409))
-def change_user(ground: GroundOf, caller: Admin, name: UserName, given: UserChange) -> User:
+def change_user(ground: GroundOf, caller: Admin, name: UserName, given: model.UserChange) -> model.User:
     """Disable or enable a user, or change the role or missions; 409 states the conflicting state."""
     return users.change_user(
         ground, name, state=given.state, role=given.role, missions=given.missions, actor=caller.name
@@ -100,7 +85,9 @@ def change_user(ground: GroundOf, caller: Admin, name: UserName, given: UserChan
 
 
 @access.post("/users/{name}/tokens", status_code=201)
-def add_token(ground: GroundOf, caller: Admin, name: UserName, given: NewToken = _LONGEST_TOKEN) -> UserWithToken:
+def add_token(
+    ground: GroundOf, caller: Admin, name: UserName, given: model.NewToken = _LONGEST_TOKEN
+) -> model.UserWithToken:
     """Create a token for a user; the response contains it, and it cannot be read again."""
     token = users.add_token(
         ground,
@@ -110,11 +97,11 @@ def add_token(ground: GroundOf, caller: Admin, name: UserName, given: NewToken =
         revoke_others=given.revoke_others,
         actor=caller.name,
     )
-    return UserWithToken(user=users.get_user(ground, name), token=token)
+    return model.UserWithToken(user=users.get_user(ground, name), token=token)
 
 
 @access.get("/tokens", responses=problems(404))
-def list_tokens(ground: GroundOf, _: Admin, user: Words | None = None) -> PageOf[Token]:
+def list_tokens(ground: GroundOf, _: Admin, user: model.Words | None = None) -> PageOf[model.Token]:
     """List tokens without their secrets, newest first."""
     return PageOf.all_of(users.list_tokens(ground, user))
 
@@ -127,8 +114,8 @@ def revoke_token(ground: GroundOf, caller: Admin, token_id: RowId) -> None:
 
 @access.get("/audit")
 def list_audit(
-    ground: GroundOf, _: Operator, request: Request, asked: Annotated[AuditFilter, Query()]
-) -> PageOf[AuditEntry]:
+    ground: GroundOf, _: Operator, request: Request, asked: Annotated[model.AuditFilter, Query()]
+) -> PageOf[model.AuditEntry]:
     """List the audit entries, newest first: actor, time, action and target."""
     if asked.since is not None and asked.until is not None and asked.since.utc_ns > asked.until.utc_ns:
         raise InvalidInput("audit", "until", f"a time after {asked.since}", str(asked.until))
@@ -136,6 +123,6 @@ def list_audit(
 
 
 @access.get("/audit/head")
-def get_audit_head(ground: GroundOf, _: Operator) -> AuditHead:
+def get_audit_head(ground: GroundOf, _: Operator) -> model.AuditHead:
     """Show number and hash of the newest entry, to be stored elsewhere."""
     return store.audit_head(ground)

@@ -1,4 +1,4 @@
-"""Requests of the client: retries, problem details, streamed bodies and paging."""
+"""Requests of the client: retries, errors from problem details, streamed bodies and paging."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""In-process client of the ground service, without a server."""
+"""In-process client of the ground service, without a server: its transport and its time limits."""
 
 from __future__ import annotations
 

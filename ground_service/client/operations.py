@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ground_service.evaluation.performance import model as performance
     from ground_service.exports import model as exports
     from ground_service.ingest import model as ingest
-    from ground_service.jobs import model as jobs
+    from ground_service.jobs import service
     from ground_service.missions import model as missions
     from ground_service.missions.ephemerides import model as ephemerides
     from ground_service.missions.timekeeping import model as timekeeping
@@ -30,7 +30,7 @@ else:
     import_lazily(
         globals(),
         "access.model passes.alarms.model contacts.commanding.model worker.condition "
-        "missions.ephemerides.model evaluation.model exports.model ingest.model jobs.model "
+        "missions.ephemerides.model evaluation.model exports.model ingest.model service.model "
         "evaluation.landmarks.model contacts.links.model missions.model passes.model "
         "evaluation.performance.model planning.model regression.model missions.timekeeping.model ",
     )
@@ -42,7 +42,7 @@ class Operations(Connection):
     # passes
 
     @operation("POST /archives")
-    def upload_archive(self, file: Path | bytes, *, name: str | None = None, key: str | None = None) -> jobs.Job:
+    def upload_archive(self, file: Path | bytes, *, name: str | None = None, key: str | None = None) -> service.Job:
         """Import a zipped pass archive: manifest, downlink, reference, catalogue and images."""
 
     @operation("GET /passes", reads="passes.store.list_passes")
@@ -201,7 +201,7 @@ class Operations(Connection):
         """Evaluate a pass now: frames, packets, detector, navigation and baselines."""
 
     @operation("POST /passes/{pass_id}/reports")
-    def request_report(self, pass_id: int, *, key: str | None = None) -> jobs.Job:
+    def request_report(self, pass_id: int, *, key: str | None = None) -> service.Job:
         """Request a report of a pass; a job creates it."""
 
     @operation("GET /reports/{report_id}")
@@ -311,15 +311,15 @@ class Operations(Connection):
     # jobs
 
     @operation("GET /jobs", reads="jobs.service.list_jobs")
-    def list_jobs(self, *, kind: str | None = None) -> Listing[jobs.Job]:
-        """List the jobs, newest first; `kind` selects jobs of one kind."""
+    def list_jobs(self, *, kind: str | None = None) -> Listing[service.Job]:
+        """List the service, newest first; `kind` selects jobs of one kind."""
 
     @operation("GET /jobs/{job_id}")
-    def get_job(self, job_id: str) -> jobs.Job:
+    def get_job(self, job_id: str) -> service.Job:
         """Show a job: its state, and its result when it is done."""
 
     @operation("POST /jobs/{job_id}/repeat")
-    def repeat_job(self, job_id: str) -> jobs.Job:
+    def repeat_job(self, job_id: str) -> service.Job:
         """Queue a failed job again, which changes nothing that is done already."""
 
     @operation("DELETE /jobs/{job_id}")
@@ -586,7 +586,7 @@ class Operations(Connection):
         """Keep the regression archive of a pass: its received data, and the inputs of the payload if they are known."""
 
     @operation("POST /regression-archives/{digest}/frames")
-    def render_kept_archive(self, digest: str) -> jobs.Job:
+    def render_kept_archive(self, digest: str) -> service.Job:
         """Render the missing frames of a kept archive as a job, and compare them with the recorded hashes."""
 
     @operation("PATCH /regression-archives/{digest}", body=("pinned",))
@@ -598,7 +598,7 @@ class Operations(Connection):
         """Delete kept archives that are not pinned and were not used for a time."""
 
     @operation("POST /regressions", body="request")
-    def start_regression(self, request: Document, *, key: str | None = None) -> jobs.Job:
+    def start_regression(self, request: Document, *, key: str | None = None) -> service.Job:
         """Compare a candidate build with a baseline: a job for every missing replay, and one for the verdict."""
 
     @operation("POST /analyses", body=("candidate", "baseline", "archives", "passes", "workers"))
@@ -611,7 +611,7 @@ class Operations(Connection):
         passes: Sequence[int] | None = None,
         workers: int | None = None,
         key: str | None = None,
-    ) -> jobs.Job:
+    ) -> service.Job:
         """Return the metrics of one build (candidate and baseline alike) as a job, without a verdict."""
 
     @operation("GET /regressions", reads="regression.store.list_regressions")

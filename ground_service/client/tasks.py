@@ -14,7 +14,7 @@ from ground_service.errors import InvalidInput
 
 if TYPE_CHECKING:
     from ground_service.ingest.model import Ingest
-    from ground_service.jobs.model import Job
+    from ground_service.jobs.service import Job
     from ground_service.missions.model import MissionDetail
 
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 2.0

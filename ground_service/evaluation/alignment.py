@@ -12,17 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lunar import frames
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.constants import NS
 from lunar.ephemeris import Ephemeris
-from lunar.frames import (
-    Orientation,
-    continuous_quaternions,
-    mcmf_from_spherical,
-    quaternion_from_matrix,
-    rtn_from_inertial,
-    spherical_from_mcmf,
-)
 from lunar.timescales import tdb_s_from_utc_ns
 from reports.values import DriftSample, ErrorBudget, NavigationStatistics
 
@@ -66,7 +59,9 @@ class ReferenceStates:
         return np.degrees(self.longitude_rad) % 360.0
 
 
-def reference_states(reference: Ephemeris | None, orientation: Orientation | None, utc_ns: IntArray) -> ReferenceStates:
+def reference_states(
+    reference: Ephemeris | None, orientation: frames.Orientation | None, utc_ns: IntArray
+) -> ReferenceStates:
     """Return the reference at `utc_ns` (n,); epochs that it does not cover are NaN.
 
     Without a reference, or without an orientation to relate it to the ground, all epochs are NaN.
@@ -83,7 +78,7 @@ def reference_states(reference: Ephemeris | None, orientation: Orientation | Non
     if orientation is not None and covered.any():
         rotation[covered] = orientation.mcmf_from_icrf(np.asarray(tdb_s_from_utc_ns(utc_ns[covered])))
     position_mcmf = np.einsum("nij,nj->ni", rotation, position)
-    latitude, longitude, altitude = spherical_from_mcmf(position_mcmf)
+    latitude, longitude, altitude = frames.spherical_from_mcmf(position_mcmf)
     return ReferenceStates(utc_ns, covered, position, velocity, rotation, position_mcmf, latitude, longitude, altitude)
 
 
@@ -91,14 +86,14 @@ def error_of_places_rtn_m(
     reference: ReferenceStates, latitude_deg: FloatArray, longitude_deg: FloatArray, altitude_m: FloatArray
 ) -> FloatArray:
     """Estimate minus reference (n, 3) in R/T/N, of estimates given as mean-Earth places at the same epochs."""
-    estimate_mcmf = mcmf_from_spherical(np.radians(latitude_deg), np.radians(longitude_deg), altitude_m)
+    estimate_mcmf = frames.mcmf_from_spherical(np.radians(latitude_deg), np.radians(longitude_deg), altitude_m)
     estimate_icrf = np.einsum("nji,nj->ni", reference.mcmf_from_icrf, estimate_mcmf)
     return error_of_positions_rtn_m(reference, estimate_icrf)
 
 
 def error_of_positions_rtn_m(reference: ReferenceStates, position_icrf_m: FloatArray) -> FloatArray:
     """Estimate minus reference (n, 3) in R/T/N, of estimated ICRF positions (n, 3) at the same epochs."""
-    rotation = rtn_from_inertial(reference.position_icrf_m, reference.velocity_icrf_m_s)
+    rotation = frames.rtn_from_inertial(reference.position_icrf_m, reference.velocity_icrf_m_s)
     return np.asarray(np.einsum("nij,nj->ni", rotation, position_icrf_m - reference.position_icrf_m))
 
 
@@ -106,7 +101,7 @@ def places_of_positions(
     reference: ReferenceStates, position_icrf_m: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Mean-Earth latitude and east longitude in degrees and altitude in m of ICRF positions (n, 3)."""
-    latitude, longitude, altitude = spherical_from_mcmf(
+    latitude, longitude, altitude = frames.spherical_from_mcmf(
         np.einsum("nij,nj->ni", reference.mcmf_from_icrf, position_icrf_m)
     )
     return np.degrees(latitude), np.degrees(longitude) % 360.0, altitude
@@ -352,14 +347,14 @@ def format_tum(utc_ns: IntArray, position_m: FloatArray, reference_m: FloatArray
     """
     seconds = (utc_ns - utc_ns[0]) / NS
     velocity = np.gradient(reference_m, seconds, axis=0)
-    turns = quaternion_from_matrix(np.swapaxes(rtn_from_inertial(reference_m, velocity), 1, 2))
+    turns = frames.quaternion_from_matrix(np.swapaxes(frames.rtn_from_inertial(reference_m, velocity), 1, 2))
     lines = [
         f"{int(t) // NS}.{int(t) % NS:09d} "
         + " ".join(f"{value:.6f}" for value in position)
         + " "
         + " ".join(f"{value:.12f}" for value in turn)
         for t, position, turn in zip(
-            utc_ns, position_m, np.roll(continuous_quaternions(turns), -1, axis=1), strict=True
+            utc_ns, position_m, np.roll(frames.continuous_quaternions(turns), -1, axis=1), strict=True
         )
     ]
     return "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines) + "\n"

@@ -275,11 +275,16 @@ def _reference_px(inputs: PassInputs, reference: TrackSeries | None) -> float:
     return inputs.viewing.camera.focal_px * float(np.hypot(*sigma[1:])) / float(np.nanmedian(reference.altitude_m))
 
 
+_LEARNED = {
+    "map_offset": "offset of the crater list used on board, 1 sigma",
+    "detection_noise": "noise of detections used on board",
+}
+
+
 def event_remarks(events: Sequence[PassEvent]) -> list[str]:
-    """Return remarks on the newest offset of the list, and on times of an attitude noisier than declared."""
-    sizes = [one for one in events if one.name == "map_offset"]
-    newest = sorted(sizes, key=lambda event: event.utc_ns)[-1:]
-    found = [f"offset of the crater list used on board, 1 sigma: {one.detail}" for one in newest]
+    """Return remarks on what was learned last on board, and on times of an attitude noisier than declared."""
+    newest = {one.name: one for one in sorted(events, key=lambda event: event.utc_ns) if one.name in _LEARNED}
+    found = [f"{_LEARNED[name]}: {one.detail}" for name, one in sorted(newest.items(), reverse=True)]
     lasting = False
     for one in sorted(events, key=lambda event: event.utc_ns):
         if one.name == "attitude_degraded":

@@ -21,14 +21,8 @@ from ground_service.evaluation.smoother import ONBOARD, SIZE, CommandedBurn, Fil
 from ground_service.evaluation.verdict import StartOrbit
 from ground_service.ground import Ground
 from ground_service.missions.catalogues import catalogue_of, read_catalogue
+from ground_service.missions.ephemerides import service
 from ground_service.missions.ephemerides.model import Ephemeris as EphemerisEntry
-from ground_service.missions.ephemerides.service import (
-    AttitudeTable,
-    covering_ephemerides,
-    get_ephemeris,
-    load_attitudes,
-    no_attitudes,
-)
 from ground_service.missions.frames import DeclaredFrames, assumed_camera, camera_of, declared_frames
 from ground_service.missions.model import Camera, Catalogue, Evidence, Mission
 from ground_service.missions.service import mission_of_pass
@@ -276,7 +270,7 @@ def outcome_samples(connection: Connection, span: PassSpan) -> tuple[OutcomeSamp
     )
 
 
-def viewing_of(camera: Camera, attitudes: AttitudeTable, span: PassSpan) -> Viewing:
+def viewing_of(camera: Camera, attitudes: service.AttitudeTable, span: PassSpan) -> Viewing:
     """Return the pointing of the camera during a pass."""
     message = attitudes.utc_ns
     utc_ns = span.utc_ns(attitudes.image_ticks.tolist()) if message is None else message
@@ -291,10 +285,10 @@ def viewing_of(camera: Camera, attitudes: AttitudeTable, span: PassSpan) -> View
     )
 
 
-def attitude_table(files: FileArchive, record: PassRecord) -> AttitudeTable:
+def attitude_table(files: FileArchive, record: PassRecord) -> service.AttitudeTable:
     """Return the attitude of each frame of a pass from its archive."""
     sha256 = record.attitude_sha256
-    return no_attitudes() if sha256 is None else load_attitudes(files.path(sha256))
+    return service.no_attitudes() if sha256 is None else service.load_attitudes(files.path(sha256))
 
 
 def orientation_of(mission: Mission, data: DataFolder) -> Orientation:
@@ -434,9 +428,9 @@ def _cpu_percent(connection: Connection, span: PassSpan, cadence_s: float | None
 
 def reference_of(connection: Connection, record: PassRecord) -> EphemerisEntry | None:
     if record.ephemeris_id is not None:
-        return get_ephemeris(connection, record.ephemeris_id)
+        return service.get_ephemeris(connection, record.ephemeris_id)
     spacecraft = get_vehicle(connection, record.vehicle_id, "spacecraft").ccsds_id
-    covering = covering_ephemerides(connection, record.start_utc_ns, record.stop_utc_ns, spacecraft)
+    covering = service.covering_ephemerides(connection, record.start_utc_ns, record.stop_utc_ns, spacecraft)
     return covering[0] if covering else None
 
 

@@ -15,14 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.errors import EvaluationError
-from ground_service.evaluation.alignment import (
-    ReferenceStates,
-    drift_by_length,
-    error_of_positions_rtn_m,
-    navigation_statistics,
-    nees,
-    places_of_positions,
-)
+from ground_service.evaluation import alignment
 from lunar.arrays import FloatArray, IntArray
 from lunar.constants import NS
 from lunar.frames import ICRF, Orientation, icrf_from_onboard, rtn_from_inertial
@@ -367,7 +360,7 @@ def smoother_model(
 
 def smoothed_series(
     filtered: FilterStates,
-    track: ReferenceStates,
+    track: alignment.ReferenceStates,
     path_m: FloatArray,
     model: SmootherModel,
     reference_covariance_m2: FloatArray,
@@ -389,8 +382,8 @@ def smoothed_series(
         return None
     smoothed = smooth(filtered, model)
     position = smoothed.state[:, :3]
-    latitude, longitude, altitude = places_of_positions(track, position)
-    error = error_of_positions_rtn_m(track, position)
+    latitude, longitude, altitude = alignment.places_of_positions(track, position)
+    error = alignment.error_of_positions_rtn_m(track, position)
     never = np.zeros(len(filtered), dtype=np.bool_)
     return NavigationSeries(
         name=SMOOTHED,
@@ -401,11 +394,11 @@ def smoothed_series(
         altitude_m=altitude,
         error_rtn_m=error,
         sigma_rtn_m=smoothed.sigma_rtn_m,
-        statistics=navigation_statistics(error, path_m, never),
+        statistics=alignment.navigation_statistics(error, path_m, never),
         description=(
             f"the filter smoothed on the ground with {model.forces.gravity.name} to degree "
             f"{model.forces.degree}, Earth and Sun"
         ),
-        nees=nees(error, smoothed.position_covariance_rtn_m2 + reference_covariance_m2),
-        drift_by_length=drift_by_length(error, path_m, never),
+        nees=alignment.nees(error, smoothed.position_covariance_rtn_m2 + reference_covariance_m2),
+        drift_by_length=alignment.drift_by_length(error, path_m, never),
     )

@@ -12,7 +12,7 @@ import numpy as np
 from ground_service.telemetry.packets import NO_TIME
 from lunar.arrays import IntArray, OctetArray
 from lunar.constants import DAY_NS
-from lunar.plausible import AGREEING_PACKETS, CLOCK_ERROR_S, SILENCE_S, UNSET_CLOCK_S
+from lunar.plausible import AGREEING_PACKETS, CLOCK_ERROR_S, SILENCE_S, SIMULATED_AHEAD_S, UNSET_CLOCK_S
 from tmtc.link.frames import UplinkSeen
 from tmtc.packets.pus import NO_TICKS, TICKS_PER_SECOND
 from tmtc.packets.space_packets import (
@@ -28,6 +28,7 @@ from tmtc.packets.stream import PacketForm
 LONGEST_STEP = round(CLOCK_ERROR_S * TICKS_PER_SECOND)
 UNSET_TICKS = round(UNSET_CLOCK_S * TICKS_PER_SECOND)
 LONGEST_SILENCE = round(SILENCE_S * TICKS_PER_SECOND)
+SIMULATED_AHEAD = round(SIMULATED_AHEAD_S * TICKS_PER_SECOND)
 
 
 def implausible_times(
@@ -72,7 +73,7 @@ def implausible_times(
         if agreed[stretch].any():
             pass
         elif reached is None:
-            if len(stretch) == 1 and (latest is None or not UNSET_TICKS <= first <= latest):
+            if len(stretch) == 1 and (latest is None or first > latest):
                 reason = "not judged: no clock, reception or other packet states this time"
         elif first - reached > LONGEST_STEP:
             if latest is not None:

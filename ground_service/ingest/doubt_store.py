@@ -9,11 +9,18 @@ from dataclasses import replace
 import numpy as np
 from sqlalchemy import Connection, delete, func, insert, select
 
-from ground_service.clock import independent_now_ns
+from ground_service.clock import independent_now_ns, is_stated
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf
 from ground_service.ingest import store
-from ground_service.ingest.core import LONGEST_STEP, UNSET_TICKS, fits_between, implausible_times, span_words
+from ground_service.ingest.core import (
+    LONGEST_STEP,
+    SIMULATED_AHEAD,
+    UNSET_TICKS,
+    fits_between,
+    implausible_times,
+    span_words,
+)
 from ground_service.ingest.model import ImplausibleFilter, ImplausiblePacket
 from ground_service.store import repository
 from ground_service.store.event_kinds import TelemetryWithdrawn, TimesDoubted, publish
@@ -135,6 +142,8 @@ def latest_ticks(newest: int | None) -> int | None:
     if now is None:
         return None
     latest = int(ticks_from_utc_ns(now)) + LONGEST_STEP
+    if newest is None and not is_stated():
+        return latest + SIMULATED_AHEAD
     return latest if newest is None or newest <= latest else None
 
 

@@ -10,7 +10,7 @@ from ground_service.http.common import API_PREFIX, GroundOf, IdempotencyKey, Ins
 from ground_service.http.requests import operations, problems
 from ground_service.ingest import doubt_store, service, store
 from ground_service.ingest.model import Ingest, IngestAccepted, Withdrawal
-from ground_service.ingest.service import Place, enter_ingest
+from ground_service.ingest.service import PiecePosition, enter_ingest
 from ground_service.jobs.service import DispatcherOf
 from ground_service.store.vehicles import FLOWN
 
@@ -65,7 +65,7 @@ async def upload_telemetry(
     """
     if (stream is None) != (offset is None):
         raise InvalidInput("telemetry", "stream, offset", "both or neither", "one of them")
-    place = None if stream is None or offset is None else Place(stream, offset)
+    place = None if stream is None or offset is None else PiecePosition(stream, offset)
     stored = await upload.stored()
     if stored.octets == 0:
         raise InvalidInput("body", "", "the octets of a downlink", "nothing")

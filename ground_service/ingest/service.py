@@ -19,8 +19,7 @@ from ground_service.ingest import doubt_store, store
 from ground_service.ingest.model import IngestResult
 from ground_service.ingest.reception import Progress, Reading
 from ground_service.ingest.recording_store import Piece, add_piece, get_piece
-from ground_service.jobs.model import Job
-from ground_service.jobs.service import OTHER_REQUEST, add_job, find_job
+from ground_service.jobs.service import OTHER_REQUEST, Job, add_job, find_job
 from ground_service.missions.store import stations_in_force
 from ground_service.store.files import StoredFile, register_file
 from ground_service.store.vehicles import FLOWN, all_vehicles, hold, lock_vehicle
@@ -35,7 +34,7 @@ from tmtc.packets.pus import NO_TICKS
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class PiecePosition:
     """Position of a file in its recording, as stated by its sender."""
 
     stream: str
@@ -49,7 +48,7 @@ def ingest_file(
     spacecraft_id: int | None = None,
     instance: str = FLOWN,
     name: str | None = None,
-    place: Place | None = None,
+    place: PiecePosition | None = None,
     station: str = "",
     link: str | None = None,
 ) -> IngestResult:
@@ -95,7 +94,7 @@ def ingest_stored(
     spacecraft_id: int | None = None,
     instance: str = FLOWN,
     name: str,
-    place: Place | None = None,
+    place: PiecePosition | None = None,
     station: str = "",
     link: str | None = None,
 ) -> IngestResult:
@@ -112,7 +111,7 @@ def enter_ingest(
     *,
     spacecraft_id: int | None,
     instance: str,
-    place: Place | None = None,
+    place: PiecePosition | None = None,
     station: str = "",
     link: str | None = None,
     job_id: str | None = None,
@@ -142,7 +141,7 @@ def _add(
     state: str,
     spacecraft_id: int | None,
     instance: str,
-    place: Place | None,
+    place: PiecePosition | None,
     station: str,
     link: str | None,
 ) -> Piece:

@@ -7,8 +7,7 @@ from ground_service.access.service import audit
 from ground_service.http.common import GroundOf, Key
 from ground_service.http.requests import operations, problems
 from ground_service.jobs import service
-from ground_service.jobs.model import Job
-from ground_service.jobs.service import DispatcherOf
+from ground_service.jobs.service import DispatcherOf, Job
 
 jobs = operations("jobs")
 

@@ -11,18 +11,42 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 from fastapi import Depends, Request
+from pydantic import Field
 from sqlalchemy import Connection, and_, delete, or_, select
 
 from ground_service import logs
 from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput, StateConflict
 from ground_service.ground import Ground
-from ground_service.http.model import PageOf
-from ground_service.jobs.model import Job, JobFilter
+from ground_service.http.model import Entity, PageOf, Paging, UtcTime
 from ground_service.store import repository
 from ground_service.store.event_kinds import JobChanged, publish
 from ground_service.store.states import JOB, change_if, move, move_all
 from ground_service.store.vehicles import hold
+
+
+class Job(Entity):
+    """A background job."""
+
+    id: str
+    kind: str = Field(examples=["report"])
+    state: str = Field(examples=["done"], description="queued, running, done or failed")
+    progress: float = Field(ge=0.0, le=1.0)
+    attempts: int
+    arguments: dict[str, Any]
+    result: dict[str, Any] | None
+    error: str | None
+    traceparent: str | None = Field(description="W3C trace context of the step that entered it")
+    created: UtcTime
+    started: UtcTime | None
+    finished: UtcTime | None
+
+
+class JobFilter(Paging):
+    """Jobs to list."""
+
+    kind: str | None = Field(default=None, max_length=40, examples=["regression"])
+
 
 JOBS = repository.JOBS
 

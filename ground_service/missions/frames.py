@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
+from ground_service.missions.automation import Section
 from ground_service.missions.model import Camera, DictionarySection, Evidence, Frames, Mission, Spacecraft, World
-from ground_service.missions.section import Section
 from lunar.camera import BrownCamera, PinholeCamera
 from lunar.datafolder import DataFolder
 from lunar.frames import IauOrientation, Orientation, load_orientation

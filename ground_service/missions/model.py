@@ -17,8 +17,7 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from ground_service.errors import InvalidInput
 from ground_service.http.model import Entity, InstanceName, UtcTime
-from ground_service.missions.automation import Automation, Channel, ChannelName, without_rules
-from ground_service.missions.section import Array, Section, Table
+from ground_service.missions.automation import Array, Automation, Channel, ChannelName, Section, Table, without_rules
 from ground_service.toml import faults, keys_at, read_table
 from lunar.boxes import Box, Region
 from lunar.errors import TimeFormatError

@@ -5,8 +5,7 @@ from typing import Annotated, Any
 from fastapi import Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 
-from ground_service.access.idempotency import added_once
-from ground_service.access.security import Operator, UploadOf, Viewer, add_list, idempotent_id
+from ground_service.access.security import Operator, UploadOf, Viewer, add_list, added_once, idempotent_id
 from ground_service.errors import InvalidInput
 from ground_service.http.common import (
     API_PREFIX,
@@ -23,33 +22,13 @@ from ground_service.http.common import (
 )
 from ground_service.http.model import PageOf, RequestTime, ns_of
 from ground_service.http.requests import operations, problems
-from ground_service.jobs.model import Job
-from ground_service.jobs.service import DispatcherOf, get_job
-from ground_service.passes import archive_import, parameters, service, store
+from ground_service.jobs.service import DispatcherOf, Job, get_job
+from ground_service.passes import archive_import, model, parameters, service, store
 from ground_service.passes import live as newest
-from ground_service.passes.model import (
-    Completeness,
-    Crater,
-    Detection,
-    Event,
-    EventFilter,
-    ExportFormat,
-    Image,
-    LiveParameter,
-    ParameterInfo,
-    ParameterSeries,
-    PassDefinition,
-    PassDetail,
-    PassParameters,
-    SpacecraftEvent,
-    SpacecraftInstance,
-    States,
-    Trend,
-)
 from ground_service.passes.series import STATE_VALUES, series_document
 from ground_service.store.vehicles import FLOWN
 
-EXPORT_MEDIA: dict[ExportFormat, str] = {
+EXPORT_MEDIA: dict[model.ExportFormat, str] = {
     "json": "application/json",
     "csv": "text/csv; charset=utf-8",
     "parquet": "application/vnd.apache.parquet",
@@ -91,11 +70,11 @@ add_list(passes, "/passes", store.list_passes)
 
 @passes.post("/passes", status_code=201)
 def define_pass(
-    ground: GroundOf, caller: Operator, given: PassDefinition, idempotency_key: OnceKey = None
-) -> PassDetail:
+    ground: GroundOf, caller: Operator, given: model.PassDefinition, idempotency_key: OnceKey = None
+) -> model.PassDetail:
     """Define a pass: an interval of a spacecraft's time."""
 
-    def define() -> PassDetail:
+    def define() -> model.PassDetail:
         pass_id = service.define_pass(
             ground,
             name=given.name,
@@ -106,30 +85,30 @@ def define_pass(
         )
         return service.get_pass(ground, pass_id)
 
-    return added_once(ground, PassDetail, caller.name, idempotency_key, given, define)
+    return added_once(ground, model.PassDetail, caller.name, idempotency_key, given, define)
 
 
 @passes.get("/passes/{pass_id}")
-def get_pass(ground: GroundOf, _: Viewer, pass_id: PassId) -> PassDetail:
+def get_pass(ground: GroundOf, _: Viewer, pass_id: PassId) -> model.PassDetail:
     """Show a pass with its manifest and reports."""
     return service.get_pass(ground, pass_id)
 
 
 @passes.get("/passes/{pass_id}/completeness")
-def get_completeness(ground: GroundOf, _: Viewer, pass_id: PassId) -> Completeness:
+def get_completeness(ground: GroundOf, _: Viewer, pass_id: PassId) -> model.Completeness:
     """Count the received and missing packets of a pass."""
-    return Completeness.of_accounting(service.completeness(ground, pass_id))
+    return model.Completeness.of_accounting(service.completeness(ground, pass_id))
 
 
 @passes.get("/passes/{pass_id}/detections")
 def list_detections(
     ground: GroundOf, _: Viewer, request: Request, pass_id: PassId, asked: PagingOf
-) -> PageOf[Detection]:
+) -> PageOf[model.Detection]:
     """List the detections of a pass, in time order."""
     return linked(request, service.detections(ground, pass_id, asked))
 
 
-@passes.get("/passes/{pass_id}/states", response_model=States)
+@passes.get("/passes/{pass_id}/states", response_model=model.States)
 def get_states(
     ground: GroundOf,
     _: Viewer,
@@ -145,27 +124,29 @@ def get_states(
 
 
 @passes.get("/passes/{pass_id}/events")
-def list_events(ground: GroundOf, _: Viewer, request: Request, pass_id: PassId, asked: PagingOf) -> PageOf[Event]:
+def list_events(ground: GroundOf, _: Viewer, request: Request, pass_id: PassId, asked: PagingOf) -> PageOf[model.Event]:
     """List the event reports of a pass, in time order."""
     return linked(request, service.list_events(ground, pass_id, asked))
 
 
 @passes.get("/passes/{pass_id}/craters")
-def list_craters(ground: GroundOf, _: Viewer, request: Request, pass_id: PassId, asked: PagingOf) -> PageOf[Crater]:
+def list_craters(
+    ground: GroundOf, _: Viewer, request: Request, pass_id: PassId, asked: PagingOf
+) -> PageOf[model.Crater]:
     """List the craters of the catalogue of a pass, the largest first."""
     return linked(request, service.craters(ground, pass_id, asked))
 
 
 @passes.get("/events", responses=problems(404))
 def list_spacecraft_events(
-    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[EventFilter, Query()]
-) -> PageOf[SpacecraftEvent]:
+    ground: GroundOf, _: Viewer, request: Request, asked: Annotated[model.EventFilter, Query()]
+) -> PageOf[model.SpacecraftEvent]:
     """List the event reports of all passes of a spacecraft, newest first."""
     return linked(request, service.spacecraft_events(ground, asked))
 
 
 @passes.get("/passes/{pass_id}/parameters")
-def list_parameters(ground: GroundOf, _: Viewer, pass_id: PassId) -> PassParameters:
+def list_parameters(ground: GroundOf, _: Viewer, pass_id: PassId) -> model.PassParameters:
     """List the parameters with series: of the payload, and of packets that the mission description defines."""
     return parameters.pass_parameters(ground, pass_id)
 
@@ -180,14 +161,14 @@ def get_packets(
     _: Viewer,
     pass_id: PassId,
     packet: Annotated[str, Path(max_length=200, description="Packet of the dictionary, or XTCE container")],
-    format: Annotated[ExportFormat, Query(description="Format of the file")] = "json",
+    format: Annotated[model.ExportFormat, Query(description="Format of the file")] = "json",
 ) -> Response:
     """Return the decoded packets of one kind in a pass, in order of on-board time, with UTC."""
     octets = parameters.export_packets(ground, pass_id, packet, format)
     return Response(octets, media_type=EXPORT_MEDIA[format])
 
 
-@passes.get("/passes/{pass_id}/telemetry/{parameter}", response_model=ParameterSeries)
+@passes.get("/passes/{pass_id}/telemetry/{parameter}", response_model=model.ParameterSeries)
 def get_parameter(
     ground: GroundOf, _: Viewer, pass_id: PassId, parameter: Parameter, max_points: MaxPoints = 1000
 ) -> Response:
@@ -195,7 +176,7 @@ def get_parameter(
     return JSONResponse(series_document(service.parameter_series(ground, pass_id, parameter, max_points)))
 
 
-@passes.get("/spacecraft/{spacecraft_id}/telemetry/{parameter}", response_model=ParameterSeries)
+@passes.get("/spacecraft/{spacecraft_id}/telemetry/{parameter}", response_model=model.ParameterSeries)
 def get_trend(
     ground: GroundOf,
     _: Viewer,
@@ -214,7 +195,7 @@ def get_trend(
 
 
 @passes.get("/spacecraft")
-def list_spacecraft(ground: GroundOf, caller: Viewer) -> PageOf[SpacecraftInstance]:
+def list_spacecraft(ground: GroundOf, caller: Viewer) -> PageOf[model.SpacecraftInstance]:
     """List the spacecraft, flown ones first."""
     return PageOf.all_of(caller.own(newest.list_spacecraft(ground)))
 
@@ -222,7 +203,7 @@ def list_spacecraft(ground: GroundOf, caller: Viewer) -> PageOf[SpacecraftInstan
 @passes.get("/spacecraft/{spacecraft_id}/parameters")
 def list_spacecraft_parameters(
     ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN
-) -> PageOf[ParameterInfo]:
+) -> PageOf[model.ParameterInfo]:
     """List the parameters of a spacecraft with series."""
     return PageOf.all_of(parameters.spacecraft_parameters(ground, spacecraft_id, instance))
 
@@ -238,7 +219,7 @@ def list_images(
     start: RequestTime,
     stop: RequestTime,
     instance: Instance = FLOWN,
-) -> PageOf[Image]:
+) -> PageOf[model.Image]:
     """List the images of an interval: downlinked thumbnails, and frames of pass archives; at most 2000."""
     return PageOf.all_of(archive_import.list_images(ground, spacecraft_id, instance, start.utc_ns, stop.utc_ns))
 
@@ -277,7 +258,7 @@ def list_live_parameters(
     spacecraft_id: Annotated[int, Query(ge=0, le=1023, examples=[76])],
     instance: Instance = FLOWN,
     live: Annotated[bool, Query(description="Newest values; series are listed by pass")] = True,
-) -> PageOf[LiveParameter]:
+) -> PageOf[model.LiveParameter]:
     """List the newest value of every parameter of a spacecraft, with its age and limit state."""
     if not live:
         raise InvalidInput("query", "live", "true; series are under /passes/{id}/telemetry", "false")
@@ -285,6 +266,8 @@ def list_live_parameters(
 
 
 @passes.get("/spacecraft/{spacecraft_id}/trends")
-def list_trends(ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN) -> list[Trend]:
+def list_trends(
+    ground: GroundOf, _: Viewer, spacecraft_id: SpacecraftId, instance: Instance = FLOWN
+) -> list[model.Trend]:
     """List statistics, slope and limit state of the housekeeping parameters over 30 days of on-board time."""
     return service.spacecraft_trends(ground, spacecraft_id, instance)

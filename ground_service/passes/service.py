@@ -16,18 +16,8 @@ from ground_service.missions import store as missions
 from ground_service.missions.catalogues import read_catalogue
 from ground_service.missions.timekeeping.core import ticks_of_utc_ns
 from ground_service.missions.timekeeping.store import load_correlations
-from ground_service.passes import sample_store, store
+from ground_service.passes import model, sample_store, store
 from ground_service.passes.core import Buckets
-from ground_service.passes.model import (
-    Crater,
-    Detection,
-    Event,
-    EventFilter,
-    PassDetail,
-    PassRecord,
-    SpacecraftEvent,
-    Trend,
-)
 from ground_service.passes.packet_accounting import packet_accounting
 from ground_service.passes.parameters import series_source, state_unit
 from ground_service.passes.sample_store import detection_frames, detection_samples
@@ -50,7 +40,7 @@ TREND_DAYS = 30
 TREND_POINTS = 60
 
 
-def get_pass(ground: Ground, pass_id: int) -> PassDetail:
+def get_pass(ground: Ground, pass_id: int) -> model.PassDetail:
     """Return a pass with its spacecraft, mission and newest reports."""
     return ground.read(store.pass_detail, pass_id)
 
@@ -104,7 +94,7 @@ def completeness(ground: Ground, pass_id: int) -> PacketAccounting:
         )
 
 
-def _opened(ground: Ground, connection: Connection, pass_id: int) -> tuple[PassRecord, PassSpan, Cache]:
+def _opened(ground: Ground, connection: Connection, pass_id: int) -> tuple[model.PassRecord, PassSpan, Cache]:
     """Return a pass, its interval of on-board time, and the cached answers on its vehicle."""
     record = store.get_pass(connection, pass_id)
     cache = Cache(ground, connection, record.vehicle_id)
@@ -121,15 +111,15 @@ def _opened(ground: Ground, connection: Connection, pass_id: int) -> tuple[PassR
     return record, span, cache
 
 
-def list_events(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Event]:
+def list_events(ground: Ground, pass_id: int, asked: Paging) -> PageOf[model.Event]:
     """Return a page of the event reports of a pass, in time order."""
     with ground.database.reading() as connection:
         _, span, _ = _opened(ground, connection, pass_id)
         found, total = sample_store.event_page(connection, span, asked, newest_first=False)
-    return asked.page((Event.of(asdict(one), time=one.utc_ns) for one in found), total)
+    return asked.page((model.Event.of(asdict(one), time=one.utc_ns) for one in found), total)
 
 
-def spacecraft_events(ground: Ground, asked: EventFilter) -> PageOf[SpacecraftEvent]:
+def spacecraft_events(ground: Ground, asked: model.EventFilter) -> PageOf[model.SpacecraftEvent]:
     """Return a page of the event reports of a spacecraft that match, newest first."""
     with ground.database.reading() as connection:
         vehicle = find_vehicle(connection, asked.spacecraft_id, asked.instance).id
@@ -147,11 +137,11 @@ def spacecraft_events(ground: Ground, asked: EventFilter) -> PageOf[SpacecraftEv
         return max((key for key, one in spans.items() if one.start_ticks <= ticks <= one.stop_ticks), default=None)
 
     return asked.page(
-        (SpacecraftEvent.of(asdict(one), time=one.utc_ns, pass_id=pass_at(one.utc_ns)) for one in found), total
+        (model.SpacecraftEvent.of(asdict(one), time=one.utc_ns, pass_id=pass_at(one.utc_ns)) for one in found), total
     )
 
 
-def detections(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Detection]:
+def detections(ground: Ground, pass_id: int, asked: Paging) -> PageOf[model.Detection]:
     """Return a page of the detections of a pass, in time order."""
     with ground.database.reading() as connection:
         _, span, cache = _opened(ground, connection, pass_id)
@@ -170,7 +160,7 @@ def detections(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Detection]
     rows -= offsets[np.searchsorted(ticks, first)]
     frames = np.searchsorted(samples.offsets, rows, side="right") - 1
     found = [
-        Detection(
+        model.Detection(
             frame_number=int(samples.frame_number[frame]),
             time=UtcTime(samples.utc_ns[frame]),
             u_px=float(samples.u_px[row]),
@@ -185,7 +175,7 @@ def detections(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Detection]
     return asked.page(found, total)
 
 
-def craters(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Crater]:
+def craters(ground: Ground, pass_id: int, asked: Paging) -> PageOf[model.Crater]:
     """Return a page of the catalogue of a pass, the largest craters first; nothing without a catalogue.
 
     An imported pass has the craters of the terrain near its ground track.
@@ -201,7 +191,7 @@ def craters(ground: Ground, pass_id: int, asked: Paging) -> PageOf[Crater]:
     columns = (catalogue.ids[chosen], np.degrees(catalogue.latitude_rad[chosen]), east, catalogue.diameter_m[chosen])
     names = ("id", "latitude_deg", "longitude_deg", "diameter_m")
     rows = zip(*(column.tolist() for column in columns), strict=True)
-    return asked.page((Crater(**dict(zip(names, row, strict=True))) for row in rows), len(catalogue))
+    return asked.page((model.Crater(**dict(zip(names, row, strict=True))) for row in rows), len(catalogue))
 
 
 def state_series(
@@ -271,20 +261,20 @@ def trend_series(
         return _parameter_series(connection, span, parameter, max_points)
 
 
-def spacecraft_trends(ground: Ground, spacecraft_id: int, instance: str) -> list[Trend]:
+def spacecraft_trends(ground: Ground, spacecraft_id: int, instance: str) -> list[model.Trend]:
     """Return the trends of the housekeeping parameters of a spacecraft; see `vehicle_trends`."""
     with ground.database.reading() as connection:
         vehicle = find_vehicle(connection, spacecraft_id, instance).id
     return vehicle_trends(ground, vehicle)
 
 
-def vehicle_trends(ground: Ground, vehicle: int) -> list[Trend]:
+def vehicle_trends(ground: Ground, vehicle: int) -> list[model.Trend]:
     """Return the trends over the last `TREND_DAYS` days of on-board time with housekeeping."""
     with ground.database.reading() as connection:
         return Cache(ground, connection, vehicle).answer("trends", lambda: _trends(connection, vehicle))
 
 
-def _trends(connection: Connection, vehicle: int) -> list[Trend]:
+def _trends(connection: Connection, vehicle: int) -> list[model.Trend]:
     version = readable_version(connection, vehicle)
     _, _, last = rollups.rolled_extent(connection, rollups.KINDS["housekeeping"][0], vehicle, version, 0, 0, LAST_TICKS)
     if last == 0:
@@ -298,14 +288,14 @@ def _trends(connection: Connection, vehicle: int) -> list[Trend]:
     return [trend for trend in trends if trend is not None]
 
 
-def trend_of(field: Field, buckets: Buckets) -> Trend | None:
+def trend_of(field: Field, buckets: Buckets) -> model.Trend | None:
     """The trend of a parameter from its stretches; None where there are no samples."""
     total = int(buckets.count.sum())
     if total == 0:
         return None
     low, high = float(buckets.low.min()), float(buckets.high.max())
     worst = int(limit_states(field, [low, high]).max())
-    return Trend(
+    return model.Trend(
         parameter=field.name,
         unit=field.unit,
         samples=total,

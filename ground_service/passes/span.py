@@ -18,8 +18,9 @@ from tmtc.dictionary.codes import EVENTS
 _EVENT_CODES = {name: code for code, name in EVENTS}
 STARTED, STOPPED = _EVENT_CODES["observation_started"], _EVENT_CODES["observation_stopped"]
 
-HOUSEKEEPING_NS = 60_000_000_000
-"""Housekeeping this far before and after the observations of a pass belongs to it, if no other observation is near."""
+HOUSEKEEPING_NS = 60_001_000_000
+"""Housekeeping this far before and after the observations of a pass belongs to it, if no other observation is near: a
+minute, and what time correlations differ by."""
 
 REACH_NS = 3_600_000_000_000
 """Event reports this far outside the planned time of a pass are read."""
@@ -48,7 +49,7 @@ class PassSpan:
 
 
 @dataclass(frozen=True, slots=True)
-class Observation:
+class ObservationSpan:
     """An observation by its event reports, on-board time; None where a report is missing, `planned` 0 if not stated."""
 
     start: int | None
@@ -65,25 +66,26 @@ class Planned:
     window_id: int | None = None
 
 
-def observations(events: Iterable[tuple[int, int, int]]) -> list[Observation]:
+def observations(events: Iterable[tuple[int, int, int]]) -> list[ObservationSpan]:
     """Return the observations of event reports (on-board time, event, planned end), in order of time.
 
     A start during an observation begins another one: the payload takes the new end and cadence from then on.
     """
-    found: list[Observation] = []
-    going: Observation | None = None
+    found: list[ObservationSpan] = []
+    going: ObservationSpan | None = None
     for ticks, event, planned in sorted(events, key=lambda one: (one[0], one[1] == STARTED)):
         if event == STARTED:
             if going is not None:
-                found.append(Observation(going.start, ticks - 1, going.planned))
-            going = Observation(ticks, None, planned)
+                found.append(ObservationSpan(going.start, ticks - 1, going.planned))
+            going = ObservationSpan(ticks, None, planned)
         else:
-            found.append(Observation(None, ticks) if going is None else Observation(going.start, ticks, going.planned))
+            start, planned = (None, 0) if going is None else (going.start, going.planned)
+            found.append(ObservationSpan(start, ticks, planned))
             going = None
     return found if going is None else [*found, going]
 
 
-def belongs_to(one: Observation, mine: Planned, others: Sequence[Planned], margin: int) -> bool:
+def belongs_to(one: ObservationSpan, mine: Planned, others: Sequence[Planned], margin: int) -> bool:
     """Return whether an observation is of `mine`, and not of one of the other windows.
 
     An observation has one window: that with the nearest start and end, of equally near ones the last entered. A pass

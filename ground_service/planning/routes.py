@@ -4,8 +4,7 @@ from typing import Annotated
 
 from fastapi import Header, Query, Response
 
-from ground_service.access.idempotency import added_once
-from ground_service.access.security import Operator, Viewer, add_list
+from ground_service.access.security import Operator, Viewer, add_list, added_once
 from ground_service.contacts.commanding import service as commanding
 from ground_service.contacts.commanding.model import Telecommand
 from ground_service.http.common import API_PREFIX, IF_MATCH_HEADER, GroundOf, Instance, OnceKey, PassId
@@ -15,22 +14,8 @@ from ground_service.http.requests import operations, problems
 from ground_service.missions import service as missions
 from ground_service.missions.model import MissionCheck
 from ground_service.missions.routes import Text
-from ground_service.planning import forecast, service, standing, store
+from ground_service.planning import forecast, model, service, standing, store
 from ground_service.planning.dry_run import rehearsed
-from ground_service.planning.model import (
-    CraterDensity,
-    PlanForecast,
-    PlannedTelecommand,
-    RequestPlan,
-    SearchResult,
-    StandingRequest,
-    StandingRequestChange,
-    StandingRequestIn,
-    Window,
-    WindowChange,
-    WindowIn,
-    WindowSearch,
-)
 
 planning = operations("planning")
 
@@ -56,7 +41,9 @@ def check_mission(
 
 
 @planning.post("/windows/search", responses=problems(404))
-def search_windows(ground: GroundOf, _: Viewer, constraints: WindowSearch = WindowSearch()) -> SearchResult:
+def search_windows(
+    ground: GroundOf, _: Viewer, constraints: model.WindowSearch = model.WindowSearch()
+) -> model.SearchResult:
     """Search candidate windows by constraints over a reference ephemeris."""
     return service.search_windows(ground, constraints)
 
@@ -66,20 +53,20 @@ add_list(planning, "/windows", store.list_windows)
 
 @planning.post("/windows", status_code=201, responses=problems(404))
 def add_window(
-    response: Response, ground: GroundOf, caller: Operator, window: WindowIn, idempotency_key: OnceKey = None
-) -> Window:
+    response: Response, ground: GroundOf, caller: Operator, window: model.WindowIn, idempotency_key: OnceKey = None
+) -> model.Window:
     """Add a window as a draft; 409 lists the conflicts with committed windows and resources."""
 
-    def add() -> Window:
+    def add() -> model.Window:
         return service.add_window(ground, window.entry(), actor=caller.name)
 
-    added = added_once(ground, Window, caller.name, idempotency_key, window, add)
+    added = added_once(ground, model.Window, caller.name, idempotency_key, window, add)
     response.headers["Location"] = f"{API_PREFIX}/windows/{added.id}"
     return _tagged(response, added)
 
 
 @planning.get("/windows/{window_id}")
-def get_window(response: Response, ground: GroundOf, _: Viewer, window_id: PassId) -> Window:
+def get_window(response: Response, ground: GroundOf, _: Viewer, window_id: PassId) -> model.Window:
     """Show a planned window."""
     return _tagged(response, ground.read(store.get_window, window_id))
 
@@ -90,9 +77,9 @@ def change_window(
     ground: GroundOf,
     caller: Operator,
     window_id: PassId,
-    change: WindowChange,
+    change: model.WindowChange,
     if_match: IfMatch = None,
-) -> Window:
+) -> model.Window:
     """Change a draft, approve a window, make it a draft again, or declare it failed."""
     window = service.change_window(
         ground,
@@ -121,7 +108,7 @@ def uplink_window(ground: GroundOf, caller: Operator, window_id: PassId) -> Page
 
 
 @planning.get("/windows/{window_id}/telecommands")
-def get_planned_telecommands(ground: GroundOf, _: Viewer, window_id: PassId) -> PageOf[PlannedTelecommand]:
+def get_planned_telecommands(ground: GroundOf, _: Viewer, window_id: PassId) -> PageOf[model.PlannedTelecommand]:
     """Show the telecommands that an uplink of the window would release, with their times; nothing is released."""
     return PageOf.all_of(service.preview_window(ground, window_id))
 
@@ -135,7 +122,7 @@ def get_forecast(
     stop: Annotated[RequestTime, Query(examples=["2029-08-08T00:00:00Z"], description="At most 8 days later")],
     instance: Instance = "flight",
     ephemeris_id: Annotated[int | None, Query(ge=1, le=2**31 - 1)] = None,
-) -> PlanForecast:
+) -> model.PlanForecast:
     """Return Sun elevation, ground track, battery, storage and downlink of the plan, and its conflicts."""
     return forecast.get_forecast(
         ground,
@@ -150,21 +137,21 @@ def get_forecast(
 @planning.get("/plan/crater-density")
 def get_crater_density(
     ground: GroundOf, _: Viewer, spacecraft_id: Annotated[int, Query(ge=0, le=1023, examples=[76])]
-) -> CraterDensity:
+) -> model.CraterDensity:
     """Return the density of craters of 5 to 30 km in the catalogue of the mission description."""
     return forecast.crater_density(ground, spacecraft_id)
 
 
-def _tag(window: Window) -> str:
+def _tag(window: model.Window) -> str:
     return f'"window-{window.id}-{window.version}-{window.state}"'
 
 
-def _tagged(response: Response, window: Window) -> Window:
+def _tagged(response: Response, window: model.Window) -> model.Window:
     response.headers["ETag"] = _tag(window)
     return window
 
 
-def _expect(found: Window, if_match: str | None) -> None:
+def _expect(found: model.Window, if_match: str | None) -> None:
     if if_match is not None and if_match.strip() != "*" and _tag(found) not in if_match:
         raise PreconditionFailed(f"window {found.id}: expected {if_match[:80]}, found {_tag(found)}")
 
@@ -177,28 +164,32 @@ add_list(requests, "/requests", store.list_requests)
 
 @requests.post("/requests", status_code=201)
 def add_request(
-    response: Response, ground: GroundOf, caller: Operator, request: StandingRequestIn, idempotency_key: OnceKey = None
-) -> StandingRequest:
+    response: Response,
+    ground: GroundOf,
+    caller: Operator,
+    request: model.StandingRequestIn,
+    idempotency_key: OnceKey = None,
+) -> model.StandingRequest:
     """Add a standing request; the planner fills the coming days from then on."""
 
-    def add() -> StandingRequest:
+    def add() -> model.StandingRequest:
         return standing.add_request(ground, request, actor=caller.name)
 
-    added = added_once(ground, StandingRequest, caller.name, idempotency_key, request, add)
+    added = added_once(ground, model.StandingRequest, caller.name, idempotency_key, request, add)
     response.headers["Location"] = f"{API_PREFIX}/requests/{added.id}"
     return added
 
 
 @requests.get("/requests/{request_id}")
-def get_request(ground: GroundOf, _: Viewer, request_id: PassId) -> StandingRequest:
+def get_request(ground: GroundOf, _: Viewer, request_id: PassId) -> model.StandingRequest:
     """Show a standing request with the numbers of its windows."""
     return ground.read(store.get_request, request_id)
 
 
 @requests.patch("/requests/{request_id}", responses=problems(409))
 def change_request(
-    ground: GroundOf, caller: Operator, request_id: PassId, change: StandingRequestChange
-) -> StandingRequest:
+    ground: GroundOf, caller: Operator, request_id: PassId, change: model.StandingRequestChange
+) -> model.StandingRequest:
     """Pause or resume a standing request, or replace its terms; planned windows stay."""
     return standing.change_request(ground, request_id, change, actor=caller.name)
 
@@ -211,6 +202,6 @@ def delete_request(ground: GroundOf, caller: Operator, request_id: PassId) -> Re
 
 
 @requests.get("/requests/{request_id}/plan")
-def get_request_plan(ground: GroundOf, _: Viewer, request_id: PassId) -> RequestPlan:
+def get_request_plan(ground: GroundOf, _: Viewer, request_id: PassId) -> model.RequestPlan:
     """Show the last plan: every candidate window, planned or rejected with the reason."""
     return ground.read(store.get_plan, request_id)

@@ -18,24 +18,15 @@ from ground_service.ground import Ground, run_apart
 from ground_service.http.model import Paging, UtcTime
 from ground_service.missions import store as missions
 from ground_service.missions.catalogues import catalogue_of
+from ground_service.missions.clocks import outages_of, stations_of
 from ground_service.missions.ephemerides import service
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.ephemerides.service import open_ephemeris
 from ground_service.missions.frames import camera_of, declared_frames
 from ground_service.missions.model import Mission
-from ground_service.missions.places import outages_of, stations_of
 from ground_service.missions.timekeeping.core import ticks_of_utc_ns
 from ground_service.missions.timekeeping.store import load_correlations
-from ground_service.planning import model, store
-from ground_service.planning.core import (
-    Candidate,
-    Constraints,
-    Planner,
-    Resources,
-    data_octets,
-    frames_between,
-    storage_peak,
-)
+from ground_service.planning import core, model, preparation, store
 from ground_service.planning.filling import Option, ResourceGrid
 from ground_service.planning.model import (
     AssessedWindow,
@@ -47,15 +38,6 @@ from ground_service.planning.model import (
     WindowPrediction,
     WindowRecord,
     WindowSearch,
-)
-from ground_service.planning.preparation import (
-    MARGIN_NS,
-    Activity,
-    TicksOf,
-    experiment_accuracy,
-    experiment_state,
-    gap_ns,
-    prepare_window,
 )
 from ground_service.planning.window_states import PlannedSpan, span_conflicts
 from ground_service.store.event_kinds import WindowChanged, publish
@@ -158,7 +140,7 @@ def search_windows(ground: Ground, given: WindowSearch) -> SearchResult:
     )
 
 
-def observable(constraints: Constraints, mission: Mission) -> Constraints:
+def observable(constraints: core.Constraints, mission: Mission) -> core.Constraints:
     """Return constraints with the limits of images that a mission description states: latitude, and daylight."""
     limit, daylight = mission.observation.latitude_limit_deg, mission.observation.needs_daylight
     if limit is not None:
@@ -408,20 +390,20 @@ def preview_window(ground: Ground, window_id: int) -> list[PlannedTelecommand]:
     ]
 
 
-def _ticks_of(connection: Connection, window: WindowRecord) -> TicksOf:
+def _ticks_of(connection: Connection, window: WindowRecord) -> preparation.TicksOf:
     correlations = load_correlations(connection, window.vehicle_id)
     return lambda utc_ns: ticks_of_utc_ns(utc_ns, correlations)
 
 
 def _activities(
-    ground: Ground, connection: Connection, window: WindowRecord, ticks_of: TicksOf
-) -> tuple[list[Activity], model.WindowUploads | None]:
+    ground: Ground, connection: Connection, window: WindowRecord, ticks_of: preparation.TicksOf
+) -> tuple[list[preparation.Activity], model.WindowUploads | None]:
     """Return the activities of a window in order of time, and what they load on board."""
     start, stop = window.start.utc_ns, window.stop.utc_ns
     # The observation ends by the second telecommand; by itself a frame later should that one be lost.
     duration_s = (stop - start) / NS + window.cadence_s
     further, uploads = _preparation(ground, connection, window, ticks_of)
-    named: list[Activity] = [
+    named: list[preparation.Activity] = [
         (utc_ns, "perform_function", {"function_id": function, "argument_1": first, "argument_2": second})
         for utc_ns, function, first, second in (
             (start, "start_observation", duration_s, window.cadence_s),
@@ -432,19 +414,21 @@ def _activities(
 
 
 def _preparation(
-    ground: Ground, connection: Connection, window: WindowRecord, ticks_of: TicksOf
-) -> tuple[list[Activity], model.WindowUploads | None]:
+    ground: Ground, connection: Connection, window: WindowRecord, ticks_of: preparation.TicksOf
+) -> tuple[list[preparation.Activity], model.WindowUploads | None]:
     """Return the activities that prepare a window, where its mission description asks for uploads, and the uploads."""
     mission = None if window.mission_id is None else missions.get_mission(connection, window.mission_id)
     if mission is None or mission.uploads is None:
         return [], None
     start, stop = window.start.utc_ns, window.stop.utc_ns
-    found = service.covering_ephemerides(connection, start - MARGIN_NS, stop + MARGIN_NS, window.spacecraft_id)
+    found = service.covering_ephemerides(
+        connection, start - preparation.MARGIN_NS, stop + preparation.MARGIN_NS, window.spacecraft_id
+    )
     whole = [
         one
         for one in found
-        if one.start.utc_ns <= start - MARGIN_NS
-        and stop + MARGIN_NS <= one.stop.utc_ns
+        if one.start.utc_ns <= start - preparation.MARGIN_NS
+        and stop + preparation.MARGIN_NS <= one.stop.utc_ns
         and _covered_spans(ground, [one], start, stop, 60.0)[1] == [(start, stop)]
     ]
     orientation = declared_frames(mission.frames, ground.data).orientation or ground.orientation
@@ -454,11 +438,11 @@ def _preparation(
         old = [one for one in whole if one.start.utc_ns <= start - round((age_h or 0.0) * 3600 * NS)]
         # Without an ephemeris of that age, the oldest arc: its age is recorded.
         orbit = old[0] if old else min(whole, key=lambda one: one.start.utc_ns)
-        begin = experiment_state(open_ephemeris(ground, orbit), error_m, start, window.spacecraft_id)
-        uploads = experiment_accuracy(uploads, error_m, begin)
+        begin = preparation.experiment_state(open_ephemeris(ground, orbit), error_m, start, window.spacecraft_id)
+        uploads = preparation.experiment_accuracy(uploads, error_m, begin)
         age = None if age_h is None else round((start - orbit.start.utc_ns) / (3600 * NS), 2)
         experiment = model.StartedOrbit(orbit_error_m=error_m, orbit_age_h=age)
-    activities, state = prepare_window(
+    activities, state = preparation.prepare_window(
         uploads,
         open_ephemeris(ground, whole[0]) if whole else None,
         orientation,
@@ -501,9 +485,9 @@ def _assessed(
         conflicts.append(PlanConflict("past", None, expected))
     commitments = store.commitments(connection, entry.spacecraft_id, entry.instance, without=window_id)
     prediction = _prediction(ground, connection, entry, mission, commitments)
-    frames = frames_between(entry.start_utc_ns, entry.stop_utc_ns, entry.cadence_s)
+    frames = core.frames_between(entry.start_utc_ns, entry.stop_utc_ns, entry.cadence_s)
     resources = resources_of(mission)
-    octets = data_octets(frames, resources.detections_per_frame, resources.estimators)
+    octets = core.data_octets(frames, resources.detections_per_frame, resources.estimators)
     limit = mission.observation.latitude_limit_deg
     if prediction is not None:
         peak = prediction.storage_peak_octets
@@ -529,7 +513,7 @@ def _assessed(
         if (conflict := _coverage_conflict(connection, entry, mission)) is not None:
             conflicts.append(conflict)
         mine = Option(entry.start_utc_ns, entry.stop_utc_ns, octets)
-        peak, _ = storage_peak([*commitments, mine], (), resources.downlink_bit_s, mine)
+        peak, _ = core.storage_peak([*commitments, mine], (), resources.downlink_bit_s, mine)
     if peak > resources.storage_octets:
         conflicts.append(
             PlanConflict(
@@ -546,17 +530,17 @@ def _assessed(
 
 def planner_of(
     ground: Ground, reference: Ephemeris, mission: Mission, catalogue: CraterCatalogue | None = None, mare: Any = None
-) -> Planner:
+) -> core.Planner:
     """Return a planner with camera and orientation of the mission; defaults replace what it does not state."""
     orientation = declared_frames(mission.frames, ground.data).orientation or ground.orientation
-    return Planner(
+    return core.Planner(
         open_ephemeris(ground, reference),
         orientation,
         resources_of(mission),
         camera_of(mission.camera),
         catalogue,
         mare,
-        gap_ns(mission.uploads),
+        preparation.gap_ns(mission.uploads),
     )
 
 
@@ -582,17 +566,17 @@ def mission_of(connection: Connection, spacecraft_id: int | None) -> Mission:
     return missions.mission_in_force(connection, spacecraft_id) or Mission(name="not stated")
 
 
-def resources_of(mission: Mission) -> Resources:
+def resources_of(mission: Mission) -> core.Resources:
     """Return the resources that a mission description states, with defaults for the others."""
-    stated, default = mission.resources, asdict(Resources())
+    stated, default = mission.resources, asdict(core.Resources())
     rates = [one.downlink_bps for one in (mission.link.stations or {}).values() if one.downlink_bps is not None]
     given: dict[str, Any] = {
         "storage_octets": None if stated.storage_mib is None else round(stated.storage_mib * (1 << 20)),
         "downlink_bit_s": min(rates, default=None) if stated.downlink_kbit_s is None else stated.downlink_kbit_s * 1e3,
-        "stations": stations_of(mission.link) or Resources().stations,
+        "stations": stations_of(mission.link) or core.Resources().stations,
     }
     given = stated.model_dump(include=set(default)) | given
-    return Resources(**default | {name: value for name, value in given.items() if value is not None})
+    return core.Resources(**default | {name: value for name, value in given.items() if value is not None})
 
 
 def assumed_resources(mission: Mission) -> list[str]:
@@ -611,7 +595,7 @@ def battery_floor(mission: Mission) -> float:
     return max(mission.resources.minimum_battery or 0.0, BATTERY_FLOOR)
 
 
-def resource_grid(planner: Planner, mission: Mission, start: int, count: int, step_s: float) -> ResourceGrid:
+def resource_grid(planner: core.Planner, mission: Mission, start: int, count: int, step_s: float) -> ResourceGrid:
     """Return the resources in `count` steps from a time on, as far as the ephemeris reaches."""
     resources, hours = planner.resources, mission.resources.observe_hours_per_day
     middles = start + (np.arange(count, dtype=np.int64) * 2 + 1) * round(step_s * NS / 2)
@@ -632,7 +616,7 @@ def resource_grid(planner: Planner, mission: Mission, start: int, count: int, st
 
 def _prediction(
     ground: Ground, connection: Connection, entry: WindowEntry, mission: Mission, commitments: Sequence[Option]
-) -> Candidate | None:
+) -> core.Candidate | None:
     """Predict the window if a reference ephemeris covers it."""
     candidates = (
         [service.get_ephemeris(connection, entry.ephemeris_id)]
@@ -679,7 +663,7 @@ def _coverage_conflict(connection: Connection, entry: WindowEntry, mission: Miss
 def _span_conflicts(
     connection: Connection, vehicle: int, window_id: int, entry: WindowEntry, mission: Mission
 ) -> list[PlanConflict]:
-    gap = gap_ns(mission.uploads)
+    gap = preparation.gap_ns(mission.uploads)
     spans = store.neighbours(connection, vehicle, entry, gap)
     predecessor = next((span for span in spans if span.id == entry.predecessor_id), None)
     if entry.predecessor_id is not None and predecessor is None:

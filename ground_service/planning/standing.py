@@ -24,20 +24,10 @@ from ground_service.http.model import UtcTime
 from ground_service.missions.ephemerides import service
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.model import Mission
+from ground_service.planning import model, store
 from ground_service.planning import service as planning
-from ground_service.planning import store
 from ground_service.planning.core import Constraints, Planner, data_octets, frames_between
 from ground_service.planning.filling import Option, ResourceGrid, choose
-from ground_service.planning.model import (
-    PlannedCandidate,
-    RequestPlan,
-    RequestTerms,
-    StandingRequest,
-    StandingRequestChange,
-    StandingRequestIn,
-    WindowEntry,
-    WindowRecord,
-)
 from ground_service.planning.preparation import gap_ns
 from ground_service.planning.progress import note_reason
 from ground_service.planning.store import RequestRecord
@@ -68,7 +58,7 @@ NOT_RELEASED = "its telecommands were not released before it began"
 NOT_APPROVED = "it was not approved before it began"
 
 
-def add_request(ground: Ground, given: StandingRequestIn, *, actor: str) -> StandingRequest:
+def add_request(ground: Ground, given: model.StandingRequestIn, *, actor: str) -> model.StandingRequest:
     """Add an active standing request.
 
     Raises
@@ -89,7 +79,9 @@ def add_request(ground: Ground, given: StandingRequestIn, *, actor: str) -> Stan
         return store.get_request(connection, key)
 
 
-def change_request(ground: Ground, request_id: int, change: StandingRequestChange, *, actor: str) -> StandingRequest:
+def change_request(
+    ground: Ground, request_id: int, change: model.StandingRequestChange, *, actor: str
+) -> model.StandingRequest:
     """Pause or resume a standing request, or replace its terms; planned windows stay.
 
     Raises
@@ -217,7 +209,7 @@ def _advance(ground: Ground, now: int, vehicle_id: int | None) -> tuple[int, int
     return approved, released
 
 
-def _decided(ground: Ground, window: WindowRecord, decision: str, reason: str | None) -> int:
+def _decided(ground: Ground, window: model.WindowRecord, decision: str, reason: str | None) -> int:
     try:
         planning.change_window(ground, window.id, actor=PLANNER, changes={}, decision=decision, reason=reason)
     except GroundError as error:  # conflicts, or another process or a person was faster
@@ -233,8 +225,8 @@ class _Situation:
     request: RequestRecord
     mission: Mission
     references: tuple[Ephemeris, ...]
-    mine: tuple[WindowRecord, ...]
-    others: tuple[WindowRecord, ...]
+    mine: tuple[model.WindowRecord, ...]
+    others: tuple[model.WindowRecord, ...]
 
 
 def _fill(ground: Ground, request_id: int, now: int) -> int:
@@ -439,7 +431,7 @@ def _stored(
         planned = []
         ids = []
         for option in chosen:
-            entry = WindowEntry(
+            entry = model.WindowEntry(
                 name=f"{request.name} {UtcTime(option.start_utc_ns)[:16]}",
                 start_utc_ns=option.start_utc_ns,
                 stop_utc_ns=option.stop_utc_ns,
@@ -457,7 +449,7 @@ def _stored(
             planned.append(_candidate(option, window.id, None))
         planned += [_candidate(option, None, why) for option, why in rejected.items()]
         failed = [one for one in situation.mine if one.state == "failed"]
-        plan = RequestPlan(
+        plan = model.RequestPlan(
             request_id=request.id,
             planned=UtcTime(now),
             until=UtcTime(max(end, now)),
@@ -473,8 +465,8 @@ def _stored(
     return len(ids)
 
 
-def _candidate(option: Option, window_id: int | None, reason: str | None) -> PlannedCandidate:
-    return PlannedCandidate(
+def _candidate(option: Option, window_id: int | None, reason: str | None) -> model.PlannedCandidate:
+    return model.PlannedCandidate(
         start=UtcTime(option.start_utc_ns),
         stop=UtcTime(option.stop_utc_ns),
         outcome="rejected" if window_id is None else "planned",
@@ -483,7 +475,7 @@ def _candidate(option: Option, window_id: int | None, reason: str | None) -> Pla
     )
 
 
-def _check_terms(terms: RequestTerms) -> None:
+def _check_terms(terms: model.RequestTerms) -> None:
     if terms.minimum_duration_s > terms.maximum_duration_s:
         raise InvalidInput(
             "request",

@@ -26,15 +26,7 @@ from ground_service.regression.model import UNUSABLE_STATES, Verdict
 from ground_service.regression.outcome import JUDGED, JUDGED_STATES, PassVerdict, RegressionOutcome, pass_figures
 from ground_service.regression.replay_samples import PassContext, ReadDownlink
 from lunar.timescales import format_utc
-from reports.values import (
-    ChangedCraters,
-    ChangedTrack,
-    GalleryFrame,
-    Gate,
-    HeadlineFigure,
-    RegressionPass,
-    RegressionReport,
-)
+from reports import values
 
 SUSPICIOUS = 1.15
 """Ratio of the median position errors from which navigation may be affected."""
@@ -91,21 +83,21 @@ def _reason(outcome: RegressionOutcome) -> str:
     return f"no loss beyond the margins on {outcome.frames_judged} frames; {_navigation(outcome.gates)}"
 
 
-def _changes(gates: Sequence[Gate]) -> str:
+def _changes(gates: Sequence[values.Gate]) -> str:
     return ", ".join(f"{_name(gate)} {_figures(gate)}" for gate in gates)
 
 
-def _name(gate: Gate) -> str:
+def _name(gate: values.Gate) -> str:
     return NAMES.get(gate.name, gate.name)
 
 
-def _figures(gate: Gate) -> str:
+def _figures(gate: values.Gate) -> str:
     change = gate.candidate - gate.baseline
     size = f"{abs(change):.3g} {gate.unit}".rstrip()
     return f"{'rises' if change > 0.0 else 'falls'} by {size} ({gate.baseline:.3g} to {gate.candidate:.3g})"
 
 
-def _navigation(gates: Sequence[Gate]) -> str:
+def _navigation(gates: Sequence[values.Gate]) -> str:
     """Return whether fixes and position errors are affected."""
     known = [
         gate
@@ -277,7 +269,7 @@ def regression_html(ground: Ground, outcome: RegressionOutcome, identity: str) -
     return render_html(regression_report(ground, outcome, identity))
 
 
-def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str) -> RegressionReport:
+def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str) -> values.RegressionReport:
     """The report of a regression as a value."""
     judged = [one for one in outcome.passes if one.state == JUDGED]
     troubled = [one for one in outcome.passes if one.state != JUDGED]
@@ -285,7 +277,7 @@ def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str)
         {str(name) for one in judged if one.context for name in one.context.manifest.get("data_sources", ())}
     )
     candidate, baseline = _names(outcome)
-    return RegressionReport(
+    return values.RegressionReport(
         title=f"{candidate} against {baseline}",
         regression_id=identity,
         candidate=candidate,
@@ -318,7 +310,7 @@ def regression_report(ground: Ground, outcome: RegressionOutcome, identity: str)
     )
 
 
-def changed_tracks(ground: Ground, judged: Sequence[PassVerdict]) -> list[ChangedTrack]:
+def changed_tracks(ground: Ground, judged: Sequence[PassVerdict]) -> list[values.ChangedTrack]:
     """Return the tracks of craters that changed most: in the frames lost, then in those gained, then in the centres."""
     rows: list[tuple[float, str, int, PassVerdict]] = []
     for one in judged:
@@ -336,7 +328,7 @@ def changed_tracks(ground: Ground, judged: Sequence[PassVerdict]) -> list[Change
     return [_changed_track(ground, one, row) for *_, row, one in rows[:CHANGED_TRACKS]]
 
 
-def _changed_track(ground: Ground, one: PassVerdict, row: int) -> ChangedTrack:
+def _changed_track(ground: Ground, one: PassVerdict, row: int) -> values.ChangedTrack:
     assert one.context and one.baseline_read and one.candidate_read
     context, old, new = one.context, one.baseline_read.frames.craters, one.candidate_read.frames.craters
     archive = ground.read(store.get_archive, one.digest)
@@ -350,7 +342,7 @@ def _changed_track(ground: Ground, one: PassVerdict, row: int) -> ChangedTrack:
         for read, label in ((one.baseline_read, "baseline"), (one.candidate_read, "candidate"))
     )
     same = old.track == old.track[row]
-    return ChangedTrack(
+    return values.ChangedTrack(
         one.name,
         math.degrees(context.catalogue.latitude_rad[crater]),
         math.degrees(context.catalogue.longitude_rad[crater]),
@@ -363,7 +355,7 @@ def _changed_track(ground: Ground, one: PassVerdict, row: int) -> ChangedTrack:
     )
 
 
-def changed_craters(judged: Sequence[PassVerdict]) -> ChangedCraters:
+def changed_craters(judged: Sequence[PassVerdict]) -> values.ChangedCraters:
     """Return the tracks of all passes by place with their change, and the ground cells of new false detections."""
     tracks, cells = [np.zeros((3, 0))], [np.zeros(0, np.int64)]
     for one in judged:
@@ -380,10 +372,12 @@ def changed_craters(judged: Sequence[PassVerdict]) -> ChangedCraters:
     false_latitude, false_longitude = cell_places_deg(np.concatenate(cells))
     west = longitude[:1].sum() - 180.0  # a pass over 0 or 180 degrees is one strip
     longitude, false_longitude = ((one - west) % 360.0 + west for one in (longitude, false_longitude))
-    return ChangedCraters(latitude, longitude, changes, false_latitude, false_longitude)
+    return values.ChangedCraters(latitude, longitude, changes, false_latitude, false_longitude)
 
 
-def _side(context: PassContext, read: ReadDownlink, frame: int, crater: int, image: Any, label: str) -> GalleryFrame:
+def _side(
+    context: PassContext, read: ReadDownlink, frame: int, crater: int, image: Any, label: str
+) -> values.GalleryFrame:
     """Return what a build found in a frame, cut out around a crater."""
     all_frames, utc = read.detections, context.frame_utc_ns[frame : frame + 1]
     chosen = np.flatnonzero(all_frames.frame_number == frame)
@@ -435,7 +429,7 @@ def _build(build: Any) -> dict[str, Any]:
     }
 
 
-def _gate(gate: Gate) -> dict[str, Any]:
+def _gate(gate: values.Gate) -> dict[str, Any]:
     row = asdict(gate)
     bounds = [row.pop("change_low"), row.pop("change_high")]
     texts = {"pass": row.pop("pass_id") or None, "reason": gate.reason or None}
@@ -456,19 +450,19 @@ def _pass(one: PassVerdict) -> dict[str, Any]:
     return found
 
 
-def _regression_pass(one: PassVerdict) -> RegressionPass:
+def _regression_pass(one: PassVerdict) -> values.RegressionPass:
     assert one.baseline_read and one.candidate_read
     sides = (one.baseline_read.frames, one.candidate_read.frames)
     figures = [{metric.name: metric.value(frames) for metric in metrics_of([frames])} for frames in sides]
     recall, precision, median = (
         (figures[0].get(name, math.nan), figures[1].get(name, math.nan)) for name in PASS_METRICS
     )
-    return RegressionPass(one.name, len(sides[0]), first_difference(*sides), recall, precision, median)
+    return values.RegressionPass(one.name, len(sides[0]), first_difference(*sides), recall, precision, median)
 
 
-def _headline(outcome: RegressionOutcome) -> tuple[HeadlineFigure, ...]:
+def _headline(outcome: RegressionOutcome) -> tuple[values.HeadlineFigure, ...]:
     return tuple(
-        HeadlineFigure(
+        values.HeadlineFigure(
             NAMES[gate.name].capitalize(), gate.candidate, gate.unit, f"baseline {gate.baseline:.3g} {gate.unit}"
         )
         for gate in outcome.gates

@@ -14,7 +14,7 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import InvalidInput
 from ground_service.ground import Ground
 from ground_service.jobs.service import set_progress
-from ground_service.regression import store
+from ground_service.regression import service, store
 from ground_service.regression.archives import kept_archives, remove_unheld
 from ground_service.regression.builds import CURRENT, Build, load_build, register_build, registered_build
 from ground_service.regression.gates.calibration import gate_noise, pass_noise
@@ -24,15 +24,6 @@ from ground_service.regression.outcome import JUDGED, RegressionOutcome
 from ground_service.regression.pass_archives import archive_of_pass
 from ground_service.regression.rendering import settle_archive
 from ground_service.regression.replay_samples import condition_of
-from ground_service.regression.service import (
-    baseline_figures,
-    do_replay,
-    find_replay,
-    is_done,
-    keep_regression,
-    may_be_replayed,
-    run_regression,
-)
 
 
 def run_placebo(
@@ -47,7 +38,7 @@ def run_placebo(
         replace(build, noise=one, digest=hashlib.sha256(f"{build.digest} noise {one}".encode()).hexdigest())
         for one in (2 * seed, 2 * seed + 1)
     ]
-    outcome = run_regression(ground, archives, sides[1], sides[0], policy, **options)
+    outcome = service.run_regression(ground, archives, sides[1], sides[0], policy, **options)
     remove_unheld(ground, ground.write(store.remove_replays, [one.digest for one in sides]))
     noise = gate_noise(outcome.gates, policy.policy)
     for one in outcome.passes:
@@ -108,13 +99,13 @@ def missing_replays(ground: Ground, arguments: Mapping[str, Any]) -> list[dict[s
     """Arguments of the jobs of the replays that a regression needs and that were not done yet."""
     builds = [registered_build(ground, arguments[side]) for side in ("baseline", "candidate")]
     chosen = set(arguments["archives"])
-    archives = {one.digest for one in kept_archives(ground) if one.digest in chosen and may_be_replayed(one)}
+    archives = {one.digest for one in kept_archives(ground) if one.digest in chosen and service.may_be_replayed(one)}
     return [
         {"archive": digest, "build": build.digest}
         for digest in arguments["archives"]
         if digest in archives
         for build in dict.fromkeys(builds)
-        if not is_done(find_replay(ground, digest, build))
+        if not service.is_done(service.find_replay(ground, digest, build))
     ]
 
 
@@ -130,7 +121,7 @@ def nightly_placebo(ground: Ground, passes: int) -> dict[str, Any] | None:
 
 def replay_job(ground: Ground, arguments: Mapping[str, Any], _job_id: str) -> dict[str, Any]:
     """One build over one archive."""
-    replay = do_replay(ground, str(arguments["archive"]), registered_build(ground, str(arguments["build"])))
+    replay = service.do_replay(ground, str(arguments["archive"]), registered_build(ground, str(arguments["build"])))
     return {"outcome": replay.outcome, "detail": replay.detail, "cpu_s": replay.cpu_s}
 
 
@@ -145,13 +136,13 @@ def regression_job(ground: Ground, arguments: Mapping[str, Any], job_id: str) ->
     text = arguments.get("policy")
     policy = load_policy() if text is None else read_policy(text.encode(), str(arguments["policy_name"]))
     outcome = _outcome(ground, arguments, job_id, policy)
-    keep_regression(ground, outcome, regression_id=job_id)
+    service.keep_regression(ground, outcome, regression_id=job_id)
     return {"regression_id": job_id, "verdict": outcome.verdict}
 
 
 def analysis_job(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
     """Return the metrics of one build over archives."""
-    return baseline_figures(_outcome(ground, arguments, job_id, load_policy()))
+    return service.baseline_figures(_outcome(ground, arguments, job_id, load_policy()))
 
 
 def _outcome(ground: Ground, arguments: Mapping[str, Any], job_id: str, policy: PolicyFile) -> RegressionOutcome:
@@ -168,4 +159,4 @@ def _outcome(ground: Ground, arguments: Mapping[str, Any], job_id: str, policy: 
     if seed := arguments.get("placebo"):
         return run_placebo(ground, archives, baseline, policy, int(seed), **options)
     repeated = bool(arguments.get("repeat_baseline"))
-    return run_regression(ground, archives, candidate, baseline, policy, repeated=repeated, **options)
+    return service.run_regression(ground, archives, candidate, baseline, policy, repeated=repeated, **options)

@@ -20,16 +20,7 @@ from ground_service.passes import sample_store
 from ground_service.passes import store as passes
 from ground_service.passes.model import PassRecord
 from ground_service.passes.span import pass_span
-from ground_service.regression import store
-from ground_service.regression.archives import (
-    INPUTS,
-    MANIFEST,
-    PassArchive,
-    check_archive,
-    kept_archive,
-    store_archive,
-    working_folder,
-)
+from ground_service.regression import archives, store
 from ground_service.regression.model import TELEMETRY_ONLY, TO_RENDER, KeptArchive
 from ground_service.regression.rendering import LIVE_BEGINNING
 from ground_service.store.vehicles import get_vehicle
@@ -65,7 +56,7 @@ def keep_pass(ground: Ground, pass_id: int, *, pinned: bool = False) -> KeptArch
         The pass has no telemetry, or its archive was imported by a version that did not store the manifest.
     """
     record = ground.read(passes.get_pass, pass_id)
-    with working_folder(ground) as work:
+    with archives.working_folder(ground) as work:
         folder = work / "archive"
         folder.mkdir()
         if record.archive_digest is not None:
@@ -73,17 +64,17 @@ def keep_pass(ground: Ground, pass_id: int, *, pinned: bool = False) -> KeptArch
         else:
             with ground.database.reading() as connection:
                 archive = _received(ground, connection, record, folder)
-        store_archive(ground, archive, pinned=pinned, pass_id=pass_id)
-    return kept_archive(ground, archive.digest)
+        archives.store_archive(ground, archive, pinned=pinned, pass_id=pass_id)
+    return archives.kept_archive(ground, archive.digest)
 
 
 def archive_of_pass(ground: Ground, pass_id: int) -> KeptArchive:
     """Return the kept archive of a pass, which is kept now if there is none."""
     kept = ground.read(store.archives_of_pass, pass_id)
-    return kept_archive(ground, kept[0].digest) if kept else keep_pass(ground, pass_id)
+    return archives.kept_archive(ground, kept[0].digest) if kept else keep_pass(ground, pass_id)
 
 
-def _imported(ground: Ground, record: PassRecord, folder: Path) -> PassArchive:
+def _imported(ground: Ground, record: PassRecord, folder: Path) -> archives.PassArchive:
     """Write the archive of an imported pass into a folder; images that the ground did not store are left out."""
     assert record.archive_digest is not None
     try:
@@ -105,9 +96,9 @@ def _imported(ground: Ground, record: PassRecord, folder: Path) -> PassArchive:
     if len(present) < len(manifest["files"]):
         manifest = {**manifest, "files": present}
         octets = json.dumps(manifest, indent=2).encode() + b"\n"
-    (folder / MANIFEST).write_bytes(octets)
-    if INPUTS not in present:
-        return PassArchive(
+    (folder / archives.MANIFEST).write_bytes(octets)
+    if archives.INPUTS not in present:
+        return archives.PassArchive(
             folder,
             hashlib.sha256(octets).hexdigest(),
             manifest,
@@ -117,10 +108,10 @@ def _imported(ground: Ground, record: PassRecord, folder: Path) -> PassArchive:
             NO_INPUTS,
         )
     # The identity is that of the imported archive, also where images are left out.
-    return replace(check_archive(folder), digest=record.archive_digest)
+    return replace(archives.check_archive(folder), digest=record.archive_digest)
 
 
-def _received(ground: Ground, connection: Connection, record: PassRecord, folder: Path) -> PassArchive:
+def _received(ground: Ground, connection: Connection, record: PassRecord, folder: Path) -> archives.PassArchive:
     """Write the received data of a live pass into a folder."""
     span = pass_span(connection, record)
     octets = b"".join(
@@ -166,11 +157,11 @@ def _received(ground: Ground, connection: Connection, record: PassRecord, folder
         },
     }
     text = json.dumps(manifest, indent=2).encode() + b"\n"
-    (folder / MANIFEST).write_bytes(text)
+    (folder / archives.MANIFEST).write_bytes(text)
     digest = hashlib.sha256(text).hexdigest()
     reason = _unrenderable(manifest)
     state = TELEMETRY_ONLY if reason else TO_RENDER
-    return PassArchive(folder, digest, manifest, frames, 0, state, reason)
+    return archives.PassArchive(folder, digest, manifest, frames, 0, state, reason)
 
 
 def _unrenderable(manifest: Mapping[str, Any]) -> str:

@@ -21,7 +21,7 @@ from ground_service.errors import GroundError, InvalidInput, Stopping
 from ground_service.evaluation.service import plain
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime
-from ground_service.regression import store
+from ground_service.regression import model, replay_samples, store
 from ground_service.regression.archives import (
     DETECTIONS,
     PassArchive,
@@ -40,25 +40,9 @@ from ground_service.regression.gates.metrics import first_difference, metrics_of
 from ground_service.regression.gates.policy import PolicyFile, load_policy
 from ground_service.regression.gates.samples import PassFrames
 from ground_service.regression.gates.statistics import joined_sums, ratio_error
-from ground_service.regression.model import (
-    COMPLETE,
-    OK,
-    TELEMETRY_ONLY,
-    Calibration,
-    KeptArchive,
-    KeptReplay,
-    Regression,
-)
 from ground_service.regression.outcome import JUDGED, TELEMETRY_JUDGED, PassVerdict, RegressionOutcome, pass_figures
 from ground_service.regression.pass_archives import NO_INPUTS
 from ground_service.regression.rendering import LIVE_BEGINNING, settle_archive
-from ground_service.regression.replay_samples import (
-    PassContext,
-    ReadDownlink,
-    condition_of,
-    pass_context,
-    read_downlink,
-)
 from ground_service.regression.runner import PERFORMANCE
 from ground_service.store.event_kinds import RegressionJudged, publish
 from ground_service.store.files import register_file
@@ -104,15 +88,15 @@ def run_regression(
     return judge_regression(ground, kept, candidate, baseline, policy)
 
 
-def _context(ground: Ground, digest: str) -> PassContext:
+def _context(ground: Ground, digest: str) -> replay_samples.PassContext:
     with working_folder(ground) as folder:
-        return pass_context(check_out(ground, digest, folder / "a", images=False), ground.data)
+        return replay_samples.pass_context(check_out(ground, digest, folder / "a", images=False), ground.data)
 
 
 def condition_of_archive(ground: Ground, digest: str) -> str:
     """Return the condition of a kept archive; empty if it cannot be read."""
     try:
-        return condition_of(_context(ground, digest))
+        return replay_samples.condition_of(_context(ground, digest))
     except (GroundError, LunarError):
         return ""
 
@@ -149,7 +133,7 @@ def fly_shards(
             raise
 
 
-def do_replay(ground: Ground, digest: str, build: Build, *, again: bool = False) -> KeptReplay:
+def do_replay(ground: Ground, digest: str, build: Build, *, again: bool = False) -> model.KeptReplay:
     """Replay a kept archive with a build, or return what was kept of an earlier time unless `again` is set.
 
     A replay of an archive that was completed meanwhile is done again.
@@ -172,13 +156,13 @@ def do_replay(ground: Ground, digest: str, build: Build, *, again: bool = False)
         ground.check_stopping()
 
 
-def _replayed(ground: Ground, digest: str, build: Build) -> tuple[KeptReplay, str]:
+def _replayed(ground: Ground, digest: str, build: Build) -> tuple[model.KeptReplay, str]:
     """Replay a kept archive; return the result, and the hash of the manifest that the archive had."""
     with working_folder(ground) as folder:
         archive = check_out(ground, digest, folder / "archive")
         refusal = _other_camera(build, archive) or _unreplayable(archive, (build,))
         if refusal:
-            refused = KeptReplay(outcome="refused", detail=refusal, machine=_machine())
+            refused = model.KeptReplay(outcome="refused", detail=refusal, machine=_machine())
             return refused, archive.manifest_sha256
         run = run_build(build, archive.folder, folder / "out", runner=ground.runner, private=(ground.home,))
         outcome, detail = run.outcome, run.detail
@@ -186,18 +170,18 @@ def _replayed(ground: Ground, digest: str, build: Build) -> tuple[KeptReplay, st
         if run.downlink is not None:
             octets = run.downlink.read_bytes()
             try:
-                context = pass_context(archive, ground.data)
+                context = replay_samples.pass_context(archive, ground.data)
             except (GroundError, LunarError):
                 pass  # a fault of the archive or of ground data, not of the build; the verdict reports it
             else:
                 try:
-                    read_downlink(context, octets)
+                    replay_samples.read_downlink(context, octets)
                 except InvalidInput as error:
                     outcome, detail = "garbage", str(error)
             stored["downlink"] = store_of(ground).put_octets(octets).sha256
         if run.performance is not None:
             stored["performance"] = store_of(ground).put_file(folder / "out" / PERFORMANCE).sha256
-        replay = KeptReplay(
+        replay = model.KeptReplay(
             outcome=outcome,
             detail=detail,
             downlink_sha256=stored["downlink"],
@@ -212,7 +196,7 @@ def _replayed(ground: Ground, digest: str, build: Build) -> tuple[KeptReplay, st
         return replay, archive.manifest_sha256
 
 
-def find_replay(ground: Ground, digest: str, build: Build) -> KeptReplay | None:
+def find_replay(ground: Ground, digest: str, build: Build) -> model.KeptReplay | None:
     """Return the stored replay; None if it was not done, or a part of it is lost."""
     replay = ground.read(store.find_replay, digest, build.digest)
     if replay is None:
@@ -222,9 +206,9 @@ def find_replay(ground: Ground, digest: str, build: Build) -> KeptReplay | None:
     return replay if all(files.path(sha256).exists() for sha256 in stored) else None
 
 
-def is_done(replay: KeptReplay | None) -> bool:
+def is_done(replay: model.KeptReplay | None) -> bool:
     """Return whether a replay need not be done again: what failed once may have failed for want of time or space."""
-    return replay is not None and replay.outcome == OK
+    return replay is not None and replay.outcome == model.OK
 
 
 def judge_regression(
@@ -277,7 +261,7 @@ def judge_regression(
     return RegressionOutcome(baseline, candidate, policy, tuple(gates), passes, tuple(remarks))
 
 
-def calibrations_of(ground: Ground) -> list[Calibration]:
+def calibrations_of(ground: Ground) -> list[model.Calibration]:
     """Return the noise of each metric in the placebos that the shipped policy judged."""
     return calibrations(ground.read(store.placebo_noise, load_policy().policy.version))
 
@@ -289,7 +273,7 @@ def keep_regression(ground: Ground, outcome: RegressionOutcome, *, regression_id
     now = utc_now_ns()
     with ground.database.writing() as connection:
         register_file(connection, html, "report", f"regression {identity}", now)
-        regression = Regression(
+        regression = model.Regression(
             id=identity, verdict=outcome.verdict, created=UtcTime(now), result=verdict_document(outcome)
         )
         flown = {one.context.mission for one in outcome.passes if one.context is not None}
@@ -322,9 +306,9 @@ def _kept(ground: Ground, given: Path | str) -> PassArchive | PassVerdict:
         return PassVerdict(path.name, "", "unusable", str(error))
 
 
-def may_be_replayed(archive: KeptArchive) -> bool:
+def may_be_replayed(archive: model.KeptArchive) -> bool:
     """Return whether a kept archive has frames, or inputs of the payload from which it can be replayed."""
-    return archive.state != TELEMETRY_ONLY or not archive.reason.startswith((LIVE_BEGINNING, NO_INPUTS))
+    return archive.state != model.TELEMETRY_ONLY or not archive.reason.startswith((LIVE_BEGINNING, NO_INPUTS))
 
 
 def _settled(ground: Ground, digest: str, path: Path) -> PassArchive:
@@ -336,7 +320,7 @@ def _settled(ground: Ground, digest: str, path: Path) -> PassArchive:
 
 def _unreplayable(archive: PassArchive, builds: Sequence[Build]) -> str:
     """Return why builds cannot replay an archive; empty if they can."""
-    if archive.state == COMPLETE:
+    if archive.state == model.COMPLETE:
         return ""
     if DETECTIONS not in archive.manifest["files"]:
         return archive.reason
@@ -358,7 +342,7 @@ def _pass_verdict(ground: Ground, archive: PassArchive, candidate: Build, baseli
     if old is None or new is None:
         return PassVerdict(archive.name, archive.digest, "unusable", "it was not flown", old, new)
     for replay, build, state in ((new, candidate, "candidate failed"), (old, baseline, "baseline failed")):
-        if replay.outcome != OK:
+        if replay.outcome != model.OK:
             message = f"{build.name} {OUTCOMES[replay.outcome]}" + (f": {replay.detail}" if replay.detail else "")
             return PassVerdict(archive.name, archive.digest, state, message, old, new)
     try:
@@ -366,16 +350,16 @@ def _pass_verdict(ground: Ground, archive: PassArchive, candidate: Build, baseli
         read = [_read(ground, context, replay) for replay in (old, new)]
     except (GroundError, LunarError) as error:
         return PassVerdict(archive.name, archive.digest, "unusable", str(error), old, new)
-    state = JUDGED if archive.state == COMPLETE else TELEMETRY_JUDGED
+    state = JUDGED if archive.state == model.COMPLETE else TELEMETRY_JUDGED
     return PassVerdict(archive.name, archive.digest, state, archive.reason, old, new, context, read[0], read[1])
 
 
-def _read(ground: Ground, context: PassContext, replay: KeptReplay) -> ReadDownlink:
+def _read(ground: Ground, context: replay_samples.PassContext, replay: model.KeptReplay) -> replay_samples.ReadDownlink:
     files = store_of(ground)
     assert replay.downlink_sha256 is not None
     performance = read_performance(files.path(replay.performance_sha256)) if replay.performance_sha256 else None
     octets = files.get(replay.downlink_sha256)
-    return read_downlink(context, octets, performance, replay.peak_rss_mib, replay.cpu_s)
+    return replay_samples.read_downlink(context, octets, performance, replay.peak_rss_mib, replay.cpu_s)
 
 
 def _other_camera(build: Build, archive: PassArchive) -> str:

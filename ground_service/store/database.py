@@ -29,18 +29,7 @@ from sqlalchemy.engine import ExceptionContext
 from sqlalchemy.exc import DataError, DBAPIError, InvalidatePoolError, SQLAlchemyError
 
 import ground_service
-from ground_service.errors import (
-    DatabaseBusy,
-    DatabaseNotMigrated,
-    DatabaseTooNew,
-    DatabaseTooOld,
-    DatabaseUnavailable,
-    GroundError,
-    InvalidInput,
-    StorageFull,
-    StorageReadOnly,
-    storage_error,
-)
+from ground_service import errors
 from ground_service.store import audit, events
 from ground_service.store.files import make_durable_folder
 
@@ -156,7 +145,7 @@ class Database:
         """
         path = self.engine.url.database
         if self.dialect == "sqlite" and path and Path(path).exists() and not os.access(path, os.W_OK):
-            raise StorageReadOnly(self.label)
+            raise errors.StorageReadOnly(self.label)
 
     @contextmanager
     def alone(self, name: str) -> Iterator[bool]:
@@ -191,7 +180,7 @@ def open_database(url: str) -> Database:
     try:
         parsed = make_url(url)
     except SQLAlchemyError:
-        raise DatabaseUnavailable(url.split("@")[-1], "expected a URL such as sqlite:///file.db") from None
+        raise errors.DatabaseUnavailable(url.split("@")[-1], "expected a URL such as sqlite:///file.db") from None
     if parsed.get_backend_name() == "sqlite":
         if parsed.database and not parsed.database.startswith((":memory:", "file:")):
             _make_folder(Path(parsed.database))
@@ -215,7 +204,7 @@ def open_database(url: str) -> Database:
         event.listen(engine, "checkout", functools.partial(_test_idle, engine))
         return Database(engine)
     except (SQLAlchemyError, ImportError) as error:
-        raise DatabaseUnavailable(parsed.render_as_string(), str(error).splitlines()[0]) from None
+        raise errors.DatabaseUnavailable(parsed.render_as_string(), str(error).splitlines()[0]) from None
 
 
 def prepare_database(url: str, *, upgrade: bool | None = None) -> Database:
@@ -242,14 +231,14 @@ def prepare_database(url: str, *, upgrade: bool | None = None) -> Database:
         if found == head:
             return database
         if found in REVISIONS_BEFORE_1_0:
-            raise DatabaseTooOld(database.label, head, str(found))
+            raise errors.DatabaseTooOld(database.label, head, str(found))
         if found is not None and found not in known:
             if oldest_program(found) in known:
                 log.info("database %s: schema revision %s of a newer version", database.label, found)
                 return database
-            raise DatabaseTooNew(database.label, head, found)
+            raise errors.DatabaseTooNew(database.label, head, found)
         if upgrade is False or (upgrade is None and database.dialect != "sqlite"):
-            raise DatabaseNotMigrated(database.label, head, found or "none")
+            raise errors.DatabaseNotMigrated(database.label, head, found or "none")
         upgrade_database(database)
     except BaseException:
         database.engine.dispose()
@@ -300,7 +289,7 @@ def upgrade_database(database: Database, revision: str = "head") -> None:
         try:
             _upgrade_once(database, revision)
             return
-        except DatabaseBusy as error:
+        except errors.DatabaseBusy as error:
             if left == 0:
                 raise
             log.info("the migration is tried again: %s", error)
@@ -322,23 +311,23 @@ def migration_config() -> Config:
     return config
 
 
-def database_error(error: DBAPIError, label: str) -> GroundError:
+def database_error(error: DBAPIError, label: str) -> errors.GroundError:
     """The error of this package that says what a database error means."""
     original: Any = error.orig
     message = str(original).splitlines()[0] if original is not None else str(error).splitlines()[0]
     name = getattr(original, "sqlite_errorname", "") or ""
     if name.startswith("SQLITE_FULL") or getattr(original, "sqlstate", None) == "53100":
-        return StorageFull(label)
+        return errors.StorageFull(label)
     if name.startswith("SQLITE_READONLY") or getattr(original, "sqlstate", None) == "25006":
-        return StorageReadOnly(label)
+        return errors.StorageReadOnly(label)
     state = str(getattr(original, "sqlstate", None) or "")
     if state in ("40001", "40P01", "55P03") or name.startswith("SQLITE_BUSY"):
-        return DatabaseBusy(message)
+        return errors.DatabaseBusy(message)
     if isinstance(error, DataError) or state.startswith("22"):
         return _refused(message)
     if name.startswith(("SQLITE_NOTADB", "SQLITE_CORRUPT")):
-        return DatabaseUnavailable(label, f"{message}; expected a SQLite database")
-    return DatabaseUnavailable(label, message)
+        return errors.DatabaseUnavailable(label, f"{message}; expected a SQLite database")
+    return errors.DatabaseUnavailable(label, message)
 
 
 _json_text = functools.partial(json.dumps, allow_nan=False)
@@ -352,8 +341,8 @@ def _refuse_values(context: ExceptionContext) -> None:
         raise _refused(str(error)) from error
 
 
-def _refused(message: str) -> InvalidInput:
-    return InvalidInput("request", "", "text and numbers that the database can hold", message[:200])
+def _refused(message: str) -> errors.InvalidInput:
+    return errors.InvalidInput("request", "", "text and numbers that the database can hold", message[:200])
 
 
 def _upgrade_once(database: Database, revision: str) -> None:
@@ -375,7 +364,7 @@ def _make_folder(path: Path) -> None:
         if not os.access(folder, os.W_OK):
             raise OSError(errno.EACCES, "read-only", str(folder))
     except OSError as error:
-        raise storage_error(error, folder) from None
+        raise errors.storage_error(error, folder) from None
 
 
 def _prepare_sqlite(connection: sqlite3.Connection, _record: object) -> None:
@@ -394,7 +383,7 @@ def _prepare_postgresql(connection: Any, _record: object) -> None:
     """Request durable commits."""
     encoding = connection.info.parameter_status("server_encoding")
     if encoding != "UTF8":
-        raise DatabaseUnavailable(
+        raise errors.DatabaseUnavailable(
             f"{connection.info.host}/{connection.info.dbname}",
             f"expected a database with the encoding UTF8, found {encoding}",
         )

@@ -1,4 +1,4 @@
-"""Leases: the right of one process among many to do something, which ends by itself if the process is killed.
+"""Leases, the rights of one process among many that end if the process is killed; wake-ups between processes.
 
 A table with leases has the columns `name` (key), `owner` and `lease_utc_ns`, the end of the lease.
 """

@@ -1,4 +1,4 @@
-"""Roles of a PostgreSQL database: the owner of the schema, and the service with limited privileges.
+"""Roles of a PostgreSQL database (owner of the schema, limited service); frozen schema of a release.
 
 The service reads and writes rows. It is not a superuser, owns nothing, cannot change the schema, and can add entries to
 the audit log but neither change nor remove them. Migrations run as the owner, who then grants the service its

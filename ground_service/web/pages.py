@@ -38,7 +38,7 @@ from ground_service.passes.series import STATE_VALUES
 from ground_service.planning.model import StandingRequestIn
 from ground_service.regression.store import get_report as get_regression_report
 from tmtc.dictionary.arguments import FUNCTION_ARGUMENTS
-from tmtc.dictionary.onboard_parameters import PARAMETERS
+from tmtc.dictionary.fields import PARAMETERS
 from tmtc.dictionary.payload import DICTIONARY, STRUCTURES
 
 _HERE = Path(__file__).parent

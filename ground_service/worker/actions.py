@@ -25,15 +25,7 @@ from ground_service.planning import store as planning
 from ground_service.planning.model import WindowRecord
 from ground_service.planning.progress import HEARD_TICKS, close_window, note_reason, span_of
 from ground_service.regression.pass_archives import keep_pass
-from ground_service.store.event_kinds import (
-    AlarmChanged,
-    ArchiveImported,
-    ContactEnded,
-    LimitsBroken,
-    PassEvaluated,
-    RegressionJudged,
-    WindowChanged,
-)
+from ground_service.store import event_kinds
 from ground_service.store.events import LoggedEvent, read_events
 from ground_service.store.vehicles import get_vehicle
 from ground_service.worker.notifications import NotDelivered, send
@@ -73,7 +65,7 @@ def _settings(connection: Connection, vehicle: int) -> Automation:
 
 
 def _after_window(connection: Connection, logged: LoggedEvent) -> Iterator[Step]:
-    event = WindowChanged.of(logged)
+    event = event_kinds.WindowChanged.of(logged)
     window = _window_of(connection, event.id)
     if window is None or window.pass_id is None:
         return
@@ -94,7 +86,7 @@ def _after_contact(connection: Connection, logged: LoggedEvent) -> Iterator[Step
 
     They have telemetry, and telemetry from after their end was received.
     """
-    event = ContactEnded.of(logged)
+    event = event_kinds.ContactEnded.of(logged)
     if event.vehicle_id is None or _settings(connection, event.vehicle_id).evaluate is False:
         return
     for window in planning.open_windows(connection, event.vehicle_id):
@@ -106,23 +98,23 @@ def _after_contact(connection: Connection, logged: LoggedEvent) -> Iterator[Step
 
 
 def _after_archive(connection: Connection, logged: LoggedEvent) -> Iterator[Step]:
-    event = ArchiveImported.of(logged)
+    event = event_kinds.ArchiveImported.of(logged)
     if _settings(connection, event.vehicle_id).evaluate is not False:
         yield _archive_of(event.pass_id)
 
 
 def _after_report(connection: Connection, logged: LoggedEvent) -> Iterator[Step]:
     """Yield the archive again after late data."""
-    event = PassEvaluated.of(logged)
+    event = event_kinds.PassEvaluated.of(logged)
     if event.event is not None and _settings(connection, event.vehicle_id).evaluate is not False:
         yield _archive_of(event.pass_id)
 
 
 STEPS: Mapping[str, Callable[[Connection, LoggedEvent], Iterator[Step]]] = {
-    WindowChanged.event_kind: _after_window,
-    ContactEnded.event_kind: _after_contact,
-    ArchiveImported.event_kind: _after_archive,
-    PassEvaluated.event_kind: _after_report,
+    event_kinds.WindowChanged.event_kind: _after_window,
+    event_kinds.ContactEnded.event_kind: _after_contact,
+    event_kinds.ArchiveImported.event_kind: _after_archive,
+    event_kinds.PassEvaluated.event_kind: _after_report,
 }
 """Follow-up by kind of event."""
 
@@ -217,7 +209,7 @@ def _landmarks_of(pass_id: int) -> Step:
 
 
 def _of_failed_window(connection: Connection, logged: LoggedEvent) -> Iterator[Message]:
-    event = WindowChanged.of(logged)
+    event = event_kinds.WindowChanged.of(logged)
     window = _window_of(connection, event.id) if event.state == "failed" else None
     if window is not None:
         text = f"window {window.id} ({window.name}) failed: {window.reason}"
@@ -226,14 +218,14 @@ def _of_failed_window(connection: Connection, logged: LoggedEvent) -> Iterator[M
 
 
 def _of_report(connection: Connection, logged: LoggedEvent) -> Iterator[Message]:
-    event = PassEvaluated.of(logged)
+    event = event_kinds.PassEvaluated.of(logged)
     summary = get_report(connection, event.report_id).summary
     text = f"report of pass {event.pass_id}: {summary.get('verdict') or 'no verdict'}"
     yield Message("report done", text, _spacecraft(connection, event.vehicle_id), event.pass_id)
 
 
 def _of_alarm(connection: Connection, logged: LoggedEvent) -> Iterator[Message]:
-    event = AlarmChanged.of(logged)
+    event = event_kinds.AlarmChanged.of(logged)
     if event.state == "raised":
         spacecraft = _spacecraft(connection, event.vehicle_id)
         yield Message("alarm", f"{event.name} ({event.severity})", spacecraft)
@@ -241,14 +233,14 @@ def _of_alarm(connection: Connection, logged: LoggedEvent) -> Iterator[Message]:
 
 def _of_limits(_connection: Connection, logged: LoggedEvent) -> Iterator[Message]:
     broken: dict[int, list[str]] = {}
-    for one in LimitsBroken.of(logged).broken:
+    for one in event_kinds.LimitsBroken.of(logged).broken:
         broken.setdefault(int(one["spacecraft_id"]), []).append(f"{one['parameter']} {one['limit_state']}")
     for spacecraft, texts in broken.items():
         yield Message("alarm", "; ".join(texts), spacecraft)
 
 
 def _of_regression(_connection: Connection, logged: LoggedEvent) -> Iterator[Message]:
-    event = RegressionJudged.of(logged)
+    event = event_kinds.RegressionJudged.of(logged)
     yield Message("gate done", f"regression {event.id}: {event.verdict}")
 
 
@@ -257,11 +249,11 @@ def _spacecraft(connection: Connection, vehicle: int) -> int:
 
 
 MESSAGES: Mapping[str, Callable[[Connection, LoggedEvent], Iterator[Message]]] = {
-    WindowChanged.event_kind: _of_failed_window,
-    PassEvaluated.event_kind: _of_report,
-    AlarmChanged.event_kind: _of_alarm,
-    LimitsBroken.event_kind: _of_limits,
-    RegressionJudged.event_kind: _of_regression,
+    event_kinds.WindowChanged.event_kind: _of_failed_window,
+    event_kinds.PassEvaluated.event_kind: _of_report,
+    event_kinds.AlarmChanged.event_kind: _of_alarm,
+    event_kinds.LimitsBroken.event_kind: _of_limits,
+    event_kinds.RegressionJudged.event_kind: _of_regression,
 }
 """Notifications by kind of event."""
 

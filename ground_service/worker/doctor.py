@@ -17,13 +17,7 @@ from ground_service.settings import Settings
 from ground_service.store import leases
 from ground_service.store.database import schema_revisions
 from ground_service.store.files import file_names
-from ground_service.worker.condition import (
-    CLOCK_LIMIT_MS,
-    broker_answers,
-    disagreements,
-    running_processes,
-    statement_of,
-)
+from ground_service.worker import condition
 from ground_service.worker.notifications import permitted_address
 from ground_service.worker.scheduler import has_scheduler
 from ground_service.worker.upkeep import CHANNEL, channel_of_heads
@@ -68,8 +62,8 @@ def _schema(ground: Ground, _settings: Settings) -> Result:
 def _processes(ground: Ground, settings: Settings) -> Result:
     if ground.database.dialect != "postgresql":
         return [], ""
-    processes = running_processes(ground.database)
-    faults = disagreements(statement_of(ground, settings), processes)
+    processes = condition.running_processes(ground.database)
+    faults = condition.disagreements(condition.statement_of(ground, settings), processes)
     versions = {one.statement.version for one in processes if one.statement is not None}
     if len(versions) > 1 or any(one.statement is None for one in processes):
         faults.append(f"expected one version, found {', '.join(sorted(versions)) or 'other ones'}")
@@ -89,12 +83,14 @@ def _clocks(ground: Ground, _settings: Settings) -> Result:
         here = (utc_now_ns() - leases.database_now_ns(connection)) // 1_000_000
     clocks = {"here": here}
     clocks |= {
-        str(one): one.statement.clock_ms for one in running_processes(ground.database) if one.statement is not None
+        str(one): one.statement.clock_ms
+        for one in condition.running_processes(ground.database)
+        if one.statement is not None
     }
     faults = [
-        f"{name}: expected within {CLOCK_LIMIT_MS} ms of the database, found {ms} ms"
+        f"{name}: expected within {condition.CLOCK_LIMIT_MS} ms of the database, found {ms} ms"
         for name, ms in clocks.items()
-        if abs(ms) > CLOCK_LIMIT_MS
+        if abs(ms) > condition.CLOCK_LIMIT_MS
     ]
     return faults, f"largest difference from the database {max(map(abs, clocks.values()))} ms"
 
@@ -107,7 +103,7 @@ def _broker(_ground: Ground, settings: Settings) -> Result:
     url = settings.resolved_broker_url()
     if url is None:
         return [], ""
-    return ([] if broker_answers(url) else ["expected a broker that answers, found none"]), "answers"
+    return ([] if condition.broker_answers(url) else ["expected a broker that answers, found none"]), "answers"
 
 
 def _archive(ground: Ground, _settings: Settings) -> Result:

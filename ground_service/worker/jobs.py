@@ -16,8 +16,7 @@ from ground_service.evaluation.service import make_report, reevaluate
 from ground_service.ground import Ground
 from ground_service.ingest.service import apply_definition, derive_without, run_ingest
 from ground_service.jobs import service
-from ground_service.jobs.model import Job
-from ground_service.jobs.service import FINISHED, enter_job
+from ground_service.jobs.service import FINISHED, Job, enter_job
 from ground_service.logs import span
 from ground_service.passes.archive_import import import_zip
 from ground_service.planning.standing import plan_tick

@@ -17,8 +17,7 @@ from ground_service.ground import Ground
 from ground_service.http.common import GroundOf
 from ground_service.http.requests import operations
 from ground_service.jobs import service
-from ground_service.jobs.model import JobFilter
-from ground_service.jobs.service import KINDS
+from ground_service.jobs.service import KINDS, JobFilter
 from ground_service.logs import span
 from ground_service.worker.condition import Health, ServiceStatus, read_condition, service_status
 

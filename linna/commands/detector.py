@@ -211,7 +211,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 
 def _bench(arguments: argparse.Namespace) -> int:
-    from payload_emulator.training.model.bench import bench
+    from payload_emulator.training.model.export import bench
 
     return emit(arguments, bench(model_octets(arguments.model), arguments.threads, arguments.frames))
 

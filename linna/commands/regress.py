@@ -22,7 +22,7 @@ LISTED = 16
 
 if TYPE_CHECKING:
     from ground_service.client import Client
-    from ground_service.jobs.model import Job
+    from ground_service.jobs.service import Job
     from ground_service.regression.model import Build
 
 

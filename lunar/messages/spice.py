@@ -24,33 +24,13 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import chebyshev
 
+from lunar import frames, timescales
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera
 from lunar.constants import MOON_RADIUS_M, NS, SECONDS_PER_DAY
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError, EphemerisError, MissingLibrary, UnknownFrameError
-from lunar.frames import (
-    CENTURY_S,
-    DAY_S,
-    IAU_E_DEG,
-    IAU_E_RATE_DEG_DAY,
-    IAU_MERIDIAN_DEG,
-    IAU_MERIDIAN_TERMS_DEG,
-    IAU_POLE_DEC_DEG,
-    IAU_POLE_DEC_TERMS_DEG,
-    IAU_POLE_RA_DEG,
-    IAU_POLE_RA_TERMS_DEG,
-    matrix_from_quaternion,
-    rotation_vector_from_matrix,
-)
 from lunar.third_bodies import moon_barycentric_icrf_m
-from lunar.timescales import (
-    J2000_TT_AS_UTC_COUNT_NS,
-    TICKS_PER_SECOND,
-    TT_MINUS_TAI_NS,
-    tai_ns_from_utc_ns,
-    utc_ns_from_tai_ns,
-)
 
 MOON = 301
 FRAME = "J2000"
@@ -95,12 +75,14 @@ def camera_id(spacecraft: int) -> int:
 
 def et_from_utc_ns(utc_ns: IntArray | int) -> FloatArray:
     """Return SPICE's ephemeris time (...) in s: TDB past J2000 by the formula of its leap-second kernels."""
-    return et_from_tai_ns(tai_ns_from_utc_ns(np.asarray(utc_ns, dtype=np.int64)))
+    return et_from_tai_ns(timescales.tai_ns_from_utc_ns(np.asarray(utc_ns, dtype=np.int64)))
 
 
 def et_from_tai_ns(tai_ns: IntArray | int) -> FloatArray:
     """Return SPICE's ephemeris time (...) in s of TAI epochs."""
-    tt_s = (np.asarray(tai_ns, dtype=np.int64) + (TT_MINUS_TAI_NS - J2000_TT_AS_UTC_COUNT_NS)) / NS
+    tt_s = (
+        np.asarray(tai_ns, dtype=np.int64) + (timescales.TT_MINUS_TAI_NS - timescales.J2000_TT_AS_UTC_COUNT_NS)
+    ) / NS
     return np.asarray(tt_s + _tdb_minus_tt_s(tt_s))
 
 
@@ -110,7 +92,7 @@ def tai_ns_from_et(et_s: FloatArray | float) -> IntArray:
     tt = et - _tdb_minus_tt_s(et - _tdb_minus_tt_s(et))
     whole = np.floor(tt)
     tt_ns = whole.astype(np.int64) * NS + np.rint((tt - whole) * NS).astype(np.int64)
-    return np.asarray(tt_ns + (J2000_TT_AS_UTC_COUNT_NS - TT_MINUS_TAI_NS))
+    return np.asarray(tt_ns + (timescales.J2000_TT_AS_UTC_COUNT_NS - timescales.TT_MINUS_TAI_NS))
 
 
 def _tdb_minus_tt_s(seconds: FloatArray) -> FloatArray:
@@ -273,7 +255,9 @@ def moon_kernel(start_utc_ns: int, stop_utc_ns: int) -> bytes:
     return _written(write)
 
 
-def ck_octets(ticks: IntArray, q_wxyz: FloatArray, spacecraft: int, *, gap_ticks: int = 10 * TICKS_PER_SECOND) -> bytes:
+def ck_octets(
+    ticks: IntArray, q_wxyz: FloatArray, spacecraft: int, *, gap_ticks: int = 10 * timescales.TICKS_PER_SECOND
+) -> bytes:
     """Return a CK (type 3) of the camera: attitudes are interpolated between images at most ``gap_ticks`` apart.
 
     Angular rates are those of the turns to the images before and after, and 0 for an image alone.
@@ -321,9 +305,9 @@ def ck_octets(ticks: IntArray, q_wxyz: FloatArray, spacecraft: int, *, gap_ticks
 
 def _angular_rates(ticks: IntArray, q_wxyz: FloatArray, joined: BoolArray) -> FloatArray:
     """Return angular velocities (n, 3) in rad/s and ICRF, of attitudes (n, 4) of which neighbours are ``joined``."""
-    camera = matrix_from_quaternion(q_wxyz)
-    turns = rotation_vector_from_matrix(np.swapaxes(camera[1:], 1, 2) @ camera[:-1])
-    between = np.where(joined[:, None], turns * TICKS_PER_SECOND / np.diff(ticks)[:, None], 0.0)
+    camera = frames.matrix_from_quaternion(q_wxyz)
+    turns = frames.rotation_vector_from_matrix(np.swapaxes(camera[1:], 1, 2) @ camera[:-1])
+    between = np.where(joined[:, None], turns * timescales.TICKS_PER_SECOND / np.diff(ticks)[:, None], 0.0)
     edge, none = np.zeros((1, 3)), np.zeros(1, dtype=np.int64)
     sides = np.concatenate([none, joined]) + np.concatenate([joined, none])
     total = np.concatenate([edge, between]) + np.concatenate([between, edge])
@@ -332,15 +316,15 @@ def _angular_rates(ticks: IntArray, q_wxyz: FloatArray, joined: BoolArray) -> Fl
 
 def format_pck() -> str:
     """Return a kernel of constants: radius of the Moon, and its orientation by the series of the IAU (IAU_MOON)."""
-    angles = np.column_stack([IAU_E_DEG, IAU_E_RATE_DEG_DAY * CENTURY_S / DAY_S]).ravel()
+    angles = np.column_stack([frames.IAU_E_DEG, frames.IAU_E_RATE_DEG_DAY * frames.CENTURY_S / frames.DAY_S]).ravel()
     values = {
         "BODY301_RADII": [MOON_RADIUS_M / 1e3] * 3,
-        "BODY301_POLE_RA": IAU_POLE_RA_DEG,
-        "BODY301_POLE_DEC": IAU_POLE_DEC_DEG,
-        "BODY301_PM": IAU_MERIDIAN_DEG,
-        "BODY301_NUT_PREC_RA": IAU_POLE_RA_TERMS_DEG,
-        "BODY301_NUT_PREC_DEC": IAU_POLE_DEC_TERMS_DEG,
-        "BODY301_NUT_PREC_PM": IAU_MERIDIAN_TERMS_DEG,
+        "BODY301_POLE_RA": frames.IAU_POLE_RA_DEG,
+        "BODY301_POLE_DEC": frames.IAU_POLE_DEC_DEG,
+        "BODY301_PM": frames.IAU_MERIDIAN_DEG,
+        "BODY301_NUT_PREC_RA": frames.IAU_POLE_RA_TERMS_DEG,
+        "BODY301_NUT_PREC_DEC": frames.IAU_POLE_DEC_TERMS_DEG,
+        "BODY301_NUT_PREC_PM": frames.IAU_MERIDIAN_TERMS_DEG,
         "BODY3_NUT_PREC_ANGLES": angles,
     }
     lines = [
@@ -355,8 +339,8 @@ def format_sclk(lines: Sequence[ClockLine], spacecraft: int) -> str:
     """Return an SCLK kernel of the on-board clock: 32 bits of seconds, 16 bits of fraction, one partition."""
     rows = []
     for one in lines:
-        tai_ns = int(tai_ns_from_utc_ns(one.utc_ns))
-        tt_ns = tai_ns + TT_MINUS_TAI_NS - J2000_TT_AS_UTC_COUNT_NS
+        tai_ns = int(timescales.tai_ns_from_utc_ns(one.utc_ns))
+        tt_ns = tai_ns + timescales.TT_MINUS_TAI_NS - timescales.J2000_TT_AS_UTC_COUNT_NS
         seconds, rest = divmod(tt_ns, NS)
         rows.append(f"    {one.start_ticks}  {seconds}.{rest:09d}  {one.rate:.15f}")
     number = -spacecraft
@@ -373,11 +357,11 @@ def format_sclk(lines: Sequence[ClockLine], spacecraft: int) -> str:
             f"SCLK_DATA_TYPE_{number} = ( 1 )",
             f"SCLK01_TIME_SYSTEM_{number} = ( 2 )",
             f"SCLK01_N_FIELDS_{number} = ( 2 )",
-            f"SCLK01_MODULI_{number} = ( {_MODULUS} {TICKS_PER_SECOND} )",
+            f"SCLK01_MODULI_{number} = ( {_MODULUS} {timescales.TICKS_PER_SECOND} )",
             f"SCLK01_OFFSETS_{number} = ( 0 0 )",
             f"SCLK01_OUTPUT_DELIM_{number} = ( 1 )",
             f"SCLK_PARTITION_START_{number} = ( 0 )",
-            f"SCLK_PARTITION_END_{number} = ( {_MODULUS * TICKS_PER_SECOND - 1} )",
+            f"SCLK_PARTITION_END_{number} = ( {_MODULUS * timescales.TICKS_PER_SECOND - 1} )",
             f"SCLK01_COEFFICIENTS_{number} = (",
             *rows,
             ")",
@@ -555,7 +539,12 @@ def _spk_segment(spice: Any, handle: int, place: str, arc: _Arc, step_s: float) 
         states.append(state)
     values, name = 1e3 * np.array(states), place.rpartition(" ")[2]
     return EphemerisSegment(
-        utc_ns_from_tai_ns(tai_ns), values[:, :3], values[:, 3:], object_name=name, object_id=name, tai_ns=tai_ns
+        timescales.utc_ns_from_tai_ns(tai_ns),
+        values[:, :3],
+        values[:, 3:],
+        object_name=name,
+        object_id=name,
+        tai_ns=tai_ns,
     )
 
 

@@ -1,4 +1,4 @@
-"""STK ephemeris files (``.e``), both ways.
+"""STK ephemeris files (``.e``), both ways; trajectories as CSV and TUM.
 
 Read are the formats EphemerisTimePosVel and EphemerisTimePosVelAcc (accelerations are not used) about the
 Moon in ICRF or J2000 axes, times in seconds since ScenarioEpoch (UTC).  An epoch that occurs twice in a row,
@@ -14,19 +14,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from lunar import frames
 from lunar.arrays import FloatArray, IntArray
 from lunar.constants import NS
 from lunar.ephemeris import Ephemeris, EphemerisSegment, parse_numbers, resampled
 from lunar.errors import DataFileError, EphemerisError, TimeFormatError, UnknownFrameError, UnknownTimeSystemError
-from lunar.frames import (
-    ICRF_NAMES,
-    J2000_NAMES,
-    Orientation,
-    continuous_quaternions,
-    icrf_from_j2000,
-    quaternion_from_matrix,
-    rtn_from_inertial,
-)
 from lunar.timescales import format_tai, parse_tai, tdb_s_from_tai_ns, utc_ns_from_tai_ns
 from lunar.visibility import subsatellite
 
@@ -216,13 +208,13 @@ def _units_and_axes(source: str, header: dict[str, tuple[str, int]]) -> tuple[fl
         place = f"line {number}" if number else "header"
         raise DataFileError(source, place, "CentralBody Moon", repr(body) if number else "none, which means Earth")
     axes, number = header.get("COORDINATESYSTEM", ("Fixed", 0))
-    if axes.upper() in ICRF_NAMES:
+    if axes.upper() in frames.ICRF_NAMES:
         turn = np.eye(3)
-    elif axes.upper() in J2000_NAMES:
-        turn = icrf_from_j2000()
+    elif axes.upper() in frames.J2000_NAMES:
+        turn = frames.icrf_from_j2000()
     else:
         place = f"{source}: line {number}" if number else f"{source}: CoordinateSystem"
-        raise UnknownFrameError(axes, (*ICRF_NAMES, *J2000_NAMES), place)
+        raise UnknownFrameError(axes, (*frames.ICRF_NAMES, *frames.J2000_NAMES), place)
     return _UNITS_M[unit.upper()], turn
 
 
@@ -280,7 +272,7 @@ CSV_COLUMNS = (
 )
 
 
-def format_csv(ephemeris: Ephemeris, orientation: Orientation) -> str:
+def format_csv(ephemeris: Ephemeris, orientation: frames.Orientation) -> str:
     """Return states (ICRF, Moon-centred) and sub-satellite points (mean-Earth, 0..360 E) as CSV text.
 
     An epoch that two arcs share has two lines.
@@ -300,9 +292,9 @@ def format_csv(ephemeris: Ephemeris, orientation: Orientation) -> str:
 def format_tum(ephemeris: Ephemeris) -> str:
     """Return poses in TUM form: seconds since 1970 UTC, ICRF metres, and the RTN axes as the body's attitude."""
     tai_ns, position_m, velocity_m_s = _states(ephemeris)
-    icrf_from_rtn = np.swapaxes(rtn_from_inertial(position_m, velocity_m_s), -1, -2)
+    icrf_from_rtn = np.swapaxes(frames.rtn_from_inertial(position_m, velocity_m_s), -1, -2)
     # Scalar last in this format.
-    attitude = np.roll(continuous_quaternions(quaternion_from_matrix(icrf_from_rtn)), -1, axis=-1)
+    attitude = np.roll(frames.continuous_quaternions(frames.quaternion_from_matrix(icrf_from_rtn)), -1, axis=-1)
     values = np.concatenate([position_m, attitude], axis=1).tolist()
     row = "%d.%09d %.6f %.6f %.6f %.12f %.12f %.12f %.12f"
     utc_ns = utc_ns_from_tai_ns(tai_ns).tolist()

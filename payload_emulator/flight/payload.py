@@ -18,15 +18,13 @@ from payload_emulator.flight.onboard.fdir import Monitors, Reaction
 from payload_emulator.flight.onboard.housekeeping import StageTimer
 from payload_emulator.flight.onboard.housekeeping_packets import send_large_data, send_structure
 from payload_emulator.flight.onboard.loads import MODEL_NUMBER, TABLE_NUMBERS, FlightParameters, FlightTables
-from payload_emulator.flight.onboard.machine import PARAMETERS_NUMBER, Machine, Observation, ProtectedMemory
+from payload_emulator.flight.onboard.machine import PARAMETERS_NUMBER, Machine, ObservationWindow, ProtectedMemory
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.onboard.observer import Observer
-from payload_emulator.flight.onboard.parameters import ParameterStore
-from payload_emulator.flight.onboard.settings import Recovery, Settings
+from payload_emulator.flight.onboard.settings import ParameterStore, Recovery, Settings
 from payload_emulator.flight.onboard.telecommands import check, execute, name_of
 from payload_emulator.flight.ports import BareBoard, Board, Load, ResetCause, Stage
-from payload_emulator.flight.telemetry.packets import Telemetry
-from payload_emulator.flight.telemetry.products import image_report, thumbnail_octets
+from payload_emulator.flight.telemetry.packets import Telemetry, image_report, thumbnail_octets
 from payload_emulator.flight.telemetry.store import PacketStore, StoreClass
 from payload_emulator.flight.vision.detections import Detector
 from tmtc.packets.pus import ACK_ACCEPTANCE, ACK_COMPLETION, ACK_START, TICKS_LIMIT, TICKS_PER_SECOND
@@ -248,7 +246,7 @@ class Payload:
         self._load_memory()
         machine.mode = PayloadMode.standby
         window = machine.observation
-        machine.observation = Observation()
+        machine.observation = ObservationWindow()
         if board.reset_cause == ResetCause.watchdog:
             self._after_watchdog()
         if machine.mode is PayloadMode.safe:
@@ -263,13 +261,13 @@ class Payload:
         machine.switch_loads()
         machine.changed = True
 
-    def _begin(self, mode: PayloadMode, window: Observation) -> None:
+    def _begin(self, mode: PayloadMode, window: ObservationWindow) -> None:
         """The mode after a boot, and the observation that goes on in it."""
         machine = self._machine
         machine.mode = mode
-        machine.observation = window if mode is PayloadMode.observing else Observation()
+        machine.observation = window if mode is PayloadMode.observing else ObservationWindow()
 
-    def _may_resume(self, window: Observation) -> bool:
+    def _may_resume(self, window: ObservationWindow) -> bool:
         machine = self._machine
         if machine.board.reset_cause == ResetCause.commanded or not machine.parameters["autoresume"]:
             return False

@@ -29,8 +29,8 @@ from lunar.timescales import parse_utc
 from payload_emulator.errors import ScenarioError
 from payload_emulator.session.typed_toml import TableFault, read_table, toml_text
 from payload_emulator.sim.board.contact_plan import parse_clock_error, parse_outage
-from payload_emulator.sim.board.faults import parse_fault
 from payload_emulator.sim.board.link import LinkSection
+from payload_emulator.sim.board.platform import parse_fault
 from payload_emulator.sim.render.sensor import SensorModel
 from reports.values import Requirements
 

@@ -7,20 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from reports import statistics
 from reports.arrays import FloatArray
 from reports.figures.canvas import Canvas, TimeScale, log_length_axis, shade_arcs, thinned, time_axis
 from reports.figures.theme import Styles, color
-from reports.statistics import (
-    Binned,
-    binned,
-    chi2_quantile,
-    error_3d_m,
-    per_degree,
-    quantiles,
-    reference_at,
-    round_edges,
-    running_mean,
-)
 from reports.values import NavigationSeries, TimeSpan, TrackSeries
 
 if TYPE_CHECKING:
@@ -70,21 +60,21 @@ def draw_consistency(
         axes.set_yscale("log")
         axes.set_title(f"{name} per degree of freedom")
         typical = float(np.median(freedom[finite])) if finite.any() else 3.0
-        low = float(chi2_quantile(0.025, typical)) / typical
-        high = float(chi2_quantile(0.975, typical)) / typical
+        low = float(statistics.chi2_quantile(0.025, typical)) / typical
+        high = float(statistics.chi2_quantile(0.975, typical)) / typical
         axes.axhspan(max(low, 1e-3), high, color=color("silver"), alpha=0.45, linewidth=0)
         axes.axhline(1.0, color=color("muted"), linewidth=0.8, linestyle=(0, (4.0, 3.0)))
         tint = styles[one.name][0]
         shown = np.flatnonzero(finite)[:: max(1, int(finite.sum()) // 700)]
         axes.plot(x[shown], scaled[shown], ".", color=tint, markersize=3.0, alpha=0.55)
         window = max(5, int(finite.sum() // 40))
-        axes.plot(*thinned(x, running_mean(scaled, window), 400), color=tint, linewidth=1.6)
-        bottom, top = quantiles(scaled, (0.005, 0.995))
+        axes.plot(*thinned(x, statistics.running_mean(scaled, window), 400), color=tint, linewidth=1.6)
+        bottom, top = statistics.quantiles(scaled, (0.005, 0.995))
         axes.set_ylim(min(max(bottom, 1e-3), 0.1) * 0.8, max(top * 1.3, 10.0))
         ticks = [t for t in (0.01, 0.1, 1.0, 10.0, 100.0, 1000.0) if axes.get_ylim()[0] <= t <= axes.get_ylim()[1]]
         axes.set_yticks(ticks, [f"{t:g}" for t in ticks])
         axes.set_yticks([], minor=True)
-        count, mean, within = per_degree(value[keep], dof[keep])
+        count, mean, within = statistics.per_degree(value[keep], dof[keep])
         axes.text(
             1.015, 0.96,
             f"mean {mean:.2f}\n{100 * within:.0f} % inside 95 "
@@ -93,13 +83,13 @@ def draw_consistency(
         )  # fmt: skip
 
 
-def dependences(one: NavigationSeries, track: TrackSeries | None) -> list[tuple[str, str, Binned]]:
+def dependences(one: NavigationSeries, track: TrackSeries | None) -> list[tuple[str, str, statistics.Binned]]:
     """Return the error of one solution by each known quantity: name, axis label and bins.
 
     The altitude is that of the reference: bins of an estimated altitude would correlate with the error.
     """
-    error = error_3d_m(one.error_rtn_m)
-    altitude_m = None if track is None else reference_at(track, one.utc_ns)[2]
+    error = statistics.error_3d_m(one.error_rtn_m)
+    altitude_m = None if track is None else statistics.reference_at(track, one.utc_ns)[2]
     quantities: list[tuple[str, str, FloatArray | None]] = [
         ("altitude", "reference altitude, km", None if altitude_m is None else altitude_m / 1e3),
         ("sun_elevation", "Sun elevation, degrees", one.sun_elevation_deg),
@@ -114,10 +104,10 @@ def dependences(one: NavigationSeries, track: TrackSeries | None) -> list[tuple[
     for name, label, quantity in quantities:
         if quantity is None:
             continue
-        edges = round_edges(quantity[np.isfinite(error)])
+        edges = statistics.round_edges(quantity[np.isfinite(error)])
         if name == "matched" and len(edges) > 1 and edges[1] - edges[0] <= 1.0:
             edges = np.arange(np.floor(edges[0]), np.ceil(edges[-1]) + 1) - 0.5
-        bins = binned(quantity, error, edges)
+        bins = statistics.binned(quantity, error, edges)
         if len(bins.centre) >= 3:
             found.append((name, label, bins))
     return found
@@ -169,10 +159,10 @@ def draw_dependence(
     if terrain:
         axes = panel(len(names))
         for k, one in enumerate(series):
-            error = error_3d_m(one.error_rtn_m)
+            error = statistics.error_3d_m(one.error_rtn_m)
             for j, kind in enumerate(terrain):
                 chosen = error[np.array([t == kind for t in one.terrain], dtype=np.bool_)] if one.terrain else error[:0]
-                p50, p95 = quantiles(chosen, (0.5, 0.95))
+                p50, p95 = statistics.quantiles(chosen, (0.5, 0.95))
                 if np.isfinite(p50):
                     place = j + (k - (len(series) - 1) / 2) * 0.16
                     axes.vlines([place], [p50], [p95], color=styles[one.name][0], linewidth=1.2)

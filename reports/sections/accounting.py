@@ -5,23 +5,16 @@ from functools import partial
 
 import numpy as np
 
+from reports import values
 from reports.document import Block, Column, Heading, Paragraph, Picture, Properties, Table
 from reports.figures import accounting
 from reports.sections.common import PassView, arc_words
 from reports.text import NOT_A_VALUE, computed_text, count_text, duration_text, percent_text, rate_text, utc_text
-from reports.values import (
-    ApidAccounting,
-    CompletenessSeries,
-    FrameAccounting,
-    PacketAccounting,
-    ReceptionQuality,
-    TimeSpan,
-)
 
 _MOST_GAPS = 40
 
 
-def _frame_steps(count: FrameAccounting) -> list[tuple[str, int]]:
+def _frame_steps(count: values.FrameAccounting) -> list[tuple[str, int]]:
     steps = (
         ("expected", count.expected),
         ("acquired", count.acquired),
@@ -34,7 +27,7 @@ def _frame_steps(count: FrameAccounting) -> list[tuple[str, int]]:
     return [(name, n) for name, n in steps if n is not None]
 
 
-def _link_quality(receptions: tuple[ReceptionQuality, ...]) -> Table:
+def _link_quality(receptions: tuple[values.ReceptionQuality, ...]) -> Table:
     return Table(
         "Link quality by reception.",
         (
@@ -112,7 +105,7 @@ def _frame_blocks(view: PassView) -> list[Block]:
     return blocks
 
 
-def _downlink_properties(packets: PacketAccounting) -> Properties:
+def _downlink_properties(packets: values.PacketAccounting) -> Properties:
     return Properties(
         (
             (
@@ -131,7 +124,7 @@ def _downlink_properties(packets: PacketAccounting) -> Properties:
     )
 
 
-def _completeness(view: PassView, completeness: CompletenessSeries) -> Picture:
+def _completeness(view: PassView, completeness: values.CompletenessSeries) -> Picture:
     report = view.report
     faulty = int(np.sum(completeness.received < completeness.expected))
     said = (
@@ -155,7 +148,7 @@ def _completeness(view: PassView, completeness: CompletenessSeries) -> Picture:
     )
 
 
-def _packets_by_apid(by_apid: Mapping[int, ApidAccounting]) -> Table:
+def _packets_by_apid(by_apid: Mapping[int, values.ApidAccounting]) -> Table:
     return Table(
         "Packets by application process.",
         (
@@ -187,7 +180,7 @@ def _packets_by_apid(by_apid: Mapping[int, ApidAccounting]) -> Table:
     )
 
 
-def _gaps(gaps: Sequence[TimeSpan]) -> Table:
+def _gaps(gaps: Sequence[values.TimeSpan]) -> Table:
     return Table(
         "Gaps in what was received.",
         (Column("from", numeric=False), Column("to", numeric=False), Column("length"), Column("of", numeric=False)),

@@ -56,7 +56,7 @@ def test_what_decides_is_tested(difference):
 
 @pytest.fixture
 def state(monkeypatch):
-    """What mutmut records, without mutmut."""
+    """Return the records of mutmut, without mutmut."""
     recorded = SimpleNamespace(_stats=set(), duration_by_test={"a": 1.0})
     monkeypatch.setattr(mutation_plugin, "_state", lambda: recorded)
     monkeypatch.setattr(mutation_plugin, "_reached", {})

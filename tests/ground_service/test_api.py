@@ -336,12 +336,12 @@ def test_requests_are_logged_with_an_id_that_the_answer_carries(client, caplog):
         made_up = client.get(f"{V1}/passes", headers={"X-Request-ID": "two\tlines"})
         client.get("/healthz")
     assert named.headers["X-Request-ID"] == "abc-1"
-    told = [vars(record) for record in caplog.records if record.name == "ground_service.worker.metrics"]
-    assert [(one["status"], one["route"], one["caller"]) for one in told] == [
+    logged = [vars(record) for record in caplog.records if record.name == "ground_service.worker.metrics"]
+    assert [(one["status"], one["route"], one["caller"]) for one in logged] == [
         (404, "/api/v1/passes/{pass_id}", "local"),
         (200, "/api/v1/passes", "local"),
     ]
-    assert [one["request_id"] for one in told] == ["abc-1", made_up.headers["X-Request-ID"]]
+    assert [one["request_id"] for one in logged] == ["abc-1", made_up.headers["X-Request-ID"]]
     assert len(made_up.headers["X-Request-ID"]) == 16
 
 
@@ -383,7 +383,7 @@ def test_a_telecommand_that_is_sent_again_under_its_key_is_queued_once(guarded):
 
 
 def test_a_key_whose_work_was_cut_off_is_refused_and_says_why(ground):
-    from ground_service.access.idempotency import once
+    from ground_service.access.security import once
     from ground_service.errors import Conflict, DatabaseUnavailable
 
     def ask(work):

@@ -134,7 +134,7 @@ def test_a_service_that_stays_busy_is_given_up_in_its_own_words(service, clock, 
 @pytest.mark.parametrize(
     "answer", [(503, {}), (503, {"Retry-After": "soon"}), (500, {"Retry-After": "1"}), (409, {}), (429, {})]
 )
-def test_what_is_no_invitation_to_come_again_is_told_at_once(service, clock, body, answer):
+def test_what_is_no_invitation_to_come_again_is_reported_at_once(service, clock, body, answer):
     service.answers = [answer]
     with pytest.raises(ServiceProblem) as caught:
         Client(service.url).add_ephemeris(body)

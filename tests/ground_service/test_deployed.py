@@ -41,7 +41,7 @@ class Overlay:
 
 @dataclass(frozen=True)
 class Deployed:
-    """What runs: the parts by their names in the compose file, the addresses and the token of the administrator."""
+    """A running deployment: parts by their names in the compose file, addresses, and token of the administrator."""
 
     parts: dict[str, Part]
     addresses: dict[str, str]

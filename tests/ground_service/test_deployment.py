@@ -50,7 +50,7 @@ def sets(table):
 
 
 def default_of(text):
-    """What a value with a variable and a default is when the variable is not set."""
+    """Return a value with a variable and a default as it is without the variable."""
     return re.sub(r"\$\{[A-Z_]+:-([^}]*)\}", r"\1", text)
 
 

@@ -31,19 +31,19 @@ DEEP = "a = " + "[" * 50_000 + "]" * 50_000
 LONG = "a = " + "9" * 5_000
 
 
-@pytest.mark.parametrize("text, told", [(DEEP, "nested too deeply"), (LONG, "too many digits")])
-def test_toml_without_end_is_refused_in_one_line(text, told, tmp_path):
-    with pytest.raises(InvalidInput, match=told):
+@pytest.mark.parametrize("text, message", [(DEEP, "nested too deeply"), (LONG, "too many digits")])
+def test_toml_without_end_is_refused_in_one_line(text, message, tmp_path):
+    with pytest.raises(InvalidInput, match=message):
         read_mission(text.encode(), "body")
     (tmp_path / "build.toml").write_text(text)
-    with pytest.raises(InvalidInput, match=told):
+    with pytest.raises(InvalidInput, match=message):
         load_build(tmp_path / "build.toml")
     with pytest.raises(ScenarioError, match="not TOML"):
         parse_scenario(text)
 
 
 @pytest.mark.parametrize(
-    "text, told",
+    "text, message",
     [
         ("a" + ".a" * 16 + " = 1", "a deeper or longer one"),
         ("[a" + ' . "b.c"' * 16 + "]", "a deeper or longer one"),
@@ -53,9 +53,9 @@ def test_toml_without_end_is_refused_in_one_line(text, told, tmp_path):
         ("# " + "x" * (4 << 20), "at most 4 MiB"),
     ],
 )
-def test_toml_that_would_cost_much_is_not_parsed(text, told, monkeypatch):
+def test_toml_that_would_cost_much_is_not_parsed(text, message, monkeypatch):
     monkeypatch.delattr("tomllib.loads")
-    with pytest.raises(InvalidInput, match=told):
+    with pytest.raises(InvalidInput, match=message):
         read_table(text, "body", "TOML")
 
 
@@ -103,8 +103,8 @@ IMPOSSIBLE = r"""
 """
 
 
-@pytest.mark.parametrize("change, told", cells(IMPOSSIBLE))
-def test_an_archive_with_impossible_numbers_leaves_no_pass(change, told, ground, synthetic_pass, tmp_path):
+@pytest.mark.parametrize("change, message", cells(IMPOSSIBLE))
+def test_an_archive_with_impossible_numbers_leaves_no_pass(change, message, ground, synthetic_pass, tmp_path):
     folder, change = tmp_path / "archive", json.loads(change)
     shutil.copytree(synthetic_pass.folder, folder)
     manifest = json.loads((folder / "manifest.json").read_text())
@@ -117,7 +117,7 @@ def test_an_archive_with_impossible_numbers_leaves_no_pass(change, told, ground,
     else:
         manifest |= change
     (folder / "manifest.json").write_text(json.dumps(manifest))
-    with pytest.raises(InvalidInput, match=told):
+    with pytest.raises(InvalidInput, match=message):
         import_archive(ground, folder)
     assert ground.read(list_passes, PassFilter()).items == []
 

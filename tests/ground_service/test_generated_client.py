@@ -32,7 +32,7 @@ def generated(service, tmp_path_factory):
         "--path", str(folder / "openapi.json"), "--output-path", str(folder / PACKAGE), "--meta", "none",
         "--fail-on-warning",
     ]  # fmt: skip
-    # The generator calls ruff, which lies beside it.
+    # The generator calls ruff, which lies in the same folder.
     environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
     made = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert made.returncode == 0, made.stdout + made.stderr

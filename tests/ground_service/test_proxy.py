@@ -41,12 +41,12 @@ class Proxied:
         return httpx.Client(base_url=self.url, verify=context, timeout=30.0)
 
     def listens(self):
-        """Whether something listens on the port of the proxy; no request is counted."""
+        """Return whether something listens on the port of the proxy; no request is counted."""
         with socket.socket() as probe:
             return probe.connect_ex(("127.0.0.1", int(self.host.split(":")[1]))) == 0
 
     def answers(self):
-        """Whether the service behind the proxy answers a client that trusts the present certificate only."""
+        """Return whether the service behind the proxy answers a client that trusts the present certificate only."""
         with self.client() as client:
             try:
                 return client.get("/api/v1/session").status_code == 401

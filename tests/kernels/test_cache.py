@@ -166,7 +166,7 @@ def imported(folder, monkeypatch):
 
 
 def dependencies(module):
-    """What the compiled code of each kernel depends on, as a hash."""
+    """Return the hash of all that the compiled code of each kernel depends on."""
     return {name: getattr(module, name)._cache._dependencies for name in KERNELS}
 
 

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from linna.cli import GROUPS
+from linna.cli import GROUPS, run
 from linna.help import example
 from linna.parser import command_parser
 from lunar.catalogue import make_catalogue, save_catalogue
@@ -83,6 +83,16 @@ def test_a_list_is_registered_to_terrain(tmp_path, typed):
     assert made.catalogue == hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def test_an_empty_result_is_status_1_and_no_file(tmp_path):
+    listed, empty, out = tmp_path / "one.csv", tmp_path / "none.csv", tmp_path / "out.csv"
+    save_catalogue(make_catalogue(np.radians([2.0]), np.radians([302.0]), [10_000.0], source="one"), listed)
+    save_catalogue(make_catalogue([], [], [], source="none"), empty)
+    hills = write_raster(tmp_path / "h.tif", 300.0, 4.0, 4.0, lambda lat, lon: 50.0 * np.sin(9 * lat) * np.cos(9 * lon))
+    assert run(["catalogue", "stats", str(empty)]) == 1
+    assert run(["catalogue", "curate", str(listed), "--terrain", str(hills), "--out", str(out)]) == 1
+    assert not out.exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -131,7 +141,7 @@ def test_frames_that_nothing_proves_are_inconclusive(typed, tmp_path):
     assert found["settings"] is None and found["distances"]["700"] == 29
 
 
-def test_packets_without_frames_are_told_and_noise_is_refused(typed, tmp_path):
+def test_packets_without_frames_are_reported_and_noise_is_refused(typed, tmp_path):
     path = tmp_path / "packets.bin"
     path.write_bytes(b"".join(make_packets(20)))
     assert typed(f"link check {path} --json")["packets_without_frames"] == 42

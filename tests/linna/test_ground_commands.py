@@ -66,7 +66,7 @@ def synthetic_archive(tmp_path, downlink, reference):
     return folder
 
 
-def test_a_wrong_token_and_a_wrong_server_are_told_in_one_line(typed, server):
+def test_a_wrong_token_and_a_wrong_server_are_reported_in_one_line(typed, server):
     wrong = typed(f"pass list --json {server}x", 2)
     assert wrong.strip() == "linna: error: token: expected one that 'linna user add' gave out, found another"
     gone = typed("pass list --server http://127.0.0.1:1 --json", 2)

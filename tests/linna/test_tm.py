@@ -37,11 +37,11 @@ def downlink(tmp_path):
 
 
 def test_check_tells_the_account_of_an_undamaged_downlink(downlink, typed):
-    told = typed(f"tm check {downlink} --json --strict")
-    assert told["packets"] == 100 and told["by_apid"] == {"0x0A4": 100}
+    summary = typed(f"tm check {downlink} --json --strict")
+    assert summary["packets"] == 100 and summary["by_apid"] == {"0x0A4": 100}
     zeros = ("gaps", "duplicates", "crc_errors", "octets_skipped", "frames_bad", "symbols_corrected")
-    assert {name: told[name] for name in zeros} == dict.fromkeys(zeros, 0)
-    assert sum(told["octets"].values()) == downlink.stat().st_size
+    assert {name: summary[name] for name in zeros} == dict.fromkeys(zeros, 0)
+    assert sum(summary["octets"].values()) == downlink.stat().st_size
 
 
 def test_check_tells_damage_and_fails_only_when_asked_to(downlink, typed):
@@ -49,21 +49,21 @@ def test_check_tells_damage_and_fails_only_when_asked_to(downlink, typed):
     octets[1279 + 9] ^= 0xFF
     del octets[2 * 1279 : 3 * 1279]
     downlink.write_bytes(octets)
-    told = typed(f"tm check {downlink} --json")
-    assert told["symbols_corrected"] == 1 and told["frames_lost"] == 1 and told["gaps"] == 1
-    assert told["packets"] + told["packets_missing"] == 100
+    summary = typed(f"tm check {downlink} --json")
+    assert summary["symbols_corrected"] == 1 and summary["frames_lost"] == 1 and summary["gaps"] == 1
+    assert summary["packets"] + summary["packets_missing"] == 100
     assert "symbols corrected 1" in typed(f"tm check {downlink} --strict", 1)
 
 
 def test_decode_writes_json_to_a_file_or_to_standard_output(downlink, tmp_path, typed):
     out = tmp_path / "packets.json"
-    told = typed(f"tm decode {downlink} --out {out} --json")
-    assert told["packets"] == told["written"] == 100 and told["out"] == str(out)
+    summary = typed(f"tm decode {downlink} --out {out} --json")
+    assert summary["packets"] == summary["written"] == 100 and summary["out"] == str(out)
     records = json.loads(out.read_text())
     assert [r["frame_number"] for r in records] == list(range(100)) and records[3]["value_1"] == 1.5
     assert typed(f"tm decode {downlink}") == records
-    told = typed(f"tm decode {downlink} --json")
-    assert told["telemetry"] == records and told["packets"] == 100
+    summary = typed(f"tm decode {downlink} --json")
+    assert summary["telemetry"] == records and summary["packets"] == 100
 
 
 def test_decode_writes_csv_and_parquet(downlink, tmp_path, typed):
@@ -77,8 +77,8 @@ def test_decode_writes_csv_and_parquet(downlink, tmp_path, typed):
 def test_bare_packets_are_decoded_as_well(tmp_path, typed):
     path = tmp_path / "packets.bin"
     path.write_bytes(b"".join(PACKETS))
-    told = typed(f"tm check {path} --json")
-    assert (told["kind"], told["packets"], told["link"]) == ("packets", 100, None)
+    summary = typed(f"tm check {path} --json")
+    assert (summary["kind"], summary["packets"], summary["link"]) == ("packets", 100, None)
 
 
 def test_only_the_wanted_packets_are_decoded(downlink, typed):
@@ -114,8 +114,8 @@ def test_an_unwritable_place_leaves_nothing_behind(downlink, tmp_path, typed):
 
 def test_settings_of_the_link_may_be_given(downlink, typed):
     arguments = "--frame-length 1115 --coding rs --randomiser none --spacecraft-id 0x4C"
-    told = typed(f"tm check {downlink} --json {arguments}")
-    assert told["link"]["randomiser"] == "none" and told["packets"] == 0
+    summary = typed(f"tm check {downlink} --json {arguments}")
+    assert summary["link"]["randomiser"] == "none" and summary["packets"] == 0
     typed(f"tm check {downlink} --frame-length 7", 2)
 
 
@@ -141,11 +141,11 @@ def foreign(tmp_path):
     return definition, capture, packets
 
 
-def test_packets_without_error_control_are_checked_only_when_told(foreign, typed):
+def test_packets_without_error_control_are_checked_only_when_stated(foreign, typed):
     definition, capture, packets = foreign
     assert "found none" in typed(f"tm check {capture}", 2)
-    told = typed(f"tm check {capture} --no-error-control --json")
-    assert told["packets"] == told["unknown"] == len(packets) and told["gaps"] == 0
+    summary = typed(f"tm check {capture} --no-error-control --json")
+    assert summary["packets"] == summary["unknown"] == len(packets) and summary["gaps"] == 0
     strict = f"tm check {capture} --no-error-control --xtce {definition} --strict"
     assert "definition: decoded 120" in typed(strict)
     capture.write_bytes(b"".join([*packets, packets[-1][:-1]]))
@@ -173,8 +173,8 @@ def test_packets_of_another_mission_are_decoded_through_their_definition(foreign
     assert [r["MODE"] for r in raw] == [p["MODE"].raw_value for p in chosen]
     assert [r["SERIAL"] for r in raw] == [p["SERIAL"] for p in chosen] and max(r["SERIAL"] for r in raw) >= 2**63
     out = tmp_path / "bus.csv"
-    told = typed(f"{decode} --format csv --out {out} --json")
-    assert told["written"] == 120 and told["verdicts"]["decoded"] == 120
+    summary = typed(f"{decode} --format csv --out {out} --json")
+    assert summary["written"] == 120 and summary["verdicts"]["decoded"] == 120
     rows = list(csv.DictReader(out.read_text().splitlines()))
     assert [r["packet"] for r in rows] == [r["packet"] for r in records]
     serials = [str(p["SERIAL"]) if "SERIAL" in p else "" for p in expected]
@@ -241,12 +241,12 @@ def timed(tmp_path, typed):
     definition = tmp_path / "bus.xml"
     definition.write_text(document(HEADER_TYPES, parameters, HEADER_CONTAINER + entries))
 
-    def told(command, packets):
+    def summary(command, packets):
         path = tmp_path / "bus.bin"
         path.write_bytes(b"".join(packets))
         return typed(f"tm {command} {path} --xtce {definition} --no-error-control")
 
-    return told
+    return summary
 
 
 def test_parts_of_segmented_packets_and_packets_without_their_header_are_counted_apart(timed):
@@ -262,7 +262,7 @@ def test_parts_of_segmented_packets_and_packets_without_their_header_are_counted
     assert timed("check --json", bare)["verdicts"]["decoded"] == 3
 
 
-def test_counts_that_restart_are_told_from_conflicts(timed):
+def test_counts_that_restart_are_distinguished_from_conflicts(timed):
     counts = [*range(25), *range(3, 30)]
     packets = [bus_packet(count, struct.pack(">IH", k, k)) for k, count in enumerate(counts)]
     out = timed("check", packets)

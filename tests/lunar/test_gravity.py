@@ -78,9 +78,9 @@ def test_every_degree_agrees_with_the_definition_whatever_the_number_of_blocks(d
 def test_nothing_happens_at_the_poles():
     field = kaula_field(60)
     pole = np.array([0.0, 0.0, -1.768e6])
-    beside = acceleration(field, pole + np.array([1e-3, 0.0, 0.0]))
+    nearby = acceleration(field, pole + np.array([1e-3, 0.0, 0.0]))
     # The gradient is 2e-6 1/s^2: 1 mm away the acceleration differs by 2e-9 m/s^2 and no more.
-    assert np.allclose(acceleration(field, pole), beside, rtol=0.0, atol=4e-9)
+    assert np.allclose(acceleration(field, pole), nearby, rtol=0.0, atol=4e-9)
     assert np.all(np.isfinite(gradient(field, pole, 20)))
 
 

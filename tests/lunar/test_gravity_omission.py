@@ -1,4 +1,4 @@
-"""What a cut gravity field lacks, as a filter's process noise."""
+"""Omission error of a truncated gravity field as process noise of a filter."""
 
 from dataclasses import dataclass
 

@@ -127,7 +127,7 @@ def across_the_light():
 
 
 def pushed(position_m):
-    """What sunlight adds to the acceleration at a place, m/s^2."""
+    """Return the acceleration by sunlight at a place, m/s^2."""
     return acceleration(SUNLIT, position_m) - acceleration(DARK, position_m)
 
 

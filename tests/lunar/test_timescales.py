@@ -112,7 +112,7 @@ def test_what_is_no_utc_epoch_is_refused_with_the_text(text):
 @given(st.integers(0, 4_102_444_800 * NS))  # 1970 to 2100
 def test_counts_survive_text_with_nine_digits_and_tai(utc_ns):
     assert parse_utc(format_utc(utc_ns, 9)) == utc_ns_from_tai_ns(tai_ns_from_utc_ns(utc_ns)) == utc_ns
-    # Seconds past J2000 up to 3.2e9 are told apart to 0.5 us.
+    # Seconds past J2000 up to 3.2e9 are resolved to 0.5 us.
     assert abs(utc_ns_from_tdb_s(tdb_s_from_utc_ns(utc_ns)) - utc_ns) <= 500
 
 

@@ -1,16 +1,40 @@
 """A small world for navigation: a rough gravity field, craters of the paper's density, the paper's orbit."""
 
+import functools
+from typing import Any
+
 import numpy as np
 import pytest
 
 from lunar.elements import Elements, icrf_state_from_elements
 from lunar.frames import IauOrientation
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
+from payload_emulator.sim.terrain import procedural
 from studies.montecarlo import NavigationCase
 from studies.montecarlo_world import crater_world, rough_gravity
 
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
 TRUTH_DEGREE = 60
+
+
+@pytest.fixture(scope="session", autouse=True)
+def drawn_moons():
+    """Keep plains and craters of the two newest seeds, which each opened world would draw; what draws is yielded."""
+    plains, craters = procedural._plains_map, procedural._draw_catalogue
+    kept = functools.lru_cache(2)(lambda salts: plains(list(salts)))
+    moons = dict[int, Any]()
+
+    def draw(rng, map_of_plains, seed):
+        if seed not in moons:
+            while len(moons) > 1:
+                del moons[next(iter(moons))]
+            moons[seed] = craters(rng, map_of_plains, seed)
+        return moons[seed]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(procedural, "_plains_map", lambda salts: kept(tuple(salts)))
+        patch.setattr(procedural, "_draw_catalogue", draw)
+        yield plains, craters
 
 
 @pytest.fixture(scope="session")

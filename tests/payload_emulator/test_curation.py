@@ -15,7 +15,7 @@ from tmtc.dictionary.tables import pack_catalogue_table, unpack_catalogue_table
 RADIUS_M = 1_737_400.0
 METRES_PER_DEG = math.radians(1.0) * RADIUS_M
 WEST, SOUTH, SIZE_DEG = 300.0, 10.0, 6.0
-# Where the raster shows craters beside the list: registration, east and north.
+# Registration of the craters in the raster to the list, east and north.
 OFFSET_M = (-35.0, 60.0)
 LIST_ERROR_M = 120.0
 
@@ -77,7 +77,7 @@ def curation(field):
 
 
 def errors_m(field, curation):
-    """Kept centres beside the raster's own, east and north."""
+    """Return kept centres less those of the raster, east and north."""
     table = curation.table
     rows = table.ids
     north = (np.degrees(table.latitude_rad) - field.latitude[rows]) * METRES_PER_DEG

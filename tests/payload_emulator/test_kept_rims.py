@@ -21,7 +21,7 @@ ALL = np.arange(6)
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     opened().measured(ALL[:1])  # compiled code comes from its own folder
-    # Ground lies beside the folder of compiled code, which builds under test read.
+    # Ground lies next to the folder of compiled code, which builds under test read.
     monkeypatch.setattr("kernels.cache_folder", lambda: tmp_path / "code")
     return tmp_path / "code-ground"
 

@@ -148,17 +148,17 @@ def test_contacts_end_behind_the_limb_of_the_moon_once_an_orbit():
     ephemeris = circling()
     times = EPOCH + np.arange(0, 4 * 3600, 20) * 10**9
     every = LinkSection(stations=("goldstone", "madrid", "canberra"), minimum_elevation_deg=5.0)
-    heard, light_s = contacts(ephemeris, times, every)
+    in_contact, light_s = contacts(ephemeris, times, every)
     # The plane holds the Earth: hidden for the angle 180 deg - 2 acos(R / r), R / r = 1737.4 / 1767.4, of each orbit.
     hidden = (np.pi - 2.0 * np.arccos(1737.4 / 1767.4)) / (2.0 * np.pi)
-    assert 1.0 - heard.mean() == pytest.approx(hidden, abs=0.04)
+    assert 1.0 - in_contact.mean() == pytest.approx(hidden, abs=0.04)
     assert np.all((light_s > 1.1) & (light_s < 1.4))
     always, way_s = contacts(ephemeris, times, LinkSection())
     assert always.all()
     # To the Earth's centre it is farther than to a station that sees the Moon, by an Earth's radius at most.
-    assert np.all((way_s[heard] > light_s[heard] - 1e-3) & (way_s[heard] < light_s[heard] + 0.0213))
+    assert np.all((way_s[in_contact] > light_s[in_contact] - 1e-3) & (way_s[in_contact] < light_s[in_contact] + 0.0213))
     one, _ = contacts(ephemeris, times, LinkSection(stations=("madrid",)))
-    assert one.sum() < heard.sum()
+    assert one.sum() < in_contact.sum()
 
 
 def test_a_station_that_there_is_not_is_named():

@@ -19,6 +19,7 @@ from lunar.frames import mcmf_from_spherical
 from lunar.timescales import parse_utc
 from payload_emulator.errors import LinkError
 from payload_emulator.flight.onboard.modes import PayloadMode
+from payload_emulator.session.live.console import rims_in_view, step_message
 from payload_emulator.session.live.session import LiveSession
 from payload_emulator.session.live.station_ports import (
     CLIENT_LIMIT,
@@ -27,15 +28,14 @@ from payload_emulator.session.live.station_ports import (
     Server,
     TelecommandBuffer,
 )
-from payload_emulator.session.live.viewing import step_message
 from payload_emulator.session.scenario import FaultsSection, parse_scenario
 from payload_emulator.session.spacecraft.loading import load_scenario_payload
 from payload_emulator.session.spacecraft.loop import StepInput, StepResult, new_spacecraft
 from payload_emulator.session.spacecraft.schedule import Operator, fly_scenario
 from payload_emulator.session.world.camera import Exposure, expose
 from payload_emulator.session.world.world import build_world
-from payload_emulator.sim.board.faults import FAULT_KINDS
 from payload_emulator.sim.board.link import Receiver
+from payload_emulator.sim.board.platform import FAULT_KINDS
 from studies.harness.parts import free_port, listens
 from tests.scenarios import live_scenario
 from tmtc.dictionary.payload import DICTIONARY
@@ -129,10 +129,8 @@ def seen_from(world, utc_ns, packets):
 
 def test_rings_of_the_catalogue_lie_on_the_rims_of_the_rendered_ground():
     world = build_world(parse_scenario(SCENARIO.replace('"reduced"', '"rendered"')), NO_DATA)
-    with watched(world, load_scenario_payload(world, NO_DATA)[0]) as (_, watcher):
-        watcher.say("run")
-        rings = watcher.until(lambda message: message["kind"] == "frame")[-1]["catalogue"]
     exposure = expose(world, int(world.frame_utc_ns[0]))
+    rings = rims_in_view(world, exposure.utc_ns, exposure.camera_from_mcmf)
     row = {int(one): k for k, one in enumerate(world.terrain.catalogue.ids)}
     craters = world.terrain.measured(np.array([row[one["id"]] for one in rings]))
     position = world.truth.positions_mcmf(exposure.utc_ns)[0]

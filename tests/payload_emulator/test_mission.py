@@ -77,8 +77,8 @@ def test_the_registration_of_the_terrain_is_stated(world):
     assert stated_of(world).catalogue.registration_north_m is None
     latitude, longitude, _ = spherical_from_mcmf(world.truth.positions_mcmf(world.frame_utc_ns))
     # A rim every half degree around the frames, all 40 m north and 20 m west of the list.
-    beside = np.radians(np.stack(np.meshgrid(np.arange(-5.0, 5.1, 0.5), np.arange(-5.0, 5.1, 0.5))))
-    places = beside.reshape(2, -1) + np.array([[latitude[0]], [longitude[0]]])
+    offsets = np.radians(np.stack(np.meshgrid(np.arange(-5.0, 5.1, 0.5), np.arange(-5.0, 5.1, 0.5))))
+    places = offsets.reshape(2, -1) + np.array([[latitude[0]], [longitude[0]]])
     same = np.ones(places.shape[1])
     registration = fit_registration(Rims(*places, -20.0 * same, 40.0 * same, 60.0 * same))
     shifted = SimpleNamespace(catalogue=world.terrain.catalogue, is_real=False, registration=registration)

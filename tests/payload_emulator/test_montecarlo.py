@@ -105,7 +105,7 @@ def test_an_attitude_of_a_degree_neither_diverges_nor_lies(case_of):
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(one, marks=pytest.mark.campaign) for one in (2, 3))])
-def test_a_jump_of_five_kilometres_that_nobody_told_of_is_noticed_and_mended(case_of, seed):
+def test_an_unannounced_jump_of_five_kilometres_is_noticed_and_mended(case_of, seed):
     case = case_of(80, kidnap=Kidnap(50, 5_000.0, announced=False))
     run = fly(case, seed)
     assert run.error_m[49] < 300.0
@@ -113,7 +113,7 @@ def test_a_jump_of_five_kilometres_that_nobody_told_of_is_noticed_and_mended(cas
     assert np.all(run.error_m[58:] < 500.0)
 
 
-def test_a_told_jump_of_tens_of_kilometres_is_mended_within_four_frames(case_of):
+def test_an_announced_jump_of_tens_of_kilometres_is_mended_within_four_frames(case_of):
     case = case_of(40, kidnap=Kidnap(25, 50_000.0, announced=True))
     run = fly(case, 4)
     assert np.all(run.error_m[29:] < 500.0)

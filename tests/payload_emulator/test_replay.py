@@ -188,7 +188,7 @@ def test_an_archive_that_cannot_be_flown_says_why(copy, tmp_path):
     refused(r"expected payload/inputs\.jsonl, found none")
 
 
-def test_a_parameter_of_older_code_is_dropped_and_told(copy, tmp_path):
+def test_a_parameter_of_older_code_is_dropped_and_reported(copy, tmp_path):
     path = copy / "payload/parameters.toml"
     path.write_text(path.read_text().replace("[detector]\n", "[detector]\nforgotten = 3\n"))
     summary = replay_archive(copy, FlightBuild(), tmp_path / "out")
@@ -258,11 +258,11 @@ flight.anchored.limits.highest_radius_m = 1 -> lowest_radius_m: expected at most
 """
 
 
-@pytest.mark.parametrize(("text", "told"), [line.split(" -> ") for line in BAD.strip().splitlines()])
-def test_a_bad_parameter_is_told_by_its_name(text, told):
+@pytest.mark.parametrize(("text", "message"), [line.split(" -> ") for line in BAD.strip().splitlines()])
+def test_a_bad_parameter_is_refused_with_its_name(text, message):
     with pytest.raises(ParameterError) as error:
         parse_parameters(text, source="p.toml")
-    assert told in str(error.value) and str(error.value).startswith(("p.toml: ", "p.toml, "))
+    assert message in str(error.value) and str(error.value).startswith(("p.toml: ", "p.toml, "))
 
 
 def test_the_shipped_suite_has_a_pass_of_every_kind():

@@ -22,7 +22,7 @@ from payload_emulator.session.live.state import VERSION, load_state, pack_state,
 from payload_emulator.session.live.station_ports import JournalEntry, StationPorts, add_to_journal, load_journal
 from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.spacecraft.loading import launch
-from payload_emulator.sim.board.faults import parse_fault
+from payload_emulator.sim.board.platform import parse_fault
 from tests.payload_emulator.test_continuous import SCENARIO
 from tmtc.link.uplink import Farm
 

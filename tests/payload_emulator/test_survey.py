@@ -78,8 +78,8 @@ def test_windows_of_all_seeds_are_counted_together_each_by_its_frames():
     assert figures["bounds"] == pytest.approx([8.23075 / 3.0, 31.5264 / 3.0], abs=1e-4)
     # Sigmas are too large by the root of the mean per degree, too small likewise; within the bounds nothing is said.
     assert (figures["nees_remark"], "sigmas" in format_survey(figures)) == ("", False)
-    for nees, told in ((1.5, "sigmas 2.0 times too large"), (24.0, "sigmas 2.0 times too small")):
-        assert f"NIS 1.00; {told}\n" in format_survey(summary([session(*[window(nees=nees)] * 3)]))
+    for nees, remark in ((1.5, "sigmas 2.0 times too large"), (24.0, "sigmas 2.0 times too small")):
+        assert f"NIS 1.00; {remark}\n" in format_survey(summary([session(*[window(nees=nees)] * 3)]))
     assert figures["nees_above_12_6_share"] == pytest.approx(1.0 / 3.0)
     assert figures["nees_trend"] == pytest.approx(8.0 - (6.0 + 12.8) / 2.0)
     assert figures["bias_rtn_m"] == pytest.approx([(8 * 1 + 12 * 5) / 20, 2.0, (8 * 3 - 12) / 20])

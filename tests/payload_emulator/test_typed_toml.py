@@ -86,14 +86,14 @@ rest = {length_m = "x"} | rest.length_m | a number | 'x'
 @pytest.mark.parametrize(
     ("table", "place", "expected", "found"), [line.split(" | ") for line in WRONG.strip().splitlines()]
 )
-def test_a_wrong_value_is_told_by_place_expectation_and_finding(table, place, expected, found):
+def test_a_wrong_value_is_reported_by_place_expectation_and_finding(table, place, expected, found):
     with pytest.raises(TableFault) as fault:
         read_table(Outer, {"name": "a"} | tomllib.loads(table), "top")
     assert (fault.value.place, fault.value.expected, fault.value.found) == (f"top.{place}", expected, found)
     assert fault.value.known == () and fault.value.nearest is None
 
 
-def test_an_unknown_key_is_told_with_the_nearest_known_one_of_its_section():
+def test_an_unknown_key_is_reported_with_the_nearest_known_one_of_its_section():
     with pytest.raises(TableFault) as fault:
         read_table(Outer, {"name": "a", "inner": {"lenght_m": 1.0}})
     assert (fault.value.place, fault.value.nearest) == ("inner.lenght_m", "length_m")
@@ -103,7 +103,7 @@ def test_an_unknown_key_is_told_with_the_nearest_known_one_of_its_section():
     assert fault.value.place == "zzz" and fault.value.nearest is None and "count" in fault.value.known
 
 
-def test_a_missing_value_and_a_table_that_is_none_are_told():
+def test_a_missing_value_and_a_table_that_is_none_are_reported():
     with pytest.raises(TableFault, match=r"expected all of name, count, .*, found none"):
         read_table(Outer, {})
     with pytest.raises(TableFault, match="top: expected a table, found 3"):

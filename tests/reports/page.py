@@ -1,4 +1,4 @@
-"""What tests read out of a page, with nothing but the standard library."""
+"""Content of a page as tests read it, with nothing but the standard library."""
 
 import re
 from html.parser import HTMLParser

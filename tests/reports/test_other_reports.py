@@ -89,7 +89,7 @@ def test_strict_and_ignore_aware_scores_stand_side_by_side():
     assert lowland.index("0.870") < lowland.index("0.930") < lowland.index("0.610")
 
 
-def test_predicted_uncertainty_stands_beside_what_it_should_be():
+def test_predicted_uncertainty_is_compared_with_what_it_should_be():
     words = Page(render_html(example.detector_report())).text
     table = words[words.index("Predicted uncertainty") :]
     for figure in ("14–20 km up", "1.33", "0.655", "0.941", "0.683"):

@@ -65,7 +65,7 @@ def test_the_first_page_has_the_verdict_the_five_figures_and_their_level(page):
     assert "3 real terrain" in start
 
 
-def test_the_detector_stands_beside_the_figures_printed_in_the_paper(page):
+def test_the_detector_is_compared_with_the_figures_printed_in_the_paper(page):
     # LINNA paper, Table II.
     for figure in ("0.7021", "0.7362", "0.8131", "0.3248", "0.3586", "0.4659", "3.50", "4.11", "4.75"):
         assert figure in page.text

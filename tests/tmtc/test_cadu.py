@@ -160,7 +160,7 @@ def test_a_frame_with_a_worn_marker_and_no_neighbours_is_accepted_only_when_it_p
     assert starts(stream, verify=lambda sync: sync.offsets == 4 * PERIOD) == [4 * PERIOD]
 
 
-def test_the_period_is_told_from_the_whole_stream_however_long_the_noise_before_it():
+def test_the_period_is_found_in_the_whole_stream_however_long_the_noise_before_it():
     noise = noise_of(5_000_000, 7)
     assert find_period(np.concatenate((noise, stream_of(40)))) == PERIOD
 

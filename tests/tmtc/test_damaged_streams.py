@@ -77,7 +77,7 @@ def test_noise_before_the_first_frame_hides_nothing(octets):
 
 
 @pytest.mark.parametrize("rate", [0.0, 2e-3])
-def test_a_station_header_before_each_frame_is_told_from_the_frame(rate):
+def test_a_station_header_before_each_frame_is_distinguished_from_the_frame(rate):
     header = np.random.default_rng(8).integers(0, 256, (len(cadus()), 8), dtype=np.uint8)
     decoded = check(np.hstack((header, with_bit_errors(cadus(), rate, seed=9))), sent())
     assert decoded.settings.coding == "rs"

@@ -36,7 +36,7 @@ def tables():
     return DICTIONARY.unpack_many(octets, cut_packets(octets))
 
 
-def test_on_board_time_is_told_in_tai():
+def test_on_board_time_is_exported_in_tai():
     assert format_onboard_time(0) == "2000-01-01T00:00:00.000000"
     # 2029-08-07T00:00:00 TAI is 10811 days after the epoch
     assert format_onboard_time(10811 * 86400 << 16 | 0x8000) == "2029-08-07T00:00:00.500000"

@@ -59,7 +59,7 @@ def test_a_capture_of_7200_packets_without_error_control_is_read_whole():
     assert decoded.by_apid == {11: 7200}
 
 
-def test_without_being_told_nothing_is_taken_for_a_packet():
+def test_without_settings_nothing_is_taken_for_a_packet():
     octets = b"".join(ephemeris(k) for k in range(100))
     assert decode(octets).packets == 0
 
@@ -221,7 +221,7 @@ def test_every_octet_of_anything_is_accounted_for(octets, ends):
     assert total == len(mixed)
 
 
-def test_idle_packets_are_told_from_the_others():
+def test_idle_packets_are_distinguished_from_the_others():
     packets = [space_packet(9, bytes((k,)), k) for k in range(10)]
     found = cut(b"".join(p + idle_packet(20) for p in packets))
     assert len(found) == 10 and found.octets_idle == 200

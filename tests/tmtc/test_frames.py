@@ -97,7 +97,7 @@ def test_octets_with_their_checksum_leave_no_remainder():
     check_crc(octets, "test")
 
 
-def test_a_wrong_checksum_is_told_with_both_values():
+def test_a_wrong_checksum_is_reported_with_both_values():
     with pytest.raises(ChecksumError, match="expected checksum 0x29B1, found 0x0000"):
         check_crc(b"123456789\0\0", "test")
     with pytest.raises(TruncatedPacket):

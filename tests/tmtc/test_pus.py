@@ -130,7 +130,7 @@ def received(parts):
 
 
 def through_packets(parts):
-    """What the other end unpacks."""
+    """Return the values that the other end unpacks."""
     for k, (name, values) in enumerate(parts):
         yield DICTIONARY.unpack(DICTIONARY.pack(name, values, ticks=k, sequence_count=k))
 

@@ -67,7 +67,7 @@ def test_a_whole_dump_that_comes_twice_is_duplicates_and_no_gap():
     assert np.all(result.verdict[:500] == FIRST)
 
 
-def test_a_burst_from_yesterday_in_the_middle_of_today_is_told_apart():
+def test_a_burst_from_yesterday_in_the_middle_of_today_is_separated():
     day = 86_400 << 16
     today, yesterday = np.arange(9000, 9100), np.arange(8900, 9000)
     counts = np.concatenate((today[:50], yesterday, today[50:]))

@@ -10,8 +10,7 @@ from typing import Any
 from tmtc.dictionary.codes import FUNCTIONS, MODES, QUANTITIES, TABLES
 from tmtc.dictionary.effects import CARRIER, FUNCTION
 from tmtc.dictionary.event_texts import number_text, time_text
-from tmtc.dictionary.fields import Field
-from tmtc.dictionary.onboard_parameters import BY_NAME, find_parameter
+from tmtc.dictionary.fields import BY_NAME, Field, find_parameter
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import encode
 from tmtc.errors import TmtcError, ValueRefused

@@ -35,7 +35,7 @@ EVENTS: Labels = (
     (23, "image_streak"), (24, "camera_recovered"),
     (59, "memory_repaired"), (60, "safe_mode_entered"), (61, "table_hash_mismatch"), (62, "memory_unrepairable"),
     (69, "store_overwritten"), (70, "event_reporting_changed"),
-    (39, "attitude_degraded"), (40, "attitude_restored"), (41, "map_offset"),
+    (39, "attitude_degraded"), (40, "attitude_restored"), (41, "map_offset"), (42, "detection_noise"),
 )  # fmt: skip
 FAILURES: Labels = (
     (1, "unknown_packet"), (2, "bad_checksum"), (3, "bad_length"), (4, "value_out_of_range"),

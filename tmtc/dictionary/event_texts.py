@@ -127,6 +127,11 @@ EVENT_TEXTS: Mapping[str, EventText] = {
         ("1 sigma of the offset of the list, m", _number("m")),
         ("fixes that it was learned from; 0: the prior", _number()),
     ),
+    "detection_noise": _of(
+        "{0} times the stated noise, from {1} fixes",
+        ("factor on the stated noise", _number()),
+        ("fixes that it was learned from; 0: the prior", _number()),
+    ),
     "anchor_read": _of("trigger: {0}, {1} estimator", ("trigger", _TRIGGER), ("estimator", _ESTIMATOR)),
     "clock_jump": _of("{0}", ("jump, s", _number("s"))),
     "clock_synchronised": _of("{0}", ("on-board time", _time)),

@@ -4,19 +4,7 @@ Everything that crosses the link is defined here; the ICD and the XTCE export ar
 adds packets, so that it decodes the telemetry of older payloads.
 """
 
-from tmtc.dictionary.codes import (
-    ESTIMATORS,
-    EVENTS,
-    FAILURES,
-    FUNCTIONS,
-    IMAGE_QUALITIES,
-    OUTCOMES,
-    QUANTITIES,
-    RESET_TRIGGERS,
-    SIZE_CLASSES,
-    STORE_CLASSES,
-    TABLES,
-)
+from tmtc.dictionary import codes
 from tmtc.dictionary.fields import HOUSEKEEPING_FIELDS, Field
 from tmtc.dictionary.schema import Dictionary, Group, PacketDefinition
 from tmtc.packets.space_packets import TYPE_TELECOMMAND
@@ -45,7 +33,7 @@ _OCTETS = (Field("octet", "u8", "One octet of the part"),)
 _PART = (
     Field("transaction", "u16", "Number of the transfer"),
     Field("part", "u16", "Number of the part, from 1"),
-    Field("table", "u8", "What is transferred", labels=TABLES),
+    Field("table", "u8", "What is transferred", labels=codes.TABLES),
     Field("count", "u16", "Octets that follow"),
 )
 
@@ -59,7 +47,7 @@ _FRAME_PACKETS = (
         "detections", APID_DETECTIONS, 129, 1, "Craters detected in one frame",
         (
             *_FRAME,
-            Field("image_quality", "u8", "Verdict on the image", labels=IMAGE_QUALITIES),
+            Field("image_quality", "u8", "Verdict on the image", labels=codes.IMAGE_QUALITIES),
             Field("count", "u8", "Number of detections that follow"),
         ),
         Group(
@@ -69,7 +57,7 @@ _FRAME_PACKETS = (
                 Field("v_px", "u16", "Centre, downwards, pixel centres at integers", "px", scale=1 / 64),
                 Field("diameter_px", "u16", "Apparent diameter", "px", scale=1 / 64, saturate=True),
                 Field("score", "u8", "Confidence", scale=1 / 255, minimum=0.0, maximum=1.0),
-                Field("size_class", "i8", "Size class by the on-board range", labels=SIZE_CLASSES),
+                Field("size_class", "i8", "Size class by the on-board range", labels=codes.SIZE_CLASSES),
                 Field(
                     "sigma_px", "u8", "Standard deviation of the centre, each axis", "px", scale=1 / 64,
                     missing=255, saturate=True,
@@ -81,8 +69,8 @@ _FRAME_PACKETS = (
         "navigation_state", APID_NAVIGATION_STATE, 129, 2, "Position of one estimator after one frame",
         (
             *_FRAME,
-            Field("estimator", "u8", "Which estimator speaks", labels=ESTIMATORS),
-            Field("outcome", "u8", "How the state came about", labels=OUTCOMES),
+            Field("estimator", "u8", "Which estimator speaks", labels=codes.ESTIMATORS),
+            Field("outcome", "u8", "How the state came about", labels=codes.OUTCOMES),
             Field("latitude_deg", "f64", "Latitude, mean-Earth frame", "deg"),
             Field("longitude_deg", "f64", "Longitude, mean-Earth frame", "deg"),
             Field("altitude_m", "f64", "Height above the 1737.4 km sphere", "m"),
@@ -96,9 +84,9 @@ _FRAME_PACKETS = (
         "frame_outcome", APID_FRAME_OUTCOME, 129, 3, "What one estimator did with one frame",
         (
             *_FRAME,
-            Field("estimator", "u8", "Which estimator speaks", labels=ESTIMATORS),
-            Field("outcome", "u8", "Outcome of the frame", labels=OUTCOMES),
-            Field("reset_trigger", "u8", "Why the estimator was re-anchored", labels=RESET_TRIGGERS),
+            Field("estimator", "u8", "Which estimator speaks", labels=codes.ESTIMATORS),
+            Field("outcome", "u8", "Outcome of the frame", labels=codes.OUTCOMES),
+            Field("reset_trigger", "u8", "Why the estimator was re-anchored", labels=codes.RESET_TRIGGERS),
             Field("detections", "u8", "Detections offered", saturate=True),
             Field("candidate_pairs", "u16", "Pairs that passed the motion bounds", saturate=True),
             Field("pairs", "u8", "Pairs used in the solution", saturate=True),
@@ -128,7 +116,7 @@ def _verification(subtype: int, name: str, text: str, step: bool, failure: bool)
     if step:
         fields.append(Field("step", "u8", "Number of the step, from 1"))
     if failure:
-        fields.append(Field("failure_code", "u16", "Why", labels=FAILURES))
+        fields.append(Field("failure_code", "u16", "Why", labels=codes.FAILURES))
     return PacketDefinition(name, APID_VERIFICATION, 1, subtype, text, tuple(fields))
 
 
@@ -137,7 +125,7 @@ _REPORTS = (
         PacketDefinition(
             f"event_{severity}", APID_EVENTS, 5, subtype, f"Event report, {meaning}",
             (
-                Field("event_id", "u16", "What happened", labels=EVENTS),
+                Field("event_id", "u16", "What happened", labels=codes.EVENTS),
                 Field("frame_number", "u32", "Frame during which it happened"),
                 Field("value_1", "f64", "First value that goes with the event"),
                 Field("value_2", "f64", "Second value that goes with the event"),
@@ -183,9 +171,9 @@ def _command(
 
 
 structure = Field("structure_id", "u16", "Housekeeping structure", minimum=1, maximum=31)
-event = Field("event_id", "u16", "Event", labels=EVENTS)
+event = Field("event_id", "u16", "Event", labels=codes.EVENTS)
 parameter = Field("parameter_id", "u16", "Number of the parameter")
-_QUANTITY = Field("quantity", "u16", "Quantity of the data pool", labels=QUANTITIES)
+_QUANTITY = Field("quantity", "u16", "Quantity of the data pool", labels=codes.QUANTITIES)
 _STRUCTURE = Field("structure_id", "u16", "Housekeeping structure, defined by telecommand", minimum=16, maximum=31)
 
 _TELECOMMANDS = (
@@ -201,7 +189,7 @@ _TELECOMMANDS = (
     _command(
         "perform_function", 8, 1, "Perform a function of the payload",
         (
-            Field("function_id", "u16", "Function", labels=FUNCTIONS),
+            Field("function_id", "u16", "Function", labels=codes.FUNCTIONS),
             Field("argument_1", "f64", "First argument (mode, duration in s, table number, m), else 0"),
             Field("argument_2", "f64", "Second argument (cadence in s, m/s), else 0"),
         ),
@@ -337,11 +325,11 @@ _PERFORMANCE = PacketDefinition(
         Field("bus_current_a", "u16", "Current drawn from the bus", "A", scale=0.001, saturate=True),
         *(
             Field(f"queue_{name}", "u16", f"Packets of class {name} waiting for downlink", saturate=True)
-            for _, name in STORE_CLASSES
+            for _, name in codes.STORE_CLASSES
         ),
         *(
             Field(f"store_{name}_permille", "u16", f"Store of class {name} in use", "1/1000", maximum=1000)
-            for _, name in STORE_CLASSES
+            for _, name in codes.STORE_CLASSES
         ),
         Field("store_overwritten", "u32", "Packets lost from the store before they were sent, since boot"),
         Field("storage_errors", "u16", "Damaged packets found in the store since boot", saturate=True),
@@ -371,7 +359,7 @@ _MACHINE_PACKETS = (
     PacketDefinition(
         "disabled_events", APID_EVENTS, 5, 8, "Events that are not reported",
         (Field("count", "u8", "Number of events that follow"),),
-        Group("count", (Field("event_id", "u16", "Event", labels=EVENTS),)),
+        Group("count", (Field("event_id", "u16", "Event", labels=codes.EVENTS),)),
     ),
     PacketDefinition(
         "schedule_report", APID_SCHEDULE, 11, 13, "Activities of the schedule, by release time",
@@ -393,7 +381,7 @@ _MACHINE_PACKETS = (
         Group(
             "count",
             (
-                Field("store_class", "u8", "Class", labels=STORE_CLASSES),
+                Field("store_class", "u8", "Class", labels=codes.STORE_CLASSES),
                 Field("packets", "u32", "Packets kept"),
                 Field("unsent", "u32", "Packets among them that wait for downlink"),
                 Field("octets", "u32", "Octets in use"),

@@ -24,27 +24,7 @@ import numpy.typing as npt
 from tmtc.arrays import BoolArray, IntArray, OctetArray, Octets, RecordArray, as_octets
 from tmtc.dictionary.fields import Field
 from tmtc.errors import MalformedPacket, TruncatedPacket, UnknownPacket, ValueRefused
-from tmtc.packets.pus import (
-    ACK_ALL,
-    TC_HEADER_LENGTH,
-    TM_HEADER_LENGTH,
-    TcSecondaryHeader,
-    TmSecondaryHeader,
-    pack_tc_header,
-    pack_tm_header,
-    unpack_tc_header,
-    unpack_tm_header,
-)
-from tmtc.packets.space_packets import (
-    CRC_LENGTH,
-    PRIMARY_HEADER_LENGTH,
-    TYPE_TELECOMMAND,
-    TYPE_TELEMETRY,
-    append_crc,
-    check_crc,
-    pack_packet,
-    unpack_primary_header,
-)
+from tmtc.packets import pus, space_packets
 from tmtc.packets.stream import PacketCut
 
 _STRUCT_CODES = {
@@ -52,8 +32,8 @@ _STRUCT_CODES = {
     "f32": "f", "f64": "d",
 }  # fmt: skip
 
-TM_DATA_START = PRIMARY_HEADER_LENGTH + TM_HEADER_LENGTH
-TC_DATA_START = PRIMARY_HEADER_LENGTH + TC_HEADER_LENGTH
+TM_DATA_START = space_packets.PRIMARY_HEADER_LENGTH + pus.TM_HEADER_LENGTH
+TC_DATA_START = space_packets.PRIMARY_HEADER_LENGTH + pus.TC_HEADER_LENGTH
 
 _TM_HEADER_DTYPE = np.dtype(
     [
@@ -90,7 +70,7 @@ class PacketDefinition:
     description: str
     fields: tuple[Field, ...]
     group: Group | None = None
-    packet_type: int = TYPE_TELEMETRY
+    packet_type: int = space_packets.TYPE_TELEMETRY
 
     @property
     def key(self) -> int:
@@ -100,12 +80,12 @@ class PacketDefinition:
     @property
     def data_start(self) -> int:
         """Octets before the first field."""
-        return TM_DATA_START if self.packet_type == TYPE_TELEMETRY else TC_DATA_START
+        return TM_DATA_START if self.packet_type == space_packets.TYPE_TELEMETRY else TC_DATA_START
 
     @property
     def base_length(self) -> int:
         """Octets of the packet without repeated items, checksum included."""
-        return self.data_start + sum(f.octets for f in self.fields) + CRC_LENGTH
+        return self.data_start + sum(f.octets for f in self.fields) + space_packets.CRC_LENGTH
 
     @property
     def item_length(self) -> int:
@@ -231,10 +211,10 @@ class Dictionary:
         """
         compiled = self._find(name)
         definition = compiled.definition
-        if definition.packet_type != TYPE_TELEMETRY:
+        if definition.packet_type != space_packets.TYPE_TELEMETRY:
             raise UnknownPacket(f"expected a telemetry packet, found telecommand {name!r}")
-        header = TmSecondaryHeader(definition.service, definition.subtype, int(ticks), message_counter, destination)
-        return compiled.packet(pack_tm_header(header), values, sequence_count)
+        header = pus.TmSecondaryHeader(definition.service, definition.subtype, int(ticks), message_counter, destination)
+        return compiled.packet(pus.pack_tm_header(header), values, sequence_count)
 
     def pack_command(
         self,
@@ -242,7 +222,7 @@ class Dictionary:
         values: Mapping[str, object],
         *,
         sequence_count: int,
-        acknowledgements: int = ACK_ALL,
+        acknowledgements: int = pus.ACK_ALL,
         source: int = 0,
     ) -> bytes:
         """Return the telecommand packet `name` with `values`, by the rules of `pack`, for finite numbers only.
@@ -251,12 +231,12 @@ class Dictionary:
         """
         compiled = self._find(name)
         definition = compiled.definition
-        if definition.packet_type != TYPE_TELECOMMAND:
+        if definition.packet_type != space_packets.TYPE_TELECOMMAND:
             raise UnknownPacket(f"expected a telecommand, found telemetry packet {name!r}")
         for field_name, value in values.items():
             _refuse_no_number(name, field_name, value)
-        header = TcSecondaryHeader(definition.service, definition.subtype, acknowledgements, source)
-        return compiled.packet(pack_tc_header(header), values, sequence_count)
+        header = pus.TcSecondaryHeader(definition.service, definition.subtype, acknowledgements, source)
+        return compiled.packet(pus.pack_tc_header(header), values, sequence_count)
 
     def unpack(self, octets: bytes) -> tuple[str, dict[str, Any]]:
         """Name and engineering values of one telemetry packet; repeated items as a mapping of arrays.
@@ -270,8 +250,8 @@ class Dictionary:
 
     def unpack_packet(self, octets: bytes) -> DecodedPacket:
         """One telemetry packet with its headers, engineering and raw values."""
-        primary = _checked_header(octets, TYPE_TELEMETRY)
-        header = unpack_tm_header(memoryview(octets)[PRIMARY_HEADER_LENGTH:])
+        primary = _checked_header(octets, space_packets.TYPE_TELEMETRY)
+        header = pus.unpack_tm_header(memoryview(octets)[space_packets.PRIMARY_HEADER_LENGTH :])
         compiled = self._identify_one(octets, header.service, header.subtype)
         values, raw = compiled.values(octets)
         return DecodedPacket(
@@ -281,8 +261,8 @@ class Dictionary:
 
     def unpack_command(self, octets: bytes) -> DecodedCommand:
         """One telecommand packet with its headers and engineering values."""
-        primary = _checked_header(octets, TYPE_TELECOMMAND)
-        header = unpack_tc_header(memoryview(octets)[PRIMARY_HEADER_LENGTH:])
+        primary = _checked_header(octets, space_packets.TYPE_TELECOMMAND)
+        header = pus.unpack_tc_header(memoryview(octets)[space_packets.PRIMARY_HEADER_LENGTH :])
         compiled = self._identify_one(octets, header.service, header.subtype)
         values, _ = compiled.values(octets)
         return DecodedCommand(
@@ -298,7 +278,7 @@ class Dictionary:
         """
         octets = as_octets(buffer)
         result = np.full(cut.offsets.size, NOT_A_TM_PACKET, dtype=np.int64)
-        usable = np.flatnonzero(cut.crc_ok & (cut.lengths >= TM_DATA_START + CRC_LENGTH))
+        usable = np.flatnonzero(cut.crc_ok & (cut.lengths >= TM_DATA_START + space_packets.CRC_LENGTH))
         if not usable.size:
             return result
         header = gather(octets, cut.offsets[usable], _TM_HEADER_DTYPE)
@@ -366,7 +346,7 @@ def gather(octets: OctetArray, starts: IntArray, dtype: np.dtype[Any]) -> Record
 
 
 def _checked_header(octets: bytes, packet_type: int) -> Any:
-    primary = unpack_primary_header(octets)
+    primary = space_packets.unpack_primary_header(octets)
     if len(octets) < primary.packet_length:
         raise TruncatedPacket("space packet", primary.packet_length, len(octets))
     if len(octets) > primary.packet_length:
@@ -378,7 +358,7 @@ def _checked_header(octets: bytes, packet_type: int) -> Any:
             f"space packet: expected type {packet_type} with a secondary header, "
             f"found type {primary.packet_type}, secondary header flag {int(primary.secondary_header)}"
         )
-    check_crc(octets, f"packet of APID 0x{primary.apid:03X}, count {primary.sequence_count}")
+    space_packets.check_crc(octets, f"packet of APID 0x{primary.apid:03X}, count {primary.sequence_count}")
     return primary
 
 
@@ -393,7 +373,7 @@ class _Compiled:
         self.base_dtype = np.dtype(_dtype_fields(definition.fields))
         self.item_dtype = np.dtype(_dtype_fields(group.fields)) if group else None
         self.settable = {f.name for f in definition.fields} | ({group.name} if group else set())
-        if definition.packet_type == TYPE_TELEMETRY:
+        if definition.packet_type == space_packets.TYPE_TELEMETRY:
             self.tm_dtype = np.dtype([("header", _TM_HEADER_DTYPE), *_dtype_fields(definition.fields)])
         if group:
             count = definition.field(group.count)
@@ -407,11 +387,11 @@ class _Compiled:
         definition = self.definition
         head = definition.packet_type << 12 | 1 << 11 | definition.apid
         body = header + self.data(values)
-        packet = pack_packet(
+        packet = space_packets.pack_packet(
             definition.apid, body + b"\0\0", sequence_count=sequence_count, packet_type=definition.packet_type
         )
         assert int.from_bytes(packet[:2], "big") == head
-        return append_crc(packet[:-CRC_LENGTH])
+        return space_packets.append_crc(packet[: -space_packets.CRC_LENGTH])
 
     def data(self, values: Mapping[str, object]) -> bytes:
         """The fields and items as octets."""
@@ -469,7 +449,7 @@ class _Compiled:
             raise MalformedPacket(f"{definition.name}: expected {expected} octets, found {found}")
         if group:
             assert self.item_dtype is not None
-            start = definition.base_length - CRC_LENGTH
+            start = definition.base_length - space_packets.CRC_LENGTH
             records = np.frombuffer(octets, dtype=self.item_dtype, count=count, offset=start)
             raw[group.name], values[group.name] = map(dict, _columns(group.fields, records))
         return values, raw
@@ -502,7 +482,7 @@ class _Compiled:
             found = np.empty(int(sizes.sum()), dtype=np.uint8)
             octets = octets.view()
             octets.flags.writeable = False  # as mostly: a kernel for both kinds would be compiled twice
-            _cutting.copy_spans(octets, starts + (definition.base_length - CRC_LENGTH), sizes, found)
+            _cutting.copy_spans(octets, starts + (definition.base_length - space_packets.CRC_LENGTH), sizes, found)
             items_raw, items = _columns(group.fields, found.view(self.item_dtype))
             owner = np.repeat(np.arange(counts.size), counts)
         return Table(

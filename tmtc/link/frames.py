@@ -1,4 +1,4 @@
-"""TM transfer frames: header, operational control field (CLCW), frame error control; many frames at once.
+"""TM transfer frames: header, control field (CLCW) and its summary, error control, randomiser; many frames at once.
 
 References
 ----------

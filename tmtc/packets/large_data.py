@@ -1,4 +1,4 @@
-"""Large data in parts (PUS service 13): a table, an image or a map cut up for packets, and put together again.
+"""Large data in parts (PUS service 13): tables, maps and thumbnails cut up for packets, and put together again.
 
 References
 ----------

@@ -1,4 +1,4 @@
-"""PUS-C secondary headers of telemetry and telecommand packets, and request ids.
+"""PUS-C secondary headers, request ids, and the times in headers (CUC, CDS).
 
 References
 ----------

@@ -1,4 +1,4 @@
-"""Space packets: primary header, idle packets, sequence counts.
+"""Space packets: primary header, idle packets, sequence counts, CRC-16 of the packet error control.
 
 References
 ----------

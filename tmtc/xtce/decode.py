@@ -23,14 +23,7 @@ import numpy.typing as npt
 from tmtc.arrays import BoolArray, IntArray, OctetArray, Octets, RecordArray, as_octets
 from tmtc.dictionary.schema import gather
 from tmtc.errors import DefinitionError
-from tmtc.packets.space_packets import (
-    FLAGS_CONTINUATION,
-    FLAGS_FIRST,
-    FLAGS_LAST,
-    FLAGS_WHOLE,
-    PRIMARY_HEADER_LENGTH,
-    SEQUENCE_COUNT_LIMIT,
-)
+from tmtc.packets import space_packets
 from tmtc.packets.stream import PacketCut, PrimaryHeaders
 from tmtc.xtce.columns import ArrayColumn, Column, OptionalColumn, RecordColumn, ValueColumn, concatenated
 from tmtc.xtce.definition import (
@@ -203,7 +196,7 @@ class Decoder:
         octets = as_octets(buffer)
         sources = [_Source(octets, cut.offsets, cut.lengths, np.empty(0, dtype=np.int64))]
         if headers is not None and not self._reads_segments:
-            verdict[cut.crc_ok & (headers.sequence_flags != FLAGS_WHOLE)] = SEGMENT
+            verdict[cut.crc_ok & (headers.sequence_flags != space_packets.FLAGS_WHOLE)] = SEGMENT
             if whole_stream and (verdict == SEGMENT).any():
                 sources.append(_join_segments(octets, cut, headers, verdict, checksum_octets))
         if headers is not None and whole_stream and not self._reads_header_flag:
@@ -290,19 +283,22 @@ def _join_segments(
     parts = np.flatnonzero(verdict == SEGMENT)
     parts = parts[np.argsort(headers.apid[parts], kind="stable")]
     apid, count, flags = headers.apid[parts], headers.sequence_count[parts], headers.sequence_flags[parts]
-    follows = (apid[1:] == apid[:-1]) & (count[1:] == (count[:-1] + 1) % SEQUENCE_COUNT_LIMIT)
-    follows &= np.isin(flags[:-1], (FLAGS_FIRST, FLAGS_CONTINUATION)) & ~headers.secondary_header[parts[1:]]
-    follows &= np.isin(flags[1:], (FLAGS_LAST, FLAGS_CONTINUATION))
+    follows = (apid[1:] == apid[:-1]) & (count[1:] == (count[:-1] + 1) % space_packets.SEQUENCE_COUNT_LIMIT)
+    follows &= (
+        np.isin(flags[:-1], (space_packets.FLAGS_FIRST, space_packets.FLAGS_CONTINUATION))
+        & ~headers.secondary_header[parts[1:]]
+    )
+    follows &= np.isin(flags[1:], (space_packets.FLAGS_LAST, space_packets.FLAGS_CONTINUATION))
     starts = np.flatnonzero(np.append(True, ~follows))
     stops = np.append(starts[1:], len(parts))
-    is_whole = (flags[starts] == FLAGS_FIRST) & (flags[stops - 1] == FLAGS_LAST)
+    is_whole = (flags[starts] == space_packets.FLAGS_FIRST) & (flags[stops - 1] == space_packets.FLAGS_LAST)
     offsets, lengths = cut.offsets.copy(), cut.lengths.copy()
     pieces: list[OctetArray] = []
     size = 0
     for start, stop in zip(starts[is_whole].tolist(), stops[is_whole].tolist(), strict=True):
         first, begin = parts[start], size
         for part in parts[start:stop].tolist():
-            skipped = 0 if part == first else PRIMARY_HEADER_LENGTH
+            skipped = 0 if part == first else space_packets.PRIMARY_HEADER_LENGTH
             left = 0 if part == parts[stop - 1] else checksum_octets
             at = cut.offsets[part]
             pieces.append(octets[at + skipped : max(at + cut.lengths[part] - left, at + skipped)])

@@ -1,4 +1,4 @@
-"""The dictionary as XTCE 1.2, for exchange with other ground systems; nothing here runs on it.
+"""The dictionary as XTCE 1.2, and the configuration of Yamcs, for exchange with other ground systems.
 
 Repeated items are an array whose size is the count in the packet, of aggregates, or of numbers if an item is one
 number; repeated octets are one binary parameter. Some decoders do not support arrays: for these, the unrolled form
@@ -14,8 +14,7 @@ OMG XTCE 1.2, namespace http://www.omg.org/spec/XTCE/20180204; CCSDS 660.0-B-2.
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 
-from tmtc.dictionary.fields import Field
-from tmtc.dictionary.onboard_parameters import PARAMETERS
+from tmtc.dictionary.fields import PARAMETERS, Field
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Dictionary, PacketDefinition
 

@@ -1,4 +1,4 @@
-"""Numbers of imported packets as matrices: one column for every parameter that is one number in each packet.
+"""Imported packets as records, and their numbers as matrices: a column for every parameter of one number a packet.
 
 Enumerations are their codes, booleans 0 and 1. Texts, octets and arrays have no column.
 """

@@ -5,8 +5,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import Query, Response
 
-from ground_service.access.idempotency import added_once, once
-from ground_service.access.security import Operator, Viewer, add_list
+from ground_service.access.security import Operator, Viewer, add_list, added_once, once
 from ground_service.contacts.commanding import service as commanding
 from ground_service.contacts.commanding import store
 from ground_service.contacts.commanding.model import (

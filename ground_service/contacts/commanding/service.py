@@ -15,31 +15,13 @@ from sqlalchemy import Connection
 
 from ground_service.access.service import audit
 from ground_service.clock import mission_now_ns, utc_now_ns
-from ground_service.contacts.commanding import store
-from ground_service.contacts.commanding.model import (
-    CommandOctets,
-    CommandRecord,
-    CommandView,
-    Handover,
-    HandoverFilter,
-    Telecommand,
-    TelecommandFilter,
-    UplinkState,
-    onboard_time,
-)
+from ground_service.contacts.commanding import model, store
 from ground_service.errors import Conflict, InvalidInput
 from ground_service.ground import Ground
 from ground_service.http.model import PageOf
 from ground_service.missions.store import approval_in_force, in_force
+from ground_service.store import vehicles
 from ground_service.store.event_kinds import CommandsSent, CommandStateChanged, HandoverChanged, publish
-from ground_service.store.vehicles import (
-    FLOWN,
-    find_vehicle,
-    get_vehicle,
-    lock_spacecraft,
-    next_telecommand,
-    vehicle_id,
-)
 from ground_service.toml import REASON_LIMIT, require_line
 from tmtc.dictionary.arguments import argument_text, arguments_by_number
 from tmtc.dictionary.effects import CommandEffect, effect_of
@@ -71,7 +53,7 @@ def enter_command(
     arguments: Mapping[str, Any],
     *,
     spacecraft_id: int,
-    instance: str = FLOWN,
+    instance: str = vehicles.FLOWN,
     timeout_s: int = DEFAULT_TIMEOUT_S,
     actor: str,
 ) -> int:
@@ -83,7 +65,7 @@ def enter_command(
         If the dictionary has no such command, or refuses its arguments.
     """
     with ground.database.writing() as connection:
-        vehicle = vehicle_id(connection, spacecraft_id, instance)
+        vehicle = vehicles.vehicle_id(connection, spacecraft_id, instance)
         return _add(connection, vehicle, name, arguments, "queued", actor, timeout_s)
 
 
@@ -181,14 +163,14 @@ def reject_command(ground: Ground, command_id: int, *, actor: str, reason: str) 
 
 
 def take_uplink(
-    ground: Ground, *, spacecraft_id: int, instance: str = FLOWN, framed: bool = True, actor: str
+    ground: Ground, *, spacecraft_id: int, instance: str = vehicles.FLOWN, framed: bool = True, actor: str
 ) -> tuple[bytes, list[int]]:
     """Return the released commands in order as CLTUs or bare packets, and their ids, and mark them as sent.
 
     Each command is returned exactly once, also to concurrent callers.
     """
     with ground.database.writing() as connection:
-        vehicle = vehicle_id(connection, spacecraft_id, instance)
+        vehicle = vehicles.vehicle_id(connection, spacecraft_id, instance)
         _require_not_held(connection, vehicle)
         return take_released(connection, vehicle, spacecraft_id, framed=framed, actor=actor)
 
@@ -200,7 +182,7 @@ def take_released(
 
     Commands whose time for transmission has passed stay released, and all commands of a spacecraft on hold.
     """
-    lock_spacecraft(connection, vehicle)
+    vehicles.lock_spacecraft(connection, vehicle)
     if store.handover_of(connection, vehicle).held_by is not None:
         return b"", []
     records = store.send_released(connection, vehicle, utc_now_ns(), mission_now_ns())
@@ -214,7 +196,7 @@ def take_released(
     return stream, ids
 
 
-def hold_spacecraft(ground: Ground, spacecraft_id: int, instance: str, *, reason: str, actor: str) -> Handover:
+def hold_spacecraft(ground: Ground, spacecraft_id: int, instance: str, *, reason: str, actor: str) -> model.Handover:
     """Stop the release and the transmission of all telecommands of a spacecraft until `resume_spacecraft`.
 
     A transmission that a station has begun is not recalled.
@@ -228,7 +210,7 @@ def hold_spacecraft(ground: Ground, spacecraft_id: int, instance: str, *, reason
     return _change_hold(ground, spacecraft_id, instance, actor=actor, reason=reason)
 
 
-def resume_spacecraft(ground: Ground, spacecraft_id: int, instance: str, *, actor: str) -> Handover:
+def resume_spacecraft(ground: Ground, spacecraft_id: int, instance: str, *, actor: str) -> model.Handover:
     """End the hold of a spacecraft.
 
     Raises
@@ -239,10 +221,12 @@ def resume_spacecraft(ground: Ground, spacecraft_id: int, instance: str, *, acto
     return _change_hold(ground, spacecraft_id, instance, actor=actor, reason=None)
 
 
-def _change_hold(ground: Ground, spacecraft_id: int, instance: str, *, actor: str, reason: str | None) -> Handover:
+def _change_hold(
+    ground: Ground, spacecraft_id: int, instance: str, *, actor: str, reason: str | None
+) -> model.Handover:
     with ground.database.writing() as connection:
-        vehicle = find_vehicle(connection, spacecraft_id, instance).id
-        lock_spacecraft(connection, vehicle)  # what is being released or taken now comes before the hold
+        vehicle = vehicles.find_vehicle(connection, spacecraft_id, instance).id
+        vehicles.lock_spacecraft(connection, vehicle)  # what is being released or taken now comes before the hold
         holder = None if reason is None else actor
         changed = store.set_hold(connection, vehicle, holder, reason or "", now_utc_ns=utc_now_ns())
         if not changed:
@@ -251,15 +235,15 @@ def _change_hold(ground: Ground, spacecraft_id: int, instance: str, *, actor: st
         return _handed_over(connection, vehicle, "resume" if reason is None else "hold", actor)
 
 
-def change_handover(ground: Ground, spacecraft_id: int, instance: str, note: str, *, actor: str) -> Handover:
+def change_handover(ground: Ground, spacecraft_id: int, instance: str, note: str, *, actor: str) -> model.Handover:
     """Replace the note for the next shift."""
     with ground.database.writing() as connection:
-        vehicle = find_vehicle(connection, spacecraft_id, instance).id
+        vehicle = vehicles.find_vehicle(connection, spacecraft_id, instance).id
         store.note_handover(connection, vehicle, note, actor=actor, now_utc_ns=utc_now_ns())
         return _handed_over(connection, vehicle, "note", actor)
 
 
-def _handed_over(connection: Connection, vehicle: int, action: str, actor: str) -> Handover:
+def _handed_over(connection: Connection, vehicle: int, action: str, actor: str) -> model.Handover:
     found = store.handover_of(connection, vehicle)
     detail = {"note": found.note} if action == "note" else {"reason": found.hold_reason}
     audit(connection, actor, f"{action} spacecraft", f"{found.spacecraft_id} {found.instance}", detail)
@@ -269,7 +253,7 @@ def _handed_over(connection: Connection, vehicle: int, action: str, actor: str) 
 
 def is_held(connection: Connection, spacecraft_id: int, instance: str) -> bool:
     """Return whether the telecommands of a spacecraft are on hold."""
-    asked = HandoverFilter(spacecraft_id=spacecraft_id, instance=instance)
+    asked = model.HandoverFilter(spacecraft_id=spacecraft_id, instance=instance)
     return any(one.held_by is not None for one in store.list_handovers(connection, asked).items)
 
 
@@ -311,26 +295,26 @@ def note_timeouts(ground: Ground, since_utc_ns: int, until_utc_ns: int) -> list[
     return noted
 
 
-def get_command(ground: Ground, command_id: int) -> CommandView:
+def get_command(ground: Ground, command_id: int) -> model.CommandView:
     """Return a telecommand and its verification."""
     return ground.read(store.get_view, command_id, utc_now_ns())
 
 
-def list_telecommands(connection: Connection, asked: TelecommandFilter) -> PageOf[Telecommand]:
+def list_telecommands(connection: Connection, asked: model.TelecommandFilter) -> PageOf[model.Telecommand]:
     """List the telecommands with their verification, newest first."""
     views, total = store.list_views(connection, asked, utc_now_ns())
     return asked.page((view.telecommand for view in views), total)
 
 
-def uplink_state(ground: Ground, spacecraft_id: int, instance: str) -> UplinkState:
+def uplink_state(ground: Ground, spacecraft_id: int, instance: str) -> model.UplinkState:
     """Return the telecommand channels of a spacecraft as the ingest that was entered last shows them.
 
     Telemetry that is ingested late counts as new: `received` states its time of reception.
     """
     with ground.database.reading() as connection:
-        find_vehicle(connection, spacecraft_id, instance)
+        vehicles.find_vehicle(connection, spacecraft_id, instance)
         channels = store.newest_channels(connection, spacecraft_id, instance)
-    return UplinkState(spacecraft_id=spacecraft_id, instance=instance, channels=channels)
+    return model.UplinkState(spacecraft_id=spacecraft_id, instance=instance, channels=channels)
 
 
 def _add(
@@ -342,7 +326,7 @@ def _add(
     actor: str,
     timeout_s: int,
     window_id: int | None = None,
-    issued: CommandOctets | None = None,
+    issued: model.CommandOctets | None = None,
 ) -> int:
     """Add a valid telecommand; return its id."""
     _packed(name, arguments, 0)
@@ -369,28 +353,28 @@ def _add(
         "enter",
         key,
         state,
-        {"name": name, "text": argument_text(name, arguments, onboard_time), "arguments": dict(arguments)},
+        {"name": name, "text": argument_text(name, arguments, model.onboard_time), "arguments": dict(arguments)},
     )
     return key
 
 
-def _release(connection: Connection, record: CommandRecord, actor: str) -> None:
+def _release(connection: Connection, record: model.CommandRecord, actor: str) -> None:
     """Assign sequence count and octets to a queued telecommand; they never change again."""
     issued = _issued(connection, record.vehicle_id, record.name, record.arguments)
     store.release(connection, record.id, issued, actor=actor, now_utc_ns=utc_now_ns())
     _note(connection, actor, "release", record.id, "released", {"sequence_count": issued.sequence_count})
 
 
-def _issued(connection: Connection, vehicle: int, name: str, arguments: Mapping[str, Any]) -> CommandOctets:
+def _issued(connection: Connection, vehicle: int, name: str, arguments: Mapping[str, Any]) -> model.CommandOctets:
     """Return the octets of a telecommand with the next sequence count of its spacecraft.
 
     The first one follows the newest telecommand that the payload reports: another ground may have sent it.
     """
     before = store.last_command_count(connection, vehicle)
     first = 0 if before is None else before + 1
-    count = next_telecommand(connection, vehicle, first) % SEQUENCE_COUNT_LIMIT
+    count = vehicles.next_telecommand(connection, vehicle, first) % SEQUENCE_COUNT_LIMIT
     _require_not_held(connection, vehicle)
-    return CommandOctets(count, _packed(name, arguments, count))
+    return model.CommandOctets(count, _packed(name, arguments, count))
 
 
 def _packed(name: str, arguments: Mapping[str, Any], count: int) -> bytes:
@@ -411,7 +395,7 @@ def _second_person(
 ) -> CommandEffect | None:
     """Return the effect for which a telecommand needs a second person; None if it needs none."""
     effect = effect_of(DICTIONARY, name, arguments, _packed(name, arguments, 0))
-    rules = approval_in_force(connection, get_vehicle(connection, vehicle, "spacecraft").ccsds_id)
+    rules = approval_in_force(connection, vehicles.get_vehicle(connection, vehicle, "spacecraft").ccsds_id)
     return effect if rules.needs_second_person(effect.subject) else None
 
 

@@ -27,7 +27,7 @@ from ground_service.errors import PASSING, GroundError, StorageFull, StorageRead
 from ground_service.ground import Ground
 from ground_service.ingest.live import SEGMENT_OCTETS, Spool, WatchedFolder
 from ground_service.ingest.model import IngestResult
-from ground_service.ingest.service import Place, ingest_file
+from ground_service.ingest.service import PiecePosition, ingest_file
 from ground_service.store.files import make_durable_folder, replace_durably
 
 CONNECT_S = 3.0
@@ -593,9 +593,9 @@ class LinkRunner:
             self._work.set()
 
     def _ingest_segment(self, path: Path, recording: str, offset: int) -> dict[str, Any]:
-        return self._ingest(path, Place(f"{self._name} {recording}", offset))
+        return self._ingest(path, PiecePosition(f"{self._name} {recording}", offset))
 
-    def _ingest(self, path: Path, place: Place | None = None) -> dict[str, Any]:
+    def _ingest(self, path: Path, place: PiecePosition | None = None) -> dict[str, Any]:
         link = self.declared.link
         made = ingest_file(
             self._ground,

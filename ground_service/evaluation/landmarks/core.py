@@ -66,7 +66,7 @@ class Frames:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
+class LandmarkFix:
     """A place that a pass has seen; `sigma_m` east, north, up; `rows` are the detections, `looks` frames in view."""
 
     latitude_rad: float
@@ -94,7 +94,7 @@ class PassPlaces:
         Their median offset from the catalogue, east, north, up, that was removed; NaN if nothing was removed.
     """
 
-    places: tuple[Place, ...]
+    places: tuple[LandmarkFix, ...]
     unmatched: int
     controls: int
     offset_m: tuple[float, float, float]
@@ -143,7 +143,7 @@ def places_of_pass(
     )
 
 
-def in_view(place: Place, frames: Frames) -> BoolArray:
+def in_view(place: LandmarkFix, frames: Frames) -> BoolArray:
     """Return in which frames (f,) a place is inside the image."""
     point = mcmf_from_spherical(place.latitude_rad, place.longitude_rad, place.height_m)
     line = np.einsum("fij,fj->fi", frames.camera_from_mcmf, point - frames.position_mcmf_m)
@@ -153,7 +153,7 @@ def in_view(place: Place, frames: Frames) -> BoolArray:
     return np.asarray(inside & near)
 
 
-def same_place(one: Place, other: Place) -> bool:
+def same_place(one: LandmarkFix, other: LandmarkFix) -> bool:
     """Return whether two passes have seen one crater."""
     reach = max(
         0.5 * REACH * min(one.diameter_m, other.diameter_m),
@@ -163,7 +163,7 @@ def same_place(one: Place, other: Place) -> bool:
     return alike and distance_m(one, other) < reach
 
 
-def is_listed(place: Place, catalogue: CraterCatalogue) -> bool:
+def is_listed(place: LandmarkFix, catalogue: CraterCatalogue) -> bool:
     near = catalogue.near(place.latitude_rad, place.longitude_rad, REACH * place.diameter_m)
     columns = (catalogue.latitude_rad[near], catalogue.longitude_rad[near], catalogue.diameter_m[near])
     return any(
@@ -172,14 +172,14 @@ def is_listed(place: Place, catalogue: CraterCatalogue) -> bool:
     )
 
 
-def distance_m(one: Place, other: Place) -> float:
+def distance_m(one: LandmarkFix, other: LandmarkFix) -> float:
     """Return the distance of two places on the sphere."""
     first = np.asarray(mcmf_from_spherical(one.latitude_rad, one.longitude_rad, 0.0))
     last = np.asarray(mcmf_from_spherical(other.latitude_rad, other.longitude_rad, 0.0))
     return float(np.linalg.norm(first - last))
 
 
-def combined(places: Sequence[Place]) -> Place:
+def combined(places: Sequence[LandmarkFix]) -> LandmarkFix:
     """Return one place from those of several passes, at least one, that have seen it.
 
     The weighted mean. If the passes scatter more than they claim, its uncertainty grows by as much. The error of the
@@ -204,7 +204,7 @@ def combined(places: Sequence[Place]) -> Place:
     scatter = float(np.std(logs)) * diameter_m if len(places) > 1 else 0.0
     size_sigma = math.hypot(min(one.diameter_sigma_m for one in places), scatter)
     latitude = origin.latitude_rad + mean[1] / MOON_RADIUS_M
-    return Place(
+    return LandmarkFix(
         float(latitude),
         float(origin.longitude_rad + mean[0] / (MOON_RADIUS_M * math.cos(origin.latitude_rad))),
         float(origin.height_m + mean[2]),
@@ -292,7 +292,7 @@ def _triangulated(
     rows: IntArray,
     points: FloatArray,
     diameter_m: FloatArray,
-) -> Place | None:
+) -> LandmarkFix | None:
     """Return the place nearest to the rays of its detections, with its formal uncertainty; None without two of them."""
     keep = np.ones(len(rows), dtype=np.bool_)
     position = frames.position_mcmf_m[owner[rows]]
@@ -318,7 +318,7 @@ def _triangulated(
     enu = np.asarray(enu_from_mcmf(latitude, longitude))
     sigma = np.sqrt(np.diag(enu @ covariance @ enu.T))
     size = diameter_m[keep]
-    return Place(
+    return LandmarkFix(
         latitude,
         longitude,
         height,
@@ -339,7 +339,7 @@ def _controls(
     frames: Frames,
     owner: IntArray,
     usable: BoolArray,
-) -> list[tuple[Place, FloatArray, float]]:
+) -> list[tuple[LandmarkFix, FloatArray, float]]:
     """Return catalogued craters triangulated like new ones: place, offset from the catalogue, ratio of diameters."""
     rows = np.flatnonzero(usable & (matches.crater_of_detection >= 0))
     crater = expected.index[matches.crater_of_detection[rows]]
@@ -371,7 +371,7 @@ def _controls(
 
 
 def _calibration(
-    controls: Sequence[tuple[Place, FloatArray, float]], reference_sigma_m: float, frames: Frames
+    controls: Sequence[tuple[LandmarkFix, FloatArray, float]], reference_sigma_m: float, frames: Frames
 ) -> tuple[tuple[float, float, float], FloatArray, FloatArray, float, float]:
     """Return offset, factors (3,) of the formal uncertainty, its further part (3,), ratio and scatter of diameters."""
     nan = float("nan")
@@ -406,13 +406,13 @@ def _calibration(
 
 
 def _calibrated(
-    place: Place,
+    place: LandmarkFix,
     offset_m: tuple[float, float, float],
     scale: FloatArray,
     error_m: FloatArray,
     size: float,
     size_sigma: float,
-) -> Place:
+) -> LandmarkFix:
     """Return a place without the common offset of its pass, and with the uncertainty that the pass has shown."""
     east, north, up = np.nan_to_num(offset_m).tolist()
     sigma = np.sqrt((scale * np.array(place.sigma_m)) ** 2 + error_m**2 + REGISTRATION_SIGMA_M**2)
@@ -428,7 +428,7 @@ def _calibrated(
     )
 
 
-def _enu_m(origin: Place, place: Place) -> tuple[float, float, float]:
+def _enu_m(origin: LandmarkFix, place: LandmarkFix) -> tuple[float, float, float]:
     turn = math.remainder(place.longitude_rad - origin.longitude_rad, 2.0 * math.pi)
     return (
         MOON_RADIUS_M * turn * math.cos(origin.latitude_rad),

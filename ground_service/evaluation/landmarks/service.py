@@ -18,17 +18,7 @@ from ground_service.errors import EvaluationError, InvalidInput, NotFound
 from ground_service.evaluation.alignment import reference_states
 from ground_service.evaluation.core import PassInputs
 from ground_service.evaluation.inputs import load_pass_inputs
-from ground_service.evaluation.landmarks.core import (
-    Frames,
-    PassPlaces,
-    Place,
-    combined,
-    in_view,
-    is_listed,
-    is_persistent,
-    places_of_pass,
-    same_place,
-)
+from ground_service.evaluation.landmarks import core
 from ground_service.evaluation.landmarks.model import (
     Landmark,
     LandmarkDetail,
@@ -173,7 +163,7 @@ def update_landmarks(ground: Ground, pass_id: int) -> LandmarkUpdate:
         record = passes.get_pass(connection, pass_id)
         mission = mission_of_pass(connection, record.mission_id, record.manifest)
     lists = listed_craters(ground, mission)
-    new = tuple(one for one in found.places if not any(is_listed(one, catalogue) for catalogue in lists))
+    new = tuple(one for one in found.places if not any(core.is_listed(one, catalogue) for catalogue in lists))
     listed = len(found.places) - len(new)
     found = replace(found, places=new)
     with ground.database.writing() as connection:
@@ -261,7 +251,7 @@ def uploaded_tables(telecommands: bytes) -> Iterator[bytes]:
             yield whole.octets
 
 
-def _places(inputs: PassInputs) -> tuple[PassPlaces, Frames]:
+def _places(inputs: PassInputs) -> tuple[core.PassPlaces, core.Frames]:
     needed = {
         "a reference ephemeris": inputs.reference,
         "a lunar orientation": inputs.orientation,
@@ -276,18 +266,18 @@ def _places(inputs: PassInputs) -> tuple[PassPlaces, Frames]:
     rotation = viewing.camera_from_mcmf(detections.utc_ns, track.position_mcmf_m, track.mcmf_from_icrf)
     expected = expected_craters(inputs.catalogue, viewing.camera, track.position_mcmf_m, rotation)
     matches = match_detections(detections, expected)
-    frames = Frames(viewing.camera, track.position_mcmf_m, rotation)
+    frames = core.Frames(viewing.camera, track.position_mcmf_m, rotation)
     sigma = inputs.reference_sigma_rtn_m or (0.0, 0.0, 0.0)
     error_m = math.hypot(sigma[1], sigma[2])
-    return places_of_pass(detections, expected, matches, inputs.catalogue, frames, error_m), frames
+    return core.places_of_pass(detections, expected, matches, inputs.catalogue, frames, error_m), frames
 
 
 def _entered(
     connection: Connection,
     spacecraft: int,
     pass_id: int,
-    found: PassPlaces,
-    frames: Frames,
+    found: core.PassPlaces,
+    frames: core.Frames,
     detections: DetectionSamples,
 ) -> int:
     """Replace what a pass says of the landmarks of its spacecraft; return the number of new ones."""
@@ -295,14 +285,14 @@ def _entered(
     left = list(found.places)
     for landmark in landmarks_of_spacecraft(connection, spacecraft):
         others = [one for one in landmark.evidence if one.pass_id != pass_id]
-        near = [place for place in left if same_place(place, place_of(landmark))]
+        near = [place for place in left if core.same_place(place, place_of(landmark))]
         evidence = list(others)
         if near:
             best = max(near, key=lambda one: (len(one.rows), one.score))
             left.remove(best)
             evidence.append(_evidence(pass_id, best, found.controls, frames, detections))
         elif others and landmark.state not in DECIDED:
-            looks = int(np.count_nonzero(in_view(place_of(landmark), frames)))
+            looks = int(np.count_nonzero(core.in_view(place_of(landmark), frames)))
             if looks:
                 evidence.append(
                     _evidence(pass_id, _unseen(place_of(landmark), looks), found.controls, frames, detections)
@@ -323,13 +313,13 @@ def _changed(connection: Connection, landmark: LandmarkDetail, evidence: Sequenc
     state: str = landmark.state
     if state not in DECIDED:
         sightings, looks = sum(len(one.sightings) for one in seen), sum(one.looks for one in evidence)
-        state = "proposed" if is_persistent(len(seen), sightings, looks) else "seen"
+        state = "proposed" if core.is_persistent(len(seen), sightings, looks) else "seen"
     change_landmark(connection, landmark.id, landmark.state, state, evidence, now, **figures)
 
 
-def place_of(one: Landmark | PassSightings) -> Place:
+def place_of(one: Landmark | PassSightings) -> core.LandmarkFix:
     """Return place and uncertainty of a landmark for computation."""
-    return Place(
+    return core.LandmarkFix(
         math.radians(one.latitude_deg),
         math.radians(one.longitude_deg),
         one.height_m,
@@ -345,7 +335,7 @@ def place_of(one: Landmark | PassSightings) -> Place:
 def _figures(evidence: Sequence[PassSightings]) -> dict[str, float]:
     """Return the columns of a landmark from its sightings on one pass or more."""
     seen = [one for one in evidence if one.sightings]
-    place = combined([place_of(one) for one in seen])
+    place = core.combined([place_of(one) for one in seen])
     return {
         **_columns(place),
         "passes": len(seen),
@@ -354,7 +344,7 @@ def _figures(evidence: Sequence[PassSightings]) -> dict[str, float]:
     }
 
 
-def _columns(place: Place) -> dict[str, float]:
+def _columns(place: core.LandmarkFix) -> dict[str, float]:
     return {
         "latitude_deg": math.degrees(place.latitude_rad),
         "longitude_deg": math.degrees(place.longitude_rad) % 360.0,
@@ -368,15 +358,17 @@ def _columns(place: Place) -> dict[str, float]:
     }
 
 
-def _unseen(place: Place, looks: int) -> Place:
+def _unseen(place: core.LandmarkFix, looks: int) -> core.LandmarkFix:
     nothing = np.zeros(0, dtype=np.int64)
-    return Place(
+    return core.LandmarkFix(
         place.latitude_rad, place.longitude_rad, place.height_m, place.sigma_m, place.diameter_m,
         place.diameter_sigma_m, 0.0, nothing, looks,
     )  # fmt: skip
 
 
-def _evidence(pass_id: int, place: Place, controls: int, frames: Frames, detections: DetectionSamples) -> PassSightings:
+def _evidence(
+    pass_id: int, place: core.LandmarkFix, controls: int, frames: core.Frames, detections: DetectionSamples
+) -> PassSightings:
     owner = np.searchsorted(detections.offsets, place.rows, side="right") - 1
     sightings = [
         Sighting(

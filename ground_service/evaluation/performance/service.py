@@ -14,19 +14,7 @@ from ground_service.clock import mission_now_ns, utc_now_ns
 from ground_service.errors import DatabaseBusy, InvalidInput, NotFound, Stopping, fault_of
 from ground_service.evaluation.alignment import bounds_per_degree
 from ground_service.evaluation.model import PassFigures, StoredReport
-from ground_service.evaluation.performance.core import (
-    ALTITUDE_EDGES_KM,
-    CONFIDENCE,
-    FALSE_ALARM_RATE,
-    METRICS,
-    SUN_EDGES_DEG,
-    change_points,
-    interval_name,
-    interval_names,
-    mean_level,
-    rolling_counts,
-    wilson,
-)
+from ground_service.evaluation.performance import core
 from ground_service.evaluation.performance.model import (
     ChangePoint,
     MonthlyReport,
@@ -232,7 +220,7 @@ def performance(
         spacecraft_id=spacecraft_id,
         instance=instance,
         window_days=window_days,
-        false_alarm_rate=FALSE_ALARM_RATE,
+        false_alarm_rate=core.FALSE_ALARM_RATE,
         passes_in_span=total,
         passes=passes,
         groups=group_figures(passes),
@@ -272,11 +260,11 @@ def group_figures(passes: Sequence[PassPerformance]) -> list[MeanByGroup]:
     """Return the mean of each metric by altitude, elevation of the Sun, terrain and build."""
     factors: list[tuple[str, list[str], list[str]]] = []
     for factor, name, edges, unit in (
-        ("altitude", "altitude_km", ALTITUDE_EDGES_KM, "km"),
-        ("sun elevation", "sun_elevation_deg", SUN_EDGES_DEG, "°"),
+        ("altitude", "altitude_km", core.ALTITUDE_EDGES_KM, "km"),
+        ("sun elevation", "sun_elevation_deg", core.SUN_EDGES_DEG, "°"),
     ):
-        groups = [interval_name(_number(getattr(one, name)), edges, unit) for one in passes]
-        factors.append((factor, groups, interval_names(edges, unit)))
+        groups = [core.interval_name(_number(getattr(one, name)), edges, unit) for one in passes]
+        factors.append((factor, groups, core.interval_names(edges, unit)))
     for factor, name in (("terrain", "terrain"), ("build", "build")):
         groups = [getattr(one, name) or NOT_STATED for one in passes]
         factors.append((factor, groups, sorted(set(groups))))
@@ -284,8 +272,8 @@ def group_figures(passes: Sequence[PassPerformance]) -> list[MeanByGroup]:
     for factor, groups, order in factors:
         for group in order:
             members = [one for one, its in zip(passes, groups, strict=True) if its == group]
-            for metric in METRICS if members else ():
-                level = mean_level([_number(getattr(one, metric)) for one in members])
+            for metric in core.METRICS if members else ():
+                level = core.mean_level([_number(getattr(one, metric)) for one in members])
                 found.append(
                     MeanByGroup(
                         factor=factor,
@@ -302,8 +290,8 @@ def group_figures(passes: Sequence[PassPerformance]) -> list[MeanByGroup]:
 
 def _changes(passes: Sequence[PassPerformance]) -> list[ChangePoint]:
     found = []
-    for metric in METRICS:
-        for change in change_points([_number(getattr(one, metric)) for one in passes]):
+    for metric in core.METRICS:
+        for change in core.change_points([_number(getattr(one, metric)) for one in passes]):
             first = passes[change.index]
             found.append(
                 ChangePoint(
@@ -335,7 +323,7 @@ def _requirements(found: Sequence[Reported], window_ns: int) -> list[Requirement
     for key in order:
         newest = newest_of[key]
         statuses = [row[key].status if key in row else "unknown" for row in rows]
-        counts = rolling_counts(times, statuses, window_ns)
+        counts = core.rolling_counts(times, statuses, window_ns)
         shares = [
             one.get("met", 0) / (one.get("met", 0) + one.get("not met", 0))
             for one in counts
@@ -343,7 +331,7 @@ def _requirements(found: Sequence[Reported], window_ns: int) -> list[Requirement
         ]
         last = counts[-1]
         met, not_met = last.get("met", 0), last.get("not met", 0)
-        share = wilson(met, met + not_met)
+        share = core.wilson(met, met + not_met)
         requirements.append(
             RequirementOverTime(
                 key=key,
@@ -372,10 +360,10 @@ def _consistency_remark(key: str, values: Sequence[float | None]) -> str:
     known = [value for value in values if value is not None]
     if not key.startswith("consistency.") or len(known) < 2:
         return ""
-    level = mean_level(known)
+    level = core.mean_level(known)
     low, high = 1.0 - level.high + level.mean, 1.0 + level.mean - level.low
     if key == "consistency.nees":
-        low, high = bounds_per_degree(NEES_DEGREES, len(known), CONFIDENCE)
+        low, high = bounds_per_degree(NEES_DEGREES, len(known), core.CONFIDENCE)
     wrong = sigma_remark(level.mean, low, high)
     return f"mean {level.mean:.2f} of {len(known)} passes: {wrong}" if wrong else ""
 

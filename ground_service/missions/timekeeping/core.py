@@ -12,17 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ground_service.errors import EvaluationError
+from lunar import timescales
 from lunar.arrays import BoolArray, IntArray
 from lunar.constants import NS
 from lunar.plausible import STATION_DIFFERENCE_NS, WHOLE_SECONDS
-from lunar.timescales import (
-    ONBOARD_EPOCH_TAI_NS,
-    TICKS_PER_SECOND,
-    tai_ns_from_utc_ns,
-    ticks_from_utc_ns,
-    utc_ns_from_tai_ns,
-    utc_ns_from_ticks,
-)
 
 IDEAL_CLOCK = 0
 """Id of the correlation of a clock that shows TAI without error."""
@@ -75,18 +68,18 @@ class TimeCorrelation:
     def utc_ns(self, ticks: IntArray) -> IntArray:
         """UTC (n,) of on-board ticks (n,)."""
         since = np.asarray(ticks, dtype=np.int64) - self.reference_ticks
-        whole, part = np.divmod(since, TICKS_PER_SECOND)  # the product overflows after two years
+        whole, part = np.divmod(since, timescales.TICKS_PER_SECOND)  # the product overflows after two years
         nominal = whole * NS + part * _NS_NUMERATOR // _NS_DENOMINATOR
         drift = np.rint(nominal * (self.drift_ppb * 1e-9)).astype(np.int64)
-        tai = int(tai_ns_from_utc_ns(self.reference_utc_ns)) + nominal + drift
-        return np.asarray(utc_ns_from_tai_ns(tai), dtype=np.int64)
+        tai = int(timescales.tai_ns_from_utc_ns(self.reference_utc_ns)) + nominal + drift
+        return np.asarray(timescales.utc_ns_from_tai_ns(tai), dtype=np.int64)
 
 
 def utc_ns_of_ticks(ticks: IntArray, correlations: Sequence[TimeCorrelation]) -> tuple[IntArray, IntArray]:
     """UTC (n,) of on-board ticks (n,), and the id of the correlation used for each."""
     ticks = np.asarray(ticks, dtype=np.int64)
     if not correlations:
-        return np.asarray(utc_ns_from_ticks(ticks), dtype=np.int64), np.full(len(ticks), IDEAL_CLOCK)
+        return np.asarray(timescales.utc_ns_from_ticks(ticks), dtype=np.int64), np.full(len(ticks), IDEAL_CLOCK)
     start = np.array([c.start_ticks for c in correlations])
     stop = np.array([c.stop_ticks for c in correlations])
     outside = np.maximum(np.maximum(start[None, :] - ticks[:, None], ticks[:, None] - stop[None, :]), 0)
@@ -127,7 +120,7 @@ def largest_step_s(runs: Sequence[TimeCorrelation], after_utc_ns: int, until_utc
 
 def ticks_of_utc_ns(utc_ns: int, correlations: Sequence[TimeCorrelation]) -> int:
     """On-board ticks that the clock shows at `utc_ns`, to about a tick."""
-    ticks = int(ticks_from_utc_ns(utc_ns))
+    ticks = int(timescales.ticks_from_utc_ns(utc_ns))
     for _ in range(3):
         shown, _ = utc_ns_of_ticks(np.array([ticks], dtype=np.int64), correlations)
         ticks += int((utc_ns - int(shown[0])) * _NS_DENOMINATOR // _NS_NUMERATOR)
@@ -163,7 +156,9 @@ def fit_correlation(ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntA
     ticks = np.asarray(ticks, dtype=np.int64)
     if len(ticks) == 0:
         raise EvaluationError("time correlation: expected at least one time report, found none")
-    sent_tai = np.asarray(tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - np.asarray(light_time_ns)
+    sent_tai = np.asarray(timescales.tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - np.asarray(
+        light_time_ns
+    )
     middle = int(np.argsort(ticks, kind="stable")[len(ticks) // 2])
     nominal = (ticks - ticks[middle]) * _NS_NUMERATOR // _NS_DENOMINATOR
     # Small numbers from here on: what the clock is off by, against the middle point.
@@ -185,7 +180,7 @@ def fit_correlation(ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntA
         start_ticks=int(ticks[kept].min()),
         stop_ticks=int(ticks[kept].max()),
         reference_ticks=int(ticks[middle]),
-        reference_utc_ns=int(utc_ns_from_tai_ns(reference_tai)),
+        reference_utc_ns=int(timescales.utc_ns_from_tai_ns(reference_tai)),
         drift_ppb=slope * 1e9,
         residual_rms_ns=float(np.sqrt(np.mean(residual**2))),
         residual_max_ns=float(np.abs(residual).max()),
@@ -246,10 +241,10 @@ def doubted_stations(
     share, or that agree with the on-board clock; otherwise neither. A single station counts as little if it differs
     from the on-board clock by whole seconds with a usual cause, from its first report on.
     """
-    sent = np.asarray(tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - light_time_ns
-    whole, part = np.divmod(np.asarray(ticks, dtype=np.int64), TICKS_PER_SECOND)
+    sent = np.asarray(timescales.tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - light_time_ns
+    whole, part = np.divmod(np.asarray(ticks, dtype=np.int64), timescales.TICKS_PER_SECOND)
     nominal = whole * NS + part * _NS_NUMERATOR // _NS_DENOMINATOR
-    off = (nominal + ONBOARD_EPOCH_TAI_NS - sent).astype(np.float64)
+    off = (nominal + timescales.ONBOARD_EPOCH_TAI_NS - sent).astype(np.float64)
     kept = np.ones(len(ticks), dtype=np.bool_)
     names = np.array(station)
     units: list[IntArray] = []
@@ -362,7 +357,7 @@ def clock_runs(ticks: IntArray, earth_utc_ns: IntArray, light_time_ns: IntArray,
     Two reports alone show a drift up to `LONE_DRIFT`, otherwise a step. A report that stands alone with what it says
     stays in the run, where the fit leaves it out.
     """
-    sent = np.asarray(tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - light_time_ns
+    sent = np.asarray(timescales.tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - light_time_ns
     order = np.lexsort((ticks, sent))
     runs: list[IntArray] = []
     for number in np.unique(boot[order]):

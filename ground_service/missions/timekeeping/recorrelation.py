@@ -20,9 +20,9 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime, time_of
+from ground_service.missions.clocks import stations_of
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.ephemerides.service import covering_ephemerides
-from ground_service.missions.places import stations_of
 from ground_service.missions.store import mission_of_vehicle
 from ground_service.missions.timekeeping import store
 from ground_service.missions.timekeeping.core import (
@@ -38,7 +38,7 @@ from ground_service.missions.timekeeping.core import (
 from ground_service.missions.timekeeping.model import RECEPTIONS_LIMIT, Correlation, TimeReport
 from ground_service.store.event_kinds import ClockDoubted, CorrelationChanged, ReceptionsEntered, publish, publish_once
 from ground_service.store.vehicles import find_vehicle, get_vehicle, lock_vehicle, vehicle_id
-from lunar.arrays import BoolArray, IntArray
+from lunar.arrays import IntArray
 from lunar.constants import SPEED_OF_LIGHT_M_S
 from lunar.ephemeris import Ephemeris as States
 from lunar.errors import LunarError
@@ -183,7 +183,7 @@ def recorrelate(ground: Ground, vehicle: int, *, over_manual: bool = False) -> b
         if mission is not None and mission.time.correlation in ("manual", "ideal") and not over_manual:
             return False
         fits, doubts = fit_runs(time_reports(ground, connection, vehicle))
-        for doubt in doubts:
+        for doubt in sorted(set(doubts.values()), key=str):
             doubted = ClockDoubted(vehicle_id=vehicle, station=doubt.station, difference_s=round(doubt.difference_s, 3))
             publish_once(connection, doubted)
         lines = {_line(one.boot_count, one) for one in old}
@@ -202,12 +202,14 @@ def _publish_change(connection: Connection, vehicle: int, before: Sequence[TimeC
     publish(connection, changed)
 
 
-def fit_runs(reports: TimeReports) -> tuple[list[tuple[int, CorrelationFit]], list[StationDoubt]]:
-    """Return the boot and the fitted line of every run of the clock, and the stations whose clocks are doubted.
+def fit_runs(reports: TimeReports) -> tuple[list[tuple[int, CorrelationFit]], dict[int, StationDoubt]]:
+    """Return the boot and the fitted line of every run of the clock, and the doubts about reports by their row.
 
     A line about which the reports scatter by more than `CORRELATION_RMS_NS` is left out.
     """
-    kept, doubts = _doubts(reports)
+    kept, doubts = doubted_stations(
+        reports.ticks, reports.earth_utc_ns, reports.light_time_ns, reports.boot, reports.station
+    )
     rows = np.flatnonzero(kept)
     runs = clock_runs(reports.ticks[rows], reports.earth_utc_ns[rows], reports.light_time_ns[rows], reports.boot[rows])
     fits = []
@@ -218,12 +220,9 @@ def fit_runs(reports: TimeReports) -> tuple[list[tuple[int, CorrelationFit]], li
         if fit.residual_rms_ns <= CORRELATION_RMS_NS:
             fits.append((int(reports.boot[run[0]]), replace(fit, rejected=rejected)))
         else:
-            doubts[int(run[0])] = StationDoubt(reports.station[run[0]], fit.residual_rms_ns * 1e-9)
-    return fits, sorted(set(doubts.values()), key=str)
-
-
-def _doubts(reports: TimeReports) -> tuple[BoolArray, dict[int, StationDoubt]]:
-    return doubted_stations(reports.ticks, reports.earth_utc_ns, reports.light_time_ns, reports.boot, reports.station)
+            doubt = StationDoubt(reports.station[run[0]], fit.residual_rms_ns * 1e-9, "one line through all (rms)")
+            doubts.update(dict.fromkeys(run.tolist(), doubt))
+    return fits, doubts
 
 
 def residuals(ground: Ground, vehicle: int) -> list[TimeReport]:
@@ -232,7 +231,7 @@ def residuals(ground: Ground, vehicle: int) -> list[TimeReport]:
         reports = time_reports(ground, connection, vehicle)
         correlations = store.load_correlations(connection, vehicle)
     utc_ns, ids = utc_ns_of_ticks(reports.ticks, correlations)
-    _, doubts = _doubts(reports)
+    _, doubts = fit_runs(reports)
     sent = np.asarray(tai_ns_from_utc_ns(reports.earth_utc_ns)) - reports.light_time_ns
     left = sent - np.asarray(tai_ns_from_utc_ns(utc_ns))
     return [

@@ -11,16 +11,10 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from ground_service.regression.gates import statistics
 from ground_service.regression.gates.core import EXACT_METRICS, FAIL, NOT_JUDGED, PASS_SPREAD, GatePolicy, verdict_of
 from ground_service.regression.gates.metrics import metrics_of
 from ground_service.regression.gates.samples import PassFrames
-from ground_service.regression.gates.statistics import (
-    aligned,
-    binomial_upper_tail,
-    mean_change,
-    ratio_change,
-    student_upper_tail,
-)
 from ground_service.regression.model import Calibration, Noise
 from reports.values import Gate
 
@@ -40,14 +34,14 @@ def pass_noise(before: PassFrames, after: PassFrames, policy: GatePolicy, condit
             continue
         if metric.sums is None:
             old, new = (np.array([metric.value(one)]) for one in (before, after))
-            change = mean_change(old, new, metric.relative)
+            change = statistics.mean_change(old, new, metric.relative)
             error, freedom = PASS_SPREAD, math.inf
         else:
-            change = ratio_change(*aligned(metric.sums(before), metric.sums(after)))
+            change = statistics.ratio_change(*statistics.aligned(metric.sums(before), metric.sums(after)))
             error, freedom = change.error, change.units - 1.0
         loss = -change.estimate if metric.higher_is_better else change.estimate
         if math.isfinite(loss / error) and freedom >= 1.0:
-            p_value = student_upper_tail(loss / error, min(freedom, 1e9))
+            p_value = statistics.student_upper_tail(loss / error, min(freedom, 1e9))
             found.append(
                 Noise(
                     metric=metric.name,
@@ -93,5 +87,5 @@ def _calibration(metric: str, condition: str, rows: Sequence[Noise]) -> Calibrat
         level=level,
         spread=float(np.sqrt(np.mean(losses**2))) if len(losses) else None,
         mean_square=float(np.mean(squares)) if squares else None,
-        calibrated=rejected == 0 or binomial_upper_tail(rejected, len(rows), level) >= DOUBT,
+        calibrated=rejected == 0 or statistics.binomial_upper_tail(rejected, len(rows), level) >= DOUBT,
     )

@@ -27,6 +27,7 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Interval
 
+from ground_service.regression.gates import statistics
 from ground_service.regression.gates.metrics import (
     FRAMES,
     LATENCY,
@@ -44,18 +45,6 @@ from ground_service.regression.gates.metrics import (
     metrics_of,
 )
 from ground_service.regression.gates.samples import KINDS, PassFrames
-from ground_service.regression.gates.statistics import (
-    Change,
-    UnitSums,
-    aligned,
-    frames_needed,
-    holm_levels,
-    joined_sums,
-    mean_change,
-    ratio_change,
-    student_quantile,
-    student_upper_tail,
-)
 from reports.text import counted, loss_text
 from reports.values import Gate
 
@@ -261,13 +250,13 @@ def _cost_gate(
 
 def _sums(
     before: Mapping[str, PassFrames], after: Mapping[str, PassFrames], names: Sequence[str], metric: Metric
-) -> tuple[UnitSums, UnitSums]:
+) -> tuple[statistics.UnitSums, statistics.UnitSums]:
     assert metric.sums is not None
-    pairs = [aligned(metric.sums(before[name]), metric.sums(after[name])) for name in names]
-    return joined_sums([one for one, _ in pairs]), joined_sums([one for _, one in pairs])
+    pairs = [statistics.aligned(metric.sums(before[name]), metric.sums(after[name])) for name in names]
+    return statistics.joined_sums([one for one, _ in pairs]), statistics.joined_sums([one for _, one in pairs])
 
 
-_LocalTest = tuple[str, Change, Metric, GateRule, int]
+_LocalTest = tuple[str, statistics.Change, Metric, GateRule, int]
 
 
 def _local_tests(
@@ -290,16 +279,16 @@ def _local_tests(
             for kind in kinds if len(kinds) > 1 else ():
                 parts[f"{KINDS[kind]} terrain"] = (_stratum(old, kind), _stratum(new, kind))
         for name, (first, second) in parts.items():
-            change = ratio_change(first, second)
+            change = statistics.ratio_change(first, second)
             frames = len(before[name]) if name in before else sum(len(before[one]) for one in names)
             if change.units >= FEWEST_TRACKS:
                 found.append((name, change, metric, rule, frames))
     return found
 
 
-def _stratum(sums: UnitSums, stratum: int) -> UnitSums:
+def _stratum(sums: statistics.UnitSums, stratum: int) -> statistics.UnitSums:
     rows = sums.stratum == stratum
-    return UnitSums(sums.unit[rows], sums.stratum[rows], sums.numerator[rows], sums.denominator[rows])
+    return statistics.UnitSums(sums.unit[rows], sums.stratum[rows], sums.numerator[rows], sums.denominator[rows])
 
 
 def _primary(
@@ -320,9 +309,9 @@ def _primary(
         return replace(nothing, frames=frames, reason="neither build has this metric")
     if metric.sums is None:
         values = [np.array([metric.value(side[name]) for name in names]) for side in (before, after)]
-        change = mean_change(values[0], values[1], metric.relative)
+        change = statistics.mean_change(values[0], values[1], metric.relative)
     else:
-        change = ratio_change(*_sums(before, after, names, metric))
+        change = statistics.ratio_change(*_sums(before, after, names, metric))
     gate = _decided("", change, metric, rule, frames, level, window=frames < WINDOW_FRAMES)
     if same and math.isfinite(change.baseline):
         return replace(
@@ -332,7 +321,7 @@ def _primary(
 
 
 def _decided(
-    place: str, change: Change, metric: Metric, rule: GateRule, frames: int, level: float, *, window: bool
+    place: str, change: statistics.Change, metric: Metric, rule: GateRule, frames: int, level: float, *, window: bool
 ) -> Gate:
     """Return the claim of one gate."""
     materiality, margin = rule.sizes(window)
@@ -356,7 +345,9 @@ def _decided(
         error, freedom = PASS_SPREAD / math.sqrt(change.units), math.inf
     if freedom < 1.0:
         return replace(gate, reason=f"{change.units} {metric.evidence} have no spread")
-    reach, ahead, power = (student_quantile(at, min(freedom, 1e9)) for at in (1.0 - level, PASS_CONFIDENCE, POWER))
+    reach, ahead, power = (
+        statistics.student_quantile(at, min(freedom, 1e9)) for at in (1.0 - level, PASS_CONFIDENCE, POWER)
+    )
     few = metric.evidence in ("tracks", "ground cells") and change.units < FEWEST_TRACKS
     claim = max(materiality, margin) if few else materiality
     low, high = loss - ahead * error, loss + ahead * error
@@ -364,7 +355,7 @@ def _decided(
         gate,
         change_low=_stated(metric, low),
         change_high=_stated(metric, high),
-        p_value=student_upper_tail(loss / error, min(freedom, 1e9)) if error > 0.0 else float(loss <= 0.0),
+        p_value=statistics.student_upper_tail(loss / error, min(freedom, 1e9)) if error > 0.0 else float(loss <= 0.0),
         resolution=_stated(metric, claim + (reach + power) * error),
     )
     if loss - reach * error > claim:
@@ -379,8 +370,8 @@ def _decided(
     if high < margin:
         return replace(gate, outcome=PASS)
     # The nearer claim: a pass if the loss is nearer to none than to the margin, else a failure.
-    needed_to_pass = frames_needed(frames, error, margin - max(loss, 0.0), ahead + power)
-    needed_to_fail = frames_needed(frames, error, loss - materiality, reach + power)
+    needed_to_pass = statistics.frames_needed(frames, error, margin - max(loss, 0.0), ahead + power)
+    needed_to_fail = statistics.frames_needed(frames, error, loss - materiality, reach + power)
     known = [one for one in (needed_to_pass, needed_to_fail) if one is not None]
     reason = f"a loss of {loss_text(_stated(metric, max(high, 0.0)), metric.relative)} cannot be excluded"
     return replace(gate, reason=reason, frames_needed=min(known, default=None))
@@ -396,17 +387,17 @@ def _informing(
 ) -> list[Gate]:
     """Return the metrics without a gate: values, and significance over the passes, which are the units."""
     decided = {rule.metric for rule in policy.rules}
-    rows: list[tuple[Metric, Change, int]] = []
+    rows: list[tuple[Metric, statistics.Change, int]] = []
     for metric in metrics.values():
         chosen = pictured if metric.name.startswith(NEEDS_FRAMES) else names
         if metric.name in decided or not chosen:
             continue
         values = [np.array([metric.value(side[name]) for name in chosen]) for side in (before, after)]
-        change = mean_change(values[0], values[1], metric.relative)
+        change = statistics.mean_change(values[0], values[1], metric.relative)
         if math.isfinite(change.baseline) or math.isfinite(change.candidate):
             rows.append((metric, change, sum(len(before[name]) for name in chosen)))
     p_values = [_two_sided(change) for _, change, _ in rows]
-    levels = holm_levels(p_values, INFORM_LEVEL)
+    levels = statistics.holm_levels(p_values, INFORM_LEVEL)
     gates = []
     for (metric, change, frames), p, level in zip(rows, p_values, levels, strict=True):
         reason = ""
@@ -423,16 +414,16 @@ def _informing(
     return gates
 
 
-def _two_sided(change: Change) -> float:
+def _two_sided(change: statistics.Change) -> float:
     """Return the p-value of a mean change of passes; 1 for fewer than `FEWEST_PASSES`."""
     if change.units < FEWEST_PASSES or not math.isfinite(change.error):
         return 1.0
     if change.error == 0.0:
         return float(change.estimate == 0.0)
-    return 2.0 * student_upper_tail(abs(change.estimate) / change.error, change.units - 1.0)
+    return 2.0 * statistics.student_upper_tail(abs(change.estimate) / change.error, change.units - 1.0)
 
 
-def _size(change: Change, metric: Metric) -> str:
+def _size(change: statistics.Change, metric: Metric) -> str:
     return f"{math.expm1(change.estimate):+.0%}" if metric.relative else f"{change.estimate:+.3g}"
 
 
@@ -464,7 +455,7 @@ def detectable(policy: GatePolicy, frames: int, passes: int) -> list[dict[str, A
     for rule in policy.rules:
         if rule.metric in SPREAD and frames:
             level = policy.fail_level * rule.weight / (2.0 if passes > 1 else 1.0)
-            reach = student_quantile(1.0 - level, 1e9) + student_quantile(POWER, 1e9)
+            reach = statistics.student_quantile(1.0 - level, 1e9) + statistics.student_quantile(POWER, 1e9)
             materiality, _ = rule.sizes(frames < WINDOW_FRAMES)
             change = round(materiality + reach * SPREAD[rule.metric] / math.sqrt(frames), 3)
             minutes = round(frames * MINUTES_PER_FRAME, 1)

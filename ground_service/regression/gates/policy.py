@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from ground_service.errors import InvalidInput, storage_error
-from ground_service.missions.section import Table
+from ground_service.missions.automation import Table
 from ground_service.regression.gates.core import EXACT_METRICS, GatePolicy, GateRule
 from ground_service.regression.gates.metrics import FRAMES, TIMES, UNDECODABLE
 from ground_service.toml import parse_table, read_table

@@ -6,19 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ground_service.evaluation.alignment import (
-    ReferenceStates,
-    error_of_places_rtn_m,
-    reference_states,
-    squared_normalised_errors,
-)
-from ground_service.evaluation.recall import (
-    SCORED_CLASSES,
-    ExpectedCraters,
-    Viewing,
-    expected_craters,
-    match_detections,
-)
+from ground_service.evaluation import alignment, recall
 from ground_service.telemetry.samples import DetectionSamples, NavigationSamples
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.camera import PinholeCamera, nadir_camera_from_mcmf
@@ -186,7 +174,7 @@ def pass_frames(
     catalogue: CraterCatalogue,
     camera: PinholeCamera,
     orientation: Orientation,
-    viewing: Viewing | None = None,
+    viewing: recall.Viewing | None = None,
 ) -> PassFrames:
     """Return the frames of a pass with their received samples.
 
@@ -204,18 +192,18 @@ def pass_frames(
         Mounting and attitudes of the camera; None: a nadir camera.
     """
     n = len(frame_ticks)
-    track = reference_states(reference, orientation, frame_utc_ns)
+    track = alignment.reference_states(reference, orientation, frame_utc_ns)
     rotations = (
         nadir_camera_from_mcmf(track.position_mcmf_m)
         if viewing is None
         else viewing.camera_from_mcmf(frame_utc_ns, track.position_mcmf_m, track.mcmf_from_icrf)
     )
-    expected = expected_craters(catalogue, camera, track.position_mcmf_m, rotations)
+    expected = recall.expected_craters(catalogue, camera, track.position_mcmf_m, rotations)
     whole = _by_frame(detections, n)
-    matches = match_detections(whole, expected)
+    matches = recall.match_detections(whole, expected)
     frame_of_crater = np.repeat(np.arange(n), np.diff(expected.offsets))
     frame_of_detection = np.repeat(np.arange(n), np.diff(whole.offsets))
-    counted = np.isin(expected.size_class, SCORED_CLASSES) & expected.complete
+    counted = np.isin(expected.size_class, recall.SCORED_CLASSES) & expected.complete
     rows = np.flatnonzero(counted)
     by = matches.detection_of_crater[rows]
     # A missed crater has the row -1: the value after the last.
@@ -223,7 +211,7 @@ def pass_frames(
         np.append(seen, np.nan)[by] - there[rows]
         for seen, there in ((whole.u_px, expected.u_px), (whole.v_px, expected.v_px))
     )
-    false = (matches.crater_of_detection < 0) & np.isin(whole.size_class, SCORED_CLASSES)
+    false = (matches.crater_of_detection < 0) & np.isin(whole.size_class, recall.SCORED_CLASSES)
     shown = np.concatenate((by[by >= 0], np.flatnonzero(false)))
     shown_frame = frame_of_detection[shown]
     lines = np.einsum(
@@ -252,7 +240,7 @@ def pass_frames(
 def _estimators(
     navigation: Mapping[str, NavigationSamples],
     outcomes: Mapping[str, Mapping[int, str]],
-    track: ReferenceStates,
+    track: alignment.ReferenceStates,
     n: int,
 ) -> dict[str, EstimatorFrames]:
     estimators = {}
@@ -263,7 +251,7 @@ def _estimators(
         altitude[at] = samples.altitude_m
         sigma = np.full((n, 3), np.nan)
         sigma[at] = samples.sigma_rtn_m
-        error = error_of_places_rtn_m(track, latitude, longitude, altitude)
+        error = alignment.error_of_places_rtn_m(track, latitude, longitude, altitude)
         stated = np.isfinite(latitude + longitude + altitude)
         estimators[name] = _estimator(stated, error, sigma, outcomes.get(name, {}))
     return estimators
@@ -279,9 +267,9 @@ def _tracks(crater: IntArray, frame: IntArray) -> IntArray:
     return track
 
 
-def terrain_kinds(catalogue: CraterCatalogue, expected: ExpectedCraters, rows: IntArray) -> IntArray:
+def terrain_kinds(catalogue: CraterCatalogue, expected: recall.ExpectedCraters, rows: IntArray) -> IntArray:
     """Return the kind of terrain (m,) around the expected craters of these rows."""
-    scored = np.isin(size_class(catalogue.diameter_m), SCORED_CLASSES)
+    scored = np.isin(size_class(catalogue.diameter_m), recall.SCORED_CLASSES)
     area_1e6_km2 = math.pi * (DENSITY_ARC_M / 1e3) ** 2 / 1e6
     craters, row_of = np.unique(expected.index[rows], return_inverse=True)
     count = [
@@ -329,7 +317,7 @@ def _estimator(
         stated=stated,
         error_m=length,
         sigma_m=claimed,
-        squared_normalised_error=squared_normalised_errors(error_rtn_m, sigma_rtn_m),
+        squared_normalised_error=alignment.squared_normalised_errors(error_rtn_m, sigma_rtn_m),
         outcome=tuple(outcomes.get(i, "") for i in range(len(length))),
         wrong=np.where(np.isfinite(length), far, np.nan),
     )

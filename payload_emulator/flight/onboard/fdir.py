@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 from lunar.arrays import FloatArray
-from payload_emulator.flight.onboard.parameters import ParameterStore
+from payload_emulator.flight.onboard.settings import ParameterStore
 from payload_emulator.flight.ports import SENSORS
 from payload_emulator.flight.telemetry.packets import Telemetry
 from payload_emulator.flight.vision.preprocess import ImageQuality

@@ -5,7 +5,7 @@ import inspect
 from payload_emulator.flight.onboard.modes import ALL_MODES, ALLOWED, TRANSITIONS, PayloadMode
 from payload_emulator.flight.ports import SENSORS, Board, Load, ResetCause, Stage
 from payload_emulator.flight.telemetry.store import SHARES, StoreClass
-from tmtc.dictionary.onboard_parameters import PARAMETERS, Parameter
+from tmtc.dictionary.fields import PARAMETERS, Parameter
 
 _PORTS = {
     "EPS": (("sensors", "switch"), "power in, switched loads"),
@@ -52,6 +52,8 @@ observation ends |
 the declared one until it is restored |
 | the crater list has an offset of another size than believed | map_offset | the size, learned from the fixes, is \
 used from then on; it is kept until another catalogue is loaded or the estimators are reset |
+| detections have another noise than stated | detection_noise | the factor, learned from the fixes, is used and kept \
+like the offset |
 | processor hangs | watchdog_reset | reset by the watchdog; the observation is resumed; `watchdog_limit` within an \
 hour: safe |
 | bits of model, parameters or tables change | model_hash_mismatch, parameters_hash_mismatch, \

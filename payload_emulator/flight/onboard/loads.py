@@ -8,25 +8,18 @@ from lunar.camera import PinholeCamera
 from payload_emulator.flight.navigation.anchored.parameters import AnchoredParameters
 from payload_emulator.flight.navigation.odometry.odometry import OdometryParameters
 from payload_emulator.flight.navigation.outcomes import Mode
-from tmtc.dictionary.tables import (
-    unpack_anchor_table,
-    unpack_burn_table,
-    unpack_catalogue_table,
-    unpack_gravity_table,
-    unpack_initial_state,
-    unpack_orientation_table,
-)
+from tmtc.dictionary import tables
 
 # Numbers of tables, as in the dictionary's table of tables.
 TABLE_NUMBERS = {"anchor_ephemeris": 1, "catalogue": 2, "gravity": 3, "orientation": 8, "initial_state": 9, "burns": 10}
 MODEL_NUMBER = 5
 UNPACKERS: dict[str, Callable[[bytes], object]] = {
-    "anchor_ephemeris": unpack_anchor_table,
-    "catalogue": unpack_catalogue_table,
-    "gravity": unpack_gravity_table,
-    "orientation": unpack_orientation_table,
-    "initial_state": unpack_initial_state,
-    "burns": unpack_burn_table,
+    "anchor_ephemeris": tables.unpack_anchor_table,
+    "catalogue": tables.unpack_catalogue_table,
+    "gravity": tables.unpack_gravity_table,
+    "orientation": tables.unpack_orientation_table,
+    "initial_state": tables.unpack_initial_state,
+    "burns": tables.unpack_burn_table,
 }
 
 

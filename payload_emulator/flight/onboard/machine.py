@@ -12,9 +12,8 @@ from payload_emulator.flight.onboard.housekeeping import STATE, Housekeeping, St
 from payload_emulator.flight.onboard.loads import MODEL_NUMBER, FlightParameters, FlightTables
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.onboard.observer import Observer
-from payload_emulator.flight.onboard.parameters import ParameterStore
 from payload_emulator.flight.onboard.schedule import Schedule
-from payload_emulator.flight.onboard.settings import Settings
+from payload_emulator.flight.onboard.settings import ParameterStore, Settings
 from payload_emulator.flight.ports import Board, Load, Memory
 from payload_emulator.flight.telemetry.packets import Telemetry
 from payload_emulator.flight.telemetry.store import PacketStore
@@ -80,7 +79,7 @@ _LOADS = {
 
 
 @dataclass(slots=True)
-class Observation:
+class ObservationWindow:
     """The observation window in progress; `stop_ticks` 0: until commanded, `cadence_ticks` 0: every frame."""
 
     stop_ticks: int = 0
@@ -110,7 +109,7 @@ class Machine:
     history: CommandHistory = field(default_factory=CommandHistory)
     housekeeping: Housekeeping = field(default_factory=Housekeeping)
     uplink: LargeDataReceiver = field(default_factory=lambda: LargeDataReceiver(_UPLINK_LIMIT_OCTETS))
-    observation: Observation = field(default_factory=Observation)
+    observation: ObservationWindow = field(default_factory=ObservationWindow)
     counts: Counter[str] = field(default_factory=Counter)
     boot_count: int = 1
     watchdog_ticks: list[int] = field(default_factory=list)
@@ -128,7 +127,7 @@ class Machine:
         self.telemetry.event("info", "mode_changed", float(before), float(mode))
         if before is PayloadMode.observing:
             self.telemetry.event("info", "observation_stopped", float(self.observer.counts["frames"]))
-            self.observation = Observation()
+            self.observation = ObservationWindow()
         self.switch_loads()
 
     def observe(self, duration_ticks: int, cadence_ticks: int) -> None:
@@ -136,7 +135,7 @@ class Machine:
         ticks = self.telemetry.ticks
         self.enter(PayloadMode.observing)
         stop = ticks + duration_ticks if duration_ticks else 0
-        self.observation, self.changed = Observation(stop, cadence_ticks, ticks), True
+        self.observation, self.changed = ObservationWindow(stop, cadence_ticks, ticks), True
         self.telemetry.event("info", "observation_started", float(stop), float(cadence_ticks))
 
     def switch_loads(self) -> None:
@@ -225,7 +224,7 @@ class Machine:
     def restore(self, values: Mapping[str, Any]) -> PayloadMode:
         """Take the settings kept before a reset; the mode of that time."""
         self.boot_count = int(values["boot_count"]) + 1
-        self.observation = Observation(*(int(value) for value in values["observation"]))
+        self.observation = ObservationWindow(*(int(value) for value in values["observation"]))
         self.parameters.restore(values["parameters"])
         self.schedule.restore(values["schedule"])
         self.schedule.enabled = bool(values["schedule_enabled"])

@@ -85,7 +85,7 @@ class Observer:
         self._states: dict[Mode, Any] = {}
         self._loaded: dict[str, Any] = {}
         self._in_trouble: set[str] = set()
-        self._map_offset: tuple[float, float] | None = None
+        self._map_offset: tuple[float, int] | None = None
         self._tables = FlightTables()
 
     @property
@@ -283,10 +283,11 @@ class Observer:
         self._trouble("fix_refused", refused, float(report.candidates), float(report.expected))
         self._trouble("filter_divergence", report.lost, sigma_m, 0.0)
         self._report_attitude(report)
-        offset = None if report.offset is None else (report.offset.sigma_m, float(report.offset.fixes))
-        if offset is not None and offset != self._map_offset:
-            self._telemetry.event("info", "map_offset", offset[0], offset[1])
-            self._map_offset = offset
+        learned = report.offset
+        if learned is not None and (learned.sigma_m, learned.fixes) != self._map_offset:
+            self._map_offset = learned.sigma_m, learned.fixes
+            self._telemetry.event("info", "map_offset", learned.sigma_m, float(learned.fixes))
+            self._telemetry.event("info", "detection_noise", learned.noise_factor, float(learned.fixes))
 
     def _send_filter(self, state: AnchoredState, report: AnchoredReport, found: Detections | None) -> None:
         """Send what the ground needs to judge and to smooth the filter: its orbit in full, the pairs of its fix."""

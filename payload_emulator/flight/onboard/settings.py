@@ -1,4 +1,4 @@
-"""Settings that survive a reset: one text of settings in two copies, the newer of which that is whole counts.
+"""On-board parameters, and settings that survive a reset: a text in two copies, of which the newer whole one counts.
 
 Each half of the memory holds a block: magic `LNST`, generation (u32), length (u32), CRC-32 of generation, length and
 content (u32), content (JSON, UTF-8); big-endian. Both are written at every change, one after the other: a reset in the
@@ -9,13 +9,14 @@ import json
 import struct
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
 import numpy as np
 
 from payload_emulator.flight.ports import Memory
+from tmtc.dictionary.fields import BY_NAME, Parameter
 
 _MAGIC = b"LNST"
 _HEADER = struct.Struct(">4sIII")
@@ -77,3 +78,30 @@ class Settings:
         if zlib.crc32(struct.pack(">II", generation, length) + content) != checksum:
             return None
         return generation, json.loads(content)
+
+
+@dataclass(slots=True)
+class ParameterStore:
+    """Values in force: the defaults and what was changed by telecommand."""
+
+    changed: dict[str, float] = field(default_factory=dict)
+    defaults: dict[str, float] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> float:
+        if name in self.changed:
+            return self.changed[name]
+        return self.defaults.get(name, BY_NAME[name].default)
+
+    def set(self, parameter: Parameter, value: float) -> None:
+        """Put a value in force that the parameter accepts."""
+        self.changed[parameter.name] = value
+
+    def restore(self, changed: Mapping[str, float]) -> int:
+        """Put kept values in force; how many were refused because this build has other limits or names."""
+        good = {
+            name: float(value)
+            for name, value in changed.items()
+            if name in BY_NAME and BY_NAME[name].accepts(float(value))
+        }
+        self.changed = good
+        return len(changed) - len(good)

@@ -13,10 +13,9 @@ from payload_emulator.flight.onboard.machine import Machine
 from payload_emulator.flight.onboard.modes import PayloadMode, allows, may_change
 from payload_emulator.flight.onboard.schedule import Activity
 from payload_emulator.flight.ports import ResetCause
-from payload_emulator.flight.telemetry.products import map_octets
+from payload_emulator.flight.telemetry.packets import map_octets
 from tmtc.dictionary.arguments import FUNCTION_ARGUMENTS
-from tmtc.dictionary.fields import Field
-from tmtc.dictionary.onboard_parameters import find_parameter
+from tmtc.dictionary.fields import Field, find_parameter
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.errors import TableError
 from tmtc.packets.pus import TICKS_PER_SECOND

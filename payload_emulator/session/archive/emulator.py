@@ -26,14 +26,8 @@ from payload_emulator.flight.ports import ResetCause
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.flight.vision.picture_search import find_sun
 from payload_emulator.flight.vision.preprocess import prepare_image
+from payload_emulator.session.archive import recording
 from payload_emulator.session.archive.mission import MISSION_FILE, mission_text, save_attitudes
-from payload_emulator.session.archive.recording import (
-    RecordedStep,
-    recorded_step,
-    save_frame_times,
-    save_image,
-    save_record,
-)
 from payload_emulator.session.archive.scoring import judge_session, score_navigation
 from payload_emulator.session.scenario import Scenario, format_scenario
 from payload_emulator.session.spacecraft.loading import LoadedPayload, check_payload_files, load_scenario_payload
@@ -42,14 +36,7 @@ from payload_emulator.session.spacecraft.schedule import fly_scenario, timeline
 from payload_emulator.session.world.camera import expose, require_renderable, true_sun_direction
 from payload_emulator.session.world.external import ExternalFrames
 from payload_emulator.session.world.world import World, build_world, clock_ticks, sample_truth
-from payload_emulator.sim.board.link import (
-    LIGHT_S,
-    Reception,
-    Transmitter,
-    save_receptions,
-    save_time_receptions,
-    transmit,
-)
+from payload_emulator.sim.board import link
 from tmtc.dictionary.payload import APID_TIME_REPORT, DICTIONARY
 from tmtc.link.settings import LinkSettings
 from tmtc.packets.pus import TICKS_PER_SECOND
@@ -157,14 +144,14 @@ class Sender:
 
     world: World
     settings: LinkSettings
-    transmitter: Transmitter = field(init=False)
+    transmitter: link.Transmitter = field(init=False)
     time_reports: list[tuple[bytes, int]] = field(default_factory=list)
     _waiting: dict[int, list[tuple[bytes, bytes]]] = field(default_factory=dict)
     _utc_ns: int = 0
-    _light_s: float = LIGHT_S
+    _light_s: float = link.LIGHT_S
 
     def __post_init__(self) -> None:
-        self.transmitter = Transmitter(self.world.scenario.spacecraft_id, self.settings)
+        self.transmitter = link.Transmitter(self.world.scenario.spacecraft_id, self.settings)
 
     def take(self, result: StepResult) -> None:
         """Take the packets of a step, and send the dumps that are complete."""
@@ -201,7 +188,7 @@ def _emulate_into(
     )
     spacecraft = new_spacecraft(world, loaded)
     sender = Sender(world, LinkSettings(coding=scenario.link.coding))
-    inputs: list[RecordedStep] = []
+    inputs: list[recording.RecordedStep] = []
     attitudes = np.full((total, 3, 3), np.nan)
     flown = fly_scenario(world, spacecraft)
     for result in progress(flown, len(timeline(world))) if progress else flown:
@@ -213,13 +200,13 @@ def _emulate_into(
             attitudes[number] = result.exposure.camera_from_mcmf
         if payload_input is None:
             continue
-        inputs.append(recorded_step(number, payload_input))
+        inputs.append(recording.recorded_step(number, payload_input))
         if number in kept:
-            save_image(folder, number, payload_input.image)
+            recording.save_image(folder, number, payload_input.image)
     sender.flush()
-    reception = transmit(sender.transmitter.dumps, sender.transmitter.settings, scenario.link, scenario.seed)
-    save_record(folder, inputs, loaded.parameters, loaded.tables)
-    save_frame_times(folder, world.frame_utc_ns)
+    reception = link.transmit(sender.transmitter.dumps, sender.transmitter.settings, scenario.link, scenario.seed)
+    recording.save_record(folder, inputs, loaded.parameters, loaded.tables)
+    recording.save_frame_times(folder, world.frame_utc_ns)
     packets = [packet for dump in sender.transmitter.dumps for packet in dump.packets]
     save_attitudes(folder, inputs)
     (folder / MISSION_FILE).write_text(mission_text(world, data), encoding="utf-8")
@@ -227,9 +214,11 @@ def _emulate_into(
     save_oem(reference, folder / "reference.oem")
     save_catalogue(catalogue, folder / "catalogue.csv")
     (folder / "downlink.cadu").write_bytes(reception.octets)
-    save_receptions(folder, sender.transmitter.dumps)
+    link.save_receptions(folder, sender.transmitter.dumps)
     emitted = np.array([utc_ns for _, utc_ns in sender.time_reports], dtype=np.int64)
-    save_time_receptions(folder, [packet for packet, _ in sender.time_reports], emitted, world.truth.states(emitted)[0])
+    link.save_time_receptions(
+        folder, [packet for packet, _ in sender.time_reports], emitted, world.truth.states(emitted)[0]
+    )
     wall_s = time.monotonic() - started
     summary = _summary(world, loaded, spacecraft, packets, reception, len(kept), wall_s)
     judged = judge_session(world, loaded, catalogue, attitudes, b"".join(packets))
@@ -244,7 +233,7 @@ def _summary(
     loaded: LoadedPayload,
     spacecraft: Spacecraft,
     packets: list[bytes],
-    reception: Reception,
+    reception: link.Reception,
     kept: int,
     wall_s: float,
 ) -> dict[str, Any]:

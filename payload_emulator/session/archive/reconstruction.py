@@ -23,22 +23,16 @@ from lunar.datafolder import DataFolder
 from payload_emulator.errors import RecordError
 from payload_emulator.flight.onboard.commanding import Refusal, parse_commands
 from payload_emulator.flight.ports import UNLIMITED, ResetCause
-from payload_emulator.flight.telemetry.products import image_report
+from payload_emulator.flight.telemetry.packets import image_report
+from payload_emulator.session.archive import recording
 from payload_emulator.session.archive.emulator import Progress, file_entries
 from payload_emulator.session.archive.mission import save_attitudes
-from payload_emulator.session.archive.recording import (
-    RecordedStep,
-    pixel_hash,
-    save_frame_times,
-    save_image,
-    save_record,
-)
 from payload_emulator.session.scenario import Scenario, parse_scenario
 from payload_emulator.session.spacecraft.loading import LoadedPayload, launch_payload
 from payload_emulator.session.world.camera import Exposure, expose
 from payload_emulator.session.world.world import CHUNK_S, World, extended_flight, first_utc_ns, frame_utc_ns, open_world
-from payload_emulator.sim.board.faults import parse_fault
-from tmtc.dictionary.onboard_parameters import find_parameter
+from payload_emulator.sim.board.platform import parse_fault
+from tmtc.dictionary.fields import find_parameter
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.schema import Table
 from tmtc.dictionary.tables import table_hash
@@ -92,18 +86,18 @@ def reconstruct(archive: Path, out: Path, data: DataFolder, progress: Progress |
     _check_loads(archive, telemetry.get("housekeeping"), loaded, telecommands)
     world = flown_until(world, first_utc_ns(world, reports[-1].ticks))
     shutil.copytree(archive, out)
-    steps: dict[int, RecordedStep] = {}
+    steps: dict[int, recording.RecordedStep] = {}
     times = []
     for number, (report, exposure) in enumerate(
         progress(_exposures(world, reports), len(reports)) if progress else _exposures(world, reports)
     ):
         _check_image(archive, number, report, exposure)
-        save_image(out, number, exposure.image)
+        recording.save_image(out, number, exposure.image)
         steps[report.ticks] = _frame_step(number, report.ticks, exposure)
         times.append(exposure.utc_ns)
     inputs = with_telecommands(steps, telecommands)
-    save_record(out, inputs, loaded.parameters, loaded.tables)
-    save_frame_times(out, np.array(times, dtype=np.int64))
+    recording.save_record(out, inputs, loaded.parameters, loaded.tables)
+    recording.save_frame_times(out, np.array(times, dtype=np.int64))
     save_attitudes(out, inputs)
     manifest |= _described(world, loaded, scenario)
     manifest["files"] = file_entries(out)
@@ -131,7 +125,7 @@ def flown_until(world: World, utc_ns: int) -> World:
     return world
 
 
-def with_telecommands(steps: Mapping[int, RecordedStep], telecommands: bytes) -> list[RecordedStep]:
+def with_telecommands(steps: Mapping[int, recording.RecordedStep], telecommands: bytes) -> list[recording.RecordedStep]:
     """Return the steps of a pass: a boot that receives the telecommands, and one at each time of release or image."""
     releases = [
         int(command.values["release_ticks"])
@@ -161,18 +155,18 @@ def _exposures(world: World, reports: Sequence[ImageReport]) -> Iterator[tuple[I
         yield report, exposure
 
 
-def _step(ticks: int) -> RecordedStep:
+def _step(ticks: int) -> recording.RecordedStep:
     """Return a step without an image."""
-    return RecordedStep(-1, ticks, _NO_ATTITUDE, b"", (0, 0), "", None, _UNKNOWN_SENSORS, 0, UNLIMITED)
+    return recording.RecordedStep(-1, ticks, _NO_ATTITUDE, b"", (0, 0), "", None, _UNKNOWN_SENSORS, 0, UNLIMITED)
 
 
-def _frame_step(number: int, ticks: int, exposure: Exposure) -> RecordedStep:
+def _frame_step(number: int, ticks: int, exposure: Exposure) -> recording.RecordedStep:
     return replace(
         _step(ticks),
         number=number,
         attitude=np.asarray(exposure.attitude, np.float64),
         image_shape=exposure.image.shape,
-        image_sha256=pixel_hash(exposure.image),
+        image_sha256=recording.pixel_hash(exposure.image),
     )
 
 

@@ -31,16 +31,7 @@ from payload_emulator.flight.ports import UNLIMITED, BareBoard, ResetCause
 from payload_emulator.flight.vision.detections import Detections, no_detections
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.flight.vision.preprocess import ImageQuality
-from payload_emulator.session.archive.recording import (
-    INPUTS,
-    PassRecord,
-    RecordedStep,
-    check_image,
-    load_image,
-    load_record,
-    missing_frames,
-    save_image,
-)
+from payload_emulator.session.archive import recording
 from payload_emulator.session.spacecraft.parameter_file import BuildParameters, parse_parameters
 from tmtc.downlink import encode_cadus
 
@@ -147,9 +138,9 @@ def replay_archive(
         The archive cannot be flown again, or an image of it is not the recorded one.
     """
     manifest = _manifest(archive)
-    record = load_record(archive)
+    record = recording.load_record(archive)
     recorded = load_detections(archive)
-    lacking = missing_frames(archive, record.inputs) if recorded is None else []
+    lacking = recording.missing_frames(archive, record.inputs) if recorded is None else []
     if lacking and data is None:
         raise RecordError(
             f"{archive}: expected every frame, found {len(lacking)} missing, the first {lacking[0]}; "
@@ -196,7 +187,7 @@ def replay_archive(
 
 
 def replay(
-    record: PassRecord,
+    record: recording.PassRecord,
     images: Iterable[Image],
     build: FlightBuild = FlightBuild(),
     *,
@@ -231,7 +222,7 @@ def replay(
     payload = started()
     packets: list[bytes] = []
     rows: list[tuple[float, float, float]] = []
-    pairs: Iterable[tuple[RecordedStep, Image]] = zip(record.inputs, images, strict=True)
+    pairs: Iterable[tuple[recording.RecordedStep, Image]] = zip(record.inputs, images, strict=True)
     for item, image in progress(pairs, len(record.inputs)) if progress else pairs:
         if board.enter_step(item) and item is not record.inputs[0]:
             payload = started()
@@ -257,12 +248,12 @@ def _with_network(build: FlightBuild, manifest: dict[str, Any]) -> FlightBuild:
     return replace(build, model=same[0] if same else shipped[DEFAULT_NETWORK])
 
 
-def stored_images(archive: Path, record: PassRecord) -> Iterator[Image]:
+def stored_images(archive: Path, record: recording.PassRecord) -> Iterator[Image]:
     """Yield the images of a pass from its archive; the next one is read while one is processed."""
-    return _ahead(lambda item: load_image(archive, item), record.inputs)
+    return _ahead(lambda item: recording.load_image(archive, item), record.inputs)
 
 
-def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iterator[Image]:
+def rendered_images(archive: Path, record: recording.PassRecord, data: DataFolder) -> Iterator[Image]:
     """Yield the images of a pass; those that its archive lacks are rendered from scenario and seed, and verified."""
     from payload_emulator.session.scenario import parse_scenario
     from payload_emulator.session.world.camera import expose
@@ -274,17 +265,17 @@ def rendered_images(archive: Path, record: PassRecord, data: DataFolder) -> Iter
     scenario = parse_scenario(str(text), source=f"scenario of {archive}")
     world = _declared_world(scenario, data, manifest.get("data_sources") or ())
     world.terrain.release_thread()
-    absent = set(missing_frames(archive, record.inputs))
+    absent = set(recording.missing_frames(archive, record.inputs))
 
-    def image_of(item: RecordedStep) -> Image:
+    def image_of(item: recording.RecordedStep) -> Image:
         if item.number not in absent or not item.image_sha256:
-            return load_image(archive, item)
+            return recording.load_image(archive, item)
         if item.number >= world.frame_utc_ns.size:
             raise RecordError(
                 f"{archive}: expected a scenario with frame {item.number}, found {world.frame_utc_ns.size} frames"
             )
         image = expose(world, int(world.frame_utc_ns[item.number])).image
-        check_image(item, image, f"frame {item.number} rendered from the scenario of {archive}")
+        recording.check_image(item, image, f"frame {item.number} rendered from the scenario of {archive}")
         return image
 
     return _ahead(image_of, record.inputs)
@@ -342,15 +333,15 @@ def complete_archive(archive: Path, out: Path, data: DataFolder, progress: Progr
     manifest = _manifest(archive)
     if out.exists():
         raise RecordError(f"{out}: expected a new folder, found something there; choose another --out")
-    if manifest.get("scenario_toml") and not (archive / INPUTS).is_file():
+    if manifest.get("scenario_toml") and not (archive / recording.INPUTS).is_file():
         return reconstruct(archive, out, data, progress)
-    record = load_record(archive)
+    record = recording.load_record(archive)
     shutil.copytree(archive, out)
-    absent = set(missing_frames(archive, record.inputs))
+    absent = set(recording.missing_frames(archive, record.inputs))
     pairs = zip(record.inputs, rendered_images(archive, record, data), strict=True)
     for item, image in progress(pairs, len(record.inputs)) if progress else pairs:
         if item.number in absent:
-            save_image(out, item.number, image)
+            recording.save_image(out, item.number, image)
     manifest["files"] = file_entries(out)
     _write_json(out / "manifest.json", manifest)
     return manifest
@@ -364,7 +355,7 @@ class RecordedBoard(BareBoard):
     downlink: int = UNLIMITED
     asked_to_reset: bool = False
 
-    def enter_step(self, item: RecordedStep) -> bool:
+    def enter_step(self, item: recording.RecordedStep) -> bool:
         """Take the place of the board in a step; whether the processor restarts before it."""
         self.uptime, self.downlink = item.uptime_ticks, item.downlink_octets
         if np.isfinite(item.sensors).all():
@@ -424,7 +415,9 @@ class _TimedDetector:
         return found
 
 
-def _ahead(load: Callable[[RecordedStep], Image], inputs: tuple[RecordedStep, ...]) -> Iterator[Image]:
+def _ahead(
+    load: Callable[[recording.RecordedStep], Image], inputs: tuple[recording.RecordedStep, ...]
+) -> Iterator[Image]:
     with ThreadPoolExecutor(max_workers=1) as reader:
         pending = [reader.submit(load, item) for item in inputs[:2]]
         for number in range(len(inputs)):

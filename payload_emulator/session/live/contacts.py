@@ -16,14 +16,7 @@ import numpy as np
 from kernels.memory import give_back
 from lunar.constants import NS
 from payload_emulator.flight.ports import UNLIMITED
-from payload_emulator.session.live.station_ports import (
-    KEPT_LIMIT_OCTETS,
-    JournalEntry,
-    StationPorts,
-    TelecommandBuffer,
-    add_to_journal,
-    load_journal,
-)
+from payload_emulator.session.live import station_ports
 from payload_emulator.session.scenario import Scenario
 from payload_emulator.session.spacecraft.loop import Spacecraft, StepResult
 from payload_emulator.session.world.world import sample_truth
@@ -91,15 +84,15 @@ class Contacts:
     keeps: bool = False
     journal_file: Path | None = None
     account: Account = field(default_factory=Account)
-    stations: dict[str, StationPorts] = field(default_factory=dict)
+    stations: dict[str, station_ports.StationPorts] = field(default_factory=dict)
     contact: StationContact | None = None
     waiting: int = 0
     _planned: deque[StationContact] = field(default_factory=deque)
     _transmitter: Transmitter = field(init=False)
-    _buffers: dict[tuple[str, int], TelecommandBuffer] = field(default_factory=dict)
+    _buffers: dict[tuple[str, int], station_ports.TelecommandBuffer] = field(default_factory=dict)
     _uplink: deque[tuple[tuple[str, int], bytes]] = field(default_factory=deque)
     _sent_up: set[int] = field(default_factory=set)
-    _to_repeat: deque[JournalEntry] = field(default_factory=deque)
+    _to_repeat: deque[station_ports.JournalEntry] = field(default_factory=deque)
     _last_step_ns: int = 0
 
     def __post_init__(self) -> None:
@@ -120,7 +113,7 @@ class Contacts:
     @property
     def is_behind(self) -> bool:
         """Return whether the ground has fallen so far behind that time must not go on."""
-        return any(one.waiting > KEPT_LIMIT_OCTETS // 16 for one in self.stations.values())
+        return any(one.waiting > station_ports.KEPT_LIMIT_OCTETS // 16 for one in self.stations.values())
 
     def plan(self, truth: Truth) -> None:
         """Find the contacts up to the end of the propagated orbit."""
@@ -184,7 +177,7 @@ class Contacts:
                 self._uplink.appendleft((connection, octets[allowed:]))
                 octets = octets[:allowed]
             allowed -= len(octets)
-            buffer = self._buffers.setdefault(connection, TelecommandBuffer(receiver))
+            buffer = self._buffers.setdefault(connection, station_ports.TelecommandBuffer(receiver))
             packets += buffer.take(octets)
         self.account.telecommands += len(packets)
         return b"".join(packets)
@@ -217,12 +210,12 @@ class Contacts:
     def open_ports(self, host: str, ports: Mapping[str, tuple[int, int]], clock: Callable[[], int]) -> None:
         """Open the ports of the stations; 0 or none stated: a free one. `clock` returns the time of the session."""
         if self.journal_file is not None:
-            left = [one for one in load_journal(self.journal_file) if one.number not in self._sent_up]
+            left = [one for one in station_ports.load_journal(self.journal_file) if one.number not in self._sent_up]
             self._to_repeat.extend(sorted(left, key=lambda one: one.utc_ns))
         taken = self._sent_up.union(one.number for one in self._to_repeat)
         for name in self.names:
             receive = partial(self.receive, clock, name)
-            self.stations[name] = StationPorts(
+            self.stations[name] = station_ports.StationPorts(
                 name, host, receive, *ports.get(name, (0, 0)), self.keeps, taken={*taken}
             )
 
@@ -235,7 +228,9 @@ class Contacts:
         if self.keeps and not has_contact:
             return False
         if self.keeps and self.journal_file is not None:
-            add_to_journal(self.journal_file, JournalEntry(clock(), station, number, octets))
+            station_ports.add_to_journal(
+                self.journal_file, station_ports.JournalEntry(clock(), station, number, octets)
+            )
         if has_contact:
             self._send_up(station, number, octets)
         else:

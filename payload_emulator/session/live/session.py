@@ -28,11 +28,10 @@ from lunar.visibility import sunlit_fraction
 from payload_emulator.errors import LinkError
 from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.flight.ports import UNLIMITED
-from payload_emulator.session.live.console import CONSOLE_EXACT, Console
+from payload_emulator.session.live.console import CONSOLE_EXACT, Console, rims_in_view, step_message
 from payload_emulator.session.live.contacts import CONTACTS_EXACT, Account, Contacts, station_names
 from payload_emulator.session.live.state import ClockFile, load_state, save_state
 from payload_emulator.session.live.station_ports import Server
-from payload_emulator.session.live.viewing import rims_in_view, step_message
 from payload_emulator.session.spacecraft.loading import LoadedPayload
 from payload_emulator.session.spacecraft.loop import Spacecraft, StepInput, StepResult, fly, new_spacecraft
 from payload_emulator.session.spacecraft.schedule import Operator, timeline

@@ -42,7 +42,7 @@ from payload_emulator.session.world.world import (
     sample_truth,
     with_reference_error,
 )
-from payload_emulator.sim.orbit.disturbances import TrueBurn
+from payload_emulator.sim.orbit.truth import TrueBurn
 from tmtc.dictionary.tables import (
     BurnTable,
     CatalogueTable,

@@ -22,9 +22,8 @@ from payload_emulator.flight.vision.preprocess import ImageQuality
 from payload_emulator.session.spacecraft.loading import LoadedPayload
 from payload_emulator.session.world.camera import Camera, CatalogueDetector, Exposure
 from payload_emulator.session.world.world import World, clock_ticks
-from payload_emulator.sim.board.faults import Fault, parse_fault
 from payload_emulator.sim.board.link import LIGHT_S, Receiver
-from payload_emulator.sim.board.platform import PlatformModel, SimulatedBoard
+from payload_emulator.sim.board.platform import Fault, PlatformModel, SimulatedBoard, parse_fault
 from payload_emulator.sim.orbit.truth import ReadCount, counted_reads
 from tmtc.packets.pus import TICKS_PER_SECOND
 

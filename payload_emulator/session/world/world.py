@@ -28,8 +28,18 @@ from payload_emulator.session.scenario import ReferenceSection, Scenario, Window
 from payload_emulator.session.world.external import ExternalFrames, external_scenario
 from payload_emulator.session.world.orbit import force_model, propagate_from, propagate_to_impact
 from payload_emulator.session.world.rims import rims_of, sources_of
-from payload_emulator.sim.orbit.disturbances import TrueBurn, changed, executed, turned_state
-from payload_emulator.sim.orbit.truth import Crossing, Truth, find_crossings, frame_times, require_above_ground, spliced
+from payload_emulator.sim.orbit.truth import (
+    Crossing,
+    TrueBurn,
+    Truth,
+    changed,
+    executed,
+    find_crossings,
+    frame_times,
+    require_above_ground,
+    spliced,
+    turned_state,
+)
 from payload_emulator.sim.terrain.opening import open_terrain
 from payload_emulator.sim.terrain.raster import RasterTerrain
 from payload_emulator.sim.terrain.registering import fitted

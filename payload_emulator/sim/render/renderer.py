@@ -21,15 +21,8 @@ from lunar.frames import spherical_from_mcmf
 from payload_emulator.errors import TerrainError
 from payload_emulator.sim.render.light import SUN_ANGULAR_RADIUS_RAD
 from payload_emulator.sim.render.photometry import Photometry
+from payload_emulator.sim.terrain import tiles
 from payload_emulator.sim.terrain.photograph import PhotographTerrain
-from payload_emulator.sim.terrain.tiles import (
-    ALBEDO_SHIFT,
-    MEAN_ALBEDO,
-    MEASURE_LEVEL,
-    TILE_SHIFT,
-    Terrain,
-    TerrainPatch,
-)
 
 Image = npt.NDArray[np.float32]
 
@@ -90,7 +83,7 @@ class View:
 
 
 def render(
-    terrain: Terrain,
+    terrain: tiles.Terrain,
     camera: PinholeCamera,
     position_mcmf_m: npt.ArrayLike,
     camera_from_mcmf: npt.ArrayLike,
@@ -108,7 +101,7 @@ def render(
     """
     photometry = photometry or Photometry()
     view = tangent_view(position_mcmf_m, camera_from_mcmf, sun_direction_mcmf)
-    ground_m = float(terrain.height_m(*_below(position_mcmf_m), MEASURE_LEVEL))
+    ground_m = float(terrain.height_m(*_below(position_mcmf_m), tiles.MEASURE_LEVEL))
     if view.altitude_m <= ground_m + 50.0:
         raise TerrainError(
             f"render: expected a camera above the ground, found it {view.altitude_m - ground_m:.0f} m above terrain "
@@ -153,7 +146,7 @@ def photographed(
 
 
 def _render_grid(
-    terrain: Terrain, camera: PinholeCamera, view: View, grid: TangentGrid, level: int, photometry: Photometry
+    terrain: tiles.Terrain, camera: PinholeCamera, view: View, grid: TangentGrid, level: int, photometry: Photometry
 ) -> Rendering:
     from payload_emulator.sim.render._grid_kernel import Grid, Nodes, Tiles, block_peaks, sweep_shadows
     from payload_emulator.sim.render._shade_kernel import Light, Surface, shade_pixels
@@ -207,8 +200,8 @@ def _render_grid(
             photometry.law == "hapke",
         ),
         Nodes(*nodes),
-        Tiles(patch.heights, patch.table, TILE_SHIFT),
-        Surface(patch.albedo, TILE_SHIFT - ALBEDO_SHIFT, MEAN_ALBEDO, photometry.albedo_contrast),
+        Tiles(patch.heights, patch.table, tiles.TILE_SHIFT),
+        Surface(patch.albedo, tiles.TILE_SHIFT - tiles.ALBEDO_SHIFT, tiles.MEAN_ALBEDO, photometry.albedo_contrast),
         shift_u,
         shift_v,
         radiance,
@@ -279,7 +272,7 @@ def _penumbra(elevation_rad: float) -> float:
     return 0.5 * (high - math.tan(min(elevation_rad, 1.5) - SUN_ANGULAR_RADIUS_RAD))
 
 
-def _fit_grid(terrain: Terrain, camera: PinholeCamera, view: View, level: int) -> tuple[TangentGrid, TangentGrid]:
+def _fit_grid(terrain: tiles.Terrain, camera: PinholeCamera, view: View, level: int) -> tuple[TangentGrid, TangentGrid]:
     """The rectangle that holds the ground in the picture as far as its border shows, and one that holds it surely."""
     low, high = -500.0, 500.0
     rays = _border_rays(camera, view)
@@ -321,7 +314,7 @@ def _reach(rays: FloatArray, altitude_m: float, height_m: npt.ArrayLike) -> Floa
     return np.asarray(np.maximum(descent - root, 0.0))
 
 
-def _border_hits(rays: FloatArray, view: View, patch: TerrainPatch) -> list[FloatArray]:
+def _border_hits(rays: FloatArray, view: View, patch: tiles.TerrainPatch) -> list[FloatArray]:
     """Return where the rays meet the ground, (n, 2) per round of a fixed-point search, the settled rounds only."""
     from payload_emulator.sim.terrain import kernels
 
@@ -333,7 +326,7 @@ def _border_hits(rays: FloatArray, view: View, patch: TerrainPatch) -> list[Floa
         if number >= 4:
             hits.append(place)
         rows, columns = patch.coordinates(*places_of_tangent(view, place[:, 0], place[:, 1], height))
-        kernels.sample_pool(patch.heights, patch.table, TILE_SHIFT, rows, columns, height)
+        kernels.sample_pool(patch.heights, patch.table, tiles.TILE_SHIFT, rows, columns, height)
     return hits
 
 
@@ -370,7 +363,7 @@ def _outline(view: View, *grids: TangentGrid) -> tuple[FloatArray, FloatArray, f
     return np.concatenate(latitudes), np.concatenate(longitudes), spacing
 
 
-def _grid_nodes(grid: TangentGrid, view: View, patch: TerrainPatch) -> tuple[Image, Image, Image, Image]:
+def _grid_nodes(grid: TangentGrid, view: View, patch: tiles.TerrainPatch) -> tuple[Image, Image, Image, Image]:
     """Patch row and column of every 32nd grid point at height 0, and their change per metre of height."""
     i = np.arange((grid.rows - 1) // NODE_STEP + 1) * NODE_STEP
     j = np.arange((grid.columns - 1) // NODE_STEP + 1) * NODE_STEP
@@ -386,12 +379,12 @@ def _grid_nodes(grid: TangentGrid, view: View, patch: TerrainPatch) -> tuple[Ima
     )
 
 
-def _heights(grid: TangentGrid, nodes: tuple[Image, Image, Image, Image], patch: TerrainPatch) -> Image:
+def _heights(grid: TangentGrid, nodes: tuple[Image, Image, Image, Image], patch: tiles.TerrainPatch) -> Image:
     from payload_emulator.sim.render._grid_kernel import Grid, Nodes, Tiles, fill_grid
 
     heights = np.empty((grid.rows, grid.columns), np.float32)
     place = Grid(grid.x0_m, grid.y0_m, grid.texel_m)
-    fill_grid(heights, Nodes(*nodes), Tiles(patch.heights, patch.table, TILE_SHIFT), place)
+    fill_grid(heights, Nodes(*nodes), Tiles(patch.heights, patch.table, tiles.TILE_SHIFT), place)
     return heights
 
 
@@ -407,7 +400,9 @@ def _sunward_grid(grid: TangentGrid, view: View) -> TangentGrid | None:
     return TangentGrid(grid.x0_m - grid.texel_m - (rows - 1) * texel, grid.y0_m - texel, texel, rows, columns)
 
 
-def _incoming_shadow(grid: TangentGrid, sunward: TangentGrid, view: View, patch: TerrainPatch) -> tuple[Image, Image]:
+def _incoming_shadow(
+    grid: TangentGrid, sunward: TangentGrid, view: View, patch: tiles.TerrainPatch
+) -> tuple[Image, Image]:
     """Height of the shadow that falls on the grid's first row from ground nearer the Sun, and how far its caster is."""
     from payload_emulator.sim.render._grid_kernel import sweep_shadows
 

@@ -9,17 +9,7 @@ import numpy.typing as npt
 from lunar.arrays import BoolArray, FloatArray
 from lunar.catalogue import CLASS_LIMITS_M, PAPER_CLASS_COUNTS, CraterCatalogue, make_catalogue
 from lunar.constants import MOON_RADIUS_M
-from payload_emulator.sim.terrain import kernels
-from payload_emulator.sim.terrain.craters import (
-    DEPTH_QUANTILES,
-    CraterShapes,
-    SmallCraters,
-    crater_profiles,
-    draw_depth_ratio,
-    draw_power_law,
-    fresh_depth_ratio,
-    shape_craters,
-)
+from payload_emulator.sim.terrain import craters, kernels
 from payload_emulator.sim.terrain.tiles import MEAN_ALBEDO, Heights, Terrain, coarse_nodes
 
 COARSE_STEP = 8
@@ -76,7 +66,7 @@ class ProceduralTerrain(Terrain):
         Depths it does not tell are drawn.
         """
         self.seed = seed
-        self._profiles = crater_profiles()
+        self._profiles = craters.crater_profiles()
         rng = np.random.Generator(np.random.PCG64([seed, 0x4D4F4F4E]))
         salts = rng.integers(1, 2**31 - 1, 64)
         self._salts = [int(salt) for salt in salts]
@@ -92,7 +82,7 @@ class ProceduralTerrain(Terrain):
         density = 1.0 - (1.0 - PLAIN_CRATERS) * self._plains[::2, ::2][:180, :360]
         weight = np.cos(np.radians(89.5 - np.arange(180)))[:, None]
         density = density / np.average(density, weights=np.broadcast_to(weight, density.shape))
-        self._small = SmallCraters(
+        self._small = craters.SmallCraters(
             seed,
             SMALL_LOW_M,
             CATALOGUE_LOW_M,
@@ -169,7 +159,7 @@ class ProceduralTerrain(Terrain):
         )
         return out.astype(np.float64)
 
-    def _craters_about(self, latitude: FloatArray, longitude: FloatArray) -> CraterShapes:
+    def _craters_about(self, latitude: FloatArray, longitude: FloatArray) -> craters.CraterShapes:
         middle_latitude = 0.5 * float(latitude[0] + latitude[-1])
         middle_longitude = 0.5 * float(longitude[0] + longitude[-1])
         half = float(latitude[0] - latitude[-1]) * 0.75 * MOON_RADIUS_M
@@ -181,7 +171,11 @@ class ProceduralTerrain(Terrain):
 
 
 def stamp(
-    out: Heights, latitude: FloatArray, longitude: FloatArray, shapes: CraterShapes, profiles: npt.NDArray[np.float32]
+    out: Heights,
+    latitude: FloatArray,
+    longitude: FloatArray,
+    shapes: craters.CraterShapes,
+    profiles: npt.NDArray[np.float32],
 ) -> None:
     """Add craters to a tile of heights in place."""
     kernels.stamp_craters(
@@ -227,19 +221,19 @@ def _plains_map(salts: list[int]) -> npt.NDArray[np.float32]:
     return np.asarray(edge * edge * (3.0 - 2.0 * edge), dtype=np.float32)
 
 
-def _shape_catalogue(catalogue: CraterCatalogue, rng: np.random.Generator) -> CraterShapes:
+def _shape_catalogue(catalogue: CraterCatalogue, rng: np.random.Generator) -> craters.CraterShapes:
     """Shapes of a given catalogue's craters, as deep as it says or else as drawn."""
-    drawn = draw_depth_ratio(rng, len(catalogue), DEPTH_QUANTILES)
+    drawn = craters.draw_depth_ratio(rng, len(catalogue), craters.DEPTH_QUANTILES)
     known = catalogue.depth_m / catalogue.diameter_m
     # Drawn ratios are of simple craters and shrink with the fresh depth of large ones; what a catalogue says does not.
-    shrink = np.minimum(1.0, fresh_depth_ratio(catalogue.diameter_m) / 0.2)
+    shrink = np.minimum(1.0, craters.fresh_depth_ratio(catalogue.diameter_m) / 0.2)
     ratio = np.where(np.isfinite(known), np.maximum(known, 0.005) / shrink, drawn)
-    return shape_craters(catalogue.latitude_rad, catalogue.longitude_rad, catalogue.diameter_m, ratio, rng)
+    return craters.shape_craters(catalogue.latitude_rad, catalogue.longitude_rad, catalogue.diameter_m, ratio, rng)
 
 
 def _draw_catalogue(
     rng: np.random.Generator, plains: npt.NDArray[np.float32], seed: int
-) -> tuple[CraterCatalogue, CraterShapes]:
+) -> tuple[CraterCatalogue, craters.CraterShapes]:
     """The synthetic catalogue from 2 km up, largest first, and the shapes that are stamped for it."""
     above = sum(PAPER_CLASS_COUNTS) + LARGE_CRATERS
     below = round(above * ((CLASS_LIMITS_M[0] / CATALOGUE_LOW_M) ** BELOW_CLASSES_EXPONENT - 1.0))
@@ -250,7 +244,7 @@ def _draw_catalogue(
         (PAPER_CLASS_COUNTS[0], CLASS_LIMITS_M[0], CLASS_LIMITS_M[1], 1.77),
         (below, CATALOGUE_LOW_M, CLASS_LIMITS_M[0] * 0.9999, BELOW_CLASSES_EXPONENT),
     )
-    diameter = np.concatenate([draw_power_law(rng, *span) for span in spans])
+    diameter = np.concatenate([craters.draw_power_law(rng, *span) for span in spans])
     diameter = diameter[np.argsort(-diameter, kind="stable")]
     count = diameter.size
     latitude, longitude = np.empty(count), np.empty(count)
@@ -262,6 +256,6 @@ def _draw_catalogue(
         column = np.rint(np.degrees(longitude[todo]) * 2.0).astype(np.int64) % 720
         keep = 1.0 - (1.0 - PLAIN_CRATERS) * plains[row, column]
         todo = todo[rng.random(todo.size) > keep]
-    ratio = draw_depth_ratio(rng, count, DEPTH_QUANTILES)
+    ratio = craters.draw_depth_ratio(rng, count, craters.DEPTH_QUANTILES)
     catalogue = make_catalogue(latitude, longitude, diameter, source=f"synthetic, seed {seed}")
-    return catalogue, shape_craters(latitude, longitude, diameter, ratio, rng)
+    return catalogue, craters.shape_craters(latitude, longitude, diameter, ratio, rng)

@@ -29,7 +29,7 @@ from payload_emulator.session.world.recipe import Recipe, Source
 from payload_emulator.training.data import dataset as store
 from payload_emulator.training.data.finishing import write_index
 from payload_emulator.training.data.frames import describe, take_frame
-from payload_emulator.training.data.shots import Place, draw_box, draw_pose, pose_at, view_position_mcmf_m
+from payload_emulator.training.data.shots import ShardBox, draw_box, draw_pose, pose_at, view_position_mcmf_m
 from payload_emulator.training.data.track import Track, lay_track
 
 _FOLDERS = ("images", "metadata", "shards")
@@ -137,7 +137,7 @@ def make_shard(
     terrain = _terrain(source, shard.seed, data_root)
     rng = np.random.Generator(np.random.Philox(key=[recipe.seed, shard.number]))
     camera = _camera(recipe)
-    place = None if source.ephemeris else Place(draw_box(source, rng))
+    place = None if source.ephemeris else ShardBox(draw_box(source, rng))
     shots: list[Any] = []
     hashes = []
     for k, number in enumerate(shard.frame_numbers):

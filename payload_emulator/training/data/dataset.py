@@ -34,7 +34,23 @@ from lunar.constants import MOON_RADIUS_M
 from payload_emulator.errors import DatasetError
 from payload_emulator.flight.vision.preprocess import gray_levels
 from payload_emulator.training.data.targets import Tier
-from payload_emulator.training.data.truth import FrameTruth
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameTruth:
+    """Catalogued craters in view of one frame, arrays (n,); `block` names the independent piece of ground."""
+
+    u_px: FloatArray
+    v_px: FloatArray
+    diameter_px: FloatArray
+    diameter_m: FloatArray
+    depth_ratio: FloatArray
+    ids: IntArray
+    width_px: int
+    height_px: int
+    sun_azimuth_image_rad: float
+    block: int
+
 
 SCHEMA_VERSION = 1
 CATEGORIES = ((0, "5-10 km"), (1, "10-15 km"), (2, "15-30 km"), (3, "3-5 km"))

@@ -13,16 +13,7 @@ import numpy as np
 from lunar.arrays import FloatArray
 from lunar.catalogue import size_class
 from payload_emulator.session.world.recipe import SPLITS, Recipe
-from payload_emulator.training.data.dataset import (
-    CATEGORIES,
-    SCHEMA_VERSION,
-    Frame,
-    choose_tiers,
-    in_picture,
-    load_shard,
-    shard_frames,
-    write_whole,
-)
+from payload_emulator.training.data import dataset
 from payload_emulator.training.data.targets import Tier
 
 FIRST_ID = 1
@@ -36,7 +27,7 @@ def write_index(folder: Path, recipe: Recipe, frames: int, shards: dict[str, str
     """Write the COCO files and, last, dataset.json with the hashes of them and of the shards."""
     files = _write_coco(folder, recipe, sorted(shards))
     index = {
-        "schema_version": SCHEMA_VERSION,
+        "schema_version": dataset.SCHEMA_VERSION,
         "name": recipe.name,
         "recipe": recipe.to_dict(),
         "recipe_sha256": recipe.digest,
@@ -47,7 +38,7 @@ def write_index(folder: Path, recipe: Recipe, frames: int, shards: dict[str, str
         "files": files,
     }
     index["sha256"] = index_digest(index)
-    write_whole(folder / "dataset.json", json.dumps(index, indent=1, sort_keys=True).encode())
+    dataset.write_whole(folder / "dataset.json", json.dumps(index, indent=1, sort_keys=True).encode())
 
 
 def index_digest(index: dict[str, Any]) -> str:
@@ -64,7 +55,7 @@ def _write_coco(folder: Path, recipe: Recipe, shards: Sequence[str]) -> dict[str
     writers = {split: _CocoFile(folder / f"coco_{split}.json", recipe) for split in SPLITS}
     try:
         for name in shards:
-            for frame in shard_frames(load_shard(folder / "shards" / f"{name}.npz")):
+            for frame in dataset.shard_frames(dataset.load_shard(folder / "shards" / f"{name}.npz")):
                 writers[frame.split].add(frame)
         return {writer.path.name: writer.finish() for writer in writers.values()}
     finally:
@@ -83,15 +74,17 @@ class _CocoFile:
         self._digest = hashlib.sha256()
         self._images: list[tuple[int, float]] = []
         self._count = 0
-        categories = [{"id": number + FIRST_ID, "name": name, "supercategory": "crater"} for number, name in CATEGORIES]
+        categories = [
+            {"id": number + FIRST_ID, "name": name, "supercategory": "crater"} for number, name in dataset.CATEGORIES
+        ]
         head = {
-            "info": {"description": recipe.name, "version": str(SCHEMA_VERSION)},
+            "info": {"description": recipe.name, "version": str(dataset.SCHEMA_VERSION)},
             "licenses": [],
             "categories": categories,
         }
         self._write(json.dumps(head)[:-1] + ', "annotations": [')
 
-    def add(self, frame: Frame) -> None:
+    def add(self, frame: dataset.Frame) -> None:
         self._images.append((frame.number, round(math.degrees(frame.sun_azimuth_rad) % 360.0, 3)))
         for annotation in _annotations(frame, *self._size):
             self._count += 1
@@ -123,7 +116,7 @@ class _CocoFile:
         self._out.write(octets)
 
 
-def _annotations(frame: Frame, width_px: int, height_px: int) -> Iterator[dict[str, Any]]:
+def _annotations(frame: dataset.Frame, width_px: int, height_px: int) -> Iterator[dict[str, Any]]:
     """COCO annotations of a frame's craters, in pixels from the corner of the first pixel.
 
     Segmentation, box and area are those of the part of the rim's ellipse that lies in the image. Under `ellipse`, the
@@ -132,8 +125,8 @@ def _annotations(frame: Frame, width_px: int, height_px: int) -> Iterator[dict[s
     """
     craters = frame.craters
     classes = size_class(craters["diameter_m"].astype(np.float64))
-    tiers, _ = choose_tiers(craters, width_px, height_px, frame.complete)
-    for k in np.flatnonzero(in_picture(craters, width_px, height_px) & (classes >= 0)):
+    tiers, _ = dataset.choose_tiers(craters, width_px, height_px, frame.complete)
+    for k in np.flatnonzero(dataset.in_picture(craters, width_px, height_px) & (classes >= 0)):
         u, v, d = (float(craters[name][k]) for name in ("u_px", "v_px", "diameter_px"))
         a, b = 0.5 * float(craters["major_px"][k]), 0.5 * float(craters["minor_px"][k])
         angle = float(craters["angle_rad"][k])

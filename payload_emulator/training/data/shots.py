@@ -25,7 +25,7 @@ _SHARD_REACH_DEG = 2.5  # frames of a shard look at neighbouring ground, so that
 
 
 @dataclass(slots=True)
-class Place:
+class ShardBox:
     """Region of the frames of a shard: the box of its source; after the first frame, the part about that frame."""
 
     box: Box
@@ -44,7 +44,7 @@ class Pose:
     camera_from_mcmf: FloatArray
 
 
-def draw_pose(terrain: Any, camera: PinholeCamera, source: Source, place: Place, rng: np.random.Generator) -> Pose:
+def draw_pose(terrain: Any, camera: PinholeCamera, source: Source, place: ShardBox, rng: np.random.Generator) -> Pose:
     """A pose whose footprint lies where the source may look, on the terrain, well above the ground.
 
     Raises
@@ -79,7 +79,7 @@ def draw_pose(terrain: Any, camera: PinholeCamera, source: Source, place: Place,
 
 
 def view_position_mcmf_m(source: Source, first: Pose, view: int) -> FloatArray:
-    """Place (3,) of a later view of a pose, MCMF m: further north at the same altitude above the map sphere."""
+    """Position (3,) of a later view of a pose, MCMF m: further north at the same altitude above the map sphere."""
     latitude, longitude = _views(source, first.latitude_rad, first.longitude_rad)[view]
     return np.asarray(mcmf_from_spherical(latitude, longitude, first.altitude_m))
 

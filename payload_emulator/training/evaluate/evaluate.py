@@ -17,8 +17,14 @@ from payload_emulator.flight.vision.detector import (
     drop_duplicates,
 )
 from payload_emulator.flight.vision.preprocess import Preparation, prepare_image, sun_up_turns, turn_back
-from payload_emulator.training.data.dataset import Dataset, Frame, diameter_on_ground_m, frame_truth, ground_points
-from payload_emulator.training.data.truth import FrameTruth
+from payload_emulator.training.data.dataset import (
+    Dataset,
+    Frame,
+    FrameTruth,
+    diameter_on_ground_m,
+    frame_truth,
+    ground_points,
+)
 from payload_emulator.training.evaluate.metrics import Scene, Thresholds, score
 from payload_emulator.training.evaluate.scoring import FrameDetections
 

@@ -26,17 +26,10 @@ from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.detector import OnnxDetector
 from payload_emulator.flight.vision.picture_search import PictureSearch, search_picture, sun_at_azimuth
 from payload_emulator.session.world.external import read_picture
+from payload_emulator.training.data.dataset import FrameTruth
 from payload_emulator.training.data.pictures import LabelledPicture, load_pictures, set_words
-from payload_emulator.training.data.truth import FrameTruth
-from payload_emulator.training.evaluate.localisation import bias_by_octant, bias_overall
-from payload_emulator.training.evaluate.scoring import (
-    Tally,
-    average_precision,
-    crater_columns,
-    detection_columns,
-    joined,
-    with_interval,
-)
+from payload_emulator.training.evaluate import scoring
+from payload_emulator.training.evaluate.metrics import bias_by_octant, bias_overall
 
 DIAMETER_RANGE_PX = (8.0, 150.0)
 DIAMETER_EDGES_PX = (8.0, 12.0, 16.0, 32.0, 64.0, 150.0)
@@ -149,7 +142,7 @@ def tally_pictures(
     criterion: Criterion,
     ranges_px: Sequence[tuple[float, float]],
     sun_azimuth_deg: FloatArray,
-) -> Tally:
+) -> scoring.Tally:
     """Every detection and expected label after matching; `ranges_px` holds the least and greatest diameter by picture.
 
     Blocks of the tally are pictures, so intervals come from resampling pictures.
@@ -166,9 +159,9 @@ def tally_pictures(
         hit = np.where(right, np.searchsorted(wanted, taken), -1)
         truth = _truth(picture, float(np.nan_to_num(sun_azimuth_deg[number])), number)
         every = np.arange(len(part))
-        detections.append(detection_columns(number, truth, part, wanted, every, hit, outcome))
-        craters.append(crater_columns(number, truth, part.score, wanted, hit))
-    return joined(detections, craters)
+        detections.append(scoring.detection_columns(number, truth, part, wanted, every, hit, outcome))
+        craters.append(scoring.crater_columns(number, truth, part.score, wanted, hit))
+    return scoring.joined(detections, craters)
 
 
 def format_picture_figures(figures: dict[str, Any]) -> str:
@@ -267,11 +260,11 @@ def _figures(
     if way is SunKnowledge.found:
         azimuths = np.array([math.nan if s.sun is None else s.sun.azimuth_deg for s in searches])
 
-    def tallied(criterion: Criterion, ranges: Sequence[tuple[float, float]]) -> Tally:
+    def tallied(criterion: Criterion, ranges: Sequence[tuple[float, float]]) -> scoring.Tally:
         return tally_pictures(pictures, found, criterion, ranges, azimuths)
 
     def both(ranges: Sequence[tuple[float, float]]) -> dict[str, Any]:
-        return {c.value: with_interval(tallied(c, ranges), threshold) for c in Criterion}
+        return {c.value: scoring.with_interval(tallied(c, ranges), threshold) for c in Criterion}
 
     whole = [options.range_px] * len(pictures)
     centre = tallied(Criterion.centre, whole)
@@ -280,7 +273,7 @@ def _figures(
     rows: dict[str, Any] = both(whole)
     return {
         **rows,
-        "average_precision": {c.value: average_precision(tallied(c, whole)) for c in Criterion},
+        "average_precision": {c.value: scoring.average_precision(tallied(c, whole)) for c in Criterion},
         "by_diameter_px": [
             {"low": low, "high": high, **both([(low, high)] * len(pictures))}
             for low, high in itertools.pairwise(DIAMETER_EDGES_PX)

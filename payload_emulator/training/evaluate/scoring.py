@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.catalogue import CLASS_LIMITS_M, size_class
 from payload_emulator.flight.vision.detections import Detections
-from payload_emulator.training.data.truth import FrameTruth
+from payload_emulator.training.data.dataset import FrameTruth
 
 PAPER_TABLE_2 = (
     {"precision": 0.7021, "recall": 0.3248, "loc_px": 3.50},

@@ -9,8 +9,7 @@ import numpy as np
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.detector import STRIDE_PX, TYPICAL_DEPTH_RATIO, remove_parallax
 from payload_emulator.flight.vision.preprocess import sun_up_turns, turn_forward
-from payload_emulator.training.data.dataset import Dataset, Frame, frame_truth
-from payload_emulator.training.data.truth import FrameTruth
+from payload_emulator.training.data.dataset import Dataset, Frame, FrameTruth, frame_truth
 from payload_emulator.training.evaluate.evaluate import detect_with_network
 from payload_emulator.training.evaluate.scoring import (
     FrameDetections,

@@ -20,24 +20,11 @@ import numpy as np
 
 from lunar.arrays import BoolArray, FloatArray, IntArray
 from payload_emulator.errors import DatasetError, ModelError
-from payload_emulator.flight.vision.calibration import (
-    CALIBRATION_KEY,
-    REFERENCE_DIAMETER_PX,
-    SigmaModel,
-    format_calibration,
-    sigma_features,
-    with_metadata,
-)
+from payload_emulator.flight.vision import calibration
 from payload_emulator.flight.vision.detections import Detections
 from payload_emulator.flight.vision.detector import DetectorParameters, OnnxDetector
-from payload_emulator.training.data.dataset import Dataset, Frame, frame_truth
-from payload_emulator.training.data.truth import FrameTruth
-from payload_emulator.training.evaluate.evaluate import (
-    EVERY_DETECTION,
-    SCORE_FLOOR,
-    detect_with_model,
-    refuse_other_camera,
-)
+from payload_emulator.training.data.dataset import Dataset, Frame, FrameTruth, frame_truth
+from payload_emulator.training.evaluate import evaluate
 from payload_emulator.training.evaluate.scoring import FrameDetections, MatchRule, match, tally
 
 _KNOTS_PX = (10.0, 14.0, 20.0, 32.0, 48.0, 80.0)
@@ -112,7 +99,7 @@ def sun_directions(diameter_px: FloatArray, sun_in_camera: FloatArray) -> FloatA
     tilt = azimuth - 0.5 * np.pi * np.rint(azimuth / (0.5 * np.pi))
     toward = np.array([np.sin(azimuth), -np.cos(azimuth)])
     across = np.array([np.cos(azimuth), np.sin(azimuth)])
-    size = np.minimum(diameter_px, _LARGEST_PULLED_PX) / REFERENCE_DIAMETER_PX
+    size = np.minimum(diameter_px, _LARGEST_PULLED_PX) / calibration.REFERENCE_DIAMETER_PX
     one = np.ones_like(size)
     return np.stack(
         [one[:, None] * toward, size[:, None] * toward, one[:, None] * np.sin(2.0 * tilt) * across], axis=-1
@@ -122,8 +109,8 @@ def sun_directions(diameter_px: FloatArray, sun_in_camera: FloatArray) -> FloatA
 def plain_model(model_octets: bytes) -> bytes:
     """The model without a calibration."""
     metadata = dict(OnnxDetector(model_octets).metadata)
-    metadata.pop(CALIBRATION_KEY, None)
-    return with_metadata(model_octets, metadata)
+    metadata.pop(calibration.CALIBRATION_KEY, None)
+    return calibration.with_metadata(model_octets, metadata)
 
 
 def fit_calibration(
@@ -139,14 +126,16 @@ def fit_calibration(
         The network gives classes and no sizes.
     """
     plain = plain_model(model_octets)
-    detector = OnnxDetector(plain, DetectorParameters(score_threshold=SCORE_FLOOR, max_detections=EVERY_DETECTION))
+    detector = OnnxDetector(
+        plain, DetectorParameters(score_threshold=evaluate.SCORE_FLOOR, max_detections=evaluate.EVERY_DETECTION)
+    )
     if detector.class_medians_m is not None:
         raise ModelError("detector network: expected one that gives sizes, found one that gives classes only")
     frames = _validation_frames(datasets)
     for dataset in datasets:
-        refuse_other_camera(detector, dataset)
+        evaluate.refuse_other_camera(detector, dataset)
     truths = [frame_truth(d, f) for d, f in frames]
-    found = [detect_with_model(detector, d, f) for d, f in progress(frames)]
+    found = [evaluate.detect_with_model(detector, d, f) for d, f in progress(frames)]
     pairs = _pairs(frames, truths, found, fit_score(truths, found))
     residual_px, evidence = fit_sun(pairs)
     sigma, sigma_evidence = fit_sigma(replace(pairs, error_px=residual_px))
@@ -155,13 +144,15 @@ def fit_calibration(
         "pairs": int(pairs.place.size),
         "labels_sha256": [dataset.digest for dataset in datasets],
     }
-    metadata = dict(detector.metadata) | {CALIBRATION_KEY: format_calibration(sigma, plain, notes)}
+    metadata = dict(detector.metadata) | {
+        calibration.CALIBRATION_KEY: calibration.format_calibration(sigma, plain, notes)
+    }
     document = {
         **notes,
         "sun": evidence,
         "sigma": {"fresh": list(sigma.fresh), "total": list(sigma.total), **sigma_evidence},
     }
-    return with_metadata(plain, metadata), document
+    return calibration.with_metadata(plain, metadata), document
 
 
 def _validation_frames(datasets: Sequence[Dataset]) -> list[tuple[Dataset, Frame]]:
@@ -241,7 +232,7 @@ def _pairs(
         )
         above_m = frame.values["altitude_m"] - frame.values["ground_m"]
         columns[0].append(np.stack([part.u_px[d] - truth.u_px[c], part.v_px[d] - truth.v_px[c]], axis=1))
-        columns[1].append(sigma_features(seen, frame.sun_camera, truth.width_px, truth.height_px))
+        columns[1].append(calibration.sigma_features(seen, frame.sun_camera, truth.width_px, truth.height_px))
         columns[2].append(sun_directions(seen.diameter_px, frame.sun_camera))
         columns[3].append(np.full(d.size, above_m / dataset.focal_px))
         columns[4].append(np.full(d.size, _place(frame), dtype=np.int64))
@@ -306,7 +297,7 @@ def fit_sun(pairs: Pairs) -> tuple[FloatArray, dict[str, Any]]:
     return residual, evidence
 
 
-def fit_sigma(pairs: Pairs) -> tuple[SigmaModel, dict[str, Any]]:
+def fit_sigma(pairs: Pairs) -> tuple[calibration.SigmaModel, dict[str, Any]]:
     """Standard deviations by their features, in all and new in every frame.
 
     Raises
@@ -331,7 +322,7 @@ def fit_sigma(pairs: Pairs) -> tuple[SigmaModel, dict[str, Any]]:
     fresh, kept_again = _log_linear(inner.features[again], 0.5 * (scatter**2).sum(axis=1), _FRESH_OUTLIER_SIGMAS)
     fresh[0] += np.log(FRESH_FACTOR)
     low, high = np.percentile(inner.features, (1.0, 99.0), axis=0)
-    model = SigmaModel(*(tuple(float(x) for x in part) for part in (fresh, total, low, high)))
+    model = calibration.SigmaModel(*(tuple(float(x) for x in part) for part in (fresh, total, low, high)))
     variance, of_frame = model.variances_px2(inner.features)
     return model, {
         "detections": int(again.sum()),
@@ -340,7 +331,7 @@ def fit_sigma(pairs: Pairs) -> tuple[SigmaModel, dict[str, Any]]:
         "outlier_share_fresh": float(1.0 - kept_again.mean()),
         "by_diameter_px": [
             {
-                "diameter_px": float(np.exp(size) * REFERENCE_DIAMETER_PX),
+                "diameter_px": float(np.exp(size) * calibration.REFERENCE_DIAMETER_PX),
                 "sigma_px": float(np.sqrt(variance[part].mean())),
                 "fresh_px": float(np.sqrt(of_frame[part].mean())),
                 "persistence": float(1.0 - of_frame[part].mean() / variance[part].mean()),

@@ -329,7 +329,7 @@ class _Team:
     def _work(self, member: Any, feeder: Feeder, first: int, count: int) -> FloatArray:
         import torch
 
-        from payload_emulator.training.model.loss import LossWeights, crater_loss
+        from payload_emulator.training.model.model import LossWeights, crater_loss
 
         p = self.parameters
         micro = count if self.device == "cuda" else min(p.micro_batch, count)

@@ -65,7 +65,7 @@ LINES = [
 ]  # fmt: skip
 
 
-def what_clients_were_told():
+def record_of_clients():
     return Ledger(
         entered=[Entered(11, 1, "ann"), Entered(12, 2, "ann"), Entered(13, 3, "ann")],
         decisions=[
@@ -78,8 +78,8 @@ def what_clients_were_told():
     )
 
 
-def test_an_archive_that_holds_what_clients_were_told_has_no_faults():
-    assert judge(what_clients_were_told(), ROWS, LINES).total() == 0
+def test_an_archive_that_holds_all_answered_requests_has_no_faults():
+    assert judge(record_of_clients(), ROWS, LINES).total() == 0
 
 
 def changed(number, **values):
@@ -98,31 +98,31 @@ def changed(number, **values):
     ],
 )  # fmt: skip
 def test_each_difference_of_a_row_is_a_fault(fault, rows):
-    assert judge(what_clients_were_told(), rows, LINES)[fault] > 0
+    assert judge(record_of_clients(), rows, LINES)[fault] > 0
 
 
 def test_a_second_hand_out_and_a_changed_answer_are_faults():
-    told = what_clients_were_told()
-    told.hand_outs.append(HandOut("ann", (1,), b"one"))
-    assert judge(told, ROWS, LINES)["double_hand_outs"] == 1
-    told = what_clients_were_told()
-    told.count("changed_answers")
-    assert judge(told, ROWS, LINES)["hand_outs_wrong"] == 1
+    record = record_of_clients()
+    record.hand_outs.append(HandOut("ann", (1,), b"one"))
+    assert judge(record, ROWS, LINES)["double_hand_outs"] == 1
+    record = record_of_clients()
+    record.count("changed_answers")
+    assert judge(record, ROWS, LINES)["hand_outs_wrong"] == 1
     sent = changed(3, state="sent")
-    told = what_clients_were_told()
-    told.count("unanswered_hand_outs")
-    assert judge(told, sent, [*LINES, AuditLine("send", 3, "ann")]).total() == 0
+    record = record_of_clients()
+    record.count("unanswered_hand_outs")
+    assert judge(record, sent, [*LINES, AuditLine("send", 3, "ann")]).total() == 0
 
 
 def test_every_change_has_one_audit_entry_of_its_actor():
-    told = what_clients_were_told()
+    record = record_of_clients()
     for number in range(len(LINES)):
         missing = [line for k, line in enumerate(LINES) if k != number]
-        assert judge(told, ROWS, missing)["audit_wrong"] == 1
-        assert judge(told, ROWS, [*LINES, LINES[number]])["audit_wrong"] == 1
+        assert judge(record, ROWS, missing)["audit_wrong"] == 1
+        assert judge(record, ROWS, [*LINES, LINES[number]])["audit_wrong"] == 1
         other = [replace(line, actor="eve") if k == number else line for k, line in enumerate(LINES)]
-        assert judge(told, ROWS, other)["audit_wrong"] == (LINES[number].command != 4 or 1)
-    assert judge(told, ROWS, [*LINES, AuditLine("release", 4, "ann")])["audit_wrong"] == 1
+        assert judge(record, ROWS, other)["audit_wrong"] == (LINES[number].command != 4 or 1)
+    assert judge(record, ROWS, [*LINES, AuditLine("release", 4, "ann")])["audit_wrong"] == 1
 
 
 def test_pieces_are_cut_at_any_octet_and_make_up_the_stream():

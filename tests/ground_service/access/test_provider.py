@@ -197,8 +197,8 @@ def test_a_user_without_a_role_is_refused(client, ground, provider, subtests):
     for roles in ([], ["visitors"], None, "", 7):
         provider.claims["roles"] = roles
         with subtests.test(roles=roles):
-            told = ("role", "claim roles", "linna-admins, linna-operators, linna-viewers")
-            refused(answered(client, provider), *told)
+            expected = ("role", "claim roles", "linna-admins, linna-operators, linna-viewers")
+            refused(answered(client, provider), *expected)
             assert users.list_users(ground) == []
 
 

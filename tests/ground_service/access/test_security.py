@@ -1,4 +1,4 @@
-"""Who a request comes from, and which role it needs."""
+"""Caller of a request, and the role that it needs."""
 
 import asyncio
 from types import SimpleNamespace

@@ -1,5 +1,5 @@
-"""Fixes repeated from single frames, and told right from wrong, on exact projections. The payload's own map
-beside the catalogue.
+"""Fixes repeated from single frames, and classified as right or wrong, on exact projections. Landmarks of the
+payload with the catalogue.
 """
 
 import math

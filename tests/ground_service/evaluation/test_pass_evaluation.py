@@ -531,13 +531,13 @@ def test_frames_are_accounted_for(report):
     assert evaluated(navigation=(more,)).accounting.navigated == 6
 
 
-def test_the_pointing_is_told_from_what_is_known_of_it():
+def test_the_pointing_is_described_by_what_is_known_of_it():
     nadir = Viewing(CAMERA).pointed(circle(CADENCE_S * np.arange(FRAMES))[0])
     every = evaluated(viewing=Viewing(CAMERA, attitude_utc_ns=TIMES, q_wxyz=quaternion_from_matrix(nadir)))
     assert scored(every)[0].detected_true == 29
     assert "into the camera in its telemetered attitude;" in scored(every)[1]
     assert len(every.remarks) == 1
-    # The first five frames were told a quarter of a turn off: of the four that see anything, only the centre is found.
+    # The attitude of five frames is a quarter of a turn off: of four that see anything, only the centre is found.
     turned = quaternion_from_matrix(axis_rotation(3, -math.pi / 2.0) @ nadir[:5])
     some = evaluated(viewing=Viewing(CAMERA, attitude_utc_ns=TIMES[:5], q_wxyz=turned))
     assert [one.detected_true for one in some.detector.per_class] == [10, 6, 5]
@@ -556,7 +556,7 @@ def identified():
     return IdentificationSamples(TIMES[frames], place, 10 * frames + named)
 
 
-def test_fixes_are_repeated_from_single_frames_and_told_right_from_wrong():
+def test_fixes_are_repeated_from_single_frames_and_classified_as_right_or_wrong():
     """A shift of 0.6 and 0.8 px is one of 20 and 27 m over the ground, on a camera that looks straight down."""
     report = evaluated(identifications=identified())
     assert series(report, "anchored").wrong_fixes == 1
@@ -592,7 +592,7 @@ def test_the_map_of_the_payload_is_compared_with_the_catalogue(report):
     assert report.payload_map is None
 
 
-def test_the_sun_and_the_ground_stand_beside_every_estimate():
+def test_every_estimate_has_the_sun_and_the_ground():
     dark_west = np.full((4, 360), 200, dtype=np.uint8)
     dark_west[:, :4] = 50
     surface = TerrainMap(dark_west, 0.0, 360.0, -90.0, 90.0)

@@ -103,9 +103,13 @@ def test_times_with_a_degraded_attitude_and_the_newest_offset_of_the_list_on_boa
     offsets = (
         event(90, "map_offset", newest),
         event(5, "map_offset", "frame 0: 60 m east and north, from 0 fixes"),
+        event(90, "detection_noise", "frame 80: 0.8 times the stated noise, from 80 fixes"),
         event(99, "boot"),
     )
-    assert event_remarks(offsets) == [f"offset of the crater list used on board, 1 sigma: {newest}"]
+    assert event_remarks(offsets) == [
+        f"offset of the crater list used on board, 1 sigma: {newest}",
+        "noise of detections used on board: frame 80: 0.8 times the stated noise, from 80 fixes",
+    ]
     assert event_remarks(()) == []
 
 
@@ -193,7 +197,7 @@ def test_an_albedo_map_is_read_once_by_all_processes_until_its_file_changes(tmp_
     assert shown(even[::-1])[512, 0] > 200 > 50 > first[512, 0]
 
 
-def test_a_file_that_is_no_picture_is_told(tmp_path):
+def test_a_file_that_is_no_picture_is_reported(tmp_path):
     (tmp_path / "albedo.jpg").write_text("no picture")
     with pytest.raises(InvalidInput, match="cannot be read"):
         surface_map(tmp_path / "albedo.jpg")
@@ -201,7 +205,7 @@ def test_a_file_that_is_no_picture_is_told(tmp_path):
 
 @pytest.mark.real_data
 def test_a_fifth_of_the_real_moon_is_dark_and_the_sea_of_tranquillity_is(data_path):
-    # Maria cover about 17 % of the Moon (Head 1976, Reviews of Geophysics 14, 265); other ground is dark beside them.
+    # Maria cover about 17 % of the Moon (Head 1976, Reviews of Geophysics 14, 265); other ground is darker.
     albedo = find_data(data_path).albedo
     assert albedo is not None
     found = surface_map(albedo)
@@ -385,8 +389,8 @@ def test_a_telemetered_attitude_wins_over_the_declared_pointing():
     mcmf_from_icrf = np.array([[[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]])
     q = quaternion_from_matrix(tilted @ mcmf_from_icrf)
     viewing = Viewing(CAMERA, attitude_utc_ns=np.array([1_000]), q_wxyz=q)
-    told = viewing.camera_from_mcmf(np.array([1_000]), POSITION, mcmf_from_icrf)
-    assert_allclose(told, tilted, atol=1e-12)
+    rotation = viewing.camera_from_mcmf(np.array([1_000]), POSITION, mcmf_from_icrf)
+    assert_allclose(rotation, tilted, atol=1e-12)
     other = viewing.camera_from_mcmf(np.array([1_001]), POSITION, mcmf_from_icrf)
     assert_allclose(other, Viewing(CAMERA).pointed(POSITION), atol=1e-12)
     assert viewing.known(np.array([999, 1_000, 1_001])).tolist() == [False, True, False]

@@ -1,4 +1,4 @@
-"""The smoother against a batch solution of the same measurements, and on what it was not told of."""
+"""The smoother against a batch solution of the same measurements, and with unannounced changes."""
 
 from dataclasses import replace
 

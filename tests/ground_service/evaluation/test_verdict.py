@@ -224,13 +224,13 @@ def test_packets_whose_loss_at_the_edges_is_not_known_are_never_complete():
 
 
 def test_two_frames_are_judged_and_one_is_not():
-    for count, told in (
+    for count, expected in (
         (2, ("met", "anchored, 2 samples")),
         (1, ("unknown", "only one frame was navigated, too few for a judgement")),
     ):
         flown = replace(series("anchored"), utc_ns=np.zeros(count, dtype=np.int64))
         judged = row("accuracy.median", EVERY_LIMIT, found(flown))
-        assert (judged.status, judged.note) == told
+        assert (judged.status, judged.note) == expected
 
 
 def table(*statuses):

@@ -12,9 +12,7 @@ import sqlite3
 import tracemalloc
 import zipfile
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +31,7 @@ from ground_service.exports import service
 from ground_service.exports.maps import Feature, Layer, cut_line, cut_ring, format_geojson, geopackage_octets
 from ground_service.exports.model import FORMATS, ExportRequest
 from ground_service.exports.service import export_pass, list_formats
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.missions import frames as declared
 from ground_service.passes.archive_import import import_archive
 from ground_service.passes.service import define_pass
@@ -56,7 +54,7 @@ from lunar.messages.spice import camera_id, et_from_utc_ns, spacecraft_id
 from lunar.timescales import format_utc, tdb_s_from_utc_ns
 from tests.ground_service.conftest import FILTER_ERROR_RTN_M, SPACECRAFT, SPHERICAL_ERROR_RTN_M
 from tests.ground_service.evaluation.still import TurnedOrientation
-from tests.ground_service.exports.conftest import COVARIANCE, FRAMES, RichPass
+from tests.ground_service.exports.conftest import COVARIANCE, FRAMES
 from tests.lazy import Lazy
 from tests.serving import TestClient
 from tmtc.errors import MissingLibrary
@@ -69,8 +67,8 @@ CRAFT = spacecraft_id(SPACECRAFT)
 
 
 @pytest.fixture
-def export(rich_ground: Ground) -> Callable[..., bytes]:
-    def run(kind: str, states: str = "reference") -> bytes:
+def export(rich_ground):
+    def run(kind, states="reference"):
         request = ExportRequest.model_validate({"pass_id": 1, "format": kind, "states": states})
         found = export_pass(rich_ground, request)
         octets = b"".join(found.blocks())
@@ -80,12 +78,12 @@ def export(rich_ground: Ground) -> Callable[..., bytes]:
     return run
 
 
-def unzipped(octets: bytes) -> dict[str, bytes]:
+def unzipped(octets):
     with zipfile.ZipFile(io.BytesIO(octets)) as archive:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-def features(export, layer: str, states: str = "reference") -> list[Any]:
+def features(export, layer, states="reference"):
     document = json.loads(export("geojson", states))
     return [one for one in document["features"] if one["properties"]["layer"] == layer]
 
@@ -102,13 +100,13 @@ def test_oem_is_the_reference_in_the_interval_of_the_pass(export, rich_pass):
         assert_array_equal(one.at(between)[0], expected)
 
 
-def errors_rtn_m(rich_pass: RichPass, utc_ns: Any, position_icrf_m: Any) -> np.ndarray:
+def errors_rtn_m(rich_pass, utc_ns, position_icrf_m):
     position, velocity = load_ephemeris(rich_pass.folder / "reference.oem").at(utc_ns)
     rtn = rtn_from_inertial(position, velocity)
     return np.einsum("nij,nj->ni", rtn, np.asarray(position_icrf_m) - position)
 
 
-def rows_of(files: dict[str, bytes], name: str) -> list[dict[str, str]]:
+def rows_of(files, name):
     return list(csv.DictReader(io.StringIO(files[f"{name}.csv"].decode())))
 
 
@@ -437,10 +435,10 @@ def test_a_missing_library_is_one_line_with_its_extra(export, monkeypatch, kind)
 
 
 @pytest.fixture
-def linna(rich_ground: Ground, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Any:
+def linna(rich_ground, tmp_path, capsys):
     """Run an export to a place below `tmp_path`; return its status and what it prints."""
 
-    def export(arguments: str, place: str) -> tuple[int, str, str]:
+    def export(arguments, place):
         status = run(["export", *arguments.split(), "--out", str(tmp_path / place), "--home", str(rich_ground.home)])
         return status, *capsys.readouterr()
 
@@ -504,7 +502,7 @@ def test_the_server_gives_the_file_with_its_name(rich_pass, tmp_path):
         assert client.get("/api/v1/exports/formats", headers=headers).json()[0]["name"] == "oem"
 
 
-def area(ring: np.ndarray) -> float:
+def area(ring):
     x, y = ring.T
     return float(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) / 2.0
 

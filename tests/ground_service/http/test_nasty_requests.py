@@ -63,13 +63,13 @@ def client(synthetic_pass, tmp_path_factory):
 
 def checked(client, method, path, operation, **request):
     answer = client.request(method, path, **request)
-    told = f"{method} {path[:100]} {str(request)[:200]}: {answer.status_code} {answer.text[:300]}"
-    assert answer.status_code < 500, told
+    message = f"{method} {path[:100]} {str(request)[:200]}: {answer.status_code} {answer.text[:300]}"
+    assert answer.status_code < 500, message
     # A path that no operation fits is answered before any operation is asked.
     known = {*operation["responses"], "404", "405", "307"}
-    assert str(answer.status_code) in known, told
+    assert str(answer.status_code) in known, message
     if answer.status_code >= 400:
-        assert answer.headers["content-type"] == "application/problem+json", told
+        assert answer.headers["content-type"] == "application/problem+json", message
         assert answer.json()["status"] == answer.status_code
 
 

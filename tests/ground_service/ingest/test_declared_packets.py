@@ -20,7 +20,7 @@ from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.doubt_store import list_implausible
 from ground_service.ingest.model import ImplausibleFilter
-from ground_service.ingest.service import Place, decode_all_again, ingest_file, undecoded_vehicles
+from ground_service.ingest.service import PiecePosition, decode_all_again, ingest_file, undecoded_vehicles
 from ground_service.missions import definitions
 from ground_service.missions import store as missions
 from ground_service.missions.definitions import definition_remarks, minimal_description, read_mission_file
@@ -114,7 +114,7 @@ def define(ground: Ground, seconds: float = 600.0) -> int:
 
 
 def interpreted(packets: list[bytes], tmp_path: Path) -> list[Any]:
-    """What space_packet_parser reads in the packets."""
+    """Return the values that space_packet_parser reads in the packets."""
     import space_packet_parser
 
     path = tmp_path / "interpreter.xml"
@@ -467,7 +467,7 @@ def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(declared: Ground
         start, stop = pieces[index]
         path = tmp_path / f"{index}.piece"
         path.write_bytes(octets[start:stop])
-        ingest_file(declared, path, spacecraft_id=76, place=Place("s", start))
+        ingest_file(declared, path, spacecraft_id=76, place=PiecePosition("s", start))
     assert parameter_series(declared, define(declared), "VOLTAGE", 1000).samples == 120
 
 

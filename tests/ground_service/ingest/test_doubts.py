@@ -160,8 +160,14 @@ def test_the_first_packet_of_an_archive_decides_nothing_until_a_clock_or_a_secon
     assert reasons(ground) == [] and ground.read(newest_ticks, 1) == first + (60 << 16)
 
 
+def test_without_a_stated_clock_the_first_packet_may_be_of_a_simulated_flight_and_not_of_another_century(ground):
+    assert receive(ground, report(TICKS + YEARS, 0)) == 1
+    assert receive(ground, report(TICKS, 1)) == 0
+    assert ground.read(newest_ticks, 1) == TICKS
+
+
 def test_a_clock_of_the_mission_judges_the_first_packet():
-    for late, doubted in ((-DAY, set()), (0, set()), (DAY, {0}), (100 - TICKS, {0})):
+    for late, doubted in ((-DAY, set()), (0, set()), (DAY, {0}), (100 - TICKS, set())):
         ticks = np.array([TICKS + late])
         assert set(implausible_times(ticks, None, None, TICKS)) == doubted
         assert implausible_times(ticks, ticks, None, TICKS) == {}

@@ -21,7 +21,7 @@ from ground_service.ground import open_ground
 from ground_service.ingest.core import NO_RECORD, LinkContent
 from ground_service.ingest.frames import FrameReader, PacketReader, Section
 from ground_service.ingest.reception import Reading
-from ground_service.ingest.service import Place, ingest_file
+from ground_service.ingest.service import PiecePosition, ingest_file
 from ground_service.store import repository
 from ground_service.telemetry.decoding import redecode
 from tests.ground_service.archive_hash import hash_of
@@ -95,7 +95,7 @@ def test_bare_packets_are_read_in_any_windows(packets):
     assert (found, skipped) == (packets, 0)
 
 
-def test_two_spacecraft_in_one_file_are_told_apart_and_one_that_is_named_excludes_the_other(packets):
+def test_two_spacecraft_in_one_file_are_separated_and_one_that_is_named_excludes_the_other(packets):
     two = encode_cadus(packets[:40], spacecraft_id=76) + encode_cadus(packets[20:60], spacecraft_id=33)
     reader, by_spacecraft = reader_of(two), {}
     for batch in reader.batches(windows(two, 1 << 20)):
@@ -119,7 +119,7 @@ def test_memory_does_not_grow_with_the_stream(stream):
         tracemalloc.reset_peak()
     tracemalloc.stop()
     assert len(peaks) == 15
-    # The first windows leave behind what is kept for good; ten more windows of the stream do not.
+    # The first windows leave behind what is kept until the end; ten more windows of the stream do not.
     assert max(peaks[4:]) - peaks[3] < len(stream)
 
 
@@ -135,7 +135,7 @@ def test_the_uplink_is_seen_alike_in_windows_and_at_once(packets, window):
     assert whole.frames == accounting.frames and whole.changes > 50 and whole.frames_lockout > 0
 
 
-def test_the_uplinks_of_two_spacecraft_in_one_file_are_told_apart(packets):
+def test_the_uplinks_of_two_spacecraft_in_one_file_are_separated(packets):
     stream = b"".join(
         DownlinkEncoder(spacecraft).encode(packets[:40], clcw=pack_clcw(Clcw(0, number)))
         for spacecraft, number in ((76, 5), (33, 200))
@@ -212,7 +212,7 @@ def test_a_piece_that_became_readable_while_it_was_read_is_read_again(one_proces
     monkeypatch.setattr(Reading, "_links_of_recording", just_before_the_rest)
     path = ground.home / "first"
     path.write_bytes(recording.octets[:600])
-    result = ingest_file(ground, path, instance="late", place=Place("r", 0))
+    result = ingest_file(ground, path, instance="late", place=PiecePosition("r", 0))
     assert (result.frames, result.octets_pending) == (2, 80)
 
 
@@ -277,7 +277,7 @@ def test_an_ingest_killed_at_any_moment_loses_and_doubles_nothing(downlink, tmp_
         assert hash_of(ground) == expected
 
 
-def test_decoding_again_puts_rows_beside_the_old_ones(downlink, ground):
+def test_decoding_again_adds_rows_to_the_old_ones(downlink, ground):
     result = ingest_file(ground, downlink)
     before = rows_of(ground, DICTIONARY.version)
     newer = dataclasses.replace(DICTIONARY, version=DICTIONARY.version + 1)

@@ -17,7 +17,7 @@ from ground_service.app import create_app
 from ground_service.errors import InvalidInput
 from ground_service.ground import open_ground
 from ground_service.http.model import Paging
-from ground_service.ingest.service import Place, ingest_file
+from ground_service.ingest.service import PiecePosition, ingest_file
 from ground_service.ingest.store import store_batch
 from ground_service.passes.service import list_events, parameter_series, state_series
 from ground_service.settings import Settings
@@ -132,7 +132,7 @@ def test_a_missing_file_is_refused(ground, tmp_path):
 def place(ground, octets, start, stream="stream", **more):
     path = ground.home / "piece"
     path.write_bytes(octets)
-    return ingest_file(ground, path, place=Place(stream, start), **more)
+    return ingest_file(ground, path, place=PiecePosition(stream, start), **more)
 
 
 def test_octets_that_wait_are_counted_and_are_no_error(ground, packets, stream, expected):
@@ -259,7 +259,7 @@ OLD = replace(DICTIONARY, version=DICTIONARY.version - 1)
 
 
 def fill_with_the_old(home, made):
-    """What the program before this one left: all packets, decoded by its dictionary."""
+    """Restore the state of an earlier program: all packets, decoded by its dictionary."""
     found = decode((made.folder / "downlink.cadu").read_bytes())
     with open_ground(home) as ground:
         with ground.database.writing() as connection:

@@ -15,7 +15,7 @@ from ground_service.ingest import store
 from ground_service.ingest.core import NO_TIME, LinkContent, RecordFormat
 from ground_service.ingest.frames import FrameReader, Section
 from ground_service.ingest.live import Spool, WatchedFolder
-from ground_service.ingest.service import Place, ingest_file
+from ground_service.ingest.service import PiecePosition, ingest_file
 from ground_service.store.event_kinds import read_events
 from ground_service.store.repository import RECEPTIONS
 from ground_service.store.vehicles import vehicle_id
@@ -45,7 +45,7 @@ def stream(synthetic_pass):
 
 def spool_of(ground, seen):
     def ingest(path, recording, offset):
-        return {"packets_new": ingest_file(ground, path, place=Place(recording, offset)).packets_new}
+        return {"packets_new": ingest_file(ground, path, place=PiecePosition(recording, offset)).packets_new}
 
     return Spool(ground.home / "spool", ingest, lambda _path, result: seen.append(result))
 

@@ -23,7 +23,7 @@ from benchmarks.downlink import (
 from ground_service.errors import InvalidInput
 from ground_service.ground import open_ground
 from ground_service.http.model import Paging
-from ground_service.ingest.service import Place, ingest_file
+from ground_service.ingest.service import PiecePosition, ingest_file
 from ground_service.missions.service import add_mission
 from ground_service.missions.store import links_in_force
 from ground_service.passes.archive_import import import_archive
@@ -220,7 +220,7 @@ def test_receptions_of_two_stations_are_merged_in_any_order_and_split(ground, se
         pieces += [(station, a, octets[a:b]) for a, b in itertools.pairwise(cuts) if b > a]
     for k in rng.permutation(len(pieces)).tolist():
         station, start, octets = pieces[k]
-        ingest(ground, octets, station=station, place=Place(station, start))
+        ingest(ground, octets, station=station, place=PiecePosition(station, start))
     assert stored(ground) == stream.packets[SPACECRAFT]
 
 
@@ -231,7 +231,7 @@ def test_two_spacecraft_have_the_same_archives_whatever_the_split(tmp_path):
         with open_ground(tmp_path / str(cut)) as ground:
             for start, part in ((cut, stream.files[0][cut:]), (0, stream.files[0][:cut])):
                 if part:
-                    ingest(ground, part, place=Place("both", start))
+                    ingest(ground, part, place=PiecePosition("both", start))
             assert {one: stored(ground, one) for one in stream.packets} == stream.packets
             vehicles = [ground.read(vehicle_id, one, "flight") for one in sorted(stream.packets)]
             hashes.add(tuple(ground.read(archive_hash, vehicle) for vehicle in vehicles))
@@ -255,5 +255,5 @@ def test_the_link_quality_of_both_stations_is_shown_with_the_merged_packets_of_t
     assert [one.frames for one in found.receptions] == [len(stream.files[1]) // 1279, len(stream.files[0]) // 1279]
     assert found.frames == sum(one.frames for one in found.receptions)
     assert {one.source for one in found.receptions} == {"mission"}
-    told = Completeness.of_accounting(found).receptions
-    assert [one.station for one in told] == ["goldstone", "madrid"]
+    receptions = Completeness.of_accounting(found).receptions
+    assert [one.station for one in receptions] == ["goldstone", "madrid"]

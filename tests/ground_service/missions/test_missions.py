@@ -236,7 +236,7 @@ def test_text_that_mentions_terrain_does_not_decide_the_evidence_level():
     declared = """
 LROC WAC GLD100 | real-terrain | None
 procedural Moon, seed 7 | procedural | 2
-a procedural Moon beside GLD100 | None | None
+a procedural Moon and GLD100 | None | None
 photograph big_tile.tif | photographs | 5
 """
     for terrain, *expected in cells(declared):

@@ -36,7 +36,7 @@ FIRST, SECOND = stream(10 * HOUR, 300), stream(20 * HOUR, 90)
 """Two passes; an event is 39 octets or so, a frame holds 28 of them."""
 
 
-def test_two_passes_in_one_file_are_told_apart():
+def test_two_passes_in_one_file_are_separated():
     one, two = both(FIRST + SECOND)
     assert (one.frames, two.frames) == (len(FIRST) // CADU, len(SECOND) // CADU)
     assert (one.octets, two.octets) == (len(FIRST), len(SECOND))

@@ -4,11 +4,8 @@ Windows outside the reference ephemerides: refused where the ground needs the ep
 
 import os
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +14,7 @@ from ground_service.access.model import AuditFilter
 from ground_service.access.store import list_audit
 from ground_service.contacts.links.core import PredictedContact
 from ground_service.errors import InvalidInput, PlanConflicts
-from ground_service.ground import Ground, run_apart
+from ground_service.ground import run_apart
 from ground_service.missions.ephemerides.service import add_ephemeris, covering_ephemerides, withdraw_ephemeris
 from ground_service.missions.service import add_mission
 from ground_service.planning.core import Constraints, Planner, Resources, data_octets, frames_between, storage_peak
@@ -42,7 +39,7 @@ RADIUS_M = MOON_RADIUS_M + 40e3
 PERIOD_S = 2.0 * np.pi * np.sqrt(RADIUS_M**3 / GM_MOON_M3_S2)
 
 
-def circle(eccentric_m: float = 0.0) -> Ephemeris:
+def circle(eccentric_m=0.0):
     """Five hours on a polar circle of 40 km altitude; `eccentric_m` lets the altitude swing by so much."""
     utc_ns = START + np.arange(0, 5 * 3600, 20, dtype=np.int64) * NS
     rate = 2.0 * np.pi / PERIOD_S
@@ -56,11 +53,11 @@ def circle(eccentric_m: float = 0.0) -> Ephemeris:
     return ephemeris_from_states(utc_ns, position, velocity)
 
 
-def planner(ephemeris: Ephemeris, **resources: Any) -> Planner:
+def planner(ephemeris, **resources):
     return Planner(ephemeris, IauOrientation(), Resources(**resources), PinholeCamera())
 
 
-def search(plan: Planner, **constraints: Any) -> Any:
+def search(plan, **constraints):
     return plan.search(Constraints(**constraints), plan.ephemeris.start_utc_ns, plan.ephemeris.stop_utc_ns, 15.0)
 
 
@@ -128,7 +125,7 @@ def test_an_empty_result_names_the_smallest_set_of_constraints_and_the_nearest_r
     assert "latitude 60 to 90 deg relaxed by" in limited.reason and "without" not in limited.reason
 
 
-def test_craters_are_counted_in_the_camera(make_pass: Callable[..., Any]):
+def test_craters_are_counted_in_the_camera(make_pass):
     folder = make_pass(frames=6, seed=3).folder
     ephemeris, catalogue = load_oem(folder / "reference.oem"), load_catalogue(folder / "catalogue.csv")
     plan = Planner(ephemeris, IauOrientation(), Resources(), PinholeCamera(), catalogue)
@@ -140,7 +137,7 @@ def test_craters_are_counted_in_the_camera(make_pass: Callable[..., Any]):
 
 
 @pytest.mark.parametrize(("duration_s", "frames"), [(90.0, 6), (90.1, 7), (104.9, 7), (5.0, 1)])
-def test_an_observation_has_a_frame_at_its_start_and_none_at_its_stop(duration_s: float, frames: int):
+def test_an_observation_has_a_frame_at_its_start_and_none_at_its_stop(duration_s, frames):
     assert frames_between(START, START + round(duration_s * NS), 15.0) == frames
 
 
@@ -225,7 +222,7 @@ approved processed command_states=SENT, frames=9, received_after=True, lost=0, r
 
 
 @pytest.mark.parametrize("row", STATES.splitlines())
-def test_the_state_follows_from_the_facts(row: str):
+def test_the_state_follows_from_the_facts(row):
     decision, expected, facts = f"{row} ".split(" ", 2)
     state, reason = state_of(WindowEvidence(decision, **eval(f"dict({facts})")))
     assert state == expected
@@ -244,13 +241,11 @@ id = 76
 """
 
 
-def window(ephemeris_id: int | None = None) -> WindowEntry:
+def window(ephemeris_id=None):
     return WindowEntry("w", OUTSIDE, OUTSIDE + 600 * 10**9, 15.0, 76, ephemeris_id=ephemeris_id)
 
 
-def test_a_window_outside_the_ephemerides_has_no_prediction_and_is_refused_if_it_needs_one(
-    ground: Ground, synthetic_pass: Any
-):
+def test_a_window_outside_the_ephemerides_has_no_prediction_and_is_refused_if_it_needs_one(ground, synthetic_pass):
     """It names the ephemeris, or its tables are made of one."""
     named = add_reference(ground, synthetic_pass.folder / "reference.oem")
     predicted = add_window(ground, window(), actor="ann").predicted
@@ -261,7 +256,7 @@ def test_a_window_outside_the_ephemerides_has_no_prediction_and_is_refused_if_it
         add_mission(ground, (MISSION + "[uploads]\n").encode())
 
 
-def test_an_ephemeris_that_gravity_does_not_move_is_refused_with_the_accelerations(ground: Ground, tmp_path: Path):
+def test_an_ephemeris_that_gravity_does_not_move_is_refused_with_the_accelerations(ground, tmp_path):
     (one,) = load_oem(save_circle(tmp_path / "km.oem")).segments
     metres = replace(one, position_m=1e3 * one.position_m, velocity_m_s=1e3 * one.velocity_m_s)
     save_oem(Ephemeris((metres,)), tmp_path / "m.oem")
@@ -271,7 +266,7 @@ def test_an_ephemeris_that_gravity_does_not_move_is_refused_with_the_acceleratio
     assert add_ephemeris(ground, ground.files.put_file(tmp_path / "km.oem"), name="km").states == 240
 
 
-def test_an_ephemeris_belongs_to_a_spacecraft_and_can_be_withdrawn(ground: Ground, synthetic_pass: Any, tmp_path: Path):
+def test_an_ephemeris_belongs_to_a_spacecraft_and_can_be_withdrawn(ground, synthetic_pass, tmp_path):
     text = (synthetic_pass.folder / "reference.oem").read_text()
     (tmp_path / "other.oem").write_text(text.replace("OBJECT_NAME = SELENITA", "OBJECT_NAME = OTHER"))
     own = add_ephemeris(ground, ground.files.put_file(synthetic_pass.folder / "reference.oem"), name="own")
@@ -282,7 +277,7 @@ def test_an_ephemeris_belongs_to_a_spacecraft_and_can_be_withdrawn(ground: Groun
     add_mission(ground, b'name = "second"\n[spacecraft]\nid = 77\nobject_names = ["Other"]\n')
     foreign = add_ephemeris(ground, other, name="other", precedence=9)
 
-    def used(spacecraft: int) -> list[int]:
+    def used(spacecraft):
         found = covering_ephemerides
         return [one.id for one in ground.read(found, own.start.utc_ns, own.stop.utc_ns, spacecraft)]
 

@@ -3,7 +3,7 @@
 import pytest
 
 from ground_service.app import create_app
-from ground_service.passes.span import Observation, Planned, belongs_to
+from ground_service.passes.span import ObservationSpan, Planned, belongs_to
 from ground_service.settings import Settings
 from lunar.timescales import format_utc, parse_utc, ticks_from_utc_ns
 from tests.ground_service.conftest import Downlink, event_packet
@@ -192,7 +192,7 @@ class Observations(Downlink):
 
 
 def telemetry(frames=5):
-    """What a payload sends about an observation that begins at START + 60 s and ends 60 s later."""
+    """Return the packets of a payload about an observation that begins at START + 60 s and ends 60 s later."""
     sent = Observations()
     sent.event("observation_started", 60)
     sent.images(0, range(60, 60 + 15 * frames, 15))
@@ -246,7 +246,7 @@ def test_a_window_with_a_value_of_another_kind_is_refused(client):
     assert client.get(f"{V1}/windows").json()["total"] == 0
 
 
-def test_of_two_decisions_the_second_is_told_the_state_that_won(client):
+def test_of_two_decisions_the_second_is_refused_with_the_state_that_won(client):
     key = approved(client, 0, 300)
     assert change(client, key, "failed").status_code == 200
     answer = change(client, key)
@@ -285,9 +285,9 @@ def test_each_window_has_the_frames_that_its_event_reports_enclose(client):
 
 def test_an_observation_has_one_window_the_nearest_and_of_equal_ones_the_last():
     first, later, same = Planned(0, 100, 1), Planned(30, 130, 2), Planned(0, 100, 3)
-    begun = Observation(30, 131, 130)
+    begun = ObservationSpan(30, 131, 130)
     assert not belongs_to(begun, first, [later], 60) and belongs_to(begun, later, [first], 60)
-    again = Observation(0, 100, 100)
+    again = ObservationSpan(0, 100, 100)
     assert not belongs_to(again, first, [same], 60) and belongs_to(again, same, [first], 60)
-    assert not belongs_to(Observation(None, 40), later, [], 60)  # the end of the one before
+    assert not belongs_to(ObservationSpan(None, 40), later, [], 60)  # the end of the one before
     assert belongs_to(begun, Planned(-50, 150), [], 60)

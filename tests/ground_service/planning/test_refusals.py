@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -11,7 +9,6 @@ import pytest
 
 from ground_service.contacts.commanding.service import get_command, take_uplink
 from ground_service.errors import Conflict, PlanConflicts
-from ground_service.ground import Ground
 from ground_service.ingest.service import ingest_file
 from ground_service.missions.service import add_mission
 from ground_service.passes.model import PassFilter
@@ -19,14 +16,14 @@ from ground_service.passes.store import list_passes
 from ground_service.planning import service as planning
 from ground_service.planning import standing
 from ground_service.planning.forecast import get_forecast
-from ground_service.planning.model import Window, WindowEntry, WindowSearch
+from ground_service.planning.model import WindowEntry, WindowSearch
 from ground_service.planning.store import get_window
 from ground_service.worker.scheduler import Scheduler
 from linna.cli import run
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.messages.oem import save_oem
 from lunar.timescales import format_utc, ticks_from_utc_ns
-from tests.ground_service.conftest import START, Clock, add_reference, circular_states, event_packet, save_circle
+from tests.ground_service.conftest import START, add_reference, circular_states, event_packet, save_circle
 from tmtc.dictionary.payload import DICTIONARY
 
 NS = 10**9
@@ -35,20 +32,20 @@ MISSION = b'name = "m"\n[spacecraft]\nid = 76\nname = "SelenITA"\n'
 
 
 @pytest.fixture
-def now(mission_time: Clock) -> Clock:
+def now(mission_time):
     mission_time.utc_ns = START
     return mission_time
 
 
-def add(ground: Ground, start: int = START + 60 * MINUTE, spacecraft: int = 76) -> Window:
+def add(ground, start=START + 60 * MINUTE, spacecraft=76):
     return planning.add_window(ground, WindowEntry("w", start, start + 10 * MINUTE, 15.0, spacecraft), actor="ann")
 
 
-def decided(ground: Ground, window: Window, decision: str) -> Window:
+def decided(ground, window, decision):
     return planning.change_window(ground, window.id, actor="bob", changes={}, decision=decision)
 
 
-def on_board(ground: Ground) -> Window:
+def on_board(ground):
     """A window whose telecommands were sent."""
     add_mission(ground, MISSION)
     window = decided(ground, add(ground), "approved")
@@ -58,17 +55,17 @@ def on_board(ground: Ground) -> Window:
     return window
 
 
-def receive(ground: Ground, *packets: bytes) -> None:
+def receive(ground, *packets):
     file = ground.home / f"{abs(hash(packets))}.packets"
     file.write_bytes(b"".join(packets))
     ingest_file(ground, file, spacecraft_id=76)
 
 
-def records(ground: Ground, window: Window) -> list[Any]:
+def records(ground, window):
     return [get_command(ground, key).record for key in window.telecommands]
 
 
-def verified(ground: Ground, window: Window, after: int, outcome: str = "verification_completed") -> list[bytes]:
+def verified(ground, window, after, outcome="verification_completed"):
     """Reports of the telecommands of a window that delete activities."""
     found = records(ground, ground.read(get_window, window.id))
     values = {} if outcome == "verification_completed" else {"failure_code": "no_such_activity"}
@@ -79,7 +76,7 @@ def verified(ground: Ground, window: Window, after: int, outcome: str = "verific
     ]
 
 
-def test_a_window_that_has_begun_is_neither_entered_nor_approved_nor_released(either: Ground, now: Clock):
+def test_a_window_that_has_begun_is_neither_entered_nor_approved_nor_released(either, now):
     add_mission(either, MISSION)
     with pytest.raises(PlanConflicts, match="expected a start after the mission time 2029-08-07T06:00:00"):
         add(either, START)
@@ -94,7 +91,7 @@ def test_a_window_that_has_begun_is_neither_entered_nor_approved_nor_released(ei
         planning.uplink_window(either, window.id, actor="ann")
 
 
-def test_a_draft_whose_time_has_come_ends(either: Ground, now: Clock):
+def test_a_draft_whose_time_has_come_ends(either, now):
     add_mission(either, MISSION)
     window = add(either)
     scheduler = Scheduler(either, MagicMock(), lambda: None, {})
@@ -106,7 +103,7 @@ def test_a_draft_whose_time_has_come_ends(either: Ground, now: Clock):
     assert (ended.state, ended.reason) == ("failed", standing.NOT_APPROVED)
 
 
-def test_nothing_to_send_is_status_2_and_no_file(ground: Ground, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_nothing_to_send_is_status_2_and_no_file(ground, tmp_path, capsys):
     window = on_board(ground)
     out = tmp_path / "w.cltu"
     assert run(["plan", "uplink", str(window.id), "--home", str(ground.home), "--out", str(out)]) == 2
@@ -115,7 +112,7 @@ def test_nothing_to_send_is_status_2_and_no_file(ground: Ground, tmp_path: Path,
     assert not out.exists()
 
 
-def test_candidates_in_the_past_are_not_offered(ground: Ground, tmp_path: Path, now: Clock):
+def test_candidates_in_the_past_are_not_offered(ground, tmp_path, now):
     add_reference(ground, save_circle(tmp_path / "a.oem"))
     now.utc_ns = START + 30 * MINUTE
     found = planning.search_windows(ground, WindowSearch())
@@ -125,7 +122,7 @@ def test_candidates_in_the_past_are_not_offered(ground: Ground, tmp_path: Path, 
         planning.search_windows(ground, WindowSearch())
 
 
-def test_a_spacecraft_without_a_description_is_not_planned(either: Ground, now: Clock):
+def test_a_spacecraft_without_a_description_is_not_planned(either, now):
     add_mission(either, MISSION)
     with pytest.raises(Conflict, match=r"spacecraft 77: .*states \(76\), found none"):
         add(either, spacecraft=77)
@@ -135,7 +132,7 @@ def test_a_spacecraft_without_a_description_is_not_planned(either: Ground, now: 
         get_forecast(either, spacecraft_id=77, instance="flight", start_utc_ns=START, stop_utc_ns=START + MINUTE)
 
 
-def test_a_window_on_board_is_cancelling_until_its_activities_are_deleted(either: Ground, now: Clock):
+def test_a_window_on_board_is_cancelling_until_its_activities_are_deleted(either, now):
     window = on_board(either)
     cancelled = decided(either, window, "failed")
     assert cancelled.state == "cancelling"
@@ -151,7 +148,7 @@ def test_a_window_on_board_is_cancelling_until_its_activities_are_deleted(either
     assert (ended.state, ended.reason) == ("failed", "it was cancelled, its activities were deleted on board")
 
 
-def test_a_cancelled_window_that_flies_all_the_same_becomes_a_pass_with_a_remark(either: Ground, now: Clock):
+def test_a_cancelled_window_that_flies_all_the_same_becomes_a_pass_with_a_remark(either, now):
     window = on_board(either)
     decided(either, window, "failed")
     take_uplink(either, spacecraft_id=76, actor="ann")
@@ -170,7 +167,7 @@ def test_a_cancelled_window_that_flies_all_the_same_becomes_a_pass_with_a_remark
     assert made.name == "w (it was flown although it was cancelled)"
 
 
-def test_a_window_that_has_begun_on_board_cannot_be_cancelled(either: Ground, now: Clock):
+def test_a_window_that_has_begun_on_board_cannot_be_cancelled(either, now):
     window = on_board(either)
     now.utc_ns += 61 * MINUTE
     for state in ("uplinked", "executing"):
@@ -180,7 +177,7 @@ def test_a_window_that_has_begun_on_board_cannot_be_cancelled(either: Ground, no
         receive(either, event_packet(int(ticks_from_utc_ns(window.start.utc_ns)), 0, "observation_started"))
 
 
-def save_with_hole(path: Path) -> Path:
+def save_with_hole(path):
     """Write an ephemeris of four hours without the second one."""
     utc_ns = START + np.arange(0, 240, dtype=np.int64) * MINUTE
     parts = [ephemeris_from_states(times, *circular_states(times)).segments[0] for times in (utc_ns[:60], utc_ns[120:])]
@@ -188,7 +185,7 @@ def save_with_hole(path: Path) -> Path:
     return path
 
 
-def test_a_search_goes_around_a_hole_or_takes_the_ephemeris_that_has_none(ground: Ground, tmp_path: Path, now: Clock):
+def test_a_search_goes_around_a_hole_or_takes_the_ephemeris_that_has_none(ground, tmp_path, now):
     hole = add_reference(ground, save_with_hole(tmp_path / "hole.oem"))
     span = {"start": format_utc(START), "stop": format_utc(START + 239 * MINUTE)}
     asked = WindowSearch.model_validate(span)

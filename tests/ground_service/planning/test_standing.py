@@ -1,6 +1,5 @@
 """Standing requests: filling, explaining, replacing, approval, and one plan of several processes, on both databases."""
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
@@ -10,16 +9,16 @@ import pytest
 from ground_service.contacts.commanding.model import TelecommandFilter
 from ground_service.contacts.commanding.service import get_command, list_telecommands
 from ground_service.errors import InvalidInput, NotFound, PlanConflicts
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.missions.service import add_mission
 from ground_service.planning import service as planning
 from ground_service.planning import standing, store
-from ground_service.planning.model import StandingRequestChange, StandingRequestIn, Window, WindowEntry, WindowFilter
+from ground_service.planning.model import StandingRequestChange, StandingRequestIn, WindowEntry, WindowFilter
 from ground_service.planning.progress import advance_windows
 from ground_service.planning.store import get_plan, get_request, get_window, list_windows
 from ground_service.store.event_kinds import read_events
 from ground_service.worker.follow_up import follow_in_process
-from tests.ground_service.conftest import START, Clock, add_reference, save_circle
+from tests.ground_service.conftest import START, add_reference, save_circle
 from tests.scenarios import SELENITA
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
@@ -55,13 +54,13 @@ AUTOMATIC = '[approval]\nwindows = "automatic"\n'
 
 
 @pytest.fixture
-def now(mission_time: Clock) -> Clock:
+def now(mission_time):
     mission_time.utc_ns = START
     return mission_time
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
-def either(request: pytest.FixtureRequest, tmp_path: Path, oem: Path) -> Iterator[Ground]:
+def either(request, tmp_path, oem):
     """A service with an ephemeris on each database, which does not follow its events: only the tests plan."""
     url = request.getfixturevalue("migrated_postgres")() if request.param == "postgresql" else None
     with open_ground(tmp_path / "home", database_url=url) as opened:
@@ -70,7 +69,7 @@ def either(request: pytest.FixtureRequest, tmp_path: Path, oem: Path) -> Iterato
 
 
 @pytest.fixture
-def ground(tmp_path: Path, oem: Path) -> Iterator[Ground]:
+def ground(tmp_path, oem):
     """As `either`, on SQLite."""
     with open_ground(tmp_path / "home") as opened:
         add_reference(opened, oem)
@@ -78,31 +77,31 @@ def ground(tmp_path: Path, oem: Path) -> Iterator[Ground]:
 
 
 @pytest.fixture(scope="module")
-def oem(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def oem(tmp_path_factory):
     path = tmp_path_factory.mktemp("oem") / "reference.oem"
     return save_circle(path, START - 3 * HOUR, 24.0 * DAYS)
 
 
-def prepare(ground: Ground, extra: str = AUTOMATIC + LINKS) -> None:
+def prepare(ground, extra=AUTOMATIC + LINKS):
     add_mission(ground, MISSION.format(extra=extra).encode(), actor="ann")
 
 
-def windows_of(ground: Ground) -> list[Window]:
+def windows_of(ground):
     """All windows in the order of their start."""
     return sorted(ground.read(list_windows, WindowFilter()).items, key=lambda one: one.start.utc_ns)
 
 
-def request(ground: Ground, **changes: object) -> int:
+def request(ground, **changes):
     values = {"name": "low Sun", "spacecraft_id": 76, "windows": 2, "horizon_days": 1.0} | changes
     return standing.add_request(ground, StandingRequestIn.model_validate(values), actor="ann").id
 
 
-def plan(ground: Ground, now: Clock, later_ns: int = 0) -> dict[str, int]:
+def plan(ground, now, later_ns=0):
     """Make one step of the planning; return its counts."""
     return standing.plan_tick(ground, now.utc_ns + later_ns)
 
 
-def planned(ground: Ground, now: Clock, extra: str = AUTOMATIC + LINKS, **changes: object) -> int:
+def planned(ground, now, extra=AUTOMATIC + LINKS, **changes):
     """Plan a request for the first time; return its key."""
     prepare(ground, extra)
     key = request(ground, **changes)
@@ -110,11 +109,11 @@ def planned(ground: Ground, now: Clock, extra: str = AUTOMATIC + LINKS, **change
     return key
 
 
-def change(ground: Ground, key: int, **changes: object) -> None:
+def change(ground, key, **changes):
     standing.change_request(ground, key, StandingRequestChange.model_validate(changes), actor="ann")
 
 
-def test_no_more_windows_are_planned_than_have_room_on_board(ground: Ground, now: Clock):
+def test_no_more_windows_are_planned_than_have_room_on_board(ground, now):
     prepare(ground, AUTOMATIC + LINKS + "\n[resources]\nwindows_on_board = 1\n")
     key = request(ground)
     assert plan(ground, now)["added"] == 1
@@ -124,7 +123,7 @@ def test_no_more_windows_are_planned_than_have_room_on_board(ground: Ground, now
     assert plan(ground, now)["added"] == 1
 
 
-def test_the_coming_days_are_filled_once_and_windows_without_a_contact_are_replaced(either: Ground, now: Clock):
+def test_the_coming_days_are_filled_once_and_windows_without_a_contact_are_replaced(either, now):
     prepare(either)
     key = request(either)
     done = plan(either, now)
@@ -157,7 +156,7 @@ def test_the_coming_days_are_filled_once_and_windows_without_a_contact_are_repla
     assert either.read(get_request, key).windows == {"approved": 2, "failed": 1}
 
 
-def test_a_request_is_planned_without_further_action(tmp_path: Path, oem: Path, now: Clock):
+def test_a_request_is_planned_without_further_action(tmp_path, oem, now):
     with open_ground(tmp_path / "home") as ground:
         add_reference(ground, oem)
         follow_in_process(ground)
@@ -167,9 +166,7 @@ def test_a_request_is_planned_without_further_action(tmp_path: Path, oem: Path, 
         assert sum(plan(ground, now).values()) == 0
 
 
-def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(
-    either: Ground, now: Clock, monkeypatch: pytest.MonkeyPatch
-):
+def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(either, now, monkeypatch):
     planned(either, now)
     first = windows_of(either)[0]
     window = either.read(store.get_record, first.id)
@@ -185,7 +182,7 @@ def test_data_of_a_replaced_window_belong_to_the_window_that_has_its_time(
     assert found[0].reason == "a telecommand of it failed"
 
 
-def test_windows_of_the_present_period_count_long_after_they_ended(ground: Ground, now: Clock):
+def test_windows_of_the_present_period_count_long_after_they_ended(ground, now):
     key = planned(ground, now, windows=1)
     (window,) = ground.read(store.windows_around, 1, now.utc_ns)
     assert ground.write(store.change_window, window, state="processed")
@@ -196,7 +193,7 @@ def test_windows_of_the_present_period_count_long_after_they_ended(ground: Groun
     assert standing.plan_tick(ground, later)["added"] >= 1  # that window belongs to an earlier period
 
 
-def test_without_automatic_approval_windows_wait_for_a_person_and_then_are_released(ground: Ground, now: Clock):
+def test_without_automatic_approval_windows_wait_for_a_person_and_then_are_released(ground, now):
     prepare(ground, LINKS)
     request(ground, windows=2)
     assert plan(ground, now) == {"failed": 0, "added": 2, "approved": 0, "released": 0}
@@ -209,7 +206,7 @@ def test_without_automatic_approval_windows_wait_for_a_person_and_then_are_relea
     assert ground.read(get_window, first.id).reason == standing.NOT_APPROVED
 
 
-def test_windows_need_a_contact_before_them(ground: Ground, now: Clock):
+def test_windows_need_a_contact_before_them(ground, now):
     closed = 'outages = ["2029-08-07T00:00:00Z/2029-08-07T18:00:00Z"]\nminimum_elevation_deg = 0.0\n'
     text = MISSION.format(extra=AUTOMATIC + LINKS).replace("minimum_elevation_deg = 0.0\n", closed)
     add_mission(ground, text.encode(), actor="ann")
@@ -222,7 +219,7 @@ def test_windows_need_a_contact_before_them(ground: Ground, now: Clock):
     assert planned and all(one.start.utc_ns > START + 12 * HOUR for one in planned)
 
 
-def test_the_duty_limit_of_the_mission_description_is_kept(ground: Ground, now: Clock):
+def test_the_duty_limit_of_the_mission_description_is_kept(ground, now):
     prepare(ground, AUTOMATIC + LINKS + "[resources]\nobserve_hours_per_day = 0.5\n")
     key = request(ground, windows=20, maximum_duration_s=900.0, minimum_duration_s=800.0)
     assert plan(ground, now)["added"] == 2
@@ -230,7 +227,7 @@ def test_the_duty_limit_of_the_mission_description_is_kept(ground: Ground, now: 
     assert "more than 0.5 h of observation within 24 h" in reasons
 
 
-def test_regions_and_the_end_of_the_ephemeris_bound_the_plan(ground: Ground, now: Clock):
+def test_regions_and_the_end_of_the_ephemeris_bound_the_plan(ground, now):
     prepare(ground)
     region = {"latitude_deg": {"min": -20.0, "max": 20.0}}
     key = request(ground, windows=5, horizon_days=10.0, regions=[region], minimum_duration_s=60.0)
@@ -248,7 +245,7 @@ UPLOADS = "[uploads]\ntables = []\n"
 ONE_PERSON = AUTOMATIC + 'one_person_for = ["perform_function/set_mode"]\n'
 
 
-def test_sequences_of_windows_do_not_overlap(ground: Ground, now: Clock):
+def test_sequences_of_windows_do_not_overlap(ground, now):
     planned(ground, now, ONE_PERSON + LINKS + UPLOADS, windows=5, minimum_duration_s=200.0, maximum_duration_s=400.0)
     windows = windows_of(ground)
     between = [(b.start.utc_ns - a.stop.utc_ns) / NS for a, b in pairwise(windows)]
@@ -256,7 +253,7 @@ def test_sequences_of_windows_do_not_overlap(ground: Ground, now: Clock):
     assert len(windows) == 5 and min(between) == 81.0
 
 
-def test_a_window_that_cannot_be_released_states_the_reason(ground: Ground, now: Clock):
+def test_a_window_that_cannot_be_released_states_the_reason(ground, now):
     planned(ground, now, LINKS + UPLOADS, windows=1)
     (window,) = windows_of(ground)
     planning.change_window(ground, window.id, actor=standing.PLANNER, changes={}, decision="approved")
@@ -266,7 +263,7 @@ def test_a_window_that_cannot_be_released_states_the_reason(ground: Ground, now:
     )
 
 
-def test_windows_keep_the_limits_of_images(ground: Ground, now: Clock):
+def test_windows_keep_the_limits_of_images(ground, now):
     planned(
         ground,
         now,
@@ -289,14 +286,14 @@ def test_windows_keep_the_limits_of_images(ground: Ground, now: Clock):
         planning.add_window(ground, entry, actor="ann")
 
 
-def test_without_an_ephemeris_the_plan_says_so(ground: Ground, now: Clock):
+def test_without_an_ephemeris_the_plan_says_so(ground, now):
     now.utc_ns += 9 * 24 * HOUR
     key = planned(ground, now, AUTOMATIC)
     made = ground.read(get_plan, key)
     assert (windows_of(ground), made.reason) == ([], "no reference ephemeris covers the coming days")
 
 
-def test_paused_and_deleted_requests_are_not_planned(ground: Ground, now: Clock):
+def test_paused_and_deleted_requests_are_not_planned(ground, now):
     prepare(ground)
     key = request(ground)
     change(ground, key, state="paused")
@@ -309,14 +306,14 @@ def test_paused_and_deleted_requests_are_not_planned(ground: Ground, now: Clock)
         ground.read(get_request, key)
 
 
-def test_contradictory_terms_are_refused(ground: Ground):
+def test_contradictory_terms_are_refused(ground):
     with pytest.raises(InvalidInput, match="minimum_duration_s: expected at most maximum_duration_s"):
         request(ground, minimum_duration_s=900.0, maximum_duration_s=600.0)
     with pytest.raises(InvalidInput, match="stop: expected a time after the start"):
         request(ground, start="2029-08-07T00:00:00Z", stop="2029-08-06T00:00:00Z")
 
 
-def test_processes_that_plan_at_the_same_time_make_one_plan(migrated_postgres, oem: Path, tmp_path: Path, now: Clock):
+def test_processes_that_plan_at_the_same_time_make_one_plan(migrated_postgres, oem, tmp_path, now):
     url = migrated_postgres()
     grounds = [open_ground(tmp_path / "home", database_url=url) for _ in range(4)]
     prepare(grounds[0])

@@ -17,8 +17,7 @@ from ground_service.errors import InvalidInput
 from ground_service.ground import open_ground
 from ground_service.http.model import UtcTime
 from ground_service.ingest.service import ingest_file
-from ground_service.jobs.model import JobFilter
-from ground_service.jobs.service import list_jobs
+from ground_service.jobs.service import JobFilter, list_jobs
 from ground_service.passes.archive_import import import_archive, read_manifest
 from ground_service.passes.service import define_pass
 from ground_service.regression import rendering, service, store
@@ -87,10 +86,10 @@ def test_an_imported_pass_is_kept_without_a_request(either, flown):
     _, digest = read_manifest(flown.folder)
     assert keep_pass(either, pass_id).digest == digest
     [kept] = kept_archives(either)
-    told = {"frames": 4, "state": "complete", "reason": ""}
-    assert kept.model_dump().items() >= {**told, "digest": digest, "pass_id": pass_id, "frames_stored": 4}.items()
+    stated = {"frames": 4, "state": "complete", "reason": ""}
+    assert kept.model_dump().items() >= {**stated, "digest": digest, "pass_id": pass_id, "frames_stored": 4}.items()
     [job] = either.read(list_jobs, JobFilter(kind="automation")).items
-    assert job.result["archive of pass 1"] == {**told, "archive": digest}
+    assert job.result["archive of pass 1"] == {**stated, "archive": digest}
     given = Comparison(candidate="current", passes=[pass_id])
     assert compared(either, given)["archives"] == [digest]
 
@@ -178,10 +177,10 @@ def test_frames_that_cannot_be_rendered_leave_telemetry_only_with_the_reason(
     assert str(tmp_path) not in kept.reason and str(either.home) not in kept.reason
     [one] = outcome.passes
     assert (one.state, outcome.verdict, outcome.gates) == ("not judged", "inconclusive", ())
-    told = "good is a program, which needs frames: the frames cannot be rendered"
-    assert one.detail.startswith(told)
+    reason = "good is a program, which needs frames: the frames cannot be rendered"
+    assert one.detail.startswith(reason)
     verdict = verdict_document(outcome)
-    assert verdict.headline.startswith(f"inconclusive: synthetic pass 5: {told}")
+    assert verdict.headline.startswith(f"inconclusive: synthetic pass 5: {reason}")
     assert "0 of 0 gates passed" in regression_text(verdict)
     assert 'failures="1" errors="0" skipped="1"' in regression_junit(verdict, 0)
     check_out(either, digest, tmp_path / "kept")
@@ -232,9 +231,9 @@ def test_a_renderer_that_fails_without_a_refusal_leaves_the_archive_to_render(
 
 
 def test_only_a_message_of_the_renderer_itself_is_a_refusal():
-    told = "archive: expected pixels with SHA-256 0, found 1"
-    error = f"linna: error: {told}"
-    assert rendering._refusal(2, f"progress\n{error}\n") == told
+    refusal = "archive: expected pixels with SHA-256 0, found 1"
+    error = f"linna: error: {refusal}"
+    assert rendering._refusal(2, f"progress\n{error}\n") == refusal
     full = ("No space left on device (/x)", "[('a', 'b', '[Errno 28] No space left on device')]")
     printed = ["Traceback\nMemoryError", "", *(f"linna: error: {one}" for one in full)]
     for given in ((1, error), (-9, error), *((2, one) for one in printed)):

@@ -96,7 +96,7 @@ def test_a_program_that_makes_too_many_files_is_stopped(fly, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("program", "outcome", "told"),
+    ("program", "outcome", "message"),
     [
         ("os.kill(os.getpid(), 11)", "crashed", "11"),
         ("while True: pass", "cpu", ""),
@@ -107,9 +107,9 @@ def test_a_program_that_makes_too_many_files_is_stopped(fly, monkeypatch):
         ),
     ],
 )
-def test_a_program_that_kills_itself_or_exceeds_a_limit_is_told_so(fly, program, outcome, told):
+def test_a_program_that_kills_itself_or_exceeds_a_limit_is_reported(fly, program, outcome, message):
     run = fly(program, LIMITS.replace("cpu_s = 10", "cpu_s = 1"))
-    assert run.outcome == outcome and told in run.detail
+    assert run.outcome == outcome and message in run.detail
 
 
 def test_a_program_that_is_not_there_is_a_crash_and_no_error_of_the_ground(archive, tmp_path):
@@ -139,13 +139,13 @@ def test_what_a_program_leaves_running_is_killed_with_it(fly, tmp_path):
 def test_a_program_gets_no_socket_but_pairs_of_its_own(fly):
     run = fly(
         "import socket\n"
-        "told = []\n"
+        "found = []\n"
         "for family in (socket.AF_INET, socket.AF_INET6, socket.AF_UNIX, socket.AF_NETLINK, socket.AF_VSOCK):\n"
-        "    try:\n        socket.socket(family); told.append('made')\n"
-        "    except OSError as error: told.append(error.errno)\n"
-        "a, b = socket.socketpair(); a.send(b'x'); told.append(b.recv(1).decode())\n"
-        "told.append(pathlib.Path('/proc/net/dev').read_text().count('\\n') - 2)\n"
-        "pathlib.Path(sys.argv[2], 'downlink.packets').write_text(str(told))\n"
+        "    try:\n        socket.socket(family); found.append('made')\n"
+        "    except OSError as error: found.append(error.errno)\n"
+        "a, b = socket.socketpair(); a.send(b'x'); found.append(b.recv(1).decode())\n"
+        "found.append(pathlib.Path('/proc/net/dev').read_text().count('\\n') - 2)\n"
+        "pathlib.Path(sys.argv[2], 'downlink.packets').write_text(str(found))\n"
     )
     # EPERM of the system call filter; and behind it a network of its own that holds an idle loopback only.
     assert run.downlink.read_text() == "[1, 1, 1, 1, 1, 'x', 1]"
@@ -156,13 +156,13 @@ def test_a_program_sees_what_the_payload_was_given_and_no_truth_or_secret(fly, m
         monkeypatch.setenv(secret, "postgresql://secret")
     run = fly(
         "seen = sorted(str(p.relative_to(sys.argv[1])) for p in pathlib.Path(sys.argv[1]).rglob('*') if p.is_file())\n"
-        "told = [*seen, *sorted(os.environ)]\n"
-        "pathlib.Path(sys.argv[2], 'downlink.packets').write_text('\\n'.join(told))\n"
+        "found = [*seen, *sorted(os.environ)]\n"
+        "pathlib.Path(sys.argv[2], 'downlink.packets').write_text('\\n'.join(found))\n"
     )
-    told = run.downlink.read_text().split("\n")
-    assert {"manifest.json", "payload/inputs.jsonl", "frames/000000.png"} <= set(told)
-    assert not {"reference.oem", "truth.oem", "catalogue.csv", "downlink.cadu"} & set(told)
-    assert "PATH" in told and not {"LINNA_DATABASE_URL", "HTTPS_PROXY", "LINNA_DATA"} & set(told)
+    found = run.downlink.read_text().split("\n")
+    assert {"manifest.json", "payload/inputs.jsonl", "frames/000000.png"} <= set(found)
+    assert not {"reference.oem", "truth.oem", "catalogue.csv", "downlink.cadu"} & set(found)
+    assert "PATH" in found and not {"LINNA_DATABASE_URL", "HTTPS_PROXY", "LINNA_DATA"} & set(found)
 
 
 def test_a_program_reads_compiled_functions_of_the_service_and_changes_none(fly, tmp_path, monkeypatch):
@@ -171,10 +171,10 @@ def test_a_program_reads_compiled_functions_of_the_service_and_changes_none(fly,
     (cache / "one").write_text("code")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
     run = fly(
-        "folder, told = pathlib.Path(os.environ['NUMBA_CACHE_DIR']), ''\n"
+        "folder, found = pathlib.Path(os.environ['NUMBA_CACHE_DIR']), ''\n"
         "try: (folder / 'two').touch()\n"
-        "except OSError as error: told = error.strerror\n"
-        "pathlib.Path(sys.argv[2], 'downlink.packets').write_text((folder / 'one').read_text() + told)\n"
+        "except OSError as error: found = error.strerror\n"
+        "pathlib.Path(sys.argv[2], 'downlink.packets').write_text((folder / 'one').read_text() + found)\n"
     )
     assert run.downlink.read_text() == "codeRead-only file system"
 
@@ -212,13 +212,13 @@ name = "x" | command = ["x", "{archive}", "{out}"] | model = "m" -> expected a c
 
 
 @pytest.mark.parametrize("row", WRONG_BUILDS.strip().split("\n"))
-def test_a_bad_build_file_is_told_by_its_key(row, tmp_path):
-    text, told = row.replace("0xF", f"0x{'f' * 5000}").split(" -> ")
+def test_a_bad_build_file_is_refused_with_its_key(row, tmp_path):
+    text, message = row.replace("0xF", f"0x{'f' * 5000}").split(" -> ")
     file = tmp_path / "build.toml"
     file.write_text(text.replace(" | ", "\n"))
     with raises(InvalidInput) as error:
         load_build(file)
-    assert told in str(error.value)
+    assert message in str(error.value)
 
 
 def test_the_identity_of_a_build_is_that_of_what_it_runs(make_build, tmp_path):
@@ -271,7 +271,7 @@ def write(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         (
             "flight.anchored.gravity_degre = 60",
@@ -283,10 +283,10 @@ def write(tmp_path):
         ),
     ],
 )
-def test_a_wrong_parameter_is_refused_in_one_line_and_nothing_is_registered(ground, write, text, told):
+def test_a_wrong_parameter_is_refused_in_one_line_and_nothing_is_registered(ground, write, text, message):
     with raises(InvalidInput) as error:
         register_build(ground, load_build(write(text)))
-    assert str(error.value) == told
+    assert str(error.value) == message
     assert ground.read(list_builds, Paging()).items == []
     assert not list((ground.home / "regression" / "builds").glob("*"))
 
@@ -312,7 +312,7 @@ def _ended(**changes):
 
 
 @pytest.mark.parametrize(
-    ("run", "told"),
+    ("run", "message"),
     [
         (_refused, "no user namespaces"),
         (_ended(exit_status=1), "status 1: MemoryError"),
@@ -321,9 +321,9 @@ def _ended(**changes):
         (_ended(cause="timeout"), "ended with timeout"),
     ],
 )
-def test_a_build_that_cannot_be_checked_is_not_registered(ground, write, monkeypatch, run, told):
+def test_a_build_that_cannot_be_checked_is_not_registered(ground, write, monkeypatch, run, message):
     monkeypatch.setattr(builds, "run_confined", run)
-    with raises(BuildNotChecked, match=told):
+    with raises(BuildNotChecked, match=message):
         register_build(ground, load_build(write("flight.anchored.gravity_degree = 60")))
     assert ground.read(list_builds, Paging()).items == []
 
@@ -334,11 +334,11 @@ def test_the_command_checks_a_build_file(write, capsys):
     file = write("detector.max_detections = 3")
     assert run_command(["replay", "--check-build", file]) == 0
     text = Path(file).read_text()
-    for wrong, told in (("schema_version = 7", "expected 1, found 7"), ("modle = 'x'", "expected 'model'")):
+    for wrong, message in (("schema_version = 7", "expected 1, found 7"), ("modle = 'x'", "expected 'model'")):
         Path(file).write_text(f"{wrong}\n{text.replace('schema_version = 1', '')}")
         capsys.readouterr()
         assert run_command(["replay", "--check-build", file]) == 2
-        assert told in capsys.readouterr().out
+        assert message in capsys.readouterr().out
     assert run_command(["replay", "--out", "x"]) == 2
     assert "expected ARCHIVE, or --check-build BUILD" in capsys.readouterr().err
 

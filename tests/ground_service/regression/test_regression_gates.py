@@ -318,12 +318,12 @@ def wrong(passes, count):
     return changed(passes, estimators={"anchored": replace(of, wrong=(np.arange(FRAMES) < count) * 1.0)})
 
 
-@pytest.mark.parametrize(("name", "fault", "told"), EXACT)
-def test_a_gross_failure_on_one_pass_fails_in_one_sentence(name, fault, told):
+@pytest.mark.parametrize(("name", "fault", "reason"), EXACT)
+def test_a_gross_failure_on_one_pass_fails_in_one_sentence(name, fault, reason):
     before = suite(0, 1, 1, **TIMES)
     after = wrong(before, fault["wrong"]) if "wrong" in fault else changed(before, **fault)
     assert name in failed(before, after)
-    assert judged(before, after, name).reason == (told if name in COSTS else f"pass 0: {told}")
+    assert judged(before, after, name).reason == (reason if name in COSTS else f"pass 0: {reason}")
     # It is one of both builds' if the baseline has it too.
     assert name not in failed(after, after)
     # Faults of the telemetry fail under a policy that names other gates only.
@@ -375,9 +375,9 @@ def test_placebos_are_rejected_as_often_as_their_level_allows_and_a_noisier_metr
     parts = [found["detector.recall", kind].placebos for kind in ("cratered", "sparse")]
     assert sum(parts) == 60 and min(parts) > 20
     worse = [one.model_copy(update={"p_value": 0.01}) if k < 60 else one for k, one in enumerate(noise)]
-    told = {one.metric: one for one in calibrations(worse) if not one.condition}["detector.recall"]
-    assert not told.calibrated
-    assert told.text == f"uncalibrated: detector.recall: {told.rejected} of 60 placebos rejected at 0.05"
+    noisy = {one.metric: one for one in calibrations(worse) if not one.condition}["detector.recall"]
+    assert not noisy.calibrated
+    assert noisy.text == f"uncalibrated: detector.recall: {noisy.rejected} of 60 placebos rejected at 0.05"
 
 
 def test_exact_gates_and_the_verdict_of_a_placebo_are_rejected_if_they_fail():

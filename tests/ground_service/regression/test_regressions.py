@@ -173,9 +173,9 @@ def test_a_bias_of_seven_tenths_of_a_pixel_fails_as_a_centre_error(judge, packet
     outcome = judge(with_detections(packets, lambda items: items | {"u_px": items["u_px"] + 0.7}))
     assert verdict_document(outcome).exit_status == 1
     assert failed(outcome) == {"detector.localisation"}
-    told = verdict_document(outcome).headline
-    assert re.match(r"fail: centre error rises by 0\.\d+ px \(", told)
-    assert told.endswith("navigation holds: share of fixes 1 to 1, median position error 30 to 30 m")
+    headline = verdict_document(outcome).headline
+    assert re.match(r"fail: centre error rises by 0\.\d+ px \(", headline)
+    assert headline.endswith("navigation holds: share of fixes 1 to 1, median position error 30 to 30 m")
 
 
 def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge, monkeypatch):
@@ -183,8 +183,8 @@ def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge, mo
     outcome = judge(network_ms=20.0)
     assert (outcome.verdict, gate(outcome, "latency.total").outcome) == ("pass", "not judged")
     assert verdict_document(outcome).headline.endswith("; latency was not judged")
-    told = "no latency is compared on 2 of 2 passes: the builds were not replayed at the same time"
-    assert told in outcome.remarks
+    message = "no latency is compared on 2 of 2 passes: the builds were not replayed at the same time"
+    assert message in outcome.remarks
     one = KeptReplay(outcome="ok", detail="", machine="a", wall_s=8.0)
     changed = ({"created_utc_ns": at} for at in (3 * 10**9, 5 * 10**9))
     overlaps = [one.overlaps(one.model_copy(update=values)) for values in (*changed, {"machine": "b"})]
@@ -196,20 +196,20 @@ def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge, mo
 
 
 @pytest.mark.parametrize(
-    ("fault", "told"),
+    ("fault", "message"),
     [
         (late_headers, "contradict the image or step that they report, by up to 7.0 s"),
         (late_states, "navigation_state packets name a time at which no image was taken"),
     ],
 )
-def test_packets_with_times_that_contradict_their_images_fail_in_one_sentence(judge, packets, fault, told):
+def test_packets_with_times_that_contradict_their_images_fail_in_one_sentence(judge, packets, fault, message):
     given = altered(packets, fault)
     outcome = judge(given)
     assert failed(outcome) - {"telemetry.frames_without_value"} == {"telemetry.times"}
     times = gate(outcome, "telemetry.times")
     moved = sum(a != b for name in given for a, b in zip(given[name], packets[name], strict=True))
     assert times.baseline == 0 < moved <= times.candidate
-    assert told in verdict_document(outcome).headline
+    assert message in verdict_document(outcome).headline
 
 
 def test_packets_out_of_order_fail_in_one_sentence(judge, packets):
@@ -219,7 +219,7 @@ def test_packets_out_of_order_fail_in_one_sentence(judge, packets):
 
 
 @pytest.mark.parametrize(
-    ("program", "told"),
+    ("program", "message"),
     [
         ("raise SystemExit('no network found')", "candidate crashed: exit status 1: no network found"),
         ("import time; time.sleep(60)", "candidate hung: stopped at its time limit"),
@@ -235,12 +235,12 @@ def test_packets_out_of_order_fail_in_one_sentence(judge, packets):
         ("pass", "candidate ended without a downlink"),
     ],
 )
-def test_a_build_that_fails_on_a_pass_is_told_so_and_fails(judge, first, program, told):
+def test_a_build_that_fails_on_a_pass_is_reported_and_fails(judge, first, program, message):
     limits = "[limits]\nwall_s = 2\nmemory_mib = 300\nfile_mib = 4\n"
     outcome = judge(archives=[first], program=program, extra=limits)
     assert ended(outcome) == ("fail", 1)
     assert outcome.passes[0].state == "candidate failed"
-    assert outcome.passes[0].detail.startswith(told)
+    assert outcome.passes[0].detail.startswith(message)
 
 
 def test_a_build_that_fails_on_one_pass_is_judged_on_the_others(judge, packets):
@@ -277,14 +277,14 @@ def test_a_placebo_leaves_the_noise_of_its_metrics_and_marks_gates_that_reject_e
     recall = [one.model_copy(update={"p_value": 0.0}) for one in recall]
     for _ in range(2):
         keep_regression(home, dataclasses.replace(outcome, noise=tuple(recall)))
-    told = "uncalibrated: detector.recall: 4 of 6 placebos rejected at 0.05"
+    message = "uncalibrated: detector.recall: 4 of 6 placebos rejected at 0.05"
     marked = judge()
-    assert gate(marked, "detector.recall").reason == f"identical in every octet; {told}"
-    assert told in marked.remarks
+    assert gate(marked, "detector.recall").reason == f"identical in every octet; {message}"
+    assert message in marked.remarks
     assert verdict_document(marked).headline == "pass: identical in every octet on 60 frames"
 
 
-def test_a_tampered_archive_is_told_and_the_rest_goes_on(judge, passes, copy):
+def test_a_tampered_archive_is_reported_and_the_rest_goes_on(judge, passes, copy):
     (copy / "reference.oem").write_text((copy / "reference.oem").read_text().replace("1", "2", 1))
     outcome = judge(archives=[copy, passes[1].folder])
     assert [item.state for item in outcome.passes] == ["unusable", "judged"]
@@ -302,7 +302,7 @@ def test_a_program_does_not_replay_a_pass_without_frames(judge, passes, copy):
     assert "2 of 30 frames are not stored, the first 7" in outcome.passes[0].detail
 
 
-def test_an_archive_or_a_build_for_another_camera_is_told(judge, first, copy):
+def test_an_archive_or_a_build_for_another_camera_is_reported(judge, first, copy):
     camera = json.loads((copy / "manifest.json").read_text())["camera"]
     enter_files(copy, camera=camera | {"width_px": 1024})
     of_build = judge(archives=[first], extra="[camera]\nfov_deg = 60\n").passes[0]
@@ -312,7 +312,7 @@ def test_an_archive_or_a_build_for_another_camera_is_told(judge, first, copy):
     assert "expected an image of the camera of 1024 x 512 px, found 512 x 512 px" in of_archive.detail
 
 
-def test_something_that_is_no_archive_is_told(judge, first, tmp_path):
+def test_something_that_is_no_archive_is_reported(judge, first, tmp_path):
     (tmp_path / "note.txt").write_text("hello")
     outcome = judge(archives=[tmp_path / "note.txt", tmp_path / "gone", first])
     assert [item.state for item in outcome.passes] == ["unusable", "unusable", "judged"]
@@ -385,9 +385,9 @@ def test_the_verdict_is_written_as_json_junit_and_text(judge, packets, copy, pas
     assert [child.tag for child in suite] == order
     for case in cases:
         assert len(case) <= 1 and case.attrib["name"] == " ".join(case.attrib["name"].split())
-    told = regression_text(verdict)
-    assert told.splitlines()[0] == figures["headline"]
-    assert "detector.localisation" in told and "unusable" in told
+    text = regression_text(verdict)
+    assert text.splitlines()[0] == figures["headline"]
+    assert "detector.localisation" in text and "unusable" in text
 
 
 def test_a_crash_is_one_failure_and_the_last_lines_of_its_program_are_in_every_output(home, judge, first):
@@ -399,9 +399,9 @@ def test_a_crash_is_one_failure_and_the_last_lines_of_its_program_are_in_every_o
     assert (len(lines), lines[-1], one["baseline"]["printed"]) == (40, "RuntimeError: no network", None)
     suite = ET.fromstring(regression_junit(verdict, 0))
     assert [suite.attrib[name] for name in ("tests", "failures", "errors", "skipped")] == ["1", "1", "0", "0"]
-    told = f"candidate crashed: exit status 1: {lines[-1]}"
-    assert suite.find("testcase[@name='synthetic pass 41']/failure").attrib["message"].endswith(told)
-    assert verdict.headline == f"fail: {told}, on synthetic pass 41"
+    message = f"candidate crashed: exit status 1: {lines[-1]}"
+    assert suite.find("testcase[@name='synthetic pass 41']/failure").attrib["message"].endswith(message)
+    assert verdict.headline == f"fail: {message}, on synthetic pass 41"
     page = regression_html(home, outcome, "0" * 32)
     for text in (regression_text(verdict), suite.findtext("system-err"), page):
         assert "Traceback (most recent call last)" in text and "line 49" in text
@@ -537,8 +537,8 @@ fail = {level=1.5, reason='y'} -> fail.level: expected less than or equal to 0.2
 
 
 @pytest.mark.parametrize("row", WRONG_POLICIES.strip("\n").split("\n"))
-def test_a_bad_policy_is_told_by_its_key(row, tmp_path):
-    text, told = row.split(" -> ")
+def test_a_bad_policy_is_refused_with_its_key(row, tmp_path):
+    text, message = row.split(" -> ")
     good = "{metric='detector.recall', weight=1, margin=0.1, reason='small'}"
     whole = {"schema_version": "3", "version": "'1'", "fail": "{level=0.01, reason='usual'}", "gate": f"[{good}]"}
     if text.startswith("{"):
@@ -548,7 +548,7 @@ def test_a_bad_policy_is_told_by_its_key(row, tmp_path):
     (tmp_path / "policy.toml").write_text("\n".join(lines))
     with pytest.raises(InvalidInput) as error:
         load_policy(tmp_path / "policy.toml")
-    assert told in str(error.value)
+    assert message in str(error.value)
 
 
 def test_the_shipped_policy_gives_a_reason_for_every_number():

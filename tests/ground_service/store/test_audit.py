@@ -132,7 +132,7 @@ def test_without_its_head_the_log_takes_no_entry_and_nothing_is_stored(database)
         assert connection.execute(text("SELECT count(*) FROM vehicles")).scalar_one() == 0
 
 
-def test_a_failed_statement_of_the_database_is_told_as_one(database):
+def test_a_failed_statement_of_the_database_is_reported_as_one(database):
     with pytest.raises(GroundError) as caught, database.writing() as connection:
         connection.execute(text("INSERT INTO nothing VALUES (1)"))
     assert isinstance(caught.value.__cause__, DBAPIError)

@@ -30,7 +30,7 @@ def state_of(ground, key):
         return str(repository.get(connection, repository.TELECOMMANDS, key, "telecommand")["state"])
 
 
-def test_a_transition_happens_once_and_the_second_is_told_the_state_that_won(either):
+def test_a_transition_happens_once_and_the_second_is_refused_with_the_state_that_won(either):
     key = add_command(either)
     either.write(move, TELECOMMAND, key, "released", reason="first")
     with (

@@ -81,12 +81,12 @@ def end_socket(one):
 
 
 class Console:
-    """The console of a payload flown live, without the payload: sends what it is told to, keeps what it hears."""
+    """The console of a payload flown live, without the payload: sends given lines, keeps received ones."""
 
     def __init__(self):
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = self._listener.getsockname()[1]
-        self.heard: list[str] = []
+        self.received: list[str] = []
         self._clients: list[socket.socket] = []
         self._thread = threading.Thread(target=self._accept, daemon=True)
         self._thread.start()
@@ -103,7 +103,7 @@ class Console:
     def _hear(self, client):
         with client, suppress(OSError), client.makefile("r") as lines:
             for line in lines:
-                self.heard += [line.strip()] if line.strip() != "watch" else []
+                self.received += [line.strip()] if line.strip() != "watch" else []
         self._clients.remove(client)
 
     def say(self, message):

@@ -112,13 +112,13 @@ def test_telemetry_received_by_one_process_is_shown_by_the_other_through_a_resta
         station.close()
 
 
-def test_a_wake_up_of_another_process_is_heard_and_an_own_one_is_not(redis_url):
-    heard = []
+def test_a_wake_up_of_another_process_is_received_and_an_own_one_is_not(redis_url):
+    received = []
     connected, woken = threading.Event(), threading.Event()
 
     def wake():
         (woken if connected.is_set() else connected).set()
-        heard.append("wake")
+        received.append("wake")
 
     async def run():
         task = asyncio.create_task(leases.listen(redis_url, wake))
@@ -130,7 +130,7 @@ def test_a_wake_up_of_another_process_is_heard_and_an_own_one_is_not(redis_url):
 
     with ThreadPoolExecutor(1) as pool:
         pool.submit(asyncio.run, run()).result()
-    assert heard == ["wake", "wake"]
+    assert received == ["wake", "wake"]
 
 
 def test_an_unavailable_broker_is_reported_once_and_not_asked_at_each_commit(monkeypatch):

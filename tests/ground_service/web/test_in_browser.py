@@ -1,4 +1,4 @@
-"""What operators do on the pages, in Chromium, also with the keyboard while the pages change."""
+"""Actions of operators on the pages, in Chromium, also with the keyboard while the pages change."""
 
 import re
 import time
@@ -336,7 +336,7 @@ def test_arguments_have_names_units_and_ranges(page):
     assert not value.evaluate("input => input.validity.valid")
 
 
-def test_a_telecommand_that_the_dictionary_refuses_is_told(page):
+def test_a_telecommand_that_the_dictionary_refuses_is_reported(page):
     settled(page, "/commands")
     page.locator("#name").select_option("insert_activity")
     page.locator("#argument-items").fill("300\n4")
@@ -439,32 +439,32 @@ def test_a_live_payload_is_watched_and_steered(page, console, live_frames):
         "Array.from(document.getElementById('frame').getContext('2d').getImageData(300, 300, 1, 1).data).slice(0, 3)"
     )
     assert grey == [24, 24, 24]  # the last frame's level
-    console.heard.clear()
+    console.received.clear()
     press(page, "Pause")
     press(page, "Step")
     page.get_by_label("Rate").select_option("60")
-    wait_for(lambda: len(console.heard) >= 3, f"heard no more than {console.heard}")
-    assert console.heard == ["pause", "step", "rate 60"]
+    wait_for(lambda: len(console.received) >= 3, f"received no more than {console.received}")
+    assert console.received == ["pause", "step", "rate 60"]
 
 
 def test_words_that_could_do_harm_do_not_reach_the_payload(page, console):
     settled(page, "/live")
     expect(page.locator("#state")).to_have_text("connected")
-    console.heard.clear()
+    console.received.clear()
     answer = page.evaluate(
         """() => new Promise((resolve) => {
           const socket = new WebSocket(`ws://${location.host}/api/v1/payload`);
           socket.onopen = () => ["quit", "run\\nquit", "rate -1", "x".repeat(3000)].forEach((one) => socket.send(one));
-          const heard = [];
+          const received = [];
           socket.onmessage = (event) => {
             const message = JSON.parse(event.data);
-            if (message.kind === "error") heard.push(message);
-            if (heard.length === 4) resolve(heard);
+            if (message.kind === "error") received.push(message);
+            if (received.length === 4) resolve(received);
           };
         })"""
     )
     assert [one["kind"] for one in answer] == ["error"] * 4
-    assert console.heard == []
+    assert console.received == []
 
 
 KEYBOARD = 79

@@ -99,7 +99,7 @@ temperature_max_c = 60.0
 
 @dataclass
 class Spacecraft:
-    """A station and a payload behind it: reports what it is told to, and verifies every telecommand it receives."""
+    """A station and a payload behind it: sends given reports, and verifies every telecommand it receives."""
 
     down: socket.socket = field(default_factory=lambda: socket.create_server(("127.0.0.1", 0)))
     up: socket.socket = field(default_factory=lambda: socket.create_server(("127.0.0.1", 0)))

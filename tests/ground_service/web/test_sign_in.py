@@ -69,11 +69,11 @@ def test_a_viewer_may_not_steer_the_payload(stranger, guarded, console):
     stranger.goto("/live")
     sign_in(stranger, guarded[1])
     expect(stranger.locator("#state")).to_have_text("connected")
-    console.heard.clear()
+    console.received.clear()
     expect(stranger.get_by_role("button", name="Pause")).to_be_hidden()
     stranger.locator("#pause").dispatch_event("click")  # a viewer who does not use the page
     expect(stranger.locator("#state")).to_contain_text("operator")
-    assert console.heard == []
+    assert console.received == []
 
 
 @pytest.mark.parametrize("address", ["/reports/{key}#part", "/?next=/reports/{key}%23part"])

@@ -15,8 +15,7 @@ from ground_service.evaluation.store import newest_report
 from ground_service.ground import open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
-from ground_service.jobs.model import JobFilter
-from ground_service.jobs.service import enter_job, list_jobs, repeat_failed, unfinished_jobs
+from ground_service.jobs.service import JobFilter, enter_job, list_jobs, repeat_failed, unfinished_jobs
 from ground_service.missions.catalogues import add_catalogue, catalogue_of
 from ground_service.missions.ephemerides.service import add_ephemeris
 from ground_service.missions.model import parse_mission

@@ -15,7 +15,7 @@ from ground_service.errors import StorageFull
 from ground_service.ground import open_ground
 from ground_service.ingest import reception
 from ground_service.ingest import store as ingest_store
-from ground_service.ingest.service import Place, enter_ingest, ingest_file
+from ground_service.ingest.service import PiecePosition, enter_ingest, ingest_file
 from ground_service.regression.archives import keep_archive
 from ground_service.regression.builds import load_build, register_build
 from ground_service.regression.jobs import missing_replays, prepared
@@ -173,17 +173,17 @@ def ingest(ground, octets, **stated):
     ingest_file(ground, path, **stated)
 
 
-@pytest.mark.parametrize(
-    "stated",
-    [{"spacecraft_id": SPACECRAFT}, {"spacecraft_id": SPACECRAFT, "place": Place("s", 100)}, {"instance": "twin"}],
-)
+HERE = {"spacecraft_id": SPACECRAFT}
+
+
+@pytest.mark.parametrize("stated", [HERE, {**HERE, "place": PiecePosition("s", 100)}, {"instance": "twin"}])
 def test_what_was_stated_with_a_downlink_holds_for_its_verification(ground, stated):
     """A spacecraft filter excludes the same packets; pieces with a position are joined by position."""
     octets = stream_of() + stream_of(SPACECRAFT + 1)
     place = stated.pop("place", None)
     cuts = [0, len(octets)] if place is None else [*range(0, 1200, 60), len(octets)]
     for start, stop in reversed(list(itertools.pairwise(cuts))):
-        stands = None if place is None else Place(place.stream, place.offset + start)
+        stands = None if place is None else PiecePosition(place.stream, place.offset + start)
         ingest(ground, octets[start:stop], place=stands, **stated)
     result = verify(ground, rebuild=True)
     assert (result.verdict, result.damaged) == ("intact", [])

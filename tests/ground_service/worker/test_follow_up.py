@@ -1,11 +1,8 @@
 """Events and their follow-up work: nothing lost, nothing done twice, re-evaluation after late data."""
 
 import json
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
@@ -13,11 +10,11 @@ from sqlalchemy import update
 
 from ground_service.app import create_app
 from ground_service.errors import StorageFull
-from ground_service.evaluation.core import PassInputs, evaluate_pass
+from ground_service.evaluation.core import evaluate_pass
 from ground_service.evaluation.model import ChangedFigure, changed_figures
 from ground_service.evaluation.service import make_report
 from ground_service.evaluation.store import list_reports
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
 from ground_service.jobs.service import unfinished_jobs
@@ -37,41 +34,40 @@ from ground_service.store.event_kinds import (
 from ground_service.worker import follow_up
 from ground_service.worker.follow_up import FollowUp, follow_in_process
 from lunar.timescales import parse_utc
-from reports.values import PassReport
-from tests.ground_service.conftest import SPACECRAFT, SyntheticPass, encode_downlink
+from tests.ground_service.conftest import SPACECRAFT, encode_downlink
 
 
-def kinds(ground: Ground) -> list[str]:
+def kinds(ground):
     return [event.kind for event in events.read_events(ground.database, 0, 1000)]
 
 
-def position(ground: Ground) -> int:
+def position(ground):
     return ground.read(log.position_of, follow_up.CONSUMER)
 
 
-def jobs_of(ground: Ground, kind: str) -> list[dict[str, Any]]:
+def jobs_of(ground, kind):
     return ground.read(repository.newest, repository.JOBS, Paging(), kind=kind)[0]
 
 
-def say(ground: Ground, *given: events.Event) -> None:
+def say(ground, *given):
     with ground.database.writing() as connection:
         for event in given:
             publish(connection, event)
 
 
-def command(vehicle: int = 1) -> events.Event:
+def command(vehicle=1):
     return CommandsSent(vehicle_id=vehicle, telecommands=(1,))
 
 
 class Recorded:
     """Stands in for the work: keeps what was asked for, and can fail."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, monkeypatch):
         self.done, self.error = [], None
         monkeypatch.setattr(follow_up, "DOING", {name: self._work(name) for name in follow_up.DOING})
 
-    def _work(self, name: str) -> Callable[[Ground, int, int], str | None]:
-        def work(_ground: Ground, key: int, _event: int) -> str | None:
+    def _work(self, name):
+        def work(_ground, key, _event):
             if self.error is not None:
                 raise self.error
             self.done.append((name, key))
@@ -81,11 +77,11 @@ class Recorded:
 
 
 @pytest.fixture
-def recorded(monkeypatch: pytest.MonkeyPatch) -> Recorded:
+def recorded(monkeypatch):
     return Recorded(monkeypatch)
 
 
-def test_an_event_exists_only_if_its_change_was_committed(either: Ground):
+def test_an_event_exists_only_if_its_change_was_committed(either):
     with pytest.raises(RuntimeError), either.database.writing() as connection:
         publish(connection, command())
         raise RuntimeError
@@ -94,8 +90,8 @@ def test_an_event_exists_only_if_its_change_was_committed(either: Ground):
         either.read(publish, command())
 
 
-def test_numbers_have_no_gaps_and_follow_the_order_of_commits(either: Ground):
-    def write(seed: int) -> None:
+def test_numbers_have_no_gaps_and_follow_the_order_of_commits(either):
+    def write(seed):
         for k in range(10):
             if (seed + k) % 3 == 0:
                 with pytest.raises(RuntimeError), either.database.writing() as connection:
@@ -111,7 +107,7 @@ def test_numbers_have_no_gaps_and_follow_the_order_of_commits(either: Ground):
         assert [event.payload["k"] for event in found if event.payload["seed"] == seed] == list(range(10))
 
 
-def test_equal_work_of_several_events_is_done_once_and_in_order(ground: Ground, recorded: Recorded):
+def test_equal_work_of_several_events_is_done_once_and_in_order(ground, recorded):
     with ground.database.listeners.held():
         for vehicle in (7, 5, 7):
             say(ground, TelemetryReceived(vehicle_id=vehicle, packets=1))
@@ -123,14 +119,14 @@ def test_equal_work_of_several_events_is_done_once_and_in_order(ground: Ground, 
     assert position(ground) == 3
 
 
-def test_work_of_a_failed_block_is_still_done(ground: Ground, recorded: Recorded):
+def test_work_of_a_failed_block_is_still_done(ground, recorded):
     with pytest.raises(RuntimeError), ground.database.listeners.held():
         say(ground, command(3))
         raise RuntimeError
     assert recorded.done == [("advance windows", 3)]
 
 
-def test_events_of_a_process_that_ended_are_handled_by_the_next(tmp_path: Path, recorded: Recorded):
+def test_events_of_a_process_that_ended_are_handled_by_the_next(tmp_path, recorded):
     with open_ground(tmp_path) as ground:  # ends between the commit and the follow-up work
         say(ground, command(3))
     assert recorded.done == []
@@ -141,7 +137,7 @@ def test_events_of_a_process_that_ended_are_handled_by_the_next(tmp_path: Path, 
         assert recorded.done == [("advance windows", 3)]
 
 
-def test_work_that_meets_a_passing_error_is_repeated(ground: Ground, recorded: Recorded):
+def test_work_that_meets_a_passing_error_is_repeated(ground, recorded):
     recorded.error = StorageFull("disk")
     say(ground, command(3))
     assert (recorded.done, position(ground)) == ([], 0)
@@ -151,7 +147,7 @@ def test_work_that_meets_a_passing_error_is_repeated(ground: Ground, recorded: R
     assert FollowUpFailed.event_kind not in kinds(ground)
 
 
-def test_work_that_fails_is_reported_with_its_events_and_does_not_stop_others(ground: Ground, recorded: Recorded):
+def test_work_that_fails_is_reported_with_its_events_and_does_not_stop_others(ground, recorded):
     recorded.error = ValueError("broken")
     say(ground, command(3))
     recorded.error = None
@@ -161,7 +157,7 @@ def test_work_that_fails_is_reported_with_its_events_and_does_not_stop_others(gr
     assert failed.payload == {"work": "advance windows 3", "events": [1], "error": "ValueError: broken"}
 
 
-def test_an_event_that_cannot_be_read_does_not_stop_others(ground: Ground, recorded: Recorded):
+def test_an_event_that_cannot_be_read_does_not_stop_others(ground, recorded):
     with ground.database.writing() as connection:
         log.publish(connection, CommandsSent.event_kind, {"vehicle": "?"})
         publish(connection, command(4))
@@ -169,15 +165,13 @@ def test_an_event_that_cannot_be_read_does_not_stop_others(ground: Ground, recor
     assert kinds(ground)[-1] == FollowUpFailed.event_kind
 
 
-def test_several_processes_handle_each_event_once(
-    migrated_postgres: Callable[[], str], recorded: Recorded, tmp_path: Path
-):
+def test_several_processes_handle_each_event_once(migrated_postgres, recorded, tmp_path):
     url = migrated_postgres()
     grounds = [open_ground(tmp_path / f"{k}", database_url=url) for k in range(3)]
     for ground in grounds:
         follow_in_process(ground)
 
-    def run(ground: Ground, first: int) -> None:
+    def run(ground, first):
         for k in range(8):
             say(ground, command(first + k))
             assert ("advance windows", first + k) in recorded.done  # complete before the caller continues
@@ -190,10 +184,8 @@ def test_several_processes_handle_each_event_once(
         ground.close()
 
 
-def test_a_service_starts_while_another_process_handles_a_backlog(
-    migrated_postgres: Callable[[], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    def waits(_seconds: float) -> None:
+def test_a_service_starts_while_another_process_handles_a_backlog(migrated_postgres, tmp_path, monkeypatch):
+    def waits(_seconds):
         raise AssertionError("the start waits for another process")
 
     url = migrated_postgres()
@@ -206,7 +198,7 @@ def test_a_service_starts_while_another_process_handles_a_backlog(
             assert position(other) == 0
 
 
-def test_old_events_are_deleted_only_after_they_were_handled(ground: Ground, recorded: Recorded):
+def test_old_events_are_deleted_only_after_they_were_handled(ground, recorded):
     say(ground, command())
     recorded.error = StorageFull("disk")
     say(ground, command(2), command(3))
@@ -217,7 +209,7 @@ def test_old_events_are_deleted_only_after_they_were_handled(ground: Ground, rec
 
 
 @pytest.fixture(scope="module")
-def halves(make_pass: Callable[..., SyntheticPass], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def halves(make_pass, tmp_path_factory):
     """Downlink of the first three quarters of a pass, and the rest."""
     packets, folder = make_pass(frames=24, seed=6).packets, tmp_path_factory.mktemp("late")
     cut, paths = len(packets) * 3 // 4, (folder / "early.cadu", folder / "late.cadu")
@@ -226,7 +218,7 @@ def halves(make_pass: Callable[..., SyntheticPass], tmp_path_factory: pytest.Tem
     return paths
 
 
-def reported_pass(ground: Ground, early: Path) -> int:
+def reported_pass(ground, early):
     ingest_file(ground, early, spacecraft_id=SPACECRAFT)
     pass_id = define_pass(
         ground, name="late data", start_utc_ns=parse_utc("2029-08-07T05:50:00Z"),
@@ -236,12 +228,12 @@ def reported_pass(ground: Ground, early: Path) -> int:
     return pass_id
 
 
-def reports_of(ground: Ground, pass_id: int) -> list[dict[str, Any]]:
+def reports_of(ground, pass_id):
     rows, _ = ground.read(repository.newest, repository.REPORTS, Paging(limit=10), pass_id=pass_id)
     return sorted(rows, key=lambda row: int(row["created_utc_ns"]))
 
 
-def test_late_data_make_a_report_with_the_changed_figures_and_their_event(either: Ground, halves: tuple[Path, Path]):
+def test_late_data_make_a_report_with_the_changed_figures_and_their_event(either, halves):
     pass_id = reported_pass(either, halves[0])
     assert len(reports_of(either, pass_id)) == 1
     ingest_file(either, halves[1], spacecraft_id=SPACECRAFT)
@@ -260,18 +252,16 @@ def test_late_data_make_a_report_with_the_changed_figures_and_their_event(either
     assert [e.payload.get("event") for e in made] == [None, again["event_number"]]
 
 
-def test_the_same_data_again_make_no_report(ground: Ground, halves: tuple[Path, Path]):
+def test_the_same_data_again_make_no_report(ground, halves):
     pass_id = reported_pass(ground, halves[0])
     ingest_file(ground, halves[0], spacecraft_id=SPACECRAFT)
     assert len(reports_of(ground, pass_id)) == 1 and jobs_of(ground, "re-evaluation") == []
 
 
-def test_late_data_evaluate_a_pass_once_for_the_comparison_and_the_report(
-    ground: Ground, halves: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-):
+def test_late_data_evaluate_a_pass_once_for_the_comparison_and_the_report(ground, halves, monkeypatch):
     pass_id, evaluated = reported_pass(ground, halves[0]), list[str]()
 
-    def evaluate(inputs: PassInputs) -> PassReport:
+    def evaluate(inputs):
         evaluated.append(inputs.pass_id)
         return evaluate_pass(inputs)
 
@@ -283,7 +273,7 @@ def test_late_data_evaluate_a_pass_once_for_the_comparison_and_the_report(
     assert parse_utc(made) // 10**9 == again["created_utc_ns"] // 10**9
 
 
-def test_an_event_that_changes_nothing_of_a_pass_makes_no_report(ground: Ground, halves: tuple[Path, Path]):
+def test_an_event_that_changes_nothing_of_a_pass_makes_no_report(ground, halves):
     pass_id = reported_pass(ground, halves[0])
     vehicle = ground.read(repository.get, repository.PASSES, pass_id, "pass")["vehicle_id"]
     # Telemetry of another time does not evaluate the pass again.
@@ -297,7 +287,7 @@ def test_an_event_that_changes_nothing_of_a_pass_makes_no_report(ground: Ground,
     assert len(reports_of(ground, pass_id)) == 1
 
 
-def test_a_re_evaluation_that_waits_already_is_not_added_again(tmp_path: Path, halves: tuple[Path, Path]):
+def test_a_re_evaluation_that_waits_already_is_not_added_again(tmp_path, halves):
     with open_ground(tmp_path) as ground:
         follow = FollowUp(ground, start=lambda _job: None)
         pass_id = reported_pass(ground, halves[0])

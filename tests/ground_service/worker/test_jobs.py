@@ -62,15 +62,15 @@ def test_whatever_error_a_job_meets_it_ends_as_failed_and_is_not_repeated(ground
 
 
 def test_a_failed_ingest_is_repeated_with_longer_and_longer_waits(either, monkeypatch):
-    """What was acknowledged is done when its cause is gone, at most 85 minutes later without anybody."""
+    """An acknowledged ingest is done at most 85 minutes after its cause is gone, without anybody."""
     work, waits_min = Mock(side_effect=[*[FileNotFoundError("gone")] * 5, {}]), (1, 4, 16, 64)
     monkeypatch.setitem(jobs.WORK, "ingest", work)
     monkeypatch.setitem(jobs.WORK, "report", work)
     job, other = (enter_job(either, kind, {"pass_id": 1, "ingest_id": 1}) for kind in ("ingest", "report"))
     scheduler = Scheduler(either, InlineDispatcher(either), lambda: None, {"retention_days": 90})
     assert run_job(either, other).state == run_job(either, job).state == "failed"
-    told = complaints(read_condition(either, None))
-    assert "1 ingests have failed; repeat or dismiss them on the page Shift." in told
+    shown = complaints(read_condition(either, None))
+    assert "1 ingests have failed; repeat or dismiss them on the page Shift." in shown
     for attempt, minutes in enumerate(waits_min, start=1):
         for passed_min, attempts in ((minutes - 0.5, attempt), (minutes, attempt + 1)):
             since = utc_now_ns() - int(passed_min * 60e9)

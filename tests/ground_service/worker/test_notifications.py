@@ -19,8 +19,7 @@ import pytest
 from ground_service.access.store import audit_head
 from ground_service.errors import InvalidInput
 from ground_service.ground import open_ground
-from ground_service.jobs.model import JobFilter
-from ground_service.jobs.service import get_job, list_jobs
+from ground_service.jobs.service import JobFilter, get_job, list_jobs
 from ground_service.missions.automation import Channel
 from ground_service.missions.service import add_mission
 from ground_service.settings import load_settings
@@ -211,7 +210,7 @@ def local(tmp_path):
 
 @pytest.mark.parametrize("offers_tls", [False, True])
 def test_a_public_mail_server_needs_tls_with_its_certificate(mailbox, monkeypatch, tmp_path, offers_tls):
-    """What is sent to the internet is neither readable on the way nor given to another server."""
+    """A message to the internet is neither readable on the way nor given to another server."""
     if offers_tls:
         environment = {"PATH": os.environ["PATH"], "LINNA_SECRETS_DIR": str(tmp_path)}
         subprocess.run(["sh", "deploy/secrets.sh"], check=True, env=environment, capture_output=True)
@@ -219,8 +218,8 @@ def test_a_public_mail_server_needs_tls_with_its_certificate(mailbox, monkeypatc
         mailbox.tls.load_cert_chain(tmp_path / "tls/certificate", tmp_path / "tls/key")
     monkeypatch.setattr(outgoing.ipaddress.IPv4Address, "is_global", property(lambda _: True))
     channel = Channel(email=("a@b.example",), smtp=mailbox.address)
-    told = "SSLCertVerificationError" if offers_tls else "expected a mail server with STARTTLS"
-    with pytest.raises(NotDelivered, match=told):
+    message = "SSLCertVerificationError" if offers_tls else "expected a mail server with STARTTLS"
+    with pytest.raises(NotDelivered, match=message):
         send(tmp_path, channel)
     assert mailbox.received == []
 

@@ -158,9 +158,9 @@ def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
         assert "audit heads" not in faults(opened, opened_to_people)
 
         # 6. Audit heads go to a channel that no mission description has, or to a folder that does not exist.
-        for target, told in (("channel:nobody", "found nobody"), (str(tmp_path / "none"), "a folder that can")):
+        for target, fault in (("channel:nobody", "found nobody"), (str(tmp_path / "none"), "a folder that can")):
             given_heads = given.model_copy(update={"audit_heads": target})
-            assert told in faults(opened, given_heads)["audit heads"]
+            assert fault in faults(opened, given_heads)["audit heads"]
     found = faults(opened, given)
     assert "expected a running api, found none; expected a running worker" in found["processes"]
 
@@ -168,9 +168,9 @@ def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
 def test_the_command_has_an_exit_status_and_json(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("LINNA_HOME", str(tmp_path / "home"))
     assert cli.run(["doctor", "--json"]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert told["verdict"] == "broken"
-    assert [one["name"] for one in told["checks"] if not one["ok"]] == ["recurring work"]
+    report = json.loads(capsys.readouterr().out)
+    assert report["verdict"] == "broken"
+    assert [one["name"] for one in report["checks"] if not one["ok"]] == ["recurring work"]
 
 
 def test_the_statement_fits_into_its_column():

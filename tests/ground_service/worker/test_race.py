@@ -7,7 +7,7 @@ from benchmarks.campaigns.race import FAULTS, Answer, Tally, holds, run, table
 
 
 @pytest.mark.campaign
-def test_of_contradicting_requests_to_two_processes_one_wins_and_all_others_are_told_so(
+def test_of_contradicting_requests_to_two_processes_one_wins_and_all_others_are_refused(
     new_postgres_database, tmp_path
 ):
     figures = run(tmp_path, new_postgres_database(), races=60, seed=3)
@@ -31,8 +31,8 @@ def test_any_fault_fails_the_campaign_and_is_in_its_table(name):
 
 def test_answers_are_counted():
     tally = Tally()
-    told, untold = b'{"state": "released"}', b"{}"
-    tally.add("release", [Answer("release", 200, told), Answer("release", 409, told), Answer("reject", 409, untold)])
+    stated, empty = b'{"state": "released"}', b"{}"
+    tally.add("release", [Answer("release", 200, stated), Answer("release", 409, stated), Answer("reject", 409, empty)])
     tally.add("uplink", [Answer("hand out", 200, b"", (7, 8)), Answer("hand out", 200, b"", (8,))])
     tally.add("ingest", [Answer("upload", 503, b"gone")])
     assert (tally.requests["release"], tally.won["release"]) == (3, 1)

@@ -5,15 +5,13 @@ import signal
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable
 from itertools import pairwise
-from pathlib import Path
 from unittest.mock import MagicMock, Mock
 
 import pytest
 
 from ground_service.errors import StorageFull
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.regression import jobs
 from ground_service.regression.model import COMPLETE, TELEMETRY_ONLY
 from ground_service.store import leases
@@ -29,29 +27,29 @@ from tests.serving import wait_for
 class Recorder:
     """A dispatcher that keeps what it gets."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.resumed, self.submitted = 0, []
 
-    def resume(self) -> None:
+    def resume(self):
         self.resumed += 1
 
-    def submit(self, kind: str, _arguments: object, *, job_id: str | None = None) -> None:
+    def submit(self, kind, _arguments, *, job_id=None):
         assert kind in ("nightly", "plan", "regression")
         self.submitted.append(job_id)
 
 
-def make(ground: Ground, placebo_passes: int = 0, **options: bool) -> tuple[Scheduler, Recorder]:
+def make(ground, placebo_passes=0, **options):
     recorder, nightly = Recorder(), {"retention_days": 90, "placebo_passes": placebo_passes}
     return Scheduler(ground, recorder, lambda: None, nightly, **options), recorder
 
 
 @pytest.fixture(autouse=True)
-def by_day(monkeypatch: pytest.MonkeyPatch) -> None:
+def by_day(monkeypatch):
     """A time at which no nightly job is entered."""
     monkeypatch.setattr(scheduling, "utc_now_ns", lambda: parse_utc("2029-08-07T00:10:00Z"))
 
 
-def test_one_of_two_works_until_its_lease_ends(either: Ground, monkeypatch: pytest.MonkeyPatch):
+def test_one_of_two_works_until_its_lease_ends(either, monkeypatch):
     (first, work_1), (second, work_2) = make(either), make(either)
     now = [parse_utc("2029-08-07T00:00:00Z")]
     monkeypatch.setattr(leases, "database_now_ns", lambda connection: now[0])
@@ -66,7 +64,7 @@ def test_one_of_two_works_until_its_lease_ends(either: Ground, monkeypatch: pyte
     assert (work_1.resumed, work_2.resumed) == (2, 1)
 
 
-def test_a_lease_of_a_clock_that_was_ahead_is_ended(either: Ground, monkeypatch: pytest.MonkeyPatch):
+def test_a_lease_of_a_clock_that_was_ahead_is_ended(either, monkeypatch):
     (first, _), (second, _) = make(either), make(either)
     now = [parse_utc("2031-08-07T00:00:00Z")]
     monkeypatch.setattr(leases, "database_now_ns", lambda connection: now[0])
@@ -76,7 +74,7 @@ def test_a_lease_of_a_clock_that_was_ahead_is_ended(either: Ground, monkeypatch:
     assert second.tick() and has_scheduler(either) and not first.tick()
 
 
-def test_a_process_that_stops_gives_its_lease_back(ground: Ground, monkeypatch: pytest.MonkeyPatch):
+def test_a_process_that_stops_gives_its_lease_back(ground, monkeypatch):
     monkeypatch.setattr(scheduling, "TICK_S", 0.01)
     (first, work), (second, _) = make(ground), make(ground)
     first.start()
@@ -86,7 +84,7 @@ def test_a_process_that_stops_gives_its_lease_back(ground: Ground, monkeypatch: 
     assert second.tick()
 
 
-def test_a_lease_is_not_given_back_by_somebody_else(either: Ground):
+def test_a_lease_is_not_given_back_by_somebody_else(either):
     with either.database.writing() as connection:
         assert leases.acquire(connection, "x", "ann", LEASE_NS)
         leases.release(connection, "x", "ben")
@@ -95,7 +93,7 @@ def test_a_lease_is_not_given_back_by_somebody_else(either: Ground):
         assert leases.acquire(connection, "y", "ben", LEASE_NS)
 
 
-def test_the_nightly_job_is_entered_once_after_half_past_midnight(ground: Ground, monkeypatch: pytest.MonkeyPatch):
+def test_the_nightly_job_is_entered_once_after_half_past_midnight(ground, monkeypatch):
     monkeypatch.setattr(scheduling, "CATCH_UP_S", -1.0)
     one, work = make(ground)
     midnight = parse_utc("2029-08-07T00:00:00Z")
@@ -107,7 +105,7 @@ def test_the_nightly_job_is_entered_once_after_half_past_midnight(ground: Ground
     assert work.submitted == [nightly_job_id(midnight), nightly_job_id(midnight + DAY_NS)]
 
 
-def test_each_night_a_placebo_takes_kept_archives_by_turns(ground: Ground, monkeypatch: pytest.MonkeyPatch):
+def test_each_night_a_placebo_takes_kept_archives_by_turns(ground, monkeypatch):
     kept = [MagicMock(digest=f"{k}" * 64, state=COMPLETE if k else TELEMETRY_ONLY) for k in range(5)]
     monkeypatch.setattr(jobs, "kept_archives", lambda ground: kept)
     chosen = []
@@ -129,7 +127,7 @@ def test_each_night_a_placebo_takes_kept_archives_by_turns(ground: Ground, monke
 
 
 @pytest.mark.parametrize("hourly", [False, True])
-def test_without_the_hourly_plan_only_events_plan(ground: Ground, hourly: bool, monkeypatch: pytest.MonkeyPatch):
+def test_without_the_hourly_plan_only_events_plan(ground, hourly, monkeypatch):
     monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
     begin, (one, work) = parse_utc("2029-08-07T05:00:00Z"), make(ground, plan_hourly=hourly)
     monkeypatch.setattr(scheduling, "mission_now_ns", lambda: begin)
@@ -137,7 +135,7 @@ def test_without_the_hourly_plan_only_events_plan(ground: Ground, hourly: bool, 
     assert (plan_job_id(begin) in work.submitted) == hourly
 
 
-def test_the_plan_is_entered_once_an_hour_of_mission_time(ground: Ground, monkeypatch: pytest.MonkeyPatch):
+def test_the_plan_is_entered_once_an_hour_of_mission_time(ground, monkeypatch):
     one, work = make(ground)
     monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
     begin = parse_utc("2029-08-07T05:00:00Z")
@@ -150,9 +148,7 @@ def test_the_plan_is_entered_once_an_hour_of_mission_time(ground: Ground, monkey
 
 
 @pytest.mark.parametrize("error", [StorageFull("database"), ConnectionError("refused")])
-def test_one_part_of_the_work_that_fails_does_not_stop_the_others(
-    ground: Ground, error: Exception, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-):
+def test_one_part_of_the_work_that_fails_does_not_stop_the_others(ground, error, monkeypatch, caplog):
     one, work = make(ground)
     monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
     work.resume = Mock(side_effect=error)
@@ -162,7 +158,7 @@ def test_one_part_of_the_work_that_fails_does_not_stop_the_others(
     ]
 
 
-def test_a_night_that_was_missed_is_made_up_for_after_a_while(ground: Ground, monkeypatch: pytest.MonkeyPatch):
+def test_a_night_that_was_missed_is_made_up_for_after_a_while(ground, monkeypatch):
     monkeypatch.setattr(scheduling, "utc_now_ns", lambda: parse_utc("2029-08-07T12:00:00Z"))
     one, work = make(ground)
     one.tick()
@@ -174,9 +170,7 @@ def test_a_night_that_was_missed_is_made_up_for_after_a_while(ground: Ground, mo
     assert len(work.submitted) == 1
 
 
-def test_the_command_has_the_lease_until_it_is_stopped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
+def test_the_command_has_the_lease_until_it_is_stopped(tmp_path, monkeypatch, capsys):
     home = tmp_path / "home"
     monkeypatch.setenv("LINNA_HOME", str(home))
     with open_ground(home) as ground:
@@ -219,15 +213,13 @@ PROCESS = """
 """
 
 
-def test_processes_on_postgresql_have_the_lease_one_after_the_other(
-    migrated_postgres: Callable[[], str], tmp_path: Path
-):
+def test_processes_on_postgresql_have_the_lease_one_after_the_other(migrated_postgres, tmp_path):
     """The one with the lease is killed, twice; each next one begins after the end of the lease before."""
     url, lines, lease_ns = migrated_postgres(), tmp_path / "lines", 700_000_000
     command = [sys.executable, "-c", textwrap.dedent(PROCESS), str(tmp_path / "home"), url, str(lines)]
     processes = [subprocess.Popen([*command, str(lease_ns)]) for _ in range(3)]
 
-    def seen() -> list[tuple[str, int]]:
+    def seen():
         found = lines.read_text().splitlines() if lines.exists() else []
         return [(owner, int(until)) for owner, until in (line.split() for line in found)]
 

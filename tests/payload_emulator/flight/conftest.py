@@ -104,7 +104,7 @@ def detections(u_px, v_px, diameter_px):
 
 @dataclass(frozen=True)
 class Toolbox:
-    """What tests of flight share, since test files cannot import each other."""
+    """Helpers that tests of flight share, since test files cannot import each other."""
 
     orbit: Callable[..., FloatArray] = paper_orbit_mcmf_m
     place: Callable[[FloatArray], tuple[float, float, float]] = place

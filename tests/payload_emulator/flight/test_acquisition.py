@@ -136,7 +136,7 @@ def test_two_detections_are_never_searched():
 
 
 def test_two_places_that_explain_as_much_are_no_place():
-    """The same pattern of craters twice, 20 km apart: which one is seen cannot be told."""
+    """The same pattern of craters twice, 20 km apart: which one is seen is ambiguous."""
     rng = default_rng(5)
     place = rng.uniform(-0.006, 0.006, (2, 9))
     apart = 20_000.0 / RADIUS_M

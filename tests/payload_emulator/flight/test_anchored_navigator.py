@@ -18,11 +18,12 @@ from payload_emulator.flight.navigation.anchored.correction import frame_limit, 
 from payload_emulator.flight.navigation.anchored.parameters import AnchoredLimits, AnchoredParameters
 from payload_emulator.flight.navigation.filter import filter as kalman
 from payload_emulator.flight.navigation.filter.filter import FilterState
+from payload_emulator.flight.navigation.filter.map_offset import OffsetRule
 from payload_emulator.flight.navigation.landmark_map import MapState
 from payload_emulator.flight.navigation.outcomes import Outcome
 from payload_emulator.flight.navigation.search.acquisition import Acquisition
 from payload_emulator.flight.navigation.search.identification import Identification
-from payload_emulator.flight.navigation.search.lost_in_space import Place
+from payload_emulator.flight.navigation.search.lost_in_space import PoseHypothesis
 from payload_emulator.flight.navigation.sighting import Pose, in_view, landmark_map
 from payload_emulator.flight.vision.detections import Detections
 from studies import montecarlo
@@ -202,9 +203,14 @@ def test_detection_noise_is_split_between_frame_and_crater(orbit):
     stated = np.linspace(0.0, 0.95, count)
     assert_allclose(correction.detection_persistence(replace(found, persistence=stated), parameters), stated)
 
-    fresh = correction.fresh_variance_px2(variance * (1.0 - share), parameters)
+    fresh, lasting = correction.split_variance_px2(variance, share, parameters)
     assert_allclose(fresh[:3], [6.3, 2.8, 0.175])
-    assert_allclose(correction.fresh_variance_px2(np.array([0.035]), parameters), [0.04])
+    assert_allclose(lasting[:3], [2.7, 1.2, 0.075])
+    # Less noise than stated lasts, so that the sum stays; more adds to it.
+    for factor, parts in ((0.5, (1.575, 7.425)), (2.0, (25.2, 2.7)), (0.01, (0.04, 8.96))):
+        learned = replace(parameters, errors=replace(parameters.errors, noise_factor=factor))
+        found_parts = correction.split_variance_px2(variance, share, learned)
+        assert_allclose((found_parts[0][0], found_parts[1][0]), parts)
     index = np.array([3, 8])
     altitude_m, low_m = 30_000.0, 400.0
     catalogue_m = navigator.state.landmarks.sigma_m[index]
@@ -219,6 +225,11 @@ def test_detection_noise_is_split_between_frame_and_crater(orbit):
         assert_allclose(low[row], [across, across, 60.0], rtol=1e-12)
     # The map itself is left alone.
     assert_allclose(navigator.state.landmarks.sigma_m[index], 60.0)
+
+
+def test_exact_detections_are_learned_to_have_less_noise_than_stated(orbit):
+    offset = orbit.flown(8, offset=OffsetRule(noise_fixes=4)).state.offset
+    assert (offset.pending, offset.fixes) == (8, 0) and 0.5 <= offset.noise_factor < 0.9
 
 
 def test_craters_enter_the_state_with_the_lasting_share_of_the_detection_error(orbit):
@@ -357,7 +368,7 @@ def test_a_place_found_without_a_prior_turns_the_orbit_with_it(orbit, monkeypatc
     axis = np.cross(prior.mean[:3], [0.3, -0.5, 0.8])
     turn = Rotation.from_rotvec(0.4 * axis / norm(axis))
     there = 1.01 * turn.apply(prior.mean[:3])
-    place = Place(
+    place = PoseHypothesis(
         orbit.rotations[0] @ there, np.zeros(3), np.array([30.0, 80.0, 50.0]), np.array([2, 5, 7]), np.array([4, 1, 9]),
         -20.0
     )  # fmt: skip

@@ -139,9 +139,9 @@ def test_the_last_256_commands_are_remembered():
     assert history.judge(packet(256), in_sequence=False) == DUPLICATE
 
 
-def test_the_sixteen_sources_heard_last_are_remembered():
+def test_the_last_sixteen_sources_are_remembered():
     history = noted(*(packet(100, source=source) for source in range(16)))
-    history.note(packet(101, source=0))  # heard again: the second is now the one longest silent
+    history.note(packet(101, source=0))  # received again: the second is now the one longest silent
     history.note(packet(100, source=16))
     assert history.judge(packet(50, source=1)) == 0
     assert history.judge(packet(50, source=0)) == OUT_OF_SEQUENCE

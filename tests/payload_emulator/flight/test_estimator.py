@@ -61,11 +61,12 @@ def test_what_was_learned_of_a_catalogue_is_kept_until_another_one_is_loaded():
         setup, state = estimator.start(tables | changed, parameters, before)
         assert setup.initial.covariance[14, 14] == state.offset.sigma_m**2
         assert setup.parameters.errors.catalogue_correlation_rad == OffsetRule().correlation_rad
+        assert setup.parameters.errors.noise_factor == (0.7 if state.offset.fixes else 1.0)
         return float(state.offset.sigma_m)
 
     setup, state = estimator.start(tables, parameters, None)
     assert state.offset == OffsetSize(60.0, 1.0)
-    learned = setup, replace(state, offset=OffsetSize(22.0, 3.0, 80))
+    learned = setup, replace(state, offset=OffsetSize(22.0, 3.0, 80, noise_factor=0.7))
     assert size_m(learned, catalogue=replace(catalogue)) == 22.0
     assert size_m(learned, catalogue=replace(catalogue, latitude_rad=catalogue.latitude_rad + 1e-9)) == 60.0
     fixed = FlightParameters(anchored=AnchoredParameters())

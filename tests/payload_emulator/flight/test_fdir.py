@@ -1,4 +1,4 @@
-"""Faults of the machine: each is told by an event, and answered."""
+"""Faults of the machine: each is reported by an event, and answered."""
 
 import numpy as np
 from pytest import approx, fixture, mark
@@ -9,7 +9,7 @@ from payload_emulator.flight.onboard.settings import Settings
 from payload_emulator.flight.payload import PayloadMode
 from payload_emulator.flight.ports import ResetCause
 from payload_emulator.flight.vision.preprocess import ImageQuality
-from tmtc.dictionary.onboard_parameters import PARAMETERS
+from tmtc.dictionary.fields import PARAMETERS
 
 NUMBERS = {parameter.name: parameter.number for parameter in PARAMETERS}
 NO_IMAGE = np.zeros((0, 0), np.uint8)
@@ -27,7 +27,7 @@ def steps(rig, count, **options):
     return [packet for _ in range(count) for packet in rig.step(**options)]
 
 
-def test_a_streak_of_dark_images_is_told_at_its_beginning_and_its_end_only(observing):
+def test_a_streak_of_dark_images_is_reported_at_its_beginning_and_its_end_only(observing):
     observing.quality = ImageQuality.DARK
     packets = steps(observing, 30)
     events = observing.events(packets)
@@ -42,7 +42,7 @@ def test_a_streak_of_dark_images_is_told_at_its_beginning_and_its_end_only(obser
     assert observing.mode is PayloadMode.observing
 
 
-def test_a_saturated_streak_shorter_than_the_limit_is_told_frame_by_frame(observing):
+def test_a_saturated_streak_shorter_than_the_limit_is_reported_frame_by_frame(observing):
     observing.quality = ImageQuality.SATURATED
     events = observing.events(steps(observing, 5))
     assert events.count("image_saturated") == 5 and "image_streak" not in events
@@ -90,7 +90,7 @@ def test_an_inference_library_that_throws_costs_frames_not_the_payload(observing
 @mark.parametrize(
     ("region", "event"), [(MODEL_NUMBER, "model_hash_mismatch"), (PARAMETERS_NUMBER, "parameters_hash_mismatch")]
 )
-def test_flipped_bits_in_memory_are_found_told_and_restored(observing, region, event):
+def test_flipped_bits_in_memory_are_found_reported_and_restored(observing, region, event):
     observing.board.memory[region][1] ^= 0x08
     packets = steps(observing, 5)
     assert observing.events(packets).count(event) == 1
@@ -195,7 +195,7 @@ def test_settings_damaged_in_one_copy_are_recovered_from_the_other(observing):
     assert observing.mode is PayloadMode.observing
 
 
-def test_packets_damaged_in_the_store_are_found_told_and_never_sent(observing):
+def test_packets_damaged_in_the_store_are_found_reported_and_never_sent(observing):
     observing.board.downlink = 0
     steps(observing, 3)
     used = np.flatnonzero(observing.board.store)
@@ -207,7 +207,7 @@ def test_packets_damaged_in_the_store_are_found_told_and_never_sent(observing):
 
 
 @mark.parametrize("jump_s", [3_600.0, 5.0, -5.0, -3_600.0])
-def test_a_clock_that_jumps_is_told_and_housekeeping_begins_again(observing, jump_s):
+def test_a_clock_that_jumps_is_reported_and_housekeeping_begins_again(observing, jump_s):
     observing.skew_ticks += round(jump_s * 65_536)
     packets = observing.step()
     jumps = [v["value_1"] for v in observing.named(packets, "event_medium")]
@@ -237,7 +237,7 @@ def test_a_clock_that_jumps_ahead_does_not_release_what_it_has_passed(rig):
         (-50.0, 0.0, "temperature_low", False), (0.0, 2.3, "power_low", False), (0.0, 3.5, "power_low", True)
     ]
 )  # fmt: skip
-def test_power_and_heat_out_of_limits_are_told_once_and_end_in_safe_beyond(observing, heat_c, drop_v, event, safe):
+def test_power_and_heat_out_of_limits_are_reported_once_and_end_in_safe_beyond(observing, heat_c, drop_v, event, safe):
     observing.board.heat_c, observing.board.drop_v = heat_c, drop_v
     packets = steps(observing, 6)
     assert observing.events(packets).count(event) == 1
@@ -249,12 +249,12 @@ def test_power_and_heat_out_of_limits_are_told_once_and_end_in_safe_beyond(obser
     assert observing.events(steps(observing, 3)).count(event) == 1
 
 
-def test_too_much_memory_is_told(rig):
+def test_too_much_memory_is_reported(rig):
     order = rig.command("set_parameter", parameter_id=NUMBERS["memory_high_kib"], value=1024.0)
     assert rig.events(rig.step(order)).count("memory_high") == 1
 
 
-def test_a_flooded_store_is_told_each_time_that_the_loss_has_doubled(rig):
+def test_a_flooded_store_is_reported_each_time_that_the_loss_has_doubled(rig):
     rig.board.downlink = 0
     rig.send("set_housekeeping_interval", structure_id=1, interval_s=1)
     for _ in range(700):

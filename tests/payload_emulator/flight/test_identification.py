@@ -1,4 +1,4 @@
-"""How many agreeing pairs a set needs, and what a set may hold. Pairs of anonymous craters between two frames.
+"""Number of agreeing pairs that a set needs, and its contents. Pairs of anonymous craters between two frames.
 Craters projected from the on-board catalogue, and the derivatives the filter lives on.
 """
 

@@ -58,7 +58,7 @@ class Mapper:
 
 
 def offset_m(landmark, craters, shift_m=0.0):
-    """How far a landmark lies from the crater that is nearest once all are shifted."""
+    """Return the distance of a landmark from the crater that is nearest once all are shifted."""
     away = landmark.position_mcmf_m - craters
     return away[np.argmin(norm(away - shift_m, axis=1))]
 
@@ -159,7 +159,7 @@ def test_memory_is_bounded():
     assert min(landmark.sightings for landmark in mapper.state.landmarks) >= 3
 
 
-def test_landmarks_stand_beside_the_catalogue_with_identities_of_their_own():
+def test_landmarks_complement_the_catalogue_with_identities_of_their_own():
     mapper = Mapper()
     craters = ground(25, 1)
     fly(mapper, craters, 2)

@@ -276,7 +276,7 @@ def test_the_same_detections_vote_at_all_altitudes_within_the_bound_of_work(inde
     assert _affordable(log_size, altitudes, np.full(20, 1.0), index, replace(RULES, votes=1)) == 40
 
 
-def test_the_index_is_small_beside_the_table(index):
+def test_the_index_is_small_compared_with_the_table(index):
     # Four float64 per crater, a few bins and the quantiles of sizes; 22 octets per crater in the table itself.
     assert index.octets < 33 * len(index) + 5_000
 

@@ -193,7 +193,7 @@ def test_an_update_is_the_least_squares_solution_with_its_covariance():
     assert np.all(eigvalsh(free.rotation.information) > 0.0)
 
 
-def test_what_all_craters_share_is_told_apart_from_the_position_by_its_prior_alone():
+def test_what_all_craters_share_is_distinguished_from_the_position_by_its_prior_alone():
     """A shift of the catalogue to the east looks like one of the camera: they divide it by their variances."""
     landmarks, index = craters(40, seed=1), np.arange(40)
     errors = replace(ERRORS, attitude_noise_rad=1e-9, catalogue_offset_m=(30.0, 1e-3, 1e-3))
@@ -535,19 +535,54 @@ def test_the_size_of_the_offset_is_learned_in_bounded_steps_and_not_from_a_few_f
     size = first_size(rule)
     assert (size.sigma_m, size.fixes) == (60.0, 0)
     for score in ((-0.2, 0.1), (math.nan, 0.1), (-0.2, 0.1)):
-        size = learned(size, score, rule)
+        size = learned(size, score, (0.0, 0.0), rule)
     # A score that is no number is no evidence: two fixes are too few.
     assert (size.sigma_m, size.pending, size.fixes) == (60.0, 2, 0)
-    size = learned(size, (-0.1, 0.115), rule)
+    size = learned(size, (-0.1, 0.115), (0.0, 0.0), rule)
     # x moves by the scores over the information 0.97 * 1 + 0.315 = 1.285: exp(-0.5 / 2.57) of the size.
     assert size.information == approx(1.285)
     assert (size.sigma_m, size.pending, size.fixes) == (approx(60.0 * math.exp(-0.5 / 2.57)), 0, 3)
+    assert (size.score, size.gained) == (0.0, 0.0)
 
     def after(score, steps):
         size = first_size(rule)
         for _ in range(3 * steps):
-            size = learned(size, (score, 0.1), rule)
+            size = learned(size, (score, 0.1), (0.0, 0.0), rule)
         return size.sigma_m
 
     assert after(-9.0, 1) == approx(30.0) and after(-9.0, 9) == 15.0
     assert after(9.0, 1) == 100.0
+    rule = replace(rule, largest_m=1e3)
+    assert after(9.0, 1) == approx(120.0)
+
+
+def test_the_noise_of_detections_is_learned_in_shorter_steps_within_its_limits():
+    rule = OffsetRule(fixes=3, noise_fixes=2)
+    size = learned(first_size(rule), (0.0, 0.1), (-8.0, 2.0), rule)
+    assert (size.noise_factor, size.noise_information) == (1.0, 20.0)
+    assert learned(size, (0.0, 0.1), (math.inf, 2.0), rule) == size
+    size = learned(size, (0.0, 0.1), (-4.0, 3.0), rule)
+    # 0.97 * 20 + 5 = 24.4; the variance moves by -12 over it, while the size waits for its third fix.
+    assert (size.noise_information, size.noise_factor) == (approx(24.4), approx(math.exp(-6.0 / 24.4)))
+    assert (size.sigma_m, size.pending, size.noise_score, size.noise_gained) == (60.0, 2, 0.0, 0.0)
+    for score, limit in ((-99.0, 0.5), (99.0, 2.0)):
+        size = first_size(rule)
+        for _ in range(12):
+            size = learned(size, (0.0, 0.1), (score, 0.1), rule)
+        assert (size.noise_factor, size.fixes) == (limit, 12)
+
+
+def test_the_score_of_the_noise_is_the_derivative_of_the_likelihood_with_its_expected_square():
+    rng, noise = default_rng(5), np.array([0.5, 0.5, 2.0, 2.0])
+    root, innovation = rng.standard_normal((4, 3)), 2.0 * rng.standard_normal(4)
+
+    def spread(x):
+        return root @ root.T + np.exp(x) * np.diag(noise)
+
+    def logarithm(x):
+        return -0.5 * (innovation @ np.linalg.solve(spread(x), innovation) + np.linalg.slogdet(spread(x))[1])
+
+    contradiction, (score, information) = kalman._judged(spread(0.0), innovation, noise)
+    assert score == approx((logarithm(1e-4) - logarithm(-1e-4)) / 2e-4, rel=1e-6) and abs(score) > 0.1
+    relative = np.linalg.solve(spread(0.0), np.diag(noise))
+    assert information == approx(0.5 * np.trace(relative @ relative)) and contradiction.shape == (2,)

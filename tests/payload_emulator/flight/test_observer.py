@@ -55,8 +55,8 @@ class Clock:
         return self.now_ns
 
 
-class Eye:
-    """A detector that returns what it is told to."""
+class ScriptedDetector:
+    """A detector that returns given detections."""
 
     def __init__(self):
         self.quality, self.found, self.fails = ImageQuality.OK, detections(6), False
@@ -69,7 +69,7 @@ class Eye:
 
 
 class Navigator:
-    """An anchored estimator that keeps what it is given and answers as it is told to."""
+    """An anchored estimator that keeps what it is given and returns given reports."""
 
     def __init__(self):
         self.given = []
@@ -109,7 +109,7 @@ def detections(count):
 
 @fixture
 def rig(monkeypatch):
-    eye, telemetry, clock, navigator = Eye(), Recorder(), Clock(), Navigator()
+    eye, telemetry, clock, navigator = ScriptedDetector(), Recorder(), Clock(), Navigator()
     observer = Observer(eye, FlightParameters(modes=(Mode.anchored,)), telemetry, clock)
     observer._states[Mode.anchored] = ("the tables", navigator.start)
     monkeypatch.setattr(anchored, "step", navigator.step)
@@ -243,15 +243,16 @@ def test_an_attitude_noisier_than_declared_is_reported_at_its_beginning_and_end(
     assert_allclose([event[2:] for event in found], [(0.2, 0.01), (0.01, 0.0), (1.0, 0.01)])
 
 
-def test_the_size_of_the_map_offset_is_sent_when_it_changes(rig):
+def test_the_size_of_the_map_offset_and_the_noise_are_sent_when_the_size_changes(rig):
     for sigma_m, fixes, pending in ((60.0, 0, 0), (60.0, 0, 7), (31.0, 40, 0), (31.0, 40, 9), (31.0, 80, 0)):
-        rig.navigator.offset = OffsetSize(sigma_m, 0.5, fixes, pending=pending)
+        rig.navigator.offset = OffsetSize(sigma_m, 0.5, fixes, pending=pending, noise_factor=0.8)
         look(rig)
-    sent = [event[2:] for event in rig.telemetry.events if event[:2] == ("info", "map_offset")]
-    assert sent == [(60.0, 0.0), (31.0, 40.0), (31.0, 80.0)]
+    for name, values in (("map_offset", (60.0, 31.0, 31.0)), ("detection_noise", (0.8, 0.8, 0.8))):
+        sent = [event[2:] for event in rig.telemetry.events if event[:2] == ("info", name)]
+        assert sent == list(zip(values, (0.0, 40.0, 80.0), strict=True))
 
 
-def test_a_reset_of_the_filter_is_told_and_counted(rig):
+def test_a_reset_of_the_filter_is_reported_and_counted(rig):
     rig.navigator.reacquired = True
     look(rig)
     assert ("medium", "filter_reset", 3.0, 6.0) in rig.telemetry.events
@@ -417,7 +418,7 @@ def test_without_an_altitude_no_detection_has_a_class(rig):
     assert items(rig, "detections", "size_class") == [[-1] * 6]
 
 
-def test_a_damaged_table_is_told_by_its_number_and_its_hash(rig):
+def test_a_damaged_table_is_reported_by_its_number_and_its_hash(rig):
     octets = b"no table at all"
     observer = observing(rig, Mode.anchored)
     observer.load_tables(FlightTables(catalogue=octets, burns=octets, anchor_ephemeris=octets))

@@ -16,7 +16,7 @@ from payload_emulator.flight.payload import FlightParameters, FlightTables, Payl
 from payload_emulator.flight.ports import Board
 from payload_emulator.flight.vision.detections import Detections, no_detections
 from payload_emulator.flight.vision.preprocess import ImageQuality
-from tmtc.dictionary.onboard_parameters import PARAMETERS
+from tmtc.dictionary.fields import PARAMETERS
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.dictionary.tables import table_hash
 

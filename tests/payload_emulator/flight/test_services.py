@@ -11,8 +11,8 @@ from pytest import approx, mark
 from payload_emulator.flight.onboard.loads import TABLE_NUMBERS
 from payload_emulator.flight.payload import PayloadMode
 from payload_emulator.flight.ports import ResetCause
-from payload_emulator.flight.telemetry.products import map_octets
-from tmtc.dictionary.onboard_parameters import PARAMETERS, find_parameter
+from payload_emulator.flight.telemetry.packets import map_octets
+from tmtc.dictionary.fields import PARAMETERS, find_parameter
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.packets.large_data import LargeDataReceiver, split, unpack_thumbnail
 from tmtc.packets.space_packets import append_crc

@@ -82,10 +82,11 @@ def update(prior, camera_from_icrf, mcmf_from_icrf, landmarks, index, uv_px, var
     summed = spread.reshape(index.size, 2, index.size, 2).sum(axis=(0, 2))
     attitude, both = np.r_[kalman.ATTITUDE, turns], np.tile(np.eye(3), 2)
     left = both @ covariance[np.ix_(attitude, attitude)] @ both.T
+    judged, noise_score = kalman._judged(spread, innovation, np.repeat(variance_px2, 2))
     return Update(
         state.only_craters(state.craters[state.craters != kalman.TURN[0]]), float(innovation @ solved[:, 0]),
         innovation.reshape(-1, 2).sum(axis=0) / np.sqrt(np.diag(summed)), uv_px - seen(mean).reshape(-1, 2),
         mean[turns], float(np.sqrt(np.max(np.linalg.eigvalsh(left)))),
         RotationEvidence(turning.T @ solved[:, 0], turning.T @ solved[:, 1:], errors.attitude_noise_rad),
-        kalman._contradiction(spread, innovation)
+        judged, noise_score=noise_score
     )  # fmt: skip

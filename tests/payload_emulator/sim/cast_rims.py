@@ -1,4 +1,4 @@
-"""How far labels lie from the rims that rays find: the measure of whether labels sit where craters are."""
+"""Distance of labels from the rims that rays find: it shows whether labels are at the craters."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The Cycles renderer up to the process boundary: the scene, what Blender is told, what comes back, what goes wrong.
+"""The Cycles renderer up to the process boundary: the scene, the input of Blender, its output, faults.
 
 Blender itself (a 374 MB wheel under the GPL) is no part of the test requirements; `linna render --compare` and the
 benchmark run it where it is available.
@@ -204,20 +204,20 @@ def blender(monkeypatch):
     return fake
 
 
-def test_blender_is_told_what_the_paper_says(tmp_path, scene, blender):
+def test_blender_gets_the_settings_of_the_paper(tmp_path, scene, blender):
     replace(scene, specular_ior=MATT_SPECULAR_IOR).save(tmp_path / "scene.npz", CyclesSettings(samples=16))
     files = [str(tmp_path / name) for name in ("scene.npz", "out.exr", "picture.png", "cost.json")]
     assert cycles_worker.main(*files) == 0
-    told = blender.context.scene
-    assert told.render.engine == "CYCLES"
-    assert (told.render.resolution_x, told.render.resolution_y) == (512, 512)
-    assert told.cycles.samples == 16 and told.cycles.use_adaptive_sampling is True
-    assert told.cycles.denoiser == "OPENIMAGEDENOISE"
-    assert told.cycles.denoising_input_passes == "RGB_ALBEDO_NORMAL"
-    assert told.world.node_tree.nodes["Background"].inputs["Strength"].default_value == 0.0
-    assert told.view_settings.view_transform == "Filmic"
+    made = blender.context.scene
+    assert made.render.engine == "CYCLES"
+    assert (made.render.resolution_x, made.render.resolution_y) == (512, 512)
+    assert made.cycles.samples == 16 and made.cycles.use_adaptive_sampling is True
+    assert made.cycles.denoiser == "OPENIMAGEDENOISE"
+    assert made.cycles.denoising_input_passes == "RGB_ALBEDO_NORMAL"
+    assert made.world.node_tree.nodes["Background"].inputs["Strength"].default_value == 0.0
+    assert made.view_settings.view_transform == "Filmic"
     # The last file format set is that of the picture.
-    assert (told.render.image_settings.file_format, told.render.image_settings.color_depth) == ("PNG", "16")
+    assert (made.render.image_settings.file_format, made.render.image_settings.color_depth) == ("PNG", "16")
     ground = blender.data.objects.new("ground", blender.data.meshes.new("cap"))
     modifier = ground.modifiers.new("dicing", "SUBSURF")
     assert modifier.use_adaptive_subdivision is True and modifier.adaptive_pixel_size == 0.5
@@ -281,8 +281,8 @@ def test_what_another_process_renders_comes_back(tmp_path, hilly, scene):
     python = interpreter(
         tmp_path,
         "import numpy, shutil\n"
-        "told = numpy.load(sys.argv[3])\n"
-        "assert told['set_samples'] == 7 and told['vertices_km'].shape == (65, 65, 3)\n"
+        "stated = numpy.load(sys.argv[3])\n"
+        "assert stated['set_samples'] == 7 and stated['vertices_km'].shape == (65, 65, 3)\n"
         f"shutil.copy({str(exr)!r}, sys.argv[4])\n"
         "open(sys.argv[5], 'wb').write(b'png')\n"
         "cost = {'blender': '5.0', 'scene_wall_s': 1, 'render_wall_s': 2, 'render_cpu_s': 3}\n"

@@ -21,8 +21,7 @@ from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError, TerrainError
 from payload_emulator.session.archive.mission import level_of
 from payload_emulator.session.scenario import parse_scenario
-from payload_emulator.sim.orbit.disturbances import changed, executed, turned_state
-from payload_emulator.sim.orbit.truth import Truth
+from payload_emulator.sim.orbit.truth import Truth, changed, executed, turned_state
 from payload_emulator.sim.render.light import sun_direction_mcmf
 from payload_emulator.sim.render.renderer import PHOTOGRAPH_RADIANCE, render
 from payload_emulator.sim.terrain.opening import open_terrain

@@ -195,6 +195,6 @@ def test_false_detections_have_their_share_and_lie_in_the_image(rng):
     assert sizes.size > 100 and sizes.min() >= 15.0 and sizes.max() <= 60.0
 
 
-def test_the_told_error_is_the_true_one_unless_stated():
+def test_the_declared_error_is_the_true_one_unless_stated():
     assert SimulatedDetector(sigma_px=1.2).stated_sigma_px == 1.2
     assert SimulatedDetector(sigma_px=1.2, claimed_sigma_px=0.7).stated_sigma_px == 0.7

@@ -1,4 +1,4 @@
-"""Where the raster ends and seeded relief begins: spectrum, craters, edges, threads."""
+"""Transition from the raster to seeded relief: spectrum, craters, edges, threads."""
 
 import threading
 from math import log10, pi, radians, sin, sqrt
@@ -45,15 +45,15 @@ def test_the_power_spectrum_goes_on_across_the_join(data_path):
     """The Moon's uplands have a Hurst exponent of 0.95 (Rosenburg et al. 2011): a spectrum falling as k^-2.9."""
     data = find_data(data_path)
     middle = np.log10([sqrt(a * b) for a, b in BANDS_KM])
-    beside = {}
+    nearby = {}
     for sharpen in (False, True):
         terrain = open_terrain("raster", data, 1, sharpen=sharpen)
         pooled = np.mean([spectrum(terrain, *place) for place in PLACES], axis=0)
         line = np.polyfit(middle[BELIEVED], pooled[BELIEVED], 1)
-        beside[sharpen] = pooled - np.polyval(line, middle)
+        nearby[sharpen] = pooled - np.polyval(line, middle)
     # The raster alone falls to a tenth and less of what its longer waves promise; sharpened it stays within a factor 2.
-    assert beside[False][8:].max() < -1.0
-    assert np.abs(beside[True]).max() < log10(2.0)
+    assert nearby[False][8:].max() < -1.0
+    assert np.abs(nearby[True]).max() < log10(2.0)
     below = np.polyfit(middle[ADDED], pooled[ADDED], 1)
     assert line[0] == approx(2.9, abs=0.6)
     assert below[0] == approx(2.9, abs=0.8)
@@ -89,14 +89,14 @@ def test_the_density_of_craters_goes_on_across_the_join(data_path):
 @mark.real_data
 def test_ground_joins_at_tile_edges_and_ends_clearly_beyond_the_tiles(data_path):
     terrain = open_terrain("raster", find_data(data_path), 1)
-    # Along 285 and 0 degrees east tiles meet; across, heights run on as they do beside.
+    # Along 285 and 0 degrees east tiles meet; across, heights run on as they do next to them.
     latitude = np.radians(np.linspace(21.0, 24.0, 300))
     for edge_deg in (285.0, 360.0 + 15.0):
         step = radians(0.25 / 256.0)
         edge = radians(edge_deg)
         across = terrain.height_m(latitude, edge + step) - terrain.height_m(latitude, edge - step)
-        beside = terrain.height_m(latitude, edge + 9 * step) - terrain.height_m(latitude, edge + 7 * step)
-        assert np.sqrt(np.mean(across**2)) < 1.5 * np.sqrt(np.mean(beside**2)) + 0.2
+        nearby = terrain.height_m(latitude, edge + 9 * step) - terrain.height_m(latitude, edge + 7 * step)
+        assert np.sqrt(np.mean(across**2)) < 1.5 * np.sqrt(np.mean(nearby**2)) + 0.2
     assert terrain.covers(np.radians([59.9, 60.1, -59.9]), np.radians(290.0)).tolist() == [True, False, True]
     # The coarse model fills in beyond 60 degrees; nobody has the pole.
     assert np.isfinite(terrain.height_m(radians(60.3), radians(290.0)))

@@ -1,4 +1,4 @@
-"""When the spacecraft observes and how it points, on an orbit simple enough to check by hand. Power, heat and
+"""Observation times and pointing of the spacecraft, on an orbit simple enough to check by hand. Power, heat and
 processor time of the simulated board; faults as text.
 """
 
@@ -14,8 +14,7 @@ from lunar.frames import matrix_from_quaternion, spherical_from_mcmf
 from lunar.timescales import tdb_s_from_utc_ns
 from payload_emulator.errors import ScenarioError
 from payload_emulator.flight import ports
-from payload_emulator.sim.board.faults import FAULT_KINDS, Fault, parse_fault
-from payload_emulator.sim.board.platform import PlatformModel, SimulatedBoard
+from payload_emulator.sim.board.platform import FAULT_KINDS, Fault, PlatformModel, SimulatedBoard, parse_fault
 from payload_emulator.sim.orbit.truth import (
     ReadCount,
     Truth,

@@ -5,8 +5,8 @@ import pytest
 
 from payload_emulator.session.world.recipe import Recipe, Source
 from payload_emulator.training.data import dataset as store
+from payload_emulator.training.data.dataset import FrameTruth
 from payload_emulator.training.data.finishing import write_index
-from payload_emulator.training.data.truth import FrameTruth
 from payload_emulator.training.evaluate.scoring import FrameDetections
 
 SIZE = 512

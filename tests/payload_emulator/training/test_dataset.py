@@ -1,5 +1,5 @@
 """Data sets on disk: what is written can be read, checked and refused. A crop shows its craters where it says
-they are. Targets and what the flight decoder makes of a network that says exactly what it was told to.
+they are. Targets and what the flight decoder makes of a network with exactly given output.
 Recipes: what is refused, and that splits cannot touch. An exported network made trainable again: the same
 outputs, and a normalisation that fits the data.
 """
@@ -83,7 +83,7 @@ def test_a_changed_index_is_found_and_one_of_another_schema_refused(copy):
     assert any("dataset.json: expected a JSON object" in problem for problem in check(copy))
 
 
-def test_an_unfinished_data_set_is_told_from_none(copy):
+def test_an_unfinished_data_set_is_distinguished_from_none(copy):
     (copy / "dataset.json").unlink()
     with pytest.raises(DatasetError, match="found none"):
         check(copy)
@@ -99,7 +99,7 @@ def test_rims_of_older_data_sets_are_round(copy):
     assert set(frame.craters["visible"]) == {1.0}
 
 
-def test_counts_stand_beside_the_papers(blob_dataset):
+def test_counts_are_compared_with_the_papers(blob_dataset):
     figures = summarise(blob_dataset.folder)
     assert figures["frames"] == 34 and figures["split"] == {"train": 24, "val": 6, "test": 4}
     assert [sum(k) for k in zip(*figures["instances_by_split"].values(), strict=True)] == figures["instances"]
@@ -378,7 +378,7 @@ def test_an_ignored_crater_takes_the_loss_away_around_it_and_adds_no_heat():
     assert t.negative[0, 25, 80] == 1.0
 
 
-def test_a_label_beside_an_ignored_crater_keeps_its_own_weight():
+def test_a_label_next_to_an_ignored_crater_keeps_its_own_weight():
     t = targets([200, 206], [100, 100], [60, 40], [Tier.IGNORE, Tier.LABEL], [1.0, 0.7])
     assert t.weight.max() == pytest.approx(0.7)
 

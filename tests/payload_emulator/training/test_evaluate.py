@@ -26,8 +26,7 @@ from payload_emulator.training.evaluate.evaluate import (
     run,
     summary,
 )
-from payload_emulator.training.evaluate.localisation import bias_by_octant, bias_overall
-from payload_emulator.training.evaluate.metrics import Scene, Thresholds, score
+from payload_emulator.training.evaluate.metrics import Scene, Thresholds, bias_by_octant, bias_overall, score
 from payload_emulator.training.evaluate.report import detector_report
 from payload_emulator.training.evaluate.scoring import average_precision, tally
 from payload_emulator.training.model.calibrate import fit_parallax, paper_threshold, without_parallax
@@ -204,7 +203,7 @@ def bias_of(*scenes):
     # Toward a Sun at the top, right, bottom, left: up, right, down, left in an image whose v grows downward.
     [(1.0, (0.0, -0.5)), (91.0, (0.5, 0.0)), (181.0, (0.0, 0.5)), (271.0, (-0.5, 0.0))],
 )
-def test_a_pull_toward_the_sun_is_told_as_such_wherever_the_sun_is(azimuth_deg, shift):
+def test_a_pull_toward_the_sun_is_reported_as_such_wherever_the_sun_is(azimuth_deg, shift):
     octants, overall = bias_of(shifted_scene(azimuth_deg, shift))
     row = octants[int(azimuth_deg // 45)]
     assert row["pairs"] == overall["pairs"] == 25

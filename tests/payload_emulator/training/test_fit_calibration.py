@@ -1,4 +1,4 @@
-"""The fit finds what was put in: scores by size, the pull of the Sun beside registration, and two parts of sigma."""
+"""The fit finds what was put in: scores by size, the pull of the Sun, registration, and two parts of sigma."""
 
 import numpy as np
 import pytest
@@ -77,7 +77,7 @@ def pairs(pull=(0.3, 0.2, 0.4), ground_m=((60.0, -30.0), (-20.0, 10.0)), lasting
     return Pairs(np.array(error), features, np.array(directions), np.array(scale), np.array(place), np.array(crater))
 
 
-def test_pull_and_registration_are_told_apart():
+def test_pull_and_registration_are_separated():
     residual, evidence = fit_sun(pairs())
     assert tuple(evidence["coefficients_px"]) == pytest.approx((0.3, 0.2, 0.4), abs=0.08)
     assert max(evidence["standard_errors_px"]) < 0.05
@@ -88,7 +88,7 @@ def test_pull_and_registration_are_told_apart():
     assert np.abs(residual.mean(axis=0)).max() < 0.05
 
 
-def test_lasting_and_fresh_errors_are_told_apart():
+def test_lasting_and_fresh_errors_are_separated():
     from dataclasses import replace
 
     every = pairs()

@@ -119,7 +119,7 @@ def test_an_ephemeris_below_the_ground_is_refused_with_the_place(polar_orbit):
         pose_at(Everywhere(31_000.0), CAMERA, along, position, "frame 3", rng)
 
 
-def test_a_recipe_names_an_ephemeris_beside_it_and_only_that_may_split_as_the_paper(tmp_path, polar_orbit):
+def test_a_recipe_names_an_ephemeris_in_its_folder_and_only_that_may_split_as_the_paper(tmp_path, polar_orbit):
     (tmp_path / "orbit.oem").write_bytes(polar_orbit.read_bytes())
     text = """[dataset]
 name = "a"

@@ -480,7 +480,7 @@ def test_a_container_in_a_container_begins_where_it_stands():
     assert values(text, [bytes((1, 2, 3, 4))]) == {"a": [1], "x": [2], "y": [3], "z": [4]}
 
 
-def test_names_in_nested_systems_are_found_by_path_and_told_apart():
+def test_names_in_nested_systems_are_found_by_path_and_distinguished():
     inner = (
         '<SpaceSystem name="dt"><TelemetryMetaData><ParameterTypeSet>'
         + integer("u8", 8)
@@ -511,7 +511,7 @@ def test_definitions_may_be_spread_over_documents():
 OWN = {"N": "U8", "M": "U8"}
 
 
-def test_a_packet_is_decoded_by_one_container_or_told_why_not():
+def test_a_packet_is_decoded_by_one_container_or_refused_with_the_reason():
     text = bus_like(
         OWN,
         container("A", ["N"], "CCSDSPacket", comparison("PKT_APID", 10, "<=")),
@@ -575,7 +575,7 @@ def test_every_truncation_of_every_packet_is_a_verdict():
     for packet in foreign.capture(12, 9):
         pieces = [packet[:n] for n in range(1, len(packet))]
         found = Decoder(definition).decode(*whole(pieces))
-        # an event that is not urgent is whole without the value, and urgent ones are told by what they lack
+        # an event that is not urgent is whole without the value, and urgent ones are recognised by the missing value
         assert {VERDICTS[v] for v in found.verdict.tolist()} <= {"too_short", "malformed"}
 
 
@@ -603,7 +603,7 @@ def of_apid(name, apid, entries, *, abstract=True):
     return first + container(name, [], f"{name}_Base", comparison("PKT_APID", apid))
 
 
-def test_first_containers_are_told_apart_by_their_conditions():
+def test_first_containers_are_distinguished_by_their_conditions():
     containers = of_apid("A", 1, ["N"]) + of_apid("B", 2, ["N", "M"]) + of_apid("C", 3, ["N"], abstract=False)
     text = document(HEADER_TYPES, {**HEADER_PARAMETERS, **OWN}, containers)
     packets = [space_packet(apid, data, 0) for apid, data in ((1, b"a"), (2, b"ab"), (3, b"c"), (4, b"d"), (2, b"x"))]

@@ -9,8 +9,7 @@ import pytest
 import space_packet_parser as spp
 from space_packet_parser.xtce.validation import validate_xtce
 
-from tmtc.dictionary.fields import Field
-from tmtc.dictionary.onboard_parameters import PARAMETERS
+from tmtc.dictionary.fields import PARAMETERS, Field
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.packets.space_packets import CRC_LENGTH
 from tmtc.packets.stream import whole_packets

@@ -426,7 +426,7 @@ def test_alarms_that_are_not_read_are_counted():
     kind = integer("t", 8)
     end = kind.index("</IntegerParameterType>")
     definition = parse_xtce(of_type(kind[:end] + alarms + kind[end:] + integer("unused", 8)))
-    assert definition.alarms_not_read == 4  # watch beside warning, changes, two in a context
+    assert definition.alarms_not_read == 4  # watch with warning, changes, two in a context
     assert definition.remarks == ("alarms that are not read: 4",)
     inside = kind[:end] + alarms.replace("<StaticAlarmRanges>", "<StaticAlarmRanges rangeForm='inside'>") + kind[end:]
     assert parse_xtce(of_type(inside)).alarms_not_read == 6

@@ -344,12 +344,14 @@ def is_lost(state: AnchoredState, parameters: AnchoredParameters) -> bool:
 
 
 def _with_errors(parameters: AnchoredParameters, attitude_rad: float, offset: OffsetSize | None) -> AnchoredParameters:
-    """Return the parameters with the noise of the attitude and the offset of the catalogue that are in use."""
+    """Return the parameters with the noise of attitude and detections and the offset that are in use."""
     errors = replace(parameters.errors, attitude_noise_rad=attitude_rad)
     if offset is not None and parameters.offset is not None:
         size_m = (offset.sigma_m, offset.sigma_m, errors.catalogue_offset_m[2])
         memory_rad = parameters.offset.correlation_rad
-        errors = replace(errors, catalogue_offset_m=size_m, catalogue_correlation_rad=memory_rad)
+        errors = replace(
+            errors, catalogue_offset_m=size_m, catalogue_correlation_rad=memory_rad, noise_factor=offset.noise_factor
+        )
     return replace(parameters, errors=errors)
 
 
@@ -357,7 +359,7 @@ def _with_learned_offset(state: AnchoredState, fix: Fix, parameters: AnchoredPar
     """Return the state after the size of the catalogue's offset was learned from a fix."""
     if state.offset is None or parameters.offset is None or state.estimate.slope is None:
         return state
-    offset = learned(state.offset, fix.update.score, parameters.offset)
+    offset = learned(state.offset, fix.update.score, fix.update.noise_score, parameters.offset)
     estimate = state.estimate.with_offset(state.offset.sigma_m, offset.sigma_m)
     return replace(state, estimate=estimate, offset=offset)
 

@@ -128,7 +128,7 @@ def correct(
         uv = np.stack([found.u_px, found.v_px], axis=1)[identification.detection]
         variance = detection_variance_px2(found, parameters)[identification.detection]
         persistence = detection_persistence(found, parameters)[identification.detection]
-        lasting = variance * persistence
+        fresh, lasting = split_variance_px2(variance, persistence, parameters)
         sigma_m = crater_sigma_m(landmarks.sigma_m[index], lasting, altitude_m, camera, parameters)
         update = method.update(
             prior.with_craters(index, sigma_m),
@@ -137,7 +137,7 @@ def correct(
             landmarks,
             index,
             uv,
-            fresh_variance_px2(variance * (1.0 - persistence), parameters),
+            fresh,
             camera,
             parameters.errors,
         )
@@ -195,9 +195,17 @@ def detection_persistence(found: Detections, parameters: AnchoredParameters) -> 
     return found.persistence
 
 
-def fresh_variance_px2(variance_px2: FloatArray, parameters: AnchoredParameters) -> FloatArray:
-    """Return variances (n,) that are new in every frame, not below the repeatability of any detector."""
-    return np.maximum(variance_px2, parameters.limits.smallest_variance_px2)
+def split_variance_px2(
+    variance_px2: FloatArray, persistence: FloatArray, parameters: AnchoredParameters
+) -> tuple[FloatArray, FloatArray]:
+    """Return the parts of variances (n,) that are new in every frame and that last.
+
+    The first is scaled as learned, not below the repeatability of any detector. What it loses lasts: the detector's
+    variance is calibrated, the share that lasts depends on the interval of the frames.
+    """
+    fresh = variance_px2 * (1.0 - persistence) * parameters.errors.noise_factor**2
+    fresh = np.maximum(fresh, parameters.limits.smallest_variance_px2)
+    return fresh, np.maximum(variance_px2 - fresh, variance_px2 * persistence)
 
 
 def is_plausible(prior: FilterState, posterior: FilterState, limits: AnchoredLimits) -> bool:

@@ -11,7 +11,7 @@ it as noise about the measured attitude.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -50,12 +50,14 @@ class CommonErrors:
         Slow part: alignment, thermal bending.
     pixel_bias_px, pixel_correlation_s
         Shift of all detections of a frame, as an uneven response to slanting light causes, for as long as the light
-        stays: 0.09 px at most in the mean over windows of the validation terrain (docs/navigation.md). Innovations
-        cannot show it and it is nearly the same as a shift of the position: a larger value lets position and bias
-        wander together.
+        stays: 0.09 px at most in the mean over five windows of the tuning terrain (docs/results/navigation.md), which
+        0.05 px exceed in one of ten draws. Innovations cannot show it and it is nearly the same as a shift of the
+        position: a larger value lets position and bias wander together.
     catalogue_offset_m, catalogue_correlation_rad
         What registration and raster leave, east, north, up: a Gauss-Markov process over the ground, and the angle at
         the Moon's centre over which it is similar (1/e). Chosen on tuning ground, with a distorted map and without.
+    noise_factor
+        Factor on the standard deviation of the part of a detection's error that is new in every frame, as learned.
     scale, scale_sigma
         Stretch of all detections about the image centre as calibrated, and how well it is known; it does not change.
         A single pass cannot tell it from an error of altitude: the periods of several orbits can.
@@ -64,12 +66,13 @@ class CommonErrors:
     attitude_noise_rad: float = float(np.radians(0.01))
     attitude_bias_rad: float = float(np.radians(0.01))
     attitude_correlation_s: float = 14_400.0
-    pixel_bias_px: float = 0.1
+    pixel_bias_px: float = 0.05
     pixel_correlation_s: float = 14_400.0
     catalogue_offset_m: tuple[float, float, float] = (40.0, 40.0, 10.0)
     catalogue_correlation_rad: float = float(np.radians(30.0))
     scale: float = 0.0
     scale_sigma: float = 5e-4
+    noise_factor: float = field(default=1.0, repr=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,6 +186,8 @@ class Update:
     score
         Derivative of the log-likelihood of the innovations by the logarithm of the variance of the catalogue offset,
         and its expected square; 0, 0 where that is not learned.
+    noise_score
+        The same for the logarithm of the factor on the variances of all detections.
     """
 
     state: FilterState
@@ -194,6 +199,7 @@ class Update:
     rotation: RotationEvidence
     contradiction: FloatArray
     score: tuple[float, float] = (0.0, 0.0)
+    noise_score: tuple[float, float] = (0.0, 0.0)
 
 
 class KalmanFilter(Protocol):
@@ -398,6 +404,7 @@ def update(
         moved = float(np.linalg.norm(mean[POSITION] - previous[POSITION]))
         if moved < _LINEAR_M and turned < _LINEAR_RAD:
             break
+    contradiction, noise_score = _judged(spread, innovation, np.repeat(variance_px2, 2))
     slope, score = _sloped(prior.slope, design, gain, spread, innovation)
     covariance = corrected_covariance(prior.covariance, design, gain, noise)
     state = FilterState(prior.ticks, mean, covariance, prior.craters, slope)
@@ -416,8 +423,9 @@ def update(
         mean[turn : turn + 3],
         float(np.sqrt(np.max(np.linalg.eigvalsh(left)))),
         rotation,
-        _contradiction(spread, innovation),
+        contradiction,
         score,
+        noise_score,
     )
 
 
@@ -445,14 +453,19 @@ def _sloped(
     return Slope(mean, 0.5 * (covariance + covariance.T)), (score, information)
 
 
-def _contradiction(spread: FloatArray, innovation: FloatArray) -> FloatArray:
-    """Return how far each pair of innovations (2 n,) contradicts all others, shape (n,)."""
+def _judged(spread: FloatArray, innovation: FloatArray, noise: FloatArray) -> tuple[FloatArray, tuple[float, float]]:
+    """Return how far each pair of innovations (2 n,) contradicts all others, (n,), and the score of their noise (2 n,).
+
+    The score is d log L / d log f at f = 1 where all noise is multiplied by f, with its expected square.
+    """
     count = innovation.size // 2
     inverse = np.linalg.inv(spread)
     pull = (inverse @ innovation).reshape(count, 2)
     each = np.arange(count)
     blocks = inverse.reshape(count, 2, count, 2)[each, :, each]
-    return np.asarray(np.einsum("ka,kab,kb->k", pull, np.linalg.inv(blocks), pull), dtype=np.float64)
+    contradiction = np.asarray(np.einsum("ka,kab,kb->k", pull, np.linalg.inv(blocks), pull), dtype=np.float64)
+    score = 0.5 * float(noise @ (pull.reshape(-1) ** 2 - np.diag(inverse)))
+    return contradiction, (score, 0.5 * float(noise @ inverse**2 @ noise))
 
 
 def corrected_covariance(covariance: FloatArray, design: FloatArray, gain: FloatArray, noise: FloatArray) -> FloatArray:

@@ -149,7 +149,7 @@ class PlaceIndex:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
+class PoseHypothesis:
     """A place of the camera that explains detections.
 
     Attributes
@@ -219,7 +219,7 @@ def candidate_places(
     index: PlaceIndex,
     camera: PinholeCamera,
     parameters: LostParameters = LostParameters(),
-) -> list[Place]:
+) -> list[PoseHypothesis]:
     """Return the best places that explain at least three detections, the least likely by chance first.
 
     Parameters
@@ -240,7 +240,7 @@ def candidate_places(
     places = _voted(uv, chosen.diameter_px, index, camera, parameters)
     fits = _fitted(places, chosen, sigma, index, camera, parameters)
     fits.sort(key=lambda place: place.log_false)
-    apart: list[Place] = []
+    apart: list[PoseHypothesis] = []
     for place in fits:
         if len(apart) == _CANDIDATES:
             break
@@ -255,7 +255,7 @@ def find_place(
     index: PlaceIndex,
     camera: PinholeCamera,
     parameters: LostParameters = LostParameters(),
-) -> Place | None:
+) -> PoseHypothesis | None:
     """Return the best place if its probability of chance and all other places are far enough, otherwise None."""
     places = candidate_places(found, sigma_px, index, camera, parameters)
     if not places or places[0].log_false > math.log(parameters.false_fix_limit):
@@ -378,7 +378,7 @@ def _fitted(
     index: PlaceIndex,
     camera: PinholeCamera,
     parameters: LostParameters,
-) -> list[Place]:
+) -> list[PoseHypothesis]:
     """Return places (MCMF), shape (n, 3), fitted to the detections they explain; those without three are left out."""
     from payload_emulator.flight.navigation.search._fit_kernel import Craters, DetectedCraters, Gates, Image, fit_place
 
@@ -402,7 +402,7 @@ def _fitted(
     )
     lowest_m = parameters.minimum_altitude_m / _ALTITUDE_SLACK
     highest_m = _ALTITUDE_SLACK * parameters.maximum_altitude_m
-    fits: list[Place] = []
+    fits: list[PoseHypothesis] = []
     for start in places:
         position, attitude, normal, pair, evidence = fit_place(
             start, NADIR_NORTH_UP, image, found, craters, parameters.attitude_sigma_rad, gates, MOON_RADIUS_M
@@ -416,7 +416,7 @@ def _fitted(
         except np.linalg.LinAlgError:
             continue
         fits.append(
-            Place(
+            PoseHypothesis(
                 position,
                 attitude,
                 np.sqrt(np.maximum(np.diag(covariance)[:3], 0.0)),
@@ -444,11 +444,11 @@ def _log_share(
     return of_place + of_attitude + volume
 
 
-def _distance_m(first: Place, second: Place) -> float:
+def _distance_m(first: PoseHypothesis, second: PoseHypothesis) -> float:
     return float(np.linalg.norm(first.position_mcmf_m - second.position_mcmf_m))
 
 
-def _same_place_m(place: Place, camera: PinholeCamera, parameters: LostParameters) -> float:
+def _same_place_m(place: PoseHypothesis, camera: PinholeCamera, parameters: LostParameters) -> float:
     """Return how far apart two fits may lie and still be of one place."""
     altitude_m = float(np.linalg.norm(place.position_mcmf_m)) - MOON_RADIUS_M
     return 2.0 * parameters.block_px * altitude_m / camera.focal_px

@@ -305,13 +305,13 @@ def clock(monkeypatch):
 
 
 def notes(ground, command):
-    """Who did what to a command, and the details, in order."""
+    """Return who did what to a command, and the details, in order."""
     with ground.database.reading() as connection:
         rows = repository.newest(connection, repository.AUDIT, Paging(), target=str(command))[0]
     return [(row["actor"], row["action"], row["detail"]) for row in sorted(rows, key=lambda row: row["id"])]
 
 
-def told(ground):
+def messages(ground):
     return [item.payload for item in read_events(ground.database, 0) if item.kind == "telecommand"]
 
 
@@ -347,7 +347,7 @@ def test_each_step_keeps_what_was_done_when_by_whom_and_tells_those_who_watch(gr
         ("bob", "release telecommand", {"sequence_count": 0}),
         ("cleo", "send telecommand", {}),
     ]
-    assert told(ground) == [{"id": command, "state": state} for state in ("queued", "released", "sent")]
+    assert messages(ground) == [{"id": command, "state": state} for state in ("queued", "released", "sent")]
 
 
 def test_a_rejection_keeps_its_reason(ground, clock):
@@ -359,7 +359,7 @@ def test_a_rejection_keeps_its_reason(ground, clock):
         "rejected", "bob", NOW + 5, "wrong cadence",
     )  # fmt: skip
     assert notes(ground, command)[1] == ("bob", "reject telecommand", {"reason": "wrong cadence"})
-    assert told(ground)[-1] == {"id": command, "state": "rejected"}
+    assert messages(ground)[-1] == {"id": command, "state": "rejected"}
 
 
 @pytest.mark.parametrize(

@@ -3,15 +3,12 @@
 import contextlib
 import socket
 import threading
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import pytest
 
 from ground_service.contacts.links import core, runner, service
 from ground_service.contacts.links.runner import LinkRunner
-from ground_service.contacts.links.service import DeclaredLink
-from ground_service.ground import Ground
 from ground_service.missions.service import add_mission
 
 TIMEOUT_S = 900.0
@@ -27,29 +24,29 @@ class Station:
     connections: list[socket.socket] = field(default_factory=list)
     uplinks: list[socket.socket] = field(default_factory=list)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         threading.Thread(target=self._take_uplinks, daemon=True).start()
 
-    def accept(self, seconds: float = TIMEOUT_S) -> socket.socket:
+    def accept(self, seconds=TIMEOUT_S):
         """Return the next telemetry connection of the service."""
         self.down.settimeout(seconds)
         connection, _ = self.down.accept()
         self.connections.append(connection)
         return connection
 
-    def _take_uplinks(self) -> None:
+    def _take_uplinks(self):
         with contextlib.suppress(OSError):
             while True:
                 connection, _ = self.up.accept()
                 self.uplinks.append(connection)
                 threading.Thread(target=self._read, args=(connection,), daemon=True).start()
 
-    def _read(self, connection: socket.socket) -> None:
+    def _read(self, connection):
         with contextlib.suppress(OSError):
             while block := connection.recv(1 << 16):
                 self.telecommands += block
 
-    def link(self, extra: str = "") -> str:
+    def link(self, extra=""):
         """Return the section of the mission description."""
         down, up = (one.getsockname()[1] for one in (self.down, self.up))
         return (
@@ -57,7 +54,7 @@ class Station:
             f'uplink = "127.0.0.1:{up}"\nsilence_s = 60.0\n{extra}\n'
         )
 
-    def close(self) -> None:
+    def close(self):
         """Close everything."""
         for one in (self.down, self.up, *self.connections, *self.uplinks):
             with contextlib.suppress(OSError):
@@ -65,7 +62,7 @@ class Station:
             one.close()
 
 
-WAITS = {"TICK_S": 0.02, "POLL_S": 0.02, "PAUSE_S": 0.1, "RETRY_S": 0.1, "MISSED_S": 0.1, "REFUSED_S": 0.1}
+WAITS = {"TICK_S": 0.05, "PAUSE_S": 0.1, "RETRY_S": 0.1, "MISSED_S": 0.1, "REFUSED_S": 0.1}
 
 
 @pytest.fixture
@@ -82,12 +79,12 @@ def station(monkeypatch):
 HEAD = 'name = "selenita"\n[spacecraft]\nid = 76\n'
 
 
-def declare(ground: Ground, text: str) -> None:
+def declare(ground, text):
     """Add a mission description with links."""
     add_mission(ground, (HEAD + text).encode(), actor="ann")
 
 
-def acquired(ground: Ground, owner: str = "here", name: str = "lab", lease_ns: int = 60 * 10**9) -> DeclaredLink:
+def acquired(ground, owner="here", name="lab", lease_ns=60 * 10**9):
     """Acquire a declared link; return its declaration."""
     declared = service.declared_links(ground)[name]
     assert service.acquire(ground, declared, owner, lease_ns)
@@ -95,7 +92,7 @@ def acquired(ground: Ground, owner: str = "here", name: str = "lab", lease_ns: i
 
 
 @contextlib.contextmanager
-def operated(ground: Ground, owner: str = "here") -> Iterator[LinkRunner]:
+def operated(ground, owner="here"):
     """Operate the link "lab" in this process."""
     runner = LinkRunner(ground, acquired(ground, owner, lease_ns=15 * 10**9), owner)
     runner.start()

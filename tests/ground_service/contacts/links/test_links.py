@@ -130,7 +130,7 @@ def test_a_connection_that_is_cut_at_any_octet_and_continued_loses_nothing(groun
 
 
 def test_parts_of_frames_are_ingested_as_they_arrive(ground, station, stream, expected):
-    """What follows may never come; if it does, it has a position in the same recording."""
+    """The rest may never come; if it does, it has a position in the same recording."""
     declare(ground, station.link())
     with operated(ground):
         connection = station.accept()
@@ -274,7 +274,7 @@ def test_a_process_without_the_lease_takes_no_telecommands(either, station):
     assert service.acquire(either, declared, "second", 15_000_000_000)
 
 
-def test_transmissions_of_which_nothing_was_heard_are_repeated_in_the_next_contact(
+def test_transmissions_without_a_sign_of_reception_are_repeated_in_the_next_contact(
     ground, station, stream, mission_time
 ):
     declare(ground, station.link())
@@ -656,7 +656,7 @@ def test_a_refused_transmission_is_given_to_no_link_that_cannot_send_it(either, 
     assert [one.id for one in either.read(store.pending_transmissions, "lab")] == [transmission.id]
 
 
-def test_the_next_owner_knows_when_a_contact_was_heard_last(either, station, stream, mission_time):
+def test_the_next_owner_knows_when_a_contact_last_received_telemetry(either, station, stream, mission_time):
     """Mission time may stand still then: counted from the start of the process, the silence would never end."""
     declare(either, station.link())
     with operated(either) as runner:

@@ -10,7 +10,7 @@ from pytest import approx, raises
 from ground_service.errors import EvaluationError, InvalidInput, NotFound, StateConflict
 from ground_service.evaluation.landmarks.core import (
     Frames,
-    Place,
+    LandmarkFix,
     combined,
     distance_m,
     is_persistent,
@@ -212,7 +212,7 @@ def test_a_pass_without_a_catalogue_is_refused_with_the_reason(ground, make_pass
 
 def _place(east_m=0.0, sigma_m=50.0, diameter_m=8000.0, looks=4):
     rows = np.arange(3)
-    return Place(0.0, east_m / MOON_RADIUS_M, 100.0, (sigma_m,) * 3, diameter_m, 200.0, 0.8, rows, looks)
+    return LandmarkFix(0.0, east_m / MOON_RADIUS_M, 100.0, (sigma_m,) * 3, diameter_m, 200.0, 0.8, rows, looks)
 
 
 def test_passes_that_agree_reduce_the_variance_but_not_what_is_common_to_them():
@@ -280,7 +280,7 @@ def test_the_uncertainty_is_that_of_the_errors_on_one_pass_and_on_three(error_px
     columns = (latitude[withheld], longitude[withheld], heights[withheld], sizes[withheld])
     squares: dict[int, list[float]] = {1: [], 3: []}
     for a, b, height, size in zip(*columns, strict=True):
-        crater = Place(a, b, height, (0.0, 0.0, 0.0), size, 0.0, 1.0, np.zeros(0, dtype=np.int64), 0)
+        crater = LandmarkFix(a, b, height, (0.0, 0.0, 0.0), size, 0.0, 1.0, np.zeros(0, dtype=np.int64), 0)
         some = [one for places in found for one in places if same_place(one, crater)]
         for count in squares:
             if len(some) >= count:

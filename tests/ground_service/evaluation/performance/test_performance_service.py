@@ -380,8 +380,8 @@ def test_operations_and_commands_give_the_same_report(ground, tmp_path, capsys):
     assert (tmp_path / "cli/report.html").read_text() == page
     capsys.readouterr()
     assert command(f"show --spacecraft-id {SPACECRAFT}") == 0
-    told = capsys.readouterr().out
-    assert "change of recall at pass 8" in told and "14 passes with a report" in told
+    printed = capsys.readouterr().out
+    assert "change of recall at pass 8" in printed and "14 passes with a report" in printed
     assert command("list --json") == 0
     assert [one["id"] for one in json.loads(capsys.readouterr().out)["reports"]] == [made.id]
     assert command(f"{report} 2029-10 --out", tmp_path) == 2

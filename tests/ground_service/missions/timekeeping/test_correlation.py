@@ -16,6 +16,7 @@ from ground_service.missions.timekeeping.core import (
     ticks_of_utc_ns,
     utc_ns_of_ticks,
 )
+from ground_service.missions.timekeeping.recorrelation import TimeReports, fit_runs
 from lunar.timescales import parse_utc, ticks_from_utc_ns, utc_ns_from_ticks
 from tests.ground_service.conftest import cells
 
@@ -180,6 +181,14 @@ def test_two_reports_hours_apart_show_a_drift_that_an_oscillator_can_have_and_ot
     later = np.array([0, 3 * 3600 * NS])
     found = clock_runs(ticks + (later // NS << 16), sent + later, *zero)
     assert len(found) == runs
+
+
+def test_reports_that_scatter_by_seconds_are_not_put_in_force_and_each_says_why():
+    clocks = {"a": [0.0, 2.0, -1.5, 1.0, -2.0, 0.5, 1.5, -1.0]}
+    ticks, received, light, boot, names = reports_of_stations("a" * 8, clocks)
+    fits, doubts = fit_runs(TimeReports(ticks, boot, ticks, received, light, boot, tuple(names)))
+    assert fits == [] and set(doubts) == set(range(8))
+    assert str(doubts[0]).endswith(" s ahead of one line through all (rms)")
 
 
 def test_a_new_correlation_moves_the_times_that_its_line_changes():

@@ -108,10 +108,10 @@ def test_a_limit_is_broken_once_and_cleared_after_acknowledgement_and_return(eit
 def test_a_worse_condition_must_be_acknowledged_again(ground):
     receive(ground, housekeeping(0, 70.0))
     acknowledge(ground)
-    for second, temperature_c, told in ((1, 75.0, ("acknowledged", "warning")), (2, 90.0, ("raised", "alarm"))):
+    for second, temperature_c, expected in ((1, 75.0, ("acknowledged", "warning")), (2, 90.0, ("raised", "alarm"))):
         receive(ground, housekeeping(second, temperature_c))
         (alarm,) = alarms(ground)
-        assert (alarm.state, alarm.severity) == told
+        assert (alarm.state, alarm.severity) == expected
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
