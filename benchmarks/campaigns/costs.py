@@ -247,7 +247,7 @@ def measured(only: Sequence[str], but: Collection[str] = ()) -> Iterator[Cost]:
     with tempfile.TemporaryDirectory(prefix="costs-") as name, PostgresServer(Path(name)) as server:
         folder, url = Path(name), server.url
         prepare_database(url, upgrade=True).engine.dispose()
-        with Deployment(folder, url=url) as service:
+        with Deployment(folder, url=url, LINNA_LINKS="false") as service:
             base = f"http://127.0.0.1:{service.ports[0]}/api/v1/"
             with httpx.Client(base_url=base, timeout=900.0) as client:
                 client.post("missions", content=MISSION).raise_for_status()
