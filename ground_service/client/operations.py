@@ -30,9 +30,10 @@ else:
     import_lazily(
         globals(),
         "access.model passes.alarms.model contacts.commanding.model worker.condition "
-        "missions.ephemerides.model evaluation.model exports.model ingest.model service.model "
+        "missions.ephemerides.model evaluation.model exports.model ingest.model "
         "evaluation.landmarks.model contacts.links.model missions.model passes.model "
-        "evaluation.performance.model planning.model regression.model missions.timekeeping.model ",
+        "evaluation.performance.model planning.model regression.model jobs.service "
+        "missions.timekeeping.model ",
     )
 
 
@@ -312,7 +313,7 @@ class Operations(Connection):
 
     @operation("GET /jobs", reads="jobs.service.list_jobs")
     def list_jobs(self, *, kind: str | None = None) -> Listing[service.Job]:
-        """List the service, newest first; `kind` selects jobs of one kind."""
+        """List the jobs, newest first; `kind` selects jobs of one kind."""
 
     @operation("GET /jobs/{job_id}")
     def get_job(self, job_id: str) -> service.Job:

@@ -18,12 +18,12 @@ from ground_service.ground import Ground, run_apart
 from ground_service.http.model import Paging, UtcTime
 from ground_service.missions import store as missions
 from ground_service.missions.catalogues import catalogue_of
-from ground_service.missions.clocks import outages_of, stations_of
 from ground_service.missions.ephemerides import service
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.ephemerides.service import open_ephemeris
 from ground_service.missions.frames import camera_of, declared_frames
 from ground_service.missions.model import Mission
+from ground_service.missions.places import outages_of, stations_of
 from ground_service.missions.timekeeping.core import ticks_of_utc_ns
 from ground_service.missions.timekeeping.store import load_correlations
 from ground_service.planning import core, model, preparation, store

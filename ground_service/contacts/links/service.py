@@ -24,11 +24,11 @@ from ground_service.errors import Conflict, InvalidInput, NotFound
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime
 from ground_service.missions import store as missions
-from ground_service.missions.clocks import outages_of, station_of
 from ground_service.missions.ephemerides import service
 from ground_service.missions.ephemerides.service import open_ephemeris
 from ground_service.missions.model import Link as LinkSection
 from ground_service.missions.model import StationConnection
+from ground_service.missions.places import outages_of, station_of
 from ground_service.store.event_kinds import ContactEnded, ContactMissed, ContactStarted, LinkChanged, publish
 from ground_service.store.vehicles import get_vehicle, vehicle_id
 from lunar.constants import NS

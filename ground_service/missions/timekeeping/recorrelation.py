@@ -20,9 +20,9 @@ from ground_service.clock import utc_now_ns
 from ground_service.errors import Conflict, InvalidInput
 from ground_service.ground import Ground
 from ground_service.http.model import UtcTime, time_of
-from ground_service.missions.clocks import stations_of
 from ground_service.missions.ephemerides.model import Ephemeris
 from ground_service.missions.ephemerides.service import covering_ephemerides
+from ground_service.missions.places import stations_of
 from ground_service.missions.store import mission_of_vehicle
 from ground_service.missions.timekeeping import store
 from ground_service.missions.timekeeping.core import (

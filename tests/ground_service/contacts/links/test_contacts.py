@@ -16,8 +16,8 @@ from ground_service.contacts.links.core import (
     predict_contacts,
     without,
 )
-from ground_service.missions.clocks import outages_of, station_of, stations_of
 from ground_service.missions.model import parse_mission
+from ground_service.missions.places import outages_of, station_of, stations_of
 from lunar.constants import NS
 from lunar.ephemeris import ephemeris_from_states
 from lunar.visibility import GroundStation, link
