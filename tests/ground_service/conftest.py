@@ -143,7 +143,7 @@ def one_set_of_statements():
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="package", autouse=True)
 def undrawn_figures():
     """Leave the figures of reports blank: they are the larger part of the time of a report; what draws is yielded."""
     draw = Drawings.svg
