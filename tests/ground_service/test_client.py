@@ -17,7 +17,8 @@ import pytest
 from ground_service.app import create_app
 from ground_service.client import Client, ServiceProblem, connection
 from ground_service.client.connection import ATTEMPTS, BUSY_S, JobFailed, Unreachable
-from ground_service.client.local import LocalTransport, local_client
+from ground_service.client.local import local_client
+from ground_service.client.transport import LocalTransport
 from ground_service.ground import open_ground
 from ground_service.settings import Settings
 from lunar.timescales import parse_utc, ticks_from_utc_ns
