@@ -77,8 +77,8 @@ class Reader(NamedTuple):
     tolerance: float = 1e-9
 
 
-def text(name: str, content: Callable[[], str | bytes]) -> Callable[[Path], Path]:
-    def write(folder: Path) -> Path:
+def text(name, content):
+    def write(folder):
         found = content()
         path = folder / name
         path.write_bytes(found if isinstance(found, bytes) else found.encode())
@@ -93,14 +93,14 @@ ELAPSED_S = np.arange(0.0, 5401.0, 60.0)
 ASKED = times([65.0, 605.0, 2675.0, 5000.0, 5300.0])
 
 
-def orbit(change: str = "x") -> Ephemeris:
+def orbit(change="x"):
     """Return the orbit with a changed state `x` (n, 6) in m and m/s at times `t`."""
     states = np.hstack(circle(ELAPSED_S, node=(0.8, 0.6, 0.0), north=(-0.36, 0.48, 0.8)))
     x = np.ascontiguousarray(value(change, x=states, t=ELAPSED_S))
     return ephemeris_from_states(times(ELAPSED_S), x[:, :3], x[:, 3:])
 
 
-def turning(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+def turning(t, x):
     """Return states in axes that turn with the Moon."""
     angle, zero = 2.6617e-6 * (t + 3e5), np.zeros_like(t)
     rows = [[np.cos(angle), np.sin(angle), zero], [-np.sin(angle), np.cos(angle), zero], [zero, zero, zero + 1.0]]
@@ -109,20 +109,20 @@ def turning(t: np.ndarray, x: np.ndarray) -> np.ndarray:
     return turned
 
 
-def one(x: np.ndarray, row: int, first: int, stop: int, factor: float) -> np.ndarray:
+def one(x, row, first, stop, factor):
     x = x.copy()
     x[row, first:stop] *= factor
     return x
 
 
-def two_objects() -> str:
+def two_objects():
     middle, stop = map(int, times([2700.0, 5400.0]))
     halves = [clipped(orbit(), a, b).segments for a, b in ((START, middle), (middle, stop))]
     first, _, second = format_oem(Ephemeris(halves[0] + halves[1])).rpartition("META_START")
     return f"{first}META_START{second.replace('SELENITA', 'OTHER')}"
 
 
-def horizons(ephemeris: Ephemeris) -> str:
+def horizons(ephemeris):
     segment = ephemeris.segments[0]
     rows, states = [], np.hstack([segment.position_m, segment.velocity_m_s]) / 1e3
     for count, state in zip(from_tai_ns(segment.tai_ns, "TDB").tolist(), states, strict=True):
@@ -147,12 +147,12 @@ ORBITS = {
 }
 
 
-def orbit_figures(path: Path) -> tuple[Any, str]:
+def orbit_figures(path):
     ephemeris = load_orbit(path)
     return np.hstack(ephemeris.at(ASKED)), ephemeris.words
 
 
-def attitudes(**fields: Any) -> tuple[AttitudeSegment, ...]:
+def attitudes(**fields):
     position, velocity = orbit().at(times(ELAPSED_S))
     down = -position / np.linalg.norm(position, axis=1, keepdims=True)
     ahead = velocity / np.linalg.norm(velocity, axis=1, keepdims=True)
@@ -160,7 +160,7 @@ def attitudes(**fields: Any) -> tuple[AttitudeSegment, ...]:
     return (AttitudeSegment(times(ELAPSED_S), np.array(q_wxyz), **fields),)
 
 
-def external(folder: Path) -> Path:
+def external(folder):
     import cv2
 
     (folder / "orbit.oem").write_text(format_oem(orbit()))
@@ -172,7 +172,7 @@ def external(folder: Path) -> Path:
     return text("attitude.aem", lambda: format_aem(attitudes(), "1.0"))(folder)
 
 
-def pointing(path: Path) -> tuple[Any, str]:
+def pointing(path):
     plain = Scenario("x")
     frames = load_external(path.parent, replace(plain, camera=replace(plain.camera, width_px=64, height_px=64)))
     ephemeris = load_orbit(frames.ephemeris)
@@ -181,12 +181,12 @@ def pointing(path: Path) -> tuple[Any, str]:
     return np.concatenate([np.append(m, shade) for m, shade in found] + [(frames.utc_ns - START) / NS]), frames.words
 
 
-def attitude_table() -> str:
+def attitude_table():
     rows = zip(ticks_from_utc_ns(times(ELAPSED_S)).tolist(), attitudes()[0].q_wxyz.tolist(), strict=True)
     return "\n".join(["image_ticks,q_w,q_x,q_y,q_z", *(",".join(map(repr, (t, *q))) for t, q in rows), ""])
 
 
-def table_pointing(path: Path) -> tuple[Any, str]:
+def table_pointing(path):
     table = load_attitudes(path)
     check_attitudes(table, orbit(), START, int(times(5400.0)))
     seconds = (utc_ns_from_ticks(table.image_ticks) - START) / NS
@@ -217,18 +217,18 @@ HEADS = {
 }
 
 
-def plain(n: int, m: int) -> float:
+def plain(n, m):
     """Return the factor of coefficients that are not normalised."""
     return math.sqrt((2 - (m == 0)) * (2 * n + 1) * math.factorial(n - m) / math.factorial(n + m))
 
 
-def field_text(name: str, change: str = "n, m, c, s") -> str:
+def field_text(name, change="n, m, c, s"):
     head, row = HEADS[name]
     rows = (row.format(*value(change, n=n, m=m, c=c, s=s)) for n, m, c, s in TERMS)
     return head + "".join(rows) + ("END\n" if "GMAT" in name else "")
 
 
-def pull(path: Path) -> tuple[Any, str]:
+def pull(path):
     field = load_gravity(path)
     return acceleration(field, AT_M), field.words
 
@@ -245,7 +245,7 @@ LISTS = {
 }
 
 
-def list_text(name: str, column: str = "id", change: str = "v") -> str:
+def list_text(name, column="id", change="v"):
     rng = np.random.default_rng(3)
     diameter_m = 3_000.0 * (1.0 - rng.random(60)) ** -0.5
     columns = dict(
@@ -267,7 +267,7 @@ def list_text(name: str, column: str = "id", change: str = "v") -> str:
     return "\n".join([",".join(heads[k] for k in kept), *(",".join(f"{v:.9g}" for v in row) for row in rows), ""])
 
 
-def catalogue_figures(path: Path) -> tuple[Any, str]:
+def catalogue_figures(path):
     found = load_catalogue(path)
     columns = (found.latitude_rad, found.longitude_rad, found.diameter_m, found.depth_m, found.rim_height_m)
     return np.column_stack([*columns, found.complete]), catalogue_words(found)
@@ -277,14 +277,7 @@ NO_CRATERS = make_catalogue([], [], [], source="none")
 DEGREE_M, STERE = math.radians(1_737_400.0), "+proj=stere +lat_0=90 +R=1737400"
 
 
-def polar(
-    path: Path,
-    crs: str = STERE,
-    step: float = 2_000.0,
-    own: str = STERE,
-    convert: Callable[[Any], Any] = np.array,
-    unit: str = "",
-) -> None:
+def polar(path, crs=STERE, step=2_000.0, own=STERE, convert=np.array, unit=""):
     """Write the ground as a polar map with places of the projection `own`."""
     import rasterio
     from rasterio.warp import transform
@@ -300,7 +293,7 @@ def polar(
             target.units = (unit,)
 
 
-def heights(path: Path) -> tuple[Any, str]:
+def heights(path):
     """Return heights as the emulator takes them, with the words of the curation."""
     is_polar = path.stem == "polar"
     places = [[76.5, 77.5, 78.5], [8.0, 16.2, 25.0]] if is_polar else [[75.3, 77.1, 78.9], [12.7, 16.2, 23.4]]
@@ -311,36 +304,36 @@ def heights(path: Path) -> tuple[Any, str]:
     return figures, "; ".join(found.readings)
 
 
-def raster(name: str, make: Callable[..., Any]) -> Callable[[Path], Path]:
+def raster(name, make):
     return lambda folder: (make(folder / name), folder / name)[1]
 
 
-def registration() -> str:
+def registration():
     k = np.arange(12)
     shifts = (np.linspace(-50, 50, 12), np.linspace(10, 90, 12), np.full(12, 15.0))
     return format_registration(Registration(k, k + 40, *shifts, 0 * k + 30, "a" * 64, {"dem.tif": "b" * 64}))
 
 
-def shifts(path: Path) -> tuple[Any, str]:
+def shifts(path):
     found = parse_registration(path.read_text(), str(path))
     columns = (found.row, found.column, found.east_m, found.north_m, found.sigma_m, found.rims)
     return np.column_stack(columns), found.words
 
 
-def kernels(folder: Path) -> Path:
+def kernels(folder):
     data = Path(os.environ["LINNA_DATA"]) / "kernels"
     (folder / "moon.bpc").symlink_to(data / "moon_pa_de421_1900-2050.bpc")
     return text("moon.tf", (data / "moon_080317.tf").read_text)(folder)
 
 
-def turned(path: Path) -> tuple[Any, str]:
+def turned(path):
     return load_orientation(path.with_suffix(".bpc"), path).mcmf_from_icrf(np.array([9e8, 1e9])), ""
 
 
 # Labels and pictures.
 
 
-def labels() -> str:
+def labels():
     rng = np.random.default_rng(5)
     boxes = np.column_stack([rng.uniform(10, 400, (30, 2)), *[rng.uniform(9, 60, 30)] * 2]).tolist()
     image = {"id": 7, "file_name": "a.png", "width": 512, "height": 480, "sun_azimuth_deg": 30.0, "pixel_m": 90.0}
@@ -349,39 +342,39 @@ def labels() -> str:
     return json.dumps({"images": [image], "annotations": listed, "categories": kinds})
 
 
-def coco(folder: Path) -> Path:
+def coco(folder):
     import cv2
 
     cv2.imwrite(str(folder / "a.png"), np.full((480, 512), 99, np.uint8))
     return text("labels.json", labels)(folder)
 
 
-def corners(box: list[float]) -> list[float]:
+def corners(box):
     x, y, w, h = box
     return [x, y, x + w, y, x + w, y + h, x, y + h]
 
 
-def labelled(path: Path) -> tuple[Any, str]:
+def labelled(path):
     (found,) = load_pictures(path.parent)
     rows = np.sort([found.u_px, found.v_px, found.diameter_px, found.crowd.astype(float)], axis=1)
     figures = np.append(rows, [found.sun_azimuth_deg, found.pixel_m, found.altitude_km])
     return figures, "; ".join([f"{np.count_nonzero(~found.crowd)} labelled craters", *set_words([found])])
 
 
-def picture(path: Path, change: str = "a") -> None:
+def picture(path, change="a"):
     import cv2
 
     shades = (np.random.default_rng(2).random((48, 64)) ** 2 * 60_000).astype(np.uint16)
     cv2.imwrite(str(path), np.ascontiguousarray(value(change, a=shades)))
 
 
-def pixel(a: np.ndarray, shade: float) -> np.ndarray:
+def pixel(a, shade):
     out = (a / 60_000).astype(np.float32)
     out[5, 6] = shade
     return out
 
 
-def seen(path: Path) -> tuple[Any, str]:
+def seen(path):
     """Return quantiles of what the network sees, and the printed remark."""
     image, remark = read_picture(path)
     prepared = prepare_image(image)
@@ -396,7 +389,7 @@ MODE = """<EnumeratedParameterType name="MODE"><UnitSet/><IntegerDataEncoding si
 <Enumeration value="1" label="SAFE"/><Enumeration value="2" label="ON"/></EnumerationList></EnumeratedParameterType>"""
 
 
-def bus(folder: Path) -> Path:
+def bus(folder):
     types = x_tce.HEADER_TYPES + x_tce.calibrated("VOLT", 12, "unsigned", x_tce.default(x_tce.polynomial(-1.5, 0.25)))
     types += x_tce.integer("I20", 20, "twosComplement") + x_tce.floating("F32", 32) + MODE
     names = {"VOLTAGE": "VOLT", "OFFSET": "I20", "RATE": "F32", "STATE": "MODE"}
@@ -410,7 +403,7 @@ def bus(folder: Path) -> Path:
     return text("bus.xml", lambda: document)(folder)
 
 
-def decoded(path: Path) -> tuple[Any, str]:
+def decoded(path):
     options = ["--xtce", str(path), "--no-error-control", "--prefix-octets", "0"]
     recording = str(path.with_suffix(".bin"))
     records = json.loads(printed("tm", "decode", recording, *options))
@@ -420,7 +413,7 @@ def decoded(path: Path) -> tuple[Any, str]:
     return np.array(figures, dtype=np.float64), printed("tm", "check", recording, *options)
 
 
-def printed(*words: str) -> str:
+def printed(*words):
     """Return what a command prints; its refusal is raised."""
     out, err = io.TextIOWrapper(io.BytesIO()), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -431,11 +424,11 @@ def printed(*words: str) -> str:
     return out.read()
 
 
-def cadus(**settings: Any) -> bytes:
+def cadus(**settings):
     return encode_cadus(make_packets(60), **({"spacecraft_id": 76, "frame_length": 892} | settings))
 
 
-def received(path: Path) -> tuple[Any, str]:
+def received(path):
     found = decode(path.read_bytes())
     octets = b"".join(found.cut.packets(found.buffer))
     return np.frombuffer(octets, np.uint8).astype(np.float64), printed("tm", "check", str(path))
@@ -444,7 +437,7 @@ def received(path: Path) -> tuple[Any, str]:
 # Documents of the ground.
 
 
-def leaves(tree: Any) -> list[float]:
+def leaves(tree):
     """Return the numbers in a tree of values; texts count by a checksum."""
     if isinstance(tree, dict):
         return [number for key in sorted(tree) for number in leaves(tree[key])]
@@ -453,17 +446,17 @@ def leaves(tree: Any) -> list[float]:
     return [float(tree) if isinstance(tree, (int, float)) else float(zlib.crc32(repr(tree).encode()))]
 
 
-def mission_values(path: Path) -> tuple[Any, str]:
+def mission_values(path):
     mission = parse_mission(path.read_text())
     return leaves(mission.model_dump(mode="json")), mission.words
 
 
-def scenario_values(path: Path) -> tuple[Any, str]:
+def scenario_values(path):
     scenario = load_scenario(path)
     return leaves(json.loads(json.dumps(asdict(scenario)))), scenario.words
 
 
-def receptions() -> str:
+def receptions():
     rows = (
         f"{ticks_from_utc_ns(START + k * 10 * NS)},{k},{format_utc(START + k * 10 * NS + NS)},Madrid\n"
         for k in range(9)
@@ -471,7 +464,7 @@ def receptions() -> str:
     return "packet_ticks,sequence_count,received_utc,station\n" + "".join(rows)
 
 
-def reception_values(path: Path) -> tuple[Any, str]:
+def reception_values(path):
     found = read_receptions(path)
     return [[r.ticks, r.sequence_count, r.earth_utc_ns / NS] for r in found], str({r.station for r in found})
 
@@ -502,12 +495,12 @@ READERS = {
 # Changes.
 
 
-def value(expression: str, **names: Any) -> Any:
+def value(expression, **names):
     """Return the value of an expression of the table of changes."""
     return eval(expression, globals() | names)
 
 
-def change(reader: str, kind: str, place: str, new: str, path: Path) -> None:
+def change(reader, kind, place, new, path):
     """Change one field of a file."""
     if kind == "frames":
         path, kind = path.with_name("frames.csv"), "every"
@@ -550,7 +543,7 @@ def change(reader: str, kind: str, place: str, new: str, path: Path) -> None:
         path.write_text(json.dumps(document))
 
 
-def change_tree(document: Any, kind: str, place: str, new: str) -> None:
+def change_tree(document, kind, place, new):
     if kind == "json":
         *keys, last = [int(key) if key.isdigit() else key for key in place.split("/")]
         for key in keys:
@@ -564,14 +557,14 @@ def change_tree(document: Any, kind: str, place: str, new: str) -> None:
         node[int(place)] = value(new, v=node[int(place)])
 
 
-def changes_of(name: str) -> list[dict[str, str]]:
+def changes_of(name):
     with (REFERENCES / "changed_inputs.csv").open(newline="") as lines:
         rows = [row for row in csv.DictReader(lines) if row["reader"] in (name, *READERS[name].changes)]
     heads = dict(zip(NAMES, LISTS.get(name, "").split(","), strict=False))
     return [row for row in rows if row["reader"] != "craters" or heads.get(row["place"])]
 
 
-def outcome(name: str, row: dict[str, str], folder: Path) -> str:
+def outcome(name, row, folder):
     """Return "refused: why", "same", "stated: words", or "SILENT: difference" of a changed file."""
     reader = READERS[name]
     path = reader.write(folder)
@@ -590,7 +583,7 @@ def outcome(name: str, row: dict[str, str], folder: Path) -> str:
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_a_changed_field_never_gives_other_figures_in_silence(name: str, tmp_path: Path) -> None:
+def test_a_changed_field_never_gives_other_figures_in_silence(name, tmp_path):
     if name == "orientation kernels" and "LINNA_DATA" not in os.environ:
         pytest.skip("LINNA_DATA is not set: no kernels on this machine")
     rows = changes_of(name)
@@ -624,11 +617,11 @@ NOT_OF_FILES = {"received"}
 """Keys of requests to the service."""
 
 
-def code_of(names: tuple[str, ...]) -> str:
+def code_of(names):
     return "\n".join(Path(importlib.import_module(name).__file__ or "").read_text() for name in names)
 
 
-def keys_of(code: str) -> set[str]:
+def keys_of(code):
     """Return the names that a reader takes from a file: its constants of keys and columns, and what it looks up."""
     constants = [code[at.start() : code.index("\n)\n" if "(\n" in code[at.start() : at.end() + 60] else "\n", at.end())]
                  for at in KEYS.finditer(code)]  # fmt: skip
@@ -637,7 +630,7 @@ def keys_of(code: str) -> set[str]:
 
 
 @pytest.mark.parametrize("section", CODE)
-def test_the_table_of_readers_has_the_names_that_the_code_reads_and_no_others(section: str) -> None:
+def test_the_table_of_readers_has_the_names_that_the_code_reads_and_no_others(section):
     page = Path(__file__).parents[1] / "docs" / "reference" / "readers.md"
     body = page.read_text().partition(f"\n## {section}\n")[2].partition("\n## ")[0]
     rows = "\n".join(line for line in body.splitlines() if line.startswith("|"))
@@ -648,7 +641,7 @@ def test_the_table_of_readers_has_the_names_that_the_code_reads_and_no_others(se
     assert {name for name in stated if name not in code.casefold() and " " not in name} == set()
 
 
-def main() -> None:
+def main():
     counts = Counter()
     for name in READERS:
         for row in changes_of(name):

@@ -44,7 +44,7 @@ from lunar.timescales import parse_utc
 from reports.values import NavigationSeries, PassEvent, TerrainMap
 
 
-def two_tones(dark_rows: int) -> TerrainMap:
+def two_tones(dark_rows):
     """A map whose northern rows are dark (grey 50 to 59) and whose rest is bright (200 to 209)."""
     image = np.full((180, 360), 200, dtype=np.uint8)
     image[:dark_rows] = 50
@@ -80,7 +80,7 @@ def test_samples_over_dark_ground_are_mare_and_those_outside_the_reference_nothi
 START = parse_utc("2029-08-07T00:00:00Z")
 
 
-def event(seconds: int, name: str, detail: str = "") -> PassEvent:
+def event(seconds, name, detail=""):
     return PassEvent(START + seconds * 10**9, "medium", name, detail)
 
 
@@ -140,13 +140,13 @@ COUNT = 60
 UTC_NS = 1_881_735_115_000_000_000 + np.arange(COUNT) * 15 * 10**9
 
 
-def orbit() -> np.ndarray:
+def orbit():
     angle = 1e-3 * 15.0 * np.arange(COUNT)
     flat = 1_768e3 * np.stack([np.cos(angle), np.sin(angle), 0.1 * np.sin(angle)], axis=1)
     return np.asarray(flat)
 
 
-def poses(text: str) -> tuple[np.ndarray, np.ndarray]:
+def poses(text):
     """Return times (n,) and 4 x 4 poses (n, 4, 4) of TUM text, from the definition of a quaternion's rotation."""
     rows = np.array([[float(word) for word in line.split()] for line in text.splitlines() if line[0] != "#"])
     matrices = np.zeros((len(rows), 4, 4))
@@ -338,7 +338,7 @@ CAMERA = BrownCamera(512, 512, 2.0 * math.pi / 3.0, k1=K1, p1=P1)
 FOCAL_PX = 256.0 / math.tan(math.radians(60.0))
 
 
-def pixel(latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[float, float]:
+def pixel(latitude_deg, longitude_deg, height_m):
     """Pixel of a place, seen from above (0, 0) by a camera that leans 15 degrees from nadir to the north."""
     latitude, longitude = math.radians(latitude_deg), math.radians(longitude_deg)
     radius = RADIUS_M + height_m

@@ -8,7 +8,6 @@ import shutil
 import struct
 import warnings
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, cast
 from unittest.mock import Mock
 
@@ -16,7 +15,6 @@ import numpy as np
 import pytest
 
 from ground_service.errors import EvaluationError, InvalidInput, NotFound
-from ground_service.ground import Ground
 from ground_service.http.model import Paging
 from ground_service.ingest.doubt_store import list_implausible
 from ground_service.ingest.model import ImplausibleFilter
@@ -41,7 +39,6 @@ from ground_service.toml import read_table
 from ground_service.worker import follow_up
 from ground_service.worker.integrity import verify
 from lunar.timescales import parse_utc, ticks_from_utc_ns, utc_ns_from_ticks
-from tests.serving import TestClient
 from tests.tmtc import foreign
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
@@ -60,14 +57,14 @@ DEFINED = f"[[packets]]\nname = 'bus'\napids = [100, 101]\npacket_checksum = 'no
 MISSION = "name = 'test'\nspacecraft = { id = 76 }\n"
 
 
-def mission(folder: Path, text: str = DEFINED, document: str = foreign.BUS) -> Path:
+def mission(folder, text=DEFINED, document=foreign.BUS):
     folder.mkdir(exist_ok=True)
     (folder / "bus.xml").write_text(document)
     (folder / "mission.toml").write_text(MISSION + text)
     return folder / "mission.toml"
 
 
-def enter(ground: Ground, text: str = DEFINED, document: str = foreign.BUS) -> None:
+def enter(ground, text=DEFINED, document=foreign.BUS):
     add_mission(ground, read_mission_file(mission(ground.home / "m", text, document)))
 
 
@@ -75,19 +72,19 @@ RENAMED = foreign.BUS.replace('"VOLTAGE"', '"BATTERY"')
 
 
 @pytest.fixture
-def declared(ground: Ground) -> Ground:
+def declared(ground):
     enter(ground)
     return ground
 
 
-def at(packet: bytes, second: float) -> bytes:
+def at(packet, second):
     """The packet with this time, in seconds after `START`, in its CDS header."""
     day, rest = divmod(START + round(second * 1e9), 86_400 * NS)
     time = struct.pack(">HIH", day - EPOCH_DAY, rest // 1_000_000, rest // 1000 % 1000)
     return packet[:6] + time + packet[14:]
 
 
-def bus_packets(count: int, seed: int = 1) -> list[bytes]:
+def bus_packets(count, seed=1):
     """Housekeeping every second and an event every fourth second."""
     rng = np.random.default_rng(seed)
     packets = []
@@ -98,22 +95,22 @@ def bus_packets(count: int, seed: int = 1) -> list[bytes]:
     return packets
 
 
-def longer(packet: bytes) -> bytes:
+def longer(packet):
     """The packet with a length that includes a checksum of two octets."""
     return packet[:4] + (int.from_bytes(packet[4:6], "big") + 2).to_bytes(2, "big") + packet[6:]
 
 
-def take(ground: Ground, packets: list[bytes]) -> Any:
+def take(ground, packets):
     path = ground.home / "bus.cadu"
     path.write_bytes(encode_cadus(packets, spacecraft_id=76))
     return ingest_file(ground, path)
 
 
-def define(ground: Ground, seconds: float = 600.0) -> int:
+def define(ground, seconds=600.0):
     return define_pass(ground, name="p", start_utc_ns=START, stop_utc_ns=START + round(seconds * 1e9), spacecraft_id=76)
 
 
-def interpreted(packets: list[bytes], tmp_path: Path) -> list[Any]:
+def interpreted(packets, tmp_path):
     """Return the values that space_packet_parser reads in the packets."""
     import space_packet_parser
 
@@ -125,7 +122,7 @@ def interpreted(packets: list[bytes], tmp_path: Path) -> list[Any]:
         return [definition.parse_bytes(packet) for packet in packets]
 
 
-def test_packets_without_a_checksum_between_others_become_series(either: Ground, tmp_path: Path, synthetic_pass: Any):
+def test_packets_without_a_checksum_between_others_become_series(either, tmp_path, synthetic_pass):
     enter(either)
     own, bus = synthetic_pass.packets, bus_packets(300)
     mixed = [packet for pair in zip(own, bus, strict=False) for packet in pair]
@@ -158,7 +155,7 @@ def test_packets_without_a_checksum_between_others_become_series(either: Ground,
     assert completeness(either, whole).crc_errors == 0
 
 
-def test_a_minimal_description_of_a_definition_decodes_its_packets(ground: Ground, tmp_path: Path):
+def test_a_minimal_description_of_a_definition_decodes_its_packets(ground, tmp_path):
     add_mission(ground, written(tmp_path, foreign.BUS).encode())
     result = take(ground, bus_packets(8))
     assert ground.read(readable_decoding, result.vehicle_id).counts["100"] == {"decoded": 8}
@@ -167,13 +164,13 @@ def test_a_minimal_description_of_a_definition_decodes_its_packets(ground: Groun
         written(tmp_path, bare)
 
 
-def written(folder: Path, text: str) -> str:
+def written(folder, text):
     folder.mkdir(exist_ok=True)
     (folder / "bus.xml").write_text(text)
     return minimal_description(folder / "bus.xml", 76)
 
 
-def test_a_minimal_description_is_one_that_the_check_accepts(tmp_path: Path):
+def test_a_minimal_description_is_one_that_the_check_accepts(tmp_path):
     bus = foreign.document(
         foreign.HEADER_TYPES,
         foreign.HEADER_PARAMETERS,
@@ -190,7 +187,7 @@ def test_a_minimal_description_is_one_that_the_check_accepts(tmp_path: Path):
     assert "160" in str(check_mission_file(saved(tmp_path, written(tmp_path / "d", own)))[1])
 
 
-def saved(folder: Path, text: str) -> Path:
+def saved(folder, text):
     (folder / "mission.toml").write_text(text)
     return folder / "mission.toml"
 
@@ -202,7 +199,7 @@ UNIX = (
 
 
 @pytest.mark.parametrize("epoch", ["1970-01-01T00:00:00Z", "1980-01-01T00:00:00Z", "2000-01-01T00:00:00Z"])
-def test_a_unix_clock_counts_no_leap_seconds(epoch: str):
+def test_a_unix_clock_counts_no_leap_seconds(epoch):
     time = PacketTime.model_validate(read_table(f"t = {UNIX.replace('EPOCH', epoch)}", "t", "TOML")["t"])
     count = (START - parse_utc(epoch)) // NS
     packet = foreign.space_packet(100, struct.pack(">IH", count, 1 << 15), 0)
@@ -214,7 +211,7 @@ def test_a_unix_clock_counts_no_leap_seconds(epoch: str):
         PacketTime.model_validate({**time.model_dump(), "epoch": "1970-01-01T00:00:00 TAI"})
 
 
-def test_parts_of_segmented_packets_are_counted_and_packets_without_header_have_no_time(declared: Ground):
+def test_parts_of_segmented_packets_are_counted_and_packets_without_header_have_no_time(declared):
     """The definition asks for the secondary header flag, but not for the sequence flags."""
     packets = bus_packets(8)
     parts = [packets[3][:2] + struct.pack(">H", flags << 14 | 50 + flags) + packets[3][4:] for flags in (1, 0, 2)]
@@ -225,7 +222,7 @@ def test_parts_of_segmented_packets_are_counted_and_packets_without_header_have_
     assert parameter_series(declared, 1, "VOLTAGE", 100).samples == 8
 
 
-def test_an_entry_may_name_several_containers_and_the_unit_of_sizes(tmp_path: Path):
+def test_an_entry_may_name_several_containers_and_the_unit_of_sizes(tmp_path):
     text = DEFINED.replace("time = ", "container = ['CCSDSPacket', 'TIMED']\nleading_size = 'octets'\ntime = ")
     found, faults = check_mission_file(mission(tmp_path, text))
     assert not faults and found is not None
@@ -233,7 +230,7 @@ def test_an_entry_may_name_several_containers_and_the_unit_of_sizes(tmp_path: Pa
     assert "expected the name of a container" in check_mission_file(mission(tmp_path, text.replace("TIMED", "X")))[1][0]
 
 
-def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground: Ground):
+def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground):
     limits = (
         "<DefaultAlarm><StaticAlarmRanges><WarningRange minInclusive='-1' maxInclusive='1000.5'/>"
         "<CriticalRange maxExclusive='1020'/></StaticAlarmRanges></DefaultAlarm>"
@@ -257,9 +254,7 @@ def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground: 
     assert "TEXT" not in listed
 
 
-def test_a_series_has_least_greatest_and_mean_value_from_samples_and_from_rollups(
-    either: Ground, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_series_has_least_greatest_and_mean_value_from_samples_and_from_rollups(either, tmp_path, monkeypatch):
     enter(either)
     bus = bus_packets(2000)
     for piece in (bus[:900], bus[900:]):
@@ -281,9 +276,7 @@ def test_a_series_has_least_greatest_and_mean_value_from_samples_and_from_rollup
     assert trend_series(either, 76, "flight", "RATE", 11).samples == 2000
 
 
-def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_kept_as_unknown(
-    either: Ground, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_kept_as_unknown(either, monkeypatch):
     monkeypatch.setattr(decoding, "BLOCK_PACKETS", 50)
     monkeypatch.setitem(cast(dict[str, Any], follow_up.DOING), "decode", lambda *_given: None)  # no job decodes
     declared = "[[packets]]\nname = 'bus'\napids = [100, 101]\npacket_checksum = 'none'\n"
@@ -312,7 +305,7 @@ def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_k
     assert progress.counts == {"100": {"decoded": 100}, "101": {"decoded": 25}}
 
 
-def test_a_revision_reads_raw_files_again_whose_packets_were_taken_for_damaged(either: Ground, synthetic_pass: Any):
+def test_a_revision_reads_raw_files_again_whose_packets_were_taken_for_damaged(either, synthetic_pass):
     own, bus = synthetic_pass.packets, bus_packets(100)
     mixed = [packet for pair in zip(own, bus, strict=False) for packet in pair]
     result = take(either, mixed)
@@ -325,11 +318,11 @@ def test_a_revision_reads_raw_files_again_whose_packets_were_taken_for_damaged(e
     assert len(redecodings(either)) == 1
 
 
-def redecodings(ground: Ground) -> list[dict[str, Any]]:
+def redecodings(ground):
     return ground.read(repository.newest, repository.JOBS, Paging(), kind="redecode")[0]
 
 
-def test_the_integrity_check_finds_packets_without_a_checksum_intact(declared: Ground):
+def test_the_integrity_check_finds_packets_without_a_checksum_intact(declared):
     take(declared, bus_packets(30))
     found = verify(declared, rebuild=True)
     assert (found.verdict, found.damaged, found.unchecked) == ("intact", [], {})
@@ -351,7 +344,7 @@ SAMPLES = repository.PARAMETER_SAMPLES
         (None, "expected this row"),
     ],
 )
-def test_the_integrity_check_finds_a_damaged_sample(either: Ground, changes: dict[str, Any] | None, reason: str):
+def test_the_integrity_check_finds_a_damaged_sample(either, changes, reason):
     enter(either)
     take(either, bus_packets(8))
     with either.database.writing() as connection:
@@ -363,9 +356,7 @@ def test_the_integrity_check_finds_a_damaged_sample(either: Ground, changes: dic
     assert reason in " ".join(one.reason for one in found)
 
 
-def test_the_integrity_check_does_not_expect_samples_of_packets_that_are_not_yet_decoded(
-    either: Ground, monkeypatch: pytest.MonkeyPatch
-):
+def test_the_integrity_check_does_not_expect_samples_of_packets_that_are_not_yet_decoded(either, monkeypatch):
     monkeypatch.setitem(cast(dict[str, Any], follow_up.DOING), "decode", lambda *_given: None)
     enter(either)
     result = take(either, bus_packets(10))
@@ -387,7 +378,7 @@ def test_the_integrity_check_does_not_expect_samples_of_packets_that_are_not_yet
     assert (found.damaged, found.unchecked, found.checked["parameter_samples"]) == ([], {}, 13)
 
 
-def archived(made: Any, folder: Path, packets: list[bytes], text: str = DEFINED) -> Path:
+def archived(made, folder, packets, text=DEFINED):
     """The synthetic archive with other packets in its downlink, and a mission description that declares them."""
     archive = shutil.copytree(made.folder, folder / "archive")
     written = {
@@ -403,7 +394,7 @@ def archived(made: Any, folder: Path, packets: list[bytes], text: str = DEFINED)
 
 
 def test_an_archive_is_decoded_with_the_packets_that_it_declares_and_the_live_spacecraft_is_not(
-    either: Ground, tmp_path: Path, synthetic_pass: Any
+    either, tmp_path, synthetic_pass
 ):
     bus = bus_packets(40)
     folder = archived(synthetic_pass, tmp_path, [*synthetic_pass.packets, *bus])
@@ -433,7 +424,7 @@ def test_an_archive_is_decoded_with_the_packets_that_it_declares_and_the_live_sp
 
 
 def test_an_archive_that_was_imported_before_is_decoded_with_its_packets_on_redecoding(
-    either: Ground, tmp_path: Path, synthetic_pass: Any, monkeypatch: pytest.MonkeyPatch
+    either, tmp_path, synthetic_pass, monkeypatch
 ):
     checked = DEFINED.replace("'none'", "'crc16'")
     packets = [packet + crc16(packet).to_bytes(2, "big") for packet in map(longer, bus_packets(20))]
@@ -451,7 +442,7 @@ def test_an_archive_that_was_imported_before_is_decoded_with_its_packets_on_rede
 
 
 def test_an_archive_that_declares_no_packets_is_decoded_with_the_description_of_the_spacecraft(
-    either: Ground, tmp_path: Path, synthetic_pass: Any
+    either, tmp_path, synthetic_pass
 ):
     enter(either)
     pass_id = import_archive(either, archived(synthetic_pass, tmp_path, bus_packets(20), ""))
@@ -459,7 +450,7 @@ def test_an_archive_that_declares_no_packets_is_decoded_with_the_description_of_
     assert trend_series(either, 76, instance, "VOLTAGE", 1000).samples == 20
 
 
-def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(declared: Ground, tmp_path: Path):
+def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(declared, tmp_path):
     octets = encode_cadus(bus_packets(120), spacecraft_id=76)
     rng = np.random.default_rng(5)
     cuts = [0, *sorted(rng.choice(len(octets), 11, replace=False).tolist()), len(octets)]
@@ -473,9 +464,7 @@ def test_pieces_cut_at_any_octet_in_any_order_give_every_packet(declared: Ground
 
 
 @pytest.mark.parametrize("window", [0, 5_000, 1 << 20])
-def test_packets_that_nothing_declares_are_kept_between_declared_ones(
-    declared: Ground, tmp_path: Path, window: int, monkeypatch: pytest.MonkeyPatch
-):
+def test_packets_that_nothing_declares_are_kept_between_declared_ones(declared, tmp_path, window, monkeypatch):
     """In frames, and as a bare stream in windows and at once."""
     packets = bus_packets(274)
     for k in range(49):
@@ -490,7 +479,7 @@ def test_packets_that_nothing_declares_are_kept_between_declared_ones(
     assert parameter_series(declared, define(declared), "VOLTAGE", 1000).samples == 274
 
 
-def test_decoded_packets_of_a_pass_are_exported_with_utc(declared: Ground, synthetic_pass: Any):
+def test_decoded_packets_of_a_pass_are_exported_with_utc(declared, synthetic_pass):
     packets = [*synthetic_pass.packets]
     (event,) = (one for one in map(DICTIONARY.unpack_packet, packets) if one.name == "event_info")
     packets.append(DICTIONARY.pack("event_low", event.values, ticks=event.ticks, sequence_count=1))
@@ -510,7 +499,7 @@ def test_decoded_packets_of_a_pass_are_exported_with_utc(declared: Ground, synth
     assert export_packets(declared, pass_id, "Housekeeping", "parquet")[:4] == b"PAR1"
 
 
-def test_the_http_interface_gives_parameters_series_and_packets(client: TestClient):
+def test_the_http_interface_gives_parameters_series_and_packets(client):
     ground = client.app.state.ground
     enter(ground)
     take(ground, bus_packets(20))
@@ -536,14 +525,14 @@ clock | clok | packets.0.time.clok: expected 'clock', found unknown key 'clok'
 
 
 @pytest.mark.parametrize("row", FAULTS.splitlines())
-def test_each_fault_of_a_declaration_is_one_line(tmp_path: Path, row: str):
+def test_each_fault_of_a_declaration_is_one_line(tmp_path, row):
     old, new, message = row.split(" | ")
     text = DEFINED * (new == "'two'") + DEFINED.replace(old, new)
     found, [fault] = check_mission_file(mission(tmp_path, text))
     assert found is None and message in fault and "\n" not in fault
 
 
-def test_each_faulty_document_is_one_line(tmp_path: Path):
+def test_each_faulty_document_is_one_line(tmp_path):
     two = DEFINED + DEFINED.replace("'bus'", "'two'").replace("[100, 101]", "[102]")
     path = mission(tmp_path, two, foreign.BUS.replace("UnitSet", "UnitsSet"))
     found, faults = check_mission_file(path)
@@ -556,7 +545,7 @@ def test_each_faulty_document_is_one_line(tmp_path: Path):
     assert "expected texts of XTCE documents" in str(read_document(path.read_text(), "m.toml")[0])
 
 
-def test_documents_have_one_limit_for_their_sum(monkeypatch: pytest.MonkeyPatch):
+def test_documents_have_one_limit_for_their_sum(monkeypatch):
     monkeypatch.setattr(definitions, "DOCUMENTS_LIMIT_OCTETS", 1000)
     packed = XTCE_COMPRESSED + base64.b64encode(gzip.compress(b"<x>" + b" " * 600)).decode()
     source = {"name": "a", "apids": [5], "packet_checksum": "none", "xtce": [packed]}
@@ -565,7 +554,7 @@ def test_documents_have_one_limit_for_their_sum(monkeypatch: pytest.MonkeyPatch)
     assert "of documents in all, found more" in faults[-1] and "in all" not in faults[0]
 
 
-def test_a_long_document_is_embedded_compressed(ground: Ground, tmp_path: Path):
+def test_a_long_document_is_embedded_compressed(ground, tmp_path):
     padded = foreign.BUS.replace("<TelemetryMetaData>", "<TelemetryMetaData><!--" + "x" * 2_000_000 + "-->")
     path = mission(tmp_path, DEFINED, padded)
     octets = read_mission_file(path)
@@ -575,7 +564,7 @@ def test_a_long_document_is_embedded_compressed(ground: Ground, tmp_path: Path):
     assert parameter_series(ground, define(ground), "VOLTAGE", 100).samples == 5
 
 
-def test_a_declared_packet_from_the_future_is_kept_apart_until_others_agree(declared: Ground):
+def test_a_declared_packet_from_the_future_is_kept_apart_until_others_agree(declared):
     rng = np.random.default_rng(7)
     take(declared, bus_packets(40))
     pass_id = define(declared)

@@ -5,19 +5,17 @@ import json
 import re
 import shutil
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 from pytest import approx
-from sqlalchemy import Connection, select
+from sqlalchemy import select
 
 from ground_service.client.local import local_client
 from ground_service.errors import InvalidInput
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.regression.archives import (
     check_archive,
     check_out,
@@ -40,7 +38,6 @@ from ground_service.regression.gates.policy import load_policy
 from ground_service.regression.gates.samples import cell_places_deg
 from ground_service.regression.jobs import run_placebo
 from ground_service.regression.model import TELEMETRY_ONLY, ArchiveRecord, KeptReplay
-from ground_service.regression.outcome import RegressionOutcome
 from ground_service.regression.service import (
     calibrations_of,
     condition_of_archive,
@@ -54,7 +51,6 @@ from ground_service.settings import Settings
 from ground_service.store.states import change_if
 from ground_service.worker.upkeep import remove_archives
 from lunar.constants import DAY_NS
-from reports.values import Gate
 from tests.ground_service.conftest import enter_files
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.packets.space_packets import append_crc
@@ -62,13 +58,13 @@ from tmtc.packets.space_packets import append_crc
 Packets = dict[str, list[bytes]]
 
 
-def altered(packets: Packets, change: Callable[[int, str, bytes], bytes]) -> Packets:
+def altered(packets, change):
     """Packets changed one by one; `change` gets the number and name of each."""
     named = {name: enumerate(some) for name, some in packets.items()}
     return {name: [change(i, DICTIONARY.unpack(one)[0], one) for i, one in some] for name, some in named.items()}
 
 
-def with_values(name: str, packet: bytes, **changed: Any) -> bytes:
+def with_values(name, packet, **changed):
     """A packet with other values."""
     decoded = DICTIONARY.unpack_packet(packet)
     values = {key: value for key, value in decoded.values.items() if key != "count"} | changed
@@ -76,23 +72,23 @@ def with_values(name: str, packet: bytes, **changed: Any) -> bytes:
     return DICTIONARY.pack(name, values, ticks=decoded.ticks, sequence_count=count)
 
 
-def late_headers(number: int, name: str, packet: bytes) -> bytes:
+def late_headers(number, name, packet):
     """Set the on-board time of three packets of four 7 s late."""
     seconds = int.from_bytes(packet[14:18], "big") + 7 * (number % 4 > 0)
     return append_crc(packet[:14] + seconds.to_bytes(4, "big") + packet[18:-2])
 
 
-def late_states(number: int, name: str, packet: bytes) -> bytes:
+def late_states(number, name, packet):
     """Let navigation states after the 100th packet name an image 7 s late."""
     if name != "navigation_state" or number < 100:
         return packet
     return with_values(name, packet, image_ticks=DICTIONARY.unpack_packet(packet).values["image_ticks"] + 7 * 65536)
 
 
-def with_detections(packets: Packets, change: Callable[[dict[str, Any]], dict[str, Any]]) -> Packets:
+def with_detections(packets, change):
     """Packets with the detections of each frame changed."""
 
-    def changed(_: int, name: str, packet: bytes) -> bytes:
+    def changed(_, name, packet):
         if name != "detections":
             return packet
         return with_values(name, packet, items=change(DICTIONARY.unpack_packet(packet).values["items"]))
@@ -101,39 +97,37 @@ def with_detections(packets: Packets, change: Callable[[dict[str, Any]], dict[st
 
 
 @pytest.fixture(scope="module")
-def passes(make_flyable: Callable) -> list[Any]:
+def passes(make_flyable):
     return [make_flyable(frames=30, seed=seed, filter_nis=3.0) for seed in (41, 42)]
 
 
 @pytest.fixture(scope="module")
-def first(passes: list[Any]) -> Path:
+def first(passes):
     return passes[0].folder
 
 
 @pytest.fixture(scope="module")
-def packets(passes: list[Any]) -> Packets:
+def packets(passes):
     return {f"synthetic pass {seed}": one.packets for seed, one in zip((41, 42), passes, strict=True)}
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Any:
+def home(tmp_path_factory):
     """A service shared by the tests of this file: replays of the good build are done once."""
     with open_ground(tmp_path_factory.mktemp("regressions")) as ground:
         yield ground
 
 
 @pytest.fixture
-def policy() -> Any:
+def policy():
     return load_policy()
 
 
 @pytest.fixture
-def judge(home: Ground, passes: list[Any], packets: Packets, make_build: Callable, policy: Any):
+def judge(home, passes, packets, make_build, policy):
     """Hold a build that sends these packets against the build that flew."""
 
-    def run(
-        given: Packets | None = None, archives: list[Path] | None = None, repeated: bool = False, **options: Any
-    ) -> RegressionOutcome:
+    def run(given=None, archives=None, repeated=False, **options):
         baseline = register_build(home, load_build(make_build("good", packets)))
         candidate = register_build(home, load_build(make_build("candidate", given or packets, **options)))
         return run_regression(
@@ -143,19 +137,19 @@ def judge(home: Ground, passes: list[Any], packets: Packets, make_build: Callabl
     return run
 
 
-def replays(connection: Connection) -> list[Any]:
+def replays(connection):
     return list(connection.execute(select(REPLAYS.c.id, REPLAYS.c.downlink_sha256)))
 
 
-def gate(outcome: RegressionOutcome, name: str) -> Gate:
+def gate(outcome, name):
     return next(gate for gate in outcome.gates if gate.name == name and not gate.pass_id)
 
 
-def ended(outcome: RegressionOutcome) -> tuple[str, int]:
+def ended(outcome):
     return outcome.verdict, verdict_document(outcome).exit_status
 
 
-def failed(outcome: RegressionOutcome) -> set[str]:
+def failed(outcome):
     return {gate.name for gate in outcome.gates if gate.outcome == "fail"}
 
 
@@ -253,7 +247,7 @@ def test_a_build_that_fails_on_one_pass_is_judged_on_the_others(judge, packets):
 
 
 @pytest.fixture
-def copy(first: Path, tmp_path: Path) -> Path:
+def copy(first, tmp_path):
     return shutil.copytree(first, tmp_path / "copy")
 
 
@@ -559,7 +553,7 @@ def test_the_shipped_policy_gives_a_reason_for_every_number():
     assert load_policy(Path("ci")) == load_policy()
 
 
-def changed_here_and_there(items: dict[str, Any]) -> dict[str, Any]:
+def changed_here_and_there(items):
     """Return detections of a slightly different build: every twelfth is missing in some frames."""
     kept = np.arange(len(items["u_px"])) % 12 != int(items["u_px"].sum()) % 17
     return {name: values[kept] for name, values in items.items()}

@@ -1,8 +1,6 @@
 """Performance over stored reports, and monthly reports by operation, command, rule and nightly job."""
 
 import json
-from collections.abc import Callable, Iterator
-from typing import Any
 
 import pytest
 from pytest import raises
@@ -25,7 +23,6 @@ from ground_service.evaluation.performance.service import (
 )
 from ground_service.evaluation.service import make_report
 from ground_service.evaluation.store import add_report
-from ground_service.ground import Ground
 from ground_service.http.model import UtcTime
 from ground_service.jobs.service import enter_job
 from ground_service.passes.archive_import import import_archive
@@ -39,30 +36,30 @@ from ground_service.worker.upkeep import nightly
 from linna.cli import run
 from linna.commands.results import performance_lines
 from lunar.timescales import parse_utc
-from tests.ground_service.conftest import ALTITUDE_M, SPACECRAFT, SyntheticPass
+from tests.ground_service.conftest import ALTITUDE_M, SPACECRAFT
 
 DAY_NS = 86_400_000_000_000
 FIRST = parse_utc("2029-08-02T06:00:00Z")
 
 
 @pytest.fixture(scope="module")
-def flown(make_pass: Callable[..., SyntheticPass]) -> SyntheticPass:
+def flown(make_pass):
     return make_pass(frames=30, seed=9)
 
 
 def add_pass(
-    ground: Ground,
-    number: int,
+    ground,
+    number,
     *,
-    instance: str = FLOWN,
-    recall: Any = ...,
-    error: float = 80.0,
-    altitude: float | None = 25.0,
-    status: str = "met",
-    build: str = "a",
-    key: str = "accuracy.median",
-    limit: float | None = 100.0,
-) -> int:
+    instance=FLOWN,
+    recall=...,
+    error=80.0,
+    altitude=25.0,
+    status="met",
+    build="a",
+    key="accuracy.median",
+    limit=100.0,
+):
     """Add a pass with a report, one a day."""
     start = FIRST + number * DAY_NS
     pass_id = define_pass(
@@ -125,7 +122,7 @@ def add_pass(
     return pass_id
 
 
-def group_means(found: Any) -> dict[tuple[str, str, str], Any]:
+def group_means(found):
     return {(one.factor, one.group, one.metric): one for one in found.groups}
 
 
@@ -198,7 +195,7 @@ def test_the_same_month_is_stored_once_and_late_data_give_a_new_report(either):
         make_monthly_report(either, SPACECRAFT, "2029-09")
 
 
-def monthly(ground: Ground) -> list[Any]:
+def monthly(ground):
     return ground.read(list_monthly_reports, MonthlyReportFilter()).items
 
 
@@ -211,7 +208,7 @@ def test_months():
 
 
 @pytest.fixture
-def september() -> Iterator[None]:
+def september():
     set_mission_clock(lambda: parse_utc("2029-09-01T00:00:05Z"))
     yield
     set_mission_clock(None)
