@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks._rows import Row
 from benchmarks._servers import Deployment
-from studies.harness.parts import Part
+from studies.harness.parts import Part, descendants
 
 READS = (
     "/passes", "/passes/1", "/passes/1/completeness", "/passes/1/events?limit=50", "/passes/1/detections?limit=50",
@@ -119,10 +119,13 @@ def _peak_anonymous_mib(part: Part) -> Iterator[list[int]]:
         watcher.join()
 
 
-def processor_s(part: Part) -> float:
-    """Processor time of a part so far, s."""
-    fields = Path(f"/proc/{part.pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+def processor_s(part: Part, *, children: bool = False) -> float:
+    """Processor time of a part so far, s; also of its children, where asked."""
+    found = 0
+    for pid in (part.pid, *(descendants(part.pid) if children else ())):
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        found += sum(map(int, fields[11 : 15 if children else 13]))
+    return found / os.sysconf("SC_CLK_TCK")
 
 
 def resident_mib(part: Part, name: str) -> int:

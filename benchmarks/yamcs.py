@@ -6,7 +6,6 @@ servers (with the JVM's own compiler). Yamcs is started with what `linna tm yamc
 `python -m benchmarks.campaigns.compatibility --row Yamcs` makes.
 """
 
-import os
 import socket
 import subprocess
 import sys
@@ -16,19 +15,20 @@ import urllib.parse
 import urllib.request
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import httpx
 
-from benchmarks._ground_service import resident_mib, wait_for_job
+from benchmarks._ground_service import processor_s, resident_mib, wait_for_job
 from benchmarks._rows import ROOT, NotMeasured, Row
 from benchmarks._servers import Deployment
 from benchmarks._yamcs import Server, until
 from benchmarks.ground import START, mixed_downlink
 from lunar.constants import DAY_NS
 from lunar.timescales import format_utc
-from studies.harness.parts import Part, descendants, free_port
+from studies.harness.parts import free_port
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.link.frame_reading import plain_frames
 from tmtc.link.settings import LinkSettings
@@ -45,15 +45,7 @@ FIGURES = (
     ("memory", "largest memory of the server", "MiB"),
     ("start", "start until it answers", "s"),
 )
-
-
-def processor_s(part: Part) -> float:
-    """Return the processor time of a process and its children until now."""
-    found = 0
-    for pid in (part.pid, *descendants(part.pid)):
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        found += sum(map(int, fields[11:15]))
-    return found / os.sysconf("SC_CLK_TCK")
+spent = partial(processor_s, children=True)
 
 
 def ours(stream: bytes, warm: bytes) -> dict[str, float]:
@@ -68,14 +60,14 @@ def ours(stream: bytes, warm: bytes) -> dict[str, float]:
                 wait_for_job(client, answer.raise_for_status().json()["job_id"])
 
             send(warm)
-            used = processor_s(part)
+            used = spent(part)
             send(stream)
-            found["store"] = PACKETS / (processor_s(part) - used)
+            found["store"] = PACKETS / (spent(part) - used)
             found["memory"] = resident_mib(part, "VmHWM")
             key = client.post("/passes", json=_definition()).raise_for_status().json()["id"]
-            used = processor_s(part)
+            used = spent(part)
             text = client.get(f"/passes/{key}/packets/{PACKET}?format=csv").raise_for_status().text
-            found["read"] = _values(text) / (processor_s(part) - used)
+            found["read"] = _values(text) / (spent(part) - used)
     return found
 
 
@@ -99,14 +91,14 @@ def theirs(stream: bytes, warm: bytes) -> dict[str, float]:
         server = Server(stack, folder, http, ENVIRONMENT)
         found = {"start": time.monotonic() - begin}
         before = _send(server, warm, frames)
-        used = processor_s(server.part)
+        used = spent(server.part)
         stored = _send(server, stream, frames) - before
-        found["store"] = stored / (processor_s(server.part) - used)
+        found["store"] = stored / (spent(server.part) - used)
         found["lost"] = PACKETS - stored
         found["memory"] = resident_mib(server.part, "VmHWM")
-        used = processor_s(server.part)
+        used = spent(server.part)
         number = _values(_exported(server))
-        found["read"] = number / (processor_s(server.part) - used)
+        found["read"] = number / (spent(server.part) - used)
     return found
 
 
