@@ -97,9 +97,9 @@ def ingest(packets: int, database_url: str | None) -> tuple[float, float]:
     return rates[0], rates[1]
 
 
-def definition(packets: int) -> dict[str, Any]:
+def definition(packets: int, step_ns: int = STEP_NS) -> dict[str, Any]:
     """A pass over all of `mixed_downlink(packets)`."""
-    stop = format_utc(START + packets * STEP_NS // 4)
+    stop = format_utc(START + packets * step_ns // 4)
     return {"name": "all", "start": format_utc(START), "stop": stop, "spacecraft_id": 76}
 
 

@@ -17,7 +17,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import httpx
 
@@ -25,7 +24,7 @@ from benchmarks._ground_service import processor_s, resident_mib, wait_for_job
 from benchmarks._rows import ROOT, NotMeasured, Row
 from benchmarks._servers import Deployment
 from benchmarks._yamcs import Server, until
-from benchmarks.ground import START, mixed_downlink
+from benchmarks.ground import START, definition, mixed_downlink
 from lunar.constants import DAY_NS
 from lunar.timescales import format_utc
 from studies.harness.parts import free_port
@@ -64,16 +63,11 @@ def ours(stream: bytes, warm: bytes) -> dict[str, float]:
             send(stream)
             found["store"] = PACKETS / (spent(part) - used)
             found["memory"] = resident_mib(part, "VmHWM")
-            key = client.post("/passes", json=_definition()).raise_for_status().json()["id"]
+            key = client.post("/passes", json=definition(PACKETS, STEP_NS)).raise_for_status().json()["id"]
             used = spent(part)
             text = client.get(f"/passes/{key}/packets/{PACKET}?format=csv").raise_for_status().text
             found["read"] = _values(text) / (spent(part) - used)
     return found
-
-
-def _definition() -> dict[str, Any]:
-    stop = format_utc(START + PACKETS // 4 * STEP_NS)
-    return {"name": "all", "start": format_utc(START), "stop": stop, "spacecraft_id": 76}
 
 
 def _values(table: str) -> int:
