@@ -305,7 +305,7 @@ class Campaign:
             state = str(repository.get(connection, repository.WINDOWS, window, "window")["decision"])
             rows = connection.execute(select(table.c.name, table.c.state).where(table.c.window_id == window)).all()
         live = Counter(row[0] for row in rows if row[1] != "rejected")
-        waiting = [row for row in rows if row[1] in ("released", "carried")]
+        waiting = [row for row in rows if row[1] in ("released", "carried") and row[0] != "delete_activity"]
         message = f"window {window} {state}: {[tuple(row) for row in rows]}"
         self.tally.fault("two_winners", "window", message, live["enable_schedule"] > 1)
         self.tally.fault("withdrawn_but_live", "window", message, state != "approved" and bool(waiting))
