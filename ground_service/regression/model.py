@@ -20,7 +20,7 @@ COMPLETE, TO_RENDER, TELEMETRY_ONLY = "complete", "to render", "telemetry only"
 
 
 LEAST_OVERLAP = 0.5
-"""Share of the elapsed time of two replays during which both ran, from which their processor times are compared."""
+"""Share of the time of the shorter of two replays during which both ran, from which processor times are compared."""
 
 REASONS_LIMIT = 5
 """Reasons in a list; the verdict has all."""
@@ -82,11 +82,11 @@ class KeptReplay(Entity):
     created_utc_ns: int = 0
 
     def overlaps(self, other: KeptReplay) -> bool:
-        """Return whether both ran on one machine at the same time, for most of the time of the longer one."""
+        """Return whether both ran on one machine at the same time, for most of the time of the shorter one."""
         if self.machine != other.machine:
             return False
         (first, short), (last, long) = sorted((one.created_utc_ns / 1e9, one.wall_s) for one in (self, other))
-        return first - max(first - short, last - long) > LEAST_OVERLAP * max(short, long)
+        return first - max(first - short, last - long) > LEAST_OVERLAP * min(short, long)
 
 
 class ArchiveChange(RequestModel):

@@ -181,8 +181,9 @@ def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge, mo
     assert message in outcome.remarks
     one = KeptReplay(outcome="ok", detail="", machine="a", wall_s=8.0)
     changed = ({"created_utc_ns": at} for at in (3 * 10**9, 5 * 10**9))
-    overlaps = [one.overlaps(one.model_copy(update=values)) for values in (*changed, {"machine": "b"})]
-    assert overlaps == [True, False, False]
+    slow = {"created_utc_ns": 24 * 10**9, "wall_s": 32.0}  # begins with the other and takes four times as long
+    overlaps = [one.overlaps(one.model_copy(update=values)) for values in (*changed, {"machine": "b"}, slow)]
+    assert overlaps == [True, False, False, True]
     # Short replays of a loaded machine may miss each other.
     monkeypatch.setattr(KeptReplay, "overlaps", lambda _one, _other: True)
     again = judge(network_ms=20.0, repeated=True)
