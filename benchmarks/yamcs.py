@@ -101,8 +101,9 @@ def _send(server: Server, cadus: bytes, port: int) -> int:
     frames = list(plain_frames([cadus], LinkSettings()))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         for at in range(0, len(frames), FRAMES_A_TURN):
-            wanted = _count(server, "frames") + len(frames[at : at + FRAMES_A_TURN])
-            for frame in frames[at : at + FRAMES_A_TURN]:
+            turn = frames[at : at + FRAMES_A_TURN]
+            wanted = _count(server, "frames") + len(turn)
+            for frame in turn:
                 out.sendto(frame, ("127.0.0.1", port))
             with suppress(TimeoutError):
                 until(lambda wanted=wanted: _count(server, "frames") >= wanted, TURN_S, "frames", 0.02)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lunar.arrays import FloatArray, IntArray
-from lunar.ephemeris import INTERPOLATIONS, Covariance, Ephemeris, EphemerisSegment, read_text
+from lunar.ephemeris import INTERPOLATIONS, Covariance, Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError, UnknownFrameError, UnknownTimeSystemError
 from lunar.frames import ICRF_NAMES, J2000_NAMES, icrf_from_j2000
 from lunar.messages.kvn import Lines, comment_lines, epoch_texts, is_number, numbered_lines, utc_epoch_text
@@ -43,11 +43,6 @@ _META_KEYS = (
     "INTERPOLATION_DEGREE",
 )
 _LOWER = np.tril_indices(6)
-
-
-def load_oem(path: Path | str) -> Ephemeris:
-    """Return the ephemeris in an OEM file; raises as `parse_oem`."""
-    return parse_oem(read_text(path, "a CCSDS OEM"), source=str(path))
 
 
 def save_oem(ephemeris: Ephemeris, path: Path | str) -> None:

@@ -36,7 +36,7 @@ from ground_service.telemetry.packets import batch_of_cut
 from ground_service.telemetry.rollups import BASE_TICKS, HOUSEKEEPING_VALUES, STATE_VALUES
 from ground_service.telemetry.writing import store_samples
 from lunar.frames import IauOrientation, rtn_from_inertial, spherical_from_mcmf
-from lunar.messages.oem import load_oem
+from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns, ticks_from_utc_ns
 from tests.ground_service.conftest import NS, SPACECRAFT, define_pass_of, encode_downlink, enter_files
 from tests.lazy import Lazy
@@ -210,7 +210,7 @@ DIAGONAL = 1.5**2 + 0.8**2 + 1.0
 def anchored_packets(made, version):
     """States and estimates of an anchored filter on the orbit of the synthetic pass, erring by `ERROR_RTN_M`."""
 
-    reference = load_oem(made.folder / "reference.oem")
+    reference = load_ephemeris(made.folder / "reference.oem")
     packets = []
     for k, utc_ns in enumerate(made.utc_ns.tolist()):
         state = np.concatenate([np.ravel(part) for part in reference.at(np.array([utc_ns]))])

@@ -27,7 +27,8 @@ from lunar.catalogue import load_catalogue
 from lunar.constants import GM_MOON_M3_S2, MOON_RADIUS_M
 from lunar.ephemeris import Ephemeris, ephemeris_from_states
 from lunar.frames import IauOrientation
-from lunar.messages.oem import load_oem, save_oem
+from lunar.messages.ephemeris_files import load_ephemeris
+from lunar.messages.oem import save_oem
 from lunar.third_bodies import sun_position_icrf_m
 from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from tests.ground_service.conftest import add_reference, save_circle
@@ -127,7 +128,7 @@ def test_an_empty_result_names_the_smallest_set_of_constraints_and_the_nearest_r
 
 def test_craters_are_counted_in_the_camera(make_pass):
     folder = make_pass(frames=6, seed=3).folder
-    ephemeris, catalogue = load_oem(folder / "reference.oem"), load_catalogue(folder / "catalogue.csv")
+    ephemeris, catalogue = load_ephemeris(folder / "reference.oem"), load_catalogue(folder / "catalogue.csv")
     plan = Planner(ephemeris, IauOrientation(), Resources(), PinholeCamera(), catalogue)
     (one,) = search(plan, craters_per_frame=30.0, minimum_duration_s=60.0).candidates
     assert one.craters_per_frame[0] >= 30.0
@@ -257,7 +258,7 @@ def test_a_window_outside_the_ephemerides_has_no_prediction_and_is_refused_if_it
 
 
 def test_an_ephemeris_that_gravity_does_not_move_is_refused_with_the_accelerations(ground, tmp_path):
-    (one,) = load_oem(save_circle(tmp_path / "km.oem")).segments
+    (one,) = load_ephemeris(save_circle(tmp_path / "km.oem")).segments
     metres = replace(one, position_m=1e3 * one.position_m, velocity_m_s=1e3 * one.velocity_m_s)
     save_oem(Ephemeris((metres,)), tmp_path / "m.oem")
     message = r"ephemeris, states of SELENITA: expected an acceleration of \S+ m/s2 .* found .*metres for kilo"

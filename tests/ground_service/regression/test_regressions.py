@@ -180,8 +180,8 @@ def test_processor_times_are_compared_only_of_replays_at_the_same_time(judge, mo
     message = "no latency is compared on 2 of 2 passes: the builds were not replayed at the same time"
     assert message in outcome.remarks
     one = KeptReplay(outcome="ok", detail="", machine="a", wall_s=8.0)
-    changed = ({"created_utc_ns": at} for at in (3 * 10**9, 5 * 10**9))
-    slow = {"created_utc_ns": 24 * 10**9, "wall_s": 32.0}  # begins with the other and takes four times as long
+    changed = ({"created_utc_ns": at} for at in (3e9, 5e9))
+    slow = {"created_utc_ns": 24e9, "wall_s": 32.0}  # begins with the other and takes four times as long
     overlaps = [one.overlaps(one.model_copy(update=values)) for values in (*changed, {"machine": "b"}, slow)]
     assert overlaps == [True, False, False, True]
     # Short replays of a loaded machine may miss each other.

@@ -8,7 +8,7 @@ from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment
 from lunar.errors import DataFileError, UnknownFrameError, UnknownTimeSystemError
 from lunar.frames import icrf_from_j2000
 from lunar.messages.ephemeris_files import load_ephemeris
-from lunar.messages.oem import format_oem, load_oem, parse_oem, save_oem
+from lunar.messages.oem import format_oem, parse_oem, save_oem
 from lunar.messages.oem_xml import format_oem_xml, parse_oem_xml
 from lunar.timescales import TIME_SYSTEMS, format_utc, parse_tai, parse_utc, utc_ns_from_tai_ns
 from tests.lunar.messages.test_messages import assert_same, rows_of
@@ -242,7 +242,7 @@ STOP_TIME            = 2029-08-07T00:04 | STOP_TIME = 2029-08-07T00:03 | line 24
 623 0.1¶ | 623 0.1¶what now¶ | line 25: expected META_START, found 'what now'
 """
 CUT = """
-CCSDS | line 1: expected CCSDS_OEM_VERS = 1.0, 2.0 or 3.0, found nothing
+CCSDS | first line: expected CCSDS_OEM_VERS
 2029-08-07T00:03:00.000Z | line 22: expected a last state at STOP_TIME
 COMMENT propagated | expected a state: epoch x y z vx vy vz, found the end
 META_STOP | expected more lines, found the end of the file
@@ -260,7 +260,7 @@ def test_a_faulty_file_is_refused_in_one_line_with_its_place(tmp_path, text, mes
     path = tmp_path / "faulty.oem"
     path.write_text(text)
     with pytest.raises(DataFileError) as caught:
-        load_oem(path)
+        load_ephemeris(path)
     found = str(caught.value)
     assert found.startswith(str(path)) and message in found and "\n" not in found
 
@@ -273,7 +273,7 @@ def test_an_unknown_frame_and_an_unknown_time_system_are_refused_with_what_is_kn
     ):
         path.write_text(replaced(old, new))
         with pytest.raises(error, match=rf"faulty\.oem: line {message}.*, found '{new.strip('= ')}'"):
-            load_oem(path)
+            load_ephemeris(path)
 
 
 # Leap seconds
