@@ -305,7 +305,7 @@ def _campaign(
                 findings += _judged(profile, kind, run, out / kind.replace(" ", "-"))
             findings += [
                 Finding(profile, kind, "seen from outside", True, text)
-                for text in [*service.damage(), *_left(leftovers[kind], folder, out)]
+                for text in [*service.damage(), *_left(kind, leftovers[kind], folder, out)]
             ]
             _tell(profile, kind, run, findings)
         worker.stdout.close()
@@ -348,12 +348,12 @@ def _judged(profile: str, kind: str, run: Mapping[str, Any], place: Path) -> lis
     return found
 
 
-def _left(leftover: str, folder: Path, out: Path) -> list[str]:
-    """Return processes and files of a build that remain after its run."""
+def _left(kind: str, leftover: str, folder: Path, out: Path) -> list[str]:
+    """Return processes and files of a build that remain after its run, while the next one may run already."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
-            if re.search(f"{leftover}|attack.py", (entry / "cmdline").read_text(errors="replace")):
+            if re.search(f"{leftover}|attack.py\0{kind}\0", (entry / "cmdline").read_text(errors="replace")):
                 found.append(f"process {entry.name} is alive")
     for place in map(Path, ("/tmp", "/dev/shm", "/var/tmp", "/run", "/", folder, out, ROOT)):
         if (place / leftover).exists():

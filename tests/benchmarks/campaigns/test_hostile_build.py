@@ -1,11 +1,13 @@
 """Hostile build against the sandbox: two kinds of attack in the suite, every kind with each profile as campaign."""
 
 import os
+import subprocess
+import sys
 
 import pytest
 
 from benchmarks.campaigns.hostile.attack_kinds import KINDS
-from benchmarks.campaigns.hostile_build import campaign, went_well
+from benchmarks.campaigns.hostile_build import _left, campaign, went_well
 
 root_only = pytest.mark.skipif(os.geteuid() != 0, reason="the profile can be taken by root only")
 
@@ -21,6 +23,16 @@ def test_a_hostile_build_achieves_nothing_as_the_user_of_the_tests(kinds):
     result = campaign("user", kinds)
     assert held(result)
     assert result.attempts > 150 and "private root" in result.isolation
+
+
+def test_a_process_that_remains_is_of_the_kind_that_left_it(tmp_path):
+    words = ["-c", "import time; time.sleep(60)", "x/attack.py", "daemon", "archive"]
+    with subprocess.Popen([sys.executable, *words]) as process:
+        try:
+            found = [_left(kind, "nothing-like-it", tmp_path, tmp_path) for kind in ("daemon", "stop others")]
+        finally:
+            process.kill()
+    assert f"process {process.pid} is alive" in found[0] and found[1] == []
 
 
 @root_only
