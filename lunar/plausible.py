@@ -120,7 +120,7 @@ not. Also the longest silence within one stretch of telemetry, shorter than an o
 SILENCE_S = 400.0 * 86_400.0
 """Longest silence of a spacecraft that flies on: a year of hibernation."""
 
-SIMULATED_AHEAD_S = 50.0 * 365.25 * 86_400.0
+SIMULATED_AHEAD_S = 20.0 * 365.25 * 86_400.0
 """Simulated flights, whose recordings arrive before their time, are no further ahead."""
 
 UNSET_CLOCK_S = 366.0 * 86_400.0

@@ -40,7 +40,6 @@ def moon_barycentric_icrf_m(tdb_s: ArrayLike) -> FloatArray:
 
 def sun_position_icrf_m(tdb_s: ArrayLike) -> FloatArray:
     """Return the Sun's position from the Moon's centre, shape ``(..., 3)``, at TDB seconds past J2000 ``(...)``."""
-
     seconds = np.asarray(tdb_s, dtype=np.float64)
     return -(_earth_from_sun_m(seconds) + _moon_from_earth_m(seconds))
 

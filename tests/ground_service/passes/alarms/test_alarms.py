@@ -36,7 +36,7 @@ from tmtc.downlink import encode_cadus
 
 SPACECRAFT = 76
 SECOND = 65_536
-START = 1_900_000_000 * SECOND
+START = 1_000_000_000 * SECOND
 
 
 def housekeeping(second, temperature_c):
