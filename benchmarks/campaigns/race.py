@@ -407,7 +407,10 @@ def run(folder: Path, url: str, races: int, apis: int = 2, seed: int = 1) -> Fig
     prepare_database(url, upgrade=True).engine.dispose()
     with open_ground(folder / "home", database_url=url) as ground:
         tokens, builds = prepare(ground, folder)
-        with Deployment(folder, apis, url=url, LINNA_PLACEBO_PASSES="0") as service, closing(Racers(service.ports, tokens)) as racers:
+        with (
+            Deployment(folder, apis, url=url, LINNA_PLACEBO_PASSES="0") as service,
+            closing(Racers(service.ports, tokens)) as racers,
+        ):
             return Campaign(ground, racers, builds, seed).run(races)
 
 
