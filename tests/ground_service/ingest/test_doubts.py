@@ -249,7 +249,10 @@ def test_reports_of_another_source_do_not_verify_a_telecommand(either):
     later = TICKS + HOUR
     receive(either, report(later, 900) + completed(later + 9, request, 7))  # of another flight
     assert get_command(either, key).state == "sent"
-    receive(either, completed(later + 10, request, 41))
+    receive(either, completed(later + 10, request, 41) + completed(later + 11, 5, 16_383))
+    assert get_command(either, key).state == "completed"
+    key, request = sent(either)
+    receive(either, completed(later + HOUR, request, 2))  # the count has begun again at 0
     assert get_command(either, key).state == "completed"
 
 

@@ -144,6 +144,12 @@ def test_craters_are_counted_by_area_and_searched_for(planned, tmp_path):
     assert rows[17, 17] > rows[9, 18] / 2  # one crater in a smaller cell
 
 
+def test_a_catalogue_without_a_crater_is_refused(ground):
+    stored = ground.files.put_octets(b"id,latitude_deg,longitude_deg,diameter_m,depth_m\n")
+    with pytest.raises(InvalidInput, match=r"catalogue: expected a crater catalogue, found none\.csv: no crater$"):
+        add_catalogue(ground, stored, "none.csv")
+
+
 def test_a_withdrawn_catalogue_is_not_used_and_can_be_held_again(ground, tmp_path):
     octets = b"id,latitude_deg,longitude_deg,diameter_m,depth_m\n1,2.0,3.0,6000.0,600.0\n"
     stored = ground.files.put_octets(octets)

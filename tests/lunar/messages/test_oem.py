@@ -265,6 +265,13 @@ def test_a_faulty_file_is_refused_in_one_line_with_its_place(tmp_path, text, mes
     assert found.startswith(str(path)) and message in found and "\n" not in found
 
 
+def test_a_line_of_more_than_64_kib_is_refused_before_it_is_parsed(tmp_path):
+    path = tmp_path / "long.oem"
+    path.write_text(replaced("EME2000", "E" * (1 << 17)))
+    with pytest.raises(DataFileError, match=r"expected at most 65536 octets in a line, found more$"):
+        load_ephemeris(path)
+
+
 def test_an_unknown_frame_and_an_unknown_time_system_are_refused_with_what_is_known(tmp_path):
     path = tmp_path / "faulty.oem"
     for old, new, error, message in (

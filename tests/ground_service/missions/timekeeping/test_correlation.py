@@ -175,6 +175,11 @@ def test_a_clock_that_was_set_after_its_only_station_was_right_is_no_fault_of_th
     assert doubted_stations(*given)[0].all() and len(clock_runs(*given[:4])) == 2
 
 
+def test_a_single_station_that_was_corrected_counts_from_then_on():
+    kept, _ = doubted_stations(*reports_of_stations("a" * 8, {"a": [-18.0] * 4 + [0.0] * 4}))
+    assert kept.tolist() == [False] * 4 + [True] * 4
+
+
 @pytest.mark.parametrize("step_s, runs", [(0.1, 1), (1.0, 2)])
 def test_two_reports_hours_apart_show_a_drift_that_an_oscillator_can_have_and_otherwise_a_step(step_s, runs):
     ticks, sent, *zero = reports_of_stations("aa", {"a": [0.0] * 2}, [0.0, step_s])[:4]
@@ -198,7 +203,8 @@ def test_a_new_correlation_moves_the_times_that_its_line_changes():
     assert moved_ticks([one, two], [one, two]) == (None, None)
     assert moved_ticks([one, two], [one, moved]) == (550 << 16, (1 << 48) - 1)
     assert moved_ticks([moved], [one, moved]) == (0, 1000 << 16)
-    assert moved_ticks([], [one]) == (0, (1 << 48) - 1)
+    ideal = TimeCorrelation(4, 0, 100 << 16, 0, int(utc_ns_of_ticks(np.array([0]), [])[0][0]), 0.0)
+    assert moved_ticks([], [one]) == moved_ticks([ideal], []) == (0, (1 << 48) - 1)
 
 
 def test_a_correlation_holds_years_away():
