@@ -1,6 +1,5 @@
 """Faults that are planted in short flights are flagged by the requirement that they break, and by no other."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -12,9 +11,8 @@ from ground_service.passes.archive_import import import_archive
 from ground_service.passes.store import get_pass
 from lunar.datafolder import DataFolder
 from payload_emulator.session.archive.emulator import emulate
-from payload_emulator.session.scenario import Scenario, parse_scenario
+from payload_emulator.session.scenario import parse_scenario
 from payload_emulator.session.world import camera
-from reports.values import PassReport
 from tests.scenarios import live_scenario
 
 # The simulated detector finds 70 % of the craters in view; the limit of the recall is a tenth below.
@@ -35,8 +33,6 @@ consistency_inside_percent = -1.0
 drift_ppm = 5.0
 """
 SCENARIO = parse_scenario(live_scenario("planted", 3, 600.0) + LIMITS)
-
-Fly = Callable[[Scenario], PassReport]
 
 
 @pytest.fixture(scope="module")

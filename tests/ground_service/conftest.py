@@ -591,5 +591,18 @@ class Clock:
 def mission_time():
     made = Clock()
     set_mission_clock(lambda: made.utc_ns)
-    yield made
-    set_mission_clock(None)
+    return made
+
+
+@pytest.fixture
+def now(mission_time):
+    """Mission time at the start of the synthetic passes."""
+    mission_time.utc_ns = START
+    return mission_time
+
+
+@pytest.fixture(autouse=True)
+def wall_clock_again():
+    """Let mission time be the wall clock after a test."""
+    yield
+    set_mission_clock()

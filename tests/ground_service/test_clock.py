@@ -3,15 +3,7 @@
 import struct
 import time
 
-import pytest
-
 from ground_service.clock import ClockFile, mission_now_ns, set_mission_clock
-
-
-@pytest.fixture(autouse=True)
-def _wall_clock_again():
-    yield
-    set_mission_clock()
 
 
 def test_mission_time_is_the_wall_clock_until_a_simulation_sets_it():

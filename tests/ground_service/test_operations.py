@@ -197,10 +197,9 @@ def shift(tmp_path_factory):
             enter_command(ground, name, arguments, spacecraft_id=76, actor="operator")
         release_command(ground, 1, actor="operator")
         yield opened, headers
-    set_mission_clock()
 
 
-def test_each_mistake_of_the_documents_is_refused_with_its_line(shift):
+def test_each_mistake_of_the_documents_is_refused_with_its_line(shift, now):
     client, headers = shift
     assert len(REFUSALS) >= 40
     for mistake, request, body, header, status, line in REFUSALS:

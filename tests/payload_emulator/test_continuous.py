@@ -7,7 +7,6 @@ import socket
 import struct
 import threading
 import time
-from typing import Any
 
 import numpy as np
 import pytest
@@ -167,8 +166,6 @@ def packets_of(records):
 
 WINDOW = EPOCH + 7 * HOUR_NS + 37 * NS
 """Start of the window, whose frames lie between whole minutes; the scenario itself observes after its epoch."""
-
-Flight = tuple[LiveSession, Ground, list[tuple[int, str, dict[str, Any]]]]
 
 
 @pytest.fixture(scope="module")

@@ -139,8 +139,6 @@ def test_an_incomplete_installation_counts_as_none(tmp_path, openmct, missing):
 
 V1 = "/api/v1"
 
-Guarded = tuple[TestClient, dict[str, dict[str, str]]]
-
 
 def test_an_administrator_manages_users(guarded):
     client, heads = guarded

@@ -8,16 +8,15 @@ import pytest
 from ground_service.errors import InvalidInput, NotFound
 from ground_service.evaluation import service as reports
 from ground_service.evaluation.service import evaluate, make_report, pass_summary
-from ground_service.ground import Ground, open_ground
+from ground_service.ground import open_ground
 from ground_service.http.model import Paging
 from ground_service.passes.archive_import import import_archive
 from ground_service.store import repository
 from lunar.timescales import format_utc
-from reports.values import PassReport, SettingsComparison
+from reports.values import SettingsComparison
 from tests.ground_service.archive_hash import archive_hash
 from tests.ground_service.conftest import enter_files
 
-Imported = tuple[Ground, int, PassReport]
 FRAMES = 40
 
 

@@ -27,7 +27,6 @@ from lunar.timescales import parse_utc, tdb_s_from_utc_ns
 from payload_emulator.flight.navigation.filter.filter import CommonErrors
 from tests.payload_emulator.flight.test_dynamics import start_state
 
-Arrays = tuple[np.ndarray, np.ndarray]
 EPOCH = parse_utc("2029-08-07T00:00:00Z")
 START_S = float(tdb_s_from_utc_ns(EPOCH))
 STEP_S, STATES = 60.0, 30

@@ -36,12 +36,6 @@ DAY = 24 * HOUR
 YEARS = 70 * 365 * DAY
 
 
-@pytest.fixture(autouse=True)
-def clock():
-    yield
-    set_mission_clock()
-
-
 LAST = TICKS + 11 * (60 << 16)
 
 

@@ -44,7 +44,6 @@ def state(ground, clock, number=76):
 def _wall_clock_again():
     yield
     follow_missions(None)
-    set_mission_clock(None)
 
 
 def seconds_after_start():

@@ -31,12 +31,6 @@ MINUTE = 60 * NS
 MISSION = b'name = "m"\n[spacecraft]\nid = 76\nname = "SelenITA"\n'
 
 
-@pytest.fixture
-def now(mission_time):
-    mission_time.utc_ns = START
-    return mission_time
-
-
 def add(ground, start=START + 60 * MINUTE, spacecraft=76):
     return planning.add_window(ground, WindowEntry("w", start, start + 10 * MINUTE, 15.0, spacecraft), actor="ann")
 

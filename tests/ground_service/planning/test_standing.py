@@ -2,7 +2,6 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 
@@ -21,7 +20,6 @@ from ground_service.worker.follow_up import follow_in_process
 from tests.ground_service.conftest import START, add_reference, save_circle
 from tests.scenarios import SELENITA
 
-DOCS = Path(__file__).resolve().parents[3] / "docs"
 NS = 10**9
 HOUR = 3600 * NS
 DAYS = 3
@@ -51,12 +49,6 @@ station = "there"
 uplink = "127.0.0.1:9"
 """
 AUTOMATIC = '[approval]\nwindows = "automatic"\n'
-
-
-@pytest.fixture
-def now(mission_time):
-    mission_time.utc_ns = START
-    return mission_time
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

@@ -4,7 +4,6 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 
 import pytest
 from sqlalchemy import MetaData, text
@@ -31,8 +30,6 @@ from tests.serving import wait_for
 HEAD = known_revisions()[0]
 EXPANSION = f"9.1_works_with_{HEAD}"
 ADD = 'op.add_column("users", sa.Column("remark", sa.Text(), nullable=True))'
-
-Migrations = Callable[..., None]
 
 
 @pytest.fixture

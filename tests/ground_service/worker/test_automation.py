@@ -45,25 +45,14 @@ from tests.ground_service.conftest import (
     circular_states,
     encode_downlink,
 )
+from tests.scenarios import SYNTHETIC
 
 FRAMES = 24
 STOP = START + 10 * CADENCE_S * NS
 
-MISSION = f"""
-name = "live"
-[spacecraft]
-id = {SPACECRAFT}
+MISSION = f"""{SYNTHETIC}gravity_degree = 12
 [time]
 correlation = "ideal"
-[frames]
-orientation = "IAU WGCCRE 2009"
-gravity_field = "GRGM1200L (12x12, built in)"
-gravity_degree = 12
-[camera]
-width_px = 512
-height_px = 512
-fov_deg = 120.0
-pointing = "nadir"
 [catalogue]
 source = "synthetic craters"
 sha256 = "{{sha256}}"
