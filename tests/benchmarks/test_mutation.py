@@ -1,7 +1,4 @@
-"""Groups of the mutation tests, and excluded mutants. The figures of how two renderings agree. Limits from
-healthy passes, against the published factors of one-sided normal tolerance bounds. The list of benchmarks:
-rows with peers, what is missing on the machine, and rows that contradict the expectation.
-"""
+"""Groups of the mutation tests; figures and limits of the benchmarks, and the list of them."""
 
 import json
 import math

@@ -1,6 +1,4 @@
-"""Rotations against SPICE, pymap3d, ERFA and a published example of NAIF. Ground tracks of an orbit in closed
-form: altitude, period, speed and passes. What is found in a data folder, and what is used in its place.
-"""
+"""Rotations against SPICE, pymap3d, ERFA and NAIF; ground tracks in closed form; data folders."""
 
 import json
 import math

@@ -1,7 +1,4 @@
-"""Orbits against closed forms, against a tighter run, and where they end; elements and burns by their
-definitions. Earth and Sun seen from the Moon against a published ephemeris. Differences of ephemerides in
-radial, transverse and normal axes.
-"""
+"""Orbits against closed forms, a tighter run and a published ephemeris; elements, burns, differences."""
 
 import json
 import math

@@ -1,6 +1,4 @@
-"""A pass with contacts, losses and faults, without rendering: the archive's own account is what the ground
-finds.  Errors of the reference: their sizes, their dynamics, and that shipped scenarios have them.
-"""
+"""A pass with contacts, losses and faults: the archive's own account is what the ground finds."""
 
 import hashlib
 import json

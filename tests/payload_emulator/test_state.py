@@ -1,6 +1,4 @@
-"""Exact states: views, known objects, refusals. Stations that confirm transmissions, and the journal that a
-killed session repeats them from.
-"""
+"""Exact states: views, known objects, refusals; stations that confirm transmissions, and their journal."""
 
 import json
 import os

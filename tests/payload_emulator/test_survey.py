@@ -1,6 +1,4 @@
-"""The survey of a region: what it flies, what it counts, how it resumes. Drawn labels and contact sheets. What
-the scores of a session count, on errors made by hand.
-"""
+"""The survey of a region: what it flies, counts and resumes; labels and scores of a session."""
 
 import json
 

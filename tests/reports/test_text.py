@@ -1,6 +1,4 @@
-"""Numbers, times and names as they are printed. Names of housekeeping parameters as panels print them. The JSON
-form of a report. Content of figures, checked by the drawn geometry.
-"""
+"""Numbers, times and names as they are printed; the JSON form of a report; figures by the drawn geometry."""
 
 import hashlib
 import json

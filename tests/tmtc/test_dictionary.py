@@ -1,8 +1,4 @@
-"""A dictionary written down and read again. Effects of telecommands: stated for all, inherited by scheduling
-telecommands, most severe if unknown. Texts of event values: what operators read in place of codes. Arguments
-of telecommands by name, with units and ranges. Estimates of the filter in packets of old payloads (lower
-triangle) and of today (upper triangle).  Thumbnails: the octets, and what is refused.
-"""
+"""A dictionary written down and read again: effects, texts, arguments, covariances and thumbnails."""
 
 import ast
 import io

@@ -1,6 +1,4 @@
-"""Browser sessions: a cookie instead of a token, ended by sign-out, time and revocation of the token. Users,
-tokens and the audit log over HTTP.
-"""
+"""Browser sessions: a cookie instead of a token; users, tokens and the audit log over HTTP."""
 
 import pytest
 from sqlalchemy import update

@@ -1,6 +1,4 @@
-"""Fixes repeated from single frames, and classified as right or wrong, on exact projections. Landmarks of the
-payload with the catalogue.
-"""
+"""Fixes repeated from single frames and classified, on exact projections; landmarks of the payload."""
 
 import math
 from dataclasses import replace

@@ -1,10 +1,4 @@
-"""The ground under a pass: mare or highland, from the albedo of the Moon. Remarks of a report on the attitude,
-from events of the payload. The choice of the frames with the lowest recall. TUM text against the evaluators'
-definitions, written out here with 4 x 4 matrices. The albedo of the Moon as a picture under maps. Drift and
-statistics, on errors whose figures can be said beforehand. Consistency against values from outside: printed
-tables of the chi-square distribution, hand-computed quadratics. Projection into a tilted, distorted camera
-over high terrain, against a projection written out here.
-"""
+"""Parts of a pass report: ground, attitude, worst frames, TUM, drift, consistency, against values from outside."""
 
 import math
 from types import SimpleNamespace

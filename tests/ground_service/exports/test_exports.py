@@ -1,7 +1,4 @@
-"""Exports of a pass, read back with the tools that they are made for. Exports over HTTP, with the client, and on
-the command line. Lines and rings at the 180th meridian and around the poles, and the geometry that GDAL makes
-of them.
-"""
+"""Exports over HTTP, client and command line, read back with the tools that they are made for."""
 
 import csv
 import importlib.util

@@ -1,6 +1,4 @@
-"""Counting packets: wraps, gaps, restarts, late and stray packets. Decoded columns as the store takes them.
-Ingests are found by the on-board times of their packets.
-"""
+"""Counts of packets: wraps, gaps, restarts, late and stray packets; decoded columns as the store takes them."""
 
 import numpy as np
 import pytest

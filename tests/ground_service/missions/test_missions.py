@@ -1,6 +1,4 @@
-"""Mission descriptions: refused values, values that are not stated, revisions, and references of passes.
-Automation and receivers of notifications in a mission description, and those of earlier versions.
-"""
+"""Mission descriptions: refused and missing values, revisions, references of passes, automation, receivers."""
 
 import json
 import logging

@@ -1,6 +1,4 @@
-"""Two spacecraft of different missions in one database: each is evaluated and planned by its own description.
-Links and resources of a mission description: valid ones, and one clear line for each fault.
-"""
+"""Two spacecraft of different missions in one database; links and resources of a mission description."""
 
 import numpy as np
 import pytest

@@ -1,8 +1,4 @@
-"""Event reports and craters across the passes of a spacecraft. Newest values of the parameters of a spacecraft.
-Housekeeping structures without a table of their own: live values, series, limits and drawing from packets.
-Data of the wrong time: yesterday's in the middle of today's, and references that do not reach the pass. The
-list of passes by the verdict of their newest report, on each database.
-"""
+"""Events, craters, newest values and verdicts across the passes of a spacecraft; data of the wrong time."""
 
 import random
 import time

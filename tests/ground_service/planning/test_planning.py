@@ -1,6 +1,4 @@
-"""Candidate windows: every sample of a candidate fulfils the constraints, computed here a second time by hand.
-Windows outside the reference ephemerides: refused where the ground needs the ephemeris.
-"""
+"""Candidate windows: every sample fulfils the constraints, computed here a second time by hand."""
 
 import os
 import re

@@ -1,7 +1,4 @@
-"""Builds as programs inside limits: what becomes of those that behave and of those that do not. Parameters of
-builds on the flight code are checked in the sandbox before registration. Verdicts in lists: names of builds,
-and why the verdict is not pass.
-"""
+"""Builds as programs inside limits: what becomes of those that behave and do not; their verdicts in lists."""
 
 import dataclasses
 import subprocess

@@ -1,7 +1,4 @@
-"""Gates on simulated passes of known recall, false detections, fixes and errors: what they claim, and what not.
-Samples of the gates: figures of one estimator by frame, units of the evidence. Paired statistics over units
-and Holm's procedure: against printed examples and simulation.
-"""
+"""Gates and paired statistics on simulated passes of known figures: what they claim, and what not."""
 
 from dataclasses import replace
 

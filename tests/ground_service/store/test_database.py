@@ -1,6 +1,4 @@
-"""The database: migrations, versions, and what goes wrong with disks, each in one clear line. Values that a
-database cannot hold are refused in one line on both databases, without the address of the database.
-"""
+"""The database: migrations, versions, disks and values that it cannot hold, each in one clear line."""
 
 import errno
 import os

@@ -199,7 +199,7 @@ def test_a_reference_that_arrives_after_the_report_completes_it(either, flown):
 
 def test_a_mission_without_a_camera_is_processed_and_its_report_says_what_that_means(ground, flown):
     before, _, rest = MISSION.partition("[camera]")
-    window_id = followed(ground, flown, mission=before + "[catalogue]" + rest.partition("[catalogue]")[2])
+    window_id = followed(ground, flown, mission=before + "[frames]" + rest.partition("[frames]")[2])
     pass_id = processed(ground, window_id)
     report = report_of(ground, pass_id)
     said = "the mission description does not state sizes of the camera, which are assumed: image width (512 px)"

@@ -1,6 +1,4 @@
-"""Number of agreeing pairs that a set needs, and its contents. Pairs of anonymous craters between two frames.
-Craters projected from the on-board catalogue, and the derivatives the filter lives on.
-"""
+"""Pairs of detections with catalogued and anonymous craters; projections and their derivatives."""
 
 import math
 

@@ -1,7 +1,4 @@
-"""The payload's door: frames and telecommands in, packets of the dictionary out. Every transition between modes,
-by telecommand, and what each mode allows. Settings that survive resets, interrupted writing and flipped bits.
-The document about the payload's ports, modes, parameters and faults is the current one, and complete.
-"""
+"""The payload: frames and telecommands in, packets out; modes, settings that survive, and its document."""
 
 import re
 

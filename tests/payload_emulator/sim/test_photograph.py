@@ -1,6 +1,4 @@
-"""Worlds whose light is that of a photograph: geometry against the sphere, registration, edges, what is refused.
-Kidnaps and burns of the true flight.
-"""
+"""Worlds whose light is that of a photograph, against the sphere; kidnaps and burns of the true flight."""
 
 from math import cos, degrees, radians, sin
 

@@ -1,6 +1,4 @@
-"""The fast renderer against closed forms and against the ray-marching oracle. The simulated detector draws what
-its confusion table says.
-"""
+"""The fast renderer against closed forms and the ray-marching oracle; the simulated detector."""
 
 from dataclasses import replace
 from math import pi, radians, sqrt, tan

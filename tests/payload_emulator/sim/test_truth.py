@@ -1,6 +1,4 @@
-"""Observation times and pointing of the spacecraft, on an orbit simple enough to check by hand. Power, heat and
-processor time of the simulated board; faults as text.
-"""
+"""Observation times and pointing on an orbit that is checked by hand; the simulated board and its faults."""
 
 from concurrent.futures import ThreadPoolExecutor
 

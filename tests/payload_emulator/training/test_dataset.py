@@ -1,8 +1,4 @@
-"""Data sets on disk: what is written can be read, checked and refused. A crop shows its craters where it says
-they are. Targets and what the flight decoder makes of a network with exactly given output.
-Recipes: what is refused, and that splits cannot touch. An exported network made trainable again: the same
-outputs, and a normalisation that fits the data.
-"""
+"""Data sets on disk: recipes, crops, targets; an exported network made trainable again."""
 
 import json
 import shutil

@@ -1,7 +1,4 @@
-"""Telecommands: validation, release by two persons, uplink, and what the reports say became of them. Second
-persons: from the effects of telecommands, raised or relaxed by a mission description. The fate of a
-telecommand for every set of reports that can come down about it (ECSS-E-ST-70-41C, service 1).
-"""
+"""Telecommands: validation, release, second persons, uplink, and what the reports say became of them."""
 
 import json
 from itertools import combinations
