@@ -91,16 +91,13 @@ def test_the_kernel_file_gives_the_constant_rotation_that_is_built_in(de421):
     assert np.max(np.abs(de421.me_from_pa @ PA_FROM_ME_DE421 - np.eye(3))) < 1e-15
 
 
-def test_the_constant_rotation_takes_the_earth_from_pa_to_me_as_naif_prints_it():
+def test_the_rotation_from_principal_to_mean_earth_axes_is_that_of_naif_and_of_900_m_on_the_ground():
     # moon_080317.tf, "Program output": state of the Earth at 2008 MAR 17 20:10:00, km and km/s.
     earth_me = (379892.825, 33510.118, -12661.5278, 0.0400357582, 0.0117963334, 0.115130508)
     earth_pa = (379908.634, 33385.003, -12516.8859, 0.0399957879, 0.0117833314, 0.115145731)
     apart = np.abs(np.reshape(earth_pa, (2, 3)) @ PA_FROM_ME_DE421 - np.reshape(earth_me, (2, 3)))
     # Positions are printed to 1 m in 380,000 km.
     assert np.all(apart.max(axis=1) < (1e-3, 1e-9))
-
-
-def test_principal_and_mean_earth_axes_are_nine_hundred_metres_apart_on_the_ground():
     # Williams, Boggs, Folkner 2008: 860 m at most on the surface ("about 0.9 km").
     place = mcmf_from_spherical(*np.meshgrid(np.linspace(-1.5, 1.5, 61), np.linspace(0, 6.2, 63)))
     offset_m = np.linalg.norm(place @ PA_FROM_ME_DE421.T - place, axis=-1)

@@ -220,7 +220,7 @@ def frame(scenario):
     return render_frame(scenario, DataFolder(), EPOCH)
 
 
-def test_a_frame_tells_where_it_was_taken_and_under_what_sun(frame):
+def test_a_frame_tells_where_and_under_what_sun_it_was_taken_as_json_without_nan(frame):
     assert frame.image.shape == (512, 512, 3) and frame.image.dtype == np.uint8
     assert frame.metadata["epoch"] == "2029-08-07T00:10:00.000Z"
     # The paper's light, and its orbit's altitudes.
@@ -228,9 +228,6 @@ def test_a_frame_tells_where_it_was_taken_and_under_what_sun(frame):
     assert -45.0 <= frame.metadata["sun_azimuth_deg"] <= 45.0
     assert 10.0 < frame.metadata["altitude_km"] < 60.0
     assert len(frame.metadata["corners_deg"]) == 4
-
-
-def test_metadata_and_labels_are_json_without_nan(frame):
     text = json.dumps({"metadata": frame.metadata, "labels": frame.labels}, allow_nan=False)
     assert json.loads(text)["labels"] == frame.labels
     assert any(label["inside"] for label in frame.labels)

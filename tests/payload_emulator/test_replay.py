@@ -225,14 +225,11 @@ def test_a_build_file_of_a_program_is_not_flown_here(tmp_path):
         load_flight_build(tmp_path / "build.toml")
 
 
-def test_parameters_survive_their_file():
+def test_parameters_survive_their_file_and_one_can_be_set_by_its_dotted_name():
     parameters = BuildParameters(flight=FlightParameters())
     again = parse_parameters(format_parameters(parameters))
     assert again == parameters
     assert again.flight.sha256 == parameters.flight.sha256
-
-
-def test_a_parameter_can_be_set_by_its_dotted_name():
     assert BuildParameters().flight.anchored.gravity_degree == 100
     changed = parse_parameters("flight.anchored.gravity_degree = 4")
     assert changed.flight.anchored.gravity_degree == 4

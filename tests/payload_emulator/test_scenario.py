@@ -35,11 +35,8 @@ def test_each_shipped_scenario_reads_and_survives_a_round_trip(file):
     assert parse_scenario(format_scenario(scenario)) == scenario
 
 
-def test_a_bare_name_means_a_shipped_scenario():
+def test_a_bare_name_means_a_shipped_scenario_and_an_empty_one_is_the_papers_orbit():
     assert load_scenario("selenita").orbit.semi_major_axis_km == 1768.180  # paper, Table I
-
-
-def test_an_empty_scenario_is_the_papers_orbit():
     assert parse_scenario('name = "x"') == Scenario(name="x")
 
 
@@ -160,14 +157,11 @@ def on_board(source, fraction=0.0):
     return onboard_catalogue(replace(scenario, navigation=navigation), measured(source))
 
 
-def test_real_craters_are_placed_below_their_rims_where_the_network_sees_them():
+def test_real_craters_are_placed_below_their_rims_where_the_network_sees_them_and_procedural_ones_on_them():
     rims = measured("LU1319381").rim_height_m
     np.testing.assert_allclose(on_board("LU1319381").rim_height_m - rims, -SEEN_BELOW_RIM_M, atol=1e-9)
     # Of the order of the measured 16 to 23 m: another sign would double the error of the altitude.
     assert 14.0 <= SEEN_BELOW_RIM_M <= 24.0
-
-
-def test_procedural_craters_are_placed_on_their_rims():
     np.testing.assert_array_equal(on_board("synthetic, seed 1").rim_height_m, measured("").rim_height_m)
 
 

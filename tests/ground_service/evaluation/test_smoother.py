@@ -137,14 +137,11 @@ def test_a_commanded_burn_is_flown_over():
     assert np.linalg.norm(error, axis=1).max() < 160.0
 
 
-def test_a_burn_that_nobody_commanded_parts_the_orbit_in_two():
+def test_a_burn_that_nobody_commanded_and_a_clock_that_went_backwards_part_the_orbit_in_two():
     session = Session(5, KICK, kick_at=14)
     known = smooth(session.filtered, QUIET)
     alone = smooth(session.filtered.select(np.arange(STATES) < 15), QUIET)
     assert_allclose(known.state[:15], alone.state, rtol=1e-12)
-
-
-def test_a_clock_that_went_backwards_parts_the_orbit_in_two():
     session = Session(6)
     times = TIMES.copy()
     times[20:] -= 3_600 * 10**9

@@ -442,14 +442,11 @@ def linna(rich_ground, tmp_path, capsys):
     return export
 
 
-def test_the_command_writes_one_file(linna, tmp_path):
+def test_the_command_writes_one_file_or_several_into_a_folder_or_a_zip(linna, tmp_path):
     status, text, _ = linna("1 --format oem --json", "pass.oem")
     out = tmp_path / "pass.oem"
     assert (status, json.loads(text)["files"]) == (0, [str(out)])
     assert parse_oem(out.read_text()).segments[0].object_name == "SELENITA"
-
-
-def test_the_command_writes_several_files_into_a_folder_or_a_zip(linna, tmp_path):
     status, text, _ = linna("1 --format csv --json", "tables")
     assert status == linna("1 --format csv", "tables.zip")[0] == 0
     assert len((tmp_path / "tables/frames.csv").read_text().splitlines()) == 1 + FRAMES

@@ -29,12 +29,9 @@ def counted(ticks, counts):
     return account.lost, account.restarts, account.conflicts
 
 
-def test_no_packets_are_no_packets():
+def test_no_packets_are_no_packets_and_a_wrap_is_no_gap():
     account = account_sequence(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
     assert (account.lost, account.conflicts, account.restarts, account.gaps) == (0, 0, 0, ())
-
-
-def test_a_wrap_is_no_gap():
     ticks, counts = stream(40_000, first=16_000)
     account = account_sequence(ticks, counts)
     assert account.lost == 0
@@ -68,13 +65,10 @@ def test_more_than_a_whole_wrap_lost_in_a_silence_is_counted_by_the_usual_rate()
     assert account_sequence(ticks[keep], counts[keep]).lost == 50_000
 
 
-def test_a_restart_begins_a_new_run_and_loses_nothing():
+def test_a_restart_begins_a_new_run_and_one_count_used_twice_is_a_conflict():
     before, counts_before = stream(500)
     after, counts_after = stream(300)
     assert counted(np.r_[before, after + before[-1] + 60 * SECOND], np.r_[counts_before, counts_after]) == (0, 1, 0)
-
-
-def test_one_count_used_twice_is_a_conflict():
     ticks, counts = stream(10)
     assert counted(np.r_[ticks, ticks[4] + 1], np.r_[counts, counts[4]]) == (0, 0, 1)
 

@@ -250,21 +250,15 @@ def test_the_duty_limit_counts_windows_that_begin_within_a_day():
     assert why(strong, (1, 1), (5, 1), (25, 0.5)) is None
 
 
-def test_quotas_are_kept_by_period_and_reasons_are_given():
+def test_quotas_are_kept_by_period_planned_windows_keep_their_resources_and_reasons_are_given():
     options = [window(k, 0.1, period=k // 4) for k in range(8)]
     chosen, reasons = choose(grid(), options, quota={0: 2, 1: 0})
     assert chosen == options[:2]
     assert set(reasons) == set(options[2:])
     assert set(reasons.values()) == {"the number of windows of its period is planned"}
-
-
-def test_planned_windows_keep_their_resources():
     committed = [window(1, 2.4)]
     chosen, reasons = choose(grid(), [window(3.5, 1), window(20, 1)], committed)
     assert chosen == [window(20, 1)] and "battery" in reasons[window(3.5, 1)]
-
-
-def test_nothing_is_chosen_of_nothing():
     assert choose(grid(), []) == ([], {})
 
 

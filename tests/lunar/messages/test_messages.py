@@ -296,13 +296,10 @@ AEM_XML = """<?xml version="1.0" encoding="UTF-8"?>
 </data></segment></body></aem>"""
 
 
-def test_an_aem_in_xml_is_read_by_the_names_of_its_elements():
+def test_an_aem_in_xml_is_read_by_its_elements_and_a_missing_scalar_is_named_with_its_line():
     (segment,) = parse_aem(AEM_XML)
     assert_array_equal(segment.utc_ns, START + np.array([0, 15]) * NS)
     assert_allclose(segment.q_wxyz, [[0.6, 0, -0.8, 0], [0, 0, 0, -1.0]], atol=1e-15)
-
-
-def test_a_quaternion_in_xml_without_its_scalar_is_named_with_its_line():
     with pytest.raises(DataFileError, match=r"line 8: expected <QC> with one value, found 'none'"):
         parse_aem(AEM_XML.replace("<QC>0.6</QC>", ""))
 

@@ -136,12 +136,9 @@ def test_the_shipped_network_is_small_and_tells_what_it_is(detector):
     assert set(tested) == {"real-strip", "real-block", "procedural-world"}
 
 
-def test_a_network_of_another_hash_is_refused():
+def test_a_network_of_another_hash_and_octets_that_are_none_are_refused():
     with raises(ModelError, match="expected SHA-256 00"):
         OnnxDetector(load_shipped_model(), expected_sha256="00" * 32)
-
-
-def test_octets_that_are_no_network_are_refused():
     with raises(ModelError, match="expected an ONNX model"):
         OnnxDetector(b"not a network")
     with raises(ModelError, match="expected an ONNX model"):
@@ -208,14 +205,11 @@ def test_craters_on_the_very_edge_of_the_heatmap_are_decoded():
     assert sorted(zip(found.u_px, found.v_px, strict=True)) == [(1.5, 1.5), (509.5, 509.5)]
 
 
-def test_a_weaker_repetition_is_dropped_and_a_nested_crater_kept():
+def test_a_weaker_repetition_is_dropped_and_a_nested_crater_and_what_it_repeats_stay():
     columns = ([100, 104, 102], [100, 101, 100], [40, 44, 12], [0.9, 0.8, 0.7], [1, 1, 1])
     found = Detections(*(np.array(column, float) for column in columns))
     kept = drop_duplicates(found, DetectorParameters())
     assert kept.diameter_px.tolist() == [40, 12]
-
-
-def test_what_a_dropped_repetition_would_have_dropped_stays():
     # The second repeats the first and goes; the third repeats only the second, so it is a crater of its own.
     found = detections([100, 108, 116], [100, 100, 100], diameter=30.0)
     assert drop_duplicates(found, DetectorParameters()).u_px.tolist() == [100, 116]
@@ -281,14 +275,11 @@ def test_a_slope_is_no_evidence_of_a_crater():
     assert evidence.tolist() == [0.0]
 
 
-def test_nothing_to_be_seen_gives_no_sun(detector):
+def test_nothing_to_be_seen_gives_no_sun_and_a_dark_picture_is_a_verdict(detector):
     noise = np.random.default_rng(3).integers(90, 110, (300, 400)).astype(np.uint8)
     outcome = search_picture(detector, noise)
     assert outcome.quality is ImageQuality.OK
     assert outcome.sun is None
-
-
-def test_a_dark_picture_is_a_verdict(detector):
     outcome = search_picture(detector, np.zeros((64, 64), np.uint8))
     assert outcome.quality is ImageQuality.DARK
     assert len(outcome.detections) == 0 and outcome.sun is None

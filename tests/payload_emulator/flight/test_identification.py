@@ -77,18 +77,12 @@ def test_one_crater_is_enough_where_the_prediction_is_good_and_not_where_it_is_b
     assert run(lone, sighting(places), sigma_px=60.0) == []
 
 
-def test_a_crater_of_another_size_is_no_match():
+def test_pairs_are_of_one_size_use_each_crater_once_and_need_detections_and_craters():
     places = np.array([[100.0, 100.0], [300.0, 200.0]])
     assert run(found(places, diameter=60.0), sighting(places), sigma_px=1.0) == []
-
-
-def test_each_detection_and_each_crater_is_used_once():
     places = np.array([[100.0, 100.0], [102.0, 101.0], [300.0, 300.0]])
     pairs = run(found(np.concatenate([places, places[:1] + 0.4])), sighting(places), sigma_px=1.0)
     assert len({i for i, _ in pairs}) == len(pairs) == len({j for _, j in pairs})
-
-
-def test_no_detections_and_no_craters_make_no_set():
     nothing = np.empty((0, 2))
     assert run(found(nothing), sighting(np.array([[5.0, 5.0]])), 1.0) == []
     assert run(found(np.array([[5.0, 5.0]])), sighting(nothing), 1.0) == []
@@ -206,14 +200,11 @@ def test_of_disagreeing_lone_pairs_the_one_nearest_the_orbital_prior_is_kept():
     assert match.earlier.tolist() == [1]
 
 
-def test_empty_frames_match_nothing():
+def test_empty_frames_match_nothing_and_a_frame_full_of_false_detections_stays_bounded():
     nothing, some = features(np.empty((0, 2)), []), features([[0.0, 0.0]], [0])
     for earlier, later in ((nothing, some), (some, nothing), (nothing, nothing)):
         match = match_frames(earlier, later, 15.0, 1)
         assert (len(match), match.candidate_pairs) == (0, 0)
-
-
-def test_a_frame_full_of_false_detections_stays_bounded():
     rng = default_rng(1)
     crowd, again = (features(rng.uniform(-50e3, 50e3, (255, 2)), np.zeros(255)) for _ in range(2))
     match = match_frames(crowd, again, 15.0, 1)

@@ -107,13 +107,10 @@ def test_false_detections_mirrored_and_turned_images_find_no_place(index):
         assert searched(detections, index) is None
 
 
-def test_a_place_off_the_map_is_no_fix(index):
+def test_a_place_off_the_map_and_too_few_detections_or_none_that_are_numbers_are_no_fix(index):
     other = craters(west_deg=100.0, seed=8)
     _, found = frame(other, 0.0, 110.0, 30e3, seed=2)
     assert searched(found, index) is None
-
-
-def test_too_few_detections_and_detections_that_are_no_numbers_are_no_fix(index):
     assert searched(no_detections(), index) is None
     _, found = frame(index.landmarks, 3.0, 359.7, 30e3, seed=5)
     assert searched(found.select(np.arange(2)), index) is None

@@ -47,7 +47,7 @@ def fly(moon, mode, seconds, seed=1):
     return state, reports, float(error), path_m
 
 
-def test_perfect_detections_on_a_smooth_sphere_drift_as_far_as_the_plane_is_wrong(moon):
+def test_perfect_detections_drift_as_far_as_the_plane_is_wrong_and_not_on_the_sphere(moon):
     # An independent re-implementation of the paper's equations drifts 1.75 % of path, 59 km in a pass
     # like this.
     drifts = []
@@ -57,9 +57,6 @@ def test_perfect_detections_on_a_smooth_sphere_drift_as_far_as_the_plane_is_wron
         assert path_m == approx(3.6e6, rel=0.03)
         assert sum(report.outcome is Outcome.multi for report in reports) >= 0.95 * len(reports)
     assert 1.6 <= np.mean(drifts) <= 1.9
-
-
-def test_perfect_detections_on_a_smooth_sphere_leave_the_spherical_odometry_exact(moon):
     for seed in (1, 2):
         _, _, error_m, path_m = fly(moon, Mode.spherical, ASCENDING, seed)
         assert 100.0 * error_m / path_m <= 0.02

@@ -224,11 +224,8 @@ def written(*every):
     return memory
 
 
-def test_new_memory_is_blank():
+def test_new_memory_is_blank_and_the_newest_of_many_is_read():
     assert Settings(np.zeros(1000, np.uint8)).read() == (Recovery.blank, {})
-
-
-def test_the_newest_of_many_is_read():
     memory = written({"a": 1}, {"a": 2}, VALUES)
     settings = Settings(memory)
     assert settings.read() == (Recovery.whole, VALUES)

@@ -159,12 +159,9 @@ def test_a_tilted_camera_tilts(hilly):
     assert_allclose(-tilted.camera_to_world[:3, 2], [0.0, sin(0.1), -cos(0.1)], atol=1e-12)
 
 
-def test_a_distorting_lens_is_refused(hilly):
+def test_a_distorting_lens_a_camera_in_the_ground_and_a_view_along_the_horizon_are_refused(hilly):
     with raises(RendererError, match="without distortion"):
         describe_scene(hilly, BrownCamera(k1=-0.01), *pose(), SUN)
-
-
-def test_a_camera_in_the_ground_and_a_view_along_the_horizon_are_refused(hilly):
     with raises(TerrainError, match="above the ground"):
         describe_scene(hilly, CAMERA, *pose(40.0), SUN)
     with raises(TerrainError):
@@ -249,18 +246,12 @@ def planes_of(scene, cosine, direct, range_km):
     return planes
 
 
-def test_passes_become_radiance_share_of_the_sun_and_range(scene):
+def test_passes_become_radiance_share_of_the_sun_and_range_and_a_missing_one_is_named(scene):
     picture = cycles.rendering_of_passes(planes_of(scene, 0.4, 0.2, 24.0), scene)
     assert picture.radiance[1, 1] == approx(0.03) and picture.radiance[0, 0] == 0.0
     assert picture.lit[1, 1] == approx(0.5, abs=1e-6) and picture.lit[0, 0] == 0.0
     assert picture.range_m[1, 1] == approx(24e3, rel=1e-6) and isnan(picture.range_m[0, 0])
-
-
-def test_ground_turned_from_the_sun_is_in_shadow(scene):
     assert cycles.rendering_of_passes(planes_of(scene, -0.2, 0.0, 24.0), scene).lit.max() == 0.0
-
-
-def test_a_missing_pass_is_named(scene):
     planes = planes_of(scene, 0.4, 0.2, 24.0)
     del planes["V.Position.Y"]
     with raises(RendererError, match=r"expected a pass Position\.Y, found V\.Combined"):

@@ -109,13 +109,10 @@ def test_what_is_cut_by_the_edge_says_so():
     assert 0.3 < labels.visible_fraction[0] < 0.7
 
 
-def test_no_crater_in_sight_gives_empty_labels():
+def test_craters_out_of_sight_or_behind_the_limb_give_no_labels():
     assert len(project_craters(crater_at(40.0, 100.0, 9000.0, 0.0), CAMERA, *pose())) == 0
     empty = make_catalogue([], [], [], source="t")
     assert len(project_craters(empty, CAMERA, *pose())) == 0
-
-
-def test_a_crater_behind_the_limb_is_no_label():
     far = crater_at(0.0, 179.0, 9000.0, 0.0)
     assert len(project_craters(far, CAMERA, *pose())) == 0
 

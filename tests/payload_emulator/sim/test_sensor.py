@@ -41,17 +41,11 @@ def test_noise_is_that_of_the_electrons_counted():
     assert image.std() == approx(sqrt(4000.0 + 400.0), rel=0.03)
 
 
-def test_light_beyond_full_scale_saturates():
+def test_light_beyond_full_scale_saturates_shadow_is_not_exposed_for_and_black_stays_black():
     assert green(field(3.0), quiet()).min() == 1.0
-
-
-def test_auto_exposure_ignores_shadow():
     scene = field(0.0)
     scene[:, :20] = 0.02
     assert auto_exposure(scene, SensorModel(exposure_target=0.8)) * 0.02 == approx(0.8, rel=1e-6)
-
-
-def test_a_black_scene_stays_black():
     assert shot(field(0.0), SensorModel(), 1).mean() < 6.0
 
 
@@ -196,25 +190,19 @@ def test_points_land_where_opencv_projects_them():
     assert_allclose(camera.project(points), expected[:, 0], atol=1e-9)
 
 
-def test_a_pixels_ray_comes_back_to_the_pixel():
+def test_the_ray_of_a_pixel_comes_back_to_it_and_is_that_of_the_pinhole_without_distortion():
     camera = BrownCamera(**BARREL)
     uv = default_rng(1).uniform(-0.5, 511.5, (400, 2))
     assert_allclose(camera.project(camera.rays(uv)), uv, atol=1e-7)
-
-
-def test_a_lens_without_distortion_is_the_pinhole():
     uv = default_rng(2).uniform(-0.5, 511.5, (50, 2))
     assert_allclose(BrownCamera().rays(uv), PinholeCamera().rays(uv), atol=1e-12)
 
 
-def test_what_lies_beyond_the_fold_of_the_lens_is_not_folded_back_into_the_picture():
+def test_what_lies_beyond_the_fold_of_the_lens_is_not_seen_and_a_fold_in_the_picture_refused():
     # d/dr (r - 0.01 r^3) = 0 at r = 5.77: a point at r = 9 would come back to r = 1.71, in the picture.
     camera = BrownCamera(k1=-0.01)
     assert np.isnan(camera.project(np.array([9.0, 0.0, 1.0]))).all()
     assert np.isfinite(camera.project(np.array([5.7, 0.0, 1.0]))).all()
-
-
-def test_a_lens_that_folds_the_picture_is_refused():
     with raises(LensError, match="folds the image"):
         BrownCamera(k1=-0.2)
 

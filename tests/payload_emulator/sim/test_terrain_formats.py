@@ -462,16 +462,13 @@ def test_sharpening_is_seeded_and_adds_what_the_raster_cannot_hold(tmp_path):
     assert np.std(first - other) > 1.0
 
 
-def test_a_raster_without_georeference_is_refused(tmp_path):
+def test_a_raster_that_is_missing_damaged_or_without_georeference_is_named(tmp_path):
     from PIL import Image
 
     path = tmp_path / "plain.png"
     Image.fromarray(np.zeros((8, 8), np.uint8)).save(path)
     with raises(TerrainError, match=r"plain\.png: expected a georeferenced raster"):
         open_layers([path])
-
-
-def test_a_missing_or_damaged_raster_is_named(tmp_path):
     with raises(TerrainError, match=r"gone\.tif: expected a raster"):
         open_layers([tmp_path / "gone.tif"])
     broken = tmp_path / "broken.tif"

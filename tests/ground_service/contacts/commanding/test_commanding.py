@@ -642,11 +642,8 @@ def test_a_command_that_was_not_sent_again_has_no_last_report():
     assert fate_of(once, [report(7, 10**12)], 0).state == "completed"
 
 
-def test_reports_of_other_requests_do_not_count():
+def test_reports_are_in_order_of_time_stage_and_step_and_those_of_other_requests_do_not_count():
     assert fate_of(COMMAND, [report(7, request=REQUEST + 1)], 0).reports == ()
-
-
-def test_reports_are_in_order_of_time_stage_and_step():
     ordered = [
         report(1, 110), report(3, 110), report(5, 120), report(5, 120, step=1), report(5, 120, step=2),
         report(7, 130),

@@ -86,12 +86,9 @@ def test_a_contact_contains_its_edges_and_the_margin():
     assert contact_at(contacts, 289, 10) is None
 
 
-def test_silence_begins_after_its_time():
+def test_silence_begins_after_its_time_and_waits_double_up_to_a_limit():
     assert not is_silent(0, 60 * NS, 60.0)
     assert is_silent(0, 60 * NS + 1, 60.0)
-
-
-def test_waits_double_up_to_a_limit():
     waits = [0.0]
     for _ in range(8):
         waits.append(next_wait_s(waits[-1]))
