@@ -30,6 +30,7 @@ from tests.ground_service.web.conftest import COUNT_REQUESTS, patient
 from tests.ground_service.web.test_in_browser import answered, settled
 from tests.ground_service.web.test_shift import MISSION, Spacecraft
 from tests.lazy import Lazy, expect
+from tests.scenarios import GOLDEN
 from tests.serving import wait_for
 
 Looks = tuple[tuple[Literal["light", "dark"], str, int], ...]
