@@ -40,15 +40,12 @@ def test_the_facts_of_the_paper_hold_to_their_printed_digits():
     assert f"{ground_arc_m(math.radians(60), 30e3) / 1e3:.1f}" == "53.4"
 
 
-def test_projection_is_that_of_opencv():
+def test_projection_is_that_of_opencv_about_the_middle_and_to_half_the_field_of_view():
     rng = np.random.default_rng(1)
     points = rng.uniform([-50e3, -50e3, 10e3], [50e3, 50e3, 60e3], (100, 3))
     f, (cx, cy) = CAMERA.focal_px, CAMERA.centre_px
     theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]]), None)
     assert np.allclose(CAMERA.project(points), theirs[:, 0], atol=1e-9)
-
-
-def test_the_boresight_is_between_the_four_middle_pixels_and_the_edge_is_half_the_field_of_view():
     assert CAMERA.centre_px == (255.5, 255.5)
     edge = CAMERA.rays(np.array([511.5, 255.5]))
     assert math.degrees(math.acos(edge[2])) == pytest.approx(60.0, abs=1e-12)
@@ -95,12 +92,9 @@ def test_the_range_to_the_sphere_is_that_of_the_cosine_rule(latitude, longitude,
     assert found == pytest.approx(expected, abs=1e-5)
 
 
-def test_from_inside_a_sphere_the_way_out_is_found():
+def test_the_way_out_of_a_sphere_is_found_and_only_what_stands_high_is_seen_over_the_horizon():
     ways = intersect_sphere(np.array([0.0, 0.0, 500.0]), np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]), 1000.0)
     assert ways == pytest.approx([500.0, 1500.0])
-
-
-def test_what_lies_behind_the_horizon_is_hidden_and_what_stands_high_is_seen_over_it():
     position = mcmf_from_spherical(0.0, 0.0, 30e3)
     arc = horizon_arc_m(30e3) / MOON_RADIUS_M
     # Length of the tangent sqrt(2 R h + h^2) = 324.25 km, and R atan(324.25 / 1737.4) = 320.57 km.
@@ -179,7 +173,7 @@ def test_uniform_craters_follow_poisson_in_the_true_footprint():
         assert study.probability_at_least[n][0] == pytest.approx(chance, abs=0.02)
 
 
-def test_probabilities_grow_with_the_field_of_view_and_fall_with_the_count():
+def test_probabilities_grow_with_the_field_of_view_and_none_is_selected_where_none_suffices():
     study = study_field_of_view(random_positions(500, 6), paper_density_catalogue(2))
     assert study.fov_deg.tolist() == list(PAPER_FOV_DEG)
     for values in study.probability_at_least.values():
@@ -188,9 +182,6 @@ def test_probabilities_grow_with_the_field_of_view_and_fall_with_the_count():
     enough = study.probability_at_least[3] > 0.9
     assert study.selected_fov_deg == study.fov_deg[np.argmax(enough)]
     assert study.selected_every_altitude_deg >= study.selected_fov_deg
-
-
-def test_no_field_of_view_is_selected_where_none_suffices():
     study = study_field_of_view(random_positions(200, 7), UNIFORM, (10.0, 20.0))
     assert math.isnan(study.selected_fov_deg)
 
@@ -208,7 +199,7 @@ def test_positions_over_regions_that_the_catalogue_leaves_out_do_not_count():
     assert 900 < study_field_of_view(random_positions(2000, 8), flagged).positions_covered < 1100
 
 
-def test_over_the_meridian_and_the_pole_craters_are_found():
+def test_craters_are_found_over_the_meridian_and_the_pole_and_nothing_to_study_is_refused():
     catalogue = make_catalogue(
         np.radians([0.0, 0.0, 89.9, 89.9, 0.2]), np.radians([359.9, 0.1, 10.0, 190.0, 0.0]), [6e3] * 5,
         source="five",
@@ -217,9 +208,6 @@ def test_over_the_meridian_and_the_pole_craters_are_found():
     study = study_field_of_view(positions, catalogue)
     assert np.count_nonzero(np.isfinite(np.tan(np.radians(study.required_fov_deg / 2)))[0]) >= 3
     assert study.required_fov_deg[0][2] < 30.0 and study.required_fov_deg[1][1] < 30.0
-
-
-def test_nothing_to_study_is_refused():
     with pytest.raises(LunarError, match="expected craters of 5-30 km under the orbit"):
         study_field_of_view(random_positions(5, 9), UNIFORM.select([]))
     with pytest.raises(LunarError, match=r"expected fields of view in 0\.\.180 deg"):

@@ -128,16 +128,13 @@ def test_the_iau_series_is_within_two_hundred_metres_of_de421_in_this_century(de
     assert apart_m.max() < 200.0
 
 
-def test_mci_has_the_iau_pole_and_its_node_on_the_icrf_equator():
+def test_mci_has_the_iau_pole_and_its_node_on_the_equator_and_the_bias_of_j2000_is_that_of_erfa():
     tdb_s = 934_027_269.183
     mci = mci_from_icrf(tdb_s)
     assert mci.shape == (3, 3)
     assert np.allclose(mci[2], IauOrientation().mcmf_from_icrf(tdb_s)[2], atol=1e-15)
     assert abs(mci[0, 2]) < 1e-15  # x lies in the equator of ICRF
     assert np.cross([0, 0, 1.0], mci[2]) @ mci[0] > 0.0  # and is the ascending node
-
-
-def test_the_frame_bias_of_j2000_is_that_of_erfa():
     bias, _, _ = erfa.bp06(2_451_545.0, 0.0)
     # ERFA carries second-order terms; they are 1e-13 rad, far below a micrometre on an orbit.
     assert np.max(np.abs(icrf_from_j2000().T - bias)) < 1e-11
@@ -363,15 +360,12 @@ def test_the_covered_share_of_a_disc_is_that_of_a_fine_grid(apart, near_radius, 
     assert share == pytest.approx(np.count_nonzero(disc & covered) / np.count_nonzero(disc), abs=0.01)
 
 
-def test_azimuth_runs_clockwise_from_north():
+def test_azimuth_runs_clockwise_from_north_and_the_subsatellite_point_undoes_the_orientation():
     place = mcmf_from_spherical(0.3, 0.5)
     east, north, up = enu_from_mcmf(0.3, 0.5)
     for azimuth in (0.0, 0.5, 2.0, 4.0, 6.0):
         sun = place + 1e11 * (math.sin(azimuth) * east + math.cos(azimuth) * north + math.tan(0.2) * up)
         assert sun_elevation_azimuth(0.3, 0.5, sun) == pytest.approx((0.2, azimuth), abs=1e-9)
-
-
-def test_the_subsatellite_point_undoes_the_orientation():
     tdb_s = tdb_s_from_utc_ns(START + np.arange(3) * 3600 * NS)
     rotation = IauOrientation().mcmf_from_icrf(tdb_s)
     position = np.einsum("nji,nj->ni", rotation, mcmf_from_spherical([0.1, -0.2, 0.3], [1.0, 2.0, -3.0], 20e3))

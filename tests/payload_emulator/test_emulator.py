@@ -300,14 +300,11 @@ def test_the_wrong_orbit_is_an_orbit():
     assert worst < 0.02
 
 
-def test_the_same_seed_gives_the_same_errors_and_none_gives_the_truth():
+def test_the_same_seed_gives_the_same_errors_none_the_truth_and_an_offset_adds_in_squares():
     np.testing.assert_array_equal(errors_rtn_m(SECTION, 1), errors_rtn_m(SECTION, 1))
     assert np.abs(errors_rtn_m(SECTION, 1) - errors_rtn_m(SECTION, 2)).max() > 1.0
     truth = circle()
     assert with_reference_error(truth, ReferenceSection(), 1) is truth
-
-
-def test_a_constant_offset_adds_in_squares():
     section = ReferenceSection(position_error_m=40.0, radial_m=30.0, transverse_m=60.0)
     assert section.sigma_rtn_m == pytest.approx((50.0, math.hypot(40.0, 60.0), 40.0))
 

@@ -63,35 +63,26 @@ def test_colours_of_figures_are_roles_so_that_they_follow_the_theme(whole_page):
         assert f"--f-{role}:{tint};" in whole_page
 
 
-def test_the_first_page_has_the_verdict_the_five_figures_and_their_level(page):
+def test_the_first_page_has_verdict_figures_and_level_and_the_detector_those_of_the_paper(page):
     start = page.text[: page.text.index("At a glance", page.text.index("Verdict"))]
     assert "Verdict: met" in start and "without reading the anchor ephemeris" in start
     for text in ("51.2 m", "148 m", "1.71 % of path", "0.704", "9 of 1 204"):
         assert text in start
     assert start.count("level 3") == 5 + 1
     assert "3 real terrain" in start
-
-
-def test_the_detector_is_compared_with_the_figures_printed_in_the_paper(page):
     # LINNA paper, Table II.
     for figure in ("0.7021", "0.7362", "0.8131", "0.3248", "0.3586", "0.4659", "3.50", "4.11", "4.75"):
         assert figure in page.text
 
 
-def test_all_six_outcomes_and_all_triggers_have_their_names(page):
+def test_outcomes_triggers_and_times_have_their_names_and_the_ledger_counts_every_read(page):
     for name in ("Anchored match", "Multi-pair match", "Singleton match", "Prediction only", "Missed"):
         assert name in page.text
     for trigger in ("initialization", "time gap", "manual step", "safety timeout"):
         assert trigger in page.text
-
-
-def test_times_are_utc_and_the_axis_names_the_day(page):
     # 1,880,964,872.5 s after 1970-01-01 is 2029-08-09 10:14:32 UTC (GNU date -u -d @1880964872).
     assert "2029-08-09 10:14:32 UTC" in page.text
     assert "UTC, 9 August 2029" in page.text
-
-
-def test_the_ledger_counts_every_read_of_the_anchor_ephemeris(page):
     ledger = page.text[page.text.rindex("Never read") :]
     assert "Never read the anchor ephemeris: anchored." in ledger
     assert "Read it: paper, spherical." in ledger
@@ -165,13 +156,10 @@ def test_only_false_alarms_of_the_scored_classes_are_marked_as_false(whole_pass)
     assert marks(3) == 0
 
 
-def test_a_reason_given_with_the_value_replaces_the_usual_one():
+def test_a_given_reason_replaces_the_usual_one_and_a_pass_without_a_reference_shows_what_it_has():
     text = of_pass(not_available={"gallery": "images were not asked for in this window"}).text
     assert "Gallery of detections not available: images were not asked for in this window" in text
     assert "gallery: images were not asked for in this window" in text
-
-
-def test_a_pass_without_a_reference_shows_what_the_estimators_said():
     nothing = np.full((40, 3), np.nan)
     one = _series(40, error_rtn_m=nothing, outcome=("fixed",) * 30 + ("coasted",) * 10)
     text = of_pass(navigation=(one,)).text
@@ -179,16 +167,13 @@ def test_a_pass_without_a_reference_shows_what_the_estimators_said():
     assert "Fixed on the catalogue" in text and "75.0 %" in text
 
 
-def test_a_pass_without_frames_says_so_and_shows_the_rest(whole_pass):
+def test_a_pass_without_frames_or_navigation_says_so_and_shows_the_rest(whole_pass):
     page = shown(whole_pass, accounting=None, gallery=(), worst_frames=(), detector=None, craters=None)
     assert page.left_open == []
     assert "Frame accounting not available: the frames of the pass were not counted" in page.text
     assert "Recall, precision, localisation not available" in page.text
     assert "Gallery of detections not available: the pass has no images on the ground" in page.text
     assert "Filter consistency" in page.text and "worst 5 frames" not in page.text
-
-
-def test_a_pass_without_navigation_says_so_and_shows_the_rest(whole_pass):
     page = shown(whole_pass, navigation=(), truth_ledger=())
     assert page.left_open == []
     assert "Navigation not available: no navigation telemetry was received" in page.text
@@ -240,16 +225,13 @@ def test_half_a_downlink_shows_the_share_that_came():
     assert "Of 148 expected, 74 (50.0 %) are processed." in text
 
 
-def test_arrays_of_different_lengths_are_refused_with_place_expected_and_found():
+def test_arrays_of_different_lengths_and_values_that_are_no_report_are_refused():
     with pytest.raises(InconsistentReport) as caught:
         of_pass(navigation=(_series(4, altitude_m=np.zeros(3)),))
     message = str(caught.value)
     assert "'anchored', altitude_m" in message and "(4,)" in message and "(3,)" in message
     with pytest.raises(InconsistentReport, match="4 labels"):
         of_pass(navigation=(_series(4, outcome=("fixed",)),))
-
-
-def test_a_value_that_is_no_report_is_refused_by_name():
     with pytest.raises(UnknownReportKind, match="dict"):
         render_html({"title": "not a report"})
 
@@ -316,30 +298,24 @@ def rows(of):
     return [[cell.text if isinstance(cell, Cell) else cell for cell in row] for row in of.rows]
 
 
-def test_table_one_has_the_altitudes_of_the_paper_and_ours():
+def test_tables_have_the_altitudes_and_scores_of_the_paper_and_ours():
     found = rows(table(report(), "Table I:"))
     assert ["Eccentricity", "0.006908", "0.006908"] in found
     found = rows(table(report(), "Altitudes over"))
     assert ["altitude, mean, km", "30.8", "30.7", "−0.0900"] in found
     assert found[-1][1:] == [count_text(5196), count_text(3834), count_text(-1362)]
-
-
-def test_table_two_has_the_scores_of_the_paper_and_ours():
     found = rows(table(report(), "Table II"))
     assert [row[1:] for row in found[6:]] == [
         ["0.813", "0.500", "−0.313"], ["0.466", "0.450", "−0.0159"], ["4.75", "1.50", "−3.25"],
     ]  # fmt: skip
 
 
-def test_outcomes_and_errors_are_counted_by_estimator():
+def test_outcomes_and_errors_are_counted_by_estimator_and_accuracies_state_their_level():
     assert ["Multi-pair match", "2", percent_text(2, 4)] in rows(table(report(), "Outcomes of all frames"))
     errors = rows(table(report(), "Position error of each estimator"))
     assert [row[0] for row in errors] == ["paper", "spherical"]
     assert errors[0][1] == errors[0][4] == "300 m"
     assert errors[0][5] == "5"
-
-
-def test_every_figure_and_table_with_an_accuracy_states_its_evidence_level():
     for figure in paper_index(report())["figures"]:
         assert figure["level"].startswith("level "), figure["caption"]
     assert "level 2 of 5" in table(report(), "Position error").caption

@@ -115,12 +115,9 @@ def test_every_reed_solomon_setting_is_found_out(errors, dual_basis, interleave)
     assert packets_of(decoded) == sent()
 
 
-def test_a_cadu_of_the_default_link_is_1279_octets():
+def test_a_cadu_of_the_default_link_is_1279_octets_and_its_frame_what_spacepackets_reads():
     octets = encode_cadus(sent()[:1], spacecraft_id=76)
     assert len(octets) == 1279 and octets[:4] == ASM
-
-
-def test_frames_are_what_spacepackets_reads():
     octets = encode_cadus(
         sent()[:40], spacecraft_id=76, virtual_channel=2, coding="none", randomiser="none", frame_length=512
     )
@@ -132,20 +129,14 @@ def test_frames_are_what_spacepackets_reads():
     assert stream.startswith(b"".join(sent()[:40]))
 
 
-def test_a_file_of_bare_packets_is_recognised():
+def test_bare_packets_are_recognised_an_empty_file_is_empty_and_long_packets_span_frames():
     decoded = read(b"".join(sent()))
     assert decoded.settings is None and decoded.frames is None
     assert decoded.packets == len(sent()) and decoded.complete
     assert decoded.by_apid == {0xA0: 20, 0xA1: 200, 0xA4: 200}
-
-
-def test_an_empty_file_is_empty():
     decoded = read(b"")
     assert (decoded.packets, decoded.octets_skipped, decoded.frame_count) == (0, 0, 0)
     assert encode_cadus([], spacecraft_id=1) == b""
-
-
-def test_packets_longer_than_frames_span_them():
     packets = [stranger_of(0x7A, 5000), *sent()[:3]]
     assert packets_of(read(encode_cadus(packets, spacecraft_id=1, frame_length=223))) == packets
 
@@ -278,7 +269,7 @@ def test_frames_of_another_spacecraft_are_not_used():
     assert read(octets, spacecraft_id=77).packets == len(make_packets(3, seed=9))
 
 
-def test_attaching_in_mid_stream_gives_no_bogus_packet_and_loses_no_whole_one():
+def test_attaching_in_mid_stream_or_frame_and_truncation_cost_no_whole_frame():
     # the first frames begin with the rest of a packet whose head was never received
     decoded = read(cadus()[3 * 1279 :])
     found = packets_of(decoded)
@@ -287,13 +278,7 @@ def test_attaching_in_mid_stream_gives_no_bogus_packet_and_loses_no_whole_one():
     assert len(found) == int(np.count_nonzero(starts[:-1] >= 3 * 1107))
     assert decoded.octets["orphaned"] == starts[len(sent()) - len(found)] - 3 * 1107
     assert decoded.crc_errors == 0
-
-
-def test_attaching_in_mid_frame_costs_only_that_frame():
     assert read(cadus()[777:]).octets["unsynchronised"] == 1279 - 777
-
-
-def test_a_truncated_downlink_gives_all_whole_frames():
     decoded = read(cadus()[: 7 * 1279 + 600])
     assert decoded.frame_count == 7 and decoded.octets["unsynchronised"] == 600
     found = packets_of(decoded)
@@ -314,22 +299,16 @@ def test_a_dump_that_comes_twice_is_duplicates_and_late_playback_and_a_reboot_le
     assert {account.boot for account in found.accounts} == {1, 2}
 
 
-def test_packets_outside_the_dictionary_are_counted_as_unknown():
+def test_unknown_packets_are_counted_given_settings_used_and_markers_without_frames_an_error():
     stranger = stranger_of(0x55, 28)
     decoded = read(b"".join([*sent()[:5], stranger, WITHDRAWN, *sent()[5:]]))
     assert decoded.unknown == 2 and not decoded.complete
     assert decoded.by_apid[0x55] == decoded.by_apid[0x0AE] == 1
     assert WITHDRAWN in set(packets_of(decoded))
-
-
-def test_markers_without_frames_between_them_are_an_error_that_says_so():
     noise = np.random.default_rng(3).integers(0, 256, (30, 700), dtype=np.uint8)
     noise[:, :4] = np.frombuffer(ASM, dtype=np.uint8)
     with pytest.raises(LinkFormatError, match="mostly 700 octets apart"):
         read(noise.tobytes())
-
-
-def test_settings_that_are_given_are_used():
     wrong = read(cadus(), settings=LinkSettings(randomiser="none", dual_basis=False))
     assert wrong.packets == 0 and wrong.frames_bad == wrong.frame_count
 
@@ -434,24 +413,18 @@ def test_command_link_control_words_come_back(clcw):
     assert unpack_clcw(pack_clcw(clcw)) == clcw
 
 
-def test_a_control_word_has_the_bits_that_the_standard_draws():
+def test_control_words_idle_data_and_checksums_are_those_of_the_standard():
     # type 0, version 00, status 000, COP 01 | VC 000101, spare 00 |
     # no RF 0, no lock 0, lockout 1, wait 0, retransmit 1, FARM-B 10, spare 0 | 17
     assert pack_clcw(Clcw(5, 17, lockout=True, retransmit=True, farm_b_counter=2)) == bytes.fromhex("01142C11")
     with pytest.raises(FrameError):
         unpack_clcw(b"\xff\xff\xff\xff")
-
-
-def test_idle_data_starts_with_the_register_of_ones():
     # 1 + D + D^2 + D^22 + D^32: thirty-two ones, then the sum of taps
     data = idle_data(1100)
     assert data[:5].hex() == "ffffffff6d"
     bits = np.unpackbits(np.frombuffer(data, dtype=np.uint8)).astype(int)
     n = np.arange(32, bits.size)
     assert np.array_equal(bits[n], (bits[n - 1] + bits[n - 2] + bits[n - 22] + bits[n - 32]) % 2)
-
-
-def test_the_checksum_has_the_published_check_value():
     # CRC-16/IBM-3740, the "CRC-16/CCITT-FALSE" of ECSS-E-ST-70-41C annex B: check value of "123456789"
     assert crc16(b"123456789") == 0x29B1
 
@@ -463,13 +436,10 @@ def test_the_checksum_agrees_with_the_vectors_of_the_standard(row):
     assert crc16(data) == int.from_bytes(checksum, "big")
 
 
-def test_octets_with_their_checksum_leave_no_remainder():
+def test_a_checksum_leaves_no_remainder_and_a_wrong_one_is_reported_with_both_values():
     octets = append_crc(b"any octets")
     assert crc16(octets) == 0
     check_crc(octets, "test")
-
-
-def test_a_wrong_checksum_is_reported_with_both_values():
     with pytest.raises(ChecksumError, match="expected checksum 0x29B1, found 0x0000"):
         check_crc(b"123456789\0\0", "test")
     with pytest.raises(TruncatedPacket):

@@ -151,11 +151,8 @@ def test_a_hole_costs_the_packets_it_touches(seed):
     assert packets_of(octets[:start] + octets[stop:]) == packets[:first] + packets[whole_again:]
 
 
-def test_a_header_alone_at_the_end_proves_nothing():
+def test_headers_alone_at_the_end_or_out_of_their_counts_are_no_packets():
     assert packets_of(b"\xff" * 100 + space_packet(5, b"abc", 0)) == []
-
-
-def test_headers_that_do_not_continue_the_counts_of_their_apid_are_no_packets():
     packets = [space_packet(9, b"abc", k) for k in range(20)]
     headers = space_packet(9, b"\xff" * 30, 9000) + space_packet(9, b"\xff" * 30, 4000)
     noise = b"\xff" * 20 + headers + b"\xff" * 5
@@ -163,15 +160,12 @@ def test_headers_that_do_not_continue_the_counts_of_their_apid_are_no_packets():
     assert found == packets[:9] + packets[10:]
 
 
-def test_a_wrong_length_costs_its_packet():
+def test_a_wrong_length_a_missing_beginning_and_end_cost_no_more_than_their_packets():
     packets = capture(100, 2)
     broken = bytearray(packets[50])
     broken[4:6] = struct.pack(">H", len(broken) + 100)
     found = packets_of(b"".join([*packets[:50], bytes(broken), *packets[51:]]))
     assert found == packets[:50] + packets[51:]
-
-
-def test_a_beginning_and_an_end_that_are_missing_cost_no_more_than_their_packets():
     packets = capture(60, 3)
     octets = b"".join(packets)
     assert packets_of(octets[5:]) == packets[1:]
@@ -227,13 +221,10 @@ def test_every_octet_of_anything_is_accounted_for(octets, ends):
     assert total == len(mixed)
 
 
-def test_idle_packets_are_distinguished_from_the_others():
+def test_idle_packets_are_distinguished_and_pieces_are_refused_without_error_control():
     packets = [space_packet(9, bytes((k,)), k) for k in range(10)]
     found = cut(b"".join(p + idle_packet(20) for p in packets))
     assert len(found) == 10 and found.octets_idle == 200
-
-
-def test_pieces_of_a_stream_are_refused_without_error_control():
     with pytest.raises(ValueRefused, match="final"):
         cut_packets(b"abc", form=UNCHECKED, final=False)
 
@@ -332,19 +323,13 @@ def read_parquet(octets):
     return parquet.read_table(io.BytesIO(octets))
 
 
-def test_parquet_columns_keep_values_and_gaps():
+def test_parquet_columns_keep_values_and_gaps_truths_as_integers_and_stay_without_rows():
     table = read_parquet(parquet_octets({"n": [1, None, -3], "x": [0.5, 1, None], "t": ["a", None, "\u00b5"]}))
     assert table.to_pydict() == {"n": [1, None, -3], "x": [0.5, 1.0, None], "t": ["a", None, "\u00b5"]}
     assert [str(field.type) for field in table.schema] == ["int64", "double", "string"]
-
-
-def test_parquet_writes_truth_values_as_integers():
     assert read_parquet(parquet_octets({"b": [True, None, np.True_.item(), False]})).to_pydict() == {
         "b": [1, None, 1, 0]
     }
-
-
-def test_parquet_without_rows_keeps_its_columns():
     assert read_parquet(parquet_octets({"n": [], "t": []})).column_names == ["n", "t"]
 
 
@@ -364,13 +349,10 @@ def test_unsigned_integers_of_64_bits_are_written_whole():
     assert read_parquet(format_records(records, "parquet")).column("image_ticks").to_pylist() == [2**64 - 1]
 
 
-def test_parquet_columns_beyond_signed_integers_stay_exact():
+def test_parquet_integers_stay_exact_and_records_are_its_rows():
     table = read_parquet(parquet_octets({"u": [0, None, 2**64 - 1], "both": [-1, 2**63, 5]}))
     assert table.to_pydict() == {"u": [0, None, 2**64 - 1], "both": ["-1", "9223372036854775808", "5"]}
     assert [str(field.type) for field in table.schema] == ["uint64", "string"]
-
-
-def test_records_are_the_rows_of_the_parquet_file():
     records = packet_records(tables())
     table = read_parquet(format_records(records, "parquet"))
     assert table.num_rows == len(records)

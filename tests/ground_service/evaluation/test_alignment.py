@@ -70,15 +70,12 @@ def test_the_reference_has_its_place_over_the_turned_moon():
     assert_allclose(np.linalg.norm(track.velocity_icrf_m_s, axis=1), SPEED_M_S, atol=1e-6)
 
 
-def test_epochs_outside_the_reference_have_no_state():
+def test_epochs_outside_or_without_a_reference_or_an_orientation_have_no_state():
     track = flown(-1.0, 0.0, 601.0)
     assert track.covered.tolist() == [False, True, False]
     _, _, *names = ReferenceStates.__slots__
     for values in (getattr(track, name) for name in names):
         assert np.isnan(values[[0, 2]]).all() and np.isfinite(values[1]).all()
-
-
-def test_without_reference_or_orientation_nothing_is_covered():
     for given in ((polar(), None), (None, Turning()), (None, None)):
         track = reference_states(*given, after(0.0, 10.0))
         assert track.covered.tolist() == [False, False]

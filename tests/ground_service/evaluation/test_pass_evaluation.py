@@ -734,7 +734,7 @@ def test_the_summary_holds_the_figures_of_the_report(report):
     }
 
 
-def test_the_summary_of_a_pass_without_figures_holds_none():
+def test_the_summary_has_no_figures_without_a_pass_and_baselines_in_their_own_place():
     report = evaluated(detections=no_detections(), navigation=(), reference=None, catalogue=None)
     empty = {
         "frames": None, "packets": 0, "packets_lost": 0, "packets_expected": 0,
@@ -743,9 +743,6 @@ def test_the_summary_of_a_pass_without_figures_holds_none():
     }  # fmt: skip
     bare = summary_of(replace(report, accounting=None, packets=None))
     assert {name: bare[name] for name in empty} == empty
-
-
-def test_baselines_have_their_own_place_in_the_summary():
     baselines = summary_of(evaluated(start_state=START))["baselines"]
     assert tuple(baselines) == BASELINES
     assert baselines["Kepler"]["max_3d_m"] > 100.0

@@ -152,15 +152,12 @@ def poses(text):
     return rows[:, 0], matrices
 
 
-def test_orientations_are_those_of_the_orbit():
+def test_orientations_are_those_of_the_orbit_and_times_keep_their_nanoseconds():
     _, true = poses(format_tum(UTC_NS, orbit(), orbit()))
     radial, normal = true[:, :3, 0], true[:, :3, 2]
     assert_allclose(radial, orbit() / np.linalg.norm(orbit(), axis=1)[:, None], atol=1e-9)
     # The plane of the made orbit is tilted by atan 0.1 about x.
     assert_allclose(normal, [[0.0, -0.0995037, 0.9950372]] * COUNT, atol=1e-4)
-
-
-def test_times_keep_their_nanoseconds():
     line = format_tum(UTC_NS[:2] + 123_456_789, orbit()[:2], orbit()[:2]).splitlines()[1]
     assert line.split()[0] == "1881735115.123456789"
 
@@ -220,7 +217,7 @@ NEVER = np.zeros(100, dtype=bool)
 STEADY = np.arange(100)[:, None] * np.array([0.0, 245.0, 0.0])
 
 
-def test_a_steady_drift_is_its_share_of_the_path_and_a_reset_hides_none():
+def test_a_drift_is_its_share_of_the_path_a_reset_hides_none_and_the_error_before_it_is_known():
     """Sawtooth: 2 % between resets, although the error at the end of the pass is nearly nothing."""
     assert drift_percent(STEADY, PATH_M, NEVER) == approx(1.0, rel=1e-12)
     height = STEADY[:, [1, 0, 2]]
@@ -228,15 +225,9 @@ def test_a_steady_drift_is_its_share_of_the_path_and_a_reset_hides_none():
     phase = np.arange(100) % 20
     sawtooth = phase[:, None] * np.array([0.0, 490.0, 0.0])
     assert drift_percent(sawtooth, PATH_M, phase == 0) == approx(2.0, rel=1e-12)
-
-
-def test_the_error_before_a_reset_is_that_of_the_sample_before():
     error = np.arange(6)[:, None] * np.array([0.0, 3.0, 4.0])
     before = error_before_reset_m(error, np.isin(np.arange(6), (0, 3)))
     assert_allclose(before, [np.nan, np.nan, np.nan, 10.0, np.nan, np.nan])
-
-
-def test_drift_by_length_crosses_no_reset():
     place = np.arange(100)
     samples = drift_by_length(STEADY * (place < 50)[:, None], PATH_M, place == 50)
     assert [sample.path_length_m for sample in samples] == [100e3, 200e3, 500e3, 1000e3]

@@ -264,13 +264,10 @@ def test_a_jump_of_a_hundred_in_chi_square_parts_the_orbit():
         assert bool(np.any(found.state[0] != filtered.state[0])) is smoothed
 
 
-def test_a_selection_keeps_the_degrees_of_its_states():
+def test_a_selection_keeps_its_degrees_and_sigmas_lie_along_the_axes_of_the_orbit():
     some = straight([0.0, 1.0, 2.0]).select(np.array([True, False, True]))
     assert some.innovation_degrees.tolist() == [0, 2]
-
-
-def test_sigmas_lie_along_the_axes_of_the_orbit():
-    """Position along y and velocity along -x: radial is y, transverse -x, normal z."""
+    # Position along y and velocity along -x: radial is y, transverse -x, normal z.
     covariance = np.zeros((1, 9, 9))
     covariance[0, :3, :3] = np.diag([4.0, 9.0, 16.0])
     state = np.array([[0.0, 2e6, 0.0, -1.6e3, 0.0, 0.0, 0.0, 0.0, 0.0]])

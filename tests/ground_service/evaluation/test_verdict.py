@@ -363,13 +363,10 @@ def test_the_table_of_a_pass_of_which_nothing_is_known():
     assert {one.status for one in requirements(Requirements(), Evaluated())} == {"not judged"}
 
 
-def test_housekeeping_without_a_finite_value_is_unknown():
+def test_values_that_are_not_finite_are_unknown_and_the_first_sample_is_no_reset():
     cold = (HousekeepingParameter("temperature_c", "", np.arange(2), np.full(2, np.nan)),)
     for key in ("resources.temperature_max", "resources.temperature_min"):
         assert (row(key, EVERY_LIMIT, found(housekeeping=cold)).status) == "unknown"
-
-
-def test_the_first_sample_is_no_reset_and_a_series_without_outcomes_has_no_count():
     for triggers, resets in (((), None), (("initialization", "none"), 0.0)):
         started = found(series("anchored", reset_trigger=triggers))
         assert row("resets", EVERY_LIMIT, started).value == resets

@@ -72,15 +72,12 @@ def test_a_fault_is_named_with_its_place_what_was_expected_and_what_was_found(li
     assert list(map(str, read_document(text, "m.toml"))) == [str(caught.value)]
 
 
-def test_every_unknown_key_has_a_line_of_its_own():
+def test_every_unknown_key_has_a_line_and_what_is_not_stated_is_none_and_listed():
     faults = read_document('name = "test"\nlinc = 1\n[camera]\nwidht_px = 5\n', "m.toml")
     assert list(map(str, faults)) == [
         "m.toml, camera.widht_px: expected 'width_px', found unknown key 'widht_px'",
         "m.toml, linc: expected 'link', found unknown key 'linc'",
     ]
-
-
-def test_what_is_not_stated_is_none_and_listed():
     mission = parse_mission(TEXT)
     assert mission.camera.width_px is None and mission.frames.gravity_field is None
     assert "camera.width_px" in mission.unknown and "camera.fov_deg" not in mission.unknown

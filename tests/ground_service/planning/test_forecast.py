@@ -208,16 +208,13 @@ def test_windows_that_touch_do_not_overlap():
         assert why(one, (1, 1), (gap + 0.02, 1)) is None
 
 
-def test_the_battery_is_that_of_a_balance_by_hand():
+def test_the_battery_is_that_of_a_balance_by_hand_whatever_the_steps():
     # 6 Wh an hour in, 20 Wh an hour out: 14 Wh an hour less, from 50 Wh to 15 Wh in 2.5 h
     assert why(grid(), (1, 2.5)) is None
     assert why(grid(), (1, 2.6)) == "the battery would fall to 28 %, expected 30 % or more"
     # full again only after 28 / 6 h
     assert why(grid(), (1, 2), (3 + 14 / 3, 2.5)) is None
     assert why(grid(), (1, 2), (3 + 14 / 3 - 0.5, 2.5)) is not None
-
-
-def test_energy_of_a_window_does_not_depend_on_the_steps():
     for start in (0.0, 0.1, 1.05, 23.0):
         change, _ = grid().flows([window(start, 0.75)])
         assert (grid().gain_wh - change).sum() == pytest.approx(15.0)
@@ -234,16 +231,13 @@ def test_stored_data_leave_in_contacts():
     assert why(full, (1, 1, 6000), (11, 1, 5000)) is None  # 3000 left in between
 
 
-def test_data_have_to_be_down_in_time():
+def test_data_have_to_be_down_in_time_and_the_duty_limit_counts_windows_of_a_day():
     late = np.zeros(48 * 6)
     late[6 * 30] = 5000.0
     slow = grid(48, downlink_octets=late)
     assert why(slow, (1, 1, 100)) == "its data would not be down within 24 h"
     assert why(slow, (8, 1, 5000)) is None
     assert why(slow, (8, 1, 5001)) == "its data would not be down within 24 h"
-
-
-def test_the_duty_limit_counts_windows_that_begin_within_a_day():
     strong = grid(72, gain_wh=np.full(72 * 6, 10.0), observe_s_per_day=7200.0)
     assert why(strong, (1, 1), (5, 1)) is None
     assert why(strong, (1, 1), (5, 1), (24.99, 0.5)) is not None

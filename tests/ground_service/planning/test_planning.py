@@ -167,7 +167,7 @@ def test_the_battery_falls_with_the_load():
     )
 
 
-def test_data_leave_the_store_in_the_order_they_came():
+def test_data_are_as_long_as_their_packets_and_leave_the_store_in_the_order_they_came():
     first, second = Option(0, 100 * NS, 1000), Option(200 * NS, 300 * NS, 500)
     contacts = [
         PredictedContact(one, a * NS, b * NS) for one, a, b in zip("aba", (400, 450, 900), (460, 500, 960), strict=True)
@@ -177,9 +177,6 @@ def test_data_leave_the_store_in_the_order_they_came():
     early = [PredictedContact("a", 100 * NS, 200 * NS)]
     assert storage_peak([first, second], early, 80.0, second) == (1000, None)
     assert storage_peak([first], contacts, 0.0, first) == (1000, None)
-
-
-def test_data_of_a_frame_are_as_long_as_its_packets():
     # Packet lengths by the ICD: detections 35 + 9 n, navigation state 84, frame outcome 59, housekeeping 92 octets.
     names = ("detections", "navigation_state", "frame_outcome", "housekeeping")
     detections, state, outcome, housekeeping = (DICTIONARY.packet(name).base_length for name in names)

@@ -165,13 +165,10 @@ def test_a_degraded_build_fails_by_the_metric_that_is_worse(passes, faults, name
         assert failed(suite(0, passes), suite(noise, passes, **faults)) == {name}
 
 
-def test_a_better_build_passes_on_one_window_and_the_bounds_say_that_it_is_better():
+def test_a_better_build_passes_on_one_window_and_a_loss_in_one_terrain_or_pass_fails_there():
     gates = judge(suite(0, 1), suite(1, 1, recall=0.8), POLICY)
     assert verdict_of(gates) == "pass"
     assert by_name(gates)["detector.recall"].change_high < 0.0
-
-
-def test_a_loss_in_one_kind_of_terrain_or_on_one_pass_alone_fails_there():
     gates = judge(suite(0), suite(1, recall=0.72, other_kind_recall=0.58), POLICY)
     assert "sparse terrain" in places(gates)
     assert "cratered terrain" not in {gate.pass_id for gate in gates}
@@ -230,15 +227,12 @@ def test_the_test_of_recall_is_mcnemars_over_tracks():
     assert (recall.outcome, recall.evidence, recall.frames) == ("fail", "120 tracks", 300)
 
 
-def test_a_failure_needs_a_lower_bound_above_what_is_material():
+def test_a_failure_needs_a_lower_bound_above_what_is_material_and_unseen_pairs_have_their_error():
     """Every thousandth row lost: certain, and not material."""
     whole = [1] * 50
     recall = judged(*rows([whole] * 4, [[0, *whole[1:]], *[whole] * 3]))
     assert recall.baseline - recall.candidate == approx(0.005)
     assert recall.p_value < 1e-6 and recall.outcome == "pass"
-
-
-def test_without_a_changed_track_the_error_is_that_of_unseen_pairs():
     recall = judged(*rows([[1, 0]], [[1, 0]], copies=100))
     assert recall.change_high == approx(stats.t(99).ppf(0.95) * 1.8 / 200)
     assert recall.outcome == "pass"
@@ -389,16 +383,13 @@ def test_exact_gates_and_the_verdict_of_a_placebo_are_rejected_if_they_fail():
     assert doubted == {"telemetry.undecodable", "verdict"}
 
 
-def test_a_position_without_a_reference_is_a_value():
+def test_a_position_without_a_reference_is_a_value_and_its_wrong_fixes_are_not_judged():
     before, silence = suite(0, 1), "telemetry.frames_without_value"
     anchored = replace(before["pass 0"].estimators["anchored"], error_m=np.full(FRAMES, np.nan))
     unknown = changed(before, estimators={"anchored": anchored})
     assert silence not in failed(before, unknown)
     silent = replace(anchored, stated=np.arange(FRAMES) > 3)
     assert silence in failed(unknown, changed(before, estimators={"anchored": silent}))
-
-
-def test_wrong_fixes_are_not_judged_without_a_reference():
     before = suite(1, passes=1)
     unknown = _estimator(np.ones(FRAMES, np.bool_), np.full((FRAMES, 3), np.nan), np.ones((FRAMES, 3)), {0: "fixed"})
     after = changed(before, estimators={"anchored": unknown})
@@ -420,15 +411,12 @@ def test_exact_gates_tolerate_what_the_policy_says():
         assert failed(wrong(five, 9), wrong(rest, count)) == names
 
 
-def test_passes_without_images_judge_fixes_and_telemetry_only():
+def test_passes_without_images_judge_fixes_and_telemetry_and_no_metric_that_builds_lack():
     gates = by_name(judge(suite(0, 2), suite(1, 2, recall=0.2, fixes=0.5), POLICY, imaged=()))
     assert gates["detector.recall"].reason == "no pass was replayed from images"
     assert gates["detector.recall"].outcome == gates["memory"].outcome == "not judged"
     assert gates["navigation.anchored.fixes"].outcome == "fail"
     assert "latency.network" not in gates and "detector.bias" not in gates
-
-
-def test_a_metric_that_neither_build_has_is_not_judged():
     before, after = (changed(suite(noise, 1), estimators={}) for noise in (0, 1))
     gates = judge(before, after, POLICY)
     assert by_name(gates)["navigation.anchored.fixes"].reason == "neither build has this metric"
@@ -478,14 +466,11 @@ def test_the_verdict_is_that_of_the_worst_deciding_gate(outcomes, verdict):
     assert verdict_of(gates) == verdict
 
 
-def test_only_passes_of_both_builds_are_compared():
+def test_only_passes_of_both_builds_are_compared_and_what_the_baseline_lacks_is_open():
     assert judge({}, {}, POLICY) == []
     before, after = suite(0, 2), suite(1, 2)
     del after["pass 0"]
     assert judged(before, after).frames == FRAMES
-
-
-def test_a_value_that_the_baseline_lacks_leaves_its_gate_open():
     fixes = judged(changed(suite(0, 1), estimators={}), suite(1, 1), "navigation.anchored.fixes")
     assert (fixes.outcome, fixes.reason) == ("inconclusive", "unknown: the baseline has no value")
 
@@ -567,15 +552,12 @@ def test_rows_are_summed_by_unit_and_units_of_either_build_are_aligned():
     assert np.isnan(sums([], [], []).value)
 
 
-def test_the_error_of_a_ratio_of_equal_units_is_that_of_a_mean():
+def test_the_error_of_a_ratio_is_that_of_a_mean_without_differences_between_kinds_of_terrain():
     values = np.random.default_rng(1).standard_normal(400)
     one = UnitSums(np.arange(400), np.zeros(400, np.int64), values, np.ones(400))
     assert ratio_error(one) == approx(np.std(values, ddof=1) / 20.0)
     assert np.isnan(ratio_error(sums([1], [1], [1])))
-
-
-def test_a_difference_between_kinds_of_terrain_is_no_chance():
-    """All units of one kind change by 1, all of the other by 0: within each kind nothing varies."""
+    # All units of one kind change by 1, all of the other by 0: within each kind nothing varies.
     kind = np.repeat([0, 1], 50)
     before = UnitSums(np.arange(100), kind, np.zeros(100), np.ones(100))
     after = UnitSums(np.arange(100), kind, kind.astype(float), np.ones(100))
@@ -599,7 +581,7 @@ def test_a_one_sided_test_is_wrong_as_often_as_it_says(correlated):
     assert 0 < wrong <= stats.binom.isf(1e-4, 400, 0.05)
 
 
-def test_the_mean_change_of_passes_is_a_ratio_for_lengths_and_a_difference_for_shares():
+def test_the_change_of_passes_is_a_ratio_or_a_difference_and_frames_follow_the_square_of_its_error():
     before, after = np.array([1.0, 2.0, 4.0, np.nan]), np.array([2.0, 4.0, 8.0, 1.0])
     assert mean_change(before, after, relative=True).estimate == approx(np.log(2.0))
     change = mean_change(before, after, relative=False)
@@ -607,9 +589,6 @@ def test_the_mean_change_of_passes_is_a_ratio_for_lengths_and_a_difference_for_s
     assert change.error == approx(np.std([1.0, 2.0, 4.0], ddof=1) / np.sqrt(3.0))
     assert (change.baseline, change.candidate) == (2.0, 3.0)
     assert mean_change(before[3:], after[3:], relative=True).units == 0
-
-
-def test_the_frames_needed_follow_the_square_of_error_over_distance():
     assert frames_needed(100, 0.05, 0.01, 1.0) == 2500
     assert frames_needed(100, 0.05, 0.0, 1.0) is None
     assert frames_needed(10, 1.0, 1e-6, 1.0) is None

@@ -366,15 +366,12 @@ def texture(shape=(512, 512, 3), dtype=np.uint8):
     return np.clip(image * full, 0, np.iinfo(dtype).max).astype(dtype)
 
 
-def test_a_good_frame_comes_out_with_zero_mean_and_unit_deviation():
+def test_a_good_frame_has_zero_mean_and_unit_deviation_whatever_its_depth_and_colour():
     prepared = prepare_image(texture())
     assert prepared.quality is ImageQuality.OK
     # Clipping at four deviations moves both by far less than a hundredth.
     assert float(prepared.gray.mean()) == approx(0.0, abs=0.01)
     assert float(prepared.gray.std()) == approx(1.0, abs=0.01)
-
-
-def test_depth_and_colour_of_the_same_scene_make_no_difference():
     reference = prepare_image(texture()).gray
     for other in (
         texture(shape=(512, 512)),
@@ -420,13 +417,10 @@ def test_a_frame_that_cannot_be_searched_is_a_verdict(image, verdict):
     assert prepare_image(image).quality is verdict
 
 
-def test_one_pixel_that_is_no_number_makes_a_float_frame_invalid():
+def test_gray_levels_round_to_the_nearest_count_and_one_that_is_no_number_is_invalid():
     image = texture(shape=(64, 64)).astype(np.float32) / 255.0
     image[3, 5] = np.inf
     assert prepare_image(image).quality is ImageQuality.INVALID
-
-
-def test_gray_levels_round_to_the_nearest_count():
     image = np.array([[[1, 1, 2], [255, 255, 255], [0, 0, 1]]], np.uint8)
     assert gray_levels(image).tolist() == [[1, 255, 0]]
 

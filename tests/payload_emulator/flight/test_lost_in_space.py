@@ -245,7 +245,7 @@ def test_scattered_detections_have_no_evidence_on_average():
     assert near.mean() < every.mean()
 
 
-def test_evidence_grows_with_agreement_of_place_and_size():
+def test_evidence_grows_with_agreement_of_place_and_size_and_with_the_score():
     pairs, diameter = [0, 1, 3], np.array([8.0, 16.0, 64.0])
     exact = PREDICTED_PX[pairs]
     best = evidence_of(exact, diameter, pairs)
@@ -255,10 +255,7 @@ def test_evidence_grows_with_agreement_of_place_and_size():
     more = np.array([*exact, [50.0, 50.0]])
     assert evidence_of(more, np.append(diameter, 200.0), [*pairs, -1]) == approx(best, abs=1e-6)
     assert evidence_of(more, np.append(diameter, 32.0), [*pairs, -1]) < best - 0.1
-
-
-def test_detections_with_a_high_score_count_more():
-    """Of two detections of about a crater's size, the one at its place is the evidence."""
+    # Of two detections of about a crater's size, the one at its place is the evidence.
     diameter, uv = np.array([16.0, 16.5]), np.array([[80.0, 30.0], [10.0, 90.0]])
     equal, sure, doubtful = (
         evidence_of(uv, diameter, [1, -1], np.array(score)) for score in ([0.5, 0.5], [0.8, 0.2], [0.2, 0.8])

@@ -275,7 +275,7 @@ def test_a_set_of_settings_knows_the_generation_that_it_wrote():
         assert found.generation == settings.generation
 
 
-def test_every_port_parameter_and_restricted_command_is_in_it():
+def test_every_port_parameter_and_command_and_the_events_of_faults_are_in_the_document():
     text = format_interfaces()
     ports = [name for name in vars(Board) if not name.startswith("_") and callable(getattr(Board, name))]
     assert len(ports) > 8
@@ -285,9 +285,6 @@ def test_every_port_parameter_and_restricted_command_is_in_it():
         assert f"| {parameter.number} | {parameter.name} |" in text
     for name in ALLOWED:
         assert f"| {name} |" in text
-
-
-def test_the_events_of_the_table_of_faults_are_those_of_the_dictionary():
     known = set(DICTIONARY.labels("event_info", "event_id").values())
     rows = format_interfaces().split("## Faults")[1].splitlines()[4:]
     named = {event for row in rows if row for event in re.findall(r"\w+", row.split("|")[2])}

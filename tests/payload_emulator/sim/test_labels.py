@@ -36,7 +36,7 @@ def crater_at(latitude_deg, longitude_deg, diameter_m, rim_height_m):
     )  # fmt: skip
 
 
-def test_a_crater_below_the_camera_is_in_the_middle_and_as_wide_as_the_lens_makes_it():
+def test_a_crater_below_is_as_wide_as_the_lens_makes_it_and_rim_height_moves_one_at_the_edge():
     catalogue = crater_at(degrees(0.2), degrees(1.0), 5000.0, 2000.0)
     labels = project_craters(catalogue, CAMERA, *pose(0.2, 1.0))
     assert (labels.u_px[0], labels.v_px[0]) == approx((255.5, 255.5), abs=1e-6)
@@ -44,9 +44,6 @@ def test_a_crater_below_the_camera_is_in_the_middle_and_as_wide_as_the_lens_make
     width = 5000.0 * (1.0 + 2000.0 / MOON_RADIUS_M)
     assert labels.diameter_px[0] == approx(CAMERA.focal_px * width / 18_001.8, rel=1e-5)
     assert labels.size_class[0] == 0 and labels.inside[0] and labels.visible_fraction[0] == 1.0
-
-
-def test_rim_height_moves_a_crater_at_the_edge():
     longitude = degrees(1.0 + 30e3 / MOON_RADIUS_M)
     low, high = (
         project_craters(crater_at(0.0, longitude, 5000.0, height), CAMERA, *pose(0.0, 1.0)).u_px[0]
@@ -103,13 +100,10 @@ def project_rim_middle(catalogue, position, rotation):
     return np.average(labels.u_px, weights=weight), np.average(labels.v_px, weights=weight)
 
 
-def test_what_is_cut_by_the_edge_says_so():
+def test_craters_cut_by_the_edge_say_so_and_those_out_of_sight_or_behind_the_limb_are_none():
     longitude = degrees(34.2e3 / MOON_RADIUS_M)
     labels = project_craters(crater_at(0.0, longitude, 9000.0, 0.0), CAMERA, *pose())
     assert 0.3 < labels.visible_fraction[0] < 0.7
-
-
-def test_craters_out_of_sight_or_behind_the_limb_give_no_labels():
     assert len(project_craters(crater_at(40.0, 100.0, 9000.0, 0.0), CAMERA, *pose())) == 0
     empty = make_catalogue([], [], [], source="t")
     assert len(project_craters(empty, CAMERA, *pose())) == 0
@@ -220,13 +214,10 @@ def test_a_label_on_a_slope_sits_on_the_slopes_rim(formula_terrain):
     assert tilt[0] == approx(300.0, rel=0.01) and abs(tilt[1]) < 1.0
 
 
-def test_labels_sit_on_procedural_rims(procedural):
+def test_labels_sit_on_procedural_rims_also_through_a_distorting_lens(procedural):
     offsets = errors_px(procedural, 10.0, 20.0, (22e3, 45e3))
     assert offsets.size >= 40
     assert sqrt(np.mean(offsets**2)) <= 0.1
-
-
-def test_labels_sit_on_rims_seen_through_a_distorting_lens(procedural):
     offsets = errors_px(procedural, 10.0, 20.0, (40e3,), BrownCamera(k1=-0.015, p1=5e-4))
     assert offsets.size >= 20
     assert sqrt(np.mean(offsets**2)) <= 0.1

@@ -52,12 +52,9 @@ def test_light_beyond_full_scale_saturates_shadow_is_not_exposed_for_and_black_s
     assert shot(field(0.0), SensorModel(), 1).mean() < 6.0
 
 
-def test_the_same_generator_gives_the_same_bits():
+def test_the_same_generator_gives_the_same_bits_blur_keeps_light_and_ground_is_slightly_red():
     scene = default_rng(5).random((64, 64)).astype(np.float32)
     assert_array_equal(shot(scene, SensorModel(), 9), shot(scene, SensorModel(), 9))
-
-
-def test_blur_keeps_light_and_spreads_a_point_as_a_gaussian():
     scene = field(0.0)
     scene[64, 64] = 0.5
     image = green(scene, quiet(psf_sigma_px=1.2))
@@ -65,9 +62,6 @@ def test_blur_keeps_light_and_spreads_a_point_as_a_gaussian():
     rows = np.arange(128) - 64
     # Integrating over pixels adds a twelfth of a pixel squared.
     assert (image.sum(axis=1) * rows**2).sum() / image.sum() == approx(1.2**2 + 1.0 / 12.0, rel=0.03)
-
-
-def test_sunlit_ground_is_slightly_red():
     image = shot(field(0.5), SensorModel(exposure=1.0, **PLAIN), 2).mean(axis=(0, 1))
     assert image[[0, 2]] / image[1] == approx([COLOUR[0], COLOUR[2]], abs=0.01)
 
@@ -96,11 +90,8 @@ def green(scene, sensor):
     return shot(scene, sensor)[..., 1] / 65535.0
 
 
-def test_exposure_is_the_share_of_full_scale_per_unit_of_radiance():
+def test_exposure_is_the_share_of_full_scale_and_gain_brightens_and_makes_noisier():
     assert green(field(0.2), quiet(exposure=2.5)).mean() == approx(0.5, abs=1e-3)
-
-
-def test_gain_brightens_and_makes_noisier():
     bright = green(field(0.1), quiet(gain=4.0))
     assert bright.mean() == approx(0.4, abs=1e-3)
     # At the same output level four times the gain is a quarter of the electrons: noise doubles.
@@ -110,14 +101,11 @@ def test_gain_brightens_and_makes_noisier():
     assert deviations[1] / deviations[0] == approx(2.0, rel=0.05)
 
 
-def test_vignetting_takes_its_share_at_the_corners_and_half_of_it_at_the_sides():
+def test_vignetting_takes_its_share_smear_follows_columns_and_stray_light_goes_everywhere():
     image = green(field(0.8), quiet(vignetting=0.4))
     assert image[64, 64] == approx(0.8, rel=1e-3)
     assert image[0, 0] == approx(0.8 * 0.6, rel=1e-3)
     assert image[64, 0] == approx(0.8 * 0.8, rel=1e-2)
-
-
-def test_smear_follows_columns_and_stray_light_goes_everywhere():
     scene = field(0.0)
     scene[10:74, 30] = 0.5
     smeared = green(scene, quiet(smear=0.1))
@@ -127,21 +115,15 @@ def test_smear_follows_columns_and_stray_light_goes_everywhere():
     assert green(field(0.5), quiet(stray=0.1)).mean() == approx(0.55, abs=1e-3)
 
 
-def test_hot_pixels_are_the_same_ones_in_every_frame():
+def test_hot_and_uneven_pixels_are_the_same_in_every_frame_and_dark_signal_lifts_a_black_picture():
     sensor = quiet(hot_pixels=1e-3)
     first = shot(field(0.1), sensor, 1)[..., 1] == 65535
     second = shot(field(0.1), sensor, 2)[..., 1] == 65535
     assert_array_equal(first, second)
     # A thousandth of 16,384; two may fall on one place.
     assert 14 <= first.sum() <= 16
-
-
-def test_dark_signal_and_offset_lift_a_black_picture():
     sensor = quiet(full_well_e=1000.0, dark_e=50.0, offset=0.1, read_noise_e=0.0)
     assert green(field(0.0), sensor).mean() == approx(0.15, abs=2e-3)
-
-
-def test_pixels_respond_unevenly_and_always_alike():
     flat = green(field(0.5), quiet(gain_mismatch=0.02))
     assert flat.std() / flat.mean() == approx(0.02, rel=0.05)
     assert_allclose(flat, green(field(0.5), quiet(gain_mismatch=0.02)), atol=1e-4)

@@ -130,16 +130,13 @@ def test_the_band_may_lie_on_one_side_of_the_equator(polar_truth):
     assert (found.stop_utc_ns - found.start_utc_ns) / NS == approx(PERIOD_S / 12.0, abs=61.0)
 
 
-def test_the_attitude_message_carries_attitude_and_sun():
+def test_the_attitude_message_carries_attitude_and_sun_and_an_error_turns_the_camera_by_its_size():
     camera_from_mcmf = nadir_camera_from_mcmf(np.array([RADIUS_M, 0.0, 0.0]))
     sun_mcmf = np.array([0.6, 0.0, 0.8])
     message = attitude_message(camera_from_mcmf, camera_from_mcmf @ sun_mcmf)
     assert_allclose(matrix_from_quaternion(message[:4]), camera_from_mcmf, atol=1e-12)
     # Camera: x east, y south, z down. The Sun stands 0.6 up and 0.8 north.
     assert_allclose(message[4:], [0.0, -0.8, -0.6], atol=1e-12)
-
-
-def test_a_pointing_error_turns_the_camera_by_its_size():
     camera = nadir_camera_from_mcmf(np.array([RADIUS_M, 0.0, 0.0]))
     turned = perturbed(camera, np.array([0.0, np.radians(2.0), 0.0]))
     angle = np.arccos((np.trace(turned @ camera.T) - 1.0) / 2.0)
@@ -202,7 +199,7 @@ def test_the_sensors_and_stages_are_those_that_flight_reads():
     assert all(hasattr(simulated, name) for name in [*members, "reset_cause", "store", "settings"])
 
 
-def test_energy_is_kept_between_arrays_loads_and_battery():
+def test_energy_is_kept_between_arrays_loads_and_battery_and_the_bus_obeys_ohms_law():
     simulated = board(charge=0.5)
     run(simulated, 60, 0.0)
     # An hour of 2.2 + 1.6 + 3.4 W out of 20 Wh, by hand.
@@ -210,9 +207,6 @@ def test_energy_is_kept_between_arrays_loads_and_battery():
     run(simulated, 60)
 
     assert simulated.charge == approx(0.5 - 7.2 / 20.0 + (9.0 - 7.2) / 20.0, abs=1e-9)
-
-
-def test_the_bus_obeys_ohms_law():
     simulated = board(charge=1.0)
     volts, amperes, _, _ = np.mean([simulated.sensors() for _ in range(400)], axis=0)
     # 12.6 V behind 0.15 ohm, 2.2 W drawn: V = 12.6 - 0.15 I, V I = 2.2; noise of 5 mV over 400 readings.

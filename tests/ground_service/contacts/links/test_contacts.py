@@ -79,23 +79,17 @@ def test_without_keeps_what_no_closed_span_covers(span, closed):
         assert kept == (not any(2 * a < halves < 2 * b for a, b in closed))
 
 
-def test_a_contact_contains_its_edges_and_the_margin():
+def test_edges_of_contacts_silences_waits_and_offsets_of_the_clock_are_where_they_are_stated():
     contacts = [PredictedContact("a", 100, 200), PredictedContact("b", 300, 400)]
     assert [contact_at(contacts, t) for t in (99, 100, 200, 201)] == [None, contacts[0], contacts[0], None]
     assert contact_at(contacts, 290, 10) == contacts[1]
     assert contact_at(contacts, 289, 10) is None
-
-
-def test_silence_begins_after_its_time_and_waits_double_up_to_a_limit():
     assert not is_silent(0, 60 * NS, 60.0)
     assert is_silent(0, 60 * NS + 1, 60.0)
     waits = [0.0]
     for _ in range(8):
         waits.append(next_wait_s(waits[-1]))
     assert waits[1:] == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0]
-
-
-def test_only_a_large_offset_of_the_clock_is_a_fault():
     limit = round(CLOCK_LIMIT_S * NS)
     assert clock_fault(None) is None and clock_fault(limit) is None and clock_fault(-limit) is None
     assert "+3600 s" in (clock_fault(3600 * NS) or "") and "-3600 s" in (clock_fault(-3600 * NS) or "")

@@ -82,16 +82,13 @@ def test_nothing_is_found_in_few_or_equal_values(values):
     assert len(values) < 2 * LEAST_PASSES or len(set(map(str, values))) == 1
 
 
-def test_a_share_has_the_interval_of_wilson():
+def test_a_share_has_the_interval_of_wilson_and_a_window_excludes_passes_of_its_length_ago():
     # Agresti and Coull, The American Statistician 52 (1998): 10 of 10 gives 0.722 to 1.
     share = wilson(10, 10)
     assert share.share == 1.0
     assert share.low == approx(0.7225, abs=1e-4)
     assert share.high == approx(1.0)
     assert math.isnan(wilson(0, 0).share)
-
-
-def test_a_rolling_window_excludes_passes_of_its_length_ago():
     counts = rolling_counts([0, 10, 20, 21], ["met", "not met", "met", "unknown"], 20)
     assert counts == [
         {"met": 1}, {"met": 1, "not met": 1}, {"met": 1, "not met": 1}, {"met": 1, "not met": 1, "unknown": 1},

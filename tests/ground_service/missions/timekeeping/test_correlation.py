@@ -71,14 +71,11 @@ def test_one_report_gives_an_offset_and_none_is_refused():
         fit_correlation(ticks[:0], received[:0], light[:0])
 
 
-def test_without_correlations_the_clock_is_ideal():
+def test_the_correlation_nearest_in_time_is_used_and_without_any_the_clock_is_ideal():
     ticks = np.array([0, 1 << 40], dtype=np.int64)
     utc, used = utc_ns_of_ticks(ticks, [])
     assert utc.tolist() == [int(utc_ns_from_ticks(int(t))) for t in ticks]
     assert set(used.tolist()) == {IDEAL_CLOCK}
-
-
-def test_the_correlation_nearest_in_time_is_used_outside_all_of_them():
     one = TimeCorrelation(1, 0, 100, 0, START, 0.0)
     two = TimeCorrelation(2, 1000, 1100, 1000, START, 0.0)
     _, used = utc_ns_of_ticks(np.array([-5, 50, 400, 700, 2000]), [one, two])
@@ -167,18 +164,12 @@ def test_a_single_station_off_by_whole_seconds_of_a_usual_cause_decides_nothing(
     assert {str(one) for one in doubts.values()} == ({words} if remark else set())
 
 
-def test_the_one_of_three_stations_that_agrees_with_the_on_board_clock_counts():
+def test_the_station_that_agrees_with_the_on_board_clock_counts_and_a_corrected_one_from_then_on():
     clocks = {"a": [-18.0] * 12, "b": [37.0] * 12, "c": [0.0] * 12}
     kept, _ = doubted_stations(*reports_of_stations("aaaabbbbbccc", clocks))
     assert np.flatnonzero(kept).tolist() == [9, 10, 11]
-
-
-def test_a_clock_that_was_set_after_its_only_station_was_right_is_no_fault_of_the_station():
     given = reports_of_stations("a" * 8, {"a": [0.0] * 8}, [0.0] * 4 + [18.0] * 4)
     assert doubted_stations(*given)[0].all() and len(clock_runs(*given[:4])) == 2
-
-
-def test_a_single_station_that_was_corrected_counts_from_then_on():
     kept, _ = doubted_stations(*reports_of_stations("a" * 8, {"a": [-18.0] * 4 + [0.0] * 4}))
     assert kept.tolist() == [False] * 4 + [True] * 4
 
