@@ -246,15 +246,12 @@ def day():
     return polar_orbit(23.999, 15.0)
 
 
-def test_a_pass_within_sixty_degrees_lasts_37_minutes(day):
+def test_a_pass_within_sixty_degrees_lasts_37_minutes_and_epochs_can_be_chosen(day):
     track = ground_track(day, IauOrientation())
     inside = np.abs(track.latitude_rad) <= math.radians(60)
     edges = np.flatnonzero(np.diff(inside.astype(int)))
     lengths = np.diff(edges)[int(inside[edges[0]]) :: 2] * 15.0 / 60.0
     assert np.mean(lengths) == pytest.approx(111.20 / 3, abs=0.1)
-
-
-def test_epochs_and_steps_can_be_chosen(day):
     epochs = even_epochs(day, 60.0)
     assert np.all(np.diff(epochs) == 60 * NS)
     track = ground_track(day, IauOrientation(), epochs)

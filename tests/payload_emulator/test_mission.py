@@ -94,16 +94,13 @@ def test_the_registration_of_the_terrain_is_stated(world):
     assert stated.registered_share == 0.0 and stated.registration_sigma_m is None
 
 
-def test_the_offset_of_the_list_that_the_payload_starts_with_is_stated(world):
+def test_limits_and_the_offset_of_the_list_that_the_payload_starts_with_are_stated(world):
     stated = stated_of(world).catalogue
     loaded = launch_payload(world.scenario, world.camera, DataFolder()).parameters.flight.anchored
     assert loaded.offset is not None
     up_m = loaded.errors.catalogue_offset_m[2]
     assert stated.offset_sigma_m == (loaded.offset.prior_m, loaded.offset.prior_m, up_m)
     assert np.radians(stated.offset_correlation_deg) == pytest.approx(loaded.offset.correlation_rad)
-
-
-def test_limits_of_the_scenario_are_stated_and_negative_ones_are_not(world):
     requirements = stated_of(world).requirements
     assert requirements.estimator == "anchored"
     assert (requirements.median_error_m, requirements.recall, requirements.memory_mib) == (42.0, None, None)

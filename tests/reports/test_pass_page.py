@@ -92,7 +92,7 @@ def test_the_list_of_evidence_levels_has_terrain_seen_in_training(page):
     assert "2 procedural Moon, 3s real terrain seen in training, 3 real terrain never used" in page.text
 
 
-def test_the_ledger_lists_the_reads_that_reset_an_estimator_only(whole_pass):
+def test_the_ledger_lists_the_reads_that_reset_an_estimator_and_a_title_with_markup_is_text(whole_pass):
     reads = tuple(
         AnchorRead("paper", whole_pass.truth_ledger[0].utc_ns, trigger, 700 + number)
         for number, trigger in enumerate(("none", "safety_timeout", "none"))
@@ -101,9 +101,6 @@ def test_the_ledger_lists_the_reads_that_reset_an_estimator_only(whole_pass):
     resets = text[text.index("Reads that reset an estimator.") : text.index("Every read is in the JSON form")]
     assert "701 safety timeout" in resets
     assert "700" not in resets and "702" not in resets
-
-
-def test_a_title_with_markup_is_text(whole_pass):
     title, series = '<script>alert("x")</script> $\\alpha$ 月', _series(3, name="<b>&</b> $x^2$ 月")
     page = of_pass(title, '";} body{display:none}</style>', navigation=(series,))
     assert page.left_open == []

@@ -88,16 +88,13 @@ def test_a_stream_that_begins_within_an_octet_is_found_and_aligned(slip):
     assert cadu_octets(octets, sync).tolist() == stream.reshape(-1, PERIOD)[1:].tolist()
 
 
-def test_a_bit_slip_costs_one_frame_and_the_rest_is_read_shifted():
+def test_a_bit_slip_costs_one_frame_and_an_inverted_stretch_is_turned_upright():
     stream = stream_of(20)
     octets, sync = sync_of_bits(np.delete(np.unpackbits(stream), 8 * (7 * PERIOD + 60)))
     rows = [k for k in range(20) if k != 7]
     assert sync.start_bits.tolist() == [8 * PERIOD * k - (k > 7) for k in rows]
     assert sync.truncated.tolist() == [PERIOD * 7]
     assert cadu_octets(octets, sync).tolist() == stream.reshape(-1, PERIOD)[rows].tolist()
-
-
-def test_an_inverted_stretch_is_turned_upright():
     stream = stream_of(20)
     turned = stream.copy()
     turned[8 * PERIOD : 15 * PERIOD] ^= 0xFF
@@ -160,16 +157,13 @@ def test_likenesses_of_a_marker_in_the_headers_of_records_do_not_catch_the_lock(
     assert not sync.inverted.any()
 
 
-def test_a_valid_frame_is_preferred_to_an_undamaged_likeness_that_others_follow():
+def test_a_likeness_that_others_follow_or_in_the_last_frame_does_not_cost_a_valid_frame():
     header = np.concatenate((MARKER, np.zeros(4, dtype=np.uint8)))
     frames = stream_of(12).reshape(-1, PERIOD)
     frames[:, 3] ^= 0b00000101
     stream = np.hstack((np.tile(header, (12, 1)), frames)).reshape(-1)
     expected = after_headers(12)
     assert starts(stream, verify=lambda sync: np.isin(sync.offsets, expected), record_octets=8) == expected
-
-
-def test_a_likeness_in_the_last_frame_does_not_cost_the_frame():
     stream = stream_of(3)
     stream[2 * PERIOD + 60 : 2 * PERIOD + 64] = MARKER ^ np.uint8([0, 0, 0, 7])
     # the stream goes on for most of a frame, whose marker and the rest are damaged

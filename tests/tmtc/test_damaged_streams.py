@@ -119,24 +119,18 @@ def test_noise_is_never_a_frame_or_a_packet(seed):
     assert not (known.frames.verdict == FRAME_GOOD).any()
 
 
-def test_frames_that_come_twice_or_in_any_order_give_every_packet():
+def test_frames_of_several_receivers_in_any_order_give_every_packet():
     n = len(cadus())
     any_order = (np.random.default_rng(seed).permutation(n) for seed in range(3))
     for order in (np.repeat(np.arange(n), 2), np.r_[1:n:2, 0:n:2], *any_order):
         decoded = check(cadus()[order], sent())
         assert (decoded.frames_lost, decoded.sequence.missing, decoded.sequence.conflicts) == (0, 0, 0)
-
-
-def test_two_receivers_with_losses_give_the_union():
     rng = np.random.default_rng(12)
     n = len(cadus())
     first, second = (np.flatnonzero(rng.random(n) > 0.15) for _ in range(2))
     received = set(first.tolist()) | set(second.tolist())
     decoded = check(np.concatenate((cadus()[first], cadus()[second])), packets_within(received))
     assert decoded.frames_lost <= n - len(received)
-
-
-def test_copies_of_frames_of_a_long_packet_are_combined():
     long = append_crc(pack_packet(0x55, bytes(range(256)) * 24, sequence_count=3)[:-2])
     octets = DownlinkEncoder(5, LinkSettings(frame_length=223)).encode([*sent()[:3], long, *sent()[3:6]])
     rows = np.frombuffer(octets, dtype=np.uint8).reshape(-1, 259)
@@ -146,15 +140,12 @@ def test_copies_of_frames_of_a_long_packet_are_combined():
     assert sum(decoded.octets.values()) == mixed.size
 
 
-def test_bit_slips_cost_only_the_frames_they_hit():
+def test_bit_slips_cost_only_the_frames_they_hit_and_an_inverted_stream_is_read():
     slips = [9 * 8 * 1279 + 4000, 50 * 8 * 1279 + 77, 100 * 8 * 1279 + 9000]
     stream = np.packbits(np.delete(np.unpackbits(cadus().reshape(-1)), slips))
     received = set(range(len(cadus()))) - {9, 50, 100}
     decoded = check(stream, packets_within(received))
     assert decoded.frames_bad == 3
-
-
-def test_an_inverted_stream_is_read():
     check(255 - cadus(), sent())
 
 

@@ -150,14 +150,11 @@ def test_the_last_frame_is_filled_exactly_however_little_is_left(spare):
     assert decoded.octets_skipped == 0 and decoded.octets["idle_packets"] in (0, spare, spare + 215)
 
 
-def test_counts_go_on_from_one_dump_to_the_next_and_past_255():
+def test_counts_go_on_from_dump_to_dump_and_virtual_channels_are_rebuilt_apart():
     encoder = DownlinkEncoder(76, LinkSettings(frame_length=64, coding="none"))
     decoded = read(b"".join(encoder.encode(sent()[k : k + 7]) for k in range(0, len(sent()), 7)))
     assert decoded.frame_count > 256 and decoded.frames_lost == 0
     assert packets_of(decoded) == sent()
-
-
-def test_virtual_channels_are_rebuilt_apart_and_idle_frames_are_counted():
     encoder = DownlinkEncoder(76)
     octets = b""
     for k in range(0, len(sent()), 20):
@@ -215,16 +212,13 @@ def test_a_lost_frame_costs_the_packets_that_touch_it_and_no_other():
     assert decoded.sequence.missing == len(hit)
 
 
-def test_frames_that_come_twice_or_late_are_not_lost():
+def test_frames_that_come_twice_or_late_are_not_lost_and_uncorrectable_ones_located():
     octets = cadus()
     frames = [octets[k : k + 1279] for k in range(0, len(octets), 1279)]
     again = frames[:20] + frames[:10] + frames[20:40] + frames[5:15] + frames[40:]
     late = frames[:10] + frames[12:20] + frames[10:12] + frames[20:]
     lost = [read(b"".join(one)).frames_lost for one in (again, late, late[:30] + late[33:] + late[:5])]
     assert lost == [0, 0, 3]
-
-
-def test_an_uncorrectable_frame_is_counted_and_its_damage_located():
     octets = bytearray(cadus())
     octets[5 * 1279 + 10 : 5 * 1279 + 10 + 17 * 5 : 5] = bytes(17)
     decoded = read(bytes(octets))
@@ -232,7 +226,7 @@ def test_an_uncorrectable_frame_is_counted_and_its_damage_located():
     assert (decoded.frames.corrected[5] < 0).sum() == 1
 
 
-def test_correctable_errors_cost_nothing_and_are_counted():
+def test_correctable_errors_cost_nothing_are_counted_and_may_be_in_every_codeword():
     octets = bytearray(cadus())
     for frame in (1, 3):
         for k in range(16 * 5):  # sixteen errors in each of the five codewords
@@ -241,9 +235,6 @@ def test_correctable_errors_cost_nothing_and_are_counted():
     assert packets_of(decoded) == sent()
     assert decoded.symbols_corrected == 160 and decoded.complete
     assert decoded.frames.corrected[[1, 3]].tolist() == [[16] * 5] * 2
-
-
-def test_a_stream_whose_every_codeword_has_errors_is_still_recognised():
     octets = bytearray(encode_cadus(sent()[:60], spacecraft_id=76, randomiser="long"))
     for at in range(0, len(octets), 1279):
         octets[at + 300 : at + 305] = octets[at + 400 : at + 405] = bytes(5)
@@ -252,15 +243,12 @@ def test_a_stream_whose_every_codeword_has_errors_is_still_recognised():
     assert decoded.settings.randomiser == "long"
 
 
-def test_a_bad_frame_checksum_discards_the_frame_of_an_uncoded_link():
+def test_frames_with_a_bad_checksum_or_of_another_spacecraft_are_not_used():
     octets = bytearray(cadus(coding="none"))
     octets[3 * 1119 + 500] ^= 1
     decoded = read(bytes(octets))
     assert decoded.frames_bad == 1 and decoded.frames.verdict[3] == FRAME_BAD_CHECKSUM
     assert decoded.crc_errors == 0 and decoded.sequence.missing > 0
-
-
-def test_frames_of_another_spacecraft_are_not_used():
     other = encode_cadus(make_packets(3, seed=9), spacecraft_id=77)
     octets = cadus() + other
     decoded = read(octets)
@@ -382,23 +370,17 @@ FIELDS = (
 )  # fmt: skip
 
 
-def test_header_fields_are_the_bits_that_the_standard_draws():
+def test_headers_are_those_of_the_standard_and_of_spacepackets_and_checksums_hold_until_a_flip():
     frames = np.frombuffer(bytes.fromhex("".join(octets for octets, _ in HEADERS)), dtype=np.uint8).reshape(3, 6)
     columns = frame_headers(frames)
     for k, name in enumerate(FIELDS):
         assert getattr(columns, name).tolist() == [values[k] for _, values in HEADERS], name
-
-
-def test_headers_agree_with_spacepackets():
     octets = bytes.fromhex("04C5 05 06 180A")
     theirs = TmFramePrimaryHeader.unpack(octets)
     ours = frame_headers(np.frombuffer(octets, dtype=np.uint8).reshape(1, 6))
     assert (theirs.master_channel_id.spacecraft_id, theirs.vc_id) == (ours.spacecraft_id[0], ours.virtual_channel[0])
     assert (theirs.master_ch_frame_count, theirs.vc_frame_count) == (ours.master_count[0], ours.channel_count[0])
     assert theirs.frame_datafield_status.first_header_pointer == ours.first_header_pointer[0]
-
-
-def test_frame_checksums_hold_until_a_bit_flips():
     frames = np.random.default_rng(0).integers(0, 256, (5, 100), dtype=np.uint8)
     append_frame_checksums(frames)
     assert frame_checksums_hold(frames).all()
@@ -488,22 +470,16 @@ def words(*clcws):
     )
 
 
-def test_a_stretch_is_summed_up_and_its_newest_word_is_shown():
+def test_stretches_and_channels_of_control_words_add_up_and_others_are_passed_over():
     locked = Clcw(0, 7, lockout=True, retransmit=True, farm_b_counter=2)
     (seen,) = uplink_seen(words(Clcw(0, 7), Clcw(0, 7), locked, locked, Clcw(0, 8, farm_b_counter=3)))
     assert (seen.frames, seen.changes) == (5, 2)
     assert (seen.frames_lockout, seen.frames_retransmit, seen.frames_wait, seen.frames_no_rf) == (2, 2, 0, 0)
     assert (seen.report_value, seen.farm_b_counter, seen.lockout) == (8, 3, False)
-
-
-def test_channels_are_kept_apart_and_what_is_no_control_word_is_passed_over():
     seen = uplink_seen(words(Clcw(3, 1), 0, Clcw(0, 9), TYPE_TWO_REPORT, Clcw(3, 2), Clcw(0, 9)))
     found = [(one.virtual_channel, one.frames, one.changes, one.report_value) for one in seen]
     assert found == [(0, 2, 0, 9), (3, 2, 1, 2)]
     assert uplink_seen(words(0, TYPE_TWO_REPORT)) == () == uplink_seen(words())
-
-
-def test_overlapping_stretches_add_up_to_the_whole():
     rng = np.random.default_rng(5)
     for _ in range(50):
         stream = words(*(Clcw(0, int(n), lockout=bool(n == 1)) for n in rng.integers(0, 3, 60)))

@@ -237,15 +237,12 @@ def check(decoded, packets):
     assert decoded.sequence.gaps == decoded.sequence.missing == 0
 
 
-def test_packets_without_error_control_are_taken_out_of_frames():
+def test_packets_without_error_control_are_taken_out_of_frames_except_lost_ones():
     packets = capture(400, 7)
     octets = encode_cadus(packets, spacecraft_id=42)
     check(decode(octets, form=UNCHECKED), packets)
     uncoded = encode_cadus(packets, spacecraft_id=42, coding="none", frame_length=223)
     check(decode(uncoded, form=UNCHECKED), packets)
-
-
-def test_a_lost_frame_costs_the_packets_that_are_in_it():
     packets = capture(400, 8)
     octets = encode_cadus(packets, spacecraft_id=42)
     size = 1279
@@ -281,14 +278,11 @@ def tables():
     return DICTIONARY.unpack_many(octets, cut_packets(octets))
 
 
-def test_on_board_time_is_exported_in_tai():
+def test_json_and_csv_hold_the_records_in_order_with_names_and_times_and_no_packets_are_none():
     assert format_onboard_time(0) == "2000-01-01T00:00:00.000000"
     # 2029-08-07T00:00:00 TAI is 10811 days after the epoch
     assert format_onboard_time(10811 * 86400 << 16 | 0x8000) == "2029-08-07T00:00:00.500000"
     assert format_onboard_time((1 << 48) - 1).startswith("2136-02-07T06:28:15.99998")
-
-
-def test_records_stand_in_the_order_of_the_stream_with_names_for_codes():
     records = packet_records(tables())
     assert [r["packet"] for r in records] == ["event_info", "detections", "detections", "navigation_state"]
     assert records[0]["event_id"] == "boot" and records[0]["value_2"] is None
@@ -298,23 +292,14 @@ def test_records_stand_in_the_order_of_the_stream_with_names_for_codes():
     assert list(records[1]["items"][0]) == ["u_px", "v_px", "diameter_px", "score", "size_class", "sigma_px"]
     assert records[2]["items"] == []
     assert records[3]["sigma_rtn_m"] == [4.0, 5.0, None]
-
-
-def test_json_and_csv_hold_the_records():
     records = packet_records(tables())
     assert json.loads(format_records(records, "json")) == records
     rows = list(csv.DictReader(io.StringIO(format_records(records, "csv").decode())))
     assert [row["frame_number"] for row in rows] == ["0", "1", "1", "1"]
     assert rows[3]["velocity_icrf_m_s_2"] == "2.0" and rows[3]["sigma_rtn_m_3"] == ""
     assert json.loads(rows[1]["items"]) == records[1]["items"]
-
-
-def test_no_packets_are_empty_files():
     assert json.loads(format_records([], "json")) == []
     assert format_records([], "csv") == b"\n"
-
-
-def test_an_unknown_format_is_refused():
     with pytest.raises(UnknownPacket, match="expected one of json, csv, parquet, found 'xml'"):
         format_records([], "xml")
 

@@ -179,7 +179,7 @@ def test_a_list_leaves_out_other_spacecraft(name, fleet):
     assert answer.json().get("total", 0) == OURS_LISTED.get(name, 0)
 
 
-def test_an_operation_without_a_decision_is_refused(fleet):
+def test_an_operation_without_a_decision_and_a_spacecraft_that_is_not_stated_are_refused(fleet):
     async def new(): ...
 
     route = APIRoute("/new", new)
@@ -187,9 +187,6 @@ def test_an_operation_without_a_decision_is_refused(fleet):
     asked = SimpleNamespace(scope={"route": route})
     with pytest.raises(Forbidden, match="operation of the whole service"):
         check_scope(asked, fleet.ours)
-
-
-def test_a_spacecraft_that_is_not_stated_is_not_one_of_the_caller(fleet):
     answer = fleet.client.post(f"{V1}/telemetry", content=b"x", headers=fleet.headers)
     assert answer.status_code == 403
     assert "as spacecraft_id, found none" in answer.json()["detail"]

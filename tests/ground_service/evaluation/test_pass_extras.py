@@ -236,7 +236,7 @@ def test_a_drift_is_its_share_of_the_path_a_reset_hides_none_and_the_error_befor
     assert samples[0].p95_percent == approx(1.0)
 
 
-def test_statistics_leave_out_samples_without_reference():
+def test_statistics_leave_out_samples_without_reference_and_weigh_with_the_whole_matrix():
     error = np.array([[3.0, 4.0, 0.0], [np.nan] * 3, [0.0, 0.0, 10.0]])
     found = navigation_statistics(error, np.array([0.0, np.nan, 1000.0]), NEVER[:3])
     assert (found.median_3d_m, found.max_3d_m, found.end_of_pass_m, found.path_length_m) == approx(
@@ -245,9 +245,6 @@ def test_statistics_leave_out_samples_without_reference():
     for count in (0, 1):
         few = navigation_statistics(np.zeros((count, 3)), np.zeros(count), NEVER[:count])
         assert np.isnan(few.drift_percent)
-
-
-def test_a_correlated_error_is_weighted_with_the_whole_matrix():
     # P = [[4, 2], [2, 3]], inverse [[3, -2], [-2, 4]] / 8; e = (2, -1): (12 + 8 + 4) / 8 = 3. The diagonal alone gives
     # 4/4 + 1/3.
     covariance = [[4.0, 2.0], [2.0, 3.0]]
@@ -283,14 +280,11 @@ def test_what_is_not_known_is_not_guessed():
     assert np.isnan(squared_normalised_errors([[1.0, 1.0], [np.nan, 1.0]], [[0.0, 1.0], [1.0, 1.0]])).all()
 
 
-def test_no_samples_and_shapes_that_do_not_fit():
+def test_no_samples_have_no_sums_and_bounds_are_those_of_printed_tables():
     assert nees(np.zeros((0, 3)), np.zeros((0, 3, 3))).shape == (0,)
     assert nees(np.ones((4, 5, 3)), np.eye(3)).shape == (4, 5)
     with pytest.raises(ValueError, match=r"expected errors \(..., d\)"):
         nees(np.ones(3), np.eye(2))
-
-
-def test_bounds_are_those_of_printed_tables():
     # Quantiles of chi-square at 0.025 and 0.975 as tables print them (NIST/SEMATECH e-Handbook, 1.3.6.7.4).
     low, high = bounds([1, 3, 6, 100])
     assert_allclose(high, [5.024, 9.348, 14.449, 129.561], atol=6e-4)
@@ -350,7 +344,7 @@ def catalogue():
     )
 
 
-def test_a_tilted_distorted_camera_sees_craters_on_high_ground_where_they_are():
+def test_a_tilted_camera_sees_craters_on_high_ground_and_beyond_a_nadir_footprint():
     viewing = Viewing(CAMERA, TILT_RAD)
     expected = expected_craters(catalogue(), CAMERA, POSITION, viewing.pointed(POSITION))
     assert expected.index.tolist() == [0, 1, 2, 3]
@@ -358,10 +352,7 @@ def test_a_tilted_distorted_camera_sees_craters_on_high_ground_where_they_are():
     assert_allclose(found, [pixel(*place, RIM_HEIGHT_M) for place in PLACES_DEG], rtol=0, atol=1e-6)
     lost = np.full((1, 3), np.nan)
     assert len(expected_craters(catalogue(), CAMERA, lost, viewing.pointed(lost)).index) == 0
-
-
-def test_a_camera_that_leans_far_sees_craters_beyond_a_nadir_footprint():
-    """2.5 degrees north of the track is 76 km, past the corner of a nadir image from 30 km (73 km)."""
+    # 2.5 degrees north of the track is 76 km, past the corner of a nadir image from 30 km (73 km).
     far = make_catalogue(np.radians([3.0]), np.radians([0.0]), np.array([9e3]), source="made", rim_height_m=np.zeros(1))
     narrow = BrownCamera(512, 512, math.radians(60.0))
     assert len(expected_craters(far, narrow, POSITION).index) == 0

@@ -339,15 +339,12 @@ def test_parquet_has_a_file_for_each_packet_type_with_units(export, rich_pass):
     assert_allclose(times - rich_pass.utc_ns, 400 / 65_536 * 1e9, atol=20_000)
 
 
-def test_tum_trajectories_differ_by_the_error(export):
+def test_trajectories_differ_by_the_error_and_images_are_those_of_the_archive(export):
     files = unzipped(export("tum"))
     solution, reference = (np.loadtxt(io.BytesIO(files[name])) for name in ("spherical.tum", "spherical-reference.tum"))
     assert len(solution) == FRAMES
     distance = np.linalg.norm(solution[:, 1:4] - reference[:, 1:4], axis=1)
     assert_allclose(distance, np.linalg.norm(SPHERICAL_ERROR_RTN_M), atol=1.0)
-
-
-def test_images_are_those_of_the_archive(export):
     files = unzipped(export("images"))
     assert sorted(files) == ["000000.png", "000004.png", "000008.png"]
     assert np.asarray(Image.open(io.BytesIO(files["000004.png"])))[0, 0] == 40

@@ -176,16 +176,13 @@ def test_a_better_build_passes_on_one_window_and_a_loss_in_one_terrain_or_pass_f
     assert "pass 3" in found and not found & {"pass 0", "pass 1", "pass 2", "pass 4"}
 
 
-def test_identical_octets_pass_at_once_whatever_the_number_of_frames():
+def test_identical_octets_pass_at_once_and_few_tracks_say_how_many_frames_are_needed():
     few = suite(0, 1, frames=6, tracks=4)
     assert verdict_of(judge(few, few, POLICY)) == "pass"
     assert judged(few, few).reason == "identical in every octet"
     # The same values with another octet somewhere are compared by chance: four tracks claim nothing.
     assert judged(few, changed(few, digests=(b"other",))).outcome == "inconclusive"
     assert judged(few, changed(few, undecodable=1)).reason.startswith("4 of 90")
-
-
-def test_few_tracks_claim_only_a_loss_beyond_the_margin_and_say_how_many_frames_are_needed():
     before, after, slight, great = (
         suite(noise, 1, tracks=30, recall=recall) for noise, recall in ((0, 0.7), (1, 0.7), (1, 0.6), (1, 0.2))
     )
@@ -336,16 +333,13 @@ def test_processor_times_are_compared_by_the_median_of_their_ratios_from_five_pa
     assert judged(suite(0, **TIMES), busy, "latency.total").outcome == "pass"
 
 
-def test_a_program_without_times_of_its_frames_is_judged_by_the_processor_time_of_its_run():
+def test_a_program_without_times_is_judged_by_its_run_and_a_share_of_the_baseline_is_a_percentage():
     """Four times the processor time fails although all packets are the same; half a second more is tolerated."""
     before = suite(0, 2, cpu_s=5.0)
     for cpu_s, outcome in ((20.0, "fail"), (5.4, "pass"), (float("nan"), "not judged")):
         gates = by_name(judge(before, suite(0, 2, cpu_s=cpu_s), POLICY))
         assert (gates["latency.run"].outcome, gates["latency.total"].outcome) == (outcome, "not judged")
     assert judged(suite(0, 2, cpu_s=0.1), suite(0, 2, cpu_s=0.4), "latency.run").passed
-
-
-def test_a_loss_that_is_a_share_of_the_baseline_is_a_percentage():
     gates = by_name(judge(suite(0, 12), suite(1, 12), POLICY))
     assert (gates["navigation.anchored.p50"].relative, gates["detector.recall"].relative) == (True, False)
     assert [loss_text(one, True) for one in (0.005, 0.15, 70.7)] == ["0.5 %", "15 %", "7,070 %"]
@@ -496,17 +490,14 @@ def test_squared_normalised_errors_are_summed_over_the_axes_and_unknown_without_
     assert not hasattr(frames, "nees")
 
 
-def test_a_track_is_one_crater_in_one_visit():
+def test_a_track_is_one_crater_in_one_visit_and_a_cell_is_where_its_sight_meets_the_sphere():
     crater = np.array([7, 3, 7, 7, 3, 7])
     frame = np.array([0, 0, 1, 2 + VISIT_GAP_FRAMES, 1, 1 + VISIT_GAP_FRAMES])
     # Crater 7 is out of view for as long as a visit may have gaps, and is then seen twice: still one track.
     assert _tracks(crater, frame).tolist() == [1, 0, 1, 1, 0, 1]
     frame[[3, 5]] += 1
     assert _tracks(crater, frame).tolist() == [1, 0, 1, 2, 0, 2]
-
-
-def test_a_ground_cell_is_where_the_line_of_sight_meets_the_sphere():
-    """From 100 km above 10.1 N 20 E: nadir, 3 degrees off nadir (5.2 km, below a cell), and above the horizon."""
+    # From 100 km above 10.1 N 20 E: nadir, 3 degrees off nadir (5.2 km, below a cell), and above the horizon.
     up = mcmf_from_spherical(np.radians(10.1), np.radians(20.0))
     up = up / np.linalg.norm(up)
     east = np.cross([0.0, 0.0, 1.0], up) / np.linalg.norm(np.cross([0.0, 0.0, 1.0], up))
@@ -517,7 +508,7 @@ def test_a_ground_cell_is_where_the_line_of_sight_meets_the_sphere():
     assert cells.tolist() == [40 * 100_000 + 78, 40 * 100_000 + 79, -1]
 
 
-def test_terrain_is_cratered_by_the_density_of_catalogued_craters():
+def test_terrain_is_cratered_by_its_density_and_holm_steps_down_as_in_the_textbook():
     """Forty craters of 6 km around 0 N 0 E, 32 within 100 km are the limit; one alone at 0 N 90 E."""
     around = np.linspace(-1.0, 1.0, 40)
     longitude = np.radians(np.append(around, 90.0))
@@ -525,10 +516,7 @@ def test_terrain_is_cratered_by_the_density_of_catalogued_craters():
     expected = ExpectedCraters(*(np.array([5, 40]) for _ in range(7)))
     kinds = terrain_kinds(catalogue, expected, np.array([0, 1]))
     assert [KINDS[kind] for kind in kinds] == ["cratered", "sparse"]
-
-
-def test_holm_steps_down_as_in_the_textbook_example():
-    """Four p-values at 0.05: 0.005 and 0.01 are refused (0.0125, 0.0167), 0.03 is kept at 0.025, all after it too."""
+    # Four p-values at 0.05: 0.005 and 0.01 are refused (0.0125, 0.0167), 0.03 is kept at 0.025, all after it too.
     p_values = [0.01, 0.04, 0.03, 0.005]
     levels = holm_levels(p_values, 0.05)
     assert [p <= level for p, level in zip(p_values, levels, strict=True)] == [True, False, False, True]

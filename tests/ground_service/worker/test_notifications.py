@@ -187,14 +187,11 @@ def test_a_refused_message_is_not_tried_again(webhook, tmp_path):
     assert len(webhook.received) == 1
 
 
-def test_a_receiver_that_is_away_is_named_after_all_attempts(tmp_path):
+def test_a_receiver_that_is_away_and_a_missing_key_are_stated(tmp_path):
     waited = []
     with pytest.raises(NotDelivered, match=f"not delivered in {ATTEMPTS} attempts: ConnectError"):
         send(tmp_path, Channel(webhook="http://127.0.0.1:9/"), wait=waited.append)
     assert waited == [1.0, 2.0]
-
-
-def test_a_missing_key_is_stated(tmp_path):
     channel = Channel(webhook="http://127.0.0.1:9/", signing_secret="hook")
     with pytest.raises(InvalidInput, match="signing_secret, hook: expected a file in secrets of the service"):
         send(tmp_path, channel)

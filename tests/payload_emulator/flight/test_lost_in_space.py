@@ -126,7 +126,7 @@ def test_false_detections_mirrored_and_turned_images_find_no_place(index):
         assert searched(detections, index) is None
 
 
-def test_a_place_off_the_map_and_too_few_detections_or_none_that_are_numbers_are_no_fix(index):
+def test_a_place_off_the_map_few_detections_and_those_that_are_no_numbers_are_no_fix(index):
     other = craters(west_deg=100.0, seed=8)
     _, found = frame(other, 0.0, 110.0, 30e3, seed=2)
     assert searched(found, index) is None
@@ -134,9 +134,6 @@ def test_a_place_off_the_map_and_too_few_detections_or_none_that_are_numbers_are
     _, found = frame(index.landmarks, 3.0, 359.7, 30e3, seed=5)
     assert searched(found.select(np.arange(2)), index) is None
     assert searched(changed(found, np.nan * found.u_px, found.v_px), index) is None
-
-
-def test_detections_that_are_no_numbers_are_left_out(index):
     place, found = frame(index.landmarks, 3.0, 359.7, 49e3, seed=5)
     u = found.u_px.copy()
     u[::7] = np.nan
@@ -312,7 +309,7 @@ def catalogue_table(count=50):
     )  # fmt: skip
 
 
-def test_an_anchor_table_of_60_s_steps_interpolates_to_a_millimetre(moon):
+def test_an_anchor_table_interpolates_to_a_millimetre_within_its_span_and_knows_the_direction(moon):
     table = unpack_anchor_table(small_anchor(moon))
     for second in (0.0, 7.5, 333.25, 600.0, 1_100.0):
         ticks = moon.ticks_at(second)
@@ -321,9 +318,6 @@ def test_an_anchor_table_of_60_s_steps_interpolates_to_a_millimetre(moon):
         assert sample.latitude_rad * moon.radius_m == approx(latitude * moon.radius_m, abs=1e-3)
         assert sample.longitude_rad * moon.radius_m == approx(longitude * moon.radius_m, abs=1e-3)
         assert table.altitude_m(ticks) == approx(altitude, abs=1e-3)
-
-
-def test_an_anchor_table_answers_nothing_outside_its_span_or_in_a_gap(moon):
     seconds = np.concatenate([np.arange(0.0, 600.0, 60.0), np.arange(2_000.0, 2_600.0, 60.0)])
     table = unpack_anchor_table(moon.anchor(seconds))
     for second in (-1.0, 1_000.0, 2_600.0):
@@ -333,9 +327,6 @@ def test_an_anchor_table_answers_nothing_outside_its_span_or_in_a_gap(moon):
         _, _, altitude = moon.place(moon.orbit([second])[0])
         # Beside the gap only the nodes of one side serve: less than eight of them, still well below a metre.
         assert table.altitude_m(moon.ticks_at(second)) == approx(altitude, abs=0.1)
-
-
-def test_the_anchor_table_knows_which_way_a_pass_moves(moon):
     seconds = np.arange(0.0, 6_600.0, 60.0)
     table = unpack_anchor_table(moon.anchor(seconds))
     z = moon.orbit(seconds)[:, 2] / np.linalg.norm(moon.orbit(seconds), axis=1)

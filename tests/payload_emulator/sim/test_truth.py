@@ -92,7 +92,7 @@ def test_a_window_runs_across_the_band_in_the_wanted_direction(polar_truth, dire
     assert np.degrees(longitude) % 360.0 == approx(longitude_deg, abs=1e-6)
 
 
-def test_a_window_whose_swath_leaves_the_terrain_is_not_taken(polar_truth):
+def test_a_window_whose_swath_leaves_the_terrain_is_not_taken_and_tells_the_latitudes(polar_truth):
     # At 30 km the swath reaches 30 km x tan 60 deg = 52 km, 1.7 degrees at the equator and 3.4 at 60 degrees.
     def narrow(latitude, longitude):
         return np.abs(np.degrees(longitude)) < 2.5
@@ -103,8 +103,6 @@ def test_a_window_whose_swath_leaves_the_terrain_is_not_taken(polar_truth):
     assert not any(one.observable for one in crossings(polar_truth, narrow))
     assert crossings(polar_truth, wide)[0].observable
 
-
-def test_a_crossing_tells_the_latitudes_without_terrain(polar_truth):
     def north_of_ten_degrees_without_a_hole(latitude, longitude):
         degrees = np.degrees(latitude)
         return (degrees > 10.0) & ~((degrees > 30.0) & (degrees < 40.0))
@@ -115,12 +113,9 @@ def test_a_crossing_tells_the_latitudes_without_terrain(polar_truth):
     assert_allclose(np.degrees(found.missing_rad), [[-60.0, 10.0], [30.0, 40.0]], atol=1.2)
 
 
-def test_a_crossing_outside_the_wanted_longitudes_is_not_observable(polar_truth):
+def test_crossings_outside_the_longitudes_are_not_observable_and_bands_lie_on_one_side(polar_truth):
     found = crossings(polar_truth, everywhere, lambda longitude: np.degrees(longitude) > 1.0)[0]
     assert not found.in_reach and not found.observable and found.missing_rad.size == 0
-
-
-def test_the_band_may_lie_on_one_side_of_the_equator(polar_truth):
     band_rad = (np.radians(20.0), np.radians(50.0))
     _, latitude = latitudes(polar_truth, band_rad)
     assert latitude.min() >= band_rad[0] and latitude.max() <= band_rad[1]

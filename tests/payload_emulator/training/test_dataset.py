@@ -211,7 +211,7 @@ def test_nothing_is_left_of_a_crater_outside_of_the_image():
     assert clipped(ellipse_polygon(-20.0, 5.0, 10.0, 5.0, 0.3), 200, 80).shape == (0, 2)
 
 
-def test_coco_boxes_surround_their_centres(blob_dataset):
+def test_boxes_surround_their_centres_and_the_ground_diameter_undoes_the_projection(blob_dataset):
     coco = json.loads((blob_dataset.folder / "coco_train.json").read_text())
     whole = [a for a in coco["annotations"] if min(a["bbox"][:2]) > 0.0 and max(far_corner(a)) < 512.0]
     assert len(whole) > 100
@@ -220,9 +220,6 @@ def test_coco_boxes_surround_their_centres(blob_dataset):
         # COCO counts from the corner of the first pixel, labels from its centre; both are rounded to 0.01 px.
         assert x + w / 2 == pytest.approx(a["centre"][0] + 0.5, abs=0.02)
         assert y + h / 2 == pytest.approx(a["centre"][1] + 0.5, abs=0.02)
-
-
-def test_the_ground_diameter_undoes_the_projection(blob_dataset):
     frame = blob_dataset.frames("test")[0]
     c = frame.craters
     ground = store.diameter_on_ground_m(blob_dataset, frame, c["u_px"], c["v_px"], c["diameter_px"])
