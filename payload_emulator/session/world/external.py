@@ -246,7 +246,7 @@ def external_scenario(scenario: Scenario, frames: ExternalFrames) -> Scenario:
 def _table(folder: Path) -> tuple[IntArray, tuple[Path, ...]]:
     path = folder / TABLE
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        with path.open(encoding="utf-8-sig", newline="") as file:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{path}: expected a table with columns file and utc, found none ({error})") from None
