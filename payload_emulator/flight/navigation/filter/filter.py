@@ -3,8 +3,9 @@
 The first 18 states are position and velocity (ICRF), empirical acceleration (radial, transverse, normal), attitude
 bias (camera axes), pixel bias, catalogue offset (east, north, up) and image scale. They are followed by three states
 for each crater that was used and is still in view: its offset from its catalogued position, east, north, up. A crater
-is observed several times on a pass with the same error, so its error is a state and not independent noise; the state is
-removed when the crater leaves the view. The attitude error of a frame, one rotation for all its detections, is a state
+is observed several times on a pass with the same error, so its error is a state and not independent noise. It begins
+with the catalogue offset of that time, which changes along the track for craters that come into view later, and ends
+when the crater leaves the view. The attitude error of a frame, one rotation for all its detections, is a state
 during an update: it is observable in a wide field of view, and the projection is too nonlinear over a degree to treat
 it as noise about the measured attitude.
 """
