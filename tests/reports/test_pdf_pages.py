@@ -15,8 +15,9 @@ from pypdf import PdfReader
 from reports import drawings
 from reports.document import Column, Document, Heading, Listing, Paragraph, Picture, Properties, Table
 from reports.drawings import KeptDrawings, drawing_hash
+from reports.html_page import html_page
 from reports.pass_report import pass_document
-from reports.pdf_pages import _typeset, pdf_pages
+from reports.pdf_pages import _typeset, pdf_of, print_form
 from reports.render import render_html, render_pages
 from tests.reports import example
 
@@ -28,9 +29,14 @@ def small():
     return example.pass_report(hours=0.2, gallery=1, worst=0)
 
 
+def pdf_pages(made):
+    return pdf_of(print_form(made), html_page(made))
+
+
 @pytest.fixture(scope="module")
 def octets(small):
-    return render_pages(small)[1]
+    page, form = render_pages(small)
+    return pdf_of(form, page)
 
 
 def pages_of(octets):
@@ -64,7 +70,7 @@ def test_all_figures_and_tables_of_the_page_are_in_it(small, octets):
 
 
 def test_text_stays_inside_the_margins(whole_pass):
-    for page in PdfReader(io.BytesIO(render_pages(whole_pass)[1])).pages:
+    for page in PdfReader(io.BytesIO(pdf_pages(pass_document(whole_pass)))).pages:
         places = []
 
         def note(text, cm, tm, *_, places=places):
@@ -137,8 +143,9 @@ def test_awkward_text_is_printed_and_not_interpreted():
 
 def test_the_process_of_a_report_does_not_keep_what_typesetting_computes():
     program = (
-        "import sys; from reports.document import Document, Paragraph; from reports.pdf_pages import pdf_pages\n"
-        "octets = pdf_pages(Document('Test', 'Title', 't', (), (Paragraph('x'),)))\n"
+        "import sys; from reports.document import Document, Paragraph\n"
+        "from reports.pdf_pages import pdf_of, print_form\n"
+        "octets = pdf_of(print_form(Document('Test', 'Title', 't', (), (Paragraph('x'),))), '')\n"
         "print(octets[:5], any(name.partition('.')[0] == 'typst' for name in sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
