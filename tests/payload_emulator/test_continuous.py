@@ -23,6 +23,7 @@ from lunar.frames import mcmf_from_spherical, spherical_from_mcmf
 from lunar.timescales import parse_utc, tai_ns_from_utc_ns
 from payload_emulator.errors import ModelError, ScenarioError
 from payload_emulator.flight.models import load_shipped_model
+from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.session.archive.mission import (
     OPERATIONS,
     live_mission_text,
@@ -236,6 +237,22 @@ def test_battery_and_temperature_follow_the_sun_and_outside_windows_no_image_is_
     assert board_c.max() - board_c.min() > 5.0
     session, _, _ = flight
     assert session.spacecraft.payload.summary()["frames_processed"] == session.account.frames == 12
+
+
+def test_the_ground_of_an_observation_is_dropped_in_the_first_change_of_contact_after_it(monkeypatch):
+    session = opened(scenario())
+    terrain = session.world.terrain
+    found = []
+    for mode in (PayloadMode.observing, PayloadMode.standby):
+        monkeypatch.setattr(session.spacecraft.payload._machine, "mode", mode)
+        terrain.release_thread()
+        terrain.height_m(0.1, 0.1)
+        terrain.release_thread()
+        session._hold(selectors.DefaultSelector())
+        session.spacecraft.camera._renderer.submit(int).result()
+        found.append(len(terrain._slots))
+    session.close()
+    assert found == [1, 0]
 
 
 def test_a_contact_ends_with_an_outage_of_its_station_and_later_telecommands_are_lost():

@@ -80,9 +80,16 @@ def test_segments_that_meet_are_written_with_their_boundary_and_those_with_a_gap
         format_stk(Ephemeris((first, second)))
 
 
-def test_a_boundary_at_a_single_state_splits_there_too_and_accelerations_are_passed_over():
+def test_a_boundary_at_a_state_also_a_rounded_one_splits_there_and_accelerations_are_passed_over():
     text = EXAMPLE.replace("Points  5", "Points  4").replace(EXAMPLE.splitlines(keepends=True)[23], "")
     assert [len(s.utc_ns) for s in parse_stk(text).segments] == [3, 2]
+    boundary = "1.2000000000e+02"
+    rounded = text.replace(boundary, f"{float(boundary) + 4e-7:.9f}")
+    assert [len(s.utc_ns) for s in parse_stk(rounded).segments] == [3, 2]
+    with pytest.raises(
+        DataFileError, match=r"SegmentBoundaryTimes: expected times of states, found .*Z, at which there"
+    ):
+        parse_stk(text.replace(boundary, f"{float(boundary) - 7.0:.3f}"))
     text = EXAMPLE.replace("EphemerisTimePosVel", "EphemerisTimePosVelAcc").replace("1.0e-01\n", "1.0e-01 0 0 0\n")
     assert len(parse_stk(text).utc_ns) == 4
 
