@@ -272,3 +272,11 @@ def test_a_transaction_that_the_database_gave_up_may_be_tried_again(sqlstate):
     error = database_error(DBAPIError("UPDATE", {}, original), "postgresql://secret@db/linna")
     assert isinstance(error, DatabaseBusy)
     assert "secret" not in str(error)
+
+
+def test_all_connections_of_a_process_together_keep_at_most_thirty_two_mib_of_pages(tmp_path):
+    engine = open_database(f"sqlite:///{tmp_path / 'linna.db'}").engine
+    with engine.connect() as connection:
+        kept_kib = -connection.exec_driver_sql("PRAGMA cache_size").scalar_one()
+    most = engine.pool.size() + engine.pool._max_overflow
+    assert most == 15 and 1024 <= kept_kib <= 32 * 1024 / most
