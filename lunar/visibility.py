@@ -110,10 +110,10 @@ def limb_clearance_m(position_icrf_m: ArrayLike, target_icrf_m: ArrayLike) -> Fl
 
 def station_icrf(station: GroundStation, utc_ns: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Return the Earth-centred position in m and the zenith of a station, each ``(..., 3)`` in ICRF axes."""
-    import erfa
+    from pymap3d import geodetic2ecef
 
     turn = np.swapaxes(_itrf_from_icrf(utc_ns), -1, -2)
-    fixed = erfa.gd2gc(1, station.longitude_rad, station.latitude_rad, station.height_m)
+    fixed = geodetic2ecef(station.latitude_rad, station.longitude_rad, station.height_m, deg=False)
     return _rotate(turn, fixed), _rotate(turn, _zenith(station))
 
 
