@@ -593,3 +593,12 @@ def mission_time():
     set_mission_clock(lambda: made.utc_ns)
     yield made
     set_mission_clock(None)
+
+
+def steps_of(connection, work):
+    """Return the result of reading on a SQLite connection, and how much work the database did, in ten operations."""
+    database, done = connection.connection.driver_connection, []
+    database.set_progress_handler(lambda: done.append(1), 10)
+    found = work(connection)
+    database.set_progress_handler(None, 0)
+    return found, len(done)
