@@ -606,3 +606,12 @@ def wall_clock_again():
     """Let mission time be the wall clock after a test."""
     yield
     set_mission_clock()
+
+
+def steps_of(connection, work):
+    """Return the result of reading on a SQLite connection, and how much work the database did, in ten operations."""
+    database, done = connection.connection.driver_connection, []
+    database.set_progress_handler(lambda: done.append(1), 10)
+    found = work(connection)
+    database.set_progress_handler(None, 0)
+    return found, len(done)
