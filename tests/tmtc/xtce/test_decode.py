@@ -668,6 +668,14 @@ def test_parts_of_segmented_packets_are_joined_also_between_others_and_over_the_
     assert verdict == [*["decoded"] * 3, *["segments_joined"] * 3]
 
 
+def test_a_part_that_was_sent_twice_is_joined_once():
+    one = parts(5, 7, b"\x00", b"\x01\x00\x00", b"\x00\x02")
+    assert stream_of([one[0], one[1], one[1], one[2]]) == ([(0, 1, 2)], ["decoded", *["segments_joined"] * 3])
+    other = one[1][:-1] + b"\x09"
+    assert stream_of([one[0], one[1], other, one[2]]) == ([], ["segments_not_joined"] * 4)
+    assert stream_of([one[0], one[1], one[1]]) == ([], ["segments_not_joined"] * 3)
+
+
 def test_each_part_has_its_checksum():
     found, _ = stream_of(parts(5, 0, b"\x00\x01CC", b"\x00\x00CC", b"\x00\x02CC"), checksum_octets=2)
     assert found == [(0, 1, 2)]
