@@ -12,8 +12,6 @@ new FOLDER. Each PNG file states its source and evidence level as its text.
 `python docs_site.py figures` writes the generated blocks of the pages again.
 """
 
-from __future__ import annotations
-
 import argparse
 import base64
 import csv

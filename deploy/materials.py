@@ -7,8 +7,6 @@ hashes and writes names, versions, hashes, licences and dependencies, also those
 of the operating system. A package whose marker excludes this Python is not needed.
 """
 
-from __future__ import annotations
-
 import argparse
 import base64
 import hashlib

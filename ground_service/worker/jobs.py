@@ -42,7 +42,7 @@ Work = Callable[[Ground, Mapping[str, Any], str], dict[str, Any]]
 
 def _report(ground: Ground, arguments: Mapping[str, Any], job_id: str) -> dict[str, Any]:
     with span("report", attributes={"linna.pass": int(arguments["pass_id"])}):
-        made = make_report(ground, int(arguments["pass_id"]), report_id=job_id, pdf=True)
+        made = make_report(ground, int(arguments["pass_id"]), report_id=job_id)
     return {"report_id": made.report_id, "pass_id": made.pass_id}
 
 

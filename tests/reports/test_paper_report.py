@@ -9,6 +9,7 @@ from reports.document import Absent, Cell, Picture, Table
 from reports.drawings import picture_files
 from reports.paper_report import paper_document, paper_figures, paper_index
 from reports.paper_values import CatalogueClasses, DetectorResult, Difference, PaperOrbit, PaperReport, PaperSession
+from reports.pdf_pages import pdf_of
 from reports.render import render_pages
 from reports.text import count_text, percent_text
 from reports.values import ClassScore, NavigationSeries, TrackSeries
@@ -110,9 +111,9 @@ def test_what_was_not_made_is_absent_with_its_reason():
 
 @pytest.mark.slow
 def test_the_document_is_a_page_and_a_pdf_and_the_same_every_time():
-    html, pdf = render_pages(report())
-    assert pdf.startswith(b"%PDF") and "form of the paper" in html.lower()
-    assert render_pages(report()) == (html, pdf)
+    html, form = render_pages(report())
+    assert pdf_of(form, html).startswith(b"%PDF") and "form of the paper" in html.lower()
+    assert render_pages(report()) == (html, form)
 
 
 def test_a_figure_is_a_png_and_a_table_of_what_it_plots():

@@ -3,8 +3,6 @@
 Revision: 1.0, the first
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from alembic import op

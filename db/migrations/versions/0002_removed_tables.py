@@ -3,8 +3,6 @@
 Revision: 1.1, after 1.0
 """
 
-from __future__ import annotations
-
 from alembic import op
 
 revision = "1.1"

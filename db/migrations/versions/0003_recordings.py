@@ -3,8 +3,6 @@
 Revision: 1.2, after 1.1
 """
 
-from __future__ import annotations
-
 import json
 import logging
 

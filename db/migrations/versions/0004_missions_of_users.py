@@ -3,8 +3,6 @@
 Revision: 1.3, after 1.2
 """
 
-from __future__ import annotations
-
 import sqlalchemy as sa
 from alembic import op
 

@@ -3,8 +3,6 @@
 Revision: 1.4, after 1.3
 """
 
-from __future__ import annotations
-
 import sqlalchemy as sa
 from alembic import op
 

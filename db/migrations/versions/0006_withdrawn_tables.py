@@ -3,8 +3,6 @@
 Revision: 1.5, after 1.4
 """
 
-from __future__ import annotations
-
 from alembic import op
 
 revision = "1.5"

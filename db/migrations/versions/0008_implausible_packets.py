@@ -3,8 +3,6 @@
 Revision: 1.7, after 1.6
 """
 
-from __future__ import annotations
-
 import sqlalchemy as sa
 from alembic import op
 

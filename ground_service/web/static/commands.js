@@ -3,7 +3,7 @@ import { get, send } from "./api.js";
 import { order } from "./chain.js";
 import { control } from "./forms.js";
 import { list } from "./lists.js";
-import { button, buttons, byId, dictionary, element, figure, loading, notice, on, show, showTable, timeText, words } from "./page.js";
+import { button, buttons, byId, dictionary, element, figure, inTurn, loading, notice, on, show, showTable, timeText, words } from "./page.js";
 
 const definition = Object.fromEntries(dictionary.telecommands.map((one) => [one.name, one]));
 const STAGES = ["accepted", "started", "completed"];
@@ -83,7 +83,7 @@ const act = (label, command, json) =>
 
 const deeds = (command) => (command.state === "queued" ? buttons(act("Release", command), act("Reject", command, { reason: "rejected on the page" })) : "");
 
-async function loadLinks() {
+const loadLinks = inTurn(async () => {
   const { items } = await get("links");
   await loadReceivers(items);
   const sendNow = (row) => button("Send now", () => order(row).then(loadLinks), { disabled: row.unsent === 0 });
@@ -104,7 +104,7 @@ async function loadLinks() {
     items,
     "No mission description in force declares a link. Without one, linna command uplink writes the octets to a file.",
   );
-}
+});
 
 // State of the telecommand receiver of each linked spacecraft, by its newest telemetry.
 const FLAGS = ["no_rf_available", "no_bit_lock", "lockout", "wait", "retransmit"];

@@ -235,12 +235,21 @@ export function limitText([least, greatest]) {
 export const stateClass = (state) => (state || "unknown").replaceAll(" ", "-");
 export const stateMark = (state, title) => element("span", { class: `state ${stateClass(state)}`, title }, state || "unknown");
 
+// A task that never runs beside itself, so that no older answer is shown over a newer one: calls while it runs are one more run.
+export function inTurn(task) {
+  let last = Promise.resolve();
+  let next = null;
+  const run = () => {
+    next = null;
+    return task();
+  };
+  return () => (next ??= last = last.then(run, run));
+}
+
 export function pager(load, size = 25) {
   let offset = Math.max(0, Math.floor(Number(stated("offset")) || 0));
-  async function go(to) {
+  const fill = inTurn(async () => {
     const pressed = [byId("previous"), byId("next")].find((one) => one === document.activeElement);
-    offset = Math.max(0, to);
-    state({ offset: offset || null });
     const page = await load(size, offset);
     byId("range").textContent = page.total
       ? `${offset + 1} to ${Math.min(offset + size, page.total)} of ${page.total}`
@@ -249,6 +258,11 @@ export function pager(load, size = 25) {
     previous.disabled = offset === 0;
     next.disabled = offset + size >= page.total;
     if (pressed?.disabled) (pressed === next ? previous : next).focus(); // a disabled button loses the focus
+  });
+  function go(to) {
+    offset = Math.max(0, to);
+    state({ offset: offset || null });
+    return fill();
   }
   on("previous", "click", () => go(offset - size));
   on("next", "click", () => go(offset + size));

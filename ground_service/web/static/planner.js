@@ -1,6 +1,6 @@
 import { bind, state, stated } from "./address.js";
 import { get, request, send } from "./api.js";
-import { acting, button, byId, element, figure, isoText, later, lengthText, loading, mayOperate, missionNow, notice, on, plural, seconds, session, show, showTable, stateMark, svg, table, timeText, trouble, watch } from "./page.js";
+import { acting, button, byId, element, figure, inTurn, isoText, later, lengthText, loading, mayOperate, missionNow, notice, on, plural, seconds, session, show, showTable, stateMark, svg, table, timeText, trouble, watch } from "./page.js";
 import { bandLegend, conflictsOf, drawLanes, drawTrack, lanesHeight, loadForecast, showMap, valuesAt } from "./forecast.js";
 import { loadRequests } from "./requests.js";
 import { approve, sequenceTable, takeBack, uplink } from "./chain.js";
@@ -389,14 +389,14 @@ async function search() {
   show("rejected", rejected.length ? element("details", {}, element("summary", {}, `${plural(rejected.length, "rejected span")} with reasons`), spans()) : null);
 }
 
-async function load() {
+const load = inTurn(async () => {
   windows = (await get("windows", { limit: 500 })).items;
   drawTimeline();
   if (windows.some((one) => one.id === listed?.id)) await showSequence(listed);
   else showChosen();
   const link = (row) => button(row.name, () => choose(row.id), { kind: "link", needs: null });
   showTable("windows", "Windows", [["Window", link], "start", LENGTH, "state", ["By", "created_by"]], windows, "No window planned: find some above.");
-}
+});
 
 const zoom = (factor, shift = 0) => () => {
   const half = ((view[1] - view[0]) / 2) * factor;

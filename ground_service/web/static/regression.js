@@ -1,6 +1,6 @@
 import { keep, restore, state, stated } from "./address.js";
 import { finished, get, request, send } from "./api.js";
-import { button, buttons, byId, element, figure, later, loading, notice, on, show, showTable, stateMark, table, timeText, trouble, watch, words } from "./page.js";
+import { button, buttons, byId, element, figure, inTurn, later, loading, notice, on, show, showTable, stateMark, table, timeText, trouble, watch, words } from "./page.js";
 
 const LATEST = 12;
 let open = stated("gates");
@@ -92,7 +92,7 @@ async function openedGates() {
   return [element("h3", {}, `Gates of ${timeText(verdict.created)}`), gateRows(verdict), changes];
 }
 
-async function loadRegressions() {
+const loadRegressions = inTurn(async () => {
   const { rows, total } = await regressionRows();
   const opened = rows.some((row) => row.verdict?.id === open) ? await openedGates() : null;
   const actions = ({ verdict }) => verdict && buttons(button("Gates and craters", () => toggle(verdict.id), { needs: null }), element("a", { class: "button", href: `/regressions/${verdict.id}`, target: "_blank" }, "Report"));
@@ -107,7 +107,7 @@ async function loadRegressions() {
     total > LATEST ? element("p", { class: "hint" }, `The ${LATEST} newest of ${figure(total)} verdicts.`) : null,
     opened,
   );
-}
+});
 
 function toggle(id) {
   open = open === id ? null : id;

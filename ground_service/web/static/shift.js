@@ -1,7 +1,7 @@
 // The shift: for each spacecraft its time, contact, windows with the step that waits, alarms, verdicts, note and hold.
 import { finished, get, request, send } from "./api.js";
 import { approve, chainOf, contactOf, inTime, uplink } from "./chain.js";
-import { acting, button, buttons, byId, element, lengthText, loading, missionNow, notice, on, parameterName, seconds, show, showTable, stateMark, table, textOf, timeText, watch } from "./page.js";
+import { acting, button, buttons, byId, element, inTurn, lengthText, loading, missionNow, notice, on, parameterName, seconds, show, showTable, stateMark, table, textOf, timeText, watch } from "./page.js";
 
 const OPEN = ["draft", "approved", "uplinked", "cancelling", "executing", "executed", "downlinked"];
 const SHOWN = 5;
@@ -184,7 +184,7 @@ document.addEventListener("pointerdown", () => {
   pressEnded = new Promise((resolve) => ["pointerup", "pointercancel"].forEach((name) => document.addEventListener(name, () => setTimeout(resolve), { once: true })));
 });
 
-async function load() {
+const load = inTurn(async () => {
   const { recorded } = await get("session");
   const [spacecraft, windows, links, contacts, alarms, passes, handovers, jobs] = await Promise.all([
     get("spacecraft"),
@@ -211,7 +211,7 @@ async function load() {
   await pressEnded; // a button that is drawn again while it is pressed is not clicked
   show("spacecraft", crafts.length ? crafts.map((craft, index) => spacecraftOf(craft, data, newest[index])) : element("p", { class: "hint" }, "No spacecraft yet: register a mission description on the page ", element("a", { href: "/missions" }, "Missions"), ", or upload a downlink."));
   showJobs(jobs.items);
-}
+});
 
 on("upload", "submit", async () => {
   const [file] = byId("file").files;

@@ -1,18 +1,20 @@
 """A synthetic pass, imported and evaluated: every figure is known beforehand."""
 
+import hashlib
 import json
 import shutil
 
 import pytest
 
-from ground_service.errors import InvalidInput, NotFound
+from ground_service.errors import InvalidInput, NotFound, StorageFull
 from ground_service.evaluation import service as reports
-from ground_service.evaluation.service import evaluate, make_report, pass_summary
+from ground_service.evaluation.service import evaluate, make_report, pass_summary, report_document
 from ground_service.ground import Ground, open_ground
 from ground_service.http.model import Paging
 from ground_service.passes.archive_import import import_archive
 from ground_service.store import repository
 from lunar.timescales import format_utc
+from reports import pdf_pages
 from reports.values import PassReport, SettingsComparison
 from tests.ground_service.archive_hash import archive_hash
 from tests.ground_service.conftest import enter_files
@@ -57,14 +59,28 @@ def test_settings_are_compared_with_those_of_the_pass_before(imported, synthetic
     assert later.comparison == SettingsComparison(first.title, changes)
 
 
-def test_a_pdf_is_made_on_request_and_reproducible(imported, tmp_path, monkeypatch):
+def test_a_pdf_is_made_of_stored_octets_when_it_is_first_read(imported, tmp_path, monkeypatch):
+    """With a full disk it is read all the same, made again for the next reader, and equal."""
     ground, pass_id, _ = imported
-    monkeypatch.setattr(reports, "utc_now_ns", lambda: 0)
-    first = make_report(ground, pass_id, out=tmp_path / "first", pdf=True)
-    second = make_report(ground, pass_id, out=tmp_path / "second", pdf=True)
-    same = first.pdf.read_bytes() == second.pdf.read_bytes()  # no comparison by pytest, which is slow
-    assert same and first.pdf.read_bytes().startswith(b"%PDF-")
-    assert make_report(ground, pass_id, out=tmp_path / "page").pdf is None
+    (tmp_path / "report.pdf").write_bytes(b"of the report before")
+    key = make_report(ground, pass_id, out=tmp_path).report_id
+    assert not (tmp_path / "report.pdf").exists()
+
+    def fail(*_):
+        raise StorageFull("archive")
+
+    def kept():
+        return ground.read(repository.get, repository.REPORTS, key, "report")["pdf_sha256"]
+
+    with monkeypatch.context() as full:
+        full.setattr(reports, "register_file", fail)
+        first = report_document(ground, key, "pdf")
+    assert first.startswith(b"%PDF-") and kept() is None
+    monkeypatch.setattr(reports, "evaluate_pass", fail)
+    digests = {hashlib.sha256(octets).hexdigest() for octets in (first, report_document(ground, key, "pdf"))}
+    assert digests == {kept()}
+    monkeypatch.setattr(pdf_pages, "pdf_of", fail)
+    assert report_document(ground, key, "pdf")[:5] == b"%PDF-"
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Packets with an implausible on-board time are kept, named, and decide nothing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Windows in the past, of unknown spacecraft, and those that are taken back from the spacecraft; on both databases."""
 
-from __future__ import annotations
-
 from unittest.mock import MagicMock
 
 import numpy as np

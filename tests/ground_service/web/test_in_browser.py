@@ -150,6 +150,32 @@ def test_small_figures_have_a_power_of_ten_and_zero_has_none_and_long_times_have
     assert found == [figures, ["59 s", "47 h 1 min", "2 d 1 h"], "2029-08-18T08:17"]
 
 
+def test_a_slow_answer_is_not_shown_over_a_newer_one(page):
+    page.goto("/licences")
+    found = page.evaluate(
+        """async () => {
+            const { inTurn } = await import("/static/page.js");
+            const waits = [60, 0, 0];
+            const shown = [];
+            let asked = "first";
+            const load = inTurn(async () => {
+                const answer = asked;
+                await new Promise((resolve) => setTimeout(resolve, waits[shown.length]));
+                shown.push(answer);
+                if (shown.length === 1) throw new Error("no connection");
+            });
+            const first = load().catch((error) => shown.push(error.message));
+            await Promise.resolve();
+            asked = "second";
+            const second = load();
+            asked = "third";
+            await Promise.all([first, second, load()]);
+            return shown;
+        }"""
+    )
+    assert found == ["first", "no connection", "third"]
+
+
 def test_the_pass_page_shows_what_came_and_makes_a_report(page):
     settled(page, "/passes")
     page.get_by_role("link", name="synthetic pass").click()

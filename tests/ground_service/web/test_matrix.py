@@ -128,7 +128,7 @@ def worked(tmp_path_factory, make_pass, make_flyable, make_build, console, serve
     ports = {"down": spacecraft.down.getsockname()[1], "up": spacecraft.up.getsockname()[1]}
     with open_ground(home) as ground:
         token = add_user(ground, "root", "admin")
-        make_report(ground, import_archive(ground, received.folder), pdf=False)
+        make_report(ground, import_archive(ground, received.folder))
         for name in ("first pass", "second pass"):
             enter_files(learned.folder, pass_name=name)
             update_landmarks(ground, import_archive(ground, learned.folder))

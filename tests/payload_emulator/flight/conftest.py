@@ -1,7 +1,5 @@
 """A smooth spherical Moon with point craters and a Kepler orbit, made without the code under test."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -7,8 +7,6 @@ References
 Nørgaard, Poulsen, Ravn (2000), New developments in state estimation for nonlinear systems, Automatica 36.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
