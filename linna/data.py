@@ -39,13 +39,13 @@ def load_orbit(path: Path, spice_id: int | None = None, step_s: float | None = N
 
     Of an SPK, body `spice_id` is taken, with a state every `step_s` seconds.
     """
-    from lunar.comparison import check_gravity
+    from lunar.comparison import check_gravity, cut_at_burns
     from lunar.messages import ephemeris_files
     from lunar.messages.spice import READ_STEP_S, load_spk
 
     if not ephemeris_files.is_spk(path):
         return ephemeris_files.load_orbit(path)
-    ephemeris = load_spk(path, spice_id, step_s or READ_STEP_S)
+    ephemeris = cut_at_burns(load_spk(path, spice_id, step_s or READ_STEP_S))
     check_gravity(ephemeris)
     return ephemeris
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -80,6 +81,7 @@ ROWS_LIMIT = 2_000_000
 """Most craters of a file; the largest public lists have 1.3 million."""
 
 _COMPOSITE = "composite of "
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,10 +319,18 @@ def load_catalogue(path: Path | str) -> CraterCatalogue:
         one id, or diameters, depths and places do not fit each other.
     """
     path = Path(path)
-    catalogue = _joined([_reader_of(path, columns)(path, columns) for columns in _read_blocks(path)])
+    blocks, is_identified = [], False
+    for columns in _read_blocks(path):
+        blocks.append(_reader_of(path, columns)(path, columns))
+        is_identified = "id" in columns
+    catalogue = _joined(blocks)
     _check_ranges(path, catalogue)
     kept = _first_of_repetitions(catalogue)
     _check_identity(path, catalogue.ids, kept)
+    if lost := len(np.setdiff1d(catalogue.ids, catalogue.ids[kept])) if is_identified else 0:
+        _log.warning(
+            "%s: left out %d of %d craters, equal to one before but for the id", path, lost, len(catalogue.ids)
+        )
     catalogue = catalogue.select(kept)
     _check_whole(path, catalogue)
     return catalogue
@@ -460,6 +470,8 @@ def _columns_of(path: Path, text: str, header: list[str], first: int) -> tuple[_
     header = header or own
     if not header:
         raise DataFileError(path, "line 1", "the column names of a crater catalogue", "an empty file")
+    if begins and len(header) == 1:
+        raise DataFileError(path, "line 1", "column names of a crater catalogue, separated by commas", header[0])
     _check_widths(path, widths, len(header), first - begins)
     lines, rows = lines[begins:], rows[begins:]
     wanted = [k for k, name in enumerate(header) if name.strip() in _KNOWN_COLUMNS]
@@ -531,7 +543,9 @@ def _ids(path: Path, columns: _Columns) -> IntArray:
     return numbers.astype(np.int64)
 
 
-def _numbered(columns: _Columns) -> IntArray:
+def _ids_or_numbers(path: Path, columns: _Columns) -> IntArray:
+    if "id" in columns:
+        return _ids(path, columns)
     rows = max(map(len, columns.values()))
     return np.arange(columns.first - 2, columns.first - 2 + rows, dtype=np.int64)
 
@@ -544,22 +558,12 @@ def _flags(path: Path, columns: _Columns, name: str) -> BoolArray:
     return np.array([text in ("1", "true") for text in texts], dtype=np.bool_)
 
 
-def _read_lu(path: Path, columns: _Columns) -> CraterCatalogue:
-    return make_catalogue(
-        *_places(path, columns, "latitude_deg", "longitude_deg"),
-        _numbers(path, columns, "diameter_m"),
-        source="LU1319381",
-        ids=_ids(path, columns),
-        depth_m=_numbers(path, columns, "depth_m", missing=True),
-    )
-
-
 def _read_composite(path: Path, columns: _Columns) -> CraterCatalogue:
     return make_catalogue(
         *_places(path, columns, "latitude_deg", "longitude_deg"),
         1000.0 * _numbers(path, columns, "diameter_km"),
         source=_COMPOSITE + ", ".join(sorted(set(columns["source"]))),
-        ids=_numbered(columns),
+        ids=_ids_or_numbers(path, columns),
         complete=_flags(path, columns, "tile_complete"),
     )
 
@@ -569,7 +573,7 @@ def _read_robbins(path: Path, columns: _Columns) -> CraterCatalogue:
         *_places(path, columns, "lat", "lon"),
         1000.0 * _numbers(path, columns, "diam"),
         source="Robbins",
-        ids=_numbered(columns),
+        ids=_ids_or_numbers(path, columns),
     )
 
 
@@ -578,7 +582,7 @@ def _read_robbins_whole(path: Path, columns: _Columns) -> CraterCatalogue:
         *_places(path, columns, "LAT_CIRC_IMG", "LON_CIRC_IMG"),
         1000.0 * _numbers(path, columns, "DIAM_CIRC_IMG"),
         source="Robbins",
-        ids=_numbered(columns),
+        ids=_ids_or_numbers(path, columns),
     )
 
 
@@ -586,23 +590,22 @@ def _read_own(path: Path, columns: _Columns) -> CraterCatalogue:
     return make_catalogue(
         *_places(path, columns, "latitude_deg", "longitude_deg"),
         _numbers(path, columns, "diameter_m"),
-        source=path.name,
+        source=path.name if set(OWN_COLUMNS) <= set(columns) else "LU1319381",
         ids=_ids(path, columns),
-        rim_height_m=_numbers(path, columns, "rim_height_m", missing=True),
+        rim_height_m=_numbers(path, columns, "rim_height_m", missing=True) if "rim_height_m" in columns else None,
         depth_m=_numbers(path, columns, "depth_m", missing=True),
-        complete=_flags(path, columns, "complete"),
+        complete=_flags(path, columns, "complete") if "complete" in columns else True,
     )
 
 
 Reader = Callable[[Path, _Columns], CraterCatalogue]
 _READERS: tuple[tuple[Reader, set[str]], ...] = (
-    (_read_own, set(OWN_COLUMNS)),
     (_read_composite, {"latitude_deg", "longitude_deg", "diameter_km", "source", "tile_complete"}),
-    (_read_lu, {"id", "latitude_deg", "longitude_deg", "diameter_m", "depth_m"}),
+    (_read_own, {"id", "latitude_deg", "longitude_deg", "diameter_m", "depth_m"}),
     (_read_robbins, {"lat", "lon", "diam"}),
     (_read_robbins_whole, {"LAT_CIRC_IMG", "LON_CIRC_IMG", "DIAM_CIRC_IMG"}),
 )
-_KNOWN_COLUMNS = frozenset().union(*(needed for _, needed in _READERS), {"rim_height_m", "complete"})
+_KNOWN_COLUMNS = frozenset().union(*(needed for _, needed in _READERS), OWN_COLUMNS)
 
 
 def _check_ranges(path: Path, catalogue: CraterCatalogue) -> None:

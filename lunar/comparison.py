@@ -1,17 +1,17 @@
 """Ephemerides compared: with each other, in radial, transverse and normal axes of the first, and with gravity."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lunar.arrays import FloatArray, IntArray
+from lunar.arrays import BoolArray, FloatArray, IntArray
 from lunar.constants import GM_EARTH_M3_S2, GM_MOON_M3_S2, NS
 from lunar.ephemeris import Ephemeris, EphemerisSegment
 from lunar.errors import EphemerisCoverageError, EphemerisError, UnmovedByGravity
 from lunar.frames import matrix_from_quaternion, rtn_from_inertial
-from lunar.plausible import OFF_NADIR_DEG, VIEWS_OF_MOON
+from lunar.plausible import OFF_NADIR_DEG, ORBIT_RADIUS_M, ORBIT_SPEED_M_S, VIEWS_OF_MOON
 from lunar.third_bodies import earth_position_icrf_m
 from lunar.timescales import format_tai, format_utc, tdb_s_from_tai_ns
 
@@ -26,6 +26,9 @@ _SINGLE, _SINGLE_M, _FEWEST = 0.02, 100.0, 6
 
 _BURN_M_S = 100.0
 """More than an orbit correction changes the velocity."""
+
+_BURN_LEAST_M_S, _UNMODELLED_M_S2 = 0.2, 5e-3
+"""Change of the velocity that is a burn, above what the field of the Moon (mascons: 3e-3 m/s2) does in a step."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,12 +104,57 @@ def check_gravity(ephemeris: Ephemeris) -> None:
         _check_single(arc)
         measured = _deviations(arc)
         if not len(measured):
+            _check_place(arc)
             continue
         weighted, off, expected, found, radius = np.median(measured, axis=0).tolist()
         # An orbit that was computed without the Earth is accepted too.
         tide = 3.0 * GM_EARTH_M3_S2 / GM_MOON_M3_S2 * (radius / _NEAREST_EARTH_M) ** 3
         if weighted > GRAVITY_TOLERANCE + min(tide, _MOST_TIDE):
             raise UnmovedByGravity(arc.object_name, radius, expected, found, off)
+
+
+def _check_place(arc: EphemerisSegment) -> None:
+    """Refuse states, too few for their motion to be judged, that are none of an orbit about the Moon."""
+    radius_m, speed_m_s = (np.linalg.norm(values, axis=1) for values in (arc.position_m, arc.velocity_m_s))
+    wrong = np.flatnonzero(~(ORBIT_RADIUS_M.holds(radius_m) & ORBIT_SPEED_M_S.holds(speed_m_s)))
+    if wrong.size:
+        k = int(wrong[0])
+        raise EphemerisError(
+            f"ephemeris state {k + 1} of {arc.object_name}, {format_tai(int(arc.tai_ns[k]))}: expected "
+            f"{ORBIT_RADIUS_M} from the centre of the Moon at {ORBIT_SPEED_M_S}, found {radius_m[k]:.6g} m at "
+            f"{speed_m_s[k]:.6g} m/s: another unit or centre?"
+        )
+
+
+def cut_at_burns(ephemeris: Ephemeris) -> Ephemeris:
+    """Return an ephemeris cut between each two states that a burn parts: nothing is interpolated across it.
+
+    From state to state the velocity changes as the attraction at both and its rates say, but for what other forces do,
+    which act on the steps before and after too.
+    """
+    parts: list[EphemerisSegment] = []
+    for one in ephemeris.segments:
+        cuts = [0, *(np.flatnonzero(_burns(one)) + 1).tolist(), len(one.utc_ns)]
+        parts += [one] if len(cuts) == 2 else one.parts(cuts)
+    return replace(ephemeris, segments=tuple(parts))
+
+
+def _burns(one: EphemerisSegment) -> BoolArray:
+    """Return in which steps (n - 1,) of a segment the velocity changes as in none of the two before and after."""
+    step = (np.diff(one.tai_ns) / NS)[:, None]
+    if len(step) < _FEWEST:
+        return np.zeros(len(step), dtype=np.bool_)
+    position, velocity = one.position_m, one.velocity_m_s
+    radius = np.linalg.norm(position, axis=1, keepdims=True)
+    pull = -GM_MOON_M3_S2 * position / radius**3
+    along = np.sum(position * velocity, axis=1, keepdims=True) / radius**2
+    rate = -GM_MOON_M3_S2 * velocity / radius**3 - 3.0 * along * pull
+    gained = 0.5 * step * (pull[:-1] + pull[1:]) - step**2 / 12.0 * np.diff(rate, axis=0)
+    left = np.linalg.norm(np.diff(velocity, axis=0) - gained, axis=1)
+    around = np.pad(left, 2, mode="reflect")
+    near = np.max([around[k : k + len(left)] for k in (0, 1, 3, 4)], axis=0)
+    turned = step[:, 0] * np.sqrt(GM_MOON_M3_S2 / radius[:-1, 0] ** 3)
+    return np.asarray((left > 5.0 * near + _BURN_LEAST_M_S + _UNMODELLED_M_S2 * step[:, 0]) & (turned < _ARC_RAD))
 
 
 def check_pointing(ephemeris: Ephemeris, utc_ns: IntArray, q_wxyz: FloatArray) -> None:

@@ -126,6 +126,16 @@ class EphemerisSegment:
             last = min(last, tai_ns_from_utc_ns(self.useable_stop_utc_ns))
         return first, last
 
+    def parts(self, cuts: Sequence[int]) -> "list[EphemerisSegment]":
+        """Return the segments from each state in ``cuts`` to before the next, those that have a useable epoch."""
+        (low, high), found = self.span_tai_ns, []
+        for first, last in pairwise(cuts):
+            if self.tai_ns[first] <= high and self.tai_ns[last - 1] >= low:
+                start, stop = int(self.utc_ns[first]), int(self.utc_ns[last - 1])
+                own = tuple(one for one in self.covariances if start <= one.utc_ns <= stop)
+                found.append(_part(self, first, last, covariances=own))
+        return found
+
     @cached_property
     def _uniform_step_ns(self) -> int:
         """Return the step where all are equal, else 0."""
@@ -193,10 +203,7 @@ class Ephemeris:
         found = []
         for one in self.segments:
             cuts = [0, *(np.flatnonzero(one._gaps) + 1).tolist(), len(one.utc_ns)]
-            for first, last in pairwise(cuts):
-                low, high = one.span_tai_ns
-                if one.tai_ns[first] <= high and one.tai_ns[last - 1] >= low:
-                    found.append(one if len(cuts) == 2 else _part(one, first, last))
+            found += [one] if len(cuts) == 2 else one.parts(cuts)
         return tuple(found)
 
     def covers(self, utc_ns: ArrayLike) -> BoolArray:

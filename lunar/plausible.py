@@ -142,6 +142,6 @@ WHOLE_SECONDS = {
     18: "GPS time instead of UTC",
     19: "GPS time instead of TAI",
     37: "TAI instead of UTC",
-    3600: "another time zone",
+    **dict.fromkeys(range(900, 14 * 3600 + 1, 900), "another time zone"),
 }
 """Differences in s between clocks that have a usual cause, with the leap seconds since 2017 (IERS Bulletin C)."""

@@ -47,7 +47,7 @@ from lunar.constants import MOON_RADIUS_M, NS
 from lunar.datafolder import DataFolder
 from lunar.ephemeris import Ephemeris
 from lunar.frames import Orientation
-from lunar.messages.ephemeris_files import load_ephemeris
+from lunar.messages.ephemeris_files import load_arcs
 from lunar.timescales import format_utc, parse_utc
 from reports.values import HousekeepingParameter, SettingsComparison
 from tmtc.dictionary.payload import APID_DETECTIONS, APID_PERFORMANCE, DICTIONARY, DRAWN, STRUCTURES
@@ -112,7 +112,7 @@ def load_pass_inputs(ground: Ground, pass_id: int, *, created_utc: str = "") -> 
         viewing = viewing_of(mission.camera, attitude_table(ground.files, record), span)
         vehicle = get_vehicle(connection, record.vehicle_id)
         ephemeris = reference_of(connection, record)
-        reference = None if ephemeris is None else load_ephemeris(ground.files.path(ephemeris.sha256))
+        reference = None if ephemeris is None else load_arcs(ground.files.path(ephemeris.sha256))
         detections = detection_samples(connection, span)
         imaged = reference_states(reference, declared.orientation, detections.utc_ns[detections.usable])
         return PassInputs(
@@ -331,7 +331,7 @@ def _clock_step_s(connection: Connection, record: PassRecord, span: PassSpan) ->
     runs = load_correlations(connection, span.vehicle)
     if not runs:
         return None
-    others = passes.passes_of_vehicle(connection, record.vehicle_id, reported=False)
+    others = passes.passes_of_vehicle(connection, record.vehicle_id)
     before = max((one.stop_utc_ns for one in others if one.stop_utc_ns <= record.start_utc_ns), default=0)
     return largest_step_s(runs, before, record.stop_utc_ns)
 
@@ -591,7 +591,7 @@ def align_pass(ground: Ground, pass_id: int) -> dict[str, Any]:
     sha256 = record.catalogue_sha256
     if sha256 is None and record.archive_digest is None and reference is not None:
         try:
-            ephemeris = load_ephemeris(ground.files.path(reference.sha256))
+            ephemeris = load_arcs(ground.files.path(reference.sha256))
             sha256 = _store_catalogue(ground, mission, ephemeris, record)
         except GroundError as error:
             missing["catalogue"] = str(error)

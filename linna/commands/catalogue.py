@@ -230,7 +230,7 @@ def run_catalogue_landmarks(arguments: argparse.Namespace) -> int:
             f", {result.median_horizontal_m:.0f} m from it (median); east and north squared over the claimed sigma: "
             f"{result.normalised_square:.2f}"
         )
-    return emit(arguments, figures, text=text)
+    return emit(arguments, figures, text=text) or int(not mapped)
 
 
 CATALOGUE: Commands = {

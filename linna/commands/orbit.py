@@ -173,9 +173,9 @@ def run_convert(arguments: argparse.Namespace) -> int:
 
 
 def _spice_id(arguments: argparse.Namespace) -> int:
-
-    if arguments.spice_id is None:
-        raise UsageError("--spice-id: expected the SPICE number of the spacecraft, such as -85, found none")
+    if arguments.spice_id is None or arguments.spice_id >= 0:  # others are those of planets, the Moon and small bodies
+        found = "none" if arguments.spice_id is None else arguments.spice_id
+        raise UsageError(f"--spice-id: expected the SPICE number of the spacecraft, such as -85, found {found}")
     return int(arguments.spice_id)
 
 

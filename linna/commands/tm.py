@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from linna.errors import UsageError
-from linna.output import emit, finish, save
+from linna.output import checked, emit, finish, save
 from linna.parser import option
 
 if TYPE_CHECKING:
@@ -85,9 +85,12 @@ def run_decode(arguments: argparse.Namespace) -> int:
         tables = {name: table for name, table in tables.items() if name in arguments.packet}
     records = packet_records(tables)
     if arguments.json and arguments.out is None:
-        return emit(arguments, {**decoded.accounting(), "telemetry": records})
+        emit(arguments, {**decoded.accounting(), "telemetry": records})
+        return _checked(arguments, records, decoded)
     octets = format_records(records, arguments.format)
-    return _write(arguments, octets, len(records), decoded.accounting(), _describe(decoded))
+    return _write(arguments, octets, len(records), decoded.accounting(), _describe(decoded)) or _checked(
+        arguments, records, decoded
+    )
 
 
 def _decode_foreign(arguments: argparse.Namespace) -> int:
@@ -104,19 +107,27 @@ def _decode_foreign(arguments: argparse.Namespace) -> int:
     records = xtce_records(found, raw=arguments.raw)
     figures = {**decoded.accounting(), **_definition_figures(found, definition)}
     if arguments.json and arguments.out is None:
-        return emit(arguments, {**figures, "telemetry": records})
+        emit(arguments, {**figures, "telemetry": records})
+        return _checked(arguments, records, decoded)
     octets = format_xtce_records(records, arguments.format)
     text = f"{_describe(decoded)}\n{_describe_definition(found, definition)}"
-    return _write(arguments, octets, len(records), figures, text)
+    return _write(arguments, octets, len(records), figures, text) or _checked(arguments, records, decoded)
+
+
+def _checked(arguments: argparse.Namespace, records: Sequence[object], decoded: DownlinkDecode) -> int:
+    names = " or ".join(arguments.packet or ()) or "any that can be decoded"
+    return checked(bool(records), f"a packet ({names}) among {decoded.packets}")
 
 
 def _write(arguments: argparse.Namespace, octets: bytes, count: int, figures: dict[str, object], text: str) -> int:
     if arguments.out is None:
         sys.stdout.buffer.write(octets)
         return 0
-    save(arguments.out, octets)
+    if count:
+        save(arguments.out, octets)
     figures = {**figures, "written": count, "out": str(arguments.out)}
-    return emit(arguments, figures, text=f"{count} packets written to {arguments.out}\n{text}")
+    done = f"{count} packets written to {arguments.out}" if count else f"{arguments.out}: not written"
+    return emit(arguments, figures, text=f"{done}\n{text}")
 
 
 def run_check(arguments: argparse.Namespace) -> int:

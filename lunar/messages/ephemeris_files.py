@@ -7,7 +7,7 @@ import io
 import itertools
 from pathlib import Path
 
-from lunar.comparison import check_gravity
+from lunar.comparison import check_gravity, cut_at_burns
 from lunar.datafolder import read_expanded
 from lunar.ephemeris import Ephemeris
 from lunar.errors import DataFileError
@@ -66,10 +66,15 @@ def load_ephemeris(path: Path | str) -> Ephemeris:
 
 
 def load_orbit(path: Path | str) -> Ephemeris:
-    """Return the ephemeris in a file, whose states must move as gravity moves them; raises as `check_gravity` too."""
-    ephemeris = load_ephemeris(path)
+    """Return the ephemeris in a file, whose states must move as gravity moves them, cut at burns."""
+    ephemeris = load_arcs(path)
     check_gravity(ephemeris)
     return ephemeris
+
+
+def load_arcs(path: Path | str) -> Ephemeris:
+    """Return the ephemeris in a file that was checked before, cut at burns."""
+    return cut_at_burns(load_ephemeris(path))
 
 
 def is_spk(path: Path | str) -> bool:

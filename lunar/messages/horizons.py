@@ -96,6 +96,10 @@ def _header(lines: list[str], source: str) -> tuple[str, tuple[float, float]]:
     number, frame = stated.get("reference frame", (1, "none"))
     if not frame.upper().startswith("ICRF"):
         raise UnknownFrameError(frame, ("ICRF",), f"{source}: line {number}")
+    for key, expected in (("output type", "GEOMETRIC"), ("center-site name", "BODY CENTER")):
+        number, found = stated.get(key, (1, expected))
+        if not found.upper().startswith(expected):
+            raise DataFileError(source, f"line {number}", f"{key.capitalize()} {expected}", repr(found))
     target = _TARGET.search(next((line for line in lines if "Target body name" in line), ""))
     name = re.sub(r"\s*\([^)]*\)", "", target[1]).strip() if target else ""
     return name or "HORIZONS TARGET", UNITS_M[units.partition(",")[0]]

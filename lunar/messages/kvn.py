@@ -64,9 +64,11 @@ class Lines:
         return key, value
 
     def rows(self, most: int) -> tuple[list[str], list[int]]:
-        """Return the next lines that begin with a digit, at most ``most``, and their numbers; pass them."""
+        """Return the next lines that begin with a digit, at most ``most``, and their numbers; pass comments too."""
         rows: list[str] = []
         numbers: list[int] = []
+        for _ in self.comments():
+            pass
         while len(rows) < most and self._next is not None and self._next[1][0].isdigit():
             self.at, line = self._next
             rows.append(line)

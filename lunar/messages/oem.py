@@ -208,8 +208,7 @@ def _parse_states(
 def _epochs(reader: Lines, texts: NDArray[np.bytes_], at: list[int], system: str) -> IntArray:
     # numpy reads calendar dates in one go; other notations, leap seconds and faults go through the slow reader, which
     # names the line.
-    if np.all(np.strings.endswith(texts, b"Z")):
-        texts = np.strings.rstrip(texts, b"Z")
+    texts = np.strings.rstrip(texts, b"Z")
     if texts[0][4:5] == b"-" and texts[0][7:8] == b"-":
         with suppress(ValueError):
             parts = [texts[k : k + _CAST_ROWS].astype("datetime64[ns]") for k in range(0, len(texts), _CAST_ROWS)]

@@ -24,6 +24,8 @@ from lunar.visibility import subsatellite
 
 _STATE_WIDTH = {"EPHEMERISTIMEPOSVEL": 7, "EPHEMERISTIMEPOSVELACC": 10}
 _UNITS_M = {"METERS": 1.0, "KILOMETERS": 1000.0, "METER": 1.0, "KILOMETER": 1000.0}
+_ROUNDED_NS = 1_000_000
+"""Times of boundaries may be rounded to this; states are further apart."""
 _MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
 _EPOCH = re.compile(r"(\d{1,2})\s+([A-Za-z]{3})[a-z]*\s+(\d{4})\s+(\d{1,2}:\d{2}:\d{2}(?:\.\d*)?)\Z", re.ASCII)
 _IGNORED = (
@@ -246,11 +248,17 @@ def _parts(
     if np.any(steps < 0):
         k = int(np.flatnonzero(steps < 0)[0]) + 1
         raise DataFileError(source, f"line {lines[first + k][0]}", "a time after the one before", "an earlier one")
+    at = np.searchsorted(tai_ns, boundary_tai_ns - _ROUNDED_NS)
+    shared = tai_ns[np.minimum(at, len(tai_ns) - 1)]
+    unknown = (shared > boundary_tai_ns + _ROUNDED_NS) & (boundary_tai_ns > tai_ns[0])
+    if unknown.any():
+        found = format_tai(int(boundary_tai_ns[unknown][0]), 6)
+        raise DataFileError(source, "SegmentBoundaryTimes", "times of states", f"{found}, at which there is none")
     starts = [0, *(np.flatnonzero(steps == 0) + 1).tolist(), len(tai_ns)]
     parts = []
     for begin, end in pairwise(starts):
         # A boundary inside an arc whose epoch occurs once: its state belongs to both sides.
-        cuts = np.flatnonzero(np.isin(tai_ns[begin + 1 : end - 1], boundary_tai_ns)) + begin + 1
+        cuts = np.flatnonzero(np.isin(tai_ns[begin + 1 : end - 1], shared)) + begin + 1
         edges = [begin, *cuts.tolist(), end - 1]
         parts += [slice(a, b + 1) for a, b in pairwise(edges) if b > a or end - begin == 1]
     return parts

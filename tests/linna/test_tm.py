@@ -7,6 +7,7 @@ import struct
 import numpy as np
 import pytest
 
+from linna.cli import run
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 from tmtc.link.cadu import ASM
@@ -66,6 +67,13 @@ def test_decode_writes_json_to_a_file_or_to_standard_output(downlink, tmp_path, 
     assert summary["telemetry"] == records and summary["packets"] == 100
 
 
+def test_decode_without_a_packet_to_write_says_so_and_writes_no_file(downlink, tmp_path, capsys):
+    out = tmp_path / "packets.json"
+    assert run(f"tm decode {downlink} --packet housekeeping --out {out}".split()) == 1
+    assert capsys.readouterr().err == "linna: expected a packet (housekeeping) among 100, found none\n"
+    assert not out.exists()
+
+
 def test_decode_writes_csv_and_parquet(downlink, tmp_path, typed):
     out = tmp_path / "packets"
     typed(f"tm decode {downlink} --format csv --out {out}")
@@ -82,7 +90,7 @@ def test_bare_packets_are_decoded_as_well(tmp_path, typed):
 
 
 def test_only_the_wanted_packets_are_decoded(downlink, typed):
-    assert typed(f"tm decode {downlink} --packet detections") == []
+    assert typed(f"tm decode {downlink} --packet detections", 1) == []
     assert "found 'nonsense'" in typed(f"tm decode {downlink} --packet nonsense", 2)
 
 

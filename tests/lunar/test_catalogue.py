@@ -138,6 +138,8 @@ lat,lon,diam/91,2,3 | line 2: expected a latitude
 lat,lon,diam/1,2,-3 | line 2: expected a diameter of 1 to 2600000 m, found -3000
 lat,lon,diam/1,2,8200 | line 2: expected a diameter of 1 to 2600000 m, found 8200000
 lat,lon,diam/1,nan,3 | line 2: expected a longitude
+lat;lon;diam/1,5;2,5;3,5 | line 1: expected column names of a crater catalogue, separated by commas, found lat;lon;diam
+id,lat,lon,diam/7,1,2,3/7,1,3,3 | lines 2 and 3, column id: expected an id of its own
 """
 
 
@@ -224,6 +226,24 @@ def test_a_crater_that_is_listed_twice_with_one_id_counts_once_and_a_worn_one_on
     assert load_catalogue(path).ids.tolist() == [1, 2]
     path.write_text(OWN.replace("\n1,-36.2,260.3,8000.0,10.0,1200.0", "\n3,-36.4,260.3,8000.0,10.0,-8.0"))
     assert load_catalogue(path).depth_m.min() == -8.0
+
+
+def test_craters_that_are_listed_twice_with_two_ids_count_once_and_are_reported(tmp_path, caplog):
+    path = tmp_path / "own.csv"
+    path.write_text(OWN.replace("\n1,-36", "\n3,-36"))
+    assert load_catalogue(path).ids.tolist() == [1, 3]
+    assert caplog.messages == [f"{path}: left out 1 of 3 craters, equal to one before but for the id"]
+
+
+def test_ids_rim_heights_and_flags_are_read_in_every_list_that_has_them(tmp_path):
+    path = tmp_path / "own.csv"
+    path.write_text("id,lat,lon,diam\n70,1,2,3\n71,1,3,3\n")
+    assert load_catalogue(path).ids.tolist() == [70, 71]
+    path.write_text("id,latitude_deg,longitude_deg,diameter_m,depth_m,rim_height_m,complete\n1,2,3,4000,,-512.5,0\n")
+    own = load_catalogue(path)
+    path.write_text("id,latitude_deg,longitude_deg,diameter_m,depth_m,rim_height_m\n1,2,3,4000,,-512.5\n")
+    assert own.rim_height_m == load_catalogue(path).rim_height_m == -512.5
+    assert not own.complete.any() and load_catalogue(path).complete.all()
 
 
 @pytest.mark.parametrize("column", ["latitude_deg", "longitude_deg", "diameter_m", "rim_height_m", "depth_m"])

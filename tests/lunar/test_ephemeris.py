@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import KroghInterpolator
 
-from lunar.comparison import check_gravity
+from lunar.comparison import check_gravity, cut_at_burns
 from lunar.constants import NS
-from lunar.ephemeris import Ephemeris, EphemerisSegment, ephemeris_from_states, resampled
+from lunar.ephemeris import Covariance, Ephemeris, EphemerisSegment, ephemeris_from_states, resampled
 from lunar.errors import DataFileError, EphemerisCoverageError, EphemerisError, UnmovedByGravity
-from lunar.frames import IauOrientation
+from lunar.frames import IauOrientation, matrix_from_quaternion
 from lunar.messages.ephemeris_files import load_ephemeris
 from lunar.timescales import parse_utc, tdb_s_from_tai_ns
 from tests.lunar.orbits import START, circle, polar_orbit, times
@@ -251,6 +251,41 @@ def test_states_that_gravity_moves_are_accepted_also_with_an_orbit_determination
     burn = np.where(np.arange(241)[:, None] > 120, 1.0001, 1.0)
     check_gravity(with_states(orbit, lambda one: {"velocity_m_s": burn * one.velocity_m_s}))
     check_gravity(with_states(polar_orbit(0.01, step_s=1.0), scaled(1.003, 1.003)))  # 36 s of 0.9 %: a mascon?
+
+
+def turned(orbit, angle_rad):
+    """An orbit whose plane turns about the place half a step after state 120, as a burn there turns it."""
+    (one,) = orbit.segments
+    place = orbit.at(int(one.utc_ns[120] + one.utc_ns[121]) // 2)[0]
+    turn = rotation_about(place / np.linalg.norm(place), angle_rad)
+    after = np.arange(len(one.utc_ns))[:, None] > 120
+    position_m, velocity_m_s = (np.where(after, x @ turn.T, x) for x in (one.position_m, one.velocity_m_s))
+    return with_states(orbit, lambda _: {"position_m": position_m, "velocity_m_s": velocity_m_s})
+
+
+def rotation_about(axis, angle_rad):
+    x, y, z = axis * np.sin(angle_rad / 2.0)
+    return matrix_from_quaternion(np.array([np.cos(angle_rad / 2.0), x, y, z]))
+
+
+def test_nothing_is_interpolated_across_a_burn_between_two_states():
+    orbit = polar_orbit(4.0)
+    covariances = tuple(Covariance(START + k * 60 * NS, "ICRF", np.eye(6)) for k in (10, 200))
+    burned = with_states(turned(orbit, 0.001), lambda one: {"covariances": covariances})
+    cut = cut_at_burns(burned)
+    assert [len(one.utc_ns) for one in cut.segments] == [121, 120]
+    assert [one.covariances for one in cut.segments] == [covariances[:1], covariances[1:]]
+    assert cut.covers(START + np.array([7200, 7230, 7260]) * NS).tolist() == [True, False, True]
+    rounded = {"velocity_m_s": np.rint(orbit.segments[0].velocity_m_s)}
+    for smooth in (orbit, turned(orbit, 0.0001), with_states(orbit, lambda one: rounded), polar_orbit(0.02)):
+        assert cut_at_burns(smooth).segments == smooth.segments
+
+
+@pytest.mark.parametrize("scale", [1e3, 1e-3])
+def test_a_single_state_in_another_unit_is_refused(scale):
+    with pytest.raises(EphemerisError, match=r"ephemeris state 1 of .* expected 1737400 to 66000000 m .* another unit"):
+        check_gravity(with_states(polar_orbit(0.0), scaled(scale, scale)))
+    check_gravity(polar_orbit(0.0))
 
 
 @pytest.mark.parametrize("change, message", [

@@ -17,6 +17,7 @@ from linna import cli
 from lunar.datafolder import DataFolder
 from lunar.timescales import parse_utc, tai_ns_from_utc_ns
 from payload_emulator.errors import ScenarioError
+from payload_emulator.flight.onboard.modes import PayloadMode
 from payload_emulator.session.archive.mission import OPERATIONS, live_mission_text, scenario_mission_text
 from payload_emulator.session.live.session import LiveSession
 from payload_emulator.session.live.station_ports import RECORD_HEADER
@@ -227,6 +228,22 @@ def test_battery_and_temperature_follow_the_sun(flight):
 def test_outside_windows_no_image_is_made_and_time_is_cheap(flight):
     session, _, _ = flight
     assert session.spacecraft.payload.summary()["frames_processed"] == session.account.frames == 12
+
+
+def test_the_ground_of_an_observation_is_dropped_in_the_first_change_of_contact_after_it(monkeypatch):
+    session = opened(scenario())
+    terrain = session.world.terrain
+    found = []
+    for mode in (PayloadMode.observing, PayloadMode.standby):
+        monkeypatch.setattr(session.spacecraft.payload._machine, "mode", mode)
+        terrain.release_thread()
+        terrain.height_m(0.1, 0.1)
+        terrain.release_thread()
+        session._hold(selectors.DefaultSelector())
+        session.spacecraft.camera._renderer.submit(int).result()
+        found.append(len(terrain._slots))
+    session.close()
+    assert found == [1, 0]
 
 
 def test_a_contact_ends_with_an_outage_of_its_station_and_later_telecommands_are_lost():

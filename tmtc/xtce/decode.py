@@ -766,7 +766,7 @@ def _read_fixed_elements(
     place = np.arange(len(owner), dtype=np.int64) - np.repeat(np.cumsum(counts) - counts, counts)
     elements = _Rows(rows.packet[owner], rows.at[owner] + place * bits, rows, owner)
     column, _, good = _read_records(run, data_type.element, fields, elements, name)
-    at = rows.at + counts * bits - data_type.gap_bits * (counts > 0)
+    at = rows.at + counts * bits - (data_type.gap_bits - data_type.tail_bits) * (counts > 0)
     if good is None:
         return ArrayColumn(counts, column), at, None
     kept = np.ones(len(rows), dtype=np.bool_)
@@ -807,6 +807,7 @@ def _read_open_elements(run: _Run, data_type: ArrayType, rows: _Rows, counts: In
         stays = np.flatnonzero(kept[owner])
         column = joined.take(stays[np.argsort(owner[stays], kind="stable")])
     index = np.flatnonzero(kept)
+    at += data_type.tail_bits * (counts > 0)
     return ArrayColumn(counts[index], column), at[index], None if kept.all() else kept
 
 

@@ -175,13 +175,17 @@ class ScalarType:
 
 @dataclass(frozen=True, slots=True)
 class ArrayType:
-    """Elements of one type with indices `first` to `last`, both included, `gap_bits` between two of them."""
+    """Elements of one type with indices `first` to `last`, both included.
+
+    `gap_bits` lie between two of them, `tail_bits` behind the last one.
+    """
 
     name: str
     element: DataType
     first: Size
     last: Size
     gap_bits: int = 0
+    tail_bits: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,6 +313,11 @@ def _place_entries(entries: tuple[Entry, ...], start: int, found: dict[tuple[int
             behind = _place_entries(entry.item.entries, at, found)
             at = behind if entry.item.bits is None else at + entry.item.bits
     return at
+
+
+def fixed_bits(data_type: DataType) -> int | None:
+    """Return the width of a type, None where it is not fixed."""
+    return _place_value(data_type, 0, Reference(""), {})
 
 
 def _place_value(

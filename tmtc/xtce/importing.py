@@ -50,6 +50,7 @@ from tmtc.xtce.definition import (
     Size,
     Spline,
     StringEncoding,
+    fixed_bits,
     references,
 )
 from tmtc.xtce.nodes import Node, parse_xml
@@ -354,7 +355,7 @@ class _Importer:
         gap = 0 if offset is None else self.size(offset, system, least=0).fixed
         if offset is not None and gap is None:
             raise offset.error("a FixedValue between repetitions", offset.children[0].tag)
-        count = self.size(node.required("Count"), system, least=0)
+        count, tail = self.size(node.required("Count"), system, least=0), 0
         if isinstance(item, Container):
             plain = [
                 (one.item.name, one.item.type)
@@ -362,14 +363,19 @@ class _Importer:
                 if isinstance(one.item, Parameter) and one == Entry(one.item)
             ]
             _expect(node, len(plain) == len(item.entries), "parameters one after another", "other entries")
-            item = Parameter(item.name, item.path, AggregateType(item.name, tuple(plain)))
+            inner, stated = AggregateType(item.name, tuple(plain)), item.bits
+            if stated is not None:
+                width = fixed_bits(inner)
+                _expect(node, width is not None and width <= stated, f"parts of {stated} bits", f"{width or 'others'}")
+                tail = stated - (width or 0)
+            item = Parameter(item.name, item.path, inner)
         if count.fixed is not None:
             last = replace(count, fixed=count.fixed - 1)
         elif count.lookup:
             last = replace(count, lookup=tuple((condition, value - 1) for condition, value in count.lookup))
         else:
             last = replace(count, intercept=count.intercept - 1)
-        return replace(item, type=ArrayType(item.type.name, item.type, Size(fixed=0), last, gap or 0))
+        return replace(item, type=ArrayType(item.type.name, item.type, Size(fixed=0), last, (gap or 0) + tail, tail))
 
     # references
 
@@ -977,11 +983,16 @@ def _limits(chain: Sequence[tuple[_System, Node]], levels: tuple[str, ...]) -> L
     stated = next((found for level in levels if (found := ranges.child(level)) is not None), None)
     if stated is None:
         return None
-    least, greatest = (
-        next((_number(stated, name, None) for name in names if name in stated.attributes), None)
-        for names in (("minInclusive", "minExclusive"), ("maxInclusive", "maxExclusive"))
-    )
-    return least, greatest
+    return _limit(stated, "min", math.inf), _limit(stated, "max", -math.inf)
+
+
+def _limit(stated: Node, side: str, inside: float) -> float | None:
+    """Return the last value without alarm on a side; an exclusive limit is an alarm itself."""
+    if f"{side}Inclusive" in stated.attributes:
+        return _number(stated, f"{side}Inclusive", None)
+    if f"{side}Exclusive" in stated.attributes:
+        return math.nextafter(_number(stated, f"{side}Exclusive", None), inside)
+    return None
 
 
 def _static_ranges(chain: Sequence[tuple[_System, Node]]) -> Node | None:
@@ -993,7 +1004,7 @@ def _static_ranges(chain: Sequence[tuple[_System, Node]]) -> Node | None:
 
 
 def _alarms_not_read(chain: Sequence[tuple[_System, Node]]) -> int:
-    """Return the number of alarms of a type other than the ranges that `_limits` reads."""
+    """Return the number of alarms of a type other than the ranges that `_limits` reads, and of those that wait."""
     read = _static_ranges(chain)
     used = [next((one for one in levels if read and read.child(one)), "") for levels in (_WARNING, _ALARM)]
     lists = ("DefaultAlarm", "ContextAlarmList", "BinaryContextAlarmList")
@@ -1006,7 +1017,8 @@ def _alarms_not_read(chain: Sequence[tuple[_System, Node]]) -> int:
         for one in alarm.children
         if one.tag in (*_WARNING, *_ALARM) and not (alarm is read and one.tag in used)
     ]
-    return len(ranges) + sum(alarm.tag in _ALARMS for alarm in found)
+    late = sum(_integer(holder, "minViolations", 1) > 1 for holder in holders)
+    return len(ranges) + late + sum(alarm.tag in _ALARMS for alarm in found)
 
 
 def _stated(chain: Sequence[tuple[_System, Node]], name: str, default: str) -> str:

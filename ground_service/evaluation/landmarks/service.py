@@ -458,7 +458,7 @@ def format_labels(landmarks: Sequence[Landmark]) -> str:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(LABEL_COLUMNS)
-    for one in sorted(_accepted(landmarks), key=lambda found: found.id):
+    for one in _accepted(landmarks):
         writer.writerow(
             (
                 f"{one.latitude_deg:.6f}", f"{one.longitude_deg % 360.0:.6f}", f"{one.height_m:.0f}",
@@ -481,16 +481,17 @@ def upload_entries(octets: bytes, transaction: int) -> list[tuple[str, dict[str,
 
 
 def _accepted(landmarks: Sequence[Landmark]) -> list[Landmark]:
-    return [one for one in landmarks if one.state == "accepted"]
+    """Return the accepted landmarks by their numbers; none is an error, as there is nothing to write."""
+    accepted = sorted((one for one in landmarks if one.state == "accepted"), key=lambda found: found.id)
+    if not accepted:
+        raise InvalidInput("landmarks", "", "accepted landmarks", f"none among {len(landmarks)}")
+    return accepted
 
 
 def _new(ids: Sequence[int], landmarks: Sequence[Landmark]) -> list[Landmark]:
     """Return the accepted landmarks that a catalogue with these identities lacks."""
-    accepted = _accepted(landmarks)
-    if not accepted:
-        raise InvalidInput("landmarks", "", "accepted landmarks", f"none among {len(landmarks)}")
     known = set(ids)
-    return [one for one in sorted(accepted, key=lambda found: found.id) if FIRST_ID + one.id not in known]
+    return [one for one in _accepted(landmarks) if FIRST_ID + one.id not in known]
 
 
 def _column(landmarks: Sequence[Landmark], name: str) -> FloatArray:

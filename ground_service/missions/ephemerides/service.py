@@ -28,7 +28,7 @@ from lunar.ephemeris import Ephemeris as States
 from lunar.errors import EphemerisError, LunarError, UnmovedByGravity
 from lunar.frames import ICRF_NAMES
 from lunar.messages.aem import CAMERA_NAMES, parse_aem
-from lunar.messages.ephemeris_files import load_ephemeris, load_orbit
+from lunar.messages.ephemeris_files import load_arcs, load_orbit
 from lunar.timescales import TICKS_PER_SECOND
 
 EPHEMERIDES = repository.EPHEMERIDES
@@ -182,7 +182,7 @@ def open_ephemeris(ground: Ground, reference: Ephemeris) -> States:
 
 @functools.lru_cache(maxsize=8)
 def _loaded(path: str) -> States:
-    return load_ephemeris(Path(path))
+    return load_arcs(Path(path))
 
 
 ATTITUDE_FILES = ("attitude.csv", "attitude.aem")

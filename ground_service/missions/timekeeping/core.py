@@ -120,10 +120,15 @@ def largest_step_s(runs: Sequence[TimeCorrelation], after_utc_ns: int, until_utc
 
 def ticks_of_utc_ns(utc_ns: int, correlations: Sequence[TimeCorrelation]) -> int:
     """On-board ticks that the clock shows at `utc_ns`, to about a tick."""
-    ticks = int(timescales.ticks_from_utc_ns(utc_ns))
+    return int(ticks_of_times(np.array([utc_ns], dtype=np.int64), correlations)[0])
+
+
+def ticks_of_times(utc_ns: IntArray, correlations: Sequence[TimeCorrelation]) -> IntArray:
+    """On-board ticks (n,) that the clock shows at times (n,), to about a tick."""
+    ticks = timescales.ticks_from_utc_ns(utc_ns)
     for _ in range(3):
-        shown, _ = utc_ns_of_ticks(np.array([ticks], dtype=np.int64), correlations)
-        ticks += int((utc_ns - int(shown[0])) * _NS_DENOMINATOR // _NS_NUMERATOR)
+        whole, part = np.divmod(utc_ns - utc_ns_of_ticks(ticks, correlations)[0], _NS_NUMERATOR)
+        ticks = ticks + whole * _NS_DENOMINATOR + part * _NS_DENOMINATOR // _NS_NUMERATOR
     return ticks
 
 
@@ -238,7 +243,8 @@ def doubted_stations(
 
     The reports of a station are split into runs as those of the clock. Two runs disagree if every change between them
     shows it: a clock that was set changes for all stations. Of runs that disagree, those count that more stations
-    share, or that agree with the on-board clock; otherwise neither. A single station counts as little if it differs
+    share, or that alone agree with the on-board clock where the others are off by seconds of a usual cause; otherwise
+    neither. A single station counts as little if it differs
     from the on-board clock by whole seconds with a usual cause, from its first report on.
     """
     sent = np.asarray(timescales.tai_ns_from_utc_ns(np.asarray(earth_utc_ns, dtype=np.int64))) - light_time_ns
@@ -261,6 +267,7 @@ def doubted_stations(
         if found.changes and abs(found.least_ns) <= found.tolerance_ns:
             group = [group[one] if number == group[other] else number for number in group]
     doubts: dict[int, StationDoubt] = {}
+    apart: list[tuple[int, int, float]] = []
     for (one, other), found in differences.items():
         sides = [{number for number, of in enumerate(group) if of == group[k]} for k in (one, other)]
         weight = [len({names[units[number][0]] for number in side}) for side in sides]
@@ -269,13 +276,16 @@ def doubted_stations(
             continue  # the clock was set on board
         near = [abs(float(np.median(off[units[k]]))) <= 0.1 * abs(found.least_ns) for k in (one, other)]
         wrong = [weight[0] < weight[1], weight[1] < weight[0]]
-        if weight[0] == weight[1]:
+        if weight[0] == weight[1] or (near[0] != near[1] and _is_whole(found.least_ns)):
             wrong = [not near[0], not near[1]] if any(near) or found.changes > 1 else [False, False]
-        for side, is_wrong, sign in zip(sides, wrong, (1.0, -1.0), strict=True):
-            for rows in (units[number] for number in side if is_wrong):
-                kept[rows] = False
-                doubt = StationDoubt(str(names[rows[0]]), sign * found.least_ns * 1e-9)
-                doubts.update(dict.fromkeys(rows.tolist(), doubt))
+        for side, is_wrong, against, sign in zip(sides, wrong, (other, one), (1.0, -1.0), strict=True):
+            apart += [(number, against, sign * found.least_ns) for number in side if is_wrong]
+    for number, _, _ in apart:
+        kept[units[number]] = False
+    # A difference from what counts says more than one from what does not.
+    for number, _, least_ns in sorted(apart, key=lambda one: bool(kept[units[one[1]]].all())):
+        doubt = StationDoubt(str(names[units[number][0]]), least_ns * 1e-9)
+        doubts.update(dict.fromkeys(units[number].tolist(), doubt))
     for name in sorted(set(station)):
         numbers = [number for number, rows in enumerate(units) if names[rows[0]] == name]
         shared = {group[number] for number in range(len(units)) if number not in numbers}

@@ -26,6 +26,7 @@ from ground_service.missions.places import stations_of
 from ground_service.missions.store import mission_of_vehicle
 from ground_service.missions.timekeeping import store
 from ground_service.missions.timekeeping.core import (
+    LONE_DRIFT,
     CorrelationFit,
     StationDoubt,
     TimeCorrelation,
@@ -118,7 +119,7 @@ def read_receptions(path: Path) -> list[ReceivedReport]:
         If the file cannot be read, or a row of it.
     """
     try:
-        with path.open(encoding="utf-8", newline="") as stream:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
             reader = csv.DictReader(stream)
             rows = list(islice(reader, RECEPTIONS_LIMIT + 1))
             names = reader.fieldnames or ()
@@ -127,8 +128,9 @@ def read_receptions(path: Path) -> list[ReceivedReport]:
     for name in ("packet_ticks", "sequence_count", "received_utc"):
         if name not in names:
             raise InvalidInput(str(path), "line 1", f"a column {name}", ",".join(names)[:120] or "nothing")
-    if len(rows) > RECEPTIONS_LIMIT:
-        raise InvalidInput(str(path), "", f"at most {RECEPTIONS_LIMIT} receptions", "more")
+    if not 0 < len(rows) <= RECEPTIONS_LIMIT:
+        found = "more" if rows else "none"
+        raise InvalidInput(str(path), "", f"1 to {RECEPTIONS_LIMIT} receptions", found)
     given = [{**row, "received": row["received_utc"]} for row in rows]
     try:
         return received_reports(given)
@@ -214,15 +216,50 @@ def fit_runs(reports: TimeReports) -> tuple[list[tuple[int, CorrelationFit]], di
     runs = clock_runs(reports.ticks[rows], reports.earth_utc_ns[rows], reports.light_time_ns[rows], reports.boot[rows])
     fits = []
     for run in (rows[found] for found in runs if len(found)):
-        fit = fit_correlation(reports.ticks[run], reports.earth_utc_ns[run], reports.light_time_ns[run])
+        fit = _fit(reports, run)
+        if fit.residual_rms_ns > CORRELATION_RMS_NS and (steady := _steady(reports, run)).size:
+            fit = _fit(reports, steady)
+            for name, mine in _by_station(reports, np.setdiff1d(run, steady)).items():
+                kept[mine], left_ns = False, _left_ns(reports, mine, fit)
+                doubt = StationDoubt(name, float(left_ns[np.argmax(np.abs(left_ns))]) * 1e-9)
+                doubts.update(dict.fromkeys(mine.tolist(), doubt))
         inside = (reports.ticks >= fit.start_ticks) & (reports.ticks <= fit.stop_ticks) & ~kept
         rejected = fit.rejected + int((inside & (reports.boot == reports.boot[run[0]])).sum())
         if fit.residual_rms_ns <= CORRELATION_RMS_NS:
             fits.append((int(reports.boot[run[0]]), replace(fit, rejected=rejected)))
         else:
-            doubt = StationDoubt(reports.station[run[0]], fit.residual_rms_ns * 1e-9, "one line through all (rms)")
-            doubts.update(dict.fromkeys(run.tolist(), doubt))
+            for name, mine in _by_station(reports, run).items():
+                doubt = StationDoubt(name, fit.residual_rms_ns * 1e-9, "one line through all (rms)")
+                doubts.update(dict.fromkeys(mine.tolist(), doubt))
     return fits, doubts
+
+
+def _fit(reports: TimeReports, rows: IntArray) -> CorrelationFit:
+    return fit_correlation(reports.ticks[rows], reports.earth_utc_ns[rows], reports.light_time_ns[rows])
+
+
+def _by_station(reports: TimeReports, rows: IntArray) -> dict[str, IntArray]:
+    names = np.array(reports.station)[rows]
+    return {str(name): rows[names == name] for name in np.unique(names)}
+
+
+def _steady(reports: TimeReports, rows: IntArray) -> IntArray:
+    """Return the reports of stations whose own lines drift as an oscillator on board can, where others drift more."""
+    stations = _by_station(reports, rows)
+    fits = {name: _fit(reports, mine) for name, mine in stations.items()}
+    good = [
+        stations[name]
+        for name, fit in fits.items()
+        if fit.residual_rms_ns <= CORRELATION_RMS_NS and abs(fit.drift_ppb) <= LONE_DRIFT * 1e9
+    ]
+    return np.concatenate(good) if 0 < len(good) < len(stations) else np.zeros(0, dtype=np.int64)
+
+
+def _left_ns(reports: TimeReports, rows: IntArray, fit: CorrelationFit) -> IntArray:
+    """Return by how much receptions are after what a line says."""
+    line = TimeCorrelation(0, fit.start_ticks, fit.stop_ticks, fit.reference_ticks, fit.reference_utc_ns, fit.drift_ppb)
+    expected = np.asarray(tai_ns_from_utc_ns(line.utc_ns(reports.ticks[rows])))
+    return np.asarray(tai_ns_from_utc_ns(reports.earth_utc_ns[rows]) - reports.light_time_ns[rows] - expected)
 
 
 def residuals(ground: Ground, vehicle: int) -> list[TimeReport]:

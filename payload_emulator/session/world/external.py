@@ -7,6 +7,7 @@ camera. Without attitudes the camera looks straight down, as the scenario points
 
 import csv
 import io
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -26,8 +27,11 @@ from payload_emulator.sim.render.sensor import Picture
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
 
 
-_NO_DATA_BELOW = -1_000.0
-"""Special values for missing pixels (-9999, -32768, -3.4e38) lie below; counts of a calibrated image do not."""
+_NO_DATA_BELOW, _NO_DATA_ABOVE = -1_000.0, 1e9
+"""Special values for missing pixels (-9999, -32768, -3.4e38; 1e20, 3.4e38) lie beyond; counts of an image do not."""
+
+_GDAL_NODATA = 42113
+"""Tag of a TIFF file with the value of pixels without data, as text."""
 
 _HOT = 4.0
 """Times the level of all but a thousandth of the pixels, from which a pixel is hot and decides no scale."""
@@ -36,9 +40,10 @@ _HOT = 4.0
 def read_picture(path: Path) -> tuple[NDArray[np.generic], str]:
     """Read the pixels of an image file (PNG, JPEG, TIFF, NPY) and the faults of some; colours in RGB order.
 
-    Pixels are 8 or 16 bits or float in 0..1, turned as EXIF states. Those without data (not finite, far below zero)
-    become black. A 16-bit file whose greatest value would fit into 12 or 14 bits is taken for one of so many. Float
-    pixels above 1 are divided by the greatest one. Hot pixels do not count for either, and are cut at full scale.
+    Pixels are 8 or 16 bits or float in 0..1, turned as EXIF states. Those without data (not finite, far below zero,
+    above 1e9, or of the value that a TIFF file states) and below zero become black. A 16-bit file whose greatest value
+    would fit into 12 or 14 bits is taken for one of so many. Float pixels above 1 are divided by the greatest one. Hot
+    pixels do not count for either, and are cut at full scale.
 
     Raises
     ------
@@ -52,22 +57,24 @@ def read_picture(path: Path) -> tuple[NDArray[np.generic], str]:
     image = _decode_npy(path) if path.suffix.lower() == ".npy" else _decode(octets)
     if image is None:
         raise DatasetError(f"{path}: expected an image (PNG, TIFF, JPEG, NPY), found none that can be read")
-    if image.dtype.kind == "i":
+    if image.dtype.kind == "i" or image.dtype.itemsize > 2:
         image = image.astype(np.float32)
-    if image.dtype not in (np.uint16, np.float32, np.float64) or not image.size:
+    if not image.size:
         return image, ""
-    missing = ~(np.greater(image, _NO_DATA_BELOW) & np.isfinite(image))
+    is_number = np.greater(image, _NO_DATA_BELOW) & np.less(image, _NO_DATA_ABOVE)
+    missing = ~is_number | np.equal(image, _stated_nodata(octets))
     image = np.where(missing, image.dtype.type(0), image)
-    limit = _HOT * float(np.quantile(image[~missing], 0.999)) if not missing.all() else 0.0
+    has_levels = image.dtype != np.uint8 and not missing.all()
+    limit = _HOT * float(np.quantile(image[~missing], 0.999)) if has_levels else 0.0
     hot = np.greater(image, limit if limit > 0.0 else np.inf)
     greatest = float(image[~hot].max())
     if image.dtype == np.uint16:
         held = next(bits for bits in (12, 14, 16) if greatest < 1 << bits)
         image = np.left_shift(np.minimum(image, (1 << held) - 1).astype(np.uint16), 16 - held)
-    elif greatest > 1.0:
+    elif image.dtype.kind == "f" and greatest > 1.0:
         image = np.divide(image, greatest)
     if image.dtype.kind == "f":
-        image = np.minimum(image, 1.0)
+        image = np.clip(image, 0.0, 1.0)
     counts = ((missing, "without data (black)"), (hot, "hot (cut)"))
     words = [f"{np.count_nonzero(mask)} {name}" for mask, name in counts if mask.any()]
     return image, f"{' and '.join(words)} of {image.size} pixels" if words else ""
@@ -91,9 +98,21 @@ def _turned(image: NDArray[np.generic], octets: bytes) -> NDArray[np.generic]:
     return np.ascontiguousarray(image[:, ::-1] if orientation in (2, 3, 6, 7) else image)
 
 
+def _stated_nodata(octets: bytes) -> float:
+    """Return the value of pixels without data that a TIFF file states; NaN where none is stated."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(io.BytesIO(octets)) as opened:
+            return float(getattr(opened, "tag_v2", {}).get(_GDAL_NODATA, math.nan))
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError):
+        return math.nan
+
+
 def _decode(octets: bytes) -> NDArray[np.generic] | None:
     import cv2
 
+    cv2.setLogLevel(0)  # it prints what an error of ours says
     data = np.frombuffer(octets, np.uint8)
     image: NDArray[np.generic] | None = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if image is None:
@@ -109,7 +128,7 @@ def _decode_npy(path: Path) -> NDArray[np.generic] | None:
         return None
     if not isinstance(image, np.ndarray) or image.ndim not in (2, 3) or image.dtype.kind not in "uf":
         return None
-    return image
+    return image if image.ndim == 2 or image.shape[2] <= 4 else None
 
 
 TABLE = "frames.csv"
@@ -227,7 +246,7 @@ def external_scenario(scenario: Scenario, frames: ExternalFrames) -> Scenario:
 def _table(folder: Path) -> tuple[IntArray, tuple[Path, ...]]:
     path = folder / TABLE
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        with path.open(encoding="utf-8-sig", newline="") as file:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{path}: expected a table with columns file and utc, found none ({error})") from None

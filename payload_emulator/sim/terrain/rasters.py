@@ -577,7 +577,8 @@ def _sphere(file: RasterFile, crs: Any) -> float:
 def _placed(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tuple[float, RasterFile]:
     """Return pixels per degree and a file at its place, as it is or resampled to longitude and latitude."""
     values, degree = crs.to_dict(), math.radians(radius_m)
-    across = down = middle_deg = 0.0
+    across = down = 0.0
+    middle_deg = float(values.get("pm", 0.0)) + float(values.get("lon_0", 0.0))
     west, north = transform.c, transform.f
     if crs.is_geographic:
         across = down = math.radians(1.0) / crs.units_factor[1]
@@ -585,7 +586,6 @@ def _placed(file: RasterFile, crs: Any, transform: Any, radius_m: float) -> tupl
         unit_m = _unit_m(values)
         down = degree / unit_m
         across = down * math.cos(math.radians(values.get("lat_ts", 0.0)))
-        middle_deg = float(values.get("lon_0", 0.0))
         west, north = west - values.get("x_0", 0.0) / unit_m, north - values.get("y_0", 0.0) / unit_m
     if across and not transform.b and not transform.d:
         wide, high = transform.a / across, -transform.e / down

@@ -27,6 +27,11 @@ from lunar.arrays import BoolArray, FloatArray
 from payload_emulator.errors import DatasetError
 from payload_emulator.session.world.external import IMAGE_SUFFIXES, read_picture
 
+_EQUAL_PX = 0.5
+"""Labels whose boxes differ by less are one: tools round what they write."""
+_LOOSE_PX = 4.0
+"""Difference of a box from its polygons, which are simplified, that is allowed for small ones."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledPicture:
@@ -70,7 +75,11 @@ def load_pictures(folder: Path, category: str = "") -> list[LabelledPicture]:
             f"{folder}: expected a COCO file (*.json with images, annotations and categories), found "
             f"{'none' if folder.is_dir() else 'no such folder'}"
         )
-    return [picture for path, document in documents for picture in _pictures(path, document, category)]
+    found = [picture for path, document in documents for picture in _pictures(path, document, category)]
+    name, count = Counter(str(picture.path.resolve()) for picture in found).most_common(1)[0] if found else ("", 0)
+    if count > 1:
+        raise DatasetError(f"{folder}: expected each image once, found {name} {count} times (two files joined?)")
+    return found
 
 
 def set_words(pictures: Sequence[LabelledPicture]) -> list[str]:
@@ -101,7 +110,7 @@ def set_words(pictures: Sequence[LabelledPicture]) -> list[str]:
 def _coco(path: Path) -> dict[str, Any] | None:
     """The document of a COCO file; None where a JSON file is of another kind."""
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise DatasetError(f"{path}: expected JSON, found none ({error})") from error
     if not isinstance(document, dict) or "annotations" not in document or "images" not in document:
@@ -187,12 +196,13 @@ def _require_boxes_in_pixels(path: Path, pictures: Sequence[LabelledPicture]) ->
     )
     if not len(box):
         return
-    for most, fewest, words in ((2.0, 1, "coordinates from 0 to 1"), (100.0, 20, "per cent")):
-        if ends.max() <= most < sizes.min() / 2.0 and len(box) >= fewest:
-            raise DatasetError(
-                f"{path}, annotations: expected boxes and polygons in pixels, found none over {ends.max():.3g}: "
-                f"{words}?"
-            )
+    is_share, is_small = ends.max() <= 2.0 < sizes.min() / 2.0, (ends / sizes).max() < 0.55 and len(box) >= 20
+    if is_share or is_small:
+        raise DatasetError(
+            f"{path}, annotations: expected boxes and polygons in pixels of images of {sizes[0, 0]:g} x "
+            f"{sizes[0, 1]:g}, found none over {ends.max():.3g}: "
+            f"{'coordinates from 0 to 1' if is_share else 'per cent, or labels of images of another size'}?"
+        )
     corners = (box[:, 2:] > box[:, :2]).all() and len(box) > 2
     beyond = np.count_nonzero((ends > sizes + 1.0).any(axis=1))
     outside = np.flatnonzero((box[:, :2] + 0.5 * box[:, 2:] > sizes + 1.0).any(axis=1))
@@ -217,7 +227,9 @@ def _picture(
     path: Path, item: Mapping[str, Any], labels: list[_Label], others: Sequence[str], place: str
 ) -> LabelledPicture:
     every = len(labels)
-    labels = list(dict.fromkeys(labels))
+    box = np.array([label.box for label in labels], dtype=np.float64).reshape(-1, 4)
+    again = [(np.abs(box[:k] - box[k]).max(axis=1) < _EQUAL_PX).any() for k in range(every)]
+    labels = [label for label, is_repeated in zip(labels, again, strict=True) if not is_repeated]
     name = _value(item, "file_name", place)
     if not isinstance(name, str) or not name:
         raise DatasetError(f"{place}.file_name: expected the name of an image file, found {name!r}")
@@ -254,10 +266,17 @@ def _picture(
 
 
 def _label(item: Mapping[str, Any], place: str) -> _Label:
-    crowd = item.get("iscrowd", 0) in (1, True)
+    crowd = item.get("iscrowd") or 0
+    if crowd not in (0, 1):
+        raise DatasetError(f"{place}.iscrowd: expected 0 or 1, found {crowd!r}")
     polygons = item.get("segmentation")
     if isinstance(polygons, list) and polygons:
         box, u, v, diameter = _of_polygons(polygons, place)
+        stated = _box(item["bbox"], place) if item.get("bbox") else box
+        if max(map(abs, np.subtract(stated, box))) > max(_LOOSE_PX, 0.5 * max(box[2:])):
+            raise DatasetError(
+                f"{place}: expected a box about the polygons, {np.round(box, 2).tolist()}, found {item['bbox']}"
+            )
         if math.isclose(math.pi / 4.0 * diameter**2, box[2] * box[3], rel_tol=1e-9):
             diameter = math.sqrt(box[2] * box[3])  # the polygon is its box, about the crater
     elif item.get("bbox"):
@@ -270,7 +289,7 @@ def _label(item: Mapping[str, Any], place: str) -> _Label:
     if "centre" in item and "diameter" in item:
         u, v = _numbers(item["centre"], 2, f"{place}.centre")
         diameter = _positive(item, "diameter", place)
-    return _Label(u, v, diameter, box, crowd)
+    return _Label(u, v, diameter, box, bool(crowd))
 
 
 def _box(value: Any, place: str) -> tuple[float, float, float, float]:

@@ -4,6 +4,7 @@ import base64
 import gzip
 import hashlib
 import json
+import math
 import shutil
 import struct
 import warnings
@@ -246,7 +247,7 @@ def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground):
     broken = "alarm" if newest.value > 1020.0 else "warning" if newest.value > 1000.5 else "within"
     assert newest.limit_state == broken
     listed = {one.name: one for one in pass_parameters(ground, define(ground)).parameters}
-    assert (listed["VOLTAGE"].warning, listed["VOLTAGE"].alarm) == ((-1.0, 1000.5), (None, 1020.0))
+    assert (listed["VOLTAGE"].warning, listed["VOLTAGE"].alarm) == ((-1.0, 1000.5), (None, math.nextafter(1020.0, 0.0)))
     assert listed["MODE"].labels == {"0": "SAFE", "1": "NOMINAL", "7": "DETUMBLE"}
     assert listed["ENABLED"].labels == {"0": "false", "1": "true"}
     assert listed["Housekeeping.DAY"].packet == "Housekeeping"  # several containers have this one

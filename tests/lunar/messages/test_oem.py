@@ -272,6 +272,11 @@ def test_a_line_of_more_than_64_kib_is_refused_before_it_is_parsed(tmp_path):
         load_ephemeris(path)
 
 
+def test_comments_between_states_are_passed():
+    text = replaced("2029-08-07T00:03:00.000Z", "COMMENT CENTER_NAME = EARTH\n2029-08-07T00:03:00.000Z")
+    assert np.array_equal(parse_oem(text).segments[0].position_m, parse_oem(VERSION_1).segments[0].position_m)
+
+
 def test_an_unknown_frame_and_an_unknown_time_system_are_refused_with_what_is_known(tmp_path):
     path = tmp_path / "faulty.oem"
     for old, new, error, message in (

@@ -88,6 +88,17 @@ def test_a_boundary_listed_for_a_single_state_splits_there_too():
     assert [len(s.utc_ns) for s in parse_stk(text).segments] == [3, 2]
 
 
+def test_boundaries_may_be_rounded_and_one_without_a_state_is_refused():
+    single = EXAMPLE.replace("Points  5", "Points  4").replace(EXAMPLE.splitlines(keepends=True)[23], "")
+    boundary = "1.2000000000e+02"
+    rounded = single.replace(boundary, f"{float(boundary) + 4e-7:.9f}")
+    assert [len(s.utc_ns) for s in parse_stk(rounded).segments] == [3, 2]
+    with pytest.raises(
+        DataFileError, match=r"SegmentBoundaryTimes: expected times of states, found .*Z, at which there"
+    ):
+        parse_stk(single.replace(boundary, f"{float(boundary) - 7.0:.3f}"))
+
+
 def test_accelerations_are_passed_over():
     text = EXAMPLE.replace("EphemerisTimePosVel", "EphemerisTimePosVelAcc").replace("1.0e-01\n", "1.0e-01 0 0 0\n")
     assert len(parse_stk(text).utc_ns) == 4

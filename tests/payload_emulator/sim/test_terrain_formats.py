@@ -258,7 +258,7 @@ def write_form(
         {"convert": lambda h: h / 1e3, "scales": (1.0, 1_737.4)},
         {"convert": np.rint, "dtype": "int16", "edge": -32768}, {"edge": -32768.0}, {"edge": -99_999.0},
         {"edge": 1e20}, {"edge": np.nan}, {"edge": 0.0, "mask": True}, {"edge": 5.0, "nodata": 5.0},
-        {"west": -350.0}, {"west": 370.0},
+        {"west": -350.0}, {"west": 370.0}, {"crs": "+proj=longlat +R=1737400 +pm=180", "west": -170.0},
         {"crs": "+proj=eqc +R=1737400 +units=km", "scale": METRES_PER_DEGREE / 1e3},
         {"crs": "+proj=eqc +R=1737400 +lon_0=180", "scale": METRES_PER_DEGREE, "west": -170.0},
         {"crs": "+proj=eqc +R=1737400", "scale": METRES_PER_DEGREE, "west": -350.0}, {"high": 1 / 32},

@@ -41,6 +41,11 @@ def test_heights_depend_neither_on_what_was_asked_before_nor_on_the_tiles_that_a
     assert_array_equal(forward, backward[::-1])
     assert_array_equal(first.height_m(latitude, longitude), second.height_m(latitude, longitude))
     assert len(second._slots) <= 4 < len(first._slots)
+    # Room that a wide view needed goes with its tiles.
+    second.patch(latitude[3:], longitude[3:])
+    assert len(second._slots) > 1
+    second.release_ground()
+    assert [second.height_m(one, one) is not None and len(second._slots) for one in (0.1, 0.5, 0.9)] == [1, 1, 1]
     assert len(second._small._cells) == 3
 
 

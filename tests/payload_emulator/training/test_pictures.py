@@ -60,7 +60,7 @@ def test_a_polygon_counts_by_its_area(tmp_path):
 
 def test_a_polygon_in_the_other_sense_is_the_same(tmp_path):
     back = [value for k in range(3, -1, -1) for value in SQUARE[2 * k : 2 * k + 2]]
-    (picture,) = load_pictures(write_set(tmp_path, annotations=label(segmentation=[back], bbox=[0, 0, 1, 1])))
+    (picture,) = load_pictures(write_set(tmp_path, annotations=label(segmentation=[back])))
     assert (picture.u_px[0], picture.v_px[0]) == pytest.approx((19.5, 29.5))
 
 
@@ -151,6 +151,8 @@ def test_a_supercategory_says_crater_too_and_a_set_without_craters_is_refused(tm
 def test_a_label_that_is_listed_twice_counts_once(tmp_path):
     (picture,) = load_pictures(write_labels(tmp_path, BOXES * 2))
     assert picture.box_px.tolist() == BOXES and picture.repeated == 4
+    (picture,) = load_pictures(write_labels(tmp_path, BOXES + [[x + 0.3, y, w, h - 0.3] for x, y, w, h in BOXES[:3]]))
+    assert picture.box_px.tolist() == BOXES and picture.repeated == 3
 
 
 @pytest.mark.parametrize(
@@ -160,6 +162,13 @@ def test_a_label_that_is_listed_twice_counts_once(tmp_path):
                     for a in d["annotations"]], r"2 of 4 beyond its edge, such as \[40.*: \[x1, y1, x2, y2\]\?"),
         (lambda d: [a.update(bbox=(np.array(a["bbox"]) / [96, 64, 96, 64]).tolist()) for a in d["annotations"]],
          r"none over 0\.\d+: coordinates from 0 to 1"),
+        (lambda d: d["annotations"].extend({"image_id": 0, "category_id": 0, "bbox": [k, k, 9, 9]} for k in range(20))
+                   or [a.update(bbox=[v / 2 for v in a["bbox"]]) for a in d["annotations"]],
+         "images of 96 x 64, found none over 45: per cent, or labels of images of another size"),
+        (lambda d: d["annotations"][0].update(iscrowd="1"), r"tions\[0\].iscrowd: expected 0 or 1, found '1'"),
+        (lambda d: d["annotations"][0].update(segmentation=[[5, 10, 15, 10, 15, 20, 5, 20]]),
+         r"tions\[0\]: expected a box about the polygons, \[5.0, 10.0, 10.0, 10.0\], found \[10, 20, 20, 20\]"),
+        (lambda d: d["images"].append({"id": 5, "file_name": "a.png"}), "each image once, found .*a.png 2 times"),
         (lambda d: d["annotations"][0].update(bbox=[300, 20, 20, 20]), "1 of 4 beyond its edge"),
         (lambda d: d["annotations"][1].update(id=0), r"tions\[1\].id: .* found 0 twice \(also annotations\[0\]\)"),
         (lambda d: d["categories"][1].update(id=0), "expected a category with a number of its own, found 0 twice"),
@@ -195,7 +204,7 @@ def test_a_picture_is_turned_as_its_exif_data_state(tmp_path, orientation, seen)
         ("float32", np.nan, 1, "without data (black)"), ("float32", np.nan, 128, "without data (black)"),
         ("int32", -32768, 128, "without data (black)"), ("float32", -3.4e38, 1, "without data (black)"),
         ("float32", 6_000.0, 1, "hot (cut)"), ("float32", np.inf, 1, "without data (black)"),
-        ("uint16", 65_535, 1, "hot (cut)"),
+        ("uint16", 65_535, 1, "hot (cut)"), ("float32", 1e20, 128, "without data (black)"),
     ],
 )  # fmt: skip
 def test_one_bad_pixel_costs_that_pixel(tmp_path, kind, bad, count, remark):
@@ -218,6 +227,25 @@ def test_one_bad_pixel_costs_that_pixel(tmp_path, kind, bad, count, remark):
     found, words = read_picture(tmp_path / "a.tif")
     assert words == f"{count} {remark} of 4096 pixels"
     np.testing.assert_array_equal(found[2:], whole[2:])
+
+
+@pytest.mark.parametrize(("kind", "value"), [("uint8", 255), ("uint16", 65_535), ("float32", -1.0)])
+def test_pixels_of_the_value_that_a_tiff_file_states_are_black(tmp_path, kind, value):
+    from PIL import Image
+
+    pixels = np.full((4, 4), 3 if kind == "float32" else 200).astype(kind)
+    Image.fromarray(pixels).save(tmp_path / "a.tif")
+    whole, _ = read_picture(tmp_path / "a.tif")
+    pixels[0] = value
+    Image.fromarray(pixels).save(tmp_path / "a.tif", tiffinfo={42113: f"{value}"})
+    found, words = read_picture(tmp_path / "a.tif")
+    assert words == "4 without data (black) of 16 pixels" and not found[0].any()
+    np.testing.assert_array_equal(found[1:], whole[1:])
+
+
+def test_values_below_zero_are_black(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([[-0.5, 0.25]]))
+    assert read_picture(tmp_path / "a.npy")[0].tolist() == [[0.0, 0.25]]
 
 
 def test_a_picture_that_is_not_searched_says_why():
@@ -251,7 +279,9 @@ def test_arrays_are_read_as_images(tmp_path):
     assert read_picture(tmp_path / "b.npy")[0].tolist() == [[0, 200]]
 
 
-@pytest.mark.parametrize("values", [np.array([1.0]), np.array([["x"]]), np.array([[-1]]), np.array([[None]])])
+@pytest.mark.parametrize(
+    "values", [np.array([1.0]), np.array([["x"]]), np.array([[-1]]), np.zeros((9, 2, 7)), np.array([[None]])]
+)
 def test_arrays_that_are_no_images_are_refused(tmp_path, values):
     np.save(tmp_path / "a.npy", values, allow_pickle=True)
     with pytest.raises(DatasetError, match="expected an image"):

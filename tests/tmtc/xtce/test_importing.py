@@ -383,6 +383,16 @@ def test_a_document_of_yamcs_pymdb_is_read_to_the_values_of_yamcs():
     assert "a member of 'id', found 'sort'" in refused(text.replace("id/kind", "id/sort"))
 
 
+BITS = "<BinaryEncoding><SizeInBits><FixedValue>{}</FixedValue></SizeInBits></BinaryEncoding>"
+
+
+def test_an_exclusive_limit_is_an_alarm_itself():
+    ranges = "<CriticalRange minExclusive='3' maxExclusive='10'/><WarningRange minInclusive='4' maxInclusive='9'/>"
+    alarm = f"<DefaultAlarm><StaticAlarmRanges>{ranges}</StaticAlarmRanges></DefaultAlarm></IntegerParameterType>"
+    found = parse_xtce(of_type(integer("t", 8).replace("</IntegerParameterType>", alarm))).parameters["a"].type
+    assert found.warning == (4.0, 9.0) and 3.0 < found.alarm[0] < 3.001 and 9.999 < found.alarm[1] < 10.0
+
+
 def test_entries_are_repeated_as_arrays():
     def repeated(entry, count):
         return entry.replace("/>", f"><RepeatEntry><Count>{count}</Count></RepeatEntry></{entry[1:].split()[0]}>")
@@ -395,6 +405,12 @@ def test_entries_are_repeated_as_arrays():
     assert values(text, [bytes((2, 10, 11, 12, 1, 2, 3, 4, 9))]) == {
         "n": [2], "a": [[10, 11, 12]], "R": [[{"b": 1, "c": 2}, {"b": 3, "c": 4}]], "z": [9],
     }  # fmt: skip
+    part = container("R", ["b", "c"])
+    wide = text.replace(part, part.replace("<EntryList>", f"{BITS.format(24)}<EntryList>"))
+    assert values(wide, [bytes((2, 10, 11, 12, 1, 2, 0, 3, 4, 0, 9)), bytes((0, 10, 11, 12, 9))]) == {
+        "n": [2, 0], "a": [[10, 11, 12]] * 2, "R": [[{"b": 1, "c": 2}, {"b": 3, "c": 4}], []], "z": [9, 9],
+    }  # fmt: skip
+    assert "expected parts of 8 bits, found 16" in refused(wide.replace("24<", "8<"))
     later = child(comparison("a", 10))
     assert "stand before, found 'a'" in refused(text.replace("</ContainerSet>", f"{later}</ContainerSet>"))
 
@@ -431,6 +447,8 @@ def test_alarms_that_are_not_read_are_counted():
     inside = kind[:end] + alarms.replace("<StaticAlarmRanges>", "<StaticAlarmRanges rangeForm='inside'>") + kind[end:]
     assert parse_xtce(of_type(inside)).alarms_not_read == 6
     assert parse_xtce(of_type(kind)).alarms_not_read == 0
+    later = kind[:end] + alarms.replace("<DefaultAlarm>", "<DefaultAlarm minViolations='3'>") + kind[end:]
+    assert parse_xtce(of_type(later)).alarms_not_read == 5
 
 
 # what is passed over on purpose

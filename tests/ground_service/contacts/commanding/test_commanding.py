@@ -25,7 +25,7 @@ from ground_service.contacts.commanding.service import (
     take_released,
     take_uplink,
 )
-from ground_service.contacts.commanding.store import list_handovers
+from ground_service.contacts.commanding.store import get_view, list_handovers
 from ground_service.errors import Conflict, InvalidInput, NotFound
 from ground_service.http.model import Paging
 from ground_service.ingest.service import ingest_file
@@ -35,6 +35,7 @@ from ground_service.planning.service import WindowEntry, add_window, change_wind
 from ground_service.planning.store import list_windows
 from ground_service.store import repository
 from ground_service.store.event_kinds import read_events
+from ground_service.telemetry.decoding import readable_version
 from lunar.timescales import parse_utc
 from tests.ground_service.conftest import cells
 from tmtc.dictionary.effects import EFFECTS, Effect
@@ -443,6 +444,24 @@ def test_a_list_of_sent_commands_takes_as_many_statements_as_one_of_them(ground)
         ground.read(list_telecommands, TelecommandFilter())
         counts.append(len(statements))
     assert len(set(counts)) == 1
+
+
+def test_the_state_of_a_telecommand_takes_no_more_work_with_a_hundred_times_the_housekeeping(ground, tmp_path):
+    command, table, steps = sent(ground), repository.SAMPLES["housekeeping"], []
+    request = {"request_id": get_command(ground, command).record.request_id}
+    downlink(ground, tmp_path, ("verification_accepted", 10**6, request))
+    for rows in (range(20), range(20, 2000)):
+        with ground.database.writing() as connection:
+            version = readable_version(connection, 1)
+            mine = dict.fromkeys(table.c.keys(), 1) | {"dictionary_version": version}
+            connection.execute(table.insert(), [mine | {"ticks": k, "packet_id": 10 + k} for k in rows])
+        with ground.database.reading() as connection:
+            database, done = connection.connection.driver_connection, []
+            database.set_progress_handler(lambda done=done: done.append(1), 10)
+            assert get_view(connection, command, 0).state == "accepted"
+            database.set_progress_handler(None, 0)
+            steps.append(len(done))
+    assert steps[0] > 10 and steps[1] < 1.1 * steps[0]
 
 
 def test_time_outs_are_noted_from_the_first_instant_asked_for_to_before_the_last(ground, clock):

@@ -332,6 +332,8 @@ def test_the_catalogue_gets_accepted_landmarks(tmp_path):
 
 def test_labels_are_what_training_reads(tmp_path):
     (tmp_path / "labels.csv").write_text(format_labels([_landmark(1), _landmark(2, "rejected")]))
+    with pytest.raises(InvalidInput, match="expected accepted landmarks, found none among 1"):
+        format_labels([_landmark(2, "rejected")])
     labels = load_landmarks(tmp_path / "labels.csv")
     assert np.degrees(labels.latitude_rad).tolist() == [11.0]
     assert labels.diameter_m.tolist() == [8000.0]

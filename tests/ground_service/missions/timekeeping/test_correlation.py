@@ -150,6 +150,7 @@ def test_a_station_whose_clock_changes_is_left_out_from_then_on():
 ALONE = """
 aaaaaa | -18.0 | behind the on-board clock: GPS time instead of UTC?
 a | 37.0 | ahead of the on-board clock: TAI instead of UTC?
+aaaaaa | 7200.0 | ahead of the on-board clock: another time zone?
 aaaaaa | 1.0 |
 aaaaaa | 5.5 |
 """
@@ -166,8 +167,26 @@ def test_a_single_station_off_by_whole_seconds_of_a_usual_cause_decides_nothing(
 
 def test_the_one_of_three_stations_that_agrees_with_the_on_board_clock_counts():
     clocks = {"a": [-18.0] * 12, "b": [37.0] * 12, "c": [0.0] * 12}
-    kept, _ = doubted_stations(*reports_of_stations("aaaabbbbbccc", clocks))
-    assert np.flatnonzero(kept).tolist() == [9, 10, 11]
+    for pattern in ("aaaabbbbbccc", "abcabcabcabc"):
+        kept, doubts = doubted_stations(*reports_of_stations(pattern, clocks))
+        assert np.flatnonzero(kept).tolist() == [k for k, name in enumerate(pattern) if name == "c"]
+        assert {one.station: round(one.difference_s) for one in doubts.values()} == {"canberra": -18, "madrid": 37}
+
+
+def test_two_stations_off_by_the_same_usual_seconds_do_not_outvote_one_that_agrees_with_the_on_board_clock():
+    clocks = {"a": [37.0] * 12, "b": [37.0] * 12, "c": [0.0] * 12}
+    given = reports_of_stations("abcabcabcabc", clocks)
+    assert np.flatnonzero(doubted_stations(*given)[0]).tolist() == [2, 5, 8, 11]
+    unset = reports_of_stations("abcabcabcabc", {**clocks, "c": [0.4] * 12}, [90.0] * 12)
+    assert np.flatnonzero(~doubted_stations(*unset)[0]).tolist() == [2, 5, 8, 11]
+
+
+def test_a_station_whose_clock_drifts_is_named_and_the_other_counts():
+    drifting = [0.01 * k for k in range(40)]
+    ticks, received, light, boot, names = reports_of_stations("ab" * 20, {"a": [0.0] * 40, "b": drifting})
+    fits, doubts = fit_runs(TimeReports(ticks, boot, ticks, received, light, boot, tuple(names)))
+    assert [(fit.points, fit.rejected) for _, fit in fits] == [(20, 19)] and sorted(doubts) == list(range(1, 40, 2))
+    assert str(doubts[1]) == "the clock of station madrid is 0.390 s ahead of the others"
 
 
 def test_a_clock_that_was_set_after_its_only_station_was_right_is_no_fault_of_the_station():

@@ -266,6 +266,8 @@ def test_an_operator_correlates_from_a_file(spacecraft, tmp_path, capsys):
 NO_FILES = r"""
 a,b\n1,2\n | line 1: expected a column packet_ticks, found a,b
 packet_ticks,sequence_count,received_utc\n1,2,then\n | receptions.0
+\ufeffpacket_ticks,sequence_count,received_utc\n1,2,then\n | receptions.0
+packet_ticks,sequence_count,received_utc\n | expected 1 to \d+ receptions, found none
 packet_ticks,sequence_count,received_utc\n1,99999,2029-08-07T06:00:00Z\n | 14 bits of count
 packet_ticks,sequence_count,received_utc,station\n1,2,2029-08-07T06:00:00Z,Mars\n | Canberra
 """
@@ -273,7 +275,7 @@ packet_ticks,sequence_count,received_utc,station\n1,2,2029-08-07T06:00:00Z,Mars\
 
 @pytest.mark.parametrize("text, message", cells(NO_FILES))
 def test_a_file_that_is_none_is_refused_in_one_line(tmp_path, text, message):
-    (tmp_path / "t.csv").write_text(text.replace(r"\n", "\n"))
+    (tmp_path / "t.csv").write_text(text.replace(r"\n", "\n").replace(r"\ufeff", "\ufeff"))
     with pytest.raises(InvalidInput, match=message):
         read_receptions(tmp_path / "t.csv")
 
