@@ -5,7 +5,6 @@ import sqlite3
 from contextlib import closing, nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -41,7 +40,6 @@ SECOND = f'spacecraft = "Second"\nspacecraft_id = 77{SCENARIO.replace("seed = 3"
 DRIFT_PPM = 5.0
 
 
-Figures = dict[str, Any]
 NO_DATA = DataFolder(None)
 TERMS = RunTerms(days=0.25, windows_per_day=1, window_s=300.0)
 
