@@ -142,6 +142,17 @@ def test_the_folder_is_private_and_files_of_others_are_ignored(tmp_path, monkeyp
     assert (tmp_path / "of-a-user").stat().st_mode & 0o777 == 0o700
 
 
+def test_the_newest_files_of_a_kind_stay_and_not_each_one_costs_a_look_at_all(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    looks, scandir = [], os.scandir
+    monkeypatch.setattr(os, "scandir", lambda folder: looks.append(folder) or scandir(folder))
+    for number in range(70):
+        keep(f"a-{number:03}", b"", 32)
+    assert len(looks) == 35
+    assert sorted(file.name for file in (tmp_path / "cache").iterdir())[0] > "a-035"
+    assert kept("a-038") == kept("a-069") == b""
+
+
 def test_damaged_and_unwritable_caches_are_compiled_around(tmp_path):
     cache, folder = tmp_path / "cache", write(tmp_path / "code")
     run(folder, cache)

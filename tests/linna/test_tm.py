@@ -159,6 +159,10 @@ def test_packets_without_error_control_are_checked_only_when_stated(foreign, typ
     assert "each behind 4 other octets" in typed(strict)
     for octets in (5, -1):
         typed(f"{strict} --prefix-octets {octets}", 2)
+    short = [struct.pack(">HHHHIHHI", 0x8C8, 0xC000 | k, 13, 26000, 1000 * k, 2500, 330, 0) for k in range(8)]
+    capture.write_bytes(b"".join([*short[:4], bytes((0x55,)) * 13, *short[4:]]))
+    noisy = typed(f"tm check {capture} --no-error-control --json")
+    assert (noisy["packets"], noisy["prefix_octets"], noisy["octets"]["skipped"]) == (7, 0, 13)
 
 
 def test_packets_of_another_mission_are_decoded_through_their_definition(foreign, tmp_path, typed):

@@ -15,7 +15,7 @@ from pypdf import PdfReader
 
 from reports import drawings
 from reports.document import Column, Document, Heading, Listing, Paragraph, Picture, Properties, Table
-from reports.drawings import KeptDrawings, drawing_hash
+from reports.drawings import KeptDrawings, drawing_hash, drawing_processes
 from reports.figures.theme import drawing
 from reports.html_page import html_page
 from reports.pass_report import pass_document
@@ -242,3 +242,19 @@ def test_an_axis_of_one_tick_shows_what_matplotlib_does():
     assert ours[0] == theirs[0] and ours[2] == theirs[2]
     assert set(ours[1]) <= set(theirs[1])  # marks of length 0 are not drawn
     assert len(ours[0]) > 8 and any("quarter" in text for text in ours[2]) and any("+1e6" in text for text in ours[2])
+
+
+def test_two_processes_draw_as_one_does(small, tmp_path, monkeypatch):
+    """What they cannot draw is left to the process that asks."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+    pictures = [one for one in pass_document(small).blocks if isinstance(one, Picture)][:3]
+    with drawing_processes(True) as processes:
+        ahead = KeptDrawings(processes)
+        ahead.prepare(pictures)
+    alone = drawings.Drawings()
+    assert [ahead[one.key] == alone.svg(one) for one in pictures] == [True] * 3
+    with drawing_processes(True) as processes:
+        assert processes.draw([replace(pictures[0], draw=lambda canvas: None)]) == []
+        assert KeptDrawings(processes).svg(pictures[0]) == ahead[pictures[0].key]
+    with drawing_processes(False) as processes:
+        assert processes is None

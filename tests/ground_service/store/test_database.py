@@ -462,3 +462,11 @@ def test_a_migration_gives_way_to_requests_that_hold_locks(new_postgres_database
         assert set(METADATA.tables["users"].columns.keys()) < set(reflected(other).tables["users"].columns.keys())
         assert [one.name for one in list_users(ground)] == ["ann"]
         other.engine.dispose()
+
+
+def test_all_connections_of_a_process_together_keep_at_most_thirty_two_mib_of_pages(tmp_path):
+    engine = open_database(f"sqlite:///{tmp_path / 'linna.db'}").engine
+    with engine.connect() as connection:
+        kept_kib = -connection.exec_driver_sql("PRAGMA cache_size").scalar_one()
+    most = engine.pool.size() + engine.pool._max_overflow
+    assert most == 15 and 1024 <= kept_kib <= 32 * 1024 / most

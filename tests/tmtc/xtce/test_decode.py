@@ -658,6 +658,14 @@ def test_parts_of_packets_are_joined_also_over_the_end_of_the_counts_each_with_i
     assert found == [(0, 1, 2)]
 
 
+def test_a_part_that_was_sent_twice_is_joined_once():
+    one = parts(5, 7, b"\x00", b"\x01\x00\x00", b"\x00\x02")
+    assert stream_of([one[0], one[1], one[1], one[2]]) == ([(0, 1, 2)], ["decoded", *["segments_joined"] * 3])
+    other = one[1][:-1] + b"\x09"
+    assert stream_of([one[0], one[1], other, one[2]]) == ([], ["segments_not_joined"] * 4)
+    assert stream_of([one[0], one[1], one[1]]) == ([], ["segments_not_joined"] * 3)
+
+
 def test_parts_that_make_no_packet_are_counted_and_not_decoded():
     def all_of_them_alone(packets):
         return stream_of(packets) == ([], ["segments_not_joined"] * len(packets))

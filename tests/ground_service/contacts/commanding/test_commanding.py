@@ -34,7 +34,7 @@ from ground_service.store import repository
 from ground_service.store.event_kinds import read_events
 from ground_service.telemetry.decoding import readable_version
 from lunar.timescales import parse_utc
-from tests.ground_service.conftest import cells
+from tests.ground_service.conftest import cells, steps_of
 from tmtc.dictionary.effects import EFFECTS, Effect
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.link.uplink import UplinkDecoder
@@ -452,11 +452,9 @@ def test_the_state_of_a_telecommand_takes_no_more_work_with_a_hundred_times_the_
             mine = dict.fromkeys(table.c.keys(), 1) | {"dictionary_version": version}
             connection.execute(table.insert(), [mine | {"ticks": k, "packet_id": 10 + k} for k in rows])
         with ground.database.reading() as connection:
-            database, done = connection.connection.driver_connection, []
-            database.set_progress_handler(lambda done=done: done.append(1), 10)
-            assert get_view(connection, command, 0).state == "accepted"
-            database.set_progress_handler(None, 0)
-            steps.append(len(done))
+            view, work = steps_of(connection, lambda given: get_view(given, command, 0))
+        assert view.state == "accepted"
+        steps.append(work)
     assert steps[0] > 10 and steps[1] < 1.1 * steps[0]
 
 

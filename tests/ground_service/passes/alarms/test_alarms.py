@@ -30,13 +30,18 @@ from ground_service.planning.service import add_window, change_window
 from ground_service.planning.standing import add_request, plan_tick
 from ground_service.store import repository
 from ground_service.store.event_kinds import AlarmChanged, read_events
+from ground_service.telemetry.values import last_packet, packets_after
 from ground_service.worker.scheduler import Watch
+from tests.ground_service.conftest import steps_of
 from tmtc.dictionary.payload import DICTIONARY
 from tmtc.downlink import encode_cadus
 
 SPACECRAFT = 76
 SECOND = 65_536
 START = 1_000_000_000 * SECOND
+
+
+WATCHED = core.WATCHED_APIDS
 
 
 def housekeeping(second, temperature_c):
@@ -137,6 +142,18 @@ def test_packets_that_arrive_again_are_not_counted_again(ground):
     with ground.database.reading() as connection:
         vehicle = connection.exec_driver_sql("SELECT id FROM vehicles").scalar_one()
     assert examine_packets(ground, vehicle) == 0
+
+
+def test_new_packets_are_found_without_a_search_of_those_before(ground):
+    steps = []
+    for seconds in (range(20), range(20, 1000)):
+        receive(ground, *(housekeeping(second, 20.0) for second in seconds))
+        with ground.database.reading() as connection:
+            last = last_packet(connection, 1)
+            found, work = steps_of(connection, lambda given, last=last: packets_after(given, 1, last - 5, WATCHED, 9))
+        assert len(found.ids) == 5
+        steps.append(work)
+    assert steps[1] < 1.5 * steps[0] + 5
 
 
 def test_late_packets_of_a_cleared_alarm_do_not_raise_it_again(ground):
