@@ -1,7 +1,4 @@
-"""Telecommands: validation, release by two persons, uplink, and what the reports say became of them. Second
-persons: from the effects of telecommands, raised or relaxed by a mission description. The fate of a
-telecommand for every set of reports that can come down about it (ECSS-E-ST-70-41C, service 1).
-"""
+"""Telecommands: validation, release, second persons, uplink, and what the reports say became of them."""
 
 import json
 from itertools import combinations
@@ -657,16 +654,10 @@ def test_reports_made_between_sending_and_sending_again_count(ticks, counts):
     assert (fate_of(COMMAND, [report(7, ticks)], 0).reports == (report(7, ticks),)) is counts
 
 
-def test_a_command_that_was_not_sent_again_has_no_last_report():
+def test_reports_are_in_order_and_those_of_other_requests_or_after_no_repetition_do_not_count():
     once = SentCommand(REQUEST, SENT_NS, 100, None, TIMEOUT_NS)
     assert fate_of(once, [report(7, 10**12)], 0).state == "completed"
-
-
-def test_reports_of_other_requests_do_not_count():
     assert fate_of(COMMAND, [report(7, request=REQUEST + 1)], 0).reports == ()
-
-
-def test_reports_are_in_order_of_time_stage_and_step():
     ordered = [
         report(1, 110), report(3, 110), report(5, 120), report(5, 120, step=1), report(5, 120, step=2),
         report(7, 130),

@@ -196,13 +196,10 @@ def test_an_alarm_is_shelved_in_mission_time_and_its_records_are_in_time_of_day(
     receive(ground, event(0))
     moment = utc_now_ns() + 1000 * 86_400 * 10**9
     set_mission_clock(lambda: moment)
-    try:
-        shelved = shelve_alarm(ground, alarms(ground)[0].id, moment + 10**9, "known", actor="eva")
-        assert shelved.state == "shelved" and abs(shelved.history[-1].time.utc_ns - utc_now_ns()) < 600e9
-        moment += 2 * 10**9
-        assert [one.state for one in alarms(ground)] == ["raised"]
-    finally:
-        set_mission_clock()
+    shelved = shelve_alarm(ground, alarms(ground)[0].id, moment + 10**9, "known", actor="eva")
+    assert shelved.state == "shelved" and abs(shelved.history[-1].time.utc_ns - utc_now_ns()) < 600e9
+    moment += 2 * 10**9
+    assert [one.state for one in alarms(ground)] == ["raised"]
 
 
 def test_changes_are_published(ground):
@@ -246,59 +243,56 @@ def test_what_stops_operations_is_an_alarm_until_it_ends(tmp_path):
     link = b'[[links]]\nname = "lab"\nkind = "tcp"\nuplink = "127.0.0.1:9"\n'
     moment = START // SECOND * 10**9
     set_mission_clock(lambda: moment)
-    try:
-        with open_ground(tmp_path) as ground:
-            add_mission(ground, text + link)
-            add_request(ground, StandingRequestIn(name="none", spacecraft_id=76, windows=1), actor="ann")
-            entry = WindowEntry("w", moment + 3600 * 10**9, moment + 4200 * 10**9, 15.0, 76)
-            window = add_window(ground, entry, actor="planner").id
-            change_window(ground, window, actor="planner", changes={}, decision="approved")
-            note_reason(ground, window, "cannot be released")
-            plan_tick(ground, moment)
-            watch = Watch(ground, holds_s=0.0)
-            watch.tick()
-            names = {"link_process_gone", "window_not_released", "plan_empty"}
-            assert {one.name for one in alarms(ground, "raised")} == names
-            watch.tick()  # no time has passed since
-            assert {one.name for one in alarms(ground, "raised")} == {*names, "mission_time_stopped"}
-            assert {(one.source, one.severity) for one in alarms(ground)} == {("operations", "alarm")}
-            # The process of the links is back; they are refused, and a window is on board.
-            assert acquire(ground, declared_links(ground)["lab"], "links", 10**12)
-            watch.tick()
-            assert active(ground) == {"no_link", "mission_time_stopped", "window_not_released", "plan_empty"}
-            ground.write(repository.change, repository.WINDOWS, window, state="uplinked")
-            watch.tick()
-            assert active(ground) == {"no_link", "mission_time_stopped", "spacecraft_gone", "plan_empty"}
-            moment += 10**9
-            watch.tick()  # mission time passes: the link alone is missing
-            assert active(ground) == {"no_link", "plan_empty"}
-            watch.tick()
-            change_state(ground, "lab", "links", "connected", None)
-            watch.tick()  # mission time stands still, but the link is there
-            assert active(ground) == {"mission_time_stopped", "plan_empty"}
-            moment += 10**9
-            watch.tick()
-            assert "mission_time_stopped" not in active(ground)
-            ground.write(repository.change, repository.WINDOWS, window, state="downlinked")
-            watch.tick()
-            assert not any(one.name == "report_overdue" for one in alarms(ground))
-            moment += 2 * 86_400 * 10**9
-            watch.tick()
-            assert active(ground) == {"report_overdue", "plan_empty"}
-            Watch(ground).tick()  # another process, which knows no ages
-            assert active(ground) == {"report_overdue", "plan_empty"}
-            watch.tick()  # no time has passed since
-            other = Watch(ground)
-            other.tick()
-            assert "mission_time_stopped" in active(ground)
-            with ground.database.writing() as connection:
-                repository.change(connection, repository.WINDOWS, window, state="processed")
-                repository.change(connection, repository.STANDING_REQUESTS, 1, state="ended")
-            add_mission(ground, text)
-            other.tick()
-            assert active(ground) == set()
-    finally:
-        set_mission_clock()
+    with open_ground(tmp_path) as ground:
+        add_mission(ground, text + link)
+        add_request(ground, StandingRequestIn(name="none", spacecraft_id=76, windows=1), actor="ann")
+        entry = WindowEntry("w", moment + 3600 * 10**9, moment + 4200 * 10**9, 15.0, 76)
+        window = add_window(ground, entry, actor="planner").id
+        change_window(ground, window, actor="planner", changes={}, decision="approved")
+        note_reason(ground, window, "cannot be released")
+        plan_tick(ground, moment)
+        watch = Watch(ground, holds_s=0.0)
+        watch.tick()
+        names = {"link_process_gone", "window_not_released", "plan_empty"}
+        assert {one.name for one in alarms(ground, "raised")} == names
+        watch.tick()  # no time has passed since
+        assert {one.name for one in alarms(ground, "raised")} == {*names, "mission_time_stopped"}
+        assert {(one.source, one.severity) for one in alarms(ground)} == {("operations", "alarm")}
+        # The process of the links is back; they are refused, and a window is on board.
+        assert acquire(ground, declared_links(ground)["lab"], "links", 10**12)
+        watch.tick()
+        assert active(ground) == {"no_link", "mission_time_stopped", "window_not_released", "plan_empty"}
+        ground.write(repository.change, repository.WINDOWS, window, state="uplinked")
+        watch.tick()
+        assert active(ground) == {"no_link", "mission_time_stopped", "spacecraft_gone", "plan_empty"}
+        moment += 10**9
+        watch.tick()  # mission time passes: the link alone is missing
+        assert active(ground) == {"no_link", "plan_empty"}
+        watch.tick()
+        change_state(ground, "lab", "links", "connected", None)
+        watch.tick()  # mission time stands still, but the link is there
+        assert active(ground) == {"mission_time_stopped", "plan_empty"}
+        moment += 10**9
+        watch.tick()
+        assert "mission_time_stopped" not in active(ground)
+        ground.write(repository.change, repository.WINDOWS, window, state="downlinked")
+        watch.tick()
+        assert not any(one.name == "report_overdue" for one in alarms(ground))
+        moment += 2 * 86_400 * 10**9
+        watch.tick()
+        assert active(ground) == {"report_overdue", "plan_empty"}
+        Watch(ground).tick()  # another process, which knows no ages
+        assert active(ground) == {"report_overdue", "plan_empty"}
+        watch.tick()  # no time has passed since
+        other = Watch(ground)
+        other.tick()
+        assert "mission_time_stopped" in active(ground)
+        with ground.database.writing() as connection:
+            repository.change(connection, repository.WINDOWS, window, state="processed")
+            repository.change(connection, repository.STANDING_REQUESTS, 1, state="ended")
+        add_mission(ground, text)
+        other.tick()
+        assert active(ground) == set()
 
 
 def test_an_alarm_states_the_procedure_of_the_mission_in_force(ground):
