@@ -386,38 +386,37 @@ def acceleration_gradient(
     rho = alpha * radius * inverse_r
     zeta = rho * z * inverse_r
     rho2 = rho * rho
-    u = complex(rho * x * inverse_r, rho * y * inverse_r)
-    harmonic = np.empty((size, size + 2), dtype=np.complex128)  # column m + 2
-    sectorial = complex(rho, 0.0)
+    u_re, u_im = rho * x * inverse_r, rho * y * inverse_r
+    harmonic = np.empty((2, size, size + 2))  # real and imaginary parts: numba compiles complex products for long
+    s_re, s_im = rho, 0.0  # sectorial; column m + 2
     for m in range(size):
         if m:
-            sectorial *= (2 * m - 1) * u
-        harmonic[m, m + 2] = sectorial
+            v_re, v_im = (2 * m - 1) * u_re, (2 * m - 1) * u_im
+            s_re, s_im = s_re * v_re - s_im * v_im, s_re * v_im + s_im * v_re
+        harmonic[0, m, m + 2], harmonic[1, m, m + 2] = s_re, s_im
         for n in range(m + 1, size):
-            older = harmonic[n - 2, m + 2] if n > m + 1 else 0.0j
-            harmonic[n, m + 2] = (2 * n - 1) * zeta * harmonic[n - 1, m + 2] - ((n - 1) ** 2 - m * m) * rho2 * older
+            last, before = (2 * n - 1) * zeta, ((n - 1) * (n - 1) - m * m) * rho2
+            for k in range(2):
+                older = harmonic[k, n - 2, m + 2] if n > m + 1 else 0.0
+                harmonic[k, n, m + 2] = last * harmonic[k, n - 1, m + 2] - before * older
     for n in range(size):
-        harmonic[n, 1] = -harmonic[n, 3].conjugate()
-        harmonic[n, 0] = harmonic[n, 4].conjugate() if size > 2 else 0.0j
+        harmonic[0, n, 1], harmonic[1, n, 1] = -harmonic[0, n, 3], harmonic[1, n, 3]
+        harmonic[0, n, 0], harmonic[1, n, 0] = harmonic[0, n, 4], -harmonic[1, n, 4]
     xx = xy = xz = yy = yz = zz = 0.0
     at = 4
     for n in range(degree + 1):
+        re, im = harmonic[0, n + 2], harmonic[1, n + 2]
         for m in range(n + 1):
-            c = complex(packed[at], -packed[at + 1])
+            c, s = packed[at], -packed[at + 1]
             at += 2
-            two_up = harmonic[n + 2, m + 4]
-            one_up = harmonic[n + 2, m + 3]
-            same = harmonic[n + 2, m + 2]
-            one_down = harmonic[n + 2, m + 1]
-            two_down = harmonic[n + 2, m]
-            even = 0.25 * (c * (two_up + two_down)).real
-            middle = 0.5 * (c * same).real
+            even = 0.25 * (c * (re[m + 4] + re[m]) - s * (im[m + 4] + im[m]))
+            middle = 0.5 * (c * re[m + 2] - s * im[m + 2])
             xx += even - middle
             yy -= even + middle
             zz += 2.0 * middle
-            xy += 0.25 * (c * (two_up - two_down)).imag
-            xz += 0.5 * (c * (one_up - one_down)).real
-            yz += 0.5 * (c * (one_up + one_down)).imag
+            xy += 0.25 * (c * (im[m + 4] - im[m]) + s * (re[m + 4] - re[m]))
+            xz += 0.5 * (c * (re[m + 3] - re[m + 1]) - s * (im[m + 3] - im[m + 1]))
+            yz += 0.5 * (c * (im[m + 3] + im[m + 1]) + s * (re[m + 3] + re[m + 1]))
     g = packed[1]
     return g * xx, g * xy, g * xz, g * yy, g * yz, g * zz
 

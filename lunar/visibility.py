@@ -108,12 +108,13 @@ def limb_clearance_m(position_icrf_m: ArrayLike, target_icrf_m: ArrayLike) -> Fl
     return np.asarray(np.where(along > 0.0, closest - MOON_RADIUS_M, np.inf))
 
 
-def station_icrf_m(station: GroundStation, utc_ns: ArrayLike) -> FloatArray:
-    """Return the Earth-centred position ``(..., 3)`` of a station in ICRF axes."""
+def station_icrf(station: GroundStation, utc_ns: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return the Earth-centred position in m and the zenith of a station, each ``(..., 3)`` in ICRF axes."""
     from pymap3d import geodetic2ecef
 
+    turn = np.swapaxes(_itrf_from_icrf(utc_ns), -1, -2)
     fixed = geodetic2ecef(station.latitude_rad, station.longitude_rad, station.height_m, deg=False)
-    return _rotate(np.swapaxes(_itrf_from_icrf(utc_ns), -1, -2), fixed)
+    return _rotate(turn, fixed), _rotate(turn, _zenith(station))
 
 
 def link(ephemeris: Ephemeris, utc_ns: ArrayLike, station: GroundStation | None = None) -> Link:
@@ -131,7 +132,7 @@ def link(ephemeris: Ephemeris, utc_ns: ArrayLike, station: GroundStation | None 
 
     received = np.asarray(utc_ns, dtype=np.int64)
     flat = received.reshape(-1)
-    offset = np.zeros((len(flat), 3)) if station is None else station_icrf_m(station, flat)
+    offset, up = 2 * (np.zeros((len(flat), 3)),) if station is None else station_icrf(station, flat)
     light_time_s = np.full(len(flat), 1.28)
     # Each round gains a factor of c / 2 km/s: three leave 1e-11 s.
     for _ in range(3):
@@ -145,7 +146,6 @@ def link(ephemeris: Ephemeris, utc_ns: ArrayLike, station: GroundStation | None 
     visible = clearance > 0.0
     elevation = np.full(len(flat), np.nan)
     if station is not None:
-        up = _rotate(np.swapaxes(_itrf_from_icrf(flat), -1, -2), _zenith(station))
         elevation = np.arcsin(np.clip(np.sum(leg * up, axis=-1) / range_m, -1.0, 1.0))
         visible &= elevation >= station.minimum_elevation_rad
     values = (visible, range_m, light_time_s, elevation, clearance)

@@ -1,8 +1,8 @@
 """A document as an A4 PDF, typeset by Typst from the template `pdf_pages.typ`.
 
-The template receives every text and number as JSON data, so that no text is interpreted as markup. Figures are the
-drawings of the HTML page in the light colours. Fonts are those that matplotlib ships; no date and no system font is
-used, so the same document gives the same octets.
+The template receives every text and number as JSON data, so that no text is interpreted as markup. That data is the
+print form of a document, which can be typeset later: figures are those of the HTML page in the light colours. Fonts are
+those that matplotlib ships; no date and no system font is used, so the same document gives the same octets.
 """
 
 import hashlib
@@ -35,7 +35,6 @@ from reports.document import (
     cells,
     evidence_label,
 )
-from reports.drawings import Drawings
 from reports.figures.canvas import WIDTH_IN
 from reports.figures.theme import LIGHT, color
 from reports.text import NOT_A_VALUE, headline_text
@@ -54,25 +53,32 @@ typst.compile(root + "/main.typ", root=root, font_paths=[fonts], ignore_system_f
 
 _LONG_WORD = re.compile(r"\S{32}")
 _BREAK = "\u200b"
+_FIGURE = re.compile(r'<figure id="[^"]*">(<svg.*?</svg>)<figcaption>', re.DOTALL)
 _ROLE = re.compile(r"var\(--f-([a-z0-9]+)\)")
 _SVG = '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" font-family="DejaVu Sans"'
 
 
-def pdf_pages(document: Document, drawings: Drawings | None = None) -> bytes:
-    """Return the octets of the PDF; `drawings` keeps figures that another rendering has drawn."""
-    drawn = Drawings() if drawings is None else drawings
+def print_form(document: Document) -> bytes:
+    """Return all of a document but its figures, as JSON."""
+    given = {
+        "kicker": document.kicker,
+        "title": document.title,
+        "identity": document.identity,
+        "footer": " · ".join(text for text in ("LINNA", document.kicker, document.identity) if text),
+        "facts": "   ".join(f"{name} {value}" for name, value in document.facts),
+        "blocks": list(_blocks(document)),
+    }
+    return json.dumps(given, separators=(",", ":")).encode()
+
+
+def pdf_of(form: bytes, page: str) -> bytes:
+    """Return the octets of the PDF of a print form and the figures of its HTML page."""
     with TemporaryDirectory(prefix="linna-report-") as folder:
         root = Path(folder)
-        blocks = list(_blocks(document, drawn, root))
-        given = {
-            "kicker": document.kicker,
-            "title": document.title,
-            "identity": document.identity,
-            "footer": " · ".join(text for text in ("LINNA", document.kicker, document.identity) if text),
-            "facts": "   ".join(f"{name} {value}" for name, value in document.facts),
-            "blocks": blocks,
-        }
-        (root / "document.json").write_text(json.dumps(_printable(given)), encoding="utf-8")
+        for number, svg in enumerate(_FIGURE.findall(page), 1):
+            light = _ROLE.sub(lambda role: LIGHT[role.group(1)], svg)
+            (root / f"figure-{number}.svg").write_text(light.replace("<svg", _SVG, 1), encoding="utf-8")
+        (root / "document.json").write_text(json.dumps(_printable(json.loads(form))), encoding="utf-8")
         (root / "main.typ").write_text(_template(), encoding="utf-8")
         return _typeset(root)
 
@@ -133,7 +139,7 @@ def _printable(value: Any) -> Any:
     return value
 
 
-def _blocks(document: Document, drawings: Drawings, root: Path) -> Iterator[dict[str, Any]]:
+def _blocks(document: Document) -> Iterator[dict[str, Any]]:
     section = table = figure = 0
     for block in document.blocks:
         match block:
@@ -145,7 +151,7 @@ def _blocks(document: Document, drawings: Drawings, root: Path) -> Iterator[dict
                 made = _table(block, table)
             case Picture():
                 figure += 1
-                made = _picture(block, figure, drawings, root)
+                made = _picture(block, figure)
             case _:
                 made = _plain(block)
         yield made
@@ -189,10 +195,7 @@ def _table(block: Table, number: int) -> dict[str, Any]:
     }
 
 
-def _picture(block: Picture, number: int, drawings: Drawings, root: Path) -> dict[str, Any]:
-    svg = _ROLE.sub(lambda role: LIGHT[role.group(1)], drawings.svg(block))
-    name = f"figure-{number}.svg"
-    (root / name).write_text(svg.replace("<svg", _SVG, 1), encoding="utf-8")
+def _picture(block: Picture, number: int) -> dict[str, Any]:
     width_in, height_in = _PAGE_IN
     # One scale for all figures, unless a page is too small.
     scale = min(width_in / max(block.width_in, WIDTH_IN), (height_in - _TEXT_IN) / block.height_in)
@@ -204,6 +207,6 @@ def _picture(block: Picture, number: int, drawings: Drawings, root: Path) -> dic
         "kind": "picture",
         "number": str(number),
         "caption": block.caption,
-        "file": name,
+        "file": f"figure-{number}.svg",
         "share": scale * block.width_in / width_in,
     }

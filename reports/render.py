@@ -32,7 +32,7 @@ def render_html(report: Any, drawings: Drawings | None = None) -> str:
 
 
 def render_pages(report: Any, drawings: Drawings | None = None) -> tuple[str, bytes]:
-    """Return a report as HTML page and as A4 PDF; each figure is drawn once, unless ``drawings`` has it.
+    """Return a report as HTML page, and in the form that `pdf_pages.pdf_of` typesets with the figures of that page.
 
     Raises
     ------
@@ -41,12 +41,14 @@ def render_pages(report: Any, drawings: Drawings | None = None) -> tuple[str, by
     InconsistentReport
         when parts of the value do not fit together
     """
-    from reports.drawings import Drawings
+    from reports.document import Picture
     from reports.html_page import html_page
-    from reports.pdf_pages import pdf_pages
+    from reports.pdf_pages import print_form
 
-    document, drawn = _document(report), Drawings() if drawings is None else drawings
-    return html_page(document, drawn), pdf_pages(document, drawn)
+    document = _document(report)
+    if drawings is not None:
+        drawings.prepare([one for one in document.blocks if isinstance(one, Picture)])
+    return html_page(document, drawings), print_form(document)
 
 
 def _document(report: Any) -> Document:

@@ -331,7 +331,7 @@ def _clock_step_s(connection: Connection, record: PassRecord, span: PassSpan) ->
     runs = load_correlations(connection, span.vehicle)
     if not runs:
         return None
-    others = passes.passes_of_vehicle(connection, record.vehicle_id, reported=False)
+    others = passes.passes_of_vehicle(connection, record.vehicle_id)
     before = max((one.stop_utc_ns for one in others if one.stop_utc_ns <= record.start_utc_ns), default=0)
     return largest_step_s(runs, before, record.stop_utc_ns)
 

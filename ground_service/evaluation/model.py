@@ -81,6 +81,7 @@ class StoredReport(Entity):
     previous_id: str | None
     changes: list[ChangedFigure] | None
     created_utc_ns: int
+    print_sha256: str | None = None
 
 
 class ClassFigures(Entity):

@@ -5,13 +5,13 @@ from typing import Annotated, Literal
 from fastapi import Query, Request, Response
 
 from ground_service.access.security import Operator, Viewer, idempotent_id
-from ground_service.errors import NotFound
 from ground_service.evaluation import service, store
 from ground_service.evaluation.model import PassFigures, Report, ReportOverview, ReportSummary
 from ground_service.http.common import API_PREFIX, GroundOf, IdempotencyKey, Key, PagingOf, PassId, linked
 from ground_service.http.model import PageOf
 from ground_service.http.requests import operations
-from ground_service.jobs.service import DispatcherOf, Job, get_job
+from ground_service.jobs.routes import DispatcherOf
+from ground_service.jobs.service import Job, get_job
 from ground_service.passes.service import get_pass
 
 REPORT_MEDIA = {"html": "text/html", "pdf": "application/pdf", "json": "application/json"}
@@ -56,13 +56,9 @@ def get_report(
     format: Annotated[Literal["html", "pdf", "json"] | None, Query(description="Default: by the Accept header")] = None,
 ) -> Response:
     """Return a report as HTML, PDF or JSON."""
-    report = ground.read(store.get_report, report_id)
     kind = format or preferred_kind(request.headers.get("accept", ""))
-    sha256: str | None = getattr(report, f"{kind}_sha256")
-    if sha256 is None:
-        raise NotFound(f"report {report_id} as", kind)
     media = REPORT_MEDIA[kind] + ("; charset=utf-8" if kind == "html" else "")
-    return Response(ground.files.get(sha256), media_type=media)
+    return Response(service.report_document(ground, report_id, kind), media_type=media)
 
 
 def preferred_kind(accept: str) -> str:

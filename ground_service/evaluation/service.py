@@ -3,8 +3,10 @@
 import hashlib
 import json
 import math
+import threading
 import uuid
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -13,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ground_service.clock import utc_now_ns
-from ground_service.errors import storage_error
+from ground_service.errors import PASSING, NotFound, storage_error
 from ground_service.evaluation import store
 from ground_service.evaluation.alignment import reference_states
 from ground_service.evaluation.core import PassInputs, evaluate_pass, summary_of
@@ -28,6 +30,7 @@ from ground_service.store.event_kinds import PassEvaluated, publish
 from ground_service.store.files import FileArchive, make_durable_folder, register_file, replace_durably
 from lunar.arrays import FloatArray
 from lunar.timescales import format_utc
+from reports import drawings
 from reports.document import evidence_number
 from reports.values import PassReport
 
@@ -69,7 +72,6 @@ class MadeReport:
     pass_id: int
     html: Path
     json: Path
-    pdf: Path | None
     summary: dict[str, Any]
 
 
@@ -108,10 +110,9 @@ def make_report(
     *,
     report_id: str | None = None,
     out: Path | None = None,
-    pdf: bool = False,
     again: Reevaluation | None = None,
 ) -> MadeReport:
-    """Evaluate a pass, render its report as HTML and JSON, and as PDF where wanted, and keep them.
+    """Evaluate a pass, render its report as HTML and JSON, and keep them with the form that its PDF is made of.
 
     Parameters
     ----------
@@ -124,12 +125,14 @@ def make_report(
     """
     identity = report_id or uuid.uuid4().hex
     now = utc_now_ns()
-    if again is None:
-        inputs = load_pass_inputs(ground, pass_id, created_utc=format_utc(now))
-        report = _evaluated(ground, inputs)
-    else:
-        inputs, report = again.inputs, replace(again.report, created_utc=format_utc(now))
-    documents = _documents(report, pdf=pdf)
+    is_first = again is None and ground.read(store.newest_report, pass_id) is None
+    with drawings.drawing_processes(is_first) as processes:  # few figures of a later report are new
+        if again is None:
+            inputs = load_pass_inputs(ground, pass_id, created_utc=format_utc(now))
+            report = _evaluated(ground, inputs)
+        else:
+            inputs, report = again.inputs, replace(again.report, created_utc=format_utc(now))
+        documents = _documents(report, drawings.KeptDrawings(processes))
     stored = {kind: ground.files.put_octets(octets) for kind, octets in documents.items()}
     summary = _summary(report, inputs)
     with ground.database.writing() as connection:
@@ -143,7 +146,8 @@ def make_report(
                 pass_id=pass_id,
                 html_sha256=stored["html"].sha256,
                 json_sha256=stored["json"].sha256,
-                pdf_sha256=stored["pdf"].sha256 if pdf else None,
+                pdf_sha256=None,
+                print_sha256=stored["print"].sha256,
                 summary=summary,
                 mission_id=record.mission_id,
                 event_number=None if again is None else again.event,
@@ -163,16 +167,49 @@ def make_report(
                 ),
             )
     folder = out if out is not None else ground.home / "reports" / f"pass-{pass_id}"
-    for kind, octets in documents.items():
-        _write_whole(folder / f"report.{kind}", octets)
-    return MadeReport(
-        identity,
-        pass_id,
-        folder / "report.html",
-        folder / "report.json",
-        folder / "report.pdf" if pdf else None,
-        summary,
-    )
+    html, data = folder / "report.html", folder / "report.json"
+    _write_whole(html, documents["html"])
+    _write_whole(data, documents["json"])
+    with suppress(OSError):
+        (folder / "report.pdf").unlink()  # of the report before
+    return MadeReport(identity, pass_id, html, data, summary)
+
+
+_typesetting = threading.Lock()
+"""Held while this process makes a PDF: who reads the same one waits for it."""
+
+
+def report_document(ground: Ground, report_id: str, kind: str) -> bytes:
+    """Return a report as html, json or pdf; the PDF is made when it is first read, and kept where that is possible.
+
+    It follows from stored octets only: processes that make it at the same time make the same file.
+
+    Raises
+    ------
+    NotFound
+        If there is no such report, or it is one of an earlier version without PDF.
+    """
+    report = ground.read(store.get_report, report_id)
+    sha256: str | None = getattr(report, f"{kind}_sha256")
+    if sha256 is not None:
+        return ground.files.get(sha256)
+    if report.print_sha256 is None:
+        raise NotFound(f"report {report_id} as", kind)
+    with _typesetting:
+        sha256 = ground.read(store.get_report, report_id).pdf_sha256
+        return _made_pdf(ground, report, report.print_sha256) if sha256 is None else ground.files.get(sha256)
+
+
+def _made_pdf(ground: Ground, report: StoredReport, print_sha256: str) -> bytes:
+    from reports.pdf_pages import pdf_of
+
+    octets = pdf_of(ground.files.get(print_sha256), ground.files.get(report.html_sha256).decode())
+    with suppress(*PASSING):
+        file = ground.files.put_octets(octets)
+        with ground.database.writing() as connection:
+            register_file(connection, file, "report", f"report of pass {report.pass_id} (pdf)", utc_now_ns())
+            store.set_pdf(connection, report.id, file.sha256)
+    return octets
 
 
 def reevaluate(ground: Ground, pass_id: int, *, report_id: str, event: int) -> MadeReport | None:
@@ -191,19 +228,15 @@ def reevaluate(ground: Ground, pass_id: int, *, report_id: str, event: int) -> M
     if not made and hashlib.sha256(to_json(report).encode()).hexdigest() == previous.json_sha256:
         return None
     again = Reevaluation(event, previous, inputs, report)
-    return make_report(ground, pass_id, report_id=report_id, pdf=previous.pdf_sha256 is not None, again=again)
+    return make_report(ground, pass_id, report_id=report_id, again=again)
 
 
-def _documents(report: PassReport, *, pdf: bool) -> dict[str, bytes]:
+def _documents(report: PassReport, drawn: drawings.Drawings) -> dict[str, bytes]:
     """Return the octets of a report by kind."""
-    from reports.drawings import KeptDrawings
-    from reports.render import render_html, render_pages, to_json
+    from reports.render import render_pages, to_json
 
-    data = to_json(report).encode()
-    if not pdf:
-        return {"html": render_html(report, KeptDrawings()).encode(), "json": data}
-    page, printed = render_pages(report, KeptDrawings())
-    return {"html": page.encode(), "json": data, "pdf": printed}
+    page, form = render_pages(report, drawn)
+    return {"html": page.encode(), "json": to_json(report).encode(), "print": form}
 
 
 def _summary(report: PassReport, inputs: PassInputs) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from ground_service.evaluation.model import Report, StoredReport
 from ground_service.http.model import PageOf, Paging
 from ground_service.passes.store import get_pass
 from ground_service.store import repository
+from ground_service.store.states import change_if
 
 _REPORTS = repository.REPORTS
 _MISSIONS = repository.MISSIONS
@@ -59,6 +60,11 @@ def list_reports(connection: Connection, pass_id: int, asked: Paging) -> PageOf[
     )
     rows, total = repository.page(connection, query, asked, _REPORTS.c.created_utc_ns.desc(), _REPORTS.c.id)
     return asked.page(map(Report.of, rows), total)
+
+
+def set_pdf(connection: Connection, report_id: str, sha256: str) -> None:
+    """Set the PDF of a report that has none."""
+    change_if(connection, _REPORTS, report_id, {"pdf_sha256": None}, pdf_sha256=sha256)
 
 
 def add_report(connection: Connection, report: StoredReport) -> bool:

@@ -25,7 +25,7 @@ SpacecraftNumber = Annotated[int, Field(ge=0, le=1023, examples=[76])]
 class Entity(BaseModel):
     """Base class of entities: database row, API response, client result and printed object in one definition."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     @classmethod
     def of(cls, row: Mapping[Any, Any], **values: Any) -> Self:

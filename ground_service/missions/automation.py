@@ -18,7 +18,7 @@ class Section(BaseModel):
     Values are not converted between types, such as true to 1; TOML arrays are read as tuples.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True, defer_build=True)
 
 
 class Table:

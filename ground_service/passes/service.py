@@ -127,7 +127,7 @@ def spacecraft_events(ground: Ground, asked: model.EventFilter) -> PageOf[model.
         found, total = sample_store.event_page(connection, span, asked, severities=asked.severity, name=asked.name)
         spans = {
             one.id: pass_span(connection, one)
-            for one in store.passes_of_vehicle(connection, vehicle, reported=False)
+            for one in store.passes_of_vehicle(connection, vehicle)
             if any(one.start_utc_ns <= at.utc_ns + REACH_NS <= one.stop_utc_ns + 2 * REACH_NS for at in found)
         }
 

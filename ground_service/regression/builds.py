@@ -56,7 +56,7 @@ _SHIPPED_MODEL = "payload_emulator/flight/models/craters.onnx"
 
 
 class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 class Limits(_Table):

@@ -57,7 +57,7 @@ requests; it is then tried again."""
 REVISIONS_BEFORE_1_0 = tuple(f"{number:04d}" for number in range(1, 12))
 """Schema revisions before version 1.0, which have no migrations."""
 
-PAGE_CACHE_KIB = 16_384
+PAGE_CACHE_KIB = 2_048
 """SQLite's own cache of each connection; what falls out of it is still in the system's, which all of them share."""
 
 

@@ -19,7 +19,7 @@ KNOWN_LIMIT = 1_000_000
 class Event(BaseModel):
     """Event of the kind `event_kind`; its fields are the payload in the log."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     event_kind: ClassVar[str]
 

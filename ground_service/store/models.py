@@ -496,9 +496,11 @@ REPORTS = table(
     optional("previous_id", String(32)),
     optional("changes", JSON),
     column("created_utc_ns", BigInteger),
+    optional("print_sha256", String(64)),
 )
 """A report made of a pass; its documents are files of the archive.
 
+The PDF is made of the print form and the figures of the page when it is first read; NULL until then.
 `mission_id` is the revision of the mission description that the evaluation used. `event_number` is the event that
 caused a re-evaluation of the pass, `previous_id` the report before it, and `changes` the changed figures; NULL for
 a report on request.

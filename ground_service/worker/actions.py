@@ -173,7 +173,7 @@ def _report_of(window: WindowRecord, pass_id: int, number: int, *, close: bool =
         done = {"pass_id": pass_id, "inputs": align_pass(ground, pass_id)}
         previous = ground.read(newest_report, pass_id, other_than=identity)
         if previous is None:
-            done["report_id"] = make_report(ground, pass_id, report_id=identity, pdf=True).report_id
+            done["report_id"] = make_report(ground, pass_id, report_id=identity).report_id
         else:
             again = reevaluate(ground, pass_id, report_id=identity, event=number)
             done["report_id"] = previous.id if again is None else again.report_id

@@ -21,11 +21,12 @@ from ground_service.ground import Ground
 from ground_service.ingest.doubt_store import needs_review, review_times
 from ground_service.ingest.service import undecoded_vehicles
 from ground_service.jobs.service import add_job, queued_arguments
+from ground_service.missions.timekeeping.core import ticks_of_times
 from ground_service.missions.timekeeping.recorrelation import recorrelate
-from ground_service.missions.timekeeping.store import vehicles_with_receptions
+from ground_service.missions.timekeeping.store import load_correlations, vehicles_with_receptions
 from ground_service.passes.alarms.service import examine_again, examine_packets, note_finding
-from ground_service.passes.span import REACH_NS, PassSpan, pass_span, vehicle_span
-from ground_service.passes.store import passes_of_vehicle, reported_without_ephemeris
+from ground_service.passes.span import REACH_NS, pass_span
+from ground_service.passes.store import get_pass, reported_times, reported_without_ephemeris
 from ground_service.planning.progress import advance_windows
 from ground_service.planning.standing import needs_plan, planned_with
 from ground_service.planning.store import get_record
@@ -351,15 +352,13 @@ def follow_in_process(ground: Ground, start: Start | None = None) -> FollowUp:
 def _reported_passes(connection: Connection, vehicle: int, first_ticks: int, last_ticks: int) -> list[int]:
     """Return the passes of a vehicle that have a report and that contain on-board times of an interval."""
 
-    def overlaps(span: PassSpan) -> bool:
-        return span.start_ticks <= last_ticks and first_ticks <= span.stop_ticks
-
-    return [
-        one.id
-        for one in passes_of_vehicle(connection, vehicle, reported=True)
-        if overlaps(vehicle_span(connection, vehicle, one.start_utc_ns - REACH_NS, one.stop_utc_ns + REACH_NS))
-        and overlaps(pass_span(connection, one))
-    ]
+    keys, start_ns, stop_ns = reported_times(connection, vehicle).T
+    correlations = load_correlations(connection, vehicle)
+    start_ticks = ticks_of_times(start_ns - REACH_NS, correlations)
+    stop_ticks = ticks_of_times(stop_ns + REACH_NS, correlations)
+    near = keys[(start_ticks <= last_ticks) & (first_ticks <= stop_ticks)].tolist()
+    spans = ((key, pass_span(connection, get_pass(connection, key))) for key in near)
+    return [key for key, span in spans if span.start_ticks <= last_ticks and first_ticks <= span.stop_ticks]
 
 
 def _job_id(kind: str, key: int, event: int) -> str:

@@ -47,6 +47,7 @@ def run_paper(arguments: argparse.Namespace) -> int:
 
         restart_for_training()
     from reports.paper_report import paper_index
+    from reports.pdf_pages import pdf_of
     from reports.render import render_pages
     from studies.paper import make_paper
 
@@ -54,10 +55,10 @@ def run_paper(arguments: argparse.Namespace) -> int:
     log(f"this takes about {duration} on two idle cores; the same command continues it")
     started = time.monotonic()
     report = make_paper(_step_folder(arguments, data_folder()), quick=arguments.quick)
-    html, pdf = render_pages(report)
+    html, form = render_pages(report)
     out = arguments.out
     (out / "paper.html").write_text(html, encoding="utf-8")
-    (out / "paper.pdf").write_bytes(pdf)
+    (out / "paper.pdf").write_bytes(pdf_of(form, html))
     save_tables(out, report)
     figures: dict[str, Any] = {
         "report": str(out / "paper.html"),

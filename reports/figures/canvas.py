@@ -49,7 +49,9 @@ class Canvas:
     def axes(self, left: float, bottom: float, width: float, height: float, **kwargs: Any) -> Axes:
         """Axes with their frame at a place in design inches from the lower left corner."""
         box = (left / self.width_in, bottom / self.height_in, width / self.width_in, height / self.height_in)
-        axes = self.figure.add_axes(box, **kwargs)
+        from reports.figures.axes import QuickAxes
+
+        axes = self.figure.add_axes(box, axes_class=QuickAxes, **kwargs)
         # At fixed distances panels line up, and matplotlib does not measure the tick labels a second time.
         axes.xaxis.set_label_coords(0.5, -_NAME_OF_X_IN / height)
         axes.yaxis.set_label_coords(-_NAME_OF_Y_IN / width, 0.5)

@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from reports.figures.canvas import Canvas, Photo
 from reports.figures.theme import LIGHT, drawing
 
-_GEOMETRY = re.compile(r' (?:d|x|y|width|height|transform|style)="[^"]*"')
+_DPI = 72
+_GEOMETRY = re.compile(r' (?:x|y|width|height|transform|style)="[^"]*"')
 _NUMBER = re.compile(r"-?\d+\.\d{3,}")
 _ID = re.compile(r' id="([^"]+)"')
 _PATH = re.compile(r' d="([^"]*)"')
@@ -30,12 +31,17 @@ def draw_svg(key: str, width_in: float, height_in: float, draw: Callable[[Canvas
     """
     from matplotlib.figure import Figure
 
+    from reports.figures.axes import PageRenderer
+
     with drawing(more={"svg.hashsalt": key}):
         figure = Figure(figsize=(width_in, height_in))
         photos: list[Photo] = []
         draw(Canvas(figure, width_in, height_in, photos=photos))
         buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+        metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        renderer = PageRenderer(_DPI * width_in, _DPI * height_in, buffer, image_dpi=_DPI, metadata=metadata)
+        figure.draw(renderer)
+        renderer.finalize()
     return _for_page(buffer.getvalue(), key, label, photos)
 
 

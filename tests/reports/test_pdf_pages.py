@@ -3,6 +3,7 @@
 import io
 import logging
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,9 +15,11 @@ from pypdf import PdfReader
 
 from reports import drawings
 from reports.document import Column, Document, Heading, Listing, Paragraph, Picture, Properties, Table
-from reports.drawings import KeptDrawings, drawing_hash
+from reports.drawings import KeptDrawings, drawing_hash, drawing_processes
+from reports.figures.theme import drawing
+from reports.html_page import html_page
 from reports.pass_report import pass_document
-from reports.pdf_pages import _typeset, pdf_pages
+from reports.pdf_pages import _typeset, pdf_of, print_form
 from reports.render import render_html, render_pages
 from tests.reports import example
 
@@ -28,9 +31,14 @@ def small():
     return example.pass_report(hours=0.2, gallery=1, worst=0)
 
 
+def pdf_pages(made):
+    return pdf_of(print_form(made), html_page(made))
+
+
 @pytest.fixture(scope="module")
 def octets(small):
-    return render_pages(small)[1]
+    page, form = render_pages(small)
+    return pdf_of(form, page)
 
 
 def pages_of(octets):
@@ -41,16 +49,13 @@ def document(*blocks):
     return Document("Test", "Title", "t", (), blocks)
 
 
-def test_it_is_a_pdf_of_numbered_a4_pages(octets):
+def test_it_is_a_pdf_of_numbered_a4_pages_without_date_and_machine(octets):
     reader = PdfReader(io.BytesIO(octets))
     assert len(reader.pages) > 2
     for number, page in enumerate(reader.pages, 1):
         # 210 by 297 mm are 595.3 by 841.9 points; half a point is a fifth of a millimetre.
         assert [float(v) for v in page.mediabox] == pytest.approx([0, 0, 595.3, 841.9], abs=0.5)
         assert f"{number} / {len(reader.pages)}" in page.extract_text()
-
-
-def test_no_date_and_no_machine_is_in_it(octets):
     assert b"CreationDate" not in octets and b"ModDate" not in octets
     assert PdfReader(io.BytesIO(octets)).metadata["/Title"].startswith("Pass report: ")
 
@@ -64,7 +69,7 @@ def test_all_figures_and_tables_of_the_page_are_in_it(small, octets):
 
 
 def test_text_stays_inside_the_margins(whole_pass):
-    for page in PdfReader(io.BytesIO(render_pages(whole_pass)[1])).pages:
+    for page in PdfReader(io.BytesIO(pdf_pages(pass_document(whole_pass)))).pages:
         places = []
 
         def note(text, cm, tm, *_, places=places):
@@ -137,8 +142,9 @@ def test_awkward_text_is_printed_and_not_interpreted():
 
 def test_the_process_of_a_report_does_not_keep_what_typesetting_computes():
     program = (
-        "import sys; from reports.document import Document, Paragraph; from reports.pdf_pages import pdf_pages\n"
-        "octets = pdf_pages(Document('Test', 'Title', 't', (), (Paragraph('x'),)))\n"
+        "import sys; from reports.document import Document, Paragraph\n"
+        "from reports.pdf_pages import pdf_of, print_form\n"
+        "octets = pdf_of(print_form(Document('Test', 'Title', 't', (), (Paragraph('x'),))), '')\n"
         "print(octets[:5], any(name.partition('.')[0] == 'typst' for name in sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
@@ -206,3 +212,49 @@ def test_late_telemetry_changes_only_the_figures_that_show_it(small):
     late = replace(small.housekeeping[0], values=small.housekeeping[0].values + 1.0)
     after = hashes(replace(small, housekeeping=(late, *small.housekeeping[1:])))
     assert [key for key in before if after[key] != before[key]] == ["housekeeping"]
+
+
+def test_an_axis_of_one_tick_shows_what_matplotlib_does():
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from reports.figures.axes import QuickAxes
+
+    def shown(kind):
+        """Texts and their places, ends of lines of the grid, and places of ticks."""
+        figure, svg = Figure(figsize=(4.0, 3.0)), io.StringIO()
+        with drawing({"axes.formatter.useoffset": True, "svg.hashsalt": "x"}):
+            for left in (0.1, 0.6):
+                axes = figure.add_axes((left, 0.2, 0.35, 0.6), axes_class=kind)
+                axes.plot([1e6 + 1.0, 1e6 + 2.0], [3.0, 400.0])
+                axes.grid(True, axis="both")
+            axes.set_yscale("log")
+            axes.set_xticks([1e6 + 1.25, 1e6 + 5.0], ["quarter", "out of view"])
+            axes.set_xlim(1e6 + 1.0, 1e6 + 2.0)
+            axes.tick_params(axis="y", labelleft=False)
+            figure.savefig(svg, format="svg", metadata={"Date": None})
+        text = svg.getvalue()
+        grid = re.findall(r'<path d="([^"]*)"[^>]*style="[^"]*#e3e7ec', text)
+        lines = sorted(re.findall(r"M ([\d.]+ [\d.]+)\s+L ([\d.]+ [\d.]+)", " ".join(grid)))
+        return lines, sorted(re.findall(r"<use [^>]* (x=.*?)style", text)), sorted(re.findall("<text.*</text>", text))
+
+    ours, theirs = shown(QuickAxes), shown(Axes)
+    assert ours[0] == theirs[0] and ours[2] == theirs[2]
+    assert set(ours[1]) <= set(theirs[1])  # marks of length 0 are not drawn
+    assert len(ours[0]) > 8 and any("quarter" in text for text in ours[2]) and any("+1e6" in text for text in ours[2])
+
+
+def test_two_processes_draw_as_one_does(small, tmp_path, monkeypatch):
+    """What they cannot draw is left to the process that asks."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+    pictures = [one for one in pass_document(small).blocks if isinstance(one, Picture)][:3]
+    with drawing_processes(True) as processes:
+        ahead = KeptDrawings(processes)
+        ahead.prepare(pictures)
+    alone = drawings.Drawings()
+    assert [ahead[one.key] == alone.svg(one) for one in pictures] == [True] * 3
+    with drawing_processes(True) as processes:
+        assert processes.draw([replace(pictures[0], draw=lambda canvas: None)]) == []
+        assert KeptDrawings(processes).svg(pictures[0]) == ahead[pictures[0].key]
+    with drawing_processes(False) as processes:
+        assert processes is None

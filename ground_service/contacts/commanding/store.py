@@ -385,7 +385,7 @@ def _fates(
         select(
             *(VERIFICATIONS.c[one.name] for one in fields(VerificationReport) if one.name not in ("count", "boot")),
             PACKETS.c.sequence_count,
-            _boot_at(vehicle, VERIFICATIONS.c.ticks),
+            _boot_at(connection, vehicle, VERIFICATIONS.c.ticks),
         )
         .select_from(VERIFICATIONS.join(PACKETS, PACKETS.c.id == VERIFICATIONS.c.packet_id))
         .where(
@@ -406,9 +406,9 @@ def _fates(
             TELECOMMANDS.c.request_id,
             TELECOMMANDS.c.id,
             TELECOMMANDS.c.sent_after_ticks,
-            _boot_at(vehicle, TELECOMMANDS.c.sent_after_ticks),
+            _boot_at(connection, vehicle, TELECOMMANDS.c.sent_after_ticks),
             PACKETS.c.sequence_count,
-            _boot_at(vehicle, PACKETS.c.ticks),
+            _boot_at(connection, vehicle, PACKETS.c.ticks),
         )
         .select_from(TELECOMMANDS.outerjoin(PACKETS, PACKETS.c.id == newest.scalar_subquery()))
         .where(
@@ -429,10 +429,12 @@ def _fates(
     return fates
 
 
-def _boot_at(vehicle: int, ticks: ColumnElement[int]) -> ScalarSelect[int]:
+def _boot_at(connection: Connection, vehicle: int, ticks: ColumnElement[int]) -> ScalarSelect[int]:
     """Return the boot of the newest housekeeping of a vehicle at or before a time."""
     known = repository.SAMPLES["housekeeping"]
-    query = select(known.c.boot_count).where(known.c.vehicle_id == vehicle, known.c.ticks <= ticks)
+    # Without the version, which the index has before the time, each time would be a search through all rows.
+    mine = known.c.vehicle_id == vehicle, known.c.dictionary_version == readable_version(connection, vehicle)
+    query = select(known.c.boot_count).where(*mine, known.c.ticks <= ticks)
     return query.order_by(known.c.ticks.desc()).limit(1).scalar_subquery()
 
 

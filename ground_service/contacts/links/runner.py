@@ -245,16 +245,6 @@ class LinkRunner:
         return self._progress.ingested
 
     @property
-    def waits_for_others(self) -> bool:
-        """Return whether telecommands wait for earlier ones of another link."""
-        return self._waits_s is not None
-
-    @property
-    def commands_unsent(self) -> int:
-        """Telecommands that could be sent now."""
-        return service.unsent(self._ground, self.declared)
-
-    @property
     def alive(self) -> bool:
         """Return whether the link is operated: started, not stopped, and owned."""
         return bool(self._threads) and all(one.is_alive() for one in self._threads)

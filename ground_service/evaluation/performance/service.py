@@ -399,6 +399,7 @@ def _month(ground: Ground, spacecraft_id: int, instance: str, month: str) -> Per
 
 
 def _keep_monthly_report(ground: Ground, found: Performance, instance: str, month: str) -> MonthlyReport:
+    from reports.pdf_pages import pdf_of
     from reports.render import render_pages, to_json
 
     value = monthly_value(found, month)
@@ -410,11 +411,11 @@ def _keep_monthly_report(ground: Ground, found: Performance, instance: str, mont
             return _entity(get_monthly_report(connection, identity))
         except NotFound:
             pass
-    page, printed = render_pages(value)
+    page, form = render_pages(value)
     now = utc_now_ns()
     stored = {
         kind: ground.files.put_octets(octets)
-        for kind, octets in (("html", page.encode()), ("pdf", printed), ("json", data))
+        for kind, octets in (("html", page.encode()), ("pdf", pdf_of(form, page)), ("json", data))
     }
     with ground.database.writing() as connection:
         for kind, file in stored.items():

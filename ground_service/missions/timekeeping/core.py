@@ -120,10 +120,15 @@ def largest_step_s(runs: Sequence[TimeCorrelation], after_utc_ns: int, until_utc
 
 def ticks_of_utc_ns(utc_ns: int, correlations: Sequence[TimeCorrelation]) -> int:
     """On-board ticks that the clock shows at `utc_ns`, to about a tick."""
-    ticks = int(timescales.ticks_from_utc_ns(utc_ns))
+    return int(ticks_of_times(np.array([utc_ns], dtype=np.int64), correlations)[0])
+
+
+def ticks_of_times(utc_ns: IntArray, correlations: Sequence[TimeCorrelation]) -> IntArray:
+    """On-board ticks (n,) that the clock shows at times (n,), to about a tick."""
+    ticks = timescales.ticks_from_utc_ns(utc_ns)
     for _ in range(3):
-        shown, _ = utc_ns_of_ticks(np.array([ticks], dtype=np.int64), correlations)
-        ticks += int((utc_ns - int(shown[0])) * _NS_DENOMINATOR // _NS_NUMERATOR)
+        whole, part = np.divmod(utc_ns - utc_ns_of_ticks(ticks, correlations)[0], _NS_NUMERATOR)
+        ticks = ticks + whole * _NS_DENOMINATOR + part * _NS_DENOMINATOR // _NS_NUMERATOR
     return ticks
 
 

@@ -384,6 +384,7 @@ def _open_session(model_octets: bytes, threads: int) -> onnxruntime.InferenceSes
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
+    options.enable_mem_pattern = False  # a plan of all buffers keeps twice the memory and saves no time
     options.log_severity_level = 3
     try:
         session = onnxruntime.InferenceSession(model_octets, options, providers=["CPUExecutionProvider"])

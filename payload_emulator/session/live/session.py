@@ -320,8 +320,13 @@ class LiveSession:
         return False
 
     def _hold(self, selector: selectors.BaseSelector) -> None:
-        """Let time stand still after a contact has begun or ended, until the console says `run`."""
+        """Let time stand still after a contact has begun or ended, until the console says `run`.
+
+        The ground of an observation that is over is dropped: the next one is over other ground.
+        """
         self.console.held = self.holds
+        if self.spacecraft.payload.mode is not PayloadMode.observing:
+            self.spacecraft.camera.release_ground()
         self.console.send(self._contact_message())
         while self.console.held and not self.stopping.is_set():
             self._serve(selector, _POLL_S)

@@ -118,6 +118,10 @@ class Camera:
             self._prepare(next_utc_ns)
         return exposure
 
+    def release_ground(self) -> None:
+        """Drop the ground of the frames so far; the next frame makes its own."""
+        self._renderer.submit(self.world.terrain.release_ground)
+
     def close(self) -> None:
         """End the threads, after which another one may ask the terrain for ground."""
         self._renderer.shutdown(cancel_futures=True)

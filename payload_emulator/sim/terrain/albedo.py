@@ -12,6 +12,8 @@ from lunar.arrays import FloatArray
 from payload_emulator.errors import TerrainError
 from payload_emulator.sim.terrain.rasters import RasterLayer, open_layers
 
+Picture = npt.NDArray[np.unsignedinteger]
+
 LEAST, GREATEST = 0.3, 2.0
 """Bounds of relative albedo: craters' rays and the darkest plains stay within."""
 
@@ -23,11 +25,11 @@ class AlbedoMap:
     """A picture of the whole Moon without shading, from the north pole and 180 degrees west."""
 
     def __init__(self, path: Path) -> None:
-        self._values = load_albedo_map(path)
+        self._picture, self._albedo = load_albedo_map(path)
 
     def relative(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> FloatArray:
         """Albedo over its mean on a grid of places, (rows, columns)."""
-        return _sample_map(self._values, latitude_rad, longitude_rad)
+        return _sample_map(self._picture, self._albedo, latitude_rad, longitude_rad)
 
 
 class AlbedoTiles:
@@ -111,11 +113,11 @@ def _averaged(layer: RasterLayer, latitude: FloatArray, longitude: FloatArray) -
         return np.asarray(np.where(boxes[1] > 0.5, boxes[0] / np.maximum(boxes[1], 1.0), np.nan))
 
 
-def load_albedo_map(path: Path) -> npt.NDArray[np.float32]:
-    """Relative albedo (1 = mean) of the whole Moon, (rows, columns) from the north pole and 180 degrees west.
+def load_albedo_map(path: Path) -> tuple[Picture, npt.NDArray[np.float32]]:
+    """Picture of the whole Moon, (rows, columns) from the north pole and 180 degrees west; relative albedo by value.
 
-    The map is a picture whose stretch is compressed; its 2nd and 98th percentiles are spread over the span that normal
-    albedo has on the Moon, 0.5 to 1.5 of the mean.
+    The stretch of the picture is compressed; its 2nd and 98th percentiles are spread over the span that normal
+    albedo has on the Moon, 0.5 to 1.5 of the mean (1).
     """
     import rasterio
 
@@ -123,29 +125,33 @@ def load_albedo_map(path: Path) -> npt.NDArray[np.float32]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
             with rasterio.open(path) as source:
-                values = source.read(1).astype(np.float32)
+                picture = source.read(1)
     except rasterio.errors.RasterioError as error:
         raise TerrainError(f"{path}: expected an albedo map, found {error}") from None
-    if values.shape[1] != 2 * values.shape[0]:
+    rows, columns = picture.shape
+    if columns != 2 * rows or picture.dtype not in (np.uint8, np.uint16):
         raise TerrainError(
-            f"{path}: expected a map of the whole Moon, twice as wide as high, "
-            f"found {values.shape[1]} x {values.shape[0]} pixels"
+            f"{path}: expected a map of the whole Moon in 8 or 16 bits, twice as wide as high, "
+            f"found {columns} x {rows} pixels of {picture.dtype}"
         )
-    middle = values[values.shape[0] // 6 : -values.shape[0] // 6]
+    middle = picture[rows // 6 : -rows // 6].astype(np.float32)
     low, mean, high = np.percentile(middle, 2), float(middle.mean()), np.percentile(middle, 98)
+    values = np.arange(np.iinfo(picture.dtype).max + 1, dtype=np.float32)
     darker, brighter = (mean - values) / (mean - low), (values - mean) / (high - mean)
     scaled = np.where(values < mean, 1.0 - 0.5 * darker, 1.0 + 0.5 * brighter)
-    return np.asarray(np.clip(scaled, 0.3, 2.0), dtype=np.float32)
+    return picture, np.asarray(np.clip(scaled, 0.3, 2.0), dtype=np.float32)
 
 
-def _sample_map(values: npt.NDArray[np.float32], latitude: FloatArray, longitude: FloatArray) -> FloatArray:
+def _sample_map(
+    picture: Picture, albedo: npt.NDArray[np.float32], latitude: FloatArray, longitude: FloatArray
+) -> FloatArray:
     """Bilinear values (rows, columns) of a whole-Moon map that starts at the north pole and 180 degrees west."""
-    height, width = values.shape
+    height, width = picture.shape
     row = np.clip((0.5 - latitude / math.pi) * height - 0.5, 0.0, height - 1.001)
     column = ((np.degrees(longitude) + 180.0) % 360.0) / 360.0 * width - 0.5
     i, j = np.floor(row).astype(np.int64), np.floor(column).astype(np.int64)
     fi, fj = (row - i)[:, None], (column - j)[None, :]
     west, east = j % width, (j + 1) % width
-    top = values[np.ix_(i, west)] * (1.0 - fj) + values[np.ix_(i, east)] * fj
-    low = values[np.ix_(i + 1, west)] * (1.0 - fj) + values[np.ix_(i + 1, east)] * fj
+    top = albedo[picture[np.ix_(i, west)]] * (1.0 - fj) + albedo[picture[np.ix_(i, east)]] * fj
+    low = albedo[picture[np.ix_(i + 1, west)]] * (1.0 - fj) + albedo[picture[np.ix_(i + 1, east)]] * fj
     return np.asarray(top * (1.0 - fi) + low * fi)

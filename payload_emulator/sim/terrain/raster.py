@@ -41,6 +41,9 @@ SMALL_EXPONENT = 2.2
 CATALOGUE_DENSITY_2KM = 0.0080
 """Craters above 2 km per km2 in LU1319381 (222,451 over 53 of 72 tiles); scales the smaller ones by place."""
 
+_Windows = dict[RasterLayer, tuple[int, int, Heights]]
+"""Newest window of each layer: first row, first column, and what `_window` returns."""
+
 
 class RasterTerrain(Terrain):
     """Terrain of georeferenced height rasters on a grid of 256 pixels per degree."""
@@ -116,12 +119,13 @@ class RasterTerrain(Terrain):
 
     def make_heights(self, latitude_rad: FloatArray, longitude_rad: FloatArray) -> Heights:
         """Heights on an even grid of places (rows, columns) in metres."""
-        out = self._resampled(latitude_rad, longitude_rad)
+        windows: _Windows = {}
         if not self._sharpen:
-            return out
+            return self._resampled(latitude_rad, longitude_rad, windows)
         step = float(latitude_rad[0] - latitude_rad[1])
         shortest = SHORTEST_WAVE_PIXELS * step * MOON_RADIUS_M / 1000.0
-        gain = self._slope_gain(latitude_rad, longitude_rad)
+        gain = self._slope_gain(latitude_rad, longitude_rad, windows)  # first: its windows hold those of the heights
+        out = self._resampled(latitude_rad, longitude_rad, windows)
         angles = (np.cos(latitude_rad), np.sin(latitude_rad), np.cos(longitude_rad), np.sin(longitude_rad))
         for (wavelength, rms), salt in zip(self._waves, self._salts, strict=False):
             if wavelength > shortest:
@@ -138,12 +142,12 @@ class RasterTerrain(Terrain):
             base = self._reflectance.relative(latitude_rad, longitude_rad)
         return mottled_albedo(base, latitude_rad, longitude_rad, self._salts[10:15])
 
-    def _resampled(self, latitude: FloatArray, longitude: FloatArray) -> Heights:
+    def _resampled(self, latitude: FloatArray, longitude: FloatArray, windows: _Windows) -> Heights:
         """Heights on a grid of places from the finest layers, cubic."""
         shape = (latitude.size, longitude.size)
         result: Heights | None = None
         for layer in reversed(self._layers):
-            values, weight = self._from_layer(layer, latitude, longitude)
+            values, weight = self._from_layer(layer, latitude, longitude, windows)
             if result is None:
                 result, share = values, weight
             else:
@@ -160,7 +164,9 @@ class RasterTerrain(Terrain):
             )
         return result
 
-    def _from_layer(self, layer: RasterLayer, latitude: FloatArray, longitude: FloatArray) -> tuple[Heights, Heights]:
+    def _from_layer(
+        self, layer: RasterLayer, latitude: FloatArray, longitude: FloatArray, windows: _Windows
+    ) -> tuple[Heights, Heights]:
         """Smoothed heights of one layer and how much they count: 1 inside, falling to 0 at the edge of its data."""
         ppd = layer.pixels_per_degree
         middle = 0.5 * float(latitude[0] + latitude[-1])
@@ -174,39 +180,27 @@ class RasterTerrain(Terrain):
         margin = max(reach, feather) + 3
         top, left = math.floor(rows[0]) - margin, math.floor(columns[0]) - margin
         height, width = math.ceil(rows[-1]) + margin + 1 - top, math.ceil(columns[-1]) + margin + 1 - left
-        source = layer.read(top, left, height, width)
+        pixels = _window(layer, top, left, height, width, feather, windows)
+        source, hole = np.ascontiguousarray(pixels[0]), pixels[1:2]
         out = np.zeros((latitude.size, longitude.size), np.float32)
-        hole = np.isnan(source)
-        if hole.all():
+        if len(hole) and hole.all():
             return out, np.zeros_like(out)
         weight = np.ones_like(out)
         if hole.any():
-            import cv2
-
-            inside = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
-            _, labels = cv2.distanceTransformWithLabels(
-                hole.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-            )
-            # Holes take the nearest height, so that the smoothing has something to work on at edges.
-            of_label = np.zeros(int(labels.max()) + 1, np.float32)
-            of_label[labels[~hole]] = source[~hole]
-            source = of_label[labels]
-            edge = np.clip((inside - 1.0) / feather, 0.0, 1.0)
-            smooth = np.asarray(edge * edge * (3.0 - 2.0 * edge), dtype=np.float32)
-            kernels.resample_cubic(smooth, *_span(rows, top), *_span(columns, left), weight)
+            kernels.resample_cubic(np.ascontiguousarray(pixels[2]), *_span(rows, top), *_span(columns, left), weight)
             weight = np.clip(weight, 0.0, 1.0)
         if sigma > 0.0:
             source = _smoothed(source, sigma, reach)
         kernels.resample_cubic(source, *_span(rows, top), *_span(columns, left), out)
         return out, weight
 
-    def _slope_gain(self, latitude: FloatArray, longitude: FloatArray) -> Heights:
+    def _slope_gain(self, latitude: FloatArray, longitude: FloatArray, windows: _Windows) -> Heights:
         """Return the roughness of the ground about each pixel, relative to average ground, (rows, columns)."""
         step = float(latitude[0] - latitude[1])
         # About 1 km between nodes whatever the level, on pixels all tiles share.
         stride = max(1, round(SLOPE_SPACING_M / (step * MOON_RADIUS_M)))
         nodes_latitude, nodes_longitude, top, left = coarse_nodes(latitude, longitude, stride, 3)
-        heights = self._resampled(nodes_latitude, nodes_longitude)
+        heights = self._resampled(nodes_latitude, nodes_longitude, windows)
         spacing = stride * step * MOON_RADIUS_M
         north = np.diff(heights, axis=0)[:, :-1] / spacing
         east = np.diff(heights, axis=1)[:-1] / (spacing * np.cos(nodes_latitude[:-1])[:, None])
@@ -220,6 +214,40 @@ class RasterTerrain(Terrain):
             np.ascontiguousarray(gain, dtype=np.float32), top - 1.5, 1.0 / stride, left - 1.5, 1.0 / stride, out
         )
         return out
+
+
+def _window(
+    layer: RasterLayer, top: int, left: int, height: int, width: int, feather: int, windows: _Windows
+) -> Heights:
+    """Return heights (1, rows, columns) of a window; with holes, which are filled, also these and weights, (3, ...).
+
+    Weights rise from 0 at holes. Cut from the window in ``windows`` if that holds this one; put there otherwise.
+    """
+    if layer in windows:
+        first_row, first_column, pixels = windows[layer]
+        y, x = top - first_row, left - first_column
+        part = pixels[:, max(y, 0) : y + height, max(x, 0) : x + width]
+        if part.shape[1:] == (height, width):
+            return part
+    source = layer.read(top, left, height, width)
+    hole = np.isnan(source)
+    pixels = source[None]
+    if hole.all():
+        pixels = np.stack([source, hole, source])
+    elif hole.any():
+        import cv2
+
+        inside = cv2.distanceTransform((~hole).astype(np.uint8), cv2.DIST_L2, 5)
+        _, labels = cv2.distanceTransformWithLabels(
+            hole.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        # Holes take the nearest height, so that the smoothing has something to work on at edges.
+        of_label = np.zeros(int(labels.max()) + 1, np.float32)
+        of_label[labels[~hole]] = source[~hole]
+        edge = np.clip((inside - 1.0) / feather, 0.0, 1.0)
+        pixels = np.stack([of_label[labels], hole, edge * edge * (3.0 - 2.0 * edge)]).astype(np.float32)
+    windows[layer] = top, left, pixels
+    return pixels
 
 
 def _share_below(diameter_m: float) -> float:
@@ -236,7 +264,7 @@ def _smoothed(values: Heights, sigma: float, reach: int) -> Heights:
     offsets = np.arange(-reach, reach + 1)
     weights = np.exp(-0.5 * (offsets / sigma) ** 2)
     weights = np.asarray(weights / weights.sum(), dtype=np.float32)
-    smoothed: Heights = kernels.smooth(np.ascontiguousarray(values), weights)
+    smoothed: Heights = kernels.smooth(values, weights)
     return smoothed
 
 

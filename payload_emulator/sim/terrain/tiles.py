@@ -328,6 +328,7 @@ class Terrain(ABC):
     def release_ground(self) -> None:
         """Drop the tiles; they are made again when they are needed."""
         self._pool = self._albedo = None
+        self._room = min(KEPT_TILES, self.cache_tiles)
         self._slots.clear()
 
     def close(self) -> None:

@@ -22,7 +22,7 @@ def compared(tmp_path_factory, make_pass, console, serve):
     with open_ground(home) as ground:
         for frames, seed in ((40, 1), (30, 2)):
             key = import_archive(ground, make_pass(frames=frames, seed=seed).folder)
-            make_report(ground, key, pdf=False)
+            make_report(ground, key)
         start = 1_900_000_000_000_000_000
         define_pass(ground, name="empty", start_utc_ns=start, stop_utc_ns=start + 60 * 10**9, spacecraft_id=76)
     with serve(home, console.port) as running:

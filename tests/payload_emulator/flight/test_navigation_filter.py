@@ -61,14 +61,13 @@ def craters(count=7, seed=2):
 
 
 def projected(state, landmarks, index, turn):
-    """Pixels (n, 2) of craters whose shifts are the last states, by rotations of SciPy."""
+    """Pixels (n, 2) of craters whose shifts, with the common offset, are the last states, by rotations of SciPy."""
     shifts = state[18:].reshape(-1, 3)
     seen = np.empty((index.size, 2))
     camera_from_icrf = Rotation.from_rotvec(-(state[9:12] + turn)).as_matrix() @ CAMERA_FROM_ICRF
     for k, crater in enumerate(index):
         east, north, up = landmarks.enu_from_mcmf[crater]
-        moved = state[14:17] + shifts[k]
-        point = landmarks.position_mcmf_m[crater] + moved[0] * east + moved[1] * north + moved[2] * up
+        point = landmarks.position_mcmf_m[crater] + shifts[k] @ [east, north, up]
         x, y, z = camera_from_icrf @ (MCMF_FROM_ICRF.T @ point - state[:3])
         focal = CAMERA.focal_px * (1.0 + state[17])
         seen[k] = [focal * x / z + 255.5 + state[12], focal * y / z + 255.5 + state[13]]
@@ -203,6 +202,7 @@ def test_what_all_craters_share_is_distinguished_from_the_position_by_its_prior_
     prior = replace(start, covariance=covariance).with_craters(index, np.full((40, 3), 1e-3))
     shifted = replace(prior, mean=prior.mean.copy())
     shifted.mean[14] = 100.0
+    shifted.mean[18::3] = 100.0
     uv = projected(shifted.mean, landmarks, index, np.zeros(3))
     found = updated(prior, landmarks, index, uv, np.full(40, 1e-2), errors)
     # East offset o and camera shift -p with o + p = 100: o : p = 30^2 : 40^2. Detections know their sum to 3 m and,
@@ -249,7 +249,7 @@ def test_derivatives_stand_in_the_columns_of_their_states():
     assert design.shape == (3, 2, size)
 
     def measured(x):
-        full = np.concatenate([x[:18], x[21:24], x[18:21], np.zeros(3)])
+        full = np.concatenate([x[:18], x[21:24], x[18:21], x[14:17]])
         return projected(full, landmarks, asked, x[24:])
 
     steps = differences(24)
@@ -357,7 +357,7 @@ def test_burns_and_restarts_add_what_they_leave_unknown():
 def test_craters_come_and_go_with_their_correlations():
     prior = prior_state(np.array([4, 1, 6]))
     assert prior.slots(np.array([6, 2, 4, 1])).tolist() == [24, -1, 18, 21]
-    assert_array_equal(prior.shifts(np.array([1, 5])), [prior.mean[21:24], np.zeros(3)])
+    assert_array_equal(prior.shifts(np.array([1, 5])), [prior.mean[21:24] - prior.mean[14:17], np.zeros(3)])
     kept = prior.only_craters(np.array([6, 4, 9]))
     places = [*range(18), 18, 19, 20, 24, 25, 26]
     assert kept.craters.tolist() == [4, 6]
@@ -367,8 +367,13 @@ def test_craters_come_and_go_with_their_correlations():
     grown = prior.with_craters(np.array([2, 4, 0]), sigma)
     assert grown.craters.tolist() == [4, 1, 6, 2, 0]
     assert_array_equal(grown.covariance[:27, :27], prior.covariance)
-    assert_allclose(np.diag(grown.covariance)[27:], [1.0, 4.0, 9.0, 49.0, 64.0, 81.0])
-    assert not grown.covariance[27:, :27].any() and not grown.mean[27:].any()
+    # A new crater stands where the common offset has it now, and is off by its own error beyond that.
+    offset, own = prior.covariance[14:17, 14:17], np.diag([1.0, 4.0, 9.0, 49.0, 64.0, 81.0])
+    assert_allclose(grown.covariance[27:, 27:], np.tile(offset, (2, 2)) + own)
+    assert_array_equal(grown.covariance[27:, :27], np.tile(prior.covariance[14:17], (2, 1)))
+    assert_array_equal(grown.mean[27:], np.tile(prior.mean[14:17], 2))
+    turned = prior.with_craters(kalman.TURN, np.ones((1, 3)))
+    assert not turned.covariance[27:, :27].any() and not turned.mean[27:].any()
     assert prior.with_craters(np.array([4]), np.ones((1, 3))) is prior
     none = first_state()
     assert none.slots(np.array([3])).tolist() == [-1]
@@ -495,7 +500,7 @@ def test_the_slope_is_the_derivative_of_state_and_likelihood_by_the_size_of_the_
             moved = kalman.predict(state, 5 * k * SECOND, model, errors)
             place = turn @ place if k else place
             prior = moved.with_craters(index, np.full((5, 3), 50.0)).only_craters(index)
-            true = np.concatenate([place, np.zeros(11), [30.0, -20.0, 0.0], np.zeros(16)])
+            true = np.concatenate([place, np.zeros(15), np.tile([30.0, -20.0, 0.0], 5)])
             uv = projected(true, landmarks, index, np.zeros(3)) + 0.8 * rng.standard_normal((5, 2))
             found = updated(prior, landmarks, index, uv, variance, errors, 1)
             logarithm += log_likelihood(prior, landmarks, index, found.nis)

@@ -3,8 +3,9 @@
 The first 18 states are position and velocity (ICRF), empirical acceleration (radial, transverse, normal), attitude
 bias (camera axes), pixel bias, catalogue offset (east, north, up) and image scale. They are followed by three states
 for each crater that was used and is still in view: its offset from its catalogued position, east, north, up. A crater
-is observed several times on a pass with the same error, so its error is a state and not independent noise; the state is
-removed when the crater leaves the view. The attitude error of a frame, one rotation for all its detections, is a state
+is observed several times on a pass with the same error, so its error is a state and not independent noise. It begins
+with the catalogue offset of that time, which changes along the track for craters that come into view later, and ends
+when the crater leaves the view. The attitude error of a frame, one rotation for all its detections, is a state
 during an update: it is observable in a wide field of view, and the projection is too nonlinear over a degree to treat
 it as noise about the measured attitude.
 """
@@ -120,24 +121,32 @@ class FilterState:
         return np.where(found, SIZE + 3 * order[at], -1)
 
     def shifts(self, index: IntArray) -> FloatArray:
-        """Return how far each given crater lies from its catalogued place, shape (n, 3), zero where not estimated."""
+        """Return how far each given crater, shape (n, 3), lies from its catalogued place beyond the common offset.
+
+        Zero where it is not estimated.
+        """
         slots = self.slots(index)
-        values = self.mean[np.maximum(slots, 0)[:, None] + np.arange(3)]
+        values = self.mean[np.maximum(slots, 0)[:, None] + np.arange(3)] - self.mean[OFFSET]
         return np.where(slots[:, None] >= 0, values, 0.0)
 
     def with_craters(self, index: IntArray, sigma_m: FloatArray) -> FilterState:
-        """Return the state with the given craters among its states; new ones at their catalogued places."""
+        """Return the state with the given craters among its states; new ones where the common offset has them.
+
+        `sigma_m`, shape (n, 3), is what a crater may be off by beyond that offset.
+        """
         new = self.slots(index) < 0
         count, size = int(np.count_nonzero(new)), self.mean.size
         if not count:
             return self
-        covariance = np.zeros((size + 3 * count, size + 3 * count))
-        covariance[:size, :size] = self.covariance
-        rest = np.arange(size, size + 3 * count)
-        covariance[rest, rest] = sigma_m[new].reshape(-1) ** 2
-        mean, slope = np.concatenate([self.mean, np.zeros(3 * count)]), self.slope
+        # A copy of the offset for each crater, which it keeps while the offset changes along the track.
+        places = np.concatenate([np.arange(size), np.tile(np.arange(OFFSET.start, OFFSET.stop), count)])
+        part = np.concatenate([np.ones(size), np.repeat(index[new] != TURN[0], 3)])
+        both, shared = np.ix_(places, places), part[:, None] * part
+        covariance, rest = self.covariance[both] * shared, np.arange(size, size + 3 * count)
+        covariance[rest, rest] += sigma_m[new].reshape(-1) ** 2
+        mean, slope = self.mean[places] * part, self.slope
         if slope is not None:
-            slope = Slope(np.pad(slope.mean, (0, 3 * count)), np.pad(slope.covariance, (0, 3 * count)))
+            slope = Slope(slope.mean[places] * part, slope.covariance[both] * shared)
         return FilterState(self.ticks, mean, covariance, np.concatenate([self.craters, index[new]]), slope)
 
     def only_craters(self, keep: IntArray) -> FilterState:
@@ -340,10 +349,10 @@ def design_matrix(sighting: Sighting, state: FilterState) -> FloatArray:
     matrix[:, :, POSITION] = sighting.by_position
     matrix[:, :, ATTITUDE] = sighting.by_attitude
     matrix[:, 0, PIXEL.start] = matrix[:, 1, PIXEL.start + 1] = 1.0
-    matrix[:, :, OFFSET] = sighting.by_offset
     matrix[:, :, SCALE] = sighting.by_scale
     slots = state.slots(sighting.index)
     known = np.flatnonzero(slots >= 0)
+    matrix[slots < 0, :, OFFSET] = sighting.by_offset[slots < 0]
     for axis in range(3):
         matrix[known, :, slots[known] + axis] = sighting.by_offset[known, :, axis]
     turn = int(state.slots(TURN)[0])
