@@ -146,6 +146,8 @@ def _octets(value: Any) -> Iterator[bytes]:
     if isinstance(value, np.ndarray) and not value.dtype.hasobject:
         yield f"{value.dtype.str}{value.shape}".encode()
         yield value.tobytes()
+    elif isinstance(value, list | tuple) and all(type(part) in (str, int, float) for part in value):
+        yield f"{tuple(value)!r} ".encode()
     elif isinstance(value, list | tuple | np.ndarray):
         yield f"{len(value)} of ".encode()
         for part in value:
