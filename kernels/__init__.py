@@ -6,6 +6,7 @@ import logging
 import os
 import time
 import uuid
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -14,6 +15,7 @@ KEPT_S = 90 * 86_400.0
 """Age at which a file is deleted: the version of the program that it belongs to may be gone."""
 
 _DIGEST_OCTETS = 32
+_written = Counter[tuple[Path, str]]()
 
 
 def cache_folder() -> Path:
@@ -51,9 +53,9 @@ def made_once(name: str, make: Callable[[], bytes], most: int = 0) -> bytes:
 
 
 def keep(name: str, octets: bytes, most: int = 0) -> None:
-    """Keep octets under a name, in one piece, unless the folder cannot be written; delete old files.
+    """Keep octets under a name, in one piece, unless the folder cannot be written; delete old files now and then.
 
-    Of a kind, the name up to its hyphen, the newest files stay: at most ``most``, or all for 0.
+    Of a kind, the name up to its hyphen, the newest files stay: at most ``most`` and a sixteenth, or all for 0.
     """
     kind = name.partition("-")[0]
     folder = _folder_of(kind)
@@ -68,6 +70,9 @@ def keep(name: str, octets: bytes, most: int = 0) -> None:
         with suppress(OSError):
             part.unlink()  # of a full disk
         return
+    _written[folder, kind] += 1
+    if (_written[folder, kind] - 1) % (max(most // 16, 1) if most else 16):
+        return  # a look at all files takes longer than all else
     with suppress(OSError), os.scandir(folder) as files:
         written = sorted((file.stat().st_mtime, file.name) for file in files)
         same = [other for _, other in written if other.partition("-")[0] == kind]

@@ -594,5 +594,27 @@ class Clock:
 def mission_time():
     made = Clock()
     set_mission_clock(lambda: made.utc_ns)
-    yield made
-    set_mission_clock(None)
+    return made
+
+
+@pytest.fixture
+def now(mission_time):
+    """Mission time at the start of the synthetic passes."""
+    mission_time.utc_ns = START
+    return mission_time
+
+
+@pytest.fixture(autouse=True)
+def wall_clock_again():
+    """Let mission time be the wall clock after a test."""
+    yield
+    set_mission_clock()
+
+
+def steps_of(connection, work):
+    """Return the result of reading on a SQLite connection, and how much work the database did, in ten operations."""
+    database, done = connection.connection.driver_connection, []
+    database.set_progress_handler(lambda: done.append(1), 10)
+    found = work(connection)
+    database.set_progress_handler(None, 0)
+    return found, len(done)

@@ -84,7 +84,7 @@ def add_correlation(ground, vehicle, created_utc_ns):
         repository.add(connection, repository.CORRELATIONS, **line, **given)
 
 
-def test_every_metric_and_label_of_alerts_and_dashboard_exists(samples):
+def test_metrics_and_labels_of_alerts_and_dashboard_are_those_of_the_condition(samples):
     for expression in expressions():
         named = set(NAME.findall(expression))
         assert named or "up{" in expression or "probe_ssl_earliest_cert_expiry{" in expression, expression
@@ -94,23 +94,17 @@ def test_every_metric_and_label_of_alerts_and_dashboard_exists(samples):
         for grouped in re.findall(r"\bby \(([^)]*)\)", expression):
             labels = {label.strip() for label in grouped.split(",")}
             assert labels <= set().union(*(samples[name] for name in named)), expression
-
-
-def test_every_metric_of_the_condition_is_drawn_or_has_an_alert(samples):
     used = {name for expression in expressions() for name in NAME.findall(expression)}
     families = {re.sub(r"_(bucket|count|sum|created|total)$", "", name) for name in samples}
     assert families == {re.sub(r"_(bucket|total)$", "", name) for name in used}
 
 
-def test_every_alert_has_a_severity_a_summary_and_an_action():
+def test_every_alert_has_a_severity_a_summary_and_an_action_and_the_limit_of_the_status():
     names = [rule["alert"] for rule in alerts()]
     assert len(set(names)) == len(names) >= 10
     for rule in alerts():
         assert rule["labels"]["severity"] in ("page", "ticket")
         assert set(rule["annotations"]) == {"summary", "action"}
-
-
-def test_the_limits_of_the_status_are_those_of_the_alerts():
     limits = {rule["alert"]: [float(word) for word in re.findall(r"[<>] ([0-9.]+)", rule["expr"])] for rule in alerts()}
     names = (
         "QueueOld QUEUE_AGE_LIMIT_S IngestLag INGEST_LAG_LIMIT_S DiskFull DISK_FREE_LIMIT BackupOld BACKUP_AGE_LIMIT_S"

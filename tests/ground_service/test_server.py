@@ -1,6 +1,4 @@
-"""Starting and ending the server: what is imported, refused addresses, draining. Names and reasons are one
-printable line.
-"""
+"""Starting and ending the server: what is imported, refused addresses, draining."""
 
 import contextlib
 import os

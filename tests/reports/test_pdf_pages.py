@@ -49,16 +49,13 @@ def document(*blocks):
     return Document("Test", "Title", "t", (), blocks)
 
 
-def test_it_is_a_pdf_of_numbered_a4_pages(octets):
+def test_it_is_a_pdf_of_numbered_a4_pages_without_date_and_machine(octets):
     reader = PdfReader(io.BytesIO(octets))
     assert len(reader.pages) > 2
     for number, page in enumerate(reader.pages, 1):
         # 210 by 297 mm are 595.3 by 841.9 points; half a point is a fifth of a millimetre.
         assert [float(v) for v in page.mediabox] == pytest.approx([0, 0, 595.3, 841.9], abs=0.5)
         assert f"{number} / {len(reader.pages)}" in page.extract_text()
-
-
-def test_no_date_and_no_machine_is_in_it(octets):
     assert b"CreationDate" not in octets and b"ModDate" not in octets
     assert PdfReader(io.BytesIO(octets)).metadata["/Title"].startswith("Pass report: ")
 

@@ -25,13 +25,10 @@ def bearer(token):
     return HTTPAuthorizationCredentials(scheme="Bearer", credentials=token)
 
 
-def test_without_users_an_open_service_has_a_local_caller_who_may_do_everything(ground):
+def test_without_users_an_open_service_has_a_local_caller_and_one_that_others_reach_is_closed(ground):
     asked = request(ground, True)
     assert caller_of(asked, None) == LOCAL_CALLER == Caller("local", "admin", None)
     assert vars(asked.state) == {"caller": "local"}
-
-
-def test_a_service_that_others_reach_is_closed_even_without_users(ground):
     with pytest.raises(NotAuthorised, match="expected a bearer token in the Authorization header, found none"):
         caller_of(request(ground, False), None)
 

@@ -91,16 +91,13 @@ def test_earth_and_sun_pull_unless_they_are_left_out():
     assert_allclose(flown(0, oblate(0)), moved[2], atol=0.02)
 
 
-def test_samples_before_the_start_have_no_position():
+def test_samples_before_the_start_have_no_position_and_an_orbit_that_meets_the_ground_is_refused():
     early = np.concatenate([[EPOCH - 1], TIMES])
     found = propagated_positions(START, early, oblate(), 0, Still(), third_bodies=False)
     assert np.isnan(found[0]).all() and found[1].tolist() == START.position_icrf_m.tolist()
     assert_allclose(found[1:], circle(), atol=0.01)
     none = propagated_positions(START, TIMES - 10**13, oblate(), 0, Still())
     assert none.shape == (4, 3) and np.isnan(none).all()
-
-
-def test_an_orbit_that_meets_the_ground_is_refused():
     falling = StartState(EPOCH, START.position_icrf_m, 0.9 * START.velocity_icrf_m_s)
     with pytest.raises(ImpactError):
         propagated_positions(falling, TIMES, oblate(), 0, Still(), third_bodies=False)

@@ -1,5 +1,4 @@
-"""Every operation of the description, asked with values that nobody expects: never a server error, always a problem
-document, always a status that the description names."""
+"""Every operation asked with values that nobody expects: a problem document with a status that it names."""
 
 import json
 from typing import Any

@@ -1,7 +1,4 @@
-"""Series from roll-ups: the same as from the samples, in whatever order they came, gaps marked. Filter estimates
-of both packet versions in the archive, and their consistency in the report. Images of a spacecraft:
-downlinked thumbnails and frames of pass archives, on spacecraft time.
-"""
+"""Series from roll-ups, the same as from the samples; estimates of the filter; images of a spacecraft."""
 
 from dataclasses import replace
 

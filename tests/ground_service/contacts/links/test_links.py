@@ -1,7 +1,4 @@
-"""One link: reception without loss, contacts, and transmission of released telecommands, on both databases. Two
-processes on PostgreSQL: one operates the link; after it is killed, the other takes over and sends. Time
-correlation of a spacecraft whose telemetry comes over a link with reception times.
-"""
+"""One link: reception without loss, contacts, transmission, takeover by another process, on both databases."""
 
 import contextlib
 import socket

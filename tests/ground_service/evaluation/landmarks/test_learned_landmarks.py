@@ -215,16 +215,13 @@ def _place(east_m=0.0, sigma_m=50.0, diameter_m=8000.0, looks=4):
     return LandmarkFix(0.0, east_m / MOON_RADIUS_M, 100.0, (sigma_m,) * 3, diameter_m, 200.0, 0.8, rows, looks)
 
 
-def test_passes_that_agree_reduce_the_variance_but_not_what_is_common_to_them():
+def test_passes_that_agree_reduce_the_variance_not_common_to_them_and_others_enlarge_it():
     """The error of the catalogue, and the 30 % of the variance that the detector repeats on every pass."""
     common = 20.0
     place = _place(sigma_m=float(np.hypot(100.0, common)))
     for count in (1, 4, 10_000):
         left = np.sqrt(100.0**2 * (0.3 + 0.7 / count) + common**2)
         assert combined([place] * count).sigma_m[0] == approx(left)
-
-
-def test_passes_that_disagree_enlarge_the_uncertainty():
     apart = combined([_place(-300.0), _place(300.0)])
     assert apart.longitude_rad == approx(0.0, abs=1e-12)
     assert apart.sigma_m[0] == approx(np.hypot(300.0, 20.0), rel=0.01)

@@ -235,8 +235,6 @@ def test_months():
 @pytest.fixture
 def september():
     set_mission_clock(lambda: parse_utc("2029-09-01T00:00:05Z"))
-    yield
-    set_mission_clock(None)
 
 
 def test_a_requirement_that_is_unknown_on_some_passes_is_not_good(ground):
