@@ -14,6 +14,7 @@ KEPT_S = 90 * 86_400.0
 """Age at which a file is deleted: the version of the program that it belongs to may be gone."""
 
 _DIGEST_OCTETS = 32
+_cleaned: set[str] = set()
 
 
 def cache_folder() -> Path:
@@ -68,8 +69,12 @@ def keep(name: str, octets: bytes, most: int = 0) -> None:
         with suppress(OSError):
             part.unlink()  # of a full disk
         return
-    with suppress(OSError), os.scandir(folder) as files:
-        written = sorted((file.stat().st_mtime, file.name) for file in files)
+    with suppress(OSError):
+        names = os.listdir(folder)
+        if kind in _cleaned and most and sum(other.startswith(kind) for other in names) <= most:
+            return  # many files of ground follow each other: their dates are read when there are too many
+        _cleaned.add(kind)
+        written = sorted(((folder / other).stat().st_mtime, other) for other in names)
         same = [other for _, other in written if other.partition("-")[0] == kind]
         old = [other for second, other in written if second < time.time() - KEPT_S]
         for other in {*old, *same[:-most]}:
