@@ -138,21 +138,6 @@ def test_a_job_that_the_disk_stops_is_held_back_longer_each_time(downlink, tmp_p
         assert row_of(ground, job)["attempts"] == 0
         clock[0] += 300.0
         dispatcher.resume()
-        dispatcher.close()
-        assert row_of(ground, job)["state"] in ("done", "queued")
-
-
-def test_a_job_is_done_once_the_disk_has_space(downlink, tmp_path, monkeypatch):
-    with open_ground(tmp_path) as ground:
-        job = enter(ground, downlink)
-        dispatcher = ThreadDispatcher(ground)
-        with monkeypatch.context() as disk:
-            disk.setattr(ingest_store, "store_batch", lambda *_: (_ for _ in ()).throw(StorageFull("database")))
-            dispatcher.resume()
-            dispatcher._pool.submit(int).result()
-        assert row_of(ground, job)["state"] == "queued"
-        monkeypatch.setattr(dispatch.time, "monotonic", lambda: 1e12)
-        dispatcher.resume()
         dispatcher._pool.submit(int).result()
         assert row_of(ground, job)["state"] == "done"
         dispatcher.close()
@@ -173,7 +158,7 @@ def test_replays_are_separate_jobs_and_the_verdict_follows(redis_url, make_flyab
         replays = [dispatcher.submit("replay", replay) for replay in missing_replays(ground, arguments)]
         assert len(replays) == 4
         verdict = dispatcher.submit("regression", arguments)
-        for job in (*replays, verdict):
+        for job in *replays, verdict:
             run_job(ground, job)
         rows = [row_of(ground, job) for job in (*replays, verdict)]
         assert [row["state"] for row in rows] == ["done"] * 5
@@ -240,7 +225,7 @@ def test_an_ingest_before_version_1_has_no_piece(either):
 
 def test_sums_of_roll_ups_may_differ_by_the_order_of_addition(ground):
     row = np.array([3.0, 0.6, 0.1, 0.3, 0.0, 0.0, np.inf, -np.inf])
-    for index, change, same in ((1, 1e-16, True), (1, 1e-6, False), (3, 1e-16, False), (0, 1.0, False)):
+    for index, change, same in (1, 1e-16, True), (1, 1e-6, False), (3, 1e-16, False), (0, 1.0, False):
         other = row.copy()
         other[index] += change
         pair = [((1,), (1, 2, 3, one.tobytes())) for one in (row, other)]
@@ -268,7 +253,7 @@ def test_a_trend_has_the_slope_of_its_line():
     assert trend.slope_per_day == approx(3.0, rel=1e-9)
     assert (trend.samples, trend.limit_state) == (200, "within")
     # 62 degrees is above the warning limit of 60 of the dictionary, 90 above the alarm limit of 85
-    for value, state in ((62.0, "warning"), (90.0, "alarm")):
+    for value, state in (62.0, "warning"), (90.0, "alarm"):
         hot = trend_of(field, downsample(utc_ns[:2], np.array([20.0, value]), 50))
         assert hot.limit_state == state
     assert trend_of(field, downsample(utc_ns[:0], np.zeros(0), 5)) is None
@@ -297,7 +282,7 @@ def test_what_is_old_goes_and_the_record_stays(ground, monkeypatch):
     with ground.database.writing() as connection:
         connection.execute(repository.EVENT_LOG.update().values(utc_ns=0))
         connection.execute(repository.ANSWERS.insert().values(key="k", request="r", answer={"id": 1}, created_utc_ns=0))
-    for name in (".incoming-old", ".incoming-new"):
+    for name in ".incoming-old", ".incoming-new":
         ground.files.root.mkdir(exist_ok=True)
         (ground.files.root / name).write_bytes(b"")
     os.utime(ground.files.root / ".incoming-old", (0, 0))
@@ -305,7 +290,7 @@ def test_what_is_old_goes_and_the_record_stays(ground, monkeypatch):
     (regression / "files").mkdir(parents=True)
     (regression / "files/.incoming-old").write_bytes(b"")
     (regression / "scratch/.working-old/archive").mkdir(parents=True)
-    for name in ("files/.incoming-old", "scratch/.working-old"):
+    for name in "files/.incoming-old", "scratch/.working-old":
         os.utime(regression / name, (0, 0))
     with working_folder(ground) as in_use:
         removed = tidy(ground, 90)
@@ -344,7 +329,7 @@ def test_ten_years_later_the_record_is_complete_and_the_operation_is_gone(ground
     run_job(ground, enter_job(ground, "plan", {}))
     before, files = counts(ground), sorted(ground.files.root.rglob("*"))
     later = utc_now_ns() + 3653 * DAY_NS
-    for module in ("upkeep", "jobs"):
+    for module in "upkeep", "jobs":
         monkeypatch.setattr(f"ground_service.worker.{module}.utc_now_ns", lambda: later)
     removed = tidy(ground, 90)
     after = counts(ground)
@@ -357,7 +342,7 @@ def test_expired_sessions_are_deleted_and_tokens_are_kept(ground, monkeypatch):
     token = users.add_user(ground, "ann", "operator", days_valid=0.001)
     old, _ = users.start_session(ground, token)
     later = utc_now_ns() + DAY_NS
-    for module in ("ground_service.access.service", "ground_service.worker.upkeep"):
+    for module in "ground_service.access.service", "ground_service.worker.upkeep":
         monkeypatch.setattr(f"{module}.utc_now_ns", lambda: later)
     new, _ = users.start_session(ground, users.add_token(ground, "ann"))
     tokens = {one.id for one in users.list_tokens(ground)}
@@ -408,7 +393,7 @@ def ground_on_postgres(upgraded, tmp_path_factory):
 def test_the_archive_is_the_same_as_on_sqlite(ground_on_postgres, ground, synthetic_pass):
     stream = synthetic_pass.folder / "downlink.cadu"
     hashes = []
-    for one in (ground, ground_on_postgres):
+    for one in ground, ground_on_postgres:
         first = ingest_file(one, stream)
         again = ingest_file(one, stream)
         assert first.packets_new == first.packets == len(synthetic_pass.packets)
@@ -461,7 +446,7 @@ def test_time_outs_are_found_on_a_server_as_well(ground_on_postgres):
 
 
 def test_a_worker_without_a_broker_is_refused(tmp_path):
-    for use in (run_worker, worker_answers):
+    for use in run_worker, worker_answers:
         with raises(SettingsError, match="LINNA_BROKER_URL: expected a broker"):
             use(Settings(home=tmp_path))
 
