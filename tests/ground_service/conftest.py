@@ -19,7 +19,6 @@ from collections import defaultdict
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from fastapi import routing
@@ -93,7 +92,7 @@ def one_tls_context():
 @fixture(scope="session", autouse=True)
 def one_description():
     """Make the OpenAPI document, which is the same for every application, once: it takes two seconds."""
-    describe, made = DescribedApi.openapi, list[dict[str, Any]]()
+    describe, made = DescribedApi.openapi, []
 
     def openapi(app):
         made[:] = made or [describe(app)]
@@ -107,7 +106,7 @@ def one_description():
 @fixture(scope="session", autouse=True)
 def one_set_of_routes():
     """Resolve the routes, which are the same for every application, once: the first request would do it in 0.2 s."""
-    resolve, made = routing._EffectiveRouteContext.from_api_route, dict[tuple[int, str], Any]()
+    resolve, made = routing._EffectiveRouteContext.from_api_route, {}
 
     def from_api_route(*, original_route, include_context):
         key = (id(original_route), include_context.path_for(original_route))
@@ -213,7 +212,7 @@ class Downlink:
     """Packets of a payload with the sequence counts of their APIDs."""
 
     def __init__(self):
-        self.sequencer, self.packets = PacketSequencer(), list[bytes]()
+        self.sequencer, self.packets = PacketSequencer(), []
 
     def send(self, name, values, ticks):
         count = self.sequencer.next(DICTIONARY.packet(name).apid)

@@ -118,7 +118,7 @@ def paper(**changed):
         "matched": np.arange(FRAMES),
         "outcome": ("matched",) * FRAMES,
     }
-    return NavigationSamples(**{**values, **changed})
+    return NavigationSamples(**values | changed)
 
 
 def anchored(**changed):
@@ -133,7 +133,7 @@ def anchored(**changed):
         "matched": 4 * fixed,
         "outcome": tuple(np.where(fixed, "fixed", "predicted").tolist()),
     }
-    return paper(**{**values, **changed})
+    return paper(**values | changed)
 
 
 def first(count):
@@ -192,7 +192,7 @@ def inputs(**changed):
         "cadence_s": CADENCE_S,
         "images": IMAGES,
     }
-    return PassInputs(**{**values, **changed})
+    return PassInputs(**values | changed)
 
 
 def evaluated(**changed):
@@ -372,7 +372,7 @@ def test_the_start_state_is_propagated_with_every_field_and_from_the_reference()
 
 def test_a_start_state_is_propagated_from_its_instant_with_a_perfect_one_if_it_is_worse():
     position, velocity = circle(0.0)
-    for east_m, names in ((0.9, ["propagate-only", "Kepler"]), (1.1, [*BASELINES])):
+    for east_m, names in (0.9, ["propagate-only", "Kepler"]), (1.1, [*BASELINES]):
         start = StartState(EPOCH, position + np.array([0.0, east_m, 0.0]), velocity)
         report = evaluated(start_state=start, onboard_gravity=builtin_gravity())
         assert [one.name for one in of_baselines(report)] == names
@@ -593,7 +593,7 @@ def test_every_estimate_has_the_sun_and_the_ground():
     ground = position * (MOON_M / RADIUS_M)
     toward = sun - ground
     sine = np.einsum("ni,ni->n", toward, position) / np.linalg.norm(toward, axis=1) / RADIUS_M
-    for name in ("paper", "anchored"):
+    for name in "paper", "anchored":
         # The Sun is an astronomical unit away: whether seen from the ground or the centre makes 1e-5 rad.
         assert_allclose(series(report, name).sun_elevation_deg, np.degrees(np.arcsin(sine)), atol=2e-3)
         assert series(report, name).terrain == tuple("mare" if x < 4.0 else "highland" for x in LONGITUDE_DEG)

@@ -1,7 +1,5 @@
 """A served ground service with one pass, and a real browser to look at it."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json
@@ -14,7 +12,6 @@ import threading
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
@@ -30,9 +27,6 @@ from tests.lazy import Lazy, expect
 from tests.serving import wait_for
 
 cv2 = Lazy("cv2")
-
-if TYPE_CHECKING:
-    pass
 
 CHROMIUM = "/usr/bin/chromium"
 OPENMCT = Path(__file__).parents[3] / "deploy" / "openmct"
@@ -114,7 +108,7 @@ class Console:
                 client.sendall(json.dumps(message).encode() + b"\n")
 
     def close(self):
-        for one in (self._listener, *self._clients):
+        for one in self._listener, *self._clients:
             end_socket(one)
         self._thread.join(TIMEOUT_S)
 
@@ -217,7 +211,7 @@ def openmct(tmp_path_factory):
     if pages.FOLDER.is_dir():
         return pages.FOLDER
     folder = tmp_path_factory.mktemp("openmct")
-    for name in ("package.json", "package-lock.json"):
+    for name in "package.json", "package-lock.json":
         shutil.copy(OPENMCT / name, folder)
     command = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund"]
     try:

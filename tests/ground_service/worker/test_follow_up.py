@@ -109,7 +109,7 @@ def test_numbers_have_no_gaps_and_follow_the_order_of_commits(either):
 
 def test_equal_work_of_several_events_is_done_once_and_in_order(ground, recorded):
     with ground.database.listeners.held():
-        for vehicle in (7, 5, 7):
+        for vehicle in 7, 5, 7:
             say(ground, TelemetryReceived(vehicle_id=vehicle, packets=1))
         assert recorded.done == []
     assert recorded.done == [
@@ -259,7 +259,7 @@ def test_the_same_data_again_make_no_report(ground, halves):
 
 
 def test_late_data_evaluate_a_pass_once_for_the_comparison_and_the_report(ground, halves, monkeypatch):
-    pass_id, evaluated = reported_pass(ground, halves[0]), list[str]()
+    pass_id, evaluated = reported_pass(ground, halves[0]), []
 
     def evaluate(inputs):
         evaluated.append(inputs.pass_id)
