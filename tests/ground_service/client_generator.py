@@ -221,7 +221,7 @@ def generate():
         ]
     )
     ruff = str(Path(sys.executable).with_name("ruff"))
-    for words in (["check", "--select", "I", "--fix", "--quiet"], ["format", "--quiet"]):
+    for words in ["check", "--select", "I", "--fix", "--quiet"], ["format", "--quiet"]:
         command = [ruff, *words, "--stdin-filename", str(TARGET), "-"]
         text = subprocess.run(command, input=text, capture_output=True, text=True, check=True).stdout
     return text

@@ -94,7 +94,7 @@ def test_passes_are_listed_in_pages_and_shown(client):
     shown = client.get(f"{V1}/passes/1").json()
     assert shown["name"] == "synthetic pass"
     assert shown["start"] == "2029-08-07T06:00:00.000000Z"
-    for path, status in (("/999", 404), ("/x", 422), ("?limit=0", 422)):
+    for path, status in ("/999", 404), ("/x", 422), ("?limit=0", 422):
         assert is_problem(client.get(f"{V1}/passes{path}"), status)
 
 
@@ -310,7 +310,7 @@ def test_watching_needs_a_token_where_there_are_users(guarded):
 
     client, heads = guarded
     token = heads["viewer"]["Authorization"].removeprefix("Bearer ")
-    for headers in ({}, {"Authorization": "Bearer wrong"}):
+    for headers in {}, {"Authorization": "Bearer wrong"}:
         with raises(WebSocketDisconnect), client.websocket_connect(f"{V1}/live", headers=headers):
             pass
     with client.websocket_connect(f"{V1}/live", headers=heads["viewer"]):
@@ -342,7 +342,7 @@ def test_requests_are_logged_with_an_id_that_the_answer_carries(client, caplog):
 
 
 def test_json_that_no_reader_takes_is_refused_in_one_line(client):
-    for body in (b"[" * 500_000, b"1" * 500_000):
+    for body in b"[" * 500_000, b"1" * 500_000:
         answer = client.post(f"{V1}/windows", content=body, headers={"Content-Type": "application/json"})
         assert is_problem(answer, 400)
         assert "expected JSON of ordinary depth" in answer.json()["detail"]
@@ -396,7 +396,7 @@ def test_a_key_whose_work_was_cut_off_is_refused_and_says_why(ground):
 
 def test_passes_and_windows_sent_again_under_their_key_are_entered_once(client):
     span = {"start": "2029-08-07T06:00:00Z", "stop": "2029-08-07T06:05:00Z", "spacecraft_id": 76}
-    for path, more in (("/passes", {}), ("/windows", {"cadence_s": 15.0})):
+    for path, more in ("/passes", {}), ("/windows", {"cadence_s": 15.0}):
         headers, body = {"Idempotency-Key": f"key {path}"}, {"name": "once", **more, **span}
         first, again = (client.post(f"{V1}{path}", json=body, headers=headers) for _ in range(2))
         assert (first.status_code, again.status_code) == (201, 201), first.text
@@ -413,7 +413,7 @@ def test_figures_of_work_that_is_over_go_away(tmp_path, monkeypatch):
         ground = opened.app.state.ground
         job = enter_job(ground, "report", {"pass_id": 1})
         figures = opened.get("/metrics").text
-        for line in ('report",state="queued"} 1.0', 'report",state="failed"} 0.0', 'plan",state="failed"} 0.0'):
+        for line in 'report",state="queued"} 1.0', 'report",state="failed"} 0.0', 'plan",state="failed"} 0.0':
             assert f'linna_jobs{{kind="{line}' in figures
         assert "linna_backup_configured 0.0" in figures and "linna_backup_age_seconds{" not in figures
         run_job(ground, job)

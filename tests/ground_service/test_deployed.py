@@ -101,7 +101,7 @@ def deployed(folder, overlay, *, is_shared):
             env={**run, "LINNA_REDIS_USERS": f"{folder}/users"},
         )  # fmt: skip
         ports = {name: free_port() for name in (*APIS, "proxy")}
-        for name in (*APIS, "worker", "scheduler", "runner"):
+        for name in *APIS, "worker", "scheduler", "runner":
             command, log = [local(word) for word in SERVICES[name]["command"]], folder / f"{name}.log"
             if name in APIS:
                 command[command.index("--host") + 1] = "127.0.0.1"

@@ -66,9 +66,9 @@ def test_every_service_is_confined(name):
 
 
 def test_images_are_exact_versions_and_the_lock_file_of_the_displays_has_checksums():
-    for name in ("db", "broker", "proxy"):
+    for name in "db", "broker", "proxy":
         assert EXACT.fullmatch(default_of(SERVICES[name]["image"]))
-    for name in ("PYTHON_IMAGE", "NODE_IMAGE"):
+    for name in "PYTHON_IMAGE", "NODE_IMAGE":
         given = default_of(SERVICES["api"]["build"]["args"][name])
         (written,) = re.findall(rf"^ARG {name}=(\S+)$", DOCKERFILE, re.MULTILINE)
         assert given == written and EXACT.fullmatch(written)
@@ -172,7 +172,7 @@ admin_token | migrate
 
 
 def test_the_service_is_not_the_owner_of_its_schema():
-    for name in ("api", "worker", "scheduler"):
+    for name in "api", "worker", "scheduler":
         environment = environment_of(name)
         assert environment["LINNA_DATABASE_URL"].startswith("postgresql+psycopg://linna@")
         assert not {key for key in environment if "MIGRATION" in key or "ALLOW_DATABASE_OWNER" in key}
@@ -282,7 +282,7 @@ def test_passwords_may_have_any_character(tmp_path):
 
 def test_the_broker_grants_what_a_worker_needs_and_no_administration(tmp_path):
     """A right that is missing would be a traceback in the log of the worker every second."""
-    for program in ("redis-server", "redis-cli"):
+    for program in "redis-server", "redis-cli":
         if shutil.which(program) is None:
             skip(f"{program} is not installed")
     (tmp_path / "broker_password").write_text("secret")
@@ -306,7 +306,7 @@ def test_the_broker_grants_what_a_worker_needs_and_no_administration(tmp_path):
         worker.finish()
         assert "Error" not in log.read_text()
         client = redis.Redis.from_url(url)
-        for command in ("CONFIG GET dir", "FLUSHALL", "ACL LIST", "SHUTDOWN"):
+        for command in "CONFIG GET dir", "FLUSHALL", "ACL LIST", "SHUTDOWN":
             with raises(redis.exceptions.NoPermissionError):
                 client.execute_command(*command.split())
         client.close()
@@ -347,7 +347,7 @@ def test_the_proxy_has_a_second_api_while_one_drains_and_sees_certificates_at_th
     # The default configuration of nginx names another file with the number of the process.
     program, flag, configuration, *_ = SERVICES["proxy"]["entrypoint"]
     reload = f"`docker compose exec proxy {program} {flag} {configuration} -s reload`"
-    for name in ("docs/deployment.md", "deploy/prometheus/linna.rules.yml"):
+    for name in "docs/deployment.md", "deploy/prometheus/linna.rules.yml":
         text = (ROOT / name).read_text()
         assert reload in text and text.count("-s reload") == text.count(reload), name
     assert f"./deploy/nginx.conf:{configuration}:ro" in SERVICES["proxy"]["volumes"]

@@ -89,7 +89,7 @@ def test_limits_of_a_build_are_bounded_and_belong_to_a_program(tmp_path):
         return load_build(file).digest
 
     assert digest("") == digest("[limits]\nwall_s = 900") != digest("[limits]\nwall_s = 901")
-    for name in ("wall_s", "cpu_s", "memory_mib", "file_mib", "folder_mib", "open_files", "processes"):
+    for name in "wall_s", "cpu_s", "memory_mib", "file_mib", "folder_mib", "open_files", "processes":
         with raises(InvalidInput, match=f"limits.{name}: expected less than or equal to"):
             digest(f"[limits]\n{name} = 1_000_000_000")
 

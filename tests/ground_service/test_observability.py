@@ -239,7 +239,7 @@ def replicas_test(healthy):
 def backup_tests(healthy):
     """Without a backup there is an alert if a folder is configured, otherwise none."""
     others = [one for one in healthy if not one["series"].startswith("linna_backup")]
-    for configured in (0, 1):
+    for configured in 0, 1:
         firing = 'count(ALERTS{alertstate="firing",alertname="LinnaBackupOld"}) or vector(0)'
         given = series_of(f"linna_backup_configured = {configured}x200")
         yield run_of(others + given, expectation(firing, "150m", configured))
@@ -283,7 +283,7 @@ def test_ages_of_waiting_work_and_of_correlations(either, synthetic_pass):
     run_job(either, done)
     now, jobs, ingests = utc_now_ns(), repository.JOBS, repository.INGESTS
     with either.database.writing() as connection:
-        for job, age_s in ((waiting, 1000), (verdict, 9000), (done, 9000)):
+        for job, age_s in (waiting, 1000), (verdict, 9000), (done, 9000):
             connection.execute(jobs.update().where(jobs.c.id == job).values(created_utc_ns=now - age_s * S))
         connection.execute(ingests.update().values(state="running", received_utc_ns=now - 2000 * S))
         connection.execute(repository.CORRELATIONS.delete())
@@ -311,7 +311,7 @@ def test_the_newest_complete_backup_counts(ground, tmp_path):
     assert newest_backup_utc_ns(tmp_path / "none") is None
     assert read_condition(ground, tmp_path / "none").backup_missing
     assert not read_condition(ground, None).backup_missing
-    for name, made in (("a", 3000 * S), ("b", 2000 * S)):
+    for name, made in ("a", 3000 * S), ("b", 2000 * S):
         backup(ground, tmp_path / "backups" / name, now_utc_ns=made)
     (tmp_path / "backups" / "c").mkdir()
     (tmp_path / "backups" / "c" / "backup.json").write_text('{"made_utc"')

@@ -187,7 +187,7 @@ def shift(tmp_path_factory):
         planning.add_window(ground, WindowEntry("w", START + HOUR, START + HOUR + HOUR // 6, 15.0, 76), actor="ann")
         planning.change_window(ground, 1, actor="ann", changes={}, decision="approved")
         reboot = {"function_id": "reboot"}
-        for name, arguments in (("test_connection", {}), ("perform_function", reboot)):
+        for name, arguments in ("test_connection", {}), ("perform_function", reboot):
             enter_command(ground, name, arguments, spacecraft_id=76, actor="operator")
         release_command(ground, 1, actor="operator")
         yield opened, headers

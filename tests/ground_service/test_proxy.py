@@ -202,7 +202,7 @@ def test_a_renewed_certificate_is_served_after_a_reload_and_clients_stay_connect
     headers = {"Authorization": f"Bearer {proxied.token}"}
     with connect(f"wss://{proxied.host}/api/v1/live", ssl=context, additional_headers=headers) as opened:
         make_secrets(tmp_path)
-        for name in ("certificate", "key"):
+        for name in "certificate", "key":
             (tmp_path / "tls" / name).replace(tls / name)
         configuration = str(proxied.folder / "nginx.conf")
         errors = str(proxied.folder / "error.log")

@@ -9,7 +9,7 @@ from tests.ground_service.conftest import cells
 
 @fixture(autouse=True)
 def bare(monkeypatch, tmp_path):
-    for name in ("HOME", "DATABASE_URL", "BROKER_URL", "HOST", "PORT", "DATABASE_URL_FILE", "BROKER_URL_FILE"):
+    for name in "HOME", "DATABASE_URL", "BROKER_URL", "HOST", "PORT", "DATABASE_URL_FILE", "BROKER_URL_FILE":
         monkeypatch.delenv(f"LINNA_{name}", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
 
@@ -38,7 +38,7 @@ def test_secrets_can_come_from_files_and_are_not_printed(monkeypatch, tmp_path):
 
 def test_a_password_can_come_from_a_file_of_its_own(monkeypatch, tmp_path):
     (tmp_path / "password").write_text("a/b@c\n")
-    for name in ("DATABASE", "MIGRATION_DATABASE", "BROKER"):
+    for name in "DATABASE", "MIGRATION_DATABASE", "BROKER":
         monkeypatch.setenv(f"LINNA_{name}_PASSWORD_FILE", str(tmp_path / "password"))
     monkeypatch.setenv("LINNA_DATABASE_URL", "postgresql://linna@db/linna")
     monkeypatch.setenv("LINNA_MIGRATION_DATABASE_URL", "postgresql://owner:own@db/linna")

@@ -193,7 +193,7 @@ def test_a_window_commanded_by_the_ground_gives_the_images_and_detections_of_the
     ]
     archived = of_kind("detections", packets_of((archive / "downlink.cadu").read_bytes()))
     found = of_kind("detections", packets)
-    for one in (*archived.values(), *found.values()):
+    for one in *archived.values(), *found.values():
         # The class of size needs an estimator, whose tables this ground has not uploaded.
         assert len(one["items"].pop("size_class")) > 5
     assert found == archived

@@ -107,7 +107,7 @@ def fleet(tmp_path_factory):
     settings = Settings(home=tmp_path_factory.mktemp("fleet"), links=False, plan_hourly=False)
     with TestClient(create_app(settings, inline_jobs=True)) as client:
         ground = client.app.state.ground
-        for name, number in (("ours", OURS), ("theirs", THEIRS)):
+        for name, number in ("ours", OURS), ("theirs", THEIRS):
             add_mission(ground, DESCRIPTION.format(name=name, number=number).encode())
         tables = METADATA.tables
         with ground.database.writing() as connection:
@@ -118,9 +118,9 @@ def fleet(tmp_path_factory):
             row_of(connection, tables["missions"], id=9, revision=REVISION, ccsds_id=THEIRS, entered_by="archive")
             row_of(connection, tables["links"], name="theirs", ccsds_id=THEIRS)
             row_of(connection, tables["ingests"], id=1, vehicle_id=1)
-            for name in ("landmarks", "monthly_reports"):
+            for name in "landmarks", "monthly_reports":
                 row_of(connection, tables[name], spacecraft_id=THEIRS)
-            for name in ("windows", "standing_requests", "telecommands", "alarms"):
+            for name in "windows", "standing_requests", "telecommands", "alarms":
                 row_of(connection, tables[name], id=1, vehicle_id=1)
             row_of(connection, tables["reports"], pass_id=1)
         token = add_user(ground, "ann", "admin", missions=["ours"])
@@ -162,7 +162,7 @@ def test_an_operation_reaches_only_spacecraft_of_the_callers_missions(route, fle
         scope={"route": route}, path_params=values, query_params=query, _json=body,
         app=SimpleNamespace(state=state),
     )  # fmt: skip
-    for caller in (Caller("eve", "viewer"), fleet.theirs):
+    for caller in Caller("eve", "viewer"), fleet.theirs:
         if scope.decision == "service" and caller.missions is not None:
             with raises(Forbidden, match="found an operation of the whole service"):
                 check_scope(asked, caller)
@@ -210,7 +210,7 @@ def test_frames_of_other_spacecraft_in_an_upload_are_not_stored(fleet):
 
 
 def test_a_description_or_ephemeris_of_another_mission_is_refused(fleet, tmp_path):
-    for name, number in (("ours", THEIRS), ("theirs", OURS), ("theirs", THEIRS), ("ours", 5)):
+    for name, number in ("ours", THEIRS), ("theirs", OURS), ("theirs", THEIRS), ("ours", 5):
         text = DESCRIPTION.format(name=name, number=number) + "[evidence]\nseed = 1\n"
         answer = fleet.client.post(f"{V1}/missions", content=text.encode(), headers=fleet.headers)
         assert answer.status_code == 403, answer.text
@@ -218,7 +218,7 @@ def test_a_description_or_ephemeris_of_another_mission_is_refused(fleet, tmp_pat
     assert fleet.client.post(f"{V1}/missions", content=text.encode(), headers=fleet.headers).status_code == 201
     orbit = save_circle(tmp_path / "orbit.oem").read_text()
     added = {}
-    for name in ("THEIRS", "OURS"):
+    for name in "THEIRS", "OURS":
         named = re.sub(r"(OBJECT_NAME\s*=\s*)\S.*", rf"\g<1>{name}", orbit)
         answer = fleet.client.post(f"{V1}/ephemerides", content=named.encode(), headers=fleet.headers)
         added[name] = answer.status_code
@@ -252,9 +252,9 @@ def test_a_token_limits_its_user_further_and_so_do_its_sessions(fleet):
 def test_a_socket_sends_only_events_of_the_callers_spacecraft(fleet):
     ground = fleet.client.app.state.ground
     with fleet.client.websocket_connect(f"{V1}/live", headers=fleet.headers) as socket:
-        for vehicle in (1, 2):
+        for vehicle in 1, 2:
             ground.write(publish, CorrelationChanged(vehicle_id=vehicle, segments=1))
-        for number in (THEIRS, OURS):
+        for number in THEIRS, OURS:
             ground.write(publish, HandoverChanged(spacecraft_id=number, instance="flight", held_by="ann"))
         assert socket.receive_json()["payload"]["vehicle_id"] == 2
         assert socket.receive_json()["payload"]["spacecraft_id"] == OURS
@@ -354,7 +354,7 @@ def test_an_expired_session_is_refused_with_its_reason_and_changes_nothing(clien
     start(client, token)
     with ground.database.writing() as connection:
         connection.execute(update(repository.TOKENS).values(expires_utc_ns=5))
-    for answer in (client.get("/api/v1/passes"), client.post("/api/v1/windows", json={}, headers=OWN)):
+    for answer in client.get("/api/v1/passes"), client.post("/api/v1/windows", json={}, headers=OWN):
         assert answer.status_code == 401 and "has expired" in answer.json()["detail"], answer.text
     # The page to sign in again is there.
     page = client.get("/", headers={"Accept": "text/html"})
@@ -363,7 +363,7 @@ def test_an_expired_session_is_refused_with_its_reason_and_changes_nothing(clien
 
 def test_a_change_with_the_cookie_from_another_origin_is_refused(client, token):
     start(client, token)
-    for headers in ({}, {"Origin": "https://example.org"}, {"Sec-Fetch-Site": "cross-site"}):
+    for headers in {}, {"Origin": "https://example.org"}, {"Sec-Fetch-Site": "cross-site"}:
         answer = client.post("/api/v1/windows", json={}, headers=headers)
         assert answer.status_code == 403, headers
     assert client.post("/api/v1/windows", json={}, headers=OWN).status_code == 422
@@ -471,6 +471,6 @@ offset=3 | 1
     for query, numbers in cells(queries):
         found = client.get(f"{V1}/audit?{query}", headers=heads["operator"]).json()
         assert " ".join(str(one["number"]) for one in found["items"]) == numbers, query
-    for query in ("since=yesterday", "actor=%00", "limit=0", f"since={newest['time']}&until=2020-01-01T00:00:00Z"):
+    for query in "since=yesterday", "actor=%00", "limit=0", f"since={newest['time']}&until=2020-01-01T00:00:00Z":
         assert client.get(f"{V1}/audit?{query}", headers=heads["operator"]).status_code == 422, query
     assert client.get(f"{V1}/audit", headers=heads["admin"]).status_code == 200

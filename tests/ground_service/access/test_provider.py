@@ -98,7 +98,7 @@ def test_a_user_of_the_provider_is_added_with_the_role_and_gets_a_session(client
 
 def test_the_request_to_the_provider_has_fresh_secrets(client, provider):
     queries = [parse_qs(urlsplit(begun(client)).query) for _ in range(2)]
-    for name in ("state", "nonce", "code_challenge"):
+    for name in "state", "nonce", "code_challenge":
         assert len({query[name][0] for query in queries}) == 2 and len(queries[0][name][0]) >= 43
     assert queries[0]["redirect_uri"] == ["http://testserver/sign-in/callback"]
     assert queries[0]["scope"] == ["openid profile"]
@@ -141,7 +141,7 @@ def test_a_token_that_was_not_made_for_this_sign_in_is_refused(client, ground, p
 
 def test_clocks_may_differ_by_a_minute(client, provider, subtests):
     """The token is valid for 300 s from the time of the provider's clock."""
-    for shift_s, word in ((-330, None), (-400, "expired"), (40, None), (100, "iat")):
+    for shift_s, word in (-330, None), (-400, "expired"), (40, None), (100, "iat"):
         provider.change = lambda claims, shift_s=shift_s: (
             claims | {one: claims[one] + shift_s for one in ("iat", "exp")}
         )
@@ -194,7 +194,7 @@ def test_elliptic_keys_are_accepted(client, provider):
 
 
 def test_a_user_without_a_role_is_refused(client, ground, provider, subtests):
-    for roles in ([], ["visitors"], None, "", 7):
+    for roles in [], ["visitors"], None, "", 7:
         provider.claims["roles"] = roles
         with subtests.test(roles=roles):
             expected = ("role", "claim roles", "linna-admins, linna-operators, linna-viewers")
@@ -250,7 +250,7 @@ def test_a_user_is_known_by_the_subject_whatever_the_name(client, provider):
 
 
 def test_a_name_that_users_cannot_have_is_refused(client, provider, subtests):
-    for name in ("service", "a b", "", None):
+    for name in "service", "a b", "", None:
         provider.claims["preferred_username"] = name
         with subtests.test(name=name):
             refused(answered(client, provider), "name")
@@ -301,7 +301,7 @@ def test_a_code_is_no_use_without_its_verifier(client, provider):
 
 
 def test_the_answer_of_another_provider_is_refused(client, provider, subtests):
-    for issuer in ("&iss=https://evil.example", ""):
+    for issuer in "&iss=https://evil.example", "":
         address = provider.authorise(begun(client))
         with subtests.test(issuer=issuer):
             refused(client.get(re.sub(r"&iss=[^&]*", issuer, address)), "iss of the answer")
@@ -316,7 +316,7 @@ def test_a_refusal_of_the_provider_is_stated(client, provider):
 
 def test_no_other_address_is_opened_after_a_sign_in(client, provider, subtests):
     pages = r"https://evil.example/ //evil.example/ /\evil.example/ \\evil.example javascript:alert(1) passes /ü"
-    for page in (*pages.split(), "", "/" + "a" * 2000):
+    for page in *pages.split(), "", "/" + "a" * 2000:
         with subtests.test(page=page):
             assert 'content="0;url=/"' in answered(client, provider, page).text
 

@@ -71,10 +71,10 @@ def test_a_revoked_token_is_refused_and_others_stay(either):
 
 
 def test_the_last_administrator_stays(either):
-    for name in ("ann", "bob"):
+    for name in "ann", "bob":
         add_user(either, name, "admin")
     change_user(either, "bob", role="viewer")
-    for change in ({"state": "disabled"}, {"role": "operator"}):
+    for change in {"state": "disabled"}, {"role": "operator"}:
         with raises(Conflict, match="user ann: expected another active administrator, found none"):
             change_user(either, "ann", **change)
     assert get_user(either, "ann").role == "admin"
@@ -101,7 +101,7 @@ def race(*tasks):
 
 def test_of_two_administrators_who_disable_each_other_one_stays(either):
     for _ in range(8):
-        for name in ("ann", "bob"):
+        for name in "ann", "bob":
             if name not in [user.name for user in list_users(either)]:
                 add_user(either, name, "admin")
             elif get_user(either, name).state == "disabled":
@@ -266,7 +266,7 @@ def test_of_two_requests_at_once_the_first_notes_the_use(ground, clock):
 
 def test_only_the_token_itself_is_accepted(ground):
     token = add_user(ground, "ann", "viewer")
-    for other in ("", token[:-1], token + " ", token.upper(), token_sha256(token)):
+    for other in "", token[:-1], token + " ", token.upper(), token_sha256(token):
         assert not token_valid(ground, other)
         with raises(NotAuthorised, match="expected one that 'linna user add' gave out, found another"):
             authenticate(ground, other)
@@ -332,7 +332,7 @@ def test_changes_that_cannot_be_made_are_refused_with_what_was_expected(ground):
     ):
         with raises(InvalidInput, match=f"^{message}$"):
             change_user(ground, "ann", **change)
-    for work in (lambda: change_user(ground, "bob", state="disabled"), lambda: get_user(ground, "bob")):
+    for work in lambda: change_user(ground, "bob", state="disabled"), lambda: get_user(ground, "bob"):
         with raises(NotFound, match="bob"):
             work()
     with raises(InvalidInput, match=r"^user, name: .*service"):
@@ -341,7 +341,7 @@ def test_changes_that_cannot_be_made_are_refused_with_what_was_expected(ground):
 
 def test_users_are_listed_by_name_and_tokens_newest_first(ground):
     assert not ground.read(has_users) and list_users(ground) == [] and list_tokens(ground) == []
-    for name in ("cleo", "ann", "bob"):
+    for name in "cleo", "ann", "bob":
         add_user(ground, name, "viewer")
     add_token(ground, "ann")
     assert ground.read(has_users)

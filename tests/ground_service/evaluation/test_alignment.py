@@ -76,7 +76,7 @@ def test_epochs_outside_or_without_a_reference_or_an_orientation_have_no_state()
     _, _, *names = ReferenceStates.__slots__
     for values in (getattr(track, name) for name in names):
         assert np.isnan(values[[0, 2]]).all() and np.isfinite(values[1]).all()
-    for given in ((polar(), None), (None, Turning()), (None, None)):
+    for given in (polar(), None), (None, Turning()), (None, None):
         track = reference_states(*given, after(0.0, 10.0))
         assert track.covered.tolist() == [False, False]
         assert track.position_icrf_m.shape == (2, 3) and track.mcmf_from_icrf.shape == (2, 3, 3)

@@ -222,13 +222,13 @@ def test_two_spacecraft_in_one_file(made, ground, tmp_path, monkeypatch):
     first, stop = int(flown.utc_ns[0]), int(flown.utc_ns[-1]) + CADENCE_S * NS
     own = (flown.folder / "downlink.cadu").read_bytes()
     other = later_events(first, 20, SPACECRAFT + 1)
-    for octets in (own + other + other, later_events(stop + 10 * HOUR_NS, 90)):
+    for octets in own + other + other, later_events(stop + 10 * HOUR_NS, 90):
         (tmp_path / "d.cadu").write_bytes(octets)
         ingest_file(ground, tmp_path / "d.cadu")
     read = []
     get = type(ground.files).get
     monkeypatch.setattr(type(ground.files), "get", lambda files, key: read.append(key) or get(files, key))
-    for spacecraft, octets, again in ((SPACECRAFT, len(own), 0), (SPACECRAFT + 1, 2 * len(other), 20)):
+    for spacecraft, octets, again in (SPACECRAFT, len(own), 0), (SPACECRAFT + 1, 2 * len(other), 20):
         key = define_pass(ground, name="p", start_utc_ns=first, stop_utc_ns=stop, spacecraft_id=spacecraft)
         found = completeness(ground, key)
         assert (found.octets, found.duplicates, found.frames_bad) == (octets, again, 0)
@@ -247,7 +247,7 @@ def test_no_reference(made, report_on):
     enter_files(flown.folder)
     report = report_on(flown)
     judged = statuses(report)
-    for key in ("accuracy.median", "accuracy.p95", "better_than.propagate-only", "detector.recall"):
+    for key in "accuracy.median", "accuracy.p95", "better_than.propagate-only", "detector.recall":
         assert judged[key] == "unknown" and rows(report)[key].value is None
     assert judged["completeness.packets"] == "met"
     assert "not met" in judged.values() and "median 3-D error" in report.verdict.partition("unknown")[2]
@@ -257,7 +257,7 @@ def test_the_wrong_orientation_is_refused(made, report_on):
     """Values that need the orientation of the Moon are unknown if the declared one is not available."""
     report = report_on(made(48, MISSION.replace("IAU WGCCRE 2009", "DE421")))
     judged = statuses(report)
-    for key in ("accuracy.median", "detector.recall", "better_than.propagate-only"):
+    for key in "accuracy.median", "detector.recall", "better_than.propagate-only":
         assert judged[key] == "unknown"
     assert "DE421, which is not available on this machine" in render_html(report)
 

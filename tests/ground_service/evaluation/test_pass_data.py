@@ -308,12 +308,12 @@ def test_a_report_is_made_in_process_without_http(imported, tmp_path, monkeypatc
     with local_client(open_ground(ground.home), "ann") as client, monkeypatch.context() as patched:
         patched.setattr(type(client), "_transport", None)
         key = client.make_report(pass_id)
-        for kind in ("html", "json", "pdf"):
+        for kind in "html", "json", "pdf":
             client.get_report(key, tmp_path / f"report.{kind}", format=kind)
         assert client.get_report_summary(key).pass_id == pass_id
         assert client.get_job(key).state == "done"
         patched.undo()
-        for ask in (client.make_report, client.get_job, client.get_report_summary):
+        for ask in client.make_report, client.get_job, client.get_report_summary:
             with raises(ServiceProblem, match=r"expected|String should match"):
                 ask(-1)
         with raises(NotFoundThere, match=f"report {'0' * 32}: not found"):
@@ -345,7 +345,7 @@ def test_a_wrong_manifest_is_refused_and_nothing_is_stored(synthetic_pass, groun
     (folder / "manifest.json").write_text(json.dumps(manifest))
     with raises(InvalidInput, match=message):
         import_archive(ground, folder)
-    for table in (repository.PASSES, repository.FILES):
+    for table in repository.PASSES, repository.FILES:
         assert ground.read(repository.newest, table, Paging())[1] == 0
 
 

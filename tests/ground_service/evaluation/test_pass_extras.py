@@ -240,7 +240,7 @@ def test_statistics_leave_out_samples_without_reference_and_weigh_with_the_whole
     assert (found.median_3d_m, found.max_3d_m, found.end_of_pass_m, found.path_length_m) == approx(
         (7.5, 10.0, 10.0, 1000.0)
     )
-    for count in (0, 1):
+    for count in 0, 1:
         few = navigation_statistics(np.zeros((count, 3)), np.zeros(count), NEVER[:count])
         assert np.isnan(few.drift_percent)
     # P = [[4, 2], [2, 3]], inverse [[3, -2], [-2, 4]] / 8; e = (2, -1): (12 + 8 + 4) / 8 = 3. The diagonal alone gives

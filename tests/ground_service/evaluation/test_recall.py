@@ -69,7 +69,7 @@ def test_a_crater_of_unknown_height_is_neither_missed_nor_a_false_alarm():
     expected = expected_craters(replace(known, rim_height_m=heights), CAMERA, POSITION)
     high = expected_craters(known, CAMERA, POSITION)
     assert_array_equal(expected.u_px, high.u_px)  # at the height of the others
-    for rows in ([0, 1, 2], [0, 2]):
+    for rows in [0, 1, 2], [0, 2]:
         columns = (high.u_px[rows], high.v_px[rows], high.diameter_px[rows])
         score = scored(detections(*columns, rows), expected).micro
         assert (score.expected, score.detected_true, score.false_alarms) == (2, 2, 0)
@@ -222,7 +222,7 @@ def test_curves_and_calibration_follow_the_scores():
 def test_alarms_count_where_most_of_the_view_is_complete():
     """Two craters of a frame, one of them in an incomplete region: half is not most."""
     found, expected, _ = three_frames()
-    for complete, alarms in (([True, True, False, False], 0), ([True, True, True, False], 1)):
+    for complete, alarms in ([True, True, False, False], 0), ([True, True, True, False], 1):
         part = replace(expected, complete=np.array([*complete, True, True, True]))
         score = score_detections(found, part, match_detections(found, part), np.full(3, 25e3))
         assert score.micro.false_alarms == alarms
@@ -252,10 +252,10 @@ def test_craters_of_many_frames_are_those_of_each_frame_alone():
     position = mcmf_from_spherical(np.zeros(501), longitude, np.full(501, ALTITUDE_M))
     position[7] = np.nan
     every = expected_craters(field(), CAMERA, position)
-    for frame in (0, 250, 500):
+    for frame in 0, 250, 500:
         alone = expected_craters(field(), CAMERA, position[[frame]])
         rows = slice(every.offsets[frame], every.offsets[frame + 1])
-        for name in ("index", "u_px", "v_px", "diameter_px", "size_class", "complete"):
+        for name in "index", "u_px", "v_px", "diameter_px", "size_class", "complete":
             assert_array_equal(getattr(every, name)[rows], getattr(alone, name))
     assert every.offsets[7] == every.offsets[8] and len(every.offsets) == 502
     assert every.offsets[-1] == len(every.index)

@@ -255,7 +255,7 @@ def test_a_jump_of_a_hundred_in_chi_square_parts_the_orbit():
     filtered = straight([0.0, 30.0])
     transition, noise = step_matrices(30.0)
     prior = transition @ filtered.covariance[0] @ transition.T + noise
-    for surprise, smoothed in ((99.0, True), (101.0, False)):
+    for surprise, smoothed in (99.0, True), (101.0, False):
         jump = np.zeros(9)
         jump[4] = np.sqrt(surprise / np.linalg.inv(prior)[4, 4])
         after = np.array([filtered.state[0], transition @ filtered.state[0] + jump])

@@ -162,7 +162,7 @@ def test_every_baseline_is_shown_and_one_that_is_missing_is_unknown():
     limits = Requirements(estimator="anchored", better_than=("snapshot",))
     evaluated = found(series("anchored"), series("Kepler", "baseline", 1.0), series("smoothed", "smoothed", 1.0))
     assert row("better_than.snapshot", limits, evaluated).status == "unknown"
-    for name in ("Kepler", "smoothed"):
+    for name in "Kepler", "smoothed":
         shown = row(f"better_than.{name}", limits, evaluated)
         assert (shown.status, shown.value, shown.limit) == ("not judged", 50.0, 1.0)
     rival = replace(limits, better_than=("Kepler",))
@@ -353,9 +353,9 @@ def test_the_table_of_a_pass_of_which_nothing_is_known():
 
 def test_values_that_are_not_finite_are_unknown_and_the_first_sample_is_no_reset():
     cold = (HousekeepingParameter("temperature_c", "", np.arange(2), np.full(2, np.nan)),)
-    for key in ("resources.temperature_max", "resources.temperature_min"):
+    for key in "resources.temperature_max", "resources.temperature_min":
         assert (row(key, EVERY_LIMIT, found(housekeeping=cold)).status) == "unknown"
-    for triggers, resets in (((), None), (("initialization", "none"), 0.0)):
+    for triggers, resets in ((), None), (("initialization", "none"), 0.0):
         started = found(series("anchored", reset_trigger=triggers))
         assert row("resets", EVERY_LIMIT, started).value == resets
 

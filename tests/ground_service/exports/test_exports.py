@@ -92,7 +92,7 @@ def test_oem_is_the_reference_in_the_interval_of_the_pass(export, rich_pass):
     assert (found.start_utc_ns, found.stop_utc_ns) == (rich_pass.utc_ns[0], rich_pass.utc_ns[-1])
     between = rich_pass.utc_ns[:-1] + 7_123_456_789
     expected = load_ephemeris(rich_pass.folder / "reference.oem").at(between)[0]
-    for one in (found, parse_oem_xml(export("oem-xml"))):
+    for one in found, parse_oem_xml(export("oem-xml")):
         assert_array_equal(one.at(between)[0], expected)
 
 
@@ -112,9 +112,9 @@ def test_states_of_the_payload_have_the_errors_of_the_report_in_each_format(expo
     utc_ns, found = rich_pass.utc_ns, {}
     tdb_s = np.asarray(tdb_s_from_utc_ns(utc_ns))
     icrf_from_mcmf = np.swapaxes(IauOrientation().mcmf_from_icrf(tdb_s), 1, 2)
-    for kind in ("oem", "oem-xml", "spk", "czml"):
+    for kind in "oem", "oem-xml", "spk", "czml":
         (tmp_path / kind).write_bytes(export(kind, "anchored"))
-    for kind in ("oem", "oem-xml"):
+    for kind in "oem", "oem-xml":
         states = list(Lazy("oem").OrbitEphemerisMessage.open(tmp_path / kind).states)
         found[kind] = 1e3 * np.array([one.position for one in states])
     with spiceypy.KernelPool(str(tmp_path / "spk")):
@@ -313,7 +313,7 @@ def test_netcdf_has_the_tables_as_groups(export, rich_pass, tmp_path):
         frames = tree["frames"].to_dataset()
         assert_array_equal(frames["utc"].values.astype("datetime64[ns]").astype(np.int64), rich_pass.utc_ns)
         assert tree["detections"]["u_px"].attrs["units"] == "px"
-        for name in ("states", "residuals", "detections", "events", "housekeeping", "reference", "attitude"):
+        for name in "states", "residuals", "detections", "events", "housekeeping", "reference", "attitude":
             table = pandas.read_csv(io.BytesIO(rows[f"{name}.csv"]))
             for column in table.columns.drop("utc"):
                 values = tree[name][column].values
@@ -383,7 +383,7 @@ def test_a_damaged_image_refuses_the_export_and_leaves_no_file(rich_ground, monk
 def test_every_format_is_listed_and_gives_the_same_octets_twice(export):
     assert [one.name for one in list_formats()] == list(FORMATS)
     assert all(one.available for one in list_formats())
-    for name in ("oem", "aem", "geojson", "csv", "parquet", "sclk"):
+    for name in "oem", "aem", "geojson", "csv", "parquet", "sclk":
         assert export(name) == export(name), name
 
 
@@ -487,7 +487,7 @@ def test_the_server_gives_the_file_with_its_name(rich_pass, tmp_path):
         assert answer.status_code == 200
         assert answer.headers["Content-Disposition"] == 'attachment; filename="pass-1.aem"'
         assert answer.content.startswith(b"CCSDS_AEM_VERS = 1.0")
-        for wrong in ({"pass_id": 1, "format": "doc"}, {"pass_id": 1}, {"pass_id": "1", "format": "aem"}):
+        for wrong in {"pass_id": 1, "format": "doc"}, {"pass_id": 1}, {"pass_id": "1", "format": "aem"}:
             assert client.post("/api/v1/exports", json=wrong, headers=headers).status_code == 422
         assert client.get("/api/v1/exports/formats", headers=headers).json()[0]["name"] == "oem"
 

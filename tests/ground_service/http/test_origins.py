@@ -39,7 +39,7 @@ def refused(answer, status):
      "192.0.2.7:8042", "user@127.0.0.1", "[::2]:8042", "0.0.0.0:8042"],
 )  # fmt: skip
 def test_a_name_that_is_not_ours_reads_nothing(client, host):
-    for path in (f"{V1}/passes", "/", "/metrics", f"{V1}/openapi.json"):
+    for path in f"{V1}/passes", "/", "/metrics", f"{V1}/openapi.json":
         answer = client.get(path, headers={"Host": host})
         assert answer.status_code in (400, 421), (path, answer.text)
     with raises(WebSocketDisconnect), client.websocket_connect(f"{V1}/live", headers={"Host": host}):
@@ -90,7 +90,7 @@ def test_a_page_of_another_origin_changes_nothing(client, browser):
 
 def test_pages_of_this_service_and_programs_may_change_what_they_like(client):
     same = {**OWN, "Sec-Fetch-Site": "same-origin", "Cookie": "other=1"}
-    for headers in (same, OWN, {}, {"Sec-Fetch-Site": "none"}, {"User-Agent": "curl/8"}):
+    for headers in same, OWN, {}, {"Sec-Fetch-Site": "none"}, {"User-Agent": "curl/8"}:
         assert client.post(f"{V1}/telecommands", json=PING, headers=headers).status_code == 201
     # What `curl --data-binary @file` sends.
     form = {"Content-Type": "application/x-www-form-urlencoded"}
@@ -100,12 +100,12 @@ def test_pages_of_this_service_and_programs_may_change_what_they_like(client):
 
 
 def test_pages_of_another_site_do_not_watch_or_read_but_may_link(client):
-    for path in (f"{V1}/live", f"{V1}/payload"):
-        for origin in ("https://attacker.example", "null", "http://127.0.0.1:3000"):
+    for path in f"{V1}/live", f"{V1}/payload":
+        for origin in "https://attacker.example", "null", "http://127.0.0.1:3000":
             headers = {"Origin": origin, "Host": "127.0.0.1:8042"}
             with raises(WebSocketDisconnect), client.websocket_connect(path, headers=headers):
                 pass
-    for headers in ({}, OWN):
+    for headers in {}, OWN:
         with client.websocket_connect(f"{V1}/live", headers={"Host": "127.0.0.1:8042", **headers}):
             pass
     cross = {"Sec-Fetch-Site": "cross-site"}

@@ -122,7 +122,7 @@ AMBIGUOUS = r"""
 
 @mark.parametrize("body, words", cells(AMBIGUOUS))
 def test_json_with_no_or_two_meanings_is_refused(client, body, words):
-    for path in ("/windows", "/telecommands", "/passes", "/requests"):
+    for path in "/windows", "/telecommands", "/passes", "/requests":
         assert words in detail(client.post(f"{V1}{path}", content=body, headers=JSON), 422)
 
 
@@ -182,7 +182,7 @@ def test_errors_of_the_store_name_no_place_and_carry_the_id_of_the_log_entry(cli
     answer = client.get(f"{V1}/jobs", headers={"X-Request-ID": "r-1"})
     assert answer.status_code in (503, 507)
     assert answer.json()["request_id"] == "r-1"
-    for secret in ("postgresql", "db.internal", "/var", "linna/files"):
+    for secret in "postgresql", "db.internal", "/var", "linna/files":
         assert secret not in answer.text
     assert str(error) in caplog.text
 
@@ -282,7 +282,7 @@ def test_a_log_entry_is_one_json_object_with_what_was_passed():
     assert entry["trace_id"] == trace_id
     assert "ValueError: broken" in entry["trace"]
     assert entry["time"].endswith("+00:00")
-    for style in ("text", "json"):
+    for style in "text", "json":
         logging.config.DictConfigurator(logging_config(style))
 
 

@@ -258,7 +258,7 @@ def test_the_parameters_are_listed_with_names_of_codes_units_and_limits(ground):
 def test_a_series_has_least_greatest_and_mean_value_from_samples_and_from_rollups(either, tmp_path, monkeypatch):
     enter(either)
     bus = bus_packets(2000)
-    for piece in (bus[:900], bus[900:]):
+    for piece in bus[:900], bus[900:]:
         take(either, piece)
     pass_id = define(either, 3000.0)
     exact = parameter_series(either, pass_id, "RATE", 10)
@@ -268,7 +268,7 @@ def test_a_series_has_least_greatest_and_mean_value_from_samples_and_from_rollup
     assert exact.buckets.high.max() == values.max()
     assert np.average(exact.buckets.mean, weights=exact.buckets.count) == approx(values.mean())
     monkeypatch.setattr(series, "FEW_ROWS", 10)
-    for coarse in (10**9, 0):  # from roll-ups, from samples
+    for coarse in 10**9, 0:  # from roll-ups, from samples
         monkeypatch.setattr(series, "COARSE", coarse)
         rolled = parameter_series(either, pass_id, "RATE", 11).buckets
         assert int(rolled.count.sum()) == 2000
@@ -570,7 +570,7 @@ def test_a_declared_packet_from_the_future_is_kept_apart_until_others_agree(decl
     take(declared, bus_packets(40))
     pass_id = define(declared)
     late = [at(foreign.housekeeping(rng, 40 + k), 3 * 86_400.0 + k) for k in range(12)]
-    for packets in ([at(foreign.housekeeping(rng, 99), 70 * 365 * 86_400.0)], late[:1]):
+    for packets in [at(foreign.housekeeping(rng, 99), 70 * 365 * 86_400.0)], late[:1]:
         take(declared, packets)
     [one, other] = declared.read(list_implausible, ImplausibleFilter(limit=9)).items
     assert (one.apid, other.apid) == (100, 100) and "after all other telemetry" in one.reason

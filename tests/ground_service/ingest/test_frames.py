@@ -76,7 +76,7 @@ def test_damage_is_accounted_for_alike_in_windows_and_at_once(stream, window):
     rng = np.random.default_rng(5)
     for at in rng.integers(0, len(stream), 3 * len(stream) // 259):
         stream[at] ^= int(rng.integers(1, 256))
-    for frame in (3, 17, 40):
+    for frame in 3, 17, 40:
         stream[frame * 259 + 10 : frame * 259 + 110] = rng.bytes(100)
     whole = decode(bytes(stream))
     found, accounting, skipped = read(bytes(stream), window)

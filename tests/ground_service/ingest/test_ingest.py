@@ -153,7 +153,7 @@ def test_an_incomplete_frame_at_either_end_of_a_whole_recording_is_counted(groun
 def test_a_frame_of_two_recordings_is_none(ground, stream):
     """The octets before and behind a cut belong together only in one recording of one instance."""
     place(ground, stream[:4000], 0)
-    for name, instance in (("other", "flight"), ("stream", "twin")):
+    for name, instance in ("other", "flight"), ("stream", "twin"):
         assert place(ground, stream[4000:], 4000, name, instance=instance).frames_joined == 0
     assert place(ground, stream[4000:], 4000).frames_joined == 1
 
@@ -162,7 +162,7 @@ def test_pieces_for_one_spacecraft_and_for_any_adjoin(ground, stream, expected):
     """The same octets read for another spacecraft before are read again."""
     for number, start in enumerate(range(0, len(stream), 1_000)):
         mine = SPACECRAFT if number % 2 else None
-        for spacecraft in (SPACECRAFT + 1, mine):
+        for spacecraft in SPACECRAFT + 1, mine:
             place(ground, stream[start : start + 1_000], start, spacecraft_id=spacecraft)
     assert hash_of(ground) == expected
 
@@ -316,7 +316,7 @@ def test_what_comes_in_meanwhile_and_a_kill_in_the_middle_change_nothing(
     assert looked_at(old)[0] >= 1  # still as the old dictionary decoded it
     ingest_file(old, more)
     with open_ground(tmp_path / "fresh") as fresh:
-        for path in (more, synthetic_pass.folder / "downlink.cadu"):
+        for path in more, synthetic_pass.folder / "downlink.cadu":
             ingest_file(fresh, path)
         redecode(fresh, 1, OLD)
         redecode(old, 1, OLD)
@@ -362,13 +362,13 @@ def upgraded(begun, tmp_path, caplog):
     stores.upgrade_database(database, "1.1")
     with database.engine.begin() as connection:
         connection.execute(text("INSERT INTO vehicles (id, ccsds_id, instance) VALUES (1, 76, 'flight')"))
-        for number, stream in ((1, ""), (2, "s")):
+        for number, stream in (1, ""), (2, "s"):
             ids = {"id": number, "sha256": str(number) * 64}
             connection.execute(text(FILE), ids)
             connection.execute(text(INGEST), ids | {"accounting": json.dumps({"octets_pending": 5})})
             connection.execute(text(PIECE), ids | {"stream": stream})
             raw = {"role": 1, "count": -1, "next_count": -1, "fit": 600, "octets": bytes(600)}
-            for domain in ("cadus a flight", "packets 76 flight"):
+            for domain in "cadus a flight", "packets 76 flight":
                 edge = {"domain": domain, "identity": ids["sha256"].encode()[:16], "start": 0, "length": 600}
                 connection.execute(text(EDGE), raw | edge | {"sha256": ids["sha256"]})
         missing, octets = begun

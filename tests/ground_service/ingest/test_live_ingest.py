@@ -74,7 +74,7 @@ def test_the_recording_of_a_run_that_crashed_goes_on(ground, stream, expected, d
     """Also if all its segments are ingested."""
     crashed = spool_of(ground, [])
     crashed.open()
-    for octets in (stream[:2000], stream[2000:3000]):
+    for octets in stream[:2000], stream[2000:3000]:
         crashed.keep(octets)
         crashed.cut()
         if drained:
@@ -116,7 +116,7 @@ def test_noise_is_part_of_the_recording_and_an_unknown_coding_does_not_stop_the_
     spool = spool_of(ground, seen := [])
     spool.open()
     markers = bytes.fromhex("1ACFFC1D") + np.random.default_rng(1).bytes(1275)
-    for octets in (b"\x00" * 5000, 40 * markers, stream):
+    for octets in b"\x00" * 5000, 40 * markers, stream:
         take(spool, octets)
     assert seen[:2] == [{"packets_new": 0}] * 2
     assert hash_of(ground) == expected
@@ -131,7 +131,7 @@ def test_files_that_appear_are_ingested_once_when_they_are_whole(tmp_path):
             folder, tmp_path / "ledger.json", lambda path: {"file": path.name}, lambda p, r: seen.append(r)
         )
 
-    for name in ("a.cadu", "b.cadu", "c.part", ".hidden"):
+    for name in "a.cadu", "b.cadu", "c.part", ".hidden":
         (folder / name).write_bytes(b"x")
         os.utime(folder / name, (1000.0 - 100.0 * (name[0] != "b"),) * 2)
     assert watched().look(1000.0) == 1
@@ -209,7 +209,7 @@ def noted(ground):
 def test_the_first_reception_counts_in_any_order(either, monkeypatch):
     with either.database.writing() as connection:
         vehicle = vehicle_id(connection, 76, "flight")
-        for received in ({(7, 1): 500, (8, 2): 600}, {(7, 1): 400}, {(7, 1): 450}):
+        for received in {(7, 1): 500, (8, 2): 600}, {(7, 1): 400}, {(7, 1): 450}:
             store.note_receptions(connection, vehicle, "madrid", received)
         store.note_receptions(connection, vehicle, "canberra", {(7, 1): 700})
     expected = [(7, 1, "canberra", 700), (7, 1, "madrid", 400), (8, 2, "madrid", 600)]

@@ -118,7 +118,7 @@ def test_stated_settings_are_used_as_they_are_and_impossible_ones_are_refused(gr
     assert (wrong.packets, section(wrong)["source"]) == (0, "stated")
     assert f"0 of {wrong.frames} frames are valid with the stated link settings" in wrong.remark
     assert ingest(ground, octets, link=right).packets == len(telemetry(30))
-    for text in ("frame_length=many", "colour=red", "coding=turbo", "frame_length=3"):
+    for text in "frame_length=many", "colour=red", "coding=turbo", "frame_length=3":
         with raises(InvalidInput, match="link"):
             ingest(ground, octets, link=text)
 
@@ -227,9 +227,9 @@ def test_receptions_of_two_stations_are_merged_in_any_order_and_split(ground, se
 def test_two_spacecraft_have_the_same_archives_whatever_the_split(tmp_path):
     stream = two_spacecraft()
     hashes = set()
-    for cut in (0, 1279 * 301, 400_001):
+    for cut in 0, 1279 * 301, 400_001:
         with open_ground(tmp_path / str(cut)) as ground:
-            for start, part in ((cut, stream.files[0][cut:]), (0, stream.files[0][:cut])):
+            for start, part in (cut, stream.files[0][cut:]), (0, stream.files[0][:cut]):
                 if part:
                     ingest(ground, part, place=PiecePosition("both", start))
             assert {one: stored(ground, one) for one in stream.packets} == stream.packets

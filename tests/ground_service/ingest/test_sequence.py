@@ -104,7 +104,7 @@ def test_wraps_are_looked_for_where_half_of_one_could_have_been_made(silence_s, 
 
 
 def test_a_fall_after_a_second_is_a_restart_and_counts_go_on_from_the_first_of_each_run():
-    for ticks, restarts in ((SECOND, 0), (SECOND + 1, 1)):
+    for ticks, restarts in (SECOND, 0), (SECOND + 1, 1):
         assert counted(np.array([0, ticks]), np.array([10, 9]))[1] == restarts
     before, counts_before = stream(5, first=16_382)
     after = before[-1] + 60 * SECOND + np.arange(3) * SECOND

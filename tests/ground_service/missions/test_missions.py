@@ -399,7 +399,7 @@ def test_commands_check_enter_list_and_show_a_description(tmp_path, capsys):
         assert cli.run(["mission", *arguments]) == 0
         return json.loads(capsys.readouterr().out)
 
-    for figures in (run("check", str(file), "--json"), run("add", str(file), *home)):
+    for figures in run("check", str(file), "--json"), run("add", str(file), *home):
         assert (figures["mission"], figures["revision"]) == ("test", revision)
         assert "camera.width_px" in figures["unknown"]
     assert [one["revision"] for one in run("list", *home)["missions"]] == [revision]

@@ -96,9 +96,9 @@ def test_every_pass_is_judged_by_the_description_of_its_spacecraft(either, made,
         assert inputs.viewing.camera == camera_of(Camera(fov_deg=120.0 if spacecraft == 76 else 40.0))
         reports[spacecraft] = evaluate_pass(inputs)
         made_report = make_report(either, pass_id)
-        for table, key in ((repository.PASSES, pass_id), (repository.REPORTS, made_report.report_id)):
+        for table, key in (repository.PASSES, pass_id), (repository.REPORTS, made_report.report_id):
             assert row(either, table, id=key)["mission_id"] == missions[spacecraft].id
-    for report, level, name, limit in ((reports[76], "2", "wide", 200.0), (reports[77], "5", "narrow", 100.0)):
+    for report, level, name, limit in (reports[76], "2", "wide", 200.0), (reports[77], "5", "narrow", 100.0):
         assert report.evidence_level[:1] == level
         assert report.provenance["mission description"].startswith(f"{name}, revision")
         assert [one.limit for one in report.requirements if one.key == "accuracy.median"] == [limit]
@@ -124,7 +124,7 @@ def test_a_window_is_predicted_with_the_camera_of_its_spacecraft(ground, made, m
     planners = []
     made_planner = planning.planner_of
     monkeypatch.setattr(planning, "planner_of", lambda *given: planners.append(made_planner(*given)) or planners[-1])
-    for spacecraft in (76, 77):
+    for spacecraft in 76, 77:
         entry = planning.WindowEntry("w", START, STOP - 60_000_000_000, 15.0, spacecraft)
         planning.add_window(ground, entry, actor="ann")
     cameras = [planner.camera for planner in planners]
@@ -144,7 +144,7 @@ def test_only_the_spacecraft_whose_description_permits_it_is_correlated_automati
     monkeypatch.setattr(recorrelation, "time_reports", reports)
     both(ground)
     vehicles = {}
-    for spacecraft in (76, 77):
+    for spacecraft in 76, 77:
         flown(ground, made, spacecraft, tmp_path)
         vehicles[spacecraft] = row(ground, repository.VEHICLES, ccsds_id=spacecraft)["id"]
         enter_receptions(ground, spacecraft, "flight", [ReceivedReport(1, 2, START)], actor="ann")

@@ -131,7 +131,7 @@ def test_an_answer_that_many_need_at_once_is_made_once(archive):
     while max(turn.threads for turn in list(turns.values())) < 4:
         assert all(one.is_alive() for one in others)
     go_on.set()
-    for one in (first, *others):
+    for one in first, *others:
         one.join(20)
     assert found == [1, 1, 1, 1]
     assert not turns

@@ -65,7 +65,7 @@ def passed(either, tmp_path):
     file = tmp_path / "events.cadu"
     file.write_bytes(encode_cadus(given, spacecraft_id=76))
     ingest_file(either, file)
-    for name, start in (("first", 0), ("second", 5 * HOUR_S)):
+    for name, start in ("first", 0), ("second", 5 * HOUR_S):
         defined(either, utc_ns(start), utc_ns(start + HOUR_S), name)
     return either
 
@@ -232,7 +232,7 @@ def test_bursts_of_yesterday_in_todays_stream_fall_into_their_own_day(ground, tm
             stream.append(burst.pop(0))
     (tmp_path / "d.cadu").write_bytes(encode_cadus(stream, spacecraft_id=76))
     assert ingest_file(ground, tmp_path / "d.cadu").packets_new == 2 * FRAMES
-    for day in (0, -1):
+    for day in 0, -1:
         found = completeness(ground, day_pass(ground, day))
         assert (found.packets, found.lost, found.conflicts) == (FRAMES, 0, 0)
 
@@ -287,7 +287,7 @@ def test_passes_are_listed_by_the_verdict_of_their_newest_report(either):
         start = (1_900_000_000 + 3600 * hour) * NS
         defined(either, start, start + 60 * NS, f"pass {hour}")
     # The second report of pass 1 is older.
-    for report in ((1, "met", 2), (1, "not met", 1), (2, "met", 1), (2, "not met", 3)):
+    for report in (1, "met", 2), (1, "not met", 1), (2, "met", 1), (2, "not met", 3):
         add_report(either, *report)
     verdicts = {"met": [1], "not met": [2], "unknown": [], "none": [3]}
     for verdict, passes in verdicts.items():

@@ -116,7 +116,7 @@ def test_a_series_of_samples_or_roll_ups_holds_every_sample_once_and_is_as_fine_
     monkeypatch.setattr(series, "COARSE", coarse)
     start, stop = int(columns["ticks"][skip]), int(columns["ticks"][-1 - drop])
     mine = (columns["estimator"] == 1) & (columns["ticks"] >= start) & (columns["ticks"] <= stop)
-    for name in ("altitude_m", "nis"):
+    for name in "altitude_m", "nis":
         found = read(ground, (vehicle, start, stop), name)
         values = columns[name][mine]
         known = values[np.isfinite(values)]

@@ -77,7 +77,7 @@ def test_a_forecast_has_the_conditions_of_the_ephemeris_and_the_resources_of_the
     found = shown(planned)
     assert found.step_s == 60.0 and len(found.time_s) == 10
     assert found.time_s[0] == START / NS + 30.0
-    for name in ("latitude_deg", "sunlit", "battery_share", "stored_octets", "sent_octets", "downlink_octets"):
+    for name in "latitude_deg", "sunlit", "battery_share", "stored_octets", "sent_octets", "downlink_octets":
         assert len(getattr(found, name)) == 10
     assert found.altitude_km == approx([30.0] * 10, abs=0.1)
     assert found.battery_floor == 0.5 and found.storage_octets == 1 << 20
@@ -203,7 +203,7 @@ def why(one, *windows):
 
 def test_windows_that_touch_do_not_overlap():
     assert why(grid(), (1, 1), (2, 1)) is None
-    for one, gap in ((grid(), 1.99), (grid(gap_ns=HOUR // 10), 2.09)):
+    for one, gap in (grid(), 1.99), (grid(gap_ns=HOUR // 10), 2.09):
         assert why(one, (1, 1), (gap, 1)) == "overlaps another window or its telecommands"
         assert why(one, (1, 1), (gap + 0.02, 1)) is None
 
@@ -215,7 +215,7 @@ def test_the_battery_is_that_of_a_balance_by_hand_whatever_the_steps():
     # full again only after 28 / 6 h
     assert why(grid(), (1, 2), (3 + 14 / 3, 2.5)) is None
     assert why(grid(), (1, 2), (3 + 14 / 3 - 0.5, 2.5)) is not None
-    for start in (0.0, 0.1, 1.05, 23.0):
+    for start in 0.0, 0.1, 1.05, 23.0:
         change, _ = grid().flows([window(start, 0.75)])
         assert (grid().gain_wh - change).sum() == approx(15.0)
 

@@ -70,7 +70,7 @@ def test_altitude_is_kept_all_along_and_missed_just_outside():
     assert len(found) >= 2
     for candidate in found:
         assert candidate.altitude_m[0] >= 45e3 - 20.0  # edges to 1 s, 20 m/s of climb at most
-        for edge, step in ((candidate.start_utc_ns, -5 * NS), (candidate.stop_utc_ns, 5 * NS)):
+        for edge, step in (candidate.start_utc_ns, -5 * NS), (candidate.stop_utc_ns, 5 * NS):
             outside = edge + step
             if plan.ephemeris.start_utc_ns <= outside <= plan.ephemeris.stop_utc_ns:
                 position, _ = plan.ephemeris.at(np.array([outside]))
@@ -146,7 +146,7 @@ def test_an_observation_has_a_frame_at_its_start_and_none_at_its_stop(duration_s
 
 def test_terrain_is_asked_of_the_map():
     north = Planner(circle(), IauOrientation(), Resources(), PinholeCamera(), mare=lambda latitude, _: latitude > 0.0)
-    for wanted, sign in ((True, 1.0), (False, -1.0)):
+    for wanted, sign in (True, 1.0), (False, -1.0):
         found = search(north, mare=wanted).candidates
         assert found
         assert all(sign * candidate.latitude_rad[0] > -1e-2 for candidate in found)
@@ -250,7 +250,7 @@ def test_a_window_outside_the_ephemerides_has_no_prediction_and_is_refused_if_it
     named = add_reference(ground, synthetic_pass.folder / "reference.oem")
     predicted = add_window(ground, window(), actor="ann").predicted
     assert (predicted.frames, predicted.battery_minimum, predicted.downlinked_by) == (40, None, None)
-    for key in (named, None):
+    for key in named, None:
         with raises(PlanConflicts, match="expected a time that a reference ephemeris covers"):
             add_window(ground, window(key), actor="ann")
         add_mission(ground, (MISSION + "[uploads]\n").encode())
@@ -394,6 +394,6 @@ def test_without_tables_only_the_mode_changes():
 
 
 def test_a_window_without_a_reference_that_covers_it_is_refused(reference):
-    for ephemeris, late in ((None, 0), (reference, 7_800 * NS)):
+    for ephemeris, late in (None, 0), (reference, 7_800 * NS):
         with raises(Conflict, match="its tables need a reference ephemeris"):
             prepared(ephemeris, late=late)

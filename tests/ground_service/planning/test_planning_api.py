@@ -241,7 +241,7 @@ def test_a_window_without_images_fails_when_no_packet_of_its_time_may_come(
 
 def test_a_window_with_a_value_of_another_kind_is_refused(client):
     names = [("name", name) for name in ("two\nlines", "\x1b[2J", "nul\x00")]
-    for field, value in (*names, ("cadence_s", True), ("spacecraft_id", True), ("spacecraft_id", 1024)):
+    for field, value in *names, ("cadence_s", True), ("spacecraft_id", True), ("spacecraft_id", 1024):
         assert window(client, 0, 300, **{"name": "n", field: value}).status_code == 422, field
     assert client.get(f"{V1}/windows").json()["total"] == 0
 

@@ -153,7 +153,7 @@ def test_the_coming_days_are_filled_once_and_windows_without_a_contact_are_repla
     commands = either.read(list_telecommands, TelecommandFilter(state="released")).items
     assert len(commands) == 6 and all(get_command(either, one.id).record.send_before_utc_ns for one in commands)
     assert [e.payload["request_id"] for e in read_events(either.database, 0, 9999) if e.kind == "plan"] == [key]
-    for later in (0, 600, 1200):
+    for later in 0, 600, 1200:
         assert sum(plan(either, now, later * NS).values()) == 0
     assert windows_of(either) == windows
     first = windows[0]
@@ -476,7 +476,7 @@ def test_a_cancelled_window_that_flies_all_the_same_becomes_a_pass_with_a_remark
 def test_a_window_that_has_begun_on_board_cannot_be_cancelled(either, now):
     window = on_board(either)
     now.utc_ns += 61 * MINUTE
-    for state in ("uplinked", "executing"):
+    for state in "uplinked", "executing":
         assert either.read(get_window, window.id).state == state
         with raises(Conflict, match="too late to delete its activities; perform_function stop_observation"):
             decided(either, window, "failed")

@@ -144,7 +144,7 @@ def test_a_pass_without_telemetry_has_no_archive(ground):
 def unrendered(flown, tmp_path):
     """An archive without two of its frames, whose scenario is not one."""
     folder = shutil.copytree(flown.folder, tmp_path / "unrendered")
-    for number in (1, 3):
+    for number in 1, 3:
         (folder / f"frames/{number:06d}.png").unlink()
     enter_files(folder, scenario_toml="no scenario")
     return folder
@@ -235,7 +235,7 @@ def test_only_a_message_of_the_renderer_itself_is_a_refusal():
     assert rendering._refusal(2, f"progress\n{error}\n") == refusal
     full = ("No space left on device (/x)", "[('a', 'b', '[Errno 28] No space left on device')]")
     printed = ["Traceback\nMemoryError", "", *(f"linna: error: {one}" for one in full)]
-    for given in ((1, error), (-9, error), *((2, one) for one in printed)):
+    for given in (1, error), (-9, error), *((2, one) for one in printed):
         assert rendering._refusal(*given) == "", given
 
 

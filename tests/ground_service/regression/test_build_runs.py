@@ -148,7 +148,7 @@ def test_a_program_gets_no_socket_but_pairs_of_its_own(fly):
 
 
 def test_a_program_sees_what_the_payload_was_given_and_no_truth_or_secret(fly, monkeypatch):
-    for secret in ("LINNA_DATABASE_URL", "HTTPS_PROXY", "LINNA_DATA"):
+    for secret in "LINNA_DATABASE_URL", "HTTPS_PROXY", "LINNA_DATA":
         monkeypatch.setenv(secret, "postgresql://secret")
     run = fly(
         "seen = sorted(str(p.relative_to(sys.argv[1])) for p in pathlib.Path(sys.argv[1]).rglob('*') if p.is_file())\n"
@@ -330,7 +330,7 @@ def test_the_command_checks_a_build_file(write, capsys):
     file = write("detector.max_detections = 3")
     assert run_command(["replay", "--check-build", file]) == 0
     text = Path(file).read_text()
-    for wrong, message in (("schema_version = 7", "expected 1, found 7"), ("modle = 'x'", "expected 'model'")):
+    for wrong, message in ("schema_version = 7", "expected 1, found 7"), ("modle = 'x'", "expected 'model'"):
         Path(file).write_text(f"{wrong}\n{text.replace('schema_version = 1', '')}")
         capsys.readouterr()
         assert run_command(["replay", "--check-build", file]) == 2
@@ -394,6 +394,6 @@ def test_reasons_are_failed_gates_then_open_ones_then_passes_without_a_compariso
 
 
 def test_a_gate_without_figures_states_its_reason_or_outcome():
-    for candidate, figures in ((None, ""), (0.7, " 0.9 to 0.7,")):
+    for candidate, figures in (None, ""), (0.7, " 0.9 to 0.7,"):
         one = gate("recall", "fail", candidate=candidate, limit=None, reason="no detections")
         assert one.text == f"recall:{figures} no detections"

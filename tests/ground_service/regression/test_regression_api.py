@@ -33,7 +33,7 @@ def test_a_build_is_registered_held_against_another_and_judged(client, make_flya
     assert kept.status_code == 201, kept.text
     assert (kept.json()["frames"], kept.json()["pinned"]) == (12, True)
     digests = []
-    for name, options in (("good", {}), ("broken", {"program": "raise SystemExit(4)"})):
+    for name, options in ("good", {}), ("broken", {"program": "raise SystemExit(4)"}):
         file = make_build(name, {"synthetic pass 51": flown.packets}, **options)
         answer = client.post(f"{V1}/builds", content=zipped(file))
         assert answer.status_code == 201, answer.text

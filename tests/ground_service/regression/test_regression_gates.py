@@ -324,7 +324,7 @@ def test_processor_times_are_compared_by_the_median_of_their_ratios_from_five_pa
     def slower(factor):
         return {**TIMES, "latency_ms": {"a": np.full(FRAMES, 40.0 * factor)}}
 
-    for passes, factor, outcome in ((4, 1.3, "pass"), (4, 1.4, "fail"), (5, 1.2, "fail"), (5, 1.1, "pass")):
+    for passes, factor, outcome in (4, 1.3, "pass"), (4, 1.4, "fail"), (5, 1.2, "fail"), (5, 1.1, "pass"):
         after = suite(1, passes, **slower(factor))
         assert judged(suite(0, passes, **TIMES), after, "latency.total").outcome == outcome
     busy = {**suite(1, **TIMES), "pass 0": simulated(0, 1, **slower(10.0))}
@@ -334,7 +334,7 @@ def test_processor_times_are_compared_by_the_median_of_their_ratios_from_five_pa
 def test_a_program_without_times_is_judged_by_its_run_and_a_share_of_the_baseline_is_a_percentage():
     """Four times the processor time fails although all packets are the same; half a second more is tolerated."""
     before = suite(0, 2, cpu_s=5.0)
-    for cpu_s, outcome in ((20.0, "fail"), (5.4, "pass"), (float("nan"), "not judged")):
+    for cpu_s, outcome in (20.0, "fail"), (5.4, "pass"), (float("nan"), "not judged"):
         gates = by_name(judge(before, suite(0, 2, cpu_s=cpu_s), POLICY))
         assert (gates["latency.run"].outcome, gates["latency.total"].outcome) == (outcome, "not judged")
     assert judged(suite(0, 2, cpu_s=0.1), suite(0, 2, cpu_s=0.4), "latency.run").passed

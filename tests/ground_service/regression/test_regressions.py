@@ -288,7 +288,7 @@ def test_a_tampered_archive_is_reported_and_the_rest_goes_on(judge, passes, copy
 
 
 def test_a_program_does_not_replay_a_pass_without_frames(judge, passes, copy):
-    for number in (7, 9):
+    for number in 7, 9:
         (copy / f"frames/{number:06d}.png").unlink()
     enter_files(copy)
     outcome = judge(archives=[copy, passes[1].folder])
@@ -397,7 +397,7 @@ def test_a_crash_is_one_failure_and_the_last_lines_of_its_program_are_in_every_o
     assert suite.find("testcase[@name='synthetic pass 41']/failure").attrib["message"].endswith(message)
     assert verdict.headline == f"fail: {message}, on synthetic pass 41"
     page = regression_html(home, outcome, "0" * 32)
-    for text in (regression_text(verdict), suite.findtext("system-err"), page):
+    for text in regression_text(verdict), suite.findtext("system-err"), page:
         assert "Traceback (most recent call last)" in text and "line 49" in text
 
 
@@ -586,7 +586,7 @@ def test_a_build_that_differs_on_few_frames_is_inconclusive_with_the_frames_need
     figures = verdict.document()
     assert (figures["verdict"], figures["frames"]) == ("inconclusive", 60)
     assert figures["frames_needed"] == outcome.frames_needed
-    for policy, kind in (("failure", "failure"), ("skip", "skipped")):
+    for policy, kind in ("failure", "failure"), ("skip", "skipped"):
         chosen = verdict.model_copy(update={"policy": verdict.policy.model_copy(update={"inconclusive": policy})})
         case = ET.fromstring(regression_junit(chosen, 0)).find(f"testcase[@name='detector.recall']/{kind}")
         assert "frames decide it, 60 compared" in case.attrib["message"]

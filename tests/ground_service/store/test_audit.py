@@ -154,7 +154,7 @@ for k in range(int(sys.argv[3])):
 
 def test_several_processes_at_once_make_one_chain(database):
     with database.writing() as connection:
-        for key in (1, 2, 3):
+        for key in 1, 2, 3:
             connection.execute(
                 text("INSERT INTO vehicles (id, ccsds_id, instance) VALUES (:k, 0, :i)"), {"k": key, "i": str(key)}
             )
@@ -197,7 +197,7 @@ def test_a_chain_that_was_cut_is_found_by_the_heads_of_another_machine(ground, t
     (ground.home / "secrets/audit").write_text("key")
     heads = tmp_path / "heads"
     heads.mkdir()
-    for name in ("ann", "bob"):
+    for name in "ann", "bob":
         add_user(ground, name, "viewer")
         nightly(ground, {"audit_heads": str(heads)})
     command = ["verify", "--home", str(ground.home), "--head", str(heads)]

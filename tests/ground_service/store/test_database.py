@@ -75,7 +75,7 @@ def test_a_migrated_database_has_the_schema_of_the_models(tmp_path, new_postgres
     with made.writing() as connection:
         METADATA.create_all(connection)
     assert described_schema(migrated) == described_schema(made)
-    for database in (migrated, made):
+    for database in migrated, made:
         database.engine.dispose()
 
 
@@ -105,7 +105,7 @@ def test_a_database_before_version_1_is_refused_with_the_way_to_carry_it_over(tm
     with database.writing() as connection:
         connection.execute(text("UPDATE alembic_version SET version_num = :found"), {"found": revision})
     database.engine.dispose()
-    for upgrade in (None, True, False):
+    for upgrade in None, True, False:
         with raises(DatabaseTooOld) as caught:
             prepare_database(url(tmp_path), upgrade=upgrade)
     assert f"found {revision} of a version before 1.0" in str(caught.value)
@@ -227,7 +227,7 @@ def test_sqlite_can_be_opened_by_anything_else(tmp_path):
 
 def test_a_commit_waits_for_the_standby_even_if_the_role_is_set_up_otherwise(new_postgres_database):
     url = new_postgres_database()
-    for unsafe in ("local", "remote_write", "off"):
+    for unsafe in "local", "remote_write", "off":
         database = open_database(f"{url}?options=-csynchronous_commit%3D{unsafe}")
         with database.reading() as connection:
             assert connection.execute(text("SHOW synchronous_commit")).scalar() == "on"
@@ -433,7 +433,7 @@ def test_a_snapshot_of_the_schema_makes_the_tables_of_this_version(tmp_path, new
     with made.writing() as connection:
         METADATA.create_all(connection)
     assert described_schema(found) == described_schema(made) != {}
-    for database in (found, made):
+    for database in found, made:
         database.engine.dispose()
 
 

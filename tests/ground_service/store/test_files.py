@@ -77,12 +77,12 @@ def test_leftovers_of_ended_processes_are_removed_at_the_start(tmp_path, ended_p
     of_ended = mine.replace(f".{os.getpid()}", f".{ended_process}")
     same_number_before = mine.rpartition(".")[0] + ".12345"
     left_over = (f"{of_ended}-b", f"{same_number_before}-d", ".incoming-old")
-    for name in (f"{mine}-a", ".incoming-00000000.1-c", *left_over):
+    for name in f"{mine}-a", ".incoming-00000000.1-c", *left_over:
         (files.root / name).write_bytes(b"half")
         folder = tmp_path / name.replace("incoming", "unpacking")
         (folder / "images").mkdir(parents=True)
         (folder / "images" / "0.png").write_bytes(b"half")
-    for old in (files.root / ".incoming-old", tmp_path / ".unpacking-old"):
+    for old in files.root / ".incoming-old", tmp_path / ".unpacking-old":
         os.utime(old, (0, 0))
     with open_ground(tmp_path):
         left = sorted(path.name for path in files.root.glob(".incoming-*"))

@@ -171,7 +171,7 @@ def test_a_folder_is_never_trimmed(tmp_path):
 
 def test_keys_come_from_files_and_are_not_shown(monkeypatch, tmp_path):
     monkeypatch.setenv("LINNA_OBJECTS", "s3://linna")
-    for name in ("access", "secret"):
+    for name in "access", "secret":
         (tmp_path / name).write_text(f"{name}-value\n")
         monkeypatch.setenv(f"LINNA_OBJECTS_{name.upper()}_KEY_FILE", str(tmp_path / name))
     found = objects_of(load_settings())

@@ -39,7 +39,7 @@ def roles(new_postgres_database):
     database = make_url(superuser).database
     engine = create_engine(superuser, isolation_level="AUTOCOMMIT")
     with engine.connect() as connection:
-        for name in (OWNER, SERVICE, BACKUP):
+        for name in OWNER, SERVICE, BACKUP:
             connection.execute(text(f"CREATE ROLE {name} LOGIN"))
         connection.execute(text(f"ALTER DATABASE {database} OWNER TO {OWNER}"))
         connection.execute(text(f"ALTER SCHEMA public OWNER TO {OWNER}"))
@@ -55,7 +55,7 @@ def roles(new_postgres_database):
     yield Roles(superuser, *urls)
     # Roles belong to the server, which other modules share.
     with engine.connect() as connection:
-        for name in (SERVICE, BACKUP, OWNER):
+        for name in SERVICE, BACKUP, OWNER:
             connection.execute(text(f"REASSIGN OWNED BY {name} TO CURRENT_USER"))
             connection.execute(text(f"DROP OWNED BY {name}"))
             connection.execute(text(f"DROP ROLE {name}"))
@@ -222,7 +222,7 @@ def test_one_right_too_many_is_noticed(roles):
     database = open_database(roles.service)
     check_role(database)
     with owner.connect() as connection:
-        for right in ("UPDATE", "DELETE", "TRUNCATE", "TRIGGER"):
+        for right in "UPDATE", "DELETE", "TRUNCATE", "TRIGGER":
             connection.execute(text(f"GRANT {right} ON audit TO {SERVICE}"))
             with raises(PowerfulRole, match="can change the audit log"):
                 check_role(database)

@@ -20,7 +20,7 @@ def compared(tmp_path_factory, make_pass, console, serve):
     """A service with two passes that have reports, and one that has none."""
     home = tmp_path_factory.mktemp("compared") / "home"
     with open_ground(home) as ground:
-        for frames, seed in ((40, 1), (30, 2)):
+        for frames, seed in (40, 1), (30, 2):
             key = import_archive(ground, make_pass(frames=frames, seed=seed).folder)
             make_report(ground, key)
         start = 1_900_000_000_000_000_000
@@ -46,7 +46,7 @@ def test_passes_chosen_on_the_list_are_compared_side_by_side(view):
     settled(view, "/passes")
     button = view.get_by_role("button", name="Compare")
     expect(button).to_be_disabled()
-    for key in ("1", "2"):
+    for key in "1", "2":
         line = view.locator("#passes tbody tr").filter(has=view.locator(f'a[href="/passes/{key}"]'))
         line.get_by_role("checkbox").press("Space")
     expect(view).to_have_url(re.compile("compare=1&compare=2"))

@@ -115,7 +115,7 @@ def test_files_of_open_mct_are_compressed_kept_and_no_others_are_reached(shown, 
     _, packed, headers = ask(f"{shown.url}/mct/{version}/openmct.js", **{"Accept-Encoding": "gzip"})
     assert headers["Content-Encoding"] == "gzip" and gzip.decompress(packed) == plain
     assert len(packed) < len(plain) / 3
-    for path in ("../package.json", "%2e%2e/package.json", "openmct.js.map", "package.json", "", "/etc/passwd"):
+    for path in "../package.json", "%2e%2e/package.json", "openmct.js.map", "package.json", "", "/etc/passwd":
         assert ask(f"{shown.url}/mct/{version}/{path}")[0] == 404, path
     assert ask(f"{shown.url}/mct/4.1.0/openmct.js")[0] == 404
 
@@ -156,7 +156,7 @@ def test_values_alarms_and_limits_follow_the_telemetry(mct, shown):
     listed = mct.locator(".c-fault-mgmt__list").filter(has=mct.get_by_label("Select fault: temperature"))
     current = listed.get_by_label("Live Value")
     expect(current).to_have_text("95.25 °C")
-    for second, temperature_c, colour in ((2, 97.5, "red"), (3, 70.0, "yellow")):
+    for second, temperature_c, colour in (2, 97.5, "red"), (3, 70.0, "yellow"):
         upload(shown.url, second, {"housekeeping": HOUSEKEEPING | {"temperature_c": temperature_c}})
         expect(current).to_have_text(f"{temperature_c:g} °C")
         expect(current).to_have_class(re.compile(f"is-limit--upr is-limit--{colour}"))
@@ -219,7 +219,7 @@ def test_the_annotation_of_a_plot_is_kept_in_the_browser(mct, shown):
     mct.get_by_placeholder("Type to select tag").click()
     mct.locator(".js-tag-option", has_text="Anomaly").click()
     expect(mct.locator(".c-tag__label", has_text="Anomaly")).to_be_visible()
-    for scheme in ("dark", "light"):
+    for scheme in "dark", "light":
         mct.emulate_media(color_scheme=scheme)
         again = open_plot(mct, shown.url)
         wait_for(lambda plot=again: marked(plot) > plain + 300, f"the marks are not drawn in the {scheme} theme")
@@ -246,7 +246,7 @@ def test_what_comes_within_a_minute_of_the_newest_telemetry_is_shown_once(mct, s
     state = "navigation_state.spherical.altitude_m"
     key = {"events": f"events~76~{instance}", "parameter": f"parameter~76~{instance}~{state}"}[kind]
     mct.evaluate(FOLLOW, key)
-    for at in (second, second + 1):
+    for at in second, second + 1:
         ticks = int(ticks_from_utc_ns(AFTER)) + at * 65_536
         packets = {
             "navigation_state": {"image_ticks": ticks, "estimator": estimator},

@@ -162,7 +162,7 @@ def prepared_home(folder, telemetry_port):
         add_mission(ground, MISSION.format(port=telemetry_port).encode(), actor="ann")
         stored = ground.files.put_file(folder / "orbits.oem")
         add_ephemeris(ground, stored, name="orbits", precedence=0, actor="ann")
-        for name, minute in (("morning", 0), ("noon", 60)):
+        for name, minute in ("morning", 0), ("noon", 60):
             start = START + minute * 60 * NS
             add_window(ground, WindowEntry(name, start, start + 180 * NS, 15.0, 76), actor="ann")
     return home

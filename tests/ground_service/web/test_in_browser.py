@@ -83,7 +83,7 @@ def test_a_pass_is_exported_with_a_button(page):
 
 def test_a_telephone_scrolls_wide_tables_rather_than_break_words(page):
     page.set_viewport_size({"width": 390, "height": 844})
-    for path in ("/missions", "/missions/{revision}", "/audit"):
+    for path in "/missions", "/missions/{revision}", "/audit":
         settled(page, path)
         expect(page.locator("tbody tr:visible").first).to_be_visible()
         assert page.evaluate("document.documentElement.scrollWidth") <= 390, path
@@ -94,7 +94,7 @@ def test_a_telephone_scrolls_wide_tables_rather_than_break_words(page):
 
 def test_marks_of_a_legend_stay_with_their_text_on_a_telephone(page):
     page.set_viewport_size({"width": 390, "height": 844})
-    for path in ("/commands", "/live"):
+    for path in "/commands", "/live":
         settled(page, path)
         loose, heights = page.evaluate(
             """() => {
@@ -581,7 +581,7 @@ def test_a_series_of_a_chart_is_hidden_with_its_band_and_shown_again_with_keys(p
     settled(page, "/telemetry?pass=1&chart=1:temperature_c")
     label = page.locator(".chart .u-legend").get_by_role("button", name="temperature")
     shown = "document.querySelector('.chart').plot.series.slice(1).map((one) => one.show)"
-    for key, pressed in (("Enter", "false"), (" ", "true")):
+    for key, pressed in ("Enter", "false"), (" ", "true"):
         label.press(key)
         expect(label).to_have_attribute("aria-pressed", pressed)
         assert set(page.evaluate(shown)) == {pressed == "true"}
@@ -596,7 +596,7 @@ def test_a_build_is_brought_run_and_judged(page, make_flyable, make_build, tmp_p
     found = {"synthetic pass 61": flown.packets}
     half = with_detections(found, lambda items: {name: values[::2] for name, values in items.items()})
     broken = {"program": "raise SystemExit(4)"}
-    for name, packets, options in (("good", found, {}), ("half", half, {}), ("broken", found, broken)):
+    for name, packets, options in ("good", found, {}), ("half", half, {}), ("broken", found, broken):
         build = make_build(name, packets, **options)
         files.append(("builds", make_archive(str(tmp_path / name), "zip", build.parent)))
     settled(page, "/regression")
@@ -605,8 +605,8 @@ def test_a_build_is_brought_run_and_judged(page, make_flyable, make_build, tmp_p
         page.locator("#zip").set_input_files(file)
         press(page, "Upload")
         expect(page.locator("#notices .good")).to_have_count(1 + files.index((kind, file)))
-    for candidate, verdict in (("good", "pass"), ("half", "fail"), ("broken", "fail")):
-        for select, build in (("#candidate", candidate), ("#baseline", "good")):
+    for candidate, verdict in ("good", "pass"), ("half", "fail"), ("broken", "fail"):
+        for select, build in ("#candidate", candidate), ("#baseline", "good"):
             option = page.locator(f"{select} option", has_text=build)
             page.locator(select).select_option(option.get_attribute("value"))
         page.get_by_role("button", name="Run", exact=True).click()

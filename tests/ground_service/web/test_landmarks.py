@@ -27,7 +27,7 @@ def searched(tmp_path_factory, make_flyable, console, serve):
     full = load_catalogue(folder / "catalogue.csv")
     save_catalogue(full.select(np.arange(len(full)) % 3 != 0), folder / "catalogue.csv")
     with open_ground(home) as ground:
-        for name in ("first pass", "second pass"):
+        for name in "first pass", "second pass":
             enter_files(folder, pass_name=name)
             update_landmarks(ground, import_archive(ground, folder))
         assert ground.read(list_landmarks, LandmarkFilter(state="proposed")).total > 25  # more than a page
@@ -73,7 +73,7 @@ def test_an_operator_reviews_landmarks_with_the_keyboard(review):
     image = drawing.locator("image").get_attribute("href")
     assert page.request.get(image).headers["content-type"] == "image/png"
     answered(page)
-    for scheme in ("light", "dark"):
+    for scheme in "light", "dark":
         page.emulate_media(color_scheme=scheme)
         assert barriers(page) == [], scheme
     page.keyboard.press("Tab")
@@ -88,7 +88,7 @@ def test_an_operator_reviews_landmarks_with_the_keyboard(review):
     expect(page.get_by_role("button", name="Accept")).to_be_visible()
     expect(page.locator("#sightings-title")).to_be_focused()
     # both pages no longer propose it: the other one by the live feed
-    for one in (page, other):
+    for one in page, other:
         expect(one.get_by_role("button", name=f"Sightings of landmark {number}", exact=True)).to_have_count(0)
     page.get_by_label("State").select_option("rejected")
     expect(page.locator("#landmarks tbody tr")).to_have_count(1)
@@ -99,7 +99,7 @@ def test_a_viewer_sees_landmarks_and_does_not_decide(review):
     page = review("viewer")
     page.get_by_role("button", name="Sightings of landmark").first.click()
     expect(page.locator("#decision-text")).to_have_text("proposed")
-    for name in ("Accept", "Reject"):
+    for name in "Accept", "Reject":
         expect(page.get_by_role("button", name=name)).to_be_hidden()
     expect(page.get_by_label("Reason")).to_be_hidden()
     press(page, "Next")

@@ -126,7 +126,7 @@ def worked(tmp_path_factory, make_pass, make_flyable, make_build, console, serve
     with open_ground(home) as ground:
         token = add_user(ground, "root", "admin")
         make_report(ground, import_archive(ground, received.folder))
-        for name in ("first pass", "second pass"):
+        for name in "first pass", "second pass":
             enter_files(learned.folder, pass_name=name)
             update_landmarks(ground, import_archive(ground, learned.folder))
         mission = add_mission(ground, MISSION.format(**ports).encode(), actor="root")

@@ -298,7 +298,7 @@ def planner(browser, tmp_path, console, serve, day_of_orbits):
     battery = "[resources]\nbattery_wh = 100.0\ngeneration_w = 0.0\nidle_w = 6.0\nobserving_w = 60.0\n"
     home_with_orbits(home, day_of_orbits, battery)
     with open_ground(home) as ground:
-        for name, minute in (("first", 60), ("second", 90)):
+        for name, minute in ("first", 60), ("second", 90):
             start = ORBITS + minute * 60 * 10**9
             add_window(ground, WindowEntry(name, start, start + 1200 * 10**9, 15.0, 76), actor="ann")
     with serve(home, console.port) as running, strict_page(browser, running.url, strict=False) as page:
@@ -342,7 +342,7 @@ def test_a_draft_is_moved_and_resized_by_keys_by_the_form_and_with_the_pointer(p
     bar = page.locator('#timeline [data-window="1"]')
     bar.press("ArrowRight")
     wait_for(lambda: times(page, 1) == (61.0, 81.0), "not moved")
-    for key, expected in (("ArrowDown", (61.0, 80.0)), ("]", (62.0, 80.0)), ("Shift+ArrowUp", (62.0, 80.0 + 1 / 6))):
+    for key, expected in ("ArrowDown", (61.0, 80.0)), ("]", (62.0, 80.0)), ("Shift+ArrowUp", (62.0, 80.0 + 1 / 6)):
         answered(page)
         bar.press(key)
         wait_for(lambda expected=expected: times(page, 1) == approx(expected), key)

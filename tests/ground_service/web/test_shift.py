@@ -85,7 +85,7 @@ class Spacecraft:
     _sending: threading.Lock = field(default_factory=threading.Lock)
 
     def __post_init__(self):
-        for task in (self._accept_listeners, self._take_telecommands):
+        for task in self._accept_listeners, self._take_telecommands:
             self._start(task)
 
     def _start(self, task, *arguments):
@@ -131,11 +131,11 @@ class Spacecraft:
             while octets := connection.recv(1 << 16):
                 for packet in decoder.decode(octets).packets:
                     request = int.from_bytes(packet[:4], "big")
-                    for stage in ("accepted", "started", "completed"):
+                    for stage in "accepted", "started", "completed":
                         self.report(f"verification_{stage}", request_id=request)
 
     def close(self):
-        for one in (self.down, self.up, *self._listeners, *self._connections):
+        for one in self.down, self.up, *self._listeners, *self._connections:
             end_socket(one)
         for task in self._tasks:
             task.join(TIMEOUT_S)
@@ -271,7 +271,7 @@ def test_an_operator_works_a_shift(operator, shift):
     expect(window).to_contain_text("begins in")
 
     # Six clicks lead from the search to telecommands that are sent, outside of a contact and in one.
-    for during, window in ((nullcontext(), 1), (telemetry(spacecraft), -1)):  # the first one is planned already
+    for during, window in (nullcontext(), 1), (telemetry(spacecraft), -1):  # the first one is planned already
         go(page, "Shift", "Planner")
         expect(page.locator("#spacecraft")).to_have_value("76 flight")
         before = int(page.evaluate("sessionStorage.n"))

@@ -265,5 +265,5 @@ def test_the_status_states_what_is_known_and_what_is_not(admin):
     # The server gets the lease of the recurring work some seconds after its start; the page asks again.
     expect(admin.get_by_role("row").filter(has_text="Recurring work is done by")).not_to_contain_text("no process")
     expect(admin.locator("#complaints")).to_contain_text("No backup is known.")
-    for text in ("No process does the recurring work.", "The newest backup is"):
+    for text in "No process does the recurring work.", "The newest backup is":
         expect(admin.locator("#complaints")).not_to_contain_text(text)

@@ -135,7 +135,7 @@ def test_sockets_are_limited_for_a_user_and_in_all(client):
     tokens = {name: users.add_user(ground, name, "viewer") for name in ("ann", "bob", "cleo")}
     second = users.add_token(ground, "ann")
     held = []
-    for token in (tokens["ann"], tokens["ann"], second):
+    for token in tokens["ann"], tokens["ann"], second:
         held.append(client.websocket_connect(LIVE, headers=bearer(token)))
         held[-1].__enter__()
     assert refused(client, tokens["ann"]) and refused(client, second)
@@ -269,7 +269,7 @@ def test_a_slow_socket_skips_values_and_no_events():
         async def send_text(self, text):
             sent.append(text)
             if text == "event 1":  # what comes while this is being sent
-                for number in (2, 3):
+                for number in 2, 3:
                     session.offer(number, f"event {number}")
                     session.offer_values((1, "housekeeping"), f"values {number}")
             await asyncio.sleep(0)

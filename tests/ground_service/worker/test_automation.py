@@ -268,7 +268,7 @@ def test_a_report_that_failed_is_stated_at_its_window_and_made_later(either, flo
 
 def test_an_unfinished_job_of_a_rule_of_an_earlier_version_ends_without_work(ground):
     ground.write(publish, RegressionJudged(id="1" * 32, verdict="fail"))
-    for kind in ("automation", "notification"):
+    for kind in "automation", "notification":
         done = run_job(ground, enter_job(ground, kind, {"event": 1}))
         assert (done.state, done.result) == ("done", {"event": 1})
     failed = run_job(ground, enter_job(ground, "automation", {"event": 99}))
@@ -387,7 +387,7 @@ def test_a_failed_ingest_is_repeated_with_longer_and_longer_waits(either, monkey
     shown = complaints(read_condition(either, None))
     assert "1 ingests have failed; repeat or dismiss them on the page Shift." in shown
     for attempt, minutes in enumerate(waits_min, start=1):
-        for passed_min, attempts in ((minutes - 0.5, attempt), (minutes, attempt + 1)):
+        for passed_min, attempts in (minutes - 0.5, attempt), (minutes, attempt + 1):
             since = utc_now_ns() - int(passed_min * 60e9)
             with either.database.writing() as connection:
                 connection.execute(repository.JOBS.update().values(finished_utc_ns=since))
@@ -452,7 +452,7 @@ def test_an_attempt_that_another_has_overtaken_changes_nothing(ground, job_that)
 def test_an_id_that_stands_for_another_request_is_refused(ground):
     enter_job(ground, "report", {"pass_id": 1}, job_id="a" * 32)
     assert enter_job(ground, "report", {"pass_id": 1}, job_id="a" * 32) == "a" * 32
-    for kind, arguments in (("report", {"pass_id": 2}), ("nightly", {})):
+    for kind, arguments in ("report", {"pass_id": 2}), ("nightly", {}):
         with raises(Conflict, match="found another"):
             ground.write(add_job, kind, arguments, job_id="a" * 32)
 
@@ -462,7 +462,7 @@ def test_an_ingest_asked_for_twice_is_one_and_of_another_file_is_refused(ground)
     given = {"spacecraft_id": 76, "instance": "flight", "job_id": "b" * 32}
     first = enter_ingest(ground, one, "one", **given)
     assert enter_ingest(ground, one, "one", **given) == first
-    for stored, changed in ((other, {}), (one, {"spacecraft_id": 77}), (one, {"instance": "else"})):
+    for stored, changed in (other, {}), (one, {"spacecraft_id": 77}), (one, {"instance": "else"}):
         with raises(Conflict, match="found another"):
             enter_ingest(ground, stored, "one", **(given | changed))
     assert ground.read(repository.newest, repository.INGESTS, Paging())[1] == 1

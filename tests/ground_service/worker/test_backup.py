@@ -41,7 +41,7 @@ def rows_of_an_empty_service(ground):
 @fixture
 def filled(ground, synthetic_pass):
     import_archive(ground, synthetic_pass.folder)
-    for k in (2, 1):
+    for k in 2, 1:
         start = START + k * 100 * NS
         add_window(ground, WindowEntry(f"w{k}", start, start + 50 * NS, 15.0, 76), actor="ann")
     change_window(ground, 1, actor="ann", changes={"predecessor_id": 2})  # it names a window with a greater key
@@ -141,7 +141,7 @@ def test_a_backup_of_version_1_0_is_restored(tmp_path):
     upgrade_database(database, "1.0")
     user = "INSERT INTO users (name, role, state, created_utc_ns) VALUES ('ann', 'viewer', 'active', 1)"
     with database.writing() as connection:
-        for statement in (user, "INSERT INTO row_digests VALUES ('users', '1', 'x')"):
+        for statement in user, "INSERT INTO row_digests VALUES ('users', '1', 'x')":
             connection.execute(text(statement))
     with database.snapshot() as connection:
         tables, head = table_digests(connection), read_head(connection)

@@ -332,7 +332,7 @@ def test_signed_heads_that_a_webhook_and_an_e_mail_got_are_checked(webhook, mail
     add_channels(local, webhook, mailbox)
     (local.home / "secrets").mkdir()
     (local.home / "secrets/audit").write_text("key")
-    for name in ("hook", "people"):
+    for name in "hook", "people":
         nightly(local, {"audit_heads": f"channel:{name}"})
     heads = tmp_path / "heads"
     heads.mkdir()
@@ -397,7 +397,7 @@ def test_receivers_get_the_events_of_their_spacecraft_that_a_person_needs(webhoo
     follow_in_process(local)
     add_hook(local, webhook)
     with local.database.writing() as connection:
-        for key, spacecraft in ((1, 76), (2, 77)):
+        for key, spacecraft in (1, 76), (2, 77):
             row_of(connection, METADATA.tables["vehicles"], id=key, ccsds_id=spacecraft, instance="flight")
         row_of(connection, METADATA.tables["passes"], id=1, vehicle_id=1)
         row_of(connection, METADATA.tables["files"], sha256="0" * 64)
@@ -519,7 +519,7 @@ def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
     with opened.database.writing() as connection:
         leases.acquire(connection, "scheduler", "somebody", 60_000_000_000)
     with ExitStack() as running:
-        for kind in ("api", "worker"):
+        for kind in "api", "worker":
             running.enter_context(present(opened, given, kind))
         assert faults(opened, given) == {}
         names = {one.name for one in examine(opened, given)}
@@ -566,7 +566,7 @@ def test_the_doctor_finds_a_healthy_deployment_and_names_each_fault(
         assert "audit heads" not in faults(opened, opened_to_people)
 
         # 6. Audit heads go to a channel that no mission description has, or to a folder that does not exist.
-        for target, fault in (("channel:nobody", "found nobody"), (str(tmp_path / "none"), "a folder that can")):
+        for target, fault in ("channel:nobody", "found nobody"), (str(tmp_path / "none"), "a folder that can"):
             given_heads = given.model_copy(update={"audit_heads": target})
             assert fault in faults(opened, given_heads)["audit heads"]
     found = faults(opened, given)

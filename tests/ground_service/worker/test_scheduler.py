@@ -97,7 +97,7 @@ def test_the_nightly_job_is_entered_once_after_half_past_midnight(ground, monkey
     monkeypatch.setattr(scheduling, "CATCH_UP_S", -1.0)
     one, work = make(ground)
     midnight = parse_utc("2029-08-07T00:00:00Z")
-    for minute, entered in ((29, 0), (30, 1), (31, 1), (1439, 1), (1440 + 29, 1), (1440 + 30, 2)):
+    for minute, entered in (29, 0), (30, 1), (31, 1), (1439, 1), (1440 + 29, 1), (1440 + 30, 2):
         now = midnight + minute * 60_000_000_000
         monkeypatch.setattr(scheduling, "utc_now_ns", lambda now=now: now)
         one.tick()
@@ -139,7 +139,7 @@ def test_the_plan_is_entered_once_an_hour_of_mission_time(ground, monkeypatch):
     one, work = make(ground)
     monkeypatch.setattr(scheduling, "needs_plan", lambda ground: True)
     begin = parse_utc("2029-08-07T05:00:00Z")
-    for second, entered in ((0, 1), (10, 1), (3599, 1), (3600, 2), (3610, 2)):
+    for second, entered in (0, 1), (10, 1), (3599, 1), (3600, 2), (3610, 2):
         now = begin + second * 1_000_000_000
         monkeypatch.setattr(scheduling, "mission_now_ns", lambda now=now: now)
         one.tick()

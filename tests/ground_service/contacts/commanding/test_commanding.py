@@ -277,7 +277,7 @@ def test_the_approval_of_a_window_by_somebody_else_is_the_second_person_of_its_t
         uplink_window(ground, planned(ground), actor="bob")
     assert ground.read(list_telecommands, TelecommandFilter()).total == 0
     [window] = [row.id for row in ground.read(list_windows, WindowFilter()).items]
-    for decision in ("draft", "approved"):
+    for decision in "draft", "approved":
         change_window(ground, window, actor="bob", changes={}, decision=decision)
     assert len(uplink_window(ground, window, actor="ann")) == 3
 
@@ -372,14 +372,14 @@ def test_a_time_out_lasts_a_second_to_68_years(ground, timeout_s, accepted):
 
 
 def test_an_unknown_name_is_answered_with_the_nearest_one(ground):
-    for name, near in (("test_conection", "test_connection"), ("zzz", DICTIONARY.telecommands[0].name)):
+    for name, near in ("test_conection", "test_connection"), ("zzz", DICTIONARY.telecommands[0].name):
         with raises(InvalidInput, match=f"of the dictionary, such as {near}, found '{name}'"):
             entered(ground, name)
 
 
 def test_commands_are_sent_in_the_order_of_their_release(ground, clock):
     first, second, third = (entered(ground, "test_connection") for _ in range(3))
-    for offset, command in ((1, second), (2, third), (2, first)):
+    for offset, command in (1, second), (2, third), (2, first):
         clock(NOW + offset)
         release_command(ground, command, actor="ann")
     stream, ids = uplinked(ground, framed=False)
@@ -444,7 +444,7 @@ def test_the_state_of_a_telecommand_takes_no_more_work_with_a_hundred_times_the_
     command, table, steps = sent(ground), repository.SAMPLES["housekeeping"], []
     request = {"request_id": get_command(ground, command).record.request_id}
     downlink(ground, tmp_path, ("verification_accepted", 10**6, request))
-    for rows in (range(20), range(20, 2000)):
+    for rows in range(20), range(20, 2000):
         with ground.database.writing() as connection:
             version = readable_version(connection, 1)
             mine = dict.fromkeys(table.c.keys(), 1) | {"dictionary_version": version}
@@ -525,7 +525,7 @@ def test_a_telecommand_released_at_once_needs_an_approval_by_two_persons(ground,
         assert (row.state, row.critical, row.timeout_s, row.window_id) == ("released", 1, 50, 3)
         assert get_command(ground, schedule()).record.critical == 1
     else:
-        for work in (lambda: add("perform_function", REBOOT), schedule):
+        for work in lambda: add("perform_function", REBOOT), schedule:
             with raises(Conflict, match=r"telecommand perform_function: .*critical"):
                 work()
         assert ground.read(list_telecommands, TelecommandFilter()).total == 1

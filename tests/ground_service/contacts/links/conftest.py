@@ -56,7 +56,7 @@ class Station:
 
     def close(self):
         """Close everything."""
-        for one in (self.down, self.up, *self.connections, *self.uplinks):
+        for one in self.down, self.up, *self.connections, *self.uplinks:
             with contextlib.suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)
             one.close()

@@ -40,14 +40,14 @@ def test_contacts_are_where_the_station_sees_the_spacecraft_cut_by_query_ephemer
     for one in contacts:
         inside = np.linspace(one.start_utc_ns + NS, one.stop_utc_ns - NS, 20).astype(np.int64)
         assert link(orbit, inside, MADRID).visible.all()
-        for edge, step in ((one.start_utc_ns, -3 * NS), (one.stop_utc_ns, 3 * NS)):
+        for edge, step in (one.start_utc_ns, -3 * NS), (one.stop_utc_ns, 3 * NS):
             if START + 10 * NS < edge < START + DAY - 10 * NS:
                 assert not link(orbit, np.array([edge + step]), MADRID).visible[0]
     whole = predict_contacts(orbit, [MADRID], START, START + DAY)
     edges = range(BLOCK_NS * (START // BLOCK_NS + 1), START + DAY, BLOCK_NS)
     above = predict_contacts(orbit, [ALWAYS], START, START + DAY)
     assert any(one.start_utc_ns < edge < one.stop_utc_ns for one in above for edge in edges)
-    for start, stop in ((START + 3 * NS, START + DAY), (whole[0].start_utc_ns + NS, whole[-1].stop_utc_ns - NS)):
+    for start, stop in (START + 3 * NS, START + DAY), (whole[0].start_utc_ns + NS, whole[-1].stop_utc_ns - NS):
         found = predict_contacts(orbit, [MADRID], start, stop)
         cut = [(max(one.start_utc_ns, start), min(one.stop_utc_ns, stop)) for one in whole]
         assert [(one.start_utc_ns, one.stop_utc_ns) for one in found] == [span for span in cut if span[0] < span[1]]

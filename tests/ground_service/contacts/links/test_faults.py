@@ -184,7 +184,7 @@ def test_a_link_that_could_not_be_opened_is_opened_later_with_its_spool_and_its_
 def test_a_gap_in_the_ephemeris_is_a_reason_and_not_an_error(ground, station, tmp_path):
     declare(ground, PLACES + station.link('station = "here"'))
     parts = []
-    for begin in (0, 7200):
+    for begin in 0, 7200:
         every = START + np.arange(begin, begin + 3601, 60, dtype=np.int64) * NS
         parts += ephemeris_from_states(every, *circular_states(every)).segments
     save_oem(Ephemeris(tuple(parts)), tmp_path / "gap.oem")

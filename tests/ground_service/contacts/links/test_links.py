@@ -136,7 +136,7 @@ def test_parts_of_frames_are_ingested_as_they_arrive(ground, station, stream, ex
     with operated(ground):
         connection = station.accept()
         start = 0
-        for stop in (700, 5 * CADU, 6 * CADU - 9, 6 * CADU, len(stream)):
+        for stop in 700, 5 * CADU, 6 * CADU - 9, 6 * CADU, len(stream):
             connection.sendall(stream[start:stop])
             wait_for(lambda stop=stop: received_of(ground) == stop, f"{stop} octets in the archive")
             start = stop
@@ -356,7 +356,7 @@ def test_expired_telecommands_are_not_sent(ground, station, stream):
     declare(ground, station.link())
     late, timely = released(ground, 2)
     with ground.database.writing() as connection:
-        for key, before in ((late, mission_now_ns() - 1), (timely, mission_now_ns() + 10**12)):
+        for key, before in (late, mission_now_ns() - 1), (timely, mission_now_ns() + 10**12):
             repository.change(connection, repository.TELECOMMANDS, key, send_before_utc_ns=before)
     with operated(ground) as runner:
         station.accept().sendall(stream[: 3 * CADU])
@@ -640,7 +640,7 @@ def test_a_refused_transmission_is_given_to_no_link_that_cannot_send_it(either, 
     declare(either, station.link() + station.link(section).replace('"lab"', '"other"'))
     released(either)
     lab, other = (acquired(either, name=name) for name in ("lab", "other"))
-    for one in (lab, other):
+    for one in lab, other:
         assert service.start_contact(either, one, utc_now_ns()) is not None
     (transmission,) = service.take_transmissions(either, lab, "here")
     if event == "released":

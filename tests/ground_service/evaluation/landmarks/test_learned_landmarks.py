@@ -71,7 +71,7 @@ def distances_m(catalogue, one):
 def both_passes(ground, thinned):
     """Import one archive under two names, as two passes over the same ground."""
     folder, ids = thinned[0], []
-    for name in ("first pass", "second pass"):
+    for name in "first pass", "second pass":
         enter_files(folder, pass_name=name)
         ids.append(import_archive(ground, folder))
     return ids
@@ -217,7 +217,7 @@ def test_passes_that_agree_reduce_the_variance_not_common_to_them_and_others_enl
     """The error of the catalogue, and the 30 % of the variance that the detector repeats on every pass."""
     common = 20.0
     place = _place(sigma_m=float(np.hypot(100.0, common)))
-    for count in (1, 4, 10_000):
+    for count in 1, 4, 10_000:
         left = np.sqrt(100.0**2 * (0.3 + 0.7 / count) + common**2)
         assert combined([place] * count).sigma_m[0] == approx(left)
     apart = combined([_place(-300.0), _place(300.0)])
@@ -254,7 +254,7 @@ def test_the_uncertainty_is_that_of_the_errors_on_one_pass_and_on_three(error_px
     along = np.radians(np.linspace(-8.0, 8.0, frames))
     own = rng.normal(0.0, np.sqrt(0.3) * error_px, (len(grid), 2))
     found = []
-    for track_deg in (-0.6, 0.0, 0.6):
+    for track_deg in -0.6, 0.0, 0.6:
         position = mcmf_from_spherical(along, np.full(frames, np.radians(track_deg)), np.full(frames, 3e4))
         turned = nadir_camera_from_mcmf(position)
         seen = expected_craters(craters, camera, position, turned)

@@ -331,7 +331,7 @@ def test_what_is_old_goes_before_anything_of_the_night_can_fail(ground, monkeypa
     monkeypatch.setattr(upkeep, "make_due_reports", fail)
     enter_job(ground, "nightly", {}, job_id=upkeep.nightly_job_id(utc_now_ns() - upkeep.DAY_NS))
     with ground.database.writing() as connection:
-        for number in (1, 2):
+        for number in 1, 2:
             publish(connection, WindowChanged(id=number, state="processed"))
     with ground.database.writing() as connection:
         connection.execute(repository.EVENT_LOG.update().values(utc_ns=0))
@@ -380,7 +380,7 @@ def test_operations_and_commands_give_the_same_report(ground, tmp_path, capsys):
         made = client.add_monthly_report(SPACECRAFT, "2029-08")
         assert [one.id for one in client.list_monthly_reports(spacecraft_id=SPACECRAFT)] == [made.id]
         assert list(client.list_monthly_reports(spacecraft_id=1)) == []
-        for kind in ("html", "pdf", "json"):
+        for kind in "html", "pdf", "json":
             client.get_monthly_report(made.id, tmp_path / f"api.{kind}", format=kind)
         found = client.get_performance(SPACECRAFT, start=str(UtcTime(FIRST)), window_days=3.0)
         assert (len(found.passes), found.window_days) == (14, 3.0)

@@ -134,7 +134,7 @@ def test_two_stations_that_disagree_with_the_on_board_clock_as_well_are_both_lef
 
 def test_a_clock_that_was_set_on_board_is_no_fault_of_a_station():
     right = {"a": [0.0] * 16, "b": [0.0] * 16}
-    for pattern in ("a" * 16, "abababababababab", "aaaabbbbaaaabbbb"):
+    for pattern in "a" * 16, "abababababababab", "aaaabbbbaaaabbbb":
         given = reports_of_stations(pattern, right, [0.0] * 8 + [1.0] * 8)
         kept, doubts = doubted_stations(*given)
         assert kept.all() and not doubts
@@ -167,7 +167,7 @@ def test_a_single_station_off_by_whole_seconds_of_a_usual_cause_decides_nothing(
 
 def test_the_station_that_agrees_with_the_on_board_clock_counts_and_a_corrected_one_from_then_on():
     clocks = {"a": [-18.0] * 12, "b": [37.0] * 12, "c": [0.0] * 12}
-    for pattern in ("aaaabbbbbccc", "abcabcabcabc"):
+    for pattern in "aaaabbbbbccc", "abcabcabcabc":
         kept, doubts = doubted_stations(*reports_of_stations(pattern, clocks))
         assert np.flatnonzero(kept).tolist() == [k for k, name in enumerate(pattern) if name == "c"]
         assert {one.station: round(one.difference_s) for one in doubts.values()} == {"canberra": -18, "madrid": 37}
@@ -222,7 +222,7 @@ def test_a_new_correlation_moves_the_times_that_its_line_changes():
 
 def test_a_correlation_holds_years_away():
     line = TimeCorrelation(1, 0, 1, int(ticks_from_utc_ns(START)), START, 0.0)
-    for years in (-9, 5):
+    for years in -9, 5:
         utc_ns = START + years * 365 * 86_400 * NS
         assert ticks_of_utc_ns(utc_ns, [line]) == approx(int(ticks_from_utc_ns(utc_ns)), abs=2)
 

@@ -170,7 +170,7 @@ def test_a_step_during_hours_without_reports_begins_a_new_line(drift_ppm):
     sent = START + np.asarray(hours * 3600 * NS, dtype=np.int64)
     error_s = hours * 3600.0 * drift_ppm * 1e-6
     none = np.zeros(len(hours), dtype=np.int64)
-    for step_s, lengths in ((0.0, [9]), (-1.0, [6, 3]), (0.1, [6, 3])):
+    for step_s, lengths in (0.0, [9]), (-1.0, [6, 3]), (0.1, [6, 3]):
         off = np.rint((error_s + np.where(hours > 5.0, step_s, 0.0)) * 65_536).astype(np.int64)
         runs = clock_runs(np.asarray(ticks_from_utc_ns(sent), dtype=np.int64) + off, sent, none, none)
         assert [len(one) for one in runs] == lengths

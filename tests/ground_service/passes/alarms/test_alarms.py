@@ -112,7 +112,7 @@ def test_a_limit_is_broken_once_and_cleared_after_acknowledgement_and_return(eit
 def test_a_worse_condition_must_be_acknowledged_again(ground):
     receive(ground, housekeeping(0, 70.0))
     acknowledge(ground)
-    for second, temperature_c, expected in ((1, 75.0, ("acknowledged", "warning")), (2, 90.0, ("raised", "alarm"))):
+    for second, temperature_c, expected in (1, 75.0, ("acknowledged", "warning")), (2, 90.0, ("raised", "alarm")):
         receive(ground, housekeeping(second, temperature_c))
         (alarm,) = alarms(ground)
         assert (alarm.state, alarm.severity) == expected
@@ -145,7 +145,7 @@ def test_packets_that_arrive_again_are_not_counted_again(ground):
 
 def test_new_packets_are_found_without_a_search_of_those_before(ground):
     steps = []
-    for seconds in (range(20), range(20, 1000)):
+    for seconds in range(20), range(20, 1000):
         receive(ground, *(housekeeping(second, 20.0) for second in seconds))
         with ground.database.reading() as connection:
             last = last_packet(connection, 1)
