@@ -2,7 +2,6 @@
 
 import math
 from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 from hypothesis import given, settings
@@ -124,7 +123,7 @@ def test_the_worst_frames_are_chosen_from_all_frames_and_not_from_those_with_an_
     inputs = SimpleNamespace(
         detections=Detections(frame_number=number, usable=number != 30), images=dict.fromkeys((0, 10, 39))
     )
-    spread, worst = _choose_frames(cast("Any", inputs), expected, Matches(row[:0], found))
+    spread, worst = _choose_frames(inputs, expected, Matches(row[:0], found))
     assert spread == [0, 10, 39]
     assert worst == list(range(20, 20 + WORST_FRAMES))
 

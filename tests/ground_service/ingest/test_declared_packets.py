@@ -9,7 +9,6 @@ import shutil
 import struct
 import warnings
 from itertools import pairwise
-from typing import Any, cast
 from unittest.mock import Mock
 
 import numpy as np
@@ -279,7 +278,7 @@ def test_a_series_has_least_greatest_and_mean_value_from_samples_and_from_rollup
 
 def test_a_later_definition_decodes_what_is_stored_and_packets_without_one_are_kept_as_unknown(either, monkeypatch):
     monkeypatch.setattr(decoding, "BLOCK_PACKETS", 50)
-    monkeypatch.setitem(cast(dict[str, Any], follow_up.DOING), "decode", lambda *_given: None)  # no job decodes
+    monkeypatch.setitem(follow_up.DOING, "decode", lambda *_given: None)  # no job decodes
     declared = "[[packets]]\nname = 'bus'\napids = [100, 101]\npacket_checksum = 'none'\n"
     enter(either, declared)
     result = take(either, bus_packets(100))
@@ -358,7 +357,7 @@ def test_the_integrity_check_finds_a_damaged_sample(either, changes, reason):
 
 
 def test_the_integrity_check_does_not_expect_samples_of_packets_that_are_not_yet_decoded(either, monkeypatch):
-    monkeypatch.setitem(cast(dict[str, Any], follow_up.DOING), "decode", lambda *_given: None)
+    monkeypatch.setitem(follow_up.DOING, "decode", lambda *_given: None)
     enter(either)
     result = take(either, bus_packets(10))
     enter(either, document=RENAMED)
