@@ -9,7 +9,6 @@ from contextlib import closing, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -46,7 +45,6 @@ SECOND = f'spacecraft = "Second"\nspacecraft_id = 77{SCENARIO.replace("seed = 3"
 DRIFT_PPM = 5.0
 
 
-Figures = dict[str, Any]
 NO_DATA = DataFolder(None)
 TERMS = RunTerms(days=0.25, windows_per_day=1, window_s=300.0)
 

@@ -388,7 +388,7 @@ def define_pass_of(ground, made):
 
 
 def _housekeeping(k):
-    values: dict[str, Any] = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
+    values = {field.name: 0 for field in DICTIONARY.packet("housekeeping").fields}
     known = json.loads('{"structure_id": 1, "boot_count": 1, "mode": "observing", "bus_voltage_v": 12.0}')
     return values | known | {"frames_processed": k, "temperature_c": 20.0 + 0.1 * k}
 

@@ -9,7 +9,6 @@ import threading
 import tracemalloc
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -295,7 +294,7 @@ def test_a_download_that_breaks_leaves_no_file(tmp_path, clock):
     assert list(tmp_path.iterdir()) == []
 
 
-ARGUMENTS: dict[str, Any] = json.loads("""{"constraints": {"a": 1}, "window": {"a": 1}, "change": {"a": 1},
+ARGUMENTS = json.loads("""{"constraints": {"a": 1}, "window": {"a": 1}, "change": {"a": 1},
     "plan": {"a": 1}, "request": {"a": 1}, "points": [{"a": 1}], "receptions": [{"a": 1}], "document": {"a": 1},
     "version": 1, "pinned": true, "format": "csv"}""") | {"file": b"octets"}
 

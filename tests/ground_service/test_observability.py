@@ -44,8 +44,7 @@ def alerts():
 
 
 def panels():
-    found = json.loads(DASHBOARD.read_text())["panels"]
-    return found
+    return json.loads(DASHBOARD.read_text())["panels"]
 
 
 def expressions():
@@ -60,7 +59,6 @@ def samples(tmp_path_factory, synthetic_pass):
     with open_ground(folder / "home") as ground:
         vehicle = ingest_file(ground, synthetic_pass.folder / "downlink.cadu").vehicle_id
         enter_job(ground, "report", {"pass_id": 1})
-        assert vehicle is not None
         add_correlation(ground, vehicle, utc_now_ns())
         backup(ground, folder / "backups" / "one", now_utc_ns=utc_now_ns())
     settings = Settings(home=folder / "home", backups=folder / "backups")
@@ -278,7 +276,6 @@ def test_ages_of_waiting_work_and_of_correlations(either, synthetic_pass):
     assert (idle.queue_age_s, idle.ingest_lag_s, idle.backup_age_s) == (0.0, 0.0, None)
     assert 0 < idle.disk_free <= idle.disk_size and idle.scheduler is None
     vehicle = ingest_file(either, synthetic_pass.folder / "downlink.cadu").vehicle_id
-    assert vehicle is not None
     # A finished ingest does not wait. The jobs of the other ages are older than the test.
     assert read_condition(either, None).ingest_lag_s == 0.0
     waiting, done = (enter_job(either, "plan", {}) for _ in range(2))

@@ -378,7 +378,6 @@ def test_the_mission_description_names_stations_and_links():
     world = open_world(scenario(SHORT), DataFolder(None))
     text = live_mission_text(world, DataFolder(None), "127.0.0.1", {"madrid": (1, 2)}, OPERATIONS)
     mission = parse_mission(text)
-    assert mission.link.stations is not None
     assert mission.link.stations["madrid"].latitude_deg == 40.43
     assert mission.link.stations["madrid"].outages == ("2029-08-07T04:00:00.000Z/2029-08-07T23:00:00.000Z",)
     assert mission.links is not None and mission.links[0].downlink == "127.0.0.1:1"
@@ -469,7 +468,6 @@ def test_the_registration_of_the_terrain_is_stated(world):
 def test_limits_and_the_offset_of_the_list_that_the_payload_starts_with_are_stated(world):
     stated = stated_of(world).catalogue
     loaded = launch_payload(world.scenario, world.camera, DataFolder()).parameters.flight.anchored
-    assert loaded.offset is not None
     up_m = loaded.errors.catalogue_offset_m[2]
     assert stated.offset_sigma_m == (loaded.offset.prior_m, loaded.offset.prior_m, up_m)
     assert np.radians(stated.offset_correlation_deg) == pytest.approx(loaded.offset.correlation_rad)

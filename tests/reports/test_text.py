@@ -117,7 +117,6 @@ def test_all_fields_are_there_with_whole_nanoseconds_and_nine_digits_in_the_same
     body = json.loads(to_json(whole_pass))
     assert body["reference"]["utc_ns"][0] == int(whole_pass.navigation[0].utc_ns[0])
     assert isinstance(body["reference"]["utc_ns"][0], int)
-    assert whole_pass.reference is not None
     back = np.array(json.loads(to_json(whole_pass))["reference"]["latitude_deg"])
     np.testing.assert_allclose(back, whole_pass.reference.latitude_deg, rtol=5.1e-9, atol=0)
 
@@ -210,7 +209,6 @@ def test_errors_are_binned_by_the_altitude_of_the_reference():
 
 def test_a_quantity_with_one_bin_is_a_sentence_and_no_plot():
     report = example.pass_report()
-    assert report.detector is not None
     one = (BinScore(15.0, 20.0, 300, 0.8, 0.7), BinScore(20.0, 25.0, 0, float("nan"), float("nan")))
     score = replace(report.detector, by_altitude_km=one)
     words = Page(render_html(replace(report, detector=score))).text

@@ -2,7 +2,6 @@
 
 import asyncio
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from fastapi.security import HTTPAuthorizationCredentials
@@ -12,7 +11,7 @@ from ground_service.access.service import LOCAL_CALLER, Caller, add_user, change
 from ground_service.errors import NotAuthorised
 from ground_service.http.problems import Forbidden
 
-NO_REQUEST: Any = None
+NO_REQUEST = None
 ROLES = ("viewer", "operator", "admin")
 
 

@@ -1,7 +1,6 @@
 """The start state flown on, against the circle of two bodies and against SciPy's integration of J2, Earth and Sun."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -45,9 +44,8 @@ def circle():
     return np.array(RADIUS_M * (np.cos(angle) * np.array([1.0, 0.0, 0.0]) + np.sin(angle) * INCLINED))
 
 
-Body = tuple[float, Callable[[float], np.ndarray]]
-EARTH: Body = (3.986004355e14, lambda tdb_s: np.asarray(earth_position_icrf_m(tdb_s)))
-SUN: Body = (1.32712440041e20, lambda tdb_s: np.asarray(sun_position_icrf_m(tdb_s)))
+EARTH = (3.986004355e14, lambda tdb_s: np.asarray(earth_position_icrf_m(tdb_s)))
+SUN = (1.32712440041e20, lambda tdb_s: np.asarray(sun_position_icrf_m(tdb_s)))
 
 
 def integrated(j2=J2, bodies=()):

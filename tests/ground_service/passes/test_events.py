@@ -225,7 +225,7 @@ def day_pass(ground, day):
 def test_bursts_of_yesterday_in_todays_stream_fall_into_their_own_day(ground, tmp_path):
     rng = random.Random(1)
     today, yesterday = housekeeping(0), housekeeping(-1)
-    stream: list[bytes] = []
+    stream = []
     while today or yesterday:
         burst = yesterday if yesterday and (not today or rng.random() < 0.3) else today
         for _ in range(min(rng.randint(1, 25), len(burst))):

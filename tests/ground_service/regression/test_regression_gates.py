@@ -62,7 +62,6 @@ NARROW = read_policy(
     "narrow",
 ).policy
 FRAMES = 49
-Passes = dict[str, PassFrames]
 
 
 def simulated(

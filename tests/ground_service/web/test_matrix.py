@@ -7,7 +7,6 @@ import itertools
 import os
 import subprocess
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -33,12 +32,11 @@ from tests.lazy import Lazy, expect
 from tests.scenarios import GOLDEN
 from tests.serving import wait_for
 
-Looks = tuple[tuple[Literal["light", "dark"], str, int], ...]
 FONTS = {"DejaVu": "DejaVu Sans", "Arial": "Liberation Sans"}
 """Fonts by the name in the table; Liberation Sans has the widths of Arial."""
 
-EVERY_LOOK: Looks = tuple(itertools.product(("light", "dark"), FONTS, (1280, 768, 390)))
-FEW_LOOKS: Looks = (
+EVERY_LOOK = tuple(itertools.product(("light", "dark"), FONTS, (1280, 768, 390)))
+FEW_LOOKS = (
     ("light", "Arial", 1280), ("dark", "Arial", 768), ("light", "DejaVu", 390), ("dark", "Arial", 390),
 )  # fmt: skip
 """Each scheme, font and width at least once; the last width is that of the keyboard."""

@@ -4,7 +4,6 @@ import errno
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -339,9 +338,6 @@ def test_a_processed_pass_is_searched_for_landmarks(either, flown, tmp_path):
     added = after.result["landmarks of pass 1"]["added"]
     page = either.read(list_landmarks, LandmarkFilter(limit=1000))
     assert page.total == added > 20 and {one.state for one in page.items} == {"seen"}
-
-
-Row = dict[str, Any]
 
 
 @pytest.fixture

@@ -98,7 +98,7 @@ def test_a_share_has_the_interval_of_wilson_and_a_window_excludes_passes_of_its_
 def test_permutations_in_blocks_give_the_same_changes(monkeypatch):
     values = np.random.default_rng(3).normal(size=60) + np.repeat([0.0, 3.0], 30)
     whole = core.change_points(values.tolist(), permutations=301)
-    largest: list[int] = []
+    largest = []
     permuted = core._largest_cusum
 
     def seen(ranks):
